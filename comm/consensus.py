@@ -1,0 +1,211 @@
+"""A network that agrees whom to follow: method 4 of the paper (section IV.F, algorithm 3)."""
+
+import math
+from typing import Annotated, ClassVar, Literal
+
+import torch
+from emberlink.envs import keys, streams, uav
+from emberlink.envs.config import WildfireConfig
+from emberlink.envs.reward import HeadingConfig, heading_reward, left_box
+from pydantic import ConfigDict, Field
+from pydantic.dataclasses import dataclass
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.data import Bounded, Composite, Unbounded
+
+from .base import CommModule
+
+TARGET = (keys.AGENTS, "target")
+"""float32 [..., 3]: where the UAV is to go, cells."""
+WAYPOINT = (keys.AGENTS, "waypoint")
+"""float32 [..., 3]: the random point that the UAV flies to as a wanderer, cells."""
+FOLLOWS = (keys.AGENTS, "follows")
+"""int64 [...]: the discoverer that a seeker follows, itself for a discoverer, -1 for a wanderer."""
+STREAK = (keys.AGENTS, "streak")
+"""int64 [...]: consecutive steps as a discoverer."""
+FIRE_SCORE = (keys.AGENTS, "fire_score")
+"""int64 [...]: fire points discovered over the streak."""
+ALTITUDE_SUM = (keys.AGENTS, "altitude_sum")
+"""float64 [...]: the altitudes of the streak added up; divided by the streak it is Avg_Alt."""
+
+_WAYPOINTS, _JITTER = range(100, 102)  # what a moment's random stream is split into
+
+
+@dataclass(frozen=True, kw_only=True, config=ConfigDict(extra="forbid", strict=True))
+class ConsensusConfig:
+    """The settings of method 4; the defaults are the paper's text."""
+
+    range: Annotated[float, Field(ge=0)] = 10.0
+    """UAVs nearer than this hear each other, cells; .inf for no limit"""
+    discoverer: Literal["new_fire", "any_fire"] = "new_fire"
+    """what a discoverer sees: new fire, or new or old fire"""
+    jitter: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.0
+    """standard deviation of what is added to x and y of a target closer than 1, cells"""
+    target: Literal["absolute", "relative"] = "absolute"
+    """whether the UAV is told the target's coordinates or the way to it"""
+    heading: HeadingConfig = HeadingConfig()
+    """the bonus for flying towards the target"""
+
+
+class Consensus(CommModule):
+    """Tells every UAV a target: 9 numbers, the UAV's own 6 and x, y, z of the target."""
+
+    config_type: ClassVar[type] = ConsensusConfig
+    memory_keys: ClassVar = (WAYPOINT, STREAK, FIRE_SCORE, ALTITUDE_SUM)
+    in_keys: ClassVar = [
+        *(keys.OBSERVATION, keys.POSITION, keys.NEW_FIRE, keys.OLD_FIRE),
+        *(keys.NEW_CENTRE, keys.OLD_CENTRE, keys.STREAM, keys.STEP),
+        *memory_keys,
+    ]
+    out_keys: ClassVar = [keys.OBSERVATION, TARGET, FOLLOWS, *memory_keys]
+
+    def __init__(self, world: WildfireConfig, config: ConsensusConfig):
+        super().__init__(world, config)
+        self.register_buffer("low", torch.tensor(world.low, dtype=torch.float64))
+        self.register_buffer("high", torch.tensor(world.high, dtype=torch.float64))
+
+    def specs(self, observation: Composite) -> Composite:
+        agents = observation[keys.AGENTS]
+        device, shape = observation.device, tuple(agents.shape)
+        features = agents[keys.OBSERVATION[1]].shape[-1]
+        agents[keys.OBSERVATION[1]] = Unbounded((*shape, features + 3), device=device)
+        for key in (TARGET, WAYPOINT):
+            low, high = (
+                side.to(device, torch.float32).expand(*shape, 3) for side in (self.low, self.high)
+            )
+            agents[key[1]] = Bounded(low, high, (*shape, 3), device=device, dtype=torch.float32)
+        for key in (FOLLOWS, STREAK, FIRE_SCORE):
+            agents[key[1]] = Unbounded(shape, device=device, dtype=torch.int64)
+        agents[ALTITUDE_SUM[1]] = Unbounded(shape, device=device, dtype=torch.float64)
+        return observation
+
+    def start(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """No streak, and a random point for everyone."""
+        position = tensordict.get(keys.POSITION)
+        nothing = torch.zeros_like(tensordict.get(keys.NEW_FIRE))
+        points = uav.random_points(
+            self._stream(tensordict, _WAYPOINTS), position.shape[-2], self.low, self.high
+        )
+        tensordict.set(WAYPOINT, points)
+        tensordict.set(STREAK, nothing)
+        tensordict.set(FIRE_SCORE, nothing.clone())
+        return tensordict.set(ALTITUDE_SUM, torch.zeros_like(position[..., 2].double()))
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        position = tensordict.get(keys.POSITION)
+        discovers = self._discovers(tensordict)
+        rank = self._track_record(tensordict, discovers)
+        follows = best_discoverer(neighbours(position, self.config.range), discovers, rank)
+        target = self._targets(tensordict, discovers, follows)
+        tensordict.set(FOLLOWS, follows)
+        tensordict.set(TARGET, target)
+        told = target - position if self.config.target == "relative" else target
+        own = tensordict.get(keys.OBSERVATION)
+        return tensordict.set(keys.OBSERVATION, torch.cat((own, self._scaled(told)), -1))
+
+    def shaping(self, before: TensorDictBase, after: TensorDictBase) -> Tensor:
+        """The heading term, unless the UAV left the box."""
+        term = heading_reward(
+            before.get(keys.POSITION),
+            after.get(keys.POSITION),
+            before.get(TARGET),
+            self.config.heading,
+        )
+        left = left_box(after.get(keys.BEYOND), self.world.reward.exit_axes)
+        return term.masked_fill(left, 0.0)
+
+    def _discovers(self, tensordict: TensorDictBase) -> Tensor:
+        fire = tensordict.get(keys.NEW_FIRE)
+        if self.config.discoverer == "any_fire":
+            fire = fire + tensordict.get(keys.OLD_FIRE)
+        return fire > 0
+
+    def _track_record(self, tensordict: TensorDictBase, discovers: Tensor) -> Tensor:
+        """Writes the streaks of this moment and returns the ranks, float64 [..., n]."""
+        discovered = tensordict.get(keys.NEW_FIRE)
+        altitude = tensordict.get(keys.POSITION)[..., 2].double()
+        streak = (tensordict.get(STREAK) + 1) * discovers
+        fire_score = (tensordict.get(FIRE_SCORE) + discovered) * discovers
+        altitude_sum = (tensordict.get(ALTITUDE_SUM) + altitude) * discovers
+        tensordict.set(STREAK, streak)
+        tensordict.set(FIRE_SCORE, fire_score)
+        tensordict.set(ALTITUDE_SUM, altitude_sum)
+        # Avg_Alt * Streak of the paper's equation is the sum of the altitudes of the streak.
+        return fire_score / altitude_sum.clamp(min=1e-9) * (discovered / altitude)
+
+    def _targets(self, tensordict: TensorDictBase, discovers: Tensor, follows: Tensor) -> Tensor:
+        """Where each UAV is to go, float32 [..., n, 3]; renews the wanderers' waypoints."""
+        position = tensordict.get(keys.POSITION)
+        waypoint, wanders = tensordict.get(WAYPOINT), follows < 0
+        stream = self._stream(tensordict, _WAYPOINTS)
+        other = uav.next_waypoint(waypoint, position, stream, self.low, self.high)
+        waypoint = torch.where(wanders[..., None], other, waypoint)
+        tensordict.set(WAYPOINT, waypoint)
+        new = (tensordict.get(keys.NEW_FIRE) > 0).unsqueeze(-1)
+        centre = torch.where(new, tensordict.get(keys.NEW_CENTRE), tensordict.get(keys.OLD_CENTRE))
+        leader = follows.clamp(min=0).unsqueeze(-1).expand_as(position)
+        target = torch.where(wanders[..., None], waypoint, position.gather(-2, leader))
+        over_fire = torch.cat((centre, position[..., 2:]), -1)
+        target = torch.where(discovers[..., None], over_fire, target)
+        return self._jittered(tensordict, target) if self.config.jitter else target
+
+    def _jittered(self, tensordict: TensorDictBase, target: Tensor) -> Tensor:
+        """Moves the x and y of targets closer than 1 by clipped noise, within the box."""
+        stream = self._stream(tensordict, _JITTER)
+        noise = streams.normal(stream, 2 * target.shape[-2]).unflatten(-1, (-1, 2))
+        noise = (self.config.jitter * noise).clamp(-1, 1)
+        near = uav.distance(tensordict.get(keys.POSITION), target) < 1
+        moved = target + torch.nn.functional.pad(noise, (0, 1)) * near[..., None]
+        return moved.clamp(self.low.float(), self.high.float())
+
+    def _stream(self, tensordict: TensorDictBase, use: int) -> Tensor:
+        moment = streams.fold(tensordict.get(keys.STREAM), tensordict.get(keys.STEP))
+        return streams.fold(moment, use)
+
+    def _scaled(self, told: Tensor) -> Tensor:
+        if self.world.observation == "raw":
+            return told
+        if self.config.target == "relative":
+            return told / ((self.high - self.low) / 2).float()
+        return uav.scale_to_box(told, self.low, self.high)
+
+
+def neighbours(position: Tensor, limit: float) -> Tensor:
+    """Who hears whom: another UAV at a distance below `limit`, bool [..., n, n].
+
+    Args:
+        position: float32 [..., n, 3], cells.
+        limit: communication range, cells.
+    """
+    near = uav.distance(position.unsqueeze(-2), position.unsqueeze(-3)) < limit
+    return near & ~torch.eye(near.shape[-1], dtype=torch.bool, device=near.device)
+
+
+def best_discoverer(adjacent: Tensor, discovers: Tensor, rank: Tensor) -> Tensor:
+    """Whom each UAV follows once its sub-network has agreed, int64 [..., n].
+
+    A non-discoverer hears the discoverers among its neighbours; the non-discoverers that are
+    connected through non-discoverers then agree on the best of all they hear: the highest rank,
+    among equal ones the lowest index. Discoverers follow themselves; -1 stands for nobody.
+
+    Args:
+        adjacent: bool [..., n, n], who hears whom.
+        discovers: bool [..., n].
+        rank: [..., n], read for discoverers only.
+    """
+    uavs = discovers.shape[-1]
+    itself = torch.eye(uavs, dtype=torch.bool, device=adjacent.device)
+    # Place 0 is the best discoverer; a stable sort puts the lower index first among equals.
+    known = rank.masked_fill(~discovers, -math.inf)
+    order = torch.sort(known, dim=-1, descending=True, stable=True).indices
+    place = order.argsort(-1).masked_fill(~discovers, uavs)
+    heard = place.unsqueeze(-2).masked_fill(~adjacent, uavs).amin(-1)
+    # Exchanging with neighbours once per round reaches, after k doublings, all within 2**k hops.
+    silent = ~discovers
+    within = (adjacent & silent.unsqueeze(-1) & silent.unsqueeze(-2)) | itself
+    for _ in range((uavs - 1).bit_length()):
+        within = (within.float() @ within.float()) > 0
+    agreed = heard.unsqueeze(-2).masked_fill(~within, uavs).amin(-1)
+    chosen = torch.where(discovers, place, agreed)
+    followed = order.gather(-1, chosen.clamp(max=uavs - 1))
+    return torch.where(chosen < uavs, followed, -1)

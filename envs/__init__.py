@@ -1,0 +1,9 @@
+"""The wildfire environment, for TorchRL and for PettingZoo."""
+
+from .config import WildfireConfig
+from .fire import FireConfig
+from .parallel import parallel_env
+from .reward import RewardConfig
+from .wildfire import WildfireEnv
+
+__all__ = ["FireConfig", "RewardConfig", "WildfireConfig", "WildfireEnv", "parallel_env"]

@@ -1,0 +1,322 @@
+"""Wildfires as data: a scenario is a set of ranges, a fire is what one seed draws from them.
+
+A fire is a time of arrival per cell, in steps; a cell burns from then on. It starts as a ring, the
+edge of a disc whose inside is burnt out and never counts as fire, and spreads by `spread`.
+Lengths of a scenario are in cells of a grid whose shorter side has 30 cells (`BASE_SIDE`); on
+another grid lengths, and with them rates, are scaled by min(X, Y)/30, so that it fits any grid.
+"""
+
+import dataclasses
+import hashlib
+import json
+import math
+import os
+import tempfile
+import warnings
+from importlib import resources
+from pathlib import Path
+from typing import Annotated, Literal, get_args
+
+import numpy as np
+import torch
+from omegaconf import OmegaConf
+from pydantic import AfterValidator, ConfigDict, Field, Strict
+from pydantic.dataclasses import dataclass
+from torch import Tensor
+
+from .spread import MAX_LENGTH_TO_BREADTH, arrival_times, disc
+from .streams import fold, uniform
+
+BASE_SIDE = 30
+HELD_OUT_FROM = 1_000_000
+GENERATOR_VERSION = 1  # raise it whenever the same config and seed give another fire
+Split = Literal["train", "heldout"]
+
+_STREAM = 0xF12E  # keeps a fire's draws apart from other uses of the same seed
+_NODES = 60  # nodes along the shorter side at least: twice the resolution of 30 cells
+_CHUNK = 200_000  # nodes computed at a time, so that the work stays in the processor's cache
+_SIDES = (8, 256)
+
+
+def _ordered(pair: tuple[float, float]) -> tuple[float, float]:
+    if pair[0] > pair[1]:
+        raise ValueError(f"a range is (low, high), got {pair}")
+    return pair
+
+
+_Ordered = AfterValidator(_ordered)
+_Pair = Strict(False)  # a list, as YAML has it, will do for a tuple
+_Degrees = Annotated[float, Field(ge=-360, le=360)]
+_Turn = Annotated[float, Field(ge=-3600, le=3600)]
+_Length = Annotated[float, Field(gt=0, le=30)]
+_Signed = Annotated[float, Field(ge=-30, le=30)]
+_Rate = Annotated[float, Field(gt=0, le=1)]
+_Fraction = Annotated[float, Field(ge=0, le=1)]
+_Ratio = Annotated[float, Field(ge=1, le=MAX_LENGTH_TO_BREADTH)]
+_Count = Annotated[int, Field(ge=0, le=32)]
+
+
+@dataclass(
+    frozen=True,
+    kw_only=True,
+    config=ConfigDict(extra="forbid", strict=True, use_attribute_docstrings=True),
+)
+class FireConfig:
+    """A distribution of fires: each pair (low, high) is the range of a uniform draw."""
+
+    name: Annotated[str, Field(min_length=1)]
+    """Name of the scenario, that of its file."""
+    bank: Annotated[int, Field(ge=1, lt=HELD_OUT_FROM)]
+    """Number of fires to train on."""
+    head_rate: Annotated[tuple[_Rate, _Rate], _Pair, _Ordered]
+    """Rate of spread of the head, cells per step."""
+    length_to_breadth: Annotated[tuple[_Ratio, _Ratio], _Pair, _Ordered]
+    """Length-to-breadth ratio of the elliptical wavelet, 1 without wind."""
+    azimuth: Annotated[tuple[_Degrees, _Degrees], _Pair, _Ordered]
+    """Direction towards which the head runs at step 0, degrees counter-clockwise from +x."""
+    turning: Annotated[tuple[_Turn, _Turn], _Pair, _Ordered]
+    """Steady turning of that direction, degrees per 1000 steps, counter-clockwise."""
+    centre_x: Annotated[tuple[_Fraction, _Fraction], _Pair, _Ordered]
+    """Centre of the initial disc along x, as a fraction of the box (0 to X - 1)."""
+    centre_y: Annotated[tuple[_Fraction, _Fraction], _Pair, _Ordered]
+    """Centre of the initial disc along y, as a fraction of the box (0 to Y - 1)."""
+    core_radius: Annotated[tuple[_Length, _Length], _Pair, _Ordered]
+    """Radius of the initial disc, cells."""
+    ring_width: Annotated[tuple[_Length, _Length], _Pair, _Ordered]
+    """Width of the part of the disc that burns at step 0, cells; the rest is burnt out."""
+    patches: Annotated[tuple[_Count, _Count], _Pair, _Ordered]
+    """Number of patches of slow fuel."""
+    patch_bearing: Annotated[tuple[_Degrees, _Degrees], _Pair, _Ordered]
+    """Where a patch lies as seen from the disc's centre, degrees from the initial azimuth."""
+    patch_distance: Annotated[tuple[_Signed, _Signed], _Pair, _Ordered]
+    """How far a patch's centre lies outside the initial disc, cells, negative inside."""
+    patch_radius: Annotated[tuple[_Length, _Length], _Pair, _Ordered]
+    """Distance from a patch's centre at which its effect has fallen to 1/e, cells."""
+    patch_rate: Annotated[tuple[_Fraction, _Fraction], _Pair, _Ordered]
+    """Multiplier of the rate of spread at a patch's centre; 1 is no effect."""
+
+
+# The position is part of a draw's key: append new fields, never reorder.
+_DRAWN = tuple(f.name for f in dataclasses.fields(FireConfig) if f.name not in {"name", "bank"})
+
+
+def scenarios() -> list[str]:
+    """Names of the scenarios: the files in `configs/fire`."""
+    folder = resources.files("emberlink.configs").joinpath("fire")
+    names = [entry.name for entry in folder.iterdir()]
+    return sorted(n.removesuffix(".yaml") for n in names if n.endswith(".yaml"))
+
+
+def load_scenario(name: str) -> FireConfig:
+    """The scenario in `configs/fire/<name>.yaml`.
+
+    Raises:
+        ValueError: no such file, or a value in it that `FireConfig` does not take.
+    """
+    if name not in scenarios():
+        raise ValueError(f"unknown fire {name!r}; known: {', '.join(scenarios())}")
+    file = resources.files("emberlink.configs").joinpath("fire", f"{name}.yaml")
+    values = OmegaConf.to_container(OmegaConf.create(file.read_text(encoding="utf-8")))
+    return FireConfig(**values)  # pyright: ignore[reportCallIssue]
+
+
+def fire_seeds(split: Split, count: int, start: int = 0) -> Tensor:
+    """Seeds of the first `count` fires of a split, int64 [count].
+
+    Training seeds lie below `HELD_OUT_FROM`, held-out seeds from it on, so no fire is in both.
+
+    Args:
+        split: "train" or "heldout".
+        count: how many.
+        start: first training seed, to train on another bank; the held-out fires never change.
+    """
+    if split not in get_args(Split):
+        raise ValueError(f"unknown split {split!r}; known: {', '.join(get_args(Split))}")
+    if count < 1 or start < 0:
+        raise ValueError(f"expected count >= 1 and start >= 0, got {count} and {start}")
+    if split == "heldout" and start:
+        raise ValueError(f"held-out fires are the same for everyone: start must be 0, got {start}")
+    if split == "train" and start + count > HELD_OUT_FROM:
+        raise ValueError(f"training seeds end before {HELD_OUT_FROM}, got {start} + {count}")
+    first = HELD_OUT_FROM if split == "heldout" else start
+    return torch.arange(first, first + count)
+
+
+def make_fires(
+    config: FireConfig,
+    seeds: Tensor,
+    grid: tuple[int, int],
+    horizon: int,
+    device: torch.device | str | None = None,
+) -> Tensor:
+    """Times of arrival of one fire per seed; each depends on its own seed alone.
+
+    Args:
+        config: the scenario.
+        seeds: int64 [fires].
+        grid: (X, Y), each 8 to 256 cells.
+        horizon: steps; later arrivals are inf. A longer horizon continues the same fires.
+        device: where to compute.
+
+    Returns:
+        float32 [fires, X, Y], steps: 0 burns from the start, inf never burns.
+    """
+    if not all(_SIDES[0] <= side <= _SIDES[1] for side in grid):
+        raise ValueError(f"grid must have {_SIDES[0]} to {_SIDES[1]} cells a side, got {grid}")
+    refine = math.ceil(_NODES / min(grid))
+    chunk = max(1, _CHUNK // (grid[0] * grid[1] * refine**2))
+    parts = seeds.to(device=device, dtype=torch.int64).split(chunk)
+    return torch.cat([_spread(config, part, grid, horizon, refine) for part in parts])
+
+
+def _spread(
+    config: FireConfig, seeds: Tensor, grid: tuple[int, int], horizon: int, refine: int
+) -> Tensor:
+    """`make_fires` for seeds that are computed together."""
+    scale = min(grid) / BASE_SIDE
+    draw = {field: _draw(config, field, seeds)[:, 0] for field in _DRAWN if "patch" not in field}
+    fractions = torch.stack([draw["centre_x"], draw["centre_y"]], 1)
+    centre = fractions * (torch.tensor(grid, device=seeds.device) - 1)
+    distance = disc(centre, draw["core_radius"] * scale)
+    start, turning = draw["azimuth"].deg2rad(), draw["turning"].deg2rad()
+    arrival = arrival_times(
+        distance,
+        grid,
+        draw["head_rate"] * scale,
+        draw["length_to_breadth"],
+        lambda time: start + turning * (time / 1000),
+        horizon=horizon,
+        refine=refine,
+        rate_field=_fuel(config, seeds, centre, draw["core_radius"], start, grid),
+        max_rate=config.head_rate[1] * scale,
+        device=seeds.device,
+    )
+    depth = -distance(*_axes(grid, seeds.device))
+    return arrival.masked_fill(depth > draw["ring_width"][:, None, None] * scale, math.inf)
+
+
+def _unit(field: str, seeds: Tensor, lanes: int) -> Tensor:
+    """Uniform draws on (0, 1), float32 [fires, lanes], from the stream of a seed and a field."""
+    key = torch.tensor([_STREAM, _DRAWN.index(field)], device=seeds.device)
+    return uniform(fold(fold(seeds, key[0]), key[1]), lanes)
+
+
+def _draw(config: FireConfig, field: str, seeds: Tensor, lanes: int = 1) -> Tensor:
+    """Uniform draws from the range of a field, float32 [fires, lanes]."""
+    low, high = getattr(config, field)
+    return low + (high - low) * _unit(field, seeds, lanes)
+
+
+def _axes(grid: tuple[int, int], device: torch.device) -> tuple[Tensor, Tensor]:
+    x, y = (torch.arange(side, dtype=torch.float32, device=device) for side in grid)
+    return x[None, :, None], y[None, None, :]
+
+
+def _fuel(
+    config: FireConfig,
+    seeds: Tensor,
+    centre: Tensor,
+    radius: Tensor,
+    azimuth: Tensor,
+    grid: tuple[int, int],
+) -> Tensor | None:
+    """Multiplier of the rates, [fires, X, Y]: a product of smooth round patches."""
+    most = config.patches[1]
+    if most == 0:
+        return None
+    scale = min(grid) / BASE_SIDE
+    low = config.patches[0]
+    count = low + (_unit("patches", seeds, 1) * (most - low + 1)).floor()
+    bearing, distance, width, rate = (
+        _draw(config, f"patch_{part}", seeds, most)
+        for part in ("bearing", "distance", "radius", "rate")
+    )
+    angle = azimuth[:, None] + bearing.deg2rad()
+    reach = (radius[:, None] + distance) * scale
+    px = (centre[:, :1] + reach * angle.cos())[..., None, None]
+    py = (centre[:, 1:] + reach * angle.sin())[..., None, None]
+    loss = (1 - rate) * (torch.arange(most, device=seeds.device) < count)
+    x, y = _axes(grid, seeds.device)
+    apart = ((x - px) ** 2 + (y - py) ** 2) / (width * scale)[..., None, None] ** 2
+    return (1 - loss[..., None, None] * torch.exp(-apart)).prod(1)
+
+
+def burning_cells(arrival: Tensor, horizon: int) -> Tensor:
+    """Number of cells that burn at the steps 0 to `horizon`, int64 [fires, horizon + 1]."""
+    step = arrival.flatten(1).ceil().clamp(max=horizon + 1).long()
+    zeros = step.new_zeros(len(step), horizon + 2)
+    return zeros.scatter_add(1, step, torch.ones_like(step)).cumsum(1)[:, :-1]
+
+
+def cache_folder() -> Path:
+    """$EMBERLINK_CACHE, else $XDG_CACHE_HOME/emberlink, else ~/.cache/emberlink."""
+    if folder := os.environ.get("EMBERLINK_CACHE"):
+        return Path(folder).expanduser()
+    return Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "emberlink"
+
+
+def bank_key(
+    config: FireConfig, split: Split, count: int, grid: tuple[int, int], horizon: int, base: int = 0
+) -> str:
+    """A hash of everything that a bank of fires depends on."""
+    parts = [GENERATOR_VERSION, dataclasses.asdict(config), split, count, *grid, horizon, base]
+    return hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:32]
+
+
+def fire_bank(
+    config: FireConfig,
+    split: Split,
+    count: int,
+    grid: tuple[int, int],
+    horizon: int,
+    *,
+    base: int = 0,
+    cache_dir: str | os.PathLike[str] | None = None,
+) -> Tensor:
+    """The first `count` fires of a split, computed once and then read from a file.
+
+    Args:
+        config, grid, horizon: as in `make_fires`.
+        split, count: as in `fire_seeds`, with `base` as its `start`.
+        cache_dir: folder of the file, `cache_folder()` by default. A damaged file is replaced; a
+            folder that cannot be written to costs a warning and the time to compute.
+
+    Returns:
+        float32 [count, X, Y] on the CPU, so that every device trains on the same fires.
+    """
+    seeds = fire_seeds(split, count, base)
+    folder = cache_folder() if cache_dir is None else Path(cache_dir)
+    file = folder / f"fire-{bank_key(config, split, count, grid, horizon, base)}.npy"
+    stored = _read(file, (count, *grid))
+    if stored is not None:
+        return stored
+    fires = make_fires(config, seeds, grid, horizon)
+    _write(file, fires)
+    return fires
+
+
+def _read(file: Path, shape: tuple[int, ...]) -> Tensor | None:
+    """The bank in a file, or None if there is none or it is not one."""
+    try:
+        with file.open("rb") as handle:
+            array = np.lib.format.read_array(handle, allow_pickle=False)
+    except (OSError, ValueError, MemoryError):  # a damaged header may ask for any size
+        return None
+    if array.dtype != np.float32 or array.shape != shape:
+        return None
+    return torch.from_numpy(array) if (array >= 0).all() else None
+
+
+def _write(file: Path, fires: Tensor) -> None:
+    """Write under a temporary name first: a reader never meets half a file."""
+    temporary = None
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.NamedTemporaryFile(dir=file.parent, suffix=".tmp", delete=False) as handle:
+            temporary = handle.name
+            np.save(handle, fires.numpy(), allow_pickle=False)
+        os.replace(temporary, file)
+    except OSError as error:
+        if temporary is not None:
+            Path(temporary).unlink(missing_ok=True)
+        warnings.warn(f"fires are not cached: cannot write {file}: {error}", stacklevel=3)

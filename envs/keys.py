@@ -1,0 +1,42 @@
+"""The TensorDict keys of the environment, and the layout of one UAV's observation.
+
+Everything a UAV has stands under "agents", with batch size [num_envs, num_uavs]; everything an
+environment has stands at the root, with batch size [num_envs].
+"""
+
+from typing import Final
+
+AGENTS: Final = "agents"
+
+OBSERVATION: Final = (AGENTS, "observation")
+"""float32 [..., features]: what the UAV's networks read."""
+ACTION: Final = (AGENTS, "action")
+"""float32 [..., 3] in [-1, 1]: a displacement in x, y and z."""
+REWARD: Final = (AGENTS, "reward")
+"""float32 [..., 1]."""
+POSITION: Final = (AGENTS, "position")
+"""float32 [..., 3]: x, y and z in cells."""
+NEW_FIRE: Final = (AGENTS, "new_fire")
+"""int64 [...]: cells in view that burn and that nobody had seen before."""
+OLD_FIRE: Final = (AGENTS, "old_fire")
+"""int64 [...]: cells in view that burn and that some UAV had seen before."""
+NO_FIRE: Final = (AGENTS, "no_fire")
+"""int64 [...]: cells in view that do not burn."""
+NEW_CENTRE: Final = (AGENTS, "new_centre")
+"""float32 [..., 2]: mean x and y of the new fire in view, 0 where there is none."""
+OLD_CENTRE: Final = (AGENTS, "old_centre")
+"""float32 [..., 2]: mean x and y of the old fire in view, 0 where there is none."""
+BEYOND: Final = (AGENTS, "beyond")
+"""bool [..., 3]: the axes along which the last move would have left the box."""
+
+STREAM: Final = "stream"
+"""int64 [num_envs]: this episode's random stream, see `emberlink.envs.streams`."""
+STEP: Final = "step"
+"""int64 [num_envs]: steps since the episode began."""
+SEEN: Final = "seen"
+"""int64 [num_envs]: burning cells that some UAV has seen this episode."""
+BURNING: Final = "burning"
+"""int64 [num_envs]: cells that burn now."""
+
+FEATURES: Final = ("x", "y", "z", "new_fire", "old_fire", "timestep")
+"""What each number of a UAV's own observation is, in order (paper, section IV.C)."""

@@ -1,0 +1,122 @@
+"""The measures of an episode: pure functions of what happened in it, step by step.
+
+`T` is the number of steps, `...` any batch (environments), `n` the UAVs. Steps count from 1; what
+never happens counts as the horizon, T. The paper's figures are named where there is one.
+"""
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from . import keys
+
+NAMES = (
+    "score",
+    "coverage",
+    "coverage_auc",
+    "coverage_time",
+    "tracking_first",
+    "tracking_last",
+    "boundary_exits",
+    "fire_exits",
+)
+
+
+def score(reward: Tensor) -> Tensor:
+    """Mean reward over UAVs and steps (figure 5). reward [..., T, n] -> [...]."""
+    return reward.float().mean((-2, -1))
+
+
+def coverage(seen: Tensor, burning: Tensor) -> Tensor:
+    """Cells seen / cells that burn at the end, in % (figure 6).
+
+    Args:
+        seen, burning: counts of cells after each step, [..., T].
+
+    Returns:
+        float32 [...]; 100 where nothing burns, since then nothing is left to see.
+    """
+    return _ratio(seen, burning)[..., -1]
+
+
+def coverage_auc(seen: Tensor, burning: Tensor) -> Tensor:
+    """Cells seen / cells that burn, averaged over all steps, in %. Arguments as `coverage`."""
+    return _ratio(seen, burning).mean(-1)
+
+
+def coverage_time(seen: Tensor, burning: Tensor) -> Tensor:
+    """The first step at which every burning cell has been seen. Arguments as `coverage`."""
+    return _first_step(seen == burning)
+
+
+def tracking_first(on_fire: Tensor) -> Tensor:
+    """The first step at which some UAV sees fire (figure 7). on_fire bool [..., T, n]."""
+    return _tracking(on_fire).amin(-1)
+
+
+def tracking_last(on_fire: Tensor) -> Tensor:
+    """The first step at which the slowest UAV sees fire (figure 7). on_fire bool [..., T, n]."""
+    return _tracking(on_fire).amax(-1)
+
+
+def boundary_exits(left: Tensor) -> Tensor:
+    """Attempted moves out of the box, mean over UAVs (figure 8). left bool [..., T, n]."""
+    return left.sum(-2).float().mean(-1)
+
+
+def fire_exits(on_fire: Tensor) -> Tensor:
+    """Times a UAV that saw fire no longer does, mean over UAVs (figure 9). bool [..., T, n]."""
+    lost = on_fire[..., :-1, :] & ~on_fire[..., 1:, :]
+    return lost.sum(-2).float().mean(-1)
+
+
+def episode_metrics(steps: TensorDictBase) -> dict[str, Tensor]:
+    """Every measure of one episode per environment.
+
+    Args:
+        steps: what `WildfireEnv` wrote under "next" in each step, batch size [..., T].
+
+    Returns:
+        float32 [...] for each of `NAMES`.
+    """
+    reward = steps[keys.REWARD].squeeze(-1)
+    seen, burning = steps[keys.SEEN], steps[keys.BURNING]
+    on_fire = steps[keys.NEW_FIRE] + steps[keys.OLD_FIRE] > 0
+    left = steps[keys.BEYOND].any(-1)
+    return {
+        "score": score(reward),
+        "coverage": coverage(seen, burning),
+        "coverage_auc": coverage_auc(seen, burning),
+        "coverage_time": coverage_time(seen, burning),
+        "tracking_first": tracking_first(on_fire),
+        "tracking_last": tracking_last(on_fire),
+        "boundary_exits": boundary_exits(left),
+        "fire_exits": fire_exits(on_fire),
+    }
+
+
+STEP_KEYS = (
+    keys.REWARD,
+    keys.SEEN,
+    keys.BURNING,
+    keys.NEW_FIRE,
+    keys.OLD_FIRE,
+    keys.BEYOND,
+)
+"""The keys that `episode_metrics` reads."""
+
+
+def _ratio(seen: Tensor, burning: Tensor) -> Tensor:
+    return torch.where(burning > 0, 100 * seen / burning.clamp(min=1), 100.0)
+
+
+def _first_step(happened: Tensor) -> Tensor:
+    """bool [..., T] -> float32 [...]: the first step (from 1) that is true, T if none is."""
+    horizon = happened.shape[-1]
+    steps = torch.arange(1, horizon + 1, device=happened.device)
+    return torch.where(happened, steps, horizon).amin(-1).float()
+
+
+def _tracking(on_fire: Tensor) -> Tensor:
+    """First step on fire per UAV: bool [..., T, n] -> float32 [..., n]."""
+    return _first_step(on_fire.transpose(-1, -2))

@@ -1,0 +1,106 @@
+"""The rewards: pure functions, and their constants."""
+
+from typing import Annotated, Literal
+
+import torch
+from pydantic import ConfigDict, Field
+from pydantic.dataclasses import dataclass
+from torch import Tensor
+
+Number = Annotated[float, Field(allow_inf_nan=False)]
+
+
+@dataclass(frozen=True, kw_only=True, config=ConfigDict(extra="forbid", strict=True))
+class RewardConfig:
+    """What a UAV earns in one step (paper, section IV.C); the defaults are the paper's text."""
+
+    new_fire: Number = 1.0
+    """per cell in view that burns and was not seen before"""
+    old_fire: Number = -4.0
+    """per cell in view that burns and was seen before"""
+    no_fire: Number = -10.0
+    """per cell in view that does not burn"""
+    exit: Number = -100.0
+    """replaces the whole reward of a step whose move would have left the box"""
+    exit_axes: Literal["xyz", "xy"] = "xyz"
+    """the axes on which leaving the box is tested"""
+
+
+@dataclass(frozen=True, kw_only=True, config=ConfigDict(extra="forbid", strict=True))
+class HeadingConfig:
+    """The bonus for flying towards the target (paper, section IV.F); defaults: the paper's."""
+
+    form: Literal["folded_linear", "folded_exponential", "linear"] = "folded_linear"
+    """one of `HEADING_FORMS`"""
+    weight: Number = 1.0
+    """factor on the term"""
+
+
+def left_box(beyond: Tensor, axes: Literal["xyz", "xy"]) -> Tensor:
+    """Whether the last move would have left the box on the tested axes, bool [...].
+
+    Args:
+        beyond: bool [..., 3], per axis.
+        axes: the axes that are tested.
+    """
+    return beyond[..., : len(axes)].any(-1)
+
+
+def view_reward(
+    new: Tensor, old: Tensor, none: Tensor, beyond: Tensor, config: RewardConfig
+) -> Tensor:
+    """The reward for what is in view, or the penalty for leaving the box, float32 [...].
+
+    Args:
+        new, old, none: integers [...], cells in view of each class.
+        beyond: bool [..., 3], the axes along which the move would have left the box.
+    """
+    earned = config.new_fire * new + config.old_fire * old + config.no_fire * none
+    return torch.where(left_box(beyond, config.exit_axes), config.exit, earned).float()
+
+
+def _degrees(vector: Tensor) -> Tensor:
+    return torch.rad2deg(torch.atan2(vector[..., 1], vector[..., 0]))
+
+
+def _folded_difference(target: Tensor, moved: Tensor) -> Tensor:
+    """| |A_target| - |A_moved| | as printed: it takes left and right for the same."""
+    return (_degrees(target).abs() - _degrees(moved).abs()).abs()
+
+
+def _folded_linear(target: Tensor, moved: Tensor) -> Tensor:
+    return (180 - _folded_difference(target, moved)) / 10
+
+
+def _folded_exponential(target: Tensor, moved: Tensor) -> Tensor:
+    return 20 * 0.94 ** _folded_difference(target, moved)
+
+
+def _linear(target: Tensor, moved: Tensor) -> Tensor:
+    """(90 - D) / 90 with D the true angle between the two; 0 where the UAV stood still."""
+    difference = (_degrees(target) - _degrees(moved) + 180).remainder(360) - 180
+    return torch.where((moved == 0).all(-1), 0.0, (90 - difference.abs()) / 90)
+
+
+HEADING_FORMS = {
+    "folded_linear": _folded_linear,
+    "folded_exponential": _folded_exponential,
+    "linear": _linear,
+}
+
+
+def heading_reward(before: Tensor, after: Tensor, target: Tensor, config: HeadingConfig) -> Tensor:
+    """The heading term, float32 [...].
+
+    Args:
+        before, after: float32 [..., 3], positions before and after the move, cells.
+        target: float32 [..., 3], where the UAV was told to go before the move, cells.
+
+    Angles are taken in the x-y plane, in degrees, from the position before the move; computed in
+    float64 because 0.1 cells of movement leave few digits.
+    """
+    ground = before[..., :2].double()
+    term = HEADING_FORMS[config.form](
+        target[..., :2].double() - ground, after[..., :2].double() - ground
+    )
+    return (config.weight * term).float()

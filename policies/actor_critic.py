@@ -1,0 +1,80 @@
+"""The networks as TensorDict modules, built from an environment's specs."""
+
+import torch
+from emberlink.envs import keys
+from tensordict.nn import TensorDictModule, TensorDictSequential
+from torchrl.data import Composite
+from torchrl.modules import OrnsteinUhlenbeckProcessModule, ValueOperator
+
+from .networks import StackedActor, StackedCritic
+
+STATE_ACTION_VALUE = (keys.AGENTS, "state_action_value")
+
+
+def make_actor(
+    observation: Composite,
+    action: Composite,
+    hidden: tuple[int, int],
+    *,
+    generator: torch.Generator | None = None,
+) -> TensorDictModule:
+    """The UAVs' actors: ("agents", "observation") -> ("agents", "action").
+
+    Args:
+        observation, action: specs of the environment, batch size [num_envs].
+        hidden: sizes of the two hidden layers.
+        generator: of the initial weights.
+    """
+    uavs, features = observation[keys.OBSERVATION].shape[-2:]
+    network = StackedActor(
+        uavs,
+        features,
+        action[keys.ACTION].shape[-1],
+        hidden,
+        device=observation.device,
+        generator=generator,
+    )
+    return TensorDictModule(network, in_keys=[keys.OBSERVATION], out_keys=[keys.ACTION])
+
+
+def make_critic(
+    observation: Composite,
+    action: Composite,
+    hidden: tuple[int, int],
+    *,
+    generator: torch.Generator | None = None,
+) -> ValueOperator:
+    """The UAVs' critics; arguments as `make_actor`."""
+    uavs, features = observation[keys.OBSERVATION].shape[-2:]
+    network = StackedCritic(
+        uavs,
+        features,
+        action[keys.ACTION].shape[-1],
+        hidden,
+        device=observation.device,
+        generator=generator,
+    )
+    return ValueOperator(
+        network, in_keys=[keys.OBSERVATION, keys.ACTION], out_keys=[STATE_ACTION_VALUE]
+    )
+
+
+def with_noise(
+    actor: TensorDictModule, action: Composite, *, theta: float, sigma: float, dt: float
+) -> TensorDictSequential:
+    """The actor with Ornstein-Uhlenbeck noise on its actions, clipped to the action box.
+
+    The noise starts anew with each episode (it reads "is_init", which `InitTracker` writes) and
+    does not fade: the paper anneals nothing.
+    """
+    noise = OrnsteinUhlenbeckProcessModule(
+        action.clone(),
+        eps_init=1.0,
+        eps_end=1.0,
+        theta=theta,
+        sigma=sigma,
+        dt=dt,
+        action_key=keys.ACTION,
+        device=action.device,
+    )
+    return TensorDictSequential(actor, noise)

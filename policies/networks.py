@@ -1,0 +1,144 @@
+"""The paper's networks, one per UAV, computed as one batched product (section III.C; SPEC table).
+
+A stack holds the weights of all UAVs in tensors whose first dimension is the UAV: nothing is
+shared, no gradient crosses, and one launch serves all.
+"""
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+
+class StackedLinear(nn.Module):
+    """A linear map per UAV.
+
+    Args:
+        uavs: how many.
+        inputs, outputs: features per UAV.
+        bound: weights and biases start uniform in [-bound, bound]; 1 / sqrt(inputs) if None, as
+            in the DDPG paper (Lillicrap et al. 2016, section 7).
+        device: of the weights.
+        generator: of the initial weights.
+    """
+
+    def __init__(
+        self,
+        uavs: int,
+        inputs: int,
+        outputs: int,
+        *,
+        bound: float | None = None,
+        device: torch.device | str | None = None,
+        generator: torch.Generator | None = None,
+    ):
+        super().__init__()
+        bound = 1 / math.sqrt(inputs) if bound is None else bound
+
+        def start(*shape: int) -> nn.Parameter:
+            # Drawn on the CPU, so that a seed means the same weights on every device.
+            values = torch.empty(shape).uniform_(-bound, bound, generator=generator)
+            return nn.Parameter(values.to(device))
+
+        self.weight = start(uavs, inputs, outputs)
+        self.bias = start(uavs, 1, outputs)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """[uavs, batch, inputs] -> [uavs, batch, outputs]."""
+        return torch.baddbmm(self.bias, x, self.weight)
+
+
+class StackedLayerNorm(nn.Module):
+    """Layer normalisation (Ba et al. 2016) with a scale and a shift per UAV."""
+
+    def __init__(self, uavs: int, features: int, *, device: torch.device | str | None = None):
+        super().__init__()
+        self.weight = nn.Parameter(torch.ones(uavs, 1, features, device=device))
+        self.bias = nn.Parameter(torch.zeros(uavs, 1, features, device=device))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """[uavs, batch, features] -> the same."""
+        normal = nn.functional.layer_norm(x, x.shape[-1:])
+        return torch.addcmul(self.bias, normal, self.weight)
+
+
+def _by_uav(x: Tensor) -> Tensor:
+    """[..., uavs, features] -> [uavs, batch, features]."""
+    return x.flatten(0, -3).transpose(0, 1) if x.ndim > 2 else x.unsqueeze(1)
+
+
+def _by_batch(x: Tensor, batch: Sequence[int]) -> Tensor:
+    """[uavs, batch, features] -> [*batch, uavs, features]."""
+    return x.transpose(0, 1).reshape(*batch, x.shape[0], x.shape[-1])
+
+
+class StackedActor(nn.Module):
+    """Observation -> 400 -> 300 -> action; LayerNorm and ReLU after each, tanh at the end.
+
+    Args:
+        uavs: how many.
+        features: numbers in an observation.
+        actions: numbers in an action.
+        hidden: sizes of the two hidden layers.
+    """
+
+    def __init__(
+        self,
+        uavs: int,
+        features: int,
+        actions: int,
+        hidden: tuple[int, int] = (400, 300),
+        *,
+        device: torch.device | str | None = None,
+        generator: torch.Generator | None = None,
+    ):
+        super().__init__()
+        first, second = hidden
+        self.first = StackedLinear(uavs, features, first, device=device, generator=generator)
+        self.first_norm = StackedLayerNorm(uavs, first, device=device)
+        self.second = StackedLinear(uavs, first, second, device=device, generator=generator)
+        self.second_norm = StackedLayerNorm(uavs, second, device=device)
+        self.action = StackedLinear(
+            uavs, second, actions, bound=3e-3, device=device, generator=generator
+        )
+
+    def forward(self, observation: Tensor) -> Tensor:
+        """float32 [..., uavs, features] -> [..., uavs, actions] in (-1, 1)."""
+        x = torch.relu(self.first_norm(self.first(_by_uav(observation))))
+        x = torch.relu(self.second_norm(self.second(x)))
+        return _by_batch(torch.tanh(self.action(x)), observation.shape[:-2])
+
+
+class StackedCritic(nn.Module):
+    """Observation and action -> value.
+
+    The action enters late: a linear map of it is added to the normalised second layer before
+    its ReLU. Arguments as `StackedActor`.
+    """
+
+    def __init__(
+        self,
+        uavs: int,
+        features: int,
+        actions: int,
+        hidden: tuple[int, int] = (400, 300),
+        *,
+        device: torch.device | str | None = None,
+        generator: torch.Generator | None = None,
+    ):
+        super().__init__()
+        first, second = hidden
+        self.first = StackedLinear(uavs, features, first, device=device, generator=generator)
+        self.first_norm = StackedLayerNorm(uavs, first, device=device)
+        self.second = StackedLinear(uavs, first, second, device=device, generator=generator)
+        self.second_norm = StackedLayerNorm(uavs, second, device=device)
+        self.action = StackedLinear(uavs, actions, second, device=device, generator=generator)
+        self.value = StackedLinear(uavs, second, 1, bound=3e-3, device=device, generator=generator)
+
+    def forward(self, observation: Tensor, action: Tensor) -> Tensor:
+        """float32 [..., uavs, features] and [..., uavs, actions] -> [..., uavs, 1]."""
+        x = torch.relu(self.first_norm(self.first(_by_uav(observation))))
+        x = self.second_norm(self.second(x))
+        x = torch.relu(x + self.action(_by_uav(action)))
+        return _by_batch(self.value(x), observation.shape[:-2])

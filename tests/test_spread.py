@@ -1,0 +1,283 @@
+"""The level set against closed forms and against the exact front from its support function."""
+
+import math
+
+import pytest
+import torch
+from emberlink.envs.spread import (
+    arrival_times,
+    disc,
+    ellipse_rates,
+    front_speed,
+    length_to_breadth,
+)
+from torch import Tensor
+
+SIDE, CORE, HEAD, HORIZON = 30.0, 3.0, 0.01, 1000.0
+STRAIGHT, TURNING = 0.0, math.pi
+
+
+def exact_arrival(n: int, ratio: float, azimuth, horizon: float = HORIZON) -> Tensor:
+    """Arrival in a domain of 30 x 30 with n nodes a side; float64 [n, n].
+
+    The front's support function is h(n, t) = h0(n) + integral of F(n, s); a point is reached when
+    the last of the half planes x·n <= h(n, t) has come to it.
+    """
+    times = torch.linspace(0, horizon, 401, dtype=torch.float64)
+    scale, middle = (n - 1) / SIDE, (n - 1) / 2
+    rates = ellipse_rates(torch.tensor(HEAD * scale).double(), torch.tensor(ratio).double())
+    xs = torch.arange(n).double() - middle
+    arrival = torch.zeros(n, n, dtype=torch.float64)
+    for angle in torch.arange(0, 360, 0.75).double().deg2rad():
+        speed = front_speed(angle, *rates, azimuth(times))
+        grown = torch.cumulative_trapezoid(speed, times)
+        support = torch.cat([torch.zeros(1).double(), grown]) + CORE * scale
+        along = xs[:, None] * angle.cos() + xs[None, :] * angle.sin()
+        right = torch.searchsorted(support, along).clamp(1, 400)
+        part = (along - support[right - 1]) / (support[right] - support[right - 1])
+        time = torch.lerp(times[right - 1], times[right], part.clamp_min(0))
+        time = torch.where(along > support[-1], math.inf, time)
+        arrival = torch.maximum(arrival, torch.where(along <= support[0], 0.0, time))
+    return arrival
+
+
+def computed_arrival(n: int, ratio: float, azimuth, refine: int = 1, **more) -> Tensor:
+    scale, middle = (n - 1) / SIDE, (n - 1) / 2
+    start = disc(torch.full((1, 2), middle), torch.tensor([CORE * scale]))
+    turning = lambda time: azimuth(torch.tensor([time]))  # noqa: E731
+    args = torch.tensor([HEAD * scale]), torch.tensor([ratio]), turning
+    return arrival_times(start, (n, n), *args, horizon=HORIZON, refine=refine, **more)[0]
+
+
+def compare(n: int, ratio: float, turn: float) -> tuple[float, float, float]:
+    """Ratio of areas, intersection over union, mean error of arrival as a part of the horizon."""
+
+    def azimuth(time: Tensor) -> Tensor:
+        return 0.3 + turn * time / HORIZON
+
+    got, want = computed_arrival(n, ratio, azimuth), exact_arrival(n, ratio, azimuth)
+    a, b = got.isfinite(), want.isfinite()
+    error = (got - want)[a & b & (want > 0)].abs().mean() / HORIZON
+    return float(a.sum() / b.sum()), float((a & b).sum() / (a | b).sum()), float(error)
+
+
+def grow(grid=(24, 24), centre=(11.0, 11.0), radius=3.0, head=0.006, ratio=2.5, azimuth=0.4, **k):
+    """One fire with plain numbers; float32 [X, Y]."""
+    start = disc(torch.tensor([centre]), torch.tensor([radius]))
+    k = {"horizon": 1000, **k}
+    args = (torch.tensor([v]) for v in (head, ratio, azimuth))
+    return arrival_times(start, grid, *args, **k)[0]
+
+
+def test_length_to_breadth_by_hand():
+    got = length_to_breadth(torch.tensor([0.0, 2.0, 5.0, 20.0]).double())
+    want = torch.tensor([1.0, 1.563707 + 0.338253 - 0.397, 3.376569 + 0.212598 - 0.397, 8.0])
+    torch.testing.assert_close(got, want.double(), atol=2e-5, rtol=0)
+    assert length_to_breadth(0.0).shape == ()
+    with pytest.raises(ValueError, match="-1"):
+        length_to_breadth(-1.0)
+
+
+def test_ellipse_rates_by_hand():
+    a, b, c = ellipse_rates(1.0, 2.0)  # e = 0.866025, R_back = 0.071797
+    torch.testing.assert_close(torch.stack([a, b, c]), torch.tensor([0.535898, 0.267949, 0.464102]))
+    assert [float(r) for r in ellipse_rates(0.5, 1.0)] == [0.5, 0.5, 0.0]
+    with pytest.raises(ValueError, match=r"0\.5"):
+        ellipse_rates(1.0, 0.5)
+
+
+@pytest.mark.parametrize("ratio", [1.0, 1.5, 4.0])
+def test_front_speed_supports_the_wavelet(ratio: float):
+    """F(n) is the farthest reach along n of the ellipse R (1 - e) / (1 - e cos ψ)."""
+    eccentricity = math.sqrt(ratio**2 - 1) / ratio
+    psi = torch.linspace(0, 2 * math.pi, 28801, dtype=torch.float64)
+    radius = (1 - eccentricity) / (1 - eccentricity * torch.cos(psi))
+    normal = torch.linspace(0, 2 * math.pi, 37, dtype=torch.float64)
+    reach = (radius * torch.cos(psi - normal[:, None])).amax(1)
+    rates = ellipse_rates(torch.tensor(1.0).double(), torch.tensor(ratio).double())
+    torch.testing.assert_close(front_speed(normal + 0.7, *rates, 0.7), reach, atol=1e-6, rtol=0)
+
+
+# Area ratio and intersection over union measured at n = 31, 61, 121, in docs/fire.md.
+ACCURACY = [
+    pytest.param(1.0, STRAIGHT, (0.977, 0.992, 0.999), id="circle"),
+    pytest.param(3.0, STRAIGHT, (0.992, 0.992, 0.998), id="ellipse"),
+    pytest.param(3.0, TURNING, (0.985, 0.994, 0.998), id="turning"),
+]
+
+
+@pytest.mark.parametrize(("ratio", "turn", "overlap"), ACCURACY)
+def test_agrees_with_the_exact_front_and_converges(ratio: float, turn: float, overlap):
+    areas, unions, errors = zip(*(compare(n, ratio, turn) for n in (31, 61, 121)), strict=True)
+    print(areas, unions, errors)
+    assert all(got >= want for got, want in zip(unions, overlap, strict=True))
+    assert abs(areas[0] - 1) < 0.025
+    assert abs(areas[2] - 1) < 0.0015
+    order = math.log2(errors[0] / errors[2]) / 2
+    assert order > 1.3
+
+
+@pytest.mark.parametrize("ratio", [1.0, 2.0, 4.0])
+def test_area_grows_as_the_offset_of_a_disc(ratio: float):
+    """π r² + r · perimeter · t + π a b t²: the mixed area of a disc and the wavelet."""
+    arrival = computed_arrival(121, ratio, torch.zeros_like)
+    a, b, _ = (float(v) for v in ellipse_rates(HEAD, ratio))
+    angle = torch.linspace(0, 2 * math.pi, 3601)
+    perimeter = float(
+        torch.trapezoid(((a * angle.sin()) ** 2 + (b * angle.cos()) ** 2).sqrt(), angle)
+    )
+    for time in (250.0, 500.0, 1000.0):
+        want = math.pi * CORE**2 + CORE * perimeter * time + math.pi * a * b * time**2
+        print(ratio, time, float((arrival <= time).sum()) / 16 / want)
+        assert float((arrival <= time).sum()) / 16 == pytest.approx(want, rel=0.012)
+
+
+def test_a_straight_front_moves_at_its_speed():
+    front = lambda x, y: (x - 3.3) + 0 * y  # noqa: E731
+    args = torch.tensor([0.01]), torch.tensor([2.0]), torch.tensor([1.0])
+    got = arrival_times(front, (12, 9), *args, horizon=900)[0]
+    speed = float(front_speed(torch.tensor(0.0), *ellipse_rates(0.01, 2.0), 1.0))
+    want = ((torch.arange(12.0) - 3.3) / speed).clamp_min(0)[:, None].expand(12, 9)
+    want = want.masked_fill(want > 900, math.inf)
+    torch.testing.assert_close(got, want, rtol=1e-4, atol=0.01)
+
+
+def test_mirror_and_quarter_turn():
+    base = grow(azimuth=0.4, centre=(11.0, 12.0))
+    close = {"rtol": 0, "atol": 0.05}
+    torch.testing.assert_close(grow(azimuth=-0.4, centre=(11.0, 11.0)).flip(1), base, **close)
+    quarter = grow(azimuth=0.4 + math.pi / 2, centre=(11.0, 11.0))
+    torch.testing.assert_close(quarter.rot90(-1), base, **close)
+
+
+def test_the_head_runs_towards_the_azimuth():
+    arrival = grow(azimuth=math.pi / 2, ratio=3.0)  # +y
+    burnt = arrival.isfinite().nonzero().float().mean(0)
+    assert burnt[0] == 11
+    assert burnt[1] > 13
+
+
+def test_arrival_never_decreases_outwards():
+    """Along rays, and over patchy fuel: every cell is reached by way of an earlier neighbour."""
+    even, field = grow(), torch.rand(1, 24, 24, generator=torch.Generator().manual_seed(3))
+    for dx, dy in ((1, 0), (1, 1), (0, 1), (-1, 1), (-1, 0), (-1, -1), (0, -1), (1, -1)):
+        ray = torch.stack([even[11 + k * dx, 11 + k * dy] for k in range(11)])
+        assert (ray[1:] >= ray[:-1]).all()
+    patchy = grow(rate_field=field, head=0.024)
+    around = (
+        torch.nn.functional.pad(patchy, (1, 1, 1, 1), value=math.inf)
+        .unfold(0, 3, 1)
+        .unfold(1, 3, 1)
+    )
+    later = (patchy > 0) & patchy.isfinite()
+    assert later.sum() > 50
+    assert (around.flatten(2).amin(2) < patchy)[later].all()
+
+
+def wall(kind: str) -> tuple[Tensor, Tensor]:
+    """Barrier cells and the cells behind them, bool [24, 24]."""
+    x, y = torch.meshgrid(torch.arange(24), torch.arange(24), indexing="ij")
+    if kind == "straight":
+        return x == 16, x > 16
+    if kind == "diagonal":  # touches at corners only
+        return x + y == 29, x + y > 29
+    ring = torch.maximum((x - 11).abs(), (y - 11).abs())
+    return ring == 5, ring > 5
+
+
+@pytest.mark.parametrize("kind", ["straight", "diagonal", "ring"])
+@pytest.mark.parametrize("refine", [1, 2, 3, 4])
+def test_a_barrier_one_cell_wide_never_burns_and_does_not_leak(kind: str, refine: int):
+    barrier, behind = wall(kind)
+    field = (~barrier).float()[None]
+    options = {"head": 0.02, "azimuth": 0.6, "refine": refine, "horizon": 2000}
+    got = grow(rate_field=field, **options)
+    assert got[barrier | behind].isinf().all()
+    assert grow(**options)[behind].isfinite().any()
+    assert got[~barrier & ~behind].isfinite().sum() > 60
+
+
+def test_the_front_goes_around_a_barrier():
+    barrier, _ = wall("straight")
+    barrier[:, 15:] = False
+    free = grow(head=0.02, ratio=1.0)
+    got = grow(head=0.02, ratio=1.0, rate_field=(~barrier).float()[None])
+    assert got[17, 11] > free[17, 11] + 100
+    assert got[17, 20].isfinite()
+    early = (slice(12, 15), slice(8, 14))
+    torch.testing.assert_close(got[early], free[early], rtol=0.02, atol=1)
+
+
+def test_a_barrier_inside_the_initial_front_does_not_burn():
+    field = torch.ones(1, 24, 24)
+    field[0, 11, 11] = 0
+    got = grow(rate_field=field)
+    assert got[11, 11].isinf()
+    assert got[12, 12] == 0
+
+
+def test_rates_in_space_and_time():
+    half = torch.full((1, 24, 24), 0.5)
+    same = grow(rate_field=half, head=0.012, max_rate=0.012)
+    torch.testing.assert_close(same, grow(head=0.006, max_rate=0.012), rtol=0, atol=0.01)
+    start = disc(torch.tensor([[11.0, 11.0]]), torch.tensor([3.0]))
+    ramp = lambda time: torch.tensor([0.012 * time / 1000])  # noqa: E731
+    more = torch.tensor([2.5]), torch.tensor([0.4])
+    got = arrival_times(start, (24, 24), ramp, *more, horizon=1000, max_rate=0.012)[0]
+    steady = grow(head=0.006)  # the same path, run at another pace: t² / 1000
+    want = (steady * 1000).sqrt()
+    finite = got.isfinite() & want.isfinite()
+    assert finite.sum() > 60
+    torch.testing.assert_close(got[finite], want[finite], rtol=0.005, atol=3)
+
+
+def test_the_edge_of_the_grid_does_not_disturb():
+    field = torch.rand(1, 40, 40, generator=torch.Generator().manual_seed(1))
+    small = field[:, 8:32, 8:32]
+    inner = grow(centre=(19.0, 5.0), azimuth=-0.3, rate_field=small, max_rate=0.006)
+    outer = grow((40, 40), (27.0, 13.0), azimuth=-0.3, rate_field=field, max_rate=0.006)[8:32, 8:32]
+    assert inner[23].isfinite().any()
+    # Fuel outside differs (it is continued from the edge), so compare three cells inside.
+    torch.testing.assert_close(inner[:21, 3:], outer[:21, 3:], rtol=0, atol=0.5)
+
+
+def test_batch_and_horizon_do_not_matter():
+    centres = torch.tensor([[9.3, 11.0], [12.0, 8.0], [11.0, 11.0]])
+    radii, heads = torch.tensor([3.0, 2.0, 4.0]), torch.tensor([0.004, 0.006, 0.005])
+    ratios, winds = torch.tensor([1.5, 3.0, 2.0]), torch.tensor([0.1, 2.0, -1.0])
+    common = {"horizon": 1000, "max_rate": 0.006}
+    batch = arrival_times(disc(centres, radii), (20, 24), heads, ratios, winds, **common)
+    assert batch.shape == (3, 20, 24)
+    assert batch.dtype == torch.float32
+    for k in range(3):
+        one = slice(k, k + 1)
+        start = disc(centres[one], radii[one])
+        alone = arrival_times(start, (20, 24), heads[one], ratios[one], winds[one], **common)
+        assert torch.equal(alone[0], batch[k])
+    half = arrival_times(
+        disc(centres, radii), (20, 24), heads, ratios, winds, horizon=500, max_rate=0.006
+    )
+    assert torch.equal(half, batch.masked_fill(batch > 500, math.inf))
+
+
+def test_double_precision_and_no_rate():
+    double = grow(dtype=torch.float64)
+    assert double.dtype == torch.float64
+    torch.testing.assert_close(double.float(), grow(), rtol=0, atol=0.05)
+    still = grow(head=0.0)
+    assert set(still.unique().tolist()) == {0.0, math.inf}
+
+
+def test_errors_name_the_value():
+    with pytest.raises(ValueError, match="refine"):
+        grow(refine=0)
+    with pytest.raises(ValueError, match="horizon"):
+        grow(horizon=0)
+    with pytest.raises(ValueError, match="rate_field must be"):
+        grow(rate_field=torch.ones(1, 24, 23))
+    with pytest.raises(ValueError, match="negative"):
+        grow(rate_field=-torch.ones(1, 24, 24))
+    start = disc(torch.tensor([[5.0, 5.0]]), torch.tensor([2.0]))
+    still = lambda time: torch.tensor([0.1])  # noqa: E731
+    with pytest.raises(ValueError, match="max_rate"):
+        arrival_times(start, (9, 9), still, torch.ones(1), torch.ones(1), horizon=9)

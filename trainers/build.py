@@ -1,0 +1,71 @@
+"""Puts the parts of a recipe together."""
+
+from typing import Any
+
+import torch
+from emberlink.comm.base import Communication
+from emberlink.envs.fire import FireConfig
+from emberlink.envs.wildfire import WildfireEnv
+from emberlink.policies.actor_critic import make_actor, make_critic
+from tensordict.nn import TensorDictModule
+from torch import Tensor
+from torchrl.envs import Compose, InitTracker, TransformedEnv
+
+from .config import RunConfig, build_comm, check_device, resolve
+
+
+def make_env(
+    method: str,
+    setup: str = "paper",
+    *,
+    num_envs: int = 1,
+    fire: str | FireConfig | Tensor | None = None,
+    seed: int = 0,
+    device: torch.device | str = "cpu",
+    **overrides: Any,
+) -> TransformedEnv:
+    """A recipe's whole environment, communication included.
+
+    Args:
+        method: a recipe: independent, shared_memory, positional, consensus, or one of yours.
+        setup: paper, released, tuned, or one of yours.
+        num_envs: environments side by side.
+        fire: as for `WildfireEnv`; the setup's own scenario if None.
+        seed: of everything random here.
+        device: where all tensors live.
+        overrides: any other setting, by its name (`horizon=50`, `num_uavs=3`) or, through a
+            mapping, its full key (`**{"env.reward.exit": -10.0}`).
+
+    Raises:
+        ValueError: an unknown method, setup or setting, or a value out of range.
+    """
+    check_device(str(device))
+    grid = list(fire.shape[-2:]) if isinstance(fire, Tensor) and fire.ndim in (2, 3) else None
+    if grid and "grid" not in overrides:
+        overrides["grid"] = grid
+    config = resolve(method, [f"setup={setup}"], **overrides)
+    fire = config.fire if fire is None else fire
+    return build_env(config, num_envs=num_envs, fire=fire, seed=seed, device=device)
+
+
+def build_env(
+    config: RunConfig,
+    *,
+    num_envs: int,
+    fire: str | FireConfig | Tensor,
+    seed: int,
+    device: torch.device | str,
+) -> TransformedEnv:
+    """The environment of a configuration: the wildfire, communication, and "is_init"."""
+    world = WildfireEnv(num_envs, config.env, fire, seed, device)
+    talk = Communication(build_comm(config).to(world.device))
+    return TransformedEnv(world, Compose(talk, InitTracker()))
+
+
+def build_networks(
+    config: RunConfig, env: TransformedEnv, generator: torch.Generator | None = None
+) -> tuple[TensorDictModule, TensorDictModule]:
+    """The UAVs' actors and critics for an environment."""
+    specs = env.observation_spec, env.full_action_spec, config.learner.hidden
+    actor = make_actor(*specs, generator=generator)
+    return actor, make_critic(*specs, generator=generator)

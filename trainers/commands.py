@@ -1,0 +1,109 @@
+"""What the commands do."""
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+
+from . import report
+from .config import check_device, resolve
+from .loop import Progress as Moment
+from .loop import Trainer
+from .run_folder import RunFolder
+
+INTERRUPTED = 130
+"""the exit status of a program that Ctrl-C ended"""
+
+
+def train(method: str, overrides: Sequence[str], console: Console) -> int:
+    """Trains a recipe, then evaluates it. Ctrl-C saves the networks and ends the training."""
+    config = resolve(method, overrides)
+    trainer = Trainer(config)
+    run = trainer.start()
+    console.print(f"{method}, setup {config.setup}, fire {config.fire.name} -> {run.path}")
+    try:
+        _train_with_bar(trainer, console)
+        results = report.evaluate_run(
+            run,
+            config,
+            trainer.actor,
+            checkpoint=run.checkpoint(),
+            fires=config.evaluation.fires,
+            report=lambda text: console.print(f"  {text}", style="dim"),
+        )
+    except KeyboardInterrupt:
+        console.print(
+            f"stopped; what was learnt is in {run.checkpoint()}\n"
+            f"evaluate it with: emberlink eval {run.path}"
+        )
+        return INTERRUPTED
+    report.print_table(console, results, config)
+    console.print(str(run.path), soft_wrap=True)
+    return 0
+
+
+def _train_with_bar(trainer: Trainer, console: Console) -> None:
+    columns = (
+        TextColumn("episode {task.fields[episode]}/{task.fields[episodes]}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("coverage {task.fields[coverage]} score {task.fields[score]}"),
+        TimeElapsedColumn(),
+        TextColumn("left"),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=console) as bar:
+        task = bar.add_task(
+            "",
+            total=trainer.steps,
+            episode=0,
+            episodes=trainer.config.episodes,
+            coverage="-",
+            score="-",
+        )
+
+        def show(moment: Moment) -> None:
+            shown = {"completed": moment.step, "episode": moment.episode}
+            if moment.line:
+                shown["coverage"] = f"{moment.line['coverage']:.1f}%"
+                shown["score"] = f"{moment.line['score']:.2f}"
+            bar.update(task, **shown)
+
+        trainer.train(show)
+
+
+def evaluate_folder(
+    folder: Path,
+    console: Console,
+    *,
+    checkpoint: Path | None = None,
+    fires: int | None = None,
+    device: str | None = None,
+) -> int:
+    """Evaluates a run folder's frozen policy and prints the table."""
+    run = RunFolder(folder)
+    config = run.config()
+    if device is not None:
+        config = dataclasses.replace(config, device=check_device(device))
+    checkpoint = checkpoint or run.checkpoint()
+    actor = report.load_actor(run, config, checkpoint)
+    results = report.evaluate_run(
+        run,
+        config,
+        actor,
+        checkpoint=checkpoint,
+        fires=fires or config.evaluation.fires,
+        report=lambda text: console.print(f"  {text}", style="dim"),
+    )
+    report.print_table(console, results, config)
+    console.print(str(run.path), soft_wrap=True)
+    return 0

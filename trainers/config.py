@@ -1,0 +1,276 @@
+"""The whole configuration of a run: its schema, and how it is put together from YAML."""
+
+import difflib
+from collections.abc import Iterator, Mapping, Sequence
+from importlib.resources import files
+from typing import Annotated, Any, Literal
+
+import torch
+from emberlink.comm import registry
+from emberlink.envs.config import WildfireConfig, from_plain
+from emberlink.envs.fire import FireConfig
+from hydra import compose, initialize_config_module
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.errors import HydraException
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+from pydantic import ConfigDict, Field, Strict, TypeAdapter, ValidationError, field_validator
+from pydantic.dataclasses import dataclass
+
+_STRICT = ConfigDict(extra="forbid", strict=True)
+_GROUPS = ("setup", "fire")
+
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Count = Annotated[int, Field(ge=1)]
+MaybeCount = Annotated[int, Field(ge=0)]
+
+
+@dataclass(frozen=True, kw_only=True, config=_STRICT)
+class LearnerConfig:
+    """DDPG for every UAV (paper, section III.C)."""
+
+    hidden: Annotated[tuple[Count, Count], Strict(False)]
+    """units of the two hidden layers"""
+    gamma: Annotated[float, Field(ge=0, lt=1)]
+    """discount per step"""
+    actor_lr: Positive
+    """Adam's learning rate of the actors"""
+    critic_lr: Positive
+    """Adam's learning rate of the critics"""
+    critic_weight_decay: NotNegative
+    """L2 penalty in the critics' Adam"""
+    tau: Annotated[float, Field(gt=0, le=0.5)]
+    """share of the networks in their targets per update"""
+    updates: Count
+    """updates of every UAV's networks per step of all environments side by side"""
+    batch: Count
+    """transitions per UAV and update"""
+    capacity: Count
+    """transitions that a replay memory holds"""
+
+
+@dataclass(frozen=True, kw_only=True, config=_STRICT)
+class ExplorationConfig:
+    """Ornstein-Uhlenbeck noise: x += theta * (0 - x) * dt + sigma * sqrt(dt) * N(0, 1)."""
+
+    theta: NotNegative
+    """pull towards 0"""
+    sigma: NotNegative
+    """strength of the noise"""
+    dt: Positive
+    """length of a step"""
+
+
+@dataclass(frozen=True, kw_only=True, config=_STRICT)
+class EvaluationConfig:
+    """Frozen policies on held-out fires."""
+
+    fires: Count
+    """held-out fires, one episode each, of the evaluation at the end"""
+    interval: MaybeCount
+    """episodes between evaluations during training; 0 for none"""
+    interval_fires: Count
+    """held-out fires of the evaluations during training"""
+
+
+@dataclass(frozen=True, kw_only=True, config=_STRICT)
+class RunConfig:
+    """Everything that a run depends on."""
+
+    method: str
+    """the recipe: a file in configs/method"""
+    setup: str
+    """the constants: a file in configs/setup"""
+    memory: Literal["private", "shared"]
+    """one replay memory per UAV, or one for all"""
+    comm: dict[str, Any]
+    """the communication module's name and its settings"""
+    env: WildfireConfig
+    fire: FireConfig
+    learner: LearnerConfig
+    exploration: ExplorationConfig
+    evaluation: EvaluationConfig
+    episodes: Count
+    """episodes of training, counted per environment: all run theirs side by side"""
+    num_envs: Count
+    """environments that collect side by side"""
+    seed: Annotated[int, Field(ge=0, lt=2**31)]
+    """of everything random in the run"""
+    device: str
+    """where environment, memory and networks live"""
+    logger: Literal["wandb", "tensorboard", "csv", "none"]
+    """the tracker beside metrics.jsonl"""
+    output: str
+    """the folder in which the run folder is made"""
+    checkpoint_interval: Count
+    """episodes between checkpoints"""
+
+    @field_validator("device")
+    @classmethod
+    def _device_is_there(cls, value: str) -> str:
+        return check_device(value)
+
+    @field_validator("comm")
+    @classmethod
+    def _comm_is_known(cls, value: dict[str, Any]) -> dict[str, Any]:
+        if "name" not in value:
+            raise ValueError(f"name is missing; known: {', '.join(registry.known())}")
+        from_plain(registry.find(value["name"]).config_type, _without_name(value))
+        return value
+
+
+def _without_name(comm: Mapping[str, Any]) -> dict[str, Any]:
+    return {key: value for key, value in comm.items() if key != "name"}
+
+
+def build_comm(config: RunConfig):
+    """The communication module of a configuration."""
+    return registry.build(config.comm["name"], config.env, _without_name(config.comm))
+
+
+def check_device(name: str) -> str:
+    """The name, if it is a device of this machine.
+
+    Raises:
+        ValueError: it is none; the message lists those there are.
+    """
+    known = ["cpu", *(f"cuda:{i}" for i in range(torch.cuda.device_count()))]
+    try:
+        device = torch.device(name)
+    except RuntimeError:
+        device = None
+    there = device is not None and (
+        device.type == "cpu" or (device.type == "cuda" and (device.index or 0) < len(known) - 1)
+    )
+    if not there:
+        raise ValueError(f"device={name} is not there; known: {', '.join(known)}")
+    return name
+
+
+def known(group: str) -> list[str]:
+    """The choices of a config group ("method", "setup" or "fire"), in alphabetical order."""
+    folder = files("emberlink.configs") / group
+    return sorted(
+        p.name.removesuffix(".yaml") for p in folder.iterdir() if p.name.endswith(".yaml")
+    )
+
+
+def resolve(method: str, overrides: Sequence[str] = (), **settings: Any) -> RunConfig:
+    """The configuration of a recipe.
+
+    Args:
+        method: a file in configs/method.
+        overrides: `key=value`, as on the command line.
+        settings: the same from Python, a key's last part being enough where it is the only one
+            so called: `horizon=50` for `env.horizon`.
+
+    Raises:
+        ValueError: one line that names the method, key or value that is wrong, and what is known.
+    """
+    if method not in known("method"):
+        raise ValueError(f"method {_quote(method, known('method'))}")
+    choices = {"method": method, "setup": "paper"}
+    with initialize_config_module(config_module="emberlink.configs", version_base="1.3"):
+        _check_overrides(method, overrides, choices)
+        try:
+            composed = compose("base", overrides=[f"method={method}", *overrides])
+            values = OmegaConf.to_container(composed, resolve=True, throw_on_missing=True)
+        except (HydraException, OmegaConfBaseException) as error:
+            raise ValueError(" ".join(str(error).split())) from None
+    values = {**choices, **values}
+    for key, value in settings.items():
+        _set(values, key, value)
+    return from_values(values)
+
+
+def _set(values: dict[str, Any], key: str, value: Any) -> None:
+    """Sets the one value whose dotted key is, or ends in, `key`."""
+    names = list(_flat(values))
+    found = [name for name in names if name == key] or [
+        name for name in names if name.endswith("." + key)
+    ]
+    if len(found) != 1:
+        among = f" is one of {', '.join(found)}: say which" if found else ""
+        raise ValueError(f"key {key!r}{among}" if found else f"key {_quote(key, names)}")
+    *path, last = found[0].split(".")
+    for part in path:
+        values = values[part]
+    values[last] = value
+
+
+def from_values(values: Mapping[str, Any]) -> RunConfig:
+    """A configuration from plain values, such as a run folder's config.yaml.
+
+    Raises:
+        ValueError: one line that names the first key that is wrong, its value and what is wrong.
+    """
+    try:
+        return from_plain(RunConfig, values)
+    except ValidationError as error:
+        raise ValueError(describe(error)) from None
+
+
+def describe(error: ValidationError, prefix: str = "") -> str:
+    """One line for what pydantic found first: the key, the value, and what was expected."""
+    first = error.errors()[0]
+    key = ".".join([prefix, *map(str, first["loc"])] if prefix else map(str, first["loc"]))
+    if isinstance(cause := first.get("ctx", {}).get("error"), ValidationError):
+        return describe(cause, key)
+    message = first["msg"].removeprefix("Value error, ")
+    if first["type"] in ("missing", "unexpected_keyword_argument"):
+        return f"{key}: {message.lower()}"
+    return f"{key}={first['input']}: {message}"
+
+
+def to_values(config: RunConfig) -> dict[str, Any]:
+    """The configuration as plain values, for YAML and trackers."""
+    return TypeAdapter(RunConfig).dump_python(config, mode="json")
+
+
+def _check_overrides(method: str, overrides: Sequence[str], choices: dict[str, str]) -> None:
+    """Finds what Hydra would explain at length, and writes down which groups were chosen."""
+    keys: list[str] | None = None
+    for text in overrides:
+        try:
+            override = OverridesParser.create().parse_override(text)
+        except HydraException:
+            raise ValueError(f"{text!r} is not of the form key=value") from None
+        key = override.key_or_group
+        if override.is_delete() or override.is_add() or override.is_sweep_override():
+            raise ValueError(f"{text!r}: only key=value with one value is understood here")
+        if key in _GROUPS:
+            chosen = str(override.value())
+            if chosen not in known(key):
+                raise ValueError(f"{key} {_quote(chosen, known(key))}")
+            choices[key] = chosen
+        else:
+            keys = keys or _known_keys(method, choices["setup"])
+            if key not in keys:
+                raise ValueError(f"key {_quote(key, keys, listed=False)}")
+    choices.pop("fire", None)
+
+
+def _known_keys(method: str, setup: str) -> list[str]:
+    composed = compose("base", overrides=[f"method={method}", f"setup={setup}"])
+    return [*_GROUPS, *_flat(OmegaConf.to_container(composed))]
+
+
+def _flat(values: Any, prefix: str = "") -> Iterator[str]:
+    for key, value in values.items():
+        yield prefix + key
+        if isinstance(value, dict):
+            yield from _flat(value, f"{prefix}{key}.")
+
+
+def _quote(value: str, among: Sequence[str], *, listed: bool = True) -> str:
+    """`value`, that it is unknown, and the near or all known ones."""
+    leaves = {name.rsplit(".", 1)[-1]: name for name in among}
+    near = difflib.get_close_matches(value, among, n=1)
+    near = near or [leaves[m] for m in difflib.get_close_matches(value, leaves, n=1)]
+    hint = f"; did you mean {near[0]}?" if near else ""
+    if listed:
+        hint += f" known: {', '.join(among)}" if hint else f"; known: {', '.join(among)}"
+    elif not near:
+        hint = f"; known: {', '.join(name for name in among if '.' not in name)}"
+    return f"{value!r} is not known{hint}"

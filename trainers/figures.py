@@ -1,0 +1,72 @@
+"""The figures of a run."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from .evaluate import LEARNED, Results
+
+CURVES = {
+    "score": "score (mean reward)",
+    "coverage": "coverage, %",
+    "tracking_first": "first UAV on fire, step",
+    "tracking_last": "last UAV on fire, step",
+    "boundary_exits": "boundary exits per UAV",
+    "fire_exits": "fire exits per UAV",
+}
+"""measure -> axis label, in the order of the paper's figures 5 to 9"""
+
+
+def training_curves(path: Path, lines: Sequence[Mapping[str, Any]], title: str) -> None:
+    """The paper's figures 5 to 9 for one run.
+
+    Args:
+        path: a .png file.
+        lines: of metrics.jsonl; the exploring policy, and "fire/measure" of frozen ones.
+        title: above the panels.
+    """
+    figure = Figure(figsize=(11, 6), layout="constrained")
+    figure.suptitle(title)
+    for axes, (name, label) in zip(figure.subplots(2, 3).flat, CURVES.items(), strict=True):
+        episodes = [line["episode"] for line in lines]
+        axes.plot(episodes, [line[name] for line in lines], color="0.6", label="exploring")
+        for key in sorted({k for line in lines for k in line if k.endswith("/" + name)}):
+            points = [(line["episode"], line[key]) for line in lines if key in line]
+            fire = key.split("/")[0]
+            axes.plot(*zip(*points, strict=True), marker="o", ms=3, label=f"frozen, {fire}")
+        axes.set(xlabel="episode", ylabel=label)
+        axes.grid(alpha=0.3)
+    figure.axes[0].legend(fontsize="small")
+    figure.savefig(path, dpi=120)
+
+
+def coverage_bars(path: Path, results: Results) -> None:
+    """Coverage of each policy on each held-out fire: every episode a dot, the mean a bar."""
+    figure = Figure(figsize=(4.5 * len(results), 3.6), layout="constrained")
+    panels = figure.subplots(1, len(results), squeeze=False, sharey=True)[0]
+    for axes, (fire, by_policy) in zip(panels, results.items(), strict=True):
+        for place, (policy, measured) in enumerate(by_policy.items()):
+            values = np.asarray(measured["coverage"])
+            colour = "tab:orange" if policy == LEARNED else "0.7"
+            axes.bar(place, values.mean(), color=colour)
+            spread = place + np.linspace(-0.25, 0.25, len(values))
+            axes.plot(spread, values, "k.", ms=3, alpha=0.5)
+        axes.set_xticks(range(len(by_policy)), [name.replace("_", "\n") for name in by_policy])
+        axes.set(title=f"held-out fires: {fire}", ylim=(0, 100))
+        axes.grid(axis="y", alpha=0.3)
+    panels[0].set_ylabel("coverage, %")
+    figure.savefig(path, dpi=120)
+
+
+def timelapse(path: Path, pictures: Sequence[np.ndarray], steps: Sequence[int]) -> None:
+    """A row of frames of one episode, as the paper's figure 3."""
+    chosen = np.linspace(0, len(pictures) - 1, min(5, len(pictures))).round().astype(int)
+    figure = Figure(figsize=(2.4 * len(chosen), 2.7), layout="constrained")
+    for axes, index in zip(figure.subplots(1, len(chosen), squeeze=False)[0], chosen, strict=True):
+        axes.imshow(pictures[index], interpolation="nearest")
+        axes.set_title(f"step {steps[index]}", fontsize="medium")
+        axes.set_axis_off()
+    figure.savefig(path, dpi=120)

@@ -1,0 +1,72 @@
+"""DDPG for all UAVs at once (Lillicrap et al. 2016; paper, section III.C)."""
+
+import torch
+from emberlink.envs import keys
+from emberlink.policies.actor_critic import STATE_ACTION_VALUE
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModule
+from torch import Tensor
+from torchrl.objectives import DDPGLoss, SoftUpdate, group_optimizers
+
+from .config import LearnerConfig
+from .memory import DONE, TERMINATED
+
+
+class Learner:
+    """Updates every UAV's actor, critic and their targets from its own batch.
+
+    Args:
+        actor, critic: the UAVs' networks, stacked; updated in place.
+        config: the learner's constants.
+    """
+
+    def __init__(self, actor: TensorDictModule, critic: TensorDictModule, config: LearnerConfig):
+        self.loss = DDPGLoss(actor, critic, delay_actor=True, delay_value=True, reduction="none")
+        self.loss.set_keys(
+            state_action_value=STATE_ACTION_VALUE,
+            reward=keys.REWARD,
+            done=DONE,
+            terminated=TERMINATED,
+        )
+        self.loss.make_value_estimator(gamma=config.gamma)
+        self.optimizer = group_optimizers(
+            torch.optim.Adam(self._parameters("actor"), lr=config.actor_lr, fused=True),
+            torch.optim.Adam(
+                self._parameters("value"),
+                lr=config.critic_lr,
+                weight_decay=config.critic_weight_decay,
+                fused=True,
+            ),
+        )
+        self.targets = SoftUpdate(self.loss, tau=config.tau)
+        self.updates = 0
+
+    def _parameters(self, network: str) -> list[Tensor]:
+        tree = getattr(self.loss, f"{network}_network_params")
+        return list(tree.values(include_nested=True, leaves_only=True))
+
+    def losses(self, batch: TensorDictBase) -> tuple[Tensor, Tensor]:
+        """The actors' and the critics' losses, one per UAV: [uavs] each.
+
+        The mean is over a UAV's batch alone: averaged over UAVs as well, every gradient would
+        shrink with the size of the team.
+        """
+        losses = self.loss(batch)
+        return losses["loss_actor"].mean(0), losses["loss_value"].mean(0)
+
+    def update(self, batch: TensorDictBase) -> tuple[Tensor, Tensor]:
+        """One step of both optimisers and of the targets.
+
+        Args:
+            batch: a sample of `make_memory`'s, batch size [batch].
+
+        Returns:
+            The actors' and the critics' losses before the step, [uavs] each, detached.
+        """
+        actor, critic = self.losses(batch)
+        (actor + critic).sum().backward()
+        self.optimizer.step()
+        self.optimizer.zero_grad()
+        self.targets.step()
+        self.updates += 1
+        return actor.detach(), critic.detach()

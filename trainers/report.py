@@ -1,0 +1,87 @@
+"""Evaluates a run's frozen policy and leaves table, eval.json, figures and an animation."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+from emberlink.envs import metrics
+from emberlink.envs.render import write_gif
+from rich.console import Console
+from rich.table import Table
+from tensordict.nn import TensorDictModule
+
+from . import evaluate, figures
+from .build import build_env, build_networks
+from .config import RunConfig
+from .run_folder import RunFolder, load_weights
+
+_ACTOR = "actor_network_params.module."
+"""what the actor's weights are called in a checkpoint, before the name within the network"""
+
+
+def load_actor(run: RunFolder, config: RunConfig, checkpoint: Path) -> TensorDictModule:
+    """The frozen policy of a run.
+
+    Raises:
+        ValueError: the checkpoint can't be read or is of another shape.
+    """
+    env = build_env(
+        config,
+        num_envs=1,
+        fire=torch.full(config.env.grid, torch.inf),
+        seed=0,
+        device=config.device,
+    )
+    actor, _ = build_networks(config, env)
+    network = actor.module
+    expected = {_ACTOR + name: value for name, value in network.state_dict().items()}
+    weights = load_weights(checkpoint, expected)
+    network.load_state_dict({name.removeprefix(_ACTOR): v for name, v in weights.items()})
+    return actor.requires_grad_(False)
+
+
+def evaluate_run(
+    run: RunFolder,
+    config: RunConfig,
+    actor: evaluate.Policy,
+    *,
+    checkpoint: Path,
+    fires: int,
+    report: Callable[[str], None],
+) -> evaluate.Results:
+    """Evaluates a frozen policy and writes eval.json, the figures and one animation."""
+
+    def say(fire: str, policy: str) -> None:
+        report(f"{policy} on {fires} fires of {fire}")
+
+    results = evaluate.evaluate(config, actor, fires=fires, report=say)
+    content = evaluate.record(config, results, checkpoint=checkpoint.name, fires=fires)
+    run.write("eval.json", content)
+    figures.coverage_bars(run.figure("coverage.png"), results)
+    lines = run.lines()
+    if lines:
+        title = f"{config.method}, setup {config.setup}, fire {config.fire.name}"
+        figures.training_curves(run.figure("training.png"), lines, title)
+    report("one episode for the animation")
+    name, arrival = next(iter(evaluate.evaluation_fires(config, 1).items()))
+    pictures, steps = evaluate.film(config, actor, fire=arrival)
+    write_gif(run.figure(f"episode_{name}.gif"), pictures)
+    figures.timelapse(run.figure(f"timelapse_{name}.png"), pictures, steps)
+    return results
+
+
+def print_table(console: Console, results: evaluate.Results, config: RunConfig) -> None:
+    """The means over episodes, a table per fire."""
+    for fire, by_policy in results.items():
+        episodes = len(next(iter(by_policy.values()))["coverage"])
+        table = Table(
+            title=f"held-out {fire}, mean of {episodes} episodes "
+            f"(frozen {config.method}, setup {config.setup})"
+        )
+        table.add_column("policy")
+        for name in metrics.NAMES:
+            table.add_column(name.replace("_", "\n"), justify="right")
+        for policy, measured in by_policy.items():
+            values = evaluate.means(measured)
+            table.add_row(policy, *(f"{values[name]:.1f}" for name in metrics.NAMES))
+        console.print(table)
