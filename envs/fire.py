@@ -7,17 +7,10 @@ another grid lengths, and with them rates, are scaled by min(X, Y)/30, so that i
 """
 
 import dataclasses
-import hashlib
-import json
 import math
-import os
-import tempfile
-import warnings
 from importlib import resources
-from pathlib import Path
 from typing import Annotated, Literal, get_args
 
-import numpy as np
 import torch
 from omegaconf import OmegaConf
 from pydantic import AfterValidator, ConfigDict, Field, Strict
@@ -29,7 +22,6 @@ from .streams import fold, uniform
 
 BASE_SIDE = 30
 HELD_OUT_FROM = 1_000_000
-GENERATOR_VERSION = 1  # raise it whenever the same config and seed give another fire
 Split = Literal["train", "heldout"]
 
 _STREAM = 0xF12E  # keeps a fire's draws apart from other uses of the same seed
@@ -243,80 +235,6 @@ def _fuel(
 
 def burning_cells(arrival: Tensor, horizon: int) -> Tensor:
     """Number of cells that burn at the steps 0 to `horizon`, int64 [fires, horizon + 1]."""
-    step = arrival.flatten(1).ceil().clamp(max=horizon + 1).long()
+    step = arrival.flatten(1).ceil().clamp(0, horizon + 1).long()
     zeros = step.new_zeros(len(step), horizon + 2)
     return zeros.scatter_add(1, step, torch.ones_like(step)).cumsum(1)[:, :-1]
-
-
-def cache_folder() -> Path:
-    """$EMBERLINK_CACHE, else $XDG_CACHE_HOME/emberlink, else ~/.cache/emberlink."""
-    if folder := os.environ.get("EMBERLINK_CACHE"):
-        return Path(folder).expanduser()
-    return Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "emberlink"
-
-
-def bank_key(
-    config: FireConfig, split: Split, count: int, grid: tuple[int, int], horizon: int, base: int = 0
-) -> str:
-    """A hash of everything that a bank of fires depends on."""
-    parts = [GENERATOR_VERSION, dataclasses.asdict(config), split, count, *grid, horizon, base]
-    return hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:32]
-
-
-def fire_bank(
-    config: FireConfig,
-    split: Split,
-    count: int,
-    grid: tuple[int, int],
-    horizon: int,
-    *,
-    base: int = 0,
-    cache_dir: str | os.PathLike[str] | None = None,
-) -> Tensor:
-    """The first `count` fires of a split, computed once and then read from a file.
-
-    Args:
-        config, grid, horizon: as in `make_fires`.
-        split, count: as in `fire_seeds`, with `base` as its `start`.
-        cache_dir: folder of the file, `cache_folder()` by default. A damaged file is replaced; a
-            folder that cannot be written to costs a warning and the time to compute.
-
-    Returns:
-        float32 [count, X, Y] on the CPU, so that every device trains on the same fires.
-    """
-    seeds = fire_seeds(split, count, base)
-    folder = cache_folder() if cache_dir is None else Path(cache_dir)
-    file = folder / f"fire-{bank_key(config, split, count, grid, horizon, base)}.npy"
-    stored = _read(file, (count, *grid))
-    if stored is not None:
-        return stored
-    fires = make_fires(config, seeds, grid, horizon)
-    _write(file, fires)
-    return fires
-
-
-def _read(file: Path, shape: tuple[int, ...]) -> Tensor | None:
-    """The bank in a file, or None if there is none or it is not one."""
-    try:
-        with file.open("rb") as handle:
-            array = np.lib.format.read_array(handle, allow_pickle=False)
-    except (OSError, ValueError, MemoryError):  # a damaged header may ask for any size
-        return None
-    if array.dtype != np.float32 or array.shape != shape:
-        return None
-    return torch.from_numpy(array) if (array >= 0).all() else None
-
-
-def _write(file: Path, fires: Tensor) -> None:
-    """Write under a temporary name first: a reader never meets half a file."""
-    temporary = None
-    try:
-        file.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile(dir=file.parent, suffix=".tmp", delete=False) as handle:
-            temporary = handle.name
-            np.save(handle, fires.numpy(), allow_pickle=False)
-        os.replace(temporary, file)
-    except OSError as error:
-        if temporary is not None:
-            Path(temporary).unlink(missing_ok=True)
-        warnings.warn(f"fires are not cached: cannot write {file}: {error}", stacklevel=3)

@@ -30,7 +30,7 @@ class RewardConfig:
 class HeadingConfig:
     """The bonus for flying towards the target (paper, section IV.F); defaults: the paper's."""
 
-    form: Literal["folded_linear", "folded_exponential", "linear"] = "folded_linear"
+    form: Literal["folded_linear", "folded_exponential", "linear", "approach"] = "folded_linear"
     """one of `HEADING_FORMS`"""
     weight: Number = 1.0
     """factor on the term"""
@@ -79,13 +79,21 @@ def _folded_exponential(target: Tensor, moved: Tensor) -> Tensor:
 def _linear(target: Tensor, moved: Tensor) -> Tensor:
     """(90 - D) / 90 with D the true angle between the two; 0 where the UAV stood still."""
     difference = (_degrees(target) - _degrees(moved) + 180).remainder(360) - 180
-    return torch.where((moved == 0).all(-1), 0.0, (90 - difference.abs()) / 90)
+    return torch.where((moved[..., :2] == 0).all(-1), 0.0, (90 - difference.abs()) / 90)
+
+
+def _approach(target: Tensor, moved: Tensor) -> Tensor:
+    """Cells by which the UAV came nearer to its target, altitude included."""
+    return torch.linalg.vector_norm(target, dim=-1) - torch.linalg.vector_norm(
+        target - moved, dim=-1
+    )
 
 
 HEADING_FORMS = {
     "folded_linear": _folded_linear,
     "folded_exponential": _folded_exponential,
     "linear": _linear,
+    "approach": _approach,
 }
 
 
@@ -99,8 +107,6 @@ def heading_reward(before: Tensor, after: Tensor, target: Tensor, config: Headin
     Angles are taken in the x-y plane, in degrees, from the position before the move; computed in
     float64 because 0.1 cells of movement leave few digits.
     """
-    ground = before[..., :2].double()
-    term = HEADING_FORMS[config.form](
-        target[..., :2].double() - ground, after[..., :2].double() - ground
-    )
+    before = before.double()
+    term = HEADING_FORMS[config.form](target.double() - before, after.double() - before)
     return (config.weight * term).float()

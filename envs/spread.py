@@ -1,7 +1,7 @@
 """Fronts that spread by Huygens' principle: a batched level set on tensors [fires, X, Y].
 
 Every point of a front sends out an elliptical wavelet; the envelope of the wavelets is the next
-front (Huygens; for wildfire Richards 1990, Int. J. Numer. Methods Eng. 29, and Finney 1998,
+front (Huygens; for wildfire Richards 1990, Int. J. Numer. Methods Eng. 30, and Finney 1998,
 FARSITE, RMRS-RP-4). The same front is the zero contour of φ with
 
     φ_t + m · (c (w·∇φ) + sqrt(a² (w·∇φ)² + b² (w⊥·∇φ)²)) = 0
@@ -33,7 +33,7 @@ _PAD = 2  # cells around the grid, so that the ends of the stencil lie outside o
 
 
 def length_to_breadth(wind: float | Tensor) -> Tensor:
-    """The length-to-breadth ratio of a wildfire in wind (Anderson 1983, INT-RP-305).
+    """The length-to-breadth ratio of a wildfire in wind (Anderson 1983, USDA INT-305).
 
     Args:
         wind: mid-flame wind speed in m/s, not negative, any shape.
@@ -196,8 +196,8 @@ def _refined(field: Tensor, grid: tuple[int, int], x: Tensor, y: Tensor) -> Tens
         return torch.lerp(low, high, along_y)
 
     smooth = between(field) / between(free).clamp_min(1e-6)
-    for i in ((u - 0.5).ceil(), (u + 0.5).floor().clamp(max=grid[0] - 1)):
-        for j in ((v - 0.5).ceil(), (v + 0.5).floor().clamp(max=grid[1] - 1)):
+    for i in ((u - 0.5).ceil(), (u + 0.5).floor()):
+        for j in ((v - 0.5).ceil(), (v + 0.5).floor()):
             smooth = smooth * at(free, i, j)
     return smooth
 

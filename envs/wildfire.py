@@ -7,7 +7,8 @@ from torchrl.envs import EnvBase
 
 from . import keys, render, specs, streams, uav
 from .config import WildfireConfig
-from .fire import FireConfig, fire_bank, load_scenario
+from .fire import FireConfig, burning_cells, load_scenario
+from .fire_bank import fire_bank
 from .reward import view_reward
 
 _NEVER = torch.iinfo(torch.int32).max
@@ -47,9 +48,12 @@ class WildfireEnv(EnvBase):
         self.config = config
         bank, self._fire_each = _arrivals(fire, config, num_envs)
         self.register_buffer("_bank", bank.to(self.device))
-        self.register_buffer("_growth", _growth(self._bank, config.horizon))
-        self.register_buffer("_low", torch.tensor(config.low, dtype=torch.float64))
-        self.register_buffer("_high", torch.tensor(config.high, dtype=torch.float64))
+        self.register_buffer("_growth", burning_cells(self._bank, config.horizon))
+        # The corners as float32 has them, as it does positions: who stands at 3.3 is not beyond it.
+        corners = torch.tensor([config.low, config.high], dtype=torch.float32).double()
+        self.register_buffer("_low", corners[0])
+        self.register_buffer("_high", corners[1])
+        self._ceiling = corners[1, 2].item()
         self._make_state()
         team = num_envs, config.num_uavs
         self.observation_spec = specs.observation_spec(*team)
@@ -168,7 +172,7 @@ class WildfireEnv(EnvBase):
         )
         self._position.copy_(position)
         cells, flat, visible = uav.view(
-            position, view_angle=config.view_angle, ceiling=config.altitude[1], grid=config.grid
+            position, view_angle=config.view_angle, ceiling=self._ceiling, grid=config.grid
         )
         new, old = self._discover(flat, visible)
         counts = {"new": new.sum(-1), "old": old.sum(-1), "none": (visible & ~new & ~old).sum(-1)}
@@ -250,13 +254,6 @@ class WildfireEnv(EnvBase):
         return torch.cat((position, torch.stack(((new > 0), (old > 0), time), -1).float()), -1)
 
 
-def _growth(bank: Tensor, horizon: int) -> Tensor:
-    """Cells that burn at each step 0 ... horizon, int64 [fires, horizon + 1]."""
-    steps = torch.arange(horizon + 1, dtype=bank.dtype, device=bank.device)
-    arrivals = bank.flatten(1).sort(-1).values
-    return torch.searchsorted(arrivals, steps.expand(len(bank), -1).contiguous(), right=True)
-
-
 def _arrivals(
     fire: str | FireConfig | Tensor, config: WildfireConfig, num_envs: int
 ) -> tuple[Tensor, bool]:
@@ -265,7 +262,8 @@ def _arrivals(
         fire = load_scenario(fire)
     if isinstance(fire, FireConfig):
         return fire_bank(fire, "train", fire.bank, config.grid, config.horizon), False
-    bank = torch.as_tensor(fire, dtype=torch.float32)
+    # A copy, in order in memory: what the caller does to theirs later is not our fire.
+    bank = torch.as_tensor(fire, dtype=torch.float32).clone(memory_format=torch.contiguous_format)
     bank = bank.unsqueeze(0) if bank.ndim == 2 else bank
     if bank.shape not in ((1, *config.grid), (num_envs, *config.grid)):
         raise ValueError(

@@ -109,7 +109,6 @@ ACCURACY = [
 @pytest.mark.parametrize(("ratio", "turn", "overlap"), ACCURACY)
 def test_agrees_with_the_exact_front_and_converges(ratio: float, turn: float, overlap):
     areas, unions, errors = zip(*(compare(n, ratio, turn) for n in (31, 61, 121)), strict=True)
-    print(areas, unions, errors)
     assert all(got >= want for got, want in zip(unions, overlap, strict=True))
     assert abs(areas[0] - 1) < 0.025
     assert abs(areas[2] - 1) < 0.0015
@@ -128,8 +127,7 @@ def test_area_grows_as_the_offset_of_a_disc(ratio: float):
     )
     for time in (250.0, 500.0, 1000.0):
         want = math.pi * CORE**2 + CORE * perimeter * time + math.pi * a * b * time**2
-        print(ratio, time, float((arrival <= time).sum()) / 16 / want)
-        assert float((arrival <= time).sum()) / 16 == pytest.approx(want, rel=0.012)
+        assert float((arrival <= time).sum()) / 16 == pytest.approx(want, rel=0.006)
 
 
 def test_a_straight_front_moves_at_its_speed():
@@ -144,10 +142,22 @@ def test_a_straight_front_moves_at_its_speed():
 
 def test_mirror_and_quarter_turn():
     base = grow(azimuth=0.4, centre=(11.0, 12.0))
-    close = {"rtol": 0, "atol": 0.05}
-    torch.testing.assert_close(grow(azimuth=-0.4, centre=(11.0, 11.0)).flip(1), base, **close)
+    torch.testing.assert_close(
+        grow(azimuth=-0.4, centre=(11.0, 11.0)).flip(1), base, rtol=0, atol=0.01
+    )
     quarter = grow(azimuth=0.4 + math.pi / 2, centre=(11.0, 11.0))
-    torch.testing.assert_close(quarter.rot90(-1), base, **close)
+    torch.testing.assert_close(quarter.rot90(-1), base, rtol=0, atol=0.01)
+
+
+def test_symmetry_with_fuel_and_barriers():
+    field = torch.rand(1, 24, 24, generator=torch.Generator().manual_seed(5))
+    field[0, 16:19, 8:11] = 0
+    even = {"centre": (11.5, 11.5), "ratio": 1.0, "head": 0.02}
+    base = grow(rate_field=field, **even)
+    for axes in ((0,), (1,), (0, 1)):
+        flipped = grow(rate_field=field.flip([a + 1 for a in axes]), **even)
+        torch.testing.assert_close(flipped.flip(axes), base, rtol=0, atol=0.01)
+    torch.testing.assert_close(grow(rate_field=field.mT, **even).mT, base, rtol=0, atol=0.01)
 
 
 def test_the_head_runs_towards_the_azimuth():
@@ -198,14 +208,21 @@ def test_a_barrier_one_cell_wide_never_burns_and_does_not_leak(kind: str, refine
 
 
 def test_the_front_goes_around_a_barrier():
+    """The shortest way from the core to behind the wall passes the wall's two upper corners."""
     barrier, _ = wall("straight")
     barrier[:, 15:] = False
-    free = grow(head=0.02, ratio=1.0)
-    got = grow(head=0.02, ratio=1.0, rate_field=(~barrier).float()[None])
-    assert got[17, 11] > free[17, 11] + 100
-    assert got[17, 20].isfinite()
+    options = {"head": 0.02, "ratio": 1.0}
+    got = grow(rate_field=(~barrier).float()[None], refine=8, **options)
+    to_wall = math.hypot(15.5 - 11, 14.5 - 11) - 3.0
+    for x, y in ((17, 11), (20, 12)):
+        path = to_wall + 1 + math.hypot(x - 16.5, y - 14.5)
+        assert 1 < float(got[x, y]) * 0.02 / path < 1.08
+    free = grow(**options)
+    assert free[17, 11] < 160
+    # In front of the wall nothing changes.
     early = (slice(12, 15), slice(8, 14))
-    torch.testing.assert_close(got[early], free[early], rtol=0.02, atol=1)
+    coarse = grow(rate_field=(~barrier).float()[None], **options)
+    torch.testing.assert_close(coarse[early], free[early], rtol=0, atol=0.3)
 
 
 def test_a_barrier_inside_the_initial_front_does_not_burn():
@@ -233,12 +250,15 @@ def test_rates_in_space_and_time():
 
 def test_the_edge_of_the_grid_does_not_disturb():
     field = torch.rand(1, 40, 40, generator=torch.Generator().manual_seed(1))
-    small = field[:, 8:32, 8:32]
-    inner = grow(centre=(19.0, 5.0), azimuth=-0.3, rate_field=small, max_rate=0.006)
-    outer = grow((40, 40), (27.0, 13.0), azimuth=-0.3, rate_field=field, max_rate=0.006)[8:32, 8:32]
-    assert inner[23].isfinite().any()
-    # Fuel outside differs (it is continued from the edge), so compare three cells inside.
-    torch.testing.assert_close(inner[:21, 3:], outer[:21, 3:], rtol=0, atol=0.5)
+    more = {"azimuth": -0.3, "max_rate": 0.006}
+    for whole, inside in ((torch.ones(1, 40, 40), 0), (field, 3)):
+        inner = grow(centre=(19.0, 5.0), rate_field=whole[:, 8:32, 8:32], **more)
+        outer = grow((40, 40), (27.0, 13.0), rate_field=whole, **more)[8:32, 8:32]
+        assert inner[23].isfinite().any()
+        # Fuel beyond the edge is that of the edge: there the patchy fire differs by right.
+        cut = (slice(0, 24 - inside), slice(inside, 24))
+        worst = 0.1 if inside else 4.0
+        torch.testing.assert_close(inner[cut], outer[cut], rtol=0, atol=worst)
 
 
 def test_batch_and_horizon_do_not_matter():
@@ -263,7 +283,7 @@ def test_batch_and_horizon_do_not_matter():
 def test_double_precision_and_no_rate():
     double = grow(dtype=torch.float64)
     assert double.dtype == torch.float64
-    torch.testing.assert_close(double.float(), grow(), rtol=0, atol=0.05)
+    torch.testing.assert_close(double.float(), grow(), rtol=0, atol=0.01)
     still = grow(head=0.0)
     assert set(still.unique().tolist()) == {0.0, math.inf}
 

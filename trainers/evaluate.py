@@ -6,7 +6,8 @@ from typing import Any
 import numpy as np
 import torch
 from emberlink.envs import metrics
-from emberlink.envs.fire import FireConfig, fire_bank, load_scenario
+from emberlink.envs.fire import FireConfig, load_scenario
+from emberlink.envs.fire_bank import fire_bank
 from emberlink.policies.scripted import SCRIPTED
 from tensordict import TensorDictBase
 from torch import Tensor

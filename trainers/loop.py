@@ -87,6 +87,12 @@ class Trainer:
             tracker.close()
             self.save()
 
+    def rehearse(self, steps: int) -> None:
+        """Collects and learns for some steps of the environments; writes nothing."""
+        for _, collected in zip(range(steps), self.collector, strict=False):
+            self._learn(collected)
+        self.collector.shutdown()
+
     def save(self) -> None:
         """Writes the networks as they are to a checkpoint."""
         assert self.run is not None
@@ -116,8 +122,7 @@ class Trainer:
         progress = Progress(0, self.steps, 0, config.episodes)
         began, moments, losses = time.monotonic(), [], []
         for step, collected in enumerate(self.collector, start=1):
-            self.memory.extend(to_rows(collected))
-            losses += self._update()
+            losses += self._learn(collected)
             moments.append(collected.get("next").select(*metrics.STEP_KEYS))
             progress.step = step
             if step % horizon == 0:
@@ -129,8 +134,12 @@ class Trainer:
                 moments, losses = [], []
             report(progress)
 
-    def _update(self) -> list[torch.Tensor]:
-        """The updates of one step: the losses, [2, uavs] each, or none before a full batch."""
+    def _learn(self, collected: TensorDictBase) -> list[torch.Tensor]:
+        """Remembers a step and makes its updates: the losses, [2, uavs] each.
+
+        There are none before the memory holds a full batch.
+        """
+        self.memory.extend(to_rows(collected))
         if len(self.memory) < self.enough:
             return []
         return [

@@ -71,17 +71,15 @@ def evaluate_run(
 
 
 def print_table(console: Console, results: evaluate.Results, config: RunConfig) -> None:
-    """The means over episodes, a table per fire."""
+    """The means over episodes: a table per fire, a column per policy."""
     for fire, by_policy in results.items():
         episodes = len(next(iter(by_policy.values()))["coverage"])
-        table = Table(
-            title=f"held-out {fire}, mean of {episodes} episodes "
-            f"(frozen {config.method}, setup {config.setup})"
-        )
-        table.add_column("policy")
+        table = Table(title=f"held-out fires: {fire} ({episodes} episodes, mean)")
+        table.add_column("measure")
+        for policy in by_policy:
+            name = f"{config.method} ({config.setup})" if policy == evaluate.LEARNED else policy
+            table.add_column(name.replace("_", " "), justify="right")
+        columns = [evaluate.means(measured) for measured in by_policy.values()]
         for name in metrics.NAMES:
-            table.add_column(name.replace("_", "\n"), justify="right")
-        for policy, measured in by_policy.items():
-            values = evaluate.means(measured)
-            table.add_row(policy, *(f"{values[name]:.1f}" for name in metrics.NAMES))
+            table.add_row(name, *(f"{column[name]:.1f}" for column in columns))
         console.print(table)
