@@ -52,10 +52,13 @@ def frame(
         draw.rectangle(box, fill=FIELD_OF_VIEW)
     for i, j in np.argwhere(fire_map > 0).tolist():
         draw.rectangle(square(i, j, 0.5), fill=FIRE)
-    for box in views:
-        draw.rectangle(box, outline=FIELD_OF_VIEW, width=max(1, scale // 6))
+    line = max(2, scale // 6)
+    for left, top, right, bottom in views:
+        # The black line shows the edge where yellow alone would not, over fire and other views.
+        draw.rectangle((left - 1, top - 1, right + 1, bottom + 1), outline=NO_FIRE)
+        draw.rectangle((left, top, right, bottom), outline=FIELD_OF_VIEW, width=line)
     for x, y, _ in position.tolist():
-        draw.ellipse(square(x, y, 0.45), fill=UAV)
+        draw.ellipse(square(x, y, max(0.45, 4 / scale)), fill=UAV)
     return np.asarray(image)
 
 
@@ -71,3 +74,27 @@ def write_gif(path: Path, frames: Iterable[NDArray[np.uint8]], *, fps: int = 20)
     images[0].save(
         path, save_all=True, append_images=images[1:], duration=round(1000 / fps), loop=0
     )
+
+
+class Window:
+    """A window that shows pictures; it stays invisible where matplotlib has no screen."""
+
+    def __init__(self, title: str):
+        from matplotlib import pyplot  # imported here: only a window needs it
+
+        self._pyplot = pyplot
+        self._figure = pyplot.figure(num=title)
+        self._image = None
+
+    def show(self, picture: NDArray[np.uint8]) -> None:
+        """Shows a picture, uint8 [height, width, 3], in place of the last one."""
+        if self._image is None:
+            axes = self._figure.add_axes((0, 0, 1, 1), frame_on=False, xticks=[], yticks=[])
+            self._image = axes.imshow(picture)
+            self._figure.show(warn=False)
+        self._image.set_data(picture)
+        self._figure.canvas.draw_idle()
+        self._figure.canvas.flush_events()
+
+    def close(self) -> None:
+        self._pyplot.close(self._figure)

@@ -21,7 +21,7 @@ def move(
         position: float32 [..., 3], cells.
         action: float32 [..., 3]; components outside [-1, 1] are clipped to it.
         displacement: cells per unit of action.
-        low, high: [3], the corners of the box, cells.
+        low, high: float64 [3], the corners of the box, cells; numbers that float32 has exactly.
 
     Returns:
         The new positions, float32 [..., 3], and the axes along which the move would have left
@@ -54,7 +54,7 @@ def view(
         flat: int64 [..., V], i * Y + j of those.
         visible: bool [..., V], which of them are in view; each cell of the grid is at most once.
     """
-    reach = math.floor(view_radius(ceiling, view_angle) + 0.5)
+    reach = min(math.floor(view_radius(ceiling, view_angle) + 0.5), max(grid) - 1)
     offsets = torch.arange(-reach, reach + 1, device=position.device)
     size = torch.tensor(grid, device=position.device).unsqueeze(-1)
     ground = position[..., :2].double().unsqueeze(-1)
@@ -71,7 +71,8 @@ def view(
 def random_points(stream: Tensor, count: int, low: Tensor, high: Tensor) -> Tensor:
     """Uniform points of the box, float32 [..., count, 3], one set for each stream of [...]."""
     unit = streams.uniform(stream, count * 3).unflatten(-1, (count, 3))
-    return low.float() + unit * (high - low).float()
+    points = low.float() + unit * (high - low).float()
+    return torch.minimum(points, high.float())  # rounding may step over the edge
 
 
 def next_waypoint(

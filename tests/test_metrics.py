@@ -1,0 +1,149 @@
+"""Measures of episodes written by hand."""
+
+import pytest
+import torch
+from emberlink.envs import WildfireConfig, WildfireEnv, keys, metrics
+from emberlink.trainers import make_env
+
+YES, NO = True, False
+
+
+def test_score_is_the_mean_over_uavs_and_steps():
+    reward = torch.tensor([[1.0, -4], [-10, 0], [-100, 2]])
+    assert metrics.score(reward).item() == pytest.approx(-111 / 6)
+
+
+def test_coverage_is_of_the_last_step():
+    seen, burning = torch.tensor([0, 30, 36]), torch.tensor([40, 40, 48])
+    assert metrics.coverage(seen, burning).item() == 75
+    assert metrics.coverage_auc(seen, burning).item() == pytest.approx((0 + 75 + 75) / 3)
+
+
+@pytest.mark.parametrize(
+    ("seen", "burning", "time"),
+    [
+        ([0, 3, 4, 4], [4, 4, 4, 4], 3),
+        ([4, 4, 4, 4], [4, 4, 4, 4], 1),
+        ([0, 1, 2, 4], [4, 4, 4, 4], 4),
+        ([0, 1, 2, 3], [4, 4, 4, 4], 4),  # never: the horizon
+        ([0, 4, 4, 4], [4, 4, 5, 6], 2),  # the fire has grown since
+        ([3, 4, 5, 6], [4, 5, 6, 7], 4),  # always one behind
+        ([0, 0, 0, 0], [0, 0, 0, 0], 1),  # nothing to see
+    ],
+)
+def test_coverage_time(seen, burning, time):
+    assert metrics.coverage_time(torch.tensor(seen), torch.tensor(burning)).item() == time
+
+
+def test_where_nothing_burns_all_is_covered():
+    nothing = torch.zeros(3, dtype=torch.int64)
+    assert metrics.coverage(nothing, nothing).item() == 100
+    assert metrics.coverage_auc(nothing, nothing).item() == 100
+
+
+def test_tracking():
+    on_fire = torch.tensor([[NO, NO, NO], [NO, YES, NO], [YES, NO, NO], [YES, YES, YES]])
+    assert metrics.tracking_first(on_fire).item() == 2
+    assert metrics.tracking_last(on_fire).item() == 4
+
+
+def test_a_uav_that_never_finds_fire_counts_as_the_horizon():
+    on_fire = torch.zeros(5, 3, dtype=torch.bool)
+    assert metrics.tracking_first(on_fire).item() == 5
+    on_fire[0, 1] = on_fire[2, 0] = YES
+    assert metrics.tracking_first(on_fire).item() == 1
+    assert metrics.tracking_last(on_fire).item() == 5
+
+
+def test_boundary_exits_count_every_attempt():
+    left = torch.tensor([[YES, NO], [YES, NO], [NO, YES], [YES, NO]])
+    assert metrics.boundary_exits(left).item() == (3 + 1) / 2
+
+
+def test_fire_exits_count_every_loss():
+    track = {
+        "twice": [YES, NO, YES, YES, NO, NO],
+        "never on": [NO, NO, NO, NO, NO, NO],
+        "stays": [NO, YES, YES, YES, YES, YES],
+        "thrice": [YES, NO, YES, NO, YES, NO],
+    }
+    on_fire = torch.tensor(list(track.values())).T
+    assert metrics.fire_exits(on_fire).item() == (2 + 0 + 0 + 3) / 4
+
+
+def test_every_measure_takes_any_batch():
+    generator = torch.Generator().manual_seed(0)
+    flags = torch.rand(2, 3, 7, 4, generator=generator) < 0.3
+    burning = torch.arange(5, 12).expand(2, 3, 7)
+    seen = (torch.rand(2, 3, 7, generator=generator) * burning).round().long()
+    cases = {
+        metrics.score: (flags.float(),),
+        metrics.coverage: (seen, burning),
+        metrics.coverage_auc: (seen, burning),
+        metrics.coverage_time: (seen, burning),
+        metrics.tracking_first: (flags,),
+        metrics.tracking_last: (flags,),
+        metrics.boundary_exits: (flags,),
+        metrics.fire_exits: (flags,),
+    }
+    assert [measure.__name__ for measure in cases] == list(metrics.NAMES)
+    for measure, data in cases.items():
+        together = measure(*data)
+        assert together.shape == (2, 3)
+        assert together.dtype == torch.float32
+        for at in [(0, 0), (1, 2)]:
+            assert together[at] == measure(*(part[at] for part in data)), measure.__name__
+
+
+def by_hand(steps) -> dict[str, float]:
+    """The measures of one episode [T], counted with loops."""
+    horizon, uavs = steps[keys.NEW_FIRE].shape
+    on = [
+        [steps[keys.NEW_FIRE][t, n] + steps[keys.OLD_FIRE][t, n] > 0 for n in range(uavs)]
+        for t in range(horizon)
+    ]
+    found = [next((t + 1 for t in range(horizon) if on[t][n]), horizon) for n in range(uavs)]
+    share = [
+        100 * int(s) / int(b) for s, b in zip(steps[keys.SEEN], steps[keys.BURNING], strict=True)
+    ]
+    left = sum(any(steps[keys.BEYOND][t, n]) for t in range(horizon) for n in range(uavs))
+    lost = sum(bool(on[t - 1][n] and not on[t][n]) for t in range(1, horizon) for n in range(uavs))
+    return {
+        "score": sum(steps[keys.REWARD].flatten().tolist()) / horizon / uavs,
+        "coverage": share[-1],
+        "coverage_auc": sum(share) / horizon,
+        "coverage_time": next((t + 1 for t, s in enumerate(share) if s == 100), horizon),
+        "tracking_first": min(found),
+        "tracking_last": max(found),
+        "boundary_exits": left / uavs,
+        "fire_exits": lost / uavs,
+    }
+
+
+@pytest.mark.parametrize("method", [None, "consensus"])
+def test_episode_metrics_equal_a_count_by_loops(method):
+    torch.manual_seed(0)  # of the random actions
+    settings = {"grid": (10, 10), "num_uavs": 4, "horizon": 60}
+    fire = torch.full((2, 10, 10), torch.inf)
+    fire[0, 4:6, 4:6] = 0  # soon seen wholly
+    fire[1] = torch.rand(10, 10) * 90 - 30  # a third from the start, then one cell a step
+    if method:
+        env = make_env(method, num_envs=2, fire=fire, num_uavs=4, horizon=60)
+    else:
+        env = WildfireEnv(2, WildfireConfig(**settings), fire)
+    steps = env.rollout(60)["next"]
+    assert steps.batch_size == (2, 60)
+    measured = metrics.episode_metrics(steps)
+    assert tuple(measured) == metrics.NAMES
+    for e in range(2):
+        expected = by_hand(steps[e])
+        assert {k: v[e].item() for k, v in measured.items()} == pytest.approx(expected, rel=1e-5)
+    assert measured["coverage_time"][0] < 60, "coverage_time is to fire"
+    assert measured["coverage_time"][1] == 60
+
+
+def test_step_keys_are_all_that_is_read():
+    env = WildfireEnv(1, WildfireConfig(horizon=5))
+    steps = env.rollout(5)["next"]
+    few = metrics.episode_metrics(steps.select(*metrics.STEP_KEYS))
+    assert few == metrics.episode_metrics(steps)

@@ -1,0 +1,110 @@
+"""Random numbers from keys: distribution, independence, reproducibility."""
+
+import math
+
+import pytest
+import torch
+from emberlink.envs import streams
+
+LANES = 20_000
+
+
+def test_uniform_looks_uniform():
+    draws = streams.uniform(torch.tensor([1, -5, 2**60]), LANES).double()
+    assert ((draws > 0) & (draws < 1)).all()
+    # Five standard errors of the mean, the variance and each of ten bins.
+    assert (draws.mean(-1) - 0.5).abs().max() < 5 * math.sqrt(1 / 12 / LANES)
+    assert (draws.var(-1) - 1 / 12).abs().max() < 5 * math.sqrt(1 / 180 / LANES)
+    bins = torch.stack([torch.histc(row, 10, 0, 1) for row in draws]) / LANES
+    assert (bins - 0.1).abs().max() < 5 * math.sqrt(0.09 / LANES)
+
+
+def test_normal_looks_normal():
+    draws = streams.normal(torch.tensor([3, 4]), LANES).double()
+    assert draws.isfinite().all()
+    assert draws.mean(-1).abs().max() < 5 / math.sqrt(LANES)
+    assert (draws.var(-1) - 1).abs().max() < 5 * math.sqrt(2 / LANES)
+    assert (draws.pow(4).mean(-1) - 3).abs().max() < 5 * math.sqrt(96 / LANES)
+
+
+@pytest.mark.parametrize(("bits", "end"), [(0, 2.0**-24), (-1, 1 - 2.0**-24)])
+def test_the_ends_are_left_out(monkeypatch, bits, end):
+    monkeypatch.setattr(streams, "fold", lambda stream, lanes: torch.full_like(lanes, bits))
+    assert streams.uniform(torch.tensor(0), 1).item() == end
+    assert streams.normal(torch.tensor(0), 1).isfinite().all()
+
+
+def correlation(one: torch.Tensor, other: torch.Tensor) -> float:
+    return torch.corrcoef(torch.stack((one.flatten(), other.flatten())).double())[0, 1].item()
+
+
+@pytest.mark.parametrize("seed", [0, 1, 12345])
+def test_neighbours_are_unrelated(seed):
+    limit = 5 / math.sqrt(LANES)
+    envs = streams.uniform(streams.streams(seed, 3), LANES)
+    assert abs(correlation(envs[0], envs[1])) < limit
+    assert abs(correlation(envs[0], envs[2])) < limit
+    # The same lane over environments, over episodes, and over seeds.
+    lane = streams.uniform(streams.streams(seed, LANES), 2)
+    assert abs(correlation(lane[:, 0], lane[:, 1])) < limit
+    assert abs(correlation(lane[1:, 0], lane[:-1, 0])) < limit
+    stream = streams.streams(seed, 1)
+    episodes = streams.uniform(streams.fold(stream, torch.arange(LANES)), 1)
+    assert abs(correlation(episodes[1:], episodes[:-1])) < limit
+    others = streams.uniform(streams.streams(seed + 1, 3), LANES)
+    assert abs(correlation(envs[0], others[0])) < limit
+    assert abs(correlation(envs[1], others[0])) < limit  # nor shifted by one
+
+
+def test_streams_never_collide():
+    every = [streams.streams(seed, 1000) for seed in range(20)]
+    folds = [streams.fold(every[0], counter) for counter in range(20)]
+    twice = [streams.fold(folds[0], counter) for counter in range(3)]
+    together = torch.cat(every + folds + twice)
+    assert len(together.unique()) == len(together)
+
+
+def test_order_of_counters_matters():
+    stream = torch.tensor([7])
+    one = streams.fold(streams.fold(stream, 1), 2)
+    other = streams.fold(streams.fold(stream, 2), 1)
+    assert one != other
+
+
+def test_a_draw_is_a_function_of_its_key():
+    stream = streams.streams(9, 4)
+    torch.manual_seed(0)
+    first = streams.uniform(stream, 5)
+    torch.manual_seed(1)
+    assert torch.equal(streams.uniform(stream, 5), first)
+    assert torch.equal(streams.uniform(stream, 50)[:, :5], first)
+    assert torch.equal(streams.uniform(stream[2], 5), first[2])
+    assert torch.equal(streams.uniform(stream.view(2, 2), 5).view(4, 5), first)
+
+
+def test_stream_i_depends_on_the_seed_and_i_alone():
+    assert torch.equal(streams.streams(3, 100)[:7], streams.streams(3, 7))
+    assert not torch.equal(streams.streams(4, 7), streams.streams(3, 7))
+
+
+def test_counters_may_be_integers_or_tensors():
+    stream = torch.tensor([1, 2, 3])
+    counters = torch.tensor([0, 5, -1])
+    folded = streams.fold(stream, counters)
+    each = [streams.fold(stream[i], int(c)) for i, c in enumerate(counters)]
+    assert folded.tolist() == [int(f) for f in each]
+
+
+def test_the_numbers_themselves():
+    """SplitMix64 in Python's unbounded integers."""
+
+    def mix(x: int) -> int:
+        x = (x ^ x >> 30) * 0xBF58476D1CE4E5B9 % 2**64
+        x = (x ^ x >> 27) * 0x94D049BB133111EB % 2**64
+        return x ^ x >> 31
+
+    golden = 0x9E3779B97F4A7C15
+    for stream, counter in [(0, 0), (1, 2), (-3, 4), (2**62, 2**40)]:
+        expected = mix((mix((stream + golden) % 2**64) + (counter + 1) * golden) % 2**64)
+        got = streams.fold(torch.tensor(stream), counter).item()
+        assert got % 2**64 == expected

@@ -1,0 +1,127 @@
+"""Motion and field of view, by hand."""
+
+import math
+
+import pytest
+import torch
+from emberlink.envs import uav
+
+LOW = torch.tensor([0.0, 0, 1], dtype=torch.float64)
+HIGH = torch.tensor([29.0, 19, 4], dtype=torch.float64)
+
+
+def move(position, action, displacement=1.0):
+    where, beyond = uav.move(
+        torch.tensor(position), torch.tensor(action), displacement=displacement, low=LOW, high=HIGH
+    )
+    assert where.dtype == torch.float32
+    return where.tolist(), beyond.tolist()
+
+
+@pytest.mark.parametrize(
+    ("position", "action", "displacement", "expected", "beyond"),
+    [
+        ([3.0, 4, 2], [0.5, -0.25, 1], 1.0, [3.5, 3.75, 3], [False, False, False]),
+        ([3.0, 4, 2], [0.5, -0.25, 1], 0.1, [3.05, 3.975, 2.1], [False, False, False]),
+        ([3.0, 4, 2], [2, -9, 0], 1.0, [4, 3, 2], [False, False, False]),
+        ([28.5, 18.5, 3.5], [1, 1, 1], 1.0, [29, 19, 4], [True, True, True]),
+        ([0.5, 0.5, 1.5], [-1, -1, -1], 1.0, [0, 0, 1], [True, True, True]),
+        ([28.0, 1, 2], [1, -1, 0], 1.0, [29, 0, 2], [False, False, False]),
+        ([29.0, 0, 4], [0.01, -0.01, 0.01], 1.0, [29, 0, 4], [True, True, True]),
+    ],
+)
+def test_move(position, action, displacement, expected, beyond):
+    where, out = move(position, action, displacement)
+    assert where == pytest.approx(expected)
+    assert out == beyond
+
+
+def test_move_takes_any_batch():
+    position = torch.rand(2, 3, 4, 3) + 2
+    where, beyond = uav.move(position, position, displacement=0.1, low=LOW, high=HIGH)
+    assert where.shape == beyond.shape == (2, 3, 4, 3)
+
+
+@pytest.mark.parametrize(("altitude", "radius"), [(1, 0.57735), (2, 1.15470), (4, 2.30940)])
+def test_view_radius(altitude, radius):
+    assert uav.view_radius(altitude, 30.0) == pytest.approx(radius, abs=1e-5)
+    assert uav.view_radius(altitude, 45.0) == pytest.approx(altitude)
+
+
+def seen(position, grid=(30, 20), view_angle=30.0, ceiling=4.0) -> set[tuple[int, int]]:
+    cells, flat, visible = uav.view(
+        torch.tensor(position), view_angle=view_angle, ceiling=ceiling, grid=grid
+    )
+    chosen = [tuple(cell) for cell in cells[visible].tolist()]
+    assert [i * grid[1] + j for i, j in chosen] == flat[visible].tolist()
+    assert len(set(chosen)) == len(chosen)
+    assert 0 <= flat.min() <= flat.max() < grid[0] * grid[1]
+    return set(chosen)
+
+
+@pytest.mark.parametrize(
+    ("position", "columns", "rows"),
+    [
+        ([5.0, 7, 1], [5], [7]),  # radius 0.577
+        ([5.5, 7, 1], [5, 6], [7]),
+        ([5.4, 7.6, 1], [5], [8]),  # 6 is 0.6 away along x, 7 as far along y
+        ([5.0, 7, 4], [3, 4, 5, 6, 7], [5, 6, 7, 8, 9]),  # radius 2.309
+        ([5.5, 7.3, 4], [4, 5, 6, 7], [5, 6, 7, 8, 9]),
+        ([0.0, 0, 4], [0, 1, 2], [0, 1, 2]),
+        ([29.0, 19, 4], [27, 28, 29], [17, 18, 19]),
+        ([0.4, 18.6, 2], [0, 1], [18, 19]),
+    ],
+)
+def test_view(position, columns, rows):
+    assert seen(position) == {(i, j) for i in columns for j in rows}
+
+
+def test_view_wider_than_the_grid_holds_every_cell_once():
+    assert len(seen([3.0, 4, 50], (8, 10), 60.0, 50.0)) == 80
+
+
+def test_view_can_be_empty_between_cells():
+    assert seen([5.5, 7.5, 0.5]) == set()
+
+
+def test_mean_cell():
+    cells = torch.tensor([[1, 5], [2, 5], [9, 9], [4, 8]])
+    some = torch.tensor([[True, True, False, True], [False, False, False, False]])
+    expected = torch.tensor([[7 / 3, 6], [0, 0]])
+    assert torch.allclose(uav.mean_cell(cells.expand(2, 4, 2), some), expected)
+
+
+def test_distance():
+    points = torch.tensor([[1.0, 2, 3], [1, 2, 3]])
+    others = torch.tensor([[3.0, 5, 9], [1, 2, 3]])
+    assert uav.distance(points, others).tolist() == [7, 0]
+
+
+def test_scale_to_box():
+    points = torch.tensor([[0.0, 0, 1], [29, 19, 4], [14.5, 9.5, 2.5], [7.25, 19, 1.75]])
+    expected = [[-1, -1, -1], [1, 1, 1], [0, 0, 0], [-0.5, 1, -0.5]]
+    assert uav.scale_to_box(points, LOW, HIGH).tolist() == expected
+
+
+def test_scale_to_a_box_of_no_height():
+    flat = torch.tensor([29.0, 19, 1], dtype=torch.float64)
+    assert uav.scale_to_box(torch.tensor([0.0, 0, 1]), LOW, flat).tolist() == [-1, -1, -1]
+
+
+def test_random_points_fill_the_box():
+    points = uav.random_points(torch.arange(500), 4, LOW, HIGH)
+    assert points.shape == (500, 4, 3)
+    assert points.dtype == torch.float32
+    flat = points.flatten(0, 1)
+    assert ((flat >= LOW) & (flat <= HIGH)).all()
+    assert torch.allclose(flat.double().mean(0), (LOW + HIGH) / 2, rtol=0.04)
+    spread = (HIGH - LOW) / math.sqrt(12)
+    assert torch.allclose(flat.double().std(0), spread, rtol=0.04)
+
+
+def test_next_waypoint_changes_only_those_that_are_reached():
+    position = torch.tensor([[[5.0, 5, 2], [5, 5, 2], [5, 5, 2]]])
+    waypoint = torch.tensor([[[5.0, 5.99, 2], [5, 6, 2], [20, 1, 3]]])
+    new = uav.next_waypoint(waypoint, position, torch.tensor([7]), LOW, HIGH)
+    assert torch.equal(new[0, 1:], waypoint[0, 1:])
+    assert torch.equal(new[0, 0], uav.random_points(torch.tensor([7]), 3, LOW, HIGH)[0, 0])

@@ -1,0 +1,294 @@
+"""The environment: hand-made moments, resets, fires, seeds; its steps are in test_steps.py."""
+
+import dataclasses
+import math
+from itertools import product
+
+import pytest
+import torch
+from emberlink.envs import WildfireConfig, WildfireEnv, keys
+from emberlink.envs.fire import load_scenario, make_fires
+from emberlink.trainers import make_env
+from tensordict import TensorDict
+from torchrl.envs import check_env_specs, step_mdp
+
+METHODS = ("independent", "shared_memory", "positional", "consensus")
+SETUPS = ("paper", "released", "tuned")
+EVERYWHERE = torch.zeros(12, 12)
+NOWHERE = torch.full((12, 12), math.inf)
+
+
+def world(fire=EVERYWHERE, num_envs=1, seed=0, **changes) -> WildfireEnv:
+    grid = tuple(fire.shape[-2:]) if isinstance(fire, torch.Tensor) else (12, 12)
+    config = WildfireConfig(**{"grid": grid, "num_uavs": 1, "horizon": 20, **changes})
+    return WildfireEnv(num_envs, config, fire, seed)
+
+
+def act(env: WildfireEnv, *actions) -> TensorDict:
+    """One step of the only environment with an action per UAV, null ones if none is given."""
+    uavs = env.config.num_uavs
+    action = torch.tensor([actions]) if actions else torch.zeros(1, uavs, 3)
+    return env.step(TensorDict({keys.ACTION: action}, [1]))["next"]
+
+
+def start(env: WildfireEnv, *positions) -> TensorDict:
+    return env.reset(position=torch.tensor(positions))
+
+
+def counts(moment: TensorDict) -> list[tuple[int, int, int]]:
+    """New, old and no fire in view of each UAV."""
+    columns = (moment[key][0].tolist() for key in (keys.NEW_FIRE, keys.OLD_FIRE, keys.NO_FIRE))
+    return list(zip(*columns, strict=True))
+
+
+def rewards(moment: TensorDict) -> list[float]:
+    return moment[keys.REWARD][0, :, 0].tolist()
+
+
+def test_of_two_uavs_over_the_same_cells_the_first_discovers():
+    env = world(num_uavs=2)
+    start(env, [3.0, 3, 2], [3, 3, 2])
+    moment = act(env)  # 2 tan 30 = 1.15: cells 2, 3 and 4 along x and y
+    assert counts(moment) == [(9, 0, 0), (0, 9, 0)]
+    assert rewards(moment) == [9, -36]
+    assert counts(act(env)) == [(0, 9, 0), (0, 9, 0)]
+    assert env.fire_map[0, 2:5, 2:5].eq(1).all()
+    assert env.fire_map.eq(1).sum() == 9
+    assert env.fire_map.eq(2).sum() == 144 - 9
+
+
+def test_of_three_uavs_each_cell_goes_to_the_lowest_index():
+    env = world(num_uavs=3)
+    start(env, [4.0, 3, 2], [3, 3, 2], [5, 4, 2])
+    moment = act(env)
+    # UAV 1 adds column 2; UAV 2 sees columns 4 to 6, rows 3 to 5, of which UAV 0 saw 2 x 2.
+    assert counts(moment) == [(9, 0, 0), (3, 6, 0), (5, 4, 0)]
+    assert rewards(moment) == [9, 3 - 24, 5 - 16]
+    assert moment[keys.SEEN].item() == 17
+    assert moment[keys.BURNING].item() == 144
+
+
+def test_fire_spreads_before_uavs_look():
+    fire = NOWHERE.clone()
+    fire[3, 3], fire[3, 4] = 2, 2.5
+    env = world(fire)
+    start(env, [3.0, 3, 2])
+    seen = [counts(act(env))[0] for _ in range(4)]
+    assert seen == [(0, 0, 9), (1, 0, 8), (1, 1, 7), (0, 2, 7)]
+
+
+def test_flags_are_of_the_moment_and_time_counts():
+    fire = NOWHERE.clone()
+    fire[3, 3] = 2
+    env = world(fire)
+    first = start(env, [3.0, 3, 2])
+    moments = [first, *(act(env) for _ in range(3))]
+    flags = [moment[keys.OBSERVATION][0, 0].tolist() for moment in moments]
+    assert flags == [[3, 3, 2, 0, 0, 0], [3, 3, 2, 0, 0, 1], [3, 3, 2, 1, 0, 2], [3, 3, 2, 0, 1, 3]]
+
+
+def test_box_observation_is_scaled():
+    env = world(grid=(12, 12), observation="box")
+    moment = start(env, [0.0, 5.5, 4])
+    assert moment[keys.OBSERVATION][0, 0].tolist() == [-1, 0, 1, 0, 0, 0]
+    assert act(env)[keys.OBSERVATION][0, 0].tolist() == pytest.approx([-1, 0, 1, 1, 0, 1 / 20])
+
+
+def test_views_are_cut_by_the_grid():
+    env = world(NOWHERE[:, :9], num_uavs=4)  # 4 tan 30 = 2.3: up to two cells each way
+    start(env, [0.0, 0, 4], [11, 8, 4], [0, 4, 4], [5, 8, 4])
+    assert counts(act(env)) == [(0, 0, 9), (0, 0, 9), (0, 0, 15), (0, 0, 15)]
+
+
+def test_a_cell_exactly_on_the_edge_is_in_view():
+    angle = math.degrees(math.atan(0.75))
+    assert 4 * math.tan(math.radians(angle)) == 3
+    beyond = torch.nextafter(torch.tensor(6.0), torch.tensor(7.0)).item()
+    env = world(view_angle=angle, num_uavs=2)
+    start(env, [6.0, 6, 4], [beyond, 6, 4])
+    assert counts(act(env)) == [(49, 0, 0), (0, 42, 0)]
+
+
+@pytest.mark.parametrize("axis", range(3))
+@pytest.mark.parametrize("direction", [-1.0, 1.0])
+@pytest.mark.parametrize("exit_axes", ["xyz", "xy"])
+def test_leaving_the_box_costs_on_the_tested_axes(axis, direction, exit_axes):
+    reward = dataclasses.replace(WildfireConfig().reward, exit_axes=exit_axes)
+    env = world(NOWHERE, reward=reward)
+    edge = [[0.0, 0, 1], [11.0, 11, 4]][direction > 0][axis]
+    position = [[5.0, 5, 2]]
+    position[0][axis] = edge
+    start(env, *position)
+    push = [0.0, 0, 0]
+    push[axis] = direction
+    moment = act(env, push)
+    assert moment[keys.POSITION][0].tolist() == position
+    assert moment[keys.BEYOND][0, 0].tolist() == [a == axis for a in range(3)]
+    tested = "xyz"[axis] in exit_axes
+    assert (rewards(moment)[0] == -100) == tested
+    # Reaching the edge exactly is not leaving.
+    position[0][axis] -= direction
+    start(env, *position)
+    assert not act(env, push)[keys.BEYOND].any()
+
+
+def test_standing_at_an_edge_that_float32_rounds_is_not_leaving():
+    env = world(altitude=(3.3, 4.1))
+    for z, push in ((3.5, -1.0), (4.0, 1.0)):
+        start(env, [5.0, 5, z])
+        assert act(env, [0, 0, push])[keys.BEYOND].any()
+        assert not act(env)[keys.BEYOND].any()
+
+
+def test_actions_are_clipped():
+    env = world()
+    start(env, [5.0, 5, 2])
+    assert act(env, [3.0, -7.0, 1.5])[keys.POSITION][0, 0].tolist() == [6, 4, 3]
+
+
+def test_reset_starts_in_the_box_and_has_seen_nothing():
+    env = world(num_envs=200, num_uavs=3, altitude=(2.0, 3.0))
+    env.rollout(5)
+    moment = env.reset()
+    position = moment[keys.POSITION]
+    low, high = torch.tensor(env.config.low), torch.tensor(env.config.high)
+    assert ((position >= low) & (position <= high)).all()
+    near = 0.02 * (high - low)  # 600 uniform points come this near to each side
+    assert (position.flatten(0, 1).amin(0) < low + near).all()
+    assert (position.flatten(0, 1).amax(0) > high - near).all()
+    for key in (keys.NEW_FIRE, keys.OLD_FIRE, keys.NO_FIRE, keys.SEEN, keys.STEP, keys.BEYOND):
+        assert not moment[key].any(), key
+    assert not moment[keys.OBSERVATION][..., 3:].any()
+    assert env.fire_map.eq(2).all()
+
+
+@pytest.mark.parametrize("method", [None, "consensus"])
+def test_partial_reset_leaves_the_others_alone(method):
+    fire = torch.linspace(0, 20, 144).view(12, 12)
+    env = make_env(method, num_envs=3, fire=fire, horizon=20) if method else world(fire, 3)
+    core = env.base_env if method else env
+    moment = env.reset()
+    for _ in range(5):
+        moment = step_mdp(env.step(env.rand_action(moment)), keep_other=True)
+    before, burning = moment.clone(), core.fire_map
+    mask = torch.tensor([[False], [True], [False]])
+    after = env.reset(moment.set("_reset", mask))
+    for key in before.keys(True, True):
+        if key in after.keys(True, True):
+            assert (after[key][0::2] == before[key][0::2]).all(), key
+    assert (core.fire_map[0::2] == burning[0::2]).all()
+    assert after[keys.STEP].tolist() == [5, 0, 5]
+    assert core.fire_map[1].eq(2).sum() == fire.le(0).sum()
+    assert (after[keys.POSITION][1] != before[keys.POSITION][1]).any()
+    following = env.step(env.rand_action(after))["next"]
+    assert following[keys.STEP].tolist() == [6, 1, 6]
+    same_stream = following[keys.STREAM] == before[keys.STREAM]
+    assert same_stream.tolist() == [True, False, True]
+
+
+def test_an_episode_is_truncated_at_the_horizon_and_never_terminated():
+    steps = world(num_envs=2).rollout(50)["next"]
+    assert steps.batch_size == (2, 20)
+    expected = [False] * 19 + [True]
+    for env in range(2):
+        assert steps["truncated"][env, :, 0].tolist() == expected
+        assert steps["done"][env, :, 0].tolist() == expected
+    assert not steps["terminated"].any()
+
+
+def test_fire_by_name_by_config_and_by_arrival_times():
+    scenario = load_scenario("paper")
+    arrival = make_fires(scenario, torch.tensor([0]), (12, 12), 20)
+    each = torch.stack([NOWHERE, EVERYWHERE, arrival[0]])
+    for fire in ("paper", scenario, arrival[0], arrival.expand(3, -1, -1)):
+        env = world(fire, 3)
+        assert torch.equal(env.arrival, arrival.expand(3, -1, -1))
+    env = world(each, 3)
+    for _ in range(2):
+        env.reset()
+        assert torch.equal(env.arrival, each)
+    assert WildfireEnv(1, None, torch.zeros(9, 17)).config.grid == (9, 17)
+
+
+@pytest.mark.parametrize("layout", ["turned", "expanded", "sliced"])
+def test_arrival_times_may_lie_in_memory_as_they_like_and_are_copied(layout):
+    plain = torch.rand(3, 9, 12)
+    fire = {
+        "turned": plain.mT.contiguous().mT,
+        "expanded": plain[:1].expand(3, 9, 12),
+        "sliced": torch.cat((plain, plain), -1)[..., :12],
+    }[layout]
+    env = world(fire, 3)
+    expected = fire.clone()
+    env.rollout(2)
+    fire.add_(1) if layout != "expanded" else plain.add_(1)
+    assert torch.equal(env.arrival, expected)
+
+
+def test_fires_of_a_bank_are_drawn_anew():
+    scenario = dataclasses.replace(load_scenario("huygens"), bank=3)
+    env = world(scenario, 64)
+    fires = []
+    for _ in range(4):
+        env.reset()
+        fires.append(env.arrival.clone())
+    kinds = torch.cat(fires).flatten(1).unique(dim=0)
+    assert len(kinds) == 3
+    assert not torch.equal(fires[0], fires[1])
+
+
+@pytest.mark.parametrize("shape", [(12,), (12, 11), (11, 12), (2, 12, 12), (1, 3, 12, 12)])
+def test_arrival_times_of_a_wrong_shape_are_named(shape):
+    with pytest.raises(ValueError, match=r"fire: .*\[12, 12\].*num_envs=3"):
+        WildfireEnv(3, WildfireConfig(grid=(12, 12)), torch.zeros(shape))
+
+
+def test_other_bad_input_is_named():
+    with pytest.raises(ValueError, match="NaN"):
+        world(torch.full((12, 12), math.nan))
+    with pytest.raises(ValueError, match=r"'papr'.*paper"):
+        world("papr")
+    with pytest.raises(ValueError, match="num_envs=0"):
+        WildfireEnv(0)
+    for position in ([[5.0, 5, 9]], [[math.nan, 5, 2]], [[5.0, 5, 2], [5, 5, 2]]):
+        with pytest.raises(ValueError, match="position"):
+            start(world(), *position)
+    for bad in ({"grid": (7, 30)}, {"num_uavs": 65}, {"altitude": (4.0, 1.0)}, {"horizon": 0}):
+        with pytest.raises(ValueError, match=next(iter(bad))):
+            WildfireConfig(**bad)
+
+
+def test_an_environment_does_not_depend_on_how_many_run_beside_it():
+    scenario = dataclasses.replace(load_scenario("huygens"), bank=5)
+    one, five = world(scenario, 1, seed=3), world(scenario, 5, seed=3)
+    action = torch.rand(5, 1, 3, generator=torch.Generator().manual_seed(0)) * 2 - 1
+    for _ in range(3):
+        alone, among = one.reset(), five.reset()
+        assert (alone == among[:1]).all()
+        assert torch.equal(one.arrival, five.arrival[:1])
+        for _ in range(4):
+            alone = one.step(TensorDict({keys.ACTION: action[:1]}, [1]))["next"]
+            among = five.step(TensorDict({keys.ACTION: action}, [5]))["next"]
+            assert (alone == among[:1]).all()
+            assert torch.equal(one.fire_map, five.fire_map[:1])
+
+
+def test_seeds_reproduce_and_differ():
+    first, same, other = (world(num_envs=2, seed=seed) for seed in (1, 1, 2))
+    starts = [env.reset()[keys.POSITION] for env in (first, same, other)]
+    assert torch.equal(starts[0], starts[1])
+    assert (starts[0] != starts[2]).all()
+    assert (starts[0][0] != starts[0][1]).all()
+    assert (first.reset()[keys.POSITION] != starts[0]).all()
+    first.set_seed(1)
+    assert torch.equal(first.reset()[keys.POSITION], starts[0])
+
+
+@pytest.mark.filterwarnings("error")
+def test_specs_of_the_bare_environment():
+    check_env_specs(world(num_envs=3, num_uavs=2))
+
+
+@pytest.mark.parametrize(("method", "setup"), list(product(METHODS, SETUPS)))
+def test_specs_of_every_recipe(method, setup):
+    check_env_specs(make_env(method, setup, num_envs=2, fire=EVERYWHERE, horizon=10))
