@@ -1,0 +1,50 @@
+# Every target does its own set-up: a virtual environment in .venv with the versions of
+# constraints.txt, installed again only when pyproject.toml or constraints.txt change.
+PYTHON ?= python3
+# processes that run tests side by side, with one thread each
+WORKERS ?= 2
+# settings of the demo; `make demo DEMO="episodes=10 seed=1"` chooses others
+DEMO ?= episodes=2 evaluation.fires=32 evaluation.interval=1
+
+VENV := .venv
+BIN := $(VENV)/bin
+INSTALLED := $(VENV)/emberlink-installed
+UNFINISHED := $(VENV)/emberlink-unfinished
+PIP := $(BIN)/python -m pip install -q --disable-pip-version-check -c constraints.txt
+
+.DEFAULT_GOAL := help
+.PHONY: help demo test lint typecheck install clean
+
+help:  ## list the targets
+	@sed -n 's/^\([a-z]*\):.*## /  make \1\t/p' $(MAKEFILE_LIST) | expand -t 20
+
+demo: $(INSTALLED)  ## train consensus for a few minutes, evaluate it, leave figures and a GIF
+	@$(BIN)/emberlink train consensus setup=tuned $(DEMO)
+
+test: $(INSTALLED)  ## run the tests
+	@OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n $(WORKERS) --dist loadgroup
+
+lint: $(INSTALLED)  ## check style and layout
+	@$(BIN)/ruff check .
+	@$(BIN)/ruff format --check .
+
+typecheck: $(INSTALLED)  ## check the types
+	@$(BIN)/basedpyright --pythonpath $(BIN)/python
+
+install: $(INSTALLED)  ## only set up .venv
+
+# The marker tells an interrupted installation from a complete one: what it left is thrown away.
+$(INSTALLED): pyproject.toml constraints.txt
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null || \
+		{ echo "emberlink needs Python 3.11 or later as '$(PYTHON)'; or name one: make PYTHON=python3.12" >&2; exit 1; }
+	@if [ -e $(UNFINISHED) ]; then rm -rf $(VENV); fi
+	@mkdir -p $(VENV) && touch $(UNFINISHED)
+	@echo "setting up $(VENV) (once; a few minutes)" >&2
+	@$(PYTHON) -m venv $(VENV)
+	@$(PIP) setuptools
+	@$(PIP) --no-build-isolation -e '.[dev]'
+	@mv $(UNFINISHED) $(INSTALLED) && touch $(INSTALLED)
+
+clean:  ## remove .venv and what tools leave behind; runs/ stays
+	@rm -rf $(VENV) build dist *.egg-info .pytest_cache .ruff_cache .hypothesis
+	@find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -1,0 +1,213 @@
+"""The wheel, its metadata, and the console script that it brings, outside the checkout."""
+
+import os
+import re
+import subprocess
+import sys
+import sysconfig
+import venv
+import zipfile
+from email.parser import HeaderParser
+from pathlib import Path, PurePosixPath
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+FOLDERS = ("envs", "comm", "policies", "trainers", "configs")
+# Written in two parts, so that this file does not hold what it forbids.
+REGISTRIES = ("pypi" + ".org", "pythonhosted" + ".org", "download.pytorch" + ".org", "npmjs" + ".")
+PRIVATE = re.compile(
+    r"(?<![\w.])/(?:work|root|home|Users)/\w|" + "|".join(map(re.escape, REGISTRIES))
+)
+
+# One process builds and installs the wheel for all of these tests.
+pytestmark = pytest.mark.xdist_group("wheel")
+
+
+def run(*command, cwd: Path, env: dict[str, str] | None = None, **options) -> str:
+    """What the command prints; the test fails, showing all, if it does."""
+    done = subprocess.run(
+        list(map(str, command)),
+        cwd=cwd,
+        env=env,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        timeout=120,
+        **options,
+    )
+    assert done.returncode == 0, f"{command}\n{done.stdout}"
+    return done.stdout
+
+
+def copy_sources(target: Path) -> Path:
+    """The checkout's files without what earlier builds left: setuptools would pick that up."""
+    for path in tracked_files():
+        if path.is_file() and not path.is_symlink():
+            copy = target / path.relative_to(ROOT)
+            copy.parent.mkdir(parents=True, exist_ok=True)
+            copy.write_bytes(path.read_bytes())
+    return target
+
+
+def tracked_files() -> list[Path]:
+    """The files that git tracks or would; all that stand here where there is no git."""
+    try:
+        listed = run(
+            *("git", "ls-files", "--cached", "--others", "--exclude-standard", "-z"), cwd=ROOT
+        )
+    except (AssertionError, FileNotFoundError):
+        skip = {".venv", ".git", "runs", "build", "dist"}
+        found = (p for p in ROOT.rglob("*") if not skip & set(p.relative_to(ROOT).parts))
+        return sorted(p for p in found if "__pycache__" not in p.parts)
+    return sorted(ROOT / name for name in listed.split("\0") if name)
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("wheel")
+    source = copy_sources(folder / "source")
+    build = (sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", folder, source)
+    run(*build, cwd=folder)
+    (found,) = folder.glob("emberlink-*.whl")
+    return found
+
+
+@pytest.fixture(scope="module")
+def metadata(wheel: Path):
+    with zipfile.ZipFile(wheel) as file:
+        (name,) = (n for n in file.namelist() if n.endswith(".dist-info/METADATA"))
+        return HeaderParser().parsestr(file.read(name).decode())
+
+
+@pytest.fixture(scope="module")
+def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of executables of an environment that holds the wheel and sees our libraries."""
+    folder = tmp_path_factory.mktemp("installed")
+    venv.create(folder, with_pip=False)
+    base = {"base": str(folder), "platbase": str(folder)}
+    library = Path(sysconfig.get_path("purelib", "venv", vars=base))
+    # A path file is no site folder: what is editable in ours is not found through it.
+    (library / "libraries.pth").write_text(sysconfig.get_path("purelib") + "\n")
+    programs = Path(sysconfig.get_path("scripts", "venv", vars=base))
+    pip = (sys.executable, "-m", "pip", "--python", programs / "python", "install", "-q")
+    # --ignore-installed: the emberlink that is seen through the path file is not to be replaced.
+    run(*pip, "--no-deps", "--no-index", "--ignore-installed", wheel, cwd=folder)
+    return programs
+
+
+@pytest.fixture
+def elsewhere(tmp_path: Path) -> tuple[Path, dict[str, str]]:
+    """A working folder that is not the checkout, and an environment that does not lead there."""
+    env = {
+        k: v for k, v in os.environ.items() if not k.startswith(("PYTHON", "PYTEST", "EMBERLINK"))
+    }
+    return tmp_path, env | {"OMP_NUM_THREADS": "1", "XDG_CACHE_HOME": str(tmp_path / "cache")}
+
+
+def test_wheel_holds_the_package_and_nothing_else(wheel: Path):
+    with zipfile.ZipFile(wheel) as file:
+        names = [PurePosixPath(name) for name in file.namelist()]
+    tops = {name.parts[0] for name in names}
+    assert {top for top in tops if not top.endswith(".dist-info")} == {"emberlink"}
+    assert len(tops) == 2
+    held = {str(PurePosixPath(*name.parts[1:])) for name in names if name.parts[0] == "emberlink"}
+    source = {
+        path.relative_to(ROOT).as_posix()
+        for path in tracked_files()
+        if path.is_file()
+        and path.relative_to(ROOT).parts[0] in FOLDERS
+        and (path.suffix in (".py", ".yaml") or path.name == "py.typed")
+    }
+    assert held == source
+    assert {f"{folder}/py.typed" for folder in FOLDERS} <= held
+    assert {"configs/__init__.py", "configs/method/consensus.yaml"} <= held
+    assert {path.split("/")[1] for path in held if path.endswith(".yaml")} >= {
+        *("base.yaml", "method", "setup", "fire", "special")
+    }
+    # Jupyter's own package is called comm: with this file, tools started here would import ours.
+    assert "comm/__init__.py" not in held
+
+
+def test_metadata(metadata):
+    assert metadata["Name"] == "emberlink"
+    assert re.fullmatch(r"\d+\.\d+\.\d+", metadata["Version"])
+    assert metadata["License-Expression"] == "MIT"
+    assert metadata.get_all("License-File") == ["LICENSE"]
+    assert metadata["Requires-Python"] == ">=3.11"
+    required = metadata.get_all("Requires-Dist")
+    assert "torchrl==0.14.1" in required
+    plain = [line for line in required if "extra ==" not in line]
+    assert not [line for line in plain if re.match(r"pytest|hypothesis|ruff|build|basedpy", line)]
+
+
+def test_licence_is_in_the_wheel(wheel: Path):
+    with zipfile.ZipFile(wheel) as file:
+        (name,) = (n for n in file.namelist() if n.endswith("licenses/LICENSE"))
+        assert file.read(name) == (ROOT / "LICENSE").read_bytes()
+
+
+def test_every_dependency_is_pinned(metadata):
+    lines = (ROOT / "constraints.txt").read_text().splitlines()
+    pins = [line for line in lines if line and not line.startswith("#")]
+    # No local version such as +cpu, no address.
+    assert [pin for pin in pins if not re.fullmatch(r"[A-Za-z0-9._-]+==[A-Za-z0-9.]+", pin)] == []
+    names = {_normal(pin.split("==")[0]) for pin in pins}
+    assert len(names) == len(pins)
+    required = {
+        _normal(re.match(r"[\w.-]+", line)[0]) for line in metadata.get_all("Requires-Dist")
+    }
+    assert required - {"emberlink"} - names == set()
+
+
+def _normal(name: str) -> str:
+    return re.sub(r"[-_.]+", "-", name).lower()
+
+
+def test_installed_package_is_imported_and_not_the_checkout(installed: Path, elsewhere):
+    cwd, env = elsewhere
+    files = "import emberlink.envs as e, emberlink.trainers.cli as t; print(e.__file__, t.__file__)"
+    printed = run(installed / "python", "-c", files, cwd=cwd, env=env).split()
+    for file in map(Path, printed):
+        assert file.is_relative_to(installed.parent)
+        assert not file.is_relative_to(ROOT)
+
+
+def test_console_script_starts(installed: Path, elsewhere):
+    cwd, env = elsewhere
+    printed = run(installed / "emberlink", "--help", cwd=cwd, env=env)
+    assert {"train", "eval", "doctor"} <= set(re.findall(r"\w+", printed))
+    assert list(cwd.iterdir()) == []
+
+
+def test_console_script_trains(installed: Path, elsewhere):
+    cwd, env = elsewhere
+    tiny = ("env.horizon=20", "env.num_uavs=2", "learner.batch=8", "learner.hidden=[8,8]")
+    tiny = (*tiny, "episodes=1", "evaluation.fires=1", "evaluation.interval=0")
+    printed = run(installed / "emberlink", "train", "independent", *tiny, cwd=cwd, env=env)
+    (folder,) = (cwd / "runs").iterdir()
+    assert Path(printed.strip().splitlines()[-1]) == folder.relative_to(cwd)
+    assert {"config.yaml", "metrics.jsonl", "eval.json"} <= {p.name for p in folder.iterdir()}
+    assert list((folder / "figures").glob("*.gif"))
+
+
+def test_typing_links_show_the_package():
+    for folder in FOLDERS:
+        link = ROOT / ".typing" / "emberlink" / folder
+        assert link.is_symlink()
+        assert not link.readlink().is_absolute()
+        assert link.resolve() == ROOT / folder
+
+
+def test_no_file_names_a_machine_or_a_registry():
+    found = {}
+    for path in tracked_files():
+        if not path.is_file() or path.is_symlink():
+            continue
+        try:
+            hits = PRIVATE.findall(path.read_text())
+        except UnicodeDecodeError:
+            continue
+        if hits:
+            found[str(path.relative_to(ROOT))] = hits
+    assert found == {}
