@@ -31,6 +31,8 @@ class CommModule(TensorDictModuleBase):
     def __init__(self, world: WildfireConfig, config: Any):
         super().__init__()
         self.world, self.config = world, config
+        own: list[Any] = [keys.OBSERVATION]
+        self.in_keys, self.out_keys = own, own
 
     def specs(self, observation: Composite) -> Composite:
         """The observation spec of the environment with everything that `forward` writes."""

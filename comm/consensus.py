@@ -1,12 +1,12 @@
 """A network that agrees whom to follow: method 4 of the paper (section IV.F, algorithm 3)."""
 
 import math
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import torch
 from emberlink.envs import keys, streams, uav
 from emberlink.envs.config import WildfireConfig
-from emberlink.envs.reward import HeadingConfig, heading_reward, left_box
+from emberlink.envs.reward import HeadingConfig, circling, heading_reward, left_box
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 from tensordict import TensorDictBase
@@ -51,29 +51,30 @@ class Consensus(CommModule):
     """Tells every UAV a target: 9 numbers, the UAV's own 6 and x, y, z of the target."""
 
     config_type: ClassVar[type] = ConsensusConfig
-    memory_keys: ClassVar = (WAYPOINT, STREAK, FIRE_SCORE, ALTITUDE_SUM)
-    in_keys: ClassVar = [
-        *(keys.OBSERVATION, keys.POSITION, keys.NEW_FIRE, keys.OLD_FIRE),
-        *(keys.NEW_CENTRE, keys.OLD_CENTRE, keys.STREAM, keys.STEP),
-        *memory_keys,
-    ]
-    out_keys: ClassVar = [keys.OBSERVATION, TARGET, FOLLOWS, *memory_keys]
+    memory_keys = (WAYPOINT, STREAK, FIRE_SCORE, ALTITUDE_SUM)
+    low: Tensor
+    high: Tensor
 
     def __init__(self, world: WildfireConfig, config: ConsensusConfig):
         super().__init__(world, config)
+        memory: list[Any] = list(self.memory_keys)
+        seen: list[Any] = [keys.NEW_FIRE, keys.OLD_FIRE, keys.NEW_CENTRE, keys.OLD_CENTRE]
+        moment: list[Any] = [keys.OBSERVATION, keys.POSITION, keys.STREAM, keys.STEP]
+        told: list[Any] = [keys.OBSERVATION, TARGET, FOLLOWS]
+        self.in_keys, self.out_keys = moment + seen + memory, told + memory
         self.register_buffer("low", torch.tensor(world.low, dtype=torch.float64))
         self.register_buffer("high", torch.tensor(world.high, dtype=torch.float64))
 
     def specs(self, observation: Composite) -> Composite:
         agents = observation[keys.AGENTS]
-        device, shape = observation.device, tuple(agents.shape)
-        features = agents[keys.OBSERVATION[1]].shape[-1]
-        agents[keys.OBSERVATION[1]] = Unbounded((*shape, features + 3), device=device)
+        device, shape = observation.device, agents.shape
+        points, features = torch.Size((*shape, 3)), agents[keys.OBSERVATION[1]].shape[-1]
+        agents[keys.OBSERVATION[1]] = Unbounded(torch.Size((*shape, features + 3)), device=device)
         for key in (TARGET, WAYPOINT):
             low, high = (
-                side.to(device, torch.float32).expand(*shape, 3) for side in (self.low, self.high)
+                side.to(device, torch.float32).expand(points) for side in (self.low, self.high)
             )
-            agents[key[1]] = Bounded(low, high, (*shape, 3), device=device, dtype=torch.float32)
+            agents[key[1]] = Bounded(low, high, points, device=device, dtype=torch.float32)
         for key in (FOLLOWS, STREAK, FIRE_SCORE):
             agents[key[1]] = Unbounded(shape, device=device, dtype=torch.int64)
         agents[ALTITUDE_SUM[1]] = Unbounded(shape, device=device, dtype=torch.float64)
@@ -105,12 +106,12 @@ class Consensus(CommModule):
 
     def shaping(self, before: TensorDictBase, after: TensorDictBase) -> Tensor:
         """The heading term, unless the UAV left the box."""
-        term = heading_reward(
-            before.get(keys.POSITION),
-            after.get(keys.POSITION),
-            before.get(TARGET),
-            self.config.heading,
-        )
+        heading = self.config.heading
+        flight = before.get(keys.POSITION), after.get(keys.POSITION), before.get(TARGET)
+        term = heading_reward(*flight, heading)
+        if heading.circle:
+            old_alone = self._discovers(before) & (before.get(keys.NEW_FIRE) == 0)
+            term = torch.where(old_alone, heading.circle * circling(*flight), term)
         left = left_box(after.get(keys.BEYOND), self.world.reward.exit_axes)
         return term.masked_fill(left, 0.0)
 
@@ -166,7 +167,7 @@ class Consensus(CommModule):
         if self.world.observation == "raw":
             return told
         if self.config.target == "relative":
-            return told / ((self.high - self.low) / 2).float()
+            return told / ((self.high - self.low) / 2).clamp(min=1e-6).float()
         return uav.scale_to_box(told, self.low, self.high)
 
 

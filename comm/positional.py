@@ -2,6 +2,7 @@
 
 from typing import ClassVar
 
+import torch
 from emberlink.envs import keys
 from pydantic import ConfigDict
 from pydantic.dataclasses import dataclass
@@ -24,14 +25,11 @@ class Positional(CommModule):
     """
 
     config_type: ClassVar[type] = PositionalConfig
-    in_keys: ClassVar = [keys.OBSERVATION]
-    out_keys: ClassVar = [keys.OBSERVATION]
 
     def specs(self, observation: Composite) -> Composite:
         *batch, uavs, features = observation[keys.OBSERVATION].shape
-        observation[keys.OBSERVATION] = Unbounded(
-            (*batch, uavs, uavs * features), device=observation.device
-        )
+        shape = torch.Size((*batch, uavs, uavs * features))
+        observation[keys.OBSERVATION] = Unbounded(shape, device=observation.device)
         return observation
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

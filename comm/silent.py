@@ -2,7 +2,6 @@
 
 from typing import ClassVar
 
-from emberlink.envs import keys
 from pydantic import ConfigDict
 from pydantic.dataclasses import dataclass
 from tensordict import TensorDictBase
@@ -19,8 +18,6 @@ class Silent(CommModule):
     """Leaves every UAV with its own 6 numbers (paper, section IV.C)."""
 
     config_type: ClassVar[type] = SilentConfig
-    in_keys: ClassVar = [keys.OBSERVATION]
-    out_keys: ClassVar = [keys.OBSERVATION]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         return tensordict

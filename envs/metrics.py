@@ -82,7 +82,7 @@ def episode_metrics(steps: TensorDictBase) -> dict[str, Tensor]:
     reward = steps[keys.REWARD].squeeze(-1)
     seen, burning = steps[keys.SEEN], steps[keys.BURNING]
     on_fire = steps[keys.NEW_FIRE] + steps[keys.OLD_FIRE] > 0
-    left = steps[keys.BEYOND].any(-1)
+    left = steps.get(keys.BEYOND).any(-1)
     return {
         "score": score(reward),
         "coverage": coverage(seen, burning),

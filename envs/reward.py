@@ -34,6 +34,8 @@ class HeadingConfig:
     """one of `HEADING_FORMS`"""
     weight: Number = 1.0
     """factor on the term"""
+    circle: Number = 0.0
+    """where not 0, factor on `circling`, which replaces the term over old fire alone"""
 
 
 def left_box(beyond: Tensor, axes: Literal["xyz", "xy"]) -> Tensor:
@@ -110,3 +112,15 @@ def heading_reward(before: Tensor, after: Tensor, target: Tensor, config: Headin
     before = before.double()
     term = HEADING_FORMS[config.form](target.double() - before, after.double() - before)
     return (config.weight * term).float()
+
+
+def circling(before: Tensor, after: Tensor, target: Tensor) -> Tensor:
+    """Cells flown around the target with the target to the left, float32 [...].
+
+    The move's component across the way to the target, times 2 d / (1 + d^2) at a distance of d:
+    full at 1 cell, less where the target is underneath the UAV or about to be lost from view.
+    Arguments as `heading_reward`.
+    """
+    way, moved = (end[..., :2].double() - before[..., :2].double() for end in (target, after))
+    arm = 2 * way / (1 + way.square().sum(-1, keepdim=True))
+    return (moved[..., 0] * arm[..., 1] - moved[..., 1] * arm[..., 0]).float()

@@ -11,10 +11,10 @@ def observation_spec(envs: int, uavs: int) -> Composite:
     agents = (envs, uavs)
 
     def real(*shape: int) -> Unbounded:
-        return Unbounded(shape, dtype=torch.float32)
+        return Unbounded(torch.Size(shape), dtype=torch.float32)
 
     def whole(*shape: int) -> Unbounded:
-        return Unbounded(shape, dtype=torch.int64)
+        return Unbounded(torch.Size(shape), dtype=torch.int64)
 
     per_uav = {
         keys.OBSERVATION[1]: real(*agents, len(keys.FEATURES)),
@@ -24,7 +24,7 @@ def observation_spec(envs: int, uavs: int) -> Composite:
         keys.NO_FIRE[1]: whole(*agents),
         keys.NEW_CENTRE[1]: real(*agents, 2),
         keys.OLD_CENTRE[1]: real(*agents, 2),
-        keys.BEYOND[1]: Binary(shape=(*agents, 3), dtype=torch.bool),
+        keys.BEYOND[1]: Binary(shape=torch.Size((*agents, 3)), dtype=torch.bool),
     }
     per_env = {key: whole(envs) for key in (keys.STREAM, keys.STEP, keys.SEEN, keys.BURNING)}
     return Composite({keys.AGENTS: Composite(per_uav, shape=agents), **per_env}, shape=(envs,))
@@ -32,14 +32,14 @@ def observation_spec(envs: int, uavs: int) -> Composite:
 
 def action_spec(envs: int, uavs: int) -> Composite:
     """A displacement per UAV in [-1, 1] along x, y and z."""
-    action = Bounded(-1.0, 1.0, (envs, uavs, 3), dtype=torch.float32)
+    action = Bounded(-1.0, 1.0, torch.Size((envs, uavs, 3)), dtype=torch.float32)
     agents = Composite({keys.ACTION[1]: action}, shape=(envs, uavs))
     return Composite({keys.AGENTS: agents}, shape=(envs,))
 
 
 def reward_spec(envs: int, uavs: int) -> Composite:
     """A reward per UAV."""
-    reward = Unbounded((envs, uavs, 1), dtype=torch.float32)
+    reward = Unbounded(torch.Size((envs, uavs, 1)), dtype=torch.float32)
     agents = Composite({keys.REWARD[1]: reward}, shape=(envs, uavs))
     return Composite({keys.AGENTS: agents}, shape=(envs,))
 
@@ -47,5 +47,5 @@ def reward_spec(envs: int, uavs: int) -> Composite:
 def done_spec(envs: int) -> Composite:
     """Done, terminated (never) and truncated (at the horizon) per environment."""
     names = ("done", "terminated", "truncated")
-    flags = {name: Binary(shape=(envs, 1), dtype=torch.bool) for name in names}
+    flags = {name: Binary(shape=torch.Size((envs, 1)), dtype=torch.bool) for name in names}
     return Composite(flags, shape=(envs,))

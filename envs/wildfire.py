@@ -31,6 +31,20 @@ class WildfireEnv(EnvBase):
         ValueError: an unknown scenario, or arrival times whose shape does not fit.
     """
 
+    # What an episode does not change ...
+    _bank: Tensor
+    _growth: Tensor
+    _low: Tensor
+    _high: Tensor
+    _seed_stream: Tensor
+    # ... and what it does.
+    _episode: Tensor
+    _fire: Tensor
+    _time: Tensor
+    _position: Tensor
+    _seen: Tensor
+    _first_seen: Tensor
+
     def __init__(
         self,
         num_envs: int = 1,
@@ -41,10 +55,11 @@ class WildfireEnv(EnvBase):
     ):
         if num_envs < 1:
             raise ValueError(f"num_envs={num_envs}: at least 1 is needed")
-        super().__init__(device=device, batch_size=[num_envs])
+        super().__init__(device=device, batch_size=torch.Size([num_envs]))
         if config is None:
-            fits = isinstance(fire, Tensor) and fire.ndim in (2, 3)
-            config = WildfireConfig(grid=tuple(fire.shape[-2:])) if fits else WildfireConfig()
+            config = WildfireConfig()
+            if isinstance(fire, Tensor) and fire.ndim in (2, 3):
+                config = WildfireConfig(grid=(fire.shape[-2], fire.shape[-1]))
         self.config = config
         bank, self._fire_each = _arrivals(fire, config, num_envs)
         self.register_buffer("_bank", bank.to(self.device))
@@ -90,7 +105,7 @@ class WildfireEnv(EnvBase):
         )
 
     def _make_state(self) -> None:
-        """What changes in an episode."""
+        """What changes in an episode, and the streams that it draws from."""
         envs, uavs, (x, y) = *self.batch_size, self.config.num_uavs, self.config.grid
         self.register_buffer("_seed_stream", torch.zeros(envs, dtype=torch.int64))
         self.register_buffer("_episode", torch.zeros(envs, dtype=torch.int64))

@@ -1,5 +1,7 @@
 """The networks as TensorDict modules, built from an environment's specs."""
 
+from typing import Any
+
 import torch
 from emberlink.envs import keys
 from tensordict.nn import TensorDictModule, TensorDictSequential
@@ -31,7 +33,7 @@ def make_actor(
         features,
         action[keys.ACTION].shape[-1],
         hidden,
-        device=observation.device,
+        device=torch.device(observation.device or "cpu"),
         generator=generator,
     )
     return TensorDictModule(network, in_keys=[keys.OBSERVATION], out_keys=[keys.ACTION])
@@ -51,7 +53,7 @@ def make_critic(
         features,
         action[keys.ACTION].shape[-1],
         hidden,
-        device=observation.device,
+        device=torch.device(observation.device or "cpu"),
         generator=generator,
     )
     return ValueOperator(
@@ -75,6 +77,7 @@ def with_noise(
         sigma=sigma,
         dt=dt,
         action_key=keys.ACTION,
-        device=action.device,
+        device=torch.device(action.device or "cpu"),
     )
-    return TensorDictSequential(actor, noise)
+    parts: list[Any] = [actor, noise]
+    return TensorDictSequential(*parts)

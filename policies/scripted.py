@@ -1,6 +1,6 @@
 """Scripted policies: what a learned one has to beat."""
 
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 from emberlink.envs import keys, streams, uav
@@ -18,9 +18,15 @@ class Scripted(TensorDictModuleBase):
         world: the environment's constants.
     """
 
+    low: torch.Tensor
+    high: torch.Tensor
+
     def __init__(self, world: WildfireConfig):
         super().__init__()
         self.world = world
+        reads: list[Any] = [keys.POSITION, keys.STREAM, keys.STEP]
+        writes: list[Any] = [keys.ACTION]
+        self.in_keys, self.out_keys = reads, writes
         self.register_buffer("low", torch.tensor(world.low, dtype=torch.float64))
         self.register_buffer("high", torch.tensor(world.high, dtype=torch.float64))
 
@@ -33,9 +39,6 @@ class Scripted(TensorDictModuleBase):
 
 class RandomActions(Scripted):
     """Every component of every action uniform in [-1, 1]."""
-
-    in_keys: ClassVar = [keys.POSITION, keys.STREAM, keys.STEP]
-    out_keys: ClassVar = [keys.ACTION]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         shape = tensordict.get(keys.POSITION).shape
@@ -50,8 +53,10 @@ class RandomWaypoints(Scripted):
     """
 
     WAYPOINT: ClassVar = "_scripted_waypoint"
-    in_keys: ClassVar = [keys.POSITION, keys.STREAM, keys.STEP]
-    out_keys: ClassVar = [keys.ACTION, WAYPOINT]
+
+    def __init__(self, world: WildfireConfig):
+        super().__init__(world)
+        self.out_keys.append(self.WAYPOINT)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         position = tensordict.get(keys.POSITION)

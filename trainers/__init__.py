@@ -1,6 +1,9 @@
 """Recipes, training, evaluation and the command line."""
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from .build import make_env
 
 __all__ = ["make_env"]
 

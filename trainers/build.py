@@ -59,7 +59,8 @@ def build_env(
     """The environment of a configuration: the wildfire, communication, and "is_init"."""
     world = WildfireEnv(num_envs, config.env, fire, seed, device)
     talk = Communication(build_comm(config).to(world.device))
-    return TransformedEnv(world, Compose(talk, InitTracker()))
+    transforms: list[Any] = [talk, InitTracker()]
+    return TransformedEnv(world, Compose(*transforms))
 
 
 def build_networks(

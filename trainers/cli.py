@@ -1,6 +1,7 @@
 """The command line: emberlink train, eval, doctor."""
 
 import argparse
+import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,6 +14,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = _parser()
     options = parser.parse_args(arguments)
     console = Console()
+    # What torchrl says of its own doings would break into the progress bar.
+    os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")
     try:
         return options.run(options, console)
     except ValueError as error:

@@ -1,8 +1,10 @@
 """What the commands do."""
 
 import dataclasses
+import logging
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 from rich.progress import (
@@ -27,6 +29,7 @@ INTERRUPTED = 130
 def train(method: str, overrides: Sequence[str], console: Console) -> int:
     """Trains a recipe, then evaluates it. Ctrl-C saves the networks and ends the training."""
     config = resolve(method, overrides)
+    logging.getLogger("torchrl").setLevel(logging.WARNING)  # it announces every storage
     trainer = Trainer(config)
     run = trainer.start()
     console.print(f"{method}, setup {config.setup}, fire {config.fire.name} -> {run.path}")
@@ -72,7 +75,7 @@ def _train_with_bar(trainer: Trainer, console: Console) -> None:
         )
 
         def show(moment: Moment) -> None:
-            shown = {"completed": moment.step, "episode": moment.episode}
+            shown: dict[str, Any] = {"completed": moment.step, "episode": moment.episode}
             if moment.line:
                 shown["coverage"] = f"{moment.line['coverage']:.1f}%"
                 shown["score"] = f"{moment.line['score']:.2f}"

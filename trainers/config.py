@@ -14,7 +14,15 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
-from pydantic import ConfigDict, Field, Strict, TypeAdapter, ValidationError, field_validator
+from pydantic import (
+    ConfigDict,
+    Field,
+    Strict,
+    TypeAdapter,
+    ValidationError,
+    field_validator,
+    model_validator,
+)
 from pydantic.dataclasses import dataclass
 
 _STRICT = ConfigDict(extra="forbid", strict=True)
@@ -48,6 +56,12 @@ class LearnerConfig:
     """transitions per UAV and update"""
     capacity: Count
     """transitions that a replay memory holds"""
+
+    @model_validator(mode="after")
+    def _a_batch_fits(self) -> "LearnerConfig":
+        if self.batch > self.capacity:
+            raise ValueError(f"batch={self.batch} is more than capacity={self.capacity} holds")
+        return self
 
 
 @dataclass(frozen=True, kw_only=True, config=_STRICT)
@@ -141,7 +155,7 @@ def check_device(name: str) -> str:
     except RuntimeError:
         device = None
     there = device is not None and (
-        device.type == "cpu" or (device.type == "cuda" and (device.index or 0) < len(known) - 1)
+        str(device) == "cpu" or (device.type == "cuda" and (device.index or 0) < len(known) - 1)
     )
     if not there:
         raise ValueError(f"device={name} is not there; known: {', '.join(known)}")
@@ -175,7 +189,7 @@ def resolve(method: str, overrides: Sequence[str] = (), **settings: Any) -> RunC
         _check_overrides(method, overrides, choices)
         try:
             composed = compose("base", overrides=[f"method={method}", *overrides])
-            values = OmegaConf.to_container(composed, resolve=True, throw_on_missing=True)
+            values: Any = OmegaConf.to_container(composed, resolve=True, throw_on_missing=True)
         except (HydraException, OmegaConfBaseException) as error:
             raise ValueError(" ".join(str(error).split())) from None
     values = {**choices, **values}
@@ -217,10 +231,13 @@ def describe(error: ValidationError, prefix: str = "") -> str:
     key = ".".join([prefix, *map(str, first["loc"])] if prefix else map(str, first["loc"]))
     if isinstance(cause := first.get("ctx", {}).get("error"), ValidationError):
         return describe(cause, key)
-    message = first["msg"].removeprefix("Value error, ")
+    message = first["msg"].removeprefix("Value error, ").replace("Input should", "should", 1)
     if first["type"] in ("missing", "unexpected_keyword_argument"):
-        return f"{key}: {message.lower()}"
-    return f"{key}={first['input']}: {message}"
+        return f"key {key!r} is {'missing' if first['type'] == 'missing' else 'not known'}"
+    if message.startswith((f"{key}=", f"{key}.")):
+        return message
+    value = "" if isinstance(first["input"], dict) else f"={first['input']}"
+    return f"{key}{value}: {message}"
 
 
 def to_values(config: RunConfig) -> dict[str, Any]:
@@ -253,7 +270,7 @@ def _check_overrides(method: str, overrides: Sequence[str], choices: dict[str, s
 
 def _known_keys(method: str, setup: str) -> list[str]:
     composed = compose("base", overrides=[f"method={method}", f"setup={setup}"])
-    return [*_GROUPS, *_flat(OmegaConf.to_container(composed))]
+    return list(dict.fromkeys([*_GROUPS, *_flat(OmegaConf.to_container(composed))]))
 
 
 def _flat(values: Any, prefix: str = "") -> Iterator[str]:

@@ -1,7 +1,7 @@
 """Frozen policies on held-out fires, beside scripted ones."""
 
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -42,7 +42,8 @@ def play(
     Returns:
         Every measure of `metrics.NAMES`, float32 [num_envs].
     """
-    horizon = env.base_env.config.horizon
+    world: Any = env.base_env
+    horizon: int = world.config.horizon
     steps: list[TensorDictBase] = []
     with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
         moment = env.reset()
@@ -54,7 +55,8 @@ def play(
             moment = step_mdp(moment, keep_other=True)
     if watch is not None:
         watch(horizon)
-    return metrics.episode_metrics(torch.stack(steps, dim=1))
+    episode: Any = torch.stack(cast(Any, steps), dim=1)
+    return metrics.episode_metrics(episode)
 
 
 def evaluation_fires(config: RunConfig, count: int) -> dict[str, Tensor]:
@@ -65,7 +67,9 @@ def evaluation_fires(config: RunConfig, count: int) -> dict[str, Tensor]:
         shown `count` times, with other start positions each.
     """
     scenarios: dict[str, FireConfig] = {HELD_OUT_SCENARIO: load_scenario(HELD_OUT_SCENARIO)}
-    scenarios.setdefault(config.fire.name, config.fire)
+    if config.fire not in scenarios.values():
+        changed = config.fire.name in scenarios
+        scenarios[config.fire.name + ("_as_trained" if changed else "")] = config.fire
     grid, horizon = config.env.grid, config.env.horizon
     return {
         name: fire_bank(scenario, "heldout", count, grid, horizon)
@@ -117,13 +121,14 @@ def film(
 ) -> tuple[list[np.ndarray], list[int]]:
     """Pictures of one episode of one environment, and their steps."""
     env = build_env(config, num_envs=1, fire=fire, seed=START_SEED, device=config.device)
+    world: Any = env.base_env
     horizon = config.env.horizon
     wanted = set(np.linspace(0, horizon, min(frames, horizon + 1)).round().astype(int).tolist())
     pictures: list[np.ndarray] = []
 
     def watch(step: int) -> None:
         if step in wanted:
-            pictures.append(env.base_env.render())
+            pictures.append(world.render())
 
     play(env, policy, watch)
     return pictures, sorted(wanted)

@@ -3,7 +3,7 @@
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
-from typing import Any
+from typing import Any, cast
 
 import torch
 from emberlink.envs import metrics
@@ -64,12 +64,18 @@ class Trainer:
         )
         self.enough = rows_needed(config.env.num_uavs, shared=shared, batch=config.learner.batch)
         self.collector = self._make_collector()
-        self.episode = 0
-        self.run: RunFolder | None = None
+        self.step = self.episode = 0
+        self._run: RunFolder | None = None
+
+    @property
+    def run(self) -> RunFolder:
+        """The run folder that `start` made."""
+        assert self._run is not None, "start() comes first"
+        return self._run
 
     def start(self) -> RunFolder:
         """Makes the run folder."""
-        self.run = RunFolder.create(self.config)
+        self._run = RunFolder.create(self.config)
         return self.run
 
     def train(self, report: Callable[[Progress], None] = lambda _: None) -> None:
@@ -78,7 +84,6 @@ class Trainer:
         Args:
             report: called after each step of the environments.
         """
-        assert self.run is not None
         tracker = Tracker(self.config, self.run)
         try:
             self._loop(tracker, report)
@@ -95,8 +100,7 @@ class Trainer:
 
     def save(self) -> None:
         """Writes the networks as they are to a checkpoint."""
-        assert self.run is not None
-        self.run.save(self.episode, self.weights())
+        self.run.save(self.step, self.weights())
 
     def weights(self) -> dict[str, torch.Tensor]:
         """All networks and their targets by name, detached."""
@@ -121,12 +125,13 @@ class Trainer:
         config, horizon = self.config, self.config.env.horizon
         progress = Progress(0, self.steps, 0, config.episodes)
         began, moments, losses = time.monotonic(), [], []
-        for step, collected in enumerate(self.collector, start=1):
+        for collected in self.collector:
+            self.step += 1
             losses += self._learn(collected)
             moments.append(collected.get("next").select(*metrics.STEP_KEYS))
-            progress.step = step
-            if step % horizon == 0:
-                self.episode = step // horizon
+            progress.step = self.step
+            if self.step % horizon == 0:
+                self.episode = self.step // horizon
                 progress.line = self._finish_episode(moments, losses, tracker)
                 progress.episode = self.episode
                 seconds = round(time.monotonic() - began, 3)
@@ -152,7 +157,8 @@ class Trainer:
     ) -> dict[str, Any]:
         """Measures an episode, writes its line, evaluates and saves where it is due."""
         config = self.config
-        measured = metrics.episode_metrics(torch.cat(moments, dim=1))
+        episode: Any = torch.cat(cast(Any, moments), dim=1)
+        measured = metrics.episode_metrics(episode)
         line: dict[str, Any] = {"episode": self.episode, "updates": self.learner.updates}
         line |= {name: value.mean().item() for name, value in measured.items()}
         if losses:

@@ -5,7 +5,7 @@ from emberlink.envs import keys
 from tensordict import TensorDict, TensorDictBase
 from torchrl.data import LazyTensorStorage, ReplayBuffer
 from torchrl.data.replay_buffers.samplers import RandomSampler
-from torchrl.data.replay_buffers.storages import Storage
+from torchrl.data.replay_buffers.storages import TensorStorage
 
 DONE = (keys.AGENTS, "done")
 TERMINATED = (keys.AGENTS, "terminated")
@@ -24,7 +24,7 @@ class TeamSampler(RandomSampler):
         self.uavs, self.shared = uavs, shared
 
     def sample(
-        self, storage: Storage, batch_size: int
+        self, storage: TensorStorage, batch_size: int
     ) -> tuple[tuple[torch.Tensor, torch.Tensor], dict]:
         """Rows and columns, int64 [batch_size, uavs] each; column k belongs to UAV k's batch."""
         shape, device = (batch_size, self.uavs), storage.device

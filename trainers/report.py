@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import torch
 from emberlink.envs import metrics
@@ -33,7 +34,7 @@ def load_actor(run: RunFolder, config: RunConfig, checkpoint: Path) -> TensorDic
         device=config.device,
     )
     actor, _ = build_networks(config, env)
-    network = actor.module
+    network: Any = actor.module
     expected = {_ACTOR + name: value for name, value in network.state_dict().items()}
     weights = load_weights(checkpoint, expected)
     network.load_state_dict({name.removeprefix(_ACTOR): v for name, v in weights.items()})
@@ -81,5 +82,6 @@ def print_table(console: Console, results: evaluate.Results, config: RunConfig) 
             table.add_column(name.replace("_", " "), justify="right")
         columns = [evaluate.means(measured) for measured in by_policy.values()]
         for name in metrics.NAMES:
-            table.add_row(name, *(f"{column[name]:.1f}" for column in columns))
+            digits = 3 if name == "score" else 1
+            table.add_row(name, *(f"{column[name]:.{digits}f}" for column in columns))
         console.print(table)

@@ -86,9 +86,9 @@ class RunFolder:
         folder.mkdir(exist_ok=True)
         return folder / file
 
-    def save(self, episode: int, weights: Mapping[str, Tensor]) -> Path:
+    def save(self, step: int, weights: Mapping[str, Tensor]) -> Path:
         """Writes a checkpoint to a name of its own, whole or not at all."""
-        path = self.path / "checkpoints" / f"episode_{episode:06d}.safetensors"
+        path = self.path / "checkpoints" / f"step_{step:09d}.safetensors"
         partial = path.with_suffix(".part")
         save_file({name: value.cpu().contiguous() for name, value in weights.items()}, partial)
         partial.replace(path)
@@ -100,7 +100,7 @@ class RunFolder:
         Raises:
             ValueError: there is none.
         """
-        found = sorted((self.path / "checkpoints").glob("episode_*.safetensors"))
+        found = sorted((self.path / "checkpoints").glob("step_*.safetensors"))
         if not found:
             raise ValueError(f"{self.path}: holds no checkpoint (checkpoints/*.safetensors)")
         return found[-1]

@@ -12,11 +12,16 @@ from .run_folder import RunFolder
 
 def _wandb(config: RunConfig, run: RunFolder) -> Logger:
     """Groups by setup and fire, tags by method and seed; offline unless WANDB_MODE says else."""
+    import wandb
+
+    offline = os.environ.get("WANDB_MODE", "offline") != "online"
     logger = WandbLogger(
         exp_name=run.path.name,
         project=os.environ.get("WANDB_PROJECT", "emberlink"),
         save_dir=str(run.path),
-        offline=os.environ.get("WANDB_MODE", "offline") != "online",
+        offline=offline,
+        log_env_packages=False,  # it would stand in the configuration as "env"
+        settings=wandb.Settings(silent=offline, console="off"),
         group=f"{config.setup}-{config.fire.name}",
         tags=[config.method, f"seed-{config.seed}"],
     )
@@ -53,7 +58,10 @@ class Tracker:
 
     def log(self, line: Mapping[str, Any], step: int) -> None:
         """One episode's line of metrics.jsonl; numbers only."""
-        if self.logger is not None:
+        if isinstance(self.logger, WandbLogger):
+            # All in one row of the history, whose step is the episode.
+            self.logger.log_metrics(dict(line), step=step, override_global_step=True)
+        elif self.logger is not None:
             for name, value in line.items():
                 self.logger.log_scalar(name, float(value), step=step)
 
