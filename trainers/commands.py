@@ -1,8 +1,9 @@
 """What the commands do."""
 
-import dataclasses
 import logging
-from collections.abc import Sequence
+import signal
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -17,13 +18,11 @@ from rich.progress import (
 )
 
 from . import report
-from .config import check_device, resolve
+from .cli import INTERRUPTED
+from .config import resolve
 from .loop import Progress as Moment
 from .loop import Trainer
 from .run_folder import RunFolder
-
-INTERRUPTED = 130
-"""the exit status of a program that Ctrl-C ended"""
 
 
 def train(method: str, overrides: Sequence[str], console: Console) -> int:
@@ -34,7 +33,10 @@ def train(method: str, overrides: Sequence[str], console: Console) -> int:
     run = trainer.start()
     console.print(f"{method}, setup {config.setup}, fire {config.fire.name} -> {run.path}")
     try:
-        _train_with_bar(trainer, console)
+        with _stopping_between_steps(trainer):
+            finished = _train_with_bar(trainer, console)
+        if not finished:
+            raise KeyboardInterrupt
         results = report.evaluate_run(
             run,
             config,
@@ -54,7 +56,23 @@ def train(method: str, overrides: Sequence[str], console: Console) -> int:
     return 0
 
 
-def _train_with_bar(trainer: Trainer, console: Console) -> None:
+@contextmanager
+def _stopping_between_steps(trainer: Trainer) -> Iterator[None]:
+    """Ctrl-C lets the step finish, so that what is saved is whole; a second one does not wait."""
+
+    def stop(number: int, frame: Any) -> None:
+        trainer.stop()
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+    before = signal.signal(signal.SIGINT, stop)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def _train_with_bar(trainer: Trainer, console: Console) -> bool:
+    """`Trainer.train` with a progress bar."""
     columns = (
         TextColumn("episode {task.fields[episode]}/{task.fields[episodes]}"),
         BarColumn(),
@@ -81,7 +99,7 @@ def _train_with_bar(trainer: Trainer, console: Console) -> None:
                 shown["score"] = f"{moment.line['score']:.2f}"
             bar.update(task, **shown)
 
-        trainer.train(show)
+        return trainer.train(show)
 
 
 def evaluate_folder(
@@ -94,9 +112,7 @@ def evaluate_folder(
 ) -> int:
     """Evaluates a run folder's frozen policy and prints the table."""
     run = RunFolder(folder)
-    config = run.config()
-    if device is not None:
-        config = dataclasses.replace(config, device=check_device(device))
+    config = run.config(**({} if device is None else {"device": device}))
     checkpoint = checkpoint or run.checkpoint()
     actor = report.load_actor(run, config, checkpoint)
     results = report.evaluate_run(

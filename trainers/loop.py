@@ -65,6 +65,7 @@ class Trainer:
         self.enough = rows_needed(config.env.num_uavs, shared=shared, batch=config.learner.batch)
         self.collector = self._make_collector()
         self.step = self.episode = 0
+        self._stopping = False
         self._run: RunFolder | None = None
 
     @property
@@ -78,11 +79,18 @@ class Trainer:
         self._run = RunFolder.create(self.config)
         return self.run
 
-    def train(self, report: Callable[[Progress], None] = lambda _: None) -> None:
+    def stop(self) -> None:
+        """Ends the training after the step that it is at, also from a signal handler."""
+        self._stopping = True
+
+    def train(self, report: Callable[[Progress], None] = lambda _: None) -> bool:
         """Trains to the end; whatever stops it, the networks are saved as they are.
 
         Args:
             report: called after each step of the environments.
+
+        Returns:
+            Whether it came to the end: False after `stop`.
         """
         tracker = Tracker(self.config, self.run)
         try:
@@ -91,6 +99,7 @@ class Trainer:
             self.collector.shutdown()
             tracker.close()
             self.save()
+        return self.step == self.steps
 
     def rehearse(self, steps: int) -> None:
         """Collects and learns for some steps of the environments; writes nothing."""
@@ -104,7 +113,8 @@ class Trainer:
 
     def weights(self) -> dict[str, torch.Tensor]:
         """All networks and their targets by name, detached."""
-        return {name: value.detach() for name, value in self.learner.loss.state_dict().items()}
+        state = self.learner.loss.state_dict()
+        return {name: value.detach() for name, value in state.items() if "_params." in name}
 
     def _make_collector(self) -> Collector:
         explorer = with_noise(
@@ -138,6 +148,8 @@ class Trainer:
                 self.run.append("timing.jsonl", {"episode": self.episode, "seconds": seconds})
                 moments, losses = [], []
             report(progress)
+            if self._stopping:
+                return
 
     def _learn(self, collected: TensorDictBase) -> list[torch.Tensor]:
         """Remembers a step and makes its updates: the losses, [2, uavs] each.

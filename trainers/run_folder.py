@@ -42,8 +42,11 @@ class RunFolder:
             raise ValueError(f"output={config.output}: {error.strerror or error}") from None
         return cls(path)
 
-    def config(self) -> RunConfig:
+    def config(self, **changes: Any) -> RunConfig:
         """The run's configuration.
+
+        Args:
+            changes: values in place of those in the file, such as `device="cpu"`.
 
         Raises:
             ValueError: there is no such folder, no config.yaml, or a value in it is wrong.
@@ -60,7 +63,7 @@ class RunFolder:
         if not isinstance(values, dict):
             raise ValueError(f"{file}: expected keys and values, found {type(values).__name__}")
         try:
-            return from_values(values)
+            return from_values({**values, **changes})
         except ValueError as error:
             raise ValueError(f"{file}: {error}") from None
 

@@ -1,0 +1,33 @@
+"""Moments of an environment made by hand."""
+
+import torch
+from emberlink.envs import keys
+from tensordict import TensorDict
+
+
+def moment(position, new, old=None, *, centre=None, old_centre=None, beyond=None, step=0, seed=1):
+    """What the environment writes; lists per UAV, or per environment and UAV."""
+    position = torch.as_tensor(position, dtype=torch.float32)
+    position = position.unsqueeze(0) if position.ndim == 2 else position
+    envs, uavs = position.shape[:2]
+
+    def of_uavs(values, *shape, dtype=torch.float32):
+        if values is None:
+            return torch.zeros(envs, uavs, *shape, dtype=dtype)
+        return torch.as_tensor(values, dtype=dtype).expand(envs, uavs, *shape).clone()
+
+    return TensorDict(
+        {
+            keys.OBSERVATION: torch.zeros(envs, uavs, 6),
+            keys.POSITION: position,
+            keys.NEW_FIRE: of_uavs(new, dtype=torch.int64),
+            keys.OLD_FIRE: of_uavs(old, dtype=torch.int64),
+            keys.NEW_CENTRE: of_uavs(centre, 2),
+            keys.OLD_CENTRE: of_uavs(old_centre, 2),
+            keys.BEYOND: of_uavs(beyond, 3, dtype=torch.bool),
+            keys.REWARD: torch.zeros(envs, uavs, 1),
+            keys.STREAM: torch.arange(envs) + seed,
+            keys.STEP: torch.full((envs,), step),
+        },
+        batch_size=[envs],
+    )

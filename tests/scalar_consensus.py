@@ -1,0 +1,94 @@
+"""Method 4 for one network of UAVs in plain Python: loops, dictionaries, explicit rounds."""
+
+import math
+from collections.abc import Sequence
+
+Point = tuple[float, float, float]
+
+
+class ScalarConsensus:
+    """Remembers, per UAV, what a discoverer has done since it became one.
+
+    Args:
+        reach: UAVs nearer than this hear each other, cells.
+        any_fire: whether old fire makes a discoverer too.
+    """
+
+    def __init__(self, reach: float, *, any_fire: bool = False):
+        self.reach, self.any_fire = reach, any_fire
+        self.history: dict[int, list[tuple[int, float]]] = {}
+        """discoverer -> (fire points, altitude) of each step of its streak"""
+
+    def step(self, position: Sequence[Point], new: Sequence[int], old: Sequence[int]) -> list[int]:
+        """Whom each UAV follows after this moment: itself if a discoverer, -1 if nobody."""
+        uavs = range(len(position))
+        finds = [new[i] > 0 or (self.any_fire and old[i] > 0) for i in uavs]
+        for i in uavs:
+            if finds[i]:
+                self.history.setdefault(i, []).append((new[i], position[i][2]))
+            else:
+                self.history.pop(i, None)
+        hears = {
+            i: [j for j in uavs if j != i and math.dist(position[i], position[j]) < self.reach]
+            for i in uavs
+        }
+        # What a UAV knows is (rank, -index): the maximum is the best, among equals the first.
+        knows = {
+            i: max(((self.rank(j), -j) for j in hears[i] if finds[j]), default=None)
+            for i in uavs
+            if not finds[i]
+        }
+        while True:
+            told = {
+                i: max(
+                    (knows[j] for j in (i, *hears[i]) if j in knows and knows[j] is not None),
+                    default=None,
+                )
+                for i in knows
+            }
+            if told == knows:
+                break
+            knows = told
+        follows = []
+        for i in uavs:
+            best = knows.get(i)
+            follows.append(i if finds[i] else -1 if best is None else -best[1])
+        return follows
+
+    def streak(self, uav: int) -> int:
+        """Consecutive steps as a discoverer."""
+        return len(self.history.get(uav, []))
+
+    def fire_score(self, uav: int) -> int:
+        """Fire points discovered over the streak."""
+        return sum(points for points, _ in self.history.get(uav, []))
+
+    def average_altitude(self, uav: int) -> float:
+        """Mean altitude over the streak."""
+        altitudes = [altitude for _, altitude in self.history[uav]]
+        return sum(altitudes) / len(altitudes)
+
+    def rank(self, uav: int) -> float:
+        """Equation of the rank of a discoverer."""
+        points, altitude = self.history[uav][-1]
+        record = self.fire_score(uav) / (self.average_altitude(uav) * self.streak(uav))
+        return record * (points / altitude)
+
+
+def bearing(start: Point, end: Point) -> float:
+    """Direction in the x-y plane, degrees in (-180, 180]."""
+    return math.degrees(math.atan2(end[1] - start[1], end[0] - start[0]))
+
+
+def heading_term(form: str, before: Point, after: Point, target: Point) -> float:
+    """The bonus for one UAV's move, by the name of its form."""
+    aimed, moved = bearing(before, target), bearing(before, after)
+    folded = abs(abs(aimed) - abs(moved))
+    if form == "folded_linear":
+        return (180 - folded) / 10
+    if form == "folded_exponential":
+        return 20 * 0.94**folded
+    if before[:2] == after[:2]:
+        return 0.0
+    apart = abs(aimed - moved)
+    return (90 - min(apart, 360 - apart)) / 90

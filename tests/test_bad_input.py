@@ -1,0 +1,187 @@
+"""What the commands refuse: one line, exit status 2, and nothing left behind."""
+
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+import yaml
+from emberlink.trainers import cli
+from emberlink.trainers.run_folder import RunFolder
+from safetensors.torch import save_file
+from tiny_run import PROGRAM, TINY, train_tiny
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory) -> Path:
+    """A run folder that `emberlink train` left."""
+    return train_tiny(tmp_path_factory.mktemp("runs"))
+
+
+@pytest.fixture
+def run(finished, tmp_path) -> Path:
+    """A copy of it, to be damaged."""
+    return Path(shutil.copytree(finished, tmp_path / "run"))
+
+
+def refused(arguments: list[str], capsys, *words: str) -> str:
+    """The one line with which a command ends at status 2; it holds all the words."""
+    capsys.readouterr()
+    assert cli.main(arguments) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.count("\n") == 1, err
+    assert err.startswith(f"emberlink {arguments[0]}: ")
+    assert len(err) < 400
+    for word in words:
+        assert word in err, err
+    return err
+
+
+METHODS = "known: consensus, independent, positional, shared_memory"
+SETUPS = "known: paper, released, tuned"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["consensu"], ["'consensu'", "did you mean consensus?", METHODS]),
+        (["zzz"], ["'zzz'", METHODS]),
+        ([""], ["''", METHODS]),
+        (["consensus", "learner.gama=0.9"], ["'learner.gama'", "did you mean learner.gamma?"]),
+        (["consensus", "horizon=10"], ["'horizon'", "did you mean env.horizon?"]),
+        (["independent", "comm.range=5"], ["'comm.range'"]),
+        (["consensus", "zzz=1"], ["'zzz'", "known: setup, fire, env", "num_envs"]),
+        (["consensus", "method=independent"], ["'method'"]),
+        (["consensus", "setup=papr"], ["setup 'papr'", "did you mean paper?", SETUPS]),
+        (["consensus", "fire=zzz"], ["fire 'zzz'", "known: huygens, paper"]),
+        (["consensus", "learner.batch=big"], ["learner.batch=big", "integer"]),
+        (["consensus", "learner.batch=1.5"], ["learner.batch=1.5", "integer"]),
+        (["consensus", "env.reward.exit=true"], ["env.reward.exit=True", "number"]),
+        (["consensus", "env.grid=30"], ["env.grid=30"]),
+        (["consensus", "env=3"], ["env=3"]),
+        (["consensus", "seed=null"], ["seed=None", "integer"]),
+        (["consensus", "env.num_uavs=0"], ["env.num_uavs=0", "greater than or equal to 1"]),
+        (["consensus", "env.num_uavs=65"], ["env.num_uavs=65", "less than or equal to 64"]),
+        (["consensus", "env.grid=[4,30]"], ["env.grid.0=4", "greater than or equal to 8"]),
+        (["consensus", "env.altitude=[4,1]"], ["altitude (4.0, 1.0)", "lowest"]),
+        (["consensus", "learner.gamma=1.5"], ["learner.gamma=1.5", "less than 1"]),
+        (["consensus", "learner.gamma=nan"], ["learner.gamma=nan"]),
+        (["consensus", "learner.capacity=5"], ["batch=8", "capacity=5"]),
+        (["consensus", "seed=-1"], ["seed=-1", "greater than or equal to 0"]),
+        (["consensus", "num_envs=0"], ["num_envs=0"]),
+        (["consensus", "logger=mlflow"], ["logger=mlflow", "'wandb', 'tensorboard', 'csv'"]),
+        (["consensus", "memory=both"], ["memory=both", "'private' or 'shared'"]),
+        (["consensus", "comm.rnge=3"], ["'comm.rnge'", "did you mean comm.range?"]),
+        (["consensus", "comm.range=-1"], ["comm.range=-1", "greater than or equal to 0"]),
+        (["consensus", "comm.heading.form=cubic"], ["comm.heading.form=cubic", "'folded_linear'"]),
+        (
+            ["consensus", "comm.name=telepathy"],
+            ["comm.name='telepathy'", "known: consensus, positional, silent"],
+        ),
+        (["consensus", "comm.name=silent"], ["comm.range"]),
+        (["consensus", "device=cuda:99"], ["device=cuda:99 is not there", "known: cpu"]),
+        (["consensus", "device=tpu"], ["device=tpu is not there", "known: cpu"]),
+        (["consensus", "device=cpu:3"], ["device=cpu:3 is not there", "known: cpu"]),
+        (["consensus", "episodes"], ["'episodes'", "key=value"]),
+        (["consensus", "a=b=c"], ["'a=b=c'", "key=value"]),
+        (["consensus", "=3"], ["key ''"]),
+        (["consensus", "+new=1"], ["'+new=1'", "key=value"]),
+        (["consensus", "~env"], ["'~env'", "key=value"]),
+        (["consensus", "seed=1,2"], ["'seed=1,2'", "one value"]),
+        (["consensus", "env.horizon=${nope}"], ["nope", "env.horizon"]),
+    ],
+    ids=lambda value: " ".join(value) if value and len(value) < 3 else "",
+)
+def test_bad_input_is_one_line_and_leaves_nothing(arguments, words, tmp_path, capsys):
+    output = tmp_path / "runs"
+    method, *wrong = arguments
+    # Short, in case it is taken after all.
+    refused(["train", method, *TINY, *wrong, f"output={output}"], capsys, *words)
+    assert not output.exists()
+
+
+def test_an_output_folder_that_is_a_file(tmp_path, capsys):
+    file = tmp_path / "file"
+    file.write_text("mine")
+    for output in (file, file / "below"):
+        refused(["train", "consensus", *TINY, f"output={output}"], capsys, f"output={output}")
+    assert file.read_text() == "mine"
+    assert list(tmp_path.iterdir()) == [file]
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(f): f.read_bytes() for f in sorted(folder.rglob("*")) if f.is_file()}
+
+
+def test_a_run_folder_that_is_none(tmp_path, capsys):
+    nowhere, empty = tmp_path / "nowhere", tmp_path / "empty"
+    empty.mkdir()
+    refused(["eval", str(nowhere)], capsys, str(nowhere), "no such run folder")
+    refused(["eval", str(empty)], capsys, str(empty), "config.yaml is missing")
+    assert not nowhere.exists()
+    assert list(empty.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"learner": {"gama": 0.9}}, ["config.yaml", "'learner.gama'"]),
+        ({"env": {"num_uavs": 0}}, ["config.yaml", "env.num_uavs=0"]),
+        ({"learner": {"hidden": [8, 9]}}, ["has shape [2, 8, 8]", "needs [2, 8, 9]"]),
+        ({"env": {"num_uavs": 3}}, ["has shape [2, 9, 8]", "needs [3, 9, 8]"]),
+        ({"comm": {"name": "positional"}}, ["config.yaml", "comm."]),
+    ],
+)
+def test_a_run_whose_configuration_does_not_fit(run, change, words, capsys):
+    file = run / "config.yaml"
+    values = yaml.safe_load(file.read_text())
+    for key, inner in change.items():
+        values[key] |= inner
+    file.write_text(yaml.safe_dump(values))
+    before = contents(run)
+    refused(["eval", str(run)], capsys, *words)
+    assert contents(run) == before
+
+
+@pytest.mark.parametrize("text", ["", "- 1\n- 2\n", "a: [", "\x00\x01"])
+def test_a_configuration_that_is_none(run, text, capsys):
+    (run / "config.yaml").write_text(text)
+    refused(["eval", str(run)], capsys, "config.yaml")
+
+
+def test_a_run_without_a_checkpoint(run, capsys):
+    shutil.rmtree(run / "checkpoints")
+    refused(["eval", str(run)], capsys, str(run), "holds no checkpoint")
+
+
+def test_a_checkpoint_that_is_none(run, capsys):
+    checkpoint = RunFolder(run).checkpoint()
+    whole = checkpoint.read_bytes()
+    for content in (b"", b"not a checkpoint", whole[: len(whole) // 2]):
+        checkpoint.write_bytes(content)
+        refused(["eval", str(run)], capsys, checkpoint.name, "not a readable checkpoint")
+    weights = {"else": torch.zeros(3)}
+    save_file(weights, checkpoint)
+    refused(["eval", str(run)], capsys, checkpoint.name, "holds no actor_network_params")
+    other = run / "nothing.safetensors"
+    refused(["eval", str(run), "--checkpoint", str(other)], capsys, other.name)
+
+
+def test_eval_on_a_device_that_is_not_there(run, capsys):
+    refused(["eval", str(run), "--device", "cuda:99"], capsys, "cuda:99", "known: cpu")
+
+
+def test_a_real_process_prints_one_line_and_ends_with_2(tmp_path):
+    done = subprocess.run(
+        [sys.executable, "-c", PROGRAM, "train", "consensus", "env.horizn=3"],
+        capture_output=True,
+        text=True,
+        cwd=tmp_path,
+        check=False,
+    )
+    expected = "emberlink train: key 'env.horizn' is not known; did you mean env.horizon?\n"
+    assert (done.returncode, done.stdout, done.stderr) == (2, "", expected)
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,139 @@
+"""The commands from the outside: what they print and leave."""
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from emberlink.envs import metrics
+from emberlink.trainers import cli
+from emberlink.trainers.run_folder import RunFolder
+from safetensors.torch import load_file, save_file
+from tiny_run import PROGRAM, TINY, train_tiny
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory) -> Path:
+    """A run folder that `emberlink train` left."""
+    return train_tiny(tmp_path_factory.mktemp("runs"))
+
+
+@pytest.fixture
+def run(finished, tmp_path) -> Path:
+    """A copy of it, to be damaged."""
+    return Path(shutil.copytree(finished, tmp_path / "run"))
+
+
+@pytest.mark.parametrize("arguments", [["trane"], ["train"], ["eval"], ["eval", "x", "--fires=0"]])
+def test_usage_errors_end_with_what_is_wrong(arguments, capsys):
+    with pytest.raises(SystemExit) as ended:
+        cli.main(arguments)
+    assert ended.value.code == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.startswith("emberlink")
+    assert err.count("\n") == 1
+    assert "--help" in err
+
+
+@pytest.mark.parametrize("command", ["train", "eval", "doctor"])
+def test_help_says_what_a_command_does_with_an_example(command, capsys):
+    with pytest.raises(SystemExit) as ended:
+        cli.main([command, "--help"])
+    assert ended.value.code == 0
+    text = capsys.readouterr().out
+    assert f"example:\n  emberlink {command}" in text
+    assert len(text.split("\n\n")[1]) > 60  # the paragraph that says what it does
+    with pytest.raises(SystemExit):
+        cli.main(["--help"])
+    assert f"\n    {command}" in capsys.readouterr().out
+
+
+def test_train_leaves_the_files_and_prints_the_table(tmp_path, capsys):
+    output = tmp_path / "some where" / "deep"
+    assert cli.main(["train", "independent", *TINY, f"output={output}"]) == 0
+    out, _ = capsys.readouterr()
+    (folder,) = output.iterdir()
+    check_evaluation(folder, out)
+    assert len((folder / "metrics.jsonl").read_text().splitlines()) == 2
+    assert [f.name for f in (folder / "checkpoints").iterdir()] == ["step_000000030.safetensors"]
+    assert (folder / "figures" / "training.png").stat().st_size > 1000
+
+
+def check_evaluation(folder: Path, out: str, *, episodes: int = 2) -> None:
+    """The table and the path are printed, and the evaluation's files are there."""
+    assert out.rstrip().splitlines()[-1] == str(folder)
+    for name in (*metrics.NAMES, "random waypoints", "random actions", "huygens"):
+        assert name in out
+    results = json.loads((folder / "eval.json").read_text())["results"]
+    for by_policy in results.values():
+        assert {"learned", "random_waypoints", "random_actions"} <= by_policy.keys()
+        for measured in by_policy.values():
+            assert measured.keys() == set(metrics.NAMES)
+            assert {len(values) for values in measured.values()} == {episodes}
+    (animation,) = (folder / "figures").glob("*.gif")
+    assert animation.read_bytes()[:6] == b"GIF89a"
+
+
+def test_eval_repeats_the_evaluation_of_train(run, capsys):
+    trained = json.loads((run / "eval.json").read_text())["results"]
+    shutil.rmtree(run / "figures")
+    (run / "eval.json").unlink()
+    assert cli.main(["eval", str(run)]) == 0
+    check_evaluation(run, capsys.readouterr().out)
+    assert json.loads((run / "eval.json").read_text())["results"] == trained
+    assert cli.main(["eval", str(run), "--fires", "1", "--device", "cpu"]) == 0
+    check_evaluation(run, capsys.readouterr().out, episodes=1)
+
+
+def test_eval_plays_the_checkpoint_it_is_given(run, capsys):
+    trained = json.loads((run / "eval.json").read_text())["results"]["huygens"]
+    checkpoint = RunFolder(run).checkpoint()
+    weights = load_file(checkpoint)
+    name = next(n for n in weights if n.startswith("actor_network_params") and "action.bias" in n)
+    save_file({**weights, name: weights[name] + 9}, run / "other.safetensors")
+    assert cli.main(["eval", str(run), "--checkpoint", str(run / "other.safetensors")]) == 0
+    check_evaluation(run, capsys.readouterr().out)
+    again = json.loads((run / "eval.json").read_text())["results"]["huygens"]
+    assert again["random_waypoints"] == trained["random_waypoints"]
+    assert min(again["learned"]["boundary_exits"]) > max(trained["learned"]["boundary_exits"])
+
+
+def wait_for(condition, process, seconds: float = 120) -> None:
+    end = time.monotonic() + seconds
+    while not condition():
+        assert process.poll() is None, process.communicate()
+        assert time.monotonic() < end
+        time.sleep(0.05)
+
+
+def test_ctrl_c_leaves_a_run_that_can_be_evaluated(tmp_path, capsys):
+    endless = [*TINY, "episodes=100000", f"output={tmp_path}"]
+    process = subprocess.Popen(
+        [sys.executable, "-c", PROGRAM, "train", "consensus", *endless],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
+    )
+    try:
+        wait_for(lambda: any(tmp_path.glob("*/metrics.jsonl")), process)
+        process.send_signal(signal.SIGINT)
+        out, err = process.communicate(timeout=60)
+    finally:
+        process.kill()
+    assert process.returncode == 130, err
+    assert "Traceback" not in err
+    (folder,) = tmp_path.iterdir()
+    assert "stopped" in out
+    checkpoint = RunFolder(folder).checkpoint()
+    done = len((folder / "metrics.jsonl").read_text().splitlines())
+    assert done <= int(checkpoint.stem.removeprefix("step_")) / 15 < done + 1
+    assert not list(folder.rglob("*.part"))
+    assert cli.main(["eval", str(folder)]) == 0
+    check_evaluation(folder, capsys.readouterr().out)

@@ -1,0 +1,222 @@
+"""What the communication modules write, on an environment and off it, and how they are found."""
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+import yaml
+from emberlink.comm import base, consensus, registry
+from emberlink.envs import keys
+from emberlink.envs.wildfire import WildfireEnv
+from emberlink.trainers import make_env
+from emberlink.trainers.config import resolve
+from torchrl.envs import step_mdp
+
+ROOT = Path(__file__).parents[1]
+METHODS = ["independent", "shared_memory", "positional", "consensus"]
+OBSERVED = {"independent": 6, "shared_memory": 6, "positional": 30, "consensus": 9}
+UAVS, ENVS, HORIZON = 5, 3, 8
+
+
+def ablaze() -> torch.Tensor:
+    """Cells that catch fire one after another: nearly everyone finds new fire all the time."""
+    return 16 * torch.rand(12, 10, generator=torch.Generator().manual_seed(0))
+
+
+def recipe(method: str, **more):
+    more = {"num_envs": ENVS, "num_uavs": UAVS, "horizon": HORIZON, **more}
+    return make_env(method, fire=ablaze(), seed=4, **more)
+
+
+def own_numbers(moment) -> torch.Tensor:
+    """A UAV's 6 numbers from everything else that the environment wrote."""
+    new, old = moment[keys.NEW_FIRE] > 0, moment[keys.OLD_FIRE] > 0
+    step = moment[keys.STEP].unsqueeze(-1).expand_as(new)
+    flags = torch.stack((new, old, step), -1).float()
+    return torch.cat((moment[keys.POSITION], flags), -1)
+
+
+def expected(method: str, moment) -> torch.Tensor:
+    own = own_numbers(moment)
+    if method == "consensus":
+        return torch.cat((own, moment[consensus.TARGET]), -1)
+    if method == "positional":
+        everyone = torch.cat([own[..., uav, :] for uav in range(UAVS)], -1)
+        return torch.stack([everyone] * UAVS, -2)
+    return own
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_first_and_next_observations_are_rewritten_alike(method):
+    env = recipe(method)
+    rollout = env.rollout(2 * HORIZON, break_when_any_done=False)
+    assert rollout[keys.OBSERVATION].shape == (ENVS, 2 * HORIZON, UAVS, OBSERVED[method])
+    assert rollout[keys.OBSERVATION].equal(expected(method, rollout))
+    following = rollout["next"]
+    assert following[keys.OBSERVATION].equal(expected(method, following))
+    assert env.observation_spec[keys.OBSERVATION].shape == (ENVS, UAVS, OBSERVED[method])
+    # The step that begins where another ended sees the very same; a new episode does not.
+    same = rollout[:, 1:][keys.OBSERVATION] == following[:, :-1][keys.OBSERVATION]
+    ended = torch.arange(1, 2 * HORIZON) == HORIZON
+    assert same[:, ~ended].all()
+    assert not same[:, ended].all()
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_communication_leaves_the_world_as_it_is(method):
+    env = recipe(method)
+    plain = WildfireEnv(ENVS, env.base_env.config, ablaze(), seed=4)
+    one, other = env.reset(), plain.reset()
+    for step in range(HORIZON):
+        action = torch.rand(ENVS, UAVS, 3, generator=torch.Generator().manual_seed(step)) * 2 - 1
+        one, other = (
+            env.step(one.set(keys.ACTION, action)),
+            plain.step(other.set(keys.ACTION, action)),
+        )
+        for key in (keys.POSITION, keys.NEW_FIRE, keys.SEEN, keys.BEYOND):
+            assert one["next"].get(key).equal(other["next"].get(key)), key
+        bonus = (one["next", *keys.REWARD] - other["next", *keys.REWARD]).abs().max()
+        assert (bonus > 0) == (method == "consensus")
+        one, other = step_mdp(one, keep_other=True), step_mdp(other, keep_other=True)
+
+
+def played(*, reset_at: int | None):
+    """Consensus for some steps with fixed actions; environment 1 starts anew in between."""
+    env = recipe("consensus", horizon=100)
+    moment, moments = env.reset(), []
+    for step in range(8):
+        if step == reset_at:
+            moment["_reset"] = torch.tensor([[False], [True], [False]])
+            moment = env.reset(moment)
+            moments.append(moment.clone())
+        action = torch.rand(ENVS, UAVS, 3, generator=torch.Generator().manual_seed(step)) * 2 - 1
+        moment = env.step(moment.set(keys.ACTION, action))
+        moment = step_mdp(moment, keep_other=True)
+        moments.append(moment.clone())
+    return moments
+
+
+def test_a_partial_reset_leaves_the_memory_of_others_alone():
+    whole, interrupted = played(reset_at=None), played(reset_at=5)
+    at_reset = interrupted.pop(5)
+    memory = *consensus.Consensus.memory_keys, consensus.TARGET, consensus.FOLLOWS
+    others = [0, 2]
+    assert (whole[4][consensus.STREAK][others] > 1).any()
+    for key in (*memory, keys.OBSERVATION):
+        assert at_reset[key][others].equal(whole[4][key][others]), key
+    for key in (consensus.STREAK, consensus.FIRE_SCORE, consensus.ALTITUDE_SUM):
+        assert (whole[4][key][1] > 0).any()
+        assert not at_reset[key][1].any()
+    assert not at_reset[consensus.WAYPOINT][1].equal(whole[4][consensus.WAYPOINT][1])
+    for one, other in zip(whole, interrupted, strict=True):
+        for key in (*memory, keys.OBSERVATION):
+            assert one[key][others].equal(other[key][others]), key
+    assert not whole[-1][keys.OBSERVATION][1].equal(interrupted[-1][keys.OBSERVATION][1])
+
+
+def test_known_modules_are_the_files_on_disk():
+    files = {file.stem for file in (ROOT / "comm").glob("*.py")} - {"base", "registry"}
+    assert registry.known() == sorted(files) == ["consensus", "positional", "silent"]
+    for name in registry.known():
+        module = registry.find(name)
+        assert issubclass(module, base.CommModule)
+        assert isinstance(registry.build(name, resolve("independent").env, {}), module)
+
+
+def test_every_recipe_names_a_module():
+    recipes = sorted(file.stem for file in (ROOT / "configs" / "method").glob("*.yaml"))
+    assert recipes == sorted(METHODS)
+    used = {resolve(method).comm["name"] for method in recipes}
+    assert used == set(registry.known())
+
+
+@pytest.mark.parametrize("name", ["consensu", "", "base", "../silent"])
+def test_an_unknown_module_is_an_error_that_lists_the_known(name):
+    with pytest.raises(ValueError, match=r"known: consensus, positional, silent$") as error:
+        registry.find(name)
+    assert repr(name) in str(error.value)
+    with pytest.raises(ValueError, match="known: consensus, positional, silent"):
+        resolve("independent", [f"comm.name='{name}'"])
+
+
+FIFTH_MODULE = '''
+from typing import Annotated, ClassVar
+
+from emberlink.envs import keys
+from pydantic import ConfigDict, Field
+from pydantic.dataclasses import dataclass
+from torchrl.data import Unbounded
+
+from .base import CommModule
+
+
+@dataclass(frozen=True, kw_only=True, config=ConfigDict(extra="forbid", strict=True))
+class FlagshipConfig:
+    gain: Annotated[float, Field(gt=0)] = 1.0
+
+
+class Flagship(CommModule):
+    """Tells everyone the position of UAV 0."""
+
+    config_type: ClassVar[type] = FlagshipConfig
+    in_keys: ClassVar = [keys.OBSERVATION, keys.POSITION]
+    out_keys: ClassVar = [keys.OBSERVATION]
+
+    def specs(self, observation):
+        shape = observation[keys.OBSERVATION].shape
+        observation[keys.OBSERVATION] = Unbounded((*shape[:-1], shape[-1] + 3))
+        return observation
+
+    def forward(self, tensordict):
+        own = tensordict.get(keys.OBSERVATION)
+        first = self.config.gain * tensordict.get(keys.POSITION)[..., :1, :]
+        return tensordict.set(
+            keys.OBSERVATION, torch.cat((own, first.expand(*own.shape[:-1], 3)), -1)
+        )
+'''
+FIFTH_RECIPE = """# @package _global_
+memory: shared
+comm:
+  name: flagship
+  gain: 1.0
+"""
+TRAIN = """
+import sys
+from pathlib import Path
+from emberlink.comm import registry
+from emberlink.trainers.cli import main
+assert Path(registry.__file__).is_relative_to(sys.argv[1]), registry.__file__
+raise SystemExit(main(["train", "flagship", "comm.gain=0.5", *sys.argv[2:]]))
+"""
+
+
+def test_a_fifth_method_is_one_file_and_one_yaml(tmp_path):
+    package = tmp_path / "copy" / "emberlink"
+    for folder in ("envs", "comm", "policies", "trainers", "configs"):
+        ignored = shutil.ignore_patterns("__pycache__")
+        shutil.copytree(ROOT / folder, package / folder, ignore=ignored)
+    (package / "comm" / "flagship.py").write_text("import torch\n" + FIFTH_MODULE)
+    (package / "configs" / "method" / "flagship.yaml").write_text(FIFTH_RECIPE)
+    overrides = ["episodes=2", "env.horizon=12", "env.num_uavs=2", "learner.hidden=[8,8]"]
+    overrides += ["learner.batch=8", "evaluation.fires=1", "evaluation.interval=0"]
+    done = subprocess.run(
+        [sys.executable, "-c", TRAIN, str(package), *overrides, f"output={tmp_path / 'runs'}"],
+        # First on the path, and so before an installed copy.
+        env={**os.environ, "PYTHONPATH": str(package.parent)},
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    (run,) = (tmp_path / "runs").iterdir()
+    assert yaml.safe_load((run / "config.yaml").read_text())["comm"] == {
+        "name": "flagship",
+        "gain": 0.5,
+    }
+    assert len((run / "metrics.jsonl").read_text().splitlines()) == 2
+    assert (run / "eval.json").exists()

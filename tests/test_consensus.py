@@ -1,0 +1,272 @@
+"""Consensus on networks made by hand."""
+
+import math
+
+import pytest
+import torch
+from emberlink.comm import consensus
+from emberlink.comm.base import Communication
+from emberlink.comm.consensus import Consensus, ConsensusConfig, best_discoverer, neighbours
+from emberlink.envs import keys
+from emberlink.envs.config import WildfireConfig
+from moments import moment
+from tensordict import TensorDict
+from torch import Tensor
+
+WORLD = WildfireConfig(grid=(64, 64))
+
+
+def in_a_row(count: int, gap: float = 9.0) -> list[list[float]]:
+    return [[gap * i, 0.0, 2.0] for i in range(count)]
+
+
+def told(position, new, *, config=None, world=WORLD, **more) -> TensorDict:
+    """A moment as an episode's first, rewritten by consensus."""
+    module = Consensus(world, config or ConsensusConfig())
+    return module(module.start(moment(position, new, **more)))
+
+
+def follows(position, new, **more) -> list[int]:
+    return told(position, new, **more)[consensus.FOLLOWS][0].tolist()
+
+
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_seekers_follow_the_discoverer_of_higher_rank(mirrored):
+    # 1 hears both 0 and 2; 2 sees more fire from the same altitude.
+    position, new = in_a_row(3), [2, 0, 3]
+    if mirrored:
+        new.reverse()
+    assert follows(position, new) == [0, 0 if mirrored else 2, 2]
+
+
+@pytest.mark.parametrize("end", [0, 6])
+def test_a_rank_travels_along_a_chain_of_any_length(end):
+    new = [0] * 7
+    new[end] = 1
+    assert follows(in_a_row(7), new) == [end] * 7
+
+
+def test_the_better_discoverer_wins_the_whole_chain():
+    assert follows(in_a_row(8), [1, 0, 0, 0, 0, 0, 0, 5]) == [0, *[7] * 7]
+
+
+def test_nothing_crosses_a_cut():
+    left, right = in_a_row(3), [[x + 40, y, z] for x, y, z in in_a_row(3)]
+    assert follows(left + right, [4, 0, 0, 0, 0, 0]) == [0, 0, 0, -1, -1, -1]
+    assert follows(left + right, [4, 0, 0, 0, 0, 9]) == [0, 0, 0, 5, 5, 5]
+
+
+def test_a_discoverer_does_not_join_two_networks_of_others():
+    # 0 - 1 - [2] - 3 - [4]: 3 hears the better 4; 1 hears only 2, and 0 only 1.
+    assert follows(in_a_row(5), [0, 0, 1, 0, 5]) == [2, 2, 2, 4, 4]
+
+
+def test_without_a_discoverer_all_wander():
+    rewritten = told(in_a_row(5), [0] * 5)
+    assert rewritten[consensus.FOLLOWS].tolist() == [[-1] * 5]
+    assert rewritten[consensus.TARGET].equal(rewritten[consensus.WAYPOINT])
+
+
+def test_everyone_may_discover():
+    assert follows(in_a_row(4), [1, 2, 3, 4]) == [0, 1, 2, 3]
+
+
+def test_ties_go_to_the_lower_index():
+    assert follows(in_a_row(3), [2, 0, 2]) == [0, 0, 2]
+    # Through a chain too, and whichever of the two is nearer.
+    assert follows(in_a_row(6), [0, 2, 0, 0, 0, 2]) == [1, 1, 1, 1, 1, 5]
+
+
+@pytest.mark.parametrize(("limit", "near"), [(10.0, False), (10.001, True), (math.inf, True)])
+def test_hearing_ends_below_the_range(limit, near):
+    position = torch.tensor([[0.0, 0.0, 1.0], [6.0, 8.0, 1.0]])
+    assert neighbours(position, limit).tolist() == [[False, near], [near, False]]
+
+
+def test_distance_is_taken_in_three_dimensions():
+    position = torch.tensor([[0.0, 0.0, 1.0], [8.0, 5.0, 4.0]])  # 9.43 on the ground, 9.90 in all
+    assert neighbours(position, 9.5).sum() == 0
+    assert neighbours(position, 9.95).sum() == 2
+
+
+def test_no_range_is_silence_and_infinite_range_is_one_network():
+    position, new = in_a_row(4, gap=20), [0, 3, 0, 0]
+    assert follows(position, new) == [-1, 1, -1, -1]
+    assert follows(position, new, config=ConsensusConfig(range=math.inf)) == [1, 1, 1, 1]
+    same = [[5.0, 5.0, 2.0]] * 3
+    assert follows(same, [0, 3, 0], config=ConsensusConfig(range=0.0)) == [-1, 1, -1]
+
+
+def test_best_discoverer_reads_the_ranks_of_discoverers_only():
+    everyone = ~torch.eye(3, dtype=torch.bool)
+    discovers = torch.tensor([False, True, False])
+    rank = torch.tensor([math.inf, -1.0, 99.0])
+    assert best_discoverer(everyone, discovers, rank).tolist() == [1, 1, 1]
+
+
+def walk(module: Consensus, *moments: TensorDict) -> TensorDict:
+    """The last of consecutive moments of an episode, each rewritten as on an environment."""
+    talk = Communication(module)
+    now = talk._reset(moments[0], moments[0])
+    for following in moments[1:]:
+        now = talk._step(now, following)
+    return now
+
+
+def test_streak_score_and_altitude_add_up_and_start_anew():
+    def at(z: float, new: int) -> TensorDict:
+        return moment([[5.0, 5.0, z]], [new])
+
+    def record(*moments: TensorDict) -> tuple[float, ...]:
+        now = walk(Consensus(WORLD, ConsensusConfig()), *moments)
+        memory = consensus.STREAK, consensus.FIRE_SCORE, consensus.ALTITUDE_SUM
+        return tuple(now[key].item() for key in memory)
+
+    first, second, third = at(1.5, 3), at(2.0, 4), at(4.0, 1)
+    assert record(at(3.0, 0)) == (0, 0, 0)
+    assert record(at(3.0, 0), first.clone()) == (1, 3, 1.5)
+    assert record(at(3.0, 0), first.clone(), second.clone()) == (2, 7, 3.5)
+    assert record(at(3.0, 0), first.clone(), second.clone(), third.clone()) == (3, 8, 7.5)
+    assert record(at(3.0, 0), first.clone(), second.clone(), at(4.0, 0)) == (0, 0, 0)
+    assert record(first.clone(), second.clone(), at(4.0, 0), third.clone()) == (1, 1, 4.0)
+
+
+def test_rank_by_hand():
+    # UAV 0: 6 then 2 points at altitudes 1 and 3: 8 / (2 * 2) * 2 / 3 = 1.3333
+    # UAV 2: 0 then 4 points at altitude 3.5: 4 / (3.5 * 1) * 4 / 3.5 = 1.3061
+    # The latest step alone would put 2 first: 2 / 3 < 4 / 3.5.
+    before = [[0.0, 0.0, 1.0], [9.0, 0.0, 2.0], [18.0, 0.0, 3.5]]
+    after = [[0.0, 0.0, 3.0], [9.0, 0.0, 2.0], [18.0, 0.0, 3.5]]
+    module = Consensus(WORLD, ConsensusConfig())
+    now = walk(module, moment(before, [6, 0, 0]), moment(after, [2, 0, 4]))
+    assert now[consensus.FOLLOWS].tolist() == [[0, 0, 2]]
+    rank = module._track_record(module.start(moment(after, [2, 0, 4])), torch.tensor([True] * 3))
+    torch.testing.assert_close(rank[0, [0, 2]], torch.tensor([4 / 9, 16 / 3.5**2]).double())
+
+
+def test_targets_by_role():
+    position = [[3.0, 4.0, 2.5], [8.0, 4.0, 1.5], [40.0, 40.0, 3.0]]
+    rewritten = told(position, [2, 0, 0], centre=[[3.25, 4.5], [0, 0], [0, 0]])
+    target = rewritten[consensus.TARGET][0]
+    assert target[0].tolist() == [3.25, 4.5, 2.5]  # the mean of the new fire, at its own z
+    assert target[1].tolist() == position[0]  # where the discoverer is, not where it goes
+    assert target[2].equal(rewritten[consensus.WAYPOINT][0, 2])
+    observed = rewritten[keys.OBSERVATION]
+    assert observed.shape == (1, 3, 9)
+    assert observed[..., 6:].equal(rewritten[consensus.TARGET])
+
+
+def test_relative_targets_are_the_way_there():
+    config = ConsensusConfig(target="relative")
+    position = [[3.0, 4.0, 2.5], [8.0, 4.0, 1.5]]
+    centre = [[3.25, 4.5], [0.0, 0.0]]
+    raw = told(position, [2, 0], centre=centre, config=config)
+    assert raw[keys.OBSERVATION][0, :, 6:].tolist() == [[0.25, 0.5, 0], [-5, 0, 1]]
+    world = WildfireConfig(grid=(21, 11), observation="box")
+    scaled = told(position, [2, 0], centre=centre, config=config, world=world)
+    expected = torch.tensor([[0.25 / 10, 0.5 / 5, 0], [-5 / 10, 0, 1 / 1.5]])
+    torch.testing.assert_close(scaled[keys.OBSERVATION][0, :, 6:], expected)
+    assert scaled[consensus.TARGET].equal(raw[consensus.TARGET])
+
+
+@pytest.mark.parametrize("target", ["absolute", "relative"])
+def test_a_box_without_height_leaves_no_nan(target):
+    world = WildfireConfig(grid=(21, 11), altitude=(2.0, 2.0), observation="box")
+    config = ConsensusConfig(target=target)
+    rewritten = told([[3.0, 4.0, 2.0], [8.0, 4.0, 2.0]], [2, 0], config=config, world=world)
+    assert rewritten[keys.OBSERVATION].isfinite().all()
+
+
+def test_a_waypoint_is_redrawn_only_by_a_wanderer_closer_than_one():
+    # 0 and 1 wander, 2 discovers, 3 seeks it; all but 1 are at their waypoint.
+    position = [[5.0, 5.0, 2.0], [30.0, 5.0, 2.0], [50.0, 50.0, 2.0], [55.0, 50.0, 2.0]]
+    waypoint = torch.tensor(
+        [[[5.0, 5.9, 2.0], [30.0, 6.0, 2.0], [50.0, 50.5, 2.0], [55.0, 50.0, 2.5]]]
+    )
+    module = Consensus(WORLD, ConsensusConfig())
+    now = module.start(moment(position, [0, 0, 1, 0])).set(consensus.WAYPOINT, waypoint.clone())
+    now = module(now)
+    assert now[consensus.FOLLOWS].tolist() == [[-1, -1, 2, 2]]
+    kept = (now[consensus.WAYPOINT] == waypoint).all(-1)
+    assert kept.tolist() == [[False, True, True, True]]
+    assert now[consensus.TARGET][0, :2].equal(now[consensus.WAYPOINT][0, :2])
+
+
+def test_waypoints_are_uniform_in_the_box_and_differ():
+    module = Consensus(WORLD, ConsensusConfig())
+    here = torch.full((500, 4, 3), 2.0)
+    points = module.start(moment(here, [0] * 4))[consensus.WAYPOINT]
+    low, high = torch.tensor(WORLD.low), torch.tensor(WORLD.high)
+    assert (points >= low).all()
+    assert (points <= high).all()
+    unit = ((points - low) / (high - low)).flatten(0, 1)
+    torch.testing.assert_close(unit.mean(0), torch.full((3,), 0.5), atol=0.03, rtol=0)
+    torch.testing.assert_close(unit.std(0), torch.full((3,), 12**-0.5), atol=0.02, rtol=0)
+    assert len(unit.unique(dim=0)) == len(unit)
+    later = module.start(moment(here, [0] * 4, step=1))[consensus.WAYPOINT]
+    assert not (later == points).all(-1).any()
+
+
+RELEASED = ConsensusConfig(discoverer="any_fire", jitter=0.75)
+
+
+def test_any_fire_makes_a_discoverer_in_released():
+    position = in_a_row(2)
+    assert follows(position, [0, 0], old=[5, 0]) == [-1, -1]
+    assert follows(position, [0, 0], old=[5, 0], config=RELEASED) == [0, 0]
+    calm = ConsensusConfig(discoverer="any_fire")
+    where = {"centre": [[3.0, 1.0], [0.0, 0.0]], "old_centre": [[7.0, 2.0], [0.0, 0.0]]}
+    old_only = told(position, [0, 0], old=[5, 0], config=calm, **where)
+    assert old_only[consensus.TARGET][0, 0].tolist() == [7.0, 2.0, 2.0]
+    both = told(position, [1, 0], old=[5, 0], config=calm, **where)
+    assert both[consensus.TARGET][0, 0].tolist() == [3.0, 1.0, 2.0]
+
+
+def test_jitter_moves_x_and_y_of_near_targets_only():
+    # 0 discovers 0.5 cells away, 1 discovers 1 cell away, 2 seeks 0 from 3 cells away.
+    position = torch.tensor([[20.0, 20.0, 2.0], [40.0, 40.0, 3.0], [20.0, 23.0, 2.0]])
+    more = {
+        "position": position.expand(4000, 3, 3),
+        "new": [9, 9, 0],
+        "centre": [[20.0, 20.5], [41.0, 40.0], [0.0, 0.0]],
+    }
+    calm = told(**more)[consensus.TARGET]
+    noise = told(config=ConsensusConfig(jitter=0.75), **more)[consensus.TARGET] - calm
+    assert noise[:, 1:].abs().max() == 0
+    assert noise[..., 2].abs().max() == 0
+    near = noise[:, 0, :2]
+    # 0.396 is the variance of N(0, 0.75) clipped to +-1, 0.182 the share of it that is clipped.
+    assert near.abs().max() <= 1 + 1e-5
+    assert near.mean().abs() < 0.03
+    assert near.var().item() == pytest.approx(0.396, abs=0.02)
+    assert (near.abs() > 1 - 1e-5).float().mean().item() == pytest.approx(0.182, abs=0.02)
+    assert abs(torch.corrcoef(near.T)[0, 1]) < 0.05
+    later = told(config=ConsensusConfig(jitter=0.75), step=1, **more)[consensus.TARGET] - calm
+    assert abs(torch.corrcoef(torch.stack((near[:, 0], later[:, 0, 0])))[0, 1]) < 0.05
+
+
+def test_the_result_does_not_depend_on_the_order_of_uavs():
+    generator = torch.Generator().manual_seed(0)
+    position = torch.rand(200, 9, 3, generator=generator) * torch.tensor([45.0, 45.0, 3.0])
+    position[..., 2] += 1
+    new = torch.randint(0, 30, (200, 9), generator=generator) * (
+        torch.rand(200, 9, generator=generator) < 0.3
+    )
+    order = torch.randperm(9, generator=generator)
+    centre = position[..., :2] + 0.5
+    waypoint = torch.full((200, 9, 3), 60.0)  # far from everyone: nobody draws another
+    module = Consensus(WORLD, ConsensusConfig())
+
+    def run(order: Tensor) -> TensorDict:
+        now = moment(position[:, order], new[:, order], centre=centre[:, order])
+        return module(module.start(now).set(consensus.WAYPOINT, waypoint.clone()))
+
+    plain, permuted = run(torch.arange(9)), run(order)
+    for key in (consensus.TARGET, consensus.STREAK, consensus.FIRE_SCORE, keys.OBSERVATION):
+        assert permuted[key].equal(plain[key][:, order]), key
+    chosen = permuted[consensus.FOLLOWS]
+    named = torch.where(chosen < 0, -1, order[chosen.clamp(min=0)])
+    assert named.equal(plain[consensus.FOLLOWS][:, order])
+    roles = plain[consensus.FOLLOWS]
+    assert (roles < 0).any()
+    assert ((roles >= 0) & (roles != torch.arange(9))).any()

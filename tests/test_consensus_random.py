@@ -1,0 +1,91 @@
+"""Consensus on random networks against plain Python."""
+
+import random
+
+import pytest
+import torch
+from emberlink.comm import consensus
+from emberlink.comm.base import Communication
+from emberlink.comm.consensus import Consensus, ConsensusConfig
+from emberlink.envs import keys
+from emberlink.envs.config import WildfireConfig
+from emberlink.envs.reward import HeadingConfig
+from moments import moment
+from scalar_consensus import ScalarConsensus, heading_term
+from tensordict import TensorDict
+from torch import Tensor
+
+FORMS = ["folded_linear", "folded_exponential", "linear"]
+
+
+@pytest.mark.parametrize("uavs", range(1, 17))
+def test_random_networks_equal_plain_python(uavs):
+    envs, steps = 63, 5  # 16 sizes of 63 networks: 1,008 in all
+    dice = random.Random(uavs)
+    any_fire, form = uavs % 2 == 0, FORMS[uavs % 3]
+    config = ConsensusConfig(
+        range=dice.choice([4.0, 7.0, 10.0]),
+        discoverer="any_fire" if any_fire else "new_fire",
+        heading=HeadingConfig(form=form),
+    )
+    world = WildfireConfig()
+    talk = Communication(Consensus(world, config))
+    scalars = [ScalarConsensus(config.range, any_fire=any_fire) for _ in range(envs)]
+    low, high = torch.tensor(world.low), torch.tensor(world.high)
+    generator = torch.Generator().manual_seed(uavs)
+
+    def draw(*shape: int) -> Tensor:
+        return torch.rand(envs, uavs, *shape, generator=generator)
+
+    position, sees = low + draw(3) * (high - low), draw() < 0.3
+    before: TensorDict | None = None
+    followed = 0
+    for step in range(steps):
+        sees = torch.where(draw() < 0.75, sees, draw() < 0.3)  # so that streaks last
+        new = ((draw() * 9 + 1).long() * sees).masked_fill(draw() < 0.1, 0)
+        now = moment(
+            position,
+            new,
+            (draw() * 3).long() * sees,
+            centre=position[..., :2] + draw(2) - 0.5,
+            old_centre=position[..., :2] + draw(2) - 0.5,
+            beyond=draw(3) < 0.1,
+            step=step,
+        )
+        now = talk._reset(now, now) if before is None else talk._step(before, now)
+        for env in range(envs):
+            followed += compare(
+                scalars[env], now[env], None if before is None else before[env], config
+            )
+        before = now
+        position = (position + 2 * draw(3) - 1).clamp(low, high)
+    if uavs > 1:
+        assert followed > 0
+
+
+def compare(scalar: ScalarConsensus, now, before, config: ConsensusConfig) -> int:
+    """Asserts that a moment of one environment is as plain Python has it; counts the seekers."""
+    position = [tuple(p) for p in now[keys.POSITION].tolist()]
+    new, old = now[keys.NEW_FIRE].tolist(), now[keys.OLD_FIRE].tolist()
+    follows = scalar.step(position, new, old)
+    assert now[consensus.FOLLOWS].tolist() == follows
+    streaks = now[consensus.STREAK].tolist()
+    target = now[consensus.TARGET].tolist()
+    for i, leader in enumerate(follows):
+        assert streaks[i] == scalar.streak(i)
+        assert now[consensus.FIRE_SCORE][i] == scalar.fire_score(i)
+        if leader == i:
+            mean = now[consensus.ALTITUDE_SUM][i].item() / streaks[i]
+            assert mean == pytest.approx(scalar.average_altitude(i), abs=1e-12)
+            centre = now[keys.NEW_CENTRE if new[i] else keys.OLD_CENTRE][i].tolist()
+            assert target[i] == [*centre, position[i][2]]
+        elif leader >= 0:
+            assert tuple(target[i]) == position[leader]
+    if before is not None:
+        for i, reward in enumerate(now[keys.REWARD].flatten().tolist()):
+            start = tuple(before[keys.POSITION][i].tolist())
+            aim = tuple(before[consensus.TARGET][i].tolist())
+            term = heading_term(config.heading.form, start, position[i], aim)
+            term *= not now[keys.BEYOND][i].any()
+            assert reward == pytest.approx(term, abs=1e-4)
+    return sum(leader not in (-1, i) for i, leader in enumerate(follows))

@@ -1,0 +1,100 @@
+"""Imports run one way: envs <- comm <- trainers, envs <- policies <- trainers."""
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+FOLDERS = ("envs", "comm", "policies", "trainers", "configs")
+ALLOWED = {
+    "envs": {"envs", "configs"},
+    "comm": {"comm", "envs"},
+    "policies": {"policies", "envs"},
+    "trainers": {"trainers", "comm", "policies", "envs", "configs"},
+    "configs": set(),
+}
+
+
+def imported(source: str, folder: str) -> set[str]:
+    """The folders of emberlink that a file of `folder` imports, wherever in the file."""
+    found = set()
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom) and node.level == 1:
+            names = [f"emberlink.{folder}"]
+        elif isinstance(node, ast.ImportFrom) and node.level > 1:
+            names = [f"emberlink.{alias.name}" for alias in node.names]
+            names = [f"emberlink.{node.module}"] if node.module else names
+        elif isinstance(node, ast.ImportFrom):
+            names = [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
+        else:
+            continue
+        found |= {name.split(".")[1] for name in names if name.startswith("emberlink.")}
+    return found & set(FOLDERS)
+
+
+@pytest.mark.parametrize("folder", FOLDERS)
+def test_a_folder_imports_only_what_it_may(folder):
+    files = sorted((ROOT / folder).rglob("*.py"))
+    assert files
+    crossing = {
+        file.relative_to(ROOT).as_posix(): sorted(more)
+        for file in files
+        if (more := imported(file.read_text(), folder) - ALLOWED[folder])
+    }
+    assert crossing == {}
+
+
+def test_the_reader_of_imports_sees_every_form():
+    forms = {
+        "import emberlink.comm.base": {"comm"},
+        "from emberlink import trainers": {"trainers"},
+        "from emberlink.trainers.build import make_env": {"trainers"},
+        "def f():\n    from emberlink.policies import networks": {"policies"},
+        "from .uav import move": {"envs"},
+        "from ..comm import base": {"comm"},
+        "import torch": set(),
+    }
+    for source, folders in forms.items():
+        assert imported(source, "envs") == folders, source
+
+
+LOADED = """
+import sys
+before = set(sys.modules)
+import {module}
+heavy = {{"torch", "torchrl", "tensordict", "hydra", "wandb", "matplotlib", "pydantic"}}
+print(*sorted(heavy & (set(sys.modules) - before)))
+"""
+
+
+@pytest.mark.parametrize("module", ["emberlink.trainers.cli", "emberlink.trainers"])
+def test_the_command_line_starts_without_torch(module):
+    code = LOADED.format(module=module)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == []
+
+
+EFFECTS = """
+import random, threading, numpy, torch, torchrl.envs, torchrl.collectors, torchrl.objectives
+import torchrl.record.loggers
+state = torch.get_rng_state(), random.getstate(), torch.get_num_threads()
+threads, default = threading.active_count(), torch.get_default_dtype()
+import emberlink.envs, emberlink.envs.parallel, emberlink.comm.registry, emberlink.comm.consensus
+import emberlink.policies.scripted, emberlink.policies.actor_critic, emberlink.trainers.loop
+assert torch.equal(state[0], torch.get_rng_state())
+assert state[1:] == (random.getstate(), torch.get_num_threads())
+assert (threads, default) == (threading.active_count(), torch.get_default_dtype())
+"""
+
+
+def test_importing_does_no_work(tmp_path):
+    done = subprocess.run(
+        [sys.executable, "-c", EFFECTS], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    assert (done.returncode, done.stdout) == (0, ""), done.stderr
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,182 @@
+"""The stacked learner: nothing crosses UAVs, and each UAV learns by plain DDPG."""
+
+import copy
+
+import pytest
+import torch
+from emberlink.envs import keys
+from emberlink.policies.actor_critic import make_actor, make_critic
+from emberlink.trainers.config import LearnerConfig
+from emberlink.trainers.learner import Learner
+from emberlink.trainers.memory import DONE, TERMINATED
+from single_ddpg import SingleActor, SingleCritic, SingleDDPG, copy_uav, matched
+from tensordict import TensorDict
+from torchrl.data import Bounded, Composite, Unbounded
+
+UAVS, FEATURES, ACTIONS, HIDDEN, BATCH = 3, 9, 3, (16, 12), 24
+RATES = {
+    "gamma": 0.95,
+    "tau": 0.05,
+    "actor_lr": 1e-3,
+    "critic_lr": 1e-2,
+    "critic_weight_decay": 0.01,
+}
+
+
+def make_learner() -> Learner:
+    observation = Composite({keys.OBSERVATION: Unbounded((1, UAVS, FEATURES))}, shape=(1,))
+    action = Composite({keys.ACTION: Bounded(-1, 1, (1, UAVS, ACTIONS))}, shape=(1,))
+    config = LearnerConfig(hidden=HIDDEN, updates=1, batch=BATCH, capacity=100, **RATES)
+    generator = torch.Generator().manual_seed(5)
+    networks = (
+        make(observation, action, HIDDEN, generator=generator) for make in (make_actor, make_critic)
+    )
+    return Learner(*networks, config)
+
+
+def make_batch(seed: int, size: int = BATCH, *, done=False, terminated=False) -> TensorDict:
+    generator = torch.Generator().manual_seed(seed)
+
+    def draw(width: int) -> torch.Tensor:
+        return torch.randn(size, UAVS, width, generator=generator)
+
+    flags = {
+        DONE: torch.full((size, UAVS, 1), done),
+        TERMINATED: torch.full((size, UAVS, 1), terminated),
+    }
+    following = {keys.OBSERVATION: draw(FEATURES), keys.REWARD: 5 * draw(1), **flags}
+    return TensorDict(
+        {
+            keys.OBSERVATION: draw(FEATURES),
+            keys.ACTION: draw(ACTIONS).tanh(),
+            "next": TensorDict(following, batch_size=[size]),
+        },
+        batch_size=[size],
+    )
+
+
+def of_uav(batch: TensorDict, uav: int) -> tuple[torch.Tensor, ...]:
+    following = batch["next"]
+    tensors = (
+        batch[keys.OBSERVATION],
+        batch[keys.ACTION],
+        following[keys.REWARD],
+        following[keys.OBSERVATION],
+        following[TERMINATED],
+    )
+    return tuple(t[:, uav] for t in tensors)
+
+
+def networks(learner: Learner) -> dict[str, torch.nn.Module]:
+    """Copies of the actors, the critics and their targets, with their present weights."""
+    copies = {}
+    for name in ("actor", "value"):
+        module = getattr(learner.loss, f"{name}_network")
+        for kind in ("", "target_"):
+            with getattr(learner.loss, f"{kind}{name}_network_params").data.to_module(module):
+                copies[kind + name] = copy.deepcopy(module.module)
+    return copies
+
+
+def single(learner: Learner, uav: int) -> SingleDDPG:
+    stacks = networks(learner)
+    actor = copy_uav(stacks["actor"], SingleActor(FEATURES, ACTIONS, HIDDEN), uav)
+    critic = copy_uav(stacks["value"], SingleCritic(FEATURES, ACTIONS, HIDDEN), uav)
+    return SingleDDPG(actor, critic, **RATES)
+
+
+@pytest.mark.parametrize("which", [0, 1])
+@pytest.mark.parametrize("uav", range(UAVS))
+def test_no_gradient_crosses_uavs(which, uav):
+    learner = make_learner()
+    learner.losses(make_batch(0))[which][uav].backward()
+    trained = "actor_network_params", "value_network_params"
+    for place, network in enumerate(trained):
+        for name, weight in getattr(learner.loss, network).items(True, True):
+            gradient = weight.grad
+            if place != which:
+                assert gradient is None or not gradient.any(), (network, name)
+                continue
+            others = [k for k in range(UAVS) if k != uav]
+            assert gradient[uav].any(), (network, name)
+            assert not gradient[others].any(), (network, name)
+
+
+def test_another_uavs_batch_changes_nothing():
+    one, other = make_learner(), make_learner()
+    batch = make_batch(0)
+    changed = batch.clone()
+    changed[keys.OBSERVATION][:, 1:] += 1
+    changed["next", *keys.REWARD][:, 1:] -= 3
+    one.update(batch)
+    other.update(changed)
+    for name, stack in networks(one).items():
+        mine, theirs = (
+            torch.cat([weight.flatten(1) for weight in network.parameters()], -1)
+            for network in (stack, networks(other)[name])
+        )
+        assert mine[0].equal(theirs[0]), name
+        for uav in range(1, UAVS):
+            assert not mine[uav].equal(theirs[uav]), name
+
+
+def test_each_uav_of_the_stack_equals_a_single_ddpg():
+    learner = make_learner()
+    singles = [single(learner, uav) for uav in range(UAVS)]
+    for step in range(10):
+        batch = make_batch(step)
+        actor_losses, critic_losses = learner.update(batch)
+        for uav, ddpg in enumerate(singles):
+            expected = ddpg.update(*of_uav(batch, uav))
+            assert (actor_losses[uav].item(), critic_losses[uav].item()) == pytest.approx(
+                expected, rel=1e-4, abs=1e-5
+            )
+    assert learner.updates == 10
+    hand = {
+        "actor": "actor",
+        "value": "critic",
+        "target_actor": "target_actor",
+        "target_value": "target_critic",
+    }
+    for kind, stack in networks(learner).items():
+        for uav, ddpg in enumerate(singles):
+            for name, ours, theirs in matched(stack, getattr(ddpg, hand[kind]), uav):
+                torch.testing.assert_close(ours, theirs, atol=2e-6, rtol=0, msg=f"{kind} {name}")
+
+
+def test_updates_move_the_networks_and_their_targets():
+    learner = make_learner()
+    before = networks(learner)
+    learner.update(make_batch(0))
+    after = networks(learner)
+    for name, stack in after.items():
+        moved = {
+            key: (value - before[name].state_dict()[key]).abs().max().item()
+            for key, value in stack.state_dict().items()
+        }
+        assert min(moved.values()) > 0, (name, moved)
+    # After one update a target has gone the share tau of the way of its network.
+    for name in ("actor", "value"):
+        for start, target, network in zip(
+            before[name].parameters(),
+            after[f"target_{name}"].parameters(),
+            after[name].parameters(),
+            strict=True,
+        ):
+            torch.testing.assert_close(target, start + 0.05 * (network - start), atol=1e-7, rtol=0)
+
+
+@pytest.mark.parametrize("terminated", [False, True])
+def test_the_time_limit_is_bootstrapped(terminated):
+    learner = make_learner()
+    for seed in range(5):  # targets that differ from the networks
+        learner.update(make_batch(seed))
+    batch = make_batch(9, size=1, done=True, terminated=terminated)
+    _, losses = learner.losses(batch)
+    stacks = networks(learner)
+    following = batch["next", *keys.OBSERVATION]
+    value = stacks["value"](batch[keys.OBSERVATION], batch[keys.ACTION])
+    beyond = stacks["target_value"](following, stacks["target_actor"](following))
+    assert beyond.abs().min() > 1e-4
+    target = batch["next", *keys.REWARD] + (0 if terminated else 0.95 * beyond)
+    torch.testing.assert_close(losses, (value - target).square()[0, :, 0], atol=1e-5, rtol=1e-5)

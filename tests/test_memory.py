@@ -1,0 +1,130 @@
+"""Whose transitions a UAV samples, how many a memory holds, and what is stored."""
+
+import pytest
+import torch
+from emberlink.envs import keys
+from emberlink.trainers import make_env
+from emberlink.trainers.memory import DONE, TERMINATED, make_memory, rows_needed, to_rows
+from tensordict import TensorDict
+
+UAVS = 4
+
+
+def memory(*, shared: bool, capacity: int = 4000, batch: int = 64, most: int = 10**9, uavs=UAVS):
+    return make_memory(
+        uavs,
+        shared=shared,
+        capacity=capacity,
+        batch=batch,
+        most=most,
+        device="cpu",
+        generator=torch.Generator().manual_seed(0),
+    )
+
+
+def labelled(first: int, count: int, uavs: int = UAVS) -> TensorDict:
+    """Rows in which every number of a transition tells its row and its UAV."""
+    row = torch.arange(first, first + count).unsqueeze(-1).expand(count, uavs)
+    label = torch.stack((row, torch.arange(uavs).expand(count, uavs)), -1).float()
+    flag = torch.zeros(count, uavs, 1, dtype=torch.bool)
+    following = {
+        "observation": label + 0.5,
+        "reward": label[..., :1] * 100 + label[..., 1:],
+        "done": flag,
+        "terminated": flag.clone(),
+    }
+    return TensorDict(
+        {"observation": label, "action": -label, "next": following}, batch_size=[count, uavs]
+    )
+
+
+def drawn(buffer, samples: int) -> torch.Tensor:
+    """(row, UAV) of the transitions in many samples, [draws, uavs, 2]."""
+    return torch.cat([buffer.sample()[keys.OBSERVATION] for _ in range(samples)]).long()
+
+
+def test_private_memory_samples_a_uavs_own_transitions():
+    buffer = memory(shared=False)
+    buffer.extend(labelled(0, 50))
+    sample = drawn(buffer, 40)
+    assert sample.shape == (40 * 64, UAVS, 2)
+    assert (sample[..., 1] == torch.arange(UAVS)).all()
+    counts = torch.stack([sample[:, k, 0].bincount(minlength=50) for k in range(UAVS)])
+    assert counts.min() > 25  # 51 expected
+    assert counts.max() < 85
+
+
+def test_shared_memory_samples_everyones_about_equally():
+    buffer = memory(shared=True)
+    buffer.extend(labelled(0, 50))
+    sample = drawn(buffer, 200)
+    for reader in range(UAVS):
+        whose = sample[:, reader, 1].bincount(minlength=UAVS) / len(sample)
+        torch.testing.assert_close(whose, torch.full((UAVS,), 1 / UAVS), atol=0.02, rtol=0)
+        each = (sample[:, reader, 0] * UAVS + sample[:, reader, 1]).bincount(minlength=50 * UAVS)
+        assert each.min() > 30  # 64 expected
+        assert each.max() < 105
+
+
+@pytest.mark.parametrize("shared", [False, True])
+def test_each_uav_has_its_own_draws(shared):
+    buffer = memory(shared=shared)
+    buffer.extend(labelled(0, 1000))
+    rows = drawn(buffer, 1)[..., 0]
+    for other in range(1, UAVS):
+        assert (rows[:, 0] == rows[:, other]).float().mean() < 0.1
+    assert not rows.equal(drawn(buffer, 1)[..., 0])
+
+
+@pytest.mark.parametrize("shared", [False, True])
+def test_a_sampled_transition_is_one_that_was_stored(shared):
+    buffer = memory(shared=shared)
+    buffer.extend(labelled(0, 300))
+    sample = buffer.sample()
+    assert sample.batch_size == (64,)
+    label, following = sample[keys.OBSERVATION], sample["next"]
+    assert sample[keys.ACTION].equal(-label)
+    assert following[keys.OBSERVATION].equal(label + 0.5)
+    assert following[keys.REWARD].equal(label[..., :1] * 100 + label[..., 1:])
+    assert following[DONE].shape == following[TERMINATED].shape == (64, UAVS, 1)
+
+
+def test_capacity_counts_uav_transitions():
+    million = {"capacity": 1_000_000, "uavs": 6}
+    assert memory(shared=True, **million)._storage.max_size == 166_667
+    assert memory(shared=False, **million)._storage.max_size == 1_000_000
+    # Nothing is allocated that a run cannot fill.
+    assert memory(shared=False, most=300, **million)._storage.max_size == 300
+
+
+@pytest.mark.parametrize(("shared", "rows"), [(True, 10), (False, 40)])
+def test_the_oldest_transitions_are_overwritten(shared, rows):
+    buffer = memory(shared=shared, capacity=40, batch=500)
+    for first in range(0, 100, 5):
+        buffer.extend(labelled(first, 5))
+    assert len(buffer) == rows
+    assert drawn(buffer, 2)[..., 0].unique().tolist() == list(range(100 - rows, 100))
+
+
+@pytest.mark.parametrize(
+    ("uavs", "shared", "rows"), [(6, True, 86), (6, False, 512), (1, True, 512), (64, True, 8)]
+)
+def test_a_full_batch_is_counted_in_transitions(uavs, shared, rows):
+    assert rows_needed(uavs, shared=shared, batch=512) == rows
+
+
+def test_rows_are_what_the_environment_did():
+    env = make_env("consensus", num_envs=2, horizon=3, num_uavs=UAVS)
+    rollout = env.rollout(3, break_when_any_done=False)
+    rows = to_rows(rollout)
+    assert rows.batch_size == (6, UAVS)
+    for at in range(6):
+        step = rollout[at // 3, at % 3]
+        row = rows[at]
+        assert row["observation"].equal(step[keys.OBSERVATION])
+        assert row["action"].equal(step[keys.ACTION])
+        assert row["next", "observation"].equal(step["next", *keys.OBSERVATION])
+        assert row["next", "reward"].equal(step["next", *keys.REWARD])
+        # The horizon ends the episode, and it is no terminal state.
+        assert row["next", "done"].flatten().tolist() == [at % 3 == 2] * UAVS
+        assert not row["next", "terminated"].any()

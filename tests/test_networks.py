@@ -1,0 +1,98 @@
+"""The stacked networks against one torch.nn network per UAV."""
+
+import math
+
+import pytest
+import torch
+from emberlink.envs import keys, specs
+from emberlink.policies.actor_critic import STATE_ACTION_VALUE, make_actor, make_critic
+from emberlink.policies.networks import StackedActor, StackedCritic
+from single_ddpg import SingleActor, SingleCritic, copy_uav
+from tensordict import TensorDict
+
+UAVS, FEATURES, ACTIONS, HIDDEN = 4, 9, 3, (20, 12)
+SIZES = UAVS, FEATURES, ACTIONS, HIDDEN
+
+
+def scrambled(network):
+    """Weights of ordinary size everywhere, scales and shifts of the norms included."""
+    generator = torch.Generator().manual_seed(1)
+    with torch.no_grad():
+        for parameter in network.parameters():
+            parameter.uniform_(-0.7, 0.7, generator=generator)
+    return network
+
+
+@pytest.mark.parametrize("batch", [(), (5,), (2, 7)])
+def test_each_actor_of_the_stack_equals_its_own_network(batch):
+    stack = scrambled(StackedActor(*SIZES))
+    observation = torch.randn(*batch, UAVS, FEATURES)
+    actions = stack(observation)
+    assert actions.shape == (*batch, UAVS, ACTIONS)
+    for uav in range(UAVS):
+        single = copy_uav(stack, SingleActor(*SIZES[1:]), uav)
+        expected = single(observation[..., uav, :])
+        torch.testing.assert_close(actions[..., uav, :], expected, atol=1e-6, rtol=1e-5)
+
+
+@pytest.mark.parametrize("batch", [(), (5,), (2, 7)])
+def test_each_critic_of_the_stack_equals_its_own_network(batch):
+    stack = scrambled(StackedCritic(*SIZES))
+    observation, action = torch.randn(*batch, UAVS, FEATURES), torch.randn(*batch, UAVS, ACTIONS)
+    values = stack(observation, action)
+    assert values.shape == (*batch, UAVS, 1)
+    for uav in range(UAVS):
+        single = copy_uav(stack, SingleCritic(*SIZES[1:]), uav)
+        expected = single(observation[..., uav, :], action[..., uav, :])
+        torch.testing.assert_close(values[..., uav, :], expected, atol=1e-5, rtol=1e-5)
+
+
+def test_initial_weights_are_those_of_the_ddpg_paper():
+    critic = StackedCritic(6, 9, 3, generator=torch.Generator().manual_seed(0))
+    bounds = {
+        "first": 1 / math.sqrt(9),
+        "second": 1 / math.sqrt(400),
+        "action": 1 / math.sqrt(3),
+        "value": 3e-3,
+    }
+    for name, bound in bounds.items():
+        for values in (critic.get_submodule(name).weight, critic.get_submodule(name).bias):
+            assert values.abs().max() <= bound
+            assert values.abs().max() > 0.5 * bound
+            assert values.mean().abs() < 0.5 * bound
+    assert critic.first.weight.shape == (6, 9, 400)
+    assert critic.second.weight.shape == (6, 400, 300)
+    for norm in (critic.first_norm, critic.second_norm):
+        assert (norm.weight == 1).all()
+        assert (norm.bias == 0).all()
+    actor = StackedActor(6, 9, 3)
+    assert actor.action.weight.abs().max() <= 3e-3
+    assert actor.first.weight.shape[2:] == (400,)
+    assert actor.second.weight.shape[1:] == (400, 300)
+
+
+def test_uavs_start_from_different_weights_and_a_seed_repeats_them():
+    def drawn(seed: int) -> list[torch.Tensor]:
+        actor = StackedActor(*SIZES, generator=torch.Generator().manual_seed(seed))
+        return [weight for name, weight in actor.named_parameters() if "norm" not in name]
+
+    for one, same, other in zip(drawn(3), drawn(3), drawn(4), strict=True):
+        assert one.equal(same)
+        assert not one.equal(other)
+        for uav in range(1, UAVS):
+            assert not one[0].equal(one[uav])
+
+
+def test_modules_read_and_write_the_keys_of_the_environment():
+    observation, action = specs.observation_spec(5, 4), specs.action_spec(5, 4)
+    actor, critic = (
+        make_actor(observation, action, HIDDEN),
+        make_critic(observation, action, HIDDEN),
+    )
+    moment = TensorDict({keys.OBSERVATION: torch.randn(5, 4, 6)}, batch_size=[5])
+    critic(actor(moment))
+    assert moment[keys.ACTION].shape == (5, 4, 3)
+    assert moment[keys.ACTION].abs().max() < 1
+    assert moment[STATE_ACTION_VALUE].shape == (5, 4, 1)
+    assert actor.module.first.weight.shape == (4, 6, HIDDEN[0])
+    assert actor.module.second.weight.shape == (4, *HIDDEN)

@@ -1,0 +1,124 @@
+"""Exploration: Ornstein-Uhlenbeck noise that starts anew with the episode, and none without."""
+
+import math
+
+import pytest
+import torch
+from emberlink.envs import keys
+from emberlink.policies.actor_critic import make_actor, with_noise
+from emberlink.trainers import evaluate, make_env
+from emberlink.trainers.config import resolve
+from emberlink.trainers.loop import Trainer
+from tensordict import TensorDict
+from torchrl.data import Bounded, Composite, Unbounded
+from torchrl.envs import ExplorationType, set_exploration_type
+
+UAVS, ENVS = 2, 4000
+
+
+class Still(torch.nn.Module):
+    """An actor that always answers 0, so that an action is its noise."""
+
+    def forward(self, observation: torch.Tensor) -> torch.Tensor:
+        return torch.zeros_like(observation[..., :3])
+
+
+def explorer(*, theta: float, sigma: float, dt: float, envs: int = ENVS, network=None):
+    observation = Composite({keys.OBSERVATION: Unbounded((envs, UAVS, 6))}, shape=(envs,))
+    action = Composite({keys.ACTION: Bounded(-1.0, 1.0, (envs, UAVS, 3))}, shape=(envs,))
+    actor = make_actor(observation, action, (8, 8))
+    actor.module = network or Still()
+    return with_noise(actor, action, theta=theta, sigma=sigma, dt=dt)
+
+
+def play(policy, starts: list[torch.Tensor | bool], envs: int = ENVS) -> torch.Tensor:
+    """The actions of consecutive steps, [steps, envs, uavs, 3]; `starts` marks new episodes."""
+    torch.manual_seed(0)
+    actions = []
+    moment = TensorDict({keys.OBSERVATION: torch.ones(envs, UAVS, 6)}, batch_size=[envs])
+    for start in starts:
+        moment["is_init"] = torch.as_tensor(start).expand(envs, 1).clone()
+        moment = policy(moment)
+        actions.append(moment[keys.ACTION].clone())
+    return torch.stack(actions)
+
+
+def test_the_noise_is_an_ornstein_uhlenbeck_process():
+    theta, sigma, dt = 0.8, 0.2, 0.25
+    x = play(explorer(theta=theta, sigma=sigma, dt=dt), [True, *[False] * 11])
+    assert x.abs().max() < 1  # nothing is clipped, so that the action is the noise
+    before, after = x[3:-1].flatten(), x[4:].flatten()
+    slope = (before * (after - before)).mean() / before.square().mean()
+    assert slope.item() == pytest.approx(-theta * dt, abs=0.01)
+    rest = after - before - slope * before
+    assert rest.std().item() == pytest.approx(sigma * math.sqrt(dt), rel=0.01)
+    assert abs(rest.mean().item()) < 0.002
+    # Every UAV and every component has its own.
+    flat = x[-1].reshape(ENVS, -1).T
+    assert (torch.corrcoef(flat) - torch.eye(UAVS * 3)).abs().max() < 0.08
+
+
+def test_the_noise_starts_anew_where_an_episode_does():
+    starts = torch.zeros(ENVS, 1, dtype=torch.bool)
+    starts[: ENVS // 2] = True
+    policy = explorer(theta=0.0, sigma=0.1, dt=1.0)
+    x = play(policy, [True, *[False] * 8, starts, False])
+    spread = x[:, : ENVS // 2].std((1, 2, 3)), x[:, ENVS // 2 :].std((1, 2, 3))
+    walk = 0.1 * torch.arange(1, 12).sqrt()
+    torch.testing.assert_close(spread[1], walk, rtol=0.03, atol=0)
+    torch.testing.assert_close(spread[0][:9], walk[:9], rtol=0.03, atol=0)
+    torch.testing.assert_close(spread[0][9:], walk[:2], rtol=0.03, atol=0)
+
+
+def test_actions_stay_in_their_box():
+    x = play(explorer(theta=0.1, sigma=5.0, dt=1.0, envs=50), [True, *[False] * 20], envs=50)
+    assert x.abs().max() == 1
+    assert (x.abs() == 1).float().mean() > 0.5
+
+
+def test_training_resets_the_noise_with_each_episode(tmp_path):
+    short = [
+        "env.horizon=6",
+        "env.num_uavs=4",
+        "episodes=3",
+        "num_envs=300",
+        "learner.hidden=[4,4]",
+    ]
+    noise = ["exploration.theta=0", "exploration.sigma=0.2", "exploration.dt=0.25"]
+    config = resolve("independent", [*short, *noise, f"output={tmp_path}"])
+    trainer = Trainer(config)
+    with torch.no_grad():  # an actor that answers 0
+        trainer.actor.module.action.weight.zero_()
+        trainer.actor.module.action.bias.zero_()
+    spread = [collected[keys.ACTION].std().item() for collected in trainer.collector]
+    trainer.collector.shutdown()
+    expected = [0.1 * math.sqrt(step) for step in range(1, 7)] * 3
+    assert spread == pytest.approx(expected, rel=0.06)
+
+
+def test_a_frozen_policy_is_deterministic():
+    policy = explorer(theta=0.1, sigma=5.0, dt=1.0, envs=7)
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        assert not play(policy, [True, False], envs=7).any()
+
+
+def test_an_evaluation_acts_exactly_as_the_actor_says():
+    env = make_env("consensus", num_envs=3, num_uavs=UAVS, horizon=12)
+    actor = make_actor(env.observation_spec, env.full_action_spec, (8, 8))
+    torch.nn.init.normal_(actor.module.action.weight, std=0.3)
+    watched = []
+
+    def policy(moment):
+        watched.append((moment[keys.OBSERVATION].clone(), actor(moment)[keys.ACTION].clone()))
+        return moment
+
+    measured = []
+    for seed in (1, 2):
+        torch.manual_seed(seed)
+        env.set_seed(5)
+        measured.append(evaluate.play(env, policy))
+    assert len(watched) == 24
+    for observation, action in watched:
+        assert action.equal(actor.module(observation))
+    for name, values in measured[0].items():
+        assert values.equal(measured[1][name]), name

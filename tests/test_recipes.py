@@ -1,0 +1,135 @@
+"""All four recipes under all three setups: a short training, its files, and its repetition."""
+
+import json
+import math
+
+import pytest
+import torch
+import yaml
+from emberlink.envs import keys, metrics
+from emberlink.trainers import report
+from emberlink.trainers.config import resolve
+from emberlink.trainers.loop import Trainer
+from emberlink.trainers.memory import rows_needed
+from emberlink.trainers.run_folder import RunFolder
+
+METHODS = ["independent", "shared_memory", "positional", "consensus"]
+SETUPS = ["paper", "released", "tuned"]
+EPISODES, HORIZON, ENVS, BATCH = 3, 70, 2, 32
+
+
+def short(method: str, output, *more: str, setup: str = "paper", seed: int = 0):
+    return resolve(
+        method,
+        [
+            *(f"setup={setup}", f"seed={seed}", f"output={output}"),
+            *(f"episodes={EPISODES}", f"env.horizon={HORIZON}", f"num_envs={ENVS}"),
+            *(f"learner.batch={BATCH}", "learner.hidden=[32,32]", "evaluation.interval=0"),
+            *more,
+        ],
+    )
+
+
+def trained(config) -> Trainer:
+    trainer = Trainer(config)
+    trainer.start()
+    trainer.train()
+    return trainer
+
+
+@pytest.mark.parametrize("setup", SETUPS)
+@pytest.mark.parametrize("method", METHODS)
+def test_a_recipe_trains(method, setup, tmp_path):
+    config = short(method, tmp_path, setup=setup)
+    trainer = Trainer(config)
+    initial = {name: weight.clone() for name, weight in trainer.weights().items()}
+    trainer.start()
+    seen = []
+    trainer.train(lambda progress: seen.append((progress.step, progress.episode)))
+    assert seen == [(step, step // HORIZON) for step in range(1, EPISODES * HORIZON + 1)]
+
+    run = trainer.run
+    assert list(tmp_path.iterdir()) == [run.path]
+    assert RunFolder(run.path).config() == config
+    check_lines(run, config)
+    networks = {name: weight for name, weight in trainer.weights().items() if "_params" in name}
+    assert len(networks) == 2 * (10 + 12)  # actor and critic, and the target of each
+    for name, weight in networks.items():
+        assert weight.isfinite().all(), name
+        assert not weight.equal(initial[name]), name
+    check_actor(run, config, trainer)
+
+
+def check_lines(run: RunFolder, config) -> None:
+    """One line an episode, all measures in it, and as many updates as there were full batches."""
+    text = (run.path / "metrics.jsonl").read_text()
+    lines = [json.loads(line) for line in text.splitlines()]
+    assert len(lines) == EPISODES
+    shared = config.memory == "shared"
+    rows = rows_needed(config.env.num_uavs, shared=shared, batch=BATCH)
+    without = math.ceil(rows / ENVS) - 1
+    for episode, line in enumerate(lines, start=1):
+        assert line["episode"] == episode
+        assert line["updates"] == episode * HORIZON - without
+        assert line.keys() >= {*metrics.NAMES, "loss_actor", "loss_critic"}
+        assert all(math.isfinite(value) for value in line.values())
+        assert 0 <= line["coverage"] <= 100
+        assert 1 <= line["tracking_first"] <= line["tracking_last"] <= HORIZON
+
+
+def check_actor(run: RunFolder, config, trainer: Trainer) -> None:
+    """The checkpoint's actor acts as the trained one does."""
+    checkpoint = run.checkpoint()
+    assert checkpoint.name == f"step_{EPISODES * HORIZON:09d}.safetensors"
+    loaded = report.load_actor(run, config, checkpoint)
+    rollout = trainer.env.rollout(5, trainer.actor)
+    for step in range(5):
+        again = loaded(rollout[:, step].select(keys.OBSERVATION))
+        assert again[keys.ACTION].equal(rollout[:, step][keys.ACTION])
+    assert rollout[keys.ACTION].abs().max() > 0
+
+
+@pytest.mark.parametrize("method", ["independent", "consensus"])
+def test_a_seed_repeats_a_run_byte_for_byte(method, tmp_path):
+    def run(name: str, seed: int) -> tuple[bytes, dict]:
+        torch.manual_seed(len(name))  # whatever went on before must not matter
+        config = short(method, tmp_path / name, "episodes=2", "env.horizon=40", seed=seed)
+        trainer = trained(config)
+        return (trainer.run.path / "metrics.jsonl").read_bytes(), trainer.weights()
+
+    (first, weights), (again, same), (other, _) = run("one", 7), run("again", 7), run("other", 8)
+    assert first == again
+    assert first != other
+    for name, weight in weights.items():
+        assert weight.equal(same[name]), name
+
+
+def test_evaluations_and_checkpoints_come_at_their_intervals(tmp_path):
+    config = short(
+        "consensus",
+        tmp_path,
+        *("episodes=5", "env.horizon=20", "checkpoint_interval=2"),
+        *("evaluation.interval=2", "evaluation.interval_fires=2"),
+    )
+    run = trained(config).run
+    frozen = {f"{fire}/{name}" for fire in ("huygens", "paper") for name in metrics.NAMES}
+    for line in run.lines():
+        assert line.keys() & frozen == (frozen if line["episode"] in (2, 4) else set())
+    saved = sorted(path.name for path in (run.path / "checkpoints").iterdir())
+    assert saved == [f"step_{20 * episode:09d}.safetensors" for episode in (2, 4, 5)]
+    assert run.checkpoint().name == saved[-1]
+    assert len(run.lines("timing.jsonl")) == 5
+
+
+def test_several_updates_a_step(tmp_path):
+    config = short("shared_memory", tmp_path, "episodes=1", "env.horizon=20", "learner.updates=3")
+    trainer = trained(config)
+    assert trainer.learner.updates == 3 * (20 - 2)  # 32 of 12 transitions a step: from step 3 on
+
+
+def test_two_runs_in_the_same_second_get_folders_of_their_own(tmp_path):
+    config = short("independent", tmp_path)
+    folders = {RunFolder.create(config).path for _ in range(3)}
+    assert len(folders) == 3
+    for folder in folders:
+        assert yaml.safe_load((folder / "config.yaml").read_text())["method"] == "independent"

@@ -1,0 +1,132 @@
+"""The constants that a recipe really runs with, against the table they were agreed in."""
+
+import dataclasses
+
+import pytest
+from emberlink.comm.consensus import ConsensusConfig
+from emberlink.envs.config import WildfireConfig, from_plain
+from emberlink.envs.reward import RewardConfig
+from emberlink.trainers.config import build_comm, known, resolve, to_values
+
+METHODS = ["independent", "shared_memory", "positional", "consensus"]
+PAPER, RELEASED = "paper", "released"
+
+# key -> value in setup paper, value in setup released
+TABLE = {
+    "env.grid": ((30, 30), (30, 30)),
+    "env.altitude": ((1.0, 4.0), (1.0, 4.0)),
+    "env.num_uavs": (6, 6),
+    "env.horizon": (1000, 1000),
+    "episodes": (200, 200),
+    "env.view_angle": (30.0, 30.0),
+    "env.displacement": (1.0, 0.1),
+    "env.reward.new_fire": (1.0, 12.0),
+    "env.reward.old_fire": (-4.0, 6.0),
+    "env.reward.no_fire": (-10.0, -4.0),
+    "env.reward.exit": (-100.0, -150.0),
+    "env.reward.exit_axes": ("xyz", "xy"),
+    "env.observation": ("raw", "raw"),
+    "learner.hidden": ((400, 300), (400, 300)),
+    "learner.actor_lr": (1e-4, 1e-4),
+    "learner.critic_lr": (1e-3, 1e-3),
+    "learner.critic_weight_decay": (0.01, 0.01),
+    "learner.tau": (0.001, 0.001),
+    "learner.capacity": (1_000_000, 1_000_000),
+    "learner.batch": (512, 512),
+    "learner.updates": (1, 1),
+    "num_envs": (1, 1),
+    "exploration.theta": (0.2, 0.2),
+    "exploration.sigma": (0.15, 0.15),
+    "exploration.dt": (0.01, 0.01),
+    "fire.name": ("paper", "paper"),
+}
+GAMMA = {(method, setup): 0.95 for method in METHODS for setup in (PAPER, RELEASED)}
+GAMMA["independent", RELEASED] = 0.92
+# What a method is: whose memory, and what is heard.
+SWITCHES = {
+    "independent": ("private", "silent"),
+    "shared_memory": ("shared", "silent"),
+    "positional": ("shared", "positional"),
+    "consensus": ("shared", "consensus"),
+}
+CONSENSUS = {
+    "range": (10.0, 10.0),
+    "discoverer": ("new_fire", "any_fire"),
+    "jitter": (0.0, 0.75),
+    "target": ("absolute", "absolute"),
+    "heading.form": ("folded_linear", "folded_exponential"),
+    "heading.weight": (1.0, 1.0),
+    "heading.circle": (0.0, 0.0),
+}
+
+
+def read(config, key: str):
+    for part in key.split("."):
+        config = getattr(config, part)
+    return config
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("column", [0, 1], ids=[PAPER, RELEASED])
+def test_every_row_of_the_table(method, column):
+    setup = (PAPER, RELEASED)[column]
+    config = resolve(method, [f"setup={setup}"])
+    assert (config.method, config.setup) == (method, setup)
+    assert {key: read(config, key) for key in TABLE} == {k: v[column] for k, v in TABLE.items()}
+    assert config.learner.gamma == GAMMA[method, setup]
+    settings = build_comm(config).config
+    if method == "consensus":
+        expected = {key: values[column] for key, values in CONSENSUS.items()}
+        assert {key: read(settings, key) for key in CONSENSUS} == expected
+    else:
+        assert dataclasses.fields(settings) == ()
+
+
+@pytest.mark.parametrize("setup", ["paper", "released", "tuned"])
+def test_methods_differ_in_two_switches(setup):
+    for method, (memory, comm) in SWITCHES.items():
+        config = resolve(method, [f"setup={setup}"])
+        assert (config.memory, config.comm["name"]) == (memory, comm)
+    # But for the discount of one method in `released` and of one in `tuned`, and nothing else.
+    plain = {"method", "memory", "comm", "learner"}
+    one, *others = (to_values(resolve(method, [f"setup={setup}"])) for method in METHODS)
+    gamma = {PAPER: [], RELEASED: METHODS[1:], "tuned": ["consensus"]}[setup]
+    for other in others:
+        assert {k: one[k] for k in one.keys() - plain} == {k: other[k] for k in one.keys() - plain}
+        changed = {key for key in one["learner"] if one["learner"][key] != other["learner"][key]}
+        assert changed == ({"gamma"} if other["method"] in gamma else set())
+
+
+def test_paper_is_the_default():
+    for method in METHODS:
+        assert resolve(method) == resolve(method, ["setup=paper"])
+
+
+@pytest.mark.parametrize(
+    ("setup", "fire"), [("paper", "paper"), ("released", "paper"), ("tuned", "huygens")]
+)
+def test_each_setup_chooses_its_fire_and_the_user_may_choose_another(setup, fire):
+    assert resolve("consensus", [f"setup={setup}"]).fire.name == fire
+    for other in known("fire"):
+        assert resolve("consensus", [f"setup={setup}", f"fire={other}"]).fire.name == other
+
+
+def test_tuned_keeps_the_physics_of_released():
+    ours, theirs = (resolve("consensus", [f"setup={s}"]).env for s in ("tuned", RELEASED))
+    for key in ("grid", "num_uavs", "horizon", "altitude", "view_angle", "displacement"):
+        assert getattr(ours, key) == getattr(theirs, key), key
+
+
+def test_defaults_in_code_are_setup_paper():
+    config = resolve("consensus")
+    assert WildfireConfig() == config.env
+    assert RewardConfig() == config.env.reward
+    settings = {key: value for key, value in config.comm.items() if key != "name"}
+    assert settings.keys() == {field.name for field in dataclasses.fields(ConsensusConfig)}
+    assert ConsensusConfig() == from_plain(ConsensusConfig, settings)
+
+
+def test_the_setups_and_methods_are_those_of_the_table():
+    assert known("method") == sorted(METHODS)
+    assert known("setup") == ["paper", "released", "tuned"]
+    assert known("fire") == ["huygens", "paper"]

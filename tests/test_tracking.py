@@ -1,0 +1,150 @@
+"""What the trackers were told, read back from their own files."""
+
+import csv
+import json
+import socket
+import struct
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from emberlink.trainers.config import resolve, to_values
+from emberlink.trainers.loop import Trainer
+from wandb.proto import wandb_internal_pb2
+
+SHORT = [
+    *("setup=tuned", "seed=3", "episodes=4", "env.horizon=12", "env.num_uavs=2", "num_envs=2"),
+    *("learner.hidden=[8,8]", "learner.batch=16"),
+    *("evaluation.interval=2", "evaluation.interval_fires=1"),
+]
+
+
+def tracked(logger: str, folder: Path):
+    """A trained run's folder, configuration, and the lines of its metrics.jsonl."""
+    config = resolve("consensus", [*SHORT, f"logger={logger}", f"output={folder / 'runs'}"])
+    trainer = Trainer(config)
+    run = trainer.start()
+    trainer.train()
+    lines = run.lines()
+    assert [line["episode"] for line in lines] == [1, 2, 3, 4]
+    assert "huygens/coverage" in lines[1]
+    assert [path.name for path in folder.iterdir()] == ["runs"]
+    return run.path, config, lines
+
+
+@pytest.fixture(autouse=True)
+def _elsewhere(tmp_path, monkeypatch):
+    """In an empty folder, with no network and with no settings of the user's."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("WANDB_CACHE_DIR", str(tmp_path.parent / f"{tmp_path.name}-cache"))
+    monkeypatch.setenv("WANDB_CONFIG_DIR", str(tmp_path.parent / f"{tmp_path.name}-config"))
+    # Set and taken away, so that what the run itself sets is taken away at the end as well.
+    for name in ("WANDB_MODE", "WANDB_API_KEY", "WANDB_PROJECT", "WANDB_SILENT"):
+        monkeypatch.setenv(name, "")
+        monkeypatch.delenv(name)
+    connect = socket.socket.connect
+
+    def local_only(self, address):
+        host = address[0] if isinstance(address, tuple) else "local"
+        assert host in ("local", "127.0.0.1", "::1", "localhost"), address
+        return connect(self, address)
+
+    monkeypatch.setattr(socket.socket, "connect", local_only)
+
+
+def records(file: Path) -> Iterator[wandb_internal_pb2.Record]:
+    """The records of a .wandb file: LevelDB's log format after a header of 7 bytes."""
+    data, at, whole = file.read_bytes(), 7, b""
+    assert data[:4] in (b":W&B", b"")
+    while at + 7 <= len(data):
+        left = 32768 - at % 32768
+        if left < 7:  # no room for a head: the rest of the block is padding
+            at += left
+            continue
+        _, length, kind = struct.unpack("<IHB", data[at : at + 7])
+        if at + 7 + length > len(data):  # still being written
+            return
+        whole += data[at + 7 : at + 7 + length]
+        at += 7 + length
+        if kind in (1, 4):  # whole, or the last part
+            record = wandb_internal_pb2.Record()
+            record.ParseFromString(whole)
+            yield record
+            whole = b""
+
+
+def finished(file: Path) -> list[wandb_internal_pb2.Record]:
+    """All records, once wandb's own process has written the last: `finish` may return before."""
+    end = time.monotonic() + 30
+    while not any(record.HasField("exit") for record in records(file)):
+        assert time.monotonic() < end, "the run's file was not finished"
+        time.sleep(0.05)
+    return list(records(file))
+
+
+def read_items(items) -> dict[str, object]:
+    return {item.nested_key[0] or item.key: json.loads(item.value_json) for item in items}
+
+
+@pytest.mark.parametrize("mode", [None, "offline"])
+def test_wandb_holds_every_number_offline(mode, tmp_path, monkeypatch, capfd):
+    if mode:
+        monkeypatch.setenv("WANDB_MODE", mode)
+    folder, config, lines = tracked("wandb", tmp_path)
+    printed = capfd.readouterr()
+    assert "wandb" not in printed.out + printed.err
+    (file,) = folder.rglob("*.wandb")
+    found = finished(file)
+    history = [read_items(r.history.item) for r in found if r.HasField("history")]
+    assert [row["_step"] for row in history] == [1, 2, 3, 4]
+    for row, line in zip(history, lines, strict=True):
+        assert {k: v for k, v in row.items() if not k.startswith("_")} == line
+    (run,) = (record.run for record in found if record.HasField("run"))
+    assert run.project == "emberlink"
+    assert run.run_group == "tuned-huygens"
+    assert sorted(run.tags) == ["consensus", "seed-3"]
+    assert run.display_name == folder.name
+    updates = [u for r in found if r.HasField("config") for u in r.config.update]
+    settings = [(u.key, json.loads(u.value_json)) for u in updates if u.key != "_wandb"]
+    assert settings == list(json.loads(json.dumps(to_values(config))).items())
+
+
+def test_tensorboard_holds_every_number(tmp_path):
+    reader = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
+    folder, _, lines = tracked("tensorboard", tmp_path)
+    (file,) = folder.rglob("events.out.tfevents.*")
+    events = reader.EventAccumulator(str(file))
+    events.Reload()
+    names = {name for line in lines for name in line}
+    assert set(events.Tags()["scalars"]) == names
+    for name in names:
+        logged = {event.step: event.value for event in events.Scalars(name)}
+        truth = {line["episode"]: line[name] for line in lines if name in line}
+        assert logged == pytest.approx(truth, rel=1e-6), name
+
+
+def test_csv_holds_every_number(tmp_path):
+    folder, _, lines = tracked("csv", tmp_path)
+    (scalars,) = folder.rglob("scalars")
+    for name in {name for line in lines for name in line}:
+        with (scalars / f"{name}.csv").open() as rows:
+            logged = {int(step): float(value) for step, value in csv.reader(rows)}
+        assert logged == {line["episode"]: line[name] for line in lines if name in line}, name
+
+
+def test_without_a_tracker_there_are_the_runs_own_files_only(tmp_path):
+    folder, _, _ = tracked("none", tmp_path)
+    files = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
+    own = {"config.yaml", "metrics.jsonl", "timing.jsonl"}
+    assert files == own | {"checkpoints/step_000000048.safetensors"}
+
+
+def test_the_tracker_does_not_change_the_run(tmp_path):
+    folders = [tmp_path / name for name in ("a", "b")]
+    texts = []
+    for folder, logger in zip(folders, ("none", "csv"), strict=True):
+        folder.mkdir()
+        path, _, _ = tracked(logger, folder)
+        texts.append((path / "metrics.jsonl").read_bytes())
+    assert texts[0] == texts[1]
