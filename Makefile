@@ -4,7 +4,7 @@ PYTHON ?= python3
 # processes that run tests side by side, with one thread each
 WORKERS ?= 2
 # settings of the demo; `make demo DEMO="episodes=10 seed=1"` chooses others
-DEMO ?= episodes=2 evaluation.fires=32 evaluation.interval=1
+DEMO ?= episodes=8 evaluation.fires=32 evaluation.interval=4
 
 VENV := .venv
 BIN := $(VENV)/bin

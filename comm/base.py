@@ -2,13 +2,14 @@
 
 from typing import Any, ClassVar
 
-from emberlink.envs import keys
-from emberlink.envs.config import WildfireConfig
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.data import Composite
 from torchrl.envs import Transform
+
+from emberlink.envs import keys
+from emberlink.envs.config import WildfireConfig
 
 
 class CommModule(TensorDictModuleBase):

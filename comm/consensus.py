@@ -4,14 +4,15 @@ import math
 from typing import Annotated, Any, ClassVar, Literal
 
 import torch
-from emberlink.envs import keys, streams, uav
-from emberlink.envs.config import WildfireConfig
-from emberlink.envs.reward import HeadingConfig, circling, heading_reward, left_box
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import Bounded, Composite, Unbounded
+
+from emberlink.envs import keys, streams, uav
+from emberlink.envs.config import WildfireConfig
+from emberlink.envs.reward import HeadingConfig, circling, heading_reward, left_box
 
 from .base import CommModule
 

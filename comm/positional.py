@@ -3,11 +3,12 @@
 from typing import ClassVar
 
 import torch
-from emberlink.envs import keys
 from pydantic import ConfigDict
 from pydantic.dataclasses import dataclass
 from tensordict import TensorDictBase
 from torchrl.data import Composite, Unbounded
+
+from emberlink.envs import keys
 
 from .base import CommModule
 

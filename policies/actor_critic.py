@@ -3,10 +3,11 @@
 from typing import Any
 
 import torch
-from emberlink.envs import keys
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torchrl.data import Composite
 from torchrl.modules import OrnsteinUhlenbeckProcessModule, ValueOperator
+
+from emberlink.envs import keys
 
 from .networks import StackedActor, StackedCritic
 

@@ -3,10 +3,11 @@
 from typing import Any, ClassVar
 
 import torch
-from emberlink.envs import keys, streams, uav
-from emberlink.envs.config import WildfireConfig
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
+
+from emberlink.envs import keys, streams, uav
+from emberlink.envs.config import WildfireConfig
 
 _POINTS, _ACTIONS = range(200, 202)  # what a moment's random stream is split into
 

@@ -1,8 +1,9 @@
 """Moments of an environment made by hand."""
 
 import torch
-from emberlink.envs import keys
 from tensordict import TensorDict
+
+from emberlink.envs import keys
 
 
 def moment(position, new, old=None, *, centre=None, old_centre=None, beyond=None, step=0, seed=1):

@@ -4,8 +4,9 @@ import copy
 from collections.abc import Iterator
 
 import torch
-from emberlink.policies.networks import StackedActor, StackedCritic, StackedLayerNorm, StackedLinear
 from torch import Tensor, nn
+
+from emberlink.policies.networks import StackedActor, StackedCritic, StackedLayerNorm, StackedLinear
 
 
 class SingleActor(nn.Module):

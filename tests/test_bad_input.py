@@ -8,10 +8,11 @@ from pathlib import Path
 import pytest
 import torch
 import yaml
-from emberlink.trainers import cli
-from emberlink.trainers.run_folder import RunFolder
 from safetensors.torch import save_file
 from tiny_run import PROGRAM, TINY, train_tiny
+
+from emberlink.trainers import cli
+from emberlink.trainers.run_folder import RunFolder
 
 
 @pytest.fixture(scope="module")

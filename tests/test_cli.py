@@ -10,11 +10,12 @@ import time
 from pathlib import Path
 
 import pytest
+from safetensors.torch import load_file, save_file
+from tiny_run import PROGRAM, TINY, train_tiny
+
 from emberlink.envs import metrics
 from emberlink.trainers import cli
 from emberlink.trainers.run_folder import RunFolder
-from safetensors.torch import load_file, save_file
-from tiny_run import PROGRAM, TINY, train_tiny
 
 
 @pytest.fixture(scope="module")

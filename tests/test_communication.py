@@ -9,12 +9,13 @@ from pathlib import Path
 import pytest
 import torch
 import yaml
+from torchrl.envs import step_mdp
+
 from emberlink.comm import base, consensus, registry
 from emberlink.envs import keys
 from emberlink.envs.wildfire import WildfireEnv
 from emberlink.trainers import make_env
 from emberlink.trainers.config import resolve
-from torchrl.envs import step_mdp
 
 ROOT = Path(__file__).parents[1]
 METHODS = ["independent", "shared_memory", "positional", "consensus"]

@@ -4,14 +4,15 @@ import math
 
 import pytest
 import torch
+from moments import moment
+from tensordict import TensorDict
+from torch import Tensor
+
 from emberlink.comm import consensus
 from emberlink.comm.base import Communication
 from emberlink.comm.consensus import Consensus, ConsensusConfig, best_discoverer, neighbours
 from emberlink.envs import keys
 from emberlink.envs.config import WildfireConfig
-from moments import moment
-from tensordict import TensorDict
-from torch import Tensor
 
 WORLD = WildfireConfig(grid=(64, 64))
 

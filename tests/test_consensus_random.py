@@ -4,16 +4,17 @@ import random
 
 import pytest
 import torch
+from moments import moment
+from scalar_consensus import ScalarConsensus, heading_term
+from tensordict import TensorDict
+from torch import Tensor
+
 from emberlink.comm import consensus
 from emberlink.comm.base import Communication
 from emberlink.comm.consensus import Consensus, ConsensusConfig
 from emberlink.envs import keys
 from emberlink.envs.config import WildfireConfig
 from emberlink.envs.reward import HeadingConfig
-from moments import moment
-from scalar_consensus import ScalarConsensus, heading_term
-from tensordict import TensorDict
-from torch import Tensor
 
 FORMS = ["folded_linear", "folded_exponential", "linear"]
 

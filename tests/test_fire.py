@@ -10,6 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from pydantic import ValidationError
+
 from emberlink.envs import fire_bank as bank_module
 from emberlink.envs.fire import (
     HELD_OUT_FROM,
@@ -21,9 +25,6 @@ from emberlink.envs.fire import (
     scenarios,
 )
 from emberlink.envs.fire_bank import bank_key, cache_folder, fire_bank
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from pydantic import ValidationError
 
 GRID, HORIZON = (30, 30), 1000
 RANGES = [f.name for f in dataclasses.fields(FireConfig) if f.name not in {"name", "bank"}]

@@ -4,13 +4,14 @@ import math
 
 import pytest
 import torch
+from moments import moment
+from torch import Tensor
+
 from emberlink.comm.base import Communication
 from emberlink.comm.consensus import Consensus, ConsensusConfig
 from emberlink.envs import keys
 from emberlink.envs.config import WildfireConfig
 from emberlink.envs.reward import HeadingConfig, RewardConfig, heading_reward
-from moments import moment
-from torch import Tensor
 
 INSIDE = (False, False, False)
 

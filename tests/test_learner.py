@@ -4,14 +4,15 @@ import copy
 
 import pytest
 import torch
+from single_ddpg import SingleActor, SingleCritic, SingleDDPG, copy_uav, matched
+from tensordict import TensorDict
+from torchrl.data import Bounded, Composite, Unbounded
+
 from emberlink.envs import keys
 from emberlink.policies.actor_critic import make_actor, make_critic
 from emberlink.trainers.config import LearnerConfig
 from emberlink.trainers.learner import Learner
 from emberlink.trainers.memory import DONE, TERMINATED
-from single_ddpg import SingleActor, SingleCritic, SingleDDPG, copy_uav, matched
-from tensordict import TensorDict
-from torchrl.data import Bounded, Composite, Unbounded
 
 UAVS, FEATURES, ACTIONS, HIDDEN, BATCH = 3, 9, 3, (16, 12), 24
 RATES = {

@@ -2,10 +2,11 @@
 
 import pytest
 import torch
+from tensordict import TensorDict
+
 from emberlink.envs import keys
 from emberlink.trainers import make_env
 from emberlink.trainers.memory import DONE, TERMINATED, make_memory, rows_needed, to_rows
-from tensordict import TensorDict
 
 UAVS = 4
 

@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+
 from emberlink.envs import WildfireConfig, WildfireEnv, keys, metrics
 from emberlink.trainers import make_env
 

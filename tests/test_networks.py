@@ -4,11 +4,12 @@ import math
 
 import pytest
 import torch
+from single_ddpg import SingleActor, SingleCritic, copy_uav
+from tensordict import TensorDict
+
 from emberlink.envs import keys, specs
 from emberlink.policies.actor_critic import STATE_ACTION_VALUE, make_actor, make_critic
 from emberlink.policies.networks import StackedActor, StackedCritic
-from single_ddpg import SingleActor, SingleCritic, copy_uav
-from tensordict import TensorDict
 
 UAVS, FEATURES, ACTIONS, HIDDEN = 4, 9, 3, (20, 12)
 SIZES = UAVS, FEATURES, ACTIONS, HIDDEN

@@ -4,14 +4,15 @@ import math
 
 import pytest
 import torch
+from tensordict import TensorDict
+from torchrl.data import Bounded, Composite, Unbounded
+from torchrl.envs import ExplorationType, set_exploration_type
+
 from emberlink.envs import keys
 from emberlink.policies.actor_critic import make_actor, with_noise
 from emberlink.trainers import evaluate, make_env
 from emberlink.trainers.config import resolve
 from emberlink.trainers.loop import Trainer
-from tensordict import TensorDict
-from torchrl.data import Bounded, Composite, Unbounded
-from torchrl.envs import ExplorationType, set_exploration_type
 
 UAVS, ENVS = 2, 4000
 

@@ -3,13 +3,14 @@
 import numpy as np
 import pytest
 import torch
-from emberlink.envs import WildfireConfig, WildfireEnv, keys, parallel_env
-from emberlink.trainers import make_env
 from pettingzoo import ParallelEnv
 from pettingzoo.test import api_test, parallel_api_test, parallel_seed_test, render_test
 from pettingzoo.utils.conversions import parallel_to_aec
 from tensordict import TensorDict
 from torchrl.envs import EnvBase, SerialEnv, step_mdp
+
+from emberlink.envs import WildfireConfig, WildfireEnv, keys, parallel_env
+from emberlink.trainers import make_env
 
 pytestmark = pytest.mark.filterwarnings("error")
 METHODS = ("independent", "shared_memory", "positional", "consensus")

@@ -6,6 +6,7 @@ import math
 import pytest
 import torch
 import yaml
+
 from emberlink.envs import keys, metrics
 from emberlink.trainers import report
 from emberlink.trainers.config import resolve

@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 import torch
-from emberlink.envs import WildfireConfig, WildfireEnv, render
 from PIL import Image
+
+from emberlink.envs import WildfireConfig, WildfireEnv, render
 
 BLACK, WHITE, YELLOW, BLUE = (0, 0, 0), (255, 255, 255), (255, 255, 0), (0, 0, 255)
 

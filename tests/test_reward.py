@@ -5,6 +5,8 @@ from itertools import pairwise
 
 import pytest
 import torch
+from pydantic import ValidationError
+
 from emberlink.envs.reward import (
     HEADING_FORMS,
     HeadingConfig,
@@ -13,7 +15,6 @@ from emberlink.envs.reward import (
     left_box,
     view_reward,
 )
-from pydantic import ValidationError
 
 INSIDE = [False, False, False]
 RELEASED = RewardConfig(new_fire=12.0, old_fire=6.0, no_fire=-4.0, exit=-150.0, exit_axes="xy")

@@ -3,6 +3,7 @@
 import dataclasses
 
 import pytest
+
 from emberlink.comm.consensus import ConsensusConfig
 from emberlink.envs.config import WildfireConfig, from_plain
 from emberlink.envs.reward import RewardConfig

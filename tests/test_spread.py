@@ -4,6 +4,8 @@ import math
 
 import pytest
 import torch
+from torch import Tensor
+
 from emberlink.envs.spread import (
     arrival_times,
     disc,
@@ -11,7 +13,6 @@ from emberlink.envs.spread import (
     front_speed,
     length_to_breadth,
 )
-from torch import Tensor
 
 SIDE, CORE, HEAD, HORIZON = 30.0, 3.0, 0.01, 1000.0
 STRAIGHT, TURNING = 0.0, math.pi

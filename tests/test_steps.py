@@ -5,11 +5,12 @@ import math
 import numpy as np
 import pytest
 import torch
-from emberlink.envs import RewardConfig, WildfireConfig, WildfireEnv, keys
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scalar_wildfire import ScalarWildfire
 from tensordict import TensorDict
+
+from emberlink.envs import RewardConfig, WildfireConfig, WildfireEnv, keys
 
 ENVS, STEPS = 4, 315
 PAPER = (1.0, -4.0, -10.0, -100.0), "xyz"

@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+
 from emberlink.envs import streams
 
 LANES = 20_000

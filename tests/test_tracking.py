@@ -9,9 +9,10 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from wandb.proto import wandb_internal_pb2
+
 from emberlink.trainers.config import resolve, to_values
 from emberlink.trainers.loop import Trainer
-from wandb.proto import wandb_internal_pb2
 
 SHORT = [
     *("setup=tuned", "seed=3", "episodes=4", "env.horizon=12", "env.num_uavs=2", "num_envs=2"),

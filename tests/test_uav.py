@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+
 from emberlink.envs import uav
 
 LOW = torch.tensor([0.0, 0, 1], dtype=torch.float64)

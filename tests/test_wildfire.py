@@ -6,11 +6,12 @@ from itertools import product
 
 import pytest
 import torch
+from tensordict import TensorDict
+from torchrl.envs import check_env_specs, step_mdp
+
 from emberlink.envs import WildfireConfig, WildfireEnv, keys
 from emberlink.envs.fire import load_scenario, make_fires
 from emberlink.trainers import make_env
-from tensordict import TensorDict
-from torchrl.envs import check_env_specs, step_mdp
 
 METHODS = ("independent", "shared_memory", "positional", "consensus")
 SETUPS = ("paper", "released", "tuned")

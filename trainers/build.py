@@ -3,13 +3,14 @@
 from typing import Any
 
 import torch
+from tensordict.nn import TensorDictModule
+from torch import Tensor
+from torchrl.envs import Compose, InitTracker, TransformedEnv
+
 from emberlink.comm.base import Communication
 from emberlink.envs.fire import FireConfig
 from emberlink.envs.wildfire import WildfireEnv
 from emberlink.policies.actor_critic import make_actor, make_critic
-from tensordict.nn import TensorDictModule
-from torch import Tensor
-from torchrl.envs import Compose, InitTracker, TransformedEnv
 
 from .config import RunConfig, build_comm, check_device, resolve
 

@@ -6,9 +6,6 @@ from importlib.resources import files
 from typing import Annotated, Any, Literal
 
 import torch
-from emberlink.comm import registry
-from emberlink.envs.config import WildfireConfig, from_plain
-from emberlink.envs.fire import FireConfig
 from hydra import compose, initialize_config_module
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
@@ -24,6 +21,10 @@ from pydantic import (
     model_validator,
 )
 from pydantic.dataclasses import dataclass
+
+from emberlink.comm import registry
+from emberlink.envs.config import WildfireConfig, from_plain
+from emberlink.envs.fire import FireConfig
 
 _STRICT = ConfigDict(extra="forbid", strict=True)
 _GROUPS = ("setup", "fire")

@@ -5,9 +5,10 @@ import time
 from importlib.metadata import version
 
 import torch
-from emberlink.envs.fire import load_scenario, make_fires
 from rich.console import Console
 from torchrl.envs.utils import check_env_specs
+
+from emberlink.envs.fire import load_scenario, make_fires
 
 from .build import make_env
 from .config import known, resolve

@@ -5,14 +5,15 @@ from typing import Any, cast
 
 import numpy as np
 import torch
-from emberlink.envs import metrics
-from emberlink.envs.fire import FireConfig, load_scenario
-from emberlink.envs.fire_bank import fire_bank
-from emberlink.policies.scripted import SCRIPTED
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import TransformedEnv, set_exploration_type, step_mdp
 from torchrl.envs.utils import ExplorationType
+
+from emberlink.envs import metrics
+from emberlink.envs.fire import FireConfig, load_scenario
+from emberlink.envs.fire_bank import fire_bank
+from emberlink.policies.scripted import SCRIPTED
 
 from .build import build_env
 from .config import RunConfig

@@ -1,12 +1,13 @@
 """DDPG for all UAVs at once (Lillicrap et al. 2016; paper, section III.C)."""
 
 import torch
-from emberlink.envs import keys
-from emberlink.policies.actor_critic import STATE_ACTION_VALUE
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor
 from torchrl.objectives import DDPGLoss, SoftUpdate, group_optimizers
+
+from emberlink.envs import keys
+from emberlink.policies.actor_critic import STATE_ACTION_VALUE
 
 from .config import LearnerConfig
 from .memory import DONE, TERMINATED

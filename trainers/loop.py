@@ -6,10 +6,11 @@ from dataclasses import asdict, dataclass, field
 from typing import Any, cast
 
 import torch
-from emberlink.envs import metrics
-from emberlink.policies.actor_critic import with_noise
 from tensordict import TensorDictBase
 from torchrl.collectors import Collector
+
+from emberlink.envs import metrics
+from emberlink.policies.actor_critic import with_noise
 
 from . import evaluate
 from .build import build_env, build_networks

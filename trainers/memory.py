@@ -1,11 +1,12 @@
 """Replay memory of a team: one per UAV, or one for all (paper, sections IV.C and IV.D)."""
 
 import torch
-from emberlink.envs import keys
 from tensordict import TensorDict, TensorDictBase
 from torchrl.data import LazyTensorStorage, ReplayBuffer
 from torchrl.data.replay_buffers.samplers import RandomSampler
 from torchrl.data.replay_buffers.storages import TensorStorage
+
+from emberlink.envs import keys
 
 DONE = (keys.AGENTS, "done")
 TERMINATED = (keys.AGENTS, "terminated")

@@ -5,11 +5,12 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from emberlink.envs import metrics
-from emberlink.envs.render import write_gif
 from rich.console import Console
 from rich.table import Table
 from tensordict.nn import TensorDictModule
+
+from emberlink.envs import metrics
+from emberlink.envs.render import write_gif
 
 from . import evaluate, figures
 from .build import build_env, build_networks

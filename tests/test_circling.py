@@ -1,0 +1,57 @@
+"""The bonus for flying around known fire, by hand."""
+
+import pytest
+import torch
+from moments import moment
+
+from emberlink.comm.base import Communication
+from emberlink.comm.consensus import FOLLOWS, Consensus, ConsensusConfig
+from emberlink.envs import keys
+from emberlink.envs.config import WildfireConfig
+from emberlink.envs.reward import HeadingConfig, circling
+
+
+@pytest.mark.parametrize(
+    ("target", "move", "bonus"),
+    [
+        # Northwards with the target to the west, which is left: all of the move counts at 1 cell,
+        ([-1.0, 0.0], [0.0, 0.1], 0.1),
+        ([1.0, 0.0], [0.0, 0.1], -0.1),  # and counts against the UAV where it is to the right.
+        ([-2.0, 0.0], [0.0, 0.1], 0.08),  # 2 d / (1 + d²) = 4/5
+        ([-0.5, 0.0], [0.0, 0.1], 0.08),  # 1 / 1.25
+        ([0.0, 0.0], [0.0, 0.1], 0.0),
+        ([-1.0, 0.0], [-0.1, 0.0], 0.0),  # straight at it
+        ([0.0, 1.0], [0.1, 0.0], 0.1),
+        ([0.6, 0.8], [0.05, 0.0], 0.04),  # 0.05 · 0.8
+    ],
+)
+def test_circling_by_hand(target, move, bonus):
+    here = torch.tensor([10.0, 10.0, 2.0])
+    there = here + torch.tensor([*move, 0.3])
+    way = here + torch.tensor([*target, -1.0])
+    assert circling(here, there, way).item() == pytest.approx(bonus, abs=1e-6)
+
+
+def test_only_a_discoverer_over_old_fire_alone_circles():
+    world = WildfireConfig(grid=(64, 64))
+    heading = HeadingConfig(form="approach", weight=2.0, circle=5.0)
+    config = ConsensusConfig(discoverer="any_fire", heading=heading, range=5.0)
+    talk = Communication(Consensus(world, config))
+    # UAV 0 sees old fire alone, UAV 1 both, UAV 2 hears UAV 1, UAV 3 nobody.
+    places = [[10.0, 10.0, 2.0], [30.0, 10.0, 2.0], [33.0, 10.0, 2.0], [50.0, 50.0, 2.0]]
+    before = moment(
+        places,
+        [0, 2, 0, 0],
+        [3, 3, 0, 0],
+        centre=[[0.0, 0.0], [31.0, 10.0], [0.0, 0.0], [0.0, 0.0]],
+        old_centre=[[9.0, 10.0], [28.0, 10.0], [0.0, 0.0], [0.0, 0.0]],
+    )
+    before = talk._reset(before, before)
+    assert before[FOLLOWS].flatten().tolist() == [0, 1, 1, -1]
+    after = moment([[x, y + 0.5, z] for x, y, z in places], [0] * 4)
+    waypoint = before["agents", "target"][0, 3]
+    start = torch.tensor(places[3])
+    nearer = (waypoint - start).norm() - (waypoint - start - torch.tensor([0, 0.5, 0])).norm()
+    gained = [5.0 * 0.5, 2 * (1 - 1.25**0.5), 2 * (3 - 9.25**0.5), 2 * nearer.item()]
+    reward = talk._step(before, after)[keys.REWARD]
+    assert reward.flatten().tolist() == pytest.approx(gained, abs=1e-5)
