@@ -28,15 +28,7 @@ def make_actor(
         hidden: sizes of the two hidden layers.
         generator: of the initial weights.
     """
-    uavs, features = observation[keys.OBSERVATION].shape[-2:]
-    network = StackedActor(
-        uavs,
-        features,
-        action[keys.ACTION].shape[-1],
-        hidden,
-        device=torch.device(observation.device or "cpu"),
-        generator=generator,
-    )
+    network = _stacked(StackedActor, observation, action, hidden, generator)
     return TensorDictModule(network, in_keys=[keys.OBSERVATION], out_keys=[keys.ACTION])
 
 
@@ -48,18 +40,23 @@ def make_critic(
     generator: torch.Generator | None = None,
 ) -> ValueOperator:
     """The UAVs' critics; arguments as `make_actor`."""
-    uavs, features = observation[keys.OBSERVATION].shape[-2:]
-    network = StackedCritic(
-        uavs,
-        features,
-        action[keys.ACTION].shape[-1],
-        hidden,
-        device=torch.device(observation.device or "cpu"),
-        generator=generator,
-    )
+    network = _stacked(StackedCritic, observation, action, hidden, generator)
     return ValueOperator(
         network, in_keys=[keys.OBSERVATION, keys.ACTION], out_keys=[STATE_ACTION_VALUE]
     )
+
+
+def _stacked(
+    kind: type[StackedActor] | type[StackedCritic],
+    observation: Composite,
+    action: Composite,
+    hidden: tuple[int, int],
+    generator: torch.Generator | None,
+) -> StackedActor | StackedCritic:
+    uavs, features = observation[keys.OBSERVATION].shape[-2:]
+    device = torch.device(observation.device or "cpu")
+    actions = action[keys.ACTION].shape[-1]
+    return kind(uavs, features, actions, hidden, device=device, generator=generator)
 
 
 def with_noise(

@@ -73,7 +73,31 @@ def _by_batch(x: Tensor, batch: Sequence[int]) -> Tensor:
     return x.transpose(0, 1).reshape(*batch, x.shape[0], x.shape[-1])
 
 
-class StackedActor(nn.Module):
+class _Trunk(nn.Module):
+    """Observation -> first -> second hidden layer, LayerNorm after each, ReLU in between."""
+
+    def __init__(
+        self,
+        uavs: int,
+        features: int,
+        hidden: tuple[int, int],
+        device: torch.device | str | None,
+        generator: torch.Generator | None,
+    ):
+        super().__init__()
+        first, second = hidden
+        self.first = StackedLinear(uavs, features, first, device=device, generator=generator)
+        self.first_norm = StackedLayerNorm(uavs, first, device=device)
+        self.second = StackedLinear(uavs, first, second, device=device, generator=generator)
+        self.second_norm = StackedLayerNorm(uavs, second, device=device)
+
+    def normalised(self, observation: Tensor) -> Tensor:
+        """[..., uavs, features] -> [uavs, batch, second], before the second ReLU."""
+        x = torch.relu(self.first_norm(self.first(_by_uav(observation))))
+        return self.second_norm(self.second(x))
+
+
+class StackedActor(_Trunk):
     """Observation -> 400 -> 300 -> action; LayerNorm and ReLU after each, tanh at the end.
 
     Args:
@@ -81,6 +105,8 @@ class StackedActor(nn.Module):
         features: numbers in an observation.
         actions: numbers in an action.
         hidden: sizes of the two hidden layers.
+        device: of the weights.
+        generator: of the initial weights.
     """
 
     def __init__(
@@ -93,24 +119,18 @@ class StackedActor(nn.Module):
         device: torch.device | str | None = None,
         generator: torch.Generator | None = None,
     ):
-        super().__init__()
-        first, second = hidden
-        self.first = StackedLinear(uavs, features, first, device=device, generator=generator)
-        self.first_norm = StackedLayerNorm(uavs, first, device=device)
-        self.second = StackedLinear(uavs, first, second, device=device, generator=generator)
-        self.second_norm = StackedLayerNorm(uavs, second, device=device)
+        super().__init__(uavs, features, hidden, device, generator)
         self.action = StackedLinear(
-            uavs, second, actions, bound=3e-3, device=device, generator=generator
+            uavs, hidden[1], actions, bound=3e-3, device=device, generator=generator
         )
 
     def forward(self, observation: Tensor) -> Tensor:
         """float32 [..., uavs, features] -> [..., uavs, actions] in (-1, 1)."""
-        x = torch.relu(self.first_norm(self.first(_by_uav(observation))))
-        x = torch.relu(self.second_norm(self.second(x)))
+        x = torch.relu(self.normalised(observation))
         return _by_batch(torch.tanh(self.action(x)), observation.shape[:-2])
 
 
-class StackedCritic(nn.Module):
+class StackedCritic(_Trunk):
     """Observation and action -> value.
 
     The action enters late: a linear map of it is added to the normalised second layer before
@@ -127,18 +147,13 @@ class StackedCritic(nn.Module):
         device: torch.device | str | None = None,
         generator: torch.Generator | None = None,
     ):
-        super().__init__()
-        first, second = hidden
-        self.first = StackedLinear(uavs, features, first, device=device, generator=generator)
-        self.first_norm = StackedLayerNorm(uavs, first, device=device)
-        self.second = StackedLinear(uavs, first, second, device=device, generator=generator)
-        self.second_norm = StackedLayerNorm(uavs, second, device=device)
-        self.action = StackedLinear(uavs, actions, second, device=device, generator=generator)
-        self.value = StackedLinear(uavs, second, 1, bound=3e-3, device=device, generator=generator)
+        super().__init__(uavs, features, hidden, device, generator)
+        self.action = StackedLinear(uavs, actions, hidden[1], device=device, generator=generator)
+        self.value = StackedLinear(
+            uavs, hidden[1], 1, bound=3e-3, device=device, generator=generator
+        )
 
     def forward(self, observation: Tensor, action: Tensor) -> Tensor:
         """float32 [..., uavs, features] and [..., uavs, actions] -> [..., uavs, 1]."""
-        x = torch.relu(self.first_norm(self.first(_by_uav(observation))))
-        x = self.second_norm(self.second(x))
-        x = torch.relu(x + self.action(_by_uav(action)))
+        x = torch.relu(self.normalised(observation) + self.action(_by_uav(action)))
         return _by_batch(self.value(x), observation.shape[:-2])

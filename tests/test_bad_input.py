@@ -9,22 +9,10 @@ import pytest
 import torch
 import yaml
 from safetensors.torch import save_file
-from tiny_run import PROGRAM, TINY, train_tiny
+from tiny_run import PROGRAM, TINY
 
 from emberlink.trainers import cli
 from emberlink.trainers.run_folder import RunFolder
-
-
-@pytest.fixture(scope="module")
-def finished(tmp_path_factory) -> Path:
-    """A run folder that `emberlink train` left."""
-    return train_tiny(tmp_path_factory.mktemp("runs"))
-
-
-@pytest.fixture
-def run(finished, tmp_path) -> Path:
-    """A copy of it, to be damaged."""
-    return Path(shutil.copytree(finished, tmp_path / "run"))
 
 
 def refused(arguments: list[str], capsys, *words: str) -> str:

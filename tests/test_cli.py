@@ -11,23 +11,11 @@ from pathlib import Path
 
 import pytest
 from safetensors.torch import load_file, save_file
-from tiny_run import PROGRAM, TINY, train_tiny
+from tiny_run import PROGRAM, TINY
 
 from emberlink.envs import metrics
 from emberlink.trainers import cli
 from emberlink.trainers.run_folder import RunFolder
-
-
-@pytest.fixture(scope="module")
-def finished(tmp_path_factory) -> Path:
-    """A run folder that `emberlink train` left."""
-    return train_tiny(tmp_path_factory.mktemp("runs"))
-
-
-@pytest.fixture
-def run(finished, tmp_path) -> Path:
-    """A copy of it, to be damaged."""
-    return Path(shutil.copytree(finished, tmp_path / "run"))
 
 
 @pytest.mark.parametrize("arguments", [["trane"], ["train"], ["eval"], ["eval", "x", "--fires=0"]])
@@ -93,16 +81,22 @@ def test_eval_repeats_the_evaluation_of_train(run, capsys):
 
 
 def test_eval_plays_the_checkpoint_it_is_given(run, capsys):
-    trained = json.loads((run / "eval.json").read_text())["results"]["huygens"]
-    checkpoint = RunFolder(run).checkpoint()
-    weights = load_file(checkpoint)
+    newest = (run / "eval.json").read_bytes()
+    trained = json.loads(newest)["results"]["huygens"]
+    weights = load_file(RunFolder(run).checkpoint())
     name = next(n for n in weights if n.startswith("actor_network_params") and "action.bias" in n)
     save_file({**weights, name: weights[name] + 9}, run / "other.safetensors")
     assert cli.main(["eval", str(run), "--checkpoint", str(run / "other.safetensors")]) == 0
-    check_evaluation(run, capsys.readouterr().out)
-    again = json.loads((run / "eval.json").read_text())["results"]["huygens"]
+    assert capsys.readouterr().out.splitlines()[-1] == str(run)
+    again = json.loads((run / "eval_other.json").read_text())
+    assert again["checkpoint"] == "other.safetensors"
+    again = again["results"]["huygens"]
     assert again["random_waypoints"] == trained["random_waypoints"]
     assert min(again["learned"]["boundary_exits"]) > max(trained["learned"]["boundary_exits"])
+    # The evaluation of the newest is still there.
+    assert (run / "eval.json").read_bytes() == newest
+    for figure in ("coverage_other.png", "timelapse_huygens_other.png"):
+        assert (run / "figures" / figure).exists()
 
 
 def wait_for(condition, process, seconds: float = 120) -> None:

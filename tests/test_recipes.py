@@ -82,7 +82,7 @@ def check_actor(run: RunFolder, config, trainer: Trainer) -> None:
     """The checkpoint's actor acts as the trained one does."""
     checkpoint = run.checkpoint()
     assert checkpoint.name == f"step_{EPISODES * HORIZON:09d}.safetensors"
-    loaded = report.load_actor(run, config, checkpoint)
+    loaded = report.load_actor(config, checkpoint)
     rollout = trainer.env.rollout(5, trainer.actor)
     for step in range(5):
         again = loaded(rollout[:, step].select(keys.OBSERVATION))

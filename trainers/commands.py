@@ -10,7 +10,6 @@ from typing import Any
 from rich.console import Console
 from rich.progress import (
     BarColumn,
-    MofNCompleteColumn,
     Progress,
     TextColumn,
     TimeElapsedColumn,
@@ -76,7 +75,6 @@ def _train_with_bar(trainer: Trainer, console: Console) -> bool:
     columns = (
         TextColumn("episode {task.fields[episode]}/{task.fields[episodes]}"),
         BarColumn(),
-        MofNCompleteColumn(),
         TextColumn("coverage {task.fields[coverage]} score {task.fields[score]}"),
         TimeElapsedColumn(),
         TextColumn("left"),
@@ -113,8 +111,9 @@ def evaluate_folder(
     """Evaluates a run folder's frozen policy and prints the table."""
     run = RunFolder(folder)
     config = run.config(**({} if device is None else {"device": device}))
+    label = f"_{checkpoint.stem}" if checkpoint else ""
     checkpoint = checkpoint or run.checkpoint()
-    actor = report.load_actor(run, config, checkpoint)
+    actor = report.load_actor(config, checkpoint)
     results = report.evaluate_run(
         run,
         config,
@@ -122,6 +121,7 @@ def evaluate_folder(
         checkpoint=checkpoint,
         fires=fires or config.evaluation.fires,
         report=lambda text: console.print(f"  {text}", style="dim"),
+        label=label,
     )
     report.print_table(console, results, config)
     console.print(str(run.path), soft_wrap=True)

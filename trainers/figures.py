@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from .evaluate import LEARNED, Results
 
@@ -38,6 +39,7 @@ def training_curves(path: Path, lines: Sequence[Mapping[str, Any]], title: str) 
             fire = key.split("/")[0]
             axes.plot(*zip(*points, strict=True), marker="o", ms=3, label=f"frozen, {fire}")
         axes.set(xlabel="episode", ylabel=label)
+        axes.xaxis.set_major_locator(MaxNLocator(integer=True))
         axes.grid(alpha=0.3)
     figure.axes[0].legend(fontsize="small")
     figure.savefig(path, dpi=120)

@@ -21,7 +21,7 @@ _ACTOR = "actor_network_params.module."
 """what the actor's weights are called in a checkpoint, before the name within the network"""
 
 
-def load_actor(run: RunFolder, config: RunConfig, checkpoint: Path) -> TensorDictModule:
+def load_actor(config: RunConfig, checkpoint: Path) -> TensorDictModule:
     """The frozen policy of a run.
 
     Raises:
@@ -50,16 +50,27 @@ def evaluate_run(
     checkpoint: Path,
     fires: int,
     report: Callable[[str], None],
+    label: str = "",
 ) -> evaluate.Results:
-    """Evaluates a frozen policy and writes eval.json, the figures and one animation."""
+    """Evaluates a frozen policy and writes eval.json, the figures and one animation.
+
+    Args:
+        run: where everything is written.
+        config: of the run.
+        actor: the frozen policy.
+        checkpoint: where it is from.
+        fires: episodes, each on a held-out fire of its own.
+        report: told what is being done.
+        label: ends the names of the files, to keep them apart from those of the newest checkpoint.
+    """
 
     def say(fire: str, policy: str) -> None:
         report(f"{policy} on {fires} fires of {fire}")
 
     results = evaluate.evaluate(config, actor, fires=fires, report=say)
     content = evaluate.record(config, results, checkpoint=checkpoint.name, fires=fires)
-    run.write("eval.json", content)
-    figures.coverage_bars(run.figure("coverage.png"), results)
+    run.write(f"eval{label}.json", content)
+    figures.coverage_bars(run.figure(f"coverage{label}.png"), results)
     lines = run.lines()
     if lines:
         title = f"{config.method}, setup {config.setup}, fire {config.fire.name}"
@@ -67,8 +78,8 @@ def evaluate_run(
     report("one episode for the animation")
     name, arrival = next(iter(evaluate.evaluation_fires(config, 1).items()))
     pictures, steps = evaluate.film(config, actor, fire=arrival)
-    write_gif(run.figure(f"episode_{name}.gif"), pictures)
-    figures.timelapse(run.figure(f"timelapse_{name}.png"), pictures, steps)
+    write_gif(run.figure(f"episode_{name}{label}.gif"), pictures)
+    figures.timelapse(run.figure(f"timelapse_{name}{label}.png"), pictures, steps)
     return results
 
 
