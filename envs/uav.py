@@ -19,7 +19,8 @@ def move(
 
     Args:
         position: float32 [..., 3], cells.
-        action: float32 [..., 3]; components outside [-1, 1] are clipped to it.
+        action: float32 [..., 3]; components outside [-1, 1] are clipped to it, and one that is
+            not a number does not move the UAV.
         displacement: cells per unit of action.
         low, high: float64 [3], the corners of the box, cells; numbers that float32 has exactly.
 
@@ -27,7 +28,8 @@ def move(
         The new positions, float32 [..., 3], and the axes along which the move would have left
         the box, bool [..., 3].
     """
-    wanted = position.double() + displacement * action.double().clamp(-1, 1)
+    step = displacement * action.double().nan_to_num(0.0).clamp(-1, 1)
+    wanted = position.double() + step
     beyond = (wanted < low) | (wanted > high)
     return wanted.clamp(low, high).to(position.dtype), beyond
 

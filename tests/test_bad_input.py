@@ -61,6 +61,7 @@ SETUPS = "known: paper, released, tuned"
         (["consensus", "learner.capacity=5"], ["batch=8", "capacity=5"]),
         (["consensus", "seed=-1"], ["seed=-1", "greater than or equal to 0"]),
         (["consensus", "num_envs=0"], ["num_envs=0"]),
+        (["consensus", "learner=[1]"], ["learner=[1]"]),
         (["consensus", "logger=mlflow"], ["logger=mlflow", "'wandb', 'tensorboard', 'csv'"]),
         (["consensus", "memory=both"], ["memory=both", "'private' or 'shared'"]),
         (["consensus", "comm.rnge=3"], ["'comm.rnge'", "did you mean comm.range?"]),

@@ -126,3 +126,12 @@ def test_next_waypoint_changes_only_those_that_are_reached():
     new = uav.next_waypoint(waypoint, position, torch.tensor([7]), LOW, HIGH)
     assert torch.equal(new[0, 1:], waypoint[0, 1:])
     assert torch.equal(new[0, 0], uav.random_points(torch.tensor([7]), 3, LOW, HIGH)[0, 0])
+
+
+def test_what_is_no_number_does_not_move_the_uav():
+    position = torch.tensor([[5.0, 6.0, 2.0]])
+    action = torch.tensor([[math.nan, math.inf, -math.inf]])
+    low, high = torch.zeros(3).double(), torch.full((3,), 9.0).double()
+    moved, beyond = uav.move(position, action, displacement=1.5, low=low, high=high)
+    assert moved.tolist() == [[5.0, 7.5, 0.5]]
+    assert not beyond.any()

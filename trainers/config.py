@@ -116,7 +116,7 @@ class RunConfig:
     """where environment, memory and networks live"""
     logger: Literal["wandb", "tensorboard", "csv", "none"]
     """the tracker beside metrics.jsonl"""
-    output: str
+    output: Annotated[str, Field(min_length=1)]
     """the folder in which the run folder is made"""
     checkpoint_interval: Count
     """episodes between checkpoints"""
