@@ -55,6 +55,8 @@ class WildfireEnv(EnvBase):
     ):
         if num_envs < 1:
             raise ValueError(f"num_envs={num_envs}: at least 1 is needed")
+        if seed < 0:
+            raise ValueError(f"seed={seed}: a number that is not negative is needed")
         super().__init__(device=device, batch_size=torch.Size([num_envs]))
         if config is None:
             config = WildfireConfig()
@@ -278,11 +280,18 @@ def _arrivals(
     if isinstance(fire, FireConfig):
         return fire_bank(fire, "train", fire.bank, config.grid, config.horizon), False
     # A copy, in order in memory: what the caller does to theirs later is not our fire.
-    bank = torch.as_tensor(fire, dtype=torch.float32).clone(memory_format=torch.contiguous_format)
+    try:
+        bank = torch.as_tensor(fire, dtype=torch.float32)
+    except (TypeError, ValueError, RuntimeError):
+        raise ValueError(
+            f"fire: a scenario's name, a FireConfig or arrival times, not {type(fire).__name__}"
+        ) from None
+    bank = bank.clone(memory_format=torch.contiguous_format)
+    shape = list(bank.shape)
     bank = bank.unsqueeze(0) if bank.ndim == 2 else bank
     if bank.shape not in ((1, *config.grid), (num_envs, *config.grid)):
         raise ValueError(
-            f"fire: arrival times of shape {tuple(fire.shape)}; expected {list(config.grid)} or "
+            f"fire: arrival times of shape {shape}; expected {list(config.grid)} or "
             f"{[num_envs, *config.grid]} (the grid of the config, num_envs={num_envs})"
         )
     if bank.isnan().any():

@@ -1,4 +1,4 @@
-"""The paper's networks, one per UAV, computed as one batched product (section III.C; SPEC table).
+"""The paper's networks, one per UAV, as one batched product (section III.C; docs/setups.md).
 
 A stack holds the weights of all UAVs in tensors whose first dimension is the UAV: nothing is
 shared, no gradient crosses, and one launch serves all.

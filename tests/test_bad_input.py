@@ -71,7 +71,9 @@ SETUPS = "known: paper, released, tuned"
             ["consensus", "comm.name=telepathy"],
             ["comm.name='telepathy'", "known: consensus, positional, silent"],
         ),
-        (["consensus", "comm.name=silent"], ["comm.range"]),
+        (["consensus", "comm.name=silent"], ["comm.", "not a setting of silent; known: none"]),
+        (["consensus", "learner.hidden=[10000000,8]"], ["learner.hidden.0=10000000", "8192"]),
+        (["consensus", "num_envs=100000000"], ["num_envs=100000000", "65536"]),
         (["consensus", "device=cuda:99"], ["device=cuda:99 is not there", "known: cpu"]),
         (["consensus", "device=tpu"], ["device=tpu is not there", "known: cpu"]),
         (["consensus", "device=cpu:3"], ["device=cpu:3 is not there", "known: cpu"]),
@@ -98,6 +100,7 @@ def test_an_output_folder_that_is_a_file(tmp_path, capsys):
     file.write_text("mine")
     for output in (file, file / "below"):
         refused(["train", "consensus", *TINY, f"output={output}"], capsys, f"output={output}")
+    refused(["train", "consensus", *TINY, "output="], capsys, "output=", "at least 1 character")
     assert file.read_text() == "mine"
     assert list(tmp_path.iterdir()) == [file]
 
@@ -175,3 +178,26 @@ def test_a_real_process_prints_one_line_and_ends_with_2(tmp_path):
     expected = "emberlink train: key 'env.horizn' is not known; did you mean env.horizon?\n"
     assert (done.returncode, done.stdout, done.stderr) == (2, "", expected)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_too_little_memory_is_one_line(capsys, monkeypatch):
+    def full(*_):
+        raise RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried 99 bytes\nmore")
+
+    monkeypatch.setattr("emberlink.trainers.commands.Trainer", full)
+    refused(["train", "consensus", *TINY], capsys, "not enough memory", "99 bytes")
+
+
+def test_a_line_that_was_not_finished_is_no_line(run):
+    lines = RunFolder(run).lines()
+    with (run / "metrics.jsonl").open("a") as out:
+        out.write('{"epi')
+    assert RunFolder(run).lines() == lines
+    (run / "metrics.jsonl").write_text("{}\nnothing\n")
+    with pytest.raises(ValueError, match=r"metrics\.jsonl: not a file of JSON lines"):
+        RunFolder(run).lines()
+
+
+def test_a_batch_that_is_never_reached_is_said(tmp_path, capsys):
+    assert cli.main(["train", "consensus", *TINY, "learner.batch=500", f"output={tmp_path}"]) == 0
+    assert "nothing will be learnt" in capsys.readouterr().out

@@ -1,6 +1,7 @@
 """What the communication modules write, on an environment and off it, and how they are found."""
 
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -144,54 +145,13 @@ def test_an_unknown_module_is_an_error_that_lists_the_known(name):
         resolve("independent", [f"comm.name='{name}'"])
 
 
-FIFTH_MODULE = '''
-from typing import Annotated, ClassVar
-
-from emberlink.envs import keys
-from pydantic import ConfigDict, Field
-from pydantic.dataclasses import dataclass
-from torchrl.data import Unbounded
-
-from .base import CommModule
-
-
-@dataclass(frozen=True, kw_only=True, config=ConfigDict(extra="forbid", strict=True))
-class FlagshipConfig:
-    gain: Annotated[float, Field(gt=0)] = 1.0
-
-
-class Flagship(CommModule):
-    """Tells everyone the position of UAV 0."""
-
-    config_type: ClassVar[type] = FlagshipConfig
-    in_keys: ClassVar = [keys.OBSERVATION, keys.POSITION]
-    out_keys: ClassVar = [keys.OBSERVATION]
-
-    def specs(self, observation):
-        shape = observation[keys.OBSERVATION].shape
-        observation[keys.OBSERVATION] = Unbounded((*shape[:-1], shape[-1] + 3))
-        return observation
-
-    def forward(self, tensordict):
-        own = tensordict.get(keys.OBSERVATION)
-        first = self.config.gain * tensordict.get(keys.POSITION)[..., :1, :]
-        return tensordict.set(
-            keys.OBSERVATION, torch.cat((own, first.expand(*own.shape[:-1], 3)), -1)
-        )
-'''
-FIFTH_RECIPE = """# @package _global_
-memory: shared
-comm:
-  name: flagship
-  gain: 1.0
-"""
 TRAIN = """
 import sys
 from pathlib import Path
 from emberlink.comm import registry
 from emberlink.trainers.cli import main
 assert Path(registry.__file__).is_relative_to(sys.argv[1]), registry.__file__
-raise SystemExit(main(["train", "flagship", "comm.gain=0.5", *sys.argv[2:]]))
+raise SystemExit(main(["train", "headcount", "comm.scale=0.5", *sys.argv[2:]]))
 """
 
 
@@ -200,8 +160,12 @@ def test_a_fifth_method_is_one_file_and_one_yaml(tmp_path):
     for folder in ("envs", "comm", "policies", "trainers", "configs"):
         ignored = shutil.ignore_patterns("__pycache__")
         shutil.copytree(ROOT / folder, package / folder, ignore=ignored)
-    (package / "comm" / "flagship.py").write_text("import torch\n" + FIFTH_MODULE)
-    (package / "configs" / "method" / "flagship.yaml").write_text(FIFTH_RECIPE)
+    # The example of the README, as printed.
+    readme = (ROOT / "README.md").read_text()
+    (module,) = re.findall(r"```python\n(# comm/headcount\.py\n.*?)```", readme, re.DOTALL)
+    (recipe,) = re.findall(r"```yaml\n(.*?)```", readme, re.DOTALL)
+    (package / "comm" / "headcount.py").write_text(module)
+    (package / "configs" / "method" / "headcount.yaml").write_text(recipe)
     overrides = ["episodes=2", "env.horizon=12", "env.num_uavs=2", "learner.hidden=[8,8]"]
     overrides += ["learner.batch=8", "evaluation.fires=1", "evaluation.interval=0"]
     done = subprocess.run(
@@ -216,8 +180,8 @@ def test_a_fifth_method_is_one_file_and_one_yaml(tmp_path):
     assert done.returncode == 0, done.stderr
     (run,) = (tmp_path / "runs").iterdir()
     assert yaml.safe_load((run / "config.yaml").read_text())["comm"] == {
-        "name": "flagship",
-        "gain": 0.5,
+        "name": "headcount",
+        "scale": 0.5,
     }
     assert len((run / "metrics.jsonl").read_text().splitlines()) == 2
     assert (run / "eval.json").exists()

@@ -1,9 +1,11 @@
 """What the trackers were told, read back from their own files."""
 
 import csv
+import importlib
 import json
 import socket
 import struct
+import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -11,6 +13,7 @@ from pathlib import Path
 import pytest
 from wandb.proto import wandb_internal_pb2
 
+from emberlink.trainers import cli
 from emberlink.trainers.config import resolve, to_values
 from emberlink.trainers.loop import Trainer
 
@@ -112,7 +115,7 @@ def test_wandb_holds_every_number_offline(mode, tmp_path, monkeypatch, capfd):
 
 
 def test_tensorboard_holds_every_number(tmp_path):
-    reader = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
+    reader = importlib.import_module("tensorboard.backend.event_processing.event_accumulator")
     folder, _, lines = tracked("tensorboard", tmp_path)
     (file,) = folder.rglob("events.out.tfevents.*")
     events = reader.EventAccumulator(str(file))
@@ -149,3 +152,17 @@ def test_the_tracker_does_not_change_the_run(tmp_path):
         path, _, _ = tracked(logger, folder)
         texts.append((path / "metrics.jsonl").read_bytes())
     assert texts[0] == texts[1]
+
+
+@pytest.mark.parametrize("logger", ["tensorboard", "wandb"])
+def test_a_tracker_that_is_not_there_is_one_line_and_leaves_nothing(
+    logger, tmp_path, capsys, monkeypatch
+):
+    monkeypatch.setitem(sys.modules, logger, None)  # importing it fails
+    output = tmp_path / "runs"
+    assert cli.main(["train", "consensus", *SHORT, f"logger={logger}", f"output={output}"]) == 2
+    err = capsys.readouterr().err
+    assert err.count("\n") == 1
+    assert f"logger={logger}" in err
+    assert "pip install" in err
+    assert not output.exists()

@@ -249,6 +249,11 @@ def test_other_bad_input_is_named():
         world(torch.full((12, 12), math.nan))
     with pytest.raises(ValueError, match=r"'papr'.*paper"):
         world("papr")
+    for nothing in (None, b"fire"):
+        with pytest.raises(ValueError, match=f"not {type(nothing).__name__}"):
+            WildfireEnv(fire=nothing)
+    with pytest.raises(ValueError, match="seed=-1"):
+        WildfireEnv(seed=-1)
     with pytest.raises(ValueError, match="num_envs=0"):
         WildfireEnv(0)
     for position in ([[5.0, 5, 9]], [[math.nan, 5, 2]], [[5.0, 5, 2], [5, 5, 2]]):

@@ -24,6 +24,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except ValueError as error:
         print(f"emberlink {options.command}: {error}", file=sys.stderr)
         return 2
+    except RuntimeError as error:
+        if "alloc" not in str(error):
+            raise
+        reason = str(error).splitlines()[0]
+        print(f"emberlink {options.command}: not enough memory: {reason}", file=sys.stderr)
+        return 2
     except KeyboardInterrupt:
         print(f"emberlink {options.command}: stopped", file=sys.stderr)
         return INTERRUPTED

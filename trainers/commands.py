@@ -18,7 +18,7 @@ from rich.progress import (
 
 from . import report
 from .cli import INTERRUPTED
-from .config import resolve
+from .config import check_device, resolve
 from .loop import Progress as Moment
 from .loop import Trainer
 from .run_folder import RunFolder
@@ -31,6 +31,12 @@ def train(method: str, overrides: Sequence[str], console: Console) -> int:
     trainer = Trainer(config)
     run = trainer.start()
     console.print(f"{method}, setup {config.setup}, fire {config.fire.name} -> {run.path}")
+    if trainer.enough > trainer.steps * config.num_envs:
+        console.print(
+            f"note: learner.batch={config.learner.batch} is more than this run collects: "
+            "nothing will be learnt",
+            style="yellow",
+        )
     try:
         with _stopping_between_steps(trainer):
             finished = _train_with_bar(trainer, console)
@@ -110,6 +116,8 @@ def evaluate_folder(
 ) -> int:
     """Evaluates a run folder's frozen policy and prints the table."""
     run = RunFolder(folder)
+    if device is not None:
+        check_device(device)
     config = run.config(**({} if device is None else {"device": device}))
     label = f"_{checkpoint.stem}" if checkpoint else ""
     checkpoint = checkpoint or run.checkpoint()

@@ -2,6 +2,7 @@
 
 import difflib
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import fields
 from importlib.resources import files
 from typing import Annotated, Any, Literal
 
@@ -31,7 +32,9 @@ _GROUPS = ("setup", "fire")
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
-Count = Annotated[int, Field(ge=1)]
+Count = Annotated[int, Field(ge=1, le=1_000_000_000)]
+Units = Annotated[int, Field(ge=1, le=8192)]
+Side = Annotated[int, Field(ge=1, le=65_536)]
 MaybeCount = Annotated[int, Field(ge=0)]
 
 
@@ -39,7 +42,7 @@ MaybeCount = Annotated[int, Field(ge=0)]
 class LearnerConfig:
     """DDPG for every UAV (paper, section III.C)."""
 
-    hidden: Annotated[tuple[Count, Count], Strict(False)]
+    hidden: Annotated[tuple[Units, Units], Strict(False)]
     """units of the two hidden layers"""
     gamma: Annotated[float, Field(ge=0, lt=1)]
     """discount per step"""
@@ -53,7 +56,7 @@ class LearnerConfig:
     """share of the networks in their targets per update"""
     updates: Count
     """updates of every UAV's networks per step of all environments side by side"""
-    batch: Count
+    batch: Annotated[int, Field(ge=1, le=1_000_000)]
     """transitions per UAV and update"""
     capacity: Count
     """transitions that a replay memory holds"""
@@ -81,11 +84,11 @@ class ExplorationConfig:
 class EvaluationConfig:
     """Frozen policies on held-out fires."""
 
-    fires: Count
+    fires: Side
     """held-out fires, one episode each, of the evaluation at the end"""
     interval: MaybeCount
     """episodes between evaluations during training; 0 for none"""
-    interval_fires: Count
+    interval_fires: Side
     """held-out fires of the evaluations during training"""
 
 
@@ -108,7 +111,7 @@ class RunConfig:
     evaluation: EvaluationConfig
     episodes: Count
     """episodes of training, counted per environment: all run theirs side by side"""
-    num_envs: Count
+    num_envs: Side
     """environments that collect side by side"""
     seed: Annotated[int, Field(ge=0, lt=2**31)]
     """of everything random in the run"""
@@ -131,7 +134,12 @@ class RunConfig:
     def _comm_is_known(cls, value: dict[str, Any]) -> dict[str, Any]:
         if "name" not in value:
             raise ValueError(f"name is missing; known: {', '.join(registry.known())}")
-        from_plain(registry.find(value["name"]).config_type, _without_name(value))
+        config_type = registry.find(value["name"]).config_type
+        settings, names = _without_name(value), [field.name for field in fields(config_type)]
+        for key in settings.keys() - names:
+            listed = ", ".join(names) or "none"
+            raise ValueError(f"comm.{key} is not a setting of {value['name']}; known: {listed}")
+        from_plain(config_type, settings)
         return value
 
 
@@ -193,7 +201,9 @@ def resolve(method: str, overrides: Sequence[str] = (), **settings: Any) -> RunC
             values: Any = OmegaConf.to_container(composed, resolve=True, throw_on_missing=True)
         except (HydraException, OmegaConfBaseException) as error:
             raise ValueError(" ".join(str(error).split())) from None
-    values = {**choices, **values}
+    if "method" in values:  # then its content did not go to the top
+        raise ValueError(f"configs/method/{method}.yaml must begin with '# @package _global_'")
+    values = {**values, **choices}
     for key, value in settings.items():
         _set(values, key, value)
     return from_values(values)

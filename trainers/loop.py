@@ -12,13 +12,12 @@ from torchrl.collectors import Collector
 from emberlink.envs import metrics
 from emberlink.policies.actor_critic import with_noise
 
-from . import evaluate
+from . import evaluate, tracking
 from .build import build_env, build_networks
 from .config import RunConfig
 from .learner import Learner
 from .memory import make_memory, rows_needed, to_rows
 from .run_folder import RunFolder
-from .tracking import Tracker
 
 
 @dataclass
@@ -42,6 +41,7 @@ class Trainer:
 
     def __init__(self, config: RunConfig):
         self.config = config
+        tracking.check(config.logger)
         generator = torch.Generator().manual_seed(config.seed)
         self.env = build_env(
             config,
@@ -93,7 +93,7 @@ class Trainer:
         Returns:
             Whether it came to the end: False after `stop`.
         """
-        tracker = Tracker(self.config, self.run)
+        tracker = tracking.Tracker(self.config, self.run)
         try:
             self._loop(tracker, report)
         finally:
@@ -132,7 +132,7 @@ class Trainer:
             trust_policy=True,
         )
 
-    def _loop(self, tracker: Tracker, report: Callable[[Progress], None]) -> None:
+    def _loop(self, tracker: tracking.Tracker, report: Callable[[Progress], None]) -> None:
         config, horizon = self.config, self.config.env.horizon
         progress = Progress(0, self.steps, 0, config.episodes)
         began, moments, losses = time.monotonic(), [], []
@@ -166,7 +166,7 @@ class Trainer:
         ]
 
     def _finish_episode(
-        self, moments: list[TensorDictBase], losses: list[torch.Tensor], tracker: Tracker
+        self, moments: list[TensorDictBase], losses: list[torch.Tensor], tracker: tracking.Tracker
     ) -> dict[str, Any]:
         """Measures an episode, writes its line, evaluates and saves where it is due."""
         config = self.config

@@ -81,7 +81,13 @@ class RunFolder:
     def lines(self, file: str = "metrics.jsonl") -> list[dict[str, Any]]:
         """The lines of a .jsonl file; none where there is no such file."""
         path = self.path / file
-        return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
+        text = path.read_text() if path.exists() else ""
+        # What a killed run had not finished writing is no line yet.
+        whole = text[: text.rfind("\n") + 1].splitlines()
+        try:
+            return [json.loads(line) for line in whole]
+        except ValueError as error:
+            raise ValueError(f"{path}: not a file of JSON lines: {error}") from None
 
     def figure(self, file: str) -> Path:
         """Where a figure goes; its folder is made if it is not there."""

@@ -1,5 +1,6 @@
 """Trackers beside metrics.jsonl: wandb, tensorboard, csv, or none."""
 
+import importlib
 import os
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -42,6 +43,21 @@ _TRACKERS: dict[str, Callable[[RunConfig, RunFolder], Logger]] = {
     "tensorboard": _tensorboard,
     "csv": _csv,
 }
+
+
+def check(logger: str) -> None:
+    """Tries what a tracker needs, before a run folder is made.
+
+    Raises:
+        ValueError: it is not installed; the message says how to install it.
+    """
+    needs = {"tensorboard": "tensorboard", "wandb": "wandb"}.get(logger)
+    try:
+        importlib.import_module(needs or __name__)
+    except ImportError as error:
+        raise ValueError(
+            f"logger={logger}: {error}; install it with: pip install 'emberlink[{needs}]'"
+        ) from None
 
 
 class Tracker:
