@@ -63,8 +63,9 @@ class Consensus(CommModule):
         moment: list[Any] = [keys.OBSERVATION, keys.POSITION, keys.STREAM, keys.STEP]
         told: list[Any] = [keys.OBSERVATION, TARGET, FOLLOWS]
         self.in_keys, self.out_keys = moment + seen + memory, told + memory
-        self.register_buffer("low", torch.tensor(world.low, dtype=torch.float64))
-        self.register_buffer("high", torch.tensor(world.high, dtype=torch.float64))
+        low, high = uav.corners(world.low, world.high)
+        self.register_buffer("low", low)
+        self.register_buffer("high", high)
 
     def specs(self, observation: Composite) -> Composite:
         agents = observation[keys.AGENTS]

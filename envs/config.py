@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Mapping
+from importlib.resources import files
 from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import ConfigDict, Field, Strict, TypeAdapter, model_validator
@@ -54,6 +55,12 @@ class WildfireConfig:
     def high(self) -> tuple[float, float, float]:
         """The box's corner with the largest coordinates, cells."""
         return self.grid[0] - 1.0, self.grid[1] - 1.0, self.altitude[1]
+
+
+def known(group: str) -> list[str]:
+    """The choices of a config group ("method", "setup" or "fire"), in alphabetical order."""
+    names = (entry.name for entry in files("emberlink.configs").joinpath(group).iterdir())
+    return sorted(name.removesuffix(".yaml") for name in names if name.endswith(".yaml"))
 
 
 def from_plain(config_type: type[T], values: Mapping[str, Any]) -> T:

@@ -17,6 +17,7 @@ from pydantic import AfterValidator, ConfigDict, Field, Strict
 from pydantic.dataclasses import dataclass
 from torch import Tensor
 
+from .config import known
 from .spread import MAX_LENGTH_TO_BREADTH, arrival_times, disc
 from .streams import fold, uniform
 
@@ -94,9 +95,7 @@ _DRAWN = tuple(f.name for f in dataclasses.fields(FireConfig) if f.name not in {
 
 def scenarios() -> list[str]:
     """Names of the scenarios: the files in `configs/fire`."""
-    folder = resources.files("emberlink.configs").joinpath("fire")
-    names = [entry.name for entry in folder.iterdir()]
-    return sorted(n.removesuffix(".yaml") for n in names if n.endswith(".yaml"))
+    return known("fire")
 
 
 def load_scenario(name: str) -> FireConfig:

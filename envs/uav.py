@@ -5,11 +5,21 @@ the same cells and the same exits, to the last one.
 """
 
 import math
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
 from . import streams
+
+
+def corners(low: Sequence[float], high: Sequence[float]) -> tuple[Tensor, Tensor]:
+    """Two corners of the box, float64 [3] each, at the values that float32 has for them.
+
+    Positions are stored as float32: who stands at an altitude of 3.3 is not beyond it.
+    """
+    both = torch.tensor([low, high], dtype=torch.float32).double()
+    return both[0], both[1]
 
 
 def move(

@@ -66,11 +66,10 @@ class WildfireEnv(EnvBase):
         bank, self._fire_each = _arrivals(fire, config, num_envs)
         self.register_buffer("_bank", bank.to(self.device))
         self.register_buffer("_growth", burning_cells(self._bank, config.horizon))
-        # The corners as float32 has them, as it does positions: who stands at 3.3 is not beyond it.
-        corners = torch.tensor([config.low, config.high], dtype=torch.float32).double()
-        self.register_buffer("_low", corners[0])
-        self.register_buffer("_high", corners[1])
-        self._ceiling = corners[1, 2].item()
+        low, high = uav.corners(config.low, config.high)
+        self.register_buffer("_low", low)
+        self.register_buffer("_high", high)
+        self._ceiling = high[2].item()
         self._make_state()
         team = num_envs, config.num_uavs
         self.observation_spec = specs.observation_spec(*team)

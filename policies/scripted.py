@@ -28,8 +28,9 @@ class Scripted(TensorDictModuleBase):
         reads: list[Any] = [keys.POSITION, keys.STREAM, keys.STEP]
         writes: list[Any] = [keys.ACTION]
         self.in_keys, self.out_keys = reads, writes
-        self.register_buffer("low", torch.tensor(world.low, dtype=torch.float64))
-        self.register_buffer("high", torch.tensor(world.high, dtype=torch.float64))
+        low, high = uav.corners(world.low, world.high)
+        self.register_buffer("low", low)
+        self.register_buffer("high", high)
 
     @staticmethod
     def moment(tensordict: TensorDictBase, use: int) -> torch.Tensor:

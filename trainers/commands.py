@@ -1,6 +1,5 @@
 """What the commands do."""
 
-import logging
 import signal
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -18,7 +17,8 @@ from rich.progress import (
 
 from . import report
 from .cli import INTERRUPTED
-from .config import check_device, resolve
+from .config import RunConfig, check_device, resolve
+from .evaluate import Policy
 from .loop import Progress as Moment
 from .loop import Trainer
 from .run_folder import RunFolder
@@ -27,7 +27,6 @@ from .run_folder import RunFolder
 def train(method: str, overrides: Sequence[str], console: Console) -> int:
     """Trains a recipe, then evaluates it. Ctrl-C saves the networks and ends the training."""
     config = resolve(method, overrides)
-    logging.getLogger("torchrl").setLevel(logging.WARNING)  # it announces every storage
     trainer = Trainer(config)
     run = trainer.start()
     console.print(f"{method}, setup {config.setup}, fire {config.fire.name} -> {run.path}")
@@ -42,22 +41,13 @@ def train(method: str, overrides: Sequence[str], console: Console) -> int:
             finished = _train_with_bar(trainer, console)
         if not finished:
             raise KeyboardInterrupt
-        results = report.evaluate_run(
-            run,
-            config,
-            trainer.actor,
-            checkpoint=run.checkpoint(),
-            fires=config.evaluation.fires,
-            report=lambda text: console.print(f"  {text}", style="dim"),
-        )
+        _evaluate(run, config, trainer.actor, run.checkpoint(), config.evaluation.fires, console)
     except KeyboardInterrupt:
         console.print(
             f"stopped; what was learnt is in {run.checkpoint()}\n"
             f"evaluate it with: emberlink eval {run.path}"
         )
         return INTERRUPTED
-    report.print_table(console, results, config)
-    console.print(str(run.path), soft_wrap=True)
     return 0
 
 
@@ -122,15 +112,28 @@ def evaluate_folder(
     label = f"_{checkpoint.stem}" if checkpoint else ""
     checkpoint = checkpoint or run.checkpoint()
     actor = report.load_actor(config, checkpoint)
+    _evaluate(run, config, actor, checkpoint, fires or config.evaluation.fires, console, label)
+    return 0
+
+
+def _evaluate(
+    run: RunFolder,
+    config: RunConfig,
+    actor: Policy,
+    checkpoint: Path,
+    fires: int,
+    console: Console,
+    label: str = "",
+) -> None:
+    """Evaluates a frozen policy, prints the table and, last, the run folder."""
     results = report.evaluate_run(
         run,
         config,
         actor,
         checkpoint=checkpoint,
-        fires=fires or config.evaluation.fires,
+        fires=fires,
         report=lambda text: console.print(f"  {text}", style="dim"),
         label=label,
     )
     report.print_table(console, results, config)
     console.print(str(run.path), soft_wrap=True)
-    return 0

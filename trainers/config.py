@@ -3,7 +3,6 @@
 import difflib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import fields
-from importlib.resources import files
 from typing import Annotated, Any, Literal
 
 import torch
@@ -24,7 +23,7 @@ from pydantic import (
 from pydantic.dataclasses import dataclass
 
 from emberlink.comm import registry
-from emberlink.envs.config import WildfireConfig, from_plain
+from emberlink.envs.config import WildfireConfig, from_plain, known
 from emberlink.envs.fire import FireConfig
 
 _STRICT = ConfigDict(extra="forbid", strict=True)
@@ -158,25 +157,17 @@ def check_device(name: str) -> str:
     Raises:
         ValueError: it is none; the message lists those there are.
     """
-    known = ["cpu", *(f"cuda:{i}" for i in range(torch.cuda.device_count()))]
+    present = ["cpu", *(f"cuda:{i}" for i in range(torch.cuda.device_count()))]
     try:
         device = torch.device(name)
     except RuntimeError:
         device = None
     there = device is not None and (
-        str(device) == "cpu" or (device.type == "cuda" and (device.index or 0) < len(known) - 1)
+        str(device) == "cpu" or (device.type == "cuda" and (device.index or 0) < len(present) - 1)
     )
     if not there:
-        raise ValueError(f"device={name} is not there; known: {', '.join(known)}")
+        raise ValueError(f"device={name} is not there; known: {', '.join(present)}")
     return name
-
-
-def known(group: str) -> list[str]:
-    """The choices of a config group ("method", "setup" or "fire"), in alphabetical order."""
-    folder = files("emberlink.configs") / group
-    return sorted(
-        p.name.removesuffix(".yaml") for p in folder.iterdir() if p.name.endswith(".yaml")
-    )
 
 
 def resolve(method: str, overrides: Sequence[str] = (), **settings: Any) -> RunConfig:

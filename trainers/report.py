@@ -76,8 +76,8 @@ def evaluate_run(
         title = f"{config.method}, setup {config.setup}, fire {config.fire.name}"
         figures.training_curves(run.figure("training.png"), lines, title)
     report("one episode for the animation")
-    name, arrival = next(iter(evaluate.evaluation_fires(config, 1).items()))
-    pictures, steps = evaluate.film(config, actor, fire=arrival)
+    name, arrival = next(iter(evaluate.evaluation_fires(config, fires).items()))
+    pictures, steps = evaluate.film(config, actor, fire=arrival[0])
     write_gif(run.figure(f"episode_{name}{label}.gif"), pictures)
     figures.timelapse(run.figure(f"timelapse_{name}{label}.png"), pictures, steps)
     return results

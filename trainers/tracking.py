@@ -45,18 +45,23 @@ _TRACKERS: dict[str, Callable[[RunConfig, RunFolder], Logger]] = {
 }
 
 
+_PACKAGES = ("wandb", "tensorboard")
+"""the trackers that are a package of their own"""
+
+
 def check(logger: str) -> None:
     """Tries what a tracker needs, before a run folder is made.
 
     Raises:
         ValueError: it is not installed; the message says how to install it.
     """
-    needs = {"tensorboard": "tensorboard", "wandb": "wandb"}.get(logger)
+    if logger not in _PACKAGES:
+        return
     try:
-        importlib.import_module(needs or __name__)
+        importlib.import_module(logger)
     except ImportError as error:
         raise ValueError(
-            f"logger={logger}: {error}; install it with: pip install 'emberlink[{needs}]'"
+            f"logger={logger}: {error}; install it with: pip install {logger}"
         ) from None
 
 
