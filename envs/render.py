@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
-from .uav import view_radius
+from .view import view_radius
 
 NO_FIRE = (0, 0, 0)
 FIRE = (255, 255, 255)

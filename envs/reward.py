@@ -45,7 +45,7 @@ def left_box(beyond: Tensor, axes: Literal["xyz", "xy"]) -> Tensor:
         beyond: bool [..., 3], per axis.
         axes: the axes that are tested.
     """
-    return beyond[..., : len(axes)].any(-1)
+    return (beyond if axes == "xyz" else beyond[..., : len(axes)]).any(-1)
 
 
 def view_reward(
@@ -54,11 +54,12 @@ def view_reward(
     """The reward for what is in view, or the penalty for leaving the box, float32 [...].
 
     Args:
-        new, old, none: integers [...], cells in view of each class.
+        new, old, none: whole numbers [...], cells in view of each class.
         beyond: bool [..., 3], the axes along which the move would have left the box.
     """
-    earned = config.new_fire * new + config.old_fire * old + config.no_fire * none
-    return torch.where(left_box(beyond, config.exit_axes), config.exit, earned).float()
+    earned = config.new_fire * new
+    earned.add_(old, alpha=config.old_fire).add_(none, alpha=config.no_fire)
+    return earned.masked_fill_(left_box(beyond, config.exit_axes), config.exit).float()
 
 
 def _degrees(vector: Tensor) -> Tensor:

@@ -52,6 +52,21 @@ def streams(seed: int, count: int, device: torch.device | str | None = None) -> 
     return fold(root, torch.arange(count, device=device))
 
 
+def integers(stream: Tensor, lanes: int, limit: int | Tensor) -> Tensor:
+    """Whole numbers 0 ... limit - 1, all equally likely to within limit / 2³².
+
+    Args:
+        stream: int64 [...].
+        lanes: how many numbers per stream.
+        limit: at most 2³¹.
+
+    Returns:
+        int64 [..., lanes].
+    """
+    bits = fold(stream.unsqueeze(-1), torch.arange(lanes, device=stream.device))
+    return (_shift(bits, 32) * limit) >> 32
+
+
 def uniform(stream: Tensor, lanes: int) -> Tensor:
     """Uniform numbers on (0, 1), both ends left out.
 

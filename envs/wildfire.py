@@ -1,5 +1,7 @@
 """The wildfire environment: glue between fire, motion, view and reward."""
 
+from collections.abc import Sequence
+
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
@@ -7,11 +9,12 @@ from torchrl.envs import EnvBase
 
 from . import keys, render, specs, streams, uav
 from .config import WildfireConfig
-from .fire import FireConfig, burning_cells, load_scenario
-from .fire_bank import fire_bank
+from .discovery import Discovery
+from .fire import FireConfig
+from .fire_bank import arrival_times
 from .reward import view_reward
+from .view import View
 
-_NEVER = torch.iinfo(torch.int32).max
 _POSITIONS, _FIRE, _STEPS = range(3)  # what an episode's random stream is split into
 
 
@@ -25,71 +28,78 @@ class WildfireEnv(EnvBase):
             arrival times in steps, inf where it never burns: [X, Y] for all environments or
             [num_envs, X, Y] for one each.
         seed: of everything random here. Environment i's randomness depends on (seed, i) alone.
+            Several seeds share the environments out between them, in order: each has as many, and
+            they are what they would be with that seed alone.
         device: where all tensors live.
 
     Raises:
-        ValueError: an unknown scenario, or arrival times whose shape does not fit.
+        ValueError: an unknown scenario, arrival times whose shape does not fit, or a number of
+            environments that the seeds cannot share out.
     """
 
-    # What an episode does not change ...
-    _bank: Tensor
-    _growth: Tensor
     _low: Tensor
     _high: Tensor
     _seed_stream: Tensor
-    # ... and what it does.
     _episode: Tensor
-    _fire: Tensor
+    _stream: Tensor
+    _step_stream: Tensor
     _time: Tensor
     _position: Tensor
     _seen: Tensor
-    _first_seen: Tensor
 
     def __init__(
         self,
         num_envs: int = 1,
         config: WildfireConfig | None = None,
         fire: str | FireConfig | Tensor = "paper",
-        seed: int = 0,
+        seed: int | Sequence[int] = 0,
         device: torch.device | str = "cpu",
     ):
         if num_envs < 1:
             raise ValueError(f"num_envs={num_envs}: at least 1 is needed")
-        if seed < 0:
+        seeds = [seed] if isinstance(seed, int) else list(seed)
+        if min(seeds, default=-1) < 0:
             raise ValueError(f"seed={seed}: a number that is not negative is needed")
+        if num_envs % len(seeds):
+            raise ValueError(f"num_envs={num_envs} is no multiple of the {len(seeds)} seeds")
         super().__init__(device=device, batch_size=torch.Size([num_envs]))
         if config is None:
             config = WildfireConfig()
             if isinstance(fire, Tensor) and fire.ndim in (2, 3):
                 config = WildfireConfig(grid=(fire.shape[-2], fire.shape[-1]))
         self.config = config
-        bank, self._fire_each = _arrivals(fire, config, num_envs)
-        self.register_buffer("_bank", bank.to(self.device))
-        self.register_buffer("_growth", burning_cells(self._bank, config.horizon))
         low, high = uav.corners(config.low, config.high)
         self.register_buffer("_low", low)
         self.register_buffer("_high", high)
-        self._ceiling = high[2].item()
-        self._make_state()
+        view = View(config.grid, view_angle=config.view_angle, ceiling=high[2].item())
+        fires, self._fire_each = arrival_times(fire, config, num_envs)
+        self._map = Discovery(
+            view, fires, horizon=config.horizon, envs=num_envs, uavs=config.num_uavs
+        )
+        for name in ("_seed_stream", "_episode", "_stream", "_step_stream", "_time", "_seen"):
+            self.register_buffer(name, torch.zeros(num_envs, dtype=torch.int64))
+        position = torch.zeros(num_envs, config.num_uavs, 3, dtype=torch.float64)
+        self.register_buffer("_position", position)
         team = num_envs, config.num_uavs
         self.observation_spec = specs.observation_spec(*team)
         self.action_spec = specs.action_spec(*team)
         self.reward_spec = specs.reward_spec(*team)
         self.done_spec = specs.done_spec(num_envs)
         self.to(self.device)
-        self.set_seed(seed)
+        self.set_seed(seeds[0])
+        each = [streams.streams(one, num_envs // len(seeds), self.device) for one in seeds]
+        self._seed_stream.copy_(torch.cat(each))
 
     @property
     def fire_map(self) -> Tensor:
         """The paper's map, uint8 [num_envs, X, Y]: 0 no fire, 1 seen, 2 not yet seen."""
-        burning = self._bank[self._fire] <= self._time[:, None, None]
-        seen = (self._first_seen < _NEVER).unflatten(-1, self.config.grid)
-        return burning.to(torch.uint8) * (2 - seen.to(torch.uint8))
+        burning = self.arrival <= self._time[:, None, None]
+        return burning.to(torch.uint8) * (2 - self._map.seen.to(torch.uint8))
 
     @property
     def arrival(self) -> Tensor:
         """The fire of each environment: arrival times in steps, float32 [num_envs, X, Y]."""
-        return self._bank[self._fire]
+        return self._map.arrival
 
     def render(self, mode: str = "rgb_array", *, env: int = 0):
         """A picture of one environment in the paper's colours, uint8 [height, width, 3].
@@ -105,27 +115,10 @@ class WildfireEnv(EnvBase):
             view_angle=self.config.view_angle,
         )
 
-    def _make_state(self) -> None:
-        """What changes in an episode, and the streams that it draws from."""
-        envs, uavs, (x, y) = *self.batch_size, self.config.num_uavs, self.config.grid
-        self.register_buffer("_seed_stream", torch.zeros(envs, dtype=torch.int64))
-        self.register_buffer("_episode", torch.zeros(envs, dtype=torch.int64))
-        self.register_buffer("_fire", torch.zeros(envs, dtype=torch.int64))
-        self.register_buffer("_time", torch.zeros(envs, dtype=torch.int64))
-        self.register_buffer("_position", torch.zeros(envs, uavs, 3))
-        self.register_buffer("_seen", torch.zeros(envs, dtype=torch.int64))
-        # When and by whom a cell was first seen, as step * num_uavs + UAV: one number that
-        # settles, without a loop over UAVs, who discovers a cell that several see at once.
-        self.register_buffer("_first_seen", torch.full((envs, x * y), _NEVER, dtype=torch.int32))
-
     def _set_seed(self, seed: int | None) -> None:
         count = self.batch_size[0]
         self._seed_stream.copy_(streams.streams(seed or 0, count, self.device))
         self._episode.zero_()
-
-    @property
-    def _stream(self) -> Tensor:
-        return streams.fold(self._seed_stream, self._episode)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs) -> TensorDictBase:
         """New positions and a new fire where "_reset" says so, else everywhere.
@@ -136,27 +129,27 @@ class WildfireEnv(EnvBase):
         """
         mask = None if tensordict is None else tensordict.get("_reset", None)
         mask = torch.ones_like(self._time, dtype=torch.bool) if mask is None else mask.view(-1)
-        self._episode += mask
-        self._time.masked_fill_(mask, 0)
-        self._seen.masked_fill_(mask, 0)
-        self._first_seen.masked_fill_(mask[:, None], _NEVER)
-        self._fire.copy_(torch.where(mask, self._draw_fire(), self._fire))
+        self._begin_episodes(mask)
         start = self._start_positions(kwargs.get("position"))
         self._position.copy_(torch.where(mask[:, None, None], start, self._position))
         # Nobody has looked yet: the first step counts what is in view.
-        nothing = torch.zeros_like(self._position[..., 0], dtype=torch.int64)
-        nowhere = torch.zeros_like(self._position[..., :2])
+        nothing = torch.zeros_like(self._position, dtype=torch.int64)
+        nowhere = torch.zeros_like(self._position).float().unsqueeze(-1).expand(-1, -1, -1, 2)
         return self._snapshot(
-            new=nothing,
-            old=nothing.clone(),
-            none=nothing.clone(),
-            new_centre=nowhere,
-            old_centre=nowhere.clone(),
-            beyond=torch.zeros_like(self._position, dtype=torch.bool),
+            self._position.float(), nothing, nowhere.clone(), torch.zeros_like(nothing) > 0
         )
 
+    def _begin_episodes(self, mask: Tensor) -> None:
+        """The next episode, bool [num_envs] says where: its stream, its fire, nothing seen."""
+        self._episode.add_(mask)
+        self._stream.copy_(streams.fold(self._seed_stream, self._episode))
+        self._step_stream.copy_(streams.fold(self._stream, _STEPS))
+        self._time.masked_fill_(mask, 0)
+        self._seen.masked_fill_(mask, 0)
+        self._map.begin(mask, self._draw_fire())
+
     def _draw_fire(self) -> Tensor:
-        envs, fires = self.batch_size[0], len(self._bank)
+        envs, fires = self.batch_size[0], len(self._map)
         if self._fire_each:
             return torch.arange(envs, device=self.device) % fires
         unit = streams.uniform(streams.fold(self._stream, _FIRE), 1).squeeze(-1)
@@ -178,7 +171,7 @@ class WildfireEnv(EnvBase):
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         config = self.config
-        self._time += 1
+        self._time.add_(1)
         position, beyond = uav.move(
             self._position,
             tensordict.get(keys.ACTION),
@@ -187,112 +180,73 @@ class WildfireEnv(EnvBase):
             high=self._high,
         )
         self._position.copy_(position)
-        cells, flat, visible = uav.view(
-            position, view_angle=config.view_angle, ceiling=self._ceiling, grid=config.grid
-        )
-        new, old = self._discover(flat, visible)
-        counts = {"new": new.sum(-1), "old": old.sum(-1), "none": (visible & ~new & ~old).sum(-1)}
-        self._seen += counts["new"].sum(-1)
-        following = self._snapshot(
-            **counts,
-            new_centre=uav.mean_cell(cells, new),
-            old_centre=uav.mean_cell(cells, old),
-            beyond=beyond,
-        )
-        reward = view_reward(**counts, beyond=beyond, config=config.reward)
-        following.set(keys.REWARD, reward.unsqueeze(-1))
-        return following
+        counts, centres = self._map.look(self._position, self._time)
+        reward = view_reward(*counts.unbind(-1), beyond, config.reward)
+        counts = counts.long()
+        self._seen.add_(counts[..., 0].sum(-1))
+        return self._snapshot(position, counts, centres, beyond, reward)
 
-    def _discover(self, flat: Tensor, visible: Tensor) -> tuple[Tensor, Tensor]:
-        """Which cells in view are new and which are old fire, bool [num_envs, n, V] each.
-
-        UAV 0 looks first: a cell is new to the lowest UAV that sees it at the first step at
-        which anyone does, and old to all others from then on.
-        """
-        uavs, area = self.config.num_uavs, self._first_seen.shape[-1]
-        arrival = self._bank.view(-1)[self._fire[:, None, None] * area + flat]
-        burning = visible & (arrival <= self._time[:, None, None])
-        stamp = self._time[:, None] * uavs + torch.arange(uavs, device=self.device)
-        stamp = stamp.unsqueeze(-1).to(torch.int32)
-        claims = torch.where(burning, stamp, _NEVER).flatten(1)
-        self._first_seen.scatter_reduce_(1, flat.flatten(1), claims, "amin")
-        first = self._first_seen.gather(1, flat.flatten(1)).view_as(flat)
-        return burning & (first == stamp), burning & (first < stamp)
+    def _step_proc_data(self, next_tensordict_out: TensorDictBase) -> TensorDictBase:
+        """TorchRL completes here what a step has left out; ours leaves nothing out."""
+        return next_tensordict_out
 
     def _snapshot(
         self,
-        *,
-        new: Tensor,
-        old: Tensor,
-        none: Tensor,
-        new_centre: Tensor,
-        old_centre: Tensor,
+        position: Tensor,
+        counts: Tensor,
+        centres: Tensor,
         beyond: Tensor,
+        reward: Tensor | None = None,
     ) -> TensorDict:
-        """The TensorDict of a moment; clones, because the state is written in place."""
-        position, time = self._position.clone(), self._time.clone()
-        agents = TensorDict(
-            {
-                keys.OBSERVATION[1]: self._observe(position, new, old, time),
-                keys.POSITION[1]: position,
-                keys.NEW_FIRE[1]: new,
-                keys.OLD_FIRE[1]: old,
-                keys.NO_FIRE[1]: none,
-                keys.NEW_CENTRE[1]: new_centre,
-                keys.OLD_CENTRE[1]: old_centre,
-                keys.BEYOND[1]: beyond,
-            },
-            batch_size=position.shape[:-1],
-            device=self.device,
-        )
-        truncated = (time >= self.config.horizon).unsqueeze(-1)
-        return TensorDict(
-            {
-                keys.AGENTS: agents,
-                keys.STREAM: streams.fold(self._stream, _STEPS),
-                keys.STEP: time,
-                keys.SEEN: self._seen.clone(),
-                keys.BURNING: self._growth[self._fire, time.clamp(max=self.config.horizon)],
-                "done": truncated,
-                "terminated": torch.zeros_like(truncated),
-                "truncated": truncated.clone(),
-            },
-            batch_size=self.batch_size,
-            device=self.device,
-        )
+        """The TensorDict of a moment.
 
-    def _observe(self, position: Tensor, new: Tensor, old: Tensor, time: Tensor) -> Tensor:
+        Args:
+            position: float32 [num_envs, n, 3].
+            counts: int64 [num_envs, n, 3], cells in view that are new, old and no fire.
+            centres: float32 [num_envs, n, 3, 2], their means.
+            beyond: bool [num_envs, n, 3].
+            reward: float32 [num_envs, n]; a reset has none.
+        """
+        time = self._time.clone()
+        new, old, none = counts.unbind(-1)
+        new_centre, old_centre, _ = centres.unbind(-2)
+        agents = {
+            keys.OBSERVATION[1]: self._observe(position, counts, time),
+            keys.POSITION[1]: position,
+            keys.NEW_FIRE[1]: new,
+            keys.OLD_FIRE[1]: old,
+            keys.NO_FIRE[1]: none,
+            keys.NEW_CENTRE[1]: new_centre,
+            keys.OLD_CENTRE[1]: old_centre,
+            keys.BEYOND[1]: beyond,
+        }
+        if reward is not None:
+            agents[keys.REWARD[1]] = reward.unsqueeze(-1)
+        truncated = (time >= self.config.horizon).unsqueeze(-1)
+        whole = {
+            keys.AGENTS: _tensordict(agents, position.shape[:-1], self.device),
+            keys.STREAM: self._step_stream.clone(),
+            keys.STEP: time,
+            keys.SEEN: self._seen.clone(),
+            keys.BURNING: self._map.burning(time),
+            "done": truncated,
+            "terminated": torch.zeros_like(truncated),
+            "truncated": truncated.clone(),
+        }
+        return _tensordict(whole, self.batch_size, self.device)
+
+    def _observe(self, position: Tensor, counts: Tensor, time: Tensor) -> Tensor:
         """x, y, z, new-fire flag, old-fire flag, timestep: float32 [num_envs, n, 6]."""
-        time = time[:, None].expand_as(new).float()
+        clock = time.view(-1, 1, 1).expand(-1, position.shape[1], 1)
         if self.config.observation == "box":
             position = uav.scale_to_box(position, self._low, self._high)
-            time = time / self.config.horizon
-        return torch.cat((position, torch.stack(((new > 0), (old > 0), time), -1).float()), -1)
+            clock = clock / self.config.horizon
+        return torch.cat((position, counts[..., :2] > 0, clock), -1)
 
 
-def _arrivals(
-    fire: str | FireConfig | Tensor, config: WildfireConfig, num_envs: int
-) -> tuple[Tensor, bool]:
-    """Arrival times, float32 [fires, X, Y], and whether environment i always has fire i."""
-    if isinstance(fire, str):
-        fire = load_scenario(fire)
-    if isinstance(fire, FireConfig):
-        return fire_bank(fire, "train", fire.bank, config.grid, config.horizon), False
-    # A copy, in order in memory: what the caller does to theirs later is not our fire.
-    try:
-        bank = torch.as_tensor(fire, dtype=torch.float32)
-    except (TypeError, ValueError, RuntimeError):
-        raise ValueError(
-            f"fire: a scenario's name, a FireConfig or arrival times, not {type(fire).__name__}"
-        ) from None
-    bank = bank.clone(memory_format=torch.contiguous_format)
-    shape = list(bank.shape)
-    bank = bank.unsqueeze(0) if bank.ndim == 2 else bank
-    if bank.shape not in ((1, *config.grid), (num_envs, *config.grid)):
-        raise ValueError(
-            f"fire: arrival times of shape {shape}; expected {list(config.grid)} or "
-            f"{[num_envs, *config.grid]} (the grid of the config, num_envs={num_envs})"
-        )
-    if bank.isnan().any():
-        raise ValueError("fire: arrival times hold NaN; a cell that never burns is inf")
-    return bank, True
+def _tensordict(source: dict, batch_size: torch.Size, device: torch.device | None) -> TensorDict:
+    """A TensorDict of tensors whose shapes and device are known to be right.
+
+    Checking them one by one takes a quarter of a step of one environment.
+    """
+    return TensorDict._new_unsafe(source, batch_size=batch_size, device=device)

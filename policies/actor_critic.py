@@ -1,15 +1,16 @@
 """The networks as TensorDict modules, built from an environment's specs."""
 
-from typing import Any
+import copy
+from collections.abc import Sequence
 
 import torch
-from tensordict.nn import TensorDictModule, TensorDictSequential
+from tensordict.nn import TensorDictModule
 from torchrl.data import Composite
-from torchrl.modules import OrnsteinUhlenbeckProcessModule, ValueOperator
+from torchrl.modules import ValueOperator
 
 from emberlink.envs import keys
 
-from .networks import StackedActor, StackedCritic
+from .networks import Generators, StackedActor, StackedCritic
 
 STATE_ACTION_VALUE = (keys.AGENTS, "state_action_value")
 
@@ -19,14 +20,14 @@ def make_actor(
     action: Composite,
     hidden: tuple[int, int],
     *,
-    generator: torch.Generator | None = None,
+    generator: Generators = None,
 ) -> TensorDictModule:
     """The UAVs' actors: ("agents", "observation") -> ("agents", "action").
 
     Args:
         observation, action: specs of the environment, batch size [num_envs].
         hidden: sizes of the two hidden layers.
-        generator: of the initial weights.
+        generator: of the initial weights; several make as many teams, see `networks`.
     """
     network = _stacked(StackedActor, observation, action, hidden, generator)
     return TensorDictModule(network, in_keys=[keys.OBSERVATION], out_keys=[keys.ACTION])
@@ -37,7 +38,7 @@ def make_critic(
     action: Composite,
     hidden: tuple[int, int],
     *,
-    generator: torch.Generator | None = None,
+    generator: Generators = None,
 ) -> ValueOperator:
     """The UAVs' critics; arguments as `make_actor`."""
     network = _stacked(StackedCritic, observation, action, hidden, generator)
@@ -51,31 +52,21 @@ def _stacked(
     observation: Composite,
     action: Composite,
     hidden: tuple[int, int],
-    generator: torch.Generator | None,
+    generator: Generators,
 ) -> StackedActor | StackedCritic:
     uavs, features = observation[keys.OBSERVATION].shape[-2:]
     device = torch.device(observation.device or "cpu")
     actions = action[keys.ACTION].shape[-1]
-    return kind(uavs, features, actions, hidden, device=device, generator=generator)
+    teams = len(generator) if isinstance(generator, Sequence) else 1
+    return kind(teams * uavs, features, actions, hidden, device=device, generator=generator)
 
 
-def with_noise(
-    actor: TensorDictModule, action: Composite, *, theta: float, sigma: float, dt: float
-) -> TensorDictSequential:
-    """The actor with Ornstein-Uhlenbeck noise on its actions, clipped to the action box.
-
-    The noise starts anew with each episode (it reads "is_init", which `InitTracker` writes) and
-    does not fade: the paper anneals nothing.
-    """
-    noise = OrnsteinUhlenbeckProcessModule(
-        action.clone(),
-        eps_init=1.0,
-        eps_end=1.0,
-        theta=theta,
-        sigma=sigma,
-        dt=dt,
-        action_key=keys.ACTION,
-        device=torch.device(action.device or "cpu"),
-    )
-    parts: list[Any] = [actor, noise]
-    return TensorDictSequential(*parts)
+def team_of(network: TensorDictModule, team: int, teams: int) -> TensorDictModule:
+    """One team's networks out of a stack; they share its memory, so that they learn with it."""
+    if teams == 1:
+        return network
+    single = copy.deepcopy(network)
+    for own, stacked in zip(single.parameters(), network.parameters(), strict=True):
+        own.data = stacked.data.unflatten(0, (teams, -1))[team]
+    single.module.uavs //= teams
+    return single

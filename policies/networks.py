@@ -1,7 +1,8 @@
 """The paper's networks, one per UAV, as one batched product (section III.C; docs/setups.md).
 
 A stack holds the weights of all UAVs in tensors whose first dimension is the UAV: nothing is
-shared, no gradient crosses, and one launch serves all.
+shared, no gradient crosses, and one launch serves all. Several teams that train side by side, one
+per seed, are a longer stack: team 0's UAVs first.
 """
 
 import math
@@ -9,6 +10,9 @@ from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
+
+Generators = torch.Generator | Sequence[torch.Generator] | None
+"""of initial weights: one for all, or one per team of a stack that shares the UAVs out in order"""
 
 
 class StackedLinear(nn.Module):
@@ -31,18 +35,23 @@ class StackedLinear(nn.Module):
         *,
         bound: float | None = None,
         device: torch.device | str | None = None,
-        generator: torch.Generator | None = None,
+        generator: Generators = None,
     ):
         super().__init__()
         bound = 1 / math.sqrt(inputs) if bound is None else bound
+        generators = generator if isinstance(generator, Sequence) else [generator]
+        team = uavs // len(generators)
 
         def start(*shape: int) -> nn.Parameter:
             # Drawn on the CPU, so that a seed means the same weights on every device.
-            values = torch.empty(shape).uniform_(-bound, bound, generator=generator)
-            return nn.Parameter(values.to(device))
+            values = [
+                torch.empty(team, *shape).uniform_(-bound, bound, generator=one)
+                for one in generators
+            ]
+            return nn.Parameter(torch.cat(values).to(device))
 
-        self.weight = start(uavs, inputs, outputs)
-        self.bias = start(uavs, 1, outputs)
+        self.weight = start(inputs, outputs)
+        self.bias = start(1, outputs)
 
     def forward(self, x: Tensor) -> Tensor:
         """[uavs, batch, inputs] -> [uavs, batch, outputs]."""
@@ -63,16 +72,6 @@ class StackedLayerNorm(nn.Module):
         return torch.addcmul(self.bias, normal, self.weight)
 
 
-def _by_uav(x: Tensor) -> Tensor:
-    """[..., uavs, features] -> [uavs, batch, features]."""
-    return x.flatten(0, -3).transpose(0, 1) if x.ndim > 2 else x.unsqueeze(1)
-
-
-def _by_batch(x: Tensor, batch: Sequence[int]) -> Tensor:
-    """[uavs, batch, features] -> [*batch, uavs, features]."""
-    return x.transpose(0, 1).reshape(*batch, x.shape[0], x.shape[-1])
-
-
 class _Trunk(nn.Module):
     """Observation -> first -> second hidden layer, LayerNorm after each, ReLU in between."""
 
@@ -82,18 +81,33 @@ class _Trunk(nn.Module):
         features: int,
         hidden: tuple[int, int],
         device: torch.device | str | None,
-        generator: torch.Generator | None,
+        generator: Generators,
     ):
         super().__init__()
+        self.uavs = uavs
         first, second = hidden
         self.first = StackedLinear(uavs, features, first, device=device, generator=generator)
         self.first_norm = StackedLayerNorm(uavs, first, device=device)
         self.second = StackedLinear(uavs, first, second, device=device, generator=generator)
         self.second_norm = StackedLayerNorm(uavs, second, device=device)
 
+    def by_uav(self, x: Tensor) -> Tensor:
+        """[..., uavs, features] -> [uavs, batch, features].
+
+        Where x has the UAVs of one team only, its first dimension holds the teams' environments,
+        team 0's first, and each team is read from its own.
+        """
+        x = x.flatten(0, -3) if x.ndim > 2 else x.unsqueeze(0)
+        teams = self.uavs // x.shape[-2]
+        return x.unflatten(0, (teams, -1)).transpose(1, 2).flatten(0, 1)
+
+    def by_batch(self, x: Tensor, shape: torch.Size) -> Tensor:
+        """The other way: [uavs, batch, features] -> [*shape, features]."""
+        return x.unflatten(0, (-1, shape[-1])).transpose(1, 2).reshape(*shape, x.shape[-1])
+
     def normalised(self, observation: Tensor) -> Tensor:
         """[..., uavs, features] -> [uavs, batch, second], before the second ReLU."""
-        x = torch.relu(self.first_norm(self.first(_by_uav(observation))))
+        x = torch.relu(self.first_norm(self.first(self.by_uav(observation))))
         return self.second_norm(self.second(x))
 
 
@@ -117,7 +131,7 @@ class StackedActor(_Trunk):
         hidden: tuple[int, int] = (400, 300),
         *,
         device: torch.device | str | None = None,
-        generator: torch.Generator | None = None,
+        generator: Generators = None,
     ):
         super().__init__(uavs, features, hidden, device, generator)
         self.action = StackedLinear(
@@ -127,7 +141,7 @@ class StackedActor(_Trunk):
     def forward(self, observation: Tensor) -> Tensor:
         """float32 [..., uavs, features] -> [..., uavs, actions] in (-1, 1)."""
         x = torch.relu(self.normalised(observation))
-        return _by_batch(torch.tanh(self.action(x)), observation.shape[:-2])
+        return self.by_batch(torch.tanh(self.action(x)), observation.shape[:-1])
 
 
 class StackedCritic(_Trunk):
@@ -145,7 +159,7 @@ class StackedCritic(_Trunk):
         hidden: tuple[int, int] = (400, 300),
         *,
         device: torch.device | str | None = None,
-        generator: torch.Generator | None = None,
+        generator: Generators = None,
     ):
         super().__init__(uavs, features, hidden, device, generator)
         self.action = StackedLinear(uavs, actions, hidden[1], device=device, generator=generator)
@@ -155,5 +169,5 @@ class StackedCritic(_Trunk):
 
     def forward(self, observation: Tensor, action: Tensor) -> Tensor:
         """float32 [..., uavs, features] and [..., uavs, actions] -> [..., uavs, 1]."""
-        x = torch.relu(self.normalised(observation) + self.action(_by_uav(action)))
-        return _by_batch(self.value(x), observation.shape[:-2])
+        x = torch.relu(self.normalised(observation) + self.action(self.by_uav(action)))
+        return self.by_batch(self.value(x), observation.shape[:-1])

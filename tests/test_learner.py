@@ -132,7 +132,6 @@ def test_each_uav_of_the_stack_equals_a_single_ddpg():
             assert (actor_losses[uav].item(), critic_losses[uav].item()) == pytest.approx(
                 expected, rel=1e-4, abs=1e-5
             )
-    assert learner.updates == 10
     hand = {
         "actor": "actor",
         "value": "critic",

@@ -18,8 +18,8 @@ def memory(*, shared: bool, capacity: int = 4000, batch: int = 64, most: int = 1
         capacity=capacity,
         batch=batch,
         most=most,
+        seeds=[0],
         device="cpu",
-        generator=torch.Generator().manual_seed(0),
     )
 
 

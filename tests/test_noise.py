@@ -5,11 +5,13 @@ import math
 import pytest
 import torch
 from tensordict import TensorDict
+from tensordict.nn import TensorDictSequential
 from torchrl.data import Bounded, Composite, Unbounded
 from torchrl.envs import ExplorationType, set_exploration_type
 
-from emberlink.envs import keys
-from emberlink.policies.actor_critic import make_actor, with_noise
+from emberlink.envs import keys, streams
+from emberlink.policies.actor_critic import make_actor
+from emberlink.policies.noise import OrnsteinUhlenbeck
 from emberlink.trainers import evaluate, make_env
 from emberlink.trainers.config import resolve
 from emberlink.trainers.loop import Trainer
@@ -29,16 +31,19 @@ def explorer(*, theta: float, sigma: float, dt: float, envs: int = ENVS, network
     action = Composite({keys.ACTION: Bounded(-1.0, 1.0, (envs, UAVS, 3))}, shape=(envs,))
     actor = make_actor(observation, action, (8, 8))
     actor.module = network or Still()
-    return with_noise(actor, action, theta=theta, sigma=sigma, dt=dt)
+    return TensorDictSequential(actor, OrnsteinUhlenbeck(theta=theta, sigma=sigma, dt=dt))
 
 
 def play(policy, starts: list[torch.Tensor | bool], envs: int = ENVS) -> torch.Tensor:
     """The actions of consecutive steps, [steps, envs, uavs, 3]; `starts` marks new episodes."""
-    torch.manual_seed(0)
     actions = []
     moment = TensorDict({keys.OBSERVATION: torch.ones(envs, UAVS, 6)}, batch_size=[envs])
+    episode = step = torch.zeros(envs, dtype=torch.int64)
     for start in starts:
-        moment["is_init"] = torch.as_tensor(start).expand(envs, 1).clone()
+        fresh = torch.as_tensor(start).flatten().expand(envs)
+        episode, step = episode + fresh, torch.where(fresh, 0, step + 1)
+        moment[keys.STREAM] = streams.fold(streams.streams(0, envs), episode)
+        moment[keys.STEP] = step
         moment = policy(moment)
         actions.append(moment[keys.ACTION].clone())
     return torch.stack(actions)

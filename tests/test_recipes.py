@@ -125,7 +125,7 @@ def test_evaluations_and_checkpoints_come_at_their_intervals(tmp_path):
 def test_several_updates_a_step(tmp_path):
     config = short("shared_memory", tmp_path, "episodes=1", "env.horizon=20", "learner.updates=3")
     trainer = trained(config)
-    assert trainer.learner.updates == 3 * (20 - 2)  # 32 of 12 transitions a step: from step 3 on
+    assert trainer.updates == 3 * (20 - 2)  # 32 of 12 transitions a step: from step 3 on
 
 
 def test_two_runs_in_the_same_second_get_folders_of_their_own(tmp_path):

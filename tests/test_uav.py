@@ -1,4 +1,4 @@
-"""Motion and field of view, by hand."""
+"""Motion, by hand."""
 
 import math
 
@@ -41,55 +41,6 @@ def test_move_takes_any_batch():
     position = torch.rand(2, 3, 4, 3) + 2
     where, beyond = uav.move(position, position, displacement=0.1, low=LOW, high=HIGH)
     assert where.shape == beyond.shape == (2, 3, 4, 3)
-
-
-@pytest.mark.parametrize(("altitude", "radius"), [(1, 0.57735), (2, 1.15470), (4, 2.30940)])
-def test_view_radius(altitude, radius):
-    assert uav.view_radius(altitude, 30.0) == pytest.approx(radius, abs=1e-5)
-    assert uav.view_radius(altitude, 45.0) == pytest.approx(altitude)
-
-
-def seen(position, grid=(30, 20), view_angle=30.0, ceiling=4.0) -> set[tuple[int, int]]:
-    cells, flat, visible = uav.view(
-        torch.tensor(position), view_angle=view_angle, ceiling=ceiling, grid=grid
-    )
-    chosen = [tuple(cell) for cell in cells[visible].tolist()]
-    assert [i * grid[1] + j for i, j in chosen] == flat[visible].tolist()
-    assert len(set(chosen)) == len(chosen)
-    assert 0 <= flat.min() <= flat.max() < grid[0] * grid[1]
-    return set(chosen)
-
-
-@pytest.mark.parametrize(
-    ("position", "columns", "rows"),
-    [
-        ([5.0, 7, 1], [5], [7]),  # radius 0.577
-        ([5.5, 7, 1], [5, 6], [7]),
-        ([5.4, 7.6, 1], [5], [8]),  # 6 is 0.6 away along x, 7 as far along y
-        ([5.0, 7, 4], [3, 4, 5, 6, 7], [5, 6, 7, 8, 9]),  # radius 2.309
-        ([5.5, 7.3, 4], [4, 5, 6, 7], [5, 6, 7, 8, 9]),
-        ([0.0, 0, 4], [0, 1, 2], [0, 1, 2]),
-        ([29.0, 19, 4], [27, 28, 29], [17, 18, 19]),
-        ([0.4, 18.6, 2], [0, 1], [18, 19]),
-    ],
-)
-def test_view(position, columns, rows):
-    assert seen(position) == {(i, j) for i in columns for j in rows}
-
-
-def test_view_wider_than_the_grid_holds_every_cell_once():
-    assert len(seen([3.0, 4, 50], (8, 10), 60.0, 50.0)) == 80
-
-
-def test_view_can_be_empty_between_cells():
-    assert seen([5.5, 7.5, 0.5]) == set()
-
-
-def test_mean_cell():
-    cells = torch.tensor([[1, 5], [2, 5], [9, 9], [4, 8]])
-    some = torch.tensor([[True, True, False, True], [False, False, False, False]])
-    expected = torch.tensor([[7 / 3, 6], [0, 0]])
-    assert torch.allclose(uav.mean_cell(cells.expand(2, 4, 2), some), expected)
 
 
 def test_distance():

@@ -1,16 +1,18 @@
 """Puts the parts of a recipe together."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch
 from tensordict.nn import TensorDictModule
 from torch import Tensor
-from torchrl.envs import Compose, InitTracker, TransformedEnv
+from torchrl.envs import TransformedEnv
 
 from emberlink.comm.base import Communication
 from emberlink.envs.fire import FireConfig
 from emberlink.envs.wildfire import WildfireEnv
 from emberlink.policies.actor_critic import make_actor, make_critic
+from emberlink.policies.networks import Generators
 
 from .config import RunConfig, build_comm, check_device, resolve
 
@@ -54,20 +56,18 @@ def build_env(
     *,
     num_envs: int,
     fire: str | FireConfig | Tensor,
-    seed: int,
+    seed: int | Sequence[int],
     device: torch.device | str,
 ) -> TransformedEnv:
-    """The environment of a configuration: the wildfire, communication, and "is_init"."""
+    """The environment of a configuration: the wildfire and communication; see `WildfireEnv`."""
     world = WildfireEnv(num_envs, config.env, fire, seed, device)
-    talk = Communication(build_comm(config).to(world.device))
-    transforms: list[Any] = [talk, InitTracker()]
-    return TransformedEnv(world, Compose(*transforms))
+    return TransformedEnv(world, Communication(build_comm(config).to(world.device)))
 
 
 def build_networks(
-    config: RunConfig, env: TransformedEnv, generator: torch.Generator | None = None
+    config: RunConfig, env: TransformedEnv, generator: Generators = None
 ) -> tuple[TensorDictModule, TensorDictModule]:
-    """The UAVs' actors and critics for an environment."""
+    """The UAVs' actors and critics for an environment; several generators make as many teams."""
     specs = env.observation_spec, env.full_action_spec, config.learner.hidden
     actor = make_actor(*specs, generator=generator)
     return actor, make_critic(*specs, generator=generator)

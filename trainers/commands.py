@@ -28,8 +28,9 @@ def train(method: str, overrides: Sequence[str], console: Console) -> int:
     """Trains a recipe, then evaluates it. Ctrl-C saves the networks and ends the training."""
     config = resolve(method, overrides)
     trainer = Trainer(config)
-    run = trainer.start()
-    console.print(f"{method}, setup {config.setup}, fire {config.fire.name} -> {run.path}")
+    trainer.start()
+    for run in trainer.runs:
+        console.print(f"{method}, setup {config.setup}, fire {config.fire.name} -> {run.path}")
     if trainer.enough > trainer.steps * config.num_envs:
         console.print(
             f"note: learner.batch={config.learner.batch} is more than this run collects: "
@@ -41,12 +42,15 @@ def train(method: str, overrides: Sequence[str], console: Console) -> int:
             finished = _train_with_bar(trainer, console)
         if not finished:
             raise KeyboardInterrupt
-        _evaluate(run, config, trainer.actor, run.checkpoint(), config.evaluation.fires, console)
+        for team, (one, run) in enumerate(zip(trainer.configs, trainer.runs, strict=True)):
+            actor, fires = trainer.team_actor(team), config.evaluation.fires
+            _evaluate(run, one, actor, run.checkpoint(), fires, console)
     except KeyboardInterrupt:
-        console.print(
-            f"stopped; what was learnt is in {run.checkpoint()}\n"
-            f"evaluate it with: emberlink eval {run.path}"
-        )
+        for run in trainer.runs:
+            console.print(
+                f"stopped; what was learnt is in {run.checkpoint()}\n"
+                f"evaluate it with: emberlink eval {run.path}"
+            )
         return INTERRUPTED
     return 0
 
@@ -88,9 +92,12 @@ def _train_with_bar(trainer: Trainer, console: Console) -> bool:
 
         def show(moment: Moment) -> None:
             shown: dict[str, Any] = {"completed": moment.step, "episode": moment.episode}
-            if moment.line:
-                shown["coverage"] = f"{moment.line['coverage']:.1f}%"
-                shown["score"] = f"{moment.line['score']:.2f}"
+            if moment.lines:
+                coverage, score = (
+                    sum(line[name] for line in moment.lines) / len(moment.lines)
+                    for name in ("coverage", "score")
+                )
+                shown |= {"coverage": f"{coverage:.1f}%", "score": f"{score:.2f}"}
             bar.update(task, **shown)
 
         return trainer.train(show)

@@ -35,6 +35,7 @@ Count = Annotated[int, Field(ge=1, le=1_000_000_000)]
 Units = Annotated[int, Field(ge=1, le=8192)]
 Side = Annotated[int, Field(ge=1, le=65_536)]
 MaybeCount = Annotated[int, Field(ge=0)]
+Seed = Annotated[int, Field(ge=0, lt=2**31)]
 
 
 @dataclass(frozen=True, kw_only=True, config=_STRICT)
@@ -111,8 +112,11 @@ class RunConfig:
     episodes: Count
     """episodes of training, counted per environment: all run theirs side by side"""
     num_envs: Side
-    """environments that collect side by side"""
-    seed: Annotated[int, Field(ge=0, lt=2**31)]
+    """environments that collect side by side, for each seed"""
+    seeds: Annotated[tuple[Seed, ...], Strict(False)]
+    """several seeds, trained side by side as one stack, a run folder each; `seed` is then this
+    run's; none for `seed` alone"""
+    seed: Seed
     """of everything random in the run"""
     device: str
     """where environment, memory and networks live"""
@@ -127,6 +131,13 @@ class RunConfig:
     @classmethod
     def _device_is_there(cls, value: str) -> str:
         return check_device(value)
+
+    @field_validator("seeds")
+    @classmethod
+    def _seeds_differ(cls, value: tuple[int, ...]) -> tuple[int, ...]:
+        if len(set(value)) < len(value):
+            raise ValueError(f"seeds={list(value)}: each seed at most once")
+        return value
 
     @field_validator("comm")
     @classmethod
@@ -197,6 +208,11 @@ def resolve(method: str, overrides: Sequence[str] = (), **settings: Any) -> RunC
     values = {**values, **choices}
     for key, value in settings.items():
         _set(values, key, value)
+    if values["seeds"]:
+        if "seed" in settings or any(text.startswith("seed=") for text in overrides):
+            raise ValueError(f"seed={values['seed']} and seeds={values['seeds']}: give one of them")
+        if isinstance(values["seeds"], list | tuple):
+            values["seed"] = values["seeds"][0]
     return from_values(values)
 
 

@@ -50,6 +50,6 @@ def _recipe(method: str):
         check_env_specs(make_env(method, num_envs=2, horizon=5, num_uavs=3))
         trainer = Trainer(resolve(method, _TINY))
         trainer.rehearse(steps=20)
-        return f"environment and {trainer.learner.updates} updates"
+        return f"environment and {trainer.updates} updates"
 
     return check

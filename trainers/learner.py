@@ -1,5 +1,7 @@
 """DDPG for all UAVs at once (Lillicrap et al. 2016; paper, section III.C)."""
 
+from functools import partial
+
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
@@ -30,17 +32,14 @@ class Learner:
             terminated=TERMINATED,
         )
         self.loss.make_value_estimator(gamma=config.gamma)
+        actor_parameters, critic_parameters = self._parameters("actor"), self._parameters("value")
+        # Capturable: Adam's count of steps is on the device too, where a CUDA graph can add to it.
+        adam = partial(torch.optim.Adam, fused=True, capturable=actor_parameters[0].is_cuda)
         self.optimizer = group_optimizers(
-            torch.optim.Adam(self._parameters("actor"), lr=config.actor_lr, fused=True),
-            torch.optim.Adam(
-                self._parameters("value"),
-                lr=config.critic_lr,
-                weight_decay=config.critic_weight_decay,
-                fused=True,
-            ),
+            adam(actor_parameters, lr=config.actor_lr),
+            adam(critic_parameters, lr=config.critic_lr, weight_decay=config.critic_weight_decay),
         )
         self.targets = SoftUpdate(self.loss, tau=config.tau)
-        self.updates = 0
 
     def _parameters(self, network: str) -> list[Tensor]:
         tree = getattr(self.loss, f"{network}_network_params")
@@ -69,5 +68,4 @@ class Learner:
         self.optimizer.step()
         self.optimizer.zero_grad()
         self.targets.step()
-        self.updates += 1
         return actor.detach(), critic.detach()

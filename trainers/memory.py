@@ -1,42 +1,84 @@
 """Replay memory of a team: one per UAV, or one for all (paper, sections IV.C and IV.D)."""
 
+from collections.abc import Sequence
+
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torchrl.data import LazyTensorStorage, ReplayBuffer
 from torchrl.data.replay_buffers.samplers import RandomSampler
 from torchrl.data.replay_buffers.storages import TensorStorage
 
-from emberlink.envs import keys
+from emberlink.envs import keys, streams
 
 DONE = (keys.AGENTS, "done")
 TERMINATED = (keys.AGENTS, "terminated")
 
 
+_SAMPLES = 2**40  # what a seed's random stream is used for; environments take the numbers from 0
+_ROWS, _COLUMNS = range(2)
+
+
 class TeamSampler(RandomSampler):
-    """Draws a batch for each UAV from a storage of shape [rows, uavs], uniformly.
+    """Draws a batch for each UAV, uniformly, from a storage of shape [rows, teams * uavs].
+
+    A draw is a function of the team's seed and of how many came before: it is the same on every
+    device, and for a team alone as for one of several.
 
     Args:
-        uavs: how many.
-        shared: whether a UAV draws from everyone's transitions or from its own alone.
+        uavs: how many a team has.
+        shared: whether a UAV draws from the transitions of its team or from its own alone.
+        rows: that the storage holds.
+        seeds: one per team.
+        device: where indices are made: the storage's.
     """
 
-    def __init__(self, uavs: int, *, shared: bool):
+    def __init__(
+        self,
+        uavs: int,
+        *,
+        shared: bool,
+        rows: int,
+        seeds: Sequence[int],
+        device: torch.device | str,
+    ):
         super().__init__()
-        self.uavs, self.shared = uavs, shared
+        self.uavs, self.shared, self.rows = uavs, shared, rows
+        # On the device, so that a recorded graph reads what they are by then.
+        self.draws = torch.zeros((), dtype=torch.int64, device=device)
+        self.filled = torch.zeros((), dtype=torch.int64, device=device)
+        self._streams = streams.fold(torch.tensor(seeds, device=device), _SAMPLES)
+        self._team = torch.arange(len(seeds), device=device)[:, None, None] * uavs
+        self._own = torch.arange(uavs, device=device)
+
+    def extend(self, index: torch.Tensor) -> None:
+        """Told by the memory where it has just written."""
+        self.filled.add_(len(index)).clamp_(max=self.rows)
 
     def sample(
         self, storage: TensorStorage, batch_size: int
     ) -> tuple[tuple[torch.Tensor, torch.Tensor], dict]:
-        """Rows and columns, int64 [batch_size, uavs] each; column k belongs to UAV k's batch."""
-        shape, device = (batch_size, self.uavs), storage.device
-
-        def draw(limit: int) -> torch.Tensor:
-            return torch.randint(limit, shape, generator=self._rng, device=device)
-
+        """Rows and columns, int64 [batch_size, teams * uavs] each; column k is for UAV k."""
         if len(storage) == 0:
             raise RuntimeError("cannot sample from an empty replay memory")
-        own = torch.arange(self.uavs, device=device).expand(shape)
-        return (draw(len(storage)), draw(self.uavs) if self.shared else own), {}
+        stream = streams.fold(self._streams, self.draws)
+        self.draws += 1
+
+        def draw(use: int, limit: int | torch.Tensor) -> torch.Tensor:
+            numbers = streams.integers(streams.fold(stream, use), batch_size * self.uavs, limit)
+            return numbers.view(-1, batch_size, self.uavs)
+
+        rows = draw(_ROWS, self.filled)
+        column = draw(_COLUMNS, self.uavs) if self.shared else self._own.expand_as(rows)
+        index = rows, column + self._team
+        return tuple(teams.transpose(0, 1).flatten(1) for teams in index), {}
+
+
+class _ClaimedStorage(LazyTensorStorage):
+    """Takes its memory at the first transition: what does not fit fails then, and not hours later."""
+
+    def _init(self, data: TensorDictBase) -> None:
+        super()._init(data)
+        self._storage.zero_()
 
 
 def make_memory(
@@ -46,27 +88,27 @@ def make_memory(
     capacity: int,
     batch: int,
     most: int,
+    seeds: Sequence[int],
     device: torch.device | str,
-    generator: torch.Generator,
 ) -> ReplayBuffer:
-    """A team's replay memory.
+    """The replay memory of a team, or of several that train side by side.
 
     Args:
-        uavs: how many.
+        uavs: how many a team has.
         shared: one memory for all, or one per UAV.
         capacity: UAV transitions that a memory holds; a shared one holds them of all together.
         batch: transitions per UAV and sample.
         most: rows (moments of an environment) that will ever be stored, so that no more is
             allocated than a run can fill.
-        generator: of the samples.
+        seeds: of the samples, one per team.
+        device: where transitions are kept.
     """
-    rows = -(-capacity // uavs) if shared else capacity
+    rows = min(-(-capacity // uavs) if shared else capacity, most)
     return ReplayBuffer(
-        storage=LazyTensorStorage(min(rows, most), device=device),
-        sampler=TeamSampler(uavs, shared=shared),
+        storage=_ClaimedStorage(rows, device=device),
+        sampler=TeamSampler(uavs, shared=shared, rows=rows, seeds=seeds, device=device),
         batch_size=batch,
         transform=_to_batch,
-        generator=generator,
     )
 
 
@@ -75,11 +117,16 @@ def rows_needed(uavs: int, *, shared: bool, batch: int) -> int:
     return -(-batch // uavs) if shared else batch
 
 
-def to_rows(step: TensorDictBase) -> TensorDict:
-    """What is remembered of a collected step, batch size [environments * steps, uavs].
+def to_rows(step: TensorDictBase, teams: int = 1) -> TensorDict:
+    """What is remembered of a collected step.
 
-    Only `terminated` stops the bootstrap, and an episode never terminates: the value beyond the
-    horizon is bootstrapped.
+    Args:
+        step: batch size [teams * environments] or [teams * environments, steps].
+        teams: how many trained side by side.
+
+    Returns:
+        Batch size [environments * steps, teams * uavs]. Only `terminated` stops the bootstrap, and
+        an episode never terminates: the value beyond the horizon is bootstrapped.
     """
     observation = step.get(keys.OBSERVATION)
     shape = observation.shape[:-1]
@@ -99,8 +146,10 @@ def to_rows(step: TensorDictBase) -> TensorDict:
             },
         },
         batch_size=shape,
+        device=observation.device,
     )
-    return rows.flatten(0, len(shape) - 2) if len(shape) > 2 else rows
+    rows = rows.flatten(0, len(shape) - 2) if len(shape) > 2 else rows
+    return rows if teams == 1 else rows.unflatten(0, (teams, -1)).transpose(0, 1).flatten(1, 2)
 
 
 def _to_batch(sample: TensorDictBase) -> TensorDict:

@@ -23,6 +23,7 @@ def _wandb(config: RunConfig, run: RunFolder) -> Logger:
         offline=offline,
         log_env_packages=False,  # it would stand in the configuration as "env"
         settings=wandb.Settings(silent=offline, console="off"),
+        reinit="create_new",  # seeds that train side by side are runs of their own
         group=f"{config.setup}-{config.fire.name}",
         tags=[config.method, f"seed-{config.seed}"],
     )

@@ -1,0 +1,44 @@
+"""How fast the environment is: UAV-steps a second, beside VMAS in the same run."""
+
+import pytest
+from workloads import flying, in_turns, make, steps_for, vmas_flying
+
+GOALS = {None: 1_000_000, "consensus": 300_000}
+
+
+@pytest.mark.parametrize("num_envs", [256, 1024, 4096])
+@pytest.mark.parametrize("method", GOALS)
+def test_uav_steps(benchmark, tell, method, num_envs):
+    steps = steps_for(num_envs)
+    benchmark.pedantic(flying(make(method, num_envs), steps), rounds=5, warmup_rounds=1)
+    rate = 6 * num_envs * steps / benchmark.stats.stats.median
+    benchmark.extra_info["uav_steps_per_second"] = rate
+    tell(
+        f"{method or 'environment alone':17} {num_envs:5} environments: {rate:12,.0f} UAV-steps/s, "
+        f"{rate / GOALS[method]:.2f} x the goal of {GOALS[method]:,}"
+    )
+
+
+@pytest.mark.parametrize("method", GOALS)
+def test_one_environment(benchmark, tell, method):
+    benchmark.pedantic(flying(make(method, 1), 400), rounds=5, warmup_rounds=1)
+    rate = 400 / benchmark.stats.stats.median
+    benchmark.extra_info["steps_per_second"] = rate
+    goal = f", {rate / 2000:.2f} x the goal of 2,000" if method is None else ""
+    tell(f"{method or 'environment alone':17}     1 environment : {rate:12,.0f} steps/s{goal}")
+
+
+@pytest.mark.parametrize("scenario", ["discovery", "sampling", "simple_spread"])
+def test_beside_vmas(tell, scenario):
+    pytest.importorskip("vmas")
+    num_envs, steps = 4096, 20
+    theirs, agents = vmas_flying(scenario, num_envs, steps)
+    ours, consensus, vmas = in_turns(
+        5, flying(make(None, num_envs), steps), flying(make("consensus", num_envs), steps), theirs
+    )
+    rate = agents * num_envs * steps / vmas
+    tell(
+        f"vmas {scenario:13} {num_envs} environments: {rate:12,.0f} agent-steps/s; ours alone "
+        f"{6 * num_envs * steps / ours / rate:.1f} x, with consensus "
+        f"{6 * num_envs * steps / consensus / rate:.1f} x that"
+    )

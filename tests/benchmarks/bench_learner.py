@@ -1,0 +1,72 @@
+"""How near the learner comes to what the machine can do, and what a training step spends on it."""
+
+import time
+
+import pytest
+import torch
+from workloads import MATRIX_FLOPS, batch_of, in_turns, matrix_product, update_flops
+
+from emberlink.trainers.config import resolve
+from emberlink.trainers.loop import Trainer
+
+METHODS = ["independent", "shared_memory", "positional", "consensus"]
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_update(benchmark, tell, method):
+    """Operations a second of an update with the paper's networks and batch: goal 65 %."""
+    trainer = Trainer(resolve(method, ["env.horizon=1000", "episodes=1"]))
+    batch = batch_of(trainer)
+    uavs, features = batch["agents", "observation"].shape[-2:]
+    flops = update_flops(uavs, features, 3, trainer.config.learner.hidden, len(batch))
+    update, product = in_turns(15, lambda: trainer.learner.update(batch), matrix_product())
+    share = (flops / update) / (MATRIX_FLOPS / product)
+    benchmark.extra_info["share_of_matrix_rate"] = share
+    benchmark.pedantic(lambda: trainer.learner.update(batch), rounds=5)
+    tell(
+        f"update, {method:13}: {1000 * update:6.1f} ms, {flops / update / 1e9:5.1f} Gflop/s = "
+        f"{100 * share:4.1f} % of a {2048}^3 product's {MATRIX_FLOPS / product / 1e9:5.1f} "
+        "(goal 65 %)"
+    )
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("setup", ["paper", "tuned"])
+def test_share_of_what_is_not_the_update(tell, method, setup):
+    """Environment, communication, noise, buffer, sampling and logging: goal 15 % in `paper`."""
+    trainer = Trainer(resolve(method, [f"setup={setup}", "env.horizon=1000"]))
+    inside, update = 0.0, trainer.learner.update
+
+    def timed(batch):
+        nonlocal inside
+        began = time.perf_counter()
+        losses = update(batch)
+        inside += time.perf_counter() - began
+        return losses
+
+    trainer.learner.update = timed
+    steps, began = 0, 0.0
+    for steps, collected in enumerate(trainer.collector):
+        if len(trainer.memory) > trainer.enough + 20 and not began:
+            began, inside, first = time.perf_counter(), 0.0, steps
+        trainer._learn(collected)
+        if began and steps == first + 100:
+            break
+    whole = time.perf_counter() - began
+    trainer.collector.shutdown()
+    goal = " (goal: at most 15 %)" if setup == "paper" else ""
+    tell(
+        f"step, {setup}, {method:13}: {10 * whole:6.2f} ms, of which "
+        f"{10 * (whole - inside):5.2f} ms = {100 * (1 - inside / whole):4.1f} % not the update{goal}"
+    )
+
+
+def test_flops_are_what_torch_counts():
+    from torch.utils.flop_counter import FlopCounterMode
+
+    trainer = Trainer(resolve("consensus", ["env.horizon=50", "episodes=1", "learner.batch=64"]))
+    batch = batch_of(trainer)
+    with FlopCounterMode(display=False) as counter:
+        trainer.learner.update(batch)
+    assert counter.get_total_flops() == update_flops(6, 9, 3, (400, 300), 64)
+    assert torch.get_default_dtype() == torch.float32

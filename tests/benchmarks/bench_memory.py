@@ -1,0 +1,63 @@
+"""What a million transitions take, and whether a long run grows."""
+
+import gc
+import resource
+from pathlib import Path
+
+import pytest
+from tensordict import TensorDict
+from workloads import make
+
+from emberlink.trainers.config import resolve
+from emberlink.trainers.loop import Trainer
+from emberlink.trainers.memory import make_memory, to_rows
+
+MILLION = 1_000_000
+
+
+def resident() -> int:
+    """Bytes of this process that are in memory now."""
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return pages * resource.getpagesize()
+
+
+@pytest.mark.parametrize("method", ["independent", "shared_memory", "positional", "consensus"])
+def test_a_million_transitions(tell, method):
+    """Resident bytes against those of the numbers: both observations, action and reward."""
+    env = make(method, 1)
+    shared = resolve(method).memory == "shared"
+    rows = to_rows(env.rollout(1))
+    uavs, features = rows["observation"].shape[-2:]
+    # Private memories hold a million each; one that is shared holds a million in all.
+    numbers = 4 * (2 * features + 3 + 1) * MILLION * (1 if shared else uavs)
+    gc.collect()
+    before = resident()
+    memory = make_memory(
+        uavs, shared=shared, capacity=MILLION, batch=512, most=10**9, seeds=[0], device="cpu"
+    )
+    memory.extend(rows)
+    used = resident() - before
+    tell(
+        f"{method:13}: {used / 1e6:6.1f} MB for {numbers / 1e6:6.1f} MB of numbers = "
+        f"{used / numbers:.3f} x (goal: at most 1.2 x)"
+    )
+    assert isinstance(memory.sample(), TensorDict)
+
+
+def test_a_long_run_does_not_grow(tell, tmp_path):
+    """100 episodes of 1000 steps of `consensus` with small networks, a memory of a million."""
+    small = ["learner.hidden=[16,16]", "learner.batch=32", "evaluation.interval=0"]
+    trainer = Trainer(resolve("consensus", ["episodes=101", *small, f"output={tmp_path}"]))
+    trainer.start()
+    seen = []
+
+    def watch(progress) -> None:
+        if progress.step % 1000 == 0:
+            seen.append(resident())
+
+    trainer.train(watch)
+    growth = (seen[-1] - seen[0]) / 1e6
+    tell(
+        f"resident memory over 100,000 steps: {seen[0] / 1e6:.0f} -> {seen[-1] / 1e6:.0f} MB, "
+        f"{growth:+.1f} MB, at most {max(seen) / 1e6:.0f} (goal: growth below 50)"
+    )

@@ -1,0 +1,40 @@
+"""Several seeds as one stack, against one after another."""
+
+import pytest
+import torch
+from workloads import in_turns
+
+from emberlink.trainers.config import resolve
+from emberlink.trainers.loop import Trainer
+
+STEPS = 20
+
+
+def learning(overrides: list[str]):
+    """Some steps of a training whose memory is filled, updates included."""
+    trainer = Trainer(resolve("consensus", ["episodes=1000", *overrides]))
+    collected = iter(trainer.collector)
+    while len(trainer.memory) < trainer.enough + 5:
+        trainer._learn(next(collected))
+
+    def learn() -> None:
+        for _ in range(STEPS):
+            trainer._learn(next(collected))
+        if trainer.config.device == "cuda":
+            torch.cuda.synchronize()
+
+    return learn
+
+
+@pytest.mark.parametrize("device", ["cpu", "cuda"])
+@pytest.mark.parametrize("setup", ["paper", "tuned"])
+def test_five_seeds(tell, setup, device):
+    if device == "cuda" and not torch.cuda.is_available():
+        pytest.skip("no GPU")
+    common = [f"setup={setup}", f"device={device}"]
+    one, five = in_turns(5, learning([*common, "seed=0"]), learning([*common, "seeds=[0,1,2,3,4]"]))
+    goal = "at most 5" if device == "cpu" else "nearly 1"
+    tell(
+        f"5 seeds, {setup}, {device}: {1000 * five / STEPS:.1f} ms a step, one alone "
+        f"{1000 * one / STEPS:.1f} ms: {five / one:.2f} x (goal: {goal})"
+    )

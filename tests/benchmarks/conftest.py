@@ -1,0 +1,20 @@
+"""The ratios of a run, printed at its end."""
+
+import pytest
+
+_RATIOS = pytest.StashKey[list[str]]()
+
+
+@pytest.fixture
+def tell(request):
+    """Adds a line to what is printed at the end."""
+    lines = request.config.stash.setdefault(_RATIOS, [])
+    return lines.append
+
+
+def pytest_terminal_summary(terminalreporter, config):
+    lines = config.stash.get(_RATIOS, [])
+    if lines:
+        terminalreporter.section("ratios taken in this run")
+        for line in lines:
+            terminalreporter.write_line(line)

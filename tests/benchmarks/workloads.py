@@ -1,0 +1,115 @@
+"""What the benchmarks time, and how: work in turns, so that whatever else the machine does hits all.
+
+Every rate is taken over whole calls of the public interface: an environment's step is TorchRL's
+`step_and_maybe_reset` with actions drawn anew.
+"""
+
+import time
+from collections.abc import Callable, Sequence
+from statistics import median
+
+import torch
+from tensordict import TensorDict
+
+from emberlink.envs import keys
+from emberlink.envs.wildfire import WildfireEnv
+from emberlink.trainers import make_env
+from emberlink.trainers.config import resolve
+from emberlink.trainers.loop import Trainer
+
+MATRIX = 2048
+
+
+def in_turns(
+    rounds: int, *works: Callable[[], object], pick: Callable[[list[float]], float] = median
+) -> list[float]:
+    """Seconds of each, the median over rounds in which every one runs once; the first is left out."""
+    taken: list[list[float]] = [[] for _ in works]
+    for _ in range(rounds + 1):
+        for work, seconds in zip(works, taken, strict=True):
+            began = time.perf_counter()
+            work()
+            seconds.append(time.perf_counter() - began)
+    return [pick(seconds[1:]) for seconds in taken]
+
+
+def make(method: str | None, num_envs: int, **settings):
+    """A recipe's environment, or the bare one."""
+    if method is None:
+        config = resolve("independent", **settings).env
+        return WildfireEnv(num_envs, config)
+    return make_env(method, num_envs=num_envs, **settings)
+
+
+def flying(env, steps: int) -> Callable[[], object]:
+    """`steps` steps of an environment with random actions."""
+    shape = env.full_action_spec[keys.ACTION].shape
+    moment = env.reset()
+
+    def fly() -> None:
+        nonlocal moment
+        for _ in range(steps):
+            moment.set(keys.ACTION, torch.rand(shape, device=env.device).mul_(2).sub_(1))
+            _, moment = env.step_and_maybe_reset(moment)
+
+    return fly
+
+
+def steps_for(num_envs: int, uavs: int = 6) -> int:
+    """Steps that take some tenths of a second."""
+    return max(5, min(400, 1_200_000 // (num_envs * uavs)))
+
+
+def vmas_flying(scenario: str, num_envs: int, steps: int) -> tuple[Callable[[], object], int]:
+    """`steps` steps of a VMAS scenario with random actions, and its number of agents."""
+    import vmas
+
+    env = vmas.make_env(scenario, num_envs=num_envs, device="cpu", continuous_actions=True)
+    env.reset()
+
+    def fly() -> None:
+        for _ in range(steps):
+            env.step([env.get_random_action(agent) for agent in env.agents])
+
+    return fly, env.n_agents
+
+
+def matrix_product(device: str = "cpu") -> Callable[[], object]:
+    """2048^3 multiply-adds in float32: what the machine reaches where nothing is in the way."""
+    one, other = (torch.randn(MATRIX, MATRIX, device=device) for _ in range(2))
+    return lambda: one @ other
+
+
+MATRIX_FLOPS = 2 * MATRIX**3
+
+
+def update_flops(
+    members: int, features: int, actions: int, hidden: Sequence[int], batch: int
+) -> int:
+    """Floating-point operations of one DDPG update of `members` networks, from the layer sizes.
+
+    Matrix products alone, a multiply-add as two. Forward: actor and critic in the actors' loss,
+    critic, target actor and target critic in the critics'. Backward, for each layer that learns the
+    product for its weights, and for each input that a gradient must pass the product for it.
+    """
+    first, second = hidden
+    trunk = features * first + first * second
+    actor = trunk + second * actions
+    critic = trunk + actions * second + second
+    forward = 2 * actor + 3 * critic
+    weights = actor + critic
+    inputs = (
+        second * actions
+        + first * second  # the actors' own layers but the first
+        + second
+        + second * actions  # through the critic to the action, past its trunk
+        + second
+        + first * second  # the critics' layers but the first and the action's
+    )
+    return 2 * batch * members * (forward + weights + inputs)
+
+
+def batch_of(trainer: Trainer) -> TensorDict:
+    """A sample of a memory that holds some hundred steps."""
+    trainer.rehearse(-(-trainer.enough // trainer.config.num_envs) + 20)
+    return trainer.memory.sample()
