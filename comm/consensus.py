@@ -162,8 +162,7 @@ class Consensus(CommModule):
         return moved.clamp(self.low.float(), self.high.float())
 
     def _stream(self, tensordict: TensorDictBase, use: int) -> Tensor:
-        moment = streams.fold(tensordict.get(keys.STREAM), tensordict.get(keys.STEP))
-        return streams.fold(moment, use)
+        return streams.at(tensordict.get(keys.STREAM), tensordict.get(keys.STEP), use)
 
     def _scaled(self, told: Tensor) -> Tensor:
         if self.world.observation == "raw":
@@ -205,10 +204,10 @@ def best_discoverer(adjacent: Tensor, discovers: Tensor, rank: Tensor) -> Tensor
     heard = place.unsqueeze(-2).masked_fill(~adjacent, uavs).amin(-1)
     # Exchanging with neighbours once per round reaches, after k doublings, all within 2**k hops.
     silent = ~discovers
-    within = (adjacent & silent.unsqueeze(-1) & silent.unsqueeze(-2)) | itself
+    within = ((adjacent & silent.unsqueeze(-1) & silent.unsqueeze(-2)) | itself).float()
     for _ in range((uavs - 1).bit_length()):
-        within = (within.float() @ within.float()) > 0
-    agreed = heard.unsqueeze(-2).masked_fill(~within, uavs).amin(-1)
+        within = (within @ within).clamp_(max=1)
+    agreed = heard.unsqueeze(-2).masked_fill(within == 0, uavs).amin(-1)
     chosen = torch.where(discovers, place, agreed)
     followed = order.gather(-1, chosen.clamp(max=uavs - 1))
     return torch.where(chosen < uavs, followed, -1)

@@ -46,6 +46,17 @@ def fold(stream: Tensor, counter: Tensor | int) -> Tensor:
     return _mix(_mix(stream + _GOLDEN) + offset)
 
 
+def at(stream: Tensor, step: Tensor, use: int) -> Tensor:
+    """The stream of one use at one step of an episode.
+
+    Args:
+        stream: of the episode, int64 [...].
+        step: int64 [...].
+        use: what for, below 1000; every use has numbers of its own.
+    """
+    return fold(stream, step * 1000 + use)
+
+
 def streams(seed: int, count: int, device: torch.device | str | None = None) -> Tensor:
     """One stream per environment: int64 [count], stream i depends on (seed, i) alone."""
     root = torch.full((count,), seed, dtype=torch.int64, device=device)

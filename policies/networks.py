@@ -6,13 +6,18 @@ per seed, are a longer stack: team 0's UAVs first.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor, nn
 
+Layer = Callable[[Tensor], Tensor]
 Generators = torch.Generator | Sequence[torch.Generator] | None
 """of initial weights: one for all, or one per team of a stack that shares the UAVs out in order"""
+
+
+_LARGE = 2**17
+"""numbers of one UAV between two layers, half a megabyte"""
 
 
 class StackedLinear(nn.Module):
@@ -57,6 +62,11 @@ class StackedLinear(nn.Module):
         """[uavs, batch, inputs] -> [uavs, batch, outputs]."""
         return torch.baddbmm(self.bias, x, self.weight)
 
+    def each(self) -> list[Layer]:
+        """One layer per UAV, [batch, inputs] -> [batch, outputs]."""
+        uavs = zip(self.weight.unbind(0), self.bias.unbind(0), strict=True)
+        return [lambda x, w=weight, b=bias: torch.addmm(b, x, w) for weight, bias in uavs]
+
 
 class StackedLayerNorm(nn.Module):
     """Layer normalisation (Ba et al. 2016) with a scale and a shift per UAV."""
@@ -71,6 +81,12 @@ class StackedLayerNorm(nn.Module):
         normal = nn.functional.layer_norm(x, x.shape[-1:])
         return torch.addcmul(self.bias, normal, self.weight)
 
+    def each(self) -> list[Layer]:
+        """One layer per UAV, [batch, features] -> the same."""
+        norm = nn.functional.layer_norm
+        uavs = zip(self.weight.unbind(0), self.bias.unbind(0), strict=True)
+        return [lambda x, w=weight[0], b=bias[0]: norm(x, w.shape, w, b) for weight, bias in uavs]
+
 
 class _Trunk(nn.Module):
     """Observation -> first -> second hidden layer, LayerNorm after each, ReLU in between."""
@@ -84,7 +100,7 @@ class _Trunk(nn.Module):
         generator: Generators,
     ):
         super().__init__()
-        self.uavs = uavs
+        self.uavs, self.widest = uavs, max(hidden)
         first, second = hidden
         self.first = StackedLinear(uavs, features, first, device=device, generator=generator)
         self.first_norm = StackedLayerNorm(uavs, first, device=device)
@@ -105,10 +121,27 @@ class _Trunk(nn.Module):
         """The other way: [uavs, batch, features] -> [*shape, features]."""
         return x.unflatten(0, (-1, shape[-1])).transpose(1, 2).reshape(*shape, x.shape[-1])
 
-    def normalised(self, observation: Tensor) -> Tensor:
-        """[..., uavs, features] -> [uavs, batch, second], before the second ReLU."""
-        x = torch.relu(self.first_norm(self.first(self.by_uav(observation))))
-        return self.second_norm(self.second(x))
+    def apply_all(
+        self,
+        network: Callable[..., Tensor],
+        layers: Sequence[StackedLinear | StackedLayerNorm],
+        *inputs: Tensor,
+    ) -> Tensor:
+        """All UAVs' networks on their inputs, [uavs, batch, features] each.
+
+        At once; but on a CPU one after another where the numbers of all would not stay in its
+        cache from one layer to the next.
+
+        Args:
+            network: of one UAV or of a stack: layers, then inputs.
+            layers: what `network` is given.
+            inputs: what it is applied to.
+        """
+        first = inputs[0]
+        if first.is_cuda or first.shape[1] * self.widest < _LARGE:
+            return network(*layers, *inputs)
+        each = zip(*(layer.each() for layer in layers), *inputs, strict=True)
+        return torch.stack([network(*one) for one in each])
 
 
 class StackedActor(_Trunk):
@@ -140,8 +173,9 @@ class StackedActor(_Trunk):
 
     def forward(self, observation: Tensor) -> Tensor:
         """float32 [..., uavs, features] -> [..., uavs, actions] in (-1, 1)."""
-        x = torch.relu(self.normalised(observation))
-        return self.by_batch(torch.tanh(self.action(x)), observation.shape[:-1])
+        layers = self.first, self.first_norm, self.second, self.second_norm, self.action
+        action = self.apply_all(_action, layers, self.by_uav(observation))
+        return self.by_batch(action, observation.shape[:-1])
 
 
 class StackedCritic(_Trunk):
@@ -169,5 +203,33 @@ class StackedCritic(_Trunk):
 
     def forward(self, observation: Tensor, action: Tensor) -> Tensor:
         """float32 [..., uavs, features] and [..., uavs, actions] -> [..., uavs, 1]."""
-        x = torch.relu(self.normalised(observation) + self.action(self.by_uav(action)))
-        return self.by_batch(self.value(x), observation.shape[:-1])
+        trunk = self.first, self.first_norm, self.second, self.second_norm
+        inputs = self.by_uav(observation), self.by_uav(action)
+        value = self.apply_all(_value, (*trunk, self.action, self.value), *inputs)
+        return self.by_batch(value, observation.shape[:-1])
+
+
+# In place of what a layer made: nothing else needs it, not even its own gradient.
+
+
+def _action(
+    first: Layer, first_norm: Layer, second: Layer, second_norm: Layer, last: Layer, x: Tensor
+) -> Tensor:
+    x = first_norm(first(x)).relu_()
+    x = second_norm(second(x)).relu_()
+    return last(x).tanh_()
+
+
+def _value(
+    first: Layer,
+    first_norm: Layer,
+    second: Layer,
+    second_norm: Layer,
+    from_action: Layer,
+    last: Layer,
+    x: Tensor,
+    action: Tensor,
+) -> Tensor:
+    x = first_norm(first(x)).relu_()
+    x = second_norm(second(x)).add_(from_action(action)).relu_()
+    return last(x)

@@ -42,7 +42,7 @@ class OrnsteinUhlenbeck(TensorDictModuleBase):
         if exploration_type() not in (None, ExplorationType.RANDOM):
             return tensordict
         action, step = tensordict.get(keys.ACTION), tensordict.get(keys.STEP)
-        moment = streams.fold(streams.fold(tensordict.get(keys.STREAM), step), _SHOCKS)
+        moment = streams.at(tensordict.get(keys.STREAM), step, _SHOCKS)
         normal = streams.normal(moment, action.shape[-2] * action.shape[-1]).view_as(action)
         before = tensordict.get(NOISE, None)
         if before is None:

@@ -35,8 +35,7 @@ class Scripted(TensorDictModuleBase):
     @staticmethod
     def moment(tensordict: TensorDictBase, use: int) -> torch.Tensor:
         """A random stream for this step and this use, int64 [num_envs]."""
-        stream = streams.fold(tensordict.get(keys.STREAM), tensordict.get(keys.STEP))
-        return streams.fold(stream, use)
+        return streams.at(tensordict.get(keys.STREAM), tensordict.get(keys.STEP), use)
 
 
 class RandomActions(Scripted):

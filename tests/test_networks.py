@@ -8,6 +8,7 @@ from single_ddpg import SingleActor, SingleCritic, copy_uav
 from tensordict import TensorDict
 
 from emberlink.envs import keys, specs
+from emberlink.policies import networks
 from emberlink.policies.actor_critic import STATE_ACTION_VALUE, make_actor, make_critic
 from emberlink.policies.networks import StackedActor, StackedCritic
 
@@ -97,3 +98,40 @@ def test_modules_read_and_write_the_keys_of_the_environment():
     assert moment[STATE_ACTION_VALUE].shape == (5, 4, 1)
     assert actor.module.first.weight.shape == (4, 6, HIDDEN[0])
     assert actor.module.second.weight.shape == (4, *HIDDEN)
+
+
+@pytest.mark.parametrize("hidden", [(12, 20), (20, 12)])
+def test_networks_one_by_one_are_the_stack(hidden, monkeypatch):
+    """Values and gradients, with inputs of one team and of two."""
+    generator = torch.Generator().manual_seed(3)
+    actor = StackedActor(4, 5, 3, hidden, generator=generator)
+    critic = StackedCritic(4, 5, 3, hidden, generator=generator)
+    for network in (actor, critic):
+        for weight in network.parameters():
+            torch.nn.init.normal_(weight, std=0.5, generator=generator)
+
+    def evaluate(large: int, uavs: int) -> list[torch.Tensor]:
+        monkeypatch.setattr(networks, "_LARGE", large)
+        observation = torch.randn(6, uavs, 5, generator=torch.Generator().manual_seed(4))
+        action = actor(observation)
+        value = critic(observation, action)
+        assert action.shape == (6, uavs, 3)
+        assert value.shape == (6, uavs, 1)
+        weights = [*actor.parameters(), *critic.parameters()]
+        return [action, value, *torch.autograd.grad(value.square().sum(), weights)]
+
+    for uavs in (4, 2):
+        for one, other in zip(evaluate(10**9, uavs), evaluate(1, uavs), strict=True):
+            torch.testing.assert_close(one, other)
+
+
+def test_a_team_reads_its_own_environments():
+    """Rows 0 to 2 are team 0's, rows 3 to 5 team 1's; each as alone."""
+    generators = [torch.Generator().manual_seed(seed) for seed in (1, 2)]
+    both = StackedActor(4, 5, 3, (8, 8), generator=generators)
+    observation = torch.randn(6, 2, 5)
+    actions = both(observation)
+    for team in range(2):
+        alone = StackedActor(2, 5, 3, (8, 8), generator=torch.Generator().manual_seed(team + 1))
+        own = slice(3 * team, 3 * team + 3)
+        torch.testing.assert_close(actions[own], alone(observation[own]))

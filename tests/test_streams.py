@@ -109,3 +109,18 @@ def test_the_numbers_themselves():
         expected = mix((mix((stream + golden) % 2**64) + (counter + 1) * golden) % 2**64)
         got = streams.fold(torch.tensor(stream), counter).item()
         assert got % 2**64 == expected
+
+
+@pytest.mark.parametrize("limit", [1, 2, 6, 1000, 166_667, 2**31])
+def test_integers_are_uniform_below_their_limit(limit):
+    drawn = streams.integers(streams.streams(0, 4), 25_000, limit)
+    assert drawn.shape == (4, 25_000)
+    assert 0 <= drawn.min() <= drawn.max() < limit
+    assert drawn.equal(streams.integers(streams.streams(0, 4), 25_000, torch.tensor(limit)))
+    unit = (drawn.double() + 0.5) / limit
+    assert abs(unit.mean().item() - 0.5) < 0.004
+    if 1 < limit <= 6:
+        counts = drawn.flatten().bincount(minlength=limit)
+        assert (counts / 100_000 - 1 / limit).abs().max() < 0.006
+    if limit >= 1000:
+        assert abs(unit.std().item() - 12**-0.5) < 0.003

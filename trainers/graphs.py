@@ -94,6 +94,6 @@ class LockstepCollector:
         """Nothing runs beside the program; there is nothing to end."""
 
     def _step(self) -> TensorDictBase:
-        acted = self.env.step(self.policy(self._moment.copy()))
+        acted = self.env.step(self.policy(self._moment.clone()))
         self._moment.update_(step_mdp(acted, keep_other=True))
         return acted.unsqueeze(-1)

@@ -15,6 +15,7 @@ from emberlink.policies.actor_critic import team_of
 from emberlink.policies.noise import OrnsteinUhlenbeck
 
 from . import evaluate, tracking
+from .allocator import keep_freed_memory
 from .build import build_env, build_networks
 from .config import RunConfig
 from .graphs import LockstepCollector, graphed
@@ -47,6 +48,7 @@ class Trainer:
     def __init__(self, config: RunConfig):
         self.config = config
         tracking.check(config.logger)
+        keep_freed_memory()
         seeds = config.seeds or (config.seed,)
         self.configs = [replace(config, seed=seed) for seed in seeds]
         self.teams = len(seeds)
@@ -149,6 +151,7 @@ class Trainer:
             device=self.config.device,
             trust_policy=True,
             track_traj_ids=False,
+            auto_register_policy_transforms=False,
         )
 
     def _loop(self, trackers: list[tracking.Tracker], report: Callable[[Progress], None]) -> None:

@@ -1,10 +1,11 @@
 """Replay memory of a team: one per UAV, or one for all (paper, sections IV.C and IV.D)."""
 
+import math
 from collections.abc import Sequence
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from torchrl.data import LazyTensorStorage, ReplayBuffer
+from torchrl.data import LazyTensorStorage, ReplayBuffer, RoundRobinWriter
 from torchrl.data.replay_buffers.samplers import RandomSampler
 from torchrl.data.replay_buffers.storages import TensorStorage
 
@@ -74,7 +75,7 @@ class TeamSampler(RandomSampler):
 
 
 class _ClaimedStorage(LazyTensorStorage):
-    """Takes its memory at the first transition: what does not fit fails then, and not hours later."""
+    """Takes its memory with the first transition: what does not fit fails then, not hours later."""
 
     def _init(self, data: TensorDictBase) -> None:
         super()._init(data)
@@ -105,7 +106,9 @@ def make_memory(
     """
     rows = min(-(-capacity // uavs) if shared else capacity, most)
     return ReplayBuffer(
-        storage=_ClaimedStorage(rows, device=device),
+        # Compilable: without it, TorchRL waits for the device to tell where it last wrote.
+        storage=_ClaimedStorage(rows, device=device, compilable=True),
+        writer=RoundRobinWriter(compilable=True),
         sampler=TeamSampler(uavs, shared=shared, rows=rows, seeds=seeds, device=device),
         batch_size=batch,
         transform=_to_batch,
@@ -128,28 +131,31 @@ def to_rows(step: TensorDictBase, teams: int = 1) -> TensorDict:
         Batch size [environments * steps, teams * uavs]. Only `terminated` stops the bootstrap, and
         an episode never terminates: the value beyond the horizon is bootstrapped.
     """
-    observation = step.get(keys.OBSERVATION)
-    shape = observation.shape[:-1]
+    *batch, uavs, _ = step.get(keys.OBSERVATION).shape
+    rows = math.prod(batch) // teams
+
+    def arrange(value: torch.Tensor) -> torch.Tensor:
+        """[*batch, uavs, features] -> [rows, teams * uavs, features]."""
+        value = value.reshape(teams, rows, uavs, -1)
+        return value.transpose(0, 1).reshape(rows, teams * uavs, -1)
 
     def per_uav(key: str) -> torch.Tensor:
-        return step.get(("next", key)).unsqueeze(-2).expand(*shape, 1)
+        return arrange(step.get(("next", key)).unsqueeze(-2).expand(*batch, uavs, 1))
 
-    rows = TensorDict(
+    return TensorDict(
         {
-            "observation": observation,
-            "action": step.get(keys.ACTION),
+            "observation": arrange(step.get(keys.OBSERVATION)),
+            "action": arrange(step.get(keys.ACTION)),
             "next": {
-                "observation": step.get(("next", *keys.OBSERVATION)),
-                "reward": step.get(("next", *keys.REWARD)),
+                "observation": arrange(step.get(("next", *keys.OBSERVATION))),
+                "reward": arrange(step.get(("next", *keys.REWARD))),
                 "done": per_uav("done"),
                 "terminated": per_uav("terminated"),
             },
         },
-        batch_size=shape,
-        device=observation.device,
+        batch_size=(rows, teams * uavs),
+        device=step.device,
     )
-    rows = rows.flatten(0, len(shape) - 2) if len(shape) > 2 else rows
-    return rows if teams == 1 else rows.unflatten(0, (teams, -1)).transpose(0, 1).flatten(1, 2)
 
 
 def _to_batch(sample: TensorDictBase) -> TensorDict:

@@ -1,4 +1,4 @@
-"""What the benchmarks time, and how: work in turns, so that whatever else the machine does hits all.
+"""What the benchmarks time, and how: works take turns, so that a busy machine hits them all.
 
 Every rate is taken over whole calls of the public interface: an environment's step is TorchRL's
 `step_and_maybe_reset` with actions drawn anew.
@@ -23,7 +23,7 @@ MATRIX = 2048
 def in_turns(
     rounds: int, *works: Callable[[], object], pick: Callable[[list[float]], float] = median
 ) -> list[float]:
-    """Seconds of each, the median over rounds in which every one runs once; the first is left out."""
+    """Seconds of each, the median over rounds in which every one runs once; one is left out."""
     taken: list[list[float]] = [[] for _ in works]
     for _ in range(rounds + 1):
         for work, seconds in zip(works, taken, strict=True):

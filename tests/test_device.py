@@ -1,0 +1,96 @@
+"""What a GPU needs, checked without one: nothing waits, and one step is the same as TorchRL's."""
+
+from dataclasses import asdict
+
+import pytest
+import torch
+from tensordict.nn import TensorDictSequential
+from test_recipes import METHODS
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from emberlink.policies.noise import OrnsteinUhlenbeck
+from emberlink.trainers.build import build_env
+from emberlink.trainers.config import resolve
+from emberlink.trainers.graphs import LockstepCollector, graphed
+from emberlink.trainers.loop import Trainer
+
+SMALL = [
+    *("env.horizon=12", "env.num_uavs=3", "num_envs=2", "episodes=3", "learner.batch=8"),
+    *("learner.hidden=[8,8]", "fire=huygens", "exploration.sigma=0.4", "exploration.dt=1"),
+]
+
+
+def lockstep(trainer: Trainer) -> LockstepCollector:
+    """Another collector over an environment like the trainer's."""
+    config = trainer.config
+    seeds = config.seeds or (config.seed,)
+    env = build_env(config, num_envs=trainer.envs, fire=config.fire, seed=seeds, device="cpu")
+    noise = OrnsteinUhlenbeck(**asdict(config.exploration))
+    policy = TensorDictSequential(trainer.actor, noise)
+    return LockstepCollector(env, policy, horizon=12, steps=trainer.steps)
+
+
+@pytest.mark.parametrize("seeds", ["seed=5", "seeds=[5,6]"])
+@pytest.mark.parametrize("method", METHODS)
+def test_the_lockstep_collector_collects_what_torchrls_does(method, seeds):
+    trainer = Trainer(resolve(method, [*SMALL, seeds, "exploration.theta=0.2"]))
+    torch.nn.init.normal_(trainer.actor.module.action.weight, std=0.3)
+    pairs = zip(trainer.collector, lockstep(trainer), strict=True)
+    count = 0
+    for theirs, ours in pairs:
+        count += 1
+        assert ours.batch_size == theirs.batch_size
+        for key in theirs.keys(include_nested=True, leaves_only=True):
+            assert ours[key].equal(theirs[key]), (count, key)
+    assert count == 36
+
+
+class Waiting(TorchDispatchMode):
+    """Notes every operation for whose result a GPU would have to be waited for."""
+
+    NAMES = (
+        *("_local_scalar_dense", "nonzero", "is_nonzero", "equal", "item", "masked_select"),
+        *("unique", "_unique2", "unique_dim", "allclose", "lift_fresh"),
+    )
+
+    def __init__(self):
+        super().__init__()
+        self.found = []
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        name = func._schema.name.removeprefix("aten::")
+        by_mask = name.startswith("index") and any(
+            isinstance(index, torch.Tensor) and index.dtype == torch.bool
+            for index in (args[1] if len(args) > 1 and isinstance(args[1], list | tuple) else ())
+        )
+        if name in self.NAMES or by_mask:
+            self.found.append(name)
+        return func(*args, **(kwargs or {}))
+
+
+@pytest.mark.parametrize("setup", ["paper", "released", "tuned"])
+@pytest.mark.parametrize("method", METHODS)
+def test_no_step_waits_for_the_device(method, setup):
+    """Environment, communication, noise, memory and update, within an episode."""
+    trainer = Trainer(resolve(method, [f"setup={setup}", *SMALL]))
+    collected = iter(lockstep(trainer))
+    for _ in range(6):
+        trainer._learn(next(collected))
+    with Waiting() as waiting:
+        for _ in range(4):
+            trainer._learn(next(collected))
+    assert trainer.updates > 4
+    assert waiting.found == []
+
+
+def test_waiting_is_noticed():
+    ones = torch.ones(3)
+    with Waiting() as waiting:
+        ones.sum().item()
+        ones[ones > 0]
+        torch.tensor([1.0])
+    assert waiting.found == ["_local_scalar_dense", "index", "lift_fresh"]
+
+
+def test_on_a_cpu_a_function_is_left_as_it_is():
+    assert graphed(dict, "cpu") is dict
