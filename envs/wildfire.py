@@ -181,7 +181,7 @@ class WildfireEnv(EnvBase):
         )
         self._position.copy_(position)
         counts, centres = self._map.look(self._position, self._time)
-        reward = view_reward(*counts.unbind(-1), beyond, config.reward)
+        reward = view_reward(*counts.unbind(-1), beyond=beyond, config=config.reward)
         counts = counts.long()
         self._seen.add_(counts[..., 0].sum(-1))
         return self._snapshot(position, counts, centres, beyond, reward)

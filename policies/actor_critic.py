@@ -2,6 +2,7 @@
 
 import copy
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from tensordict.nn import TensorDictModule
@@ -68,5 +69,6 @@ def team_of(network: TensorDictModule, team: int, teams: int) -> TensorDictModul
     single = copy.deepcopy(network)
     for own, stacked in zip(single.parameters(), network.parameters(), strict=True):
         own.data = stacked.data.unflatten(0, (teams, -1))[team]
-    single.module.uavs //= teams
+    stack: Any = single.module
+    stack.uavs //= teams
     return single

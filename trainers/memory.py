@@ -70,8 +70,10 @@ class TeamSampler(RandomSampler):
 
         rows = draw(_ROWS, self.filled)
         column = draw(_COLUMNS, self.uavs) if self.shared else self._own.expand_as(rows)
-        index = rows, column + self._team
-        return tuple(teams.transpose(0, 1).flatten(1) for teams in index), {}
+        rows, columns = (
+            of_teams.transpose(0, 1).flatten(1) for of_teams in (rows, column + self._team)
+        )
+        return (rows, columns), {}
 
 
 class _ClaimedStorage(LazyTensorStorage):
