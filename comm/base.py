@@ -9,10 +9,11 @@ from torchrl.data import Composite
 from torchrl.envs import Transform
 
 from emberlink.envs import keys
+from emberlink.envs.buffers import Buffers
 from emberlink.envs.config import WildfireConfig
 
 
-class CommModule(TensorDictModuleBase):
+class CommModule(Buffers, TensorDictModuleBase):
     """Rewrites the UAVs' observations from what they can hear of each other.
 
     A subclass in a file of its own, `comm/<name>.py`, is a new way to communicate: its file name

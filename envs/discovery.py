@@ -1,15 +1,16 @@
 """What burns, and who saw it first: the maps of all environments side by side."""
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
+from .buffers import Buffers
 from .fire import burning_cells
 from .view import View
 
 _NEVER = torch.iinfo(torch.int32).max
 
 
-class Discovery(nn.Module):
+class Discovery(Buffers):
     """The fire of every environment, and what its UAVs have seen of it.
 
     UAV 0 looks first: a cell is new to the lowest UAV that sees it at the first step at which
@@ -80,14 +81,14 @@ class Discovery(nn.Module):
 
         Args:
             position: float64 [envs, uavs, 3], cells.
-            step: of this look, int64 [envs].
+            step: of this look, float32 [envs].
 
         Returns:
             Cells in view that are new fire, old fire and no fire: how many, float64
             [envs, uavs, 3], and their mean (i, j), float32 [envs, uavs, 3, 2].
         """
         centre, cells, near = self._view.look(position, self._start)
-        stamp, first_seen, now = self._stamp, self._first_seen, step.float().view(-1, 1, 1)
+        stamp, first_seen, now = self._stamp, self._first_seen, step.view(-1, 1, 1)
         stamp.add_(self._uavs)
         arrival = self._arrival.take(cells)
         burning = near & (arrival <= now)

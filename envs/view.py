@@ -3,7 +3,9 @@
 import math
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
+
+from .buffers import Buffers
 
 
 def view_radius(altitude: float, view_angle: float) -> float:
@@ -11,7 +13,7 @@ def view_radius(altitude: float, view_angle: float) -> float:
     return altitude * math.tan(math.radians(view_angle))
 
 
-class View(nn.Module):
+class View(Buffers):
     """A camera that looks down: |i - x| <= z tan(angle) and |j - y| <= z tan(angle).
 
     Every UAV is given a window of V cells around the cell that is nearest to it. So that a window
@@ -25,7 +27,6 @@ class View(nn.Module):
     """
 
     _offsets: Tensor
-    _strides: Tensor
     _window: Tensor
     _moments: Tensor
 
@@ -37,14 +38,11 @@ class View(nn.Module):
         self._slope = math.tan(math.radians(view_angle))
         offsets = torch.arange(-reach, reach + 1)
         i, j = torch.meshgrid(offsets, offsets, indexing="ij")
-        columns = self._padded[1]
         self.register_buffer("_offsets", offsets.double())
-        self.register_buffer("_strides", torch.tensor([columns, 1.0], dtype=torch.float64))
-        self.register_buffer("_window", ((i + reach) * columns + j + reach).flatten())
-        # Sums of these stay whole numbers that float32 has exactly, unless the window is huge.
-        exact = torch.float32 if i.numel() * (reach + 1) < 2**24 else torch.float64
+        self.register_buffer("_window", ((i + reach) * self._padded[1] + j + reach).flatten())
+        # In float64, so that the sums of a window of any size are whole numbers.
         moments = torch.stack((i, j, torch.ones_like(i)), -1).flatten(0, 1)
-        self.register_buffer("_moments", moments.to(exact))
+        self.register_buffer("_moments", moments.double())
 
     @property
     def area(self) -> int:
@@ -80,7 +78,8 @@ class View(nn.Module):
         near = distance <= (position[..., 2:] * self._slope).unsqueeze(-1)
         columns, rows = near.unbind(-2)
         near = (columns.unsqueeze(-1) & rows.unsqueeze(-2)).flatten(-2)
-        corner = (centre @ self._strides).long() + start
+        i, j = centre.unbind(-1)
+        corner = torch.add(j, i, alpha=self._padded[1]).long() + start
         return centre, corner.unsqueeze(-1) + self._window, near
 
     def tally(self, classes: Tensor, centre: Tensor) -> tuple[Tensor, Tensor]:
@@ -93,7 +92,7 @@ class View(nn.Module):
         Returns:
             Counts, float64 [..., k], and mean (i, j), float32 [..., k, 2], 0 where there is none.
         """
-        sums = (classes.to(self._moments.dtype) @ self._moments).double()
+        sums = classes.double() @ self._moments
         count = sums[..., 2:]
         total = torch.addcmul(sums[..., :2], count, centre.unsqueeze(-2))
         return count.squeeze(-1), total.div_(count.clamp(min=1)).float()

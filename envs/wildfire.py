@@ -8,6 +8,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 
 from . import keys, render, specs, streams, uav
+from .buffers import Buffers
 from .config import WildfireConfig
 from .discovery import Discovery
 from .fire import FireConfig
@@ -18,7 +19,7 @@ from .view import View
 _POSITIONS, _FIRE, _STEPS = range(3)  # what an episode's random stream is split into
 
 
-class WildfireEnv(EnvBase):
+class WildfireEnv(Buffers, EnvBase):
     """A team of UAVs over a spreading fire, batched over environments.
 
     Args:
@@ -180,7 +181,7 @@ class WildfireEnv(EnvBase):
             high=self._high,
         )
         self._position.copy_(position)
-        counts, centres = self._map.look(self._position, self._time)
+        counts, centres = self._map.look(self._position, self._time.float())
         reward = view_reward(*counts.unbind(-1), beyond=beyond, config=config.reward)
         counts = counts.long()
         self._seen.add_(counts[..., 0].sum(-1))
