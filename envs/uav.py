@@ -37,8 +37,8 @@ def move(
         The new positions, float32 [..., 3], and the axes along which the move would have left
         the box, bool [..., 3].
     """
-    step = displacement * action.nan_to_num(0.0).clamp_(-1, 1).double()
-    wanted = position.double() + step
+    pushed = action.nan_to_num(0.0).clamp_(-1, 1)
+    wanted = torch.add(position.double(), pushed, alpha=displacement)
     inside = wanted.clamp(low, high)
     return inside.float(), inside != wanted
 

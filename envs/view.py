@@ -93,6 +93,6 @@ class View(Buffers):
             Counts, float64 [..., k], and mean (i, j), float32 [..., k, 2], 0 where there is none.
         """
         sums = classes.double() @ self._moments
-        count = sums[..., 2:]
-        total = torch.addcmul(sums[..., :2], count, centre.unsqueeze(-2))
+        offset, count = sums.split((2, 1), -1)
+        total = torch.addcmul(offset, count, centre.unsqueeze(-2))
         return count.squeeze(-1), total.div_(count.clamp(min=1)).float()
