@@ -6,6 +6,7 @@ import pytest
 import torch
 from tensordict.nn import TensorDictSequential
 from test_recipes import METHODS
+from torch._subclasses.fake_tensor import FakeTensorMode
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from emberlink.policies.noise import OrnsteinUhlenbeck
@@ -81,6 +82,32 @@ def test_no_step_waits_for_the_device(method, setup):
             trainer._learn(next(collected))
     assert trainer.updates > 4
     assert waiting.found == []
+
+
+@pytest.fixture
+def one_gpu(monkeypatch):
+    """A GPU that computes nothing: tensors have shapes and devices, and no numbers."""
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
+    monkeypatch.setattr("emberlink.trainers.loop.graphed", lambda function, device: function)
+    monkeypatch.setattr("emberlink.trainers.graphs.graphed", lambda function, device: function)
+    with FakeTensorMode(allow_non_fake_inputs=True) as mode:
+        yield mode
+
+
+@pytest.mark.parametrize("setup", ["paper", "tuned"])
+@pytest.mark.parametrize("method", METHODS)
+def test_everything_of_a_step_is_on_the_gpu(method, setup, one_gpu):
+    """Numbers that are needed on the host, and tensors of two devices in one operation, fail."""
+    trainer = Trainer(resolve(method, [f"setup={setup}", *SMALL, "device=cuda:0"]))
+    assert isinstance(trainer.collector, LockstepCollector)
+    for step, collected in enumerate(trainer.collector):
+        for name, value in collected.items(include_nested=True, leaves_only=True):
+            assert value.device == torch.device("cuda:0"), name
+        losses = trainer._learn(collected)
+        assert all(loss.is_cuda for loss in losses)
+        if step == 10:  # within the first episode: a reset may wait
+            break
+    assert trainer.updates > 4
 
 
 def test_waiting_is_noticed():

@@ -83,6 +83,14 @@ class _ClaimedStorage(LazyTensorStorage):
         super()._init(data)
         self._storage.zero_()
 
+    def get(self, index: tuple[torch.Tensor, torch.Tensor]) -> TensorDictBase:
+        """Reads rows that `TeamSampler` drew.
+
+        From all rows there will ever be: TorchRL cuts off those not yet written, and a recorded
+        graph would go on drawing from as many as there were when it was recorded.
+        """
+        return self._storage[index]
+
 
 def make_memory(
     uavs: int,

@@ -1,9 +1,12 @@
-"""Coverage of the frozen policies against seconds of training: one run, one line per measurement.
+"""Coverage of the frozen policies against seconds of training.
 
-    python tests/benchmarks/time_to_result.py FILE [key=value ...]
+    python tests/benchmarks/time_to_result.py train FILE [key=value ...]
+    python tests/benchmarks/time_to_result.py draw FIGURE.png LABEL=FILE [LABEL=FILE ...]
 
-Trains `consensus` in `tuned` with the given overrides, stops the clock every 500 steps, plays 32
-held-out fires, and appends {"step", "seconds", "coverage"} to FILE.
+`train` trains `consensus` in `tuned` with the given overrides, stops the clock every 500 steps,
+plays 32 held-out fires, and appends {"seed", "step", "seconds", "coverage"} to FILE. `draw` draws
+such files, a line a seed, and prints when each run had 90 % of its final coverage (the mean of its
+last three measurements).
 """
 
 import json
@@ -21,7 +24,7 @@ from emberlink.trainers.loop import Trainer
 EVERY, FIRES = 500, 32
 
 
-def main(file: Path, overrides: list[str]) -> None:
+def train(file: Path, overrides: list[str]) -> None:
     config = resolve("consensus", ["setup=tuned", "evaluation.interval=0", *overrides])
     trainer = Trainer(config)
     trainer.start()
@@ -51,5 +54,38 @@ def main(file: Path, overrides: list[str]) -> None:
     trainer.train(measure)
 
 
+def read(file: str) -> dict[int, list[dict]]:
+    """Seed -> its measurements, in order."""
+    runs: dict[int, list[dict]] = {}
+    for line in Path(file).read_text().splitlines():
+        measured = json.loads(line)
+        runs.setdefault(measured["seed"], []).append(measured)
+    return runs
+
+
+def draw(figure: Path, named: list[str]) -> None:
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot as plt
+
+    canvas, panel = plt.subplots(figsize=(7, 3.6), layout="constrained")
+    for number, (label, file) in enumerate(name.split("=") for name in named):
+        for seed, run in read(file).items():
+            seconds, coverage = ([one[key] for one in run] for key in ("seconds", "coverage"))
+            first = {} if seed else {"label": label}
+            panel.plot(seconds, coverage, color=f"C{number}", alpha=0.8, **first)
+            final = sum(coverage[-3:]) / 3
+            reached = next(one for one in run if one["coverage"] >= 0.9 * final)
+            print(
+                f"| {label} | {seed} | {final:.1f} | {reached['seconds']:.0f} | "
+                f"{reached['step']} | {seconds[-1]:.0f} | {1000 * seconds[-1] / run[-1]['step']:.1f} |"
+            )
+    panel.set(xlabel="seconds of training", ylabel="coverage, %", ylim=(0, 100))
+    panel.grid(alpha=0.3)
+    panel.legend()
+    canvas.savefig(figure, dpi=110)
+
+
 if __name__ == "__main__":
-    main(Path(sys.argv[1]), sys.argv[2:])
+    {"train": train, "draw": draw}[sys.argv[1]](Path(sys.argv[2]), sys.argv[3:])

@@ -1,0 +1,89 @@
+"""What the benchmarks count, and when the guard fails."""
+
+import guard
+import pytest
+import time_to_result
+import workloads
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils.flop_counter import flop_registry
+
+from emberlink.trainers.config import resolve
+from emberlink.trainers.loop import Trainer
+
+
+class Flops(TorchDispatchMode):
+    """Adds up what torch's own formulas say of every operation."""
+
+    total = 0
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        out = func(*args, **(kwargs or {}))
+        formula = flop_registry.get(func._overloadpacket)
+        if formula is not None:
+            self.total += formula(*args, **(kwargs or {}), out_val=out)
+        return out
+
+
+@pytest.mark.parametrize(
+    ("method", "features", "hidden", "batch"),
+    [
+        ("independent", 6, (40, 30), 64),
+        ("positional", 24, (16, 24), 32),
+        ("consensus", 9, (400, 300), 512),
+    ],
+)
+def test_flops_of_an_update_are_what_torch_counts(method, features, hidden, batch):
+    settings = ["env.horizon=200", "episodes=1", "env.num_uavs=4"]
+    sizes = [f"learner.hidden={list(hidden)}", f"learner.batch={batch}"]
+    trainer = Trainer(resolve(method, [*settings, *sizes]))
+    sample = workloads.batch_of(trainer)
+    with Flops() as counter:
+        trainer.learner.update(sample)
+    assert counter.total == workloads.update_flops(4, features, 3, hidden, batch)
+
+
+def test_works_take_turns():
+    done = []
+    seconds = workloads.in_turns(3, lambda: done.append("a"), lambda: done.append("b"))
+    assert done == ["a", "b"] * 4
+    assert len(seconds) == 2
+    assert all(taken >= 0 for taken in seconds)
+
+
+@pytest.mark.parametrize(
+    ("taken", "kept", "calls"),
+    [
+        ([2.0], True, 1),
+        ([1.0], True, 1),
+        ([2.8], True, 1),  # 0.71 of the speed
+        ([2.9, 2.0], True, 2),  # 0.69, and then not
+        ([2.9, 5.0, 2.9], False, 3),
+    ],
+)
+def test_the_guard_fails_at_a_loss_of_30_percent(taken, kept, calls, capsys):
+    left = list(taken)
+    assert guard.check("work", 2.0, lambda: left.pop(0)) is kept
+    assert len(taken) - len(left) == calls
+    assert ("has lost more than 30%" in capsys.readouterr().out) is not kept
+
+
+def test_the_guard_has_a_record_of_every_work():
+    recorded = guard.json.loads(guard.BASELINE.read_text())
+    assert recorded.keys() == guard.works().keys()
+    assert all(ratio > 0 for ratio in recorded.values())
+
+
+def test_time_to_90_percent(tmp_path, capsys):
+    file = tmp_path / "runs.jsonl"
+    lines = [(500, 10, 40), (1000, 20, 71), (1500, 30, 73), (2000, 40, 79), (2500, 50, 88)]
+    file.write_text(
+        "".join(
+            f'{{"seed": 3, "step": {step}, "seconds": {seconds}, "coverage": {coverage}}}\n'
+            for step, seconds, coverage in lines
+        )
+    )
+    figure = tmp_path / "figure.png"
+    time_to_result.draw(figure, [f"now={file}"])
+    # The last three make 80; 90 % of that is 72, which the third has.
+    assert capsys.readouterr().out == "| now | 3 | 80.0 | 30 | 1500 | 50 | 20.0 |\n"
+    assert figure.stat().st_size > 5000
