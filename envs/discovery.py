@@ -48,7 +48,7 @@ class Discovery(Buffers):
         self.register_buffer("_growth_start", torch.zeros(envs, dtype=torch.int64))
         first_seen = torch.full((envs, view.area), _NEVER, dtype=torch.int32)
         self.register_buffer("_first_seen", first_seen)
-        self.register_buffer("_stamp", torch.zeros(envs, uavs, 1, dtype=torch.int32))
+        self.register_buffer("_stamp", self._uav.repeat(envs, 1, 1))
 
     def __len__(self) -> int:
         """How many fires there are."""

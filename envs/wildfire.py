@@ -58,7 +58,7 @@ class WildfireEnv(Buffers, EnvBase):
     ):
         if num_envs < 1:
             raise ValueError(f"num_envs={num_envs}: at least 1 is needed")
-        seeds = [seed] if isinstance(seed, int) else list(seed)
+        seeds = list(seed) if isinstance(seed, Sequence) else [int(seed)]
         if min(seeds, default=-1) < 0:
             raise ValueError(f"seed={seed}: a number that is not negative is needed")
         if num_envs % len(seeds):

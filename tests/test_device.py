@@ -6,7 +6,7 @@ import pytest
 import torch
 from tensordict.nn import TensorDictSequential
 from test_recipes import METHODS
-from torch._subclasses.fake_tensor import FakeTensorMode
+from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from emberlink.policies.noise import OrnsteinUhlenbeck
@@ -84,30 +84,51 @@ def test_no_step_waits_for_the_device(method, setup):
     assert waiting.found == []
 
 
-@pytest.fixture
-def one_gpu(monkeypatch):
-    """A GPU that computes nothing: tensors have shapes and devices, and no numbers."""
-    monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
-    monkeypatch.setattr("emberlink.trainers.loop.graphed", lambda function, device: function)
-    monkeypatch.setattr("emberlink.trainers.graphs.graphed", lambda function, device: function)
-    with FakeTensorMode(allow_non_fake_inputs=True) as mode:
-        yield mode
+class Elsewhere(TorchFunctionMode):
+    """Notes every call that makes a tensor on the CPU, or moves one, whatever the device is."""
+
+    MAKES = (
+        *("arange", "zeros", "ones", "full", "empty", "tensor", "as_tensor", "eye", "rand"),
+        *("randn", "randint", "linspace", "from_numpy", "scalar_tensor"),
+    )
+    MOVES = ("cpu", "cuda", "item", "tolist", "numpy", "pin_memory")
+
+    def __init__(self):
+        super().__init__()
+        self.found = []
+
+    def __torch_function__(self, func, types, args=(), kwargs=None):
+        kwargs = kwargs or {}
+        name = getattr(func, "__name__", "")
+        moves = name == "to" and not any(isinstance(arg, torch.dtype) for arg in args)
+        if moves or name in self.MOVES or (name in self.MAKES and kwargs.get("device") is None):
+            self.found.append(name)
+        return func(*args, **kwargs)
 
 
-@pytest.mark.parametrize("setup", ["paper", "tuned"])
+@pytest.mark.parametrize("setup", ["paper", "released", "tuned"])
 @pytest.mark.parametrize("method", METHODS)
-def test_everything_of_a_step_is_on_the_gpu(method, setup, one_gpu):
-    """Numbers that are needed on the host, and tensors of two devices in one operation, fail."""
-    trainer = Trainer(resolve(method, [f"setup={setup}", *SMALL, "device=cuda:0"]))
-    assert isinstance(trainer.collector, LockstepCollector)
-    for step, collected in enumerate(trainer.collector):
-        for name, value in collected.items(include_nested=True, leaves_only=True):
-            assert value.device == torch.device("cuda:0"), name
-        losses = trainer._learn(collected)
-        assert all(loss.is_cuda for loss in losses)
-        if step == 10:  # within the first episode: a reset may wait
-            break
+def test_everything_of_a_step_is_made_where_it_is_used(method, setup):
+    trainer = Trainer(resolve(method, [f"setup={setup}", *SMALL, "seeds=[5,6]"]))
+    collected = iter(lockstep(trainer))
+    for _ in range(6):
+        trainer._learn(next(collected))
+    with Elsewhere() as elsewhere:
+        for _ in range(4):
+            trainer._learn(next(collected))
     assert trainer.updates > 4
+    assert elsewhere.found == []
+
+
+def test_what_is_made_elsewhere_is_noticed():
+    ones = torch.ones(3)
+    with Elsewhere() as elsewhere:
+        torch.zeros(3)
+        torch.zeros(3, device="cpu")
+        ones.tolist()
+        ones.to("cpu")
+        ones.to(torch.float64)
+    assert elsewhere.found == ["zeros", "tolist", "to"]
 
 
 def test_waiting_is_noticed():

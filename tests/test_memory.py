@@ -129,3 +129,23 @@ def test_rows_are_what_the_environment_did():
         # The horizon ends the episode, and it is no terminal state.
         assert row["next", "done"].flatten().tolist() == [at % 3 == 2] * UAVS
         assert not row["next", "terminated"].any()
+
+
+@pytest.mark.parametrize("shared", [False, True])
+def test_a_million_transitions_take_little_more_than_their_numbers(shared):
+    """Both observations, action and reward; the rest is two flags."""
+    buffer = memory(shared=shared, capacity=1_000_000, uavs=6)
+    row = to_rows(make_env("consensus", horizon=2).rollout(1))
+    buffer.extend(row)
+    transitions = 1_000_002 if shared else 6_000_000  # rows of six
+    assert len(buffer._storage._storage) * 6 == transitions
+    numbers = 4 * (9 + 9 + 3 + 1) * transitions
+    assert buffer._storage._storage.bytes() <= 1.2 * numbers
+
+
+def test_an_emptied_memory_forgets():
+    buffer = memory(shared=True)
+    buffer.extend(labelled(0, 50))
+    buffer.empty()
+    buffer.extend(labelled(900, 20))
+    assert drawn(buffer, 3)[..., 0].min() >= 900

@@ -9,8 +9,9 @@ from test_recipes import METHODS
 
 from emberlink.envs import keys
 from emberlink.envs.wildfire import WildfireEnv
-from emberlink.trainers import cli, report
-from emberlink.trainers.config import resolve
+from emberlink.policies.noise import NOISE
+from emberlink.trainers import cli, make_env, report
+from emberlink.trainers.config import from_values, resolve, to_values
 from emberlink.trainers.loop import Trainer
 from emberlink.trainers.memory import to_rows
 
@@ -92,20 +93,21 @@ def next_of(batch: TensorDict, uavs: slice) -> TensorDict:
     return TensorDict({"agents": agents}, batch_size=batch.batch_size)
 
 
-def test_seeds_of_a_stack_differ(tmp_path):
-    trainer = trained(
-        resolve(
-            "consensus",
-            [
-                *("env.horizon=30", "episodes=1", "learner.batch=24", "learner.hidden=[8,8]"),
-                *(f"seeds={SEEDS}", f"output={tmp_path}", "evaluation.interval=0"),
-            ],
-        )
-    )
+def test_seeds_of_a_stack_differ_in_all_that_is_random():
+    """Weights, start positions, fires, noise, and what is drawn from the memory."""
+    settings = ["fire=huygens", "env.horizon=30", "learner.batch=24", "learner.hidden=[8,8]"]
+    trainer = Trainer(resolve("consensus", [*settings, f"seeds={SEEDS}"]))
     first, second = (trainer.weights(team) for team in range(2))
-    for name, weight in first.items():
-        if "norm" not in name:
-            assert not weight.equal(second[name]), name
+    assert not any(first[name].equal(second[name]) for name in first if "norm" not in name)
+    assert not trainer.env.base_env.arrival[0].equal(trainer.env.base_env.arrival[1])
+    collected = next(iter(trainer.collector))
+    for key in (keys.POSITION, NOISE):
+        assert not collected[key][0].isclose(collected[key][1]).any(), key
+    trainer.memory.extend(to_rows(collected, 2))
+    trainer.memory._sampler.filled.fill_(1000)
+    (rows, columns), _ = trainer.memory._sampler.sample(trainer.memory._storage, 24)
+    assert (rows[:, :6] == rows[:, 6:]).float().mean() < 0.05
+    assert columns[:, :6].max() < 6 <= columns[:, 6:].min()
 
 
 def test_environments_of_several_seeds_are_those_of_each():
@@ -168,3 +170,27 @@ def test_wrong_seeds(overrides, message, capsys, tmp_path):
     assert message in error
     assert error.count("\n") == 1
     assert not list(tmp_path.iterdir())
+
+
+def test_seeds_from_python():
+    for seeds in ([1, 2], (1, 2), range(1, 3)):
+        assert resolve("consensus", seeds=seeds).seeds == (1, 2)
+    assert resolve("consensus", seeds=[4, 2]).seed == 4
+    assert WildfireEnv(2, seed=torch.tensor(3)).reset()[keys.STREAM].shape == (2,)
+    with pytest.raises(ValueError, match="an environment takes seed="):
+        make_env("consensus", seeds=[1, 2])
+
+
+def test_a_configuration_from_before_there_were_seeds():
+    values = to_values(resolve("consensus"))
+    del values["seeds"]
+    assert from_values(values) == resolve("consensus")
+
+
+def test_every_seed_has_a_tracker_of_its_own(tmp_path):
+    small = ["env.horizon=8", "episodes=2", "learner.batch=8", "learner.hidden=[4,4]"]
+    more = [f"seeds={SEEDS}", "logger=csv", f"output={tmp_path}", "evaluation.interval=0"]
+    for run in trained(resolve("independent", [*small, *more])).runs:
+        (scores,) = (run.path / "csv").rglob("score.csv")
+        logged = [float(line.split(",")[1]) for line in scores.read_text().splitlines()]
+        assert logged == pytest.approx([line["score"] for line in run.lines()])

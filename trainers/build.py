@@ -47,6 +47,8 @@ def make_env(
     if grid and "grid" not in overrides:
         overrides["grid"] = grid
     config = resolve(method, [f"setup={setup}"], **overrides)
+    if config.seeds:
+        raise ValueError(f"seeds={list(config.seeds)}: of a training; an environment takes seed=")
     fire = config.fire if fire is None else fire
     return build_env(config, num_envs=num_envs, fire=fire, seed=seed, device=device)
 

@@ -1,7 +1,7 @@
 """The whole configuration of a run: its schema, and how it is put together from YAML."""
 
 import difflib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import fields
 from typing import Annotated, Any, Literal
 
@@ -113,7 +113,7 @@ class RunConfig:
     """episodes of training, counted per environment: all run theirs side by side"""
     num_envs: Side
     """environments that collect side by side, for each seed"""
-    seeds: Annotated[tuple[Seed, ...], Strict(False)]
+    seeds: Annotated[tuple[Seed, ...], Strict(False)] = ()
     """several seeds, trained side by side as one stack, a run folder each; `seed` is then this
     run's; none for `seed` alone"""
     seed: Seed
@@ -207,7 +207,7 @@ def resolve(method: str, overrides: Sequence[str] = (), **settings: Any) -> RunC
         raise ValueError(f"configs/method/{method}.yaml must begin with '# @package _global_'")
     values = {**values, **choices}
     for key, value in settings.items():
-        _set(values, key, value)
+        _set(values, key, list(value) if key == "seeds" and isinstance(value, Iterable) else value)
     if values["seeds"]:
         if "seed" in settings or any(text.startswith("seed=") for text in overrides):
             raise ValueError(f"seed={values['seed']} and seeds={values['seeds']}: give one of them")

@@ -26,20 +26,25 @@ class CudaGraph(Generic[T]):
 
     Args:
         function: what it returns is overwritten by the next call.
+        device: the GPU that it works on.
     """
 
-    def __init__(self, function: Callable[[], T]):
-        self._function, self._calls = function, 0
+    def __init__(self, function: Callable[[], T], device: torch.device):
+        self._function, self._device, self._calls = function, device, 0
         self._graph: torch.cuda.CUDAGraph | None = None
         self._result: T | None = None
 
     def __call__(self) -> T:
+        with torch.cuda.device(self._device):
+            return self._call()
+
+    def _call(self) -> T:
         self._calls += 1
         if self._calls <= _WARM_UP:
             return self._call_beside()
         if self._graph is None:
             self._graph = torch.cuda.CUDAGraph()
-            with torch.cuda.graph(self._graph):
+            with torch.cuda.graph(self._graph, stream=torch.cuda.Stream()):
                 self._result = self._function()
         self._graph.replay()
         result: Any = self._result
@@ -57,7 +62,8 @@ class CudaGraph(Generic[T]):
 
 def graphed(function: Callable[[], T], device: torch.device | str) -> Callable[[], T]:
     """The function as a CUDA graph, or itself where the device is no GPU."""
-    return CudaGraph(function) if torch.device(device).type == "cuda" else function
+    device = torch.device(device)
+    return CudaGraph(function, device) if device.type == "cuda" else function
 
 
 class LockstepCollector:

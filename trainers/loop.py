@@ -39,7 +39,8 @@ class Progress:
 class Trainer:
     """A run, or one of each seed side by side: their networks are one stack, and nothing crosses.
 
-    Built whole before a folder is made, so that an error leaves nothing behind.
+    Built whole before a folder is made, so that an error leaves nothing behind. From then on the
+    process keeps the memory that it frees (see `allocator`).
 
     Args:
         config: everything that the run depends on.
@@ -101,15 +102,16 @@ class Trainer:
         Returns:
             Whether it came to the end: False after `stop`.
         """
-        runs = zip(self.configs, self.runs, strict=True)
-        trackers = [tracking.Tracker(config, run) for config, run in runs]
+        trackers: list[tracking.Tracker] = []
         try:
+            for config, run in zip(self.configs, self.runs, strict=True):
+                trackers.append(tracking.Tracker(config, run))
             self._loop(trackers, report)
         finally:
+            self.save()
             self.collector.shutdown()
             for tracker in trackers:
                 tracker.close()
-            self.save()
         return self.step == self.steps
 
     def rehearse(self, steps: int) -> None:

@@ -55,6 +55,10 @@ class TeamSampler(RandomSampler):
         """Told by the memory where it has just written."""
         self.filled.add_(len(index)).clamp_(max=self.rows)
 
+    def _empty(self) -> None:
+        """Told by the memory that it holds nothing any more."""
+        self.filled.zero_()
+
     def sample(
         self, storage: TensorStorage, batch_size: int
     ) -> tuple[tuple[torch.Tensor, torch.Tensor], dict]:

@@ -44,9 +44,10 @@ def test_a_recipe_learns_the_same(method, seeds, tmp_path):
         )
         trainer.start()
         trainer.train()
-        weights.append(trainer.weights())
-    for name, value in weights[0].items():
-        torch.testing.assert_close(weights[1][name].cpu(), value, rtol=1e-2, atol=1e-3)
+        weights.append([trainer.weights(team) for team in range(trainer.teams)])
+    for cpu, gpu in zip(*weights, strict=True):
+        for name, value in cpu.items():
+            torch.testing.assert_close(gpu[name].cpu(), value, rtol=1e-2, atol=1e-3)
 
 
 def seconds_of(method: str, output, *overrides: str) -> float:
@@ -81,10 +82,12 @@ def test_four_methods_five_seeds(tell, tmp_path):
 def test_nothing_waits_for_the_device(tmp_path):
     """torch itself raises where a step would wait for the GPU."""
     trainer = Trainer(resolve("consensus", ["device=cuda", "episodes=1", f"output={tmp_path}"]))
-    for step, collected in enumerate(trainer.collector):
-        if step == trainer.enough + 10:
-            torch.cuda.set_sync_debug_mode("error")
-        if step == trainer.enough + 60:
-            break
-        trainer._learn(collected)
-    torch.cuda.set_sync_debug_mode("default")
+    try:
+        for step, collected in enumerate(trainer.collector):
+            if step == trainer.enough + 10:
+                torch.cuda.set_sync_debug_mode("error")
+            if step == trainer.enough + 60:
+                break
+            trainer._learn(collected)
+    finally:
+        torch.cuda.set_sync_debug_mode("default")

@@ -49,7 +49,7 @@ def test_share_of_what_is_not_the_update(tell, method, setup):
         if len(trainer.memory) > trainer.enough + 20 and not began:
             began, inside, first = time.perf_counter(), 0.0, steps
         trainer._learn(collected)
-        if began and steps == first + 100:
+        if began and steps == first + 99:
             break
     whole = time.perf_counter() - began
     trainer.collector.shutdown()

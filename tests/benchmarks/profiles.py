@@ -1,6 +1,6 @@
 """Where the time goes: torch's own profile of an update and of environment steps.
 
-    python tests/benchmarks/profiles.py
+python tests/benchmarks/profiles.py
 """
 
 from collections.abc import Callable

@@ -26,6 +26,8 @@ EVERY, FIRES = 500, 32
 
 def train(file: Path, overrides: list[str]) -> None:
     config = resolve("consensus", ["setup=tuned", "evaluation.interval=0", *overrides])
+    if config.seeds:
+        raise SystemExit("seeds: one run at a time is timed; give seed=")
     trainer = Trainer(config)
     trainer.start()
     grid, horizon = config.env.grid, config.env.horizon
@@ -77,9 +79,10 @@ def draw(figure: Path, named: list[str]) -> None:
             panel.plot(seconds, coverage, color=f"C{number}", alpha=0.8, **first)
             final = sum(coverage[-3:]) / 3
             reached = next(one for one in run if one["coverage"] >= 0.9 * final)
+            each = 1000 * seconds[-1] / run[-1]["step"]
             print(
                 f"| {label} | {seed} | {final:.1f} | {reached['seconds']:.0f} | "
-                f"{reached['step']} | {seconds[-1]:.0f} | {1000 * seconds[-1] / run[-1]['step']:.1f} |"
+                f"{reached['step']} | {seconds[-1]:.0f} | {each:.1f} |"
             )
     panel.set(xlabel="seconds of training", ylabel="coverage, %", ylim=(0, 100))
     panel.grid(alpha=0.3)
