@@ -31,7 +31,7 @@ bench: $(INSTALLED)  ## run the benchmarks (about half an hour; BENCH="-k update
 	@$(BIN)/python -m pytest tests/benchmarks -q -p no:xdist -o python_files='bench_*.py' $(BENCH)
 
 guard: $(INSTALLED)  ## check that nothing has become slower (a few seconds)
-	@OMP_NUM_THREADS=1 $(BIN)/python tests/benchmarks/guard.py
+	@$(BIN)/python tests/benchmarks/guard.py
 
 lint: $(INSTALLED)  ## check style and layout
 	@$(BIN)/ruff check .
