@@ -45,7 +45,7 @@ def left_box(beyond: Tensor, axes: Literal["xyz", "xy"]) -> Tensor:
         beyond: bool [..., 3], per axis.
         axes: the axes that are tested.
     """
-    return (beyond if axes == "xyz" else beyond[..., : len(axes)]).any(-1)
+    return beyond[..., : len(axes)].any(-1)
 
 
 def view_reward(

@@ -63,6 +63,11 @@ def streams(seed: int, count: int, device: torch.device | str | None = None) -> 
     return fold(root, torch.arange(count, device=device))
 
 
+def _lanes(stream: Tensor, lanes: int) -> Tensor:
+    """64 random bits per stream and lane, int64 [..., lanes]."""
+    return fold(stream.unsqueeze(-1), torch.arange(lanes, device=stream.device))
+
+
 def integers(stream: Tensor, lanes: int, limit: int | Tensor) -> Tensor:
     """Whole numbers 0 ... limit - 1, all equally likely to within limit / 2³².
 
@@ -74,8 +79,7 @@ def integers(stream: Tensor, lanes: int, limit: int | Tensor) -> Tensor:
     Returns:
         int64 [..., lanes].
     """
-    bits = fold(stream.unsqueeze(-1), torch.arange(lanes, device=stream.device))
-    return (_shift(bits, 32) * limit) >> 32
+    return (_shift(_lanes(stream, lanes), 32) * limit) >> 32
 
 
 def uniform(stream: Tensor, lanes: int) -> Tensor:
@@ -88,8 +92,7 @@ def uniform(stream: Tensor, lanes: int) -> Tensor:
     Returns:
         float32 [..., lanes]: odd multiples of 2⁻²⁴.
     """
-    bits = fold(stream.unsqueeze(-1), torch.arange(lanes, device=stream.device))
-    return (_shift(bits, 41).to(torch.float32) + 0.5) * 2.0**-23
+    return (_shift(_lanes(stream, lanes), 41).to(torch.float32) + 0.5) * 2.0**-23
 
 
 def normal(stream: Tensor, lanes: int) -> Tensor:

@@ -135,10 +135,9 @@ class WildfireEnv(Buffers, EnvBase):
         self._position.copy_(torch.where(mask[:, None, None], start, self._position))
         # Nobody has looked yet: the first step counts what is in view.
         nothing = torch.zeros_like(self._position, dtype=torch.int64)
-        nowhere = torch.zeros_like(self._position).float().unsqueeze(-1).expand(-1, -1, -1, 2)
-        return self._snapshot(
-            self._position.float(), nothing, nowhere.clone(), torch.zeros_like(nothing) > 0
-        )
+        nowhere = nothing.new_zeros((*nothing.shape, 2), dtype=torch.float32)
+        inside = torch.zeros_like(nothing, dtype=torch.bool)
+        return self._snapshot(self._position.float(), nothing, nowhere, inside)
 
     def _begin_episodes(self, mask: Tensor) -> None:
         """The next episode, bool [num_envs] says where: its stream, its fire, nothing seen."""

@@ -1,7 +1,6 @@
 """The networks as TensorDict modules, built from an environment's specs."""
 
 import copy
-from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -11,7 +10,7 @@ from torchrl.modules import ValueOperator
 
 from emberlink.envs import keys
 
-from .networks import Generators, StackedActor, StackedCritic
+from .networks import Generators, StackedActor, StackedCritic, of_teams
 
 STATE_ACTION_VALUE = (keys.AGENTS, "state_action_value")
 
@@ -58,8 +57,8 @@ def _stacked(
     uavs, features = observation[keys.OBSERVATION].shape[-2:]
     device = torch.device(observation.device or "cpu")
     actions = action[keys.ACTION].shape[-1]
-    teams = len(generator) if isinstance(generator, Sequence) else 1
-    return kind(teams * uavs, features, actions, hidden, device=device, generator=generator)
+    uavs *= len(of_teams(generator))
+    return kind(uavs, features, actions, hidden, device=device, generator=generator)
 
 
 def team_of(network: TensorDictModule, team: int, teams: int) -> TensorDictModule:

@@ -16,6 +16,11 @@ Generators = torch.Generator | Sequence[torch.Generator] | None
 """of initial weights: one for all, or one per team of a stack that shares the UAVs out in order"""
 
 
+def of_teams(generator: Generators) -> Sequence[torch.Generator | None]:
+    """The generator of each team."""
+    return generator if isinstance(generator, Sequence) else [generator]
+
+
 _LARGE = 2**17
 """numbers of one UAV between two layers, half a megabyte"""
 
@@ -44,7 +49,7 @@ class StackedLinear(nn.Module):
     ):
         super().__init__()
         bound = 1 / math.sqrt(inputs) if bound is None else bound
-        generators = generator if isinstance(generator, Sequence) else [generator]
+        generators = of_teams(generator)
         team = uavs // len(generators)
 
         def start(*shape: int) -> nn.Parameter:

@@ -69,21 +69,6 @@ class Waiting(TorchDispatchMode):
         return func(*args, **(kwargs or {}))
 
 
-@pytest.mark.parametrize("setup", ["paper", "released", "tuned"])
-@pytest.mark.parametrize("method", METHODS)
-def test_no_step_waits_for_the_device(method, setup):
-    """Environment, communication, noise, memory and update, within an episode."""
-    trainer = Trainer(resolve(method, [f"setup={setup}", *SMALL]))
-    collected = iter(lockstep(trainer))
-    for _ in range(6):
-        trainer._learn(next(collected))
-    with Waiting() as waiting:
-        for _ in range(4):
-            trainer._learn(next(collected))
-    assert trainer.updates > 4
-    assert waiting.found == []
-
-
 class Elsewhere(TorchFunctionMode):
     """Notes every call that makes a tensor on the CPU, or moves one, whatever the device is."""
 
@@ -106,18 +91,22 @@ class Elsewhere(TorchFunctionMode):
         return func(*args, **kwargs)
 
 
+@pytest.mark.parametrize(
+    ("watch", "seeds"), [(Waiting, "seed=5"), (Elsewhere, "seeds=[5,6]")], ids=["waits", "moves"]
+)
 @pytest.mark.parametrize("setup", ["paper", "released", "tuned"])
 @pytest.mark.parametrize("method", METHODS)
-def test_everything_of_a_step_is_made_where_it_is_used(method, setup):
-    trainer = Trainer(resolve(method, [f"setup={setup}", *SMALL, "seeds=[5,6]"]))
+def test_no_step_leaves_the_device(method, setup, watch, seeds):
+    """Environment, communication, noise, memory and update, within an episode."""
+    trainer = Trainer(resolve(method, [f"setup={setup}", *SMALL, seeds]))
     collected = iter(lockstep(trainer))
     for _ in range(6):
         trainer._learn(next(collected))
-    with Elsewhere() as elsewhere:
+    with watch() as watched:
         for _ in range(4):
             trainer._learn(next(collected))
     assert trainer.updates > 4
-    assert elsewhere.found == []
+    assert watched.found == []
 
 
 def test_what_is_made_elsewhere_is_noticed():

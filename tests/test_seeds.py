@@ -5,7 +5,7 @@ import json
 import pytest
 import torch
 from tensordict import TensorDict
-from test_recipes import METHODS
+from test_recipes import METHODS, trained
 
 from emberlink.envs import keys
 from emberlink.envs.wildfire import WildfireEnv
@@ -16,13 +16,6 @@ from emberlink.trainers.loop import Trainer
 from emberlink.trainers.memory import to_rows
 
 SEEDS = [3, 11]
-
-
-def trained(config) -> Trainer:
-    trainer = Trainer(config)
-    trainer.start()
-    trainer.train()
-    return trainer
 
 
 @pytest.mark.parametrize(

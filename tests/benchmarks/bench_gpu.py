@@ -4,13 +4,12 @@ import time
 
 import pytest
 import torch
+from workloads import METHODS
 
 from emberlink.envs import keys
 from emberlink.trainers import make_env
 from emberlink.trainers.config import resolve
 from emberlink.trainers.loop import Trainer
-
-METHODS = ["independent", "shared_memory", "positional", "consensus"]
 
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")
 

@@ -3,12 +3,10 @@
 import time
 
 import pytest
-from workloads import MATRIX_FLOPS, batch_of, in_turns, matrix_product, update_flops
+from workloads import MATRIX_FLOPS, METHODS, batch_of, in_turns, matrix_product, update_flops
 
 from emberlink.trainers.config import resolve
 from emberlink.trainers.loop import Trainer
-
-METHODS = ["independent", "shared_memory", "positional", "consensus"]
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -24,7 +22,7 @@ def test_update(benchmark, tell, method):
     benchmark.pedantic(lambda: trainer.learner.update(batch), rounds=5)
     tell(
         f"update, {method:13}: {1000 * update:6.1f} ms, {flops / update / 1e9:5.1f} Gflop/s = "
-        f"{100 * share:4.1f} % of a {2048}^3 product's {MATRIX_FLOPS / product / 1e9:5.1f} "
+        f"{100 * share:4.1f} % of a 2048^3 product's {MATRIX_FLOPS / product / 1e9:5.1f} "
         "(goal 65 %)"
     )
 

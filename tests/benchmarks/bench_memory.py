@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 from tensordict import TensorDict
-from workloads import make
+from workloads import METHODS, make
 
 from emberlink.trainers.config import resolve
 from emberlink.trainers.loop import Trainer
@@ -22,7 +22,7 @@ def resident() -> int:
     return pages * resource.getpagesize()
 
 
-@pytest.mark.parametrize("method", ["independent", "shared_memory", "positional", "consensus"])
+@pytest.mark.parametrize("method", METHODS)
 def test_a_million_transitions(tell, method):
     """Resident bytes against those of the numbers: both observations, action and reward."""
     env = make(method, 1)

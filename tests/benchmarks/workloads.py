@@ -12,11 +12,13 @@ import torch
 from tensordict import TensorDict
 
 from emberlink.envs import keys
+from emberlink.envs.config import known
 from emberlink.envs.wildfire import WildfireEnv
 from emberlink.trainers import make_env
 from emberlink.trainers.config import resolve
 from emberlink.trainers.loop import Trainer
 
+METHODS = known("method")
 MATRIX = 2048
 
 
