@@ -6,7 +6,8 @@ per seed, are a longer stack: team 0's UAVs first.
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 
 import torch
 from torch import Tensor, nn
@@ -69,7 +70,7 @@ class StackedLinear(nn.Module):
 
     def each(self) -> list[Layer]:
         """One layer per UAV, [batch, inputs] -> [batch, outputs]."""
-        uavs = zip(self.weight.unbind(0), self.bias.unbind(0), strict=True)
+        uavs = zip(self.weight.unbind(0), self.bias.squeeze(1).unbind(0), strict=True)
         return [lambda x, w=weight, b=bias: torch.addmm(b, x, w) for weight, bias in uavs]
 
 
@@ -89,8 +90,9 @@ class StackedLayerNorm(nn.Module):
     def each(self) -> list[Layer]:
         """One layer per UAV, [batch, features] -> the same."""
         norm = nn.functional.layer_norm
-        uavs = zip(self.weight.unbind(0), self.bias.unbind(0), strict=True)
-        return [lambda x, w=weight[0], b=bias[0]: norm(x, w.shape, w, b) for weight, bias in uavs]
+        uavs = (of_uav.squeeze(1).unbind(0) for of_uav in (self.weight, self.bias))
+        each = zip(*uavs, strict=True)
+        return [lambda x, w=weight, b=bias: norm(x, w.shape, w, b) for weight, bias in each]
 
 
 class _Trunk(nn.Module):
@@ -122,31 +124,32 @@ class _Trunk(nn.Module):
         teams = self.uavs // x.shape[-2]
         return x.unflatten(0, (teams, -1)).transpose(1, 2).flatten(0, 1)
 
-    def by_batch(self, x: Tensor, shape: torch.Size) -> Tensor:
-        """The other way: [uavs, batch, features] -> [*shape, features]."""
+    def by_batch(self, x: Tensor | list[Tensor], shape: torch.Size) -> Tensor:
+        """The other way: [uavs, batch, features], or its parts, -> [*shape, features]."""
+        x = torch.stack(x) if isinstance(x, list) else x
         return x.unflatten(0, (-1, shape[-1])).transpose(1, 2).reshape(*shape, x.shape[-1])
 
     def apply_all(
         self,
         network: Callable[..., Tensor],
         layers: Sequence[StackedLinear | StackedLayerNorm],
-        *inputs: Tensor,
-    ) -> Tensor:
+        x: Tensor,
+        *more: Tensor | list[Tensor],
+    ) -> Tensor | list[Tensor]:
         """All UAVs' networks on their inputs, [uavs, batch, features] each.
 
         At once; but on a CPU one after another where the numbers of all would not stay in its
-        cache from one layer to the next.
+        cache from one layer to the next. Then a list, and `more` may be such lists.
 
         Args:
             network: of one UAV or of a stack: layers, then inputs.
             layers: what `network` is given.
-            inputs: what it is applied to.
+            x, more: what it is applied to.
         """
-        first = inputs[0]
-        if first.is_cuda or first.shape[1] * self.widest < _LARGE:
-            return network(*layers, *inputs)
-        each = zip(*(layer.each() for layer in layers), *inputs, strict=True)
-        return torch.stack([network(*one) for one in each])
+        if x.is_cuda or x.shape[1] * self.widest < _LARGE:
+            return network(*layers, x, *more)
+        each = zip(*(layer.each() for layer in layers), x, *more, strict=True)
+        return [network(*one) for one in each]
 
 
 class StackedActor(_Trunk):
@@ -205,36 +208,59 @@ class StackedCritic(_Trunk):
         self.value = StackedLinear(
             uavs, hidden[1], 1, bound=3e-3, device=device, generator=generator
         )
+        self._shared: dict[tuple, tuple[Tensor, Tensor | list[Tensor]]] | None = None
 
     def forward(self, observation: Tensor, action: Tensor) -> Tensor:
         """float32 [..., uavs, features] and [..., uavs, actions] -> [..., uavs, 1]."""
-        trunk = self.first, self.first_norm, self.second, self.second_norm
-        inputs = self.by_uav(observation), self.by_uav(action)
-        value = self.apply_all(_value, (*trunk, self.action, self.value), *inputs)
+        hidden = self._hidden(observation)
+        value = self.apply_all(_value, (self.action, self.value), self.by_uav(action), hidden)
         return self.by_batch(value, observation.shape[:-1])
+
+    @contextmanager
+    def sharing(self) -> Iterator[None]:
+        """Within, what the action has no part in is computed once for the same observation.
+
+        DDPG asks a critic for the value of two actions at each observation of a batch: the one
+        that was taken, in the critic's loss, and the actor's, in the actor's loss. Nothing may
+        write to observations or weights meanwhile.
+        """
+        self._shared = {}
+        try:
+            yield
+        finally:
+            self._shared = None
+
+    def _hidden(self, observation: Tensor) -> Tensor | list[Tensor]:
+        """The second layer before the action is added, [uavs, batch, features] or its parts."""
+        layers = self.first, self.first_norm, self.second, self.second_norm
+        if self._shared is None:
+            return self.apply_all(_trunk, layers, self.by_uav(observation))
+        weight = self.first.weight
+        key = observation.data_ptr(), observation.shape, weight.data_ptr()
+        if key not in self._shared or weight.requires_grad:
+            hidden = self.apply_all(_trunk, layers, self.by_uav(observation))
+            # With the observation, so that its memory is not another's before the end.
+            self._shared[key] = observation, hidden
+            return hidden
+        # Asked for by who learns nothing here, such as the actor's loss.
+        _, hidden = self._shared[key]
+        return [one.detach() for one in hidden] if isinstance(hidden, list) else hidden.detach()
 
 
 # In place of what a layer made: nothing else needs it, not even its own gradient.
 
 
+def _trunk(first: Layer, first_norm: Layer, second: Layer, second_norm: Layer, x: Tensor) -> Tensor:
+    x = first_norm(first(x)).relu_()
+    return second_norm(second(x))
+
+
 def _action(
     first: Layer, first_norm: Layer, second: Layer, second_norm: Layer, last: Layer, x: Tensor
 ) -> Tensor:
-    x = first_norm(first(x)).relu_()
-    x = second_norm(second(x)).relu_()
+    x = _trunk(first, first_norm, second, second_norm, x).relu_()
     return last(x).tanh_()
 
 
-def _value(
-    first: Layer,
-    first_norm: Layer,
-    second: Layer,
-    second_norm: Layer,
-    from_action: Layer,
-    last: Layer,
-    x: Tensor,
-    action: Tensor,
-) -> Tensor:
-    x = first_norm(first(x)).relu_()
-    x = second_norm(second(x)).add_(from_action(action)).relu_()
-    return last(x)
+def _value(from_action: Layer, last: Layer, action: Tensor, hidden: Tensor) -> Tensor:
+    return last((hidden + from_action(action)).relu_())

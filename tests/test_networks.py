@@ -135,3 +135,46 @@ def test_a_team_reads_its_own_environments():
         alone = StackedActor(2, 5, 3, (8, 8), generator=torch.Generator().manual_seed(team + 1))
         own = slice(3 * team, 3 * team + 3)
         torch.testing.assert_close(actions[own], alone(observation[own]))
+
+
+@pytest.mark.parametrize("large", [1, 10**9], ids=["one by one", "stack"])
+def test_critics_share_what_the_action_has_no_part_in(large, monkeypatch):
+    """Values and gradients are those without; what another network or observation has is not."""
+    monkeypatch.setattr(networks, "_LARGE", large)
+    critic, other = scrambled(StackedCritic(*SIZES)), StackedCritic(*SIZES)
+    observation, following = torch.randn(2, 5, UAVS, FEATURES)
+    taken, chosen = torch.randn(2, 5, UAVS, ACTIONS).requires_grad_()
+    fixed = {name: weight.detach() for name, weight in critic.named_parameters()}
+    target = {name: weight.detach() for name, weight in other.named_parameters()}
+    made = []
+    trunk = networks._trunk
+    monkeypatch.setattr(networks, "_trunk", lambda *layers: made.append(1) or trunk(*layers))
+
+    def values() -> list[torch.Tensor]:
+        call = torch.func.functional_call
+        return [
+            critic(observation, taken),
+            call(critic, target, (observation, taken)),
+            call(critic, target, (following, taken)),
+            call(critic, fixed, (observation, chosen)),
+            call(critic, fixed, (following, chosen)),
+        ]
+
+    def gradients(value: torch.Tensor) -> tuple:
+        inputs = [*critic.parameters(), taken, chosen]
+        return torch.autograd.grad(value.sum(), inputs, allow_unused=True, retain_graph=True)
+
+    apart, runs = values(), len(made)
+    with critic.sharing():
+        together = values()
+    assert len(made) - runs == runs * 4 // 5  # four of five
+    for one, same in zip(apart, together, strict=True):
+        assert one.equal(same)
+        if one.requires_grad:
+            for mine, theirs in zip(gradients(one), gradients(same), strict=True):
+                assert (mine is None) == (theirs is None)
+                torch.testing.assert_close(mine, theirs) if mine is not None else None
+    before = len(made)
+    critic(observation, taken)
+    critic(observation, taken)
+    assert len(made) - before == 2 * runs // 5  # outside nothing is kept

@@ -1,6 +1,7 @@
 """DDPG for all UAVs at once (Lillicrap et al. 2016; paper, section III.C)."""
 
 from functools import partial
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -51,7 +52,9 @@ class Learner:
         The mean is over a UAV's batch alone: averaged over UAVs as well, every gradient would
         shrink with the size of the team.
         """
-        losses = self.loss(batch)
+        critic: Any = self.loss.value_network
+        with critic.module.sharing():
+            losses = self.loss(batch)
         return losses["loss_actor"].mean(0), losses["loss_value"].mean(0)
 
     def update(self, batch: TensorDictBase) -> tuple[Tensor, Tensor]:
