@@ -40,7 +40,7 @@ class ConsensusConfig:
     """UAVs nearer than this hear each other, cells; .inf for no limit"""
     discoverer: Literal["new_fire", "any_fire"] = "new_fire"
     """what a discoverer sees: new fire, or new or old fire"""
-    jitter: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.0
+    jitter: Annotated[float, Field(ge=0, le=1e30)] = 0.0
     """standard deviation of what is added to x and y of a target closer than 1, cells"""
     target: Literal["absolute", "relative"] = "absolute"
     """whether the UAV is told the target's coordinates or the way to it"""
@@ -64,8 +64,8 @@ class Consensus(CommModule):
         told: list[Any] = [keys.OBSERVATION, TARGET, FOLLOWS]
         self.in_keys, self.out_keys = moment + seen + memory, told + memory
         low, high = uav.corners(world.low, world.high)
-        self.register_buffer("low", low)
-        self.register_buffer("high", high)
+        self.register_buffer("low", low, persistent=False)
+        self.register_buffer("high", high, persistent=False)
 
     def specs(self, observation: Composite) -> Composite:
         agents = observation[keys.AGENTS]

@@ -1,6 +1,7 @@
 """Frozen policies on held-out fires, beside scripted ones."""
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any, cast
 
 import numpy as np
@@ -13,18 +14,22 @@ from torchrl.envs.utils import ExplorationType
 from emberlink.envs import metrics
 from emberlink.envs.fire import FireConfig, load_scenario
 from emberlink.envs.fire_bank import fire_bank
+from emberlink.envs.wildfire import WildfireEnv
 from emberlink.policies.scripted import SCRIPTED
 
 from .build import build_env
-from .config import RunConfig
+from .config import RunConfig, resolve
+from .scripted_results import Measured, ScriptedResults
 
 HELD_OUT_SCENARIO = "huygens"
 START_SEED = 20_250_923
-"""of the start positions, the same for every policy"""
+"""of everything random in episode 0, start positions included; that of episode i is i more"""
+BLOCK = 50
+"""environments stepped together, also where fewer are wanted"""
 LEARNED = "learned"
 
 Policy = Callable[[TensorDictBase], TensorDictBase]
-Results = dict[str, dict[str, dict[str, list[float]]]]
+Results = dict[str, dict[str, Measured]]
 """fire -> policy -> measure -> one number per episode"""
 
 
@@ -60,21 +65,26 @@ def play(
     return metrics.episode_metrics(episode)
 
 
+def evaluation_scenarios(config: RunConfig) -> dict[str, FireConfig]:
+    """The scenarios of an evaluation by name: `huygens`, and the one trained on."""
+    scenarios: dict[str, FireConfig] = {HELD_OUT_SCENARIO: load_scenario(HELD_OUT_SCENARIO)}
+    if config.fire not in scenarios.values():
+        changed = config.fire.name in scenarios
+        scenarios[config.fire.name + ("_as_trained" if changed else "")] = config.fire
+    return scenarios
+
+
 def evaluation_fires(config: RunConfig, count: int) -> dict[str, Tensor]:
-    """The fires of an evaluation by scenario: held-out `huygens`, and the fire trained on.
+    """The held-out fires of an evaluation by scenario.
 
     Returns:
         Arrival times, float32 [count, X, Y] each; a scenario that is always the same fire is
         shown `count` times, with other start positions each.
     """
-    scenarios: dict[str, FireConfig] = {HELD_OUT_SCENARIO: load_scenario(HELD_OUT_SCENARIO)}
-    if config.fire not in scenarios.values():
-        changed = config.fire.name in scenarios
-        scenarios[config.fire.name + ("_as_trained" if changed else "")] = config.fire
     grid, horizon = config.env.grid, config.env.horizon
     return {
         name: fire_bank(scenario, "heldout", count, grid, horizon)
-        for name, scenario in scenarios.items()
+        for name, scenario in evaluation_scenarios(config).items()
     }
 
 
@@ -88,28 +98,99 @@ def evaluate(
 ) -> Results:
     """Every policy on every held-out fire, from the same start positions.
 
+    Episode i is the same whatever is played beside it: its random numbers are those of the seed
+    `START_SEED` + i, and `BLOCK` environments are always stepped together, since the last bit of a
+    product of matrices depends on how large they are.
+
     Args:
-        config: of the run; its environment, communication included, is used.
+        config: of the run; its environment is used, communication included but where a scripted
+            policy needs another.
         actor: the frozen policy.
         fires: how many held-out fires, one episode each.
-        scripted: whether the scripted policies are played too.
+        scripted: whether the scripted policies are reported too.
         report: called with the fire and the policy before each is played.
     """
-    policies: dict[str, Policy] = {LEARNED: actor}
-    if scripted:
-        for name, policy in SCRIPTED.items():
-            policies[name] = policy(config.env).to(config.device)
     results: Results = {}
     for fire, arrival in evaluation_fires(config, fires).items():
-        for name, policy in policies.items():
+
+        def say(policy: str, fire: str = fire) -> None:
             if report is not None:
-                report(fire, name)
-            env = build_env(
-                config, num_envs=fires, fire=arrival, seed=START_SEED, device=config.device
-            )
-            measured = play(env, policy)
-            results.setdefault(fire, {})[name] = {k: v.tolist() for k, v in measured.items()}
+                report(fire, policy)
+
+        say(LEARNED)
+        results[fire] = {LEARNED: play_blocks(config, lambda _: actor, arrival)}
+        for name in SCRIPTED if scripted else ():
+            results[fire][name] = play_scripted(config, name, arrival, report=say)
     return results
+
+
+def play_scripted(
+    config: RunConfig,
+    name: str,
+    arrival: Tensor,
+    *,
+    report: Callable[[str], None] = lambda _: None,
+) -> Measured:
+    """What a scripted policy reaches, read from the cache where it has been played before.
+
+    Args:
+        config: of the run.
+        name: one of `SCRIPTED`.
+        arrival: float32 [fires, X, Y].
+        report: called with the name if it has to be played.
+    """
+    world = scripted_config(config, name)
+    protocol = {"start_seed": START_SEED, "block": BLOCK}
+    cache = ScriptedResults(name, world, arrival, protocol)
+    measured = cache.read()
+    if measured is None:
+        report(name)
+        measured = play_blocks(world, SCRIPTED[name], arrival)
+        cache.write(measured)
+    return measured
+
+
+def scripted_config(config: RunConfig, name: str) -> RunConfig:
+    """The configuration of the environment that a scripted policy is played in.
+
+    The run's own, unless the policy needs the communication of a recipe: then with that of the
+    recipe in the run's setup, where the run's is of another kind.
+    """
+    recipe = SCRIPTED[name].recipe
+    if recipe is None:
+        return config
+    comm = resolve(recipe, [f"setup={config.setup}"]).comm
+    return config if comm["name"] == config.comm["name"] else replace(config, comm=comm)
+
+
+def play_blocks(
+    config: RunConfig, policy: Callable[[WildfireEnv], Policy], arrival: Tensor
+) -> Measured:
+    """One episode on each fire, `BLOCK` at a time.
+
+    Args:
+        config: of the environment.
+        policy: makes the policy for an environment.
+        arrival: float32 [fires, X, Y].
+
+    Returns:
+        Every measure of `metrics.NAMES`, a number per fire.
+    """
+    count = len(arrival)
+    measured: Measured = {name: [] for name in metrics.NAMES}
+    for start in range(0, count, BLOCK):
+        episodes = torch.arange(start, start + BLOCK)
+        env = build_env(
+            config,
+            num_envs=BLOCK,
+            fire=arrival[episodes.clamp(max=count - 1)],  # what fills the last block is not kept
+            seed=(START_SEED + episodes).tolist(),
+            device=config.device,
+        )
+        world: Any = env.base_env
+        for name, values in play(env, policy(world)).items():
+            measured[name] += values[: count - start].tolist()
+    return measured
 
 
 def means(results: Mapping[str, list[float]]) -> dict[str, float]:
@@ -133,15 +214,3 @@ def film(
 
     play(env, policy, watch)
     return pictures, sorted(wanted)
-
-
-def record(config: RunConfig, results: Results, **about: Any) -> dict[str, Any]:
-    """What eval.json holds: enough to redo any statistics without running anything."""
-    return {
-        "method": config.method,
-        "setup": config.setup,
-        "seed": config.seed,
-        "start_seed": START_SEED,
-        **about,
-        "results": results,
-    }

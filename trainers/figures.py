@@ -33,7 +33,9 @@ def training_curves(path: Path, lines: Sequence[Mapping[str, Any]], title: str) 
     figure.suptitle(title)
     for axes, (name, label) in zip(figure.subplots(2, 3).flat, CURVES.items(), strict=True):
         episodes = [line["episode"] for line in lines]
-        axes.plot(episodes, [line[name] for line in lines], color="0.6", label="exploring")
+        axes.plot(
+            episodes, [line.get(name, np.nan) for line in lines], color="0.6", label="exploring"
+        )
         for key in sorted({k for line in lines for k in line if k.endswith("/" + name)}):
             points = [(line["episode"], line[key]) for line in lines if key in line]
             fire = key.split("/")[0]
@@ -47,19 +49,32 @@ def training_curves(path: Path, lines: Sequence[Mapping[str, Any]], title: str) 
 
 def coverage_bars(path: Path, results: Results) -> None:
     """Coverage of each policy on each held-out fire: every episode a dot, the mean a bar."""
-    figure = Figure(figsize=(4.5 * len(results), 3.6), layout="constrained")
+    most = max(len(by_policy) for by_policy in results.values())
+    size = (1.6 + 0.55 * most) * len(results), 3.9
+    figure = Figure(figsize=size, layout="constrained")
     panels = figure.subplots(1, len(results), squeeze=False, sharey=True)[0]
     for axes, (fire, by_policy) in zip(panels, results.items(), strict=True):
         for place, (policy, measured) in enumerate(by_policy.items()):
             values = np.asarray(measured["coverage"])
-            colour = "tab:orange" if policy == LEARNED else "0.7"
+            colour = "tab:orange" if policy == LEARNED else "0.75"
             axes.bar(place, values.mean(), color=colour)
-            spread = place + np.linspace(-0.25, 0.25, len(values))
-            axes.plot(spread, values, "k.", ms=3, alpha=0.5)
-        axes.set_xticks(range(len(by_policy)), [name.replace("_", "\n") for name in by_policy])
-        axes.set(title=f"held-out fires: {fire}", ylim=(0, 100))
+            axes.annotate(
+                f"{values.mean():.0f}",
+                (place, 101),
+                ha="center",
+                va="bottom",
+                fontsize="small",
+                annotation_clip=False,
+            )
+            spread = place + np.linspace(-0.3, 0.3, len(values))
+            axes.plot(spread, values, "k.", ms=2, alpha=0.4)
+        names = [name.replace("_", " ") for name in by_policy]
+        axes.set_xticks(range(len(by_policy)), names, rotation=35, ha="right")
+        axes.set_title(f"held-out fires: {fire}", pad=18)
+        axes.set_ylim(0, 100)
         axes.grid(axis="y", alpha=0.3)
-    panels[0].set_ylabel("coverage, %")
+        axes.set_axisbelow(True)
+    panels[0].set_ylabel("coverage, % (mean above)")
     figure.savefig(path, dpi=120)
 
 

@@ -1,22 +1,29 @@
 """Evaluates a run's frozen policy and leaves table, eval.json, figures and an animation."""
 
+import platform
 from collections.abc import Callable
+from dataclasses import asdict
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import torch
+from rich import box
 from rich.console import Console
 from rich.table import Table
 from tensordict.nn import TensorDictModule
 
 from emberlink.envs import metrics
+from emberlink.envs.fire import fire_seeds
 from emberlink.envs.render import write_gif
+from emberlink.policies.scripted import SCRIPTED
 
 from . import evaluate, figures
 from .build import build_env, build_networks
 from .config import RunConfig
 from .run_folder import RunFolder, load_weights
 
+_PACKAGES = ("emberlink", "torch", "torchrl", "tensordict", "numpy")
 _ACTOR = "actor_network_params.module."
 """what the actor's weights are called in a checkpoint, before the name within the network"""
 
@@ -37,7 +44,7 @@ def load_actor(config: RunConfig, checkpoint: Path) -> TensorDictModule:
     actor, _ = build_networks(config, env)
     network: Any = actor.module
     expected = {_ACTOR + name: value for name, value in network.state_dict().items()}
-    weights = load_weights(checkpoint, expected)
+    weights = load_weights(checkpoint, expected, config)
     network.load_state_dict({name.removeprefix(_ACTOR): v for name, v in weights.items()})
     return actor.requires_grad_(False)
 
@@ -68,7 +75,7 @@ def evaluate_run(
         report(f"{policy} on {fires} fires of {fire}")
 
     results = evaluate.evaluate(config, actor, fires=fires, report=say)
-    content = evaluate.record(config, results, checkpoint=checkpoint.name, fires=fires)
+    content = record(config, results, checkpoint=checkpoint.name, fires=fires)
     run.write(f"eval{label}.json", content)
     figures.coverage_bars(run.figure(f"coverage{label}.png"), results)
     lines = run.lines()
@@ -83,17 +90,61 @@ def evaluate_run(
     return results
 
 
+def record(config: RunConfig, results: evaluate.Results, **about: Any) -> dict[str, Any]:
+    """What eval.json holds: enough to redo any statistics without running anything."""
+    configs = evaluate.evaluation_scenarios(config)
+    count = len(next(iter(results.values()))[evaluate.LEARNED]["coverage"])
+    seeds = fire_seeds("heldout", count).tolist()
+    return {
+        "method": config.method,
+        "setup": config.setup,
+        "seed": config.seed,
+        "start_seed": evaluate.START_SEED,
+        **about,
+        "start_seeds": list(range(evaluate.START_SEED, evaluate.START_SEED + count)),
+        "held_out": {
+            name: {"fire_seeds": seeds, "scenario": asdict(configs[name])} for name in results
+        },
+        "environment": asdict(config.env),
+        "communication": {
+            evaluate.LEARNED: config.comm,
+            **{name: evaluate.scripted_config(config, name).comm for name in SCRIPTED},
+        },
+        "device": config.device,
+        "versions": {
+            "python": platform.python_version(),
+            **{name: version(name) for name in _PACKAGES},
+        },
+        "results": results,
+    }
+
+
 def print_table(console: Console, results: evaluate.Results, config: RunConfig) -> None:
-    """The means over episodes: a table per fire, a column per policy."""
+    """The means over episodes: a table per fire, a row per policy, a column per measure."""
     for fire, by_policy in results.items():
         episodes = len(next(iter(by_policy.values()))["coverage"])
-        table = Table(title=f"held-out fires: {fire} ({episodes} episodes, mean)")
-        table.add_column("measure")
-        for policy in by_policy:
-            name = f"{config.method} ({config.setup})" if policy == evaluate.LEARNED else policy
-            table.add_column(name.replace("_", " "), justify="right")
-        columns = [evaluate.means(measured) for measured in by_policy.values()]
+        table = Table(
+            title=f"held-out fires: {fire} ({episodes} episodes, mean; setup {config.setup})",
+            box=box.SIMPLE_HEAD,
+            padding=0,
+            show_edge=False,
+        )
+        # One word below the other: names and all measures fit a terminal of 80 columns.
+        table.add_column(min_width=13)
         for name in metrics.NAMES:
-            digits = 3 if name == "score" else 1
-            table.add_row(name, *(f"{column[name]:.{digits}f}" for column in columns))
+            table.add_column(name.replace("_", "\n"), justify="right", no_wrap=True)
+        for policy, measured in by_policy.items():
+            learned = policy == evaluate.LEARNED
+            means = evaluate.means(measured)
+            table.add_row(
+                config.method if learned else policy.replace("_", " "),
+                *(_short(name, means[name]) for name in metrics.NAMES),
+                style="bold" if learned else None,
+            )
         console.print(table)
+
+
+def _short(measure: str, value: float) -> str:
+    """One decimal; of a score, which may be a small reward, as many as make four digits."""
+    digits = max(1, 4 - len(str(int(abs(value))))) if measure == "score" else 1
+    return f"{value:.{digits}f}"

@@ -1,0 +1,26 @@
+"""What method 4 could do if learning were perfect at what its bonus asks for."""
+
+from typing import ClassVar
+
+from tensordict import TensorDictBase
+
+from emberlink.envs import keys
+from emberlink.envs.wildfire import WildfireEnv
+
+from .base import Scripted
+
+
+class Pursuit(Scripted):
+    """Flies straight at the target that the network agrees on, altitude included."""
+
+    recipe: ClassVar[str | None] = "consensus"
+
+    TARGET = (keys.AGENTS, "target")
+    """float32 [num_envs, n, 3], cells: what `comm/consensus.py` writes"""
+
+    def __init__(self, env: WildfireEnv):
+        super().__init__(env)
+        self.in_keys.append(self.TARGET)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        return self.fly(tensordict, tensordict.get(self.TARGET))

@@ -1,0 +1,255 @@
+"""The protocol: the same fires and starts for everyone, and the same numbers every time."""
+
+import io
+import itertools
+import json
+import math
+import os
+from dataclasses import replace
+
+import pytest
+import torch
+from rich.console import Console
+
+from emberlink.envs import metrics
+from emberlink.envs.fire import fire_seeds, load_scenario, make_fires
+from emberlink.envs.fire_bank import cache_folder
+from emberlink.policies.scripted import SCRIPTED
+from emberlink.trainers import cli, evaluate, report, scripted_results
+from emberlink.trainers.build import build_env, build_networks
+from emberlink.trainers.config import resolve
+from emberlink.trainers.run_folder import RunFolder
+
+SMALL = ["env.horizon=12", "env.num_uavs=2", "learner.hidden=[8,8]", "env.grid=[12,10]"]
+
+
+def small(method: str = "consensus", *more: str):
+    return resolve(method, ["setup=tuned", *SMALL, *more])
+
+
+def untrained(config):
+    """An actor that answers large actions."""
+    env = build_env(config, num_envs=1, fire="paper", seed=0, device="cpu")
+    actor, _ = build_networks(config, env, torch.Generator().manual_seed(0))
+    draw = torch.Generator().manual_seed(1)
+    weight = actor.module.action.weight
+    weight.data = torch.randn(weight.shape, generator=draw)
+    return actor.requires_grad_(False)
+
+
+@pytest.fixture
+def cache(tmp_path, monkeypatch):
+    """An empty cache, of a program that was started just now."""
+    monkeypatch.setenv("EMBERLINK_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr(scripted_results, "_IMPORTED", 2**62)
+    return tmp_path / "cache"
+
+
+@pytest.fixture
+def played(monkeypatch):
+    """Notes how many blocks are really played."""
+    count, play = [], evaluate.play
+    monkeypatch.setattr(evaluate, "play", lambda *args: (count.append(args), play(*args))[1])
+    return count
+
+
+def test_every_evaluation_plays_a_hundred_fires():
+    assert resolve("consensus").evaluation.fires == 100
+
+
+@pytest.mark.parametrize("method", ["consensus", "independent"])
+def test_an_episode_does_not_depend_on_those_beside_it(method, cache):
+    config = small(method)
+    actor = untrained(config)
+    few, more, many = (evaluate.evaluate(config, actor, fires=n) for n in (1, 3, 53))
+    for fire, policy, name in itertools.product(many, many["huygens"], metrics.NAMES):
+        numbers = many[fire][policy][name]
+        assert len(numbers) == 53
+        assert few[fire][policy][name] == numbers[:1]
+        assert more[fire][policy][name] == numbers[:3]
+    assert len(set(many["huygens"]["learned"]["coverage_auc"])) > 25
+
+
+def test_all_policies_start_alike_on_the_same_fires(cache, monkeypatch):
+    config = small("independent", "fire=paper")
+    begun: dict = {}
+
+    def play(env, policy):
+        moment = env.reset()
+        world = env.base_env
+        seen = moment["agents", "position"].tolist(), world.arrival.tolist()
+        begun.setdefault(len(begun), seen)
+        return {name: torch.zeros(evaluate.BLOCK) for name in metrics.NAMES}
+
+    monkeypatch.setattr(evaluate, "play", play)
+    evaluate.evaluate(config, untrained(config), fires=4)
+    policies = 1 + len(SCRIPTED)
+    assert len(begun) == 2 * policies
+    seeds = fire_seeds("heldout", 4)
+    for panel, scenario in enumerate(("huygens", "paper")):
+        fires = make_fires(load_scenario(scenario), seeds, (12, 10), 12).tolist()
+        for place in range(policies):
+            starts, arrival = begun[panel * policies + place]
+            assert starts == begun[0][0]
+            assert arrival[:4] == fires
+    # Episode i is that of the seed START_SEED + i alone.
+    alone = build_env(config, num_envs=1, fire="paper", seed=evaluate.START_SEED + 2, device="cpu")
+    assert alone.reset()["agents", "position"][0].tolist() == begun[0][0][2]
+
+
+def test_pursuit_is_played_with_the_consensus_of_the_setup():
+    own = small("consensus", "comm.range=3")
+    assert evaluate.scripted_config(own, "pursuit") == own
+    for method in ("independent", "shared_memory", "positional"):
+        for setup in ("paper", "released", "tuned"):
+            config = resolve(method, [f"setup={setup}", "env.num_uavs=4"])
+            changed = evaluate.scripted_config(config, "pursuit")
+            assert changed.comm == resolve("consensus", [f"setup={setup}"]).comm
+            assert replace(changed, comm=config.comm) == config
+            for name in SCRIPTED.keys() - {"pursuit"}:
+                assert evaluate.scripted_config(config, name) is config
+
+
+def test_eval_json_is_the_same_to_the_byte(run, cache, played):
+    assert cli.main(["eval", str(run), "--fires", "3"]) == 0
+    first = (run / "eval.json").read_bytes()
+    blocks = len(played)
+    assert cli.main(["eval", str(run), "--fires", "3"]) == 0
+    assert (run / "eval.json").read_bytes() == first
+    assert len(played) - blocks == 3  # the learned policy on both fires, and the animation
+    for file in cache.glob("scripted-*"):
+        file.unlink()
+    assert cli.main(["eval", str(run), "--fires", "3"]) == 0
+    assert (run / "eval.json").read_bytes() == first
+    assert len(played) == 2 * blocks + 3
+
+
+def test_eval_json_says_what_was_played(run, cache):
+    assert cli.main(["eval", str(run), "--fires", "3"]) == 0
+    content = json.loads((run / "eval.json").read_text())
+    config = RunFolder(run).config()
+    assert content["method"] == "consensus"
+    assert content["checkpoint"] == RunFolder(run).checkpoint().name
+    assert content["fires"] == 3
+    assert content["start_seeds"] == [content["start_seed"] + i for i in range(3)]
+    assert content["environment"]["horizon"] == config.env.horizon
+    assert content["versions"].keys() >= {"emberlink", "torch", "python"}
+    assert list(content["results"]) == list(content["held_out"]) == ["huygens", "paper"]
+    for fire, about in content["held_out"].items():
+        assert about["fire_seeds"] == [1_000_000, 1_000_001, 1_000_002]
+        assert about["scenario"]["name"] == fire
+        by_policy = content["results"][fire]
+        assert list(by_policy) == ["learned", *SCRIPTED] == list(content["communication"])
+        for measured in by_policy.values():
+            assert list(measured) == list(metrics.NAMES)
+            for numbers in measured.values():
+                assert len(numbers) == 3
+                assert all(math.isfinite(x) for x in numbers)
+
+
+# The cache of what scripted policies reach
+
+
+def lawnmower(config, fires: int = 2):
+    return evaluate.play_scripted(
+        config, "lawnmower", evaluate.evaluation_fires(config, fires)["huygens"]
+    )
+
+
+def test_a_scripted_policy_is_played_once(cache, played):
+    first = lawnmower(small())
+    assert len(played) == 1
+    assert lawnmower(small("consensus", "seed=3", "episodes=7", "learner.batch=9")) == first
+    assert len(played) == 1
+    (file,) = cache.glob("scripted-*")
+    assert json.loads(file.read_text()) == first
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        *("env.displacement=0.7", "env.reward.no_fire=-1.5", "env.num_uavs=3", "env.horizon=13"),
+        *("comm.range=4", "comm.heading.weight=2"),
+    ],
+)
+def test_what_the_numbers_depend_on_is_in_the_name(change, cache, played):
+    lawnmower(small())
+    lawnmower(small("consensus", change))
+    assert len(played) == 2
+
+
+def test_other_fires_policies_protocols_and_sources_have_files_of_their_own(
+    cache, played, monkeypatch
+):
+    config = small()
+    lawnmower(config)
+    lawnmower(config, fires=3)
+    evaluate.play_scripted(config, "oracle", evaluate.evaluation_fires(config, 2)["huygens"])
+    assert len(played) == 3
+    monkeypatch.setattr(evaluate, "START_SEED", 5)
+    lawnmower(config)
+    assert len(played) == 4
+    monkeypatch.setattr(scripted_results, "source_digest", lambda: "other")
+    lawnmower(config)
+    assert len(played) == 5
+
+
+@pytest.mark.parametrize(
+    "content", ["", "{", "[]", '{"score": [1.0]}', "whole with NaN", "one episode less"]
+)
+def test_a_damaged_file_is_replaced(content, cache, played):
+    first = lawnmower(small())
+    (file,) = cache.glob("scripted-*")
+    if content == "whole with NaN":
+        content = json.dumps({**first, "coverage": [math.nan, 1.0]})
+    elif content == "one episode less":
+        content = json.dumps({name: numbers[:1] for name, numbers in first.items()})
+    file.write_text(content)
+    assert lawnmower(small()) == first
+    assert len(played) == 2
+    assert json.loads(file.read_text()) == first
+    assert not list(cache.glob("*.tmp"))
+
+
+def test_changed_source_is_neither_read_nor_written(cache, played, monkeypatch):
+    newest = max(f.stat().st_mtime_ns for f in scripted_results.sources())
+    lawnmower(small())
+    monkeypatch.setattr(scripted_results, "_IMPORTED", newest - 1)
+    lawnmower(small())
+    assert len(played) == 2
+    monkeypatch.setattr(scripted_results, "_IMPORTED", newest)
+    lawnmower(small())
+    assert len(played) == 2
+    assert len(list(cache.glob("scripted-*"))) == 1
+
+
+def test_a_cache_that_cannot_be_written_costs_a_warning(cache, monkeypatch):
+    fires = evaluate.evaluation_fires(small(), 2)["huygens"]
+
+    def fail(*_):
+        raise OSError("disk full")
+
+    monkeypatch.setattr(os, "replace", fail)
+    with pytest.warns(UserWarning, match="scripted results are not cached.*disk full"):
+        evaluate.play_scripted(small(), "stationary", fires)
+    assert not list(cache_folder().glob("*.tmp"))
+
+
+@pytest.mark.parametrize("width", [80, 100])
+def test_the_table_fits_a_terminal(width):
+    config = resolve("shared_memory", ["setup=released"])
+    measured = {name: [1000.0] for name in metrics.NAMES}
+    measured |= {"score": [-123.456], "fire_exits": [499.5]}
+    results = {"huygens": dict.fromkeys(("learned", *SCRIPTED), measured)}
+    console = Console(width=width, record=True, file=io.StringIO())
+    report.print_table(console, results, config)
+    text = console.export_text()
+    assert "…" not in text
+    assert max(map(len, text.splitlines())) <= width
+    lines = text.splitlines()
+    for policy in ("shared_memory", "stationary", "lawnmower", "pursuit", "oracle"):
+        (row,) = (line for line in lines if line.startswith(policy))
+        assert row.split() == [policy, "-123.5", *["1000.0"] * 6, "499.5"]
+    words = [word for line in lines[:4] for word in line.split()]
+    for name in metrics.NAMES:
+        assert set(name.split("_")) <= set(words), name

@@ -1,0 +1,296 @@
+"""Scripted policies: what each does by hand, and what all of them keep to."""
+
+import itertools
+import math
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torchrl.envs import step_mdp
+
+from emberlink.comm import consensus
+from emberlink.envs import WildfireConfig, WildfireEnv, keys, metrics
+from emberlink.envs.view import view_radius
+from emberlink.policies.base import Scripted
+from emberlink.policies.lawnmower import Lawnmower, stops
+from emberlink.policies.oracle import Oracle
+from emberlink.policies.pursuit import Pursuit
+from emberlink.policies.scripted import SCRIPTED
+from emberlink.trainers.build import build_env
+from emberlink.trainers.config import known, resolve
+from emberlink.trainers.evaluate import play, scripted_config
+
+NEVER = math.inf
+THREE = math.degrees(math.atan(1.2 / 4))  # the view angle: from 4 three cells by three are seen
+
+
+def world(grid=(9, 9), uavs=1, **settings) -> WildfireConfig:
+    return WildfireConfig(grid=grid, num_uavs=uavs, **settings)
+
+
+def episode(env, policy, steps: int, **reset):
+    """The moments on which a policy acts, with its actions."""
+    moments, moment = [], env.reset(**reset)
+    for _ in range(steps):
+        moment = policy(moment)
+        moments.append(moment.clone())
+        moment = step_mdp(env.step(moment), keep_other=True)
+    return moments
+
+
+def flown(env, policy, steps: int, position) -> list:
+    """Where the UAVs of the first environment were, rounded to 1e-3 cells."""
+    start = torch.tensor(position, dtype=torch.float32)
+    moments = episode(env, policy, steps, position=start)
+    return [[[round(x, 3) for x in uav] for uav in m[keys.POSITION][0].tolist()] for m in moments]
+
+
+# Lawnmower
+
+
+def test_the_lawnmower_of_one_uav_by_hand():
+    # Three cells are seen. 8 x 9 cells: strips of x 0-1, 2-4, 5-7, each in y 0-2, 3-5, 6-8.
+    path = [[0.5, 1], [0.5, 4], [0.5, 7], [3, 7], [3, 4], [3, 1], [6, 1], [6, 4], [6, 7]]
+    assert stops((8, 9), 1.2).tolist() == path
+    env = WildfireEnv(1, world((8, 9), displacement=3.0, view_angle=THREE), torch.zeros(8, 9))
+    places = flown(env, Lawnmower(env), 20, [[3.5, 4.0, 4.0]])
+    path = [[*ground, 4] for ground in path]
+    expected = [[3.5, 4, 4], *path, *path[-2::-1], path[1], path[2]]
+    assert [uavs[0] for uavs in places] == expected
+
+
+def test_the_lawnmower_gives_every_uav_its_strips():
+    # The paper's world: 5 cells are seen, six strips of 30 for six UAVs.
+    env = WildfireEnv(1, WildfireConfig(), torch.zeros(30, 30))
+    mower = Lawnmower(env)
+    assert sorted({x for x, _ in mower.stops.tolist()}) == [2, 7, 12, 17, 22, 27]
+    assert sorted({y for _, y in mower.stops.tolist()}) == [2, 7, 12, 17, 22, 27]
+    places = flown(env, mower, 140, [[x, 14.0, 1.0] for x in (2.0, 7.0, 12.0, 17.0, 22.0, 27.0)])
+    for uav, x in enumerate((2, 7, 12, 17, 22, 27)):
+        own = [place[uav] for place in places[20:]]
+        assert {(place[0], place[2]) for place in own} == {(x, 4)}
+        turns = [place[1] for place in own if place[1] in (2, 27)]
+        assert turns in ([2, 27, 2, 27, 2], [27, 2, 27, 2, 27])
+
+
+def test_more_uavs_than_stops_and_fewer_than_strips():
+    env = WildfireEnv(1, world((8, 8), uavs=5, view_angle=60.0), torch.zeros(8, 8))
+    mower = Lawnmower(env)  # a view 13 wide: one stop for all
+    assert mower.stops.tolist() == [[3.5, 3.5]]
+    assert flown(env, mower, 12, [[0.0, 0.0, 2.0]] * 5)[-1] == [[3.5, 3.5, 4]] * 5
+    env = WildfireEnv(1, world((30, 30), uavs=4), torch.zeros(30, 30))
+    mower = Lawnmower(env)  # 36 stops, nine each
+    assert mower.first.tolist() == [0, 9, 18, 27]
+    assert mower.period.tolist() == [16] * 4
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    grid=st.tuples(st.integers(8, 21), st.integers(8, 21)),
+    uavs=st.integers(1, 9),
+    angle=st.floats(2, 75),
+    ceiling=st.floats(1, 6),
+    displacement=st.floats(0.9, 40),
+)
+def test_the_lawnmower_sees_every_cell(grid, uavs, angle, ceiling, displacement):
+    config = world(
+        grid,
+        uavs,
+        view_angle=angle,
+        altitude=(0.8, ceiling),
+        displacement=displacement,
+        horizon=2500,
+    )
+    env = WildfireEnv(1, config, torch.zeros(grid))  # all burns: what is seen is counted
+    mower = Lawnmower(env)
+    flight = len(mower.stops) * (2 + math.ceil(max(grid) / displacement)) // uavs
+    moment = env.reset()
+    for _ in range(3 * max(grid) + 2 * flight):
+        moment = step_mdp(env.step(mower(moment)), keep_other=True)
+        if moment[keys.SEEN].item() == grid[0] * grid[1]:
+            return
+    pytest.fail(f"{moment[keys.SEEN].item()} of {grid[0] * grid[1]} cells were seen")
+
+
+# Pursuit
+
+
+def test_pursuit_reads_what_consensus_writes():
+    assert Pursuit.TARGET == consensus.TARGET
+
+
+def test_pursuit_flies_straight_at_the_target_by_hand():
+    env = WildfireEnv(1, world(uavs=3, displacement=0.5), torch.full((9, 9), NEVER))
+    moment = env.reset(position=torch.tensor([[1.0, 1, 2], [5, 5, 4], [3, 3, 3]]))
+    moment[Pursuit.TARGET] = torch.tensor([[[5.0, 3, 1], [5, 5, 3.75], [3, 3, 3]]])
+    action = Pursuit(env)(moment)[keys.ACTION].mul(1e4).round() / 1e4
+    # By (4, 2, -1) cells: 8, 4, -2 units. By (0, 0, -0.25): half a unit, and there it stops.
+    assert action.tolist() == [[[1, 0.5, -0.25], [0, 0, -0.5], [0, 0, 0]]]
+
+
+# Oracle
+
+
+def scalar_oracle(position, arrival, seen, step, config) -> list[tuple[float, float]]:
+    """Where each UAV of one environment is sent: the rule with loops."""
+    radius = view_radius(config.altitude[1], config.view_angle)
+    cells = list(itertools.product(range(config.grid[0]), range(config.grid[1])))
+    left = {c for c in cells if arrival[c[0]][c[1]] <= config.horizon and not seen[c[0]][c[1]]}
+
+    def far(uav, cell):
+        x, y, _ = position[uav]
+        wait = max(arrival[cell[0]][cell[1]] - step, 0.0)
+        return max(abs(x - cell[0]), abs(y - cell[1])) + wait * 1000.0
+
+    uavs = range(len(position))
+    order = sorted(uavs, key=lambda u: (min((far(u, c) for c in left), default=NEVER), u))
+    sent = {}
+    for uav in order:
+        if not left:
+            sent[uav] = tuple(position[uav][:2])
+            continue
+        sent[uav] = chosen = min(left, key=lambda c: (far(uav, c), c))
+        left = {c for c in left if max(abs(c[0] - chosen[0]), abs(c[1] - chosen[1])) > radius}
+    return [sent[uav] for uav in uavs]
+
+
+def sent(env, oracle, moment):
+    """Where the oracle flies to, if a step is long enough to get anywhere: [num_envs, n, 2]."""
+    action = oracle(moment.clone())[keys.ACTION]
+    return moment[keys.POSITION][..., :2] + action[..., :2] * env.config.displacement
+
+
+def test_the_oracle_by_hand():
+    # Three cells by three are seen from 4. (4, 4) burns, (0, 8) will at step 3, (8, 0) at step 2,
+    # (8, 1) at 2.5 and in view with it; (4, 0) only after the horizon.
+    arrival = torch.full((9, 9), NEVER)
+    arrival[4, 4], arrival[0, 8], arrival[8, 0], arrival[8, 1], arrival[4, 0] = 0, 3, 2, 2.5, 50
+    config = world(uavs=4, displacement=16.0, horizon=20, view_angle=THREE)
+    env = WildfireEnv(1, config, arrival)
+    start = torch.tensor([[0.0, 0, 4], [8, 8, 4], [5, 4, 4], [1, 1, 4]])
+    moment = env.reset(position=start)
+    # UAV 2 is nearest to (4, 4), as 1; 1 and 3 are at 4 and 3. UAV 3 chooses second, then 0, 1.
+    places = sent(env, Oracle(env), moment)
+    assert places.mul(1e3).round().tolist() == [[[0, 8e3], [8e3, 8e3], [4e3, 4e3], [8e3, 0]]]
+
+
+def test_an_oracle_flies_at_full_altitude_and_nowhere_once_all_is_covered():
+    env = WildfireEnv(1, world(uavs=2, displacement=1.0), torch.full((9, 9), NEVER))
+    moment = env.reset(position=torch.tensor([[2.0, 2, 1], [6, 6, 4]]))
+    action = Oracle(env)(moment)[keys.ACTION]
+    assert action.mul(1e4).round().tolist() == [[[0, 0, 1e4], [0, 0, 0]]]
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    seed=st.integers(0, 10**6),
+    grid=st.tuples(st.integers(8, 12), st.integers(8, 12)),
+    uavs=st.integers(1, 7),
+    angle=st.floats(5, 60),
+)
+def test_the_oracle_against_its_rule_with_loops(seed, grid, uavs, angle):
+    draw = torch.Generator().manual_seed(seed)
+    envs, horizon = 3, 8
+    config = world(grid, uavs, view_angle=angle, displacement=32.0, horizon=horizon)
+    # Whole steps and a few values, so that there are ties; and cells that never burn.
+    arrival = torch.randint(-3, 14, (envs, *grid), generator=draw).float()
+    arrival[torch.rand(arrival.shape, generator=draw) < 0.6] = NEVER
+    env = WildfireEnv(envs, config, arrival, seed=seed)
+    oracle = Oracle(env)
+    position = torch.rand(envs, uavs, 3, generator=draw) * torch.tensor([*grid, 0.0])
+    position = position.floor() + torch.tensor([0.0, 0.0, 4.0])
+    moment = env.reset(position=position)
+    for step in range(4):
+        seen = (env.fire_map == 1).tolist()
+        expected = [
+            scalar_oracle(moment[keys.POSITION][e].tolist(), env.arrival[e].tolist(), *rest)
+            for e, rest in enumerate(zip(seen, [step] * envs, [config] * envs, strict=True))
+        ]
+        assert (sent(env, oracle, moment) - torch.tensor(expected)).abs().max() < 1e-4
+        # Half of a step on, so that it stands between cells.
+        moment = oracle(moment)
+        moment[keys.ACTION] = moment[keys.ACTION] / 2
+        moment = step_mdp(env.step(moment), keep_other=True)
+
+
+# All of them
+
+SHAPES = [((30, 30), 6, 0.1), ((8, 17), 1, 1.0), ((21, 9), 9, 30.0)]
+
+
+def build(method: str, name: str, shape, *, seeds, fire):
+    """An environment that a policy can be played in, and the policy."""
+    grid, uavs, displacement = shape
+    changed = [f"env.grid=[{grid[0]},{grid[1]}]", f"env.num_uavs={uavs}", "env.horizon=25"]
+    config = resolve(method, ["setup=tuned", *changed, f"env.displacement={displacement}"])
+    config = scripted_config(config, name)
+    env = build_env(config, num_envs=len(seeds), fire=fire, seed=seeds, device="cpu")
+    return env, SCRIPTED[name](env.base_env)
+
+
+def fires(shape, count: int):
+    """Random fires that grow: [count, X, Y]."""
+    draw = torch.Generator().manual_seed(count)
+    arrival = 60 * torch.rand(count, *shape[0], generator=draw) - 20
+    return arrival.where(arrival < 30, NEVER)
+
+
+@pytest.mark.parametrize("shape", SHAPES, ids=str)
+@pytest.mark.parametrize("method", known("method"))
+@pytest.mark.parametrize("name", SCRIPTED)
+def test_every_policy_in_every_recipe(name, method, shape):
+    arrival = fires(shape, 3)
+    env, policy = build(method, name, shape, seeds=[5, 6, 7], fire=arrival)
+    moments = episode(env, policy, 25)
+    for moment in moments:
+        action = moment[keys.ACTION]
+        assert action.shape == (3, shape[1], 3)
+        assert action.dtype == torch.float32
+        assert action.isfinite().all()
+        assert action.abs().max() <= 1
+        if name != "random_actions":  # who flies to a point of the box does not leave it
+            assert not moment[keys.BEYOND].any()
+    # The second environment alone is what it is between the others.
+    env, policy = build(method, name, shape, seeds=[6], fire=arrival[1:2])
+    for alone, moment in zip(episode(env, policy, 25), moments, strict=True):
+        assert alone[keys.ACTION][0].equal(moment[keys.ACTION][1])
+        assert alone[keys.POSITION][0].equal(moment[keys.POSITION][1])
+
+
+@pytest.mark.parametrize("name", SCRIPTED)
+def test_a_policy_begins_anew_with_every_episode(name):
+    env, policy = build("consensus", name, SHAPES[0], seeds=[3, 4], fire=fires(SHAPES[0], 2))
+    assert isinstance(policy, Scripted)
+    moments = episode(env, policy, 20)
+    env.set_seed(1)
+    first = episode(env, policy, 20)
+    env.set_seed(1)
+    moment = env.reset()
+    # What an episode before has left in the TensorDict means nothing in the first step.
+    for key in moments[-1].keys():  # noqa: SIM118
+        if key.startswith("_"):
+            moment[key] = moments[-1][key]
+    for expected in first:
+        moment = policy(moment)
+        assert moment[keys.ACTION].equal(expected[keys.ACTION])
+        moment = step_mdp(env.step(moment), keep_other=True)
+
+
+def test_what_each_policy_covers():
+    """Within wide bounds; docs/evaluation.md has the numbers."""
+    config = resolve("consensus", ["setup=tuned"])
+    bounds = {
+        "stationary": (2, 12),
+        "random_actions": (12, 28),
+        "random_waypoints": (82, 96),
+        "lawnmower": (86, 98),
+        "pursuit": (8, 35),
+        "oracle": (99, 100),
+    }
+    assert bounds.keys() == SCRIPTED.keys()
+    for name, (least, most) in bounds.items():
+        env = build_env(config, num_envs=12, fire="huygens", seed=11, device="cpu")
+        measured = play(env, SCRIPTED[name](env.base_env))
+        assert measured.keys() == set(metrics.NAMES)
+        assert least <= measured["coverage"].mean().item() <= most, name
