@@ -13,6 +13,59 @@ NO_FIRE = (0, 0, 0)
 FIRE = (255, 255, 255)
 FIELD_OF_VIEW = (255, 255, 0)
 UAV = (0, 0, 255)
+MAX_COLOURS = 256
+"""that a GIF can hold"""
+
+
+class Chart:
+    """The map as a picture to draw on: no fire black, fire white, field of view yellow.
+
+    Args:
+        fire_map: [X, Y], 0 where nothing burns, 1 fire that was seen, 2 fire that was not.
+        position: [n, 3], cells.
+        view_angle: half the opening angle of the cameras, degrees.
+        scale: pixels per cell.
+        seen_fire: the colour of fire that was seen.
+    """
+
+    def __init__(
+        self,
+        fire_map: NDArray[np.uint8],
+        position: NDArray[np.float32],
+        *,
+        view_angle: float,
+        scale: int,
+        seen_fire: tuple[int, int, int] = FIRE,
+    ):
+        self.scale = scale
+        self._rows = fire_map.shape[1]
+        self.image = Image.new("RGB", (fire_map.shape[0] * scale, self._rows * scale), NO_FIRE)
+        self.draw = ImageDraw.Draw(self.image)
+        views = [self.square(x, y, view_radius(z, view_angle)) for x, y, z in position.tolist()]
+        for box in views:
+            self.draw.rectangle(box, fill=FIELD_OF_VIEW)
+        for value, colour in ((1, seen_fire), (2, FIRE)):
+            cells = Image.fromarray(np.uint8(255) * (fire_map.T[::-1] == value))
+            mask = cells.resize(self.image.size, Image.Resampling.NEAREST)
+            self.image.paste(colour, mask=mask)
+        line = max(2, scale // 6)
+        for left, top, right, bottom in views:
+            # The black line shows the edge where yellow alone would not, over fire and other views.
+            self.draw.rectangle((left - 1, top - 1, right + 1, bottom + 1), outline=NO_FIRE)
+            self.draw.rectangle((left, top, right, bottom), outline=FIELD_OF_VIEW, width=line)
+
+    def point(self, x: float, y: float) -> tuple[float, float]:
+        """The pixel at a place in cells; x grows to the right and y upwards."""
+        return (x + 0.5) * self.scale, (self._rows - 0.5 - y) * self.scale
+
+    def square(self, x: float, y: float, half: float) -> tuple[float, float, float, float]:
+        """The box of pixels around a place, `half` cells to each side; a pixel at least."""
+        (across, down), reach = self.point(x, y), max(half * self.scale, 0.5)
+        return across - reach, down - reach, across + reach - 1, down + reach - 1
+
+    def uav(self, x: float, y: float) -> None:
+        """A blue disc."""
+        self.draw.ellipse(self.square(x, y, max(0.45, 4 / self.scale)), fill=UAV)
 
 
 def frame(
@@ -33,33 +86,11 @@ def frame(
     Returns:
         uint8 [Y * scale, X * scale, 3]; x grows to the right and y upwards.
     """
-    columns, rows = fire_map.shape
-    scale = max(2, size // max(columns, rows))
-    image = Image.new("RGB", (columns * scale, rows * scale), NO_FIRE)
-    draw = ImageDraw.Draw(image)
-
-    def square(x: float, y: float, half: float) -> tuple[float, float, float, float]:
-        across, down = (x + 0.5) * scale, (rows - 0.5 - y) * scale
-        return (
-            across - half * scale,
-            down - half * scale,
-            across + half * scale - 1,
-            down + half * scale - 1,
-        )
-
-    views = [square(x, y, view_radius(z, view_angle)) for x, y, z in position.tolist()]
-    for box in views:
-        draw.rectangle(box, fill=FIELD_OF_VIEW)
-    for i, j in np.argwhere(fire_map > 0).tolist():
-        draw.rectangle(square(i, j, 0.5), fill=FIRE)
-    line = max(2, scale // 6)
-    for left, top, right, bottom in views:
-        # The black line shows the edge where yellow alone would not, over fire and other views.
-        draw.rectangle((left - 1, top - 1, right + 1, bottom + 1), outline=NO_FIRE)
-        draw.rectangle((left, top, right, bottom), outline=FIELD_OF_VIEW, width=line)
+    scale = max(2, size // max(fire_map.shape))
+    chart = Chart(fire_map, position, view_angle=view_angle, scale=scale)
     for x, y, _ in position.tolist():
-        draw.ellipse(square(x, y, max(0.45, 4 / scale)), fill=UAV)
-    return np.asarray(image)
+        chart.uav(x, y)
+    return np.asarray(chart.image)
 
 
 def write_gif(path: Path, frames: Iterable[NDArray[np.uint8]], *, fps: int = 20) -> None:
@@ -68,12 +99,43 @@ def write_gif(path: Path, frames: Iterable[NDArray[np.uint8]], *, fps: int = 20)
     Raises:
         ValueError: there is no frame.
     """
-    images = [Image.fromarray(picture).quantize(32) for picture in frames]
+    images = [Image.fromarray(picture).quantize(MAX_COLOURS) for picture in frames]
     if not images:
         raise ValueError(f"{path}: an animation needs at least one frame")
+    images = _one_palette(images)
+    duration = round(1000 / fps)
     images[0].save(
-        path, save_all=True, append_images=images[1:], duration=round(1000 / fps), loop=0
+        path,
+        "GIF",
+        save_all=True,
+        append_images=images[1:],
+        duration=duration,
+        loop=0,
+        optimize=False,
     )
+
+
+def _one_palette(images: list[Image.Image]) -> list[Image.Image]:
+    """The same pictures with one palette for all, where their colours fit into one.
+
+    What does not change from one to the next then costs next to nothing.
+    """
+    colours: dict[bytes, int] = {}
+    tables: list[list[int]] = []
+    for image in images:
+        palette = bytes(image.getpalette() or ())
+        entries = (palette[i : i + 3] for i in range(0, len(palette), 3))
+        tables.append([colours.setdefault(entry, len(colours)) for entry in entries])
+    # One place is left for what stays as it was.
+    if len(colours) >= MAX_COLOURS:
+        return images
+    shared = []
+    for image, table in zip(images, tables, strict=True):
+        numbers = np.array(table, np.uint8)[np.asarray(image)]
+        renumbered = Image.fromarray(numbers, "P")
+        renumbered.putpalette(b"".join(colours))
+        shared.append(renumbered)
+    return shared
 
 
 class Window:

@@ -132,3 +132,18 @@ def test_window_shows_the_last_picture(monkeypatch):
     assert window.show(last) is None
     assert np.array_equal(window._image.get_array(), last)
     window.close()
+
+
+@pytest.mark.parametrize("altitude", [0.0, 1e-3, 0.1])
+def test_a_view_smaller_than_a_pixel_is_no_error(altitude):
+    assert colour(picture(positions=[(5, 5, altitude)]), 5, 5) == BLUE
+
+
+def test_a_colour_that_comes_later_is_kept():
+    frames = [np.full((4, 6, 3), shade, np.uint8) for shade in range(0, 250, 5)]
+    frames[7][0, 0] = (1, 2, 250)
+    images = [Image.fromarray(frame).quantize(256) for frame in frames]
+    shared = render._one_palette(images)
+    assert len({bytes(image.getpalette()) for image in shared}) == 1
+    for image, frame in zip(shared, frames, strict=True):
+        assert np.array_equal(np.asarray(image.convert("RGB")), frame)

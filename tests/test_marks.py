@@ -1,0 +1,204 @@
+"""Links, roles, targets, panels and legend, probed pixel by pixel."""
+
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDict
+
+from emberlink.comm.consensus import FOLLOWS, TARGET
+from emberlink.envs import keys, marks, panels
+from emberlink.envs.marks import LINK, ROLE_COLOURS, ROLES, Moment
+from emberlink.envs.panels import Episode, Screen
+from emberlink.envs.render import UAV
+from emberlink.trainers import recording
+
+WHERE = [(2, 2, 1), (12, 2, 1), (22, 12, 1)]
+
+
+def moment(**changes) -> Moment:
+    values = {
+        "step": 4,
+        "seen": 3,
+        "burning": 8,
+        "fire_map": np.zeros((30, 20), np.uint8),
+        "position": np.array(WHERE, np.float32),
+    }
+    return Moment(**{**values, **changes})
+
+
+def screen(*moments: Moment, size: int = 360, **options) -> Screen:
+    shown = [Episode(title="one", view_angle=30.0, moments=[each]) for each in moments]
+    return Screen(shown, size=size, **options)
+
+
+def drawn(*moments: Moment, panel: int = 0, **options) -> np.ndarray:
+    """The map of one panel."""
+    made = screen(*moments, **options)
+    (x, y), (width, height) = made.map_corner(panel), made.map_size
+    return made.picture(0)[y : y + height, x : x + width]
+
+
+def around(image: np.ndarray, x: float, y: float, reach: int = 2) -> set[tuple[int, ...]]:
+    """The colours near a place given in cells of a 30 x 20 grid."""
+    scale = image.shape[1] // 30
+    across, down = int((x + 0.5) * scale), int((19.5 - y) * scale)
+    part = image[down - reach : down + reach + 1, across - reach : across + reach + 1]
+    return {tuple(colour) for colour in part.reshape(-1, 3).tolist()}
+
+
+def all_of(image: np.ndarray) -> set[tuple[int, ...]]:
+    return {tuple(colour) for colour in np.unique(image.reshape(-1, 3), axis=0).tolist()}
+
+
+def linked(*pairs: tuple[int, int], n: int = 3) -> np.ndarray:
+    links = np.zeros((n, n), bool)
+    for i, j in pairs:
+        links[i, j] = links[j, i] = True
+    return links
+
+
+def test_a_link_is_drawn_between_those_who_hear_each_other_and_nowhere_else():
+    image = drawn(moment(links=linked((0, 1))))
+    assert LINK in around(image, 7, 2)
+    assert LINK not in around(image, 17, 7)  # between UAV 1 and UAV 2
+    assert LINK not in around(image, 12, 7)  # between UAV 0 and UAV 2
+    assert LINK in around(drawn(moment(links=linked((1, 2)))), 17, 7)
+    assert LINK not in all_of(drawn(moment()))
+
+
+def test_a_uav_wears_the_colour_of_its_role_around_its_blue_disc():
+    image = drawn(moment(roles=np.array([0, 1, 2])))
+    for (x, y, _), colour in zip(WHERE, ROLE_COLOURS, strict=True):
+        near = around(image, x, y, reach=6)
+        assert {UAV, colour} <= near
+        assert not (set(ROLE_COLOURS) - {colour}) & near
+    plain = all_of(drawn(moment()))
+    assert UAV in plain
+    assert not set(ROLE_COLOURS) & plain
+
+
+def test_roles_differ_in_shape_too():
+    shapes = set()
+    for role in range(len(ROLES)):
+        image = drawn(moment(roles=np.full(3, role)))
+        shapes.add((image == ROLE_COLOURS[role]).all(-1).tobytes())
+    assert len(shapes) == 3
+
+
+def test_a_target_is_a_cross_with_a_way_to_it():
+    target = np.array([(2, 12, 1), (12, 14, 1), (22, 2, 1)], np.float32)
+    image = drawn(moment(roles=np.array([0, 1, 2]), target=target))
+    for (x, y, _), colour in zip(target.tolist(), ROLE_COLOURS, strict=True):
+        assert colour in around(image, x, y)
+    assert ROLE_COLOURS[1] in around(image, 12, 8, reach=5)
+    assert marks.TARGET in around(drawn(moment(target=target)), 2, 12)
+
+
+def test_a_large_team_has_no_lines_to_its_targets():
+    n = marks.MANY + 1
+    position = np.tile(np.array([[2, 2, 1]], np.float32), (n, 1))
+    target = np.tile(np.array([[2, 16, 1]], np.float32), (n, 1))
+    options = {"position": position, "roles": np.zeros(n, int), "target": target}
+    image = drawn(moment(**options))
+    assert ROLE_COLOURS[0] in around(image, 2, 16)
+    assert ROLE_COLOURS[0] not in around(image, 2, 9, reach=20)
+
+
+def test_a_uav_that_flies_higher_has_a_larger_square():
+    low, high = (
+        (drawn(moment(position=np.array([(9, 9, z)], np.float32))) == (255, 255, 0)).all(-1).sum()
+        for z in (1, 4)
+    )
+    assert high > 8 * low
+
+
+def test_each_panel_shows_its_own_episode():
+    left, right = moment(roles=np.zeros(3, int), links=linked((0, 1))), moment()
+    assert {LINK, ROLE_COLOURS[0]} <= all_of(drawn(left, right, panel=0))
+    assert not {LINK, ROLE_COLOURS[0]} & all_of(drawn(left, right, panel=1))
+
+
+def test_the_legend_names_what_occurs_and_nothing_else():
+    def words(*moments, **options):
+        return [word for word, _ in screen(*moments, **options)._legend()]
+
+    whole = moment(roles=np.zeros(3, int), links=linked(), target=np.zeros((3, 3)))
+    ends = [*ROLES, "hear each other", "target"]
+    assert words(moment()) == ["fire", "field of view", "UAV"]
+    assert words(whole) == ["fire", "field of view", *ends]
+    assert words(moment(), whole) == ["fire", "field of view", "UAV", *ends]
+    assert words(moment(), tell_seen=True)[:2] == ["fire", "fire, seen"]
+
+
+def test_seen_fire_is_told_apart_only_where_asked():
+    fire = np.zeros((30, 20), np.uint8)
+    fire[25, 5], fire[27, 5] = 1, 2
+    assert around(drawn(moment(fire_map=fire)), 25, 5) == {(255, 255, 255)}
+    told = drawn(moment(fire_map=fire), tell_seen=True)
+    assert around(told, 25, 5) == {panels.SEEN_FIRE}
+    assert around(told, 27, 5) == {(255, 255, 255)}
+
+
+def test_step_and_coverage_are_written():
+    first, second = screen(moment()).picture(0), screen(moment(seen=4)).picture(0)
+    assert not np.array_equal(first[:50], second[:50])
+    assert moment().coverage == 37.5
+    assert moment(seen=0, burning=0).coverage == 100
+
+
+@pytest.mark.parametrize("grid", [(8, 8), (30, 30), (60, 40), (8, 256), (256, 8), (256, 256)])
+@pytest.mark.parametrize("count", [1, 2, 3, 4, 7])
+def test_panels_do_not_overlap_and_sides_are_even(grid, count):
+    one = moment(fire_map=np.zeros(grid, np.uint8), position=np.zeros((1, 3), np.float32))
+    made = screen(*[one] * count, size=250)
+    height, width, _ = made.picture(0).shape
+    assert height % 2 == width % 2 == 0
+    covered = np.zeros((height, width), int)
+    for panel in range(count):
+        x, y = made.map_corner(panel)
+        covered[y : y + made.map_size[1], x : x + made.map_size[0]] += 1
+    assert covered.max() == 1
+    assert covered.sum() == count * made.map_size[0] * made.map_size[1]
+
+
+def test_four_square_maps_are_two_by_two():
+    made = screen(*[moment(fire_map=np.zeros((30, 30), np.uint8))] * 4)
+    corners = [made.map_corner(panel) for panel in range(4)]
+    assert len({x for x, _ in corners}) == len({y for _, y in corners}) == 2
+
+
+def tensordict(features: int, **agents) -> TensorDict:
+    own = {
+        "observation": torch.zeros(3, features),
+        "position": torch.tensor(WHERE, dtype=torch.float32),
+        **agents,
+    }
+    counts = {name: torch.tensor(5) for name in (keys.STEP, keys.SEEN, keys.BURNING)}
+    return TensorDict({keys.AGENTS: TensorDict(own, [3]), **counts}, [])
+
+
+def test_roles_follow_from_whom_a_uav_follows():
+    follows = torch.tensor([0, 0, -1, 3, 1])
+    assert [ROLES[role] for role in recording.roles(follows)] == [
+        *("discoverer", "seeker", "wanderer", "discoverer", "seeker")
+    ]
+
+
+def test_what_is_drawn_goes_by_what_the_tensordict_holds():
+    nothing = torch.zeros(30, 20, dtype=torch.uint8)
+    told = {FOLLOWS[1]: torch.tensor([0, 0, -1]), TARGET[1]: torch.ones(3, 3)}
+    seen = recording.moment(tensordict(9, **told), nothing, hears=True, limit=10.5)
+    # UAVs 0 and 1 are 10 cells apart, 1 and 2 are 14.1.
+    assert np.array_equal(seen.links, linked((0, 1)))
+    assert seen.roles.tolist() == [0, 1, 2]
+    assert np.array_equal(seen.target, np.ones((3, 3)))
+    at_limit = recording.moment(tensordict(9, **told), nothing, hears=True, limit=10.0)
+    assert not at_limit.links.any()
+    everyone = recording.moment(tensordict(18), nothing, hears=True, limit=torch.inf)
+    assert everyone.links.sum() == 6
+    assert everyone.roles is everyone.target is None
+    for silent in (
+        recording.moment(tensordict(6), nothing, hears=True, limit=10),
+        recording.moment(tensordict(9, **told), nothing, hears=False, limit=10),
+    ):
+        assert silent.links is silent.roles is silent.target is None

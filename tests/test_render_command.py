@@ -1,0 +1,255 @@
+"""`emberlink render` from the outside: its files, what they hold, and what it refuses."""
+
+import dataclasses
+import os
+from pathlib import Path
+
+import imageio_ffmpeg
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from rich.console import Console
+from safetensors.torch import save_file
+
+from emberlink.envs import marks, video
+from emberlink.envs.config import known
+from emberlink.policies.scripted import SCRIPTED
+from emberlink.trainers import cli, evaluate, render
+from emberlink.trainers.build import build_env, build_networks
+from emberlink.trainers.config import resolve
+from emberlink.trainers.run_folder import RunFolder
+
+SHORT = ("setup=tuned", "learner.hidden=[8,8]", "env.horizon=12", "env.num_uavs=3")
+
+
+def make_run(folder, method="consensus", *overrides):
+    """A run folder with networks that have learnt nothing."""
+    config = resolve(method, [*SHORT, *overrides, f"output={folder}"])
+    nowhere = torch.full(config.env.grid, torch.inf)
+    env = build_env(config, num_envs=1, fire=nowhere, seed=0, device="cpu")
+    actor, _ = build_networks(config, env, torch.Generator().manual_seed(config.seed))
+    weights = {
+        f"actor_network_params.module.{name}": value.contiguous()
+        for name, value in actor.module.state_dict().items()
+    }
+    run = RunFolder.create(config)
+    save_file(weights, run.path / "checkpoints" / "step_000000012.safetensors")
+    return run.path
+
+
+def rendered(capsys, *arguments) -> list[str]:
+    capsys.readouterr()
+    assert cli.main(["render", *map(str, arguments)]) == 0
+    return capsys.readouterr().out.splitlines()
+
+
+def gif_frames(path) -> list[np.ndarray]:
+    with Image.open(path) as film:
+        frames = []
+        for index in range(film.n_frames):
+            film.seek(index)
+            frames.append(np.asarray(film.convert("RGB")))
+    return frames
+
+
+def test_a_run_alone_gives_a_gif_and_an_mp4_that_play(tmp_path, capsys):
+    run = make_run(tmp_path)
+    *_, gif, mp4 = rendered(capsys, run, "--fps", "10")
+    assert gif == str(run / "figures" / "episode_huygens_0.gif")
+    assert mp4 == str(run / "figures" / "episode_huygens_0.mp4")
+    frames = gif_frames(gif)
+    assert len(frames) == 13
+    reader = imageio_ffmpeg.read_frames(mp4)
+    about = next(reader)
+    shots = [np.frombuffer(shot, np.uint8) for shot in reader]
+    height, width, _ = frames[0].shape
+    assert about["size"] == (width, height)
+    assert about["codec"] == "h264"
+    assert about["pix_fmt"].startswith("yuv420p")
+    assert about["fps"] == 10
+    assert len(shots) == 13
+    for frame, shot in zip(frames, shots, strict=True):
+        assert np.abs(frame.astype(int) - shot.reshape(frame.shape)).mean() < 4
+    assert not list(run.rglob(".*"))
+
+
+def test_a_second_one_takes_another_name(tmp_path, capsys):
+    run = make_run(tmp_path)
+    first = rendered(capsys, run, "--frames", 2)[-2:]
+    before = [Path(path).read_bytes() for path in first]
+    second = rendered(capsys, run, "--frames", 3)[-2:]
+    assert [os.path.basename(path) for path in second] == [
+        *("episode_huygens_0_2.gif", "episode_huygens_0_2.mp4")
+    ]
+    assert [Path(path).read_bytes() for path in first] == before
+    assert [len(gif_frames(path)) for path in (first[0], second[0])] == [2, 3]
+
+
+def panels_of(runs, choices, monkeypatch):
+    """The episodes that a command shows, without its files."""
+    caught = []
+
+    class Caught(Exception):
+        pass
+
+    def catch(episodes, **_):
+        caught.extend(episodes)
+        raise Caught
+
+    monkeypatch.setattr(render, "Screen", catch)
+    with pytest.raises(Caught):
+        render.render([str(run) for run in runs], Console(quiet=True), choices)
+    monkeypatch.undo()
+    return caught
+
+
+def test_all_methods_side_by_side_have_the_same_fire_and_the_same_starts(tmp_path, monkeypatch):
+    methods = known("method")
+    runs = [make_run(tmp_path, method) for method in methods]
+    choices = render.Choices(fire="paper:3", policies=list(SCRIPTED))
+    episodes = panels_of(runs, choices, monkeypatch)
+    assert len(episodes) == len(methods) + len(SCRIPTED)
+    first, *others = episodes
+    for other in others:
+        assert np.array_equal(other.moments[0].position, first.moments[0].position)
+        for one, two in zip(first.moments, other.moments, strict=True):
+            assert one.step == two.step
+            assert np.array_equal(one.fire_map > 0, two.fire_map > 0)
+    assert any(
+        not np.array_equal(other.moments[-1].position, first.moments[-1].position)
+        for other in others
+    )
+    for method, episode in zip(methods, episodes, strict=False):
+        assert episode.title == f"{method}, setup tuned, seed 0"
+        now = episode.moments[-1]
+        assert (now.links is not None) == (method in ("consensus", "positional"))
+        assert (now.roles is not None) == (now.target is not None) == (method == "consensus")
+    for name, episode in zip(SCRIPTED, episodes[len(methods) :], strict=True):
+        listens = SCRIPTED[name].recipe is not None
+        assert {v is not None for v in (episode.moments[-1].links, episode.moments[-1].roles)} == {
+            listens
+        }
+
+
+def test_an_episode_is_the_evaluations(tmp_path, monkeypatch):
+    run = RunFolder(make_run(tmp_path))
+    config = run.config()
+    actor = render.load_actor(config, run.checkpoint())
+    results = evaluate.evaluate(config, actor, fires=3, scripted=False)["huygens"]
+    covered = results[evaluate.LEARNED]["coverage"]
+    assert len(set(covered)) > 1
+    for index in range(3):
+        choices = render.Choices(fire=str(index))
+        (episode,) = panels_of([run.path], choices, monkeypatch)
+        assert episode.moments[-1].coverage == pytest.approx(covered[index], rel=1e-6)
+
+
+@pytest.mark.parametrize("horizon", [1, 2, 12])
+@pytest.mark.parametrize("uavs", [1, 64])
+def test_other_teams_and_horizons(horizon, uavs, tmp_path, capsys):
+    run = make_run(tmp_path, "consensus", f"env.horizon={horizon}", f"env.num_uavs={uavs}")
+    *_, gif, mp4 = rendered(capsys, run, "--frames", 3)
+    assert len(gif_frames(gif)) == min(3, horizon + 1)
+    assert imageio_ffmpeg.count_frames_and_secs(mp4)[0] == min(3, horizon + 1)
+
+
+@pytest.mark.parametrize("grid", ["[60,40]", "[8,64]"])
+def test_other_grids(grid, tmp_path, capsys):
+    run = make_run(tmp_path, "positional", f"env.grid={grid}")
+    out = tmp_path / "shot.png"
+    assert rendered(capsys, run, "--output", out, "--step", 5, "--size", 200)[-1] == str(out)
+    with Image.open(out) as picture:
+        assert tuple(marks.LINK) in {colour for _, colour in picture.convert("RGB").getcolors(256)}
+
+
+def refused(arguments, capsys, *words: str) -> None:
+    capsys.readouterr()
+    assert cli.main(["render", *map(str, arguments)]) == 2
+    err = capsys.readouterr().err
+    assert err.startswith("emberlink render: ")
+    assert err.count("\n") == 1, err
+    for word in words:
+        assert word in err, err
+
+
+def test_what_is_refused(tmp_path, capsys):
+    run = make_run(tmp_path)
+    wide = make_run(tmp_path, "consensus", "env.grid=[40,30]")
+    team = make_run(tmp_path, "independent", "env.num_uavs=4")
+    there = tmp_path / "there.gif"
+    there.write_text("mine")
+    cases = [
+        ([tmp_path / "none"], ["no such run folder"]),
+        ([run, "--fire", "zzz"], ["fire 'zzz'", "known: huygens, paper"]),
+        ([run, "--fire", "65536"], ["'65536'", "0 to 65535"]),
+        ([run, "--fire=-1"], ["'-1'", "0 to 65535"]),
+        ([run, "--fire", "paper:x"], ["'paper:x'", "0 to 65535"]),
+        ([run, "--fire", ""], ["fire ''"]),
+        ([run, "--policy", "zzz"], ["policy 'zzz'", "random_waypoints"]),
+        ([run, wide], ["env.grid=[40, 30]", "[30, 30]"]),
+        ([run, team], ["env.num_uavs=4", "has 3"]),
+        ([run, "--output", there], ["there.gif is there already"]),
+        ([run, "--output", tmp_path / "no" / "a.gif"], [str(tmp_path / "no"), "no such folder"]),
+        ([run, "--output", tmp_path / "no"], ["no such folder", ".gif, .mp4, .png"]),
+        ([run, "--step", "3"], ["step=3", ".png"]),
+        ([run, "--output", tmp_path / "a.png", "--step", "13"], ["step=13", "0 to 12"]),
+        ([run, "--checkpoint", tmp_path / "x"], ["not a readable checkpoint"]),
+        ([run, run, "--checkpoint", there], ["1 checkpoints for 2 runs"]),
+    ]
+    for arguments, words in cases:
+        refused(arguments, capsys, *words)
+    (run / "checkpoints" / "step_000000012.safetensors").unlink()
+    refused([run], capsys, "holds no checkpoint")
+    assert there.read_text() == "mine"
+    assert not [*tmp_path.rglob("*.mp4"), *tmp_path.rglob("*.png")]
+
+
+@pytest.mark.parametrize("option", ["--fps=0", "--fps=51", "--frames=0", "--size=1", "--step=-1"])
+def test_numbers_out_of_range(option, capsys):
+    with pytest.raises(SystemExit):
+        cli.main(["render", "x", option])
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_a_failing_ffmpeg_is_one_line(tmp_path, capsys, monkeypatch):
+    run = make_run(tmp_path)
+    for program in ("false", "true"):
+        monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", program)
+        refused([run, "--output", tmp_path / "a.mp4"], capsys, "a.mp4", "ffmpeg failed")
+    assert not list(tmp_path.glob("*.mp4"))
+    assert not list(tmp_path.glob(".*"))
+
+
+def test_a_name_taken_meanwhile_is_not_overwritten(tmp_path):
+    path = tmp_path / "a.gif"
+
+    def write():
+        with render._published(path) as partial:
+            partial.write_text("ours")
+            path.write_text("theirs")
+
+    with pytest.raises(ValueError, match="already"):
+        write()
+    assert path.read_text() == "theirs"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_video_needs_a_frame(tmp_path):
+    with pytest.raises(ValueError, match="at least one frame"):
+        video.write_mp4(tmp_path / "a.mp4", [])
+
+
+def test_nothing_that_is_shared_is_forgotten():
+    """Start positions and fires differ where one of these does, and nowhere else."""
+    base = resolve("independent", SHORT).env
+    other = {"reward", "observation", "displacement", "view_angle"}
+    assert {field.name for field in dataclasses.fields(base)} == other | set(render.SHARED)
+
+
+def test_a_video_that_lacks_frames_is_no_video(tmp_path, monkeypatch):
+    frames = [np.zeros((16, 16, 3), np.uint8)] * 3
+    video.write_mp4(tmp_path / "whole.mp4", frames)
+    monkeypatch.setattr(imageio_ffmpeg, "count_frames_and_secs", lambda _: (2, 1.0))
+    with pytest.raises(ValueError, match="not all 3 frames"):
+        video.write_mp4(tmp_path / "part.mp4", frames)
