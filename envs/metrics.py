@@ -20,6 +20,8 @@ NAMES = (
     "boundary_exits",
     "fire_exits",
 )
+HIGHER_IS_BETTER = frozenset({"score", "coverage", "coverage_auc"})
+"""The measures of which more is better; of the others less is."""
 
 
 def score(reward: Tensor) -> Tensor:

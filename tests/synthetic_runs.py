@@ -1,0 +1,86 @@
+"""Run folders with made-up numbers."""
+
+import json
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from emberlink.envs import metrics
+from emberlink.trainers.config import resolve, to_values
+
+HORIZON = 40
+
+
+@cache
+def _values(method: str, overrides: tuple[str, ...]) -> dict[str, Any]:
+    return to_values(resolve(method, ("setup=tuned", f"env.horizon={HORIZON}", *overrides)))
+
+
+def write_run(
+    folder: Path,
+    method: str = "consensus",
+    seed: int = 0,
+    *,
+    name: str | None = None,
+    overrides: tuple[str, ...] = (),
+    episodes: int = 3,
+    fires: int = 4,
+    learned: dict[str, Any] | None = None,
+    scripted: tuple[str, ...] = ("random_actions", "random_waypoints"),
+    scenarios: tuple[str, ...] = ("huygens",),
+) -> Path:
+    """A finished, evaluated run without checkpoints.
+
+    Args:
+        learned: the learned policy's numbers, measure -> a number, or one per held-out fire;
+            random where left out.
+    """
+    config = {**_values(method, (f"episodes={episodes}", *overrides)), "seed": seed}
+    run = folder / (name or f"{method}_{config['setup']}_s{seed}")
+    run.mkdir(parents=True)
+    (run / "config.yaml").write_text(yaml.safe_dump(config, sort_keys=False))
+    own = np.random.default_rng([seed, *method.encode()])
+    lines = [
+        {"episode": e, **{m: float(v) for m, v in zip(metrics.NAMES, own.random(8), strict=True)}}
+        for e in range(1, episodes + 1)
+    ]
+    (run / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    everyones = np.random.default_rng(7)
+    results: dict[str, Any] = {}
+    for scenario in scenarios:
+        given = {
+            m: np.broadcast_to(v, fires).astype(float).tolist() for m, v in (learned or {}).items()
+        }
+        results[scenario] = {
+            "learned": {m: (60 * own.random(fires)).tolist() for m in metrics.NAMES} | given
+        }
+        for policy in scripted:
+            results[scenario][policy] = {
+                m: (60 * everyones.random(fires)).tolist() for m in metrics.NAMES
+            }
+    write_evaluation(
+        run,
+        {
+            "method": method,
+            "setup": config["setup"],
+            "seed": seed,
+            "start_seed": 1,
+            "checkpoint": "step_000000120.safetensors",
+            "fires": fires,
+            "results": results,
+        },
+    )
+    return run
+
+
+def read_evaluation(run: Path) -> dict[str, Any]:
+    """What eval.json holds."""
+    return json.loads((run / "eval.json").read_text())
+
+
+def write_evaluation(run: Path, content: Any) -> None:
+    """Another eval.json."""
+    (run / "eval.json").write_text(json.dumps(content))

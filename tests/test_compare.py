@@ -1,0 +1,531 @@
+"""`emberlink compare`: which runs are counted, and how; its numbers; its page."""
+
+import html.parser
+import json
+import shutil
+from itertools import permutations
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from synthetic_runs import read_evaluation, write_evaluation, write_run
+
+from emberlink.envs import metrics
+from emberlink.trainers import cli
+from emberlink.trainers.comparison_numbers import numbers
+from emberlink.trainers.comparison_runs import Run, find, gather, read
+
+METHODS = ("consensus", "independent", "positional", "shared_memory")
+
+
+def gathered(*paths):
+    """Sections and notes of run folders."""
+    runs = [read(path) for path in find(paths)]
+    assert all(isinstance(run, Run) for run in runs), runs
+    return gather(runs)
+
+
+def only(*paths):
+    """The numbers of the one section."""
+    (section,), _ = gathered(*paths)
+    return numbers(section)
+
+
+def ranking(one, measure, fire="huygens"):
+    return next(r for r in one.fires[fire] if r.measure == measure)
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory):
+    """Two methods with three and two seeds."""
+    folder = tmp_path_factory.mktemp("runs")
+    for seed, coverage in enumerate((50, 70, 60)):
+        write_run(folder, "consensus", seed, learned={"coverage": [coverage - 5, coverage + 5] * 2})
+    for seed, coverage in enumerate((40, 65)):
+        write_run(folder, "independent", seed, learned={"coverage": coverage})
+    return folder
+
+
+def test_numbers_by_hand(runs):
+    one = only(runs)
+    first, second = ranking(one, "coverage").rows
+    assert (first.method, first.seeds, first.values) == ("consensus", [0, 1, 2], [50, 70, 60])
+    assert (first.iqm, first.interval) == (60, (50, 70))
+    # 50 beats 40; 70 beats both; 60 beats 40: 4 of 6 pairs.
+    assert (first.next, first.improvement) == ("independent", pytest.approx(4 / 6))
+    assert (second.iqm, second.interval, second.next) == (52.5, (40, 65), None)
+    assert (second.improvement, second.improvement_interval) == (None, None)
+    (claim,) = (v for v in one.verdicts if v.measure == "coverage")
+    assert claim.ratio == pytest.approx(60 / 52.5)
+    assert claim.interval == pytest.approx((50 / 65, 70 / 40), abs=0.1)
+    assert (claim.best_other, claim.verdict, claim.fewest_seeds) == ("independent", "undecided", 2)
+
+
+def test_less_is_better_where_it_is(tmp_path):
+    for seed in range(3):
+        write_run(tmp_path, "consensus", seed, learned={"tracking_first": 10 + seed})
+        write_run(tmp_path, "positional", seed, learned={"tracking_first": 30 + seed})
+    one = only(tmp_path)
+    first, last = ranking(one, "tracking_first").rows
+    assert (first.method, first.improvement) == ("consensus", 1)
+    assert last.method == "positional"
+    (claim,) = (v for v in one.verdicts if v.measure == "tracking_first")
+    assert claim.ratio == pytest.approx(31 / 11)
+    assert claim.verdict == "holds"
+
+
+def test_every_measure_has_a_direction():
+    assert set(metrics.NAMES) >= metrics.HIGHER_IS_BETTER
+    assert {"tracking_first", "boundary_exits", "fire_exits", "coverage_time"}.isdisjoint(
+        metrics.HIGHER_IS_BETTER
+    )
+
+
+def test_verdicts(tmp_path):
+    """Ratios 2, 1 and about 1.3, with seeds that hardly differ or differ much."""
+    cases = {"holds": (60, 30, 0), "does not hold": (30, 30, 0), "undecided": (39, 30, 10)}
+    for verdict, (own, other, spread) in cases.items():
+        for seed in range(5):
+            shift = spread * (seed - 2) / 2
+            write_run(tmp_path / verdict, "consensus", seed, learned={"coverage": own + shift})
+            write_run(tmp_path / verdict, "positional", seed, learned={"coverage": other - shift})
+        got = [v for v in only(tmp_path / verdict).verdicts if v.measure == "coverage"]
+        assert [v.verdict for v in got] == [verdict]
+
+
+def test_the_best_of_the_other_methods_is_the_one_compared_with(tmp_path):
+    for method, exits in (("consensus", 2), ("independent", 9), ("positional", 5)):
+        for seed in range(2):
+            write_run(tmp_path, method, seed, learned={"boundary_exits": exits})
+    (claim,) = (v for v in only(tmp_path).verdicts if v.measure == "boundary_exits")
+    assert (claim.best_other, claim.ratio) == ("positional", pytest.approx(2.5))
+    assert claim.interval == pytest.approx((2.5, 2.5))
+
+
+def test_a_ratio_to_nothing_is_infinite(tmp_path, capsys):
+    for method, exits in (("consensus", 0), ("independent", 9)):
+        for seed in range(2):
+            write_run(tmp_path, method, seed, learned={"boundary_exits": exits})
+    assert cli.main(["compare", str(tmp_path), "--output", str(tmp_path / "out")]) == 0
+    assert "∞" in capsys.readouterr().out
+    content = json.loads((tmp_path / "out" / "compare.json").read_text())
+    assert content["setups"][0]["claims"][2]["interval"] == ["inf", "inf"]
+
+
+def test_with_one_seed_there_is_no_interval(tmp_path, capsys):
+    for method in ("consensus", "independent"):
+        write_run(tmp_path, method, 0)
+    one = only(tmp_path)
+    for rank in one.fires["huygens"]:
+        assert [row.interval for row in rank.rows] == [None, None]
+        assert rank.rows[0].improvement_interval is None
+        assert rank.rows[0].improvement in (0, 0.5, 1)
+    assert {v.verdict for v in one.verdicts} == {"undecided"}
+    assert all(c.low is None for by in one.curves.values() for c in by.values())
+    assert cli.main(["compare", str(tmp_path), "--output", str(tmp_path / "out")]) == 0
+    assert "only 1 seed)" in capsys.readouterr().out
+    assert "With one seed there is no interval" in (tmp_path / "out/compare.html").read_text()
+
+
+def test_two_seeds_are_flagged(runs, tmp_path, capsys):
+    assert cli.main(["compare", str(runs), "--output", str(tmp_path / "out")]) == 0
+    assert "only 2 seeds" in capsys.readouterr().out
+    assert "too few for an interval" in (tmp_path / "out/compare.html").read_text()
+
+
+def summary(one):
+    """Everything that statistics say of a section, as plain numbers."""
+    rows = [row for rank in one.fires["huygens"] for row in rank.rows]
+    return [
+        *((r.method, r.iqm, r.interval, r.improvement, r.improvement_interval) for r in rows),
+        *((v.ratio, v.interval, v.verdict) for v in one.verdicts),
+    ]
+
+
+def approximately(value):
+    if isinstance(value, list | tuple):
+        return [approximately(v) for v in value]
+    return pytest.approx(value, rel=1e-9) if isinstance(value, float) else value
+
+
+def plain(value):
+    return [plain(v) for v in value] if isinstance(value, list | tuple) else value
+
+
+def test_episodes_are_not_independent_runs(runs, tmp_path):
+    """Each episode ten times over changes no interval: the number of episodes is in none."""
+    copy = shutil.copytree(runs, tmp_path / "copy")
+    for run in find([copy]):
+        content = read_evaluation(run)
+        content["fires"] *= 10
+        for policies in content["results"].values():
+            for measured in policies.values():
+                measured |= {name: values * 10 for name, values in measured.items()}
+        write_evaluation(run, content)
+    assert plain(summary(only(copy))) == approximately(summary(only(runs)))
+    # A tenth seed more does: so the comparison above can fail.
+    write_run(copy, "consensus", 9, fires=40)
+    assert plain(summary(only(copy))) != approximately(summary(only(runs)))
+
+
+def test_spread_within_a_run_is_in_no_interval(tmp_path):
+    for seed, mean in enumerate((20, 30, 40)):
+        write_run(tmp_path / "calm", "consensus", seed, learned={"coverage": mean})
+        wild = [mean - 20, mean + 20, mean - 15, mean + 15]
+        write_run(tmp_path / "wild", "consensus", seed, learned={"coverage": wild})
+    calm, wild = (ranking(only(tmp_path / n), "coverage").rows[0] for n in ("calm", "wild"))
+    assert calm.interval == wild.interval == (20, 40)
+
+
+def test_the_order_of_runs_does_not_matter(runs, tmp_path):
+    folders = find([runs])
+    whole = []
+    for place, order in enumerate([folders, folders[::-1], [*folders[2:], *folders[:2]]]):
+        out = tmp_path / str(place)
+        assert cli.main(["compare", *map(str, order), "--output", str(out)]) == 0
+        whole.append({file.name: file.read_bytes() for file in out.iterdir()})
+    assert whole[0] == whole[1] == whole[2]
+    assert {"compare.html", "compare.json"} < whole[0].keys()
+    assert sum(name.endswith(".png") for name in whole[0]) == 5
+
+
+@settings(
+    deadline=None, max_examples=12, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+@given(st.lists(st.integers(1, 6), min_size=1, max_size=4), st.integers(0, 2**20))
+def test_any_number_of_methods_and_seeds(tmp_path_factory, counts, start):
+    folder = tmp_path_factory.mktemp("any")
+    for method, count in zip(METHODS, counts, strict=False):
+        for seed in range(count):
+            write_run(folder, method, start + seed)
+    one = only(folder)
+    for rank in one.fires["huygens"]:
+        rows = rank.rows
+        assert {r.method: len(r.values) for r in rows} == dict(zip(METHODS, counts, strict=False))
+        ordered = sorted((r.iqm for r in rows), reverse=rank.measure in metrics.HIGHER_IS_BETTER)
+        assert [r.iqm for r in rows] == ordered
+        assert [r.next for r in rows] == [*(r.method for r in rows[1:]), None]
+        for row in rows:
+            assert (row.interval is None) == (len(row.seeds) == 1)
+            if row.interval:
+                low, high = row.interval
+                assert min(row.values) - 1e-9 <= low <= high <= max(row.values) + 1e-9
+    assert len(one.verdicts) == (3 if len(counts) > 1 else 0)
+
+
+def test_setups_fires_and_configurations_are_kept_apart(tmp_path):
+    write_run(tmp_path, "consensus", 0)
+    write_run(tmp_path, "consensus", 1, overrides=("learner.batch=64",))
+    write_run(tmp_path, "consensus", 2, overrides=("learner.batch=64", "device=cpu"))
+    write_run(tmp_path, "consensus", 0, name="r", overrides=("setup=released",))
+    both = ("huygens", "paper")
+    write_run(tmp_path, "consensus", 0, name="p", overrides=("fire=paper",), scenarios=both)
+    sections, notes = gathered(tmp_path)
+    assert [(s.label, [(g.label, g.seeds) for g in s.groups]) for s in sections] == [
+        ("setup released, trained on paper", [("consensus", [0])]),
+        (
+            "setup tuned, trained on huygens",
+            [("consensus (learner.batch=256)", [0]), ("consensus (learner.batch=64)", [1, 2])],
+        ),
+        ("setup tuned, trained on paper", [("consensus", [0])]),
+    ]
+    assert [s.trained_on for s in sections] == ["", "huygens", "paper"]
+    assert any("not all methods have the same learner.batch" in note for note in notes)
+
+
+def test_what_does_not_change_the_training_is_said_and_does_not_part_runs(tmp_path):
+    write_run(tmp_path, "consensus", 0)
+    write_run(tmp_path, "consensus", 1, overrides=("logger=csv", "output=elsewhere"))
+    (section,), notes = gathered(tmp_path)
+    assert [g.seeds for g in section.groups] == [[0, 1]]
+    assert notes == [
+        "setup tuned, trained on huygens, consensus: taken together though logger differ"
+    ]
+
+
+def test_a_seed_counts_once(tmp_path):
+    old = write_run(tmp_path, "consensus", 0, name="2026-01-01", learned={"coverage": 1})
+    new = write_run(tmp_path, "consensus", 0, name="2026-01-02", learned={"coverage": 2})
+    write_run(tmp_path, "consensus", 1, learned={"coverage": 3})
+    for order in permutations((old, new, tmp_path)):
+        (section,), notes = gathered(*order)
+        (row,) = ranking(numbers(section), "coverage").rows
+        assert (row.seeds, row.values) == ([0, 1], [2, 3])
+        (note,) = notes
+        assert f"{new} is taken, {old} is left out" in note
+
+
+def test_scripted_policies_have_rows_of_their_own(tmp_path):
+    for seed in range(2):
+        write_run(tmp_path, "consensus", seed)
+        write_run(tmp_path, "positional", seed)
+    content = read_evaluation(tmp_path / "positional_tuned_s0")
+    expected = np.mean(content["results"]["huygens"]["random_actions"]["coverage"])
+    one = only(tmp_path)
+    rank = ranking(one, "coverage")
+    assert [row.method for row in rank.rows].count("random_actions") == 0
+    assert rank.scripted["random_actions"] == {"": pytest.approx(expected)}
+    assert one.notes == []
+    # A method's own reward gives it a score of its own, in all its runs alike.
+    for seed in range(2):
+        run = tmp_path / f"positional_tuned_s{seed}"
+        content = read_evaluation(run)
+        content["results"]["huygens"]["random_actions"]["score"] = [7.0] * 4
+        write_evaluation(run, content)
+    one = only(tmp_path)
+    assert ranking(one, "score").scripted["random_actions"]["positional"] == 7
+    assert ranking(one, "score").scripted["random_actions"]["consensus"] != 7
+    assert one.notes == []
+    # But coverage is the same on the same fires.
+    content["results"]["huygens"]["random_actions"]["coverage"] = [7.0] * 4
+    write_evaluation(run, content)
+    (note,) = only(tmp_path).notes
+    assert "random_actions does not have the same coverage" in note
+
+
+def test_curves_are_over_seeds(runs):
+    one = only(runs)
+    lines = [
+        [json.loads(line)["coverage"] for line in (run / "metrics.jsonl").read_text().splitlines()]
+        for run in find([runs])
+        if run.name.startswith("consensus")
+    ]
+    curve = one.curves["coverage"]["consensus"]
+    assert curve.iqm == pytest.approx(np.mean(lines, axis=0))
+    assert curve.low == pytest.approx(np.min(lines, axis=0))
+    assert curve.high == pytest.approx(np.max(lines, axis=0))
+
+
+class Tags(html.parser.HTMLParser):
+    """Whether every tag is closed, and what is loaded from where."""
+
+    VOID = frozenset({"meta", "img", "br", "link"})
+
+    def __init__(self):
+        super().__init__()
+        self.open, self.seen, self.loaded, self.text = [], set(), [], ""
+
+    def handle_starttag(self, tag, attrs):
+        self.seen.add(tag)
+        self.loaded += [value for key, value in attrs if key in ("src", "href")]
+        if tag not in self.VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        self.text += data
+
+
+def page(folder) -> Tags:
+    tags = Tags()
+    tags.feed((folder / "compare.html").read_text())
+    tags.close()
+    assert tags.open == []
+    return tags
+
+
+def test_the_page_holds_everything_and_loads_nothing(runs, tmp_path):
+    out = tmp_path / "out"
+    assert cli.main(["compare", str(runs), "--output", str(out)]) == 0
+    tags = page(out)
+    assert "script" not in tags.seen
+    assert len(tags.loaded) == 5
+    assert all(address.startswith("data:image/png;base64,iVBOR") for address in tags.loaded)
+    source = (out / "compare.html").read_text()
+    for scheme in ("http:", "https:", "//", "url(", "@import"):
+        assert scheme not in source.replace("\n", " ").split("base64,")[0]
+        assert scheme not in tags.text
+    for said in (*metrics.NAMES, "consensus", "independent", "60.0", "[50.0, 70.0]", "figure 9"):
+        assert said in tags.text
+    content = json.loads((out / "compare.json").read_text())
+    (setup,) = content["setups"]
+    coverage = next(r for r in setup["fires"]["huygens"] if r["measure"] == "coverage")
+    assert coverage["rows"][0]["values"] == [50, 70, 60]
+    assert setup["curves"]["coverage"].keys() == {"consensus", "independent"}
+    assert content["settings"]["resamples"] == 10_000
+
+
+HOSTILE = '<script>alert("1")</script>[red]$x_{/../'
+
+
+def test_names_from_files_are_text(tmp_path, capsys):
+    """Not markup of the page, the console or a figure's formulas."""
+    run = write_run(tmp_path / "runs", name="a<b>&'\"")
+    content = read_evaluation(run)
+    results = content["results"]
+    results["huygens"][HOSTILE] = results["huygens"]["random_actions"]
+    results[HOSTILE] = results["huygens"]
+    write_evaluation(run, content)
+    assert cli.main(["compare", str(run), "--output", str(tmp_path / "out")]) == 0
+    tags = page(tmp_path / "out")
+    assert "script" not in tags.seen
+    assert HOSTILE in tags.text
+    assert HOSTILE in "".join(capsys.readouterr().out.split("\n"))
+    assert all(file.parent == tmp_path / "out" for file in (tmp_path / "out").rglob("*"))
+
+
+def test_unfinished_runs_are_named_and_left_out(tmp_path, capsys):
+    runs = tmp_path / "runs"
+    good = write_run(runs, "consensus", 0)
+    stopped = write_run(runs, "consensus", 1)
+    lines = (stopped / "metrics.jsonl").read_text().splitlines(keepends=True)
+    (stopped / "metrics.jsonl").write_text(lines[0])
+    bare = write_run(runs, "consensus", 2)
+    (bare / "eval.json").unlink()
+    older = write_run(runs, "consensus", 3)
+    (older / "checkpoints").mkdir()
+    (older / "checkpoints" / "step_000000160.safetensors").touch()
+    (runs / "notes").mkdir()
+    assert cli.main(["compare", str(runs), str(good), "--output", str(tmp_path / "out")]) == 0
+    said = " ".join(capsys.readouterr().out.replace("\n", " ").split())
+    content = json.loads((tmp_path / "out" / "compare.json").read_text())
+    assert {one["run"]: one["why"][:22] for one in content["left_out"]} == {
+        str(stopped): "unfinished: 1 of 3 epi",
+        str(bare): "not evaluated: there i",
+        str(older): "eval.json is of step_0",
+    }
+    assert [run["seed"] for run in content["setups"][0]["runs"]] == [0]
+    for name in (stopped.name, bare.name, older.name):
+        assert f"{name} is left out" in page(tmp_path / "out").text
+    assert said.count("is left out") == 3
+
+
+def spoil(run, change):
+    content = read_evaluation(run)
+    change(content)
+    write_evaluation(run, content)
+
+
+def lacking(content):
+    del content["results"]["huygens"]["learned"]["fire_exits"]
+
+
+def shorter(content):
+    content["results"]["huygens"]["learned"]["coverage"].pop()
+
+
+def not_a_number(content):
+    content["results"]["huygens"]["learned"]["coverage"][1] = float("nan")
+
+
+def fewer_fires(content):
+    content["fires"] = 2
+    for measured in content["results"]["huygens"].values():
+        measured |= {name: values[:2] for name, values in measured.items()}
+
+
+SPOILT = {
+    "text": (lambda run: (run / "eval.json").write_text("{"), ("eval.json", "JSON")),
+    "a list": (lambda run: (run / "eval.json").write_text("[]"), ("eval.json",)),
+    "binary": (lambda run: (run / "eval.json").write_bytes(b"\xff\xfe"), ("eval.json",)),
+    "a measure": (lambda run: spoil(run, lacking), ("eval.json", "learned lacks fire_exits")),
+    "an episode": (lambda run: spoil(run, shorter), ("coverage has 3 episodes; fires=4",)),
+    "nan": (lambda run: spoil(run, not_a_number), ("eval.json", "coverage.1=nan", "finite")),
+    "no fire": (lambda run: spoil(run, lambda c: c["results"].clear()), ("no fire",)),
+    "no learned": (
+        lambda run: spoil(run, lambda c: c["results"]["huygens"].pop("learned")),
+        ("holds no policy 'learned'",),
+    ),
+    "another's": (lambda run: spoil(run, lambda c: c.update(seed=5)), ("seed=5", "says 1")),
+    "fires": (lambda run: spoil(run, fewer_fires), ("number of held-out fires is 4 and 2",)),
+    "starts": (lambda run: spoil(run, lambda c: c.update(start_seed=2)), ("start_seed", "1 and 2")),
+    "held-out": (
+        lambda run: spoil(run, lambda c: c.update(held_out={"huygens": {"fire_seeds": [9]}})),
+        ("were not evaluated on the same fires of huygens",),
+    ),
+    "scenario": (
+        lambda run: spoil(run, lambda c: c.update(results={"x": c["results"]["huygens"]})),
+        ("was evaluated on huygens", "on x"),
+    ),
+    "horizon": (
+        lambda run: (run / "config.yaml").write_text(
+            (run / "config.yaml").read_text().replace("horizon: 40", "horizon: 50")
+        ),
+        ("env.horizon is 40 and 50",),
+    ),
+    "config": (
+        lambda run: (run / "config.yaml").write_text("seed: 1"),
+        ("config.yaml", "'method' is missing"),
+    ),
+    "metrics": (
+        lambda run: (run / "metrics.jsonl").write_text("{}\n"),
+        ("metrics.jsonl: ", "line"),
+    ),
+    "metrics' json": (
+        lambda run: (run / "metrics.jsonl").write_text("{\n"),
+        ("metrics.jsonl: not a file of JSON lines",),
+    ),
+    "an episode twice": (
+        lambda run: (run / "metrics.jsonl").write_text(
+            2 * (run / "metrics.jsonl").read_text().splitlines(keepends=True)[0]
+        ),
+        ("metrics.jsonl: line 2 is not that of episode 2",),
+    ),
+    "a curve": (
+        lambda run: (run / "metrics.jsonl").write_text('{"episode": 1, "score": null}\n'),
+        ("metrics.jsonl: ", "number"),
+    ),
+}
+
+
+@pytest.mark.parametrize("case", SPOILT)
+def test_what_is_wrong_is_said_in_a_line_and_nothing_is_left(case, tmp_path, capsys):
+    change, said = SPOILT[case]
+    write_run(tmp_path / "runs", "consensus", 0)
+    change(write_run(tmp_path / "runs", "independent", 1))
+    assert cli.main(["compare", str(tmp_path / "runs"), "--output", str(tmp_path / "out")]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("emberlink compare: ")
+    assert error.count("\n") == 1
+    for part in said:
+        assert part in error
+    assert [path.name for path in tmp_path.iterdir()] == ["runs"]
+
+
+def test_no_runs(tmp_path, capsys):
+    for path, said in (
+        (tmp_path, "neither a run folder nor a folder that holds runs"),
+        (tmp_path / "missing", "there is no such run folder"),
+    ):
+        assert cli.main(["compare", str(path)]) == 2
+        assert said in capsys.readouterr().err
+    run = write_run(tmp_path)
+    (run / "eval.json").unlink()
+    assert cli.main(["compare", str(run)]) == 2
+    assert capsys.readouterr().err == (
+        "emberlink compare: no finished run among 1: nothing to compare\n"
+    )
+
+
+def test_nothing_is_overwritten(runs, tmp_path, monkeypatch, capsys):
+    taken = tmp_path / "taken"
+    taken.mkdir()
+    (taken / "mine").write_text("x")
+    for path in (taken, taken / "mine"):
+        assert cli.main(["compare", str(runs), "--output", str(path)]) == 2
+        assert "is there and not an empty folder" in capsys.readouterr().err
+    assert [file.name for file in taken.iterdir()] == ["mine"]
+    monkeypatch.chdir(tmp_path)
+    for name in ("compare", "compare_2"):
+        assert cli.main(["compare", str(runs)]) == 0
+        assert capsys.readouterr().out.rstrip().splitlines()[-1] == f"{name}/compare.html"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["compare", "compare_2", "taken"]
+
+
+def test_a_real_run_has_a_timelapse(finished, tmp_path):
+    assert cli.main(["compare", str(finished.parent), "--output", str(tmp_path / "out")]) == 0
+    (timelapse,) = (tmp_path / "out").glob("*timelapse*.png")
+    tags = page(tmp_path / "out")
+    assert len(tags.loaded) == 6
+    assert "frozen policy of step_000000030.safetensors" in tags.text
+    assert timelapse.stat().st_size > 1000
+
+
+def test_help_says_what_compare_does_with_an_example(capsys):
+    with pytest.raises(SystemExit) as ended:
+        cli.main(["compare", "--help"])
+    assert ended.value.code == 0
+    assert "example:\n  emberlink compare" in capsys.readouterr().out

@@ -1,0 +1,144 @@
+"""Statistics over seeds against hand-computed numbers and independent re-implementations."""
+
+import itertools
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from emberlink.trainers import seed_statistics as statistics
+from emberlink.trainers.seed_statistics import advantage, as_ratio, band, improvement, interval, iqm
+
+numbers = st.lists(st.integers(0, 40).map(float), min_size=1, max_size=9)
+several = st.lists(st.integers(0, 40).map(float), min_size=2, max_size=6)
+
+
+def plain_iqm(values) -> float:
+    """The interquartile mean, by hand."""
+    ordered = sorted(values)
+    cut = len(ordered) // 4
+    kept = ordered[cut : len(ordered) - cut]
+    return sum(kept) / len(kept)
+
+
+def plain_improvement(one, other) -> float:
+    """The probability of improvement, pair by pair."""
+    pairs = list(itertools.product(one, other))
+    return sum(1.0 if a > b else 0.5 if a == b else 0.0 for a, b in pairs) / len(pairs)
+
+
+def plain_interval(statistic, *samples) -> tuple[float, float]:
+    """The percentile interval of every resample there is, each as likely as the others."""
+    drawn = [list(itertools.product(sample, repeat=len(sample))) for sample in samples]
+    values = [statistic(*chosen) for chosen in itertools.product(*drawn)]
+    return float(np.quantile(values, 0.025)), float(np.quantile(values, 0.975))
+
+
+@pytest.mark.parametrize(
+    ("values", "expected"),
+    [
+        ([7], 7),
+        ([1, 3], 2),
+        ([1, 2, 9], 4),
+        ([0, 1, 3, 100], 2),
+        ([0, 1, 3, 5, 100], 3),
+        ([8, 7, 6, 5, 4, 3, 2, 1], 4.5),
+    ],
+)
+def test_iqm_of_few_seeds(values, expected):
+    assert iqm(np.asarray(values, float)) == expected
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "expected"),
+    [([2], [1], 1), ([1], [2], 0), ([1], [1], 0.5), ([1, 3], [2, 2], 0.5), ([1, 3], [1, 2], 0.625)],
+)
+def test_probability_of_improvement_by_hand(one, other, expected):
+    assert improvement(np.asarray(one, float), np.asarray(other, float)) == expected
+
+
+@settings(deadline=None)
+@given(numbers, numbers)
+def test_statistics_equal_plain_ones(one, other):
+    a, b = np.asarray(one), np.asarray(other)
+    assert iqm(a) == pytest.approx(plain_iqm(one))
+    assert improvement(a, b) == pytest.approx(plain_improvement(one, other))
+    assert improvement(a, b) + improvement(b, a) == pytest.approx(1)
+
+
+@pytest.mark.parametrize(
+    ("own", "others", "higher", "ratio"),
+    [
+        ([6, 6], ([3, 3], [4, 4]), True, 1.5),
+        ([20], ([30], [26]), False, 1.3),
+        ([2], ([0],), True, float("inf")),
+        ([0], ([5],), False, float("inf")),
+        ([0], ([5],), True, 0),
+        ([0], ([0], [0]), False, 1),
+    ],
+)
+def test_ratio_to_the_best_other(own, others, higher, ratio):
+    share = advantage(
+        np.asarray(own, float), *(np.asarray(o, float) for o in others), higher=higher
+    )
+    assert as_ratio(float(share)) == pytest.approx(ratio)
+
+
+def test_one_seed_gives_no_interval_and_two_their_range():
+    assert interval(iqm, [3.0]) is None
+    assert interval(improvement, [3.0, 4.0], [1.0]) is None
+    assert interval(iqm, [3.0, 5.0]) == (3, 5)
+    assert interval(iqm, [3.0, 5.0, 4.0]) == (3, 5)
+    assert interval(iqm, [4.0, 4.0, 4.0]) == (4, 4)
+
+
+@pytest.mark.parametrize("values", [[1, 2, 4, 8], [0.1, 0.7, 0.2, 0.9, 0.4]])
+def test_interval_is_that_of_all_resamples(values):
+    low, high = plain_interval(lambda chosen: plain_iqm(chosen), values)
+    got = interval(iqm, values)
+    # 10,000 of them are drawn, so that the ends may fall on the neighbouring value.
+    assert got is not None
+    assert got == pytest.approx((low, high), abs=0.06 * (max(values) - min(values)))
+    # Of 4 seeds the ends are the worst and the best, of 5 they are within.
+    assert (got == (min(values), max(values))) == (len(values) < statistics.FEW)
+
+
+def test_interval_draws_within_each_method():
+    one, other = [1.0, 4.0, 5.0], [2.0, 3.0, 6.0]
+    expected = plain_interval(plain_improvement, one, other)
+    assert interval(improvement, one, other) == pytest.approx(expected, abs=1 / 9)
+    # Drawn from both together the ends would be 0 and 1.
+    apart = interval(improvement, [1.0, 2.0, 3.0], [7.0, 8.0, 9.0])
+    assert apart == (0, 0)
+
+
+@settings(deadline=None, max_examples=25)
+@given(several, several)
+def test_intervals_hold_the_statistic_and_do_not_depend_on_what_was_drawn_before(one, other):
+    first = interval(iqm, one)
+    interval(improvement, one, other)
+    assert interval(iqm, one) == first
+    assert first is not None
+    assert min(one) <= first[0] <= first[1] <= max(one)
+    got = interval(improvement, one, other)
+    assert got is not None
+    assert 0 <= got[0] <= got[1] <= 1
+
+
+def test_band_is_the_interval_at_every_episode():
+    values = np.random.default_rng(0).random((5, 3))
+    ends = band(values)
+    assert ends is not None
+    for episode in range(3):
+        expected = interval(iqm, values[:, episode].tolist())
+        assert (ends[0][episode], ends[1][episode]) == expected
+    assert band(values[:1]) is None
+
+
+def test_few_seeds_hold_the_median_as_seldom_as_is_said():
+    draws = np.random.default_rng(0).standard_normal((20_000, 4))
+    for seeds, share in ((2, 0.5), (3, 0.75), (4, 0.875)):
+        some = draws[:, :seeds]
+        held = (some.min(1) < 0) & (some.max(1) > 0)
+        assert held.mean() == pytest.approx(share, abs=0.01)

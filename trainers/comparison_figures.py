@@ -1,0 +1,101 @@
+"""The paper's figures 5 to 9 for several methods and seeds."""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import MaxNLocator
+
+from .comparison_numbers import Curve, Numbers
+from .figures import CURVES
+
+FIGURES = {
+    5: (("score",), "Averaged rewards collected by all UAVs at each episode."),
+    6: (("coverage",), "The share of the fire region that was seen, of all that burns."),
+    7: (
+        ("tracking_first", "tracking_last"),
+        "The fastest (solid) and slowest (dotted) time taken by the UAVs to track the fire.",
+    ),
+    8: (("boundary_exits",), "Attempted moves out of the box, mean over UAVs."),
+    9: (("fire_exits",), "Times a UAV fell out of the fire region, mean over UAVs."),
+}
+"""the paper's number -> a measure per panel, and what it shows"""
+COLOURS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#D55E00", "#56B4E9", "#8C6D00", "#000000")
+"""of methods; told apart by the colour-blind (Okabe and Ito, 2008; a dark yellow in place of the
+yellow that white paper hides)"""
+DASHES = (
+    *((0, (7, 3)), (0, (7, 2, 1, 2)), (0, (3, 2)), (0, (7, 2, 1, 2, 1, 2)), (0, (12, 4))),
+    *((0, (3, 2, 1, 2)), (0, (12, 2, 3, 2)), (0, (1, 1))),
+)
+"""of scripted policies"""
+DOTTED = "tracking_last"
+"""drawn dotted, as in the paper's figure 7"""
+
+
+def figure(path: Path, numbers: Numbers, measures: tuple[str, ...]) -> None:
+    """One of the paper's figures: over training, a line per method and a band over its seeds.
+
+    Args:
+        path: a .png file.
+        numbers: of a setup.
+        measures: a panel each.
+    """
+    figure = Figure(figsize=(9.2, 3.8), layout="constrained")
+    colours = {
+        group.label: COLOURS[i % len(COLOURS)] for i, group in enumerate(numbers.section.groups)
+    }
+    policies = _policies(numbers)
+    panels = figure.subplots(1, len(measures), squeeze=False)[0]
+    for axes, measure in zip(panels, measures, strict=True):
+        _scripted_lines(axes, numbers, measure, policies, colours)
+        _curves(axes, numbers.curves[measure], measure, colours)
+        axes.set(xlabel="episode of training", ylabel=CURVES[measure])
+        axes.xaxis.set_major_locator(MaxNLocator(nbins=6, integer=True))
+        axes.grid(alpha=0.3)
+    handles = [Line2D([], [], color=colour, lw=2, label=name) for name, colour in colours.items()]
+    handles += [
+        Line2D([], [], color="0.3", ls=dash, lw=1.3, label=f"scripted: {name.replace('_', ' ')}")
+        for name, dash in policies.items()
+    ]
+    legend = figure.legend(
+        handles=handles, loc="outside right upper", frameon=False, handlelength=3
+    )
+    for text in legend.get_texts():  # a name is no formula
+        text.set_parse_math(False)
+    figure.savefig(path, dpi=120, metadata={"Software": None})
+
+
+def _curves(
+    axes: Axes, curves: Mapping[str, Curve], measure: str, colours: Mapping[str, str]
+) -> None:
+    for label, curve in curves.items():
+        episodes = range(1, len(curve.iqm) + 1)
+        colour, style = colours[label], ":" if measure == DOTTED else "-"
+        marker = "o" if len(episodes) == 1 else ""
+        axes.plot(episodes, curve.iqm, color=colour, ls=style, lw=2, marker=marker)
+        if curve.low is not None and curve.high is not None:
+            axes.fill_between(episodes, curve.low, curve.high, color=colour, alpha=0.18, lw=0)
+
+
+def _policies(numbers: Numbers) -> dict[str, tuple[int, tuple[int, ...]]]:
+    """The scripted policies and their dashes."""
+    names = sorted({policy for one in numbers.on_trained for policy in one.scripted})
+    return {name: DASHES[i % len(DASHES)] for i, name in enumerate(names)}
+
+
+def _scripted_lines(
+    axes: Axes,
+    numbers: Numbers,
+    measure: str,
+    policies: Mapping[str, tuple[int, tuple[int, ...]]],
+    colours: Mapping[str, str],
+) -> None:
+    """A line per scripted policy; where its number is one method's own, in that method's colour."""
+    for ranking in numbers.on_trained:
+        if ranking.measure == measure:
+            for policy, by_method in ranking.scripted.items():
+                for methods, value in by_method.items():
+                    colour = colours.get(methods, "0.3")
+                    axes.axhline(value, color=colour, ls=policies[policy], lw=1.3, zorder=1)
