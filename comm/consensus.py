@@ -1,6 +1,5 @@
 """A network that agrees whom to follow: method 4 of the paper (section IV.F, algorithm 3)."""
 
-import math
 from typing import Annotated, Any, ClassVar, Literal
 
 import torch
@@ -29,7 +28,7 @@ FIRE_SCORE = (keys.AGENTS, "fire_score")
 ALTITUDE_SUM = (keys.AGENTS, "altitude_sum")
 """float64 [...]: the altitudes of the streak added up; divided by the streak it is Avg_Alt."""
 
-_WAYPOINTS, _JITTER = range(100, 102)  # what a moment's random stream is split into
+_WAYPOINTS, _JITTER, _LOST = range(100, 103)  # what a moment's random stream is split into
 
 
 @dataclass(frozen=True, kw_only=True, config=ConfigDict(extra="forbid", strict=True))
@@ -44,6 +43,14 @@ class ConsensusConfig:
     """standard deviation of what is added to x and y of a target closer than 1, cells"""
     target: Literal["absolute", "relative"] = "absolute"
     """whether the UAV is told the target's coordinates or the way to it"""
+    agree: bool = True
+    """whether sub-networks agree; if not, a UAV knows of the discoverers it hears itself alone"""
+    follow: Literal["best", "nearest"] = "best"
+    """which of the discoverers that it knows of a UAV follows: of highest rank, or nearest to it"""
+    wander: bool = True
+    """whether who has nobody to follow is given random targets; if not, it has no target"""
+    loss: Annotated[float, Field(ge=0, le=1)] = 0.0
+    """probability that nothing gets from one UAV to another in a step, each way for itself"""
     heading: HeadingConfig = HeadingConfig()
     """the bonus for flying towards the target"""
 
@@ -98,7 +105,9 @@ class Consensus(CommModule):
         position = tensordict.get(keys.POSITION)
         discovers = self._discovers(tensordict)
         rank = self._track_record(tensordict, discovers)
-        follows = best_discoverer(neighbours(position, self.config.range), discovers, rank)
+        known = known_discoverers(self._hears(tensordict), discovers, agree=self.config.agree)
+        worse = -rank.unsqueeze(-2) if self.config.follow == "best" else apart(position)
+        follows = first_choice(known, worse, discovers)
         target = self._targets(tensordict, discovers, follows)
         tensordict.set(FOLLOWS, follows)
         tensordict.set(TARGET, target)
@@ -114,8 +123,19 @@ class Consensus(CommModule):
         if heading.circle:
             old_alone = self._discovers(before) & (before.get(keys.NEW_FIRE) == 0)
             term = torch.where(old_alone, heading.circle * circling(*flight), term)
+        if not self.config.wander:
+            term = term.masked_fill(before.get(FOLLOWS) < 0, 0.0)
         left = left_box(after.get(keys.BEYOND), self.world.reward.exit_axes)
         return term.masked_fill(left, 0.0)
+
+    def _hears(self, tensordict: TensorDictBase) -> Tensor:
+        """Who hears whom at this moment, bool [..., n, n]."""
+        heard = neighbours(tensordict.get(keys.POSITION), self.config.range)
+        if self.config.loss:
+            uavs = heard.shape[-1]
+            unit = streams.uniform(self._stream(tensordict, _LOST), uavs * uavs)
+            heard = heard & (unit.unflatten(-1, (uavs, uavs)) >= self.config.loss)
+        return heard
 
     def _discovers(self, tensordict: TensorDictBase) -> Tensor:
         fire = tensordict.get(keys.NEW_FIRE)
@@ -147,7 +167,8 @@ class Consensus(CommModule):
         new = (tensordict.get(keys.NEW_FIRE) > 0).unsqueeze(-1)
         centre = torch.where(new, tensordict.get(keys.NEW_CENTRE), tensordict.get(keys.OLD_CENTRE))
         leader = follows.clamp(min=0).unsqueeze(-1).expand_as(position)
-        target = torch.where(wanders[..., None], waypoint, position.gather(-2, leader))
+        alone = waypoint if self.config.wander else position
+        target = torch.where(wanders[..., None], alone, position.gather(-2, leader))
         over_fire = torch.cat((centre, position[..., 2:]), -1)
         target = torch.where(discovers[..., None], over_fire, target)
         return self._jittered(tensordict, target) if self.config.jitter else target
@@ -172,6 +193,11 @@ class Consensus(CommModule):
         return uav.scale_to_box(told, self.low, self.high)
 
 
+def apart(position: Tensor) -> Tensor:
+    """Distances between UAVs, float64 [..., n, n], cells; of positions [..., n, 3]."""
+    return uav.distance(position.unsqueeze(-2), position.unsqueeze(-3))
+
+
 def neighbours(position: Tensor, limit: float) -> Tensor:
     """Who hears whom: another UAV at a distance below `limit`, bool [..., n, n].
 
@@ -179,35 +205,45 @@ def neighbours(position: Tensor, limit: float) -> Tensor:
         position: float32 [..., n, 3], cells.
         limit: communication range, cells.
     """
-    near = uav.distance(position.unsqueeze(-2), position.unsqueeze(-3)) < limit
+    near = apart(position) < limit
     return near & ~torch.eye(near.shape[-1], dtype=torch.bool, device=near.device)
 
 
-def best_discoverer(adjacent: Tensor, discovers: Tensor, rank: Tensor) -> Tensor:
-    """Whom each UAV follows once its sub-network has agreed, int64 [..., n].
+def known_discoverers(heard: Tensor, discovers: Tensor, *, agree: bool = True) -> Tensor:
+    """Which discoverers each UAV knows of once its sub-network has agreed, bool [..., n, n].
 
-    A non-discoverer hears the discoverers among its neighbours; the non-discoverers that are
-    connected through non-discoverers then agree on the best of all they hear: the highest rank,
-    among equal ones the lowest index. Discoverers follow themselves; -1 stands for nobody.
+    A non-discoverer hears the discoverers among its neighbours; non-discoverers that are connected
+    through non-discoverers then know of all that any of them hears.
 
     Args:
-        adjacent: bool [..., n, n], who hears whom.
+        heard: bool [..., n, n], who (row) hears whom (column).
         discovers: bool [..., n].
-        rank: [..., n], read for discoverers only.
+        agree: whether they tell each other.
     """
     uavs = discovers.shape[-1]
-    itself = torch.eye(uavs, dtype=torch.bool, device=adjacent.device)
-    # Place 0 is the best discoverer; a stable sort puts the lower index first among equals.
-    known = rank.masked_fill(~discovers, -math.inf)
-    order = torch.sort(known, dim=-1, descending=True, stable=True).indices
-    place = order.argsort(-1).masked_fill(~discovers, uavs)
-    heard = place.unsqueeze(-2).masked_fill(~adjacent, uavs).amin(-1)
+    known = heard & discovers.unsqueeze(-2)
+    if not agree:
+        return known
     # Exchanging with neighbours once per round reaches, after k doublings, all within 2**k hops.
     silent = ~discovers
-    within = ((adjacent & silent.unsqueeze(-1) & silent.unsqueeze(-2)) | itself).float()
+    itself = torch.eye(uavs, dtype=torch.bool, device=heard.device)
+    within = ((heard & silent.unsqueeze(-1) & silent.unsqueeze(-2)) | itself).float()
     for _ in range((uavs - 1).bit_length()):
         within = (within @ within).clamp_(max=1)
-    agreed = heard.unsqueeze(-2).masked_fill(within == 0, uavs).amin(-1)
-    chosen = torch.where(discovers, place, agreed)
-    followed = order.gather(-1, chosen.clamp(max=uavs - 1))
-    return torch.where(chosen < uavs, followed, -1)
+    return (within @ known.float()) > 0
+
+
+def first_choice(known: Tensor, worse: Tensor, discovers: Tensor) -> Tensor:
+    """Whom each UAV follows, int64 [..., n]: itself if a discoverer, -1 if it knows of none.
+
+    Args:
+        known: bool [..., n, n], the discoverers that a UAV (row) knows of.
+        worse: [..., n or 1, n], what is better the lower it is; among equals the lower index.
+        discovers: bool [..., n].
+    """
+    uavs = discovers.shape[-1]
+    # Places differ, so that the least of them is one UAV on every device.
+    place = torch.sort(worse, dim=-1, stable=True).indices.argsort(-1)
+    best, chosen = place.masked_fill(~known, uavs).min(-1)
+    chosen = torch.where(best < uavs, chosen, -1)
+    return torch.where(discovers, torch.arange(uavs, device=chosen.device), chosen)

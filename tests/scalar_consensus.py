@@ -1,7 +1,7 @@
 """Method 4 for one network of UAVs in plain Python: loops, dictionaries, explicit rounds."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 
 Point = tuple[float, float, float]
 
@@ -12,15 +12,30 @@ class ScalarConsensus:
     Args:
         reach: UAVs nearer than this hear each other, cells.
         any_fire: whether old fire makes a discoverer too.
+        agree: whether UAVs tell each other what they hear.
+        nearest: whether they follow the nearest discoverer in place of the best.
     """
 
-    def __init__(self, reach: float, *, any_fire: bool = False):
-        self.reach, self.any_fire = reach, any_fire
+    def __init__(
+        self, reach: float, *, any_fire: bool = False, agree: bool = True, nearest: bool = False
+    ):
+        self.reach, self.any_fire, self.agree, self.nearest = reach, any_fire, agree, nearest
         self.history: dict[int, list[tuple[int, float]]] = {}
         """discoverer -> (fire points, altitude) of each step of its streak"""
 
-    def step(self, position: Sequence[Point], new: Sequence[int], old: Sequence[int]) -> list[int]:
-        """Whom each UAV follows after this moment: itself if a discoverer, -1 if nobody."""
+    def step(
+        self,
+        position: Sequence[Point],
+        new: Sequence[int],
+        old: Sequence[int],
+        lost: Container[tuple[int, int]] = (),
+    ) -> list[int]:
+        """Whom each UAV follows after this moment: itself if a discoverer, -1 if nobody.
+
+        Args:
+            position, new, old: of each UAV.
+            lost: the pairs (i, j) of which i does not hear j.
+        """
         uavs = range(len(position))
         finds = [new[i] > 0 or (self.any_fire and old[i] > 0) for i in uavs]
         for i in uavs:
@@ -29,31 +44,30 @@ class ScalarConsensus:
             else:
                 self.history.pop(i, None)
         hears = {
-            i: [j for j in uavs if j != i and math.dist(position[i], position[j]) < self.reach]
+            i: [
+                j
+                for j in uavs
+                if j != i
+                and math.dist(position[i], position[j]) < self.reach
+                and (i, j) not in lost
+            ]
             for i in uavs
         }
-        # What a UAV knows is (rank, -index): the maximum is the best, among equals the first.
-        knows = {
-            i: max(((self.rank(j), -j) for j in hears[i] if finds[j]), default=None)
-            for i in uavs
-            if not finds[i]
-        }
-        while True:
-            told = {
-                i: max(
-                    (knows[j] for j in (i, *hears[i]) if j in knows and knows[j] is not None),
-                    default=None,
-                )
-                for i in knows
-            }
+        knows = {i: {j for j in hears[i] if finds[j]} for i in uavs if not finds[i]}
+        while self.agree:
+            told = {i: knows[i].union(*(knows[j] for j in hears[i] if not finds[j])) for i in knows}
             if told == knows:
                 break
             knows = told
-        follows = []
-        for i in uavs:
-            best = knows.get(i)
-            follows.append(i if finds[i] else -1 if best is None else -best[1])
-        return follows
+
+        def worse(i: int, j: int) -> tuple[float, int]:
+            """Of two, the one for which this is lower is followed."""
+            return (math.dist(position[i], position[j]) if self.nearest else -self.rank(j)), j
+
+        return [
+            i if finds[i] else min(knows[i], key=lambda j, i=i: worse(i, j), default=-1)
+            for i in uavs
+        ]
 
     def streak(self, uav: int) -> int:
         """Consecutive steps as a discoverer."""

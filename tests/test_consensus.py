@@ -10,9 +10,16 @@ from torch import Tensor
 
 from emberlink.comm import consensus
 from emberlink.comm.base import Communication
-from emberlink.comm.consensus import Consensus, ConsensusConfig, best_discoverer, neighbours
+from emberlink.comm.consensus import (
+    Consensus,
+    ConsensusConfig,
+    first_choice,
+    known_discoverers,
+    neighbours,
+)
 from emberlink.envs import keys
 from emberlink.envs.config import WildfireConfig
+from emberlink.envs.reward import HeadingConfig
 
 WORLD = WildfireConfig(grid=(64, 64))
 
@@ -98,11 +105,64 @@ def test_no_range_is_silence_and_infinite_range_is_one_network():
     assert follows(same, [0, 3, 0], config=ConsensusConfig(range=0.0)) == [-1, 1, -1]
 
 
-def test_best_discoverer_reads_the_ranks_of_discoverers_only():
+def test_the_choice_reads_the_ranks_of_discoverers_only():
     everyone = ~torch.eye(3, dtype=torch.bool)
     discovers = torch.tensor([False, True, False])
     rank = torch.tensor([math.inf, -1.0, 99.0])
-    assert best_discoverer(everyone, discovers, rank).tolist() == [1, 1, 1]
+    known = known_discoverers(everyone, discovers)
+    assert first_choice(known, -rank.unsqueeze(-2), discovers).tolist() == [1, 1, 1]
+
+
+def test_without_agreement_only_neighbours_are_known():
+    # 0 - [1] - 2 - 3 - 4 - [5]: 3 hears neither of the two.
+    alone = ConsensusConfig(agree=False)
+    assert follows(in_a_row(6), [0, 1, 0, 0, 0, 9], config=alone) == [1, 1, 1, -1, 5, 5]
+    assert follows(in_a_row(6), [0, 1, 0, 0, 0, 9]) == [1, 1, 5, 5, 5, 5]
+
+
+def test_the_nearest_discoverer_in_place_of_the_best():
+    nearest = ConsensusConfig(follow="nearest")
+    # 2 to 4 learn of both from each other; 5 has found more, and 3 is as near to 1: lower index.
+    assert follows(in_a_row(6), [0, 1, 0, 0, 0, 9], config=nearest) == [1, 1, 1, 1, 5, 5]
+
+
+def test_without_wandering_there_is_no_target_and_no_bonus():
+    still = ConsensusConfig(
+        wander=False, target="relative", heading=HeadingConfig(form="approach", weight=2.0)
+    )
+    talk = Communication(Consensus(WORLD, still))
+    start = [[5.0, 5.0, 2.0], [30.0, 30.0, 2.0], [33.0, 34.0, 2.0]]
+    moved = [[5.0, 6.0, 2.0], [30.0, 30.0, 2.0], [33.0, 33.0, 2.0]]
+    first = moment(start, [0, 4, 0], centre=[[0.0, 0.0], [30.0, 30.0], [0.0, 0.0]])
+    first = talk._reset(first, first)
+    assert first[consensus.FOLLOWS].tolist() == [[-1, 1, 1]]
+    assert first[consensus.TARGET][0, 0].tolist() == start[0]
+    assert first[keys.OBSERVATION][0, 0, -3:].tolist() == [0.0, 0.0, 0.0]
+    second = talk._step(first, moment(moved, [0, 0, 0], step=1))
+    # The first has no target; the third came from 5 to sqrt(18) of the second.
+    expected = torch.tensor([0.0, 0.0, 2 * (5 - 18**0.5)])
+    torch.testing.assert_close(second[keys.REWARD].flatten(), expected)
+
+
+@pytest.mark.parametrize("loss", [0.0, 0.2, 0.5, 1.0])
+def test_messages_are_lost_as_often_as_they_are_said_to_be(loss):
+    envs, uavs = 500, 6
+    module = Consensus(WORLD, ConsensusConfig(loss=loss, range=math.inf))
+    position = torch.rand(envs, uavs, 3) * 20 + 1
+    heard = torch.stack(
+        [
+            module._hears(moment(position, torch.zeros(envs, uavs).long(), step=step))
+            for step in range(3)
+        ]
+    )
+    assert not heard.diagonal(dim1=-2, dim2=-1).any()
+    off = ~torch.eye(uavs, dtype=torch.bool)
+    share = heard[..., off].float().mean().item()
+    assert share == pytest.approx(1 - loss, abs=0.01)  # 45,000 links, 4 standard deviations
+    if 0 < loss < 1:
+        both = (heard & heard.mT)[..., off].float().mean().item()
+        assert both == pytest.approx((1 - loss) ** 2, abs=0.015)  # each way for itself
+        assert not heard[0].equal(heard[1])
 
 
 def walk(module: Consensus, *moments: TensorDict) -> TensorDict:

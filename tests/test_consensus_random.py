@@ -12,7 +12,7 @@ from torch import Tensor
 from emberlink.comm import consensus
 from emberlink.comm.base import Communication
 from emberlink.comm.consensus import Consensus, ConsensusConfig
-from emberlink.envs import keys
+from emberlink.envs import keys, streams
 from emberlink.envs.config import WildfireConfig
 from emberlink.envs.reward import HeadingConfig
 
@@ -28,10 +28,21 @@ def test_random_networks_equal_plain_python(uavs):
         range=dice.choice([4.0, 7.0, 10.0]),
         discoverer="any_fire" if any_fire else "new_fire",
         heading=HeadingConfig(form=form),
+        agree=uavs % 5 != 2,
+        follow="nearest" if uavs % 4 in (1, 2) else "best",
+        loss=0.3 if uavs % 3 == 0 else 0.0,
     )
     world = WildfireConfig()
     talk = Communication(Consensus(world, config))
-    scalars = [ScalarConsensus(config.range, any_fire=any_fire) for _ in range(envs)]
+    scalars = [
+        ScalarConsensus(
+            config.range,
+            any_fire=any_fire,
+            agree=config.agree,
+            nearest=config.follow == "nearest",
+        )
+        for _ in range(envs)
+    ]
     low, high = torch.tensor(world.low), torch.tensor(world.high)
     generator = torch.Generator().manual_seed(uavs)
 
@@ -54,7 +65,10 @@ def test_random_networks_equal_plain_python(uavs):
             step=step,
         )
         now = talk._reset(now, now) if before is None else talk._step(before, now)
+        unit = streams.uniform(streams.at(now[keys.STREAM], now[keys.STEP], 102), uavs * uavs)
+        lost = (unit < config.loss).unflatten(-1, (uavs, uavs))
         for env in range(envs):
+            scalars[env].lost = {tuple(pair) for pair in lost[env].nonzero().tolist()}
             followed += compare(
                 scalars[env], now[env], None if before is None else before[env], config
             )
@@ -68,7 +82,7 @@ def compare(scalar: ScalarConsensus, now, before, config: ConsensusConfig) -> in
     """Asserts that a moment of one environment is as plain Python has it; counts the seekers."""
     position = [tuple(p) for p in now[keys.POSITION].tolist()]
     new, old = now[keys.NEW_FIRE].tolist(), now[keys.OLD_FIRE].tolist()
-    follows = scalar.step(position, new, old)
+    follows = scalar.step(position, new, old, scalar.lost)
     assert now[consensus.FOLLOWS].tolist() == follows
     streaks = now[consensus.STREAK].tolist()
     target = now[consensus.TARGET].tolist()
