@@ -16,7 +16,7 @@ UNFINISHED := $(VENV)/emberlink-unfinished
 PIP := $(BIN)/python -m pip install -q --disable-pip-version-check -c constraints.txt
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test bench guard lint typecheck install clean
+.PHONY: help demo test soak bench guard lint typecheck install clean
 
 help:  ## list the targets
 	@sed -n 's/^\([a-z]*\):.*## /  make \1\t/p' $(MAKEFILE_LIST) | expand -t 20
@@ -26,6 +26,9 @@ demo: $(INSTALLED)  ## train consensus for a few minutes, evaluate it, leave fig
 
 test: $(INSTALLED)  ## run the tests
 	@OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n $(WORKERS) --dist loadgroup
+
+soak: $(INSTALLED)  ## kill, interrupt and damage trainings over and over (about half an hour)
+	@OMP_NUM_THREADS=1 $(BIN)/python tests/soak/soak.py $(SOAK)
 
 bench: $(INSTALLED)  ## run the benchmarks (about half an hour; BENCH="-k update" runs some)
 	@$(BIN)/python -m pytest tests/benchmarks -q -p no:xdist -o python_files='bench_*.py' $(BENCH)

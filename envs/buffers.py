@@ -9,7 +9,8 @@ class Buffers(nn.Module):
     """A module that has its buffers and submodules as plain attributes as well.
 
     `nn.Module` finds them only after everything else has been tried: a tenth of a step of one
-    environment. Buffers are to be written in place, and moved with `to`.
+    environment. Buffers are to be written in place, and moved with `to`. Those that change with the
+    steps are an environment's state, which a checkpoint holds; constants are `persistent=False`.
     """
 
     def register_buffer(self, name: str, tensor: Tensor | None, persistent: bool = True) -> None:

@@ -38,12 +38,16 @@ class Discovery(Buffers):
     def __init__(self, view: View, fires: Tensor, *, horizon: int, envs: int, uavs: int):
         super().__init__()
         self._view, self._horizon, self._uavs = view, horizon, uavs
-        self.register_buffer("_growth", burning_cells(fires, horizon).flatten())
+        self.register_buffer("_growth", burning_cells(fires, horizon).flatten(), persistent=False)
         # Beyond the edge nothing burns and nothing does not: NaN is neither before nor after now.
-        self.register_buffer("_fires", view.pad(fires, torch.nan))
-        self.register_buffer("_start", torch.arange(envs).unsqueeze(-1) * view.area)
-        self.register_buffer("_uav", torch.arange(uavs, dtype=torch.int32).unsqueeze(-1))
-        self.register_buffer("_never", torch.tensor(_NEVER, dtype=torch.int32))
+        self.register_buffer("_fires", view.pad(fires, torch.nan), persistent=False)
+        self.register_buffer(
+            "_start", torch.arange(envs).unsqueeze(-1) * view.area, persistent=False
+        )
+        self.register_buffer(
+            "_uav", torch.arange(uavs, dtype=torch.int32).unsqueeze(-1), persistent=False
+        )
+        self.register_buffer("_never", torch.tensor(_NEVER, dtype=torch.int32), persistent=False)
         self.register_buffer("_arrival", self._fires[:1].repeat(envs, 1))
         self.register_buffer("_growth_start", torch.zeros(envs, dtype=torch.int64))
         first_seen = torch.full((envs, view.area), _NEVER, dtype=torch.int32)

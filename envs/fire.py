@@ -13,11 +13,11 @@ from typing import Annotated, Literal, get_args
 
 import torch
 from omegaconf import OmegaConf
-from pydantic import AfterValidator, ConfigDict, Field, Strict
+from pydantic import AfterValidator, ConfigDict, Field, Strict, ValidationError
 from pydantic.dataclasses import dataclass
 from torch import Tensor
 
-from .config import known
+from .config import Name, describe, known
 from .spread import MAX_LENGTH_TO_BREADTH, arrival_times, disc
 from .streams import fold, uniform
 
@@ -57,7 +57,7 @@ _Count = Annotated[int, Field(ge=0, le=32)]
 class FireConfig:
     """A distribution of fires: each pair (low, high) is the range of a uniform draw."""
 
-    name: Annotated[str, Field(min_length=1)]
+    name: Name
     """Name of the scenario, that of its file."""
     bank: Annotated[int, Field(ge=1, lt=HELD_OUT_FROM)]
     """Number of fires to train on."""
@@ -108,7 +108,10 @@ def load_scenario(name: str) -> FireConfig:
         raise ValueError(f"unknown fire {name!r}; known: {', '.join(scenarios())}")
     file = resources.files("emberlink.configs").joinpath("fire", f"{name}.yaml")
     values = OmegaConf.to_container(OmegaConf.create(file.read_text(encoding="utf-8")))
-    return FireConfig(**values)  # pyright: ignore[reportCallIssue]
+    try:
+        return FireConfig(**values)  # pyright: ignore[reportCallIssue]
+    except ValidationError as error:
+        raise ValueError(f"configs/fire/{name}.yaml: {describe(error)}") from None
 
 
 def fire_seeds(split: Split, count: int, start: int = 0) -> Tensor:

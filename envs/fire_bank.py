@@ -108,14 +108,16 @@ def arrival_times(
 
 def _read(file: Path, shape: tuple[int, ...]) -> Tensor | None:
     """The bank in a file, or None if there is none or it is not one."""
+    if not file.is_file():  # a pipe would never end
+        return None
     try:
-        with file.open("rb") as handle:
-            array = np.lib.format.read_array(handle, allow_pickle=False)
+        # Mapped, so that a header that promises more than there is costs no memory.
+        array = np.load(file, mmap_mode="r", allow_pickle=False)
+        if array.dtype != np.float32 or array.shape != shape or not (array >= 0).all():
+            return None
+        return torch.from_numpy(np.array(array))
     except Exception:  # numpy raises what it likes on a damaged header, TokenError among others
         return None
-    if array.dtype != np.float32 or array.shape != shape:
-        return None
-    return torch.from_numpy(array) if (array >= 0).all() else None
 
 
 def _write(file: Path, fires: Tensor) -> None:

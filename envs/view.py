@@ -38,11 +38,13 @@ class View(Buffers):
         self._slope = math.tan(math.radians(view_angle))
         offsets = torch.arange(-reach, reach + 1)
         i, j = torch.meshgrid(offsets, offsets, indexing="ij")
-        self.register_buffer("_offsets", offsets.double())
-        self.register_buffer("_window", ((i + reach) * self._padded[1] + j + reach).flatten())
+        self.register_buffer("_offsets", offsets.double(), persistent=False)
+        self.register_buffer(
+            "_window", ((i + reach) * self._padded[1] + j + reach).flatten(), persistent=False
+        )
         # In float64, so that the sums of a window of any size are whole numbers.
         moments = torch.stack((i, j, torch.ones_like(i)), -1).flatten(0, 1)
-        self.register_buffer("_moments", moments.double())
+        self.register_buffer("_moments", moments.double(), persistent=False)
 
     @property
     def area(self) -> int:

@@ -70,8 +70,8 @@ class WildfireEnv(Buffers, EnvBase):
                 config = WildfireConfig(grid=(fire.shape[-2], fire.shape[-1]))
         self.config = config
         low, high = uav.corners(config.low, config.high)
-        self.register_buffer("_low", low)
-        self.register_buffer("_high", high)
+        self.register_buffer("_low", low, persistent=False)
+        self.register_buffer("_high", high, persistent=False)
         view = View(config.grid, view_angle=config.view_angle, ceiling=high[2].item())
         fires, self._fire_each = arrival_times(fire, config, num_envs)
         self._map = Discovery(

@@ -51,7 +51,10 @@ def test_train_leaves_the_files_and_prints_the_table(tmp_path, capsys):
     (folder,) = output.iterdir()
     check_evaluation(folder, out)
     assert len((folder / "metrics.jsonl").read_text().splitlines()) == 2
-    assert [f.name for f in (folder / "checkpoints").iterdir()] == ["step_000000030.safetensors"]
+    names = sorted(f.name for f in (folder / "checkpoints").iterdir())
+    assert names == [
+        f"{name}.safetensors" for name in ("best", "state_000000030", "step_000000030")
+    ]
     assert (folder / "figures" / "training.png").stat().st_size > 1000
 
 

@@ -1,8 +1,6 @@
 """What the commands do."""
 
-import signal
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,59 +13,98 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
+from emberlink.envs.config import known
+
 from . import report
-from .cli import INTERRUPTED
 from .config import RunConfig, check_device, resolve
 from .evaluate import Policy
+from .interruption import Interrupted, Interruption
 from .loop import Progress as Moment
 from .loop import Trainer
+from .resume import resume
 from .run_folder import RunFolder
 
 
-def train(method: str, overrides: Sequence[str], console: Console) -> int:
-    """Trains a recipe, then evaluates it. Ctrl-C saves the networks and ends the training."""
-    config = resolve(method, overrides)
-    trainer = Trainer(config)
-    trainer.start()
-    for run in trainer.runs:
-        console.print(f"{method}, setup {config.setup}, fire {config.fire.name} -> {run.path}")
+def train(method: str | None, overrides: Sequence[str], console: Console) -> int:
+    """Trains a recipe, or goes on with a run, then evaluates it.
+
+    Ctrl-C and SIGTERM finish the step, save, and end the training.
+    """
+    trainer = _trainer(method, overrides, console)
+    config = trainer.config
+    if trainer.step == trainer.steps and (trainer.run.path / "eval.json").exists():
+        trainer.close()
+        console.print(
+            f"{trainer.run.path} is finished, {config.episodes} episodes; nothing is left to do. "
+            f"More: emberlink train resume={trainer.run.path} episodes={2 * config.episodes}",
+            soft_wrap=True,
+        )
+        return 0
     if trainer.enough > trainer.steps * config.num_envs:
         console.print(
             f"note: learner.batch={config.learner.batch} is more than this run collects: "
             "nothing will be learnt",
             style="yellow",
         )
+    interruption = Interruption(trainer.stop)
     try:
-        with _stopping_between_steps(trainer):
-            finished = _train_with_bar(trainer, console)
-        if not finished:
-            raise KeyboardInterrupt
-        for team, (one, run) in enumerate(zip(trainer.configs, trainer.runs, strict=True)):
-            actor, fires = trainer.team_actor(team), config.evaluation.fires
-            _evaluate(run, one, actor, run.checkpoint(), fires, console)
+        with interruption:
+            _train_with_bar(trainer, console)
+            interruption.at_once = True
+            if interruption.received:
+                raise Interrupted
+            for team, (one, run) in enumerate(zip(trainer.configs, trainer.runs, strict=True)):
+                actor, fires = trainer.team_actor(team), config.evaluation.fires
+                _evaluate(run, one, actor, run.checkpoint(), fires, console)
     except KeyboardInterrupt:
-        for run in trainer.runs:
-            console.print(
-                f"stopped; what was learnt is in {run.checkpoint()}\n"
-                f"evaluate it with: emberlink eval {run.path}"
-            )
-        return INTERRUPTED
+        _say_where(trainer, console)
+        return interruption.status
+    except ValueError as error:
+        raise ValueError(f"{error}; {_newest(trainer)}") from None
     return 0
 
 
-@contextmanager
-def _stopping_between_steps(trainer: Trainer) -> Iterator[None]:
-    """Ctrl-C lets the step finish, so that what is saved is whole; a second one does not wait."""
+def _trainer(method: str | None, overrides: Sequence[str], console: Console) -> Trainer:
+    """A new training, or that of the run folder that `resume=` names."""
+    if method is not None and "=" in method:
+        method, overrides = None, [method, *overrides]
+    folders = [text.partition("=")[2] for text in overrides if text.startswith("resume=")]
+    if not folders:
+        if method is None:
+            raise ValueError(f"{overrides[0]!r} is no method; known: {', '.join(known('method'))}")
+        trainer = Trainer(resolve(method, overrides))
+        trainer.start()
+    elif len(folders) > 1 or not folders[0]:
+        raise ValueError("resume=RUN: one run folder is needed")
+    else:
+        others = [text for text in overrides if not text.startswith("resume=")]
+        trainer = resume(Path(folders[0]), method, others)
+        console.print(f"resumed at step {trainer.step} of {trainer.steps}")
+    config = trainer.config
+    for run in trainer.runs:
+        text = f"{config.method}, setup {config.setup}, fire {config.fire.name} -> {run.path}"
+        console.print(text)
+    return trainer
 
-    def stop(number: int, frame: Any) -> None:
-        trainer.stop()
-        signal.signal(signal.SIGINT, signal.default_int_handler)
 
-    before = signal.signal(signal.SIGINT, stop)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)
+def _say_where(trainer: Trainer, console: Console) -> None:
+    for run in trainer.runs:
+        networks = run.networks()
+        if networks:
+            console.print(
+                f"stopped; what was learnt is in {networks[-1]}\n"
+                f"evaluate it with: emberlink eval {run.path}",
+                soft_wrap=True,
+            )
+    console.print(f"resume with: emberlink train resume={trainer.run.path}", soft_wrap=True)
+
+
+def _newest(trainer: Trainer) -> str:
+    """The newest checkpoint of a run that an error ended, and how to go on from it."""
+    states, folder = trainer.run.states(), trainer.run.path
+    if not states:
+        return f"there is no checkpoint yet: emberlink train resume={folder} begins again"
+    return f"the last good checkpoint is {states[-1]}, resume with: emberlink train resume={folder}"
 
 
 def _train_with_bar(trainer: Trainer, console: Console) -> bool:
@@ -84,7 +121,8 @@ def _train_with_bar(trainer: Trainer, console: Console) -> bool:
         task = bar.add_task(
             "",
             total=trainer.steps,
-            episode=0,
+            completed=trainer.step,
+            episode=trainer.episode,
             episodes=trainer.config.episodes,
             coverage="-",
             score="-",

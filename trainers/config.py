@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal
 import torch
 from hydra import compose, initialize_config_module
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import QuotedString
 from hydra.errors import HydraException
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -23,7 +24,15 @@ from pydantic import (
 from pydantic.dataclasses import dataclass
 
 from emberlink.comm import registry
-from emberlink.envs.config import WildfireConfig, from_plain, known
+from emberlink.envs.config import (
+    Name,
+    WildfireConfig,
+    describe,
+    from_plain,
+    known,
+    plain,
+    shown,
+)
 from emberlink.envs.fire import FireConfig
 
 _STRICT = ConfigDict(extra="forbid", strict=True)
@@ -96,9 +105,9 @@ class EvaluationConfig:
 class RunConfig:
     """Everything that a run depends on."""
 
-    method: str
+    method: Name
     """the recipe: a file in configs/method"""
-    setup: str
+    setup: Name
     """the constants: a file in configs/setup"""
     memory: Literal["private", "shared"]
     """one replay memory per UAV, or one for all"""
@@ -126,6 +135,10 @@ class RunConfig:
     """the folder in which the run folder is made"""
     checkpoint_interval: Count
     """episodes between checkpoints"""
+    checkpoint_steps: MaybeCount = 0
+    """steps between further checkpoints, counted through the whole run; 0 for none"""
+    keep: Count = 5
+    """checkpoints of which the networks stay; the two newest hold what a resumed run needs too"""
 
     @field_validator("device")
     @classmethod
@@ -177,7 +190,7 @@ def check_device(name: str) -> str:
         str(device) == "cpu" or (device.type == "cuda" and (device.index or 0) < len(present) - 1)
     )
     if not there:
-        raise ValueError(f"device={name} is not there; known: {', '.join(present)}")
+        raise ValueError(f"device={shown(name)} is not there; known: {', '.join(present)}")
     return name
 
 
@@ -202,18 +215,58 @@ def resolve(method: str, overrides: Sequence[str] = (), **settings: Any) -> RunC
             composed = compose("base", overrides=[f"method={method}", *overrides])
             values: Any = OmegaConf.to_container(composed, resolve=True, throw_on_missing=True)
         except (HydraException, OmegaConfBaseException) as error:
-            raise ValueError(" ".join(str(error).split())) from None
+            raise ValueError(" ".join(str(error).split())[:300]) from None
     if "method" in values:  # then its content did not go to the top
         raise ValueError(f"configs/method/{method}.yaml must begin with '# @package _global_'")
     values = {**values, **choices}
     for key, value in settings.items():
-        _set(values, key, list(value) if key == "seeds" and isinstance(value, Iterable) else value)
+        if key in choices:
+            raise ValueError(f"{key}={shown(value)}: not a setting but a choice of several")
+        several = isinstance(value, Iterable) and not isinstance(value, str | bytes | Mapping)
+        _set(values, key, plain(list(value) if key == "seeds" and several else value, key))
     if values["seeds"]:
         if "seed" in settings or any(text.startswith("seed=") for text in overrides):
             raise ValueError(f"seed={values['seed']} and seeds={values['seeds']}: give one of them")
         if isinstance(values["seeds"], list | tuple):
             values["seed"] = values["seeds"][0]
     return from_values(values)
+
+
+def override(config: RunConfig, overrides: Sequence[str]) -> RunConfig:
+    """A configuration with some values changed.
+
+    Args:
+        config: of a run.
+        overrides: `key=value`, as on the command line; `setup` and `fire` must be what they are.
+
+    Raises:
+        ValueError: a key is not known, or a value does not fit.
+    """
+    values = to_values(config)
+    known_keys = list(flat(values))
+    for text in overrides:
+        key, value = _parsed(text)
+        if key in _GROUPS:
+            there = config.setup if key == "setup" else config.fire.name
+            if str(value) != there:
+                raise ValueError(f"{text}: the run has {key}={there}")
+        elif key not in known_keys:
+            raise ValueError(f"key {_quote(key, known_keys, listed=False)}")
+        else:
+            _set(values, key, value)
+    return from_values(values)
+
+
+def _parsed(text: str) -> tuple[str, Any]:
+    """Key and value of one `key=value`."""
+    try:
+        parsed = OverridesParser.create().parse_override(text)
+    except HydraException:
+        raise ValueError(f"{text!r} is not of the form key=value") from None
+    if parsed.is_delete() or parsed.is_add() or parsed.is_sweep_override():
+        raise ValueError(f"{text!r}: only key=value with one value is understood here")
+    value: Any = parsed.value()
+    return parsed.key_or_group, value.text if isinstance(value, QuotedString) else value
 
 
 def _set(values: dict[str, Any], key: str, value: Any) -> None:
@@ -243,21 +296,6 @@ def from_values(values: Mapping[str, Any]) -> RunConfig:
         raise ValueError(describe(error)) from None
 
 
-def describe(error: ValidationError, prefix: str = "") -> str:
-    """One line for what pydantic found first: the key, the value, and what was expected."""
-    first = error.errors()[0]
-    key = ".".join([prefix, *map(str, first["loc"])] if prefix else map(str, first["loc"]))
-    if isinstance(cause := first.get("ctx", {}).get("error"), ValidationError):
-        return describe(cause, key)
-    message = first["msg"].removeprefix("Value error, ").replace("Input should", "should", 1)
-    if first["type"] in ("missing", "unexpected_keyword_argument"):
-        return f"key {key!r} is {'missing' if first['type'] == 'missing' else 'not known'}"
-    if message.startswith((f"{key}=", f"{key}.")):
-        return message
-    value = "" if isinstance(first["input"], dict) else f"={first['input']}"
-    return f"{key}{value}: {message}"
-
-
 def to_values(config: RunConfig) -> dict[str, Any]:
     """The configuration as plain values, for YAML and trackers."""
     return TypeAdapter(RunConfig).dump_python(config, mode="json")
@@ -269,11 +307,11 @@ def _check_overrides(method: str, overrides: Sequence[str], choices: dict[str, s
     for text in overrides:
         try:
             override = OverridesParser.create().parse_override(text)
-        except HydraException:
-            raise ValueError(f"{text!r} is not of the form key=value") from None
+        except (HydraException, ValueError, RecursionError):
+            raise ValueError(f"{shown(text)!r} is not of the form key=value") from None
         key = override.key_or_group
         if override.is_delete() or override.is_add() or override.is_sweep_override():
-            raise ValueError(f"{text!r}: only key=value with one value is understood here")
+            raise ValueError(f"{shown(text)!r}: only key=value with one value is understood here")
         if key in _GROUPS:
             chosen = str(override.value())
             if chosen not in known(key):
@@ -298,6 +336,16 @@ def _flat(values: Any, prefix: str = "") -> Iterator[str]:
             yield from _flat(value, f"{prefix}{key}.")
 
 
+def flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested values by dotted key."""
+    found: dict[str, Any] = {}
+    for key, value in values.items():
+        found |= (
+            flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {prefix + key: value}
+        )
+    return found
+
+
 def _quote(value: str, among: Sequence[str], *, listed: bool = True) -> str:
     """`value`, that it is unknown, and the near or all known ones."""
     leaves = {name.rsplit(".", 1)[-1]: name for name in among}
@@ -308,4 +356,4 @@ def _quote(value: str, among: Sequence[str], *, listed: bool = True) -> str:
         hint += f" known: {', '.join(among)}" if hint else f"; known: {', '.join(among)}"
     elif not near:
         hint = f"; known: {', '.join(name for name in among if '.' not in name)}"
-    return f"{value!r} is not known{hint}"
+    return f"{shown(value)!r} is not known{hint}"

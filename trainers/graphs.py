@@ -81,6 +81,7 @@ class LockstepCollector:
 
     def __init__(self, env: EnvBase, policy: TensorDictModuleBase, *, horizon: int, steps: int):
         self.env, self.policy, self.horizon, self.steps = env, policy, horizon, steps
+        self._done = 0
         self._moment: TensorDictBase = env.reset()
         with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
             acted = policy(self._moment.copy())
@@ -89,12 +90,26 @@ class LockstepCollector:
         self._advance = graphed(self._step, env.device or "cpu")
 
     def __iter__(self) -> Iterator[TensorDictBase]:
-        for step in range(self.steps):
-            if step and step % self.horizon == 0:
-                self._moment.update_(self.env.reset())
+        while self._done < self.steps:
             with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
                 collected = self._advance()
+            self._done += 1
+            if self._done % self.horizon == 0:
+                self._moment.update_(self.env.reset())
             yield collected
+
+    @property
+    def carried(self) -> TensorDictBase:
+        """The moment that the next step begins with: observations, communication, noise."""
+        return self._moment
+
+    def go_on(self, carried: TensorDictBase, step: int) -> None:
+        """Goes on from a moment, so many steps into the run.
+
+        Written into the tensors that there are: a recorded graph reads those.
+        """
+        self._moment.update_(carried.select(*self._moment.keys(True, True)))
+        self._done = step
 
     def shutdown(self) -> None:
         """Nothing runs beside the program; there is nothing to end."""

@@ -1,27 +1,32 @@
 """Training: collect, remember, update; measure, evaluate and save at intervals."""
 
 import time
-from collections.abc import Callable
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any, cast
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModule, TensorDictSequential
-from torchrl.collectors import Collector
+from tensordict.nn import TensorDictModule
 
 from emberlink.envs import metrics
 from emberlink.policies.actor_critic import team_of
-from emberlink.policies.noise import OrnsteinUhlenbeck
 
-from . import evaluate, tracking
+from . import checkpoint, evaluate, state, tracking
 from .allocator import keep_freed_memory
 from .build import build_env, build_networks
-from .config import RunConfig
-from .graphs import LockstepCollector, graphed
+from .collecting import make_collector
+from .config import RunConfig, to_values
+from .graphs import graphed
 from .learner import Learner
-from .memory import make_memory, rows_needed, to_rows
+from .lock import Lock
+from .memory import TeamSampler, make_memory, rows_needed, to_rows
 from .run_folder import RunFolder
+
+LINES = ("metrics.jsonl", "timing.jsonl")
+"""the files of a run folder that have a line for each episode"""
+SIBLINGS = "siblings.json"
+"""names the folders of the seeds that train side by side, in order"""
 
 
 @dataclass
@@ -48,7 +53,6 @@ class Trainer:
 
     def __init__(self, config: RunConfig):
         self.config = config
-        tracking.check(config.logger)
         keep_freed_memory()
         seeds = config.seeds or (config.seed,)
         self.configs = [replace(config, seed=seed) for seed in seeds]
@@ -72,10 +76,24 @@ class Trainer:
             device=config.device,
         )
         self.enough = rows_needed(uavs, shared=shared, batch=config.learner.batch)
-        self.collector = self._make_collector()
+        self.collector = make_collector(
+            config, self.env, self.actor, envs=self.envs, steps=self.steps
+        )
         self._update = graphed(self._sample_and_update, config.device)
         self.step = self.episode = self.updates = 0
+        self.moments: list[TensorDictBase] = []
+        """of the episode that is not finished, batch size [environments, steps] each"""
+        self.losses: list[torch.Tensor] = []
+        """of the same"""
+        self.seconds = 0.0
+        """of training before this process took it up"""
+        self.best: list[float | None] = [None] * self.teams
+        """the highest coverage of each seed, with which best.safetensors was written"""
+        self.saved: int | None = None
+        """the step of the newest checkpoint"""
         self.runs: list[RunFolder] = []
+        self._locks: list[Lock] = []
+        self._began = time.monotonic()
         self._stopping = False
 
     @property
@@ -84,35 +102,59 @@ class Trainer:
         assert self.runs, "start() comes first"
         return self.runs[0]
 
+    @property
+    def sampler(self) -> TeamSampler:
+        """What draws from the memory."""
+        sampler: Any = self.memory.sampler
+        return sampler
+
     def start(self) -> RunFolder:
         """Makes the run folders, one for each seed, and returns the first."""
-        self.runs = [RunFolder.create(config) for config in self.configs]
+        runs = [RunFolder.create(config) for config in self.configs]
+        if self.teams > 1:
+            for run in runs:
+                run.write(SIBLINGS, {"folders": [one.path.name for one in runs]})
+        self.take(runs, [Lock(run.path) for run in runs])
         return self.run
+
+    def take(self, runs: Sequence[RunFolder], locks: Sequence[Lock]) -> None:
+        """Takes run folders, one for each seed, to write to; `train` gives the locks up."""
+        self.runs, self._locks = list(runs), list(locks)
 
     def stop(self) -> None:
         """Ends the training after the step that it is at, also from a signal handler."""
         self._stopping = True
 
     def train(self, report: Callable[[Progress], None] = lambda _: None) -> bool:
-        """Trains to the end; whatever stops it, the networks are saved as they are.
+        """Trains to the end, or until `stop`, and saves.
+
+        Where an error ends it, or an exception of a signal's, nothing more is saved: what is there
+        between two steps alone is whole.
 
         Args:
             report: called after each step of the environments.
 
         Returns:
             Whether it came to the end: False after `stop`.
+
+        Raises:
+            ValueError: a file cannot be written, such as to a full disk.
         """
-        trackers: list[tracking.Tracker] = []
+        trackers = tracking.Trackers(self.configs, self.runs, episode=self.episode)
         try:
-            for config, run in zip(self.configs, self.runs, strict=True):
-                trackers.append(tracking.Tracker(config, run))
             self._loop(trackers, report)
+            if self.saved != self.step:
+                self.save()
         finally:
-            self.save()
-            self.collector.shutdown()
-            for tracker in trackers:
-                tracker.close()
+            trackers.close()
+            self.close()
         return self.step == self.steps
+
+    def close(self) -> None:
+        """Ends the collector and gives the run folders up; `train` does it."""
+        self.collector.shutdown()
+        for lock in self._locks:
+            lock.release()
 
     def rehearse(self, steps: int) -> None:
         """Collects and learns for some steps of the environments; writes nothing."""
@@ -121,9 +163,32 @@ class Trainer:
         self.collector.shutdown()
 
     def save(self) -> None:
-        """Writes the networks as they are to a checkpoint of each run."""
-        for team, run in enumerate(self.runs):
-            run.save(self.step, self.weights(team))
+        """Writes a checkpoint: all that this training is, and each run's networks.
+
+        The state first: networks are evidence that there was one.
+
+        Raises:
+            ValueError: it cannot be written; the checkpoints before it are as they were.
+        """
+        header = {
+            "kind": "state",
+            "config": to_values(self.config),
+            "folders": [run.path.name for run in self.runs],
+            "files": [{name: run.size(name) for name in LINES} for run in self.runs],
+            "best": self.best,
+            "seconds": round(self._elapsed(), 3),
+            **state.counters(self),
+        }
+        checkpoint.write(self.run.state(self.step), state.tensors(self), header)
+        self.save_networks()
+        for run in self.runs:
+            run.rotate(self.config.keep, states=2)
+        self.saved = self.step
+
+    def save_networks(self) -> None:
+        """Writes the networks alone to a checkpoint of each run."""
+        for team, (config, run) in enumerate(zip(self.configs, self.runs, strict=True)):
+            run.save(self.weights(team), config, self.step)
 
     def weights(self, team: int = 0) -> dict[str, torch.Tensor]:
         """All networks of one seed and their targets by name, detached."""
@@ -138,44 +203,34 @@ class Trainer:
         """The actors of one seed, without noise, as they are now."""
         return team_of(self.actor, team, self.teams)
 
-    def _make_collector(self) -> Collector | LockstepCollector:
-        parts: list[Any] = [self.actor, OrnsteinUhlenbeck(**asdict(self.config.exploration))]
-        explorer = TensorDictSequential(*parts)
-        if torch.device(self.config.device).type == "cuda":
-            return LockstepCollector(
-                self.env, explorer, horizon=self.config.env.horizon, steps=self.steps
-            )
-        return Collector(
-            self.env,
-            explorer,
-            frames_per_batch=self.envs,
-            total_frames=self.steps * self.envs,
-            device=self.config.device,
-            trust_policy=True,
-            track_traj_ids=False,
-            auto_register_policy_transforms=False,
-        )
-
-    def _loop(self, trackers: list[tracking.Tracker], report: Callable[[Progress], None]) -> None:
+    def _loop(self, trackers: tracking.Trackers, report: Callable[[Progress], None]) -> None:
         config, horizon = self.config, self.config.env.horizon
-        progress = Progress(0, self.steps, 0, config.episodes)
-        began, moments, losses = time.monotonic(), [], []
+        progress = Progress(self.step, self.steps, self.episode, config.episodes)
+        self._began = time.monotonic()
         for collected in self.collector:
             self.step += 1
-            losses += self._learn(collected)
-            moments.append(collected.get("next").select(*metrics.STEP_KEYS).clone())
+            self.losses += self._learn(collected)
+            self.moments.append(collected.get("next").select(*metrics.STEP_KEYS).clone())
             progress.step = self.step
             if self.step % horizon == 0:
                 self.episode = self.step // horizon
-                progress.lines = self._finish_episode(moments, losses, trackers)
+                progress.lines = self._finish_episode(trackers)
                 progress.episode = self.episode
-                seconds = round(time.monotonic() - began, 3)
-                for run in self.runs:
-                    run.append("timing.jsonl", {"episode": self.episode, "seconds": seconds})
-                moments, losses = [], []
+            if self._is_due():
+                self.save()
             report(progress)
             if self._stopping:
                 return
+
+    def _elapsed(self) -> float:
+        return self.seconds + time.monotonic() - self._began
+
+    def _is_due(self) -> bool:
+        """Whether a checkpoint is to be made after this step."""
+        config = self.config
+        by_steps = config.checkpoint_steps and self.step % config.checkpoint_steps == 0
+        by_episodes = self.step % (config.checkpoint_interval * config.env.horizon) == 0
+        return bool(by_steps or by_episodes)
 
     def _learn(self, collected: TensorDictBase) -> list[torch.Tensor]:
         """Remembers a step and makes its updates: the losses, [2, teams * uavs] each.
@@ -192,24 +247,36 @@ class Trainer:
     def _sample_and_update(self) -> torch.Tensor:
         return torch.stack(self.learner.update(self.memory.sample()))
 
-    def _finish_episode(
-        self,
-        moments: list[TensorDictBase],
-        losses: list[torch.Tensor],
-        trackers: list[tracking.Tracker],
-    ) -> list[dict[str, Any]]:
-        """Measures an episode, writes its lines, evaluates and saves where it is due."""
+    def _finish_episode(self, trackers: tracking.Trackers) -> list[dict[str, Any]]:
+        """Measures an episode, evaluates where it is due, writes the lines."""
         config = self.config
-        lines = self._measure(moments, losses)
-        if config.evaluation.interval and self.episode % config.evaluation.interval == 0:
+        lines = self._measure(self.moments, self.losses)
+        self.moments, self.losses = [], []
+        interval = config.evaluation.interval
+        if interval and self.episode % interval == 0:
             for team, line in enumerate(lines):
                 line |= self._evaluate(team)
-        if self.episode % config.checkpoint_interval == 0:
-            self.save()
-        for line, run, tracker in zip(lines, self.runs, trackers, strict=True):
+        seconds = round(self._elapsed(), 3)
+        for team, (line, run) in enumerate(zip(lines, self.runs, strict=True)):
+            self._keep_best(team, line)
             run.append("metrics.jsonl", line)
-            tracker.log(line, step=self.episode)
+            run.append("timing.jsonl", {"episode": self.episode, "seconds": seconds})
+        trackers.log(lines, step=self.episode)
         return lines
+
+    def _keep_best(self, team: int, line: dict[str, Any]) -> None:
+        """Writes the networks whose coverage is the highest so far.
+
+        On held-out fires, where there are evaluations during training; else the episode's own.
+        """
+        frozen = [value for name, value in line.items() if name.endswith("/coverage")]
+        if self.config.evaluation.interval and not frozen:
+            return
+        coverage = sum(frozen) / len(frozen) if frozen else line["coverage"]
+        best = self.best[team]
+        if best is None or coverage > best:
+            self.best[team] = coverage
+            self.runs[team].save_best(self.weights(team), self.configs[team], self.step)
 
     def _measure(
         self, moments: list[TensorDictBase], losses: list[torch.Tensor]

@@ -1,17 +1,19 @@
 """A run on disk: config.yaml, metrics.jsonl, checkpoints, evaluation, figures."""
 
 import json
+import os
 from collections.abc import Mapping
+from contextlib import suppress
 from datetime import datetime
 from pathlib import Path
 from typing import Any
 
 import yaml
-from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
 from torch import Tensor
 
+from . import checkpoint as files
 from .config import RunConfig, from_values, to_values
+from .reading import LONGEST_JSON, parse_json, read_text, read_yaml
 
 
 class RunFolder:
@@ -37,10 +39,15 @@ class RunFolder:
             path = _new_folder(Path(config.output) / name)
             (path / "checkpoints").mkdir()
             (path / "figures").mkdir()
-            (path / "config.yaml").write_text(yaml.safe_dump(to_values(config), sort_keys=False))
+            run = cls(path)
+            run.write_config(config)
         except OSError as error:
             raise ValueError(f"output={config.output}: {error.strerror or error}") from None
-        return cls(path)
+        return run
+
+    def write_config(self, config: RunConfig) -> None:
+        """Writes the resolved configuration whole, or leaves what was there."""
+        self._replace("config.yaml", yaml.safe_dump(to_values(config), sort_keys=False))
 
     def config(self, **changes: Any) -> RunConfig:
         """The run's configuration.
@@ -55,11 +62,9 @@ class RunFolder:
         if not self.path.is_dir():
             raise ValueError(f"{self.path}: there is no such run folder")
         try:
-            values = yaml.safe_load(file.read_text())
+            values = read_yaml(file)
         except FileNotFoundError:
             raise ValueError(f"{self.path}: not a run folder, config.yaml is missing") from None
-        except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-            raise ValueError(f"{file}: cannot be read: {' '.join(str(error).split())}") from None
         if not isinstance(values, dict):
             raise ValueError(f"{file}: expected keys and values, found {type(values).__name__}")
         try:
@@ -68,24 +73,83 @@ class RunFolder:
             raise ValueError(f"{file}: {error}") from None
 
     def append(self, file: str, line: Mapping[str, Any]) -> None:
-        """Adds a line of JSON and hands it to the system at once."""
-        with (self.path / file).open("a") as out:
-            out.write(json.dumps(line) + "\n")
+        """Adds a line of JSON and hands it to the system at once, whole or not at all.
+
+        Raises:
+            ValueError: it cannot be written, such as to a full disk.
+        """
+        path = self.path / file
+        handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
+        before = os.fstat(handle).st_size
+        try:
+            left = (json.dumps(line) + "\n").encode()
+            while left:
+                left = left[os.write(handle, left) :]
+        except OSError as error:
+            os.ftruncate(handle, before)
+            raise ValueError(f"{path}: cannot be written: {error.strerror}") from None
+        finally:
+            os.close(handle)
+
+    def size(self, file: str) -> int:
+        """Bytes in a file, all of them flushed to the disk; 0 where there is none."""
+        try:
+            with (self.path / file).open("rb") as content:
+                os.fsync(content.fileno())
+                return os.fstat(content.fileno()).st_size
+        except FileNotFoundError:
+            return 0
+
+    def check_lines(self, file: str, size: int, lines: int) -> None:
+        """That a .jsonl file still begins as it was when a checkpoint was made.
+
+        Args:
+            file: its name.
+            size: bytes that it had.
+            lines: that these hold.
+
+        Raises:
+            ValueError: it holds less, or other lines.
+        """
+        path = self.path / file
+        kept = path.read_bytes()[:size] if path.exists() else b""
+        found = kept.count(b"\n") if kept.endswith(b"\n") else -1
+        if len(kept) < size or found != (lines if lines else -1):
+            raise ValueError(
+                f"{path}: the checkpoint was made when it had {lines} lines in {size} bytes; its "
+                f"first {len(kept)} bytes are not those"
+            )
+
+    def cut(self, file: str, size: int) -> None:
+        """Cuts a file back to so many bytes, where it has more."""
+        path = self.path / file
+        if path.exists() and path.stat().st_size > size:
+            os.truncate(path, size)
 
     def write(self, file: str, content: Mapping[str, Any]) -> None:
         """Writes a JSON file whole, or leaves what was there."""
+        self._replace(file, json.dumps(content, indent=1) + "\n")
+
+    def _replace(self, file: str, text: str) -> None:
         partial = self.path / (file + ".part")
-        partial.write_text(json.dumps(content, indent=1) + "\n")
+        partial.unlink(missing_ok=True)  # a link would lead to another's file
+        partial.write_text(text)
         partial.replace(self.path / file)
 
     def lines(self, file: str = "metrics.jsonl") -> list[dict[str, Any]]:
         """The lines of a .jsonl file; none where there is no such file."""
         path = self.path / file
-        text = path.read_text() if path.exists() else ""
+        text = read_text(path, LONGEST_JSON) if path.exists() else ""
         # What a killed run had not finished writing is no line yet.
         whole = text[: text.rfind("\n") + 1].splitlines()
         try:
-            return [json.loads(line) for line in whole]
+            found = [parse_json(line) for line in whole]
+            for line in found:
+                if not isinstance(line, dict) or "episode" not in line:
+                    raise ValueError("a line is not of the form {episode: ..., ...}")
+                if not all(isinstance(value, int | float) for value in line.values()):
+                    raise ValueError("a line holds what is no number")
+            return found
         except ValueError as error:
             raise ValueError(f"{path}: not a file of JSON lines: {error}") from None
 
@@ -95,49 +159,113 @@ class RunFolder:
         folder.mkdir(exist_ok=True)
         return folder / file
 
-    def save(self, step: int, weights: Mapping[str, Tensor]) -> Path:
-        """Writes a checkpoint to a name of its own, whole or not at all."""
-        path = self.path / "checkpoints" / f"step_{step:09d}.safetensors"
-        partial = path.with_suffix(".part")
-        save_file({name: value.cpu().contiguous() for name, value in weights.items()}, partial)
-        partial.replace(path)
+    @property
+    def checkpoints(self) -> Path:
+        """The folder of the checkpoints."""
+        return self.path / "checkpoints"
+
+    def save(self, weights: Mapping[str, Tensor], config: RunConfig, step: int) -> Path:
+        """Writes networks to a name of their own, whole or not at all."""
+        path = self.checkpoints / f"step_{step:09d}.safetensors"
+        files.write(path, weights, _network_header(config, step))
         return path
 
+    def save_best(self, weights: Mapping[str, Tensor], config: RunConfig, step: int) -> None:
+        """Writes networks to best.safetensors, in place of those that were there."""
+        path = self.checkpoints / "best.safetensors"
+        files.write(path, weights, _network_header(config, step))
+
+    def state(self, step: int) -> Path:
+        """Where everything else that a resumed run needs is written."""
+        return self.checkpoints / f"state_{step:09d}.safetensors"
+
+    def states(self) -> list[Path]:
+        """What a run can be resumed from, oldest first."""
+        return sorted(self.checkpoints.glob("state_*.safetensors"))
+
+    def networks(self) -> list[Path]:
+        """The checkpoints' networks, oldest first."""
+        return sorted(self.checkpoints.glob("step_*.safetensors"))
+
     def checkpoint(self) -> Path:
-        """The newest checkpoint.
+        """The newest checkpoint's networks.
 
         Raises:
             ValueError: there is none.
         """
-        found = sorted((self.path / "checkpoints").glob("step_*.safetensors"))
+        found = self.networks()
         if not found:
             raise ValueError(f"{self.path}: holds no checkpoint (checkpoints/*.safetensors)")
         return found[-1]
 
+    def rotate(self, keep: int, states: int) -> None:
+        """Takes all but the newest `keep` networks and `states` states away."""
+        for path in self.networks()[:-keep] + self.states()[:-states]:
+            path.unlink(missing_ok=True)
 
-def load_weights(path: Path, expected: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    def take_away_after(self, step: int) -> None:
+        """Takes away what a resumed run makes again, and what a killed one had begun to write."""
+        for path in self.networks() + self.states():
+            if step_of(path) > step:
+                path.unlink()
+        for path in [*self.path.glob("*.part"), *self.checkpoints.glob("*.part")]:
+            path.unlink()
+        for path in self.checkpoints.glob(".tmp*"):  # safetensors' own
+            path.unlink()
+
+
+def step_of(checkpoint: Path) -> int:
+    """The step that a checkpoint's name tells; -1 where it tells none."""
+    with suppress(ValueError):
+        return int(checkpoint.stem.rpartition("_")[2])
+    return -1
+
+
+def _network_header(config: RunConfig, step: int) -> dict[str, Any]:
+    return {
+        "kind": "networks",
+        "step": step,
+        "method": config.method,
+        "uavs": config.env.num_uavs,
+        "seed": config.seed,
+    }
+
+
+def load_weights(
+    path: Path, expected: Mapping[str, Tensor], config: RunConfig | None = None
+) -> dict[str, Tensor]:
     """The weights of a checkpoint, float32, by name.
 
     Args:
         path: a safetensors file.
         expected: tensors of the names and shapes that must be there.
+        config: whose method and number of UAVs the checkpoint must have; any if None.
 
     Raises:
-        ValueError: the file can't be read, or a tensor is missing or of another shape.
+        ValueError: the file can't be read or is damaged, a tensor is missing or of another shape
+            or type, or a number is NaN or infinite.
     """
-    try:
-        weights = load_file(path)
-    except (OSError, SafetensorError) as error:
-        raise ValueError(f"{path}: not a readable checkpoint: {error}") from None
+    header, weights = files.read(path)
+    if header is not None and config is not None:
+        wanted = _network_header(config, 0)
+        for name in ("method", "uavs"):
+            if header.get(name, wanted[name]) != wanted[name]:
+                raise ValueError(
+                    f"{path}: a checkpoint of {name}={header[name]}; "
+                    f"this configuration has {name}={wanted[name]}"
+                )
     for name, tensor in expected.items():
         if name not in weights:
             raise ValueError(f"{path}: holds no {name}")
-        if weights[name].shape != tensor.shape:
+        found = weights[name]
+        if found.shape != tensor.shape or found.dtype != tensor.dtype:
             raise ValueError(
-                f"{path}: {name} has shape {list(weights[name].shape)}; "
-                f"this configuration needs {list(tensor.shape)}"
+                f"{path}: {name} has shape {list(found.shape)}, {found.dtype}; this configuration "
+                f"needs {list(tensor.shape)}, {tensor.dtype}"
             )
-    return {name: weights[name] for name in expected}
+    chosen = {name: weights[name] for name in expected}
+    files.check_finite(path, chosen)
+    return chosen
 
 
 def _new_folder(path: Path) -> Path:

@@ -1,0 +1,229 @@
+"""Trainings in processes that are forked from one that has imported everything, to be killed."""
+
+import os
+import random
+import shutil
+import signal
+import time
+import traceback
+from collections.abc import Callable
+from pathlib import Path
+
+from emberlink.trainers import checkpoint
+from emberlink.trainers.config import resolve
+from emberlink.trainers.loop import Trainer
+from emberlink.trainers.resume import resume
+
+HORIZON, EPISODES, EVERY = 20, 4, 3
+SMALL = [
+    *(f"env.horizon={HORIZON}", "env.num_uavs=2", "num_envs=2", f"checkpoint_steps={EVERY}"),
+    *("learner.hidden=[8,8]", "learner.batch=16", "learner.capacity=60", "fire=paper"),
+    *("evaluation.interval=0", "evaluation.fires=1", "keep=3"),
+]
+METHODS = ("independent", "shared_memory", "positional", "consensus")
+
+
+class Child:
+    """A forked process that does something and says what it has done.
+
+    Args:
+        work: is given a function that writes a line to the log; its result is the exit status.
+        folder: where `log` and what it prints, `out`, are written.
+    """
+
+    def __init__(self, work: Callable[[Callable[[str], None]], int], folder: Path):
+        folder.mkdir(parents=True, exist_ok=True)
+        self.log, self.out = folder / "log", folder / "out"
+        for file in (self.log, self.out):
+            file.unlink(missing_ok=True)
+        self.pid = os.fork()
+        if self.pid == 0:
+            status = 99
+            try:
+                out = os.open(self.out, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
+                os.dup2(out, 1)
+                os.dup2(out, 2)
+                log = os.open(self.log, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
+                status = work(lambda line: os.write(log, f"{line}\n".encode()) and None)
+            except BaseException:
+                traceback.print_exc()
+            finally:
+                os._exit(status)
+
+    def lines(self) -> list[str]:
+        return self.log.read_text().splitlines() if self.log.exists() else []
+
+    def wait_for(self, condition: Callable[[], bool], seconds: float = 120) -> bool:
+        """Whether it came to that before it ended."""
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            if condition():
+                return True
+            if os.waitid(os.P_PID, self.pid, os.WEXITED | os.WNOHANG | os.WNOWAIT):
+                return condition()
+            time.sleep(0.002)
+        raise TimeoutError(f"{self.lines()} {self.text()}")
+
+    def send(self, number: int) -> None:
+        os.kill(self.pid, number)
+
+    def end(self) -> int:
+        """The exit status; of a signal, its negative number."""
+        return os.waitstatus_to_exitcode(os.waitpid(self.pid, 0)[1])
+
+    def text(self) -> str:
+        return self.out.read_text() if self.out.exists() else ""
+
+
+def temporary(folder: Path) -> list[str]:
+    """Files that a save had begun to write."""
+    found = [*folder.rglob("*.part"), *folder.rglob(".tmp*")]
+    return sorted(path.name for path in found)
+
+
+def watch_saves(say: Callable[[str], None], die_at: tuple[str, int] | None) -> None:
+    """Writes down every save, and kills this process at the n-th call of a part of one.
+
+    For a forked process: it changes modules.
+    """
+    calls = 0
+
+    def dying(name: str, function: Callable) -> Callable:
+        def call(*arguments, **named):
+            nonlocal calls
+            if die_at is not None and die_at[0] == name:
+                calls += 1
+                if calls == die_at[1]:
+                    os.kill(os.getpid(), signal.SIGKILL)
+            return function(*arguments, **named)
+
+        return call
+
+    for name in ("save_file", "_digest", "flush_folder"):
+        setattr(checkpoint, name, dying(name, getattr(checkpoint, name)))
+    os.fsync = dying("fsync", os.fsync)
+    Path.replace = dying("replace", Path.replace)
+    Path.unlink = dying("unlink", Path.unlink)
+    save = Trainer.save
+
+    def saying(trainer: Trainer) -> None:
+        say(f"saving {trainer.step}")
+        save(trainer)
+        say(f"saved {trainer.step}")
+
+    Trainer.save = saying
+
+
+def training(method: str, output: Path, die_at: tuple[str, int] | None = None):
+    """Begins a run, or resumes the one that is there, and trains to the end."""
+
+    def work(say: Callable[[str], None]) -> int:
+        watch_saves(say, die_at)
+        runs = sorted(output.glob("*/config.yaml"))
+        if runs:
+            trainer = resume(runs[0].parent)
+        else:
+            trainer = Trainer(resolve(method, [*SMALL, f"episodes={EPISODES}", f"output={output}"]))
+            trainer.start()
+        say(f"at {trainer.step} {','.join(temporary(output))}")
+        trainer.train()
+        return 0
+
+    return work
+
+
+PARTS = ("save_file", "_digest", "fsync", "replace", "flush_folder", "unlink")
+
+
+def kill_until_finished(
+    method: str, folder: Path, draw: random.Random, kills: int
+) -> tuple[int, list[str]]:
+    """Kills a training at random moments until it has come to its end.
+
+    Args:
+        method: of the training.
+        folder: an empty one.
+        draw: decides when.
+        kills: at most.
+
+    Returns:
+        How often it was killed, and what was wrong, nothing if all is well.
+    """
+    output, wrong, done, saved = folder / "runs", [], 0, 0
+    begun = saved
+    while True:
+        kind = draw.choice(("moment", "save", "part")) if done < kills else "none"
+        part = draw.choice(PARTS), draw.randint(1, 12)
+        child = Child(training(method, output, part if kind == "part" else None), folder)
+        if kind == "moment":
+            child.wait_for(lambda c=child: bool(c.lines()))
+            time.sleep(draw.uniform(0, 0.3))
+        elif kind == "save":
+            last = draw.randint(1, 4)
+            child.wait_for(
+                lambda c=child, n=last: sum(x.startswith("saving") for x in c.lines()) >= n
+            )
+            time.sleep(draw.uniform(0, 0.015))
+        if kind in ("moment", "save"):
+            child.send(signal.SIGKILL)
+        status = child.end()
+        lines = child.lines()
+        for line in lines:
+            word, _, rest = line.partition(" ")
+            if word == "at":
+                step, _, left = rest.partition(" ")
+                # The newest whole save, or the one that was killed between its end and its notice.
+                if int(step) not in (saved, begun):
+                    wrong.append(f"resumed at {step}; saved {saved}, begun {begun}")
+                if left:
+                    wrong.append(f"left after the resume: {left}")
+                saved = int(step)
+            elif word == "saving":
+                begun = int(rest)
+            else:
+                saved = int(rest)
+        for path in output.rglob("checkpoints/*.safetensors"):
+            if not path.name.startswith(".tmp"):
+                try:
+                    checkpoint.read(path)
+                except ValueError as error:
+                    wrong.append(str(error))
+        if status == -signal.SIGKILL:
+            done += 1
+        elif status == 0:
+            return done, wrong
+        else:
+            return done, [*wrong, f"status {status}: {child.text()}"]
+
+
+def outcome(output: Path) -> dict[str, bytes]:
+    """What a finished run has learnt and written down, whole."""
+    (folder,) = output.iterdir()
+    networks = sorted((folder / "checkpoints").glob("step_*.safetensors"))[-1]
+    files = [networks, folder / "checkpoints" / "best.safetensors", folder / "metrics.jsonl"]
+    return {path.name: path.read_bytes() for path in files}
+
+
+def reference(method: str, folder: Path) -> dict[str, bytes]:
+    """The outcome of a run that nobody disturbs."""
+    child = Child(training(method, folder / "runs"), folder)
+    assert child.end() == 0, child.text()
+    return outcome(folder / "runs")
+
+
+def kill_trials(folder: Path, kills: int, seed: int) -> tuple[int, list[str]]:
+    """So many kills, over as many runs of all methods as it takes; what was wrong."""
+    draw, done, wrong, number = random.Random(seed), 0, [], 0
+    references: dict[str, dict[str, bytes]] = {}
+    while done < kills:
+        method = METHODS[number % len(METHODS)]
+        if method not in references:
+            references[method] = reference(method, folder / f"reference_{method}")
+        here = folder / f"kill_{number}"
+        killed, found = kill_until_finished(method, here, draw, min(kills - done, 8))
+        if not found and outcome(here / "runs") != references[method]:
+            found = [f"{method}: another outcome than of the run that nobody killed"]
+        wrong += found
+        done, number = done + killed, number + 1
+        shutil.rmtree(here)
+    return done, wrong

@@ -1,0 +1,150 @@
+"""Checkpoints that are damaged, or of something else."""
+
+import json
+import random
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+from safetensors.torch import load_file, save_file
+
+from emberlink.trainers import checkpoint
+
+
+def truncated(path: Path, draw: random.Random) -> None:
+    content = path.read_bytes()
+    path.write_bytes(content[: draw.randrange(len(content))])
+
+
+def bit_flipped(path: Path, draw: random.Random) -> None:
+    """One bit, half the time in the header."""
+    content = bytearray(path.read_bytes())
+    header = 8 + int.from_bytes(content[:8], "little")
+    place = draw.randrange(header if draw.random() < 0.5 else len(content))
+    content[place] ^= 1 << draw.randrange(8)
+    path.write_bytes(content)
+
+
+def zeroed(path: Path, draw: random.Random) -> None:
+    """A block of a disk that was never written."""
+    content = bytearray(path.read_bytes())
+    begin = draw.randrange(len(content))
+    end = min(begin + 4096, len(content))
+    if not any(content[begin:end]):
+        begin = 0
+    content[begin:end] = bytes(end - begin)
+    path.write_bytes(content)
+
+
+def lengthened(path: Path, draw: random.Random) -> None:
+    path.write_bytes(path.read_bytes() + draw.randbytes(draw.randint(1, 100)))
+
+
+def _sealed_again(path: Path, change: Callable[[dict, dict[str, torch.Tensor]], None]) -> None:
+    """As a program that knows the format would have written it."""
+    header, content = checkpoint.read(path)
+    assert header is not None
+    change(header, content)
+    version, rest = header.pop("format"), {k: v for k, v in header.items() if k != "sha256"}
+    before, checkpoint.FORMAT = checkpoint.FORMAT, version
+    try:
+        checkpoint.write(path, content, rest)
+    finally:
+        checkpoint.FORMAT = before
+
+
+def of_another_method(path: Path, draw: random.Random) -> None:
+    def change(header: dict, _) -> None:
+        values = header.get("config", header)
+        methods = {"independent", "positional", "shared_memory", "consensus"}
+        values["method"] = draw.choice(sorted(methods - {values["method"]}))
+
+    _sealed_again(path, change)
+
+
+def of_another_team(path: Path, draw: random.Random) -> None:
+    def change(header: dict, _) -> None:
+        other = draw.randint(3, 9)
+        if "config" in header:
+            header["config"]["env"]["num_uavs"] = other
+        else:
+            header["uavs"] = other
+
+    _sealed_again(path, change)
+
+
+def of_another_version(path: Path, draw: random.Random) -> None:
+    _sealed_again(path, lambda header, _: header.update(format=draw.choice((0, 2, 7, "1", None))))
+
+
+def with_nan(path: Path, draw: random.Random) -> None:
+    def change(_, content: dict[str, torch.Tensor]) -> None:
+        names = [
+            name
+            for name, value in content.items()
+            if value.is_floating_point()
+            and name.partition("/")[0] not in ("world", "carried", "moments", "losses")
+            # What is evaluated, of a file of networks.
+            and ("/" in name or name.startswith("actor_network_params"))
+        ]
+        values = content[draw.choice(sorted(names))].view(-1)
+        values[draw.randrange(len(values))] = draw.choice((float("nan"), float("inf")))
+
+    _sealed_again(path, change)
+
+
+def without_a_tensor(path: Path, draw: random.Random) -> None:
+    def change(_, content: dict[str, torch.Tensor]) -> None:
+        needed = [n for n in content if "/" in n or n.startswith("actor_network_params")]
+        groups = ("losses", "moments", "communication")
+        del content[draw.choice([n for n in needed if n.partition("/")[0] not in groups])]
+
+    _sealed_again(path, change)
+
+
+def without_a_seal(path: Path, draw: random.Random) -> None:
+    """Only for a state: networks from before there were seals are read."""
+    save_file(load_file(path), path)
+
+
+def not_a_checkpoint(path: Path, draw: random.Random) -> None:
+    content = json.dumps({"__metadata__": {"emberlink": draw.choice(("", "{}", "[1]", "nul"))}})
+    path.write_bytes(
+        draw.choice(
+            (b"", draw.randbytes(50), len(content).to_bytes(8, "little") + content.encode())
+        )
+    )
+
+
+KINDS = (
+    *(truncated, bit_flipped, zeroed, lengthened, of_another_method, of_another_team),
+    *(of_another_version, with_nan, without_a_tensor, not_a_checkpoint),
+)
+
+
+def damage_trials(
+    files: list[tuple[Path, Callable[[Path], object]]], count: int, seed: int
+) -> tuple[int, list[str]]:
+    """Damages each of some files in turn and has it read; what was accepted or not clear.
+
+    Args:
+        files: sound checkpoints, each with what reads it.
+        count: how many trials.
+        seed: of what is drawn.
+    """
+    draw, wrong = random.Random(seed), []
+    for number in range(count):
+        path, reader = files[number % len(files)]
+        kind, sound = KINDS[number // len(files) % len(KINDS)], path.read_bytes()
+        kind(path, draw)
+        try:
+            reader(path)
+        except ValueError as error:
+            text = str(error).replace(str(path.parent.parent), "")
+            if str(path) not in str(error) or "\n" in text or len(text) > 300:
+                wrong.append(f"{kind.__name__}: {error}")
+        else:
+            wrong.append(f"{kind.__name__} was accepted")
+        finally:
+            path.write_bytes(sound)
+    return count, wrong

@@ -1,0 +1,126 @@
+"""Trainings that a signal or a full disk ends."""
+
+import random
+import resource
+import shutil
+import signal
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+
+from children import (
+    EPISODES,
+    HORIZON,
+    METHODS,
+    SMALL,
+    Child,
+    outcome,
+    reference,
+    temporary,
+    training,
+)
+
+from emberlink.trainers import checkpoint, cli
+from emberlink.trainers.resume import resume
+from emberlink.trainers.run_folder import RunFolder, step_of
+
+
+def command(arguments: list[str], before: Callable[[], None] = lambda: None):
+    """`emberlink` with arguments, in a forked process."""
+
+    def work(say: Callable[[str], None]) -> int:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        before()
+        say("here")
+        return cli.main(arguments)
+
+    return work
+
+
+def signal_trial(number: int, folder: Path, draw: random.Random) -> list[str]:
+    """Sends a signal at a random moment of a training; what was wrong."""
+    method, output = draw.choice(METHODS), folder / "runs"
+    arguments = ["train", method, *SMALL, "episodes=100000", f"output={output}"]
+    child, wrong = Child(command(arguments), folder), []
+    step = draw.randint(1, 30)
+    child.wait_for(lambda: any(step_of(p) >= step for p in output.rglob("state_*.safetensors")))
+    child.send(number)
+    status, text = child.end(), child.text()
+    (path,) = output.iterdir()
+    if status != 128 + number:
+        wrong.append(f"exit status {status}")
+    if f"resume with: emberlink train resume={path}" not in text or "Traceback" in text:
+        wrong.append(text)
+    newest, run = RunFolder(path).states()[-1], RunFolder(path)
+    header = checkpoint.read(newest)[0] or {}
+    lines = (path / "metrics.jsonl").read_bytes() if (path / "metrics.jsonl").exists() else b""
+    if header["files"][0]["metrics.jsonl"] != len(lines):
+        wrong.append("metrics.jsonl and the checkpoint are of different moments")
+    if step_of(run.checkpoint()) != header["step"] or temporary(path) or (path / "lock").exists():
+        wrong.append(f"left: {sorted(p.name for p in path.rglob('*'))}")
+    # With as few episodes as allow it, so that it ends.
+    done = -(-header["step"] // HORIZON)
+
+    def go_on(say: Callable[[str], None]) -> int:
+        return not resume(path, method, [f"episodes={done}"]).train()
+
+    again = Child(go_on, folder)
+    if again.end() != 0:
+        wrong.append(again.text())
+    shutil.rmtree(folder)
+    return wrong
+
+
+def full_disk_trial(folder: Path, draw: random.Random, *, mount: bool = False) -> list[str]:
+    """Lets a training run out of room; what was wrong.
+
+    Args:
+        folder: an empty one.
+        draw: decides how much room.
+        mount: whether by a file system of limited size (as root) or by a limit for every file.
+    """
+    method = draw.choice(METHODS)
+    undisturbed = folder.parent / f"undisturbed_{method}"
+    if not undisturbed.exists():
+        reference(method, undisturbed)
+    expected = outcome(undisturbed / "runs")
+    sizes = sorted(p.stat().st_size for p in undisturbed.rglob("state_*"))
+    output, wrong = folder / "disk" / "runs", []
+    output.mkdir(parents=True)
+    if mount:
+        room = draw.randint(2 * sizes[0], 3 * sizes[0] + 60_000)
+        subprocess.run(
+            ["mount", "-t", "tmpfs", "-o", f"size={room}", "tmpfs", str(output)], check=True
+        )
+
+    def limited() -> None:
+        if not mount:
+            room = draw.randint(sizes[0] - 9_000, sizes[0] - 300)
+            resource.setrlimit(resource.RLIMIT_FSIZE, (room, room))
+
+    try:
+        arguments = ["train", method, *SMALL, f"episodes={EPISODES}", f"output={output}"]
+        child = Child(command(arguments, limited), folder)
+        status, text = child.end(), child.text()
+        (path,) = output.iterdir()
+        run = RunFolder(path)
+        last = text.strip().splitlines()[-1]
+        if status != 2 or "cannot be written" not in last or "Traceback" in text:
+            wrong.append(f"{status}: {text}")
+        good = str(run.states()[-1]) if run.states() else "there is no checkpoint yet"
+        if good not in last or f"emberlink train resume={path}" not in last:
+            wrong.append(f"does not name the last good checkpoint: {last}")
+        if temporary(path):
+            wrong.append(f"left: {temporary(path)}")
+        if not all(file.read_bytes().endswith(b"\n") for file in path.glob("*.jsonl")):
+            wrong.append("half a line")
+        if mount:
+            subprocess.run(["mount", "-o", "remount,size=100m", str(output)], check=True)
+        again = Child(training(method, output), folder)
+        if again.end() != 0 or outcome(output) != expected:
+            wrong.append(f"cannot go on: {again.text()}")
+    finally:
+        if mount:
+            subprocess.run(["umount", str(output)], check=True)
+    shutil.rmtree(folder)
+    return wrong

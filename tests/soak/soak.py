@@ -1,0 +1,109 @@
+"""Stops trainings in every way that is known, many times over, and prints a table.
+
+python tests/soak/soak.py            # about half an hour
+python tests/soak/soak.py --small    # a tenth of it
+"""
+
+import argparse
+import json
+import os
+import random
+import signal
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")
+
+from children import METHODS, SMALL, kill_trials
+from damage import damage_trials
+from ends import full_disk_trial, signal_trial
+
+from emberlink.trainers import report
+from emberlink.trainers.config import resolve
+from emberlink.trainers.loop import Trainer
+from emberlink.trainers.resume import resume
+
+Result = tuple[int, list[str]]
+
+
+def readable(folder: Path, method: str) -> list[tuple[Path, Callable[[Path], object]]]:
+    """A stopped run's state and networks, each with what reads it."""
+    trainer = Trainer(resolve(method, [*SMALL, "episodes=3", f"output={folder}"]))
+    trainer.start()
+    trainer.train(lambda progress: trainer.stop() if progress.step == 33 else None)
+    config = trainer.config
+
+    def resumed(path: Path) -> None:
+        resume(path).close()
+
+    def loaded(path: Path) -> None:
+        report.load_actor(config, path)
+
+    return [(trainer.run.states()[-1], resumed), (trainer.run.checkpoint(), loaded)]
+
+
+def trials(folder: Path, counts: dict[str, int], seed: int) -> dict[str, tuple[Callable, int]]:
+    """Every kind of trial by name: what makes so many of them."""
+    draw = random.Random(seed)
+
+    def repeated(trial: Callable[[Path], list[str]]) -> Callable[[int], Result]:
+        def many(count: int) -> Result:
+            found = [trial(folder / f"trial_{number}") for number in range(count)]
+            return count, [one for each in found for one in each]
+
+        return many
+
+    def damaged(count: int) -> Result:
+        # What is not the training's: read by the four methods in turn.
+        files = readable(folder / "damage", METHODS[seed % 4 - 1])
+        return damage_trials(files, count, seed)
+
+    every = {
+        "kill -9": lambda count: kill_trials(folder, count, seed),
+        "SIGTERM": repeated(lambda here: signal_trial(signal.SIGTERM, here, draw)),
+        "SIGINT": repeated(lambda here: signal_trial(signal.SIGINT, here, draw)),
+        "file size limit": repeated(lambda here: full_disk_trial(here, draw)),
+        "full file system": repeated(lambda here: full_disk_trial(here, draw, mount=True)),
+        "damaged checkpoint": damaged,
+    }
+    return {name: (every[name], count) for name, count in counts.items() if count}
+
+
+def run(folder: Path, counts: dict[str, int], seed: int = 0) -> dict[str, tuple[int, list[str]]]:
+    """Makes all trials: how many there were of each kind, and what was wrong."""
+    results = {}
+    for name, (many, count) in trials(folder, counts, seed).items():
+        began = time.monotonic()
+        done, wrong = many(count)
+        results[name] = done, wrong
+        print(f"| {name} | {done} | {len(wrong)} | {time.monotonic() - began:.0f} |", flush=True)
+        for one in wrong[:5]:
+            print("   ", one[:1000], flush=True)
+    return results
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--small", action="store_true", help="a tenth of the trials")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--counts", type=json.loads, help="of each kind, as JSON")
+    options = parser.parse_args()
+    share = 10 if options.small else 1
+    counts = options.counts or {
+        "kill -9": 200 // share,
+        "SIGTERM": 50 // share,
+        "SIGINT": 50 // share,
+        "file size limit": 50 // share,
+        "full file system": 20 // share if os.geteuid() == 0 else 0,
+        "damaged checkpoint": 1000 // share,
+    }
+    print("| trial | how many | failures | seconds |\n|---|---|---|---|", flush=True)
+    with tempfile.TemporaryDirectory() as folder:
+        results = run(Path(folder), counts, options.seed)
+    return int(any(wrong for _, wrong in results.values()))
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

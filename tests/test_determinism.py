@@ -1,0 +1,44 @@
+"""A seed is a run: the same again, whatever else runs; another one is another."""
+
+import pytest
+import torch
+from test_recipes import METHODS
+from test_resume import begun, until
+
+from emberlink.envs import keys
+from emberlink.envs.config import WildfireConfig
+from emberlink.envs.wildfire import WildfireEnv
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_seed_repeats_its_run_byte_for_byte(method, tmp_path):
+    def lines(folder: str, seed: int) -> bytes:
+        torch.manual_seed(len(folder))  # whatever was drawn before must not matter
+        trainer = until(begun(method, tmp_path / folder, "episodes=2", f"seed={seed}"), None)
+        assert trainer.updates > 0
+        return (trainer.run.path / "metrics.jsonl").read_bytes()
+
+    first = lines("one", 7)
+    assert first.count(b"\n") == 2
+    assert lines("again", 7) == first
+    assert lines("another", 8) != first
+
+
+@pytest.mark.parametrize("fire", ["paper", "huygens"])
+def test_an_environment_does_not_know_how_many_others_there_are(fire):
+    """Over two episodes, with the same actions."""
+    world = WildfireConfig(horizon=15)
+    few, many = (WildfireEnv(count, world, fire=fire, seed=3) for count in (2, 5))
+    generator = torch.Generator().manual_seed(0)
+    for _ in range(2):
+        moments = [env.reset() for env in (few, many)]
+        for _ in range(15):
+            one, other = moments
+            for key in (keys.OBSERVATION, keys.POSITION, keys.STREAM, keys.BURNING):
+                assert one[key].equal(other[key][:2]), key
+            assert not other[keys.STREAM][2:].unsqueeze(1).eq(one[keys.STREAM]).any()
+            action = torch.rand(5, *one[keys.POSITION].shape[1:], generator=generator) * 2 - 1
+            moments = [
+                env.step(moment.set(keys.ACTION, action[: len(moment)]))["next"]
+                for env, moment in zip((few, many), moments, strict=True)
+            ]

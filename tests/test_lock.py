@@ -1,0 +1,110 @@
+"""One training a run folder."""
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from test_resume import begun, until
+
+from emberlink.trainers import cli
+from emberlink.trainers.lock import Lock
+from emberlink.trainers.resume import resume
+
+HOLD = """
+import sys, time
+from pathlib import Path
+sys.path.insert(0, "trainers")
+from lock import Lock
+lock = Lock(Path(sys.argv[1]))
+print("locked", flush=True)
+time.sleep(60)
+"""
+
+
+@pytest.fixture
+def other(tmp_path):
+    """Another process that has locked a folder."""
+    process = subprocess.Popen(
+        [sys.executable, "-c", HOLD, str(tmp_path)],
+        stdout=subprocess.PIPE,
+        text=True,
+        cwd=Path(__file__).parent.parent,
+    )
+    assert process.stdout is not None
+    assert process.stdout.readline() == "locked\n"
+    yield process
+    process.kill()
+    process.wait()
+
+
+def test_the_second_refuses_and_names_the_first(other, tmp_path):
+    with pytest.raises(ValueError, match=f"process {other.pid} on {socket.gethostname()}"):
+        Lock(tmp_path)
+    assert (tmp_path / "lock").exists()
+
+
+def test_the_lock_of_a_dead_process_is_taken_over(other, tmp_path):
+    other.send_signal(signal.SIGKILL)
+    other.wait()
+    assert (tmp_path / "lock").exists()
+    lock = Lock(tmp_path)
+    assert lock.stale == f"process {other.pid} on {socket.gethostname()}"
+    assert str(os.getpid()) in (tmp_path / "lock").read_text()
+    lock.release()
+    assert not (tmp_path / "lock").exists()
+
+
+def test_a_number_that_was_given_out_again_is_not_taken_for_the_dead_process(tmp_path):
+    """The file names a process that lives: this one; it has not locked anything."""
+    (tmp_path / "lock").write_text(f"process {os.getpid()} on {socket.gethostname()}\n")
+    lock = Lock(tmp_path)
+    with pytest.raises(ValueError, match="is training here"):
+        Lock(tmp_path)
+    lock.release()
+    lock.release()
+    Lock(tmp_path).release()
+
+
+def test_a_lock_file_that_was_taken_away_in_between_is_no_lock(tmp_path, monkeypatch):
+    """The holder gives up between the other's open and flock: both must not have it."""
+    import fcntl
+
+    real, first = fcntl.flock, Lock(tmp_path)
+
+    def flock(handle: int, how: int) -> None:
+        first.release()
+        real(handle, how)
+
+    monkeypatch.setattr(fcntl, "flock", flock)
+    second = Lock(tmp_path)
+    assert os.path.samestat(os.fstat(second._handle), (tmp_path / "lock").stat())
+    monkeypatch.undo()
+    with pytest.raises(ValueError, match="is training here"):
+        Lock(tmp_path)
+    second.release()
+
+
+def test_a_folder_that_cannot_be_locked(tmp_path):
+    with pytest.raises(ValueError, match=r"lock: cannot be locked"):
+        Lock(tmp_path / "missing")
+
+
+def test_two_trainings_in_one_folder(tmp_path, capsys):
+    trainer = until(begun("independent", tmp_path, "seeds=[1,2]"), 10)
+    assert not list(tmp_path.rglob("lock"))
+    first = resume(trainer.run.path)
+    try:
+        for run in first.runs:
+            before = {path: path.read_bytes() for path in run.path.rglob("*") if path.is_file()}
+            assert cli.main(["train", f"resume={run.path}"]) == 2
+            error = capsys.readouterr().err
+            assert f"process {os.getpid()}" in error
+            assert error.count("\n") == 1
+            assert before == {p: p.read_bytes() for p in run.path.rglob("*") if p.is_file()}
+    finally:
+        first.close()
+    resume(trainer.run.path).close()

@@ -1,0 +1,288 @@
+"""A run that was stopped and resumed is, bit for bit, the run that was not."""
+
+import shutil
+from pathlib import Path
+from weakref import WeakKeyDictionary
+
+import pytest
+import torch
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from test_recipes import METHODS
+
+from emberlink.trainers import checkpoint, cli, state
+from emberlink.trainers.config import resolve
+from emberlink.trainers.loop import Progress, Trainer
+from emberlink.trainers.resume import resume
+from emberlink.trainers.run_folder import RunFolder
+
+HORIZON, EPISODES = 20, 4
+SMALL = [
+    *(f"env.horizon={HORIZON}", f"episodes={EPISODES}", "env.num_uavs=2", "num_envs=2"),
+    # A memory of 60 rows comes round after 30 of the 80 steps.
+    *("learner.hidden=[8,8]", "learner.batch=16", "learner.capacity=60"),
+    *("evaluation.interval=0", "evaluation.interval_fires=1", "evaluation.fires=1"),
+]
+
+
+def begun(method: str, output: Path, *more: str) -> Trainer:
+    trainer = Trainer(resolve(method, [*SMALL, f"output={output}", *more]))
+    trainer.start()
+    return trainer
+
+
+def until(trainer: Trainer, step: int | None) -> Trainer:
+    """Trains until a step, or to the end; what it is by then goes to `final`."""
+
+    def watch(progress: Progress) -> None:
+        if progress.step == step:
+            trainer.stop()
+        if progress.step == progress.steps:
+            final[trainer] = everything(trainer)
+
+    trainer.train(watch)
+    return trainer
+
+
+final: WeakKeyDictionary[Trainer, dict[str, torch.Tensor]] = WeakKeyDictionary()
+
+
+def stopped_at(steps: list[int], method: str, output: Path, *more: str) -> Trainer:
+    """A run that was stopped at each of some steps, and resumed, and has come to its end."""
+    trainer = until(begun(method, output, *more), steps[0])
+    for step in [*steps[1:], None]:
+        trainer = until(resume(trainer.run.path), step)
+    return trainer
+
+
+def everything(trainer: Trainer) -> dict[str, torch.Tensor]:
+    found = {name: value.clone() for name, value in state.tensors(trainer).items()}
+    return found | {name: torch.tensor(value) for name, value in state.counters(trainer).items()}
+
+
+def assert_same(one: Trainer, other: Trainer) -> None:
+    """The same state to the last bit, and the same lines."""
+    first, second = final[one], final[other]
+    assert first.keys() == second.keys()
+    for name, value in first.items():
+        assert value.dtype == second[name].dtype
+        # As bytes: NaN is NaN, and 0 is not -0.
+        assert value.numpy().tobytes() == second[name].numpy().tobytes(), name
+    for a, b in zip(one.runs, other.runs, strict=True):
+        assert (a.path / "metrics.jsonl").read_bytes() == (b.path / "metrics.jsonl").read_bytes()
+        assert [line["episode"] for line in b.lines("timing.jsonl")] == [
+            line["episode"] for line in a.lines("timing.jsonl")
+        ]
+        assert a.networks()[-1].read_bytes() == b.networks()[-1].read_bytes()
+        best = "checkpoints/best.safetensors"
+        assert (a.path / best).read_bytes() == (b.path / best).read_bytes()
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """The uninterrupted run of a method."""
+    runs: dict[tuple, Trainer] = {}
+
+    def of(method: str, *more: str) -> Trainer:
+        if (method, *more) not in runs:
+            folder = tmp_path_factory.mktemp("whole")
+            runs[method, *more] = until(begun(method, folder, *more), None)
+        return runs[method, *more]
+
+    return of
+
+
+# Before the first update, within an episode, at its end, behind it, before the last step; at 33 of
+# 80 the memory has just come round.
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("steps", [[1, 33], [40], [41, 42, 79]])
+def test_a_stopped_run_is_the_run_that_was_not(method, steps, whole, tmp_path):
+    assert_same(whole(method), stopped_at(steps, method, tmp_path))
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_seeds_side_by_side_are_resumed_together(method, whole, tmp_path):
+    one = stopped_at([27, 60], method, tmp_path, "seeds=[0,1,2]")
+    assert len(one.runs) == 3
+    assert_same(whole(method, "seeds=[0,1,2]"), one)
+
+
+def test_every_step_can_be_the_last_one(whole, tmp_path):
+    """One run that is stopped after each 5 steps, so within, at and behind every episode's end."""
+    steps, evaluated = list(range(5, HORIZON * EPISODES, 5)), "evaluation.interval=2"
+    assert_same(whole("consensus", evaluated), stopped_at(steps, "consensus", tmp_path, evaluated))
+
+
+def test_several_updates_a_step_and_the_released_setup(whole, tmp_path):
+    more = ["setup=released", "learner.updates=3"]
+    assert_same(whole("consensus", *more), stopped_at([9, 50], "consensus", tmp_path, *more))
+
+
+def test_whichever_seeds_folder_is_named(tmp_path):
+    trainer = until(begun("independent", tmp_path, "seeds=[4,5]"), 25)
+    again = resume(trainer.runs[1].path)
+    assert [run.path for run in again.runs] == [run.path.absolute() for run in trainer.runs]
+    assert again.step == 25
+    again.close()
+    moved = tmp_path / "elsewhere"
+    moved.mkdir()
+    for run in trainer.runs:
+        shutil.move(run.path, moved)
+    until(resume(moved / trainer.run.path.name), None)
+    shutil.rmtree(moved / trainer.runs[1].path.name)
+    with pytest.raises(ValueError, match=r"no such run folder|cannot be locked"):
+        resume(moved / trainer.run.path.name)
+
+
+def test_what_came_after_the_checkpoint_is_cut_off_and_made_again(whole, tmp_path):
+    trainer = until(begun("positional", tmp_path, "checkpoint_steps=7"), 45)
+    run = trainer.run
+    (run.checkpoints / "state_000000045.safetensors").unlink()
+    (run.checkpoints / "state_000000049.safetensors.part").write_bytes(b"half a file")
+    (run.checkpoints / ".tmpQ3x9Zk").write_bytes(b"half a file of safetensors'")
+    (run.path / "metrics.jsonl").open("a").write('{"episode": 3, "upd')
+    again = resume(run.path)
+    assert again.step == 42
+    left = {path.name for path in run.checkpoints.iterdir()}
+    assert "step_000000045.safetensors" not in left
+    assert not [name for name in left if name.endswith(".part") or name.startswith(".tmp")]
+    assert len(run.lines()) == (run.path / "metrics.jsonl").read_text().count("\n") == 2
+    assert_same(whole("positional"), until(again, None))
+
+
+def test_a_run_without_a_checkpoint_begins_again(whole, tmp_path):
+    trainer = until(begun("consensus", tmp_path), 30)
+    for path in trainer.run.states() + trainer.run.networks():
+        path.unlink()
+    again = resume(trainer.run.path)
+    assert (again.step, trainer.run.lines()) == (0, [])
+    assert_same(whole("consensus"), until(again, None))
+
+
+def test_more_episodes_are_those_of_a_run_that_had_them_from_the_start(whole, tmp_path):
+    """Also of a memory that was full to the last row, and is larger now."""
+    roomy = "learner.capacity=100000"
+    short = until(begun("shared_memory", tmp_path, roomy, "episodes=2"), None)
+    assert len(short.memory) == short.memory.sampler.rows == 2 * 2 * HORIZON
+    again = resume(short.run.path, overrides=[f"episodes={EPISODES}"])
+    assert_same(whole("shared_memory", roomy), until(again, None))
+    assert RunFolder(short.run.path).config().episodes == EPISODES
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["env.num_uavs=3"], "env.num_uavs=3: the run has env.num_uavs=2"),
+        (["learner.gamma=0.5"], "learner.gamma=0.5"),
+        (["seed=9"], "seed=9"),
+        (["output=elsewhere"], "output=elsewhere"),
+        (["setup=tuned"], "setup=tuned: the run has setup=paper"),
+        (["fire=huygens"], "fire=huygens: the run has fire=paper"),
+        (["episodes=1"], "episodes=1: the run has done 1.5"),
+        (["keap=3"], "'keap' is not known; did you mean keep?"),
+        (["keep=0"], "keep=0"),
+    ],
+)
+def test_what_was_learnt_with_is_kept(overrides, message, paused, capsys):
+    before = contents(paused)
+    assert cli.main(["train", f"resume={paused}", *overrides]) == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.count("\n") == 1
+    assert contents(paused) == before
+
+
+@pytest.fixture(scope="module")
+def _paused(tmp_path_factory) -> Path:
+    return until(begun("consensus", tmp_path_factory.mktemp("paused")), 30).run.path
+
+
+@pytest.fixture
+def paused(_paused, tmp_path) -> Path:
+    """A copy of a run that was stopped at step 30."""
+    return Path(shutil.copytree(_paused, tmp_path / "paused"))
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(path): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def test_the_command_goes_on_and_says_when_nothing_is_left(paused, whole, capsys):
+    quiet = ["evaluation.fires=2", "checkpoint_interval=1", "keep=2", "setup=paper"]
+    assert cli.main(["train", "positional", f"resume={paused}"]) == 2
+    assert "the run is of method 'consensus'" in capsys.readouterr().err
+    assert cli.main(["train", "consensus", f"resume={paused}", *quiet]) == 0
+    assert "resumed at step 30 of 80" in capsys.readouterr().out
+    uninterrupted = (whole("consensus").run.path / "metrics.jsonl").read_bytes()
+    assert (paused / "metrics.jsonl").read_bytes() == uninterrupted
+    assert len(RunFolder(paused).networks()) == 2
+    before = contents(paused)
+    assert cli.main(["train", f"resume={paused}"]) == 0
+    assert "is finished" in capsys.readouterr().out
+    assert contents(paused) == before
+
+
+def test_folders_that_cannot_be_resumed(paused, tmp_path, capsys):
+    def refused(path: Path | str, *words: str) -> None:
+        assert cli.main(["train", f"resume={path}"]) == 2
+        error = capsys.readouterr().err
+        assert error.count("\n") == 1
+        for word in words:
+            assert word in error
+
+    refused("", "one run folder")
+    refused(tmp_path / "none", "no such run folder")
+    refused(tmp_path, "config.yaml is missing")
+    lines = (paused / "metrics.jsonl").read_text()
+    (paused / "metrics.jsonl").write_text(lines[:-5])
+    refused(paused, "metrics.jsonl", "1 lines")
+    (paused / "metrics.jsonl").write_text("#" + lines[1:-1] + "x")
+    refused(paused, "metrics.jsonl", "1 lines")
+    (paused / "metrics.jsonl").write_text(lines)
+    RunFolder(paused).states()[0].unlink()
+    refused(paused, "holds networks alone", "emberlink eval")
+
+
+def test_a_tracker_goes_on_where_the_checkpoint_was_made(tmp_path):
+    def rows(trainer: Trainer) -> dict[str, str]:
+        folder = trainer.run.path / "csv"
+        return {path.name: path.read_text() for path in folder.rglob("*.csv")}
+
+    more = ["logger=csv", "evaluation.interval=0"]
+    one = until(begun("independent", tmp_path / "a", *more), None)
+    two = until(begun("independent", tmp_path / "b", *more, "checkpoint_interval=1"), 70)
+    for path in [two.run.state(70), *two.run.networks()[-1:]]:
+        path.unlink()  # stands for a run that was killed: csv knows of later episodes
+    assert rows(one) == rows(until(resume(two.run.path), None))
+    assert len(rows(one)["score.csv"].splitlines()) == EPISODES
+
+
+def test_old_checkpoints_go_and_the_best_stays(tmp_path):
+    more = ["checkpoint_steps=9", "keep=3", "evaluation.interval=1"]
+    trainer = until(begun("consensus", tmp_path, *more), None)
+    run = trainer.run
+    assert [path.stem[-3:] for path in run.networks()] == ["063", "072", "080"]
+    assert [path.stem[-3:] for path in run.states()] == ["072", "080"]
+    header = checkpoint.read_header(run.checkpoints / "best.safetensors")
+    assert header is not None
+    held_out = [line["huygens/coverage"] + line["paper/coverage"] for line in run.lines()]
+    assert header["step"] == HORIZON * (1 + held_out.index(max(held_out)))
+
+
+def test_tensorboard_forgets_what_comes_again(tmp_path):
+    """A run that was killed before its first checkpoint: all four episodes come twice."""
+    trainer = until(begun("independent", tmp_path, "logger=tensorboard"), 70)
+    for path in trainer.run.states() + trainer.run.networks():
+        path.unlink()
+    until(resume(trainer.run.path), None)
+    events = EventAccumulator(str(trainer.run.path / "tensorboard"))
+    events.Reload()
+    assert [event.step for event in events.Scalars("score")] == [1, 2, 3, 4]
+
+
+def test_wandb_keeps_the_name_of_the_run(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("WANDB_MODE", "offline")
+    trainer = until(begun("independent", tmp_path / "runs", "logger=wandb"), 25)
+    until(resume(trainer.run.path), None)
+    folders = sorted((trainer.run.path / "wandb").glob("offline-run-*"))
+    assert len({folder.name.rpartition("-")[2] for folder in folders}) == 1

@@ -1,0 +1,62 @@
+"""One training a run folder: a lock that dies with its process."""
+
+import fcntl
+import os
+import socket
+from pathlib import Path
+
+
+class Lock:
+    """The right to train in a run folder: an exclusive `flock` on its file `lock`.
+
+    The system gives it up when the process ends, however it ends, so that no number of a process
+    that has been given out again can be taken for it. The file holds the process's number and
+    machine, for the message.
+
+    Args:
+        folder: of the run.
+
+    Raises:
+        ValueError: another process has it, or the file cannot be made.
+    """
+
+    def __init__(self, folder: Path):
+        self.path = folder / "lock"
+        self.stale: str | None = None
+        """what had locked the folder and is gone, if anything"""
+        try:
+            self._handle = self._take()
+        except BlockingIOError:
+            raise ValueError(f"{folder}: {self._holder()} is training here") from None
+        except OSError as error:
+            raise ValueError(f"{self.path}: cannot be locked: {error.strerror}") from None
+
+    def release(self) -> None:
+        """Takes the file away and gives the lock up; a second time does nothing."""
+        if self._handle >= 0:
+            self.path.unlink(missing_ok=True)
+            os.close(self._handle)
+            self._handle = -1
+
+    def _take(self) -> int:
+        while True:
+            handle = os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o644)
+            try:
+                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                # Whoever had it may have taken the file away between the two calls.
+                if self.path.exists() and os.path.samestat(os.fstat(handle), self.path.stat()):
+                    self.stale = os.pread(handle, 200, 0).decode(errors="replace").strip() or None
+                    os.ftruncate(handle, 0)
+                    text = f"process {os.getpid()} on {socket.gethostname()}\n"
+                    os.pwrite(handle, text.encode(), 0)
+                    return handle
+            except BaseException:
+                os.close(handle)
+                raise
+            os.close(handle)
+
+    def _holder(self) -> str:
+        try:
+            return self.path.read_text(errors="replace").strip() or "another process"
+        except OSError:
+            return "another process"

@@ -1,0 +1,145 @@
+"""Going on with a run that was stopped, as if it had not been."""
+
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from . import checkpoint, state
+from .config import RunConfig, flat, from_values, override, to_values
+from .lock import Lock
+from .loop import LINES, SIBLINGS, Trainer
+from .reading import LONGEST_YAML, parse_json, read_text
+from .run_folder import RunFolder
+
+MAY_CHANGE = ("episodes", "device", "logger", "checkpoint_interval", "checkpoint_steps", "keep")
+"""keys that a resumed run may be given anew, beside those of `evaluation`"""
+
+
+def resume(path: Path, method: str | None = None, overrides: Sequence[str] = ()) -> Trainer:
+    """The training of a run folder, where its newest checkpoint was made.
+
+    Metrics of later steps are cut off, and later or half-written checkpoints taken away: the
+    training makes them again. A run that has no checkpoint yet begins again.
+
+    Args:
+        path: a run folder, of any of the seeds that train side by side; or one of its
+            `checkpoints/state_*.safetensors`, to go back further.
+        method: must be the run's, if given.
+        overrides: `key=value`, of keys that change nothing that was learnt.
+
+    Raises:
+        ValueError: one line that says what cannot be resumed and why. Nothing was changed.
+    """
+    chosen = path if path.suffix == ".safetensors" else None
+    runs = _runs(path.parent.parent if chosen else path)
+    before = runs[0].config()
+    config = _changed(before, method, overrides)
+    with ExitStack() as stack:
+        locks = [Lock(run.path) for run in runs]
+        for lock in locks:
+            stack.callback(lock.release)
+        trainer = Trainer(config)
+        if len(runs) != trainer.teams:
+            raise ValueError(f"{runs[0].path}: {len(runs)} folders for {trainer.teams} seeds")
+        sizes = _restore(trainer, runs, chosen)
+        for run, of in zip(runs, sizes, strict=True):
+            for file in LINES:
+                run.check_lines(file, of[file], trainer.episode)
+        # From here on everything is known to fit.
+        for run, of, one in zip(runs, sizes, trainer.configs, strict=True):
+            for file in LINES:
+                run.cut(file, of[file])
+            run.take_away_after(trainer.step)
+            if config != before:
+                run.write_config(one)
+        trainer.take(runs, locks)
+        if trainer.step:
+            trainer.saved = trainer.step
+            trainer.save_networks()
+        stack.pop_all()
+    return trainer
+
+
+def _runs(folder: Path) -> list[RunFolder]:
+    """The folders of all seeds that train with the one whose folder this is, in order."""
+    file = folder / SIBLINGS
+    if not file.exists():
+        return [RunFolder(folder)]
+    try:
+        names = parse_json(read_text(file, LONGEST_YAML))["folders"]
+        return [RunFolder(folder.absolute().parent / Path(name).name) for name in names]
+    except (OSError, ValueError, TypeError, KeyError):
+        raise ValueError(f"{file}: does not name the folders of the other seeds") from None
+
+
+def _changed(config: RunConfig, method: str | None, overrides: Sequence[str]) -> RunConfig:
+    if method is not None and method != config.method:
+        raise ValueError(f"method {method!r}: the run is of method {config.method!r}")
+    changed = override(config, overrides)
+    for key, (new, old) in _differences(changed, config).items():
+        if key not in MAY_CHANGE and not key.startswith("evaluation."):
+            raise ValueError(f"{key}={new}: the run has {key}={old}; a resumed run keeps it")
+    return changed
+
+
+def _differences(one: RunConfig, other: RunConfig) -> dict[str, tuple[Any, Any]]:
+    first, second = flat(to_values(one)), flat(to_values(other))
+    return {
+        key: (first.get(key), second.get(key))
+        for key in [*first, *(key for key in second if key not in first)]
+        if first.get(key) != second.get(key)
+    }
+
+
+def _restore(
+    trainer: Trainer, runs: Sequence[RunFolder], chosen: Path | None
+) -> list[Mapping[str, int]]:
+    """Puts the training where the checkpoint was made: bytes of each run's files by then."""
+    first = runs[0]
+    states = first.states()
+    if chosen is None and not states:
+        if first.networks():
+            raise ValueError(
+                f"{first.path}: holds networks alone (checkpoints/state_*.safetensors is missing); "
+                f"they can be evaluated: emberlink eval {first.path}"
+            )
+        return [dict.fromkeys(LINES, 0) for _ in runs]
+    path = chosen or states[-1]
+    try:
+        _restore_from(trainer, path)
+    except ValueError as error:
+        older = [one for one in states if one < path]
+        hint = f"; the one before it: emberlink train resume={older[-1]}" if older else ""
+        raise ValueError(f"{error}{hint}") from None
+    header = checkpoint.read_header(path) or {}
+    if header["folders"] != [run.path.name for run in runs] and len(runs) > 1:
+        raise ValueError(f"{path}: of the folders {', '.join(header['folders'])}")
+    return header["files"]
+
+
+def _restore_from(trainer: Trainer, path: Path) -> None:
+    header, content = checkpoint.read(path)
+    if header is None or header.get("kind") != "state":
+        raise ValueError(f"{path}: holds networks alone; nothing can be resumed from it")
+    try:
+        _check_config(trainer.config, path, header["config"])
+        if header["step"] > trainer.steps:
+            done = header["step"] / trainer.config.env.horizon
+            raise ValueError(f"episodes={trainer.config.episodes}: the run has done {done:g}")
+        state.restore(trainer, path, header, content)
+        trainer.best, trainer.seconds = list(header["best"]), float(header["seconds"])
+    except (KeyError, TypeError, AttributeError) as error:
+        raise ValueError(f"{path}: its header is not one of a state: {error}") from None
+
+
+def _check_config(config: RunConfig, path: Path, values: Mapping[str, Any]) -> None:
+    """That the checkpoint's configuration is the run's, but for what may change."""
+    free = {key: getattr(config, key) for key in (*MAY_CHANGE, "output", "evaluation")}
+    try:
+        made = from_values({**values, "device": config.device})
+    except ValueError as error:
+        raise ValueError(f"{path}: made with a configuration that is none: {error}") from None
+    for key, (found, wanted) in _differences(replace(made, **free), config).items():
+        raise ValueError(f"{path}: made with {key}={found}; the run has {key}={wanted}")
