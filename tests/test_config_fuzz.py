@@ -1,0 +1,331 @@
+"""Every key of the configuration: what fits is built and stepped, all else is one line naming it.
+
+The keys, their types and bounds are read from the schema, so that a new key is fuzzed as well.
+"""
+
+import copy
+import functools
+import math
+import re
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from pydantic import TypeAdapter
+from robustness import SOAK
+
+from emberlink.comm import registry
+from emberlink.envs import keys
+from emberlink.envs.config import known
+from emberlink.trainers import cli
+from emberlink.trainers.build import build_env
+from emberlink.trainers.config import RunConfig, from_values, resolve, to_values
+from emberlink.trainers.loop import Trainer
+
+EXAMPLES = 5000 if SOAK else 500
+FUZZ = settings(
+    max_examples=EXAMPLES // 2,  # half of them right, half of them wrong
+    deadline=None,
+    derandomize=not SOAK,
+    suppress_health_check=list(HealthCheck),
+    database=None,
+)
+# The largest values that are tried where larger ones would only take long.
+CAPS = {
+    "env.grid": 17,
+    "env.num_uavs": 4,
+    "env.horizon": 12,
+    "fire.bank": 2,
+    "fire.patches": 2,
+    "learner.hidden": 12,
+    "learner.capacity": 400,
+    "learner.batch": 30,
+    "learner.updates": 2,
+    "episodes": 3,
+    "num_envs": 3,
+}
+FIXED = {"device": ["cpu"], "output": ["runs", "a b/c-ü"]}
+SCHEMA = TypeAdapter(RunConfig).json_schema()
+COMM = {
+    name: TypeAdapter(registry.find(name).config_type).json_schema() for name in registry.known()
+}
+
+
+def entered(schema: dict, root: dict) -> dict:
+    """The schema that a reference stands for."""
+    return root["$defs"][schema["$ref"].rsplit("/", 1)[-1]] if "$ref" in schema else schema
+
+
+def leaves(schema: dict, root: dict, prefix: str = "") -> Iterator[tuple[str, dict]]:
+    """Every key that holds a value, with its schema, `comm` aside."""
+    for name, below in schema["properties"].items():
+        below = entered(below, root)
+        if "properties" in below:
+            yield from leaves(below, root, f"{prefix}{name}.")
+        elif prefix + name != "comm":
+            yield prefix + name, below
+
+
+KEYS = dict(leaves(SCHEMA, SCHEMA))
+COMM_KEYS = {
+    name: {f"comm.{key}": below for key, below in leaves({"properties": {}, **one}, one)}
+    for name, one in COMM.items()
+}
+
+
+def bounds(schema: dict) -> tuple[float, float]:
+    return (
+        schema.get("minimum", schema.get("exclusiveMinimum", -math.inf)),
+        schema.get("maximum", schema.get("exclusiveMaximum", math.inf)),
+    )
+
+
+def fitting(key: str, schema: dict) -> st.SearchStrategy:
+    """Values that fit a key."""
+    low, high = bounds(schema)
+    cap = CAPS.get(key, math.inf)
+    kind = schema.get("type")
+    if key in FIXED:
+        return st.sampled_from(FIXED[key])
+    if "enum" in schema or "const" in schema:
+        return st.sampled_from(schema.get("enum", [schema.get("const")]))
+    if "anyOf" in schema:
+        return st.one_of([fitting(key, one) for one in schema["anyOf"]])
+    if kind == "null":
+        return st.none()
+    if kind == "boolean":
+        return st.booleans()
+    if kind == "integer":
+        least = int(low) if math.isfinite(low) else None
+        most = min(high - ("exclusiveMaximum" in schema), cap)
+        return st.integers(least, int(most) if math.isfinite(most) else None)
+    if kind == "number":
+        return st.floats(
+            None if low == -math.inf else low,
+            None if high == math.inf else high,
+            exclude_min="exclusiveMinimum" in schema,
+            exclude_max="exclusiveMaximum" in schema,
+            allow_nan=False,
+            allow_infinity=False,
+        )
+    if kind == "string":
+        return st.from_regex(re.compile(schema["pattern"], re.ASCII), fullmatch=True).map(
+            lambda text: text[:100]
+        )
+    assert kind == "array", (key, schema)
+    if "prefixItems" in schema:
+        parts = [fitting(key, entered(one, SCHEMA)) for one in schema["prefixItems"]]
+        pair = st.tuples(*parts)
+        return pair.map(list) if key in ("env.grid", "learner.hidden") else pair.map(sorted)
+    return st.lists(fitting(key, schema["items"]), unique=True, max_size=3)
+
+
+def wrong(schema: dict) -> list:
+    """Values that do not fit: other types, beyond the bounds, of another length."""
+    low, high = bounds(schema)
+    kind = schema.get("type")
+    other: list = [None, {}, {"a": {"b": 1}}, b"x", {1, 2}, object(), "\ud800", "a\nb", 10**5000]
+    if "anyOf" in schema:
+        kinds = [set(map(repr, wrong(one))) for one in schema["anyOf"]]
+        return [one for one in wrong(schema["anyOf"][0]) if all(repr(one) in k for k in kinds)]
+    if kind in ("integer", "number"):
+        other += [True, False, "1", "", "1e400", [1], [], math.nan, "∞", 1j]
+        other += [low - max(1, abs(low)), -(10**400)] if math.isfinite(low) else []
+        other += [high + max(1, abs(high)), math.inf, 10**400] if math.isfinite(high) else []
+        other += [low] if "exclusiveMinimum" in schema else []
+        other += [high] if "exclusiveMaximum" in schema else []
+        return [*other, 1.5, 3.0, math.inf] if kind == "integer" else other
+    if kind == "array":
+        parts = schema.get("prefixItems", [schema.get("items")])
+        right = [1] * len(parts)
+        other += ["ab", 3, True, math.nan, [[1], [1]], [None] * len(parts), ["x"] * len(parts)]
+        other += [[*right[:-1], one] for one in (True, "1", math.nan, {}, 10**400, -(10**9))]
+        return [*other, [], right[:-1], [*right, 1]] if "prefixItems" in schema else other
+    if kind == "boolean":
+        return [*other, 0, 1, "true", [True]]
+    assert kind == "string", schema
+    return [*other, 1, 1.5, True, [], ["a"], *(["", "nothing", "Raw "] if "enum" in schema else [])]
+
+
+@functools.cache
+def recipe(method: str, setup: str) -> dict:
+    return to_values(resolve(method, [f"setup={setup}"]))
+
+
+def put(values: dict, key: str, value) -> dict:
+    changed = copy.deepcopy(values)
+    *path, last = key.split(".")
+    at = changed
+    for part in path:
+        at = at[part]
+    at[last] = value
+    return changed
+
+
+@st.composite
+def valid_values(draw) -> dict:
+    """A recipe with every one of its keys drawn anew."""
+    method = draw(st.sampled_from(known("method")))
+    values = copy.deepcopy(recipe(method, draw(st.sampled_from(known("setup")))))
+    for key, schema in {**KEYS, **COMM_KEYS[values["comm"]["name"]]}.items():
+        values = put(values, key, draw(fitting(key, schema)))
+    learner = values["learner"]
+    learner["capacity"] = max(learner["capacity"], learner["batch"])
+    return values
+
+
+def stepped(values: dict) -> None:
+    config = from_values(values)
+    assert to_values(config) == values  # nothing was coerced, and nothing left out
+    env = build_env(config, num_envs=config.num_envs, fire=config.fire, seed=1, device="cpu")
+    moment = env.reset()
+    for _ in range(2):
+        moment = env.rand_action(moment)
+        moment = env.step(moment)["next"]
+    for key in (keys.OBSERVATION, keys.REWARD, keys.POSITION):
+        assert moment[key].isfinite().all(), key
+
+
+@FUZZ
+@given(valid_values())
+def test_what_fits_is_built_and_stepped(values):
+    stepped(values)
+
+
+@settings(FUZZ, max_examples=max(15, EXAMPLES // 50))
+@given(valid_values())
+def test_what_fits_collects_and_learns(values):
+    values["seeds"] = values["seeds"][:2]
+    for name in ("episodes", "num_envs"):
+        values[name] = 2
+    values["env"]["horizon"] = max(values["env"]["horizon"], 3)
+    Trainer(from_values(values)).rehearse(steps=3)
+
+
+def refused(key: str, build) -> str:
+    with pytest.raises(ValueError, match=re.escape(key) or ".") as caught:
+        build()
+    text = str(caught.value)
+    assert type(caught.value) is ValueError
+    assert key in text, text
+    assert text.isprintable(), text
+    assert len(text) < 1500, text
+    return text
+
+
+def every_key() -> list[tuple[str, str, dict]]:
+    """A method that has the key, the key, its schema."""
+    of_comm = {recipe(method, "paper")["comm"]["name"]: method for method in known("method")}
+    found = [("consensus", key, schema) for key, schema in KEYS.items()]
+    for name, several in COMM_KEYS.items():
+        found += [(of_comm[name], key, schema) for key, schema in several.items()]
+    return found
+
+
+@pytest.mark.parametrize(("method", "key", "schema"), every_key(), ids=lambda one: str(one)[:40])
+def test_what_does_not_fit_is_one_line_that_names_the_key(method, key, schema):
+    values = recipe(method, "tuned")
+    for value in wrong(schema):
+        refused(key, lambda value=value: from_values(put(values, key, value)))
+    *path, last = key.split(".")
+    for other in (last + "s", last[:-1] + "é", last.upper(), f" {last}", "_target_", "", "a\nb"):
+        name = ".".join([*path, other])
+        told = name if other.isprintable() and other else ".".join(path)
+        refused(told, lambda name=name: from_values(put(values, name, 1)))
+    without = copy.deepcopy(values)
+    at = functools.reduce(dict.__getitem__, path, without)
+    del at[last]
+    if "default" not in schema:
+        refused(key, lambda: from_values(without))
+
+
+@FUZZ
+@given(st.data())
+def test_several_wrong_values_are_one_line_that_names_one_of_them(data):
+    method = data.draw(st.sampled_from(known("method")))
+    values = recipe(method, data.draw(st.sampled_from(known("setup"))))
+    there = {**KEYS, **COMM_KEYS[values["comm"]["name"]]}
+    chosen = data.draw(st.lists(st.sampled_from(sorted(there)), min_size=1, max_size=3))
+    for key in chosen:
+        values = put(values, key, data.draw(st.sampled_from(wrong(there[key]))))
+    text = refused("", lambda: from_values(values))
+    assert any(key in text for key in chosen), (chosen, text)
+
+
+TEXTS = (
+    "true",
+    "null",
+    "'x y'",
+    "1e400",
+    "nan",
+    "-inf",
+    "[1,2,3,4]",
+    "{a: {b: 1}}",
+    "²",
+    "${nope}",
+)
+
+
+@pytest.mark.parametrize("text", TEXTS)
+def test_the_command_line_refuses_what_does_not_fit(text, tmp_path, capsys):
+    rng = np.random.default_rng(len(text))
+    numbers = [k for k, s in KEYS.items() if s.get("type") in ("integer", "number", "array")]
+    for key in rng.permutation(numbers)[: 400 if SOAK else 4]:
+        arguments = ["train", "consensus", f"{key}={text}", f"output={tmp_path / 'x'}"]
+        assert cli.main(arguments) == 2
+        out, err = capsys.readouterr()
+        assert (out, err.count("\n")) == ("", 1)
+        assert key in err
+    assert list(tmp_path.iterdir()) == []
+
+
+def flat(values: dict, prefix: str = "") -> Iterator[str]:
+    for key, value in values.items():
+        if isinstance(value, dict):
+            yield from flat(value, f"{prefix}{key}.")
+        else:
+            yield prefix + key
+
+
+def test_every_key_of_every_group_is_fuzzed():
+    fuzzed = set(KEYS).union(*COMM_KEYS.values()) | {"comm.name"}
+    found: set[str] = set()
+    for method in known("method"):
+        for setup in known("setup"):
+            for fire in known("fire"):
+                config = resolve(method, [f"setup={setup}", f"fire={fire}"])
+                found |= set(flat(to_values(config)))
+    assert found == fuzzed
+    assert set(CAPS) | set(FIXED) <= fuzzed  # none of these is a key that went
+
+
+@pytest.mark.parametrize(
+    ("given", "plain"),
+    [
+        ({"seeds": np.arange(3)}, [0, 1, 2]),
+        ({"seeds": [np.int64(4), np.int32(5)]}, [4, 5]),
+        ({"seeds": range(2)}, [0, 1]),
+        ({"seed": np.int64(7)}, 7),
+        ({"env.grid": np.array([12, 9])}, [12, 9]),
+        ({"learner.gamma": np.float64(0.5)}, 0.5),
+    ],
+)
+def test_numpys_numbers_are_numbers(given, plain):
+    ((key, _),) = given.items()
+    values = to_values(resolve("consensus", **given))
+    for part in key.split("."):
+        values = values[part]
+    assert values == plain
+
+
+@pytest.mark.parametrize("name", ["setup", "method_", "setups"])
+def test_a_choice_is_not_taken_for_a_setting(name):
+    refused(name, lambda: resolve("consensus", **{name: "tuned"}))
+
+
+def test_seeds_from_python_that_are_none():
+    for seeds in ("12", {1: 2}, b"12", [torch.tensor(1)], [1.0], [True], [[1]], 3):
+        refused("seeds", lambda seeds=seeds: resolve("consensus", seeds=seeds))

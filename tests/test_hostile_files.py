@@ -1,0 +1,391 @@
+"""Files that were made to do harm, in every place where one is read: refused, nothing executed."""
+
+import contextlib
+import io
+import json
+import os
+import pickle
+import resource
+import struct
+import subprocess
+import sys
+import time
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import yaml
+from tiny_run import TINY
+
+from emberlink.envs.fire import load_scenario
+from emberlink.envs.fire_bank import bank_key, fire_bank
+from emberlink.trainers import cli
+from emberlink.trainers.config import resolve
+from emberlink.trainers.run_folder import RunFolder
+
+
+class Bomb:
+    """Leaves a mark where it is unpickled."""
+
+    def __init__(self, mark: Path):
+        self.mark = mark
+
+    def __reduce__(self):
+        return os.mkdir, (str(self.mark),)
+
+
+@pytest.fixture
+def mark(tmp_path) -> Path:
+    return tmp_path / "mark"
+
+
+def refused(arguments: list[str], capsys, mark: Path) -> str:
+    """The one line with which a command ends, quickly, with little memory and without a mark."""
+    capsys.readouterr()
+    before, began = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, time.monotonic()
+    status = cli.main(arguments)
+    out, err = capsys.readouterr()
+    assert status == 2, (out, err)
+    assert err.count("\n") == 1, err
+    assert err[:-1].isprintable(), err
+    assert len(err) < 700
+    assert "Traceback" not in err
+    assert time.monotonic() - began < 15
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 500_000  # kB
+    assert not mark.exists()
+    return err
+
+
+def torch_saved(mark: Path) -> bytes:
+    into = io.BytesIO()
+    torch.save({"actor": Bomb(mark)}, into)
+    return into.getvalue()
+
+
+def zipped(mark: Path) -> bytes:
+    into = io.BytesIO()
+    with zipfile.ZipFile(into, "w") as archive:
+        archive.writestr("fires.npy", object_array(mark))
+    return into.getvalue()
+
+
+def object_array(mark: Path) -> bytes:
+    into = io.BytesIO()
+    np.save(into, np.array([Bomb(mark)], dtype=object), allow_pickle=True)
+    return into.getvalue()
+
+
+def safetensors(header: object, body: bytes = b"") -> bytes:
+    text = header if isinstance(header, bytes) else json.dumps(header).encode()
+    return struct.pack("<Q", len(text)) + text + body
+
+
+def promising(shape: list[int], end: int) -> bytes:
+    about = {"dtype": "F32", "shape": shape, "data_offsets": [0, end]}
+    return safetensors({"actor_network_params.module.0": about}, b"\0" * 64)
+
+
+CHECKPOINTS = {
+    "pickle": lambda mark: pickle.dumps(Bomb(mark)),
+    "old pickle": lambda mark: pickle.dumps(Bomb(mark), protocol=0),
+    "torch.save": torch_saved,
+    "npy of objects": object_array,
+    "npz of objects": zipped,
+    "header longer than the file": lambda _: struct.pack("<Q", 2**63) + b"{}",
+    "header of all bytes": lambda _: struct.pack("<Q", 2**64 - 1),
+    "tensor larger than the file": lambda _: promising([2**40], 2**42),
+    "tensor that overflows": lambda _: promising([2**62, 2**62], 64),
+    "tensor of negative size": lambda _: promising([-4], 64),
+    "deep header": lambda _: safetensors(b"[" * 200_000),
+    "header that is no mapping": lambda _: safetensors([1, 2]),
+    "metadata that is code": lambda _: safetensors(
+        {"__metadata__": {"emberlink": "__import__('os').mkdir('mark')"}}
+    ),
+    "names that climb": lambda _: safetensors(
+        {"../../mark": {"dtype": "F32", "shape": [1], "data_offsets": [0, 4]}}, b"\0" * 4
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", CHECKPOINTS)
+def test_a_checkpoint(kind, run, mark, capsys):
+    RunFolder(run).checkpoint().write_bytes(CHECKPOINTS[kind](mark))
+    refused(["eval", str(run)], capsys, mark)
+
+
+@pytest.mark.parametrize("kind", ["pickle", "torch.save"])
+def test_a_checkpoint_of_another_name(kind, run, mark, capsys):
+    other = run / "weights.pt"
+    other.write_bytes(CHECKPOINTS[kind](mark))
+    refused(["eval", str(run), "--checkpoint", str(other)], capsys, mark)
+
+
+@pytest.mark.parametrize("kind", CHECKPOINTS)
+def test_the_state_of_a_run_that_is_resumed(kind, run, mark, capsys):
+    states = RunFolder(run).states() or [run / "checkpoints" / "state_000000030.safetensors"]
+    for state in states:
+        state.write_bytes(CHECKPOINTS[kind](mark))
+    with pytest.raises(ValueError, match=r"state_\d+\.safetensors") as caught:
+        resumed(run)
+    assert "\n" not in str(caught.value)
+    assert not mark.exists()
+
+
+def resumed(run: Path):
+    from emberlink.trainers.resume import resume
+
+    trainer = resume(run, overrides=["episodes=3"])
+    trainer.collector.shutdown()
+    return trainer
+
+
+LAUGHS = "a: &a [x,x,x,x,x,x,x,x,x]\n" + "".join(
+    f"{new}: &{new} [{','.join([f'*{old}'] * 9)}]\n"
+    for old, new in zip("abcdefghi", "bcdefghij", strict=True)
+)
+CONFIGS = {
+    "apply": "seed: !!python/object/apply:os.mkdir [{mark}]\n",
+    "apply of system": "!!python/object/apply:os.system ['mkdir {mark}']\n",
+    "new": "seed: !!python/object/new:os.mkdir [{mark}]\n",
+    "name": "seed: !!python/name:os.system\n",
+    "module": "seed: !!python/module:antigravity\n",
+    "tuple": "seeds: !!python/tuple [1, 2]\n",
+    "own tag": "seed: !seed 1\n",
+    "key with a tag": "? !!python/object/apply:os.mkdir [{mark}]\n: 1\n",
+    "billion laughs": LAUGHS,
+    "list within itself": "seeds: &a [*a]\n",
+    "deep lists": "seeds: " + "[" * 2000,
+    "deep mappings": "{{a: " * 1000,
+    "long": "output: " + "x" * 200_000,
+    "many digits": "seed: " + "9" * 5000,
+    "the same key twice": "seed: 1\nseed: 2\n",
+    "two documents": "seed: 1\n---\nseed: 2\n",
+    "date": "seed: 2020-01-01\n",
+    "bytes": "output: !!binary aGk=\n",
+    "set": "seeds: !!set {{1, 2}}\n",
+    "escape": 'output: "\\e[2J\\n"\n',
+    "interpolation": "seed: ${{oc.env:HOME}}\n",
+    "target": "env: {{_target_: os.mkdir, path: {mark}}}\n",
+    "top target": "_target_: os.mkdir\n_args_: [{mark}]\n",
+    "module of comm": "comm: {{name: ../../os}}\n",
+    "base of comm": "comm: {{name: base}}\n",
+    "name that climbs": "method: ../../mark\n",
+    "fire that climbs": "fire: {{name: ../../mark}}\n",
+    "markup": "method: '[/red]'\n",
+}
+
+
+@pytest.mark.parametrize("kind", CONFIGS)
+def test_a_configuration(kind, run, mark, capsys):
+    file = run / "config.yaml"
+    hostile = CONFIGS[kind].format(mark=mark)
+    replaced: set[str] = set()
+    with contextlib.suppress(yaml.YAMLError, RecursionError, ValueError):
+        replaced = set(yaml.safe_load(hostile))
+    # As far as can be, in the midst of a configuration that is right.
+    whole = yaml.safe_load(file.read_text())
+    if kind not in ("the same key twice", "billion laughs", "two documents"):
+        rest = {name: value for name, value in whole.items() if name not in replaced}
+        seed = re_keyed(hostile)
+        rest.pop(seed, None)
+        hostile = yaml.safe_dump(rest) + hostile if seed else hostile
+    file.write_text(hostile)
+    assert "config.yaml" in refused(["eval", str(run)], capsys, mark)
+    with pytest.raises(ValueError, match=r"config\.yaml"):
+        resumed(run)
+    assert not mark.exists()
+
+
+def re_keyed(text: str) -> str:
+    """The key that a text begins with, if it begins with one."""
+    head = text.partition(":")[0]
+    return head if head.isidentifier() else ""
+
+
+LINES = {
+    "no mapping": "[1]\n",
+    "text": '{"episode": "__import__(\'os\')"}\n',
+    "nested": '{"episode": 1, "score": {"a": 1}}\n',
+    "the same key twice": '{"episode": 1, "episode": 2}\n',
+    "deep": "[" * 100_000 + "\n",
+    "no episode": '{"score": 1}\n',
+    "no text": "\x00\x01\n",
+}
+
+
+@pytest.mark.parametrize("kind", LINES)
+def test_the_lines_of_a_run(kind, run, mark, capsys):
+    (run / "metrics.jsonl").write_text(LINES[kind])
+    assert "metrics.jsonl" in refused(["eval", str(run), "--fires", "1"], capsys, mark)
+
+
+def test_numbers_of_a_run_without_bounds(run, capsys):
+    many = "9" * 5000
+    (run / "metrics.jsonl").write_text(
+        f'{{"episode": 1, "score": NaN, "coverage": 1e999}}\n{{"episode": 2, "score": {many}}}\n'
+    )
+    assert cli.main(["eval", str(run), "--fires", "1"]) == 0
+    assert RunFolder(run).lines()[1]["score"] == float("inf")
+
+
+EVALUATIONS = {
+    "pickle": lambda mark: pickle.dumps(Bomb(mark)),
+    "deep": lambda _: b"[" * 200_000,
+    "huge": lambda _: b'{"seed": ' + b"9" * 100_000 + b"}",
+    "nan": lambda _: (
+        b'{"method": "x", "setup": "y", "seed": 0, "start_seed": 0, '
+        b'"checkpoint": "z", "fires": 1, "results": {"a": {"b": {"coverage": [NaN]}}}}'
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", EVALUATIONS)
+def test_an_evaluation(kind, run, mark, capsys, tmp_path):
+    (run / "eval.json").write_bytes(EVALUATIONS[kind](mark))
+    refused(["compare", str(run), "--output", str(tmp_path / "out")], capsys, mark)
+    assert not (tmp_path / "out").exists()
+
+
+BANKS = {
+    **{kind: CHECKPOINTS[kind] for kind in ("pickle", "torch.save", "npy of objects")},
+    "npz of objects": zipped,
+    "code in the header": lambda _: header("__import__('os').mkdir('mark')"),
+    "deep header": lambda _: header("(" * 5000),
+    "far too large": lambda _: header(
+        "{'descr': '<f4', 'fortran_order': False, 'shape': (1099511627776, 9, 9), }"
+    ),
+}
+
+
+def header(text: str) -> bytes:
+    return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(text)) + text.encode() + b"\0" * 64
+
+
+@pytest.mark.parametrize("kind", BANKS)
+def test_a_cached_bank_of_fires_is_made_anew(kind, tmp_path, mark, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    config = load_scenario("paper")
+    arguments = config, "train", 1, (9, 9), 5
+    right = fire_bank(*arguments, cache_dir=tmp_path / "cache")
+    file = tmp_path / "cache" / f"fire-{bank_key(*arguments)}.npy"
+    whole = file.read_bytes()
+    file.write_bytes(BANKS[kind](mark))
+    assert torch.equal(fire_bank(*arguments, cache_dir=tmp_path / "cache"), right)
+    assert file.read_bytes() == whole
+    assert not mark.exists()
+
+
+OVERRIDES = [
+    "env._target_=os.system",
+    "learner={_target_: os.system, _args_: [mkdir mark]}",
+    "+hook._target_=os.system",
+    "++env._target_=os.system",
+    "hydra.run.dir=mark",
+    "hydra.searchpath=[file:///tmp]",
+    "hydra/launcher=basic",
+    "special=../../mark",
+    "setup=../../mark",
+    "fire=/etc/passwd",
+    "fire@env=paper",
+    'seed=${oc.decode:\'__import__("os").mkdir("mark")\'}',
+    "seed=${eval:1}",
+    "seed=${hydra:runtime.cwd}",
+    "env.horizon=${env.horizon}",
+    "seeds=" + "[" * 3000 + "]" * 3000,
+    "seed=" + "9" * 5000,
+    "output='a\\nb'".replace("\\n", "\n"),
+    "comm.name=os",
+    "comm.name=../registry",
+    "method=../../mark",
+]
+
+
+@pytest.mark.parametrize("text", OVERRIDES, ids=lambda text: text[:30])
+def test_an_override(text, tmp_path, mark, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    refused(["train", "consensus", *TINY, text], capsys, mark)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_method_that_is_a_path(tmp_path, mark, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "mine.yaml").write_text("# @package _global_\nmemory: shared\n")
+    for method in ("./mine", "../mine", str(tmp_path / "mine"), "consensus.yaml", "base"):
+        refused(["train", method], capsys, mark)
+
+
+def test_a_scenario_with_a_tag(tmp_path, mark, monkeypatch):
+    import emberlink.envs.fire as module
+
+    folder = tmp_path / "fire"
+    folder.mkdir()
+    (folder / "paper.yaml").write_text(f"name: !!python/object/apply:os.mkdir [{mark}]\n")
+    monkeypatch.setattr(module.resources, "files", lambda _: tmp_path)
+    with pytest.raises(Exception, match="python/object/apply"):
+        load_scenario("paper")
+    assert not mark.exists()
+
+
+@pytest.mark.parametrize("name", ["config.yaml", "checkpoint", "metrics.jsonl", "eval.json"])
+@pytest.mark.parametrize("kind", ["pipe", "endless", "folder"])
+def test_what_is_no_regular_file(name, kind, run, mark, capsys, tmp_path):
+    """A pipe that nobody writes to, a device without an end, and a folder."""
+    file = RunFolder(run).checkpoint() if name == "checkpoint" else run / name
+    file.unlink()
+    if kind == "pipe":
+        os.mkfifo(file)
+    elif kind == "endless":
+        file.symlink_to("/dev/zero")
+    else:
+        file.mkdir()
+    command = ["eval", str(run), "--fires", "1"]
+    if name == "eval.json":
+        command = ["compare", str(run), "--output", str(tmp_path / "out")]
+    refused(command, capsys, mark)
+
+
+def test_links_out_of_a_run_folder_are_not_written_through(run, tmp_path):
+    mine = tmp_path / "mine"
+    mine.write_text("mine")
+    for name in ("eval.json.part", "config.yaml.part"):
+        (run / name).symlink_to(mine)
+    assert cli.main(["eval", str(run), "--fires", "1"]) == 0
+    RunFolder(run).write_config(resolve("consensus"))
+    assert mine.read_text() == "mine"
+
+
+def test_a_run_folder_that_is_a_link(run, tmp_path):
+    link = tmp_path / "link"
+    link.symlink_to(run)
+    assert cli.main(["eval", str(link), "--fires", "1"]) == 0
+    (tmp_path / "loop").symlink_to(tmp_path / "loop")
+    assert cli.main(["eval", str(tmp_path / "loop")]) == 2
+
+
+def test_a_run_folder_whose_name_is_markup(run, tmp_path, capsys):
+    odd = tmp_path / "[red]a[" / "blue] :boom:"
+    odd.parent.mkdir()
+    run.rename(odd)
+    assert cli.main(["eval", str(odd), "--fires", "1"]) == 0
+    assert str(odd) in capsys.readouterr().out.replace("\n", "")
+
+
+def test_the_files_of_the_working_folder_are_not_run(tmp_path, mark):
+    """Neither modules nor settings of a folder in which somebody runs the program."""
+    bomb = f"import os\nos.mkdir({str(mark)!r})\n"
+    for name in ("torch", "yaml", "hydra", "wandb", "comm", "configs", "sitecustomize"):
+        (tmp_path / f"{name}.py").write_text(bomb)
+    (tmp_path / "conf").mkdir()
+    (tmp_path / "base.yaml").write_text("seed: 99\n")
+    program = Path(sys.executable).with_name("emberlink")
+    done = subprocess.run(
+        [program, "train", "consensus", "zzz=1"],
+        capture_output=True,
+        text=True,
+        cwd=tmp_path,
+        check=False,
+    )
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1)
+    assert not mark.exists()

@@ -1,0 +1,180 @@
+"""What holds after every step, whatever is configured and whatever the UAVs do."""
+
+import copy
+import functools
+import math
+
+import numpy as np
+import pytest
+import torch
+from robustness import SOAK
+
+from emberlink.envs import keys
+from emberlink.envs.config import known
+from emberlink.trainers.build import build_env
+from emberlink.trainers.config import from_values, resolve, to_values
+
+STEPS = 10_000_000 if SOAK else 100_000
+"""environment steps in all"""
+ENVS = 64
+METHODS, SETUPS = known("method"), known("setup")
+
+
+@functools.cache
+def recipe(method: str, setup: str) -> dict:
+    return to_values(resolve(method, [f"setup={setup}"]))
+
+
+def random_settings(rng: np.random.Generator) -> dict:
+    """A valid configuration: a recipe with everything that the environment reads at random."""
+    method, setup = str(rng.choice(METHODS)), str(rng.choice(SETUPS))
+    values = copy.deepcopy(recipe(method, setup))
+    altitude = np.sort(rng.choice([0.01, 0.5, 1.0, 3.3, 7.0, 40.0], 2))
+    # Steep cameras high up see the whole map: the window stays small enough to be quick.
+    angle = float(rng.choice([0.01, 15.0, 30.0, 45.0, 80.0]))
+    values["env"] |= {
+        "grid": [int(side) for side in rng.choice([8, 9, 13, 24], 2)],
+        "num_uavs": int(rng.choice([1, 2, 3, 7])),
+        "horizon": int(rng.choice([1, 2, 9, 14])),
+        "altitude": altitude.tolist(),
+        "view_angle": angle,
+        "displacement": float(rng.choice([1e-3, 0.1, 1.0, 5.5, 256.0])),
+        "observation": str(rng.choice(["raw", "box"])),
+    }
+    values["env"]["reward"] = {
+        "exit_axes": str(rng.choice(["xyz", "xy"])),
+        **{name: float(rng.normal(0, 50)) for name in ("new_fire", "old_fire", "no_fire", "exit")},
+    }
+    if values["comm"]["name"] == "consensus":
+        heading = ["folded_linear", "folded_exponential", "linear", "approach"]
+        values["comm"] |= {
+            "range": float(rng.choice([0.0, 3.0, 10.0, math.inf])),
+            "discoverer": str(rng.choice(["new_fire", "any_fire"])),
+            "jitter": float(rng.choice([0.0, 0.75, 1e6])),
+            "target": str(rng.choice(["absolute", "relative"])),
+            "heading": {
+                "form": str(rng.choice(heading)),
+                "weight": float(rng.normal(0, 3)),
+                "circle": float(rng.choice([0.0, 3.0])),
+            },
+        }
+    return values
+
+
+def random_fire(rng: np.random.Generator, config, generator: torch.Generator):
+    """Arrival times of every kind, one fire for all or for each; or the scenario."""
+    kind = rng.integers(6)
+    shape = [*([ENVS] if rng.integers(2) else []), *config.env.grid]
+    if kind == 0:
+        return config.fire.__class__(**{**vars(config.fire), "bank": 2})
+    if kind == 1:
+        return torch.full(shape, math.inf)
+    if kind == 2:
+        return torch.zeros(shape)
+    arrival = torch.rand(shape, generator=generator) * (config.env.horizon + 3)
+    if kind == 3:
+        return arrival.round() - 1  # burning since before the start, and at whole steps
+    never = torch.rand(shape, generator=generator) < 0.5
+    return arrival.masked_fill(never, math.inf) if kind == 4 else -arrival * 1e30
+
+
+def random_actions(shape: torch.Size, generator: torch.Generator) -> torch.Tensor:
+    """Half of the numbers sane; the others NaN, infinite, huge, and just beyond."""
+    odd = torch.tensor([math.nan, math.inf, -math.inf, 3e38, -3e38, 1.0001, -1.0, 1e-45, -0.0])
+    sane = torch.rand(shape, generator=generator) * 2 - 1
+    picked = odd[torch.randint(len(odd), shape, generator=generator)]
+    return torch.where(torch.rand(shape, generator=generator) < 0.5, sane, picked)
+
+
+def footprint(position: torch.Tensor, config) -> torch.Tensor:
+    """Cells of the grid within |i - x| <= z tan(angle), |j - y| <= z tan(angle): counted anew."""
+    here = position.double()
+    half = here[..., 2:] * math.tan(math.radians(config.view_angle))
+    near = [
+        ((torch.arange(side).double() - here[..., axis, None]).abs() <= half).sum(-1)
+        for axis, side in enumerate(config.grid)
+    ]
+    return near[0] * near[1]
+
+
+def check(moment, before, env, config, looked: torch.Tensor) -> None:
+    """All that must hold at a moment, and from the moment a step before to it, if given.
+
+    After a reset nobody has looked yet: `looked`, bool [ENVS], is where someone has.
+    """
+    world = env.base_env
+    position = moment[keys.POSITION]
+    low, high = (torch.tensor(corner, dtype=torch.float32) for corner in (config.low, config.high))
+    assert ((low <= position) & (position <= high)).all()
+    new, old, none = (moment[key] for key in (keys.NEW_FIRE, keys.OLD_FIRE, keys.NO_FIRE))
+    assert (new >= 0).all()
+    assert (old >= 0).all()
+    assert (none >= 0).all()
+    total = footprint(position, config) * looked[:, None]
+    assert torch.equal(new + old + none, total)
+    burning = world.arrival <= moment[keys.STEP][:, None, None]
+    seen = world._map.seen
+    assert not (seen & ~burning).any()
+    assert torch.equal(moment[keys.SEEN], seen.sum((1, 2)))
+    assert torch.equal(moment[keys.BURNING], burning.sum((1, 2)))
+    if before is not None:
+        assert (moment[keys.BURNING] >= before[keys.BURNING]).all()
+        assert torch.equal(moment[keys.SEEN] - before[keys.SEEN], new.sum(1))
+        assert torch.equal(moment[keys.STEP], before[keys.STEP] + 1)
+    for key, value in moment.items(include_nested=True, leaves_only=True):
+        if value.is_floating_point():
+            assert value.isfinite().all(), key
+
+
+def play(seed: int, steps: int) -> int:
+    """A random configuration for at least an episode and a half; the environment steps taken."""
+    rng, generator = np.random.default_rng(seed), torch.Generator().manual_seed(seed)
+    config = from_values(random_settings(rng))
+    fire = random_fire(rng, config, generator)
+    env = build_env(config, num_envs=ENVS, fire=fire, seed=seed, device="cpu")
+    moment, before, taken = env.reset(), None, 0
+    everywhere = torch.ones(ENVS, dtype=torch.bool)
+    check(moment, None, env, config.env, looked=~everywhere)
+    for _ in range(steps):
+        shape = torch.Size((ENVS, config.env.num_uavs, 3))
+        moment[keys.ACTION] = random_actions(shape, generator)
+        before = moment
+        after = env.step(moment)["next"]
+        taken += ENVS
+        check(after, before, env, config.env, looked=everywhere)
+        assert torch.equal(after["done"].squeeze(-1), after[keys.STEP] >= config.env.horizon)
+        again = after["done"].squeeze(-1) | (torch.rand(ENVS, generator=generator) < 0.05)
+        moment = after.exclude(keys.REWARD).clone()
+        if again.any():
+            moment["_reset"] = again.unsqueeze(-1)
+            moment = env.reset(moment)
+            check(moment, None, env, config.env, looked=~again)
+            same = ~again
+            assert torch.equal(moment[keys.OBSERVATION][same], after[keys.OBSERVATION][same])
+    return taken
+
+
+def sweep(steps: int, first: int = 0) -> int:
+    """Plays one configuration after the other until so many environment steps are taken."""
+    taken, seed = 0, first
+    while taken < steps:
+        taken += play(seed, steps=20)
+        seed += 1
+    return taken
+
+
+@pytest.mark.parametrize("part", range(4))
+def test_the_invariants_hold(part):
+    assert sweep(STEPS // 4, first=1_000_000 * part) >= STEPS // 4
+
+
+def test_every_kind_of_configuration_is_played():
+    """What the sweep draws covers every recipe, and each of the odd values."""
+    drawn = [random_settings(np.random.default_rng(seed)) for seed in range(60)]
+    assert {one["method"] for one in drawn} == set(METHODS)
+    assert {one["setup"] for one in drawn} == set(SETUPS)
+    assert {tuple(one["env"]["grid"]) for one in drawn} >= {(8, 24), (24, 8)}
+    odd = random_actions(torch.Size((4000,)), torch.Generator().manual_seed(0))
+    assert odd.isnan().any()
+    assert odd.isinf().any()
+    assert (odd.abs() > 1).any()

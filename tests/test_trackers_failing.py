@@ -1,0 +1,223 @@
+"""A tracker that fails, in whichever way: the training goes on, and one warning says so."""
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+import warnings
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+
+import pytest
+import wandb
+from tiny_run import PROGRAM
+
+from emberlink.trainers import cli, tracking
+from emberlink.trainers.config import resolve
+from emberlink.trainers.loop import Progress, Trainer
+
+EPISODES = 4
+SHORT = [
+    *(f"episodes={EPISODES}", "env.horizon=8", "env.num_uavs=2", "fire=paper"),
+    *("learner.hidden=[8,8]", "learner.batch=8", "evaluation.interval=0"),
+]
+
+
+def train(logger: str, folder: Path, watch: Callable[[Progress], None] = lambda _: None, *more):
+    """Trains to the end and returns the warnings about the tracker."""
+    config = resolve("independent", [*SHORT, f"logger={logger}", f"output={folder}", *more])
+    trainer = Trainer(config)
+    trainer.start()
+    began = time.monotonic()
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        assert trainer.train(watch)
+    assert time.monotonic() - began < 30
+    for run in trainer.runs:
+        assert [line["episode"] for line in run.lines()] == list(range(1, EPISODES + 1))
+        assert run.checkpoint().name == f"step_{EPISODES * 8:09d}.safetensors"
+    return [str(one.message) for one in caught if "logger=" in str(one.message)]
+
+
+def only(messages: list[str], *words: str) -> None:
+    (message,) = messages
+    assert message.count("\n") == 0
+    for word in (*words, "training goes on", "metrics.jsonl"):
+        assert word in message
+
+
+@pytest.fixture(autouse=True)
+def _elsewhere(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name in ("WANDB_CACHE_DIR", "WANDB_CONFIG_DIR", "WANDB_DATA_DIR"):
+        monkeypatch.setenv(name, str(tmp_path / "wandb-own"))
+    for name in ("WANDB_MODE", "WANDB_API_KEY", "WANDB_BASE_URL", "WANDB_SERVICE"):
+        monkeypatch.setenv(name, "")
+        monkeypatch.delenv(name)
+    monkeypatch.setattr(tracking, "PATIENCE", 1.5)
+    # wandb reads its settings once in a process: what an earlier test had set is forgotten.
+    with suppress(Exception):
+        wandb.teardown()
+
+
+class Fragile:
+    """A tracker that fails, or waits for ever, at one moment."""
+
+    def __init__(self, moment: str, how: Callable[[], None]):
+        self.moment, self.how, self.told = moment, how, []
+        self.meet("init")
+
+    def meet(self, moment: str) -> None:
+        if moment == self.moment:
+            self.how()
+
+    def log_scalar(self, name: str, value: float, step: int) -> None:
+        if step == 2:
+            self.meet("log")
+        self.told.append((name, step))
+
+
+def fail() -> None:
+    raise OSError(28, "No space left on device\nnone at all")
+
+
+def leave() -> None:
+    raise SystemExit(1)
+
+
+def wait() -> None:
+    threading.Event().wait()
+
+
+@pytest.mark.parametrize("how", [fail, leave, wait])
+@pytest.mark.parametrize("moment", ["init", "log", "finish"])
+def test_it_fails_or_never_answers(moment, how, tmp_path, monkeypatch):
+    made = []
+
+    def make(*_):
+        made.append(Fragile(moment, how))
+        return made[-1]
+
+    monkeypatch.setitem(tracking._TRACKERS, "csv", make)
+    monkeypatch.setattr(tracking, "_finish", lambda logger: logger.meet("finish"))
+    expected = {fail: "No space left", leave: "SystemExit", wait: "no answer within 1.5 s"}[how]
+    # A stack of two seeds: two trackers, and still one warning.
+    only(train("csv", tmp_path, lambda _: None, "seeds=[3,4]"), "logger=csv", expected)
+    if moment == "log":
+        assert {step for _, step in made[0].told} == {1}  # and nothing after it had failed
+
+
+@pytest.mark.parametrize("logger", ["wandb", "tensorboard"])
+def test_its_package_is_not_there(logger, tmp_path, monkeypatch):
+    for name in (logger, "torch.utils.tensorboard"):
+        monkeypatch.setitem(sys.modules, name, None)  # importing it fails
+    only(train(logger, tmp_path), f"logger={logger}", "Error")
+
+
+@pytest.mark.parametrize("logger", ["csv", "tensorboard"])
+def test_its_folder_cannot_be_made(logger, tmp_path):
+    config = resolve("independent", [*SHORT, f"logger={logger}", f"output={tmp_path}"])
+    trainer = Trainer(config)
+    run = trainer.start()
+    (run.path / logger).write_text("in the way")
+    with pytest.warns(UserWarning, match=f"logger={logger} has stopped") as caught:
+        assert trainer.train()
+    assert len([one for one in caught if "logger=" in str(one.message)]) == 1
+    assert len(run.lines()) == EPISODES
+    assert (run.path / logger).read_text() == "in the way"
+
+
+def test_wandb_has_no_such_mode(tmp_path, monkeypatch):
+    monkeypatch.setenv("WANDB_MODE", "nonsense")
+    only(train("wandb", tmp_path), "logger=wandb", "mode")
+
+
+def test_wandb_is_switched_off(tmp_path, monkeypatch):
+    monkeypatch.setenv("WANDB_MODE", "disabled")
+    assert train("wandb", tmp_path) == []
+    assert list(tmp_path.rglob("*.wandb")) == []
+
+
+def test_wandb_cannot_reach_its_server(tmp_path, monkeypatch):
+    """Nobody listens at port 9 of this machine; the key is none."""
+    monkeypatch.setenv("WANDB_MODE", "online")
+    monkeypatch.setenv("WANDB_BASE_URL", "http://127.0.0.1:9")
+    monkeypatch.setenv("WANDB_API_KEY", "0" * 40)
+    monkeypatch.setattr(tracking, "_CONNECTING", 1.0)
+    only(train("wandb", tmp_path), "logger=wandb")
+
+
+def service() -> int:
+    """The process that wandb has started beside this one."""
+    end = time.monotonic() + 20
+    while time.monotonic() < end:
+        for folder in Path("/proc").iterdir():
+            try:
+                about = (folder / "stat").read_text().rsplit(")", 1)[-1].split()
+                if int(about[1]) == os.getpid() and about[0] != "Z":
+                    command = (folder / "cmdline").read_bytes()
+                    if b"wandb-core" in command:
+                        return int(folder.name)
+            except (OSError, IndexError, ValueError):
+                continue
+        time.sleep(0.02)
+    raise AssertionError("wandb has started no process")
+
+
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="needs Linux's /proc")
+@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGSTOP])
+def test_wandbs_process_is_killed_or_stands_still(how, tmp_path):
+    struck: list[int] = []
+
+    def strike(moment: Progress) -> None:
+        if moment.step == 10:
+            time.sleep(1)  # it may still be starting
+            struck.append(service())
+            os.kill(struck[0], how)
+            time.sleep(0.3)
+
+    try:
+        only(train("wandb", tmp_path, strike), "logger=wandb")
+    finally:
+        for process in struck:
+            os.kill(process, signal.SIGKILL)
+
+
+def test_a_program_whose_wandb_was_killed_ends_in_peace(tmp_path):
+    """What wandb would do at the end of the program is its own, and shown to nobody."""
+    program = (
+        "import os, signal, time\n"
+        "from test_trackers_failing import service\n"
+        "from emberlink.trainers import loop\n"
+        "measure = loop.Trainer._measure\n"
+        "def strike(self, *rest):\n"
+        "    if self.episode == 2:\n"
+        "        os.kill(service(), signal.SIGKILL)\n"
+        "        time.sleep(0.3)\n"
+        "    return measure(self, *rest)\n"
+        "loop.Trainer._measure = strike\n" + PROGRAM
+    )
+    arguments = ["train", "independent", *SHORT, "evaluation.fires=1", "logger=wandb"]
+    done = subprocess.run(
+        [sys.executable, "-c", program, *arguments, f"output={tmp_path / 'runs'}"],
+        capture_output=True,
+        text=True,
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": str(Path(__file__).parent)},
+        check=False,
+        timeout=100,
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stderr.count("logger=wandb has stopped") == 1, done.stderr
+    assert "Traceback" not in done.stderr
+    (folder,) = (tmp_path / "runs").iterdir()
+    assert (folder / "metrics.jsonl").read_text().count("\n") == EPISODES
+    assert (folder / "eval.json").exists()
+
+
+def test_none_at_all(tmp_path):
+    assert train("none", tmp_path) == []
+    assert cli.main(["train", "independent", *SHORT, "logger=mlflow", f"output={tmp_path}/x"]) == 2
