@@ -1,5 +1,7 @@
 """What the benchmarks count, and when the guard fails."""
 
+from contextlib import nullcontext
+
 import guard
 import pytest
 import time_to_result
@@ -32,14 +34,18 @@ class Flops(TorchDispatchMode):
         ("consensus", 9, (400, 300), 512),
     ],
 )
-def test_flops_of_an_update_are_what_torch_counts(method, features, hidden, batch):
+@pytest.mark.parametrize("shared", [False, True])
+def test_flops_of_an_update_are_what_torch_counts(method, features, hidden, batch, shared):
     settings = ["env.horizon=200", "episodes=1", "env.num_uavs=4"]
     sizes = [f"learner.hidden={list(hidden)}", f"learner.batch={batch}"]
     trainer = Trainer(resolve(method, [*settings, *sizes]))
     sample = workloads.batch_of(trainer)
+    if not shared:
+        critic = trainer.learner.loss.value_network.module
+        critic.sharing = nullcontext
     with Flops() as counter:
         trainer.learner.update(sample)
-    assert counter.total == workloads.update_flops(4, features, 3, hidden, batch)
+    assert counter.total == workloads.update_flops(4, features, 3, hidden, batch, shared=shared)
 
 
 def test_works_take_turns():

@@ -86,19 +86,29 @@ MATRIX_FLOPS = 2 * MATRIX**3
 
 
 def update_flops(
-    members: int, features: int, actions: int, hidden: Sequence[int], batch: int
+    members: int,
+    features: int,
+    actions: int,
+    hidden: Sequence[int],
+    batch: int,
+    *,
+    shared: bool = False,
 ) -> int:
     """Floating-point operations of one DDPG update of `members` networks, from the layer sizes.
 
     Matrix products alone, a multiply-add as two. Forward: actor and critic in the actors' loss,
     critic, target actor and target critic in the critics'. Backward, for each layer that learns the
     product for its weights, and for each input that a gradient must pass the product for it.
+
+    Args:
+        shared: with the critics' trunk once for both losses, as our learner has it; else as often
+            as DDPG asks for it.
     """
     first, second = hidden
     trunk = features * first + first * second
     actor = trunk + second * actions
     critic = trunk + actions * second + second
-    forward = 2 * actor + 3 * critic
+    forward = 2 * actor + 3 * critic - (trunk if shared else 0)
     weights = actor + critic
     inputs = (
         second * actions
