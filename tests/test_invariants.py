@@ -16,7 +16,7 @@ from emberlink.trainers.config import from_values, resolve, to_values
 
 STEPS = 10_000_000 if SOAK else 100_000
 """environment steps in all"""
-ENVS = 64
+ENVS = 512 if SOAK else 64
 METHODS, SETUPS = known("method"), known("setup")
 
 
@@ -52,6 +52,10 @@ def random_settings(rng: np.random.Generator) -> dict:
             "discoverer": str(rng.choice(["new_fire", "any_fire"])),
             "jitter": float(rng.choice([0.0, 0.75, 1e6])),
             "target": str(rng.choice(["absolute", "relative"])),
+            "agree": bool(rng.integers(2)),
+            "follow": str(rng.choice(["best", "nearest"])),
+            "wander": bool(rng.integers(2)),
+            "loss": float(rng.choice([0.0, 0.5, 1.0])),
             "heading": {
                 "form": str(rng.choice(heading)),
                 "weight": float(rng.normal(0, 3)),
