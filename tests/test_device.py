@@ -85,7 +85,9 @@ class Elsewhere(TorchFunctionMode):
     def __torch_function__(self, func, types, args=(), kwargs=None):
         kwargs = kwargs or {}
         name = getattr(func, "__name__", "")
-        moves = name == "to" and not any(isinstance(arg, torch.dtype) for arg in args)
+        # Without waiting: fused Adam asks for its flag on the device where it is.
+        there = kwargs == {"non_blocking": True}
+        moves = name == "to" and not (there or any(isinstance(arg, torch.dtype) for arg in args))
         if moves or name in self.MOVES or (name in self.MAKES and kwargs.get("device") is None):
             self.found.append(name)
         return func(*args, **kwargs)

@@ -117,7 +117,11 @@ def test_wheel_holds_the_package_and_nothing_else(wheel: Path):
         for path in tracked_files()
         if path.is_file()
         and path.relative_to(ROOT).parts[0] in FOLDERS
-        and (path.suffix in (".py", ".yaml", ".html") or path.name == "py.typed")
+        and (
+            path.suffix in (".py", ".yaml", ".html")
+            or path.name == "py.typed"
+            or "pretrained" in path.parts
+        )
     }
     assert held == source
     assert {f"{folder}/py.typed" for folder in FOLDERS} <= held

@@ -88,7 +88,16 @@ def _parser() -> argparse.ArgumentParser:
         "the run folder.",
         "emberlink eval runs/2026-01-31_12-00-00_consensus_tuned_s0 --fires 64",
     )
-    evaluation.add_argument("folder", metavar="RUN", type=Path, help="a run folder")
+    evaluation.add_argument(
+        "folder", metavar="RUN", help="a run folder, or pretrained:METHOD, pretrained:SETUP/METHOD"
+    )
+    evaluation.add_argument(
+        "overrides",
+        metavar="key=value",
+        nargs="*",
+        help="keys of comm. or env. in place of the run's, such as comm.loss=0.5; "
+        "the files are named after them",
+    )
     evaluation.add_argument("--checkpoint", type=Path, help="another than the newest")
     evaluation.add_argument(
         "--fires", type=_positive, help="episodes; as the run has it if left out"
@@ -237,6 +246,7 @@ def _eval(options: argparse.Namespace, console: "Console") -> int:
     return evaluate_folder(
         options.folder,
         console,
+        overrides=options.overrides,
         checkpoint=options.checkpoint,
         fires=options.fires,
         device=options.device,

@@ -1,5 +1,6 @@
 """What the commands do."""
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -16,13 +17,18 @@ from rich.progress import (
 from emberlink.envs.config import known
 
 from . import report
-from .config import RunConfig, check_device, resolve
+from .config import RunConfig, check_device, override, resolve
+from .divergence import Divergence
 from .evaluate import Policy
 from .interruption import Interrupted, Interruption
 from .loop import Progress as Moment
 from .loop import Trainer
+from .pretrained import open_run
 from .resume import resume
 from .run_folder import RunFolder
+
+_EVALUATED_WITH = ("comm.", "env.")
+"""beginnings of keys that an evaluation may be given in place of the run's"""
 
 
 def train(method: str | None, overrides: Sequence[str], console: Console) -> int:
@@ -60,7 +66,7 @@ def train(method: str | None, overrides: Sequence[str], console: Console) -> int
         _say_where(trainer, console)
         return interruption.status
     except ValueError as error:
-        raise ValueError(f"{error}; {_newest(trainer)}") from None
+        raise ValueError(f"{error}; {_newest(trainer, _with(error, config))}") from None
     return 0
 
 
@@ -79,7 +85,8 @@ def _trainer(method: str | None, overrides: Sequence[str], console: Console) -> 
     else:
         others = [text for text in overrides if not text.startswith("resume=")]
         trainer = resume(Path(folders[0]), method, others)
-        console.print(f"resumed at step {trainer.step} of {trainer.steps}")
+        rate = "" if trainer.rate == 1 else f", learning rates x {trainer.rate:g}"
+        console.print(f"resumed at step {trainer.step} of {trainer.steps}{rate}")
     config = trainer.config
     for run in trainer.runs:
         text = f"{config.method}, setup {config.setup}, fire {config.fire.name} -> {run.path}"
@@ -99,12 +106,17 @@ def _say_where(trainer: Trainer, console: Console) -> None:
     console.print(f"resume with: emberlink train resume={trainer.run.path}", soft_wrap=True)
 
 
-def _newest(trainer: Trainer) -> str:
+def _newest(trainer: Trainer, more: str) -> str:
     """The newest checkpoint of a run that an error ended, and how to go on from it."""
-    states, folder = trainer.run.states(), trainer.run.path
+    states, command = trainer.run.states(), f"emberlink train resume={trainer.run.path}{more}"
     if not states:
-        return f"there is no checkpoint yet: emberlink train resume={folder} begins again"
-    return f"the last good checkpoint is {states[-1]}, resume with: emberlink train resume={folder}"
+        return f"there is no checkpoint yet: {command} begins again"
+    return f"the last good checkpoint is {states[-1]}, resume with: {command}"
+
+
+def _with(error: ValueError, config: RunConfig) -> str:
+    """What a run that an error ended is to be resumed with, so that it does not end there again."""
+    return " on_nan=rollback" if isinstance(error, Divergence) and config.on_nan == "stop" else ""
 
 
 def _train_with_bar(trainer: Trainer, console: Console) -> bool:
@@ -137,25 +149,44 @@ def _train_with_bar(trainer: Trainer, console: Console) -> bool:
                 )
                 shown |= {"coverage": f"{coverage:.1f}%", "score": f"{score:.2f}"}
             bar.update(task, **shown)
+            if moment.note:
+                console.print(moment.note, style="yellow", soft_wrap=True)
 
         return trainer.train(show)
 
 
 def evaluate_folder(
-    folder: Path,
+    name: str,
     console: Console,
     *,
+    overrides: Sequence[str] = (),
     checkpoint: Path | None = None,
     fires: int | None = None,
     device: str | None = None,
 ) -> int:
-    """Evaluates a run folder's frozen policy and prints the table."""
-    run = RunFolder(folder)
+    """Evaluates a run's frozen policy and prints the table.
+
+    Args:
+        name: a run folder, or a trained policy that comes with emberlink.
+        console: told what is being done.
+        overrides: `key=value` of the environment or the communication, in place of the run's.
+        checkpoint: another than the newest.
+        fires: episodes; as the run has it if None.
+        device: another than the run's.
+    """
+    run = open_run(name)
     if device is not None:
         check_device(device)
     config = run.config(**({} if device is None else {"device": device}))
     label = f"_{checkpoint.stem}" if checkpoint else ""
     checkpoint = checkpoint or run.checkpoint()
+    for text in overrides:
+        if not text.startswith(_EVALUATED_WITH):
+            raise ValueError(
+                f"{text!r}: an evaluation can be given keys of {' and '.join(_EVALUATED_WITH)} only"
+            )
+        config = override(config, [text])
+        label += "_" + re.sub(r"[^\w.=+-]", "-", text)
     actor = report.load_actor(config, checkpoint)
     _evaluate(run, config, actor, checkpoint, fires or config.evaluation.fires, console, label)
     return 0

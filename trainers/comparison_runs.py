@@ -13,6 +13,7 @@ from pydantic.dataclasses import dataclass as checked
 
 from emberlink.envs import metrics
 
+from . import pretrained
 from .config import RunConfig, describe, flat, to_values
 from .evaluate import LEARNED
 from .figures import CURVES
@@ -21,7 +22,7 @@ from .run_folder import RunFolder
 
 NOT_COMPARED = (
     *("seed", "seeds", "output", "device", "logger", "evaluation"),
-    *("checkpoint_interval", "checkpoint_steps", "keep"),
+    *("checkpoint_interval", "checkpoint_steps", "keep", "on_nan"),
 )
 """keys in which the runs of a group may differ: none changes what is trained"""
 NAMELESS = ("seed", "seeds", "output")
@@ -108,12 +109,16 @@ class Section:
 def find(paths: Iterable[Path]) -> list[Path]:
     """The run folders among `paths` and directly in them, each once, in order of their names.
 
+    A path may also be the name of trained policies, as `pretrained:tuned`.
+
     Raises:
         ValueError: a path is neither a run folder nor holds one.
     """
     found: dict[Path, Path] = {}
     for path in paths:
-        if (path / "config.yaml").is_file():
+        if pretrained.is_name(str(path)):
+            folders = pretrained.find(str(path))
+        elif (path / "config.yaml").is_file():
             folders = [path]
         elif path.is_dir():
             folders = [folder.parent for folder in path.glob("*/config.yaml")]

@@ -139,6 +139,9 @@ class RunConfig:
     """steps between further checkpoints, counted through the whole run; 0 for none"""
     keep: Count = 5
     """checkpoints of which the networks stay; the two newest hold what a resumed run needs too"""
+    on_nan: Literal["stop", "rollback"] = "stop"
+    """what is done where a number is not finite: the run ends, or goes back to its last checkpoint
+    with smaller learning rates"""
 
     @field_validator("device")
     @classmethod

@@ -14,6 +14,7 @@ from emberlink.policies.actor_critic import STATE_ACTION_VALUE
 
 from .config import LearnerConfig
 from .memory import DONE, TERMINATED
+from .watch import Watch
 
 
 class Learner:
@@ -40,11 +41,24 @@ class Learner:
             adam(actor_parameters, lr=config.actor_lr),
             adam(critic_parameters, lr=config.critic_lr, weight_decay=config.critic_weight_decay),
         )
-        self.targets = SoftUpdate(self.loss, tau=config.tau)
+        self._rates = [group["lr"] for group in self.optimizer.param_groups]
+        self.watch = Watch(self._named("actor") | self._named("value", "critic"))
+        self.optimizer.found_inf = self.watch.bad  # pyright: ignore[reportAttributeAccessIssue]
+        self.targets = _Targets(self.loss, config.tau, self.watch)
 
     def _parameters(self, network: str) -> list[Tensor]:
+        return list(self._named(network).values())
+
+    def _named(self, network: str, name: str = "") -> dict[str, Tensor]:
+        """A network's tensors in the order in which they are used, "actor.first.weight" first."""
         tree = getattr(self.loss, f"{network}_network_params")
-        return list(tree.values(include_nested=True, leaves_only=True))
+        items = tree.items(include_nested=True, leaves_only=True)
+        return {".".join((name or network, *key[1:])): value for key, value in items}
+
+    def slow_down(self, rate: float) -> None:
+        """Sets the learning rates to this share of the configuration's."""
+        for group, full in zip(self.optimizer.param_groups, self._rates, strict=True):
+            group["lr"] = rate * full
 
     def losses(self, batch: TensorDictBase) -> tuple[Tensor, Tensor]:
         """The actors' and the critics' losses, one per UAV: [uavs] each.
@@ -58,7 +72,7 @@ class Learner:
         return losses["loss_actor"].mean(0), losses["loss_value"].mean(0)
 
     def update(self, batch: TensorDictBase) -> tuple[Tensor, Tensor]:
-        """One step of both optimisers and of the targets.
+        """One step of both optimisers and of the targets; none once something is not finite.
 
         Args:
             batch: a sample of `make_memory`'s, batch size [batch].
@@ -66,9 +80,29 @@ class Learner:
         Returns:
             The actors' and the critics' losses before the step, [uavs] each, detached.
         """
+        self.watch.drawn(batch)
         actor, critic = self.losses(batch)
         (actor + critic).sum().backward()
+        actor, critic = actor.detach(), critic.detach()
+        self.watch.learnt(torch.stack((actor, critic)))
         self.optimizer.step()
         self.optimizer.zero_grad()
+        self.watch.updated()
         self.targets.step()
-        return actor.detach(), critic.detach()
+        return actor, critic
+
+
+class _Targets(SoftUpdate):
+    """Soft updates that stop where the watch has found something."""
+
+    def __init__(self, loss: DDPGLoss, tau: float, watch: Watch):
+        super().__init__(loss, tau=tau)
+        self._tau, self._watch = tau, watch
+
+    def _step(self, p_source: Any, p_target: Any) -> None:
+        sources, targets = (
+            [one.data for one in tree.values(include_nested=True, leaves_only=True)]
+            for tree in (p_source, p_target)
+        )
+        share = self._watch.share(self._tau).to(targets[0].dtype)
+        torch._foreach_lerp_(targets, sources, [share] * len(targets))  # pyright: ignore[reportPrivateImportUsage]

@@ -12,7 +12,7 @@ from tensordict.nn import TensorDictModule
 from emberlink.envs import metrics
 from emberlink.policies.actor_critic import team_of
 
-from . import checkpoint, evaluate, state, tracking
+from . import checkpoint, divergence, evaluate, rollback, state, tracking
 from .allocator import keep_freed_memory
 from .build import build_env, build_networks
 from .collecting import make_collector
@@ -39,6 +39,8 @@ class Progress:
     episodes: int
     lines: list[dict[str, Any]] = field(default_factory=list)
     """the last finished episode's line of metrics.jsonl, of every seed"""
+    note: str = ""
+    """what the user is to be told: that the training went back"""
 
 
 class Trainer:
@@ -58,13 +60,33 @@ class Trainer:
         self.configs = [replace(config, seed=seed) for seed in seeds]
         self.teams = len(seeds)
         self.envs = self.teams * config.num_envs
+        self.steps = config.episodes * config.env.horizon
+        self.rate = 1.0
+        """share of the configuration's learning rates that is left; see `rollback`"""
+        self.tries = self.furthest = 0
+        """rollbacks since a checkpoint lay beyond the step that they were for, and that step"""
+        self.seconds = 0.0
+        """of training before this process took it up"""
+        self.best: list[float | None] = [None] * self.teams
+        """the highest coverage of each seed, with which best.safetensors was written"""
+        self.runs: list[RunFolder] = []
+        self._locks: list[Lock] = []
+        self._began = time.monotonic()
+        self._stopping = False
+        self.build()
+
+    def build(self) -> None:
+        """Makes everything that training changes, as it is before the first step."""
+        config = self.config
+        seeds = [one.seed for one in self.configs]
         self.env = build_env(
             config, num_envs=self.envs, fire=config.fire, seed=seeds, device=config.device
         )
         generators = [torch.Generator().manual_seed(seed) for seed in seeds]
         self.actor, critic = build_networks(config, self.env, generators)
         self.learner = Learner(self.actor, critic, config.learner)
-        self.steps = config.episodes * config.env.horizon
+        self.learner.slow_down(self.rate)
+        divergence.listen(self.env, self.learner.watch)
         uavs, shared = config.env.num_uavs, config.memory == "shared"
         self.memory = make_memory(
             uavs,
@@ -85,16 +107,10 @@ class Trainer:
         """of the episode that is not finished, batch size [environments, steps] each"""
         self.losses: list[torch.Tensor] = []
         """of the same"""
-        self.seconds = 0.0
-        """of training before this process took it up"""
-        self.best: list[float | None] = [None] * self.teams
-        """the highest coverage of each seed, with which best.safetensors was written"""
+        self.begun = 0, 0
+        """steps and updates that were behind it when it was built or restored"""
         self.saved: int | None = None
         """the step of the newest checkpoint"""
-        self.runs: list[RunFolder] = []
-        self._locks: list[Lock] = []
-        self._began = time.monotonic()
-        self._stopping = False
 
     @property
     def run(self) -> RunFolder:
@@ -138,17 +154,21 @@ class Trainer:
             Whether it came to the end: False after `stop`.
 
         Raises:
+            Divergence: a number was not finite, and `on_nan` is not rollback or did not help.
             ValueError: a file cannot be written, such as to a full disk.
         """
-        trackers = tracking.Trackers(self.configs, self.runs, episode=self.episode)
         try:
-            self._loop(trackers, report)
-            if self.saved != self.step:
-                self.save()
+            while True:
+                try:
+                    self._train(report)
+                    return self.step == self.steps
+                except divergence.Divergence as found:
+                    note = rollback.roll_back(self, found, LINES)
+                progress = self._progress()
+                progress.note = note
+                report(progress)
         finally:
-            trackers.close()
             self.close()
-        return self.step == self.steps
 
     def close(self) -> None:
         """Ends the collector and gives the run folders up; `train` does it."""
@@ -170,13 +190,15 @@ class Trainer:
         Raises:
             ValueError: it cannot be written; the checkpoints before it are as they were.
         """
+        if self.step > self.furthest:
+            self.tries = 0
         header = {
             "kind": "state",
             "config": to_values(self.config),
             "folders": [run.path.name for run in self.runs],
             "files": [{name: run.size(name) for name in LINES} for run in self.runs],
             "best": self.best,
-            "seconds": round(self._elapsed(), 3),
+            "seconds": round(self.elapsed(), 3),
             **state.counters(self),
         }
         checkpoint.write(self.run.state(self.step), state.tensors(self), header)
@@ -203,13 +225,37 @@ class Trainer:
         """The actors of one seed, without noise, as they are now."""
         return team_of(self.actor, team, self.teams)
 
+    def elapsed(self) -> float:
+        """Seconds of training by now."""
+        return self.seconds + time.monotonic() - self._began
+
+    def _progress(self) -> Progress:
+        return Progress(self.step, self.steps, self.episode, self.config.episodes)
+
+    def _train(self, report: Callable[[Progress], None]) -> None:
+        """Trains to the end, until `stop`, or until a number is not finite."""
+        trackers = tracking.Trackers(self.configs, self.runs, episode=self.episode)
+        try:
+            self._loop(trackers, report)
+            if self.saved != self.step:
+                self._look(wait=True)
+                self.save()
+        finally:
+            trackers.close()
+
+    def _look(self, *, wait: bool) -> None:
+        """Ends the training where a number is not finite; before anything of it is written."""
+        if self.learner.watch.look(wait=wait):
+            raise divergence.found(self)
+
     def _loop(self, trackers: tracking.Trackers, report: Callable[[Progress], None]) -> None:
-        config, horizon = self.config, self.config.env.horizon
-        progress = Progress(self.step, self.steps, self.episode, config.episodes)
+        horizon = self.config.env.horizon
+        progress = self._progress()
         self._began = time.monotonic()
         for collected in self.collector:
             self.step += 1
             self.losses += self._learn(collected)
+            self._look(wait=self.step % horizon == 0 or self._is_due())
             self.moments.append(collected.get("next").select(*metrics.STEP_KEYS).clone())
             progress.step = self.step
             if self.step % horizon == 0:
@@ -221,9 +267,6 @@ class Trainer:
             report(progress)
             if self._stopping:
                 return
-
-    def _elapsed(self) -> float:
-        return self.seconds + time.monotonic() - self._began
 
     def _is_due(self) -> bool:
         """Whether a checkpoint is to be made after this step."""
@@ -237,7 +280,9 @@ class Trainer:
 
         There are none before the memory holds a full batch.
         """
-        self.memory.extend(to_rows(collected, self.teams))
+        rows = to_rows(collected, self.teams)
+        self.learner.watch.collected(rows)
+        self.memory.extend(rows)
         if len(self.memory) < self.enough:
             return []
         count = self.config.learner.updates
@@ -256,7 +301,7 @@ class Trainer:
         if interval and self.episode % interval == 0:
             for team, line in enumerate(lines):
                 line |= self._evaluate(team)
-        seconds = round(self._elapsed(), 3)
+        seconds = round(self.elapsed(), 3)
         for team, (line, run) in enumerate(zip(lines, self.runs, strict=True)):
             self._keep_best(team, line)
             run.append("metrics.jsonl", line)

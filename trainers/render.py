@@ -23,6 +23,7 @@ from emberlink.policies.scripted import SCRIPTED
 from .build import build_env
 from .config import RunConfig, build_comm
 from .evaluate import BLOCK, HELD_OUT_SCENARIO, START_SEED, scripted_config
+from .pretrained import open_run
 from .recording import record
 from .report import load_actor
 from .run_folder import RunFolder
@@ -67,11 +68,6 @@ class Choices:
     """of a single picture; the last if None"""
     seen: bool = False
     """whether fire that was seen is grey"""
-
-
-def open_run(name: str) -> RunFolder:
-    """The run that is meant by what stands on the command line."""
-    return RunFolder(name)
 
 
 def render(runs: Sequence[str], console: Console, choices: Choices) -> int:

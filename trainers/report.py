@@ -24,7 +24,7 @@ from .config import RunConfig
 from .run_folder import RunFolder, load_weights
 
 _PACKAGES = ("emberlink", "torch", "torchrl", "tensordict", "numpy")
-_ACTOR = "actor_network_params.module."
+ACTOR = "actor_network_params.module."
 """what the actor's weights are called in a checkpoint, before the name within the network"""
 
 
@@ -43,9 +43,9 @@ def load_actor(config: RunConfig, checkpoint: Path) -> TensorDictModule:
     )
     actor, _ = build_networks(config, env)
     network: Any = actor.module
-    expected = {_ACTOR + name: value for name, value in network.state_dict().items()}
+    expected = {ACTOR + name: value for name, value in network.state_dict().items()}
     weights = load_weights(checkpoint, expected, config)
-    network.load_state_dict({name.removeprefix(_ACTOR): v for name, v in weights.items()})
+    network.load_state_dict({name.removeprefix(ACTOR): v for name, v in weights.items()})
     return actor.requires_grad_(False)
 
 

@@ -13,7 +13,10 @@ from .loop import LINES, SIBLINGS, Trainer
 from .reading import LONGEST_YAML, parse_json, read_text
 from .run_folder import RunFolder
 
-MAY_CHANGE = ("episodes", "device", "logger", "checkpoint_interval", "checkpoint_steps", "keep")
+MAY_CHANGE = (
+    *("episodes", "device", "logger", "on_nan"),
+    *("checkpoint_interval", "checkpoint_steps", "keep"),
+)
 """keys that a resumed run may be given anew, beside those of `evaluation`"""
 
 

@@ -30,12 +30,12 @@ def tensors(trainer: "Trainer") -> dict[str, Tensor]:
         "networks": networks(trainer),
         "optimizer": _optimizer(trainer),
         # The action is chosen anew.
-        "carried": _flat(trainer.collector.carried.exclude(keys.ACTION)),
+        "carried": flat(trainer.collector.carried.exclude(keys.ACTION)),
         "world": trainer.env.base_env.state_dict(),
         "communication": trainer.env.transform.state_dict(),
     }
     if trainer.moments:
-        groups["moments"] = _flat(_joined(trainer.moments))
+        groups["moments"] = flat(_joined(trainer.moments))
     if trainer.losses:
         groups["losses"] = {"all": torch.stack(trainer.losses)}
     found = {
@@ -46,7 +46,7 @@ def tensors(trainer: "Trainer") -> dict[str, Tensor]:
     filled = len(trainer.memory)
     if filled:  # by far the most: not copied
         rows: Any = trainer.memory.storage[:filled]
-        found |= {f"memory/{name}": value for name, value in _flat(rows).items()}
+        found |= {f"memory/{name}": value for name, value in flat(rows).items()}
     return found
 
 
@@ -58,6 +58,9 @@ def counters(trainer: "Trainer") -> dict[str, Any]:
         "draws": int(trainer.sampler.draws),
         "rows": len(trainer.memory),
         "losses": len(trainer.losses),
+        "rate": trainer.rate,
+        "tries": trainer.tries,
+        "furthest": trainer.furthest,
     }
 
 
@@ -82,19 +85,50 @@ def restore(trainer: "Trainer", path: Path, header: Mapping[str, Any], content: 
             files.check_finite(path, {name: value})
     env = trainer.env
     places = {
-        "networks": networks(trainer),
         "world": env.base_env.state_dict(),
         "communication": env.transform.state_dict(),
     }
     for group, place in places.items():
         _copy(path, group, place, groups.get(group, {}))
     trainer.step, trainer.updates = header["step"], header["updates"]
+    trainer.begun = trainer.step, trainer.updates
     trainer.episode = trainer.step // trainer.config.env.horizon
-    _restore_optimizer(trainer, path, groups.get("optimizer", {}))
+    restore_learner(trainer, path, header, groups)
     _restore_memory(trainer, path, header, groups.get("memory", {}))
-    carried = _carried(trainer, path, groups.get("carried", {}))
-    trainer.collector.go_on(carried, trainer.step)
+    if trainer.step:  # before the first one there is no noise yet, and nothing else to carry
+        carried = _carried(trainer, path, groups.get("carried", {}))
+        trainer.collector.go_on(carried, trainer.step)
     _restore_episode(trainer, path, header, groups)
+
+
+def learner(trainer: "Trainer") -> dict[str, Tensor]:
+    """What an update changes, "group/name" -> tensor: networks, targets, optimisers."""
+    groups = {"networks": networks(trainer), "optimizer": _optimizer(trainer)}
+    return {
+        f"{group}/{name}": value
+        for group, content in groups.items()
+        for name, value in content.items()
+    }
+
+
+def restore_learner(
+    trainer: "Trainer", path: Path, header: Mapping[str, Any], groups: Mapping[str, dict]
+) -> None:
+    """Puts networks, targets and optimisers where others were, and the learning rates.
+
+    Raises:
+        ValueError: something is missing, is of another shape or type, or out of range.
+    """
+    _copy(path, "networks", networks(trainer), groups.get("networks", {}))
+    _restore_optimizer(trainer, path, groups.get("optimizer", {}))
+    # States from before there were rollbacks have no rate.
+    rate, tries, furthest = (
+        header.get(name, value) for name, value in (("rate", 1.0), ("tries", 0), ("furthest", 0))
+    )
+    if not 0 < rate <= 1 or not all(isinstance(one, int) and one >= 0 for one in (tries, furthest)):
+        raise ValueError(f"{path}: rate={rate}, tries={tries}, furthest={furthest}: out of range")
+    trainer.rate, trainer.tries, trainer.furthest = float(rate), tries, furthest
+    trainer.learner.slow_down(trainer.rate)
 
 
 def networks(trainer: "Trainer") -> dict[str, Tensor]:
@@ -103,7 +137,7 @@ def networks(trainer: "Trainer") -> dict[str, Tensor]:
     return {name: value for name, value in state.items() if "_params." in name}
 
 
-def _flat(tree: TensorDictBase) -> dict[str, Tensor]:
+def flat(tree: TensorDictBase) -> dict[str, Tensor]:
     return {
         key if isinstance(key, str) else ".".join(key): value
         for key, value in tree.items(include_nested=True, leaves_only=True)
@@ -116,7 +150,7 @@ def _joined(moments: list[TensorDictBase]) -> TensorDictBase:
     return joined
 
 
-def _nested(content: Mapping[str, Tensor], dims: int, device: torch.device | str) -> TensorDict:
+def nested(content: Mapping[str, Tensor], dims: int, device: torch.device | str) -> TensorDict:
     batch = next(iter(content.values())).shape[:dims]
     tree = TensorDict({}, batch_size=batch, device=device)
     for name, value in content.items():
@@ -190,7 +224,7 @@ def _restore_memory(
         )
     if written:
         _check_shapes(path, "memory", _memory_places(trainer, header["rows"]), found)
-        content = _nested(found, 2, trainer.config.device)
+        content = nested(found, 2, trainer.config.device)
         memory.extend(content)
         # Of a memory that has come round, once more: the next row goes behind the newest.
         if written > rows and written % rows:
@@ -229,7 +263,7 @@ def _restore_episode(
             name = key if isinstance(key, str) else ".".join(key)
             if name not in moments or moments[name].shape[:2] != batch:
                 raise ValueError(f"{path}: holds no moments/{name} of {batch[1]} steps")
-        trainer.moments = [_nested(moments, 2, device)]
+        trainer.moments = [nested(moments, 2, device)]
     if header["losses"]:
         shape = header["losses"], 2, trainer.teams * config.env.num_uavs
         _check_shapes(path, "losses", {"all": torch.empty(shape, device="meta")}, losses)
@@ -238,8 +272,8 @@ def _restore_episode(
 
 def _carried(trainer: "Trainer", path: Path, found: dict[str, Tensor]) -> TensorDict:
     """The carried moment: what the environment's reset gives, and the noise."""
-    places = _flat(trainer.collector.carried.exclude(keys.ACTION))
+    places = flat(trainer.collector.carried.exclude(keys.ACTION))
     shape = trainer.env.full_action_spec[keys.ACTION].shape
     places[".".join(NOISE)] = torch.empty(shape, device="meta")
     _check_shapes(path, "carried", places, found)
-    return _nested(found, 1, trainer.config.device)
+    return nested(found, 1, trainer.config.device)

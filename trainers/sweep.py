@@ -21,7 +21,15 @@ from .interruption import Interruption
 from .run_folder import RunFolder
 from .sweep_progress import SweepProgress
 
-_MAY_DIFFER = ("output", "device", "logger", "keep", "checkpoint_interval", "checkpoint_steps")
+_MAY_DIFFER = (
+    "output",
+    "device",
+    "logger",
+    "keep",
+    "checkpoint_interval",
+    "checkpoint_steps",
+    "on_nan",
+)
 """keys in which a run that is there may differ from the one that is wanted"""
 _PROGRAM = "from emberlink.trainers.cli import main; raise SystemExit(main())"
 _BETWEEN_LOOKS = 0.5  # seconds

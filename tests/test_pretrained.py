@@ -1,0 +1,141 @@
+"""Trained policies that come with emberlink, in place of run folders."""
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+import torch
+import yaml
+from tiny_run import TINY
+
+from emberlink.trainers import pretrained
+from emberlink.trainers.cli import main
+from emberlink.trainers.report import load_actor
+from emberlink.trainers.run_folder import RunFolder
+
+
+@pytest.fixture(scope="module")
+def packed(tmp_path_factory) -> tuple[Path, list[Path]]:
+    """Two seeds of one method and one of another, and the runs that they are from."""
+    folder = tmp_path_factory.mktemp("packed")
+    root, runs = folder / "shipped", []
+    for method, seed in (("consensus", 3), ("consensus", 10), ("independent", 3)):
+        output = folder / f"{method}{seed}"
+        arguments = [method, "setup=tuned", *TINY, f"seed={seed}", f"output={output}"]
+        assert main(["train", *arguments]) == 0
+        (run,) = output.iterdir()
+        runs.append(run)
+    assert pretrained.main([*map(str, runs), "--into", str(root)]) == 0
+    return root, runs
+
+
+@pytest.fixture
+def shipped(packed, tmp_path, monkeypatch) -> Path:
+    """They come with the package, and the working folder is an empty one."""
+    root, _ = packed
+    monkeypatch.setattr(pretrained, "_shipped", lambda: root)
+    monkeypatch.chdir(tmp_path)
+    return root
+
+
+def test_what_is_packed_is_the_run_without_what_its_training_needs(packed):
+    root, runs = packed
+    for run, place in zip(runs, ("consensus/s3", "consensus/s10", "independent/s3"), strict=True):
+        mine = root / "tuned" / place
+        files = {file.relative_to(mine).as_posix() for file in mine.rglob("*") if file.is_file()}
+        checkpoint = RunFolder(run).checkpoint().name
+        expected = {"config.yaml", "metrics.jsonl", "eval.json", f"checkpoints/{checkpoint}"}
+        assert files == expected
+        for file in ("metrics.jsonl", "eval.json"):
+            assert (mine / file).read_bytes() == (run / file).read_bytes()
+        values = yaml.safe_load((mine / "config.yaml").read_text())
+        assert values["output"] == "runs"  # and no path of a machine
+        assert str(run.parent) not in (mine / "config.yaml").read_text()
+        config = RunFolder(run).config()
+        one, other = (load_actor(config, RunFolder(path).checkpoint()) for path in (run, mine))
+        for name, weight in one.state_dict().items():
+            assert weight.equal(other.state_dict()[name])
+
+
+def test_a_name_stands_for_a_run_folder(shipped, tmp_path, capsys):
+    assert main(["eval", "pretrained:consensus"]) == 0
+    folder = tmp_path / "runs" / "pretrained_tuned_consensus_s3"
+    assert [path.name for path in (tmp_path / "runs").iterdir()] == [folder.name]
+    made, given = (
+        json.loads((path / "eval.json").read_text())
+        for path in (folder, shipped / "tuned" / "consensus" / "s3")
+    )
+    assert made == given  # the same fires, the same numbers
+    assert (folder / "figures" / "coverage.png").exists()
+    assert main(["render", "pretrained:tuned/consensus/10", "pretrained:independent"]) == 0
+    printed = capsys.readouterr().out
+    assert "pretrained_tuned_consensus_s10/figures/side_by_side" in printed.replace("\n", "")
+
+
+def test_a_copy_that_is_there_is_used_and_kept(shipped, tmp_path):
+    run = pretrained.open_run("pretrained:consensus")
+    (run.path / "note.txt").write_text("mine")
+    assert pretrained.open_run("pretrained:tuned/consensus/3").path == run.path
+    assert (tmp_path / run.path / "note.txt").read_text() == "mine"
+
+
+def test_names_of_several(shipped):
+    def names(text: str) -> list[str]:
+        return ["/".join(path.parts[-2:]) for path in pretrained.find(text)]
+
+    assert names("pretrained:tuned") == ["consensus/s3", "consensus/s10", "independent/s3"]
+    assert names("pretrained:consensus") == ["consensus/s3", "consensus/s10"]
+    assert names("pretrained:tuned/consensus/10") == ["consensus/s10"]
+
+
+def test_they_can_be_compared(shipped, tmp_path):
+    assert main(["compare", "pretrained:tuned", "--output", "all"]) == 0
+    numbers = json.loads((tmp_path / "all" / "compare.json").read_text())
+    assert len(numbers["setups"]) == 1
+    assert not (tmp_path / "runs").exists()
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("pretrained:consensos", "tuned/consensus, tuned/independent"),
+        ("pretrained:tuned", "one is needed"),
+        ("pretrained:tuned/consensus/4", "no such trained policy"),
+        ("pretrained:", "no such trained policy"),
+        ("pretrained:../../tuned", "no such trained policy"),
+    ],
+)
+def test_other_names_are_errors_of_one_line(name, said, shipped, capsys):
+    for command in ("eval", "render"):
+        assert main([command, name]) == 2
+        error = capsys.readouterr().err
+        assert said in error
+        assert error.count("\n") == 1
+
+
+def test_only_finished_runs_are_packed_and_nothing_is_overwritten(packed, tmp_path, capsys):
+    root, (run, *_) = packed
+    assert pretrained.main([str(run), "--into", str(root)]) == 2
+    assert "is there already" in capsys.readouterr().err
+    copy = tmp_path / "copy"
+    shutil.copytree(run, copy)
+    (copy / "eval.json").unlink()
+    assert pretrained.main([str(copy), "--into", str(tmp_path / "new")]) == 2
+    assert "not finished" in capsys.readouterr().err
+    assert not (tmp_path / "new").exists()
+
+
+def test_every_policy_that_is_shipped_loads():
+    folders = sorted(file.parent for file in pretrained._shipped().glob("*/*/*/config.yaml"))
+    assert folders
+    for folder in folders:
+        run = RunFolder(folder)
+        config = run.config()
+        assert folder.parts[-3:] == (config.setup, config.method, f"s{config.seed}")
+        actor = load_actor(config, run.checkpoint())
+        assert all(torch.isfinite(weight).all() for weight in actor.parameters())
+        assert len(run.lines()) == config.episodes
+        evaluation = json.loads((folder / "eval.json").read_text())
+        assert evaluation["checkpoint"] == run.checkpoint().name
+        assert evaluation["fires"] >= 100
