@@ -58,7 +58,16 @@ def _elsewhere(tmp_path, monkeypatch):
         monkeypatch.setenv(name, "")
         monkeypatch.delenv(name)
     monkeypatch.setattr(tracking, "PATIENCE", 1.5)
-    # wandb reads its settings once in a process: what an earlier test had set is forgotten.
+    forget()
+    yield
+    for thread in threading.enumerate():
+        if thread.name == tracking.ENDING:
+            thread.join(30)
+    forget()
+
+
+def forget() -> None:
+    """wandb reads its settings once in a process: what a test has set is no other test's."""
     with suppress(Exception):
         wandb.teardown()
 

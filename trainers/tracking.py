@@ -79,6 +79,9 @@ def _csv(config: RunConfig, run: RunFolder, episode: int) -> Logger:
     return logger
 
 
+ENDING = "emberlink-ends-wandb"
+"""the name of a thread that may go on after a tracker was given up"""
+
 _Maker = Callable[[RunConfig, RunFolder, int], Logger]
 """of a run's tracker, which is to know what came up to an episode and nothing later"""
 _TRACKERS: dict[str, _Maker] = {
@@ -185,6 +188,6 @@ def _release_wandb() -> None:
         with suppress(BaseException):
             sys.modules["wandb"].teardown()
 
-    ending = threading.Thread(target=teardown, daemon=True)
+    ending = threading.Thread(target=teardown, name=ENDING, daemon=True)
     ending.start()
     ending.join(2.0)
