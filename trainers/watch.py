@@ -85,19 +85,19 @@ class Watch:
         self._updates.add_(self.bad == 0)
 
     def look(self, *, wait: bool = False) -> bool:
-        """Whether something was found: by now, or on a GPU by the last look.
+        """Whether something was found: by now, or on a GPU as far as it has got word of.
 
         Args:
             wait: by now on a GPU as well, for which it is waited.
         """
         if wait or not self.bad.is_cuda:
             return bool(self.bad)
-        before, self._arriving = self._arriving, self._send()
-        if before is None:
+        if self._arriving is None:
+            self._arriving = self._send()
+        event, arrived = self._arriving
+        if not event.query():  # on its way, and nothing is waited for
             return False
-        # One step old: the device has the next one to do meanwhile.
-        event, arrived = before
-        event.synchronize()
+        self._arriving = None
         return bool(arrived)
 
     def _send(self) -> tuple[Any, Tensor]:
