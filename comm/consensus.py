@@ -39,7 +39,7 @@ class ConsensusConfig:
     """UAVs nearer than this hear each other, cells; .inf for no limit"""
     discoverer: Literal["new_fire", "any_fire"] = "new_fire"
     """what a discoverer sees: new fire, or new or old fire"""
-    jitter: Annotated[float, Field(ge=0, le=1e30)] = 0.0
+    jitter: Annotated[float, Field(ge=0, le=1e12)] = 0.0
     """standard deviation of what is added to x and y of a target closer than 1, cells"""
     target: Literal["absolute", "relative"] = "absolute"
     """whether the UAV is told the target's coordinates or the way to it"""

@@ -7,8 +7,8 @@ from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 from torch import Tensor
 
-Number = Annotated[float, Field(ge=-1e30, le=1e30)]
-"""so far below the largest float32 that no sum over a view gets there"""
+Number = Annotated[float, Field(ge=-1e12, le=1e12)]
+"""so far below the largest float32 that no square of a sum over a view gets there"""
 
 
 @dataclass(frozen=True, kw_only=True, config=ConfigDict(extra="forbid", strict=True))

@@ -4,11 +4,12 @@ import errno
 import json
 import os
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import torch
-from damage import damage_trials, without_a_seal
+from damage import damage_trials, sealed_again, without_a_seal
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from safetensors.torch import load_file, save_file
@@ -83,6 +84,153 @@ def test_a_state_without_a_seal_is_refused_and_the_one_before_it_is_named(tmp_pa
     until(trainer, None)
     with pytest.raises(ValueError, match="nothing can be resumed from it"):
         resume(run.checkpoint())
+
+
+@pytest.fixture(scope="module")
+def _stopped(tmp_path_factory) -> Path:
+    (path, _), _ = readable(tmp_path_factory.mktemp("stopped"), "consensus")
+    return path.parent.parent
+
+
+@pytest.fixture
+def stopped(_stopped, tmp_path) -> Path:
+    """The newest state of a copy of a run: after 33 steps of 2 environments, 12 in an episode."""
+    run = RunFolder(shutil.copytree(_stopped, tmp_path / "run"))
+    return run.states()[-1]
+
+
+def refused(path: Path, change: Callable[[dict, dict[str, torch.Tensor]], object]) -> str:
+    """Why a state is refused after a change of its header and tensors, and a new seal."""
+    sound = path.read_bytes()
+    sealed_again(path, change)
+    with pytest.raises(ValueError, match=r"^.*/state_\d+\.safetensors: ") as error:
+        resume(path)
+    path.write_bytes(sound)
+    text = str(error.value)
+    assert "\n" not in text
+    assert len(text.replace(str(path.parent.parent), "")) < 300
+    return text.partition("; the one before it")[0].removeprefix(f"{path}: ")
+
+
+def test_nan_is_refused_wherever_it_is(stopped):
+    _, content = checkpoint.read(stopped)
+    floating = [name for name, value in content.items() if value.is_floating_point()]
+    assert {name.partition("/")[0] for name in floating} == {
+        *("networks", "optimizer", "memory", "carried", "world", "moments", "losses")
+    }
+    others = [n for n in floating if not n.startswith(("networks/", "optimizer/"))]
+    for name in [*others, "networks/actor_network_params.module.first.bias", "optimizer/0.step"]:
+        for bad in (float("nan"), float("inf")):
+
+            def change(_, content: dict, name: str = name, bad: float = bad) -> None:
+                values = content[name].view(-1)
+                values[values.isfinite().nonzero()[-1]] = bad
+
+            assert name in refused(stopped, change)
+
+
+def test_a_fire_that_is_of_no_episode_is_refused(stopped):
+    def margin(_, content: dict) -> None:
+        content["world/_map._arrival"][0, 0] = 3.0  # where NaN is right
+
+    def later(_, content: dict) -> None:
+        arrival = content["world/_map._arrival"]
+        arrival[arrival.isfinite()] += 1
+
+    for change in (margin, later):
+        assert refused(stopped, change) == "world/_map._arrival is not one of step 33"
+
+
+# 8 rows are a batch for two UAVs, so each step from the 4th has an update.
+HEADERS = [
+    ("files", [{"timing.jsonl": 33}], "files.0: "),
+    ("files", [{"metrics.jsonl": 1, "timing.jsonl": -1}], "files.0.timing.jsonl=-1: "),
+    ("files", [], "files=[]: should hold 1, one for each seed"),
+    ("folders", [], "folders=[]: should hold 1"),
+    ("folders", [3], "folders.0=3: "),
+    ("best", [], "best=[]: should hold 1"),
+    ("best", ["x"], "best.0=x: "),
+    ("best", [float("nan")], "best.0=nan: "),
+    ("draws", -5, "draws=-5: "),
+    ("draws", "x", "draws=x: "),
+    ("draws", 4, "draws=4: should be 30 after 33 steps"),
+    ("updates", 31, "updates=31: should be 30 after 33 steps"),
+    ("losses", 12, "losses=12: should be "),
+    ("rows", 29, "rows=29: should be 30"),
+    ("seconds", float("nan"), "seconds=nan: "),
+    ("seconds", -1.0, "seconds=-1.0: "),
+    ("step", 33.0, "step=33.0: "),
+    ("step", True, "step=True: "),
+    ("step", 32, "step=32: should be its name's"),
+    ("rate", 0.0, "rate=0.0: "),
+    ("tries", -1, "tries=-1: "),
+    ("furthest", None, "furthest=None: "),
+    ("config", 3, "config=3: "),
+    ("more", 3, "key 'more' is not known"),
+]
+
+
+@pytest.mark.parametrize(("key", "value", "message"), HEADERS)
+def test_a_header_that_is_wrong_is_refused(key, value, message, stopped):
+    reason = refused(stopped, lambda header, _: header.update({key: value}))
+    assert reason.startswith(f"its header: {message}")
+
+
+@pytest.mark.parametrize("key", ["folders", "files", "best", "seconds", "step", "updates", "draws"])
+def test_a_header_that_lacks_a_key_is_refused(key, stopped):
+    reason = refused(stopped, lambda header, _: header.pop(key))
+    assert reason == f"its header: key '{key}' is missing"
+
+
+@pytest.mark.parametrize(
+    "group", ["networks", "optimizer", "memory", "carried", "world", "moments"]
+)
+def test_a_tensor_that_no_state_has_is_refused(group, stopped):
+    for name in (f"{group}/x.step", f"{group}/more", f"{group}s/more", "x"):
+        reason = refused(stopped, lambda _, content, n=name: content.update({n: torch.ones(2)}))
+        assert reason.startswith(f"holds {name}, which ")
+
+
+@pytest.mark.parametrize(
+    "name", ["_episode", "_time", "_seen", "_stream", "_map._growth_start", "_map._stamp"]
+)
+@pytest.mark.parametrize("value", [-1, 1000, 2**31 - 2])
+def test_a_counter_of_the_world_out_of_range_is_refused(name, value, stopped):
+    reason = refused(stopped, lambda _, content: content[f"world/{name}"].fill_(value))
+    assert reason == f"world/{name} is not one of step 33"
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("world/_position", -7), ("world/_map._first_seen", -1)]
+)
+def test_what_the_world_cannot_hold_is_refused(name, value, stopped):
+    assert refused(stopped, lambda _, content: content[name].fill_(value)).startswith(name)
+
+
+@pytest.mark.parametrize("name", ["step", "seen", "stream"])
+def test_a_carried_moment_of_another_world_is_refused(name, stopped):
+    reason = refused(stopped, lambda _, content: content[f"carried/{name}"].add_(1))
+    assert reason.startswith(f"carried/{name} is not world/")
+
+
+def test_adam_counts_the_updates(stopped):
+    reason = refused(stopped, lambda _, content: content["optimizer/3.step"].add_(1))
+    assert reason == "optimizer/3.step is not 30, the number of updates"
+    reason = refused(stopped, lambda _, content: content["optimizer/3.exp_avg_sq"].sub_(9))
+    assert reason == "optimizer/3.exp_avg_sq holds a number below 0"
+
+
+def test_only_an_earlier_state_is_the_one_before(stopped):
+    """Not one of the same step under another name, nor a later one."""
+    run = RunFolder(stopped.parent.parent)
+    first, last = run.states()
+    copy = Path(shutil.copy(last, last.with_name("state_x.safetensors")))
+    for path, named in ((last, first), (first, None), (copy, None)):
+        without_a_seal(path, None)  # pyright: ignore[reportArgumentType]
+        with pytest.raises(ValueError, match="nothing can be resumed from it") as error:
+            resume(path)
+        _, _, hint = str(error.value).partition("the one before it: emberlink train resume=")
+        assert hint == (str(named) if named else "")
 
 
 def test_networks_from_before_there_was_a_seal(run, capsys):

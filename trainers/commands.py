@@ -38,7 +38,7 @@ def train(method: str | None, overrides: Sequence[str], console: Console) -> int
     """
     trainer = _trainer(method, overrides, console)
     config = trainer.config
-    if trainer.step == trainer.steps and (trainer.run.path / "eval.json").exists():
+    if trainer.step == trainer.steps and all(run.evaluated() for run in trainer.runs):
         trainer.close()
         console.print(
             f"{trainer.run.path} is finished, {config.episodes} episodes; nothing is left to do. "
@@ -61,7 +61,8 @@ def train(method: str | None, overrides: Sequence[str], console: Console) -> int
                 raise Interrupted
             for team, (one, run) in enumerate(zip(trainer.configs, trainer.runs, strict=True)):
                 actor, fires = trainer.team_actor(team), config.evaluation.fires
-                _evaluate(run, one, actor, run.checkpoint(), fires, console)
+                if not run.evaluated():
+                    _evaluate(run, one, actor, run.checkpoint(), fires, console)
     except KeyboardInterrupt:
         _say_where(trainer, console)
         return interruption.status

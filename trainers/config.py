@@ -38,8 +38,8 @@ from emberlink.envs.fire import FireConfig
 _STRICT = ConfigDict(extra="forbid", strict=True)
 _GROUPS = ("setup", "fire")
 
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Positive = Annotated[float, Field(gt=0, le=1e30)]
+NotNegative = Annotated[float, Field(ge=0, le=1e30)]
 Count = Annotated[int, Field(ge=1, le=1_000_000_000)]
 Units = Annotated[int, Field(ge=1, le=8192)]
 Side = Annotated[int, Field(ge=1, le=65_536)]
@@ -315,6 +315,10 @@ def _check_overrides(method: str, overrides: Sequence[str], choices: dict[str, s
         key = override.key_or_group
         if override.is_delete() or override.is_add() or override.is_sweep_override():
             raise ValueError(f"{shown(text)!r}: only key=value with one value is understood here")
+        if isinstance(override.value(), dict):
+            raise ValueError(f"{shown(text)!r}: give its keys one by one, as {key}.KEY=VALUE")
+        if key == "fire.name":
+            raise ValueError(f"{shown(text)!r}: a scenario is chosen with fire=NAME")
         if key in _GROUPS:
             chosen = str(override.value())
             if chosen not in known(key):

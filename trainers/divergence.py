@@ -1,7 +1,8 @@
 """What a training says and leaves behind where a number is not finite: culprit, bundle, replay."""
 
+import itertools
 import platform
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -239,7 +240,9 @@ def _by_team(own: Tensor, teams: int) -> Tensor:
 
 def _write(trainer: "Trainer", place: int, batch: TensorDictBase, culprit: Culprit) -> Path:
     """Writes a bundle to a new folder of the first seed's run."""
-    folder = next(_free(trainer.run.path, f"divergence_step_{culprit.step}"))
+    whole = _free(trainer.run.path, f"divergence_step_{culprit.step}")
+    folder = whole.with_name(whole.name + ".part")
+    folder.mkdir()
     watch = trainer.learner.watch
     content = {f"batch/{name}": value for name, value in state.flat(batch).items()}
     if place == COLLECTED and watch.own is not None:
@@ -269,7 +272,8 @@ def _write(trainer: "Trainer", place: int, batch: TensorDictBase, culprit: Culpr
         "config": to_values(trainer.config),
     }
     RunFolder(folder).write("report.json", report)
-    return folder
+    folder.rename(whole)
+    return whole
 
 
 def _range(value: Tensor) -> dict[str, Any]:
@@ -280,15 +284,10 @@ def _range(value: Tensor) -> dict[str, Any]:
     return {"finite": ends, "not_finite": value.numel() - finite.numel()}
 
 
-def _free(parent: Path, name: str) -> Iterator[Path]:
-    """A new folder, made; nothing that is there is touched."""
-    for attempt in range(1, 10_000):
-        folder = parent / (name if attempt == 1 else f"{name}_{attempt}")
-        try:
-            folder.mkdir()
-        except FileExistsError:
-            continue
-        yield folder
+def _free(parent: Path, name: str) -> Path:
+    """A name that nothing there has."""
+    names = (name if attempt == 1 else f"{name}_{attempt}" for attempt in itertools.count(1))
+    return next(path for one in names if not (path := parent / one).exists())
 
 
 def _grouped(content: Mapping[str, Tensor]) -> dict[str, dict[str, Tensor]]:

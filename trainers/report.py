@@ -75,19 +75,36 @@ def evaluate_run(
         report(f"{policy} on {fires} fires of {fire}")
 
     results = evaluate.evaluate(config, actor, fires=fires, report=say)
-    content = record(config, results, checkpoint=checkpoint.name, fires=fires)
-    run.write(f"eval{label}.json", content)
+    try:
+        _draw(run, config, actor, results, report, label)
+    except OSError as error:
+        raise ValueError(
+            f"{run.path / 'figures'}: cannot be written: {error.strerror or error}"
+        ) from None
+    # Last: with it, an evaluation is whole.
+    run.write(f"eval{label}.json", record(config, results, checkpoint=checkpoint.name, fires=fires))
+    return results
+
+
+def _draw(
+    run: RunFolder,
+    config: RunConfig,
+    actor: evaluate.Policy,
+    results: evaluate.Results,
+    report: Callable[[str], None],
+    label: str,
+) -> None:
     figures.coverage_bars(run.figure(f"coverage{label}.png"), results)
     lines = run.lines()
     if lines:
         title = f"{config.method}, setup {config.setup}, fire {config.fire.name}"
         figures.training_curves(run.figure("training.png"), lines, title)
     report("one episode for the animation")
-    name, arrival = next(iter(evaluate.evaluation_fires(config, fires).items()))
+    count = len(next(iter(results.values()))[evaluate.LEARNED]["coverage"])
+    name, arrival = next(iter(evaluate.evaluation_fires(config, count).items()))
     pictures, steps = evaluate.film(config, actor, fire=arrival[0])
     write_gif(run.figure(f"episode_{name}{label}.gif"), pictures)
     figures.timelapse(run.figure(f"timelapse_{name}{label}.png"), pictures, steps)
-    return results
 
 
 def record(config: RunConfig, results: evaluate.Results, **about: Any) -> dict[str, Any]:

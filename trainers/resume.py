@@ -6,12 +6,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from . import checkpoint, state
+from emberlink.envs.config import shown
+
+from . import checkpoint, state, state_header
 from .config import RunConfig, flat, from_values, override, to_values
 from .lock import Lock
 from .loop import LINES, SIBLINGS, Trainer
 from .reading import LONGEST_YAML, parse_json, read_text
-from .run_folder import RunFolder
+from .run_folder import RunFolder, step_of
 
 MAY_CHANGE = (
     *("episodes", "device", "logger", "on_nan"),
@@ -43,6 +45,8 @@ def resume(path: Path, method: str | None = None, overrides: Sequence[str] = ())
         locks = [Lock(run.path) for run in runs]
         for lock in locks:
             stack.callback(lock.release)
+        if chosen is None and not (runs[0].states() or runs[0].networks()):
+            _check_beginning(runs, config)
         trainer = Trainer(config)
         if len(runs) != trainer.teams:
             raise ValueError(f"{runs[0].path}: {len(runs)} folders for {trainer.teams} seeds")
@@ -72,9 +76,28 @@ def _runs(folder: Path) -> list[RunFolder]:
         return [RunFolder(folder)]
     try:
         names = parse_json(read_text(file, LONGEST_YAML))["folders"]
-        return [RunFolder(folder.absolute().parent / Path(name).name) for name in names]
+        runs = [RunFolder(folder.resolve().parent / Path(name).name) for name in names]
     except (OSError, ValueError, TypeError, KeyError):
         raise ValueError(f"{file}: does not name the folders of the other seeds") from None
+    for run in runs:
+        if not run.path.is_dir():
+            raise ValueError(f"{run.path}: is missing; its seed trains side by side with {folder}")
+    return runs
+
+
+def _check_beginning(runs: Sequence[RunFolder], config: RunConfig) -> None:
+    """That a run without a checkpoint never had one: its lines are few, and it begins again."""
+    most = config.checkpoint_interval
+    if config.checkpoint_steps:
+        most = min(most, -(-config.checkpoint_steps // config.env.horizon))
+    for run in runs:
+        lines = run.lines()
+        if len(lines) > most or (run.path / "eval.json").exists():
+            raise ValueError(
+                f"{run.path}: has metrics of {len(lines)} episodes and no checkpoint "
+                "(checkpoints/state_*.safetensors): nothing to go on from, and nothing was changed"
+            )
+        run.checkpoints.mkdir(exist_ok=True)
 
 
 def _changed(config: RunConfig, method: str | None, overrides: Sequence[str]) -> RunConfig:
@@ -111,30 +134,29 @@ def _restore(
         return [dict.fromkeys(LINES, 0) for _ in runs]
     path = chosen or states[-1]
     try:
-        _restore_from(trainer, path)
+        header = _restore_from(trainer, path)
     except ValueError as error:
-        older = [one for one in states if one < path]
+        older = [one for one in states if 0 <= step_of(one) < step_of(path)]
         hint = f"; the one before it: emberlink train resume={older[-1]}" if older else ""
         raise ValueError(f"{error}{hint}") from None
-    header = checkpoint.read_header(path) or {}
-    if header["folders"] != [run.path.name for run in runs] and len(runs) > 1:
-        raise ValueError(f"{path}: of the folders {', '.join(header['folders'])}")
-    return header["files"]
+    if header.folders != [run.path.name for run in runs] and len(runs) > 1:
+        raise ValueError(f"{path}: of the folders {shown(', '.join(header.folders))}")
+    return [*header.files]
 
 
-def _restore_from(trainer: Trainer, path: Path) -> None:
-    header, content = checkpoint.read(path)
-    if header is None or header.get("kind") != "state":
+def _restore_from(trainer: Trainer, path: Path) -> state_header.Header:
+    found, content = checkpoint.read(path)
+    if found is None or found.get("kind") != "state":
         raise ValueError(f"{path}: holds networks alone; nothing can be resumed from it")
-    try:
-        _check_config(trainer.config, path, header["config"])
-        if header["step"] > trainer.steps:
-            done = header["step"] / trainer.config.env.horizon
-            raise ValueError(f"episodes={trainer.config.episodes}: the run has done {done:g}")
-        state.restore(trainer, path, header, content)
-        trainer.best, trainer.seconds = list(header["best"]), float(header["seconds"])
-    except (KeyError, TypeError, AttributeError) as error:
-        raise ValueError(f"{path}: its header is not one of a state: {error}") from None
+    header = state_header.parse(path, found)
+    if step_of(path) not in (-1, header.step):
+        raise ValueError(f"{path}: its header: step={header.step}: should be its name's")
+    _check_config(trainer.config, path, header.config)
+    if header.step > trainer.steps:
+        done = header.step / trainer.config.env.horizon
+        raise ValueError(f"episodes={trainer.config.episodes}: the run has done {done:g}")
+    state.restore(trainer, path, found, content)
+    return header
 
 
 def _check_config(config: RunConfig, path: Path, values: Mapping[str, Any]) -> None:

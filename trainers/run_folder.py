@@ -2,9 +2,11 @@
 
 import json
 import os
+import shutil
 from collections.abc import Mapping
 from contextlib import suppress
 from datetime import datetime
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -39,10 +41,10 @@ class RunFolder:
             path = _new_folder(Path(config.output) / name)
             (path / "checkpoints").mkdir()
             (path / "figures").mkdir()
-            run = cls(path)
-            run.write_config(config)
         except OSError as error:
             raise ValueError(f"output={config.output}: {error.strerror or error}") from None
+        run = cls(path)
+        run.write_config(config)
         return run
 
     def write_config(self, config: RunConfig) -> None:
@@ -79,7 +81,10 @@ class RunFolder:
             ValueError: it cannot be written, such as to a full disk.
         """
         path = self.path / file
-        handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
+        try:
+            handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
+        except OSError as error:
+            raise ValueError(f"{path}: cannot be written: {error.strerror}") from None
         before = os.fstat(handle).st_size
         try:
             left = (json.dumps(line) + "\n").encode()
@@ -112,7 +117,10 @@ class RunFolder:
             ValueError: it holds less, or other lines.
         """
         path = self.path / file
-        kept = path.read_bytes()[:size] if path.exists() else b""
+        try:
+            kept = path.read_bytes()[:size] if path.exists() else b""
+        except OSError as error:
+            raise ValueError(f"{path}: cannot be read: {error.strerror}") from None
         found = kept.count(b"\n") if kept.endswith(b"\n") else -1
         if len(kept) < size or found != (lines if lines else -1):
             raise ValueError(
@@ -131,10 +139,15 @@ class RunFolder:
         self._replace(file, json.dumps(content, indent=1) + "\n")
 
     def _replace(self, file: str, text: str) -> None:
-        partial = self.path / (file + ".part")
-        partial.unlink(missing_ok=True)  # a link would lead to another's file
-        partial.write_text(text)
-        partial.replace(self.path / file)
+        path, partial = self.path / file, self.path / (file + ".part")
+        try:
+            partial.unlink(missing_ok=True)  # a link would lead to another's file
+            partial.write_text(text)
+            partial.replace(path)
+        except OSError as error:
+            with suppress(OSError):
+                partial.unlink(missing_ok=True)
+            raise ValueError(f"{path}: cannot be written: {error.strerror or error}") from None
 
     def lines(self, file: str = "metrics.jsonl") -> list[dict[str, Any]]:
         """The lines of a .jsonl file; none where there is no such file."""
@@ -203,15 +216,26 @@ class RunFolder:
         for path in self.networks()[:-keep] + self.states()[:-states]:
             path.unlink(missing_ok=True)
 
+    def evaluated(self) -> bool:
+        """Whether eval.json is there, and of the newest checkpoint."""
+        try:
+            about = parse_json(read_text(self.path / "eval.json", LONGEST_JSON))
+            return about["checkpoint"] == self.checkpoint().name
+        except (OSError, ValueError, KeyError, TypeError):
+            return False
+
     def take_away_after(self, step: int) -> None:
         """Takes away what a resumed run makes again, and what a killed one had begun to write."""
         for path in self.networks() + self.states():
             if step_of(path) > step:
                 path.unlink()
-        for path in [*self.path.glob("*.part"), *self.checkpoints.glob("*.part")]:
+        begun = [self.path.glob(f"{name}.part") for name in ("config.yaml", "*.json")]
+        # safetensors' own names begin with .tmp
+        begun += [self.checkpoints.glob(name) for name in ("*.safetensors.part", ".tmp*")]
+        for path in chain(*begun):
             path.unlink()
-        for path in self.checkpoints.glob(".tmp*"):  # safetensors' own
-            path.unlink()
+        for path in self.path.glob("divergence_step_*.part"):
+            shutil.rmtree(path)
 
 
 def step_of(checkpoint: Path) -> int:

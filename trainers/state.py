@@ -13,15 +13,22 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from emberlink.envs import keys, metrics
+from emberlink.envs.config import shown
 from emberlink.policies.noise import NOISE
 
 from . import checkpoint as files
+from . import state_header, state_world
+from .state_header import Header
 
 if TYPE_CHECKING:
     from .loop import Trainer
 
-_FINITE = ("networks", "optimizer", "memory")
-"""groups in which a number that is not finite is damage; fires hold infinity, edges NaN"""
+_GROUPS = (
+    *("networks", "optimizer", "memory", "carried", "world", "communication"),
+    *("moments", "losses"),
+)
+_LARGEST_STEP = 2**24
+"""to which Adam can count, in float32"""
 
 
 def tensors(trainer: "Trainer") -> dict[str, Tensor]:
@@ -75,30 +82,42 @@ def restore(trainer: "Trainer", path: Path, header: Mapping[str, Any], content: 
         header, content: what `counters` and `tensors` gave.
 
     Raises:
-        ValueError: something is missing, is of another shape or type, or is NaN.
+        ValueError: something is missing, unknown, out of range, of another shape or type, or NaN.
     """
-    groups: dict[str, dict[str, Tensor]] = {}
-    for name, value in content.items():
-        group, _, rest = name.partition("/")
-        groups.setdefault(group, {})[rest] = value
-        if group in _FINITE:
-            files.check_finite(path, {name: value})
-    env = trainer.env
-    places = {
-        "world": env.base_env.state_dict(),
-        "communication": env.transform.state_dict(),
-    }
-    for group, place in places.items():
-        _copy(path, group, place, groups.get(group, {}))
-    trainer.step, trainer.updates = header["step"], header["updates"]
-    trainer.begun = trainer.step, trainer.updates
+    made = state_header.parse(path, header)
+    state_header.check(path, made, trainer)
+    groups = _grouped(path, content)
+    # Fires hold infinity, and their margin NaN; they are compared.
+    of_fires = f"world/{state_world.ARRIVAL}"
+    files.check_finite(path, {name: one for name, one in content.items() if name != of_fires})
+    trainer.step, trainer.updates = made.step, made.updates
+    begun: Any = (made.step, made.updates)
+    trainer.begun = begun
     trainer.episode = trainer.step // trainer.config.env.horizon
     restore_learner(trainer, path, header, groups)
-    _restore_memory(trainer, path, header, groups.get("memory", {}))
+    _check_adam(trainer, path, groups["optimizer"])
+    world = state_world.begin_episode(trainer)
+    _check_shapes(path, "world", world, groups["world"])
+    state_world.check(path, groups["world"], trainer)
+    _copy(path, "world", world, groups["world"])
+    _copy(path, "communication", trainer.env.transform.state_dict(), groups["communication"])
+    _restore_memory(trainer, path, made, groups["memory"])
     if trainer.step:  # before the first one there is no noise yet, and nothing else to carry
-        carried = _carried(trainer, path, groups.get("carried", {}))
+        carried = _carried(trainer, path, groups["carried"])
+        state_world.check_carried(path, groups["carried"], groups["world"])
         trainer.collector.go_on(carried, trainer.step)
-    _restore_episode(trainer, path, header, groups)
+    _restore_episode(trainer, path, made, groups)
+    trainer.best, trainer.seconds = list(made.best), made.seconds
+
+
+def _grouped(path: Path, content: Mapping[str, Tensor]) -> dict[str, dict[str, Tensor]]:
+    groups: dict[str, dict[str, Tensor]] = {group: {} for group in _GROUPS}
+    for name, value in content.items():
+        group, _, rest = name.partition("/")
+        if group not in groups:
+            raise ValueError(f"{path}: holds {shown(name)}, which no state has")
+        groups[group][rest] = value
+    return groups
 
 
 def learner(trainer: "Trainer") -> dict[str, Tensor]:
@@ -163,15 +182,7 @@ def nested(content: Mapping[str, Tensor], dims: int, device: torch.device | str)
 
 
 def _copy(path: Path, group: str, place: Mapping[str, Tensor], found: dict[str, Tensor]) -> None:
-    for name, value in place.items():
-        if name not in found:
-            raise ValueError(f"{path}: holds no {group}/{name}")
-        new = found[name]
-        if new.shape != value.shape or new.dtype != value.dtype:
-            raise ValueError(
-                f"{path}: {group}/{name} has shape {list(new.shape)}, {new.dtype}; this version "
-                f"needs {list(value.shape)}, {value.dtype}"
-            )
+    _check_shapes(path, group, place, found)
     with torch.no_grad():
         for name, value in place.items():
             value.copy_(found[name])
@@ -185,51 +196,61 @@ def _optimizer(trainer: "Trainer") -> dict[str, Tensor]:
 def _restore_optimizer(trainer: "Trainer", path: Path, found: dict[str, Tensor]) -> None:
     optimizer = trainer.learner.optimizer
     parameters = [one for group in optimizer.param_groups for one in group["params"]]
+    places: dict[str, Tensor] = {}
+    for index, one in enumerate(parameters if trainer.updates else ()):
+        of = {"step": torch.zeros(()), "exp_avg": one, "exp_avg_sq": one}
+        places |= {f"{index}.{key}": value for key, value in of.items()}
+    _check_shapes(path, "optimizer", places, found)
     state: dict[int, dict[str, Tensor]] = {}
-    for name, value in found.items():
+    for name in places:
         index, _, key = name.partition(".")
-        state.setdefault(int(index), {})[key] = value
-    if state.keys() != set(range(len(parameters) if trainer.updates else 0)):
-        raise ValueError(f"{path}: holds the optimiser's state of {len(state)} tensors")
-    for index, of in state.items():
-        one = parameters[index]
-        places = {"step": torch.zeros(()), "exp_avg": one, "exp_avg_sq": one}
-        _check_shapes(path, f"optimizer/{index}", places, of)
+        state.setdefault(int(index), {})[key] = found[name]
     groups = optimizer.state_dict()["param_groups"]
     optimizer.load_state_dict({"state": state, "param_groups": groups})
+
+
+def _check_adam(trainer: "Trainer", path: Path, found: Mapping[str, Tensor]) -> None:
+    """That Adam has counted the updates, and that squares are no less than 0."""
+    counted = min(trainer.updates, _LARGEST_STEP)
+    for name, value in found.items():
+        if name.endswith(".step") and value.item() != counted:
+            raise ValueError(f"{path}: optimizer/{name} is not {counted}, the number of updates")
+        if name.endswith(".exp_avg_sq") and (value < 0).any():
+            raise ValueError(f"{path}: optimizer/{name} holds a number below 0")
 
 
 def _check_shapes(
     path: Path, group: str, places: Mapping[str, Tensor], found: Mapping[str, Tensor]
 ) -> None:
+    """That a group holds what it must, and nothing else."""
+    for name in found:
+        if name not in places:
+            raise ValueError(f"{path}: holds {shown(f'{group}/{name}')}, which this state has not")
     for name, place in places.items():
         if name not in found:
-            raise ValueError(f"{path}: holds no {group}.{name}")
-        if found[name].shape != place.shape or found[name].dtype != place.dtype:
+            raise ValueError(f"{path}: holds no {group}/{name}")
+        new = found[name]
+        if new.shape != place.shape or new.dtype != place.dtype:
             raise ValueError(
-                f"{path}: {group}.{name} has shape {list(found[name].shape)}, "
-                f"{found[name].dtype}; this version needs {list(place.shape)}, {place.dtype}"
+                f"{path}: {group}/{name} has shape {list(new.shape)}, {new.dtype}; this version "
+                f"needs {list(place.shape)}, {place.dtype}"
             )
 
 
 def _restore_memory(
-    trainer: "Trainer", path: Path, header: Mapping[str, Any], found: dict[str, Tensor]
+    trainer: "Trainer", path: Path, header: Header, found: dict[str, Tensor]
 ) -> None:
-    memory, envs = trainer.memory, trainer.config.num_envs
-    rows, written = trainer.sampler.rows, trainer.step * envs
-    if header["rows"] != min(rows, written):
-        raise ValueError(
-            f"{path}: holds {header['rows']} rows of memory; after {trainer.step} steps there are "
-            f"{min(rows, written)}"
-        )
+    memory, rows = trainer.memory, trainer.sampler.rows
+    written = trainer.step * trainer.config.num_envs
+    places = _memory_places(trainer, header.rows) if written else {}
+    _check_shapes(path, "memory", places, found)
     if written:
-        _check_shapes(path, "memory", _memory_places(trainer, header["rows"]), found)
         content = nested(found, 2, trainer.config.device)
         memory.extend(content)
         # Of a memory that has come round, once more: the next row goes behind the newest.
         if written > rows and written % rows:
             memory.extend(content[: written % rows])
-    trainer.sampler.draws.fill_(header["draws"])
+    trainer.sampler.draws.fill_(header.draws)
 
 
 def _memory_places(trainer: "Trainer", rows: int) -> dict[str, Tensor]:
@@ -252,22 +273,29 @@ def _memory_places(trainer: "Trainer", rows: int) -> dict[str, Tensor]:
 
 
 def _restore_episode(
-    trainer: "Trainer", path: Path, header: Mapping[str, Any], groups: Mapping[str, dict]
+    trainer: "Trainer", path: Path, header: Header, groups: Mapping[str, dict]
 ) -> None:
     """What is known of the episode that is not finished."""
     config, device = trainer.config, trainer.config.device
-    moments, losses = groups.get("moments", {}), groups.get("losses", {})
-    batch = (trainer.envs, trainer.step % config.env.horizon)
-    if batch[1]:
-        for key in metrics.STEP_KEYS:
-            name = key if isinstance(key, str) else ".".join(key)
-            if name not in moments or moments[name].shape[:2] != batch:
-                raise ValueError(f"{path}: holds no moments/{name} of {batch[1]} steps")
+    moments, losses = groups["moments"], groups["losses"]
+    time = trainer.step % config.env.horizon
+    _check_shapes(path, "moments", _moment_places(trainer, time) if time else {}, moments)
+    if time:
         trainer.moments = [nested(moments, 2, device)]
-    if header["losses"]:
-        shape = header["losses"], 2, trainer.teams * config.env.num_uavs
-        _check_shapes(path, "losses", {"all": torch.empty(shape, device="meta")}, losses)
+    shape = header.losses, 2, trainer.teams * config.env.num_uavs
+    places = {"all": torch.empty(shape, device="meta")} if header.losses else {}
+    _check_shapes(path, "losses", places, losses)
+    if header.losses:
         trainer.losses = list(losses["all"].to(device).unbind(0))
+
+
+def _moment_places(trainer: "Trainer", time: int) -> dict[str, Tensor]:
+    """What is measured of so many steps of an episode, without taking the room."""
+    one = flat(trainer.env.fake_tensordict().get("next").select(*metrics.STEP_KEYS))
+    return {
+        name: torch.empty(len(value), time, *value.shape[1:], dtype=value.dtype, device="meta")
+        for name, value in one.items()
+    }
 
 
 def _carried(trainer: "Trainer", path: Path, found: dict[str, Tensor]) -> TensorDict:

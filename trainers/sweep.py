@@ -65,7 +65,7 @@ class Job:
     def finished(self) -> bool:
         """Whether every seed has been trained and evaluated."""
         return len(self.folders) == len(self.configs) and all(
-            (run.path / "eval.json").exists() for run in self.folders.values()
+            run.evaluated() for run in self.folders.values()
         )
 
     @property
