@@ -15,6 +15,8 @@ from emberlink.envs import metrics
 from emberlink.trainers import cli
 from emberlink.trainers.comparison_numbers import numbers
 from emberlink.trainers.comparison_runs import Run, find, gather, read
+from emberlink.trainers.config import to_values
+from emberlink.trainers.run_folder import RunFolder
 
 METHODS = ("consensus", "independent", "positional", "shared_memory")
 
@@ -188,7 +190,7 @@ def test_the_order_of_runs_does_not_matter(runs, tmp_path):
         whole.append({file.name: file.read_bytes() for file in out.iterdir()})
     assert whole[0] == whole[1] == whole[2]
     assert {"compare.html", "compare.json"} < whole[0].keys()
-    assert sum(name.endswith(".png") for name in whole[0]) == 5
+    assert sum(name.endswith(".png") for name in whole[0]) == 6
 
 
 @settings(
@@ -227,12 +229,67 @@ def test_setups_fires_and_configurations_are_kept_apart(tmp_path):
         ("setup released, trained on paper", [("consensus", [0])]),
         (
             "setup tuned, trained on huygens",
-            [("consensus (learner.batch=256)", [0]), ("consensus (learner.batch=64)", [1, 2])],
+            [("consensus", [0]), ("consensus (learner.batch=64)", [1, 2])],
         ),
         ("setup tuned, trained on paper", [("consensus", [0])]),
     ]
     assert [s.trained_on for s in sections] == ["", "huygens", "paper"]
     assert any("not all methods have the same learner.batch" in note for note in notes)
+
+
+def in_another_world(run, name, coverage, **about):
+    """An evaluation of a run with messages lost, beside its own."""
+    content = read_evaluation(run)
+    config = RunFolder(run).config()
+    comm = {"learned": {**config.comm, "loss": 0.5}}
+    content |= {"environment": to_values(config)["env"], "communication": comm, **about}
+    content["results"]["huygens"]["learned"]["coverage"] = [coverage] * 4
+    (run / name).write_text(json.dumps(content))
+
+
+def test_evaluations_in_other_worlds_are_no_trainings(tmp_path, capsys):
+    """They have rows in the tables, and no claims, curves and colours."""
+    for seed in (0, 1):
+        run = write_run(tmp_path, "consensus", seed, learned={"coverage": 80 + seed})
+        write_run(tmp_path, "independent", seed, learned={"coverage": 30 + seed})
+        in_another_world(run, "eval_comm.loss=0.5.json", 60 + seed)
+    for name, about in {
+        "eval_step_7.json": {"checkpoint": "step_7.safetensors"},
+        "eval_fires.json": {"fires": 4, "start_seed": 2},
+    }.items():
+        in_another_world(run, name, 10, **about)
+    shutil.copy(run / "eval.json", run / "eval_the_same.json")
+    assert cli.main(["compare", str(tmp_path), "--output", str(tmp_path / "out")]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "eval_step_7.json is left out: evaluated otherwise: checkpoint is step_7" in said
+    assert "eval_fires.json is left out: evaluated otherwise: start_seed is 2" in said
+    (one,) = json.loads((tmp_path / "out" / "compare.json").read_text())["setups"]
+    (coverage,) = [r for r in one["fires"]["huygens"] if r["measure"] == "coverage"]
+    assert [(r["method"], r["iqm"]) for r in coverage["rows"]] == [
+        ("consensus", 80.5),
+        ("consensus, evaluated with comm.loss=0.5", 60.5),
+        ("independent", 30.5),
+    ]
+    assert {claim["method"] for claim in one["claims"]} == {"consensus"}
+    assert one["curves"]["coverage"].keys() == {"consensus", "independent"}
+    assert (tmp_path / "out" / "1_tuned_frozen_1_huygens.png").stat().st_size > 10_000
+
+
+def test_who_hears_something_else_may_fly_otherwise(tmp_path):
+    """Scripted pursuit follows the messages: no note, and a number for each group."""
+    for seed, (loss, coverage) in enumerate([(0.0, 40.0), (0.5, 20.0)]):
+        run = write_run(
+            tmp_path, "consensus", seed, overrides=(f"comm.loss={loss}",), scripted=("pursuit",)
+        )
+        content = read_evaluation(run)
+        content["communication"] = {"pursuit": {"name": "consensus", "loss": loss}}
+        content["results"]["huygens"]["pursuit"]["coverage"] = [coverage] * 4
+        write_evaluation(run, content)
+    one = only(tmp_path)
+    assert ranking(one, "coverage").scripted == {
+        "pursuit": {"consensus": 40.0, "consensus (comm.loss=0.5)": 20.0}
+    }
+    assert not [note for note in one.notes if "pursuit" in note]
 
 
 def test_what_does_not_change_the_training_is_said_and_does_not_part_runs(tmp_path):
@@ -333,7 +390,7 @@ def test_the_page_holds_everything_and_loads_nothing(runs, tmp_path):
     assert cli.main(["compare", str(runs), "--output", str(out)]) == 0
     tags = page(out)
     assert "script" not in tags.seen
-    assert len(tags.loaded) == 5
+    assert len(tags.loaded) == 6
     assert all(address.startswith("data:image/png;base64,iVBOR") for address in tags.loaded)
     source = (out / "compare.html").read_text()
     for scheme in ("http:", "https:", "//", "url(", "@import"):
@@ -520,7 +577,7 @@ def test_a_real_run_has_a_timelapse(finished, tmp_path):
     assert cli.main(["compare", str(finished.parent), "--output", str(tmp_path / "out")]) == 0
     (timelapse,) = (tmp_path / "out").glob("*timelapse*.png")
     tags = page(tmp_path / "out")
-    assert len(tags.loaded) == 6
+    assert len(tags.loaded) == 5 + 2 + 1  # figures 5 to 9, one for each fire, the timelapse
     assert "frozen policy of step_000000030.safetensors" in tags.text
     assert timelapse.stat().st_size > 1000
 

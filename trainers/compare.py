@@ -24,7 +24,7 @@ from .comparison_page import (
     ratio,
     record,
 )
-from .comparison_runs import Run, checkpoint, find, gather, read
+from .comparison_runs import Run, checkpoint, evaluated_otherwise, find, gather, read
 from .report import load_actor
 
 FRAMES = 5
@@ -88,7 +88,9 @@ def _read_all(paths: Sequence[Path]) -> tuple[list[Run], list[tuple[str, str]]]:
     for path in find(paths):
         found = read(path)
         if isinstance(found, Run):
-            runs.append(found)
+            others, why = evaluated_otherwise(found)
+            runs += [found, *others]
+            left_out += why
         else:
             left_out.append((str(path), found))
     return runs, left_out
@@ -96,19 +98,38 @@ def _read_all(paths: Sequence[Path]) -> tuple[list[Run], list[tuple[str, str]]]:
 
 def _chapter(folder: Path, place: int, one: Numbers, notes: list[str], console: Console) -> Chapter:
     """Draws a section's pictures into the folder."""
-    name = re.sub(r"[^A-Za-z0-9]+", "_", one.section.runs[0].config.setup)[:40]
+    name = _for_a_file(one.section.runs[0].config.setup)
     console.print(Text(f"  figures of {one.section.label}", style="dim"))
     pictures: list[Picture] = []
+    frozen: list[Picture] = []
+    for number, fire in enumerate(one.fires, 1):
+        path = folder / f"{place}_{name}_frozen_{number}_{_for_a_file(fire)}.png"
+        comparison_figures.frozen(path, one, fire)
+        frozen.append(Picture(path, _frozen_caption(one, fire)))
     for number, (measures, caption) in comparison_figures.FIGURES.items():
         path = folder / f"{place}_{name}_figure_{number}.png"
         comparison_figures.figure(path, one, measures)
         pictures.append(Picture(path, _caption(one, number, caption)))
     films = list(_timelapses(folder, f"{place}_{name}", one, notes, console))
-    return Chapter(one, pictures, films)
+    return Chapter(one, frozen, pictures, films)
+
+
+def _for_a_file(name: str) -> str:
+    return re.sub(r"[^A-Za-z0-9]+", "_", name)[:40]
+
+
+def _frozen_caption(one: Numbers, fire: str) -> str:
+    count = one.section.runs[0].evaluation.fires
+    return (
+        f"Frozen policies on {count} held-out fires of {fire}. Small dots: a run's mean over its "
+        "episodes, one a seed. Large dot: interquartile mean over seeds; line: 95 % bootstrap "
+        "interval over seeds, none with one seed. Dashed: scripted policies; in a method's row "
+        "alone where the number is that method's."
+    )
 
 
 def _caption(one: Numbers, number: int, what: str) -> str:
-    seeds = ", ".join(f"{group.label} {len(group.runs)}" for group in one.section.groups)
+    seeds = ", ".join(f"{group.label} {len(group.runs)}" for group in one.section.as_trained)
     text = (
         f"The paper's figure {number}. {what} The exploring policy in each episode of training, "
         "mean over the environments side by side. Line: interquartile mean over seeds; band: 95 % "
@@ -127,7 +148,7 @@ def _timelapses(
     folder: Path, name: str, one: Numbers, notes: list[str], console: Console
 ) -> Iterator[Picture]:
     """One episode of the first seed of each method, as a row of frames."""
-    for place, group in enumerate(one.section.groups, 1):
+    for place, group in enumerate(one.section.as_trained, 1):
         run = group.runs[0]
         newest = checkpoint(run.path)
         if newest is None:

@@ -1,5 +1,6 @@
 """The paper's figures 5 to 9 for several methods and seeds."""
 
+import textwrap
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -30,6 +31,8 @@ DASHES = (
     *((0, (3, 2, 1, 2)), (0, (12, 2, 3, 2)), (0, (1, 1))),
 )
 """of scripted policies"""
+FROZEN = ("coverage", "tracking_first", "tracking_last", "boundary_exits")
+"""measures of the figure of frozen policies; its rows are ranked by the first"""
 DOTTED = "tracking_last"
 """drawn dotted, as in the paper's figure 7"""
 
@@ -43,9 +46,7 @@ def figure(path: Path, numbers: Numbers, measures: tuple[str, ...]) -> None:
         measures: a panel each.
     """
     figure = Figure(figsize=(9.2, 3.8), layout="constrained")
-    colours = {
-        group.label: COLOURS[i % len(COLOURS)] for i, group in enumerate(numbers.section.groups)
-    }
+    colours = _colours(numbers)
     policies = _policies(numbers)
     panels = figure.subplots(1, len(measures), squeeze=False)[0]
     for axes, measure in zip(panels, measures, strict=True):
@@ -54,17 +55,71 @@ def figure(path: Path, numbers: Numbers, measures: tuple[str, ...]) -> None:
         axes.set(xlabel="episode of training", ylabel=CURVES[measure])
         axes.xaxis.set_major_locator(MaxNLocator(nbins=6, integer=True))
         axes.grid(alpha=0.3)
+    _legend(figure, colours, policies)
+    figure.savefig(path, dpi=120, metadata={"Software": None})
+
+
+def frozen(path: Path, numbers: Numbers, fire: str) -> None:
+    """Frozen policies on one evaluation fire: a row per method, a panel per measure.
+
+    Args:
+        path: a .png file.
+        numbers: of a setup.
+        fire: one of `numbers.fires`.
+    """
+    rankings = {one.measure: one for one in numbers.fires[fire]}
+    order = [row.method for row in rankings[FROZEN[0]].rows][::-1]
+    colours = _colours(numbers)
+    policies = _policies(numbers)
+    names = [textwrap.fill(name, 34, break_on_hyphens=False) for name in order]
+    tall = sum(0.14 + 0.2 * (1 + name.count("\n")) for name in names)
+    figure = Figure(figsize=(3.4 * len(FROZEN), 1.5 + max(tall, 1.4)), layout="constrained")
+    panels = figure.subplots(1, len(FROZEN), sharey=True)
+    for axes, measure in zip(panels, FROZEN, strict=True):
+        ranking = rankings[measure]
+        for row in ranking.rows:
+            y, colour = order.index(row.method), colours.get(row.method, "0.45")
+            axes.plot(row.values, [y] * len(row.values), "o", ms=3, color=colour, alpha=0.5)
+            axes.plot([row.iqm], [y], "o", ms=7, color=colour)
+            if row.interval is not None:
+                axes.plot(row.interval, [y, y], "-", lw=2, color=colour)
+        for policy, by_method in ranking.scripted.items():
+            for methods, value in by_method.items():
+                places = [order.index(one) for one in methods.split(", ") if one in order]
+                low, high = (min(places), max(places)) if places else (0, len(order) - 1)
+                ends = [low - 0.5, high + 0.5]
+                axes.plot([value] * 2, ends, color="0.3", ls=policies[policy], lw=1.3, zorder=1)
+        better = "more" if ranking.higher_is_better else "less"
+        axes.set(xlabel=f"{CURVES[measure]}\n({better} is better)")
+        axes.set_ylim(-0.5, len(order) - 0.5)
+        axes.grid(alpha=0.3, axis="x")
+    panels[0].set_yticks(range(len(order)), names, parse_math=False)
+    _legend(figure, {}, policies)
+    figure.savefig(path, dpi=120, metadata={"Software": None})
+
+
+def _colours(numbers: Numbers) -> dict[str, str]:
+    groups = enumerate(numbers.section.as_trained)
+    return {group.label: COLOURS[i % len(COLOURS)] for i, group in groups}
+
+
+def _legend(
+    figure: Figure,
+    colours: Mapping[str, str],
+    policies: Mapping[str, tuple[int, tuple[int, ...]]],
+) -> None:
     handles = [Line2D([], [], color=colour, lw=2, label=name) for name, colour in colours.items()]
     handles += [
         Line2D([], [], color="0.3", ls=dash, lw=1.3, label=f"scripted: {name.replace('_', ' ')}")
         for name, dash in policies.items()
     ]
+    if not handles:
+        return
     legend = figure.legend(
         handles=handles, loc="outside right upper", frameon=False, handlelength=3
     )
     for text in legend.get_texts():  # a name is no formula
         text.set_parse_math(False)
-    figure.savefig(path, dpi=120, metadata={"Software": None})
 
 
 def _curves(

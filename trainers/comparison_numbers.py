@@ -8,6 +8,7 @@ from itertools import zip_longest
 import numpy as np
 
 from emberlink.envs import metrics
+from emberlink.policies.scripted import SCRIPTED
 
 from . import seed_statistics as statistics
 from .comparison_runs import Group, Section
@@ -130,11 +131,11 @@ def numbers(section: Section) -> Numbers:
         verdict
         for fire in fires
         for claim in CLAIMS
-        for group in section.groups
+        for group in section.as_trained
         if group.method == claim.method
         for verdict in _verdict(section, fire, claim, group)
     ]
-    curves = {name: {g.label: _curve(g, name) for g in section.groups} for name in CURVES}
+    curves = {name: {g.label: _curve(g, name) for g in section.as_trained} for name in CURVES}
     return Numbers(section, rankings, verdicts, curves, list(dict.fromkeys(notes)))
 
 
@@ -188,7 +189,8 @@ def _scripted(
         seen = [number for own in each.values() for number in own]
         if len(seen) < len(section.runs):
             notes.append(f"{section.label}: {policy} was played for {len(seen)} of the runs only")
-        for own in each.values() if measure in BY_METHOD else [seen]:
+        own_world = measure in BY_METHOD or _in_worlds_of_their_own(section, policy)
+        for own in each.values() if own_world else [seen]:
             if own and not _same(own):
                 notes.append(
                     f"{section.label}: {policy} does not have the same {measure} on {fire} in all "
@@ -197,6 +199,14 @@ def _scripted(
                 )
         found[policy] = _by_methods({label: own[0] for label, own in each.items() if own})
     return found
+
+
+def _in_worlds_of_their_own(section: Section, policy: str) -> bool:
+    """Whether a policy that follows what it hears hears something else for each group."""
+    if policy not in SCRIPTED or SCRIPTED[policy].recipe is None:
+        return False
+    worlds = [run.evaluation.communication.get(policy) for run in section.runs]
+    return any(world != worlds[0] for world in worlds)
 
 
 def _by_methods(each: Mapping[str, float]) -> dict[str, float]:
@@ -218,7 +228,7 @@ def _same(values: Sequence[float]) -> bool:
 
 
 def _verdict(section: Section, fire: str, claim: Claim, group: Group) -> list[Verdict]:
-    others = [other for other in section.groups if other.method != group.method]
+    others = [other for other in section.as_trained if other.method != group.method]
     if not others:
         return []
     higher = claim.measure in metrics.HIGHER_IS_BETTER

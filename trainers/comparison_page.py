@@ -51,7 +51,10 @@ class Chapter:
     """What the page says of one setup."""
 
     numbers: Numbers
+    frozen: Sequence[Picture]
+    """a figure for each evaluation fire"""
     figures: Sequence[Picture]
+    """of training"""
     timelapses: Sequence[Picture]
 
 

@@ -3,7 +3,7 @@
 import json
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any
@@ -14,7 +14,7 @@ from pydantic.dataclasses import dataclass as checked
 from emberlink.envs import metrics
 
 from . import pretrained
-from .config import RunConfig, describe, flat, to_values
+from .config import RunConfig, describe, flat, resolve, to_values
 from .evaluate import LEARNED
 from .figures import CURVES
 from .reading import LONGEST_JSON, read_text
@@ -45,6 +45,10 @@ class Evaluation:
     """fire -> policy -> measure -> one number per episode"""
     held_out: dict[str, Any] = Field(default_factory=dict)
     """fire -> what the fires were made from"""
+    environment: dict[str, Any] = Field(default_factory=dict)
+    """settings of the environment"""
+    communication: dict[str, dict[str, Any]] = Field(default_factory=dict)
+    """policy -> settings of the communication"""
 
 
 @dataclass(frozen=True)
@@ -56,6 +60,8 @@ class Run:
     lines: Sequence[Mapping[str, Any]]
     """of metrics.jsonl, one an episode"""
     evaluation: Evaluation
+    evaluated_with: Mapping[str, Any] = field(default_factory=dict)
+    """dotted key -> value, where the evaluation's is not the one trained with"""
 
     @cached_property
     def values(self) -> dict[str, Any]:
@@ -78,6 +84,11 @@ class Group:
     """by seed, each seed once"""
 
     @property
+    def as_trained(self) -> bool:
+        """Whether the evaluation was in the world that the runs were trained in."""
+        return not self.runs[0].evaluated_with
+
+    @property
     def method(self) -> str:
         return self.runs[0].config.method
 
@@ -92,6 +103,11 @@ class Section:
 
     label: str
     groups: tuple[Group, ...]
+
+    @property
+    def as_trained(self) -> list[Group]:
+        """The groups of which each is a training of its own."""
+        return [group for group in self.groups if group.as_trained]
 
     @property
     def runs(self) -> list[Run]:
@@ -143,14 +159,10 @@ def read(path: Path) -> Run | str:
     lines = _lines(folder)
     if len(lines) < config.episodes:
         return f"unfinished: {len(lines)} of {config.episodes} episodes"
-    file = path / "eval.json"
     try:
-        evaluation = TypeAdapter(Evaluation).validate_json(read_text(file, LONGEST_JSON))
+        evaluation = _evaluation(path / "eval.json", config)
     except FileNotFoundError:
         return f"not evaluated: there is no eval.json (emberlink eval {path})"
-    except ValidationError as error:
-        raise ValueError(f"{file}: {' '.join(describe(error).split())[:300]}") from None
-    _check_evaluation(file, evaluation, config)
     newest = checkpoint(path)
     if newest is not None and newest.name != evaluation.checkpoint:
         return (
@@ -158,6 +170,44 @@ def read(path: Path) -> Run | str:
             f"(emberlink eval {path})"
         )
     return Run(path, config, lines, evaluation)
+
+
+def evaluated_otherwise(run: Run) -> tuple[list[Run], list[tuple[str, str]]]:
+    """The same run in other worlds, such as with messages lost: one for each eval_*.json that is.
+
+    Returns:
+        What there is, and what is left out: file, why.
+
+    Raises:
+        ValueError: a file is damaged.
+    """
+    found: list[Run] = []
+    left_out: list[tuple[str, str]] = []
+    for file in sorted(run.path.glob("eval_*.json")):
+        evaluation = _evaluation(file, run.config)
+        world = {"env": evaluation.environment}
+        world["comm"] = evaluation.communication.get(LEARNED, {})
+        other = {key: value for key, value in flat(world).items() if run.values.get(key) != value}
+        why = [
+            f"{name} is {getattr(evaluation, name)}, in eval.json {getattr(run.evaluation, name)}"
+            for name in ("checkpoint", "fires", "start_seed")
+            if getattr(evaluation, name) != getattr(run.evaluation, name)
+        ]
+        why += [f"{key}={other[key]}" for key in ("env.horizon", "env.grid") if key in other]
+        if other and not why:
+            found.append(replace(run, evaluation=evaluation, evaluated_with=other))
+        elif other:
+            left_out.append((str(file), f"evaluated otherwise: {', '.join(why)}"))
+    return found, left_out
+
+
+def _evaluation(file: Path, config: RunConfig) -> Evaluation:
+    try:
+        evaluation = TypeAdapter(Evaluation).validate_json(read_text(file, LONGEST_JSON))
+    except ValidationError as error:
+        raise ValueError(f"{file}: {' '.join(describe(error).split())[:300]}") from None
+    _check_evaluation(file, evaluation, config)
+    return evaluation
 
 
 def checkpoint(path: Path) -> Path | None:
@@ -232,10 +282,15 @@ def gather(runs: Sequence[Run]) -> tuple[list[Section], list[str]]:
 
 
 def _groups(section: str, runs: Sequence[Run], notes: list[str]) -> list[Group]:
-    members = _split(runs, lambda run: [run.config.method, _trained(run)])
+    members = _split(runs, lambda run: [run.config.method, _trained(run), run.evaluated_with])
     apart = (*NOT_COMPARED, "method")
     named = [(m[0].config.method, m) for m in members]
-    labels = _labels(named, lambda key: key.split(".")[0] not in apart)
+    labels = [
+        label + "".join(f", evaluated with {k}={v}" for k, v in m[0].evaluated_with.items())
+        for label, m in zip(
+            _labels(named, lambda key: key.split(".")[0] not in apart), members, strict=True
+        )
+    ]
     groups: list[Group] = []
     for label, together in sorted(zip(labels, members, strict=True), key=lambda pair: pair[0]):
         by_seed = {run.config.seed: run for run in together}
@@ -273,14 +328,31 @@ def _split(runs: Iterable[Run], key: Callable[[Run], Any]) -> list[list[Run]]:
 
 
 def _labels(named: Sequence[tuple[str, Sequence[Run]]], wanted: Callable[[str], bool]) -> list[str]:
-    """The names; where one stands for several lists of runs, with the keys that set them apart."""
+    """The names; where one stands for several lists of runs, with the keys that set them apart.
+
+    Keys that are as in the recipe are left out.
+    """
     labels: list[str] = []
     for name, members in named:
         alike = [other[0] for same, other in named if same == name]
         keys = [key for key in _differing(alike) if wanted(key)]
-        apart = ", ".join(f"{key}={members[0].values.get(key)}" for key in keys)
+        own, recipe = members[0].values, _recipe(members[0].config) if keys else {}
+        apart = ", ".join(
+            f"{key}={own.get(key)}"
+            for key in keys
+            if key not in recipe or own.get(key) != recipe[key]
+        )
         labels.append(f"{name} ({apart})" if apart else name)
     return labels
+
+
+def _recipe(config: RunConfig) -> dict[str, Any]:
+    """What a run's method, setup and fire are without further settings, by dotted key."""
+    try:
+        choices = [f"setup={config.setup}", f"fire={config.fire.name}"]
+        return flat(to_values(resolve(config.method, choices)))
+    except ValueError:  # no longer known
+        return {}
 
 
 def _differing(runs: Sequence[Run]) -> list[str]:
