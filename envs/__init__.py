@@ -2,8 +2,16 @@
 
 from .config import WildfireConfig
 from .fire import FireConfig
+from .fire_file import FileFireConfig
 from .parallel import parallel_env
 from .reward import RewardConfig
 from .wildfire import WildfireEnv
 
-__all__ = ["FireConfig", "RewardConfig", "WildfireConfig", "WildfireEnv", "parallel_env"]
+__all__ = [
+    "FileFireConfig",
+    "FireConfig",
+    "RewardConfig",
+    "WildfireConfig",
+    "WildfireEnv",
+    "parallel_env",
+]

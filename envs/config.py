@@ -14,6 +14,8 @@ from .reward import RewardConfig
 
 T = TypeVar("T")
 
+TAG = "kind:"
+"""begins the name of one of several types that a value may be of; no part of its key"""
 Name = Annotated[str, Field(pattern=r"^\w[\w.+-]*$", max_length=100)]
 """what may be part of a file's name, and of a measure's"""
 
@@ -121,7 +123,8 @@ def shown(value: Any) -> str:
 def describe(error: ValidationError, prefix: str = "") -> str:
     """One line for what pydantic found first: the key, the value, and what was expected."""
     first = error.errors()[0]
-    key = ".".join([prefix, *map(str, first["loc"])] if prefix else map(str, first["loc"]))
+    parts = [str(part) for part in first["loc"] if not str(part).startswith(TAG)]
+    key = ".".join([prefix, *parts] if prefix else parts)
     if isinstance(cause := first.get("ctx", {}).get("error"), ValidationError):
         return describe(cause, key)
     message = first["msg"].removeprefix("Value error, ").replace("Input should", "should", 1)

@@ -1,7 +1,8 @@
 """Wildfires as data: a scenario is a set of ranges, a fire is what one seed draws from them.
 
 A fire is a time of arrival per cell, in steps; a cell burns from then on. It starts as a ring, the
-edge of a disc whose inside is burnt out and never counts as fire, and spreads by `spread`.
+edge of a disc whose inside is burnt out and never counts as fire, and spreads by `spread`. Other
+waves, such as oil on water, are scenarios too: "fire" stands for whatever spreads.
 Lengths of a scenario are in cells of a grid whose shorter side has 30 cells (`BASE_SIDE`); on
 another grid lengths, and with them rates, are scaled by min(X, Y)/30, so that it fits any grid.
 """
@@ -9,7 +10,7 @@ another grid lengths, and with them rates, are scaled by min(X, Y)/30, so that i
 import dataclasses
 import math
 from importlib import resources
-from typing import Annotated, Literal, get_args
+from typing import Annotated, Any, Literal, get_args
 
 import torch
 from omegaconf import OmegaConf
@@ -18,8 +19,10 @@ from pydantic.dataclasses import dataclass
 from torch import Tensor
 
 from .config import Name, describe, known
-from .spread import MAX_LENGTH_TO_BREADTH, arrival_times, disc
+from .drift import current, longest_step, tide_speed
+from .spread import arrival_times, disc
 from .streams import fold, uniform
+from .wavelet import MAX_LENGTH_TO_BREADTH
 
 BASE_SIDE = 30
 HELD_OUT_FROM = 1_000_000
@@ -46,6 +49,9 @@ _Signed = Annotated[float, Field(ge=-30, le=30)]
 _Rate = Annotated[float, Field(gt=0, le=1)]
 _Fraction = Annotated[float, Field(ge=0, le=1)]
 _Ratio = Annotated[float, Field(ge=1, le=MAX_LENGTH_TO_BREADTH)]
+_Drift = Annotated[float, Field(ge=0, le=1)]
+_Reach = Annotated[float, Field(ge=0, le=30)]
+_Period = Annotated[float, Field(ge=100, le=1e6)]
 _Count = Annotated[int, Field(ge=0, le=32)]
 
 
@@ -87,15 +93,28 @@ class FireConfig:
     """Distance from a patch's centre at which its effect has fallen to 1/e, cells."""
     patch_rate: Annotated[tuple[_Fraction, _Fraction], _Pair, _Ordered]
     """Multiplier of the rate of spread at a patch's centre; 1 is no effect."""
+    drift_rate: Annotated[tuple[_Drift, _Drift], _Pair, _Ordered] = (0.0, 0.0)
+    """Steady drift of the medium towards the azimuth, cells per step."""
+    tide_reach: Annotated[tuple[_Reach, _Reach], _Pair, _Ordered] = (0.0, 0.0)
+    """How far the medium swings to and fro along one axis, from turn to turn, cells."""
+    tide_period: Annotated[tuple[_Period, _Period], _Pair, _Ordered] = (1000.0, 1000.0)
+    """Steps from flood to flood."""
+    tide_phase: Annotated[tuple[_Degrees, _Degrees], _Pair, _Ordered] = (0.0, 0.0)
+    """Where in its period the tide is at step 0, degrees; at 0 it runs strongest."""
+    tide_bearing: Annotated[tuple[_Degrees, _Degrees], _Pair, _Ordered] = (0.0, 0.0)
+    """Axis of the tide, degrees counter-clockwise from +x: whereto it runs at phase 0."""
+    two_sided: bool = False
+    """Whether the back of the wavelet runs as fast as its head."""
 
 
+_FIXED = {"name", "bank", "two_sided"}
 # The position is part of a draw's key: append new fields, never reorder.
-_DRAWN = tuple(f.name for f in dataclasses.fields(FireConfig) if f.name not in {"name", "bank"})
+_DRAWN = tuple(f.name for f in dataclasses.fields(FireConfig) if f.name not in _FIXED)
 
 
 def scenarios() -> list[str]:
-    """Names of the scenarios: the files in `configs/fire`."""
-    return known("fire")
+    """Names of the generator's scenarios: the files in `configs/fire` that have no `kind`."""
+    return [name for name in known("fire") if "kind" not in _values(name)]
 
 
 def load_scenario(name: str) -> FireConfig:
@@ -106,12 +125,16 @@ def load_scenario(name: str) -> FireConfig:
     """
     if name not in scenarios():
         raise ValueError(f"unknown fire {name!r}; known: {', '.join(scenarios())}")
-    file = resources.files("emberlink.configs").joinpath("fire", f"{name}.yaml")
-    values = OmegaConf.to_container(OmegaConf.create(file.read_text(encoding="utf-8")))
     try:
-        return FireConfig(**values)  # pyright: ignore[reportCallIssue]
+        return FireConfig(**_values(name))
     except ValidationError as error:
         raise ValueError(f"configs/fire/{name}.yaml: {describe(error)}") from None
+
+
+def _values(name: str) -> dict[str, Any]:
+    file = resources.files("emberlink.configs").joinpath("fire", f"{name}.yaml")
+    values: Any = OmegaConf.to_container(OmegaConf.create(file.read_text(encoding="utf-8")))
+    return values
 
 
 def fire_seeds(split: Split, count: int, start: int = 0) -> Tensor:
@@ -158,9 +181,15 @@ def make_fires(
     if not all(_SIDES[0] <= side <= _SIDES[1] for side in grid):
         raise ValueError(f"grid must have {_SIDES[0]} to {_SIDES[1]} cells a side, got {grid}")
     refine = math.ceil(_NODES / min(grid))
-    chunk = max(1, _CHUNK // (grid[0] * grid[1] * refine**2))
+    sides = (side + 2 * _margin(config, grid) for side in grid)
+    chunk = max(1, _CHUNK // (math.prod(sides) * refine**2))
     parts = seeds.to(device=device, dtype=torch.int64).split(chunk)
     return torch.cat([_spread(config, part, grid, horizon, refine) for part in parts])
+
+
+def _margin(config: FireConfig, grid: tuple[int, int]) -> int:
+    """Cells around the grid from which a tide can bring something back."""
+    return math.ceil(config.tide_reach[1] * min(grid) / BASE_SIDE)
 
 
 def _spread(
@@ -173,16 +202,25 @@ def _spread(
     centre = fractions * (torch.tensor(grid, device=seeds.device) - 1)
     distance = disc(centre, draw["core_radius"] * scale)
     start, turning = draw["azimuth"].deg2rad(), draw["turning"].deg2rad()
+
+    def azimuth(time: float) -> Tensor:
+        return start + turning * (time / 1000)
+
+    fastest = config.drift_rate[1] + tide_speed(config.tide_reach[1], config.tide_period[0])
     arrival = arrival_times(
         distance,
         grid,
         draw["head_rate"] * scale,
         draw["length_to_breadth"],
-        lambda time: start + turning * (time / 1000),
+        azimuth,
         horizon=horizon,
+        two_sided=config.two_sided,
+        drift=current(draw, azimuth, scale) if fastest > 0 else None,
+        margin=_margin(config, grid),
+        max_step=longest_step(config.tide_period[0]) if config.tide_reach[1] > 0 else math.inf,
         refine=refine,
         rate_field=_fuel(config, seeds, centre, draw["core_radius"], start, grid),
-        max_rate=config.head_rate[1] * scale,
+        max_rate=(config.head_rate[1] + fastest) * scale,
         device=seeds.device,
     )
     depth = -distance(*_axes(grid, seeds.device))

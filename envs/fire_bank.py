@@ -12,8 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .config import WildfireConfig
-from .fire import FireConfig, Split, fire_seeds, load_scenario, make_fires
+from .fire import FireConfig, Split, fire_seeds, make_fires
 
 GENERATOR_VERSION = 1  # raise it whenever the same config and seed give another fire
 
@@ -63,47 +62,6 @@ def fire_bank(
     fires = make_fires(config, seeds, grid, horizon)
     _write(file, fires)
     return fires
-
-
-def arrival_times(
-    fire: str | FireConfig | Tensor, config: WildfireConfig, num_envs: int
-) -> tuple[Tensor, bool]:
-    """The fires that a `WildfireEnv` is given, whatever form they are given in.
-
-    Args:
-        fire: a scenario's name, a config, or arrival times.
-        config: of the environment.
-        num_envs: environments.
-
-    Returns:
-        Arrival times, float32 [fires, X, Y], and whether environment i always has fire i, or the
-        only one.
-
-    Raises:
-        ValueError: an unknown scenario, or arrival times whose shape or values do not fit.
-    """
-    if isinstance(fire, str):
-        fire = load_scenario(fire)
-    if isinstance(fire, FireConfig):
-        return fire_bank(fire, "train", fire.bank, config.grid, config.horizon), False
-    # A copy, in order in memory: what the caller does to theirs later is not our fire.
-    try:
-        bank = torch.as_tensor(fire, dtype=torch.float32)
-    except (TypeError, ValueError, RuntimeError):
-        raise ValueError(
-            f"fire: a scenario's name, a FireConfig or arrival times, not {type(fire).__name__}"
-        ) from None
-    bank = bank.clone(memory_format=torch.contiguous_format)
-    shape = list(bank.shape)
-    bank = bank.unsqueeze(0) if bank.ndim == 2 else bank
-    if bank.shape not in ((1, *config.grid), (num_envs, *config.grid)):
-        raise ValueError(
-            f"fire: arrival times of shape {shape}; expected {list(config.grid)} or "
-            f"{[num_envs, *config.grid]} (the grid of the config, num_envs={num_envs})"
-        )
-    if bank.isnan().any():
-        raise ValueError("fire: arrival times hold NaN; a cell that never burns is inf")
-    return bank, True
 
 
 def _read(file: Path, shape: tuple[int, ...]) -> Tensor | None:

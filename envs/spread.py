@@ -4,11 +4,12 @@ Every point of a front sends out an elliptical wavelet; the envelope of the wave
 front (Huygens; for wildfire Richards 1990, Int. J. Numer. Methods Eng. 30, and Finney 1998,
 FARSITE, RMRS-RP-4). The same front is the zero contour of φ with
 
-    φ_t + m · (c (w·∇φ) + sqrt(a² (w·∇φ)² + b² (w⊥·∇φ)²)) = 0
+    φ_t + m · (u·∇φ + c (w·∇φ) + sqrt(a² (w·∇φ)² + b² (w⊥·∇φ)²)) = 0
 
 where w is the unit vector of the direction of maximum spread, (a, b, c) the rates at which the
-wavelet's half length, half breadth and centre grow, and m ≥ 0 a multiplier in space (fuel; 0 is
-a barrier). Nothing here is about fire alone: any wave with an elliptical wavelet will do.
+wavelet's half length, half breadth and centre grow, u the drift of the medium (none for fire, the
+current for oil on water), and m ≥ 0 a multiplier in space (fuel; 0 is a barrier). Nothing here is
+about fire alone: any wave with an elliptical wavelet will do.
 
 Conventions: cell (i, j) has its centre at x = i, y = j; lengths are in cells, times in steps,
 rates in cells per step; an azimuth is in radians, counter-clockwise from the +x axis, and points
@@ -21,66 +22,16 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from .wavelet import ellipse_rates
+
 Varying = Tensor | Callable[[float], Tensor]
-"""A value per fire, [fires], or a function from the time in steps to one."""
+"""A value per fire, [fires] (a drift: [fires, 2]), or a function from the time in steps to one."""
 
 Distance = Callable[[Tensor, Tensor], Tensor]
 """From x [1, NX, 1] and y [1, 1, NY] to the signed distance [fires, NX, NY], negative inside."""
 
-MAX_LENGTH_TO_BREADTH = 8.0
 COURANT = 0.4
 _PAD = 2  # cells around the grid, so that the ends of the stencil lie outside of it
-
-
-def length_to_breadth(wind: float | Tensor) -> Tensor:
-    """The length-to-breadth ratio of a wildfire in wind (Anderson 1983, USDA INT-305).
-
-    Args:
-        wind: mid-flame wind speed in m/s, not negative, any shape.
-
-    Returns:
-        0.936 exp(0.2566 U) + 0.461 exp(−0.1548 U) − 0.397, at most 8, in the shape of `wind`.
-    """
-    speed = torch.as_tensor(wind)
-    if (speed < 0).any():
-        raise ValueError(f"wind speed must not be negative, got {speed.min().item()}")
-    ratio = 0.936 * torch.exp(0.2566 * speed) + 0.461 * torch.exp(-0.1548 * speed) - 0.397
-    return ratio.clamp(1.0, MAX_LENGTH_TO_BREADTH)
-
-
-def ellipse_rates(
-    head_rate: float | Tensor, length_to_breadth: float | Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Rates of the wavelet of a point ignition, which stands in a focus of its ellipse.
-
-    Args:
-        head_rate: rate of the head, cells per step.
-        length_to_breadth: at least 1, broadcast against `head_rate`.
-
-    Returns:
-        (a, b, c): growth of the half length, of the half breadth, and speed of the centre.
-    """
-    head, ratio = torch.as_tensor(head_rate), torch.as_tensor(length_to_breadth)
-    if (ratio < 1).any():
-        raise ValueError(f"length_to_breadth must be at least 1, got {ratio.min().item()}")
-    eccentricity = torch.sqrt(ratio**2 - 1) / ratio
-    back = head * (1 - eccentricity) / (1 + eccentricity)
-    a = (head + back) / 2
-    return a, a / ratio, (head - back) / 2
-
-
-def front_speed(normal: Tensor, a: Tensor, b: Tensor, c: Tensor, azimuth: float | Tensor) -> Tensor:
-    """Speed of a straight front along its outward normal, cells per step.
-
-    This is F(n) = c (n·w) + sqrt(b² + (a² − b²)(n·w)²), the support function of the wavelet.
-
-    Args:
-        normal: angle of the normal in radians; all arguments are broadcast together.
-        a, b, c: from `ellipse_rates`.
-        azimuth: direction of maximum spread in radians.
-    """
-    along = torch.cos(normal - azimuth)
-    return c * along + torch.sqrt(b**2 + (a**2 - b**2) * along**2)
 
 
 def disc(centre: Tensor, radius: Tensor) -> Distance:
@@ -101,9 +52,13 @@ def arrival_times(
     azimuth: Varying,
     *,
     horizon: float,
+    two_sided: bool = False,
+    drift: Varying | None = None,
+    margin: int = 0,
     refine: int = 2,
     rate_field: Tensor | None = None,
     max_rate: float | None = None,
+    max_step: float = math.inf,
     device: torch.device | str | None = None,
     dtype: torch.dtype = torch.float32,
 ) -> Tensor:
@@ -119,11 +74,18 @@ def arrival_times(
         grid: (X, Y), cells.
         head_rate, length_to_breadth, azimuth: [fires], or a function of time returning it.
         horizon: steps.
+        two_sided: as in `ellipse_rates`.
+        drift: velocity of the medium, cells per step, [fires, 2] or a function of time: it carries
+            the front along, away from some of the cells it has reached; the first arrival counts.
+        margin: cells around the grid that are computed too, so that what a drift carries out of
+            the grid can come back.
         refine: nodes per cell and axis.
         rate_field: multiplier of all rates at the cells, [fires, X, Y] or [1, X, Y], not
             negative; linear in between. A cell with 0 never burns and lets nothing through.
-        max_rate: upper bound of head rate · multiplier, cells per step; needed if `head_rate`
-            is a function.
+        max_rate: upper bound of (head rate + speed of the drift) · multiplier, cells per step;
+            needed if `head_rate` or `drift` is a function.
+        max_step: upper bound of a time step, steps; needed if a function of time varies faster
+            than the front crosses a node.
         device: where to compute.
         dtype: float32, or float64 for studies of accuracy.
 
@@ -133,15 +95,21 @@ def arrival_times(
     """
     if refine < 1 or horizon <= 0 or min(grid) < 1:
         raise ValueError(f"expected refine, horizon, grid > 0; got {refine}, {horizon}, {grid}")
-    x, y = (_nodes(cells, refine, device, dtype) for cells in grid)
+    pad = _PAD + margin
+    x, y = (_nodes(cells, pad, refine, device, dtype) for cells in grid)
     phi = distance(x[None, :, None], y[None, None, :])
     rates = None if rate_field is None else _refined(rate_field.to(phi), grid, x, y)
-    step = COURANT / refine / max(_rate_bound(head_rate, rates, max_rate), 1e-12)
-    cells = (slice(None), *(slice(_PAD * refine, -_PAD * refine, refine) for _ in grid))
+    step = COURANT / refine / max(_rate_bound(head_rate, drift, rates, max_rate), 1e-12)
+    step = min(step, max_step)
+    cells = (slice(None), *(slice(pad * refine, -pad * refine, refine) for _ in grid))
 
     def speed(field: Tensor, time: float) -> Tensor:
-        now = (v(time) if callable(v) else v for v in (head_rate, length_to_breadth, azimuth))
-        decay = _hamiltonian(field * refine, *(v.to(phi) for v in now))
+        def now(value: Varying) -> Tensor:
+            return (value(time) if callable(value) else value).to(phi)
+
+        wavelet = ellipse_rates(now(head_rate), now(length_to_breadth), two_sided)
+        current = None if drift is None else now(drift)
+        decay = _hamiltonian(field * refine, wavelet, now(azimuth), current)
         return decay if rates is None else decay * rates
 
     blocked = torch.zeros_like(phi[cells], dtype=torch.bool)
@@ -153,24 +121,31 @@ def arrival_times(
         second = speed(phi - step * first, (k + 1) * step)
         new = phi - step / 2 * (first + second)
         old, now = phi[cells], new[cells]
-        crossed = (old > 0) & (now <= 0)
+        crossed = (old > 0) & (now <= 0) & arrival.isinf()
         arrival = torch.where(crossed, (k + old / (old - now)) * step, arrival)
         phi = new
     return arrival.masked_fill(arrival > horizon, math.inf)
 
 
-def _nodes(cells: int, refine: int, device: torch.device | str | None, dtype: torch.dtype):
+def _nodes(
+    cells: int, pad: int, refine: int, device: torch.device | str | None, dtype: torch.dtype
+) -> Tensor:
     """Coordinates of the fine nodes of one axis; every `refine`-th is the centre of a cell."""
-    count = (cells - 1 + 2 * _PAD) * refine + 1
-    return torch.arange(count, device=device, dtype=dtype) / refine - _PAD
+    count = (cells - 1 + 2 * pad) * refine + 1
+    return torch.arange(count, device=device, dtype=dtype) / refine - pad
 
 
-def _rate_bound(head_rate: Varying, rates: Tensor | None, max_rate: float | None) -> float:
+def _rate_bound(
+    head_rate: Varying, drift: Varying | None, rates: Tensor | None, max_rate: float | None
+) -> float:
     if max_rate is not None:
         return max_rate
-    if not isinstance(head_rate, Tensor):
-        raise ValueError("max_rate is needed when head_rate is a function, got None")
-    return float(head_rate.max()) * (1.0 if rates is None else max(float(rates.max()), 0.0))
+    still = drift is None
+    if not isinstance(head_rate, Tensor) or not (still or isinstance(drift, Tensor)):
+        which = "drift" if isinstance(head_rate, Tensor) else "head_rate"
+        raise ValueError(f"max_rate is needed when {which} is a function, got None")
+    fastest = float(head_rate.max() if still else (head_rate + drift.norm(dim=1)).max())
+    return fastest * (1.0 if rates is None else max(float(rates.max()), 0.0))
 
 
 def _refined(field: Tensor, grid: tuple[int, int], x: Tensor, y: Tensor) -> Tensor:
@@ -202,13 +177,19 @@ def _refined(field: Tensor, grid: tuple[int, int], x: Tensor, y: Tensor) -> Tens
     return smooth
 
 
-def _hamiltonian(phi: Tensor, head: Tensor, ratio: Tensor, azimuth: Tensor) -> Tensor:
+def _hamiltonian(
+    phi: Tensor,
+    wavelet: tuple[Tensor, Tensor, Tensor],
+    azimuth: Tensor,
+    drift: Tensor | None,
+) -> Tensor:
     """−φ_t of the equation with unit multiplier; `phi` is scaled to unit spacing of the nodes.
 
     H is convex and homogeneous of degree one, so H = V·∇φ with V = ∂H/∂∇φ the velocity of the
-    characteristics: V from central differences tells which side is upwind.
+    characteristics in the medium: V from central differences, and the drift on top of it, tell
+    which side is upwind.
     """
-    a, b, c = (r[:, None, None] for r in ellipse_rates(head, ratio))
+    a, b, c = (r[:, None, None] for r in wavelet)
     wx, wy = torch.cos(azimuth)[:, None, None], torch.sin(azimuth)[:, None, None]
 
     def velocity(px: Tensor, py: Tensor) -> tuple[Tensor, Tensor]:
@@ -220,9 +201,13 @@ def _hamiltonian(phi: Tensor, head: Tensor, ratio: Tensor, azimuth: Tensor) -> T
     x_left, x_right, px = _differences(phi)
     y_left, y_right, py = (d.mT for d in _differences(phi.mT))
     vx, vy = velocity(px, py)
-    decay = vx * torch.where(vx > 0, x_left, x_right) + vy * torch.where(vy > 0, y_left, y_right)
-    # A front never runs backwards; limited differences of opposite signs could pretend it does.
-    return decay.clamp_min(0)
+    ux, uy = (0.0, 0.0) if drift is None else drift[..., None, None].unbind(1)
+    dx = torch.where(vx + ux > 0, x_left, x_right)
+    dy = torch.where(vy + uy > 0, y_left, y_right)
+    # In its medium a front never runs backwards; limited differences of opposite signs could
+    # pretend it does. The medium itself may carry it back.
+    decay = (vx * dx + vy * dy).clamp_min(0)
+    return decay if drift is None else decay + (ux * dx + uy * dy)
 
 
 def _differences(phi: Tensor) -> tuple[Tensor, Tensor, Tensor]:

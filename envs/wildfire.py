@@ -11,9 +11,8 @@ from . import keys, render, specs, streams, uav
 from .buffers import Buffers
 from .config import WildfireConfig
 from .discovery import Discovery
-from .fire import FireConfig
-from .fire_bank import arrival_times
 from .reward import view_reward
+from .scenario import ScenarioConfig, arrival_times
 from .view import View
 
 _POSITIONS, _FIRE, _STEPS = range(3)  # what an episode's random stream is split into
@@ -52,7 +51,7 @@ class WildfireEnv(Buffers, EnvBase):
         self,
         num_envs: int = 1,
         config: WildfireConfig | None = None,
-        fire: str | FireConfig | Tensor = "paper",
+        fire: str | ScenarioConfig | Tensor = "paper",
         seed: int | Sequence[int] = 0,
         device: torch.device | str = "cpu",
     ):

@@ -45,7 +45,7 @@ SETUPS = "known: paper, released, tuned"
         (["consensus", "zzz=1"], ["'zzz'", "known: setup, fire, env", "num_envs"]),
         (["consensus", "method=independent"], ["'method'"]),
         (["consensus", "setup=papr"], ["setup 'papr'", "did you mean paper?", SETUPS]),
-        (["consensus", "fire=zzz"], ["fire 'zzz'", "known: huygens, paper"]),
+        (["consensus", "fire=zzz"], ["fire 'zzz'", "known: file, huygens, oil_slick, paper"]),
         (["consensus", "learner.batch=big"], ["learner.batch=big", "integer"]),
         (["consensus", "learner.batch=1.5"], ["learner.batch=1.5", "integer"]),
         (["consensus", "env.reward.exit=true"], ["env.reward.exit=True", "number"]),

@@ -20,6 +20,7 @@ from robustness import SOAK
 from emberlink.comm import registry
 from emberlink.envs import keys
 from emberlink.envs.config import known
+from emberlink.envs.fire import scenarios
 from emberlink.trainers import cli
 from emberlink.trainers.build import build_env
 from emberlink.trainers.config import RunConfig, from_values, resolve, to_values
@@ -295,7 +296,7 @@ def test_every_key_of_every_group_is_fuzzed():
     found: set[str] = set()
     for method in known("method"):
         for setup in known("setup"):
-            for fire in known("fire"):
+            for fire in scenarios():
                 config = resolve(method, [f"setup={setup}", f"fire={fire}"])
                 found |= set(flat(to_values(config)))
     assert found == fuzzed

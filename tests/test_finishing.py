@@ -3,12 +3,16 @@
 import errno
 import os
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 from tiny_run import TINY
 
 from emberlink.trainers import cli, report
+from emberlink.trainers.config import resolve
+from emberlink.trainers.loop import Trainer
 from emberlink.trainers.resume import resume
 from emberlink.trainers.run_folder import RunFolder
 
@@ -79,8 +83,7 @@ def test_ctrl_c_in_the_evaluation_of_the_second_seed(tmp_path, capsys, monkeypat
 
 
 def test_an_evaluation_of_an_earlier_checkpoint_is_not_the_end(run, capsys):
-    status, said, _ = trained(capsys, f"resume={run.path}", "episodes=3")
-    assert status == 0
+    assert trained(capsys, f"resume={run.path}", "episodes=3")[0] == 0
     assert run.evaluated()
     assert run.checkpoint().name == "step_000000045.safetensors"
     (run.path / "eval.json").write_text("{}")
@@ -152,3 +155,153 @@ def test_settings_that_would_do_something_else_than_they_say(text, said, tmp_pat
     assert error.count("\n") == 1
     assert said in error
     assert not list(tmp_path.iterdir())
+
+
+def test_the_folder_stays_locked_until_the_evaluation_is_written(tmp_path, capsys, monkeypatch):
+    seen, evaluate = [], report.evaluate_run
+
+    def look(run, *arguments, **options):
+        with pytest.raises(ValueError, match="is training here"):
+            resume(run.path)
+        seen.append(run)
+        return evaluate(run, *arguments, **options)
+
+    monkeypatch.setattr(report, "evaluate_run", look)
+    more = ["seeds=[0,1]", f"output={tmp_path / 'runs'}"]
+    assert trained(capsys, "independent", *TINY, *more)[0] == 0
+    assert len(seen) == 2
+    assert not list((tmp_path / "runs").glob("*/lock"))
+
+
+@pytest.mark.parametrize("call", range(1, 5))
+def test_a_kill_while_the_folders_of_seeds_are_made(call, tmp_path, capsys):
+    """Either nothing is there that could be taken for a run, or it goes on with all its seeds."""
+    runs = tmp_path / "runs"
+    program = (
+        "import os, sys\n"
+        "from emberlink.trainers.run_folder import RunFolder\n"
+        "from emberlink.trainers.cli import main\n"
+        "calls = iter(range(1, 99))\n"
+        "def counted(real):\n"
+        "    def wrapped(*given):\n"
+        f"        if next(calls) == {call}: os.kill(os.getpid(), 9)\n"
+        "        return real(*given)\n"
+        "    return wrapped\n"
+        "RunFolder.write = counted(RunFolder.write)\n"
+        "RunFolder.write_config = counted(RunFolder.write_config)\n"
+        "main(sys.argv[1:])\n"
+    )
+    arguments = ["train", "independent", *TINY, "seeds=[0,1]", f"output={runs}"]
+    ended = subprocess.run([sys.executable, "-c", program, *arguments], capture_output=True)
+    assert ended.returncode == -9
+    folders = sorted(runs.iterdir())
+    assert len(folders) == 2
+    first, second = map(RunFolder, folders)
+    assert first.has_config() >= second.has_config()
+    if first.has_config():
+        assert trained(capsys, f"resume={second.path}")[0] == 0
+        assert [RunFolder(path).config().seed for path in folders] == [0, 1]
+        assert first.evaluated()
+        assert second.evaluated()
+    assert cli.main(["sweep", "independent", *TINY, "seeds=[0,1]", f"output={runs}"]) == 0
+
+
+def test_copies_that_a_user_keeps_are_not_the_runs(run, capsys):
+    newest, state = run.checkpoint(), run.states()[-1]
+    for name in ("step_mine.safetensors", "step_1.safetensors", "state_backup.safetensors"):
+        shutil.copy(state if "state" in name else newest, run.checkpoints / name)
+    assert run.checkpoint() == newest
+    assert run.states()[-1] == state
+    status, said, _ = trained(capsys, f"resume={run.path}", "episodes=3")
+    assert status == 0
+    assert "resumed at step 30" in said
+    assert run.evaluated()
+    assert (run.checkpoints / "state_backup.safetensors").exists()
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        ('{"folders": []}', "does not name the folders"),
+        ('{"folders": ["' + 5000 * "x" + '"]}', "does not name the folders"),
+        ('{"folders": ["elsewhere"]}', "does not name the folders"),
+        ('{"folders": 3}', "does not name the folders"),
+    ],
+)
+def test_siblings_that_are_none(content, said, run, capsys):
+    (run.path / "siblings.json").write_text(content)
+    status, _, error = trained(capsys, f"resume={run.path}")
+    assert status == 2
+    assert error.count("\n") == 1
+    assert f"{run.path / 'siblings.json'}: {said}" in error
+
+
+def test_a_seed_of_another_training_is_refused(tmp_path, capsys):
+    more = ["seeds=[0,1]", f"output={tmp_path}"]
+    assert trained(capsys, "independent", *TINY, *more)[0] == 0
+    first, second = sorted(tmp_path.iterdir())
+    text = (second / "config.yaml").read_text()
+    for old, new, said in (
+        ("tau: 0.001", "tau: 0.002", "not of the run of"),
+        ("\nseed: 1", "\nseed: 7", "seed=7, not 1"),
+    ):
+        assert old in text
+        (second / "config.yaml").write_text(text.replace(old, new))
+        status, _, error = trained(capsys, f"resume={first}")
+        assert status == 2
+        assert said in error
+
+
+def test_folders_with_the_names_of_half_written_files_stay(run, capsys):
+    for name in ("eval.json.part", "checkpoints/x.safetensors.part", "checkpoints/.tmpx"):
+        (run.path / name).mkdir()
+    (run.checkpoints / "step_999999999.safetensors").mkdir()
+    (run.path / "divergence_step_3.part").write_text("mine")
+    assert trained(capsys, f"resume={run.path}", "episodes=3")[0] == 0
+    assert (run.path / "divergence_step_3.part").read_text() == "mine"
+
+
+def test_a_range_without_a_limit_is_read_again(tmp_path, capsys):
+    arguments = ["consensus", *TINY, "comm.range=inf", f"output={tmp_path / 'runs'}"]
+    assert trained(capsys, *arguments)[0] == 0
+    run = run_of(tmp_path / "runs")
+    assert run.config().comm["range"] == float("inf")
+    assert trained(capsys, f"resume={run.path}", "episodes=3")[0] == 0
+    assert cli.main(["eval", str(run.path), "--fires", "2"]) == 0
+    assert cli.main(["compare", str(run.path), "--output", str(tmp_path / "out")]) == 0
+
+
+@pytest.mark.parametrize("key", ["displacement", "num_uavs", "new_fire", "range"])
+def test_a_world_that_lacks_a_key_is_not_completed(key, tmp_path, capsys):
+    """The default may be another setup's: the run would be played in another world."""
+    arguments = ["consensus", *TINY, "setup=tuned", f"output={tmp_path / 'runs'}"]
+    assert trained(capsys, *arguments)[0] == 0
+    run = run_of(tmp_path / "runs")
+    file = run.path / "config.yaml"
+    lines = [one for one in file.read_text().splitlines() if not one.lstrip().startswith(f"{key}:")]
+    file.write_text("\n".join(lines) + "\n")
+    assert cli.main(["eval", str(run.path)]) == 2
+    error = capsys.readouterr().err
+    assert f"{file}: key " in error
+    assert f".{key}' is missing" in error
+
+
+def test_metrics_are_on_the_disk_before_the_state_that_counts_them(tmp_path, monkeypatch):
+    """Else a loss of power could leave a state that knows of lines which are not there."""
+    trainer = Trainer(resolve("independent", [*TINY, "episodes=1", f"output={tmp_path}"]))
+    run = trainer.start()
+    synced: list[str] = []
+    flush = os.fsync
+
+    def note(handle: int) -> None:
+        synced.append(os.readlink(f"/proc/self/fd/{handle}"))
+        flush(handle)
+
+    monkeypatch.setattr(os, "fsync", note)
+    trainer.train()
+    names = [Path(path).name for path in synced]
+    state = names.index("state_000000015.safetensors.part")
+    assert {"metrics.jsonl", "timing.jsonl"} <= set(names[:state])
+    del synced[:]
+    run.write("eval.json", {})
+    assert [Path(path).name.split(".")[0] for path in synced] == ["eval", run.path.name]

@@ -27,7 +27,9 @@ from emberlink.envs.fire import (
 from emberlink.envs.fire_bank import bank_key, cache_folder, fire_bank
 
 GRID, HORIZON = (30, 30), 1000
-RANGES = [f.name for f in dataclasses.fields(FireConfig) if f.name not in {"name", "bank"}]
+RANGES = [
+    f.name for f in dataclasses.fields(FireConfig) if f.name not in {"name", "bank", "two_sided"}
+]
 
 
 def settings_of(**changes: Any) -> dict[str, Any]:
@@ -38,9 +40,10 @@ def settings_of(**changes: Any) -> dict[str, Any]:
 def test_every_file_is_a_scenario_of_its_name():
     files = resources.files("emberlink.configs").joinpath("fire").iterdir()
     names = sorted(Path(str(file)).stem for file in files)
-    assert scenarios() == names
-    assert {"huygens", "paper"} <= set(names)
-    assert [load_scenario(name).name for name in names] == names
+    generated = [name for name in names if name != "file"]
+    assert scenarios() == generated
+    assert {"huygens", "oil_slick", "paper"} <= set(names)
+    assert [load_scenario(name).name for name in generated] == generated
 
 
 def test_unknown_scenario_lists_the_known_ones():
@@ -337,13 +340,15 @@ def test_the_key_changes_with_everything(monkeypatch: pytest.MonkeyPatch):
 
     keys = [key(), key(split="heldout"), key(count=3), key(grid=(10, 12)), key(horizon=51)]
     keys += [key(base=1), key({**base, "name": "other"}), key({**base, "bank": 3})]
+    keys.append(key({**base, "two_sided": True}))
     for field in RANGES:
         low, high = base[field]
-        other = (low, low) if low < high else (low, high + 1)
+        more = 1 if field == "patches" else 0.001
+        other = (low, low) if low < high else (low, high + more)
         keys.append(key({**base, field: other}))
     monkeypatch.setattr(bank_module, "GENERATOR_VERSION", 999)
     keys.append(key())
-    assert len(set(keys)) == len(keys) == 9 + len(RANGES)
+    assert len(set(keys)) == len(keys) == 10 + len(RANGES)
 
 
 @pytest.mark.parametrize("field", RANGES)

@@ -130,7 +130,7 @@ def test_several_updates_a_step(tmp_path):
 
 def test_two_runs_in_the_same_second_get_folders_of_their_own(tmp_path):
     config = short("independent", tmp_path)
-    folders = {RunFolder.create(config).path for _ in range(3)}
+    folders = {Trainer(config).start().path for _ in range(3)}
     assert len(folders) == 3
     for folder in folders:
         assert yaml.safe_load((folder / "config.yaml").read_text())["method"] == "independent"

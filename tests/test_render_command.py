@@ -14,6 +14,7 @@ from safetensors.torch import save_file
 
 from emberlink.envs import marks, video
 from emberlink.envs.config import known
+from emberlink.envs.publish import published
 from emberlink.policies.scripted import SCRIPTED
 from emberlink.trainers import cli, evaluate, render
 from emberlink.trainers.build import build_env, build_networks
@@ -34,6 +35,7 @@ def make_run(folder, method="consensus", *overrides):
         for name, value in actor.module.state_dict().items()
     }
     run = RunFolder.create(config)
+    run.write_config(config)
     save_file(weights, run.path / "checkpoints" / "step_000000012.safetensors")
     return run.path
 
@@ -181,7 +183,7 @@ def test_what_is_refused(tmp_path, capsys):
     there.write_text("mine")
     cases = [
         ([tmp_path / "none"], ["no such run folder"]),
-        ([run, "--fire", "zzz"], ["fire 'zzz'", "known: huygens, paper"]),
+        ([run, "--fire", "zzz"], ["fire 'zzz'", "known: huygens, oil_slick, paper"]),
         ([run, "--fire", "65536"], ["'65536'", "0 to 65535"]),
         ([run, "--fire=-1"], ["'-1'", "0 to 65535"]),
         ([run, "--fire", "paper:x"], ["'paper:x'", "0 to 65535"]),
@@ -225,7 +227,7 @@ def test_a_name_taken_meanwhile_is_not_overwritten(tmp_path):
     path = tmp_path / "a.gif"
 
     def write():
-        with render._published(path) as partial:
+        with published(path) as partial:
             partial.write_text("ours")
             path.write_text("theirs")
 

@@ -6,6 +6,7 @@ import pytest
 
 from emberlink.comm.consensus import ConsensusConfig
 from emberlink.envs.config import WildfireConfig, from_plain
+from emberlink.envs.fire import scenarios
 from emberlink.envs.reward import RewardConfig
 from emberlink.trainers.config import build_comm, known, resolve, to_values
 
@@ -108,7 +109,7 @@ def test_paper_is_the_default():
 )
 def test_each_setup_chooses_its_fire_and_the_user_may_choose_another(setup, fire):
     assert resolve("consensus", [f"setup={setup}"]).fire.name == fire
-    for other in known("fire"):
+    for other in scenarios():
         assert resolve("consensus", [f"setup={setup}", f"fire={other}"]).fire.name == other
 
 
@@ -130,4 +131,4 @@ def test_defaults_in_code_are_setup_paper():
 def test_the_setups_and_methods_are_those_of_the_table():
     assert known("method") == sorted(METHODS)
     assert known("setup") == ["paper", "released", "tuned"]
-    assert known("fire") == ["huygens", "paper"]
+    assert known("fire") == ["file", "huygens", "oil_slick", "paper"]

@@ -9,7 +9,7 @@ from torch import Tensor
 from torchrl.envs import TransformedEnv
 
 from emberlink.comm.base import Communication
-from emberlink.envs.fire import FireConfig
+from emberlink.envs.scenario import ScenarioConfig
 from emberlink.envs.wildfire import WildfireEnv
 from emberlink.policies.actor_critic import make_actor, make_critic
 from emberlink.policies.networks import Generators
@@ -22,7 +22,7 @@ def make_env(
     setup: str = "paper",
     *,
     num_envs: int = 1,
-    fire: str | FireConfig | Tensor | None = None,
+    fire: str | ScenarioConfig | Tensor | None = None,
     seed: int = 0,
     device: torch.device | str = "cpu",
     **overrides: Any,
@@ -57,7 +57,7 @@ def build_env(
     config: RunConfig,
     *,
     num_envs: int,
-    fire: str | FireConfig | Tensor,
+    fire: str | ScenarioConfig | Tensor,
     seed: int | Sequence[int],
     device: torch.device | str,
 ) -> TransformedEnv:

@@ -1,11 +1,15 @@
-"""The command line: emberlink train, eval, compare, render, sweep, doctor."""
+"""The command line: emberlink train, eval, compare, render, sweep, fire, doctor."""
 
 import argparse
+import errno
 import os
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, NoReturn
+from typing import TYPE_CHECKING
+
+from .arguments import Parser, between, command, positive
+from .fire_arguments import add_fire
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -34,6 +38,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         reason = str(error).splitlines()[0]
         print(f"emberlink {options.command}: not enough memory: {reason}", file=sys.stderr)
         return 2
+    except OSError as error:
+        if error.errno not in (errno.ENOSPC, errno.EDQUOT):
+            raise
+        print(f"emberlink {options.command}: cannot write: {error.strerror}", file=sys.stderr)
+        return 2
     except KeyboardInterrupt:
         print(f"emberlink {options.command}: stopped", file=sys.stderr)
         return INTERRUPTED
@@ -43,21 +52,13 @@ def _one_line(error: ValueError) -> str:
     return "".join(c if c.isprintable() else " " for c in " ".join(str(error).split()))
 
 
-class _Parser(argparse.ArgumentParser):
-    """Says what is wrong in one line, where argparse would print the usage before it."""
-
-    def error(self, message: str) -> NoReturn:
-        print(f"{self.prog}: {message} (see {self.prog} --help)", file=sys.stderr)
-        raise SystemExit(2)
-
-
 def _parser() -> argparse.ArgumentParser:
-    parser = _Parser(
+    parser = Parser(
         prog="emberlink",
         description="Teams of UAVs that learn to find and cover a spreading wildfire.",
     )
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    train = _command(
+    train = command(
         commands,
         "train",
         _train,
@@ -78,7 +79,7 @@ def _parser() -> argparse.ArgumentParser:
         help="any key of configs/base.yaml or of the chosen setup, such as setup=tuned, "
         "fire=huygens, seed=1, env.num_uavs=3, logger=csv",
     )
-    evaluation = _command(
+    evaluation = command(
         commands,
         "eval",
         _eval,
@@ -100,10 +101,10 @@ def _parser() -> argparse.ArgumentParser:
     )
     evaluation.add_argument("--checkpoint", type=Path, help="another than the newest")
     evaluation.add_argument(
-        "--fires", type=_positive, help="episodes; as the run has it if left out"
+        "--fires", type=positive, help="episodes; as the run has it if left out"
     )
     evaluation.add_argument("--device", help="another than the run's")
-    comparison = _command(
+    comparison = command(
         commands,
         "compare",
         _compare,
@@ -124,7 +125,7 @@ def _parser() -> argparse.ArgumentParser:
         "--output", metavar="FOLDER", type=Path, help="a new folder; compare if left out"
     )
     _add_render(commands)
-    many = _command(
+    many = command(
         commands,
         "sweep",
         _sweep,
@@ -140,9 +141,10 @@ def _parser() -> argparse.ArgumentParser:
         nargs="+",
         help="methods, all if none is given; keys as for train, with one value or several",
     )
-    many.add_argument("--jobs", type=_positive, help="runs at a time; one per core if left out")
+    many.add_argument("--jobs", type=positive, help="runs at a time; one per core if left out")
     many.add_argument("--dry-run", action="store_true", help="only say what would be done")
-    _command(
+    add_fire(commands)
+    command(
         commands,
         "doctor",
         _doctor,
@@ -155,7 +157,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _add_render(commands) -> None:
-    rendering = _command(
+    rendering = command(
         commands,
         "render",
         _render,
@@ -195,40 +197,13 @@ def _add_render(commands) -> None:
         help="a folder, or a new file that ends in .gif, .mp4 or .png (one picture)",
     )
     add("--step", metavar="STEP", type=_step, help="of a .png; the last if left out")
-    add("--frames", type=_positive, default=126, help="at most (default: 126)")
+    add("--frames", type=positive, default=126, help="at most (default: 126)")
     add("--fps", type=_fps, default=12, help="frames per second, 1 to 50 (default: 12)")
     add("--size", type=_size, help="pixels of a map's longer side, 100 to 2000")
     add("--seen", action="store_true", help="draw fire that a UAV has seen grey")
 
 
-def _command(commands, name, run, summary, description, example) -> argparse.ArgumentParser:
-    parser = commands.add_parser(
-        name,
-        help=summary,
-        description=description,
-        epilog=f"example:\n  {example}",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    parser.set_defaults(run=run)
-    return parser
-
-
-def _positive(text: str) -> int:
-    if not text.isdecimal() or int(text) < 1:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number above 0")
-    return int(text)
-
-
-def _between(low: int, high: int) -> Callable[[str], int]:
-    def number(text: str) -> int:
-        if not text.isdecimal() or not low <= int(text) <= high:
-            raise argparse.ArgumentTypeError(f"{text!r} is not a whole number {low} to {high}")
-        return int(text)
-
-    return number
-
-
-_step, _fps, _size = _between(0, 1_000_000), _between(1, 50), _between(100, 2000)
+_step, _fps, _size = between(0, 1_000_000), between(1, 50), between(100, 2000)
 
 
 # The commands import what they need when they run: `emberlink --help` need not wait for torch.

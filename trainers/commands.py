@@ -55,7 +55,7 @@ def train(method: str | None, overrides: Sequence[str], console: Console) -> int
     interruption = Interruption(trainer.stop)
     try:
         with interruption:
-            _train_with_bar(trainer, console)
+            _train_with_bar(trainer, console)  # the folders stay ours for the evaluation
             interruption.at_once = True
             if interruption.received:
                 raise Interrupted
@@ -68,6 +68,8 @@ def train(method: str | None, overrides: Sequence[str], console: Console) -> int
         return interruption.status
     except ValueError as error:
         raise ValueError(f"{error}; {_newest(trainer, _with(error, config))}") from None
+    finally:
+        trainer.close()
     return 0
 
 
@@ -111,7 +113,7 @@ def _newest(trainer: Trainer, more: str) -> str:
     """The newest checkpoint of a run that an error ended, and how to go on from it."""
     states, command = trainer.run.states(), f"emberlink train resume={trainer.run.path}{more}"
     if not states:
-        return f"there is no checkpoint yet: {command} begins again"
+        return f"there is no checkpoint: {command} begins again, if there has been none"
     return f"the last good checkpoint is {states[-1]}, resume with: {command}"
 
 
@@ -153,7 +155,7 @@ def _train_with_bar(trainer: Trainer, console: Console) -> bool:
             if moment.note:
                 console.print(moment.note, style="yellow", soft_wrap=True)
 
-        return trainer.train(show)
+        return trainer.train(show, hold=True)
 
 
 def evaluate_folder(

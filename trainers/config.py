@@ -2,7 +2,7 @@
 
 import difflib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import fields
+from dataclasses import asdict, fields, replace
 from typing import Annotated, Any, Literal
 
 import torch
@@ -33,7 +33,7 @@ from emberlink.envs.config import (
     plain,
     shown,
 )
-from emberlink.envs.fire import FireConfig
+from emberlink.envs.scenario import Scenario, fires_of
 
 _STRICT = ConfigDict(extra="forbid", strict=True)
 _GROUPS = ("setup", "fire")
@@ -114,7 +114,7 @@ class RunConfig:
     comm: dict[str, Any]
     """the communication module's name and its settings"""
     env: WildfireConfig
-    fire: FireConfig
+    fire: Scenario
     learner: LearnerConfig
     exploration: ExplorationConfig
     evaluation: EvaluationConfig
@@ -178,6 +178,12 @@ def build_comm(config: RunConfig):
     return registry.build(config.comm["name"], config.env, _without_name(config.comm))
 
 
+def comm_settings(config: RunConfig) -> dict[str, Any]:
+    """All settings of a configuration's communication module, defaults included."""
+    config_type = registry.find(config.comm["name"]).config_type
+    return asdict(from_plain(config_type, _without_name(config.comm)))
+
+
 def check_device(name: str) -> str:
     """The name, if it is a device of this machine.
 
@@ -209,8 +215,8 @@ def resolve(method: str, overrides: Sequence[str] = (), **settings: Any) -> RunC
     Raises:
         ValueError: one line that names the method, key or value that is wrong, and what is known.
     """
-    if method not in known("method"):
-        raise ValueError(f"method {_quote(method, known('method'))}")
+    if not isinstance(method, str) or method not in known("method"):
+        raise ValueError(f"method {_quote(str(method), known('method'))}")
     choices = {"method": method, "setup": "paper"}
     with initialize_config_module(config_module="emberlink.configs", version_base="1.3"):
         _check_overrides(method, overrides, choices)
@@ -232,7 +238,8 @@ def resolve(method: str, overrides: Sequence[str] = (), **settings: Any) -> RunC
             raise ValueError(f"seed={values['seed']} and seeds={values['seeds']}: give one of them")
         if isinstance(values["seeds"], list | tuple):
             values["seed"] = values["seeds"][0]
-    return from_values(values)
+    config = from_values(values)
+    return replace(config, fire=fires_of(config.fire).pinned())
 
 
 def override(config: RunConfig, overrides: Sequence[str]) -> RunConfig:
@@ -257,7 +264,9 @@ def override(config: RunConfig, overrides: Sequence[str]) -> RunConfig:
             raise ValueError(f"key {_quote(key, known_keys, listed=False)}")
         else:
             _set(values, key, value)
-    return from_values(values)
+    changed = from_values(values)
+    # As it was opened: with the run's own copy of the fires.
+    return replace(changed, fire=config.fire) if changed.fire == config.fire else changed
 
 
 def _parsed(text: str) -> tuple[str, Any]:
@@ -266,14 +275,22 @@ def _parsed(text: str) -> tuple[str, Any]:
         parsed = OverridesParser.create().parse_override(text)
     except HydraException:
         raise ValueError(f"{text!r} is not of the form key=value") from None
-    if parsed.is_delete() or parsed.is_add() or parsed.is_sweep_override():
+    if parsed.is_delete() or _adds(parsed) or parsed.is_sweep_override():
         raise ValueError(f"{text!r}: only key=value with one value is understood here")
     value: Any = parsed.value()
     return parsed.key_or_group, value.text if isinstance(value, QuotedString) else value
 
 
+def _adds(parsed: Any) -> bool:
+    return parsed.is_add() or parsed.is_force_add()
+
+
 def _set(values: dict[str, Any], key: str, value: Any) -> None:
-    """Sets the one value whose dotted key is, or ends in, `key`."""
+    """Sets the one value whose dotted key is, or ends in, `key`.
+
+    Of a mapping, what it holds and nothing else; but another communication module takes the place
+    of the one that was there.
+    """
     names = list(_flat(values))
     found = [name for name in names if name == key] or [
         name for name in names if name.endswith("." + key)
@@ -284,7 +301,15 @@ def _set(values: dict[str, Any], key: str, value: Any) -> None:
     *path, last = found[0].split(".")
     for part in path:
         values = values[part]
-    values[last] = value
+    there = values[last]
+    both = isinstance(there, dict) and isinstance(value, dict)
+    if not both or there.get("name") != value.get("name", there.get("name")):
+        values[last] = value
+        return
+    for name, one in value.items():
+        if name not in there:
+            raise ValueError(f"key {_quote(f'{found[0]}.{name}', names)}")
+        _set(values, f"{last}.{name}", one)
 
 
 def from_values(values: Mapping[str, Any]) -> RunConfig:
@@ -301,23 +326,30 @@ def from_values(values: Mapping[str, Any]) -> RunConfig:
 
 def to_values(config: RunConfig) -> dict[str, Any]:
     """The configuration as plain values, for YAML and trackers."""
-    return TypeAdapter(RunConfig).dump_python(config, mode="json")
+    return _lists(TypeAdapter(RunConfig).dump_python(config))
+
+
+def _lists(value: Any) -> Any:
+    """Lists for tuples, within mappings too; infinite numbers stay, as they would not in JSON."""
+    if isinstance(value, Mapping):
+        return {key: _lists(one) for key, one in value.items()}
+    return [_lists(one) for one in value] if isinstance(value, list | tuple) else value
 
 
 def _check_overrides(method: str, overrides: Sequence[str], choices: dict[str, str]) -> None:
     """Finds what Hydra would explain at length, and writes down which groups were chosen."""
-    keys: list[str] | None = None
+    others: list[str] = []
     for text in overrides:
         try:
             override = OverridesParser.create().parse_override(text)
         except (HydraException, ValueError, RecursionError):
             raise ValueError(f"{shown(text)!r} is not of the form key=value") from None
         key = override.key_or_group
-        if override.is_delete() or override.is_add() or override.is_sweep_override():
+        if override.is_delete() or _adds(override) or override.is_sweep_override():
             raise ValueError(f"{shown(text)!r}: only key=value with one value is understood here")
         if isinstance(override.value(), dict):
             raise ValueError(f"{shown(text)!r}: give its keys one by one, as {key}.KEY=VALUE")
-        if key == "fire.name":
+        if key in ("fire.name", "fire.kind"):
             raise ValueError(f"{shown(text)!r}: a scenario is chosen with fire=NAME")
         if key in _GROUPS:
             chosen = str(override.value())
@@ -325,14 +357,17 @@ def _check_overrides(method: str, overrides: Sequence[str], choices: dict[str, s
                 raise ValueError(f"{key} {_quote(chosen, known(key))}")
             choices[key] = chosen
         else:
-            keys = keys or _known_keys(method, choices["setup"])
-            if key not in keys:
-                raise ValueError(f"key {_quote(key, keys, listed=False)}")
+            others.append(key)
+    keys = _known_keys(method, choices) if others else []
+    for key in others:
+        if key not in keys:
+            raise ValueError(f"key {_quote(key, keys, listed=False)}")
     choices.pop("fire", None)
 
 
-def _known_keys(method: str, setup: str) -> list[str]:
-    composed = compose("base", overrides=[f"method={method}", f"setup={setup}"])
+def _known_keys(method: str, choices: dict[str, str]) -> list[str]:
+    chosen = [f"{group}={choices[group]}" for group in _GROUPS if group in choices]
+    composed = compose("base", overrides=[f"method={method}", *chosen])
     return list(dict.fromkeys([*_GROUPS, *_flat(OmegaConf.to_container(composed))]))
 
 

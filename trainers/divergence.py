@@ -18,7 +18,7 @@ from emberlink.envs import keys
 from . import checkpoint, state
 from .config import to_values
 from .run_folder import RunFolder
-from .watch import COLLECTED, LEARNT, Watch
+from .watch import CARRIED, COLLECTED, LEARNT, WEIGHTS, Watch
 
 if TYPE_CHECKING:
     from .loop import Trainer
@@ -93,11 +93,45 @@ def found(trainer: "Trainer") -> Divergence:
     batch = _rows(trainer, step) if place == COLLECTED else trainer.learner.watch.batch
     assert batch is not None, "something was found in a batch"
     culprit = _search(trainer, place, batch, step, update)
+    return _kept(trainer, place, batch, culprit)
+
+
+def _kept(trainer: "Trainer", place: int, batch: TensorDictBase, culprit: Culprit) -> Divergence:
     try:
         bundle = _write(trainer, place, batch, culprit)
     except (OSError, ValueError) as error:
         return Divergence(f"{culprit}; nothing could be kept of it: {error}", culprit, None)
     return Divergence(f"{culprit}; what reproduces it is in {bundle}", culprit, bundle)
+
+
+def carried(trainer: "Trainer", name: str, value: Tensor) -> Divergence:
+    """What is to be said of a state that must not be saved, and the bundle.
+
+    Args:
+        name, value: of the tensor of the state that is not finite.
+    """
+    culprit = _carried(trainer, name, value, trainer.step + 1)
+    batch = trainer.collector.carried.exclude(keys.ACTION)
+    return _kept(trainer, CARRIED, batch, culprit)
+
+
+def _carried(trainer: "Trainer", name: str, value: Tensor, step: int) -> Culprit:
+    """Whose a number is in what a step begins with: a UAV's where [environments, uavs, ...]."""
+    wrong = ~value.isfinite()
+    place = wrong.nonzero()[0].tolist()
+    uavs = trainer.config.env.num_uavs
+    of_uavs = value.ndim > 1 and value.shape[:2] == (trainer.envs, uavs)
+    text = name.replace("/", " ").replace(f"{keys.AGENTS}.", "")
+    return Culprit(
+        tensor=f"{text}, with which the step begins",
+        uav=place[1] if of_uavs else 0,
+        seed=trainer.configs[place[0] // trainer.config.num_envs if of_uavs else 0].seed,
+        uavs=int(wrong.flatten(2).any(2).any(0).sum()) if value.ndim > 2 and of_uavs else 1,
+        environment=place[0] % trainer.config.num_envs if of_uavs else None,
+        step=step,
+        update=None,
+        value=f"{float(value[tuple(place)]):g}",
+    )
 
 
 def replay(bundle: Path | str, device: str = "cpu") -> Culprit | None:
@@ -127,6 +161,8 @@ def replay(bundle: Path | str, device: str = "cpu") -> Culprit | None:
         groups = _grouped(content)
         watch = trainer.learner.watch
         batch = state.nested(groups["batch"], 1, trainer.config.device)
+        if place == CARRIED:
+            return _replayed(trainer, groups["batch"], step)
         if place == COLLECTED:
             watch.own = groups["own"]["all"].to(trainer.config.device) if "own" in groups else None
             watch.collected(batch)
@@ -136,6 +172,13 @@ def replay(bundle: Path | str, device: str = "cpu") -> Culprit | None:
     except (AssertionError, KeyError, TypeError) as error:
         raise ValueError(f"{folder}: not a bundle of a divergence: {error}") from None
     return _search(trainer, place, batch, step, update) if watch.look(wait=True) else None
+
+
+def _replayed(trainer: "Trainer", content: Mapping[str, Tensor], step: int) -> Culprit | None:
+    for name, value in content.items():
+        if value.is_floating_point() and not value.isfinite().all():
+            return _carried(trainer, f"carried/{name}", value, step)
+    return None
 
 
 def _rows(trainer: "Trainer", step: int) -> TensorDictBase:
@@ -259,7 +302,7 @@ def _write(trainer: "Trainer", place: int, batch: TensorDictBase, culprit: Culpr
     checkpoint.write(folder / "weights.safetensors", learner, header)
     RunFolder(folder).write_config(trainer.config)
     shown = {**content, **learner}
-    if place >= LEARNT:
+    if place in (LEARNT, WEIGHTS):
         shown |= _learnt(watch)
     report = {
         "culprit": asdict(culprit),

@@ -2,7 +2,7 @@
 
 import platform
 import time
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 
 import torch
 from rich.console import Console
@@ -15,6 +15,7 @@ from .config import known, resolve
 from .loop import Trainer
 
 _PACKAGES = ("emberlink", "torch", "torchrl", "tensordict", "pettingzoo", "wandb", "hydra-core")
+_GEO = ("rasterio", "geopandas", "pyogrio", "shapely", "pyproj")
 _TINY = ("env.horizon=40", "env.num_uavs=3", "episodes=1", "num_envs=2", "learner.batch=32")
 
 
@@ -26,6 +27,7 @@ def doctor(console: Console) -> int:
     console.print(
         f"devices: cpu ({torch.get_num_threads()} threads), {', '.join(gpus) or 'no GPU'}"
     )
+    console.print(f"fires from files: {_geo()}")
     checks = {"fire": _fire} | {method: _recipe(method) for method in known("method")}
     began, failures = time.monotonic(), 0
     for name, check in checks.items():
@@ -37,6 +39,14 @@ def doctor(console: Console) -> int:
     seconds = time.monotonic() - began
     console.print(f"self-test: {failures} of {len(checks)} failed, {seconds:.1f} s")
     return int(failures > 0)
+
+
+def _geo() -> str:
+    """The versions of what the extra `geo` installs."""
+    try:
+        return ", ".join(f"{name} {version(name)}" for name in _GEO)
+    except PackageNotFoundError as error:
+        return f"{error.name} is not installed: pip install 'emberlink[geo]'"
 
 
 def _fire() -> str:

@@ -12,8 +12,8 @@ from torchrl.envs import TransformedEnv, set_exploration_type, step_mdp
 from torchrl.envs.utils import ExplorationType
 
 from emberlink.envs import metrics
-from emberlink.envs.fire import FireConfig, load_scenario
-from emberlink.envs.fire_bank import fire_bank
+from emberlink.envs.fire import load_scenario
+from emberlink.envs.scenario import ScenarioConfig, fires_of
 from emberlink.envs.wildfire import WildfireEnv
 from emberlink.policies.scripted import SCRIPTED
 
@@ -65,9 +65,9 @@ def play(
     return metrics.episode_metrics(episode)
 
 
-def evaluation_scenarios(config: RunConfig) -> dict[str, FireConfig]:
+def evaluation_scenarios(config: RunConfig) -> dict[str, ScenarioConfig]:
     """The scenarios of an evaluation by name: `huygens`, and the one trained on."""
-    scenarios: dict[str, FireConfig] = {HELD_OUT_SCENARIO: load_scenario(HELD_OUT_SCENARIO)}
+    scenarios: dict[str, ScenarioConfig] = {HELD_OUT_SCENARIO: load_scenario(HELD_OUT_SCENARIO)}
     if config.fire not in scenarios.values():
         changed = config.fire.name in scenarios
         scenarios[config.fire.name + ("_as_trained" if changed else "")] = config.fire
@@ -83,7 +83,7 @@ def evaluation_fires(config: RunConfig, count: int) -> dict[str, Tensor]:
     """
     grid, horizon = config.env.grid, config.env.horizon
     return {
-        name: fire_bank(scenario, "heldout", count, grid, horizon)
+        name: fires_of(scenario).heldout(count, grid, horizon)
         for name, scenario in evaluation_scenarios(config).items()
     }
 
@@ -199,7 +199,7 @@ def means(results: Mapping[str, list[float]]) -> dict[str, float]:
 
 
 def film(
-    config: RunConfig, policy: Policy, *, fire: Tensor | FireConfig, frames: int = 100
+    config: RunConfig, policy: Policy, *, fire: Tensor | ScenarioConfig, frames: int = 100
 ) -> tuple[list[np.ndarray], list[int]]:
     """Pictures of one episode of one environment, and their steps."""
     env = build_env(config, num_envs=1, fire=fire, seed=START_SEED, device=config.device)

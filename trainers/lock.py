@@ -3,6 +3,7 @@
 import fcntl
 import os
 import socket
+from contextlib import suppress
 from pathlib import Path
 
 
@@ -34,7 +35,8 @@ class Lock:
     def release(self) -> None:
         """Takes the file away and gives the lock up; a second time does nothing."""
         if self._handle >= 0:
-            self.path.unlink(missing_ok=True)
+            with suppress(OSError):  # of a folder that has become read-only, the file stays
+                self.path.unlink(missing_ok=True)
             os.close(self._handle)
             self._handle = -1
 

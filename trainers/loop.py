@@ -10,6 +10,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 
 from emberlink.envs import metrics
+from emberlink.envs.scenario import fires_of
 from emberlink.policies.actor_critic import team_of
 
 from . import checkpoint, divergence, evaluate, rollback, state, tracking
@@ -72,7 +73,7 @@ class Trainer:
         self.runs: list[RunFolder] = []
         self._locks: list[Lock] = []
         self._began = time.monotonic()
-        self._stopping = False
+        self._stopping = self._untracked = False
         self.build()
 
     def build(self) -> None:
@@ -127,9 +128,18 @@ class Trainer:
     def start(self) -> RunFolder:
         """Makes the run folders, one for each seed, and returns the first."""
         runs = [RunFolder.create(config) for config in self.configs]
+        # Whoever finds a config.yaml finds all folders, the first of which has one.
         if self.teams > 1:
             for run in runs:
                 run.write(SIBLINGS, {"folders": [one.path.name for one in runs]})
+        for run, config in zip(runs, self.configs, strict=True):
+            run.write_config(config)
+        grid, horizon = self.config.env.grid, self.config.env.horizon
+        self.configs = [
+            replace(one, fire=fires_of(one.fire).kept(run.path, grid, horizon))
+            for one, run in zip(self.configs, runs, strict=True)
+        ]
+        self.config = replace(self.config, fire=self.configs[0].fire)
         self.take(runs, [Lock(run.path) for run in runs])
         return self.run
 
@@ -141,7 +151,9 @@ class Trainer:
         """Ends the training after the step that it is at, also from a signal handler."""
         self._stopping = True
 
-    def train(self, report: Callable[[Progress], None] = lambda _: None) -> bool:
+    def train(
+        self, report: Callable[[Progress], None] = lambda _: None, *, hold: bool = False
+    ) -> bool:
         """Trains to the end, or until `stop`, and saves.
 
         Where an error ends it, or an exception of a signal's, nothing more is saved: what is there
@@ -149,6 +161,7 @@ class Trainer:
 
         Args:
             report: called after each step of the environments.
+            hold: keeps the run folders to write more to them, until `close`.
 
         Returns:
             Whether it came to the end: False after `stop`.
@@ -168,7 +181,10 @@ class Trainer:
                 progress.note = note
                 report(progress)
         finally:
-            self.close()
+            if hold:
+                self.collector.shutdown()
+            else:
+                self.close()
 
     def close(self) -> None:
         """Ends the collector and gives the run folders up; `train` does it."""
@@ -188,8 +204,12 @@ class Trainer:
         The state first: networks are evidence that there was one.
 
         Raises:
+            Divergence: what the next step begins with is not finite.
             ValueError: it cannot be written; the checkpoints before it are as they were.
         """
+        tensors = state.tensors(self)
+        if name := state.not_finite(tensors):
+            raise divergence.carried(self, name, tensors[name])
         if self.step > self.furthest:
             self.tries = 0
         header = {
@@ -201,7 +221,7 @@ class Trainer:
             "seconds": round(self.elapsed(), 3),
             **state.counters(self),
         }
-        checkpoint.write(self.run.state(self.step), state.tensors(self), header)
+        checkpoint.write(self.run.state(self.step), tensors, header)
         self.save_networks()
         for run in self.runs:
             run.rotate(self.config.keep, states=2)
@@ -234,7 +254,9 @@ class Trainer:
 
     def _train(self, report: Callable[[Progress], None]) -> None:
         """Trains to the end, until `stop`, or until a number is not finite."""
-        trackers = tracking.Trackers(self.configs, self.runs, episode=self.episode)
+        # After a rollback, one that has failed is not tried again.
+        configs = [replace(one, logger="none") if self._untracked else one for one in self.configs]
+        trackers = tracking.Trackers(configs, self.runs, episode=self.episode)
         try:
             self._loop(trackers, report)
             if self.saved != self.step:
@@ -242,6 +264,7 @@ class Trainer:
                 self.save()
         finally:
             trackers.close()
+            self._untracked = self._untracked or trackers.given_up
 
     def _look(self, *, wait: bool) -> None:
         """Ends the training where a number is not finite; before anything of it is written."""

@@ -17,6 +17,8 @@ from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
 
+from emberlink.envs.fire_file import KEPT
+
 from . import checkpoint
 from .report import ACTOR
 from .run_folder import RunFolder
@@ -106,8 +108,9 @@ def pack(run: RunFolder, into: Path) -> Path:
     (target / "checkpoints").mkdir(parents=True)
     checkpoint.write(target / "checkpoints" / newest.name, actors, about)
     RunFolder(target).write_config(config)
-    for file in ("metrics.jsonl", "eval.json"):
-        shutil.copyfile(run.path / file, target / file)
+    for file in ("metrics.jsonl", "eval.json", KEPT):
+        if (run.path / file).is_file():
+            shutil.copyfile(run.path / file, target / file)
     return target
 
 

@@ -64,11 +64,15 @@ def parse_json(text: str) -> Any:
 
 
 class _PlainLoader(yaml.SafeLoader):
-    """SafeLoader without aliases, with which a short file can stand for an endless one."""
+    """SafeLoader without tags, which turn one value into another, and without aliases, with which
+    a short file can stand for an endless one."""
 
     def compose_node(self, parent: Any, index: Any) -> Any:
         if self.check_event(yaml.AliasEvent):
             raise ValueError("aliases (*name) are not read here")
+        event: Any = self.peek_event()
+        if event.tag is not None or event.anchor is not None:
+            raise ValueError("tags (!!name) and anchors (&name) are not read here")
         return super().compose_node(parent, index)
 
     def construct_mapping(self, node: Any, deep: bool = False) -> dict[Hashable, Any]:

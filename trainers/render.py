@@ -3,7 +3,6 @@
 import dataclasses
 import os
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +12,11 @@ from rich.console import Console
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
-from emberlink.envs.fire import FireConfig, fire_seeds, load_scenario, make_fires, scenarios
+from emberlink.envs.fire import load_scenario, scenarios
 from emberlink.envs.panels import Episode, Screen
+from emberlink.envs.publish import free_name, published
 from emberlink.envs.render import write_gif
+from emberlink.envs.scenario import ScenarioConfig, fires_of
 from emberlink.envs.video import write_mp4
 from emberlink.envs.wildfire import WildfireEnv
 from emberlink.policies.scripted import SCRIPTED
@@ -81,8 +82,8 @@ def render(runs: Sequence[str], console: Console, choices: Choices) -> int:
     Raises:
         ValueError: one line for whatever cannot be played, drawn or written.
     """
-    scenario, index = find_fire(choices.fire)
     folders = [open_run(name) for name in runs]
+    scenario, index = find_fire(choices.fire, folders[0].config(device="cpu").fire)
     panels = [*_learned(folders, choices.checkpoints), *_scripted(folders, choices.policies)]
     _check_comparable(panels)
     config = panels[0].config.env
@@ -90,22 +91,24 @@ def render(runs: Sequence[str], console: Console, choices: Choices) -> int:
     stem = "_".join([shown, scenario.name, str(index), *(p.stem for p in choices.checkpoints)])
     paths = _free_paths(choices.output, folders[0], stem)
     steps = _steps(choices, config.horizon, [path.suffix for path in paths])
-    arrival = make_fires(
-        scenario, fire_seeds("heldout", index + 1)[index:], config.grid, config.horizon
-    )
+    arrival = fires_of(scenario).one_heldout(index, config.grid, config.horizon)
     episodes = [_play(panel, arrival, index, steps, console) for panel in panels]
     least, most = _ALONE if len(panels) == 1 else _BESIDE
     size = min(max(_CELL * max(config.grid), least), most)
     screen = Screen(episodes, size=choices.size or size, tell_seen=choices.seen)
     for path in paths:
-        with _published(path) as partial:
+        with published(path) as partial:
             _WRITERS[path.suffix](partial, screen, len(steps), choices.fps)
         console.print(str(path), soft_wrap=True, highlight=False)
     return 0
 
 
-def find_fire(text: str) -> tuple[FireConfig, int]:
+def find_fire(text: str, trained: ScenarioConfig) -> tuple[ScenarioConfig, int]:
     """The scenario and the number of the held-out fire that NAME, INDEX or NAME:INDEX means.
+
+    Args:
+        text: of the command line.
+        trained: what the run was trained on: its name is known too.
 
     Raises:
         ValueError: there is no such scenario or fire.
@@ -115,13 +118,14 @@ def find_fire(text: str) -> tuple[FireConfig, int]:
         if ":" in text
         else ((HELD_OUT_SCENARIO, "", text) if text.lstrip("-").isdecimal() else (text, "", "0"))
     )
-    if name not in scenarios():
-        raise ValueError(f"fire {name!r} is not known; known: {', '.join(scenarios())}")
+    known = dict.fromkeys([*scenarios(), trained.name])
+    if name not in known:
+        raise ValueError(f"fire {name!r} is not known; known: {', '.join(known)}")
     if not index.isdecimal() or int(index) >= FIRES:
         raise ValueError(
             f"fire {text!r}: there is no held-out fire {index!r}; known: 0 to {FIRES - 1}"
         )
-    return load_scenario(name), int(index)
+    return load_scenario(name) if name in scenarios() else trained, int(index)
 
 
 def _learned(folders: Sequence[RunFolder], checkpoints: Sequence[Path]) -> Iterator[Panel]:
@@ -231,24 +235,6 @@ def _free_paths(output: Path | None, run: RunFolder, stem: str) -> list[Path]:
         folder = run.figure(stem).parent if output is None else output
     except OSError as error:
         raise ValueError(f"{run.path}: {error.strerror or error}") from None
-    for attempt in range(1, 10_000):
-        name = stem if attempt == 1 else f"{stem}_{attempt}"
-        paths = [folder / f"{name}{suffix}" for suffix in (".gif", ".mp4")]
-        if not any(os.path.lexists(path) for path in paths):
-            return paths
-    raise ValueError(f"{folder}: {stem} and 9999 more are there already")
-
-
-@contextmanager
-def _published(path: Path) -> Iterator[Path]:
-    """A file to write, which gets its name once it is whole and if nobody else took that."""
-    partial = path.with_name(f".{os.getpid()}-{path.name}")
-    try:
-        yield partial
-        os.link(partial, path)
-    except FileExistsError:
-        raise ValueError(f"{path} is there already; nothing is overwritten") from None
-    except OSError as error:
-        raise ValueError(f"{path}: {error.strerror or error}") from None
-    finally:
-        partial.unlink(missing_ok=True)
+    suffixes = (".gif", ".mp4")
+    name = free_name(folder, stem, suffixes)
+    return [name.with_name(f"{name.name}{suffix}") for suffix in suffixes]

@@ -14,8 +14,8 @@ from rich.table import Table
 from tensordict.nn import TensorDictModule
 
 from emberlink.envs import metrics
-from emberlink.envs.fire import fire_seeds
 from emberlink.envs.render import write_gif
+from emberlink.envs.scenario import fires_of
 from emberlink.policies.scripted import SCRIPTED
 
 from . import evaluate, figures
@@ -111,7 +111,6 @@ def record(config: RunConfig, results: evaluate.Results, **about: Any) -> dict[s
     """What eval.json holds: enough to redo any statistics without running anything."""
     configs = evaluate.evaluation_scenarios(config)
     count = len(next(iter(results.values()))[evaluate.LEARNED]["coverage"])
-    seeds = fire_seeds("heldout", count).tolist()
     return {
         "method": config.method,
         "setup": config.setup,
@@ -119,9 +118,7 @@ def record(config: RunConfig, results: evaluate.Results, **about: Any) -> dict[s
         "start_seed": evaluate.START_SEED,
         **about,
         "start_seeds": list(range(evaluate.START_SEED, evaluate.START_SEED + count)),
-        "held_out": {
-            name: {"fire_seeds": seeds, "scenario": asdict(configs[name])} for name in results
-        },
+        "held_out": {name: fires_of(configs[name]).about(count) for name in results},
         "environment": asdict(config.env),
         "communication": {
             evaluate.LEARNED: config.comm,

@@ -38,8 +38,9 @@ def resume(path: Path, method: str | None = None, overrides: Sequence[str] = ())
         ValueError: one line that says what cannot be resumed and why. Nothing was changed.
     """
     chosen = path if path.suffix == ".safetensors" else None
-    runs = _runs(path.parent.parent if chosen else path)
+    runs = _runs(path.absolute().parent.parent if chosen else path)
     before = runs[0].config()
+    _check_siblings(runs, before)
     config = _changed(before, method, overrides)
     with ExitStack() as stack:
         locks = [Lock(run.path) for run in runs]
@@ -48,8 +49,6 @@ def resume(path: Path, method: str | None = None, overrides: Sequence[str] = ())
         if chosen is None and not (runs[0].states() or runs[0].networks()):
             _check_beginning(runs, config)
         trainer = Trainer(config)
-        if len(runs) != trainer.teams:
-            raise ValueError(f"{runs[0].path}: {len(runs)} folders for {trainer.teams} seeds")
         sizes = _restore(trainer, runs, chosen)
         for run, of in zip(runs, sizes, strict=True):
             for file in LINES:
@@ -59,7 +58,7 @@ def resume(path: Path, method: str | None = None, overrides: Sequence[str] = ())
             for file in LINES:
                 run.cut(file, of[file])
             run.take_away_after(trainer.step)
-            if config != before:
+            if config != before or not run.has_config():
                 run.write_config(one)
         trainer.take(runs, locks)
         if trainer.step:
@@ -72,17 +71,35 @@ def resume(path: Path, method: str | None = None, overrides: Sequence[str] = ())
 def _runs(folder: Path) -> list[RunFolder]:
     """The folders of all seeds that train with the one whose folder this is, in order."""
     file = folder / SIBLINGS
-    if not file.exists():
-        return [RunFolder(folder)]
     try:
+        if not file.exists():
+            return [RunFolder(folder)]
         names = parse_json(read_text(file, LONGEST_YAML))["folders"]
         runs = [RunFolder(folder.resolve().parent / Path(name).name) for name in names]
+        missing = [run.path for run in runs if not run.path.is_dir()]
+        if folder.resolve() not in [run.path for run in runs]:
+            raise ValueError(folder)
+    except PermissionError as error:
+        raise ValueError(f"{file}: cannot be read: {error.strerror}") from None
     except (OSError, ValueError, TypeError, KeyError):
         raise ValueError(f"{file}: does not name the folders of the other seeds") from None
-    for run in runs:
-        if not run.path.is_dir():
-            raise ValueError(f"{run.path}: is missing; its seed trains side by side with {folder}")
+    for path in missing:
+        raise ValueError(f"{path}: is missing; its seed trains side by side with {folder}")
     return runs
+
+
+def _check_siblings(runs: Sequence[RunFolder], config: RunConfig) -> None:
+    """That each seed's folder is of this training, as far as it has got to say so."""
+    seeds = config.seeds or (config.seed,)
+    if len(runs) != len(seeds):
+        raise ValueError(
+            f"{runs[0].path}: is of {len(seeds)} seeds, {SIBLINGS} names {len(runs)} folders"
+        )
+    for run, seed in zip(runs, seeds, strict=True):
+        if run.has_config() and replace(run.config(), seed=config.seed) != config:
+            raise ValueError(f"{run.path / 'config.yaml'}: not of the run of {runs[0].path}")
+        if run.has_config() and run.config().seed != seed:
+            raise ValueError(f"{run.path / 'config.yaml'}: seed={run.config().seed}, not {seed}")
 
 
 def _check_beginning(runs: Sequence[RunFolder], config: RunConfig) -> None:

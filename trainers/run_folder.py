@@ -2,9 +2,11 @@
 
 import json
 import os
+import re
 import shutil
 from collections.abc import Mapping
 from contextlib import suppress
+from dataclasses import replace
 from datetime import datetime
 from itertools import chain
 from pathlib import Path
@@ -13,9 +15,15 @@ from typing import Any
 import yaml
 from torch import Tensor
 
+from emberlink.envs.scenario import fires_of
+
 from . import checkpoint as files
-from .config import RunConfig, from_values, to_values
+from .config import RunConfig, comm_settings, flat, from_values, to_values
 from .reading import LONGEST_JSON, parse_json, read_text, read_yaml
+
+_NOT_FROM_THE_START = ("comm.agree", "comm.follow", "comm.wander", "comm.loss")
+"""settings that runs of the first release were made without; their defaults change nothing"""
+_NUMBERED = re.compile(r"(state|step)_\d{9,18}\.safetensors")
 
 
 class RunFolder:
@@ -30,7 +38,7 @@ class RunFolder:
 
     @classmethod
     def create(cls, config: RunConfig) -> "RunFolder":
-        """A new folder under `config.output` with the resolved configuration in it.
+        """A new folder under `config.output`, in which `write_config` comes next.
 
         Raises:
             ValueError: the folder can't be made.
@@ -43,13 +51,15 @@ class RunFolder:
             (path / "figures").mkdir()
         except OSError as error:
             raise ValueError(f"output={config.output}: {error.strerror or error}") from None
-        run = cls(path)
-        run.write_config(config)
-        return run
+        return cls(path)
 
     def write_config(self, config: RunConfig) -> None:
         """Writes the resolved configuration whole, or leaves what was there."""
         self._replace("config.yaml", yaml.safe_dump(to_values(config), sort_keys=False))
+
+    def has_config(self) -> bool:
+        """Whether there is a configuration: it is written last when a folder is made."""
+        return (self.path / "config.yaml").exists()
 
     def config(self, **changes: Any) -> RunConfig:
         """The run's configuration.
@@ -70,9 +80,11 @@ class RunFolder:
         if not isinstance(values, dict):
             raise ValueError(f"{file}: expected keys and values, found {type(values).__name__}")
         try:
-            return from_values({**values, **changes})
+            config = from_values({**values, **changes})
+            _check_whole(values, config)
         except ValueError as error:
             raise ValueError(f"{file}: {error}") from None
+        return replace(config, fire=fires_of(config.fire).opened(self.path))
 
     def append(self, file: str, line: Mapping[str, Any]) -> None:
         """Adds a line of JSON and hands it to the system at once, whole or not at all.
@@ -131,19 +143,27 @@ class RunFolder:
     def cut(self, file: str, size: int) -> None:
         """Cuts a file back to so many bytes, where it has more."""
         path = self.path / file
-        if path.exists() and path.stat().st_size > size:
-            os.truncate(path, size)
+        try:
+            if path.exists() and path.stat().st_size > size:
+                os.truncate(path, size)
+        except OSError as error:
+            raise ValueError(f"{path}: cannot be cut: {error.strerror}") from None
 
     def write(self, file: str, content: Mapping[str, Any]) -> None:
         """Writes a JSON file whole, or leaves what was there."""
         self._replace(file, json.dumps(content, indent=1) + "\n")
 
     def _replace(self, file: str, text: str) -> None:
-        path, partial = self.path / file, self.path / (file + ".part")
+        # Not the name of another process's, such as an evaluation beside a training.
+        path, partial = self.path / file, self.path / f"{file}.{os.getpid()}.part"
         try:
             partial.unlink(missing_ok=True)  # a link would lead to another's file
-            partial.write_text(text)
+            with partial.open("x") as content:
+                content.write(text)
+                content.flush()
+                os.fsync(content.fileno())
             partial.replace(path)
+            files.flush_folder(self.path)
         except OSError as error:
             with suppress(OSError):
                 partial.unlink(missing_ok=True)
@@ -194,11 +214,16 @@ class RunFolder:
 
     def states(self) -> list[Path]:
         """What a run can be resumed from, oldest first."""
-        return sorted(self.checkpoints.glob("state_*.safetensors"))
+        return self._numbered("state")
 
     def networks(self) -> list[Path]:
         """The checkpoints' networks, oldest first."""
-        return sorted(self.checkpoints.glob("step_*.safetensors"))
+        return self._numbered("step")
+
+    def _numbered(self, name: str) -> list[Path]:
+        """The files that are called so with a step; what a user has put beside them is not ours."""
+        found = self.checkpoints.glob(f"{name}_*.safetensors")
+        return sorted((path for path in found if _is_ours(path)), key=step_of)
 
     def checkpoint(self) -> Path:
         """The newest checkpoint's networks.
@@ -226,16 +251,39 @@ class RunFolder:
 
     def take_away_after(self, step: int) -> None:
         """Takes away what a resumed run makes again, and what a killed one had begun to write."""
-        for path in self.networks() + self.states():
-            if step_of(path) > step:
-                path.unlink()
-        begun = [self.path.glob(f"{name}.part") for name in ("config.yaml", "*.json")]
+        begun = [
+            self.path.glob(name + end)
+            for name in ("config.yaml", "*.json", "fires.npz")
+            for end in (".part", ".[0-9]*.part")
+        ]
         # safetensors' own names begin with .tmp
         begun += [self.checkpoints.glob(name) for name in ("*.safetensors.part", ".tmp*")]
-        for path in chain(*begun):
-            path.unlink()
-        for path in self.path.glob("divergence_step_*.part"):
-            shutil.rmtree(path)
+        later = [path for path in self.networks() + self.states() if step_of(path) > step]
+        try:
+            for path in chain(later, *begun):
+                if path.is_file() or path.is_symlink():  # what is none is not ours
+                    path.unlink()
+            for path in self.path.glob("divergence_step_*.part"):
+                if path.is_dir() and not path.is_symlink():
+                    shutil.rmtree(path)
+        except OSError as error:
+            raise ValueError(f"{error.filename}: cannot be taken away: {error.strerror}") from None
+
+
+def _is_ours(path: Path) -> bool:
+    return _NUMBERED.fullmatch(path.name) is not None and path.is_file()
+
+
+def _check_whole(values: Mapping[str, Any], config: RunConfig) -> None:
+    """That nothing of the world has been left to a default, which may be another setup's.
+
+    Raises:
+        ValueError: a key of `env` or `comm` is missing that every run folder has.
+    """
+    written, whole = flat(values), {"env": to_values(config)["env"], "comm": comm_settings(config)}
+    for key in flat(whole):
+        if key not in written and key not in _NOT_FROM_THE_START:
+            raise ValueError(f"key {key!r} is missing")
 
 
 def step_of(checkpoint: Path) -> int:

@@ -16,7 +16,6 @@ from emberlink.envs import keys, metrics
 from emberlink.envs.config import shown
 from emberlink.policies.noise import NOISE
 
-from . import checkpoint as files
 from . import state_header, state_world
 from .state_header import Header
 
@@ -57,6 +56,20 @@ def tensors(trainer: "Trainer") -> dict[str, Tensor]:
     return found
 
 
+def not_finite(content: Mapping[str, Tensor]) -> str | None:
+    """The first of a state's tensors that holds what none may hold, if any."""
+    # Fires hold infinity, and their margin NaN; they are compared.
+    of_fires = f"world/{state_world.ARRIVAL}"
+    return next(
+        (
+            name
+            for name, value in content.items()
+            if name != of_fires and value.is_floating_point() and not value.isfinite().all()
+        ),
+        None,
+    )
+
+
 def counters(trainer: "Trainer") -> dict[str, Any]:
     """The numbers that go with `tensors`."""
     return {
@@ -87,9 +100,8 @@ def restore(trainer: "Trainer", path: Path, header: Mapping[str, Any], content: 
     made = state_header.parse(path, header)
     state_header.check(path, made, trainer)
     groups = _grouped(path, content)
-    # Fires hold infinity, and their margin NaN; they are compared.
-    of_fires = f"world/{state_world.ARRIVAL}"
-    files.check_finite(path, {name: one for name, one in content.items() if name != of_fires})
+    if name := not_finite(content):
+        raise ValueError(f"{path}: {shown(name)} holds NaN or infinite numbers")
     trainer.step, trainer.updates = made.step, made.updates
     begun: Any = (made.step, made.updates)
     trainer.begun = begun

@@ -112,6 +112,8 @@ class Trackers:
         self._lines = queue.SimpleQueue()
         self._failure: str | None = None
         self._thread: threading.Thread | None = None
+        self.given_up = False
+        """whether it has failed, and a warning has said so"""
         if make := _TRACKERS.get(self._name):
             self._thread = threading.Thread(target=self._work, args=(make,), daemon=True)
             self._thread.start()
@@ -154,7 +156,7 @@ class Trackers:
                     _finish(logger)
 
     def _give_up(self, reason: str) -> None:
-        self._thread = None
+        self._thread, self.given_up = None, True
         if self._name == "wandb":
             _release_wandb()
         shown = reason if len(reason) <= 200 else reason[:200] + " ..."

@@ -11,8 +11,9 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-NOTHING, COLLECTED, LEARNT, WEIGHTS = range(4)
-"""where something was found: in a collected step, in losses and gradients, in what they made"""
+NOTHING, COLLECTED, LEARNT, WEIGHTS, CARRIED = range(5)
+"""where something was found: in a collected step, in losses and gradients, in what they made; in
+what the next step begins with, which is looked at before it is saved"""
 
 
 class Watch:

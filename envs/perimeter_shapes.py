@@ -1,0 +1,90 @@
+"""The area that perimeters enclose: polygons, closed lines, collections of them."""
+
+from typing import Any
+
+import numpy as np
+
+from .geo import library
+
+_GAP = 0.01  # of a line's length: a gap that small between its ends is closed
+MOST_RINGS = 20_000
+"""closed lines of one time"""
+
+
+def enclosed(geometries: Any, names: list[int]) -> Any:
+    """The area inside perimeters of one time, a shapely polygon or several.
+
+    Args:
+        geometries: of shapely; those of lines are taken together: a closed line within another
+            is an unburnt island.
+        names: number of the feature of each, for messages.
+
+    Raises:
+        ValueError: a feature encloses nothing, or a line is not closed.
+    """
+    shapely = library("shapely", "perimeters")
+    areas: list[Any] = []
+    lines: list[Any] = []
+    for geometry, name in zip(geometries, names, strict=True):
+        if geometry is None or geometry.is_empty:
+            raise ValueError(f"feature {name} has no geometry; expected a perimeter")
+        before = len(areas) + len(lines)
+        for part in _parts(shapely.force_2d(geometry)):
+            if part.geom_type == "Polygon":
+                areas.append(_valid(shapely, part))
+            elif part.geom_type in ("LineString", "LinearRing"):
+                lines.append(part)
+        if len(areas) + len(lines) == before:
+            raise ValueError(
+                f"feature {name} is of {geometry.geom_type}; expected polygons or lines"
+            )
+    if lines:
+        areas.append(_within_lines(shapely, lines, names))
+    area = shapely.union_all(areas)
+    if not area.area > 0:
+        raise ValueError(f"feature {names[0]} encloses no area; expected a perimeter")
+    return area
+
+
+def _parts(geometry: Any) -> list[Any]:
+    """The simple geometries in one, whatever is nested in what."""
+    found, left = [], [geometry]
+    while left:
+        one = left.pop()
+        if hasattr(one, "geoms"):
+            left.extend(one.geoms)
+        elif not one.is_empty:
+            found.append(one)
+    return found
+
+
+def _valid(shapely: Any, polygon: Any) -> Any:
+    """A polygon that does not cross itself, of the same shells."""
+    if polygon.is_valid:
+        return polygon
+    return shapely.make_valid(polygon, method="structure", keep_collapsed=False)
+
+
+def _within_lines(shapely: Any, lines: list[Any], names: list[int]) -> Any:
+    """What closed lines enclose; those within an odd number of others are islands."""
+    merged = _parts(shapely.line_merge(shapely.MultiLineString(lines)))
+    rings: dict[bytes, Any] = {}
+    for line in merged:
+        ends = np.asarray(line.coords)[[0, -1]]
+        gap = float(np.hypot(*(ends[1] - ends[0])))
+        if len(line.coords) < 3 or gap > _GAP * line.length:
+            raise ValueError(
+                f"feature {names[0]}: a line of {len(line.coords)} points is not closed, {gap:g} "
+                f"of its length of {line.length:g} is missing; expected closed lines"
+            )
+        area = _valid(shapely, shapely.Polygon(line.coords))
+        rings.setdefault(shapely.normalize(area).wkb, area)
+    areas = sorted(rings.values(), key=lambda area: -area.area)
+    if len(areas) > MOST_RINGS:
+        raise ValueError(f"{len(areas)} closed lines of one time; at most {MOST_RINGS} are read")
+    tree = shapely.STRtree(areas)
+    inner, outer = tree.query(areas, predicate="covered_by")
+    depth = np.bincount(inner[outer < inner], minlength=len(areas))
+    burnt = shapely.union_all([a for a, deep in zip(areas, depth, strict=True) if deep % 2 == 0])
+    islands = [a for a, deep in zip(areas, depth, strict=True) if deep % 2]
+    return shapely.difference(burnt, shapely.union_all(islands)) if islands else burnt

@@ -1,0 +1,65 @@
+"""The elliptical wavelet that every point of a front sends out: its rates and its shape.
+
+A wavelet grows at the rate `a` along its axis and at `b` across, in half lengths, while its centre
+moves at `c` along the axis: (a, b, c), cells per step. Angles are in radians, counter-clockwise
+from +x, and point towards where the head runs.
+"""
+
+import torch
+from torch import Tensor
+
+MAX_LENGTH_TO_BREADTH = 8.0
+
+
+def length_to_breadth(wind: float | Tensor) -> Tensor:
+    """The length-to-breadth ratio of a wildfire in wind (Anderson 1983, USDA INT-305).
+
+    Args:
+        wind: mid-flame wind speed in m/s, not negative, any shape.
+
+    Returns:
+        0.936 exp(0.2566 U) + 0.461 exp(−0.1548 U) − 0.397, at most 8, in the shape of `wind`.
+    """
+    speed = torch.as_tensor(wind)
+    if (speed < 0).any():
+        raise ValueError(f"wind speed must not be negative, got {speed.min().item()}")
+    ratio = 0.936 * torch.exp(0.2566 * speed) + 0.461 * torch.exp(-0.1548 * speed) - 0.397
+    return ratio.clamp(1.0, MAX_LENGTH_TO_BREADTH)
+
+
+def ellipse_rates(
+    head_rate: float | Tensor, length_to_breadth: float | Tensor, two_sided: bool = False
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Rates of the wavelet of a point source, which stands in a focus of its ellipse.
+
+    Args:
+        head_rate: rate of the head, cells per step.
+        length_to_breadth: at least 1, broadcast against `head_rate`.
+        two_sided: the source stands in the centre instead: the back runs as fast as the head.
+
+    Returns:
+        (a, b, c): growth of the half length, of the half breadth, and speed of the centre.
+    """
+    head, ratio = torch.as_tensor(head_rate), torch.as_tensor(length_to_breadth)
+    if (ratio < 1).any():
+        raise ValueError(f"length_to_breadth must be at least 1, got {ratio.min().item()}")
+    if two_sided:
+        return head, head / ratio, torch.zeros_like(head)
+    eccentricity = torch.sqrt(ratio**2 - 1) / ratio
+    back = head * (1 - eccentricity) / (1 + eccentricity)
+    a = (head + back) / 2
+    return a, a / ratio, (head - back) / 2
+
+
+def front_speed(normal: Tensor, a: Tensor, b: Tensor, c: Tensor, azimuth: float | Tensor) -> Tensor:
+    """Speed of a straight front along its outward normal, cells per step.
+
+    This is F(n) = c (n·w) + sqrt(b² + (a² − b²)(n·w)²), the support function of the wavelet.
+
+    Args:
+        normal: angle of the normal in radians; all arguments are broadcast together.
+        a, b, c: from `ellipse_rates`.
+        azimuth: direction of maximum spread in radians.
+    """
+    along = torch.cos(normal - azimuth)
+    return c * along + torch.sqrt(b**2 + (a**2 - b**2) * along**2)

@@ -1,0 +1,52 @@
+"""The exact front of a disc that grows by an elliptical wavelet and drifts: its support function.
+
+The grown disc is convex, so it is the intersection of half planes: relative to the drifting centre,
+x·n <= h(n, t) = radius + integral of F(n, s) ds for every normal n, where F is the wavelet's own
+support function. A point is reached at the first t at which all of them hold.
+"""
+
+import math
+
+import numpy as np
+
+STEPS, NORMALS = 320, 180
+
+
+def support(normal, a, b, c, azimuth):
+    """How fast a straight front with this normal moves: the farthest reach of the wavelet."""
+    along = np.cos(normal - azimuth)
+    return c * along + np.sqrt((a * along) ** 2 + (b * np.sin(normal - azimuth)) ** 2)
+
+
+def running(values, times):
+    """The integral of sampled values from the first time to each of the times."""
+    steps = (values[1:] + values[:-1]) / 2 * np.diff(times)[:, None]
+    return np.concatenate([np.zeros_like(values[:1]), np.cumsum(steps, 0)])
+
+
+def exact_arrival(
+    grid: tuple[int, int], centre, radius: float, rates, azimuth, velocity, horizon: float
+) -> np.ndarray:
+    """Arrival at the centres of the cells, [X, Y], steps.
+
+    Args:
+        rates: (a, b, c) of the wavelet.
+        azimuth: from times [T] to radians [T].
+        velocity: from times [T] to the drift [T, 2].
+    """
+    times = np.linspace(0, horizon, STEPS + 1)
+    normals = np.linspace(0, 2 * math.pi, NORMALS, endpoint=False)
+    reach = radius + running(support(normals, *rates, azimuth(times)[:, None]), times)
+    moved = np.asarray(centre) + running(velocity(times), times)
+    points = np.stack(np.meshgrid(*(np.arange(side) for side in grid), indexing="ij"), -1)
+    unit = np.stack([np.cos(normals), np.sin(normals)]).astype(np.float32)
+    along = points.astype(np.float32) @ unit
+    arrival, before = np.full(grid, math.inf), np.full(grid, math.inf)
+    for k, time in enumerate(times):
+        outside = (along - (moved[k] @ unit + reach[k]).astype(np.float32)).max(-1)
+        new = (outside <= 0) & np.isinf(arrival)
+        # Cells inside at the start have no time before; the others were reached in between.
+        part = before[new] / (before[new] - outside[new]) if k else 0.0
+        arrival[new] = time if k == 0 else times[k - 1] + part * (time - times[k - 1])
+        before = outside
+    return arrival

@@ -1,0 +1,152 @@
+"""Fires whose arrival is known at every point, written as the files that people have."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import geopandas
+import numpy as np
+import rasterio
+import shapely
+from rasterio.transform import from_origin
+
+CELL = 30.0
+CORNER = 500_000.0, 4_000_000.0
+UTM = "EPSG:32611"
+
+
+@dataclass(frozen=True)
+class Ellipses:
+    """Elliptical fires from points, metres and minutes: the front at t is that at 1, t times."""
+
+    origins: Sequence[tuple[float, float]] = ((1500.0, 1300.0),)
+    head: float = 4.0
+    """metres per minute"""
+    breadth: float = 2.0
+    """length-to-breadth ratio"""
+    azimuth: float = 40.0
+    """degrees counter-clockwise from +x"""
+
+    @property
+    def axes(self) -> tuple[float, float, float]:
+        """Half length, half breadth and shift of the ellipse after a minute."""
+        e = math.sqrt(self.breadth**2 - 1) / self.breadth
+        back = self.head * (1 - e) / (1 + e)
+        return (self.head + back) / 2, (self.head + back) / 2 / self.breadth, (self.head - back) / 2
+
+    def arrival(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """Minutes, of ((along - c t) / a)² + (across / b)² = t²."""
+        a, b, c = self.axes
+        turn = math.radians(self.azimuth)
+        times = []
+        for x0, y0 in self.origins:
+            along = (x - x0) * math.cos(turn) + (y - y0) * math.sin(turn)
+            across = (y - y0) * math.cos(turn) - (x - x0) * math.sin(turn)
+            square = a**2 - c**2
+            root = np.sqrt((along * c) ** 2 + square * (along**2 + (across * a / b) ** 2))
+            times.append((-along * c + root) / square)
+        return np.min(times, axis=0)
+
+    def perimeter(self, time: float, points: int = 90) -> shapely.Geometry:
+        """The area burnt by a time."""
+        a, b, c = self.axes
+        angle = np.linspace(0, 2 * np.pi, points, endpoint=False)
+        along, across = (c + a * np.cos(angle)) * time, b * np.sin(angle) * time
+        turn = math.radians(self.azimuth)
+        x = along * math.cos(turn) - across * math.sin(turn)
+        y = along * math.sin(turn) + across * math.cos(turn)
+        rings = [np.stack([x + x0, y + y0], 1) for x0, y0 in self.origins]
+        return shapely.union_all([shapely.Polygon(ring) for ring in rings])
+
+
+def raster_of(fire: Ellipses, until: float, cells: int = 100, cell: float = CELL) -> np.ndarray:
+    """Arrival at the centres of cells, rows from north to south; -9999 after `until`."""
+    at = (np.arange(cells) + 0.5) * cell
+    times = fire.arrival(at[None, :], at[::-1, None])
+    return np.where(times <= until, times, -9999.0)
+
+
+def write_asc(path: Path, times: np.ndarray, cell: float = CELL, **header: object) -> Path:
+    """ESRI ASCII as FARSITE writes it."""
+    keys = {
+        "NCOLS": times.shape[1],
+        "NROWS": times.shape[0],
+        "XLLCORNER": CORNER[0],
+        "YLLCORNER": CORNER[1],
+        "CELLSIZE": cell,
+        "NODATA_VALUE": -9999.0,
+        **header,
+    }
+    lines = [f"{key} {value}" for key, value in keys.items() if value is not None]
+    rows = [" ".join(repr(float(value)) for value in row) for row in times]
+    path.write_text("\n".join([*lines, *rows, ""]))
+    return path
+
+
+def write_tif(path: Path, times: np.ndarray, cell: float = CELL, **about: object) -> Path:
+    """A GeoTIFF of one band, or of a band for each of [bands, rows, columns]."""
+    bands = np.atleast_3d(times.T).T if times.ndim == 2 else times
+    tags = about.pop("tags", {})
+    north = CORNER[1] + cell * bands.shape[1]
+    settings = {
+        "driver": "GTiff",
+        "count": len(bands),
+        "height": bands.shape[1],
+        "width": bands.shape[2],
+        "dtype": bands.dtype,
+        "nodata": -9999.0,
+        "crs": UTM,
+        "transform": from_origin(CORNER[0], north, cell, cell),
+        **about,
+    }
+    with rasterio.open(path, "w", **settings) as dataset:
+        dataset.write(bands)
+        dataset.update_tags(**tags)
+    return path
+
+
+def frame_of(
+    fire: Ellipses, times: Sequence[float], kind: str = "polygon", column: str = "Elapsed_Mi"
+) -> geopandas.GeoDataFrame:
+    """Perimeters at some times, elapsed minutes, in the coordinates of the rasters."""
+    shapes = [shapely.transform(fire.perimeter(time), lambda at: at + CORNER) for time in times]
+    return geopandas.GeoDataFrame(
+        {column: np.array(times, float)}, geometry=[KINDS[kind](one) for one in shapes], crs=UTM
+    )
+
+
+def _with_z(shape: shapely.Geometry) -> shapely.Geometry:
+    point = shapely.Point(*shape.centroid.coords[0], 7.0)
+    return shapely.GeometryCollection([shapely.force_3d(shape, 7.0), point])
+
+
+KINDS = {
+    "polygon": lambda shape: shape,
+    "multipolygon": lambda shape: (
+        shapely.MultiPolygon([shape]) if shape.geom_type == "Polygon" else shape
+    ),
+    "line": lambda shape: shape.boundary,
+    "multiline": lambda shape: _in_parts(shape.boundary),
+    "collection": _with_z,
+}
+"""how a perimeter is written"""
+
+
+def _in_parts(line: shapely.Geometry) -> shapely.Geometry:
+    parts = []
+    for one in getattr(line, "geoms", [line]):
+        at = list(one.coords)
+        third = len(at) // 3
+        parts += [at[: third + 1], at[third : 2 * third + 1][::-1], at[2 * third :]]
+    return shapely.MultiLineString(parts)
+
+
+def points_text(fire: Ellipses, lines: int, skipped: int = 6000, points: int = 90) -> str:
+    """The paper's text: a line per iteration, the same front until `skipped`."""
+    rows = []
+    for line in range(lines):
+        time = 60 + max(line - skipped, 0)
+        at = shapely.get_coordinates(fire.perimeter(time, points).boundary) / 100 + 29 / 3
+        rows.append("".join(f"{x:.3f},{y:.3f},1.0," for x, y in at))
+    return "\n".join([*rows, ""])

@@ -1,0 +1,464 @@
+"""`emberlink fire` from the outside: pictures, numbers, banks, and what it refuses."""
+
+import json
+import os
+import resource
+import sys
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rasterio
+import torch
+from PIL import Image
+
+from emberlink.envs import bank_files
+from emberlink.envs.bank_files import write_bank
+from emberlink.envs.fire import burning_cells, fire_seeds, load_scenario, make_fires
+from emberlink.envs.fire_bank import GENERATOR_VERSION
+from emberlink.envs.publish import published
+from emberlink.envs.scenario import fires_of
+from emberlink.trainers import cli, fire_figure
+from emberlink.trainers.config import resolve
+
+HUYGENS = load_scenario("huygens")
+
+
+@pytest.fixture(autouse=True)
+def _in_a_folder_of_its_own(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+
+def ran(capsys, *arguments) -> list[str]:
+    """The lines that a command prints; it ends well and says nothing else."""
+    capsys.readouterr()
+    assert cli.main(["fire", *map(str, arguments)]) == 0
+    out, err = capsys.readouterr()
+    assert err == ""
+    return out.splitlines()
+
+
+def refused(capsys, *arguments) -> str:
+    """The one line with which a command ends at status 2."""
+    capsys.readouterr()
+    assert cli.main(["fire", *map(str, arguments)]) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.startswith(f"emberlink fire {arguments[0]}: ")
+    assert err.count("\n") == 1, err
+    return err
+
+
+def numbers(lines: list[str]) -> dict[str, float]:
+    """The rows of the table, without the colons that only sentences have."""
+    found = {}
+    for line in lines[1:-5]:
+        name, _, rest = line.partition("  ")
+        found[name] = float(rest.split()[0])
+    return found
+
+
+def area(path, colour: tuple[float, ...] | str) -> int:
+    """Pixels of a colour, or of a grey."""
+    wanted = [255 * float(colour)] * 3 if isinstance(colour, str) else colour
+    with Image.open(path) as picture:
+        pixels = np.asarray(picture.convert("RGB"), dtype=float)
+    return int((np.abs(pixels - wanted) <= 1).all(-1).sum())
+
+
+def ascii_raster(path: Path, times: np.ndarray, *, cell: float = 30.0) -> Path:
+    """Writes arrival times [X, Y], inf for never, as others' programs do: north up."""
+    rows = np.where(np.isinf(times), -9999, times).T[::-1]
+    transform = rasterio.Affine(cell, 0, 0, 0, -cell, cell * len(rows))
+    height, width = rows.shape
+    shape = {"width": width, "height": height, "count": 1, "dtype": "float32"}
+    with rasterio.open(
+        path, "w", driver="AAIGrid", nodata=-9999, transform=transform, **shape
+    ) as raster:
+        raster.write(rows.astype(np.float32), 1)
+    for beside in path.parent.glob(f"{path.stem}.prj"):
+        beside.unlink()
+    return path
+
+
+def disc(side: int = 40, speed: float = 0.05, at: tuple[int, int] = (15, 22)) -> np.ndarray:
+    """A fire that spreads evenly from a point, [X, Y], minutes."""
+    x, y = np.meshgrid(np.arange(side), np.arange(side), indexing="ij")
+    times = np.hypot(x - at[0], y - at[1]) / speed
+    return np.where(times <= 250, times, np.inf)
+
+
+def test_preview_prints_the_numbers_of_the_held_out_fire(capsys):
+    (fire,) = make_fires(HUYGENS, fire_seeds("heldout", 4)[3:], (40, 30), 400)
+    burning = burning_cells(fire[None], 400)[0]
+    lines = ran(capsys, "preview", "huygens:3", "env.grid=[40,30]", "env.horizon=400")
+    assert lines[0] == "huygens, held-out fire 3: 40 x 30 cells, 400 steps, setup paper"
+    found = numbers(lines)
+    assert found["burning at the start"] == burning[0]
+    assert found["burning at the end"] == burning[-1]
+    assert found["growth, mean"] == pytest.approx(float(burning[-1] - burning[0]) / 400, rel=0.01)
+    most = max(int(burning[t + 20] - burning[t]) for t in range(381)) / 20
+    assert found["growth, most"] == pytest.approx(most, rel=0.01)
+    assert found["a UAV flies"] == 1
+    assert found["a UAV sees"] == pytest.approx(8 / 3**0.5, rel=0.01)  # 2 x 4 x tan 30 degrees
+    assert found["the team sweeps"] == pytest.approx(6 * 8 / 3**0.5, rel=0.01)
+    assert lines[-5] == "UAVs can keep up: yes"
+    assert all(len(line) <= 80 for line in lines[:10])
+    assert lines[-1] == "fire_huygens_3.png"
+
+
+def test_preview_draws_what_it_says(capsys, tmp_path):
+    (*_, name) = ran(capsys, "preview", "paper")
+    with Image.open(name) as picture:
+        assert picture.format == "PNG"
+        assert max(picture.size) == 900
+    cell = area(name, fire_figure.BURNT_OUT) / 30  # cells that are burnt out (docs/fire.md)
+    never = 900 - 30 - 141  # all but those and what burns; the square and lines cover some
+    assert 0.9 * never < area(name, fire_figure.NEVER) / cell < never
+    assert cell < area(name, (255, 255, 0)) < 3 * cell
+    # Nothing is burnt out before a fire that starts from a point.
+    source = ascii_raster(tmp_path / "point.asc", disc())
+    (*_, name) = ran(capsys, "preview", source, "fire.units=minutes", "fire.ring_width=null")
+    assert name == "fire_point.png"
+    assert area(name, fire_figure.NEVER) > 100 * cell
+    assert area(name, fire_figure.BURNT_OUT) < cell / 2
+
+
+@pytest.mark.parametrize("grid", ["[8,8]", "[8,64]", "[100,60]", "[256,200]"])
+@pytest.mark.parametrize("view", ["env.view_angle=5", "env.view_angle=80"])
+def test_preview_of_other_maps(grid, view, capsys):
+    (*_, name) = ran(capsys, "preview", "huygens", f"env.grid={grid}", view, "env.horizon=50")
+    assert Path(name).stat().st_size > 5000
+
+
+def test_preview_overwrites_nothing(capsys, tmp_path):
+    first = ran(capsys, "preview", "paper")[-1]
+    before = Path(first).read_bytes()
+    assert ran(capsys, "preview", "paper")[-1] == "fire_paper_0_2.png"
+    assert ran(capsys, "preview", "paper", "--output", tmp_path)[-1] == str(
+        tmp_path / "fire_paper_0_3.png"
+    )
+    assert ran(capsys, "preview", "--output", "own.png", "paper")[-1] == "own.png"
+    assert "own.png is there already" in refused(capsys, "preview", "paper", "--output", "own.png")
+    assert Path(first).read_bytes() == before
+    assert len(list(tmp_path.iterdir())) == 4
+
+
+@pytest.mark.filterwarnings("error::UserWarning")
+def test_names_that_mean_something_elsewhere_are_shown_as_they_are(capsys, tmp_path):
+    keys = ("fire.units=minutes", "env.grid=[20,20]")
+    odd = tmp_path / "a b=[1]$_{$ 火, it's ${env}$.asc"
+    ascii_raster(tmp_path / "plain.asc", disc()).rename(odd)
+    lines = ran(capsys, "preview", odd, *keys)
+    assert lines[0].startswith(odd.name)
+    assert Path(lines[-1]).stat().st_size > 5000
+    longer = odd.rename(tmp_path / f"{'long' * 50}.asc")
+    (*_, name) = ran(capsys, "preview", longer, keys[0], "env.grid=[8,64]")
+    assert len(name) < 120
+    with Image.open(name) as picture:  # nothing runs over its sides
+        assert (np.asarray(picture.convert("L"))[:, [0, -1]] == 255).all()
+
+
+@pytest.mark.parametrize(
+    ("changes", "failing"),
+    [
+        (["env.displacement=0.004", "env.num_uavs=64"], ["a UAV flies 0.004"]),
+        (["env.displacement=0.03", "env.num_uavs=1"], ["the team sweeps 0.139"]),
+        (["env.displacement=0.001"], ["a UAV flies 0.001", "the team sweeps 0.0277"]),
+        (["env.horizon=5", "env.num_uavs=1"], ["of 77 cells at the end 21.3"]),
+    ],
+)
+def test_preview_says_why_uavs_cannot_keep_up(changes, failing, capsys):
+    lines = ran(capsys, "preview", "paper", *changes)
+    assert lines[-5] == "UAVs can keep up: no"
+    bad = [line for line in lines[-4:-1] if line.startswith("  - ")]
+    assert len(bad) == len(failing), lines
+    for line, words in zip(bad, failing, strict=True):
+        assert words in line
+
+
+@pytest.mark.parametrize("suffix", [".npy", ".tif", ".tiff"])
+def test_make_writes_the_scenarios_fires(suffix, capsys, tmp_path):
+    file = tmp_path / f"bank{suffix}"
+    lines = ran(
+        capsys,
+        *("make", "--count", 5, "huygens", "--split", "heldout", "env.grid=[20,34]"),
+        *("env.horizon=300", "fire.head_rate=[0.01,0.02]", "--output", file),
+    )
+    assert lines == ["5 fires of 20 x 34 cells, 300 steps", str(file)]
+    config = load_scenario("huygens")
+    object.__setattr__(config, "head_rate", (0.01, 0.02))
+    expected = make_fires(config, fire_seeds("heldout", 5), (20, 34), 300).numpy()
+    assert np.isinf(expected).any()
+    if suffix == ".npy":
+        fires, about = np.load(file), json.loads(file.with_suffix(".json").read_text())
+        names, rate = about["fires"], about["fire"]["head_rate"]
+        assert about["axes"] == ["fire", "x", "y"]
+    else:
+        with rasterio.open(file) as raster:
+            rows, about, names = raster.read(), raster.tags(), list(raster.descriptions)
+            assert (raster.nodata, raster.crs) == (-9999, None)
+            # A cell's centre has its (i, j) as coordinates.
+            assert raster.xy(0, 0) == (0, 33)
+            for i, j in ((0, 0), (7, 20), (19, 33)):
+                (values,) = raster.sample([(i, j)])
+                wanted = expected[:, i, j]
+                assert np.array_equal(values, np.where(np.isinf(wanted), -9999, wanted))
+        fires = np.where(rows == -9999, np.inf, rows)[:, ::-1].transpose(0, 2, 1)
+        rate = json.loads(about["fire"])["head_rate"]
+    assert fires.dtype == np.float32
+    assert np.array_equal(fires, expected)
+    assert names == [f"huygens heldout {seed}" for seed in range(1_000_000, 1_000_005)]
+    assert rate == [0.01, 0.02]
+    told = {key: str(about[key]) for key in ("units", "scenario", "split", "seeds", "horizon")}
+    assert told == {
+        **{"units": "steps", "scenario": "huygens", "split": "heldout", "horizon": "300"},
+        "seeds": "1000000 to 1000004",
+    }
+    assert int(about["generator_version"]) == GENERATOR_VERSION
+    assert about["emberlink_version"]
+
+
+def test_make_without_more_writes_what_is_trained_on(capsys, tmp_path):
+    assert ran(capsys, "make", "paper")[-1] == "paper_train_1.npy"
+    assert ran(capsys, "make", "paper")[-1] == "paper_train_1_2.npy"
+    assert ran(capsys, "make", "huygens", "env.horizon=9", "fire.bank=3")[-1] == (
+        "huygens_train_3.npy"
+    )
+    expected = make_fires(HUYGENS, fire_seeds("train", 3), (30, 30), 9).numpy()
+    assert np.array_equal(np.load("huygens_train_3.npy"), expected)
+    assert ran(capsys, "make", "paper", "--split", "heldout", "env.horizon=9")[0].startswith("100")
+    assert not list(tmp_path.glob(".*"))
+
+
+@pytest.mark.parametrize("suffix", [".npy", ".tif"])
+@pytest.mark.parametrize("count", [1, 7])
+def test_a_bank_comes_back_bit_for_bit(suffix, count, capsys, tmp_path):
+    file, again = tmp_path / f"bank{suffix}", tmp_path / "again.npy"
+    ran(capsys, "make", "huygens", "--count", count, "env.grid=[24,40]", "--output", file)
+    fires = make_fires(HUYGENS, fire_seeds("train", count), (24, 40), 1000)
+    ran(capsys, "import", file, "env.grid=[24,40]", "--output", again)
+    assert torch.equal(torch.from_numpy(np.load(again)), fires)
+    # What is trained on: all but every fifth, if there are several.
+    keys = ["fire=file", f"fire.path={file}", "env.grid=[24,40]"]
+    scenario = fires_of(resolve("consensus", keys).fire)
+    held_out = [4] if count == 7 else [0]
+    trained = [i for i in range(count) if i not in held_out or count == 1]
+    assert torch.equal(scenario.train((24, 40), 1000), fires[trained])
+    assert torch.equal(scenario.heldout(1, (24, 40), 1000), fires[held_out])
+
+
+def test_import_of_several_files_is_each_of_them(capsys, tmp_path):
+    one = ascii_raster(tmp_path / "one.asc", disc())
+    two = ascii_raster(tmp_path / "a=b.asc", disc(30, 0.03, (12, 12)))
+    keys = ("fire.units=minutes", "env.grid=[25,20]", "env.horizon=200")
+    assert ran(capsys, "import", one, *keys, two, "--output", "both.tif") == [
+        *("2 fires of 25 x 20 cells, 200 steps", "both.tif")
+    ]
+    for name, file in (("first.npy", one), ("second.npy", two)):
+        ran(capsys, "import", file, *keys, "--output", name)
+    with rasterio.open("both.tif") as raster:
+        both, tags, names = raster.read(), raster.tags(), raster.descriptions
+    for rows, name in zip(both, ("first.npy", "second.npy"), strict=True):
+        fire = np.load(name)[0]
+        assert fire.min() == 0
+        assert 190 < fire[np.isfinite(fire)].max() <= 200
+        assert np.array_equal(np.where(rows == -9999, np.inf, rows)[::-1].T, fire)
+    assert names == ("one.asc", "a=b.asc")
+    assert [source["file"] for source in json.loads(tags["sources"])] == ["one.asc", "a=b.asc"]
+    assert tags["units"] == "steps"
+    lines = ran(capsys, "preview", "both.tif:1", *keys[1:])
+    assert lines[0] == "both.tif, fire 1 of 2: 25 x 20 cells, 200 steps, setup paper"
+    assert numbers(lines)["burning at the end"] == np.isfinite(np.load("second.npy")).sum()
+    assert lines[-1] == "fire_both_1.png"
+
+
+def test_a_file_with_the_name_of_a_scenario_is_found_by_its_path(capsys, tmp_path):
+    ascii_raster(tmp_path / "huygens.asc", disc()).rename(tmp_path / "huygens")
+    assert ran(capsys, "preview", "huygens")[0].startswith("huygens, held-out fire 0: ")
+    assert ran(capsys, "preview", "./huygens", "fire.units=minutes")[0].startswith("huygens: 30")
+
+
+KNOWN = "known: huygens, oil_slick, paper"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["preview", "huygns"], ["huygns", "did you mean huygens?", KNOWN]),
+        (["preview", "zzz:3"], ["zzz:3", KNOWN]),
+        (["preview", ""], [KNOWN]),
+        (["preview", ":3"], [KNOWN]),
+        (["preview", "x" * 5000], ["xxx...xxx", KNOWN]),
+        (["preview", "paper", "--output", "x" * 5000 + ".png"], ["File name too long"]),
+        (["make", "paper", "--output", "x" * 5000 + ".tif"], ["File name too long"]),
+        (["import", "x" * 5000, "--output", "a.npy"], ["xxx...xxx"]),
+        (["preview", "huygens:x"], ["huygens:x", "'x'", "0 to 65535"]),
+        (["preview", "huygens:-1"], ["'-1'", "0 to 65535"]),
+        (["preview", "huygens:"], ["''", "0 to 65535"]),
+        (["preview", "huygens:65536"], ["'65536'", "0 to 65535"]),
+        (["preview", "bank.npy:2"], ["bank.npy:2", "no fire '2'", "0 to 1"]),
+        (["preview", "folder"], ["folder", "expected a file"]),
+        (["preview", "empty.tif"], ["empty.tif", "empty"]),
+        (["preview", "paper", "env.gird=[9,9]"], ["'env.gird'", "did you mean env.grid?"]),
+        (["preview", "paper", "fire.heat_rate=[1,1]"], ["did you mean fire.head_rate?"]),
+        (["preview", "paper", "fire.units=minutes"], ["'fire.units'"]),
+        (["preview", "paper", "seed=3"], ["'seed=3'", "keys of setup, env. and fire. only"]),
+        (["preview", "paper", "fire=huygens"], ["'fire=huygens'", "without a key"]),
+        (["preview", "paper", "setup=zzz"], ["setup 'zzz'", "known: paper, released, tuned"]),
+        (["preview", "paper", "env.grid=[4,30]"], ["env.grid.0=4"]),
+        (["preview", "paper", "again"], ["'again'", "key=value"]),
+        (["preview", "paper", "--output", "there.png"], ["there.png is there already"]),
+        (["preview", "paper", "--output", "a.jpg"], ["a.jpg", "must end in .png"]),
+        (["preview", "paper", "--output", "no/a.png"], ["no: there is no such folder"]),
+        (["make", "zzz"], ["'zzz'", KNOWN]),
+        (["make", "file"], ["'file'", KNOWN]),
+        (["make", "paper:1"], ["'paper:1'", "did you mean paper?"]),
+        (["make", "paper", "fire.bank=0"], ["fire.bank=0"]),
+        (["make", "paper", "--count", "5000", "--output", "a.tif"], ["5000 fires", "4096", ".npy"]),
+        (["make", "paper", "--count", "300000"], ["300000 fires", "1073741824"]),
+        (["make", "paper", "--count", "9" * 30], ["at most"]),
+        (["make", "paper", "--count", "1000001", "env.grid=[8,8]"], ["training seeds end"]),
+        (["make", "paper", "--output", "bank.npy"], ["bank.npy is there already"]),
+        (["make", "paper", "--output", "beside.npy"], ["beside.json is there already"]),
+        (["make", "paper", "--output", "folder"], ["folder", "is a folder", ".npy, .tif, .tiff"]),
+        (["make", "paper", "--output", "a.zip"], ["a.zip", ".npy or .tif or .tiff"]),
+        (["make", "paper", "--output", "no/a.npy"], ["no: there is no such folder"]),
+        (["import", "none.asc", "--output", "a.npy"], ["none.asc", "no such file"]),
+        (["import", "folder", "--output", "a.npy"], ["folder", "expected a file"]),
+        (["import", "empty.tif", "--output", "a.npy"], ["empty.tif", "empty"]),
+        (["import", "env.grid=[9,9]", "--output", "a.npy"], ["FILE", "is missing"]),
+        (["import", "bank.npy", "fire.path=x", "--output", "a.npy"], ["fire.path"]),
+        (["import", "bank.npy", "fire.unit=steps", "--output", "a.npy"], ["fire.units?"]),
+        (["import", "bank.npy", "--output", "bank.npy"], ["bank.npy is there already"]),
+        (["import", "bank.npy", "--output", "a.asc"], ["a.asc", "must end in"]),
+    ],
+    ids=lambda value: " ".join(value)[:40] if value and value[0] in cli_actions() else "",
+)
+def test_mistakes_are_one_line_and_leave_nothing(arguments, words, capsys, tmp_path):
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "empty.tif").touch()
+    (tmp_path / "there.png").write_text("mine")
+    (tmp_path / "beside.json").write_text("mine")
+    write_bank(tmp_path / "bank.npy", make_fires(HUYGENS, fire_seeds("train", 2), (30, 30), 300))
+    before = {path.name: path.is_file() and path.read_bytes() for path in tmp_path.iterdir()}
+    err = refused(capsys, *arguments)
+    assert len(err) < 400
+    for word in words:
+        assert word in err, err
+    assert before == {p.name: p.is_file() and p.read_bytes() for p in tmp_path.iterdir()}
+
+
+def cli_actions() -> tuple[str, ...]:
+    return "preview", "make", "import"
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["zzz"],
+        ["preview"],
+        ["make", "paper", "--count", "0"],
+        ["make", "paper", "--count", "x"],
+        ["make", "paper", "--split", "test"],
+        ["import", "x.asc"],
+        ["import", "--output", "x.npy"],
+    ],
+)
+def test_usage_errors_are_one_line(arguments, capsys):
+    with pytest.raises(SystemExit) as ended:
+        cli.main(["fire", *arguments])
+    assert ended.value.code == 2
+    out, err = capsys.readouterr()
+    assert (out, err.count("\n")) == ("", 1)
+    assert err.startswith("emberlink fire")
+    assert "--help" in err
+
+
+def test_without_an_action_the_help_is_printed(capsys):
+    out = "\n".join(ran(capsys))
+    assert "usage: emberlink fire" in out
+    for action in cli_actions():
+        assert f"\n    {action} " in out
+        with pytest.raises(SystemExit) as ended:
+            cli.main(["fire", action, "--help"])
+        assert ended.value.code == 0
+        assert f"example:\n  emberlink fire {action} " in capsys.readouterr().out
+
+
+def test_without_the_extra_one_line_says_which(capsys, tmp_path, monkeypatch):
+    ran(capsys, "make", "paper", "--output", "bank.tif")
+    monkeypatch.setitem(sys.modules, "rasterio", None)
+    for arguments in (
+        ["make", "paper", "--output", "a.tif"],
+        ["import", "bank.tif", "--output", "a.npy"],
+        ["preview", "bank.tif"],
+    ):
+        assert "pip install 'emberlink[geo]'" in refused(capsys, *arguments)
+    assert ran(capsys, "make", "paper", "--output", "a.npy")[-1] == "a.npy"
+    assert [path.name for path in sorted(tmp_path.iterdir())] == ["a.json", "a.npy", "bank.tif"]
+
+
+@contextmanager
+def files_of_at_most(size: int):
+    """As a disk that is full after so many bytes."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+@pytest.mark.parametrize("size", [0, 100, 2000])
+def test_a_full_disk_is_one_line_and_leaves_nothing(size, capsys, tmp_path):
+    for arguments in (
+        ["make", "huygens", "--count", 30, "--output", "a.npy"],
+        ["make", "huygens", "--count", 30, "--output", "a.tif"],
+        ["preview", "huygens"],
+    ):
+        with files_of_at_most(size):
+            assert "File too large" in refused(capsys, *arguments)
+        assert list(tmp_path.iterdir()) == []
+
+
+def test_a_name_that_is_taken_meanwhile_is_left_alone(tmp_path, monkeypatch):
+    fires = make_fires(HUYGENS, fire_seeds("train", 1), (30, 30), 300)
+    link = os.link
+
+    def overtaken(source, target):
+        if target.suffix == ".npy":
+            target.write_text("theirs")
+        link(source, target)
+
+    monkeypatch.setattr(os, "link", overtaken)
+    with pytest.raises(ValueError, match=r"bank.npy is there already"):
+        write_bank(tmp_path / "bank.npy", fires)
+    assert (tmp_path / "bank.npy").read_text() == "theirs"
+    assert [path.name for path in tmp_path.iterdir()] == ["bank.npy"]
+
+
+def test_where_there_are_no_links_a_file_is_published_all_the_same(tmp_path, monkeypatch):
+    def none(source, target):
+        raise PermissionError(1, "Operation not permitted")
+
+    monkeypatch.setattr(os, "link", none)
+    path = tmp_path / "a"
+    with published(path) as partial:
+        partial.write_text("whole")
+    assert path.read_text() == "whole"
+    with pytest.raises(ValueError, match="already"), published(path) as partial:
+        partial.write_text("another")
+    assert path.read_text() == "whole"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("wrong", [float("nan"), -1.0])
+def test_what_is_no_time_is_not_written(wrong, tmp_path):
+    fires = torch.zeros(1, 8, 8)
+    fires[0, 2, 3] = wrong
+    for suffix in bank_files.SUFFIXES:
+        with pytest.raises(ValueError, match="NaN or a negative"):
+            write_bank(tmp_path / f"a{suffix}", fires)
+    assert list(tmp_path.iterdir()) == []

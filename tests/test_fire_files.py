@@ -1,0 +1,325 @@
+"""`fire=file` from the command line to the evaluation, and what a run keeps of its files."""
+
+import json
+import shutil
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import yaml
+from fire_files import Ellipses, frame_of, points_text, raster_of, write_asc, write_tif
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from tiny_run import TINY
+
+from emberlink.envs.config import known
+from emberlink.envs.fire import load_scenario, make_fires, scenarios
+from emberlink.envs.fire_file import KEPT, FileFireConfig, read_fires, splits
+from emberlink.envs.scenario import fires_of
+from emberlink.envs.wildfire import WildfireEnv
+from emberlink.trainers import cli
+from emberlink.trainers.config import from_values, override, resolve, to_values
+from emberlink.trainers.run_folder import RunFolder
+
+GRID, HORIZON = (12, 10), 15
+SMALL = [*TINY, "env.grid=[12,10]"]
+
+
+@pytest.fixture(scope="module")
+def source(tmp_path_factory) -> Path:
+    """A raster of a fire."""
+    times = raster_of(Ellipses(), 300.0, cells=40, cell=75.0)
+    return write_asc(tmp_path_factory.mktemp("source") / "fire.asc", times, 75.0)
+
+
+@pytest.fixture(scope="module")
+def trained(source, tmp_path_factory) -> Path:
+    """A run on a copy of it: the folder of both."""
+    folder = tmp_path_factory.mktemp("trained")
+    shutil.copy(source, folder / "fire.asc")
+    keys = ["fire=file", f"fire.path={folder}/fire.asc", "fire.units=minutes"]
+    assert cli.main(["train", "consensus", *SMALL, *keys, f"output={folder}/runs"]) == 0
+    return folder
+
+
+@pytest.fixture
+def run(trained, tmp_path) -> Path:
+    """A copy of the run; its file is where it was."""
+    return Path(shutil.copytree(next((trained / "runs").iterdir()), tmp_path / "run"))
+
+
+def fails(arguments, capfd) -> str:
+    """The one line of standard error with which a command ends."""
+    capfd.readouterr()
+    assert cli.main([str(one) for one in arguments]) == 2
+    lines = capfd.readouterr().err.strip().splitlines()
+    assert len(lines) == 1, lines
+    return lines[0]
+
+
+def bank_of(count, horizon=HORIZON):
+    """Some fires of the generator."""
+    return make_fires(load_scenario("huygens"), torch.arange(count), GRID, horizon)
+
+
+@pytest.mark.parametrize("method", known("method"))
+@pytest.mark.parametrize("setup", known("setup"))
+def test_every_recipe_takes_a_file(source, method, setup):
+    keys = ["fire=file", f"fire.path={source}", "fire.units=minutes", f"setup={setup}"]
+    config = resolve(method, keys, grid=list(GRID), horizon=HORIZON)
+    assert config.fire.name == "file"
+    assert len(config.fire.sha256) == 64
+    env = WildfireEnv(2, config.env, config.fire)
+    expected = read_fires(config.fire, GRID, HORIZON)[0]
+    env.reset()
+    assert torch.equal(env.arrival, expected.expand(2, -1, -1))
+
+
+def test_keys_come_in_any_order_and_setup_keeps_its_own(source):
+    keys = [f"fire.path={source}", "fire.units=minutes", "fire.margin=0.2", "fire=file"]
+    assert resolve("consensus", keys).fire.margin == 0.2
+    for text, wrong in (
+        ("fire.pth=a", "fire.path"),
+        ("fire.units=weeks", "fire.units"),
+        ("fire.margin=0.5", "fire.margin"),
+        ("fire.ring_width=0", "fire.ring_width"),
+        ("fire.start=nan", "fire.start"),
+        ("fire.minutes_per_step=-1", "fire.minutes_per_step"),
+        ("fire.bank=3", "fire.bank"),
+        ("fire.kind=spread", "chosen with fire=NAME"),
+        ("fire.sha256=abc", "fire.sha256"),
+        ("fire.kept=abc", "fire.kept"),
+    ):
+        with pytest.raises(ValueError, match=wrong):
+            resolve("consensus", [*keys, text])
+    with pytest.raises(ValueError, match="end and minutes_per_step"):
+        resolve("consensus", [*keys, "fire.end=5", "fire.minutes_per_step=1"])
+    with pytest.raises(ValueError, match=r"fire\.path.*not known"):
+        resolve("consensus", [f"fire.path={source}"])
+
+
+def test_without_a_path_or_a_file_a_line_says_so(capfd, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert "fire.path=None: a file is needed" in fails(["train", "consensus", "fire=file"], capfd)
+    for path in ("none.asc", "3mph120deg7hr.asc", "2020.tif", ".", "a folder/x.shp"):
+        line = fails(["train", "consensus", "fire=file", f"fire.path={path}"], capfd)
+        assert Path(path).name in line
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_run_tells_what_it_was_trained_on(trained):
+    (run,) = (trained / "runs").iterdir()
+    fire = yaml.safe_load((run / "config.yaml").read_text())["fire"]
+    assert fire["path"] == f"{trained}/fire.asc"
+    assert len(fire["sha256"]) == 64
+    assert "kept" not in fire
+    evaluation = json.loads((run / "eval.json").read_text())
+    assert set(evaluation["results"]) == {"huygens", "file"}
+    assert evaluation["held_out"]["file"]["scenario"] == fire
+    with np.load(run / KEPT) as kept:
+        expected = read_fires(RunFolder(run).config().fire, GRID, HORIZON)
+        assert np.array_equal(kept["train"], expected.numpy())
+        assert np.array_equal(kept["heldout"], expected.numpy())
+
+
+def test_a_run_is_evaluated_rendered_and_resumed_without_its_file(run, trained, tmp_path, capfd):
+    gone = trained / "fire.asc"
+    gone.rename(trained / "elsewhere.asc")
+    try:
+        before = json.loads((run / "eval.json").read_text())["results"]
+        assert cli.main(["eval", str(run)]) == 0
+        assert json.loads((run / "eval.json").read_text())["results"] == before
+        assert cli.main(["eval", str(run), "comm.loss=0.5"]) == 0
+        picture = tmp_path / "a.png"
+        assert cli.main(["render", str(run), "--fire", "file:3", "--output", str(picture)]) == 0
+        assert picture.stat().st_size > 1000
+        assert cli.main(["train", f"resume={run}", "episodes=3"]) == 0
+        assert len(RunFolder(run).lines()) == 3
+        # On another grid the file itself is needed.
+        line = fails(["eval", run, "env.horizon=9"], capfd)
+        assert line.endswith("fire.asc: there is no such file")
+        (run / KEPT).write_bytes((run / KEPT).read_bytes()[:300])
+        assert fails(["eval", run], capfd).endswith("fire.asc: there is no such file")
+    finally:
+        (trained / "elsewhere.asc").rename(gone)
+    assert cli.main(["eval", str(run)]) == 0
+    assert (
+        json.loads((run / "eval.json").read_text())["results"]["file"].keys()
+        == before["file"].keys()
+    )
+
+
+def test_a_file_that_changed_is_named(run, trained, capfd):
+    file = trained / "fire.asc"
+    before = file.read_text()
+    file.write_text(before.replace("CELLSIZE 75.0", "CELLSIZE 74.0"))
+    try:
+        (run / KEPT).unlink()
+        for arguments in (["eval", run], ["train", f"resume={run}", "episodes=3"]):
+            assert "fire.asc: has changed" in fails(arguments, capfd)
+    finally:
+        file.write_text(before)
+    assert cli.main(["train", f"resume={run}", "episodes=3"]) == 0
+
+
+def test_a_copy_of_another_configuration_is_not_taken(run, trained):
+    config = RunFolder(run).config()
+    assert config.fire.kept == str(run / KEPT)
+    (trained / "fire.asc").rename(trained / "away.asc")
+    try:
+        assert splits(config.fire, GRID, HORIZON)["train"].shape == (1, *GRID)
+        changed = override(config, ["env.reward.exit=-3"])
+        assert changed.fire.kept == config.fire.kept
+        for other in (
+            splits_of(config.fire, (10, 12), HORIZON),
+            splits_of(config.fire, GRID, HORIZON + 1),
+            splits_of(FileFireConfig(**{**vars(config.fire), "margin": 0.2}), GRID, HORIZON),
+        ):
+            with pytest.raises(ValueError, match="no such file"):
+                other()
+    finally:
+        (trained / "away.asc").rename(trained / "fire.asc")
+
+
+def splits_of(*arguments):
+    return lambda: splits(*arguments)
+
+
+def test_old_runs_load_as_they_were():
+    values = to_values(resolve("consensus", ["setup=tuned"]))
+    assert "kind" not in values["fire"]
+    assert from_values(values) == resolve("consensus", ["setup=tuned"])
+    with pytest.raises(ValueError, match=r"^fire\.bank=0: "):
+        from_values({**values, "fire": {**values["fire"], "bank": 0}})
+    with pytest.raises(ValueError, match=r"key 'fire\.kind' is not known"):
+        from_values({**values, "fire": {**values["fire"], "kind": "other"}})
+
+
+def test_of_several_fires_every_fifth_is_held_out(tmp_path):
+    for count, train, heldout in (
+        (1, [0], [0]),
+        (3, [0, 1], [2]),
+        (5, [0, 1, 2, 3], [4]),
+        (12, [0, 1, 2, 3, 5, 6, 7, 8, 10, 11], [4, 9]),
+    ):
+        fires = bank_of(count)
+        path = tmp_path / f"{count}.npy"
+        np.save(path, fires.numpy())
+        found = fires_of(FileFireConfig(path=str(path)))
+        assert torch.equal(found.train(GRID, HORIZON), fires[train])
+        repeated = (heldout * 7)[:7]
+        assert torch.equal(found.heldout(7, GRID, HORIZON), fires[repeated])
+        assert torch.equal(found.one_heldout(3, GRID, HORIZON), fires[repeated[3:4]])
+
+
+def test_a_second_file_is_held_out(tmp_path, source):
+    fires = bank_of(7)
+    np.save(tmp_path / "bank.npy", fires.numpy())
+    keys = {"units": "minutes", "heldout": str(source)}
+    config = FileFireConfig(path=str(tmp_path / "bank.npy"), **keys)
+    found = fires_of(config)
+    assert torch.equal(found.train(GRID, HORIZON), fires)
+    other = read_fires(FileFireConfig(path=str(source), units="minutes"), GRID, HORIZON)
+    assert torch.equal(found.heldout(2, GRID, HORIZON), other.expand(2, -1, -1))
+    pinned = found.pinned()
+    assert pinned.sha256 != pinned.heldout_sha256
+    with pytest.raises(ValueError, match=r"nothing\.asc: there is no such file"):
+        fires_of(FileFireConfig(path=str(source), heldout="nothing.asc")).pinned()
+
+
+def test_a_bank_is_taken_as_it_is(tmp_path):
+    fires = bank_of(6, 900)
+    np.save(tmp_path / "bank.npy", fires.numpy())
+    np.save(tmp_path / "double.npy", fires.double().numpy())
+    np.save(tmp_path / "one.npy", fires[0].numpy())
+    bands = torch.where(fires.isinf(), -9999.0, fires).numpy().transpose(0, 2, 1)[:, ::-1]
+    tags = {"tags": {"units": "steps"}, "crs": None}
+    write_tif(tmp_path / "bank.tif", bands, **tags)
+    write_tif(tmp_path / "one.tif", bands[0].copy(), **tags)
+    for name in ("bank.npy", "double.npy", "bank.tif"):
+        config = FileFireConfig(path=str(tmp_path / name))
+        assert torch.equal(read_fires(config, GRID, 900), fires)
+    for name in ("one.npy", "one.tif"):
+        config = FileFireConfig(path=str(tmp_path / name))
+        assert torch.equal(read_fires(config, GRID, 900), fires[:1])
+    config = FileFireConfig(path=str(tmp_path / "bank.npy"))
+    early = read_fires(config, GRID, 500)
+    assert torch.equal(early, torch.where(fires <= 500, fires, torch.inf))
+    stretched = read_fires(
+        FileFireConfig(path=str(tmp_path / "bank.npy"), start=0.0, end=900.0, ring_width=None),
+        GRID,
+        1800,
+    )
+    assert torch.allclose(stretched, fires * 2)
+
+
+def test_a_bank_on_another_grid_keeps_the_earliest(tmp_path):
+    fires = make_fires(load_scenario("huygens"), torch.arange(3), (24, 20), HORIZON)
+    np.save(tmp_path / "bank.npy", fires.numpy())
+    got = read_fires(FileFireConfig(path=str(tmp_path / "bank.npy")), GRID, HORIZON)
+    assert torch.equal(got, fires.reshape(3, 12, 2, 10, 2).amin((2, 4)))
+
+
+def test_the_name_of_a_scenario_needs_no_file():
+    assert "file" not in scenarios()
+    assert "file" in known("fire")
+    with pytest.raises(ValueError, match="unknown fire 'file'"):
+        WildfireEnv(1, fire="file")
+
+
+@pytest.mark.parametrize(
+    ("suffix", "module"), [("asc", "rasterio"), ("tif", "rasterio"), ("shp", "pyogrio")]
+)
+def test_without_the_extra_the_message_says_so(tmp_path, monkeypatch, source, suffix, module):
+    frame_of(Ellipses(), (60.0, 120.0)).to_file(tmp_path / "fire.shp")
+    write_tif(tmp_path / "fire.tif", raster_of(Ellipses(), 300.0))
+    shutil.copy(source, tmp_path / "fire.asc")
+    monkeypatch.setitem(sys.modules, module, None)
+    config = FileFireConfig(path=str(tmp_path / f"fire.{suffix}"), units="minutes")
+    with pytest.raises(ValueError, match=r"needs the extra geo: pip install 'emberlink\[geo\]'"):
+        read_fires(config, GRID, HORIZON)
+
+
+def test_numpy_and_text_need_no_extra(tmp_path, monkeypatch):
+    fires = bank_of(2)
+    np.save(tmp_path / "bank.npy", fires.numpy())
+    (tmp_path / "fire.txt").write_text(points_text(Ellipses(), 6040, points=24))
+    for module in ("rasterio", "pyogrio", "geopandas", "shapely", "pyproj", "pandas"):
+        monkeypatch.setitem(sys.modules, module, None)
+    got = read_fires(FileFireConfig(path=str(tmp_path / "bank.npy")), GRID, HORIZON)
+    assert torch.equal(got, fires)
+    text = FileFireConfig(path=str(tmp_path / "fire.txt"))
+    assert torch.isfinite(read_fires(text, GRID, 1000)).any()
+
+
+@settings(max_examples=80, deadline=None)
+@given(
+    st.tuples(st.integers(8, 40), st.integers(8, 40)),
+    st.integers(1, 2000),
+    st.fixed_dictionaries(
+        {
+            "start": st.none() | st.floats(-100, 400),
+            "end": st.none() | st.floats(-100, 400),
+            "margin": st.none() | st.floats(0, 0.45),
+            "ring_width": st.none() | st.floats(0.01, 30),
+        }
+    ),
+)
+def test_any_choice_gives_a_grid_or_a_line(source, grid, horizon, keys):
+    config = FileFireConfig(path=str(source), units="minutes", **keys)
+    try:
+        fire = read_fires(config, grid, horizon)
+    except ValueError as error:
+        problem = str(error)
+    else:
+        problem = ""
+    if problem:
+        assert problem.startswith(f"{source}: from ")
+        assert "\n" not in problem
+        return
+    assert fire.shape == (1, *grid)
+    assert (fire >= 0).all()
+    assert (fire.isinf() | (fire <= horizon)).all()
+    assert fire.isfinite().sum() >= 2

@@ -1,0 +1,237 @@
+"""Perimeters over time: of every kind, in every format, and against the raster of the same fire."""
+
+import datetime
+
+import geopandas
+import numpy as np
+import pandas
+import pytest
+import shapely
+import torch
+from fire_files import CORNER, KINDS, UTM, Ellipses, frame_of, raster_of, write_asc
+
+from emberlink.envs.fire_file import FileFireConfig, read_fires
+
+GRID, HORIZON = (30, 30), 1000
+HOURS = (60.0, 120.0, 180.0, 240.0, 300.0)
+FIRES = {
+    "head to the north-east": Ellipses(),
+    "slow and round": Ellipses(origins=((1400.0, 1600.0),), head=3.0, breadth=1.2, azimuth=200),
+    "narrow, to the south": Ellipses(origins=((1500.0, 2400.0),), breadth=2.5, azimuth=-85),
+    "two that merge": Ellipses(origins=((1200.0, 1300.0), (1750.0, 1500.0)), head=3.0),
+}
+
+
+def read(path, grid=GRID, horizon=HORIZON, **keys):
+    """The one fire of a file, [X, Y]; nothing of it burnt out."""
+    config = FileFireConfig(path=str(path), **{"ring_width": None, **keys})
+    (fire,) = read_fires(config, grid, horizon)
+    return fire
+
+
+def overlaps(one, two, steps=(0, 250, 500, 750, 1000)):
+    """Intersection over union of the burnt area at some steps."""
+    pairs = [(one <= step, two <= step) for step in steps]
+    return [((a & b).sum() / (a | b).sum()).item() for a, b in pairs]
+
+
+@pytest.mark.parametrize("name", FIRES)
+@pytest.mark.parametrize("grid", [(30, 30), (48, 36)])
+def test_a_fire_is_the_same_from_its_raster_and_from_its_perimeters(tmp_path, name, grid):
+    fire, span = FIRES[name], {"start": 180.0, "end": 360.0}
+    raster = write_asc(tmp_path / "fire.asc", raster_of(fire, 360.0, 150, 20.0), 20.0)
+    frame_of(fire, (120.0, *range(180, 390, 30)), "line").to_file(tmp_path / "fire.shp")
+    one = read(raster, grid, units="minutes", **span)
+    two = read(tmp_path / "fire.shp", grid, **span)
+    assert min(overlaps(one, two)) > 0.9, overlaps(one, two)
+    later = torch.isfinite(one) & torch.isfinite(two) & (one > 0) & (two > 0)
+    assert (one - two)[later].abs().mean() < 0.06 * HORIZON
+
+
+@pytest.mark.parametrize(
+    ("kind", "suffix"),
+    [
+        (kind, suffix)
+        for kind in KINDS
+        for suffix in ("shp", "geojson", "gpkg")
+        if (kind, suffix) != ("collection", "shp")  # which has none
+    ],
+)
+def test_each_kind_of_geometry_in_each_format(tmp_path, kind, suffix):
+    frame_of(FIRES["two that merge"], HOURS).to_file(tmp_path / "plain.gpkg")
+    path = tmp_path / f"fire.{suffix}"
+    frame_of(FIRES["two that merge"], HOURS, kind).to_file(path)
+    plain, fire = read(tmp_path / "plain.gpkg"), read(path)
+    assert torch.equal(torch.isfinite(fire), torch.isfinite(plain))
+    both = torch.isfinite(plain)
+    assert torch.allclose(fire[both], plain[both], atol=1e-2)
+
+
+def squares(*sides, column, values, kind=None):
+    """Concentric squares, metres from the corner of the other files; one for each side."""
+    boxes = [shapely.box(*(np.array([-s, -s, s, s]) / 2)) for s in sides]
+    shapes = [shapely.transform(box, lambda at: at + CORNER) for box in boxes]
+    return geopandas.GeoDataFrame({column: values}, geometry=shapes, crs=UTM)
+
+
+def test_between_two_squares_by_hand(tmp_path):
+    squares(100, 500, column="Elapsed_Mi", values=[0, 400]).to_file(tmp_path / "fire.shp")
+    # 25 cells of 20 m, of which the middle 5 x 5 burn at 0 and the outermost last.
+    fire = read(tmp_path / "fire.shp", (25, 25), 400, margin=0.0)
+    assert (fire[10:15, 10:15] == 0).all()
+    assert torch.isfinite(fire).all()
+    row = fire[12, 15:]
+    assert (row.diff() > 0).all()
+    # Ten cells from front to front, of which each starts where the one before ends.
+    assert row.tolist() == pytest.approx([k * 40 for k in range(10)], abs=20)
+    assert torch.allclose(fire, fire.flip(0), atol=1e-3)
+    assert torch.allclose(fire, fire.T, atol=1e-3)
+
+
+def test_what_burnt_once_stays_burnt(tmp_path):
+    """Observed perimeters do not contain each other: shifted squares, of which the union counts."""
+    frame = squares(200, 300, 310, column="Elapsed_Mi", values=[0, 60, 120])
+    frame.loc[1, "geometry"] = shapely.affinity.translate(frame.geometry[1], 80, 0)
+    frame.to_file(tmp_path / "fire.shp")
+    fire = read(tmp_path / "fire.shp")
+    burnt = [(fire <= step).sum().item() for step in (0, 500, 1000)]
+    union = shapely.union_all(frame.geometry.tolist())
+    cell = 385 / 24  # the whole is 385 m wide and fills 80 % of 30 cells
+    assert burnt[2] == pytest.approx(union.area / cell**2, rel=0.05)
+    assert burnt[0] < burnt[1] < burnt[2]
+
+
+def test_growth_alone_accumulates(tmp_path):
+    """Some maps hold, for each time, what burnt since the last."""
+    whole = squares(200, 300, 400, column="Elapsed_Mi", values=[0, 60, 120])
+    grown = whole.copy()
+    grown.loc[1, "geometry"] = whole.geometry[1].difference(whole.geometry[0])
+    grown.loc[2, "geometry"] = whole.geometry[2].difference(whole.geometry[1])
+    whole.to_file(tmp_path / "whole.gpkg")
+    grown.to_file(tmp_path / "grown.gpkg")
+    assert torch.equal(read(tmp_path / "grown.gpkg"), read(tmp_path / "whole.gpkg"))
+
+
+def test_an_island_is_a_line_within_a_line(tmp_path):
+    outer, last = squares(300, 420, column="t", values=[0, 1]).geometry
+    hole = shapely.transform(shapely.box(-60, -60, 60, 60), lambda at: at + CORNER)
+    shapes = [outer.boundary, hole.boundary, last.boundary, hole.boundary]
+    frame = geopandas.GeoDataFrame({"Elapsed_Mi": [0, 0, 60, 60]}, geometry=shapes, crs=UTM)
+    frame.to_file(tmp_path / "lines.shp")
+    areas = [outer.difference(hole), last.difference(hole)]
+    frame = geopandas.GeoDataFrame({"Elapsed_Mi": [0, 60]}, geometry=areas, crs=UTM)
+    frame.to_file(tmp_path / "areas.gpkg")
+    lines = read(tmp_path / "lines.shp")
+    assert torch.equal(lines, read(tmp_path / "areas.gpkg"))
+    assert torch.isinf(lines[14:16, 14:16]).all()
+
+
+def test_areas_that_cross_themselves(tmp_path):
+    at = np.array([(0, 0), (300, 300), (300, 0), (0, 300), (0, 0)]) - 150.0
+    bow = shapely.Polygon(at + np.array(CORNER))
+    large = squares(500, column="t", values=[1]).geometry[0]
+    for name, shapes in (("areas", [bow, large]), ("lines", [bow.boundary, large.boundary])):
+        frame = geopandas.GeoDataFrame({"Elapsed_Mi": [0, 60]}, geometry=shapes, crs=UTM)
+        frame.to_file(tmp_path / f"{name}.gpkg")
+        fire = read(tmp_path / f"{name}.gpkg")
+        assert (fire[[9, 9, 20, 20], [12, 17, 12, 17]] == 0).all()  # the two lobes
+        assert (fire[[14, 15, 14, 15], [9, 9, 20, 20]] > 0).all()  # and what is between them
+        assert (fire <= 0).sum() == pytest.approx(45000 / (500 / 24) ** 2, rel=0.35)
+
+
+def test_a_first_perimeter_smaller_than_a_cell_is_not_lost(tmp_path):
+    squares(0.5, 5000, column="Elapsed_Mi", values=[0, 60]).to_file(tmp_path / "fire.shp")
+    assert (read(tmp_path / "fire.shp") == 0).any()
+
+
+TEN = datetime.datetime(2020, 8, 19, 22, tzinfo=datetime.UTC)
+DATED = [TEN + datetime.timedelta(hours=k) for k in range(3)]
+COLUMNS = {
+    "iso text": ("poly_DateCurrent", [d.isoformat() for d in DATED]),
+    "text with slashes": ("date", [d.strftime("%Y/%m/%d %H:%M:%S+00") for d in DATED]),
+    "milliseconds": ("poly_DateC", [int(d.timestamp() * 1000) for d in DATED]),
+    "timestamps": ("GDB_FROM_DA", pandas.to_datetime(DATED)),
+    "naive timestamps": ("when", pandas.to_datetime([d.replace(tzinfo=None) for d in DATED])),
+    "zones that differ": (
+        "date",
+        ["2020-08-19T22:00:00Z", "2020-08-19T16:00:00-07:00", "2020-08-20T02:00:00+02:00"],
+    ),
+    "any name": ("seen", [d.isoformat() for d in DATED]),
+}
+
+
+@pytest.mark.parametrize("suffix", ["geojson", "gpkg", "shp"])
+@pytest.mark.parametrize("name", COLUMNS)
+@pytest.mark.filterwarnings("ignore::RuntimeWarning", "ignore::UserWarning")
+def test_calendar_times(tmp_path, name, suffix):
+    column, values = COLUMNS[name]
+    if (name, suffix) == ("milliseconds", "shp"):
+        values = [float(value) for value in values]
+    squares(200, 300, 400, column="Elapsed_Mi", values=[0, 60, 120]).to_file(tmp_path / "e.shp")
+    squares(200, 300, 400, column=column, values=values).to_file(tmp_path / f"fire.{suffix}")
+    elapsed, path = read(tmp_path / "e.shp"), tmp_path / f"fire.{suffix}"
+    assert torch.equal(read(path), elapsed)
+    half = read(tmp_path / "e.shp", start=60.0)
+    assert torch.equal(read(path, start="2020-08-19T23:00"), half)
+    assert torch.equal(read(path, start="2020-08-19T16:00-07:00", end="2020-08-20 00:00Z"), half)
+    assert torch.equal(read(path, start=1.0, units="hours"), half)
+    assert torch.equal(read(path, start="2020-08-19T23:00", minutes_per_step=0.06), half)
+
+
+def test_farsites_month_day_and_hour(tmp_path):
+    frame = squares(200, 300, 400, column="Month", values=[12.0, 12.0, 1.0])
+    frame["Day"], frame["Hour"] = [31.0, 31.0, 1.0], [2200.0, 2300.0, 0.0]
+    frame.to_file(tmp_path / "fire.shp")
+    squares(200, 300, 400, column="Elapsed_Mi", values=[0, 60, 120]).to_file(tmp_path / "e.shp")
+    assert torch.equal(read(tmp_path / "fire.shp"), read(tmp_path / "e.shp"))
+
+
+@pytest.mark.parametrize(
+    ("column", "keys"),
+    [
+        ("hours", {}),
+        ("HOURS", {"units": "hours"}),
+        ("time", {"units": "hours"}),
+        ("size", {"units": "hours", "time_field": "size"}),
+        ("Size", {"units": "hours", "time_field": "size"}),
+    ],
+)
+def test_elapsed_times(tmp_path, column, keys):
+    squares(200, 300, 400, column=column, values=[0, 1, 2]).to_file(tmp_path / "fire.gpkg")
+    squares(200, 300, 400, column="Elapsed_Mi", values=[0, 60, 120]).to_file(tmp_path / "e.shp")
+    assert torch.equal(read(tmp_path / "fire.gpkg", **keys), read(tmp_path / "e.shp"))
+
+
+def test_degrees_are_projected(tmp_path):
+    plain = frame_of(FIRES["two that merge"], HOURS)
+    plain.to_file(tmp_path / "plain.gpkg")
+    degrees = plain.to_crs("EPSG:4326")
+    degrees.to_file(tmp_path / "fire.geojson")
+    bare = degrees.set_crs(None, allow_override=True)
+    bare.to_file(tmp_path / "bare.shp")
+    expected = read(tmp_path / "plain.gpkg")
+    for name, keys in (("fire.geojson", {}), ("bare.shp", {"crs": "EPSG:4326"})):
+        got = read(tmp_path / name, **keys)
+        assert min(overlaps(got, expected)) > 0.97
+
+
+def test_geojson_on_a_plane_that_names_no_projection(tmp_path):
+    plain = frame_of(FIRES["two that merge"], HOURS)
+    plain.to_file(tmp_path / "plain.gpkg")
+    plain.set_crs(None, allow_override=True).to_file(tmp_path / "fire.geojson")
+    assert torch.allclose(read(tmp_path / "fire.geojson"), read(tmp_path / "plain.gpkg"), atol=0.01)
+
+
+def test_a_layer_is_chosen(tmp_path):
+    path = tmp_path / "fires.gpkg"
+    for layer, name in (("one", "slow and round"), ("two", "two that merge")):
+        frame_of(FIRES[name], HOURS).to_file(path, layer=layer)
+    frame_of(FIRES["two that merge"], HOURS).to_file(tmp_path / "two.gpkg")
+    assert torch.equal(read(path, layer="two"), read(tmp_path / "two.gpkg"))
+
+
+def test_the_order_of_features_does_not_matter(tmp_path):
+    frame = frame_of(FIRES["slow and round"], HOURS)
+    frame.to_file(tmp_path / "fire.shp")
+    frame.iloc[[3, 0, 4, 2, 1]].to_file(tmp_path / "other.shp")
+    assert torch.equal(read(tmp_path / "other.shp"), read(tmp_path / "fire.shp"))

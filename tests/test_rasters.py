@@ -1,0 +1,335 @@
+"""Rasters of arrival times on grids, against numbers by hand and a loop over cells."""
+
+import math
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import rasterio
+import torch
+from fire_files import CORNER, UTM, Ellipses, write_asc, write_tif
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from rasterio.transform import from_origin
+
+from emberlink.envs.arrival import Clock, RasterSource, Window
+from emberlink.envs.fire_file import FileFireConfig, read_fires
+
+INF = math.inf
+PLAIN = {"units": "minutes", "ring_width": None, "margin": None}
+
+
+def read(path, grid=(8, 8), horizon=10, **keys):
+    """The one fire of a file, [X, Y]."""
+    (fire,) = read_fires(FileFireConfig(path=str(path), **{**PLAIN, **keys}), grid, horizon)
+    return fire
+
+
+def corner(times, rows, columns):
+    """Rows and columns of a raster of 8 x 8 that never burns elsewhere."""
+    whole = np.full((8, 8), -9999.0)
+    whole[:rows, :columns] = times
+    return whole
+
+
+@pytest.mark.parametrize("write", [write_asc, write_tif])
+def test_a_raster_of_the_grids_own_size_is_taken_cell_by_cell(tmp_path, write):
+    times = corner([[0, 5, 10], [2, 4, -9999]], 2, 3)
+    fire = read(write(tmp_path / f"fire.{write.__name__[6:]}", times))
+    # North up: row 0 is at y = 7; 10 minutes are 10 steps.
+    expected = torch.full((8, 8), INF)
+    expected[0, 7], expected[1, 7], expected[2, 7] = 0, 5, 10
+    expected[0, 6], expected[1, 6] = 2, 4
+    assert torch.equal(fire, expected)
+
+
+def test_of_the_cells_in_a_coarse_one_the_earliest_counts(tmp_path):
+    times = np.full((16, 24), -9999.0)
+    times[:2, :3] = [[9, 8, 4], [7, -9999, 6]]
+    times[15, 23] = 14
+    # Cells of 3: [24, 16] on 8 x 8 leave a free cell and a third below and above.
+    fire = read(write_asc(tmp_path / "fire.asc", times), horizon=10)
+    # The raster's rows 0 and 1 are the northern two of 16; the grid's rows of 3 begin 4 lower.
+    assert fire[0, 6] == 0  # the earliest of all six, 4 minutes, is step 0
+    assert fire[7, 1] == 10
+    assert torch.isfinite(fire).sum() == 2
+
+
+def test_between_the_cells_of_a_coarser_raster_times_are_interpolated(tmp_path):
+    times = np.full((4, 4), -9999.0)
+    times[0, :3] = [0, 4, 8]
+    fire = read(write_asc(tmp_path / "fire.asc", times), horizon=8)
+    # A cell of the raster is 2 x 2 of the grid's, whose centres lie 1/4 and 3/4 across it.
+    # What burns before all around it does so as a whole.
+    assert fire[:6, 7].tolist() == pytest.approx([0, 0, 3, 5, 7, 8])
+    assert torch.equal(fire[:6, 6], fire[:6, 7])
+    assert torch.isfinite(fire).sum() == 12
+
+
+def test_the_earliest_arrival_is_kept_where_the_grid_is_finer(tmp_path):
+    times = np.full((5, 5), -9999.0)
+    times[1:4, 1:4] = [[6, 5, 6], [5, 1, 5], [6, 5, 6]]
+    fire = read(write_asc(tmp_path / "fire.asc", times), (9, 9), horizon=100)
+    assert fire.min() == 0
+    assert fire[4, 4] == 0
+    assert (fire[fire > 0] > 20).all()
+    assert torch.isfinite(fire).sum() > 9
+
+
+@pytest.mark.parametrize("never", [-9999.0, -1.0, np.nan, np.inf, -3.4028234663852886e38])
+def test_what_never_burns(tmp_path, never):
+    times = np.where(corner([[1, 2], [3, 4]], 2, 2) < 0, never, corner([[1, 2], [3, 4]], 2, 2))
+    asc = write_asc(tmp_path / "fire.asc", times, NODATA_VALUE=None)
+    tif = write_tif(tmp_path / "fire.tif", times, nodata=None)
+    own = write_tif(tmp_path / "own.tif", np.where(times == never, 777, times), nodata=777)
+    for path in (asc, tif) if np.isnan(never) else (asc, tif, own):
+        assert torch.isfinite(read(path)).sum() == 4
+
+
+def test_zero_is_a_time(tmp_path):
+    times = corner([[0, 0, 3]], 1, 3)
+    fire = read(write_asc(tmp_path / "fire.asc", times), horizon=6)
+    assert fire[:3, 7].tolist() == [0, 0, 6]
+
+
+@pytest.mark.parametrize("kind", ["int16", "int32", "uint16", "float32", "float64"])
+def test_numbers_of_any_real_type(tmp_path, kind):
+    never = 65535 if kind == "uint16" else -9999
+    times = corner([[0, 2], [4, 6]], 2, 2)
+    times = np.where(times < 0, never, times).astype(kind)
+    fire = read(write_tif(tmp_path / "fire.tif", times, nodata=never), horizon=3)
+    assert fire[0, 7] == 0
+    assert fire[1, 6] == 3
+    assert torch.isfinite(fire).sum() == 4
+
+
+def test_bytes_with_nodata_scale_and_offset(tmp_path):
+    times = np.full((8, 8), 255, "uint8")
+    times[0, :3] = [0, 10, 40]
+    path = write_tif(tmp_path / "fire.tif", times, nodata=255)
+    with rasterio.open(path, "r+") as dataset:
+        dataset.scales, dataset.offsets = (0.5,), (100.0,)
+    fire = read(path, start=100.0, end=120.0, horizon=20)
+    assert fire[:3, 7].tolist() == [0, 5, 20]
+
+
+@pytest.mark.parametrize(
+    ("keys", "expected"),
+    [
+        ({}, [0, 5, 10, 20]),
+        ({"start": 10.0}, [0, 0, 0, 20]),  # 10 and later of 20: what burns by then burns at 0
+        ({"start": 5.0}, [0, 0, 20 / 3, 20]),
+        ({"end": 10.0}, [0, 10, 20, INF]),
+        ({"start": 5.0, "end": 10.0}, [0, 0, 20, INF]),
+        ({"minutes_per_step": 0.5}, [0, 10, 20, INF]),
+        ({"minutes_per_step": 2.0}, [0, 2.5, 5, 10]),
+        ({"start": -10.0, "end": 30.0}, [5, 7.5, 10, 15]),
+        ({"units": "hours", "minutes_per_step": 60.0}, [0, 5, 10, 20]),
+        ({"units": "seconds", "minutes_per_step": 1 / 60}, [0, 5, 10, 20]),
+        ({"units": "days", "minutes_per_step": 1440.0, "start": 1.0}, [0, 4, 9, 19]),
+        ({"units": "steps"}, [0, 5, 10, 20]),
+        ({"units": "steps", "end": 10.0}, [0, 10, 20, INF]),
+    ],
+)
+def test_the_span_of_time_fills_the_episode(tmp_path, keys, expected):
+    path = write_asc(tmp_path / "fire.asc", corner([[0, 5, 10, 20]], 1, 4))
+    fire = read(path, horizon=20, **keys)
+    assert fire[:4, 7].tolist() == pytest.approx(expected)
+
+
+def test_a_crop_leaves_the_margin_on_all_sides(tmp_path):
+    times = np.full((60, 50), -9999.0)
+    times[20:44, 10:22] = np.arange(24)[:, None] + 1.0
+    path = write_asc(tmp_path / "fire.asc", times)
+    fire = read(path, (30, 30), horizon=100, margin=0.1)
+    # 24 cells over 80 % of 30: a cell of the raster is one of the grid's. 12 columns are centred.
+    assert torch.isfinite(fire[9:21, 3:27]).all()
+    assert torch.isfinite(fire).sum() == 12 * 24
+    assert fire[9, 26] == 0
+    assert fire[9, 3] == 100
+    to_ten = read(path, (30, 30), horizon=100, margin=0.1, end=12.0)
+    # Twelve rows have burnt by then, 12 x 12 cells that now fill 24 x 24; the centres of the last
+    # are beyond that of the row of 12 minutes.
+    assert torch.isfinite(to_ten[3:27, 4:27]).all()
+    assert torch.isfinite(to_ten).sum() == 24 * 23
+
+
+def test_the_inside_of_the_front_is_burnt_out(tmp_path):
+    at = np.arange(30) - 14.5
+    far = np.hypot(at[:, None], at[None, :])
+    path = write_asc(tmp_path / "fire.asc", np.where(far < 14, far, -9999))
+    keys = {"start": 8.0, "end": 14.0}
+    solid = read(path, (30, 30), **keys)
+    ring = read(path, (30, 30), **keys, ring_width=3.0)
+    burnt_out = torch.isinf(ring) & torch.isfinite(solid)
+    assert torch.equal(ring[~burnt_out], solid[~burnt_out])
+    # Deeper than 3 cells within a disc of 8: a disc of about 5.
+    inner, outer = torch.as_tensor(far < 4.4), torch.as_tensor(far < 5.6)
+    assert (burnt_out >= inner).all()
+    assert (burnt_out <= outer).all()
+    wider = read(path, (30, 30), **keys, ring_width=20.0)
+    assert torch.equal(wider, solid)
+
+
+def test_a_ring_is_scaled_with_the_grid_and_a_lake_has_no_front(tmp_path):
+    at = np.arange(60) - 29.5
+    far = np.hypot(at[:, None], at[None, :])
+    times = np.where(far < 28, far, -9999.0)
+    times[29:31, 29:31] = -9999.0
+    path = write_asc(tmp_path / "fire.asc", times)
+    fire = read(path, (60, 60), start=16.0, ring_width=3.0)
+    assert torch.isinf(fire[torch.as_tensor(far < 9)]).all()
+    assert (fire[torch.as_tensor((far > 11) & (far < 16))] == 0).all()
+
+
+def test_degrees_are_projected_to_metres(tmp_path):
+    n, step = 60, 0.001  # at 60 degrees north a degree of longitude is half as long
+    latitude = 60 + (np.arange(n)[::-1] + 0.5) * step
+    longitude = -117 + (np.arange(2 * n) + 0.5) * step
+    x = (longitude + 117 - n * step)[None, :] * 55.8
+    y = (latitude - 60 - n * step / 2)[:, None] * 111.4
+    far = np.hypot(x, y)
+    times = np.where(far < 2.5, far * 10, -9999.0)
+    about = {"crs": "EPSG:4326", "transform": from_origin(-117, 60 + n * step, step, step)}
+    path = write_tif(tmp_path / "fire.tif", times, **about)
+    plain = write_tif(tmp_path / "plain.tif", times, **{**about, "crs": None})
+    fire = read(path, (30, 30), margin=0.1)
+    assert torch.equal(read(plain, (30, 30), margin=0.1, crs="EPSG:4326"), fire)
+    i, j = np.nonzero(torch.isfinite(fire).numpy())
+    assert np.ptp(i) == pytest.approx(np.ptp(j), abs=1)
+    # A disc, without holes.
+    assert len(i) == pytest.approx(math.pi * (np.ptp(i) + 1) ** 2 / 4, rel=0.05)
+    assert read(path, (30, 30), margin=0.1, crs="EPSG:3857").isfinite().any()
+
+
+def test_a_raster_turned_by_its_transform(tmp_path):
+    """The same fire, once on cells along x and y and once on cells turned by 30 degrees."""
+    fire, n, cell = Ellipses(origins=((0.0, 0.0),)), 120, 25.0
+    turned = rasterio.Affine.translation(*CORNER) @ rasterio.Affine.rotation(30)
+    turned = turned @ rasterio.Affine.scale(cell, -cell) @ rasterio.Affine.translation(-60, -60)
+    row, column = np.mgrid[:n, :n] + 0.5
+    x, y = turned.a * column + turned.b * row, turned.d * column + turned.e * row
+    times = fire.arrival(x + turned.c - CORNER[0], y + turned.f - CORNER[1])
+    path = write_tif(tmp_path / "turned.tif", np.where(times < 250, times, -9999), transform=turned)
+    at = (np.arange(n) - 59.5) * cell
+    straight = fire.arrival(at[None, :], at[::-1, None])
+    other = write_tif(tmp_path / "straight.tif", np.where(straight < 250, straight, -9999), cell)
+    one, two = (read(p, (30, 30), margin=0.1, end=250.0) for p in (path, other))
+    for step in (4, 6, 8, 10):
+        assert iou(one <= step, two <= step) > 0.88
+    assert iou(one <= 10, two <= 10) > 0.93
+
+
+def iou(one, two):
+    return ((one & two).sum() / (one | two).sum()).item()
+
+
+def test_ascii_dialects(tmp_path):
+    times = corner([[0, 5, 10], [2, 4, -9999]], 2, 3)
+    plain = read(write_asc(tmp_path / "fire.asc", times))
+    text = (tmp_path / "fire.asc").read_text()
+    for number, other in enumerate(
+        [
+            text.lower(),
+            text.replace("\n", "\r\n"),
+            text.replace(" ", "\t"),
+            text.replace("\n", " \n"),
+            text.rstrip("\n"),
+            text + "\n\n",
+            text.replace("CELLSIZE 30.0", "DX 30\nDY 30"),
+            text.replace("XLLCORNER", "XLLCENTER").replace("YLLCORNER", "YLLCENTER"),
+            text.replace("NODATA_VALUE -9999.0\n", ""),
+            text.replace("NODATA_VALUE -9999.0", "NODATA_VALUE nan").replace("-9999.0", "nan"),
+        ]
+    ):
+        path = tmp_path / f"{number}.asc"
+        path.write_bytes(other.encode())
+        assert torch.equal(read(path), plain)
+
+
+def test_a_projection_beside_an_asc(tmp_path):
+    times = corner([[0, 5, 10], [2, 4, 9]], 2, 3)
+    path = write_asc(tmp_path / "fire.asc", times)
+    plain = read(path)
+    (tmp_path / "fire.prj").write_text(rasterio.crs.CRS.from_string(UTM).to_wkt())
+    assert torch.equal(read(path), plain)
+    degrees = write_asc(tmp_path / "deg.asc", times, 0.001, XLLCORNER=-117.0, YLLCORNER=36.0)
+    with pytest.raises(ValueError, match=r"deg\.asc: .*fire\.crs=EPSG:4326"):
+        read(degrees)
+    (tmp_path / "deg.prj").write_text(rasterio.crs.CRS.from_string("EPSG:4326").to_wkt())
+    assert torch.isfinite(read(degrees, margin=0.1)).any()
+
+
+def test_a_large_raster_takes_neither_much_memory_nor_long(tmp_path):
+    """20,000 x 20,000 cells in less than 1 GB; 1.6 GB they are."""
+    path, side = tmp_path / "large.tif", 20_000
+    about = {
+        "driver": "GTiff",
+        "count": 1,
+        "height": side,
+        "width": side,
+        "dtype": "float32",
+        "nodata": -9999.0,
+        "sparse_ok": True,
+        "tiled": True,
+        "crs": UTM,
+        "transform": from_origin(*CORNER, 30, 30),
+    }
+    at = np.arange(1024) - 511.5
+    far = np.hypot(at[:, None], at[None, :]).astype("float32")
+    with rasterio.open(path, "w", **about) as dataset:
+        dataset.write(far, 1, window=rasterio.windows.Window(4096, 8192, 1024, 1024))
+    program = (
+        "import resource, sys; from emberlink.envs.fire_file import *\n"
+        "before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss\n"
+        "config = FileFireConfig(path=sys.argv[1], units='minutes', end=500.0, ring_width=None)\n"
+        "fire = read_fires(config, (30, 30), 1000)[0]\n"
+        "after = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss\n"
+        "print(int(fire.isfinite().sum()), after - before)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program, path], capture_output=True, text=True, timeout=60
+    )
+    assert done.stderr == ""
+    cells, kilobytes = map(int, done.stdout.split())
+    assert cells == pytest.approx(math.pi * 12**2, rel=0.15)
+    assert kilobytes < 1_000_000
+
+
+def by_loops(times, window):
+    """The earliest of the cells whose centre lies in each cell of the grid; None where none."""
+    found = {}
+    rows = len(times)
+    for r, row in enumerate(times):
+        for c, time in enumerate(row):
+            i = math.floor((c + 0.5 - window.x) / window.side + 1e-6)
+            j = math.floor((rows - r - 0.5 - window.y) / window.side + 1e-6)
+            found[i, j] = min(time, found.get((i, j), INF))
+    return found
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    st.integers(2, 12),
+    st.integers(2, 12),
+    st.floats(0.3, 4),
+    st.floats(-3, 3),
+    st.floats(-3, 3),
+    st.integers(0, 2**32 - 1),
+)
+def test_no_arrival_is_lost(rows, columns, side, x, y, seed):
+    random = np.random.default_rng(seed)
+    times = random.uniform(0, 100, (rows, columns))
+    times[random.random(times.shape) < 0.3] = INF
+    times[0, 0] = 5.0
+    window = Window(x, y, side, (8, 9))
+    source = RasterSource(times, (1, 0, 0, 0, -1, rows), Clock("minutes"))
+    got = source.on(window, INF)
+    assert (got >= times.min() - 1e-9).all()
+    assert (np.isinf(got) | (got <= times[times < INF].max() + 1e-9)).all()
+    expected = by_loops(times, window)
+    for i in range(8):
+        for j in range(9):
+            if (i, j) in expected and (side >= 1 or expected[i, j] == times.min()):
+                assert got[i, j] == pytest.approx(expected[i, j], rel=1e-12)
