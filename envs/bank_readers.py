@@ -59,9 +59,9 @@ def read_bands(path: Path) -> Iterator[RasterSource]:
             _check_size((dataset.count, dataset.width, dataset.height))
             if np.dtype(dataset.dtypes[0]).kind not in "iuf":
                 raise ValueError(f"values of type {dataset.dtypes[0]}; expected numbers")
-            for index in range(dataset.count):
-                band = dataset.read(index + 1)
-                yield _fire(index, np.where(band == dataset.nodata, np.inf, band))
+            nodata, bands = dataset.nodata, dataset.read()
+        for index, band in enumerate(bands):
+            yield _fire(index, np.where(band == nodata, np.inf, band))
     except (rasterio.errors.RasterioError, OSError) as error:
         raise ValueError(f"{first_line(error)}; expected a whole GeoTIFF") from None
 

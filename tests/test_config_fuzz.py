@@ -56,7 +56,8 @@ COMM = {
 
 
 def entered(schema: dict, root: dict) -> dict:
-    """The schema that a reference stands for."""
+    """The schema that a reference stands for; of a scenario that of the generator's."""
+    schema = schema.get("oneOf", [schema])[0]
     return root["$defs"][schema["$ref"].rsplit("/", 1)[-1]] if "$ref" in schema else schema
 
 
