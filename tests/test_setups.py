@@ -8,7 +8,7 @@ from emberlink.comm.consensus import ConsensusConfig
 from emberlink.envs.config import WildfireConfig, from_plain
 from emberlink.envs.fire import scenarios
 from emberlink.envs.reward import RewardConfig
-from emberlink.trainers.config import build_comm, known, resolve, to_values
+from emberlink.trainers.config import build_comm, flat, known, resolve, to_values
 
 METHODS = ["independent", "shared_memory", "positional", "consensus"]
 PAPER, RELEASED = "paper", "released"
@@ -84,19 +84,36 @@ def test_every_row_of_the_table(method, column):
         assert dataclasses.fields(settings) == ()
 
 
-@pytest.mark.parametrize("setup", ["paper", "released", "tuned"])
-def test_methods_differ_in_two_switches(setup):
-    for method, (memory, comm) in SWITCHES.items():
-        config = resolve(method, [f"setup={setup}"])
-        assert (config.memory, config.comm["name"]) == (memory, comm)
-    # But for the discount of one method in `released` and of one in `tuned`, and nothing else.
-    plain = {"method", "memory", "comm", "learner"}
-    one, *others = (to_values(resolve(method, [f"setup={setup}"])) for method in METHODS)
-    gamma = {PAPER: [], RELEASED: METHODS[1:], "tuned": ["consensus"]}[setup]
-    for other in others:
-        assert {k: one[k] for k in one.keys() - plain} == {k: other[k] for k in one.keys() - plain}
-        changed = {key for key in one["learner"] if one["learner"][key] != other["learner"][key]}
-        assert changed == ({"gamma"} if other["method"] in gamma else set())
+CORRELATED = {"exploration.theta": 0.1, "exploration.sigma": 0.15}
+OWN = {
+    PAPER: {},
+    RELEASED: {"independent": {"learner.gamma": 0.92}},
+    "tuned": {
+        "independent": {"env.reward.new_fire": 1.0},
+        "shared_memory": CORRELATED,
+        "positional": {"env.reward.new_fire": 1.0, **CORRELATED},
+        "consensus": {"learner.gamma": 0.9},
+    },
+}
+"""what a setup changes for one method, beside the two switches"""
+
+
+@pytest.mark.parametrize("setup", OWN)
+def test_methods_differ_in_two_switches_and_in_what_is_listed(setup):
+    every = {method: resolve(method, [f"setup={setup}"]) for method in METHODS}
+    common: dict[str, set[str]] = {}
+    for method, config in every.items():
+        assert (config.memory, config.comm["name"]) == SWITCHES[method]
+        own = OWN[setup].get(method, {})
+        values = flat(to_values(config))
+        assert {key: values[key] for key in own} == own
+        for key in values.keys() - own.keys():
+            if key.split(".")[0] not in ("method", "memory", "comm"):
+                common.setdefault(key, set()).add(repr(values[key]))
+    assert all(len(values) == 1 for values in common.values())
+    for own in OWN[setup].values():  # and what is listed is not what the others have
+        for key, value in own.items():
+            assert repr(value) not in common.get(key, set())
 
 
 def test_paper_is_the_default():
