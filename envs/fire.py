@@ -14,9 +14,11 @@ from typing import Annotated, Any, Literal, get_args
 
 import torch
 from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 from pydantic import AfterValidator, ConfigDict, Field, Strict, ValidationError
 from pydantic.dataclasses import dataclass
 from torch import Tensor
+from yaml import YAMLError
 
 from .config import Name, describe, known
 from .drift import current, longest_step, tide_speed
@@ -133,7 +135,13 @@ def load_scenario(name: str) -> FireConfig:
 
 def _values(name: str) -> dict[str, Any]:
     file = resources.files("emberlink.configs").joinpath("fire", f"{name}.yaml")
-    values: Any = OmegaConf.to_container(OmegaConf.create(file.read_text(encoding="utf-8")))
+    try:
+        values: Any = OmegaConf.to_container(OmegaConf.create(file.read_text(encoding="utf-8")))
+    except (YAMLError, OmegaConfBaseException) as error:
+        reason = " ".join(str(error).split())[:200]
+        raise ValueError(f"configs/fire/{name}.yaml: cannot be read: {reason}") from None
+    if not isinstance(values, dict):
+        raise ValueError(f"configs/fire/{name}.yaml: expected keys and values")
     return values
 
 

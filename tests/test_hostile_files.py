@@ -319,11 +319,12 @@ def test_a_method_that_is_a_path(tmp_path, mark, monkeypatch, capsys):
 def test_a_scenario_with_a_tag(tmp_path, mark, monkeypatch):
     import emberlink.envs.fire as module
 
-    folder = tmp_path / "fire"
-    folder.mkdir()
-    (folder / "paper.yaml").write_text(f"name: !!python/object/apply:os.mkdir [{mark}]\n")
+    with module.resources.as_file(module.resources.files("emberlink.configs")) as ours:
+        shutil.copytree(ours / "fire", tmp_path / "fire")
+    text = f"name: !!python/object/apply:os.mkdir [{mark}]\n"
+    (tmp_path / "fire" / "paper.yaml").write_text(text)
     monkeypatch.setattr(module.resources, "files", lambda _: tmp_path)
-    with pytest.raises(Exception, match="python/object/apply"):
+    with pytest.raises(ValueError, match=r"^configs/fire/paper.yaml: .*python/object/apply"):
         load_scenario("paper")
     assert not mark.exists()
 
