@@ -116,7 +116,11 @@ def plain(value: Any, key: str = "", deepest: int = 16) -> Any:
 def shown(value: Any) -> str:
     """A value in a message: as it is where it is short and can be printed, else cut and escaped."""
     text = value if isinstance(value, str) else reprlib.repr(value)
-    text = text if len(text) <= 100 else f"{text[:60]}...{text[-20:]}"
+    return printable(text if len(text) <= 100 else f"{text[:60]}...{text[-20:]}")
+
+
+def printable(text: str) -> str:
+    """The text on one line, what cannot be printed escaped."""
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 

@@ -16,7 +16,7 @@ from . import formats
 from .arrival import Source, Units
 from .ascii_grids import read_ascii
 from .bank_readers import is_bank, read_bands, read_npy
-from .config import Name, shown
+from .config import Name, printable
 from .fire_window import on_grid
 from .front_points import read_front_points
 from .geo import quiet
@@ -111,11 +111,11 @@ def read_fires(config: FileFireConfig, grid: tuple[int, int], horizon: int) -> T
         with quiet():
             found = _gridded(path, config, grid, horizon)
     except ValueError as error:
-        raise ValueError(f"{shown(str(path))}: {error}") from None
+        raise ValueError(f"{printable(str(path))}: {error}") from None
     except OSError as error:
-        raise ValueError(f"{shown(str(path))}: cannot be read: {error.strerror or error}") from None
+        raise ValueError(f"{printable(str(path))}: cannot be read: {error.strerror or error}") from None
     except MemoryError:
-        raise ValueError(f"{shown(str(path))}: not enough memory to read it") from None
+        raise ValueError(f"{printable(str(path))}: not enough memory to read it") from None
     return torch.from_numpy(np.stack(found))
 
 
@@ -165,10 +165,10 @@ def _checked(file: str, expected: str | None) -> str:
     try:
         found = formats.digest(path)
     except ValueError as error:
-        raise ValueError(f"{shown(str(path))}: {error}") from None
+        raise ValueError(f"{printable(str(path))}: {error}") from None
     if expected not in (None, found):
         raise ValueError(
-            f"{shown(str(path))}: has changed: its content has sha256 {found[:12]}..., that of the "
+            f"{printable(str(path))}: has changed: its content has sha256 {found[:12]}..., that of the "
             f"run {str(expected)[:12]}..."
         )
     return found

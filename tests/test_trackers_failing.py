@@ -54,7 +54,7 @@ def _elsewhere(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for name in ("WANDB_CACHE_DIR", "WANDB_CONFIG_DIR", "WANDB_DATA_DIR"):
         monkeypatch.setenv(name, str(tmp_path / "wandb-own"))
-    for name in ("WANDB_MODE", "WANDB_API_KEY", "WANDB_BASE_URL", "WANDB_SERVICE"):
+    for name in ("WANDB_MODE", "WANDB_API_KEY", "WANDB_BASE_URL"):
         monkeypatch.setenv(name, "")
         monkeypatch.delenv(name)
     monkeypatch.setattr(tracking, "PATIENCE", 1.5)
@@ -67,9 +67,13 @@ def _elsewhere(tmp_path, monkeypatch):
 
 
 def forget() -> None:
-    """wandb reads its settings once in a process: what a test has set is no other test's."""
+    """wandb reads its settings once in a process: what a test has set is no other test's.
+
+    Nor is the process that it works in, which it finds again by an environment variable.
+    """
     with suppress(Exception):
         wandb.teardown()
+    os.environ.pop("WANDB_SERVICE", None)
 
 
 class Fragile:

@@ -193,3 +193,5 @@ def _release_wandb() -> None:
     ending = threading.Thread(target=teardown, name=ENDING, daemon=True)
     ending.start()
     ending.join(2.0)
+    # By which a later run of this process would look for the one that is gone.
+    os.environ.pop("WANDB_SERVICE", None)
