@@ -113,7 +113,8 @@ def read_fires(config: FileFireConfig, grid: tuple[int, int], horizon: int) -> T
     except ValueError as error:
         raise ValueError(f"{printable(str(path))}: {error}") from None
     except OSError as error:
-        raise ValueError(f"{printable(str(path))}: cannot be read: {error.strerror or error}") from None
+        reason = error.strerror or error
+        raise ValueError(f"{printable(str(path))}: cannot be read: {reason}") from None
     except MemoryError:
         raise ValueError(f"{printable(str(path))}: not enough memory to read it") from None
     return torch.from_numpy(np.stack(found))
@@ -168,8 +169,8 @@ def _checked(file: str, expected: str | None) -> str:
         raise ValueError(f"{printable(str(path))}: {error}") from None
     if expected not in (None, found):
         raise ValueError(
-            f"{printable(str(path))}: has changed: its content has sha256 {found[:12]}..., that of the "
-            f"run {str(expected)[:12]}..."
+            f"{printable(str(path))}: has changed: its content has sha256 {found[:12]}..., that of "
+            f"the run {str(expected)[:12]}..."
         )
     return found
 
