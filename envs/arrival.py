@@ -11,6 +11,9 @@ from .geo import Bounds, Move, same
 
 Units = Literal["steps", "seconds", "minutes", "hours", "days"]
 SECONDS = {"seconds": 1.0, "minutes": 60.0, "hours": 3600.0, "days": 86400.0}
+FINE_SIDE = 180
+"""A cell of the grid is looked at in its parts, of which the earliest counts: so many along the
+grid's shorter side. Fires from rasters and from perimeters are looked at in the same places."""
 _EDGE = 1e-6  # cells: a centre that lies on an edge belongs to the same side whatever is rounded
 
 
@@ -49,6 +52,11 @@ class Window:
         side = max(width / grid[0], height / grid[1]) / (1 - 2 * margin)
         x, y = (bounds[0] + bounds[2]) / 2, (bounds[1] + bounds[3]) / 2
         return cls(x - side * grid[0] / 2, y - side * grid[1] / 2, side, grid)
+
+    @property
+    def cuts(self) -> int:
+        """Into how many parts along each side a cell is cut to be looked at."""
+        return max(1, round(FINE_SIDE / min(self.grid)))
 
     def finer(self, times: int, ring: tuple[int, int]) -> "Window":
         """The same with each cell cut into times x times, and further such cells around it."""
@@ -124,43 +132,72 @@ class RasterSource:
         self.extent = self._around(edge_rows, edge_columns)
 
     def burnt(self, until: float) -> Bounds:
-        """What the cells burnt by a time cover."""
-        burnt = self.times <= until
-        rows, columns = np.flatnonzero(burnt.any(1)), np.flatnonzero(burnt.any(0))
-        left, right = burnt[rows].argmax(1), burnt.shape[1] - 1 - burnt[rows, ::-1].argmax(1)
-        top = burnt[:, columns].argmax(0)
-        low = burnt.shape[0] - 1 - burnt[::-1, columns].argmax(0)
-        return self._around(
-            np.concatenate([rows, rows, top, low]),
-            np.concatenate([left, right, columns, columns]),
-        )
+        """What has burnt by a time covers: to the front where it goes on, else whole cells.
+
+        Raises:
+            ValueError: a single cell has burnt.
+        """
+        if (self.times <= until).sum() < 2:
+            raise ValueError(
+                f"from {self.clock.shown(self.first)} to {self.clock.shown(until)} a single cell "
+                "burns: no fire spreads; expected a later end"
+            )
+        rows: list[np.ndarray] = []
+        columns: list[np.ndarray] = []
+        for times, along, across in ((self.times, columns, rows), (self.times.T, rows, columns)):
+            lines = np.flatnonzero((times <= until).any(1))
+            last = times.shape[1] - 1
+            along += [_first(times[lines], until), last - _first(times[lines, ::-1], until)]
+            across += [lines, lines]
+        x, y = self._plane(np.concatenate(rows), np.concatenate(columns))
+        return float(x.min()), float(y.min()), float(x.max()), float(y.max())
 
     def on(self, window: Window, until: float) -> np.ndarray:
-        """The earliest arrival among the cells whose centre lies in a cell of the grid.
+        """The earliest arrival in each cell of a grid: at points in it, between the burnt cells
+        around them, and at the centres of the raster's own cells.
 
-        Where no centre does, and everywhere on a grid finer than the raster: that of the grid
-        cell's centre, between the burnt cells around it; a cell that burns before those around it
-        does so as a whole.
+        On a grid finer than the raster, of these centres those count that burn before all around
+        them. A map of the whole box is one of cells, not of points in a field.
         """
-        row, column = self._cell(*window.centres())
-        if window.side < (1 - _EDGE) * self._side():
-            return self._between(row, column)
-        found = self._earliest(window)
-        nearest = np.rint(row).astype(np.int64), np.rint(column).astype(np.int64)
-        i, j = window.cells(*self._plane(*nearest))
-        mine = np.indices(window.grid)
-        empty = np.isinf(found) & ((i != mine[0]) | (j != mine[1]))
-        found[empty] = self._between(row[empty], column[empty])
-        return found
+        fine = window.side < (1 - _EDGE) * self._side()
+        if self.whole or self._own(window):
+            return self._cells(window, fine)
+        cuts, (columns, rows) = window.cuts, window.grid
+        points = self._cell(*window.finer(cuts, (0, 0)).centres())
+        found = self._between(*points).reshape(columns, cuts, rows, cuts).min((1, 3))
+        times = self.times
+        if fine:
+            times = np.where(times == minimum_filter(times, 3), times, np.inf)
+        return np.minimum(found, self._earliest(times, window))
 
-    def _earliest(self, window: Window) -> np.ndarray:
+    def _own(self, window: Window) -> bool:
+        """Whether the grid's cells are the raster's."""
+        at = self._cell(*window.centres())
+        apart = max(np.abs(one - np.rint(one)).max() for one in at)
+        return abs(window.side / self._side() - 1) < _EDGE and bool(apart < 1e-3)
+
+    def _cells(self, window: Window, fine: bool) -> np.ndarray:
+        """The earliest of the cells whose centre lies in one of the grid, else the nearest."""
+        row, column = (np.rint(at).astype(np.int64) for at in self._cell(*window.centres()))
+        height, width = self.times.shape
+        inside = (row >= 0) & (column >= 0) & (row < height) & (column < width)
+        near = self.times[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)]
+        near = np.where(inside, near, np.inf)
+        if fine:
+            return near
+        found = self._earliest(self.times, window)
+        i, j = window.cells(*self._plane(row, column))
+        mine = np.indices(window.grid)
+        return np.where(np.isinf(found) & ((i != mine[0]) | (j != mine[1])), near, found)
+
+    def _earliest(self, times: np.ndarray, window: Window) -> np.ndarray:
         """The earliest arrival among the centres in each cell of the grid."""
         found = np.full(window.grid, np.inf)
-        rows, columns = np.nonzero(np.isfinite(self.times))
+        rows, columns = np.nonzero(np.isfinite(times))
         i, j = window.cells(*self._plane(rows, columns))
         inside = (i >= 0) & (j >= 0) & (i < window.grid[0]) & (j < window.grid[1])
         places = i[inside], j[inside]
-        np.minimum.at(found, places, self.times[rows[inside], columns[inside]])
+        np.minimum.at(found, places, times[rows[inside], columns[inside]])
         return found
 
     def _side(self) -> float:
@@ -176,7 +213,6 @@ class RasterSource:
         inside = (near[0] >= 0) & (near[1] >= 0) & (near[0] < height) & (near[1] < width)
         r, c = np.clip(near[0], 0, height - 1), np.clip(near[1], 0, width - 1)
         own = np.where(inside, self.times[r, c], np.inf)
-        first = own == minimum_filter(self.times, 3)[r, c]
         total, weights = np.zeros(row.shape), np.zeros(row.shape)
         r0, c0 = np.floor(row).astype(np.int64), np.floor(column).astype(np.int64)
         for dr in (0, 1):
@@ -187,8 +223,8 @@ class RasterSource:
                 weight = np.where(np.isfinite(time), weight, 0)
                 total += weight * np.where(np.isfinite(time), time, 0)
                 weights += weight
-        between = total / np.where(weights > 0, weights, 1)
-        return np.where(first | np.isinf(own) | (weights == 0), own, between)
+        between = np.maximum(total / np.where(weights > 0, weights, 1), self.first)
+        return np.where(np.isinf(own) | (weights == 0), own, between)
 
     def _plane(self, row: np.ndarray, column: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Where cells' centres are on the plane; parts of a cell are allowed."""
@@ -213,3 +249,13 @@ class RasterSource:
             np.concatenate([columns - 0.5, columns + 0.5, columns - 0.5, columns + 0.5]),
         )
         return float(x.min()), float(y.min()), float(x.max()), float(y.max())
+
+
+def _first(times: np.ndarray, until: float) -> np.ndarray:
+    """Where on each line of cells what has burnt begins, cells from the first one's centre."""
+    at = (times <= until).argmax(1)
+    lines = np.arange(len(times))
+    inner, outer = times[lines, at], times[lines, np.maximum(at - 1, 0)]
+    goes_on = (at > 0) & np.isfinite(outer)
+    step = np.where(goes_on, outer - inner, 1.0)
+    return at - np.where(goes_on, (until - inner) / step, 0.5)

@@ -9,7 +9,8 @@ import numpy as np
 
 from .arrival import RasterSource, Units
 from .formats import beside
-from .geo import first_line, library
+from .geo import library
+from .geotiff import opened
 from .rasters import clean, raster_source
 
 MOST_CELLS = 25_000_000
@@ -91,14 +92,11 @@ def _affine(header: dict[str, float], rows: int) -> tuple[float, ...]:
 
 def _crs(path: Path) -> Any:
     """The projection in the .prj beside it, of which GDAL knows all kinds."""
-    rasterio = library("rasterio", f"{path.suffix} rasters")
     if beside(path, ".prj") is None:
+        library("rasterio", f"{path.suffix} rasters")
         return None
-    try:
-        with rasterio.open(path, driver="AAIGrid") as dataset:
-            return dataset.crs
-    except rasterio.errors.RasterioError as error:
-        raise ValueError(f"{first_line(error)}; expected ESRI ASCII") from None
+    with opened(path, "AAIGrid") as dataset:
+        return dataset.crs
 
 
 def _whole(header: dict[str, float], key: str) -> int:

@@ -6,7 +6,8 @@ from pathlib import Path
 import numpy as np
 
 from .arrival import Clock, RasterSource
-from .geo import first_line, library
+from .geo import first_line
+from .geotiff import opened
 from .rasters import check_spreads, clean
 
 MOST_CELLS = 300_000_000
@@ -39,12 +40,8 @@ def read_npy(path: Path) -> Iterator[RasterSource]:
 
 def is_bank(path: Path) -> bool:
     """Whether a GeoTIFF is a bank: tagged units=steps, and of no place on the Earth."""
-    rasterio = library("rasterio", "GeoTIFF")
-    try:
-        with rasterio.open(path, driver="GTiff") as dataset:
-            return dataset.tags().get("units") == "steps" and dataset.crs is None
-    except (rasterio.errors.RasterioError, OSError) as error:
-        raise ValueError(f"{first_line(error)}; expected a GeoTIFF") from None
+    with opened(path) as dataset:
+        return dataset.tags().get("units") == "steps" and dataset.crs is None
 
 
 def read_bands(path: Path) -> Iterator[RasterSource]:
@@ -53,17 +50,13 @@ def read_bands(path: Path) -> Iterator[RasterSource]:
     Raises:
         ValueError: one line that names what is wrong, and the fire.
     """
-    rasterio = library("rasterio", "GeoTIFF")
-    try:
-        with rasterio.open(path, driver="GTiff") as dataset:
-            _check_size((dataset.count, dataset.width, dataset.height))
-            if np.dtype(dataset.dtypes[0]).kind not in "iuf":
-                raise ValueError(f"values of type {dataset.dtypes[0]}; expected numbers")
-            nodata, bands = dataset.nodata, dataset.read()
-        for index, band in enumerate(bands):
-            yield _fire(index, np.where(band == nodata, np.inf, band))
-    except (rasterio.errors.RasterioError, OSError) as error:
-        raise ValueError(f"{first_line(error)}; expected a whole GeoTIFF") from None
+    with opened(path) as dataset:
+        _check_size((dataset.count, dataset.width, dataset.height))
+        if np.dtype(dataset.dtypes[0]).kind not in "iuf":
+            raise ValueError(f"values of type {dataset.dtypes[0]}; expected numbers")
+        nodata, bands = dataset.nodata, dataset.read()
+    for index, band in enumerate(bands):
+        yield _fire(index, band if nodata is None else np.where(band == nodata, np.inf, band))
 
 
 def _check_size(shape: tuple[int, ...]) -> None:

@@ -19,11 +19,11 @@ from .bank_readers import is_bank, read_bands, read_npy
 from .config import Name, printable
 from .fire_window import on_grid
 from .front_points import read_front_points
-from .geo import quiet
+from .geo import one_line, quiet
 from .perimeters import read_perimeters
 from .rasters import read_geotiff
 
-READER_VERSION = 1  # raise it whenever the same file gives another grid
+READER_VERSION = 2  # raise it whenever the same file gives another grid
 KEPT = "fires.npz"
 """the file of a run folder that holds the run's own copy of its grids"""
 _EVERY, _HELD_OUT = 5, 4  # of several fires, those whose number has this remainder are held out
@@ -111,7 +111,7 @@ def read_fires(config: FileFireConfig, grid: tuple[int, int], horizon: int) -> T
         with quiet():
             found = _gridded(path, config, grid, horizon)
     except ValueError as error:
-        raise ValueError(f"{printable(str(path))}: {error}") from None
+        raise ValueError(f"{printable(str(path))}: {one_line(str(error))}") from None
     except OSError as error:
         reason = error.strerror or error
         raise ValueError(f"{printable(str(path))}: cannot be read: {reason}") from None

@@ -11,8 +11,6 @@ SIDE = 30
 """cells of the paper's map"""
 SKIPPED = 6000
 """lines before the one that is step 0"""
-LONGEST = 200_000_000
-"""bytes"""
 _ALLOWED = b"0123456789+-.eE, \t\r\n"
 _PLUS = ((0, 0), (1, 0), (-1, 0), (0, 1), (0, -1))
 

@@ -60,6 +60,11 @@ def first_line(error: BaseException) -> str:
     return lines[0][:200]
 
 
+def one_line(text: str) -> str:
+    """A message without line breaks and control characters, which a file may bring into it."""
+    return "".join(c if c.isprintable() else " " for c in text)
+
+
 def same(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The coordinates as they are."""
     return x, y

@@ -25,21 +25,26 @@ def enclosed(geometries: Any, names: list[int]) -> Any:
     shapely = library("shapely", "perimeters")
     areas: list[Any] = []
     lines: list[Any] = []
+    drawn: list[int] = []  # the feature of each line
     for geometry, name in zip(geometries, names, strict=True):
         if geometry is None or geometry.is_empty:
             raise ValueError(f"feature {name} has no geometry; expected a perimeter")
         before = len(areas) + len(lines)
-        for part in _parts(shapely.force_2d(geometry)):
+        parts = _parts(shapely.force_2d(geometry))
+        if any(part.geom_type == "Polygon" for part in parts):  # open lines beside it are left over
+            parts = [part for part in parts if "Line" not in part.geom_type or part.is_closed]
+        for part in parts:
             if part.geom_type == "Polygon":
                 areas.append(_valid(shapely, part))
             elif part.geom_type in ("LineString", "LinearRing"):
                 lines.append(part)
+                drawn.append(name)
         if len(areas) + len(lines) == before:
             raise ValueError(
                 f"feature {name} is of {geometry.geom_type}; expected polygons or lines"
             )
     if lines:
-        areas.append(_within_lines(shapely, lines, names))
+        areas.append(_within_lines(shapely, lines, drawn))
     area = shapely.union_all(areas)
     if not area.area > 0:
         raise ValueError(f"feature {names[0]} encloses no area; expected a perimeter")
@@ -65,6 +70,12 @@ def _valid(shapely: Any, polygon: Any) -> Any:
     return shapely.make_valid(polygon, method="structure", keep_collapsed=False)
 
 
+def _drawn_in(merged: Any, lines: list[Any], names: list[int]) -> int:
+    """The feature that a line comes from, the first if from several."""
+    end = merged.coords[0]
+    return next(n for one, n in zip(lines, names, strict=True) if end in list(one.coords))
+
+
 def _within_lines(shapely: Any, lines: list[Any], names: list[int]) -> Any:
     """What closed lines enclose; those within an odd number of others are islands."""
     merged = _parts(shapely.line_merge(shapely.MultiLineString(lines)))
@@ -74,8 +85,9 @@ def _within_lines(shapely: Any, lines: list[Any], names: list[int]) -> Any:
         gap = float(np.hypot(*(ends[1] - ends[0])))
         if len(line.coords) < 3 or gap > _GAP * line.length:
             raise ValueError(
-                f"feature {names[0]}: a line of {len(line.coords)} points is not closed, {gap:g} "
-                f"of its length of {line.length:g} is missing; expected closed lines"
+                f"feature {_drawn_in(line, lines, names)}: a line of {len(line.coords)} points is "
+                f"not closed, {gap:g} of its length of {line.length:g} is missing; expected "
+                "closed lines"
             )
         area = _valid(shapely, shapely.Polygon(line.coords))
         rings.setdefault(shapely.normalize(area).wkb, area)
@@ -85,6 +97,8 @@ def _within_lines(shapely: Any, lines: list[Any], names: list[int]) -> Any:
     tree = shapely.STRtree(areas)
     inner, outer = tree.query(areas, predicate="covered_by")
     depth = np.bincount(inner[outer < inner], minlength=len(areas))
-    burnt = shapely.union_all([a for a, deep in zip(areas, depth, strict=True) if deep % 2 == 0])
-    islands = [a for a, deep in zip(areas, depth, strict=True) if deep % 2]
-    return shapely.difference(burnt, shapely.union_all(islands)) if islands else burnt
+    burnt = shapely.Polygon()
+    for level in range(int(depth.max(initial=0)) + 1):
+        here = shapely.union_all([a for a, deep in zip(areas, depth, strict=True) if deep == level])
+        burnt = burnt.difference(here) if level % 2 else burnt.union(here)
+    return burnt

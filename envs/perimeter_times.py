@@ -28,6 +28,8 @@ CALENDAR = (
 """columns of calendar time, in lower case, the surest first"""
 _EPOCH_MS = 1e11  # numbers above it are milliseconds since 1970: 1973 and later
 _LATEST = 1e12
+_WRITTEN = {8: "%Y%m%d", 12: "%Y%m%d%H%M", 14: "%Y%m%d%H%M%S"}
+"""dates as numbers of so many digits"""
 
 
 @dataclass(frozen=True)
@@ -87,8 +89,6 @@ def _column(frame: Any, name: str, unit: Units | None) -> Times:
         numbers = np.array([float(value) for value in values])
     except ValueError:
         return _calendar([_parsed(v, i, name) for i, v in enumerate(values)], name)
-    if name.lower() not in ELAPSED and unit is None and all(len(v) == 8 for v in values):
-        return _calendar([_parsed(v, i, name) for i, v in enumerate(values)], name)
     return _numbers(numbers, name, unit)
 
 
@@ -99,6 +99,8 @@ def _numbers(values: np.ndarray, name: str, unit: Units | None) -> Times:
         raise ValueError(
             f"feature {wrong[0]} has {name}={values[wrong[0]]:g}; expected a time of 0 or more"
         )
+    if name.lower() not in ELAPSED and (form := _date_form(values)):
+        return _calendar([_written(v, form, i, name) for i, v in enumerate(values)], name)
     if (values > _EPOCH_MS).all() and name.lower() not in ELAPSED:
         return _calendar([datetime.fromtimestamp(value / 1000, UTC) for value in values], name)
     if values.max() > _LATEST:
@@ -112,6 +114,28 @@ def _numbers(values: np.ndarray, name: str, unit: Units | None) -> Times:
             "hours, days or steps"
         )
     return Times(values, Clock(said or unit or "minutes"))
+
+
+def _date_form(values: np.ndarray) -> str:
+    """How numbers such as 20200819, 202008191300 or 20200819130000 are written; "" if not so."""
+    if (values != np.floor(values)).any():
+        return ""
+    for digits, form in _WRITTEN.items():
+        year, rest = np.divmod(values, 10.0 ** (digits - 4))
+        month = rest // 10.0 ** (digits - 6)
+        if ((year >= 1900) & (year <= 2100) & (month >= 1) & (month <= 12)).all():
+            return form
+    return ""
+
+
+def _written(value: float, form: str, feature: int, name: str) -> datetime:
+    try:
+        return datetime.strptime(f"{value:.0f}", form)
+    except ValueError:
+        raise ValueError(
+            f"feature {feature} has {name}={value:.0f}, which is no date as others in it are; "
+            "expected such as 20200819"
+        ) from None
 
 
 def _calendar(moments: list[datetime], name: str) -> Times:
@@ -162,7 +186,7 @@ def parse_time(text: str) -> datetime:
 
 def _farsite(frame: Any, lower: dict[str, str]) -> Times:
     """FARSITE's columns Month, Day and Hour (1300 is 13:00), which say no year."""
-    parts = [frame[lower[key]].to_numpy(dtype=np.float64) for key in ("month", "day", "hour")]
+    parts = [_whole_numbers(frame, lower[key]) for key in ("month", "day", "hour")]
     # From December to January the year changes; a fire does not last for half a year.
     over = bool((parts[0] >= 11).any() and (parts[0] <= 2).any())
     moments: list[datetime] = []
@@ -179,3 +203,15 @@ def _farsite(frame: Any, lower: dict[str, str]) -> Times:
                 "date and a time such as 1300"
             ) from None
     return _calendar(moments, "Month, Day, Hour")
+
+
+def _whole_numbers(frame: Any, name: str) -> np.ndarray:
+    values: list[float] = []
+    for feature, value in enumerate(frame[name]):
+        try:
+            values.append(int(float(value)))
+        except (TypeError, ValueError, OverflowError):
+            raise ValueError(
+                f"feature {feature} has {name}={str(value)[:40]}; expected a whole number"
+            ) from None
+    return np.array(values, np.float64)

@@ -12,10 +12,6 @@ from .geo import Bounds, first_line, library, to_plane
 from .perimeter_shapes import enclosed
 from .perimeter_times import perimeter_times
 
-FINE_SIDE = 60
-"""A cell of the grid is cut into parts, of which the earliest counts: so many along the grid's
-shorter side, and at least 2 x 2 in a cell. Of a raster's cells within one of the grid the earliest
-counts too; a fire has about as many."""
 MOST_TIMES = 500
 _SURVEY = 256  # cells along the longer side where only the extent is asked for
 _WITHIN, _SHRUNK = 0.99, 0.75  # see `_check_order`
@@ -74,7 +70,8 @@ def read_perimeters(
     for moment in moments:
         which = np.flatnonzero(times.values == moment).tolist()
         area = enclosed(frame.geometry.iloc[which], which)
-        areas.append(shapely.transform(area, lambda at: np.stack(project(at[:, 0], at[:, 1]), 1)))
+        area = shapely.transform(area, lambda at: np.stack(project(at[:, 0], at[:, 1]), 1))
+        areas.append(_valid(shapely, area))
     return PerimeterSource(areas, moments, times.clock)
 
 
@@ -150,7 +147,7 @@ class PerimeterSource:
         right = window.x + window.grid[0] * window.side
         upper = window.y + window.grid[1] * window.side
         beyond = max(window.x - x0, x1 - right), max(window.y - y0, y1 - upper)
-        cuts = max(2, round(FINE_SIDE / min(window.grid)))
+        cuts = window.cuts
         around: list[int] = []
         for past, cells in zip(beyond, window.grid, strict=True):
             needed = int(np.ceil(max(past, 0) / window.side)) + 1
@@ -179,18 +176,32 @@ class PerimeterSource:
     def _check_order(self) -> None:
         """That areas do not shrink: then times go backwards, or are of another fire."""
         burnt = first = _inside(self._areas[0], self._window)
+        largest = self._areas[0].area
         for k in range(1, len(self._areas)):
-            area = _inside(self._areas[k], self._window)
-            size, before = area.sum(), burnt.sum()
-            if (area & burnt).sum() >= _WITHIN * size and size < _SHRUNK * before:
-                raise ValueError(
-                    f"the perimeter of {self.clock.shown(self._times[k])} lies within what had "
-                    f"burnt before and is {100 * size / before:.0f} % of it: times go backwards; "
-                    "expected areas that grow"
-                )
-            burnt = burnt | area
+            area, exact = _inside(self._areas[k], self._window), self._areas[k].area
+            # By cells at first: areas of many perimeters take long to unite.
+            if area.sum() < _SHRUNK * burnt.sum() or exact < _SHRUNK * largest:
+                self._check_shrinks(k)
+            burnt, largest = burnt | area, max(largest, exact)
         if first.sum() == burnt.sum():
             raise ValueError("all cells burn at once: no perimeter adds to the first; expected two")
+
+    def _check_shrinks(self, k: int) -> None:
+        """That a perimeter is not but a part of what had burnt before."""
+        shapely = library("shapely", "perimeters")
+        area, before = self._areas[k], shapely.union_all(self._areas[:k])
+        within = area.intersection(before).area >= _WITHIN * area.area
+        if within and area.area < _SHRUNK * before.area:
+            raise ValueError(
+                f"the perimeter of {self.clock.shown(self._times[k])} lies within what had "
+                f"burnt before and is {100 * area.area / before.area:.0f} % of it: times go "
+                "backwards; expected areas that grow"
+            )
+
+
+def _valid(shapely: Any, area: Any) -> Any:
+    """An area that still does not cross itself after it was projected."""
+    return area if area.is_valid else shapely.make_valid(area)
 
 
 def _depth(area: np.ndarray) -> np.ndarray:

@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 
 from .arrival import Clock, RasterSource, Units
-from .geo import Bounds, first_line, library, to_plane
+from .geo import Bounds, library, to_plane
+from .geotiff import opened
 
 MOST_CELLS = 500_000_000
 """of a GeoTIFF, which is read strip by strip"""
@@ -19,7 +20,8 @@ NEVER = (-9999.0, -1.0)
 """NODATA of FARSITE and FlamMap, and of ELMFIRE"""
 _VOID = 1e30  # beyond it a number is NODATA that nobody declared, such as -3.4e38
 _STRIP = 2_000_000  # cells read at a time
-_CACHE = 100_000_000  # bytes that GDAL keeps of what it decoded; its default is 5 % of the memory
+_MOST_BYTES = 200_000_000  # of a row of blocks, which GDAL decodes as a whole
+_Part = tuple[int, int, int, int]  # first row and column, and how many
 
 
 def read_geotiff(path: Path, unit: Units | None, crs: str | None) -> RasterSource:
@@ -28,18 +30,23 @@ def read_geotiff(path: Path, unit: Units | None, crs: str | None) -> RasterSourc
     Raises:
         ValueError: one line that names what is wrong.
     """
-    rasterio = library("rasterio", "GeoTIFF")
-    try:
-        with rasterio.Env(GDAL_CACHEMAX=_CACHE), rasterio.open(path, driver="GTiff") as dataset:
-            _check_band(dataset)
-            times, factor = _read_strips(dataset)
-            tags = dataset.tags()
-            transform = dataset.transform * dataset.transform.scale(factor)
-            source_crs = dataset.crs
-    except (rasterio.errors.RasterioError, OSError) as error:
-        raise ValueError(f"{first_line(error)}; expected a whole GeoTIFF") from None
+    with opened(path) as dataset:
+        _check_band(dataset)
+        if dataset.transform.is_identity:
+            raise ValueError(
+                "no geotransform: it does not say where its cells are, or has lost it; expected "
+                "one, as gdal_translate -a_ullr gives it"
+            )
+        whole = 0, 0, dataset.height, dataset.width
+        parts = [_read(dataset, whole)]
+        burnt = _burnt(parts[0][0], whole)
+        if _factor(burnt) < _factor(whole):  # a small fire in a large raster
+            parts.append(_read(dataset, burnt))
+        tags, source_crs = dataset.tags(), dataset.crs
     unit = unit or ("steps" if tags.get("units") == "steps" else None)
-    return raster_source(times, transform, source_crs, unit, crs)
+    sources = [raster_source(times, at, source_crs, unit, crs) for times, at in parts]
+    sources[-1].extent = sources[0].extent
+    return sources[-1]
 
 
 def clean(times: np.ndarray, never: np.ndarray | None = None) -> np.ndarray:
@@ -47,11 +54,15 @@ def clean(times: np.ndarray, never: np.ndarray | None = None) -> np.ndarray:
 
     Args:
         times: as a file has them, any real type.
-        never: where the file itself says so.
+        never: where the file itself says so; if it does not, the greatest number of an integer
+            type is no time, and the least of one with a sign.
 
     Raises:
         ValueError: a number is no time.
     """
+    if never is None and times.dtype.kind in "iu":
+        most = np.iinfo(times.dtype)
+        never = (times == most.max) | (times == (most.min if most.min < 0 else most.max))
     times = np.array(times, dtype=np.result_type(times, np.float32))
     if never is not None:
         np.copyto(times, np.inf, where=never)
@@ -137,27 +148,54 @@ def _check_band(dataset: Any) -> None:
             f"{dataset.width} x {dataset.height} cells; at most {MOST_CELLS} are read: expected a "
             "part of it, as gdalwarp -te cuts out"
         )
+    rows, columns = dataset.block_shapes[0]
+    size = rows * max(columns, dataset.width) * kind.itemsize
+    if size > _MOST_BYTES:
+        raise ValueError(
+            f"blocks of {columns} x {rows} cells, {size} bytes in a row of them; at most "
+            f"{_MOST_BYTES} are decoded at a time: expected smaller ones, as gdal_translate -co "
+            "TILED=YES writes"
+        )
 
 
-def _read_strips(dataset: Any) -> tuple[np.ndarray, int]:
-    """Times, and how many cells along each side were taken together."""
+def _factor(part: _Part) -> int:
+    """How many cells along each side are taken together."""
+    return math.ceil(max(part[2:]) / KEPT_SIDE)
+
+
+def _burnt(times: np.ndarray, whole: _Part) -> _Part:
+    """The part of a raster that ever burns, with a block around it; of the times of its blocks."""
+    factor, burnt = _factor(whole), np.isfinite(times)
+    if not burnt.any():
+        return whole
+    found: list[tuple[int, int]] = []
+    for axis in (0, 1):
+        at = np.flatnonzero(burnt.any(1 - axis))
+        first, end = max(at[0] - 1, 0) * factor, min((at[-1] + 2) * factor, whole[2 + axis])
+        found.append((int(first), int(end - first)))
+    return found[0][0], found[1][0], found[0][1], found[1][1]
+
+
+def _read(dataset: Any, part: _Part) -> tuple[np.ndarray, Any]:
+    """Times of a part, strip by strip, and where they are."""
     windows = library("rasterio.windows", "GeoTIFF")
-    width, height = dataset.width, dataset.height
-    factor = math.ceil(max(width, height) / KEPT_SIDE)
+    first, left, count, width = part
+    factor = _factor(part)
     # Whole blocks at a time, or each would be decoded again for the next strip.
     tall = factor * math.ceil(max(_STRIP // width, dataset.block_shapes[0][0]) / factor)
     kept: list[np.ndarray] = []
-    for top in range(0, height, tall):
-        window = windows.Window(0, top, width, min(tall, height - top))
-        part = dataset.read(1, window=window)
-        never = None if dataset.nodata is None else part == dataset.nodata
+    for top in range(0, count, tall):
+        window = windows.Window(left, first + top, width, min(tall, count - top))
+        values = dataset.read(1, window=window)
+        never = None if dataset.nodata is None else values == dataset.nodata
         if _masked(dataset):
             never = dataset.read_masks(1, window=window) == 0
         if never is not None and never.all():  # most of a large raster
-            part, never = np.full(part.shape, np.inf, np.float32), None
-        times = _earliest(clean(part, never), factor).astype(np.float64)
+            values, never = np.full(values.shape, np.inf, np.float32), None
+        times = _earliest(clean(values, never), factor).astype(np.float64)
         kept.append(times * dataset.scales[0] + dataset.offsets[0])
-    return np.concatenate(kept), factor
+    at = dataset.transform * dataset.transform.translation(left, first)
+    return np.concatenate(kept), at * at.scale(factor)
 
 
 def _masked(dataset: Any) -> bool:

@@ -77,6 +77,7 @@ def cases(folder: Path) -> Iterator[Case]:
     good = wholes(folder / "whole")
     for make in (_no_files, _cut, _garbage, _other_kinds, _headers, _values, _rasters):
         yield from make(folder / make.__name__, good)
+    yield from _tagged(folder / "_tagged", good)
     for make in (_banks, _tables, _shapes, _shapefiles, _json, _texts, _choices):
         yield from make(folder / make.__name__, good)
 
@@ -127,6 +128,34 @@ def _cut(folder: Path, good: dict[str, Path]) -> Iterator[Case]:
                 keys_of(kind),
                 source if harmless or text or kind in ("tif", "deflated", "bands") else None,
             )
+
+
+def _tagged(folder: Path, good: dict[str, Path]) -> Iterator[Case]:
+    """GeoTIFFs whose tags are at the end, as of an update: cut off there, and with tags spoilt."""
+    folder.mkdir()
+    whole = folder / "whole.tif"
+    shutil.copy(good["tif"], whole)
+    before = whole.stat().st_size
+    with rasterio.open(whole, "r+") as dataset:
+        dataset.update_tags(author="the tower")
+    content = whole.read_bytes()
+    for length in range(before, len(content)):
+        path = folder / f"tagged_{length}.tif"
+        path.write_bytes(content[:length])
+        yield Case(f"tagged tif cut to {length}", path, "damaged|expected", MINUTES, whole)
+    for tag in (33550, 33922):  # GeoPixelScale, GeoTiePoints
+        at = content.rindex(struct.pack("<HH", tag, 12))
+        for number, (offset, spoilt) in enumerate(
+            ((0, b"\1"), (2, b"\xff"), (4, b"\0\0\0\0"), (8, b"\xff\xff\xff\x7f"), (4, b"\1"))
+        ):
+            path = folder / f"spoilt_{tag}_{number}.tif"
+            where = at + offset
+            path.write_bytes(content[:where] + spoilt + content[where + len(spoilt) :])
+            # Where on the Earth it is, which is in the second, changes no grid.
+            same = whole if tag == 33922 else None
+            yield Case(f"tif with tag {tag} spoilt, {number}", path, "", MINUTES, same)
+    without = write_tif(folder / "no_place.tif", raster_of(FIRE, 300.0), transform=None)
+    yield Case("tif without a geotransform", without, "no geotransform", MINUTES)
 
 
 def _beside(folder: Path, source: Path) -> Path:

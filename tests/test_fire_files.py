@@ -323,3 +323,13 @@ def test_any_choice_gives_a_grid_or_a_line(source, grid, horizon, keys):
     assert (fire >= 0).all()
     assert (fire.isinf() | (fire <= horizon)).all()
     assert fire.isfinite().sum() >= 2
+
+
+def test_a_message_is_one_line_whatever_a_library_says(tmp_path, monkeypatch):
+    def damaged(path):
+        raise ValueError("*** in database main ***\nPage 1: \x1b[31mcorruption")
+
+    np.save(tmp_path / "fire.npy", bank_of(1).numpy())
+    monkeypatch.setattr("emberlink.envs.fire_file.formats.find_format", damaged)
+    with pytest.raises(ValueError, match=r"main \*\*\* Page 1:  \[31mcorruption$"):
+        read_fires(FileFireConfig(path=str(tmp_path / "fire.npy")), GRID, HORIZON)

@@ -1,6 +1,7 @@
 """Rasters of arrival times on grids, against numbers by hand and a loop over cells."""
 
 import math
+import os
 import subprocess
 import sys
 
@@ -8,11 +9,12 @@ import numpy as np
 import pytest
 import rasterio
 import torch
-from fire_files import CORNER, UTM, Ellipses, write_asc, write_tif
+from fire_files import CORNER, UTM, Ellipses, raster_of, write_asc, write_tif
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from rasterio.transform import from_origin
 
+from emberlink.envs import geotiff, rasters
 from emberlink.envs.arrival import Clock, RasterSource, Window
 from emberlink.envs.fire_file import FileFireConfig, read_fires
 
@@ -60,10 +62,12 @@ def test_between_the_cells_of_a_coarser_raster_times_are_interpolated(tmp_path):
     times = np.full((4, 4), -9999.0)
     times[0, :3] = [0, 4, 8]
     fire = read(write_asc(tmp_path / "fire.asc", times), horizon=8)
-    # A cell of the raster is 2 x 2 of the grid's, whose centres lie 1/4 and 3/4 across it.
-    # What burns before all around it does so as a whole.
-    assert fire[:6, 7].tolist() == pytest.approx([0, 0, 3, 5, 7, 8])
-    assert torch.equal(fire[:6, 6], fire[:6, 7])
+    # A cell of the raster is 2 x 2 of the grid's, each looked at 22 x 22 times: of the cell whose
+    # left edge is k half cells of the raster from its outer edge, first at k / 2 + 1 / 88. Times
+    # are 4 a cell, from the centre of the first cell on and to that of the last.
+    first = [4 * (k / 2 + 1 / 88 - 1 / 2) for k in range(1, 5)]  # the first of all is step 0
+    assert fire[:6, 7].tolist() == pytest.approx([0, 0, *first[1:], 8], abs=1e-5)
+    assert torch.equal(fire[2:6, 6], fire[2:6, 7])
     assert torch.isfinite(fire).sum() == 12
 
 
@@ -149,10 +153,11 @@ def test_a_crop_leaves_the_margin_on_all_sides(tmp_path):
     assert fire[9, 26] == 0
     assert fire[9, 3] == 100
     to_ten = read(path, (30, 30), horizon=100, margin=0.1, end=12.0)
-    # Twelve rows have burnt by then, 12 x 12 cells that now fill 24 x 24; the centres of the last
-    # are beyond that of the row of 12 minutes.
-    assert torch.isfinite(to_ten[3:27, 4:27]).all()
-    assert torch.isfinite(to_ten).sum() == 24 * 23
+    # The front of 12 minutes is at the centre of the twelfth row: 11.5 rows of 12 fill 22 x 23.
+    burnt = torch.isfinite(to_ten)
+    assert burnt.any(1).nonzero()[:, 0].tolist() == list(range(3, 27))
+    assert burnt.any(0).nonzero()[:, 0].tolist() == list(range(3, 27))
+    assert burnt.sum() == 24 * 24
 
 
 def test_the_inside_of_the_front_is_burnt_out(tmp_path):
@@ -198,8 +203,8 @@ def test_degrees_are_projected_to_metres(tmp_path):
     assert torch.equal(read(plain, (30, 30), margin=0.1, crs="EPSG:4326"), fire)
     i, j = np.nonzero(torch.isfinite(fire).numpy())
     assert np.ptp(i) == pytest.approx(np.ptp(j), abs=1)
-    # A disc, without holes.
-    assert len(i) == pytest.approx(math.pi * (np.ptp(i) + 1) ** 2 / 4, rel=0.05)
+    # A disc of 24 cells, without holes, and the cells on its edge.
+    assert len(i) == pytest.approx(math.pi * (24 + 1) ** 2 / 4, rel=0.03)
     assert read(path, (30, 30), margin=0.1, crs="EPSG:3857").isfinite().any()
 
 
@@ -259,6 +264,68 @@ def test_a_projection_beside_an_asc(tmp_path):
         read(degrees)
     (tmp_path / "deg.prj").write_text(rasterio.crs.CRS.from_string("EPSG:4326").to_wkt())
     assert torch.isfinite(read(degrees, margin=0.1)).any()
+
+
+def test_an_integers_greatest_number_is_no_time(tmp_path):
+    for kind in ("uint16", "uint32", "int32", "int16"):
+        never = np.iinfo(kind).max
+        times = corner([[0, 2], [4, 6]], 2, 2)
+        times = np.where(times < 0, np.float64(never), times).astype(kind)
+        fire = read(write_tif(tmp_path / f"{kind}.tif", times, nodata=None), horizon=3)
+        assert torch.isfinite(fire).sum() == 4
+
+
+def test_a_mask_says_what_never_burns(tmp_path):
+    times = np.full((8, 8), 3.0, "float32")
+    times[:2, :2] = [[0, 2], [4, 6]]
+    path = write_tif(tmp_path / "fire.tif", times, nodata=None)
+    with rasterio.Env(GDAL_TIFF_INTERNAL_MASK=True), rasterio.open(path, "r+") as dataset:
+        dataset.write_mask(times != 3)
+    assert torch.isfinite(read(path, horizon=3)).sum() == 4
+
+
+def test_of_cells_taken_together_the_earliest_is_kept(tmp_path):
+    """A raster of 4100 cells a side, of which a fire fills the width: three by three are one."""
+    times = np.full((60, 4100), -9999.0, "float32")
+    times[30, :] = np.arange(4100) + 100.0
+    times[30, [1000, 1001, 1002]] = [9, 50, 9]
+    path = write_tif(tmp_path / "fire.tif", times)
+    with geotiff.opened(path) as dataset:
+        kept, _ = rasters._read(dataset, (0, 0, 60, 4100))
+    assert kept.shape == (20, 1367)
+    by_hand = [[times[30, k : k + 3].min() for k in range(0, 4100, 3)]]
+    assert np.array_equal(kept[[10]], by_hand)
+    assert kept.min() == 9
+
+
+def test_a_small_fire_in_a_large_raster_is_read_finely(tmp_path):
+    fire = raster_of(Ellipses(), 300.0).astype("float32")
+    large = np.full((2200, 6300), -9999.0, "float32")
+    large[901:1001, 4003:4103] = fire
+    one = read(write_tif(tmp_path / "one.tif", fire), (30, 30), margin=0.1)
+    path = write_tif(tmp_path / "large.tif", large, compress="deflate")
+    two = read(path, (30, 30), margin=0.1)
+    assert torch.allclose(one, two, atol=1e-2)
+    with pytest.raises(ValueError, match="no fire spreads"):  # on all that the file covers
+        read(path, (60, 20))
+
+
+def test_what_libtiff_prints_is_an_error_and_is_not_shown(tmp_path, capfd):
+    path = write_tif(tmp_path / "fire.tif", corner([[0, 5, 10], [2, 4, 9]], 2, 3))
+    said = "damaged: _tiffSeekProc: Invalid argument"
+    with pytest.raises(ValueError, match=said), geotiff.opened(path):
+        os.write(2, b"_tiffSeekProc: Invalid argument.\n")
+    assert capfd.readouterr().err == ""
+    with geotiff.opened(path):
+        os.write(2, b"of someone else\n")
+    assert capfd.readouterr().err == "of someone else\n"
+
+
+def test_large_blocks_are_refused(tmp_path):
+    values = np.zeros((7200, 7200), "float32")
+    path = write_tif(tmp_path / "fire.tif", values, blockysize=7200, compress="deflate")
+    with pytest.raises(ValueError, match=r"blocks of 7200 x 7200 cells.*at most 200000000"):
+        read(path)
 
 
 def test_a_large_raster_takes_neither_much_memory_nor_long(tmp_path):
@@ -326,10 +393,17 @@ def test_no_arrival_is_lost(rows, columns, side, x, y, seed):
     window = Window(x, y, side, (8, 9))
     source = RasterSource(times, (1, 0, 0, 0, -1, rows), Clock("minutes"))
     got = source.on(window, INF)
+    cells = RasterSource(times, (1, 0, 0, 0, -1, rows), Clock("steps"), whole=True)
+    cells = cells.on(window, INF)
     assert (got >= times.min() - 1e-9).all()
     assert (np.isinf(got) | (got <= times[times < INF].max() + 1e-9)).all()
     expected = by_loops(times, window)
     for i in range(8):
         for j in range(9):
-            if (i, j) in expected and (side >= 1 or expected[i, j] == times.min()):
-                assert got[i, j] == pytest.approx(expected[i, j], rel=1e-12)
+            if (i, j) not in expected:
+                continue
+            if side >= 1:
+                assert cells[i, j] == expected[i, j]
+                assert got[i, j] <= expected[i, j]
+            if expected[i, j] == times.min():
+                assert got[i, j] == times.min()
