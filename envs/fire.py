@@ -34,6 +34,7 @@ _STREAM = 0xF12E  # keeps a fire's draws apart from other uses of the same seed
 _NODES = 60  # nodes along the shorter side at least: twice the resolution of 30 cells
 _CHUNK = 200_000  # nodes computed at a time, so that the work stays in the processor's cache
 _SIDES = (8, 256)
+_LEAST = 1e-6  # radius of a patch, cells: its square is no number below some 1e-19
 
 
 def _ordered(pair: tuple[float, float]) -> tuple[float, float]:
@@ -277,7 +278,9 @@ def _fuel(
     py = (centre[:, 1:] + reach * angle.sin())[..., None, None]
     loss = (1 - rate) * (torch.arange(most, device=seeds.device) < count)
     x, y = _axes(grid, seeds.device)
-    apart = ((x - px) ** 2 + (y - py) ** 2) / (width * scale)[..., None, None] ** 2
+    apart = ((x - px) ** 2 + (y - py) ** 2) / (width * scale).clamp_min(_LEAST)[
+        ..., None, None
+    ] ** 2
     return (1 - loss[..., None, None] * torch.exp(-apart)).prod(1)
 
 

@@ -276,6 +276,8 @@ def test_the_command_line_refuses_what_does_not_fit(text, tmp_path, capsys):
     rng = np.random.default_rng(len(text))
     numbers = [k for k, s in KEYS.items() if s.get("type") in ("integer", "number", "array")]
     for key in rng.permutation(numbers)[: 400 if SOAK else 4]:
+        if (key, text) == ("seeds", "[1,2,3,4]"):  # fits
+            continue
         arguments = ["train", "consensus", f"{key}={text}", f"output={tmp_path / 'x'}"]
         assert cli.main(arguments) == 2
         out, err = capsys.readouterr()

@@ -417,3 +417,16 @@ def test_every_valid_config_gives_a_fire(low, high, ratio, radius, patches, seed
     assert arrival.shape == (1, 8, 9)
     assert (arrival >= 0).all()
     assert ((arrival <= 20) | arrival.isinf()).all()
+
+
+def test_a_patch_as_small_as_a_number_can_be_is_no_nan():
+    """At the centre of a cell its distance and its radius, squared, are both 0."""
+    config = dataclasses.replace(
+        load_scenario("paper"),
+        patch_radius=(1e-30, 1e-30),
+        patch_distance=(-5.75, -5.75),
+        centre_x=(0.5, 0.5),
+        centre_y=(0.5, 0.5),
+    )
+    fires = make_fires(config, fire_seeds("train", 1), (31, 31), 50)
+    assert not fires.isnan().any()
