@@ -6,13 +6,13 @@ from pathlib import Path
 import numpy as np
 
 from .arrival import Clock, RasterSource
+from .config import SIDES
 from .geo import first_line
 from .geotiff import opened
 from .rasters import check_spreads, clean
 
 MOST_CELLS = 300_000_000
 """of all fires together: 1.2 GB"""
-_SIDES = (8, 256)
 
 
 def read_npy(path: Path) -> Iterator[RasterSource]:
@@ -61,9 +61,9 @@ def read_bands(path: Path) -> Iterator[RasterSource]:
 
 def _check_size(shape: tuple[int, ...]) -> None:
     fires, width, height = shape
-    if not all(_SIDES[0] <= side <= _SIDES[1] for side in (width, height)):
+    if not all(SIDES[0] <= side <= SIDES[1] for side in (width, height)):
         raise ValueError(
-            f"fires of {width} x {height} cells; expected {_SIDES[0]} to {_SIDES[1]} a side"
+            f"fires of {width} x {height} cells; expected {SIDES[0]} to {SIDES[1]} a side"
         )
     if fires * width * height > MOST_CELLS:
         raise ValueError(

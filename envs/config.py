@@ -14,6 +14,10 @@ from .reward import RewardConfig
 
 T = TypeVar("T")
 
+SIDES = (8, 256)
+"""least and most cells along a side of a grid"""
+_Side = Annotated[int, Field(ge=SIDES[0], le=SIDES[1])]
+
 TAG = "kind:"
 """begins the name of one of several types that a value may be of; no part of its key"""
 Name = Annotated[str, Field(pattern=r"^\w[\w.+-]*$", max_length=100)]
@@ -24,10 +28,7 @@ Name = Annotated[str, Field(pattern=r"^\w[\w.+-]*$", max_length=100)]
 class WildfireConfig:
     """The world and the team; the defaults are the paper's text."""
 
-    grid: Annotated[
-        tuple[Annotated[int, Field(ge=8, le=256)], Annotated[int, Field(ge=8, le=256)]],
-        Strict(False),
-    ] = (30, 30)
+    grid: Annotated[tuple[_Side, _Side], Strict(False)] = (30, 30)
     """cells along x and y"""
     num_uavs: Annotated[int, Field(ge=1, le=64)] = 6
     """UAVs in the team"""
@@ -62,6 +63,16 @@ class WildfireConfig:
     def high(self) -> tuple[float, float, float]:
         """The box's corner with the largest coordinates, cells."""
         return self.grid[0] - 1.0, self.grid[1] - 1.0, self.altitude[1]
+
+
+def check_grid(grid: tuple[int, int]) -> None:
+    """That a map has as many cells along each side as fires are made and read for.
+
+    Raises:
+        ValueError: it has not.
+    """
+    if not all(SIDES[0] <= side <= SIDES[1] for side in grid):
+        raise ValueError(f"grid must have {SIDES[0]} to {SIDES[1]} cells a side, got {grid}")
 
 
 def known(group: str) -> list[str]:

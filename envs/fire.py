@@ -20,7 +20,7 @@ from pydantic.dataclasses import dataclass
 from torch import Tensor
 from yaml import YAMLError
 
-from .config import Name, describe, known
+from .config import Name, check_grid, describe, known
 from .drift import current, longest_step, tide_speed
 from .spread import arrival_times, disc
 from .streams import fold, uniform
@@ -33,7 +33,6 @@ Split = Literal["train", "heldout"]
 _STREAM = 0xF12E  # keeps a fire's draws apart from other uses of the same seed
 _NODES = 60  # nodes along the shorter side at least: twice the resolution of 30 cells
 _CHUNK = 200_000  # nodes computed at a time, so that the work stays in the processor's cache
-_SIDES = (8, 256)
 _LEAST = 1e-6  # radius of a patch, cells: its square is no number below some 1e-19
 
 
@@ -126,10 +125,11 @@ def load_scenario(name: str) -> FireConfig:
     Raises:
         ValueError: no such file, or a value in it that `FireConfig` does not take.
     """
-    if name not in scenarios():
+    values = _values(name) if name in known("fire") else None
+    if values is None or "kind" in values:
         raise ValueError(f"unknown fire {name!r}; known: {', '.join(scenarios())}")
     try:
-        return FireConfig(**_values(name))
+        return FireConfig(**values)
     except ValidationError as error:
         raise ValueError(f"configs/fire/{name}.yaml: {describe(error)}") from None
 
@@ -187,8 +187,7 @@ def make_fires(
     Returns:
         float32 [fires, X, Y], steps: 0 burns from the start, inf never burns.
     """
-    if not all(_SIDES[0] <= side <= _SIDES[1] for side in grid):
-        raise ValueError(f"grid must have {_SIDES[0]} to {_SIDES[1]} cells a side, got {grid}")
+    check_grid(grid)
     refine = math.ceil(_NODES / min(grid))
     sides = (side + 2 * _margin(config, grid) for side in grid)
     chunk = max(1, _CHUNK // (math.prod(sides) * refine**2))
@@ -278,9 +277,8 @@ def _fuel(
     py = (centre[:, 1:] + reach * angle.sin())[..., None, None]
     loss = (1 - rate) * (torch.arange(most, device=seeds.device) < count)
     x, y = _axes(grid, seeds.device)
-    apart = ((x - px) ** 2 + (y - py) ** 2) / (width * scale).clamp_min(_LEAST)[
-        ..., None, None
-    ] ** 2
+    wide = (width * scale).clamp_min(_LEAST)[..., None, None]
+    apart = ((x - px) ** 2 + (y - py) ** 2) / wide**2
     return (1 - loss[..., None, None] * torch.exp(-apart)).prod(1)
 
 

@@ -14,16 +14,13 @@ from pydantic.dataclasses import dataclass as checked
 from emberlink.envs import metrics
 
 from . import pretrained
-from .config import RunConfig, describe, flat, resolve, to_values
+from .config import NOT_LEARNT_WITH, RunConfig, describe, flat, resolve, to_values
 from .evaluate import LEARNED
 from .figures import CURVES
 from .reading import LONGEST_JSON, read_text
 from .run_folder import RunFolder
 
-NOT_COMPARED = (
-    *("seed", "seeds", "output", "device", "logger", "evaluation"),
-    *("checkpoint_interval", "checkpoint_steps", "keep", "on_nan"),
-)
+NOT_COMPARED = ("seed", "seeds", "output", "evaluation", *NOT_LEARNT_WITH)
 """keys in which the runs of a group may differ: none changes what is trained"""
 NAMELESS = ("seed", "seeds", "output")
 """those of them that nobody need be told of"""

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 import torch
 from hydra import compose, initialize_config_module
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import QuotedString
+from hydra.core.override_parser.types import Override, QuotedString
 from hydra.errors import HydraException
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -37,6 +37,11 @@ from emberlink.envs.scenario import Scenario, fires_of
 
 _STRICT = ConfigDict(extra="forbid", strict=True)
 _GROUPS = ("setup", "fire")
+NOT_LEARNT_WITH = (
+    *("device", "logger", "on_nan"),
+    *("checkpoint_interval", "checkpoint_steps", "keep"),
+)
+"""keys that change nothing of what is learnt, so that runs that differ in them are the same"""
 
 Positive = Annotated[float, Field(gt=0, le=1e30)]
 NotNegative = Annotated[float, Field(ge=0, le=1e30)]
@@ -271,18 +276,21 @@ def override(config: RunConfig, overrides: Sequence[str]) -> RunConfig:
 
 def _parsed(text: str) -> tuple[str, Any]:
     """Key and value of one `key=value`."""
-    try:
-        parsed = OverridesParser.create().parse_override(text)
-    except HydraException:
-        raise ValueError(f"{text!r} is not of the form key=value") from None
-    if parsed.is_delete() or _adds(parsed) or parsed.is_sweep_override():
-        raise ValueError(f"{text!r}: only key=value with one value is understood here")
+    parsed = _override(text)
     value: Any = parsed.value()
     return parsed.key_or_group, value.text if isinstance(value, QuotedString) else value
 
 
-def _adds(parsed: Any) -> bool:
-    return parsed.is_add() or parsed.is_force_add()
+def _override(text: str) -> Override:
+    """What Hydra makes of one `key=value`."""
+    try:
+        parsed = OverridesParser.create().parse_override(text)
+    except (HydraException, ValueError, RecursionError):
+        raise ValueError(f"{shown(text)!r} is not of the form key=value") from None
+    adds = parsed.is_add() or parsed.is_force_add()
+    if parsed.is_delete() or adds or parsed.is_sweep_override():
+        raise ValueError(f"{shown(text)!r}: only key=value with one value is understood here")
+    return parsed
 
 
 def _set(values: dict[str, Any], key: str, value: Any) -> None:
@@ -340,19 +348,14 @@ def _check_overrides(method: str, overrides: Sequence[str], choices: dict[str, s
     """Finds what Hydra would explain at length, and writes down which groups were chosen."""
     others: list[str] = []
     for text in overrides:
-        try:
-            override = OverridesParser.create().parse_override(text)
-        except (HydraException, ValueError, RecursionError):
-            raise ValueError(f"{shown(text)!r} is not of the form key=value") from None
-        key = override.key_or_group
-        if override.is_delete() or _adds(override) or override.is_sweep_override():
-            raise ValueError(f"{shown(text)!r}: only key=value with one value is understood here")
-        if isinstance(override.value(), dict):
+        parsed = _override(text)
+        key = parsed.key_or_group
+        if isinstance(parsed.value(), dict):
             raise ValueError(f"{shown(text)!r}: give its keys one by one, as {key}.KEY=VALUE")
         if key in ("fire.name", "fire.kind"):
             raise ValueError(f"{shown(text)!r}: a scenario is chosen with fire=NAME")
         if key in _GROUPS:
-            chosen = str(override.value())
+            chosen = str(parsed.value())
             if chosen not in known(key):
                 raise ValueError(f"{key} {_quote(chosen, known(key))}")
             choices[key] = chosen

@@ -1,6 +1,5 @@
 """What a training says and leaves behind where a number is not finite: culprit, bundle, replay."""
 
-import itertools
 import platform
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
@@ -14,6 +13,7 @@ from torch import Tensor
 from torchrl.envs import TransformedEnv
 
 from emberlink.envs import keys
+from emberlink.envs.publish import free_name
 
 from . import checkpoint, state
 from .config import to_values
@@ -283,7 +283,7 @@ def _by_team(own: Tensor, teams: int) -> Tensor:
 
 def _write(trainer: "Trainer", place: int, batch: TensorDictBase, culprit: Culprit) -> Path:
     """Writes a bundle to a new folder of the first seed's run."""
-    whole = _free(trainer.run.path, f"divergence_step_{culprit.step}")
+    whole = free_name(trainer.run.path, f"divergence_step_{culprit.step}", [""])
     folder = whole.with_name(whole.name + ".part")
     folder.mkdir()
     watch = trainer.learner.watch
@@ -325,12 +325,6 @@ def _range(value: Tensor) -> dict[str, Any]:
     finite = value[value.isfinite()]
     ends = [finite.min().item(), finite.max().item()] if finite.numel() else None
     return {"finite": ends, "not_finite": value.numel() - finite.numel()}
-
-
-def _free(parent: Path, name: str) -> Path:
-    """A name that nothing there has."""
-    names = (name if attempt == 1 else f"{name}_{attempt}" for attempt in itertools.count(1))
-    return next(path for one in names if not (path := parent / one).exists())
 
 
 def _grouped(content: Mapping[str, Tensor]) -> dict[str, dict[str, Tensor]]:

@@ -10,8 +10,9 @@ from typing import Any
 from torch import Tensor
 
 from emberlink.envs.config import shown
-from emberlink.envs.fire import FireConfig, fire_seeds, make_fires, scenarios
+from emberlink.envs.fire import scenarios
 from emberlink.envs.fire_file import FileFireConfig, read_fires
+from emberlink.envs.scenario import fires_of
 
 from .config import RunConfig, resolve
 
@@ -46,7 +47,7 @@ def find(text: str, overrides: Sequence[str]) -> Source:
         ValueError: there is no such fire, or a key or value is wrong.
     """
     name, _, index = text.rpartition(":") if ":" in text else (text, "", "0")
-    if name in scenarios() and name != FILE:
+    if name in scenarios():
         config = generated(name, overrides)
         return Source(
             title=f"{name}, held-out fire {index}",
@@ -77,9 +78,7 @@ def _held_out(config: RunConfig, text: str, index: str) -> Tensor:
         raise ValueError(
             f"{shown(text)}: there is no held-out fire {index!r}; known: 0 to {HELD_OUT - 1}"
         )
-    seeds = fire_seeds("heldout", int(index) + 1)[int(index) :]
-    assert isinstance(config.fire, FireConfig)
-    return make_fires(config.fire, seeds, config.env.grid, config.env.horizon)[0]
+    return fires_of(config.fire).one_heldout(int(index), config.env.grid, config.env.horizon)[0]
 
 
 def generated(scenario: str, overrides: Sequence[str]) -> RunConfig:
@@ -88,7 +87,7 @@ def generated(scenario: str, overrides: Sequence[str]) -> RunConfig:
     Raises:
         ValueError: there is no such scenario, its fires are read, or a key or value is wrong.
     """
-    known = [name for name in scenarios() if name != FILE]
+    known = scenarios()
     if scenario not in known:
         hint = _near(scenario, known)
         raise ValueError(f"fire {shown(scenario)!r} is not known{hint} known: {', '.join(known)}")
@@ -132,7 +131,7 @@ def read(config: RunConfig) -> Tensor:
 
 
 def _unknown(text: str) -> str:
-    known = [name for name in scenarios() if name != FILE]
+    known = scenarios()
     hint = _near(text.rpartition(":")[0] or text, known)
     return f"{shown(text)}: no file or scenario is so called{hint} known: {', '.join(known)}"
 

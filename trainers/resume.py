@@ -9,16 +9,13 @@ from typing import Any
 from emberlink.envs.config import shown
 
 from . import checkpoint, state, state_header
-from .config import RunConfig, flat, from_values, override, to_values
+from .config import NOT_LEARNT_WITH, RunConfig, flat, from_values, override, to_values
 from .lock import Lock
 from .loop import LINES, SIBLINGS, Trainer
 from .reading import LONGEST_YAML, parse_json, read_text
 from .run_folder import RunFolder, step_of
 
-MAY_CHANGE = (
-    *("episodes", "device", "logger", "on_nan"),
-    *("checkpoint_interval", "checkpoint_steps", "keep"),
-)
+MAY_CHANGE = ("episodes", *NOT_LEARNT_WITH)
 """keys that a resumed run may be given anew, beside those of `evaluation`"""
 
 
@@ -96,10 +93,13 @@ def _check_siblings(runs: Sequence[RunFolder], config: RunConfig) -> None:
             f"{runs[0].path}: is of {len(seeds)} seeds, {SIBLINGS} names {len(runs)} folders"
         )
     for run, seed in zip(runs, seeds, strict=True):
-        if run.has_config() and replace(run.config(), seed=config.seed) != config:
+        if not run.has_config():
+            continue
+        own = run.config()
+        if replace(own, seed=config.seed) != config:
             raise ValueError(f"{run.path / 'config.yaml'}: not of the run of {runs[0].path}")
-        if run.has_config() and run.config().seed != seed:
-            raise ValueError(f"{run.path / 'config.yaml'}: seed={run.config().seed}, not {seed}")
+        if own.seed != seed:
+            raise ValueError(f"{run.path / 'config.yaml'}: seed={own.seed}, not {seed}")
 
 
 def _check_beginning(runs: Sequence[RunFolder], config: RunConfig) -> None:

@@ -15,21 +15,14 @@ from rich.console import Console
 from rich.table import Table
 
 from emberlink.envs.config import known
+from emberlink.envs.publish import free_name
 
-from .config import RunConfig, flat, resolve, to_values
+from .config import NOT_LEARNT_WITH, RunConfig, flat, resolve, to_values
 from .interruption import Interruption
 from .run_folder import RunFolder
 from .sweep_progress import SweepProgress
 
-_MAY_DIFFER = (
-    "output",
-    "device",
-    "logger",
-    "keep",
-    "checkpoint_interval",
-    "checkpoint_steps",
-    "on_nan",
-)
+_MAY_DIFFER = ("output", *NOT_LEARNT_WITH)
 """keys in which a run that is there may differ from the one that is wanted"""
 _PROGRAM = "from emberlink.trainers.cli import main; raise SystemExit(main())"
 _BETWEEN_LOOKS = 0.5  # seconds
@@ -172,7 +165,7 @@ class _Team:
         try:
             logs.mkdir(parents=True, exist_ok=True)
             stem = f"{config.setup}_{job.method}_s" + "-".join(str(c.seed) for c in job.configs)
-            job.log = _free(logs, stem)
+            job.log = Path(f"{free_name(logs, stem, ['.txt'])}.txt")
             with job.log.open("x") as log:
                 # A session of its own: Ctrl-C is for the sweep, which tells them to save.
                 self._running[job] = subprocess.Popen(
@@ -235,11 +228,6 @@ def _runs_in(output: Path) -> list[tuple[tuple, RunFolder]]:
         except ValueError:
             continue  # of another version, or not one of ours
     return found
-
-
-def _free(folder: Path, stem: str) -> Path:
-    names = (f"{stem}{'' if i == 1 else f'_{i}'}.txt" for i in range(1, 1_000_000))
-    return next(path for name in names if not (path := folder / name).exists())
 
 
 def _last_line(log: Path) -> str:
