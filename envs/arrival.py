@@ -74,6 +74,17 @@ class Window:
         )
         return np.meshgrid(x, y, indexing="ij")
 
+    def beyond(self, bounds: Bounds) -> np.ndarray:
+        """Which cells lie outside of some bounds with all of their area, bool [X, Y]."""
+        outside: list[np.ndarray] = []
+        for start, count, low, high in zip(
+            (self.x, self.y), self.grid, bounds[:2], bounds[2:], strict=True
+        ):
+            edges = start + np.arange(count + 1) * self.side
+            near = _EDGE * self.side
+            outside.append((edges[1:] <= low + near) | (edges[:-1] >= high - near))
+        return outside[0][:, None] | outside[1][None, :]
+
     def cells(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Which cell each point lies in; it may be outside the grid."""
         i, j = ((at - start) / self.side for at, start in ((x, self.x), (y, self.y)))
@@ -84,8 +95,10 @@ class Source(Protocol):
     """A fire as a file has it."""
 
     clock: Clock
+    began: float
+    """when the fire began, as far as is known"""
     first: float
-    """earliest arrival"""
+    """earliest arrival that was seen"""
     last: float
     """latest arrival"""
     extent: Bounds
@@ -125,7 +138,8 @@ class RasterSource:
         self.times, self.clock, self.whole = times.astype(np.float64), clock, whole
         self._affine, self._moves = affine, moves
         burning = times[np.isfinite(times)]
-        self.first, self.last = float(burning.min()), float(burning.max())
+        self.began = self.first = float(burning.min())
+        self.last = float(burning.max())
         rows, columns = (np.arange(count) for count in times.shape)
         edge_rows = np.concatenate([rows, rows, 0 * columns, 0 * columns + len(rows) - 1])
         edge_columns = np.concatenate([0 * rows, 0 * rows + len(columns) - 1, columns, columns])
@@ -252,10 +266,16 @@ class RasterSource:
 
 
 def _first(times: np.ndarray, until: float) -> np.ndarray:
-    """Where on each line of cells what has burnt begins, cells from the first one's centre."""
+    """Where on each line of cells what has burnt begins, cells from the first one's centre.
+
+    Beyond the last cell that has a time the front goes on as fast as it came, if it would not have
+    reached the next one; else it ends with the cell.
+    """
+    lines, count = np.arange(len(times)), times.shape[1]
     at = (times <= until).argmax(1)
-    lines = np.arange(len(times))
     inner, outer = times[lines, at], times[lines, np.maximum(at - 1, 0)]
+    before = times[lines, np.minimum(at + 1, count - 1)]
     goes_on = (at > 0) & np.isfinite(outer)
-    step = np.where(goes_on, outer - inner, 1.0)
-    return at - np.where(goes_on, (until - inner) / step, 0.5)
+    step = np.where(goes_on, outer - inner, inner - before)
+    left = np.where(step > 0, until - inner, 0.5) / np.where(step > 0, step, 1.0)
+    return at - np.where(goes_on | (left < 1), left, 0.5)

@@ -16,18 +16,17 @@ from . import formats
 from .arrival import Source, Units
 from .ascii_grids import read_ascii
 from .bank_readers import is_bank, read_bands, read_npy
-from .config import Name, printable
+from .config import Name, check_grid, printable
 from .fire_window import on_grid
 from .front_points import read_front_points
 from .geo import one_line, quiet
 from .perimeters import read_perimeters
 from .rasters import read_geotiff
 
-READER_VERSION = 2  # raise it whenever the same file gives another grid
+READER_VERSION = 3  # raise it whenever the same file gives another grid
 KEPT = "fires.npz"
 """the file of a run folder that holds the run's own copy of its grids"""
 _EVERY, _HELD_OUT = 5, 4  # of several fires, those whose number has this remainder are held out
-_SIDES = (8, 256)
 _Number = Annotated[float, Field(allow_inf_nan=False)]
 _Time = _Number | Annotated[str, Field(min_length=1, max_length=40)]
 _Digest = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
@@ -59,7 +58,7 @@ class FileFireConfig:
     units: Units | None = None
     """Of the numbers in the file, and of `start` and `end`."""
     start: _Time | None = None
-    """Time of step 0, in `units`, or ISO text for calendar times; the first arrival if None."""
+    """Time of step 0, in `units`, or ISO text for calendar times; when the fire began if None."""
     end: _Time | None = None
     """Time of the last step, as `start`; the last arrival if None."""
     minutes_per_step: Annotated[float, Field(gt=0, le=1e9)] | None = None
@@ -104,8 +103,7 @@ def read_fires(config: FileFireConfig, grid: tuple[int, int], horizon: int) -> T
     Raises:
         ValueError: one line that names the file and what is wrong with it.
     """
-    if not all(_SIDES[0] <= side <= _SIDES[1] for side in grid):
-        raise ValueError(f"grid must have {_SIDES[0]} to {_SIDES[1]} cells a side, got {grid}")
+    check_grid(grid)
     path = Path(config.path).expanduser()
     try:
         with quiet():

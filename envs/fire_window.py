@@ -49,12 +49,10 @@ def on_grid(source: Source, choices: Choices, grid: tuple[int, int], horizon: in
     as_it_is = untouched and source.clock.unit == "steps"
     start, end = (0.0, float(horizon)) if as_it_is else _span(source, choices, horizon)
     margin = None if source.whole else choices.margin
-    if margin is None:
-        window = Window.around(source.extent, grid, 0)
-    else:
-        window = Window.around(source.burnt(end), grid, margin)
+    bounds = source.extent if margin is None else source.burnt(end)
+    window = Window.around(bounds, grid, margin or 0)
     times = source.on(window, end)
-    times[times > end] = np.inf
+    times[(times > end) | window.beyond(bounds)] = np.inf
     if choices.ring_width is not None and not (source.whole and as_it_is):
         times[_burnt_out(times, start, choices.ring_width * min(grid) / BASE_SIDE)] = np.inf
     steps = (np.maximum(times, start) - start) / (end - start) * horizon
@@ -71,7 +69,7 @@ def on_grid(source: Source, choices: Choices, grid: tuple[int, int], horizon: in
 def _span(source: Source, choices: Choices, horizon: int) -> tuple[float, float]:
     """First and last moment of the episode, in the source's time."""
     start = _moment(choices.start, "start", source, choices.units)
-    start = source.first if start is None else start
+    start = source.began if start is None else start
     end = _moment(choices.end, "end", source, choices.units)
     if choices.minutes_per_step is not None:
         if source.clock.unit == "steps":

@@ -7,6 +7,7 @@ import numpy as np
 from .geo import library
 
 _GAP = 0.01  # of a line's length: a gap that small between its ends is closed
+_POINT = 1e-3  # of an area's width: what is left of it where it is drawn in to a point
 MOST_RINGS = 20_000
 """closed lines of one time"""
 
@@ -49,6 +50,29 @@ def enclosed(geometries: Any, names: list[int]) -> Any:
     if not area.area > 0:
         raise ValueError(f"feature {names[0]} encloses no area; expected a perimeter")
     return area
+
+
+def ignition(area: Any, moved: np.ndarray) -> Any:
+    """Where a fire began of which an area is what has burnt since.
+
+    Args:
+        area: a shapely polygon or several.
+        moved: float64 [4], how far the least x and y and the greatest x and y of the whole have
+            moved since. The box around each polygon is drawn in by that, to a point at most.
+    """
+    shapely = library("shapely", "perimeters")
+    began: list[Any] = []
+    for part in (part for part in _parts(area) if part.geom_type == "Polygon"):
+        now = np.array(part.bounds)
+        size, then = now[2:] - now[:2], now - moved
+        scale = np.maximum((then[2:] - then[:2]) / size, _POINT)
+        shift = np.clip((then[:2] + then[2:]) / 2, now[:2], now[2:]) - scale * (now[:2] + size / 2)
+        small = shapely.transform(part, lambda at, scale=scale, shift=shift: at * scale + shift)
+        small = small.intersection(part)
+        if not small.area > 0:
+            small = part.representative_point().buffer(_POINT * size.min())
+        began.append(small)
+    return shapely.union_all(began)
 
 
 def _parts(geometry: Any) -> list[Any]:

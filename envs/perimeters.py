@@ -9,7 +9,7 @@ from scipy.ndimage import distance_transform_edt
 
 from .arrival import Clock, Units, Window
 from .geo import Bounds, first_line, library, to_plane
-from .perimeter_shapes import enclosed
+from .perimeter_shapes import enclosed, ignition
 from .perimeter_times import perimeter_times
 
 MOST_TIMES = 500
@@ -97,7 +97,9 @@ def _too_large(bounds: Bounds) -> bool:
 class PerimeterSource:
     """A fire of which the burnt area is known at some times; between them fronts are interpolated.
 
-    Perimeters that were observed do not contain each other: what burnt once stays burnt.
+    Perimeters that were observed do not contain each other: what burnt once stays burnt. Of elapsed
+    times, the fire before the first perimeter is taken back to 0, or to a point: the edges of the
+    box around it moved as fast as from the first to the second.
 
     Args:
         areas: shapely's, on the plane, one for each time.
@@ -113,7 +115,10 @@ class PerimeterSource:
                 f"one perimeter, of {clock.shown(times[0])}; expected two times or more"
             )
         self.clock, self.first, self.last = clock, float(times[0]), float(times[-1])
-        self._areas, self._times = areas, times
+        if clock.origin is None and times[0] > 0:
+            area, began = _began(areas, times)
+            areas, times = [area, *areas], np.concatenate([[began], times])
+        self._areas, self._times, self.began = areas, times, float(times[0])
         boxes = np.array([area.bounds for area in areas])
         low, high = np.minimum.accumulate(boxes[:, :2]), np.maximum.accumulate(boxes[:, 2:])
         self._boxes = np.concatenate([low, high], axis=1)
@@ -197,6 +202,16 @@ class PerimeterSource:
                 f"burnt before and is {100 * area.area / before.area:.0f} % of it: times go "
                 "backwards; expected areas that grow"
             )
+
+
+def _began(areas: Sequence[Any], times: np.ndarray) -> tuple[Any, float]:
+    """The area that burnt when the clock or the fire began, whichever was later, and that time."""
+    first, second = (np.array(area.bounds) for area in areas[:2])
+    grown = np.concatenate([np.minimum(second - first, 0)[:2], np.maximum(second - first, 0)[2:]])
+    speed = grown / (times[1] - times[0])
+    width, spread = ((at[2:] - at[:2]).sum() for at in (first, speed))
+    time = max(0.0, times[0] - width / spread) if spread > 0 else times[0]
+    return ignition(areas[0], speed * (times[0] - time)), time
 
 
 def _valid(shapely: Any, area: Any) -> Any:

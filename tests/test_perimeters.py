@@ -48,6 +48,60 @@ def test_a_fire_is_the_same_from_its_raster_and_from_its_perimeters(tmp_path, na
     assert (one - two)[later].abs().mean() < 0.06 * HORIZON
 
 
+@pytest.mark.parametrize("name", FIRES)
+@pytest.mark.parametrize("grid", [(30, 30), (48, 36)])
+def test_by_default_both_begin_when_the_fire_began(tmp_path, name, grid):
+    fire = FIRES[name]
+    raster = write_asc(tmp_path / "fire.asc", raster_of(fire, 300.0, 150, 20.0), 20.0)
+    frame_of(fire, HOURS, "line").to_file(tmp_path / "fire.shp")
+    one = read(raster, grid, units="minutes", start=0.0)  # its first cell burns some minutes later
+    two = read(tmp_path / "fire.shp", grid)
+    found = overlaps(one, two, (300, 475, 650, 825, 1000))
+    assert min(found) > 0.9, found
+
+
+def test_before_the_first_perimeter_by_hand(tmp_path):
+    """Edges that move 50 m an hour: at 0 a square of 200 m, where the first one has 300 m."""
+    squares(300, 400, column="Elapsed_Mi", values=[60, 120]).to_file(tmp_path / "fire.shp")
+    fire = read(tmp_path / "fire.shp", (40, 40), 120, margin=0.0)  # cells of 10 m
+    assert (fire[10:30, 10:30] == 0).all()
+    assert (fire == 0).sum() == 20 * 20
+    assert (fire <= 60).sum() == pytest.approx(30 * 30, abs=4 * 30)
+    assert (fire[5:9, 20] > 0).all()
+    assert (fire[5:9, 20] < 60).all()
+    # Three hours before the first perimeter it was a point, which is as far back as it goes.
+    for first in (180, 360):
+        squares(300, 400, column="Elapsed_Mi", values=[first, first + 60]).to_file(
+            tmp_path / "late.shp"
+        )
+        late = read(tmp_path / "late.shp", (40, 40), 240, margin=0.0)
+        assert 1 <= (late == 0).sum() <= 4
+        assert (late == 0)[19:21, 19:21].any()
+        assert (late <= 180).sum() == pytest.approx(30 * 30, abs=4 * 30)
+    # Calendar time begins at the first perimeter.
+    squares(300, 400, column="date", values=["2020-08-19", "2020-08-20"]).to_file(
+        tmp_path / "dates.gpkg"
+    )
+    dated = read(tmp_path / "dates.gpkg", (40, 40), 120, margin=0.0)
+    assert (dated == 0).sum() == pytest.approx(30 * 30, abs=4 * 30)
+
+
+def test_before_the_first_perimeter_each_part_is_drawn_in(tmp_path):
+    """Edges of the whole that move 50 m: two squares of 200 m began as two of 100 m; what stays
+    where it is, as the lower edge, did so before."""
+    shapes = [
+        shapely.MultiPolygon([shapely.box(0, 0, 200, 200), shapely.box(400, 0, 600, 200)]),
+        shapely.box(-50, 0, 650, 250),
+    ]
+    shapes = [shapely.transform(shape, lambda at: at + CORNER) for shape in shapes]
+    frame = geopandas.GeoDataFrame({"Elapsed_Mi": [60, 120]}, geometry=shapes, crs=UTM)
+    frame.to_file(tmp_path / "fire.gpkg")
+    fire = read(tmp_path / "fire.gpkg", (70, 25), 120, margin=0.0)  # cells of 10 m
+    expected = torch.zeros(70, 25, dtype=torch.bool)
+    expected[10:20, :15] = expected[50:60, :15] = True
+    assert torch.equal(fire == 0, expected)
+
+
 @pytest.mark.parametrize(
     ("kind", "suffix"),
     [

@@ -146,12 +146,19 @@ def test_a_crop_leaves_the_margin_on_all_sides(tmp_path):
     times = np.full((60, 50), -9999.0)
     times[20:44, 10:22] = np.arange(24)[:, None] + 1.0
     path = write_asc(tmp_path / "fire.asc", times)
-    fire = read(path, (30, 30), horizon=100, margin=0.1)
-    # 24 cells over 80 % of 30: a cell of the raster is one of the grid's. 12 columns are centred.
+    fire = read(path, (30, 30), horizon=100, margin=0.1, end=24.5)
+    # A row a minute: the front of 24.5 minutes is where the row of 24 ends. 24 cells over 80 % of
+    # 30: a cell of the raster is one of the grid's. 12 columns are centred.
     assert torch.isfinite(fire[9:21, 3:27]).all()
     assert torch.isfinite(fire).sum() == 12 * 24
     assert fire[9, 26] == 0
-    assert fire[9, 3] == 100
+    assert fire[9, 3].item() == pytest.approx(100 * 23 / 23.5)
+    for keys in ({}, {"end": 24.0}, {"end": 23.75}, {"end": 24.9}, {"end": 25.0}, {"end": 90.0}):
+        burnt = torch.isfinite(read(path, (30, 30), horizon=100, margin=0.1, **keys))
+        assert burnt.any(0).nonzero()[:, 0].tolist() == list(range(3, 27))
+    # Had it gone on, the next row would burn at 25: from then on the fire ends with its cells.
+    late = read(path, (30, 30), horizon=100, margin=0.1, end=25.0)
+    assert torch.equal(torch.isfinite(late), torch.isfinite(fire))
     to_ten = read(path, (30, 30), horizon=100, margin=0.1, end=12.0)
     # The front of 12 minutes is at the centre of the twelfth row: 11.5 rows of 12 fill 22 x 23.
     burnt = torch.isfinite(to_ten)
