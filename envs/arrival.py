@@ -1,7 +1,7 @@
 """Arrival times on a source's own cells, and how they come onto a grid."""
 
 from dataclasses import dataclass, replace
-from datetime import datetime
+from datetime import datetime, timedelta
 from typing import Literal, Protocol
 
 import numpy as np
@@ -27,10 +27,13 @@ class Clock:
 
     def shown(self, time: float) -> str:
         """A time in a message."""
-        if self.origin is None:
-            return f"{time:g} {self.unit}"
-        seconds = self.origin.timestamp() + time * SECONDS[self.unit]
-        return datetime.fromtimestamp(seconds, self.origin.tzinfo).isoformat(timespec="minutes")
+        if self.origin is not None:
+            try:
+                shown = self.origin + timedelta(seconds=time * SECONDS[self.unit])
+                return shown.isoformat(timespec="minutes")
+            except OverflowError:  # no year of four digits
+                pass
+        return f"{time:g} {self.unit}"
 
 
 @dataclass(frozen=True)
@@ -138,8 +141,8 @@ class RasterSource:
         self.times, self.clock, self.whole = times.astype(np.float64), clock, whole
         self._affine, self._moves = affine, moves
         burning = times[np.isfinite(times)]
-        self.began = self.first = float(burning.min())
-        self.last = float(burning.max())
+        self.first, self.last = float(burning.min()), float(burning.max())
+        self.began = 0.0 if self._from_zero() else self.first
         rows, columns = (np.arange(count) for count in times.shape)
         edge_rows = np.concatenate([rows, rows, 0 * columns, 0 * columns + len(rows) - 1])
         edge_columns = np.concatenate([0 * rows, 0 * rows + len(columns) - 1, columns, columns])
@@ -183,6 +186,16 @@ class RasterSource:
         if fine:
             times = np.where(times == minimum_filter(times, 3), times, np.inf)
         return np.minimum(found, self._earliest(times, window))
+
+    def _from_zero(self) -> bool:
+        """Whether the first cell burns no later than the front crosses a cell there: the ignition
+        was in it, at time 0, and not in the middle."""
+        if self.whole or self.clock.unit == "steps" or self.clock.origin is not None:
+            return False
+        row, column = np.unravel_index(self.times.argmin(), self.times.shape)
+        around = self.times[max(row - 1, 0) : row + 2, max(column - 1, 0) : column + 2]
+        later = around[np.isfinite(around) & (around > self.first)]
+        return bool(0 <= self.first <= (later - self.first).max(initial=0.0))
 
     def _own(self, window: Window) -> bool:
         """Whether the grid's cells are the raster's."""

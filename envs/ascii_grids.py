@@ -9,7 +9,7 @@ import numpy as np
 
 from .arrival import RasterSource, Units
 from .formats import beside
-from .geo import library
+from .geo import check_projection, library
 from .geotiff import opened
 from .rasters import clean, raster_source
 
@@ -44,7 +44,9 @@ def read_ascii(path: Path, unit: Units | None, crs: str | None) -> RasterSource:
         values = list(_rows(file, rows, columns, count, len(header) + 1))
     times = np.concatenate(values).reshape(count, columns)
     never = times == header["nodata_value"] if "nodata_value" in header else None
-    return raster_source(clean(times, never), _affine(header, count), _crs(path), unit, crs)
+    at, own_crs = _affine(header, count), _crs(path)
+    check_projection(path, own_crs)
+    return raster_source(clean(times, never), at, own_crs, unit, crs)
 
 
 def _header(file: Any) -> tuple[dict[str, float], bytes]:

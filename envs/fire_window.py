@@ -53,6 +53,8 @@ def on_grid(source: Source, choices: Choices, grid: tuple[int, int], horizon: in
     window = Window.around(bounds, grid, margin or 0)
     times = source.on(window, end)
     times[(times > end) | window.beyond(bounds)] = np.inf
+    if choices.start is None and not as_it_is and not (times <= start).any():
+        times[times == times.min()] = start  # the first cell burns from the beginning
     if choices.ring_width is not None and not (source.whole and as_it_is):
         times[_burnt_out(times, start, choices.ring_width * min(grid) / BASE_SIDE)] = np.inf
     steps = (np.maximum(times, start) - start) / (end - start) * horizon

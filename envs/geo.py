@@ -6,9 +6,12 @@ import math
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+from .formats import beside
 
 Move = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 """from x and y to x and y"""
@@ -18,6 +21,7 @@ Bounds = tuple[float, float, float, float]
 _LOGGERS = ("rasterio", "pyogrio", "fiona", "shapely", "pyproj")
 _DEGREE_CELL = 0.1  # a cell as large as this is 11 km wide if its side is in degrees
 _DEGREE_EXTENT = 5.0  # a fire as large as this is 500 km wide if it is in degrees
+_WIDEST = 20.0  # degrees
 _FARTHEST = 1e9  # metres; no projection of the Earth has such coordinates
 
 
@@ -56,6 +60,8 @@ def quiet() -> Iterator[None]:
 
 def first_line(error: BaseException) -> str:
     """What a library says is wrong, short."""
+    if error.__cause__ and "previous exception" in str(error):
+        error = error.__cause__
     lines = str(error).strip().splitlines() or [type(error).__name__]
     return lines[0][:200]
 
@@ -109,7 +115,15 @@ def to_plane(crs: Any, wanted: str | None, bounds: Bounds, cell: float | None) -
 def _moves(source: Any, target: Any, bounds: Bounds) -> tuple[Move, Move]:
     transformer = library("pyproj", "a projection").Transformer
     there = transformer.from_crs(source, target, always_xy=True).transform
-    back = transformer.from_crs(target, source, always_xy=True).transform
+    inverse = transformer.from_crs(target, source, always_xy=True).transform
+    middle = (bounds[0] + bounds[2]) / 2
+
+    def back(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        x, y = inverse(x, y)
+        if source.is_geographic:  # a file that goes beyond 180 degrees has longitudes that do
+            x = x - 360 * np.rint((x - middle) / 360)
+        return x, y
+
     corners = there(np.array(bounds[0::2]), np.array(bounds[1::2]))
     if not np.isfinite(corners).all() or np.abs(corners).max() > _FARTHEST:
         raise ValueError(
@@ -142,8 +156,32 @@ def _refuse_degrees(bounds: Bounds, cell: float | None) -> None:
         )
 
 
+def check_projection(path: Path, crs: Any) -> None:
+    """That a .prj beside a file, if there is one, was understood.
+
+    Args:
+        path: the file.
+        crs: what was found; None for nothing.
+
+    Raises:
+        ValueError: it was not.
+    """
+    prj = beside(path, ".prj")
+    if crs is None and prj is not None and prj.stat().st_size:
+        raise ValueError(
+            f"{prj.name}, beside it, holds no projection that is known; expected one, or no such "
+            "file and fire.crs, such as fire.crs=EPSG:32611"
+        )
+
+
 def _utm(bounds: Bounds) -> Any:
     """The UTM zone around the middle."""
+    width, height = bounds[2] - bounds[0], bounds[3] - bounds[1]
+    if max(width, height) > _WIDEST:
+        raise ValueError(
+            f"{width:g} x {height:g} degrees: a UTM zone is no plane for them; expected fire.crs, "
+            "a projection in metres, or a file of the fire alone"
+        )
     pyproj = library("pyproj", "degrees")
     x, y = (bounds[0] + bounds[2]) / 2, (bounds[1] + bounds[3]) / 2
     x = (x + 180) % 360 - 180

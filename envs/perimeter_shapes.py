@@ -62,7 +62,7 @@ def ignition(area: Any, moved: np.ndarray) -> Any:
     """
     shapely = library("shapely", "perimeters")
     began: list[Any] = []
-    for part in (part for part in _parts(area) if part.geom_type == "Polygon"):
+    for part in polygons(area):
         now = np.array(part.bounds)
         size, then = now[2:] - now[:2], now - moved
         scale = np.maximum((then[2:] - then[:2]) / size, _POINT)
@@ -73,6 +73,11 @@ def ignition(area: Any, moved: np.ndarray) -> Any:
             small = part.representative_point().buffer(_POINT * size.min())
         began.append(small)
     return shapely.union_all(began)
+
+
+def polygons(area: Any) -> list[Any]:
+    """The polygons that an area consists of."""
+    return [part for part in _parts(area) if part.geom_type == "Polygon"]
 
 
 def _parts(geometry: Any) -> list[Any]:

@@ -21,12 +21,16 @@ ELAPSED: dict[str, Units] = {
 }
 """columns of elapsed time, in lower case, whose name says the unit"""
 CALENDAR = (
-    *("poly_datecurrent", "poly_datec", "gdb_from_date", "gdb_from_da", "perdatetime"),
-    *("perdattime", "perimeterdatetime", "datecurrent", "datecurren", "datetime", "date_time"),
-    *("timestamp", "acq_datetime", "acq_time", "acq_date", "date_", "date", "time", "t"),
+    *("poly_polygondatetime", "poly_polyg", "polygondatetime", "polygondat"),
+    *("perimeterdatetime", "perimeterd", "perdatetime", "perdatetim", "perdattime"),
+    *("gdb_from_date", "gdb_from_d", "poly_datecurrent", "poly_datec", "datecurrent", "datecurren"),
+    *("datetime", "date_time", "timestamp", "acq_datetime", "acq_dateti", "acq_time", "acq_date"),
+    *("date_", "date", "time", "t"),
 )
-"""columns of calendar time, in lower case, the surest first"""
+"""columns of calendar time, in lower case and as a .dbf cuts them to ten letters: when a perimeter
+was mapped, before when its record was changed"""
 _EPOCH_MS = 1e11  # numbers above it are milliseconds since 1970: 1973 and later
+_LATEST_MS = 2.5e14  # in the year 9892
 _LATEST = 1e12
 _WRITTEN = {8: "%Y%m%d", 12: "%Y%m%d%H%M", 14: "%Y%m%d%H%M%S"}
 """dates as numbers of so many digits"""
@@ -102,6 +106,10 @@ def _numbers(values: np.ndarray, name: str, unit: Units | None) -> Times:
     if name.lower() not in ELAPSED and (form := _date_form(values)):
         return _calendar([_written(v, form, i, name) for i, v in enumerate(values)], name)
     if (values > _EPOCH_MS).all() and name.lower() not in ELAPSED:
+        if values.max() > _LATEST_MS:
+            raise ValueError(
+                f"{name}={values.max():g} is no time; expected milliseconds since 1970"
+            )
         return _calendar([datetime.fromtimestamp(value / 1000, UTC) for value in values], name)
     if values.max() > _LATEST:
         raise ValueError(f"{name}={values.max():g} is no time; expected less than {_LATEST:g}")
@@ -146,7 +154,10 @@ def _calendar(moments: list[datetime], name: str) -> Times:
             f"{name}: feature {aware.index(True)} has a time zone and feature "
             f"{aware.index(False)} has none; expected all or none"
         )
-    moments = [m.astimezone(UTC) if m.tzinfo else m.replace(tzinfo=UTC) for m in moments]
+    try:
+        moments = [m.astimezone(UTC) if m.tzinfo else m.replace(tzinfo=UTC) for m in moments]
+    except OverflowError:
+        raise ValueError(f"{name} has a time before year 1 or after 9999") from None
     first = min(moments)
     values = [(moment - first) / timedelta(minutes=1) for moment in moments]
     return Times(np.array(values), Clock("minutes", first))

@@ -8,8 +8,8 @@ import numpy as np
 from scipy.ndimage import distance_transform_edt
 
 from .arrival import Clock, Units, Window
-from .geo import Bounds, first_line, library, to_plane
-from .perimeter_shapes import enclosed, ignition
+from .geo import Bounds, check_projection, first_line, library, to_plane
+from .perimeter_shapes import enclosed, ignition, polygons
 from .perimeter_times import perimeter_times
 
 MOST_TIMES = 500
@@ -49,12 +49,16 @@ def read_perimeters(
     except ValueError:
         raise
     except Exception as error:  # of GDAL, of text that is none, of geometries that are none
+        if isinstance(error, pyogrio.errors.CRSError):
+            check_projection(path, None)
         raise ValueError(f"{first_line(error)}; expected perimeters") from None
     if not hasattr(frame, "geometry") or len(frame) == 0:
         raise ValueError("no feature with a geometry; expected perimeters")
     missing = np.flatnonzero((frame.geometry.isna() | frame.geometry.is_empty).to_numpy())
     if len(missing):
         raise ValueError(f"feature {missing[0]} has no geometry; expected a perimeter in each")
+    if not json:
+        check_projection(path, frame.crs)
     times = perimeter_times(frame, time_field, unit)
     source_crs = frame.crs
     x0, y0, x1, y1 = (float(value) for value in frame.total_bounds)
@@ -98,8 +102,8 @@ class PerimeterSource:
     """A fire of which the burnt area is known at some times; between them fronts are interpolated.
 
     Perimeters that were observed do not contain each other: what burnt once stays burnt. Of elapsed
-    times, the fire before the first perimeter is taken back to 0, or to a point: the edges of the
-    box around it moved as fast as from the first to the second.
+    times, the fire before the first perimeter is taken back to 0: the edges of the box around it
+    moved as fast as from the first to the second, from a point at most.
 
     Args:
         areas: shapely's, on the plane, one for each time.
@@ -116,8 +120,7 @@ class PerimeterSource:
             )
         self.clock, self.first, self.last = clock, float(times[0]), float(times[-1])
         if clock.origin is None and times[0] > 0:
-            area, began = _began(areas, times)
-            areas, times = [area, *areas], np.concatenate([[began], times])
+            areas, times = [_began(areas, times), *areas], np.concatenate([[0.0], times])
         self._areas, self._times, self.began = areas, times, float(times[0])
         boxes = np.array([area.bounds for area in areas])
         low, high = np.minimum.accumulate(boxes[:, :2]), np.maximum.accumulate(boxes[:, 2:])
@@ -204,14 +207,14 @@ class PerimeterSource:
             )
 
 
-def _began(areas: Sequence[Any], times: np.ndarray) -> tuple[Any, float]:
-    """The area that burnt when the clock or the fire began, whichever was later, and that time."""
+def _began(areas: Sequence[Any], times: np.ndarray) -> Any:
+    """The area that burnt at time 0."""
     first, second = (np.array(area.bounds) for area in areas[:2])
     grown = np.concatenate([np.minimum(second - first, 0)[:2], np.maximum(second - first, 0)[2:]])
     speed = grown / (times[1] - times[0])
     width, spread = ((at[2:] - at[:2]).sum() for at in (first, speed))
-    time = max(0.0, times[0] - width / spread) if spread > 0 else times[0]
-    return ignition(areas[0], speed * (times[0] - time)), time
+    back = min(times[0], width / spread) if spread > 0 else 0.0  # then it is a point
+    return ignition(areas[0], speed * back)
 
 
 def _valid(shapely: Any, area: Any) -> Any:
@@ -232,7 +235,10 @@ def _inside(area: Any, window: Window) -> np.ndarray:
         window.x, window.y + window.grid[1] * window.side, window.side, window.side
     )
     about = {"out_shape": window.grid[::-1], "transform": affine, "dtype": "uint8"}
-    inside = features.rasterize([area], **about)
-    if not inside.any():  # smaller than a cell, and not to be lost
-        inside = features.rasterize([area], all_touched=True, **about)
-    return inside[::-1].T.astype(bool)
+    inside = features.rasterize([area], **about)[::-1].T.astype(bool)
+    # A polygon that covers no cell's centre is not to be lost.
+    shapely = library("shapely", "perimeters")
+    i, j = window.cells(*shapely.get_coordinates(shapely.point_on_surface(polygons(area))).T)
+    within = (i >= 0) & (j >= 0) & (i < window.grid[0]) & (j < window.grid[1])
+    inside[i[within], j[within]] = True
+    return inside

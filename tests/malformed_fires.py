@@ -309,6 +309,11 @@ def _rasters(folder: Path, good: dict[str, Path]) -> Iterator[Case]:
         "degrees without a projection": (times, _degrees(), "fire.crs"),
         "degrees that are none": (times, {"crs": "EPSG:4326"}, "not degrees"),
         "beyond the Earth": (times, {"transform": affine(75, 0, 1e200, 0, -75, 0)}, "Earth"),
+        "half the world": (
+            times,
+            {"crs": "EPSG:4326", "transform": affine(4, 0, -80, 0, -4, 80)},
+            "160 x 160 degrees.*fire.crs",
+        ),
         "no zone": (
             times,
             {"crs": "EPSG:4326", "transform": affine(1e-3, 0, 10, 0, -1e-3, -89)},
@@ -413,6 +418,10 @@ def _tables(folder: Path, good: dict[str, Path]) -> Iterator[Case]:
         "hour 1275": ({"Month": [4] * 5, "Day": [1] * 5, "Hour": [1275] * 5}, "Hour=1275", {}),
         "start in words": (date, "fire.start=noon", {"start": "noon"}),
         "start as a number": (date, "fire.units", {"start": 60.0}),
+        "start beyond all time": (date, "no fire spreads", {"start": 1e300, "units": "days"}),
+        "start in the year 12000": (date, "no fire spreads", {"start": 4e6, "units": "days"}),
+        "before year 1": ({"date": ["0001-01-01T00:00:00+14:00"] * 5}, "date.*year 1", {}),
+        "milliseconds of no year": ({"date": [1e18 + t for t in TIMES]}, "date=1e\\+18", {}),
         "end before start": (
             {"Elapsed_Mi": list(TIMES)},
             "after the start",
@@ -513,7 +522,12 @@ def _shapefiles(folder: Path, good: dict[str, Path]) -> Iterator[Case]:
     yield Case("dbf that promises 1e9 records", path, "cut off")
     path = _beside(folder / "prj", good["shp"])
     path.with_suffix(".prj").write_text("PROJCS[nonsense")
-    yield Case("shp with a prj of nonsense", path, "", {}, good["shp"])
+    yield Case("shp with a prj of nonsense", path, "fire.prj.*no projection")
+    yield Case("… and fire.crs", path, "fire.prj.*no projection", {"crs": UTM})
+    path = folder / "prj.asc"
+    shutil.copy(good["asc"], path)
+    path.with_suffix(".prj").write_bytes(b"\xff\xfe\x00 of nothing")
+    yield Case("asc with a prj of nonsense", path, "prj.prj.*no projection", MINUTES)
 
 
 def _json(folder: Path, good: dict[str, Path]) -> Iterator[Case]:

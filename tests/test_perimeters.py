@@ -54,8 +54,7 @@ def test_by_default_both_begin_when_the_fire_began(tmp_path, name, grid):
     fire = FIRES[name]
     raster = write_asc(tmp_path / "fire.asc", raster_of(fire, 300.0, 150, 20.0), 20.0)
     frame_of(fire, HOURS, "line").to_file(tmp_path / "fire.shp")
-    one = read(raster, grid, units="minutes", start=0.0)  # its first cell burns some minutes later
-    two = read(tmp_path / "fire.shp", grid)
+    one, two = read(raster, grid, units="minutes"), read(tmp_path / "fire.shp", grid)
     found = overlaps(one, two, (300, 475, 650, 825, 1000))
     assert min(found) > 0.9, found
 
@@ -69,15 +68,15 @@ def test_before_the_first_perimeter_by_hand(tmp_path):
     assert (fire <= 60).sum() == pytest.approx(30 * 30, abs=4 * 30)
     assert (fire[5:9, 20] > 0).all()
     assert (fire[5:9, 20] < 60).all()
-    # Three hours before the first perimeter it was a point, which is as far back as it goes.
-    for first in (180, 360):
+    # Three hours before the first perimeter it was a point; six hours before it still is one.
+    for first, width in ((180, 30), (360, 30)):
         squares(300, 400, column="Elapsed_Mi", values=[first, first + 60]).to_file(
             tmp_path / "late.shp"
         )
-        late = read(tmp_path / "late.shp", (40, 40), 240, margin=0.0)
+        late = read(tmp_path / "late.shp", (40, 40), first + 60, margin=0.0)
         assert 1 <= (late == 0).sum() <= 4
         assert (late == 0)[19:21, 19:21].any()
-        assert (late <= 180).sum() == pytest.approx(30 * 30, abs=4 * 30)
+        assert (late <= first).sum() == pytest.approx(width**2, abs=4 * width)
     # Calendar time begins at the first perimeter.
     squares(300, 400, column="date", values=["2020-08-19", "2020-08-20"]).to_file(
         tmp_path / "dates.gpkg"
@@ -100,6 +99,23 @@ def test_before_the_first_perimeter_each_part_is_drawn_in(tmp_path):
     expected = torch.zeros(70, 25, dtype=torch.bool)
     expected[10:20, :15] = expected[50:60, :15] = True
     assert torch.equal(fire == 0, expected)
+
+
+def test_a_small_polygon_beside_a_large_one_is_not_lost(tmp_path):
+    """A spot fire of 4 m, cells of 62 m that are looked at in parts of 10 m."""
+    spot = [shapely.box(2000, 0, 2000 + side, side) for side in (4, 8)]
+    large = [shapely.box(0, 0, side, side) for side in (1000, 1200)]
+    shapes = [shapely.MultiPolygon(pair) for pair in zip(large, spot, strict=True)]
+    shapes = [shapely.transform(shape, lambda at: at + CORNER) for shape in shapes]
+    for first in (0, 60):
+        frame = geopandas.GeoDataFrame(
+            {"Elapsed_Mi": [first, first + 60]}, geometry=shapes, crs=UTM
+        )
+        frame.to_file(tmp_path / "fire.gpkg")
+        fire = read(tmp_path / "fire.gpkg")
+        right = fire[25:]
+        assert (right == 0).sum() == 1
+        assert torch.isfinite(right).sum() == 1
 
 
 @pytest.mark.parametrize(
@@ -243,6 +259,25 @@ def test_calendar_times(tmp_path, name, suffix):
     assert torch.equal(read(path, start="2020-08-19T16:00-07:00", end="2020-08-20 00:00Z"), half)
     assert torch.equal(read(path, start=1.0, units="hours"), half)
     assert torch.equal(read(path, start="2020-08-19T23:00", minutes_per_step=0.06), half)
+
+
+def test_when_a_perimeter_was_mapped_counts_not_when_its_record_was_changed(tmp_path):
+    """The columns of NIFC's and GeoMAC's layers, as they are and as a .dbf cuts them."""
+    squares(200, 300, 400, column="Elapsed_Mi", values=[0, 60, 120]).to_file(tmp_path / "e.shp")
+    elapsed, changed = read(tmp_path / "e.shp"), [DATED[0], DATED[2], DATED[2]]
+    columns = {
+        "poly_PolygonDateTime": "poly_DateCurrent",
+        "poly_Polyg": "poly_DateC",
+        "perimeterdatetime": "datecurrent",
+        "perimeterd": "datecurren",
+        "GDB_FROM_D": "datecurren",
+    }
+    for number, (mapped, edited) in enumerate(columns.items()):
+        frame = squares(200, 300, 400, column=edited, values=[d.isoformat() for d in changed])
+        frame[mapped] = [d.isoformat() for d in DATED]
+        suffix = "shp" if len(mapped) <= 10 else "gpkg"
+        frame.to_file(tmp_path / f"{number}.{suffix}")
+        assert torch.equal(read(tmp_path / f"{number}.{suffix}"), elapsed), mapped
 
 
 def test_farsites_month_day_and_hour(tmp_path):

@@ -152,7 +152,7 @@ def test_a_crop_leaves_the_margin_on_all_sides(tmp_path):
     assert torch.isfinite(fire[9:21, 3:27]).all()
     assert torch.isfinite(fire).sum() == 12 * 24
     assert fire[9, 26] == 0
-    assert fire[9, 3].item() == pytest.approx(100 * 23 / 23.5)
+    assert fire[9, 3].item() == pytest.approx(100 * 24 / 24.5)
     for keys in ({}, {"end": 24.0}, {"end": 23.75}, {"end": 24.9}, {"end": 25.0}, {"end": 90.0}):
         burnt = torch.isfinite(read(path, (30, 30), horizon=100, margin=0.1, **keys))
         assert burnt.any(0).nonzero()[:, 0].tolist() == list(range(3, 27))
@@ -235,6 +235,36 @@ def test_a_raster_turned_by_its_transform(tmp_path):
 
 def iou(one, two):
     return ((one & two).sum() / (one | two).sum()).item()
+
+
+@pytest.mark.parametrize("first", [0.0, 3.0, 10.0, 10.5, 700.0])
+def test_a_fire_begins_at_0_where_its_first_cell_allows_it(tmp_path, first):
+    """A cell each ten minutes, the first at `first`: an ignition at its edge was at 0 at most
+    ten minutes before."""
+    path = write_asc(tmp_path / "fire.asc", corner([[first + t for t in (0, 10, 20, 30)]], 1, 4))
+    began = 0.0 if first <= 10 else first
+    fire = read(path, horizon=100)[:4, 7]
+    last = first + 30 - began
+    later = [100 * (first + t - began) / last for t in (10, 20, 30)]
+    assert fire.tolist() == pytest.approx([0.0, *later], abs=1e-3)
+    given = read(path, horizon=100, start=0.0)[:4, 7]
+    assert given[0].item() == pytest.approx(100 * first / (first + 30), abs=1e-3)
+    steps = read(path, horizon=800, units="steps")[:4, 7]
+    assert steps.tolist() == pytest.approx([first + t for t in (0, 10, 20, 30)])
+
+
+def test_degrees_beyond_the_antimeridian(tmp_path):
+    """The same fire at 175 and across 180 degrees, on cells much coarser than the grid's parts."""
+    at = np.arange(10) - 4.5
+    times = np.hypot(at[:, None], at[None, :]) * 10
+    fires = []
+    for west in (176.995, 179.995):
+        about = {"crs": "EPSG:4326", "transform": from_origin(west, 0.005, 0.001, 0.001)}
+        fires.append(read(write_tif(tmp_path / f"{west}.tif", times, **about), (30, 30)))
+    assert torch.isfinite(fires[0]).all() or torch.isfinite(fires[0]).sum() > 700
+    assert torch.equal(torch.isfinite(fires[0]), torch.isfinite(fires[1]))
+    both = torch.isfinite(fires[0])
+    assert torch.allclose(fires[0][both], fires[1][both], atol=1.0)
 
 
 def test_ascii_dialects(tmp_path):

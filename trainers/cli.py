@@ -178,9 +178,9 @@ def _add_render(commands) -> None:
     )
     add(
         "--fire",
-        default="huygens",
         metavar="FIRE",
-        help="a held-out fire: NAME, INDEX or NAME:INDEX, such as huygens:3 (default: huygens:0)",
+        help="a held-out fire: NAME, INDEX or NAME:INDEX, such as huygens:3 (default: huygens:0, "
+        "or the first of the file that the first run was trained on)",
     )
     add(
         "--checkpoint",

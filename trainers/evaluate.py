@@ -13,6 +13,7 @@ from torchrl.envs.utils import ExplorationType
 
 from emberlink.envs import metrics
 from emberlink.envs.fire import load_scenario
+from emberlink.envs.fire_file import FileFireConfig
 from emberlink.envs.scenario import ScenarioConfig, fires_of
 from emberlink.envs.wildfire import WildfireEnv
 from emberlink.policies.scripted import SCRIPTED
@@ -63,6 +64,11 @@ def play(
         watch(horizon)
     episode: Any = torch.stack(cast(Any, steps), dim=1)
     return metrics.episode_metrics(episode)
+
+
+def shown_scenario(trained: ScenarioConfig) -> str:
+    """Of an evaluation's scenarios, the name of the one to draw: one's own file, else `huygens`."""
+    return trained.name if isinstance(trained, FileFireConfig) else HELD_OUT_SCENARIO
 
 
 def evaluation_scenarios(config: RunConfig) -> dict[str, ScenarioConfig]:

@@ -23,7 +23,7 @@ from emberlink.policies.scripted import SCRIPTED
 
 from .build import build_env
 from .config import RunConfig, build_comm
-from .evaluate import BLOCK, HELD_OUT_SCENARIO, START_SEED, scripted_config
+from .evaluate import BLOCK, START_SEED, scripted_config, shown_scenario
 from .pretrained import open_run
 from .recording import record
 from .report import load_actor
@@ -53,8 +53,8 @@ class Panel:
 class Choices:
     """What the command can be told; the defaults are those of the command line."""
 
-    fire: str = HELD_OUT_SCENARIO
-    """NAME, INDEX or NAME:INDEX of a held-out fire"""
+    fire: str | None = None
+    """NAME, INDEX or NAME:INDEX of a held-out fire; see `find_fire`"""
     policies: Sequence[str] = ()
     """scripted policies that play beside the runs"""
     checkpoints: Sequence[Path] = ()
@@ -103,20 +103,22 @@ def render(runs: Sequence[str], console: Console, choices: Choices) -> int:
     return 0
 
 
-def find_fire(text: str, trained: ScenarioConfig) -> tuple[ScenarioConfig, int]:
+def find_fire(text: str | None, trained: ScenarioConfig) -> tuple[ScenarioConfig, int]:
     """The scenario and the number of the held-out fire that NAME, INDEX or NAME:INDEX means.
 
     Args:
-        text: of the command line.
+        text: of the command line; what is not said of it is as for `shown_scenario`, and 0.
         trained: what the run was trained on: its name is known too.
 
     Raises:
         ValueError: there is no such scenario or fire.
     """
+    usual = shown_scenario(trained)
+    text = usual if text is None else text
     name, _, index = (
         text.rpartition(":")
         if ":" in text
-        else ((HELD_OUT_SCENARIO, "", text) if text.lstrip("-").isdecimal() else (text, "", "0"))
+        else ((usual, "", text) if text.lstrip("-").isdecimal() else (text, "", "0"))
     )
     known = dict.fromkeys([*scenarios(), trained.name])
     if name not in known:
