@@ -237,6 +237,19 @@ def test_setups_fires_and_configurations_are_kept_apart(tmp_path):
     assert any("not all methods have the same learner.batch" in note for note in notes)
 
 
+def test_groups_are_named_as_one_types_their_settings(tmp_path):
+    for seed, setting in enumerate(("comm.agree=false", "comm.range=inf", "comm.follow=nearest")):
+        write_run(tmp_path, "consensus", seed, overrides=(setting,))
+    write_run(tmp_path, "consensus", 9)
+    (section,), _ = gathered(tmp_path)
+    assert [group.label for group in section.groups] == [
+        "consensus",
+        "consensus (comm.agree=false)",
+        "consensus (comm.follow=nearest)",
+        "consensus (comm.range=inf)",
+    ]
+
+
 def in_another_world(run, name, coverage, **about):
     """An evaluation of a run with messages lost, beside its own."""
     content = read_evaluation(run)

@@ -283,7 +283,7 @@ def _groups(section: str, runs: Sequence[Run], notes: list[str]) -> list[Group]:
     apart = (*NOT_COMPARED, "method")
     named = [(m[0].config.method, m) for m in members]
     labels = [
-        label + "".join(f", evaluated with {k}={v}" for k, v in m[0].evaluated_with.items())
+        label + "".join(f", evaluated with {_typed(*one)}" for one in m[0].evaluated_with.items())
         for label, m in zip(
             _labels(named, lambda key: key.split(".")[0] not in apart), members, strict=True
         )
@@ -324,6 +324,12 @@ def _split(runs: Iterable[Run], key: Callable[[Run], Any]) -> list[list[Run]]:
     return list(found.values())
 
 
+def _typed(key: str, value: Any) -> str:
+    """A setting as one types it."""
+    words = {None: "null", True: "true", False: "false"}
+    return f"{key}={words[value] if value is None or isinstance(value, bool) else value}"
+
+
 def _labels(named: Sequence[tuple[str, Sequence[Run]]], wanted: Callable[[str], bool]) -> list[str]:
     """The names; where one stands for several lists of runs, with the keys that set them apart.
 
@@ -335,7 +341,7 @@ def _labels(named: Sequence[tuple[str, Sequence[Run]]], wanted: Callable[[str], 
         keys = [key for key in _differing(alike) if wanted(key)]
         own, recipe = members[0].values, _recipe(members[0].config) if keys else {}
         apart = ", ".join(
-            f"{key}={own.get(key)}"
+            _typed(key, own.get(key))
             for key in keys
             if key not in recipe or own.get(key) != recipe[key]
         )
