@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from matplotlib.axes import Axes
 from synthetic_runs import read_evaluation, write_evaluation, write_run
 
 from emberlink.envs import metrics
-from emberlink.trainers import cli
-from emberlink.trainers.comparison_numbers import numbers
+from emberlink.trainers import cli, comparison_figures
+from emberlink.trainers.comparison_numbers import Scripted, numbers
 from emberlink.trainers.comparison_runs import Run, find, gather, read
 from emberlink.trainers.config import to_values
 from emberlink.trainers.run_folder import RunFolder
@@ -127,14 +128,72 @@ def test_with_one_seed_there_is_no_interval(tmp_path, capsys):
     assert {v.verdict for v in one.verdicts} == {"undecided"}
     assert all(c.low is None for by in one.curves.values() for c in by.values())
     assert cli.main(["compare", str(tmp_path), "--output", str(tmp_path / "out")]) == 0
-    assert "only 1 seed)" in capsys.readouterr().out
+    assert " 1* " in capsys.readouterr().out
     assert "With one seed there is no interval" in (tmp_path / "out/compare.html").read_text()
 
 
 def test_two_seeds_are_flagged(runs, tmp_path, capsys):
     assert cli.main(["compare", str(runs), "--output", str(tmp_path / "out")]) == 0
-    assert "only 2 seeds" in capsys.readouterr().out
+    assert " 2* " in capsys.readouterr().out
     assert "too few for an interval" in (tmp_path / "out/compare.html").read_text()
+
+
+def test_a_group_of_one_seed_hides_no_other_of_few(tmp_path, capsys):
+    for seed, method in enumerate(["consensus", "independent", "independent"]):
+        write_run(tmp_path, method, seed)
+    assert cli.main(["compare", str(tmp_path), "--output", str(tmp_path / "out")]) == 0
+    said = capsys.readouterr().out
+    assert "* fewer than 5 seeds" in said
+    assert [said.count(f" {seeds}* ") for seeds in (1, 2)] == [8, 8]
+    page = (tmp_path / "out/compare.html").read_text()
+    assert "With one seed there is no interval" in page
+    assert "Fewer than 5 seeds, marked *" in page
+    assert page.count('<td class="n">1*</td>') == 8
+
+
+def test_where_scripted_policies_are_drawn(tmp_path, monkeypatch):
+    """A line in the rows whose number it is, and in no other, whatever the rows' names."""
+    assert list(comparison_figures._stretches([0, 1, 3, 5, 6])) == [(0, 1), (3, 3), (5, 6)]
+    drawn = []
+    plot = Axes.plot
+
+    def watched(self, *args, **about):
+        drawn.append((args, about))
+        return plot(self, *args, **about)
+
+    monkeypatch.setattr(Axes, "plot", watched)
+    own = ("comm.agree=false", "comm.wander=false")
+    for seed, keys in enumerate([(), own, ("comm.loss=0.5",)]):
+        coverage = {"coverage": 90.0 - 10 * seed}
+        run = write_run(
+            tmp_path, "consensus", seed, overrides=keys, scripted=("pursuit",), learned=coverage
+        )
+        content = read_evaluation(run)
+        content["communication"] = {"pursuit": {"name": str(seed % 2)}}
+        content["results"]["huygens"]["pursuit"]["coverage"] = [40.0 - 20 * (seed % 2)] * 4
+        write_evaluation(run, content)
+    one = only(tmp_path)
+    assert [row.method for row in ranking(one, "coverage").rows][1].count(", ") == 1
+    comparison_figures.frozen(tmp_path / "figure.png", one, "huygens")
+    lines = [
+        (args[0][0], *args[1])
+        for args, about in drawn
+        if about.get("zorder") == 1 and args[0][0] in (20.0, 40.0)
+    ]
+    # From the top: 90, 80 and 70 %; the middle one's pursuit comes to 20 %, the others' to 40 %.
+    assert sorted(lines)[:3] == [(20.0, 0.5, 1.5), (40.0, -0.5, 0.5), (40.0, 1.5, 2.5)]
+
+
+def test_an_output_that_cannot_be(runs, tmp_path, capsys):
+    (tmp_path / "file").write_text("mine")
+    (tmp_path / "link").symlink_to("nowhere")
+    for output in ("file", "file/sub", "link", "x" * 300):
+        assert cli.main(["compare", str(runs), "--output", str(tmp_path / output)]) == 2
+        said = capsys.readouterr().err
+        assert f"--output {tmp_path / output}: " in said.replace("\n", ""), said
+        assert said.count("\n") == 1
+    assert (tmp_path / "file").read_text() == "mine"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "link"]
 
 
 def summary(one):
@@ -283,6 +342,11 @@ def test_evaluations_in_other_worlds_are_no_trainings(tmp_path, capsys):
         ("consensus, evaluated with comm.loss=0.5", 60.5),
         ("independent", 30.5),
     ]
+    # The same trainings twice are no two samples.
+    assert [r["improvement"] for r in coverage["rows"]] == [None, 1.0, None]
+    assert [r["evaluated_with"] for r in one["runs"]] == [{}] * 2 + [{"comm.loss": 0.5}] * 2 + [
+        {}
+    ] * 2
     assert {claim["method"] for claim in one["claims"]} == {"consensus"}
     assert one["curves"]["coverage"].keys() == {"consensus", "independent"}
     assert (tmp_path / "out" / "1_tuned_frozen_1_huygens.png").stat().st_size > 10_000
@@ -300,7 +364,7 @@ def test_who_hears_something_else_may_fly_otherwise(tmp_path):
         write_evaluation(run, content)
     one = only(tmp_path)
     assert ranking(one, "coverage").scripted == {
-        "pursuit": {"consensus": 40.0, "consensus (comm.loss=0.5)": 20.0}
+        "pursuit": [Scripted(["consensus"], 40.0), Scripted(["consensus (comm.loss=0.5)"], 20.0)]
     }
     assert not [note for note in one.notes if "pursuit" in note]
 
@@ -336,7 +400,7 @@ def test_scripted_policies_have_rows_of_their_own(tmp_path):
     one = only(tmp_path)
     rank = ranking(one, "coverage")
     assert [row.method for row in rank.rows].count("random_actions") == 0
-    assert rank.scripted["random_actions"] == {"": pytest.approx(expected)}
+    assert rank.scripted["random_actions"] == [Scripted([], pytest.approx(expected))]
     assert one.notes == []
     # A method's own reward gives it a score of its own, in all its runs alike.
     for seed in range(2):
@@ -345,8 +409,10 @@ def test_scripted_policies_have_rows_of_their_own(tmp_path):
         content["results"]["huygens"]["random_actions"]["score"] = [7.0] * 4
         write_evaluation(run, content)
     one = only(tmp_path)
-    assert ranking(one, "score").scripted["random_actions"]["positional"] == 7
-    assert ranking(one, "score").scripted["random_actions"]["consensus"] != 7
+    consensus, positional = ranking(one, "score").scripted["random_actions"]
+    assert positional == Scripted(["positional"], 7.0)
+    assert consensus.methods == ["consensus"]
+    assert consensus.value != 7
     assert one.notes == []
     # But coverage is the same on the same fires.
     content["results"]["huygens"]["random_actions"]["coverage"] = [7.0] * 4

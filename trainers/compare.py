@@ -13,12 +13,12 @@ from rich.text import Text
 from . import comparison_figures, evaluate, figures
 from .comparison_numbers import Numbers, numbers
 from .comparison_page import (
+    FLAG,
     Chapter,
     Picture,
     Report,
+    counts,
     decision,
-    few,
-    fewest,
     html,
     lines,
     ratio,
@@ -26,6 +26,7 @@ from .comparison_page import (
 )
 from .comparison_runs import Run, checkpoint, evaluated_otherwise, find, gather, read
 from .report import load_actor
+from .seed_statistics import FEW
 
 FRAMES = 5
 """of a timelapse"""
@@ -43,7 +44,14 @@ def compare(paths: Sequence[Path], console: Console, output: Path | None = None)
         ValueError: there is nothing to compare, the runs can't be compared, a file is damaged, or
             the folder holds something.
     """
-    folder = _free(output)
+    try:
+        return _compare(paths, console, _free(output))
+    except OSError as error:
+        place = "" if output is None else f"--output {output}: "
+        raise ValueError(f"{place}cannot be written: {error.strerror or error}") from None
+
+
+def _compare(paths: Sequence[Path], console: Console, folder: Path) -> int:
     runs, left_out = _read_all(paths)
     for path, why in left_out:
         console.print(Text(f"note: {path} is left out: {why}", style="yellow"))
@@ -77,6 +85,8 @@ def _free(output: Path | None) -> Path:
     if output is None:
         tried = (Path("compare" if i == 1 else f"compare_{i}") for i in range(1, 10_000))
         return next(path for path in tried if not path.exists())
+    if output.is_symlink() and not output.exists():
+        raise ValueError(f"--output {output}: a link to what is not there; name a new folder")
     if output.exists() and (not output.is_dir() or any(output.iterdir())):
         raise ValueError(f"--output {output}: is there and not an empty folder; name a new one")
     return output
@@ -124,7 +134,8 @@ def _frozen_caption(one: Numbers, fire: str) -> str:
         f"Frozen policies on {count} held-out fires of {fire}. Small dots: a run's mean over its "
         "episodes, one a seed. Large dot: interquartile mean over seeds; line: 95 % bootstrap "
         "interval over seeds, none with one seed. Dashed: scripted policies; in a method's row "
-        "alone where the number is that method's."
+        "alone where the number is that method's. Steps and exits on a logarithmic scale, linear "
+        "near 0."
     )
 
 
@@ -157,10 +168,10 @@ def _timelapses(
         console.print(Text(f"  timelapse of {group.label}", style="dim"))
         actor = load_actor(run.config, newest)
         fires = evaluate.evaluation_fires(run.config, run.evaluation.fires)
-        fire, arrival = next(iter(fires.items()))
-        pictures, steps = evaluate.film(run.config, actor, fire=arrival[0], frames=FRAMES)
+        fire = evaluate.shown_scenario(run.config.fire)
+        pictures, steps = evaluate.film(run.config, actor, fire=fires[fire][0], frames=FRAMES)
         path = folder / f"{name}_timelapse_{place}.png"
-        figures.timelapse(path, pictures, steps)
+        figures.timelapse(path, pictures, steps, group.label)
         yield Picture(
             path,
             f"{group.label}, seed {run.config.seed}: the frozen policy of {newest.name} on the "
@@ -172,9 +183,11 @@ def _timelapses(
 def _print(console: Console, one: Numbers) -> None:
     for fire, rankings in one.fires.items():
         trained = ", the fire trained on" if fire == one.section.trained_on else ""
-        flag = few(fewest(one))
-        title = f"{one.section.label}: on {fire}{trained}{flag}"
-        table = Table(title=Text(title), caption="↑ more is better, ↓ less is better")
+        title = f"{one.section.label}: on {fire}{trained}"
+        caption = "↑ more is better, ↓ less is better"
+        if min(counts(one)) < FEW:
+            caption += f"; {FLAG} fewer than {FEW} seeds are too few for an interval"
+        table = Table(title=Text(title), caption=caption)
         for column in ("policy", "seeds", "IQM", "95 % interval", "P(better than the next)"):
             table.add_column(column, justify="left" if column == "policy" else "right")
         for ranking in rankings:

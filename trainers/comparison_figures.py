@@ -1,13 +1,13 @@
 """The paper's figures 5 to 9 for several methods and seeds."""
 
 import textwrap
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.ticker import MaxNLocator
+from matplotlib.ticker import MaxNLocator, ScalarFormatter
 
 from .comparison_numbers import Curve, Numbers
 from .figures import CURVES
@@ -33,6 +33,8 @@ DASHES = (
 """of scripted policies"""
 FROZEN = ("coverage", "tracking_first", "tracking_last", "boundary_exits")
 """measures of the figure of frozen policies; its rows are ranked by the first"""
+LOGARITHMIC = {"tracking_first": 1.0, "tracking_last": 1.0, "boundary_exits": 0.1}
+"""measures of that figure whose axis is logarithmic -> below which number it is linear"""
 DOTTED = "tracking_last"
 """drawn dotted, as in the paper's figure 7"""
 
@@ -80,15 +82,19 @@ def frozen(path: Path, numbers: Numbers, fire: str) -> None:
         for row in ranking.rows:
             y, colour = order.index(row.method), colours.get(row.method, "0.45")
             axes.plot(row.values, [y] * len(row.values), "o", ms=3, color=colour, alpha=0.5)
-            axes.plot([row.iqm], [y], "o", ms=7, color=colour)
+            axes.plot([row.iqm], [y], "o", ms=6, color=colour)
             if row.interval is not None:
-                axes.plot(row.interval, [y, y], "-", lw=2, color=colour)
-        for policy, by_method in ranking.scripted.items():
-            for methods, value in by_method.items():
-                places = [order.index(one) for one in methods.split(", ") if one in order]
-                low, high = (min(places), max(places)) if places else (0, len(order) - 1)
-                ends = [low - 0.5, high + 0.5]
-                axes.plot([value] * 2, ends, color="0.3", ls=policies[policy], lw=1.3, zorder=1)
+                axes.plot(row.interval, [y, y], "|-", lw=2, ms=9, mew=1.5, color=colour)
+        for policy, each in ranking.scripted.items():
+            for one in each:
+                dash = policies[policy]
+                for low, high in _stretches([order.index(name) for name in one.methods or order]):
+                    ends = [low - 0.5, high + 0.5]
+                    axes.plot([one.value] * 2, ends, color="0.3", ls=dash, lw=1.3, zorder=1)
+        if measure in LOGARITHMIC:
+            axes.set_xscale("symlog", linthresh=LOGARITHMIC[measure])
+            axes.xaxis.set_major_formatter(ScalarFormatter())
+            axes.set_xlim(left=0)
         better = "more" if ranking.higher_is_better else "less"
         axes.set(xlabel=f"{CURVES[measure]}\n({better} is better)")
         axes.set_ylim(-0.5, len(order) - 0.5)
@@ -96,6 +102,14 @@ def frozen(path: Path, numbers: Numbers, fire: str) -> None:
     panels[0].set_yticks(range(len(order)), names, parse_math=False)
     _legend(figure, {}, policies)
     figure.savefig(path, dpi=120, metadata={"Software": None})
+
+
+def _stretches(places: Sequence[int]) -> Iterator[tuple[int, int]]:
+    """First and last of each stretch of rows that lie next to each other."""
+    ordered = sorted(places)
+    starts = [i for i in ordered if i - 1 not in ordered]
+    ends = [i for i in ordered if i + 1 not in ordered]
+    yield from zip(starts, ends, strict=True)
 
 
 def _colours(numbers: Numbers) -> dict[str, str]:
@@ -149,8 +163,9 @@ def _scripted_lines(
 ) -> None:
     """A line per scripted policy; where its number is one method's own, in that method's colour."""
     for ranking in numbers.on_trained:
-        if ranking.measure == measure:
-            for policy, by_method in ranking.scripted.items():
-                for methods, value in by_method.items():
-                    colour = colours.get(methods, "0.3")
-                    axes.axhline(value, color=colour, ls=policies[policy], lw=1.3, zorder=1)
+        for policy, each in ranking.scripted.items() if ranking.measure == measure else ():
+            for one in each:
+                shown = [name for name in one.methods if name in colours]
+                if shown or not one.methods:
+                    colour = colours[shown[0]] if len(shown) == 1 else "0.3"
+                    axes.axhline(one.value, color=colour, ls=policies[policy], lw=1.3, zorder=1)

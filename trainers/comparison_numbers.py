@@ -56,8 +56,19 @@ class Row:
     next: str | None
     """the method ranked next; None for the last"""
     improvement: float | None
-    """probability that a run is better than a run of the next"""
+    """probability that a run is better than a run of the next; None where these are the same
+    trainings, evaluated in another world"""
     improvement_interval: Interval | None
+
+
+@dataclass(frozen=True)
+class Scripted:
+    """What a scripted policy comes to."""
+
+    methods: list[str]
+    """whose number it is; none where it is the same for all"""
+    value: float
+    """the mean over episodes"""
 
 
 @dataclass(frozen=True)
@@ -68,8 +79,8 @@ class Ranking:
     higher_is_better: bool
     rows: list[Row]
     """best first"""
-    scripted: dict[str, dict[str, float]]
-    """policy -> methods, or "" where it is the same for all -> the mean over episodes"""
+    scripted: dict[str, list[Scripted]]
+    """by policy"""
 
 
 @dataclass(frozen=True)
@@ -152,7 +163,7 @@ def _ranking(section: Section, fire: str, measure: str, notes: list[str]) -> Ran
     for group, other in zip_longest(order, order[1:]):
         own = values[group.label]
         probability = ends = None
-        if other is not None:
+        if other is not None and not _same_trainings(group, other):
             pair = (own, values[other.label]) if higher else (values[other.label], own)
             probability = float(statistics.improvement(np.asarray(pair[0]), np.asarray(pair[1])))
             ends = statistics.interval(statistics.improvement, *pair)
@@ -171,12 +182,16 @@ def _ranking(section: Section, fire: str, measure: str, notes: list[str]) -> Ran
     return Ranking(measure, higher, rows, _scripted(section, fire, measure, notes))
 
 
+def _same_trainings(one: Group, other: Group) -> bool:
+    return not {run.path for run in one.runs}.isdisjoint(run.path for run in other.runs)
+
+
 def _scripted(
     section: Section, fire: str, measure: str, notes: list[str]
-) -> dict[str, dict[str, float]]:
+) -> dict[str, list[Scripted]]:
     """A scripted policy's mean over episodes; for each method where theirs differ."""
     policies = dict.fromkeys(p for run in section.runs for p in run.evaluation.results[fire])
-    found: dict[str, dict[str, float]] = {}
+    found: dict[str, list[Scripted]] = {}
     for policy in sorted(policies.keys() - {LEARNED}):
         each = {
             group.label: [
@@ -209,18 +224,16 @@ def _in_worlds_of_their_own(section: Section, policy: str) -> bool:
     return any(world != worlds[0] for world in worlds)
 
 
-def _by_methods(each: Mapping[str, float]) -> dict[str, float]:
-    """The numbers of several methods, equal ones once, under "" where all are equal."""
-    alike: list[tuple[list[str], float]] = []
+def _by_methods(each: Mapping[str, float]) -> list[Scripted]:
+    """The numbers of several methods, equal ones once."""
+    alike: list[Scripted] = []
     for method, value in each.items():
-        methods = next((names for names, other in alike if _same([value, other])), None)
-        if methods is None:
-            alike.append(([method], value))
+        same = next((one for one in alike if _same([value, one.value])), None)
+        if same is None:
+            alike.append(Scripted([method], value))
         else:
-            methods.append(method)
-    if len(alike) == 1:
-        return {"": alike[0][1]}
-    return {", ".join(methods): value for methods, value in alike}
+            same.methods.append(method)
+    return alike if len(alike) > 1 else [Scripted([], one.value) for one in alike]
 
 
 def _same(values: Sequence[float]) -> bool:

@@ -16,6 +16,8 @@ from . import seed_statistics as statistics
 from .comparison_numbers import Numbers, Ranking, Verdict
 
 NONE = "-"
+FLAG = "*"
+"""behind a number of seeds that is too small for an interval"""
 DIGITS = {"score": 3, "boundary_exits": 2, "fire_exits": 2}
 """behind the point; of other measures one"""
 
@@ -75,7 +77,7 @@ def lines(ranking: Ranking) -> Iterator[Line]:
     for row in ranking.rows:
         yield Line(
             name=row.method,
-            seeds=str(len(row.seeds)),
+            seeds=f"{len(row.seeds)}{FLAG if len(row.seeds) < statistics.FEW else ''}",
             mean=f"{row.iqm:.{digits}f}",
             interval=_interval(row.interval, digits),
             improvement=(
@@ -87,10 +89,12 @@ def lines(ranking: Ranking) -> Iterator[Line]:
             next=row.next or NONE,
             scripted=False,
         )
-    for policy, by_method in ranking.scripted.items():
-        for methods, value in by_method.items():
-            name = policy.replace("_", " ") + (f" ({methods})" if methods else "")
-            yield Line(name, NONE, f"{value:.{digits}f}", NONE, NONE, NONE, scripted=True)
+    for policy, each in ranking.scripted.items():
+        for one in each:
+            whose = f" ({', '.join(one.methods)})" if one.methods else ""
+            mean = f"{one.value:.{digits}f}"
+            name = policy.replace("_", " ") + whose
+            yield Line(name, NONE, mean, NONE, NONE, NONE, scripted=True)
 
 
 def heading(ranking: Ranking) -> str:
@@ -113,9 +117,9 @@ def few(seeds: int) -> str:
     return "" if seeds >= statistics.FEW else f" (only {seeds} seed{'s' if seeds > 1 else ''})"
 
 
-def fewest(numbers: Numbers) -> int:
-    """Seeds of the method that has the fewest."""
-    return min(len(group.runs) for group in numbers.section.groups)
+def counts(numbers: Numbers) -> list[int]:
+    """Seeds of each group."""
+    return [len(group.runs) for group in numbers.section.groups]
 
 
 def settings() -> dict[str, Any]:
@@ -143,7 +147,7 @@ def html(report: Report) -> str:
         "heading": heading,
         "ratio": ratio,
         "decision": decision,
-        "fewest": fewest,
+        "counts": counts,
     }
     return environment.from_string(source).render(report=report, settings=settings())
 
@@ -172,6 +176,7 @@ def _chapter(numbers: Numbers) -> dict[str, Any]:
                 "seed": run.config.seed,
                 "episodes": run.config.episodes,
                 "num_envs": run.config.num_envs,
+                "evaluated_with": dict(run.evaluated_with),
                 "checkpoint": run.evaluation.checkpoint,
                 "held_out_fires": run.evaluation.fires,
             }

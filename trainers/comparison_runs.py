@@ -8,7 +8,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import ConfigDict, Field, FiniteFloat, TypeAdapter, ValidationError
+from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 from pydantic.dataclasses import dataclass as checked
 
 from emberlink.envs import metrics
@@ -20,6 +20,9 @@ from .figures import CURVES
 from .reading import LONGEST_JSON, read_text
 from .run_folder import RunFolder
 
+LARGEST = 1e12
+"""of a measure; what is beyond it is damage"""
+Measured = Annotated[float, Field(ge=-LARGEST, le=LARGEST, allow_inf_nan=False)]
 NOT_COMPARED = ("seed", "seeds", "output", "evaluation", *NOT_LEARNT_WITH)
 """keys in which the runs of a group may differ: none changes what is trained"""
 NAMELESS = ("seed", "seeds", "output")
@@ -38,7 +41,7 @@ class Evaluation:
     checkpoint: str
     fires: Annotated[int, Field(ge=1)]
     """episodes of every policy on every fire"""
-    results: dict[str, dict[str, dict[str, list[FiniteFloat]]]]
+    results: dict[str, dict[str, dict[str, list[Measured]]]]
     """fire -> policy -> measure -> one number per episode"""
     held_out: dict[str, Any] = Field(default_factory=dict)
     """fire -> what the fires were made from"""
@@ -227,8 +230,11 @@ def _lines(folder: RunFolder) -> list[dict[str, Any]]:
             raise ValueError(f"{file}: line {number} is not that of episode {number}")
         for name in CURVES:
             value = line.get(name)
-            if not isinstance(value, int | float) or not math.isfinite(value):
-                raise ValueError(f"{file}: line {number}: {name}={value} is not a finite number")
+            number_like = isinstance(value, int | float) and not isinstance(value, bool)
+            if not number_like or not abs(value) <= LARGEST:
+                raise ValueError(
+                    f"{file}: line {number}: {name}={value} is no finite number up to {LARGEST:g}"
+                )
     return lines
 
 

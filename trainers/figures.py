@@ -78,7 +78,9 @@ def coverage_bars(path: Path, results: Results) -> None:
     figure.savefig(path, dpi=120)
 
 
-def timelapse(path: Path, pictures: Sequence[np.ndarray], steps: Sequence[int]) -> None:
+def timelapse(
+    path: Path, pictures: Sequence[np.ndarray], steps: Sequence[int], title: str = ""
+) -> None:
     """A row of frames of one episode, as the paper's figure 3."""
     chosen = np.linspace(0, len(pictures) - 1, min(5, len(pictures))).round().astype(int)
     figure = Figure(figsize=(2.4 * len(chosen), 2.7), layout="constrained")
@@ -86,4 +88,6 @@ def timelapse(path: Path, pictures: Sequence[np.ndarray], steps: Sequence[int]) 
         axes.imshow(pictures[index], interpolation="nearest")
         axes.set_title(f"step {steps[index]}", fontsize="medium")
         axes.set_axis_off()
+    if title:
+        figure.suptitle(title, parse_math=False)
     figure.savefig(path, dpi=120)
