@@ -134,8 +134,8 @@ def _frozen_caption(one: Numbers, fire: str) -> str:
         f"Frozen policies on {count} held-out fires of {fire}. Small dots: a run's mean over its "
         "episodes, one a seed. Large dot: interquartile mean over seeds; line: 95 % bootstrap "
         "interval over seeds, none with one seed. Dashed: scripted policies; in a method's row "
-        "alone where the number is that method's. Steps and exits on a logarithmic scale, linear "
-        "near 0."
+        "alone where the number is that method's. The first UAV's step and exits on a logarithmic "
+        "scale, linear near 0."
     )
 
 

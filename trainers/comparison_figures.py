@@ -7,7 +7,7 @@ from pathlib import Path
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.ticker import MaxNLocator, ScalarFormatter
+from matplotlib.ticker import MaxNLocator, StrMethodFormatter
 
 from .comparison_numbers import Curve, Numbers
 from .figures import CURVES
@@ -33,7 +33,7 @@ DASHES = (
 """of scripted policies"""
 FROZEN = ("coverage", "tracking_first", "tracking_last", "boundary_exits")
 """measures of the figure of frozen policies; its rows are ranked by the first"""
-LOGARITHMIC = {"tracking_first": 1.0, "tracking_last": 1.0, "boundary_exits": 0.1}
+LOGARITHMIC = {"tracking_first": 1.0, "boundary_exits": 0.1}
 """measures of that figure whose axis is logarithmic -> below which number it is linear"""
 DOTTED = "tracking_last"
 """drawn dotted, as in the paper's figure 7"""
@@ -93,7 +93,7 @@ def frozen(path: Path, numbers: Numbers, fire: str) -> None:
                     axes.plot([one.value] * 2, ends, color="0.3", ls=dash, lw=1.3, zorder=1)
         if measure in LOGARITHMIC:
             axes.set_xscale("symlog", linthresh=LOGARITHMIC[measure])
-            axes.xaxis.set_major_formatter(ScalarFormatter())
+            axes.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
             axes.set_xlim(left=0)
         better = "more" if ranking.higher_is_better else "less"
         axes.set(xlabel=f"{CURVES[measure]}\n({better} is better)")

@@ -230,10 +230,12 @@ def _lines(folder: RunFolder) -> list[dict[str, Any]]:
             raise ValueError(f"{file}: line {number} is not that of episode {number}")
         for name in CURVES:
             value = line.get(name)
-            number_like = isinstance(value, int | float) and not isinstance(value, bool)
-            if not number_like or not abs(value) <= LARGEST:
+            if isinstance(value, bool | None) or not isinstance(value, int | float):
+                value = math.nan
+            if not abs(value) <= LARGEST:
                 raise ValueError(
-                    f"{file}: line {number}: {name}={value} is no finite number up to {LARGEST:g}"
+                    f"{file}: line {number}: {name}={line.get(name)} is no finite number up to "
+                    f"{LARGEST:g}"
                 )
     return lines
 
