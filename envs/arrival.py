@@ -77,6 +77,11 @@ class Window:
         )
         return np.meshgrid(x, y, indexing="ij")
 
+    def earliest(self, parts: np.ndarray) -> np.ndarray:
+        """The least in each cell, [X, Y], of a number for each of its parts, [X cuts, Y cuts]."""
+        columns, rows = self.grid
+        return parts.reshape(columns, self.cuts, rows, self.cuts).min((1, 3))
+
     def beyond(self, bounds: Bounds) -> np.ndarray:
         """Which cells lie outside of some bounds with all of their area, bool [X, Y]."""
         outside: list[np.ndarray] = []
@@ -92,6 +97,11 @@ class Window:
         """Which cell each point lies in; it may be outside the grid."""
         i, j = ((at - start) / self.side for at, start in ((x, self.x), (y, self.y)))
         return np.floor(i + _EDGE).astype(np.int64), np.floor(j + _EDGE).astype(np.int64)
+
+
+def within(i: np.ndarray, j: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """Which pairs of indices are those of a cell, bool."""
+    return (i >= 0) & (j >= 0) & (i < shape[0]) & (j < shape[1])
 
 
 class Source(Protocol):
@@ -179,9 +189,8 @@ class RasterSource:
         fine = window.side < (1 - _EDGE) * self._side()
         if self.whole or self._own(window):
             return self._cells(window, fine)
-        cuts, (columns, rows) = window.cuts, window.grid
-        points = self._cell(*window.finer(cuts, (0, 0)).centres())
-        found = self._between(*points).reshape(columns, cuts, rows, cuts).min((1, 3))
+        points = self._cell(*window.finer(window.cuts, (0, 0)).centres())
+        found = window.earliest(self._between(*points))
         times = self.times
         if fine:
             times = np.where(times == minimum_filter(times, 3), times, np.inf)
@@ -206,10 +215,7 @@ class RasterSource:
     def _cells(self, window: Window, fine: bool) -> np.ndarray:
         """The earliest of the cells whose centre lies in one of the grid, else the nearest."""
         row, column = (np.rint(at).astype(np.int64) for at in self._cell(*window.centres()))
-        height, width = self.times.shape
-        inside = (row >= 0) & (column >= 0) & (row < height) & (column < width)
-        near = self.times[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)]
-        near = np.where(inside, near, np.inf)
+        near = self._at(row, column)
         if fine:
             return near
         found = self._earliest(self.times, window)
@@ -222,10 +228,16 @@ class RasterSource:
         found = np.full(window.grid, np.inf)
         rows, columns = np.nonzero(np.isfinite(times))
         i, j = window.cells(*self._plane(rows, columns))
-        inside = (i >= 0) & (j >= 0) & (i < window.grid[0]) & (j < window.grid[1])
+        inside = within(i, j, window.grid)
         places = i[inside], j[inside]
         np.minimum.at(found, places, times[rows[inside], columns[inside]])
         return found
+
+    def _at(self, row: np.ndarray, column: np.ndarray) -> np.ndarray:
+        """The times of cells; inf outside the raster."""
+        height, width = self.times.shape
+        near = self.times[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)]
+        return np.where(within(row, column, self.times.shape), near, np.inf)
 
     def _side(self) -> float:
         """The shorter side of the cell in the middle, on the plane."""
@@ -236,10 +248,7 @@ class RasterSource:
     def _between(self, row: np.ndarray, column: np.ndarray) -> np.ndarray:
         """Bilinear among burnt cells; never where the cell that a point lies in never burns."""
         height, width = self.times.shape
-        near = np.rint(row).astype(np.int64), np.rint(column).astype(np.int64)
-        inside = (near[0] >= 0) & (near[1] >= 0) & (near[0] < height) & (near[1] < width)
-        r, c = np.clip(near[0], 0, height - 1), np.clip(near[1], 0, width - 1)
-        own = np.where(inside, self.times[r, c], np.inf)
+        own = self._at(np.rint(row).astype(np.int64), np.rint(column).astype(np.int64))
         total, weights = np.zeros(row.shape), np.zeros(row.shape)
         r0, c0 = np.floor(row).astype(np.int64), np.floor(column).astype(np.int64)
         for dr in (0, 1):

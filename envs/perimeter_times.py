@@ -21,14 +21,14 @@ ELAPSED: dict[str, Units] = {
 }
 """columns of elapsed time, in lower case, whose name says the unit"""
 CALENDAR = (
-    *("poly_polygondatetime", "poly_polyg", "polygondatetime", "polygondat"),
-    *("perimeterdatetime", "perimeterd", "perdatetime", "perdatetim", "perdattime"),
-    *("gdb_from_date", "gdb_from_d", "poly_datecurrent", "poly_datec", "datecurrent", "datecurren"),
-    *("datetime", "date_time", "timestamp", "acq_datetime", "acq_dateti", "acq_time", "acq_date"),
+    *("poly_polygondatetime", "polygondatetime", "perimeterdatetime", "perdatetime", "perdattime"),
+    *("gdb_from_date", "poly_datecurrent", "datecurrent"),
+    *("datetime", "date_time", "timestamp", "acq_datetime", "acq_time", "acq_date"),
     *("date_", "date", "time", "t"),
 )
-"""columns of calendar time, in lower case and as a .dbf cuts them to ten letters: when a perimeter
-was mapped, before when its record was changed"""
+"""columns of calendar time, in lower case: when a perimeter was mapped, before when its record was
+changed"""
+_DBF = 10  # letters of a column's name that a .dbf keeps
 _EPOCH_MS = 1e11  # numbers above it are milliseconds since 1970: 1973 and later
 _LATEST_MS = 2.5e14  # in the year 9892
 _LATEST = 1e12
@@ -63,7 +63,7 @@ def perimeter_times(frame: Any, wanted: str | None, unit: Units | None) -> Times
             raise ValueError(f"no column {wanted!r} (fire.time_field); there are {_listed(names)}")
         name = wanted if wanted in names else lower[wanted.lower()]
         return _column(frame, name, unit)
-    for known in (*ELAPSED, *CALENDAR):
+    for known in (*ELAPSED, *(one for name in CALENDAR for one in (name, name[:_DBF]))):
         if known in lower:
             return _column(frame, lower[known], unit)
     if {"month", "day", "hour"} <= set(lower):

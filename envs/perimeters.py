@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from scipy.ndimage import distance_transform_edt
 
-from .arrival import Clock, Units, Window
+from .arrival import Clock, Units, Window, within
 from .geo import Bounds, check_projection, first_line, library, to_plane
 from .perimeter_shapes import enclosed, ignition, polygons
 from .perimeter_times import perimeter_times
@@ -162,8 +162,7 @@ class PerimeterSource:
             around.append(cuts * min(needed, 2 * cells))
         fine = window.finer(cuts, (around[0], around[1]))
         inner = self._interpolated(fine, count)[around[0] : -around[0], around[1] : -around[1]]
-        columns, rows = window.grid
-        return inner.reshape(columns, cuts, rows, cuts).min((1, 3))
+        return window.earliest(inner)
 
     def _interpolated(self, window: Window, count: int) -> np.ndarray:
         """Arrival times of the first perimeters: between two fronts by how near each of them is."""
@@ -239,6 +238,6 @@ def _inside(area: Any, window: Window) -> np.ndarray:
     # A polygon that covers no cell's centre is not to be lost.
     shapely = library("shapely", "perimeters")
     i, j = window.cells(*shapely.get_coordinates(shapely.point_on_surface(polygons(area))).T)
-    within = (i >= 0) & (j >= 0) & (i < window.grid[0]) & (j < window.grid[1])
-    inside[i[within], j[within]] = True
+    there = within(i, j, window.grid)
+    inside[i[there], j[there]] = True
     return inside

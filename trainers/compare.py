@@ -167,9 +167,8 @@ def _timelapses(
             continue
         console.print(Text(f"  timelapse of {group.label}", style="dim"))
         actor = load_actor(run.config, newest)
-        fires = evaluate.evaluation_fires(run.config, run.evaluation.fires)
-        fire = evaluate.shown_scenario(run.config.fire)
-        pictures, steps = evaluate.film(run.config, actor, fire=fires[fire][0], frames=FRAMES)
+        fire, arrival = evaluate.shown_fire(run.config)
+        pictures, steps = evaluate.film(run.config, actor, fire=arrival, frames=FRAMES)
         path = folder / f"{name}_timelapse_{place}.png"
         figures.timelapse(path, pictures, steps, group.label)
         yield Picture(

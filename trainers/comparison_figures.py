@@ -162,8 +162,8 @@ def _scripted_lines(
     colours: Mapping[str, str],
 ) -> None:
     """A line per scripted policy; where its number is one method's own, in that method's colour."""
-    for ranking in numbers.on_trained:
-        for policy, each in ranking.scripted.items() if ranking.measure == measure else ():
+    for ranking in (one for one in numbers.on_trained if one.measure == measure):
+        for policy, each in ranking.scripted.items():
             for one in each:
                 shown = [name for name in one.methods if name in colours]
                 if shown or not one.methods:

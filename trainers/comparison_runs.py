@@ -23,6 +23,7 @@ from .run_folder import RunFolder
 LARGEST = 1e12
 """of a measure; what is beyond it is damage"""
 Measured = Annotated[float, Field(ge=-LARGEST, le=LARGEST, allow_inf_nan=False)]
+_MEASURE = TypeAdapter(Measured)
 NOT_COMPARED = ("seed", "seeds", "output", "evaluation", *NOT_LEARNT_WITH)
 """keys in which the runs of a group may differ: none changes what is trained"""
 NAMELESS = ("seed", "seeds", "output")
@@ -230,13 +231,12 @@ def _lines(folder: RunFolder) -> list[dict[str, Any]]:
             raise ValueError(f"{file}: line {number} is not that of episode {number}")
         for name in CURVES:
             value = line.get(name)
-            if isinstance(value, bool | None) or not isinstance(value, int | float):
-                value = math.nan
-            if not abs(value) <= LARGEST:
+            try:
+                _MEASURE.validate_python(value, strict=True)
+            except ValidationError:
                 raise ValueError(
-                    f"{file}: line {number}: {name}={line.get(name)} is no finite number up to "
-                    f"{LARGEST:g}"
-                )
+                    f"{file}: line {number}: {name}={value} is no finite number up to {LARGEST:g}"
+                ) from None
     return lines
 
 

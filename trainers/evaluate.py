@@ -94,6 +94,13 @@ def evaluation_fires(config: RunConfig, count: int) -> dict[str, Tensor]:
     }
 
 
+def shown_fire(config: RunConfig) -> tuple[str, Tensor]:
+    """The evaluation's fire to draw: its scenario's name, and arrival times, float32 [X, Y]."""
+    name = shown_scenario(config.fire)
+    fires = fires_of(evaluation_scenarios(config)[name])
+    return name, fires.one_heldout(0, config.env.grid, config.env.horizon)[0]
+
+
 def evaluate(
     config: RunConfig,
     actor: Policy,

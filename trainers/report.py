@@ -100,10 +100,8 @@ def _draw(
         title = f"{config.method}, setup {config.setup}, fire {config.fire.name}"
         figures.training_curves(run.figure("training.png"), lines, title)
     report("one episode for the animation")
-    count = len(next(iter(results.values()))[evaluate.LEARNED]["coverage"])
-    name = evaluate.shown_scenario(config.fire)
-    arrival = evaluate.evaluation_fires(config, count)[name]
-    pictures, steps = evaluate.film(config, actor, fire=arrival[0])
+    name, arrival = evaluate.shown_fire(config)
+    pictures, steps = evaluate.film(config, actor, fire=arrival)
     write_gif(run.figure(f"episode_{name}{label}.gif"), pictures)
     figures.timelapse(run.figure(f"timelapse_{name}{label}.png"), pictures, steps)
 
