@@ -11,9 +11,10 @@ from torchrl.data import Bounded, Composite, Unbounded
 
 from emberlink.envs import keys, streams, uav
 from emberlink.envs.config import WildfireConfig
-from emberlink.envs.reward import HeadingConfig, circling, heading_reward, left_box
+from emberlink.envs.reward import left_box
 
 from .base import CommModule
+from .heading import HeadingConfig, circling, heading_reward
 
 TARGET = (keys.AGENTS, "target")
 """float32 [..., 3]: where the UAV is to go, cells."""

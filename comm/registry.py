@@ -6,7 +6,8 @@ from pathlib import Path
 from pkgutil import iter_modules
 from typing import Any
 
-from emberlink.envs.config import WildfireConfig, from_plain
+from emberlink.envs.config import WildfireConfig
+from emberlink.envs.validation import from_plain
 
 from .base import CommModule
 

@@ -20,10 +20,11 @@ from pydantic.dataclasses import dataclass
 from torch import Tensor
 from yaml import YAMLError
 
-from .config import Name, check_grid, describe, known
+from .config import check_grid
 from .drift import current, longest_step, tide_speed
 from .spread import arrival_times, disc
 from .streams import fold, uniform
+from .validation import Name, describe, known
 from .wavelet import MAX_LENGTH_TO_BREADTH
 
 BASE_SIDE = 30

@@ -16,12 +16,13 @@ from . import formats
 from .arrival import Source, Units
 from .ascii_grids import read_ascii
 from .bank_readers import is_bank, read_bands, read_npy
-from .config import Name, check_grid, printable
+from .config import check_grid
 from .fire_window import on_grid
 from .front_points import read_front_points
 from .geo import one_line, quiet
 from .perimeters import read_perimeters
 from .rasters import read_geotiff
+from .validation import Name, printable
 
 READER_VERSION = 3  # raise it whenever the same file gives another grid
 KEPT = "fires.npz"

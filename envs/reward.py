@@ -1,42 +1,10 @@
 """The rewards: pure functions, and their constants."""
 
-from typing import Annotated, Literal
+from typing import Literal
 
-import torch
-from pydantic import ConfigDict, Field
-from pydantic.dataclasses import dataclass
 from torch import Tensor
 
-Number = Annotated[float, Field(ge=-1e12, le=1e12)]
-"""so far below the largest float32 that no square of a sum over a view gets there"""
-
-
-@dataclass(frozen=True, kw_only=True, config=ConfigDict(extra="forbid", strict=True))
-class RewardConfig:
-    """What a UAV earns in one step (paper, section IV.C); the defaults are the paper's text."""
-
-    new_fire: Number = 1.0
-    """per cell in view that burns and was not seen before"""
-    old_fire: Number = -4.0
-    """per cell in view that burns and was seen before"""
-    no_fire: Number = -10.0
-    """per cell in view that does not burn"""
-    exit: Number = -100.0
-    """replaces the whole reward of a step whose move would have left the box"""
-    exit_axes: Literal["xyz", "xy"] = "xyz"
-    """the axes on which leaving the box is tested"""
-
-
-@dataclass(frozen=True, kw_only=True, config=ConfigDict(extra="forbid", strict=True))
-class HeadingConfig:
-    """The bonus for flying towards the target (paper, section IV.F); defaults: the paper's."""
-
-    form: Literal["folded_linear", "folded_exponential", "linear", "approach"] = "folded_linear"
-    """one of `HEADING_FORMS`"""
-    weight: Number = 1.0
-    """factor on the term"""
-    circle: Number = 0.0
-    """where not 0, factor on `circling`, which replaces the term over old fire alone"""
+from .config import RewardConfig
 
 
 def left_box(beyond: Tensor, axes: Literal["xyz", "xy"]) -> Tensor:
@@ -61,68 +29,3 @@ def view_reward(
     earned = config.new_fire * new
     earned.add_(old, alpha=config.old_fire).add_(none, alpha=config.no_fire)
     return earned.masked_fill_(left_box(beyond, config.exit_axes), config.exit).float()
-
-
-def _degrees(vector: Tensor) -> Tensor:
-    return torch.rad2deg(torch.atan2(vector[..., 1], vector[..., 0]))
-
-
-def _folded_difference(target: Tensor, moved: Tensor) -> Tensor:
-    """| |A_target| - |A_moved| | as printed: it takes left and right for the same."""
-    return (_degrees(target).abs() - _degrees(moved).abs()).abs()
-
-
-def _folded_linear(target: Tensor, moved: Tensor) -> Tensor:
-    return (180 - _folded_difference(target, moved)) / 10
-
-
-def _folded_exponential(target: Tensor, moved: Tensor) -> Tensor:
-    return 20 * 0.94 ** _folded_difference(target, moved)
-
-
-def _linear(target: Tensor, moved: Tensor) -> Tensor:
-    """(90 - D) / 90 with D the true angle between the two; 0 where the UAV stood still."""
-    difference = (_degrees(target) - _degrees(moved) + 180).remainder(360) - 180
-    return torch.where((moved[..., :2] == 0).all(-1), 0.0, (90 - difference.abs()) / 90)
-
-
-def _approach(target: Tensor, moved: Tensor) -> Tensor:
-    """Cells by which the UAV came nearer to its target, altitude included."""
-    return torch.linalg.vector_norm(target, dim=-1) - torch.linalg.vector_norm(
-        target - moved, dim=-1
-    )
-
-
-HEADING_FORMS = {
-    "folded_linear": _folded_linear,
-    "folded_exponential": _folded_exponential,
-    "linear": _linear,
-    "approach": _approach,
-}
-
-
-def heading_reward(before: Tensor, after: Tensor, target: Tensor, config: HeadingConfig) -> Tensor:
-    """The heading term, float32 [...].
-
-    Args:
-        before, after: float32 [..., 3], positions before and after the move, cells.
-        target: float32 [..., 3], where the UAV was told to go before the move, cells.
-
-    Angles are taken in the x-y plane, in degrees, from the position before the move; computed in
-    float64 because 0.1 cells of movement leave few digits.
-    """
-    before = before.double()
-    term = HEADING_FORMS[config.form](target.double() - before, after.double() - before)
-    return (config.weight * term).float()
-
-
-def circling(before: Tensor, after: Tensor, target: Tensor) -> Tensor:
-    """Cells flown around the target with the target to the left, float32 [...].
-
-    The move's component across the way to the target, times 2 d / (1 + d^2) at a distance of d:
-    full at 1 cell, less where the target is underneath the UAV or about to be lost from view.
-    Arguments as `heading_reward`.
-    """
-    way, moved = (end[..., :2].double() - before[..., :2].double() for end in (target, after))
-    arm = 2 * way / (1 + way.square().sum(-1, keepdim=True))
-    return (moved[..., 0] * arm[..., 1] - moved[..., 1] * arm[..., 0]).float()

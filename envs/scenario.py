@@ -9,10 +9,11 @@ from pydantic import Discriminator, Tag
 from torch import Tensor
 
 from . import fire_file
-from .config import TAG, WildfireConfig
+from .config import WildfireConfig
 from .fire import FireConfig, fire_seeds, load_scenario, make_fires
 from .fire_bank import fire_bank
 from .fire_file import FileFireConfig
+from .validation import TAG
 
 Grid = tuple[int, int]
 

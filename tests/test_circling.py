@@ -6,9 +6,9 @@ from moments import moment
 
 from emberlink.comm.base import Communication
 from emberlink.comm.consensus import FOLLOWS, Consensus, ConsensusConfig
+from emberlink.comm.heading import HeadingConfig, circling
 from emberlink.envs import keys
 from emberlink.envs.config import WildfireConfig
-from emberlink.envs.reward import HeadingConfig, circling
 
 
 @pytest.mark.parametrize(

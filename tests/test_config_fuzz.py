@@ -19,12 +19,13 @@ from robustness import SOAK
 
 from emberlink.comm import registry
 from emberlink.envs import keys
-from emberlink.envs.config import known
 from emberlink.envs.fire import scenarios
+from emberlink.envs.validation import known
 from emberlink.trainers import cli
 from emberlink.trainers.build import build_env
-from emberlink.trainers.config import RunConfig, from_values, resolve, to_values
+from emberlink.trainers.config import from_values, resolve, to_values
 from emberlink.trainers.loop import Trainer
+from emberlink.trainers.schema import RunConfig
 
 EXAMPLES = 5000 if SOAK else 500
 FUZZ = settings(

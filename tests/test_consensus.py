@@ -17,9 +17,9 @@ from emberlink.comm.consensus import (
     known_discoverers,
     neighbours,
 )
+from emberlink.comm.heading import HeadingConfig
 from emberlink.envs import keys
 from emberlink.envs.config import WildfireConfig
-from emberlink.envs.reward import HeadingConfig
 
 WORLD = WildfireConfig(grid=(64, 64))
 

@@ -12,9 +12,9 @@ from torch import Tensor
 from emberlink.comm import consensus
 from emberlink.comm.base import Communication
 from emberlink.comm.consensus import Consensus, ConsensusConfig
+from emberlink.comm.heading import HeadingConfig
 from emberlink.envs import keys, streams
 from emberlink.envs.config import WildfireConfig
-from emberlink.envs.reward import HeadingConfig
 
 FORMS = ["folded_linear", "folded_exponential", "linear"]
 

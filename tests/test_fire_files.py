@@ -14,10 +14,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tiny_run import TINY
 
-from emberlink.envs.config import known
 from emberlink.envs.fire import load_scenario, make_fires, scenarios
 from emberlink.envs.fire_file import KEPT, FileFireConfig, read_fires, splits
 from emberlink.envs.scenario import fires_of
+from emberlink.envs.validation import known
 from emberlink.envs.wildfire import WildfireEnv
 from emberlink.trainers import cli
 from emberlink.trainers.config import from_values, override, resolve, to_values

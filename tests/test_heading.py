@@ -9,9 +9,9 @@ from torch import Tensor
 
 from emberlink.comm.base import Communication
 from emberlink.comm.consensus import Consensus, ConsensusConfig
+from emberlink.comm.heading import HeadingConfig, heading_reward
 from emberlink.envs import keys
-from emberlink.envs.config import WildfireConfig
-from emberlink.envs.reward import HeadingConfig, RewardConfig, heading_reward
+from emberlink.envs.config import RewardConfig, WildfireConfig
 
 INSIDE = (False, False, False)
 

@@ -10,7 +10,7 @@ import torch
 from robustness import SOAK
 
 from emberlink.envs import keys
-from emberlink.envs.config import known
+from emberlink.envs.validation import known
 from emberlink.trainers.build import build_env
 from emberlink.trainers.config import from_values, resolve, to_values
 

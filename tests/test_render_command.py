@@ -13,8 +13,8 @@ from rich.console import Console
 from safetensors.torch import save_file
 
 from emberlink.envs import marks, video
-from emberlink.envs.config import known
 from emberlink.envs.publish import published
+from emberlink.envs.validation import known
 from emberlink.policies.scripted import SCRIPTED
 from emberlink.trainers import cli, evaluate, render
 from emberlink.trainers.build import build_env, build_networks

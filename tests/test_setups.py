@@ -5,10 +5,11 @@ import dataclasses
 import pytest
 
 from emberlink.comm.consensus import ConsensusConfig
-from emberlink.envs.config import WildfireConfig, from_plain
+from emberlink.envs.config import RewardConfig, WildfireConfig
 from emberlink.envs.fire import scenarios
-from emberlink.envs.reward import RewardConfig
-from emberlink.trainers.config import build_comm, flat, known, resolve, to_values
+from emberlink.envs.validation import from_plain
+from emberlink.trainers.config import flat, known, resolve, to_values
+from emberlink.trainers.schema import build_comm
 
 METHODS = ["independent", "shared_memory", "positional", "consensus"]
 PAPER, RELEASED = "paper", "released"

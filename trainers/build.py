@@ -14,7 +14,8 @@ from emberlink.envs.wildfire import WildfireEnv
 from emberlink.policies.actor_critic import make_actor, make_critic
 from emberlink.policies.networks import Generators
 
-from .config import RunConfig, build_comm, check_device, resolve
+from .config import resolve
+from .schema import RunConfig, build_comm, check_device
 
 
 def make_env(

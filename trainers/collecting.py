@@ -11,8 +11,8 @@ from torchrl.envs import TransformedEnv
 
 from emberlink.policies.noise import OrnsteinUhlenbeck
 
-from .config import RunConfig
 from .graphs import LockstepCollector
+from .schema import RunConfig
 
 
 class CarryingCollector(Collector):

@@ -14,10 +14,10 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-from emberlink.envs.config import known
+from emberlink.envs.validation import known
 
 from . import report
-from .config import RunConfig, check_device, override, resolve
+from .config import override, resolve
 from .divergence import Divergence
 from .evaluate import Policy
 from .interruption import Interrupted, Interruption
@@ -26,6 +26,7 @@ from .loop import Trainer
 from .pretrained import open_run
 from .resume import resume
 from .run_folder import RunFolder
+from .schema import RunConfig, check_device
 
 _EVALUATED_WITH = ("comm.", "env.")
 """beginnings of keys that an evaluation may be given in place of the run's"""

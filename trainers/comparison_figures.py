@@ -10,7 +10,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator, StrMethodFormatter
 
 from .comparison_numbers import Curve, Numbers
-from .figures import CURVES
+from .results import CURVES
 
 FIGURES = {
     5: (("score",), "Averaged rewards collected by all UAVs at each episode."),

@@ -12,8 +12,8 @@ from emberlink.policies.scripted import SCRIPTED
 
 from . import seed_statistics as statistics
 from .comparison_runs import Group, Section
-from .evaluate import HELD_OUT_SCENARIO, LEARNED
-from .figures import CURVES
+from .evaluate import HELD_OUT_SCENARIO
+from .results import CURVES, LEARNED
 from .seed_statistics import Interval
 
 SAME = 1e-5

@@ -14,11 +14,11 @@ from pydantic.dataclasses import dataclass as checked
 from emberlink.envs import metrics
 
 from . import pretrained
-from .config import NOT_LEARNT_WITH, RunConfig, describe, flat, resolve, to_values
-from .evaluate import LEARNED
-from .figures import CURVES
+from .config import describe, flat, resolve, to_values
 from .reading import LONGEST_JSON, read_text
+from .results import CURVES, LEARNED
 from .run_folder import RunFolder
+from .schema import NOT_LEARNT_WITH, RunConfig
 
 LARGEST = 1e12
 """of a measure; what is beyond it is damage"""

@@ -19,19 +19,18 @@ from emberlink.envs.wildfire import WildfireEnv
 from emberlink.policies.scripted import SCRIPTED
 
 from .build import build_env
-from .config import RunConfig, resolve
-from .scripted_results import Measured, ScriptedResults
+from .config import resolve
+from .results import LEARNED, Measured, Results
+from .schema import RunConfig
+from .scripted_results import ScriptedResults
 
 HELD_OUT_SCENARIO = "huygens"
 START_SEED = 20_250_923
 """of everything random in episode 0, start positions included; that of episode i is i more"""
 BLOCK = 50
 """environments stepped together, also where fewer are wanted"""
-LEARNED = "learned"
 
 Policy = Callable[[TensorDictBase], TensorDictBase]
-Results = dict[str, dict[str, Measured]]
-"""fire -> policy -> measure -> one number per episode"""
 
 
 def play(

@@ -8,17 +8,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from .evaluate import LEARNED, Results
-
-CURVES = {
-    "score": "score (mean reward)",
-    "coverage": "coverage, %",
-    "tracking_first": "first UAV on fire, step",
-    "tracking_last": "last UAV on fire, step",
-    "boundary_exits": "boundary exits per UAV",
-    "fire_exits": "fire exits per UAV",
-}
-"""measure -> axis label, in the order of the paper's figures 5 to 9"""
+from .results import CURVES, LEARNED, Results
 
 
 def training_curves(path: Path, lines: Sequence[Mapping[str, Any]], title: str) -> None:

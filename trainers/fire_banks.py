@@ -17,8 +17,9 @@ from emberlink.envs.fire import FireConfig, Split, fire_seeds, make_fires
 from emberlink.envs.fire_bank import GENERATOR_VERSION
 from emberlink.envs.publish import free_name
 
-from .config import RunConfig, to_values
+from .config import to_values
 from .fire_source import from_file, generated, read
+from .schema import RunConfig
 
 _AT_A_TIME = 16  # fires between two movements of the progress bar
 

@@ -9,12 +9,13 @@ from typing import Any
 
 from torch import Tensor
 
-from emberlink.envs.config import shown
 from emberlink.envs.fire import scenarios
 from emberlink.envs.fire_file import FileFireConfig, read_fires
 from emberlink.envs.scenario import fires_of
+from emberlink.envs.validation import shown
 
-from .config import RunConfig, resolve
+from .config import resolve
+from .schema import RunConfig
 
 HELD_OUT = 65_536
 """held-out fires of a scenario: as many as an evaluation can have"""

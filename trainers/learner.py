@@ -12,8 +12,8 @@ from torchrl.objectives import DDPGLoss, SoftUpdate, group_optimizers
 from emberlink.envs import keys
 from emberlink.policies.actor_critic import STATE_ACTION_VALUE
 
-from .config import LearnerConfig
 from .memory import DONE, TERMINATED
+from .schema import LearnerConfig
 from .watch import Watch
 
 

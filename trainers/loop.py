@@ -17,12 +17,13 @@ from . import checkpoint, divergence, evaluate, rollback, state, tracking
 from .allocator import keep_freed_memory
 from .build import build_env, build_networks
 from .collecting import make_collector
-from .config import RunConfig, to_values
+from .config import to_values
 from .graphs import graphed
 from .learner import Learner
 from .lock import Lock
 from .memory import TeamSampler, make_memory, rows_needed, to_rows
 from .run_folder import RunFolder
+from .schema import RunConfig
 
 LINES = ("metrics.jsonl", "timing.jsonl")
 """the files of a run folder that have a line for each episode"""

@@ -22,12 +22,12 @@ from emberlink.envs.wildfire import WildfireEnv
 from emberlink.policies.scripted import SCRIPTED
 
 from .build import build_env
-from .config import RunConfig, build_comm
 from .evaluate import BLOCK, START_SEED, scripted_config, shown_scenario
 from .pretrained import open_run
 from .recording import record
 from .report import load_actor
 from .run_folder import RunFolder
+from .schema import RunConfig, build_comm
 
 FIRES = 65_536
 """held-out fires of a scenario: as many as an evaluation can have"""

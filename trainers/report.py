@@ -20,8 +20,8 @@ from emberlink.policies.scripted import SCRIPTED
 
 from . import evaluate, figures
 from .build import build_env, build_networks
-from .config import RunConfig
 from .run_folder import RunFolder, load_weights
+from .schema import RunConfig
 
 _PACKAGES = ("emberlink", "torch", "torchrl", "tensordict", "numpy")
 ACTOR = "actor_network_params.module."

@@ -6,14 +6,15 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from emberlink.envs.config import shown
+from emberlink.envs.validation import shown
 
 from . import checkpoint, state, state_header
-from .config import NOT_LEARNT_WITH, RunConfig, flat, from_values, override, to_values
+from .config import flat, from_values, override, to_values
 from .lock import Lock
 from .loop import LINES, SIBLINGS, Trainer
 from .reading import LONGEST_YAML, parse_json, read_text
 from .run_folder import RunFolder, step_of
+from .schema import NOT_LEARNT_WITH, RunConfig
 
 MAY_CHANGE = ("episodes", *NOT_LEARNT_WITH)
 """keys that a resumed run may be given anew, beside those of `evaluation`"""

@@ -18,8 +18,9 @@ from torch import Tensor
 from emberlink.envs.scenario import fires_of
 
 from . import checkpoint as files
-from .config import RunConfig, comm_settings, flat, from_values, to_values
+from .config import flat, from_values, to_values
 from .reading import LONGEST_JSON, parse_json, read_text, read_yaml
+from .schema import RunConfig, comm_settings
 
 _NOT_FROM_THE_START = ("comm.agree", "comm.follow", "comm.wander", "comm.loss")
 """settings that runs of the first release were made without; their defaults change nothing"""

@@ -24,11 +24,9 @@ import emberlink.policies.scripted
 from emberlink.envs import metrics
 from emberlink.envs.fire_bank import cache_folder
 
-from .config import RunConfig
 from .reading import LONGEST_JSON, parse_json, read_text
-
-Measured = dict[str, list[float]]
-"""measure -> one number per episode"""
+from .results import Measured
+from .schema import RunConfig
 
 _SOURCES = (emberlink.envs.wildfire, emberlink.comm.base, emberlink.policies.scripted)
 _IMPORTED = time.time_ns()

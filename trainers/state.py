@@ -13,7 +13,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from emberlink.envs import keys, metrics
-from emberlink.envs.config import shown
+from emberlink.envs.validation import shown
 from emberlink.policies.noise import NOISE
 
 from . import state_header, state_world

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from pydantic import ConfigDict, Field, ValidationError
 from pydantic.dataclasses import dataclass
 
-from emberlink.envs.config import describe, from_plain, shown
+from emberlink.envs.validation import describe, from_plain, shown
 
 if TYPE_CHECKING:
     from .loop import Trainer

@@ -14,12 +14,13 @@ from hydra.errors import HydraException
 from rich.console import Console
 from rich.table import Table
 
-from emberlink.envs.config import known
 from emberlink.envs.publish import free_name
+from emberlink.envs.validation import known
 
-from .config import NOT_LEARNT_WITH, RunConfig, flat, resolve, to_values
+from .config import flat, resolve, to_values
 from .interruption import Interruption
 from .run_folder import RunFolder
+from .schema import NOT_LEARNT_WITH, RunConfig
 from .sweep_progress import SweepProgress
 
 _MAY_DIFFER = ("output", *NOT_LEARNT_WITH)

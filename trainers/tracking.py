@@ -14,8 +14,9 @@ from typing import Any
 
 from torchrl.record.loggers import CSVLogger, Logger, TensorboardLogger, WandbLogger
 
-from .config import RunConfig, to_values
+from .config import to_values
 from .run_folder import RunFolder
+from .schema import RunConfig
 
 PATIENCE = 60.0
 """seconds that the end of a training waits for its tracker"""

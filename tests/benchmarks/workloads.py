@@ -12,7 +12,7 @@ import torch
 from tensordict import TensorDict
 
 from emberlink.envs import keys
-from emberlink.envs.config import known
+from emberlink.envs.validation import known
 from emberlink.envs.wildfire import WildfireEnv
 from emberlink.trainers import make_env
 from emberlink.trainers.config import resolve
