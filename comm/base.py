@@ -9,8 +9,8 @@ from torchrl.data import Composite
 from torchrl.envs import Transform
 
 from emberlink.envs import keys
-from emberlink.envs.buffers import Buffers
 from emberlink.envs.config import WildfireConfig
+from emberlink.envs.utils.buffers import Buffers
 
 
 class CommModule(Buffers, TensorDictModuleBase):

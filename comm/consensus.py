@@ -9,12 +9,14 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import Bounded, Composite, Unbounded
 
-from emberlink.envs import keys, streams, uav
+from emberlink.envs import keys
 from emberlink.envs.config import WildfireConfig
-from emberlink.envs.reward import left_box
+from emberlink.envs.utils import counter_rng
+from emberlink.envs.world import motion
+from emberlink.envs.world.reward import left_box
 
+from ._heading import HeadingConfig, circling, heading_reward
 from .base import CommModule
-from .heading import HeadingConfig, circling, heading_reward
 
 TARGET = (keys.AGENTS, "target")
 """float32 [..., 3]: where the UAV is to go, cells."""
@@ -71,7 +73,7 @@ class Consensus(CommModule):
         moment: list[Any] = [keys.OBSERVATION, keys.POSITION, keys.STREAM, keys.STEP]
         told: list[Any] = [keys.OBSERVATION, TARGET, FOLLOWS]
         self.in_keys, self.out_keys = moment + seen + memory, told + memory
-        low, high = uav.corners(world.low, world.high)
+        low, high = motion.corners(world.low, world.high)
         self.register_buffer("low", low, persistent=False)
         self.register_buffer("high", high, persistent=False)
 
@@ -94,7 +96,7 @@ class Consensus(CommModule):
         """No streak, and a random point for everyone."""
         position = tensordict.get(keys.POSITION)
         nothing = torch.zeros_like(tensordict.get(keys.NEW_FIRE))
-        points = uav.random_points(
+        points = motion.random_points(
             self._stream(tensordict, _WAYPOINTS), position.shape[-2], self.low, self.high
         )
         tensordict.set(WAYPOINT, points)
@@ -134,7 +136,7 @@ class Consensus(CommModule):
         heard = neighbours(tensordict.get(keys.POSITION), self.config.range)
         if self.config.loss:
             uavs = heard.shape[-1]
-            unit = streams.uniform(self._stream(tensordict, _LOST), uavs * uavs)
+            unit = counter_rng.uniform(self._stream(tensordict, _LOST), uavs * uavs)
             heard = heard & (unit.unflatten(-1, (uavs, uavs)) >= self.config.loss)
         return heard
 
@@ -162,7 +164,7 @@ class Consensus(CommModule):
         position = tensordict.get(keys.POSITION)
         waypoint, wanders = tensordict.get(WAYPOINT), follows < 0
         stream = self._stream(tensordict, _WAYPOINTS)
-        other = uav.next_waypoint(waypoint, position, stream, self.low, self.high)
+        other = motion.next_waypoint(waypoint, position, stream, self.low, self.high)
         waypoint = torch.where(wanders[..., None], other, waypoint)
         tensordict.set(WAYPOINT, waypoint)
         new = (tensordict.get(keys.NEW_FIRE) > 0).unsqueeze(-1)
@@ -177,26 +179,26 @@ class Consensus(CommModule):
     def _jittered(self, tensordict: TensorDictBase, target: Tensor) -> Tensor:
         """Moves the x and y of targets closer than 1 by clipped noise, within the box."""
         stream = self._stream(tensordict, _JITTER)
-        noise = streams.normal(stream, 2 * target.shape[-2]).unflatten(-1, (-1, 2))
+        noise = counter_rng.normal(stream, 2 * target.shape[-2]).unflatten(-1, (-1, 2))
         noise = (self.config.jitter * noise).clamp(-1, 1)
-        near = uav.distance(tensordict.get(keys.POSITION), target) < 1
+        near = motion.distance(tensordict.get(keys.POSITION), target) < 1
         moved = target + torch.nn.functional.pad(noise, (0, 1)) * near[..., None]
         return moved.clamp(self.low.float(), self.high.float())
 
     def _stream(self, tensordict: TensorDictBase, use: int) -> Tensor:
-        return streams.at(tensordict.get(keys.STREAM), tensordict.get(keys.STEP), use)
+        return counter_rng.at(tensordict.get(keys.STREAM), tensordict.get(keys.STEP), use)
 
     def _scaled(self, told: Tensor) -> Tensor:
         if self.world.observation == "raw":
             return told
         if self.config.target == "relative":
             return told / ((self.high - self.low) / 2).clamp(min=1e-6).float()
-        return uav.scale_to_box(told, self.low, self.high)
+        return motion.scale_to_box(told, self.low, self.high)
 
 
 def apart(position: Tensor) -> Tensor:
     """Distances between UAVs, float64 [..., n, n], cells; of positions [..., n, 3]."""
-    return uav.distance(position.unsqueeze(-2), position.unsqueeze(-3))
+    return motion.distance(position.unsqueeze(-2), position.unsqueeze(-3))
 
 
 def neighbours(position: Tensor, limit: float) -> Tensor:

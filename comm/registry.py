@@ -7,7 +7,7 @@ from pkgutil import iter_modules
 from typing import Any
 
 from emberlink.envs.config import WildfireConfig
-from emberlink.envs.validation import from_plain
+from emberlink.envs.utils.validation import from_plain
 
 from .base import CommModule
 
@@ -17,7 +17,11 @@ _OWN_FILES = ("base", "registry")
 def known() -> list[str]:
     """The names of the modules, in alphabetical order."""
     beside = iter_modules([str(Path(__file__).parent)])
-    return sorted(module.name for module in beside if module.name not in _OWN_FILES)
+    return sorted(
+        module.name
+        for module in beside
+        if module.name not in _OWN_FILES and not module.name.startswith("_")
+    )
 
 
 def find(name: str) -> type[CommModule]:

@@ -1,10 +1,10 @@
 """The wildfire environment, for TorchRL and for PettingZoo."""
 
-from .config import RewardConfig, WildfireConfig
-from .fire import FireConfig
-from .fire_file import FileFireConfig
-from .parallel import parallel_env
-from .wildfire import WildfireEnv
+from emberlink.envs.config import RewardConfig, WildfireConfig
+from emberlink.envs.fire.generator import FireConfig
+from emberlink.envs.fire_files.reader import FileFireConfig
+from emberlink.envs.pettingzoo import parallel_env
+from emberlink.envs.wildfire import WildfireEnv
 
 __all__ = [
     "FileFireConfig",

@@ -30,7 +30,7 @@ BEYOND: Final = (AGENTS, "beyond")
 """bool [..., 3]: the axes along which the last move would have left the box."""
 
 STREAM: Final = "stream"
-"""int64 [num_envs]: this episode's random stream, see `emberlink.envs.streams`."""
+"""int64 [num_envs]: this episode's random stream, see `emberlink.envs.utils.counter_rng`."""
 STEP: Final = "step"
 """int64 [num_envs]: steps since the episode began."""
 SEEN: Final = "seen"

@@ -7,13 +7,17 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from . import keys, render, specs, streams, uav
-from .buffers import Buffers
+from emberlink.envs.rendering import frame
+from emberlink.envs.utils import counter_rng
+from emberlink.envs.utils.buffers import Buffers
+from emberlink.envs.world import motion
+from emberlink.envs.world.coverage_map import Discovery
+from emberlink.envs.world.reward import view_reward
+from emberlink.envs.world.sensor import View
+
+from . import keys, specs
 from .config import WildfireConfig
-from .discovery import Discovery
-from .reward import view_reward
-from .scenario import ScenarioConfig, arrival_times
-from .view import View
+from .scenarios import ScenarioConfig, arrival_times
 
 _POSITIONS, _FIRE, _STEPS = range(3)  # what an episode's random stream is split into
 
@@ -68,7 +72,7 @@ class WildfireEnv(Buffers, EnvBase):
             if isinstance(fire, Tensor) and fire.ndim in (2, 3):
                 config = WildfireConfig(grid=(fire.shape[-2], fire.shape[-1]))
         self.config = config
-        low, high = uav.corners(config.low, config.high)
+        low, high = motion.corners(config.low, config.high)
         self.register_buffer("_low", low, persistent=False)
         self.register_buffer("_high", high, persistent=False)
         view = View(config.grid, view_angle=config.view_angle, ceiling=high[2].item())
@@ -87,7 +91,7 @@ class WildfireEnv(Buffers, EnvBase):
         self.done_spec = specs.done_spec(num_envs)
         self.to(self.device)
         self.set_seed(seeds[0])
-        each = [streams.streams(one, num_envs // len(seeds), self.device) for one in seeds]
+        each = [counter_rng.streams(one, num_envs // len(seeds), self.device) for one in seeds]
         self._seed_stream.copy_(torch.cat(each))
 
     @property
@@ -109,7 +113,7 @@ class WildfireEnv(Buffers, EnvBase):
         """
         if mode != "rgb_array":
             raise ValueError(f"render mode {mode!r} is not known; known: 'rgb_array'")
-        return render.frame(
+        return frame.frame(
             self.fire_map[env].cpu().numpy(),
             self._position[env].cpu().numpy(),
             view_angle=self.config.view_angle,
@@ -117,7 +121,7 @@ class WildfireEnv(Buffers, EnvBase):
 
     def _set_seed(self, seed: int | None) -> None:
         count = self.batch_size[0]
-        self._seed_stream.copy_(streams.streams(seed or 0, count, self.device))
+        self._seed_stream.copy_(counter_rng.streams(seed or 0, count, self.device))
         self._episode.zero_()
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs) -> TensorDictBase:
@@ -141,8 +145,8 @@ class WildfireEnv(Buffers, EnvBase):
     def _begin_episodes(self, mask: Tensor) -> None:
         """The next episode, bool [num_envs] says where: its stream, its fire, nothing seen."""
         self._episode.add_(mask)
-        self._stream.copy_(streams.fold(self._seed_stream, self._episode))
-        self._step_stream.copy_(streams.fold(self._stream, _STEPS))
+        self._stream.copy_(counter_rng.fold(self._seed_stream, self._episode))
+        self._step_stream.copy_(counter_rng.fold(self._stream, _STEPS))
         self._time.masked_fill_(mask, 0)
         self._seen.masked_fill_(mask, 0)
         self._map.begin(mask, self._draw_fire())
@@ -151,13 +155,13 @@ class WildfireEnv(Buffers, EnvBase):
         envs, fires = self.batch_size[0], len(self._map)
         if self._fire_each:
             return torch.arange(envs, device=self.device) % fires
-        unit = streams.uniform(streams.fold(self._stream, _FIRE), 1).squeeze(-1)
+        unit = counter_rng.uniform(counter_rng.fold(self._stream, _FIRE), 1).squeeze(-1)
         return (unit.double() * fires).long()
 
     def _start_positions(self, given: Tensor | None) -> Tensor:
         if given is None:
-            stream = streams.fold(self._stream, _POSITIONS)
-            return uav.random_points(stream, self.config.num_uavs, self._low, self._high)
+            stream = counter_rng.fold(self._stream, _POSITIONS)
+            return motion.random_points(stream, self.config.num_uavs, self._low, self._high)
         given = torch.as_tensor(given, dtype=torch.float32, device=self.device)
         outside = (given < self._low) | (given > self._high)
         if given.shape[-2:] != self._position.shape[-2:] or outside.any() or given.isnan().any():
@@ -171,7 +175,7 @@ class WildfireEnv(Buffers, EnvBase):
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         config = self.config
         self._time.add_(1)
-        position, beyond = uav.move(
+        position, beyond = motion.move(
             self._position,
             tensordict.get(keys.ACTION),
             displacement=config.displacement,
@@ -238,7 +242,7 @@ class WildfireEnv(Buffers, EnvBase):
         """x, y, z, new-fire flag, old-fire flag, timestep: float32 [num_envs, n, 6]."""
         clock = time.view(-1, 1, 1).expand(-1, position.shape[1], 1)
         if self.config.observation == "box":
-            position = uav.scale_to_box(position, self._low, self._high)
+            position = motion.scale_to_box(position, self._low, self._high)
             clock = clock / self.config.horizon
         return torch.cat((position, counts[..., :2] > 0, clock), -1)
 

@@ -6,7 +6,12 @@ from collections.abc import Iterator
 import torch
 from torch import Tensor, nn
 
-from emberlink.policies.networks import StackedActor, StackedCritic, StackedLayerNorm, StackedLinear
+from emberlink.policies.networks.stacked import (
+    StackedActor,
+    StackedCritic,
+    StackedLayerNorm,
+    StackedLinear,
+)
 
 
 class SingleActor(nn.Module):

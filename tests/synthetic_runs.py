@@ -9,7 +9,7 @@ import numpy as np
 import yaml
 
 from emberlink.envs import metrics
-from emberlink.trainers.config import resolve, to_values
+from emberlink.trainers.config.compose import resolve, to_values
 
 HORIZON = 40
 

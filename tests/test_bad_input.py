@@ -11,14 +11,14 @@ import yaml
 from safetensors.torch import save_file
 from tiny_run import PROGRAM, TINY
 
-from emberlink.trainers import cli
-from emberlink.trainers.run_folder import RunFolder
+from emberlink.trainers.cli import main
+from emberlink.trainers.runs.run_folder import RunFolder
 
 
 def refused(arguments: list[str], capsys, *words: str) -> str:
     """The one line with which a command ends at status 2; it holds all the words."""
     capsys.readouterr()
-    assert cli.main(arguments) == 2
+    assert main.main(arguments) == 2
     out, err = capsys.readouterr()
     assert out == ""
     assert err.count("\n") == 1, err
@@ -184,7 +184,7 @@ def test_too_little_memory_is_one_line(capsys, monkeypatch):
     def full(*_):
         raise RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried 99 bytes\nmore")
 
-    monkeypatch.setattr("emberlink.trainers.commands.Trainer", full)
+    monkeypatch.setattr("emberlink.trainers.cli.train_eval.Trainer", full)
     refused(["train", "consensus", *TINY], capsys, "not enough memory", "99 bytes")
 
 
@@ -199,5 +199,5 @@ def test_a_line_that_was_not_finished_is_no_line(run):
 
 
 def test_a_batch_that_is_never_reached_is_said(tmp_path, capsys):
-    assert cli.main(["train", "consensus", *TINY, "learner.batch=500", f"output={tmp_path}"]) == 0
+    assert main.main(["train", "consensus", *TINY, "learner.batch=500", f"output={tmp_path}"]) == 0
     assert "nothing will be learnt" in capsys.readouterr().out

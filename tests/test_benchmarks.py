@@ -9,8 +9,8 @@ import workloads
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils.flop_counter import flop_registry
 
-from emberlink.trainers.config import resolve
-from emberlink.trainers.loop import Trainer
+from emberlink.trainers.config.compose import resolve
+from emberlink.trainers.training.trainer import Trainer
 
 
 class Flops(TorchDispatchMode):

@@ -17,9 +17,11 @@ from soak import readable
 from test_recipes import METHODS
 from test_resume import until
 
-from emberlink.trainers import checkpoint, cli, report
-from emberlink.trainers.resume import resume
-from emberlink.trainers.run_folder import RunFolder, load_weights
+from emberlink.trainers.cli import main
+from emberlink.trainers.evaluation import report
+from emberlink.trainers.runs import checkpoint_file
+from emberlink.trainers.runs.run_folder import RunFolder, load_weights
+from emberlink.trainers.training.resume import resume
 
 RELEASED = Path(__file__).parent / "released"
 """run folders as earlier versions left them"""
@@ -34,8 +36,8 @@ def test_what_is_written_is_read(tmp_path_factory, sizes, header):
     path = tmp_path_factory.mktemp("checkpoint") / "one.safetensors"
     content = {name: torch.randn(size) for name, size in sizes.items()}
     own = {key: value for key, value in header.items() if key not in ("sha256", "format")}
-    checkpoint.write(path, content, own)
-    found, tensors = checkpoint.read(path)
+    checkpoint_file.write(path, content, own)
+    found, tensors = checkpoint_file.read(path)
     assert found is not None
     assert {k: v for k, v in found.items() if k not in ("sha256", "format")} == own
     assert tensors.keys() == content.keys()
@@ -45,18 +47,18 @@ def test_what_is_written_is_read(tmp_path_factory, sizes, header):
 
 def test_every_byte_is_sealed(tmp_path):
     path = tmp_path / "one.safetensors"
-    checkpoint.write(path, {"a": torch.arange(5.0)}, {"kind": "networks", "step": 3})
+    checkpoint_file.write(path, {"a": torch.arange(5.0)}, {"kind": "networks", "step": 3})
     sound = path.read_bytes()
     for place in range(len(sound)):
         flipped = bytearray(sound)
         flipped[place] ^= 1 << place % 8
         path.write_bytes(flipped)
         with pytest.raises(ValueError, match=r"one\.safetensors"):
-            checkpoint.read(path)
+            checkpoint_file.read(path)
     for length in range(len(sound)):
         path.write_bytes(sound[:length])
         with pytest.raises(ValueError, match=r"one\.safetensors"):
-            checkpoint.read(path)
+            checkpoint_file.read(path)
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -73,7 +75,7 @@ def test_a_state_without_a_seal_is_refused_and_the_one_before_it_is_named(tmp_pa
     assert len(run.states()) == 2
     without_a_seal(path, None)  # pyright: ignore[reportArgumentType]
     before = {one: one.read_bytes() for one in run.path.rglob("*") if one.is_file()}
-    assert cli.main(["train", f"resume={run.path}"]) == 2
+    assert main.main(["train", f"resume={run.path}"]) == 2
     error = capsys.readouterr().err
     assert error.count("\n") == 1
     assert f"the one before it: emberlink train resume={run.states()[0]}" in error
@@ -113,7 +115,7 @@ def refused(path: Path, change: Callable[[dict, dict[str, torch.Tensor]], object
 
 
 def test_nan_is_refused_wherever_it_is(stopped):
-    _, content = checkpoint.read(stopped)
+    _, content = checkpoint_file.read(stopped)
     floating = [name for name, value in content.items() if value.is_floating_point()]
     assert {name.partition("/")[0] for name in floating} == {
         *("networks", "optimizer", "memory", "carried", "world", "moments", "losses")
@@ -236,12 +238,12 @@ def test_only_an_earlier_state_is_the_one_before(stopped):
 def test_networks_from_before_there_was_a_seal(run, capsys):
     path = RunFolder(run).checkpoint()
     save_file(load_file(path), path)
-    assert checkpoint.read_header(path) is None
-    assert cli.main(["eval", str(run)]) == 0
+    assert checkpoint_file.read_header(path) is None
+    assert main.main(["eval", str(run)]) == 0
     for state in RunFolder(run).states():
         state.unlink()
     capsys.readouterr()
-    assert cli.main(["train", f"resume={run}"]) == 2
+    assert main.main(["train", f"resume={run}"]) == 2
     assert "holds networks alone" in capsys.readouterr().err
 
 
@@ -271,15 +273,17 @@ def test_files_of_earlier_versions(folder, tmp_path):
 @pytest.mark.parametrize("part", ["save_file", "fsync", "replace"])
 def test_a_save_that_fails_leaves_what_was_there(part, tmp_path, monkeypatch):
     path = tmp_path / "one.safetensors"
-    checkpoint.write(path, {"a": torch.ones(3)}, {})
+    checkpoint_file.write(path, {"a": torch.ones(3)}, {})
     before = path.read_bytes()
 
     def full(*_, **__):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    monkeypatch.setattr({"save_file": checkpoint, "fsync": os, "replace": Path}[part], part, full)
+    monkeypatch.setattr(
+        {"save_file": checkpoint_file, "fsync": os, "replace": Path}[part], part, full
+    )
     with pytest.raises(ValueError, match=r"one\.safetensors: cannot be written: No space left"):
-        checkpoint.write(path, {"a": torch.zeros(3)}, {})
+        checkpoint_file.write(path, {"a": torch.zeros(3)}, {})
     monkeypatch.undo()
     assert path.read_bytes() == before
     assert [one.name for one in tmp_path.iterdir()] == [path.name]
@@ -300,7 +304,7 @@ def test_what_is_written_is_flushed_before_it_gets_its_name(tmp_path, monkeypatc
     monkeypatch.setattr(os, "fsync", flushing)
     monkeypatch.setattr(Path, "replace", renaming)
     path = tmp_path.resolve() / "one.safetensors"
-    checkpoint.write(path, {"a": torch.ones(3)}, {})
+    checkpoint_file.write(path, {"a": torch.ones(3)}, {})
     assert done == [f"{path}.part", "rename", str(path.parent)]
 
 

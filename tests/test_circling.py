@@ -4,9 +4,9 @@ import pytest
 import torch
 from moments import moment
 
+from emberlink.comm._heading import HeadingConfig, circling
 from emberlink.comm.base import Communication
 from emberlink.comm.consensus import FOLLOWS, Consensus, ConsensusConfig
-from emberlink.comm.heading import HeadingConfig, circling
 from emberlink.envs import keys
 from emberlink.envs.config import WildfireConfig
 

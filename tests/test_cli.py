@@ -14,15 +14,15 @@ from safetensors.torch import load_file, save_file
 from tiny_run import PROGRAM, TINY
 
 from emberlink.envs import metrics
-from emberlink.policies.scripted import SCRIPTED
-from emberlink.trainers import cli
-from emberlink.trainers.run_folder import RunFolder
+from emberlink.policies.scripted.registry import SCRIPTED
+from emberlink.trainers.cli import main
+from emberlink.trainers.runs.run_folder import RunFolder
 
 
 @pytest.mark.parametrize("arguments", [["trane"], ["train"], ["eval"], ["eval", "x", "--fires=0"]])
 def test_usage_errors_end_with_what_is_wrong(arguments, capsys):
     with pytest.raises(SystemExit) as ended:
-        cli.main(arguments)
+        main.main(arguments)
     assert ended.value.code == 2
     out, err = capsys.readouterr()
     assert out == ""
@@ -34,19 +34,19 @@ def test_usage_errors_end_with_what_is_wrong(arguments, capsys):
 @pytest.mark.parametrize("command", ["train", "eval", "doctor"])
 def test_help_says_what_a_command_does_with_an_example(command, capsys):
     with pytest.raises(SystemExit) as ended:
-        cli.main([command, "--help"])
+        main.main([command, "--help"])
     assert ended.value.code == 0
     text = capsys.readouterr().out
     assert f"example:\n  emberlink {command}" in text
     assert len(text.split("\n\n")[1]) > 60  # the paragraph that says what it does
     with pytest.raises(SystemExit):
-        cli.main(["--help"])
+        main.main(["--help"])
     assert f"\n    {command}" in capsys.readouterr().out
 
 
 def test_train_leaves_the_files_and_prints_the_table(tmp_path, capsys):
     output = tmp_path / "some where" / "deep"
-    assert cli.main(["train", "independent", *TINY, f"output={output}"]) == 0
+    assert main.main(["train", "independent", *TINY, f"output={output}"]) == 0
     out, _ = capsys.readouterr()
     (folder,) = output.iterdir()
     check_evaluation(folder, out)
@@ -78,10 +78,10 @@ def test_eval_repeats_the_evaluation_of_train(run, capsys):
     trained = json.loads((run / "eval.json").read_text())["results"]
     shutil.rmtree(run / "figures")
     (run / "eval.json").unlink()
-    assert cli.main(["eval", str(run)]) == 0
+    assert main.main(["eval", str(run)]) == 0
     check_evaluation(run, capsys.readouterr().out)
     assert json.loads((run / "eval.json").read_text())["results"] == trained
-    assert cli.main(["eval", str(run), "--fires", "1", "--device", "cpu"]) == 0
+    assert main.main(["eval", str(run), "--fires", "1", "--device", "cpu"]) == 0
     check_evaluation(run, capsys.readouterr().out, episodes=1)
 
 
@@ -91,7 +91,7 @@ def test_eval_plays_the_checkpoint_it_is_given(run, capsys):
     weights = load_file(RunFolder(run).checkpoint())
     name = next(n for n in weights if n.startswith("actor_network_params") and "action.bias" in n)
     save_file({**weights, name: weights[name] + 9}, run / "other.safetensors")
-    assert cli.main(["eval", str(run), "--checkpoint", str(run / "other.safetensors")]) == 0
+    assert main.main(["eval", str(run), "--checkpoint", str(run / "other.safetensors")]) == 0
     assert capsys.readouterr().out.splitlines()[-1] == str(run)
     again = json.loads((run / "eval_other.json").read_text())
     assert again["checkpoint"] == "other.safetensors"
@@ -135,5 +135,5 @@ def test_ctrl_c_leaves_a_run_that_can_be_evaluated(tmp_path, capsys):
     done = len((folder / "metrics.jsonl").read_text().splitlines())
     assert done <= int(checkpoint.stem.removeprefix("step_")) / 15 < done + 1
     assert not list(folder.rglob("*.part"))
-    assert cli.main(["eval", str(folder)]) == 0
+    assert main.main(["eval", str(folder)]) == 0
     check_evaluation(folder, capsys.readouterr().out)

@@ -16,7 +16,7 @@ from emberlink.comm import base, consensus, registry
 from emberlink.envs import keys
 from emberlink.envs.wildfire import WildfireEnv
 from emberlink.trainers import make_env
-from emberlink.trainers.config import resolve
+from emberlink.trainers.config.compose import resolve
 
 ROOT = Path(__file__).parents[1]
 METHODS = ["independent", "shared_memory", "positional", "consensus"]
@@ -149,7 +149,7 @@ TRAIN = """
 import sys
 from pathlib import Path
 from emberlink.comm import registry
-from emberlink.trainers.cli import main
+from emberlink.trainers.cli.main import main
 assert Path(registry.__file__).is_relative_to(sys.argv[1]), registry.__file__
 raise SystemExit(main(["train", "headcount", "comm.scale=0.5", *sys.argv[2:]]))
 """

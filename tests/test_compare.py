@@ -13,11 +13,12 @@ from matplotlib.axes import Axes
 from synthetic_runs import read_evaluation, write_evaluation, write_run
 
 from emberlink.envs import metrics
-from emberlink.trainers import cli, comparison_figures
-from emberlink.trainers.comparison_numbers import Scripted, numbers
-from emberlink.trainers.comparison_runs import Run, find, gather, read
-from emberlink.trainers.config import to_values
-from emberlink.trainers.run_folder import RunFolder
+from emberlink.trainers.cli import main
+from emberlink.trainers.comparison import plots
+from emberlink.trainers.comparison.rankings import Scripted, numbers
+from emberlink.trainers.comparison.runs import Run, find, gather, read
+from emberlink.trainers.config.compose import to_values
+from emberlink.trainers.runs.run_folder import RunFolder
 
 METHODS = ("consensus", "independent", "positional", "shared_memory")
 
@@ -110,7 +111,7 @@ def test_a_ratio_to_nothing_is_infinite(tmp_path, capsys):
     for method, exits in (("consensus", 0), ("independent", 9)):
         for seed in range(2):
             write_run(tmp_path, method, seed, learned={"boundary_exits": exits})
-    assert cli.main(["compare", str(tmp_path), "--output", str(tmp_path / "out")]) == 0
+    assert main.main(["compare", str(tmp_path), "--output", str(tmp_path / "out")]) == 0
     assert "∞" in capsys.readouterr().out
     content = json.loads((tmp_path / "out" / "compare.json").read_text())
     claims = {one["measure"]: one for one in content["setups"][0]["claims"]}
@@ -127,13 +128,13 @@ def test_with_one_seed_there_is_no_interval(tmp_path, capsys):
         assert rank.rows[0].improvement in (0, 0.5, 1)
     assert {v.verdict for v in one.verdicts} == {"undecided"}
     assert all(c.low is None for by in one.curves.values() for c in by.values())
-    assert cli.main(["compare", str(tmp_path), "--output", str(tmp_path / "out")]) == 0
+    assert main.main(["compare", str(tmp_path), "--output", str(tmp_path / "out")]) == 0
     assert " 1* " in capsys.readouterr().out
     assert "With one seed there is no interval" in (tmp_path / "out/compare.html").read_text()
 
 
 def test_two_seeds_are_flagged(runs, tmp_path, capsys):
-    assert cli.main(["compare", str(runs), "--output", str(tmp_path / "out")]) == 0
+    assert main.main(["compare", str(runs), "--output", str(tmp_path / "out")]) == 0
     assert " 2* " in capsys.readouterr().out
     assert "too few for an interval" in (tmp_path / "out/compare.html").read_text()
 
@@ -141,7 +142,7 @@ def test_two_seeds_are_flagged(runs, tmp_path, capsys):
 def test_a_group_of_one_seed_hides_no_other_of_few(tmp_path, capsys):
     for seed, method in enumerate(["consensus", "independent", "independent"]):
         write_run(tmp_path, method, seed)
-    assert cli.main(["compare", str(tmp_path), "--output", str(tmp_path / "out")]) == 0
+    assert main.main(["compare", str(tmp_path), "--output", str(tmp_path / "out")]) == 0
     said = capsys.readouterr().out
     assert "* fewer than 5 seeds" in said
     assert [said.count(f" {seeds}* ") for seeds in (1, 2)] == [8, 8]
@@ -153,7 +154,7 @@ def test_a_group_of_one_seed_hides_no_other_of_few(tmp_path, capsys):
 
 def test_where_scripted_policies_are_drawn(tmp_path, monkeypatch):
     """A line in the rows whose number it is, and in no other, whatever the rows' names."""
-    assert list(comparison_figures._stretches([0, 1, 3, 5, 6])) == [(0, 1), (3, 3), (5, 6)]
+    assert list(plots._stretches([0, 1, 3, 5, 6])) == [(0, 1), (3, 3), (5, 6)]
     drawn = []
     plot = Axes.plot
 
@@ -174,7 +175,7 @@ def test_where_scripted_policies_are_drawn(tmp_path, monkeypatch):
         write_evaluation(run, content)
     one = only(tmp_path)
     assert [row.method for row in ranking(one, "coverage").rows][1].count(", ") == 1
-    comparison_figures.frozen(tmp_path / "figure.png", one, "huygens")
+    plots.frozen(tmp_path / "figure.png", one, "huygens")
     lines = [
         (args[0][0], *args[1])
         for args, about in drawn
@@ -188,7 +189,7 @@ def test_an_output_that_cannot_be(runs, tmp_path, capsys):
     (tmp_path / "file").write_text("mine")
     (tmp_path / "link").symlink_to("nowhere")
     for output in ("file", "file/sub", "link", "x" * 300):
-        assert cli.main(["compare", str(runs), "--output", str(tmp_path / output)]) == 2
+        assert main.main(["compare", str(runs), "--output", str(tmp_path / output)]) == 2
         said = capsys.readouterr().err
         assert f"--output {tmp_path / output}: " in said.replace("\n", ""), said
         assert said.count("\n") == 1
@@ -245,7 +246,7 @@ def test_the_order_of_runs_does_not_matter(runs, tmp_path):
     whole = []
     for place, order in enumerate([folders, folders[::-1], [*folders[2:], *folders[:2]]]):
         out = tmp_path / str(place)
-        assert cli.main(["compare", *map(str, order), "--output", str(out)]) == 0
+        assert main.main(["compare", *map(str, order), "--output", str(out)]) == 0
         whole.append({file.name: file.read_bytes() for file in out.iterdir()})
     assert whole[0] == whole[1] == whole[2]
     assert {"compare.html", "compare.json"} < whole[0].keys()
@@ -331,7 +332,7 @@ def test_evaluations_in_other_worlds_are_no_trainings(tmp_path, capsys):
     }.items():
         in_another_world(run, name, 10, **about)
     shutil.copy(run / "eval.json", run / "eval_the_same.json")
-    assert cli.main(["compare", str(tmp_path), "--output", str(tmp_path / "out")]) == 0
+    assert main.main(["compare", str(tmp_path), "--output", str(tmp_path / "out")]) == 0
     said = " ".join(capsys.readouterr().out.split())
     assert "eval_step_7.json is left out: evaluated otherwise: checkpoint is step_7" in said
     assert "eval_fires.json is left out: evaluated otherwise: start_seed is 2" in said
@@ -466,7 +467,7 @@ def page(folder) -> Tags:
 
 def test_the_page_holds_everything_and_loads_nothing(runs, tmp_path):
     out = tmp_path / "out"
-    assert cli.main(["compare", str(runs), "--output", str(out)]) == 0
+    assert main.main(["compare", str(runs), "--output", str(out)]) == 0
     tags = page(out)
     assert "script" not in tags.seen
     assert len(tags.loaded) == 6
@@ -496,7 +497,7 @@ def test_names_from_files_are_text(tmp_path, capsys):
     results["huygens"][HOSTILE] = results["huygens"]["random_actions"]
     results[HOSTILE] = results["huygens"]
     write_evaluation(run, content)
-    assert cli.main(["compare", str(run), "--output", str(tmp_path / "out")]) == 0
+    assert main.main(["compare", str(run), "--output", str(tmp_path / "out")]) == 0
     tags = page(tmp_path / "out")
     assert "script" not in tags.seen
     assert HOSTILE in tags.text
@@ -516,7 +517,7 @@ def test_unfinished_runs_are_named_and_left_out(tmp_path, capsys):
     (older / "checkpoints").mkdir()
     (older / "checkpoints" / "step_000000160.safetensors").touch()
     (runs / "notes").mkdir()
-    assert cli.main(["compare", str(runs), str(good), "--output", str(tmp_path / "out")]) == 0
+    assert main.main(["compare", str(runs), str(good), "--output", str(tmp_path / "out")]) == 0
     said = " ".join(capsys.readouterr().out.replace("\n", " ").split())
     content = json.loads((tmp_path / "out" / "compare.json").read_text())
     assert {one["run"]: one["why"][:22] for one in content["left_out"]} == {
@@ -613,7 +614,7 @@ def test_what_is_wrong_is_said_in_a_line_and_nothing_is_left(case, tmp_path, cap
     change, said = SPOILT[case]
     write_run(tmp_path / "runs", "consensus", 0)
     change(write_run(tmp_path / "runs", "independent", 1))
-    assert cli.main(["compare", str(tmp_path / "runs"), "--output", str(tmp_path / "out")]) == 2
+    assert main.main(["compare", str(tmp_path / "runs"), "--output", str(tmp_path / "out")]) == 2
     error = capsys.readouterr().err
     assert error.startswith("emberlink compare: ")
     assert error.count("\n") == 1
@@ -627,11 +628,11 @@ def test_no_runs(tmp_path, capsys):
         (tmp_path, "neither a run folder nor a folder that holds runs"),
         (tmp_path / "missing", "there is no such run folder"),
     ):
-        assert cli.main(["compare", str(path)]) == 2
+        assert main.main(["compare", str(path)]) == 2
         assert said in capsys.readouterr().err
     run = write_run(tmp_path)
     (run / "eval.json").unlink()
-    assert cli.main(["compare", str(run)]) == 2
+    assert main.main(["compare", str(run)]) == 2
     assert capsys.readouterr().err == (
         "emberlink compare: no finished run among 1: nothing to compare\n"
     )
@@ -642,18 +643,18 @@ def test_nothing_is_overwritten(runs, tmp_path, monkeypatch, capsys):
     taken.mkdir()
     (taken / "mine").write_text("x")
     for path in (taken, taken / "mine"):
-        assert cli.main(["compare", str(runs), "--output", str(path)]) == 2
+        assert main.main(["compare", str(runs), "--output", str(path)]) == 2
         assert "is there and not an empty folder" in capsys.readouterr().err
     assert [file.name for file in taken.iterdir()] == ["mine"]
     monkeypatch.chdir(tmp_path)
     for name in ("compare", "compare_2"):
-        assert cli.main(["compare", str(runs)]) == 0
+        assert main.main(["compare", str(runs)]) == 0
         assert capsys.readouterr().out.rstrip().splitlines()[-1] == f"{name}/compare.html"
     assert sorted(path.name for path in tmp_path.iterdir()) == ["compare", "compare_2", "taken"]
 
 
 def test_a_real_run_has_a_timelapse(finished, tmp_path):
-    assert cli.main(["compare", str(finished.parent), "--output", str(tmp_path / "out")]) == 0
+    assert main.main(["compare", str(finished.parent), "--output", str(tmp_path / "out")]) == 0
     (timelapse,) = (tmp_path / "out").glob("*timelapse*.png")
     tags = page(tmp_path / "out")
     assert len(tags.loaded) == 5 + 2 + 1  # figures 5 to 9, one for each fire, the timelapse
@@ -663,6 +664,6 @@ def test_a_real_run_has_a_timelapse(finished, tmp_path):
 
 def test_help_says_what_compare_does_with_an_example(capsys):
     with pytest.raises(SystemExit) as ended:
-        cli.main(["compare", "--help"])
+        main.main(["compare", "--help"])
     assert ended.value.code == 0
     assert "example:\n  emberlink compare" in capsys.readouterr().out

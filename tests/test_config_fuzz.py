@@ -19,13 +19,13 @@ from robustness import SOAK
 
 from emberlink.comm import registry
 from emberlink.envs import keys
-from emberlink.envs.fire import scenarios
-from emberlink.envs.validation import known
-from emberlink.trainers import cli
+from emberlink.envs.fire.generator import scenarios
+from emberlink.envs.utils.validation import known
 from emberlink.trainers.build import build_env
-from emberlink.trainers.config import from_values, resolve, to_values
-from emberlink.trainers.loop import Trainer
-from emberlink.trainers.schema import RunConfig
+from emberlink.trainers.cli import main
+from emberlink.trainers.config.compose import from_values, resolve, to_values
+from emberlink.trainers.config.schema import RunConfig
+from emberlink.trainers.training.trainer import Trainer
 
 EXAMPLES = 5000 if SOAK else 500
 FUZZ = settings(
@@ -280,7 +280,7 @@ def test_the_command_line_refuses_what_does_not_fit(text, tmp_path, capsys):
         if (key, text) == ("seeds", "[1,2,3,4]"):  # fits
             continue
         arguments = ["train", "consensus", f"{key}={text}", f"output={tmp_path / 'x'}"]
-        assert cli.main(arguments) == 2
+        assert main.main(arguments) == 2
         out, err = capsys.readouterr()
         assert (out, err.count("\n")) == ("", 1)
         assert key in err

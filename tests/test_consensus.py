@@ -9,6 +9,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from emberlink.comm import consensus
+from emberlink.comm._heading import HeadingConfig
 from emberlink.comm.base import Communication
 from emberlink.comm.consensus import (
     Consensus,
@@ -17,7 +18,6 @@ from emberlink.comm.consensus import (
     known_discoverers,
     neighbours,
 )
-from emberlink.comm.heading import HeadingConfig
 from emberlink.envs import keys
 from emberlink.envs.config import WildfireConfig
 

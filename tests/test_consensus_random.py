@@ -10,11 +10,12 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from emberlink.comm import consensus
+from emberlink.comm._heading import HeadingConfig
 from emberlink.comm.base import Communication
 from emberlink.comm.consensus import Consensus, ConsensusConfig
-from emberlink.comm.heading import HeadingConfig
-from emberlink.envs import keys, streams
+from emberlink.envs import keys
 from emberlink.envs.config import WildfireConfig
+from emberlink.envs.utils import counter_rng
 
 FORMS = ["folded_linear", "folded_exponential", "linear"]
 
@@ -65,7 +66,9 @@ def test_random_networks_equal_plain_python(uavs):
             step=step,
         )
         now = talk._reset(now, now) if before is None else talk._step(before, now)
-        unit = streams.uniform(streams.at(now[keys.STREAM], now[keys.STEP], 102), uavs * uavs)
+        unit = counter_rng.uniform(
+            counter_rng.at(now[keys.STREAM], now[keys.STEP], 102), uavs * uavs
+        )
         lost = (unit < config.loss).unflatten(-1, (uavs, uavs))
         for env in range(envs):
             scalars[env].lost = {tuple(pair) for pair in lost[env].nonzero().tolist()}

@@ -9,11 +9,11 @@ from test_recipes import METHODS
 from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from emberlink.policies.noise import OrnsteinUhlenbeck
+from emberlink.policies.exploration import OrnsteinUhlenbeck
 from emberlink.trainers.build import build_env
-from emberlink.trainers.config import resolve
-from emberlink.trainers.graphs import LockstepCollector, graphed
-from emberlink.trainers.loop import Trainer
+from emberlink.trainers.config.compose import resolve
+from emberlink.trainers.rollout.cuda_graphs import LockstepCollector, graphed
+from emberlink.trainers.training.trainer import Trainer
 
 SMALL = [
     *("env.horizon=12", "env.num_uavs=3", "num_envs=2", "episodes=3", "learner.batch=8"),

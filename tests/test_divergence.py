@@ -14,15 +14,17 @@ from test_recipes import METHODS
 from test_resume import assert_same, until
 
 from emberlink.envs.wildfire import WildfireEnv
-from emberlink.trainers import checkpoint, cli, divergence, state
-from emberlink.trainers.config import resolve
-from emberlink.trainers.divergence import Culprit, Divergence, replay
-from emberlink.trainers.learner import Learner
-from emberlink.trainers.loop import Trainer
-from emberlink.trainers.memory import rows_needed
-from emberlink.trainers.resume import resume
-from emberlink.trainers.run_folder import RunFolder
-from emberlink.trainers.watch import Watch, norms
+from emberlink.trainers.cli import main
+from emberlink.trainers.config.compose import resolve
+from emberlink.trainers.learners.ddpg import Learner
+from emberlink.trainers.learners.nan_guard import Watch, norms
+from emberlink.trainers.learners.replay_buffer import rows_needed
+from emberlink.trainers.runs import checkpoint_file
+from emberlink.trainers.runs.run_folder import RunFolder
+from emberlink.trainers.training import divergence, state
+from emberlink.trainers.training.divergence import Culprit, Divergence, replay
+from emberlink.trainers.training.resume import resume
+from emberlink.trainers.training.trainer import Trainer
 
 HORIZON, UAVS, ENVS, BATCH = 20, 3, 2, 16
 STEP, UAV, ENV = 33, 1, 1
@@ -170,7 +172,7 @@ def clean(tmp_path_factory):
         if method not in found:
             trainer = begun(method, tmp_path_factory.mktemp("clean"), "checkpoint_steps=1")
             until(trainer, STEP)
-            before, after = (checkpoint.read(path)[1] for path in trainer.run.states())
+            before, after = (checkpoint_file.read(path)[1] for path in trainer.run.states())
             found[method] = before, after
         return found[method]
 
@@ -179,7 +181,7 @@ def clean(tmp_path_factory):
 
 def check_weights(bundle: Path, wanted: dict, *, but: str | None = None) -> None:
     """That networks and optimisers in a bundle are those of a state, to the last bit."""
-    _, weights = checkpoint.read(bundle / "weights.safetensors")
+    _, weights = checkpoint_file.read(bundle / "weights.safetensors")
     names = [name for name in wanted if name.startswith(("networks/", "optimizer/"))]
     assert weights.keys() == set(names)
     for name in names:
@@ -214,7 +216,7 @@ def test_it_stops_at_once_and_names_the_number(method, place, clean, tmp_path, m
     ranges = {name: one for name, one in report["ranges"].items() if one["not_finite"]}
     # Losses and gradients are not of what was collected, and all else is good.
     assert any(error.culprit.tensor.split()[-1].split(".")[-1] in name for name in ranges)
-    _, batch = checkpoint.read(bundle / "batch.safetensors")
+    _, batch = checkpoint_file.read(bundle / "batch.safetensors")
     rows = BATCH if place == "gradient" else ENVS
     assert batch["batch/next.agents.reward" if rows == BATCH else "batch/next.reward"].shape == (
         *(rows, UAVS, 1),
@@ -308,7 +310,7 @@ def test_a_learning_rate_that_blows_up(tmp_path):
 
 def test_the_command_says_it_in_one_line(tmp_path, monkeypatch, capsys):
     Poison(monkeypatch, "reward")
-    assert cli.main(["train", "consensus", *SMALL, f"output={tmp_path}"]) == 2
+    assert main.main(["train", "consensus", *SMALL, f"output={tmp_path}"]) == 2
     (run,) = tmp_path.iterdir()
     error = capsys.readouterr().err
     assert error == (
@@ -318,7 +320,7 @@ def test_the_command_says_it_in_one_line(tmp_path, monkeypatch, capsys):
         f"resume={run} on_nan=rollback\n"
     )
     monkeypatch.undo()
-    assert cli.main(["train", f"resume={run}", "on_nan=rollback"]) == 0
+    assert main.main(["train", f"resume={run}", "on_nan=rollback"]) == 0
     assert RunFolder(run).config().on_nan == "rollback"
 
 
@@ -404,7 +406,7 @@ def test_a_rollback_that_does_not_help_is_given_up(tmp_path, monkeypatch, capsys
 
     monkeypatch.setattr(WildfireEnv, "_snapshot", poisoned)
     command = ["train", "consensus", *SMALL, *ROLLBACK, "checkpoint_steps=0", f"output={tmp_path}"]
-    assert cli.main(command) == 2
+    assert main.main(command) == 2
     out, err = capsys.readouterr()
     assert err.count("\n") == 1
     assert "given up after 5 rollbacks, learning rates x 0.03125" in err
@@ -429,16 +431,16 @@ def test_a_rollback_that_does_not_help_is_given_up(tmp_path, monkeypatch, capsys
 def test_a_state_with_rates_that_cannot_be_is_refused(tmp_path):
     trainer = until(begun("independent", tmp_path), 10)
     path = trainer.run.states()[-1]
-    header, content = checkpoint.read(path)
+    header, content = checkpoint_file.read(path)
     for wrong in ({"rate": 0}, {"rate": 2.0}, {"rate": "a"}, {"tries": -1}, {"furthest": 1.5}):
-        checkpoint.write(path, content, header | wrong)
+        checkpoint_file.write(path, content, header | wrong)
         with pytest.raises(ValueError, match=path.name):
             resume(trainer.run.path)
 
 
 @pytest.mark.parametrize("wrong", ["nan", "off", "true"])
 def test_what_can_be_chosen(wrong, capsys):
-    assert cli.main(["train", "consensus", f"on_nan={wrong}"]) == 2
+    assert main.main(["train", "consensus", f"on_nan={wrong}"]) == 2
     assert "'stop' or 'rollback'" in capsys.readouterr().err
 
 

@@ -12,13 +12,14 @@ import torch
 from rich.console import Console
 
 from emberlink.envs import metrics
-from emberlink.envs.fire import fire_seeds, load_scenario, make_fires
-from emberlink.envs.fire_bank import cache_folder
-from emberlink.policies.scripted import SCRIPTED
-from emberlink.trainers import cli, evaluate, report, scripted_results
+from emberlink.envs.fire.cache import cache_folder
+from emberlink.envs.fire.generator import fire_seeds, load_scenario, make_fires
+from emberlink.policies.scripted.registry import SCRIPTED
 from emberlink.trainers.build import build_env, build_networks
-from emberlink.trainers.config import resolve
-from emberlink.trainers.run_folder import RunFolder
+from emberlink.trainers.cli import main
+from emberlink.trainers.config.compose import resolve
+from emberlink.trainers.evaluation import baseline_cache, evaluate, report
+from emberlink.trainers.runs.run_folder import RunFolder
 
 SMALL = ["env.horizon=12", "env.num_uavs=2", "learner.hidden=[8,8]", "env.grid=[12,10]"]
 
@@ -41,7 +42,7 @@ def untrained(config):
 def cache(tmp_path, monkeypatch):
     """An empty cache, of a program that was started just now."""
     monkeypatch.setenv("EMBERLINK_CACHE", str(tmp_path / "cache"))
-    monkeypatch.setattr(scripted_results, "_IMPORTED", 2**62)
+    monkeypatch.setattr(baseline_cache, "_IMPORTED", 2**62)
     return tmp_path / "cache"
 
 
@@ -111,21 +112,21 @@ def test_pursuit_is_played_with_the_consensus_of_the_setup():
 
 
 def test_eval_json_is_the_same_to_the_byte(run, cache, played):
-    assert cli.main(["eval", str(run), "--fires", "3"]) == 0
+    assert main.main(["eval", str(run), "--fires", "3"]) == 0
     first = (run / "eval.json").read_bytes()
     blocks = len(played)
-    assert cli.main(["eval", str(run), "--fires", "3"]) == 0
+    assert main.main(["eval", str(run), "--fires", "3"]) == 0
     assert (run / "eval.json").read_bytes() == first
     assert len(played) - blocks == 3  # the learned policy on both fires, and the animation
     for file in cache.glob("scripted-*"):
         file.unlink()
-    assert cli.main(["eval", str(run), "--fires", "3"]) == 0
+    assert main.main(["eval", str(run), "--fires", "3"]) == 0
     assert (run / "eval.json").read_bytes() == first
     assert len(played) == 2 * blocks + 3
 
 
 def test_eval_json_says_what_was_played(run, cache):
-    assert cli.main(["eval", str(run), "--fires", "3"]) == 0
+    assert main.main(["eval", str(run), "--fires", "3"]) == 0
     content = json.loads((run / "eval.json").read_text())
     config = RunFolder(run).config()
     assert content["method"] == "consensus"
@@ -189,7 +190,7 @@ def test_other_fires_policies_protocols_and_sources_have_files_of_their_own(
     monkeypatch.setattr(evaluate, "START_SEED", 5)
     lawnmower(config)
     assert len(played) == 4
-    monkeypatch.setattr(scripted_results, "source_digest", lambda: "other")
+    monkeypatch.setattr(baseline_cache, "source_digest", lambda: "other")
     lawnmower(config)
     assert len(played) == 5
 
@@ -212,12 +213,12 @@ def test_a_damaged_file_is_replaced(content, cache, played):
 
 
 def test_changed_source_is_neither_read_nor_written(cache, played, monkeypatch):
-    newest = max(f.stat().st_mtime_ns for f in scripted_results.sources())
+    newest = max(f.stat().st_mtime_ns for f in baseline_cache.sources())
     lawnmower(small())
-    monkeypatch.setattr(scripted_results, "_IMPORTED", newest - 1)
+    monkeypatch.setattr(baseline_cache, "_IMPORTED", newest - 1)
     lawnmower(small())
     assert len(played) == 2
-    monkeypatch.setattr(scripted_results, "_IMPORTED", newest)
+    monkeypatch.setattr(baseline_cache, "_IMPORTED", newest)
     lawnmower(small())
     assert len(played) == 2
     assert len(list(cache.glob("scripted-*"))) == 1

@@ -9,7 +9,7 @@ import pytest
 import torch
 from exact_front import exact_arrival
 
-from emberlink.envs.wavelet import ellipse_rates
+from emberlink.envs.fire.ellipse import ellipse_rates
 
 SIDE, RADIUS, HEAD, RATIO, END = 45, 4.0, 0.035, 1.5, 420.0
 HEADER = "ncols {0}\nnrows {1}\nxllcorner 0\nyllcorner 0\ncellsize 30\nNODATA_value -9999\n"

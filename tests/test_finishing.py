@@ -10,16 +10,17 @@ from pathlib import Path
 import pytest
 from tiny_run import TINY
 
-from emberlink.trainers import cli, report
-from emberlink.trainers.config import resolve
-from emberlink.trainers.loop import Trainer
-from emberlink.trainers.resume import resume
-from emberlink.trainers.run_folder import RunFolder
+from emberlink.trainers.cli import main
+from emberlink.trainers.config.compose import resolve
+from emberlink.trainers.evaluation import report
+from emberlink.trainers.runs.run_folder import RunFolder
+from emberlink.trainers.training.resume import resume
+from emberlink.trainers.training.trainer import Trainer
 
 
 def trained(capsys, *arguments: str | Path) -> tuple[int, str, str]:
     """Status of `emberlink train`, what it printed, and its errors."""
-    status = cli.main(["train", *map(str, arguments)])
+    status = main.main(["train", *map(str, arguments)])
     printed = capsys.readouterr()
     return status, printed.out, printed.err
 
@@ -179,8 +180,8 @@ def test_a_kill_while_the_folders_of_seeds_are_made(call, tmp_path, capsys):
     runs = tmp_path / "runs"
     program = (
         "import os, sys\n"
-        "from emberlink.trainers.run_folder import RunFolder\n"
-        "from emberlink.trainers.cli import main\n"
+        "from emberlink.trainers.runs.run_folder import RunFolder\n"
+        "from emberlink.trainers.cli.main import main\n"
         "calls = iter(range(1, 99))\n"
         "def counted(real):\n"
         "    def wrapped(*given):\n"
@@ -203,7 +204,7 @@ def test_a_kill_while_the_folders_of_seeds_are_made(call, tmp_path, capsys):
         assert [RunFolder(path).config().seed for path in folders] == [0, 1]
         assert first.evaluated()
         assert second.evaluated()
-    assert cli.main(["sweep", "independent", *TINY, "seeds=[0,1]", f"output={runs}"]) == 0
+    assert main.main(["sweep", "independent", *TINY, "seeds=[0,1]", f"output={runs}"]) == 0
 
 
 def test_copies_that_a_user_keeps_are_not_the_runs(run, capsys):
@@ -267,8 +268,8 @@ def test_a_range_without_a_limit_is_read_again(tmp_path, capsys):
     run = run_of(tmp_path / "runs")
     assert run.config().comm["range"] == float("inf")
     assert trained(capsys, f"resume={run.path}", "episodes=3")[0] == 0
-    assert cli.main(["eval", str(run.path), "--fires", "2"]) == 0
-    assert cli.main(["compare", str(run.path), "--output", str(tmp_path / "out")]) == 0
+    assert main.main(["eval", str(run.path), "--fires", "2"]) == 0
+    assert main.main(["compare", str(run.path), "--output", str(tmp_path / "out")]) == 0
 
 
 @pytest.mark.parametrize("key", ["displacement", "num_uavs", "new_fire", "range"])
@@ -280,7 +281,7 @@ def test_a_world_that_lacks_a_key_is_not_completed(key, tmp_path, capsys):
     file = run.path / "config.yaml"
     lines = [one for one in file.read_text().splitlines() if not one.lstrip().startswith(f"{key}:")]
     file.write_text("\n".join(lines) + "\n")
-    assert cli.main(["eval", str(run.path)]) == 2
+    assert main.main(["eval", str(run.path)]) == 2
     error = capsys.readouterr().err
     assert f"{file}: key " in error
     assert f".{key}' is missing" in error

@@ -14,8 +14,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from emberlink.envs import fire_bank as bank_module
-from emberlink.envs.fire import (
+from emberlink.envs.fire import cache as bank_module
+from emberlink.envs.fire.cache import bank_key, cache_folder, fire_bank
+from emberlink.envs.fire.generator import (
     HELD_OUT_FROM,
     FireConfig,
     burning_cells,
@@ -24,7 +25,6 @@ from emberlink.envs.fire import (
     make_fires,
     scenarios,
 )
-from emberlink.envs.fire_bank import bank_key, cache_folder, fire_bank
 
 GRID, HORIZON = (30, 30), 1000
 RANGES = [

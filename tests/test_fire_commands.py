@@ -13,14 +13,15 @@ import rasterio
 import torch
 from PIL import Image
 
-from emberlink.envs import bank_files
-from emberlink.envs.bank_files import write_bank
-from emberlink.envs.fire import burning_cells, fire_seeds, load_scenario, make_fires
-from emberlink.envs.fire_bank import GENERATOR_VERSION
-from emberlink.envs.publish import published
-from emberlink.envs.scenario import fires_of
-from emberlink.trainers import cli, fire_figure
-from emberlink.trainers.config import resolve
+from emberlink.envs.fire.cache import GENERATOR_VERSION
+from emberlink.envs.fire.generator import burning_cells, fire_seeds, load_scenario, make_fires
+from emberlink.envs.fire_files import bank_writer
+from emberlink.envs.fire_files.bank_writer import write_bank
+from emberlink.envs.scenarios import fires_of
+from emberlink.envs.utils.atomic_io import published
+from emberlink.trainers.cli import main
+from emberlink.trainers.config.compose import resolve
+from emberlink.trainers.fires import plot
 
 HUYGENS = load_scenario("huygens")
 
@@ -33,7 +34,7 @@ def _in_a_folder_of_its_own(tmp_path, monkeypatch):
 def ran(capsys, *arguments) -> list[str]:
     """The lines that a command prints; it ends well and says nothing else."""
     capsys.readouterr()
-    assert cli.main(["fire", *map(str, arguments)]) == 0
+    assert main.main(["fire", *map(str, arguments)]) == 0
     out, err = capsys.readouterr()
     assert err == ""
     return out.splitlines()
@@ -42,7 +43,7 @@ def ran(capsys, *arguments) -> list[str]:
 def refused(capsys, *arguments) -> str:
     """The one line with which a command ends at status 2."""
     capsys.readouterr()
-    assert cli.main(["fire", *map(str, arguments)]) == 2
+    assert main.main(["fire", *map(str, arguments)]) == 2
     out, err = capsys.readouterr()
     assert out == ""
     assert err.startswith(f"emberlink fire {arguments[0]}: ")
@@ -113,16 +114,16 @@ def test_preview_draws_what_it_says(capsys, tmp_path):
     with Image.open(name) as picture:
         assert picture.format == "PNG"
         assert max(picture.size) == 900
-    cell = area(name, fire_figure.BURNT_OUT) / 30  # cells that are burnt out (docs/fire.md)
+    cell = area(name, plot.BURNT_OUT) / 30  # cells that are burnt out (docs/fire.md)
     never = 900 - 30 - 141  # all but those and what burns; the square and lines cover some
-    assert 0.9 * never < area(name, fire_figure.NEVER) / cell < never
+    assert 0.9 * never < area(name, plot.NEVER) / cell < never
     assert cell < area(name, (255, 255, 0)) < 3 * cell
     # Nothing is burnt out before a fire that starts from a point.
     source = ascii_raster(tmp_path / "point.asc", disc())
     (*_, name) = ran(capsys, "preview", source, "fire.units=minutes", "fire.ring_width=null")
     assert name == "fire_point.png"
-    assert area(name, fire_figure.NEVER) > 100 * cell
-    assert area(name, fire_figure.BURNT_OUT) < cell / 2
+    assert area(name, plot.NEVER) > 100 * cell
+    assert area(name, plot.BURNT_OUT) < cell / 2
 
 
 @pytest.mark.parametrize("grid", ["[8,8]", "[8,64]", "[100,60]", "[256,200]"])
@@ -368,7 +369,7 @@ def cli_actions() -> tuple[str, ...]:
 )
 def test_usage_errors_are_one_line(arguments, capsys):
     with pytest.raises(SystemExit) as ended:
-        cli.main(["fire", *arguments])
+        main.main(["fire", *arguments])
     assert ended.value.code == 2
     out, err = capsys.readouterr()
     assert (out, err.count("\n")) == ("", 1)
@@ -382,7 +383,7 @@ def test_without_an_action_the_help_is_printed(capsys):
     for action in cli_actions():
         assert f"\n    {action} " in out
         with pytest.raises(SystemExit) as ended:
-            cli.main(["fire", action, "--help"])
+            main.main(["fire", action, "--help"])
         assert ended.value.code == 0
         assert f"example:\n  emberlink fire {action} " in capsys.readouterr().out
 
@@ -458,7 +459,7 @@ def test_where_there_are_no_links_a_file_is_published_all_the_same(tmp_path, mon
 def test_what_is_no_time_is_not_written(wrong, tmp_path):
     fires = torch.zeros(1, 8, 8)
     fires[0, 2, 3] = wrong
-    for suffix in bank_files.SUFFIXES:
+    for suffix in bank_writer.SUFFIXES:
         with pytest.raises(ValueError, match="NaN or a negative"):
             write_bank(tmp_path / f"a{suffix}", fires)
     assert list(tmp_path.iterdir()) == []

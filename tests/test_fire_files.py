@@ -14,14 +14,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tiny_run import TINY
 
-from emberlink.envs.fire import load_scenario, make_fires, scenarios
-from emberlink.envs.fire_file import KEPT, FileFireConfig, read_fires, splits
-from emberlink.envs.scenario import fires_of
-from emberlink.envs.validation import known
+from emberlink.envs.fire.generator import load_scenario, make_fires, scenarios
+from emberlink.envs.fire_files.reader import KEPT, FileFireConfig, read_fires, splits
+from emberlink.envs.scenarios import fires_of
+from emberlink.envs.utils.validation import known
 from emberlink.envs.wildfire import WildfireEnv
-from emberlink.trainers import cli
-from emberlink.trainers.config import from_values, override, resolve, to_values
-from emberlink.trainers.run_folder import RunFolder
+from emberlink.trainers.cli import main
+from emberlink.trainers.config.compose import from_values, override, resolve, to_values
+from emberlink.trainers.runs.run_folder import RunFolder
 
 GRID, HORIZON = (12, 10), 15
 SMALL = [*TINY, "env.grid=[12,10]"]
@@ -40,7 +40,7 @@ def trained(source, tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("trained")
     shutil.copy(source, folder / "fire.asc")
     keys = ["fire=file", f"fire.path={folder}/fire.asc", "fire.units=minutes"]
-    assert cli.main(["train", "consensus", *SMALL, *keys, f"output={folder}/runs"]) == 0
+    assert main.main(["train", "consensus", *SMALL, *keys, f"output={folder}/runs"]) == 0
     return folder
 
 
@@ -53,7 +53,7 @@ def run(trained, tmp_path) -> Path:
 def fails(arguments, capfd) -> str:
     """The one line of standard error with which a command ends."""
     capfd.readouterr()
-    assert cli.main([str(one) for one in arguments]) == 2
+    assert main.main([str(one) for one in arguments]) == 2
     lines = capfd.readouterr().err.strip().splitlines()
     assert len(lines) == 1, lines
     return lines[0]
@@ -129,13 +129,13 @@ def test_a_run_is_evaluated_rendered_and_resumed_without_its_file(run, trained, 
     gone.rename(trained / "elsewhere.asc")
     try:
         before = json.loads((run / "eval.json").read_text())["results"]
-        assert cli.main(["eval", str(run)]) == 0
+        assert main.main(["eval", str(run)]) == 0
         assert json.loads((run / "eval.json").read_text())["results"] == before
-        assert cli.main(["eval", str(run), "comm.loss=0.5"]) == 0
+        assert main.main(["eval", str(run), "comm.loss=0.5"]) == 0
         picture = tmp_path / "a.png"
-        assert cli.main(["render", str(run), "--fire", "file:3", "--output", str(picture)]) == 0
+        assert main.main(["render", str(run), "--fire", "file:3", "--output", str(picture)]) == 0
         assert picture.stat().st_size > 1000
-        assert cli.main(["train", f"resume={run}", "episodes=3"]) == 0
+        assert main.main(["train", f"resume={run}", "episodes=3"]) == 0
         assert len(RunFolder(run).lines()) == 3
         # On another grid the file itself is needed.
         line = fails(["eval", run, "env.horizon=9"], capfd)
@@ -144,7 +144,7 @@ def test_a_run_is_evaluated_rendered_and_resumed_without_its_file(run, trained, 
         assert fails(["eval", run], capfd).endswith("fire.asc: there is no such file")
     finally:
         (trained / "elsewhere.asc").rename(gone)
-    assert cli.main(["eval", str(run)]) == 0
+    assert main.main(["eval", str(run)]) == 0
     assert (
         json.loads((run / "eval.json").read_text())["results"]["file"].keys()
         == before["file"].keys()
@@ -161,7 +161,7 @@ def test_a_file_that_changed_is_named(run, trained, capfd):
             assert "fire.asc: has changed" in fails(arguments, capfd)
     finally:
         file.write_text(before)
-    assert cli.main(["train", f"resume={run}", "episodes=3"]) == 0
+    assert main.main(["train", f"resume={run}", "episodes=3"]) == 0
 
 
 def test_a_copy_of_another_configuration_is_not_taken(run, trained):
@@ -330,6 +330,6 @@ def test_a_message_is_one_line_whatever_a_library_says(tmp_path, monkeypatch):
         raise ValueError("*** in database main ***\nPage 1: \x1b[31mcorruption")
 
     np.save(tmp_path / "fire.npy", bank_of(1).numpy())
-    monkeypatch.setattr("emberlink.envs.fire_file.formats.find_format", damaged)
+    monkeypatch.setattr("emberlink.envs.fire_files.reader.detect.find_format", damaged)
     with pytest.raises(ValueError, match=r"main \*\*\* Page 1:  \[31mcorruption$"):
         read_fires(FileFireConfig(path=str(tmp_path / "fire.npy")), GRID, HORIZON)

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from emberlink.envs.config import WildfireConfig
-from emberlink.envs.spread import arrival_times, disc
-from emberlink.trainers.fire_numbers import (
+from emberlink.envs.fire.level_set import arrival_times, disc
+from emberlink.trainers.fires.stats import (
     Growth,
     Team,
     burnt_out,

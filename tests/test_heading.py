@@ -7,9 +7,9 @@ import torch
 from moments import moment
 from torch import Tensor
 
+from emberlink.comm._heading import HeadingConfig, heading_reward
 from emberlink.comm.base import Communication
 from emberlink.comm.consensus import Consensus, ConsensusConfig
-from emberlink.comm.heading import HeadingConfig, heading_reward
 from emberlink.envs import keys
 from emberlink.envs.config import RewardConfig, WildfireConfig
 

@@ -20,11 +20,11 @@ import torch
 import yaml
 from tiny_run import TINY
 
-from emberlink.envs.fire import load_scenario
-from emberlink.envs.fire_bank import bank_key, fire_bank
-from emberlink.trainers import cli
-from emberlink.trainers.config import resolve
-from emberlink.trainers.run_folder import RunFolder
+from emberlink.envs.fire.cache import bank_key, fire_bank
+from emberlink.envs.fire.generator import load_scenario
+from emberlink.trainers.cli import main
+from emberlink.trainers.config.compose import resolve
+from emberlink.trainers.runs.run_folder import RunFolder
 
 
 class Bomb:
@@ -46,7 +46,7 @@ def refused(arguments: list[str], capsys, mark: Path) -> str:
     """The one line with which a command ends, quickly, with little memory and without a mark."""
     capsys.readouterr()
     before, began = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, time.monotonic()
-    status = cli.main(arguments)
+    status = main.main(arguments)
     out, err = capsys.readouterr()
     assert status == 2, (out, err)
     assert err.count("\n") == 1, err
@@ -135,7 +135,7 @@ def test_the_state_of_a_run_that_is_resumed(kind, run, mark, capsys):
 
 
 def resumed(run: Path):
-    from emberlink.trainers.resume import resume
+    from emberlink.trainers.training.resume import resume
 
     trainer = resume(run, overrides=["episodes=3"])
     trainer.collector.shutdown()
@@ -227,7 +227,7 @@ def test_numbers_of_a_run_without_bounds(run, capsys):
     (run / "metrics.jsonl").write_text(
         f'{{"episode": 1, "score": NaN, "coverage": 1e999}}\n{{"episode": 2, "score": {many}}}\n'
     )
-    assert cli.main(["eval", str(run), "--fires", "1"]) == 0
+    assert main.main(["eval", str(run), "--fires", "1"]) == 0
     assert RunFolder(run).lines()[1]["score"] == float("inf")
 
 
@@ -318,7 +318,7 @@ def test_a_method_that_is_a_path(tmp_path, mark, monkeypatch, capsys):
 
 
 def test_a_scenario_with_a_tag(tmp_path, mark, monkeypatch):
-    import emberlink.envs.fire as module
+    import emberlink.envs.fire.generator as module
 
     with module.resources.as_file(module.resources.files("emberlink.configs")) as ours:
         shutil.copytree(ours / "fire", tmp_path / "fire")
@@ -353,7 +353,7 @@ def test_links_out_of_a_run_folder_are_not_written_through(run, tmp_path):
     mine.write_text("mine")
     for name in ("eval.json.part", "config.yaml.part"):
         (run / name).symlink_to(mine)
-    assert cli.main(["eval", str(run), "--fires", "1"]) == 0
+    assert main.main(["eval", str(run), "--fires", "1"]) == 0
     RunFolder(run).write_config(resolve("consensus"))
     assert mine.read_text() == "mine"
 
@@ -361,16 +361,16 @@ def test_links_out_of_a_run_folder_are_not_written_through(run, tmp_path):
 def test_a_run_folder_that_is_a_link(run, tmp_path):
     link = tmp_path / "link"
     link.symlink_to(run)
-    assert cli.main(["eval", str(link), "--fires", "1"]) == 0
+    assert main.main(["eval", str(link), "--fires", "1"]) == 0
     (tmp_path / "loop").symlink_to(tmp_path / "loop")
-    assert cli.main(["eval", str(tmp_path / "loop")]) == 2
+    assert main.main(["eval", str(tmp_path / "loop")]) == 2
 
 
 def test_a_run_folder_whose_name_is_markup(run, tmp_path, capsys):
     odd = tmp_path / "[red]a[" / "blue] :boom:"
     odd.parent.mkdir()
     run.rename(odd)
-    assert cli.main(["eval", str(odd), "--fires", "1"]) == 0
+    assert main.main(["eval", str(odd), "--fires", "1"]) == 0
     assert str(odd) in capsys.readouterr().out.replace("\n", "")
 
 

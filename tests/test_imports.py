@@ -72,7 +72,7 @@ print(*sorted(heavy & (set(sys.modules) - before)))
 """
 
 
-@pytest.mark.parametrize("module", ["emberlink.trainers.cli", "emberlink.trainers"])
+@pytest.mark.parametrize("module", ["emberlink.trainers.cli.main", "emberlink.trainers"])
 def test_the_command_line_starts_without_torch(module):
     code = LOADED.format(module=module)
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
@@ -84,8 +84,9 @@ import random, threading, numpy, torch, torchrl.envs, torchrl.collectors, torchr
 import torchrl.record.loggers
 state = torch.get_rng_state(), random.getstate(), torch.get_num_threads()
 threads, default = threading.active_count(), torch.get_default_dtype()
-import emberlink.envs, emberlink.envs.parallel, emberlink.comm.registry, emberlink.comm.consensus
-import emberlink.policies.scripted, emberlink.policies.actor_critic, emberlink.trainers.loop
+import emberlink.envs, emberlink.envs.pettingzoo, emberlink.comm.registry, emberlink.comm.consensus
+import emberlink.policies.scripted.registry, emberlink.policies.networks.actor_critic
+import emberlink.trainers.training.trainer
 assert torch.equal(state[0], torch.get_rng_state())
 assert state[1:] == (random.getstate(), torch.get_num_threads())
 assert (threads, default) == (threading.active_count(), torch.get_default_dtype())

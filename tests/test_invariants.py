@@ -10,9 +10,9 @@ import torch
 from robustness import SOAK
 
 from emberlink.envs import keys
-from emberlink.envs.validation import known
+from emberlink.envs.utils.validation import known
 from emberlink.trainers.build import build_env
-from emberlink.trainers.config import from_values, resolve, to_values
+from emberlink.trainers.config.compose import from_values, resolve, to_values
 
 STEPS = 10_000_000 if SOAK else 100_000
 """environment steps in all"""

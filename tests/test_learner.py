@@ -9,10 +9,10 @@ from tensordict import TensorDict
 from torchrl.data import Bounded, Composite, Unbounded
 
 from emberlink.envs import keys
-from emberlink.policies.actor_critic import make_actor, make_critic
-from emberlink.trainers.learner import Learner
-from emberlink.trainers.memory import DONE, TERMINATED
-from emberlink.trainers.schema import LearnerConfig
+from emberlink.policies.networks.actor_critic import make_actor, make_critic
+from emberlink.trainers.config.schema import LearnerConfig
+from emberlink.trainers.learners.ddpg import Learner
+from emberlink.trainers.learners.replay_buffer import DONE, TERMINATED
 
 UAVS, FEATURES, ACTIONS, HIDDEN, BATCH = 3, 9, 3, (16, 12), 24
 RATES = {

@@ -10,9 +10,9 @@ from pathlib import Path
 import pytest
 from test_resume import begun, until
 
-from emberlink.trainers import cli
-from emberlink.trainers.lock import Lock
-from emberlink.trainers.resume import resume
+from emberlink.trainers.cli import main
+from emberlink.trainers.runs.lock import Lock
+from emberlink.trainers.training.resume import resume
 
 HOLD = """
 import sys, time
@@ -100,7 +100,7 @@ def test_two_trainings_in_one_folder(tmp_path, capsys):
     try:
         for run in first.runs:
             before = {path: path.read_bytes() for path in run.path.rglob("*") if path.is_file()}
-            assert cli.main(["train", f"resume={run.path}"]) == 2
+            assert main.main(["train", f"resume={run.path}"]) == 2
             error = capsys.readouterr().err
             assert f"process {os.getpid()}" in error
             assert error.count("\n") == 1

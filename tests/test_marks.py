@@ -6,11 +6,12 @@ import torch
 from tensordict import TensorDict
 
 from emberlink.comm.consensus import FOLLOWS, TARGET
-from emberlink.envs import keys, marks, panels
-from emberlink.envs.marks import LINK, ROLE_COLOURS, ROLES, Moment
-from emberlink.envs.panels import Episode, Screen
-from emberlink.envs.render import UAV
-from emberlink.trainers import recording
+from emberlink.envs import keys
+from emberlink.envs.rendering import marks, panels
+from emberlink.envs.rendering.frame import UAV
+from emberlink.envs.rendering.marks import LINK, ROLE_COLOURS, ROLES, Moment
+from emberlink.envs.rendering.panels import Episode, Screen
+from emberlink.trainers.evaluation import record_episode
 
 WHERE = [(2, 2, 1), (12, 2, 1), (22, 12, 1)]
 
@@ -179,7 +180,7 @@ def tensordict(features: int, **agents) -> TensorDict:
 
 def test_roles_follow_from_whom_a_uav_follows():
     follows = torch.tensor([0, 0, -1, 3, 1])
-    assert [ROLES[role] for role in recording.roles(follows)] == [
+    assert [ROLES[role] for role in record_episode.roles(follows)] == [
         *("discoverer", "seeker", "wanderer", "discoverer", "seeker")
     ]
 
@@ -187,18 +188,18 @@ def test_roles_follow_from_whom_a_uav_follows():
 def test_what_is_drawn_goes_by_what_the_tensordict_holds():
     nothing = torch.zeros(30, 20, dtype=torch.uint8)
     told = {FOLLOWS[1]: torch.tensor([0, 0, -1]), TARGET[1]: torch.ones(3, 3)}
-    seen = recording.moment(tensordict(9, **told), nothing, hears=True, limit=10.5)
+    seen = record_episode.moment(tensordict(9, **told), nothing, hears=True, limit=10.5)
     # UAVs 0 and 1 are 10 cells apart, 1 and 2 are 14.1.
     assert np.array_equal(seen.links, linked((0, 1)))
     assert seen.roles.tolist() == [0, 1, 2]
     assert np.array_equal(seen.target, np.ones((3, 3)))
-    at_limit = recording.moment(tensordict(9, **told), nothing, hears=True, limit=10.0)
+    at_limit = record_episode.moment(tensordict(9, **told), nothing, hears=True, limit=10.0)
     assert not at_limit.links.any()
-    everyone = recording.moment(tensordict(18), nothing, hears=True, limit=torch.inf)
+    everyone = record_episode.moment(tensordict(18), nothing, hears=True, limit=torch.inf)
     assert everyone.links.sum() == 6
     assert everyone.roles is everyone.target is None
     for silent in (
-        recording.moment(tensordict(6), nothing, hears=True, limit=10),
-        recording.moment(tensordict(9, **told), nothing, hears=False, limit=10),
+        record_episode.moment(tensordict(6), nothing, hears=True, limit=10),
+        record_episode.moment(tensordict(9, **told), nothing, hears=False, limit=10),
     ):
         assert silent.links is silent.roles is silent.target is None

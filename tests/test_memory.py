@@ -6,7 +6,13 @@ from tensordict import TensorDict
 
 from emberlink.envs import keys
 from emberlink.trainers import make_env
-from emberlink.trainers.memory import DONE, TERMINATED, make_memory, rows_needed, to_rows
+from emberlink.trainers.learners.replay_buffer import (
+    DONE,
+    TERMINATED,
+    make_memory,
+    rows_needed,
+    to_rows,
+)
 
 UAVS = 4
 

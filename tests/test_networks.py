@@ -8,9 +8,9 @@ from single_ddpg import SingleActor, SingleCritic, copy_uav
 from tensordict import TensorDict
 
 from emberlink.envs import keys, specs
-from emberlink.policies import networks
-from emberlink.policies.actor_critic import STATE_ACTION_VALUE, make_actor, make_critic
-from emberlink.policies.networks import StackedActor, StackedCritic
+from emberlink.policies.networks import stacked
+from emberlink.policies.networks.actor_critic import STATE_ACTION_VALUE, make_actor, make_critic
+from emberlink.policies.networks.stacked import StackedActor, StackedCritic
 
 UAVS, FEATURES, ACTIONS, HIDDEN = 4, 9, 3, (20, 12)
 SIZES = UAVS, FEATURES, ACTIONS, HIDDEN
@@ -111,7 +111,7 @@ def test_networks_one_by_one_are_the_stack(hidden, monkeypatch):
             torch.nn.init.normal_(weight, std=0.5, generator=generator)
 
     def evaluate(large: int, uavs: int) -> list[torch.Tensor]:
-        monkeypatch.setattr(networks, "_LARGE", large)
+        monkeypatch.setattr(stacked, "_LARGE", large)
         observation = torch.randn(6, uavs, 5, generator=torch.Generator().manual_seed(4))
         action = actor(observation)
         value = critic(observation, action)
@@ -140,15 +140,15 @@ def test_a_team_reads_its_own_environments():
 @pytest.mark.parametrize("large", [1, 10**9], ids=["one by one", "stack"])
 def test_critics_share_what_the_action_has_no_part_in(large, monkeypatch):
     """Values and gradients are those without; what another network or observation has is not."""
-    monkeypatch.setattr(networks, "_LARGE", large)
+    monkeypatch.setattr(stacked, "_LARGE", large)
     critic, other = scrambled(StackedCritic(*SIZES)), StackedCritic(*SIZES)
     observation, following = torch.randn(2, 5, UAVS, FEATURES)
     taken, chosen = torch.randn(2, 5, UAVS, ACTIONS).requires_grad_()
     fixed = {name: weight.detach() for name, weight in critic.named_parameters()}
     target = {name: weight.detach() for name, weight in other.named_parameters()}
     made = []
-    trunk = networks._trunk
-    monkeypatch.setattr(networks, "_trunk", lambda *layers: made.append(1) or trunk(*layers))
+    trunk = stacked._trunk
+    monkeypatch.setattr(stacked, "_trunk", lambda *layers: made.append(1) or trunk(*layers))
 
     def values() -> list[torch.Tensor]:
         call = torch.func.functional_call

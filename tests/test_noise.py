@@ -9,12 +9,14 @@ from tensordict.nn import TensorDictSequential
 from torchrl.data import Bounded, Composite, Unbounded
 from torchrl.envs import ExplorationType, set_exploration_type
 
-from emberlink.envs import keys, streams
-from emberlink.policies.actor_critic import make_actor
-from emberlink.policies.noise import OrnsteinUhlenbeck
-from emberlink.trainers import evaluate, make_env
-from emberlink.trainers.config import resolve
-from emberlink.trainers.loop import Trainer
+from emberlink.envs import keys
+from emberlink.envs.utils import counter_rng
+from emberlink.policies.exploration import OrnsteinUhlenbeck
+from emberlink.policies.networks.actor_critic import make_actor
+from emberlink.trainers import make_env
+from emberlink.trainers.config.compose import resolve
+from emberlink.trainers.evaluation import evaluate
+from emberlink.trainers.training.trainer import Trainer
 
 UAVS, ENVS = 2, 4000
 
@@ -42,7 +44,7 @@ def play(policy, starts: list[torch.Tensor | bool], envs: int = ENVS) -> torch.T
     for start in starts:
         fresh = torch.as_tensor(start).flatten().expand(envs)
         episode, step = episode + fresh, torch.where(fresh, 0, step + 1)
-        moment[keys.STREAM] = streams.fold(streams.streams(0, envs), episode)
+        moment[keys.STREAM] = counter_rng.fold(counter_rng.streams(0, envs), episode)
         moment[keys.STEP] = step
         moment = policy(moment)
         actions.append(moment[keys.ACTION].clone())

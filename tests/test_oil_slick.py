@@ -11,10 +11,16 @@ from exact_front import exact_arrival
 from pydantic import ValidationError
 from torch import Tensor
 
-from emberlink.envs import fire
-from emberlink.envs.fire import FireConfig, burning_cells, fire_seeds, load_scenario, make_fires
-from emberlink.envs.spread import arrival_times, disc
-from emberlink.envs.wavelet import ellipse_rates
+from emberlink.envs.fire import generator
+from emberlink.envs.fire.ellipse import ellipse_rates
+from emberlink.envs.fire.generator import (
+    FireConfig,
+    burning_cells,
+    fire_seeds,
+    load_scenario,
+    make_fires,
+)
+from emberlink.envs.fire.level_set import arrival_times, disc
 
 GRID, HORIZON = (30, 30), 1000
 NEW = ("drift_rate", "tide_reach", "tide_period", "tide_phase", "tide_bearing", "two_sided")
@@ -234,10 +240,10 @@ def test_what_leaves_the_grid_comes_back():
 
 
 def test_the_margin_is_how_far_a_tide_carries():
-    assert fire._margin(load_scenario("huygens"), GRID) == 0
+    assert generator._margin(load_scenario("huygens"), GRID) == 0
     tide = slick(tide_reach=6.37)
-    assert fire._margin(tide, GRID) == 7
-    assert fire._margin(tide, (60, 90)) == 13
+    assert generator._margin(tide, GRID) == 7
+    assert generator._margin(tide, (60, 90)) == 13
 
 
 def lehr(minutes: float, knots: float) -> tuple[float, float]:

@@ -170,7 +170,7 @@ def _normal(name: str) -> str:
 
 def test_installed_package_is_imported_and_not_the_checkout(installed: Path, elsewhere):
     cwd, env = elsewhere
-    files = "import emberlink.envs as e, emberlink.trainers.cli as t; print(e.__file__, t.__file__)"
+    files = "import emberlink.envs as e, emberlink.trainers as t; print(e.__file__, t.__file__)"
     printed = run(installed / "python", "-c", files, cwd=cwd, env=env).split()
     for file in map(Path, printed):
         assert file.is_relative_to(installed.parent)

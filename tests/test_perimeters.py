@@ -10,7 +10,7 @@ import shapely
 import torch
 from fire_files import CORNER, KINDS, UTM, Ellipses, frame_of, raster_of, write_asc
 
-from emberlink.envs.fire_file import FileFireConfig, read_fires
+from emberlink.envs.fire_files.reader import FileFireConfig, read_fires
 
 GRID, HORIZON = (30, 30), 1000
 HOURS = (60.0, 120.0, 180.0, 240.0, 300.0)

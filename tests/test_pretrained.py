@@ -9,10 +9,10 @@ import torch
 import yaml
 from tiny_run import TINY
 
-from emberlink.trainers import pretrained
-from emberlink.trainers.cli import main
-from emberlink.trainers.report import load_actor
-from emberlink.trainers.run_folder import RunFolder
+from emberlink.trainers.cli.main import main
+from emberlink.trainers.evaluation.report import load_actor
+from emberlink.trainers.runs import pretrained
+from emberlink.trainers.runs.run_folder import RunFolder
 
 
 @pytest.fixture(scope="module")

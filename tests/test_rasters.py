@@ -14,9 +14,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from rasterio.transform import from_origin
 
-from emberlink.envs import geotiff, rasters
-from emberlink.envs.arrival import Clock, RasterSource, Window
-from emberlink.envs.fire_file import FileFireConfig, read_fires
+from emberlink.envs.fire_files import gdal_open, geotiff
+from emberlink.envs.fire_files.arrival_raster import Clock, RasterSource, Window
+from emberlink.envs.fire_files.reader import FileFireConfig, read_fires
 
 INF = math.inf
 PLAIN = {"units": "minutes", "ring_width": None, "margin": None}
@@ -327,8 +327,8 @@ def test_of_cells_taken_together_the_earliest_is_kept(tmp_path):
     times[30, :] = np.arange(4100) + 100.0
     times[30, [1000, 1001, 1002]] = [9, 50, 9]
     path = write_tif(tmp_path / "fire.tif", times)
-    with geotiff.opened(path) as dataset:
-        kept, _ = rasters._read(dataset, (0, 0, 60, 4100))
+    with gdal_open.opened(path) as dataset:
+        kept, _ = geotiff._read(dataset, (0, 0, 60, 4100))
     assert kept.shape == (20, 1367)
     by_hand = [[times[30, k : k + 3].min() for k in range(0, 4100, 3)]]
     assert np.array_equal(kept[[10]], by_hand)
@@ -350,10 +350,10 @@ def test_a_small_fire_in_a_large_raster_is_read_finely(tmp_path):
 def test_what_libtiff_prints_is_an_error_and_is_not_shown(tmp_path, capfd):
     path = write_tif(tmp_path / "fire.tif", corner([[0, 5, 10], [2, 4, 9]], 2, 3))
     said = "damaged: _tiffSeekProc: Invalid argument"
-    with pytest.raises(ValueError, match=said), geotiff.opened(path):
+    with pytest.raises(ValueError, match=said), gdal_open.opened(path):
         os.write(2, b"_tiffSeekProc: Invalid argument.\n")
     assert capfd.readouterr().err == ""
-    with geotiff.opened(path):
+    with gdal_open.opened(path):
         os.write(2, b"of someone else\n")
     assert capfd.readouterr().err == "of someone else\n"
 
@@ -385,7 +385,7 @@ def test_a_large_raster_takes_neither_much_memory_nor_long(tmp_path):
     with rasterio.open(path, "w", **about) as dataset:
         dataset.write(far, 1, window=rasterio.windows.Window(4096, 8192, 1024, 1024))
     program = (
-        "import resource, sys; from emberlink.envs.fire_file import *\n"
+        "import resource, sys; from emberlink.envs.fire_files.reader import *\n"
         "before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss\n"
         "config = FileFireConfig(path=sys.argv[1], units='minutes', end=500.0, ring_width=None)\n"
         "fire = read_fires(config, (30, 30), 1000)[0]\n"

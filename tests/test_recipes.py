@@ -8,11 +8,11 @@ import torch
 import yaml
 
 from emberlink.envs import keys, metrics
-from emberlink.trainers import report
-from emberlink.trainers.config import resolve
-from emberlink.trainers.loop import Trainer
-from emberlink.trainers.memory import rows_needed
-from emberlink.trainers.run_folder import RunFolder
+from emberlink.trainers.config.compose import resolve
+from emberlink.trainers.evaluation import report
+from emberlink.trainers.learners.replay_buffer import rows_needed
+from emberlink.trainers.runs.run_folder import RunFolder
+from emberlink.trainers.training.trainer import Trainer
 
 METHODS = ["independent", "shared_memory", "positional", "consensus"]
 SETUPS = ["paper", "released", "tuned"]

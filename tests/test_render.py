@@ -5,7 +5,8 @@ import pytest
 import torch
 from PIL import Image
 
-from emberlink.envs import WildfireConfig, WildfireEnv, render
+from emberlink.envs import WildfireConfig, WildfireEnv
+from emberlink.envs.rendering import frame
 
 BLACK, WHITE, YELLOW, BLUE = (0, 0, 0), (255, 255, 255), (255, 255, 0), (0, 0, 255)
 
@@ -15,7 +16,7 @@ def picture(fire=(), positions=(), grid=(30, 20), **options) -> np.ndarray:
     for i, j in fire:
         fire_map[i, j] = 2
     position = np.array(positions, np.float32).reshape(-1, 3)
-    return render.frame(fire_map, position, **{"view_angle": 30.0, **options})
+    return frame.frame(fire_map, position, **{"view_angle": 30.0, **options})
 
 
 def colour(image: np.ndarray, x: float, y: float, grid=(30, 20)) -> tuple[int, ...]:
@@ -47,7 +48,7 @@ def test_seen_and_unseen_fire_look_the_same():
     seen, unseen = np.zeros((2, 9, 9), np.uint8)
     seen[3, 4], unseen[3, 4] = 1, 2
     nobody = np.zeros((0, 3), np.float32)
-    assert np.array_equal(*(render.frame(m, nobody, view_angle=30.0) for m in (seen, unseen)))
+    assert np.array_equal(*(frame.frame(m, nobody, view_angle=30.0) for m in (seen, unseen)))
 
 
 def test_x_grows_to_the_right_and_y_upwards():
@@ -107,7 +108,7 @@ def test_the_environment_renders_one_of_its_members():
 def test_animation(tmp_path):
     frames = [picture(fire=[(3 + t, 5)], positions=[(2 * t, 6, 4)]) for t in range(7)]
     path = tmp_path / "episode.gif"
-    render.write_gif(path, iter(frames), fps=10)
+    frame.write_gif(path, iter(frames), fps=10)
     with Image.open(path) as film:
         assert film.n_frames == 7
         assert film.info["duration"] == 100
@@ -119,14 +120,14 @@ def test_animation(tmp_path):
 
 def test_an_animation_needs_a_frame(tmp_path):
     with pytest.raises(ValueError, match=r"none\.gif"):
-        render.write_gif(tmp_path / "none.gif", [])
+        frame.write_gif(tmp_path / "none.gif", [])
     assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.filterwarnings("error")
 def test_window_shows_the_last_picture(monkeypatch):
     monkeypatch.setenv("MPLBACKEND", "agg")
-    window = render.Window("test")
+    window = frame.Window("test")
     first, last = picture(positions=[(3, 3, 4)]), picture(positions=[(9, 9, 4)])
     assert window.show(first) is None
     assert window.show(last) is None
@@ -142,8 +143,8 @@ def test_a_view_smaller_than_a_pixel_is_no_error(altitude):
 def test_a_colour_that_comes_later_is_kept():
     frames = [np.full((4, 6, 3), shade, np.uint8) for shade in range(0, 250, 5)]
     frames[7][0, 0] = (1, 2, 250)
-    images = [Image.fromarray(frame).quantize(256) for frame in frames]
-    shared = render._one_palette(images)
+    images = [Image.fromarray(original).quantize(256) for original in frames]
+    shared = frame._one_palette(images)
     assert len({bytes(image.getpalette()) for image in shared}) == 1
-    for image, frame in zip(shared, frames, strict=True):
-        assert np.array_equal(np.asarray(image.convert("RGB")), frame)
+    for image, original in zip(shared, frames, strict=True):
+        assert np.array_equal(np.asarray(image.convert("RGB")), original)

@@ -12,14 +12,15 @@ from PIL import Image
 from rich.console import Console
 from safetensors.torch import save_file
 
-from emberlink.envs import marks, video
-from emberlink.envs.publish import published
-from emberlink.envs.validation import known
-from emberlink.policies.scripted import SCRIPTED
-from emberlink.trainers import cli, evaluate, render
+from emberlink.envs.rendering import marks, video
+from emberlink.envs.utils.atomic_io import published
+from emberlink.envs.utils.validation import known
+from emberlink.policies.scripted.registry import SCRIPTED
 from emberlink.trainers.build import build_env, build_networks
-from emberlink.trainers.config import resolve
-from emberlink.trainers.run_folder import RunFolder
+from emberlink.trainers.cli import main, render
+from emberlink.trainers.config.compose import resolve
+from emberlink.trainers.evaluation import evaluate
+from emberlink.trainers.runs.run_folder import RunFolder
 
 SHORT = ("setup=tuned", "learner.hidden=[8,8]", "env.horizon=12", "env.num_uavs=3")
 
@@ -42,7 +43,7 @@ def make_run(folder, method="consensus", *overrides):
 
 def rendered(capsys, *arguments) -> list[str]:
     capsys.readouterr()
-    assert cli.main(["render", *map(str, arguments)]) == 0
+    assert main.main(["render", *map(str, arguments)]) == 0
     return capsys.readouterr().out.splitlines()
 
 
@@ -167,7 +168,7 @@ def test_other_grids(grid, tmp_path, capsys):
 
 def refused(arguments, capsys, *words: str) -> None:
     capsys.readouterr()
-    assert cli.main(["render", *map(str, arguments)]) == 2
+    assert main.main(["render", *map(str, arguments)]) == 2
     err = capsys.readouterr().err
     assert err.startswith("emberlink render: ")
     assert err.count("\n") == 1, err
@@ -210,7 +211,7 @@ def test_what_is_refused(tmp_path, capsys):
 @pytest.mark.parametrize("option", ["--fps=0", "--fps=51", "--frames=0", "--size=1", "--step=-1"])
 def test_numbers_out_of_range(option, capsys):
     with pytest.raises(SystemExit):
-        cli.main(["render", "x", option])
+        main.main(["render", "x", option])
     assert capsys.readouterr().err.count("\n") == 1
 
 

@@ -9,11 +9,13 @@ import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from test_recipes import METHODS
 
-from emberlink.trainers import checkpoint, cli, state
-from emberlink.trainers.config import resolve
-from emberlink.trainers.loop import Progress, Trainer
-from emberlink.trainers.resume import resume
-from emberlink.trainers.run_folder import RunFolder
+from emberlink.trainers.cli import main
+from emberlink.trainers.config.compose import resolve
+from emberlink.trainers.runs import checkpoint_file
+from emberlink.trainers.runs.run_folder import RunFolder
+from emberlink.trainers.training import state
+from emberlink.trainers.training.resume import resume
+from emberlink.trainers.training.trainer import Progress, Trainer
 
 HORIZON, EPISODES = 20, 4
 SMALL = [
@@ -184,7 +186,7 @@ def test_more_episodes_are_those_of_a_run_that_had_them_from_the_start(whole, tm
 )
 def test_what_was_learnt_with_is_kept(overrides, message, paused, capsys):
     before = contents(paused)
-    assert cli.main(["train", f"resume={paused}", *overrides]) == 2
+    assert main.main(["train", f"resume={paused}", *overrides]) == 2
     error = capsys.readouterr().err
     assert message in error
     assert error.count("\n") == 1
@@ -208,22 +210,22 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 def test_the_command_goes_on_and_says_when_nothing_is_left(paused, whole, capsys):
     quiet = ["evaluation.fires=2", "checkpoint_interval=1", "keep=2", "setup=paper"]
-    assert cli.main(["train", "positional", f"resume={paused}"]) == 2
+    assert main.main(["train", "positional", f"resume={paused}"]) == 2
     assert "the run is of method 'consensus'" in capsys.readouterr().err
-    assert cli.main(["train", "consensus", f"resume={paused}", *quiet]) == 0
+    assert main.main(["train", "consensus", f"resume={paused}", *quiet]) == 0
     assert "resumed at step 30 of 80" in capsys.readouterr().out
     uninterrupted = (whole("consensus").run.path / "metrics.jsonl").read_bytes()
     assert (paused / "metrics.jsonl").read_bytes() == uninterrupted
     assert len(RunFolder(paused).networks()) == 2
     before = contents(paused)
-    assert cli.main(["train", f"resume={paused}"]) == 0
+    assert main.main(["train", f"resume={paused}"]) == 0
     assert "is finished" in capsys.readouterr().out
     assert contents(paused) == before
 
 
 def test_folders_that_cannot_be_resumed(paused, tmp_path, capsys):
     def refused(path: Path | str, *words: str) -> None:
-        assert cli.main(["train", f"resume={path}"]) == 2
+        assert main.main(["train", f"resume={path}"]) == 2
         error = capsys.readouterr().err
         assert error.count("\n") == 1
         for word in words:
@@ -262,7 +264,7 @@ def test_old_checkpoints_go_and_the_best_stays(tmp_path):
     run = trainer.run
     assert [path.stem[-3:] for path in run.networks()] == ["063", "072", "080"]
     assert [path.stem[-3:] for path in run.states()] == ["072", "080"]
-    header = checkpoint.read_header(run.checkpoints / "best.safetensors")
+    header = checkpoint_file.read_header(run.checkpoints / "best.safetensors")
     assert header is not None
     held_out = [line["huygens/coverage"] + line["paper/coverage"] for line in run.lines()]
     assert header["step"] == HORIZON * (1 + held_out.index(max(held_out)))

@@ -7,9 +7,9 @@ import pytest
 import torch
 from pydantic import ValidationError
 
-from emberlink.comm.heading import HEADING_FORMS, HeadingConfig, heading_reward
+from emberlink.comm._heading import HEADING_FORMS, HeadingConfig, heading_reward
 from emberlink.envs.config import RewardConfig
-from emberlink.envs.reward import left_box, view_reward
+from emberlink.envs.world.reward import left_box, view_reward
 
 INSIDE = [False, False, False]
 RELEASED = RewardConfig(new_fire=12.0, old_fire=6.0, no_fire=-4.0, exit=-150.0, exit_axes="xy")

@@ -11,15 +11,15 @@ from torchrl.envs import step_mdp
 
 from emberlink.comm import consensus
 from emberlink.envs import WildfireConfig, WildfireEnv, keys, metrics
-from emberlink.envs.view import view_radius
-from emberlink.policies.base import Scripted
-from emberlink.policies.lawnmower import Lawnmower, stops
-from emberlink.policies.oracle import Oracle
-from emberlink.policies.pursuit import Pursuit
-from emberlink.policies.scripted import SCRIPTED
+from emberlink.envs.world.sensor import view_radius
+from emberlink.policies.scripted.base import Scripted
+from emberlink.policies.scripted.follow_target import Pursuit
+from emberlink.policies.scripted.lawnmower import Lawnmower, stops
+from emberlink.policies.scripted.oracle import Oracle
+from emberlink.policies.scripted.registry import SCRIPTED
 from emberlink.trainers.build import build_env
-from emberlink.trainers.config import known, resolve
-from emberlink.trainers.evaluate import play, scripted_config
+from emberlink.trainers.config.compose import known, resolve
+from emberlink.trainers.evaluation.evaluate import play, scripted_config
 
 NEVER = math.inf
 THREE = math.degrees(math.atan(1.2 / 4))  # the view angle: from 4 three cells by three are seen

@@ -7,8 +7,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from emberlink.trainers import seed_statistics as statistics
-from emberlink.trainers.seed_statistics import advantage, as_ratio, band, improvement, interval, iqm
+from emberlink.trainers.comparison import bootstrap as statistics
+from emberlink.trainers.comparison.bootstrap import (
+    advantage,
+    as_ratio,
+    band,
+    improvement,
+    interval,
+    iqm,
+)
 
 numbers = st.lists(st.integers(0, 40).map(float), min_size=1, max_size=9)
 several = st.lists(st.integers(0, 40).map(float), min_size=2, max_size=6)

@@ -9,11 +9,13 @@ from test_recipes import METHODS, trained
 
 from emberlink.envs import keys
 from emberlink.envs.wildfire import WildfireEnv
-from emberlink.policies.noise import NOISE
-from emberlink.trainers import cli, make_env, report
-from emberlink.trainers.config import from_values, resolve, to_values
-from emberlink.trainers.loop import Trainer
-from emberlink.trainers.memory import to_rows
+from emberlink.policies.exploration import NOISE
+from emberlink.trainers import make_env
+from emberlink.trainers.cli import main
+from emberlink.trainers.config.compose import from_values, resolve, to_values
+from emberlink.trainers.evaluation import report
+from emberlink.trainers.learners.replay_buffer import to_rows
+from emberlink.trainers.training.trainer import Trainer
 
 SEEDS = [3, 11]
 
@@ -128,7 +130,7 @@ def test_every_seed_gets_a_run_folder_that_evaluates(tmp_path, capsys):
         "evaluation.interval_fires=2",
     ]
     arguments = ["train", "positional", *small, "seeds=[7,8]", f"output={tmp_path}"]
-    assert cli.main(arguments) == 0
+    assert main.main(arguments) == 0
     folders = sorted(tmp_path.iterdir())
     assert [folder.name[-2:] for folder in folders] == ["s7", "s8"]
     evaluated = []
@@ -140,7 +142,7 @@ def test_every_seed_gets_a_run_folder_that_evaluates(tmp_path, capsys):
         assert "huygens/coverage" in run.lines()[0]
         result = json.loads((folder / "eval.json").read_text())
         assert result["seed"] == seed
-        assert cli.main(["eval", str(folder)]) == 0
+        assert main.main(["eval", str(folder)]) == 0
         # The checkpoint plays as the networks in the stack did.
         assert json.loads((folder / "eval.json").read_text()) == result
         evaluated.append(result["results"]["paper"]["learned"])
@@ -158,7 +160,7 @@ def test_every_seed_gets_a_run_folder_that_evaluates(tmp_path, capsys):
     ],
 )
 def test_wrong_seeds(overrides, message, capsys, tmp_path):
-    assert cli.main(["train", "consensus", *overrides, f"output={tmp_path}"]) == 2
+    assert main.main(["train", "consensus", *overrides, f"output={tmp_path}"]) == 2
     error = capsys.readouterr().err
     assert message in error
     assert error.count("\n") == 1

@@ -6,10 +6,10 @@ import pytest
 
 from emberlink.comm.consensus import ConsensusConfig
 from emberlink.envs.config import RewardConfig, WildfireConfig
-from emberlink.envs.fire import scenarios
-from emberlink.envs.validation import from_plain
-from emberlink.trainers.config import flat, known, resolve, to_values
-from emberlink.trainers.schema import build_comm
+from emberlink.envs.fire.generator import scenarios
+from emberlink.envs.utils.validation import from_plain
+from emberlink.trainers.config.compose import flat, known, resolve, to_values
+from emberlink.trainers.config.schema import build_comm
 
 METHODS = ["independent", "shared_memory", "positional", "consensus"]
 PAPER, RELEASED = "paper", "released"

@@ -6,8 +6,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from emberlink.envs.spread import arrival_times, disc
-from emberlink.envs.wavelet import ellipse_rates, front_speed, length_to_breadth
+from emberlink.envs.fire.ellipse import ellipse_rates, front_speed, length_to_breadth
+from emberlink.envs.fire.level_set import arrival_times, disc
 
 SIDE, CORE, HEAD, HORIZON = 30.0, 3.0, 0.01, 1000.0
 STRAIGHT, TURNING = 0.0, math.pi

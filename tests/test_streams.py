@@ -5,13 +5,13 @@ import math
 import pytest
 import torch
 
-from emberlink.envs import streams
+from emberlink.envs.utils import counter_rng
 
 LANES = 20_000
 
 
 def test_uniform_looks_uniform():
-    draws = streams.uniform(torch.tensor([1, -5, 2**60]), LANES).double()
+    draws = counter_rng.uniform(torch.tensor([1, -5, 2**60]), LANES).double()
     assert ((draws > 0) & (draws < 1)).all()
     # Five standard errors of the mean, the variance and each of ten bins.
     assert (draws.mean(-1) - 0.5).abs().max() < 5 * math.sqrt(1 / 12 / LANES)
@@ -21,7 +21,7 @@ def test_uniform_looks_uniform():
 
 
 def test_normal_looks_normal():
-    draws = streams.normal(torch.tensor([3, 4]), LANES).double()
+    draws = counter_rng.normal(torch.tensor([3, 4]), LANES).double()
     assert draws.isfinite().all()
     assert draws.mean(-1).abs().max() < 5 / math.sqrt(LANES)
     assert (draws.var(-1) - 1).abs().max() < 5 * math.sqrt(2 / LANES)
@@ -30,9 +30,9 @@ def test_normal_looks_normal():
 
 @pytest.mark.parametrize(("bits", "end"), [(0, 2.0**-24), (-1, 1 - 2.0**-24)])
 def test_the_ends_are_left_out(monkeypatch, bits, end):
-    monkeypatch.setattr(streams, "fold", lambda stream, lanes: torch.full_like(lanes, bits))
-    assert streams.uniform(torch.tensor(0), 1).item() == end
-    assert streams.normal(torch.tensor(0), 1).isfinite().all()
+    monkeypatch.setattr(counter_rng, "fold", lambda stream, lanes: torch.full_like(lanes, bits))
+    assert counter_rng.uniform(torch.tensor(0), 1).item() == end
+    assert counter_rng.normal(torch.tensor(0), 1).isfinite().all()
 
 
 def correlation(one: torch.Tensor, other: torch.Tensor) -> float:
@@ -42,57 +42,57 @@ def correlation(one: torch.Tensor, other: torch.Tensor) -> float:
 @pytest.mark.parametrize("seed", [0, 1, 12345])
 def test_neighbours_are_unrelated(seed):
     limit = 5 / math.sqrt(LANES)
-    envs = streams.uniform(streams.streams(seed, 3), LANES)
+    envs = counter_rng.uniform(counter_rng.streams(seed, 3), LANES)
     assert abs(correlation(envs[0], envs[1])) < limit
     assert abs(correlation(envs[0], envs[2])) < limit
     # The same lane over environments, over episodes, and over seeds.
-    lane = streams.uniform(streams.streams(seed, LANES), 2)
+    lane = counter_rng.uniform(counter_rng.streams(seed, LANES), 2)
     assert abs(correlation(lane[:, 0], lane[:, 1])) < limit
     assert abs(correlation(lane[1:, 0], lane[:-1, 0])) < limit
-    stream = streams.streams(seed, 1)
-    episodes = streams.uniform(streams.fold(stream, torch.arange(LANES)), 1)
+    stream = counter_rng.streams(seed, 1)
+    episodes = counter_rng.uniform(counter_rng.fold(stream, torch.arange(LANES)), 1)
     assert abs(correlation(episodes[1:], episodes[:-1])) < limit
-    others = streams.uniform(streams.streams(seed + 1, 3), LANES)
+    others = counter_rng.uniform(counter_rng.streams(seed + 1, 3), LANES)
     assert abs(correlation(envs[0], others[0])) < limit
     assert abs(correlation(envs[1], others[0])) < limit  # nor shifted by one
 
 
 def test_streams_never_collide():
-    every = [streams.streams(seed, 1000) for seed in range(20)]
-    folds = [streams.fold(every[0], counter) for counter in range(20)]
-    twice = [streams.fold(folds[0], counter) for counter in range(3)]
+    every = [counter_rng.streams(seed, 1000) for seed in range(20)]
+    folds = [counter_rng.fold(every[0], counter) for counter in range(20)]
+    twice = [counter_rng.fold(folds[0], counter) for counter in range(3)]
     together = torch.cat(every + folds + twice)
     assert len(together.unique()) == len(together)
 
 
 def test_order_of_counters_matters():
     stream = torch.tensor([7])
-    one = streams.fold(streams.fold(stream, 1), 2)
-    other = streams.fold(streams.fold(stream, 2), 1)
+    one = counter_rng.fold(counter_rng.fold(stream, 1), 2)
+    other = counter_rng.fold(counter_rng.fold(stream, 2), 1)
     assert one != other
 
 
 def test_a_draw_is_a_function_of_its_key():
-    stream = streams.streams(9, 4)
+    stream = counter_rng.streams(9, 4)
     torch.manual_seed(0)
-    first = streams.uniform(stream, 5)
+    first = counter_rng.uniform(stream, 5)
     torch.manual_seed(1)
-    assert torch.equal(streams.uniform(stream, 5), first)
-    assert torch.equal(streams.uniform(stream, 50)[:, :5], first)
-    assert torch.equal(streams.uniform(stream[2], 5), first[2])
-    assert torch.equal(streams.uniform(stream.view(2, 2), 5).view(4, 5), first)
+    assert torch.equal(counter_rng.uniform(stream, 5), first)
+    assert torch.equal(counter_rng.uniform(stream, 50)[:, :5], first)
+    assert torch.equal(counter_rng.uniform(stream[2], 5), first[2])
+    assert torch.equal(counter_rng.uniform(stream.view(2, 2), 5).view(4, 5), first)
 
 
 def test_stream_i_depends_on_the_seed_and_i_alone():
-    assert torch.equal(streams.streams(3, 100)[:7], streams.streams(3, 7))
-    assert not torch.equal(streams.streams(4, 7), streams.streams(3, 7))
+    assert torch.equal(counter_rng.streams(3, 100)[:7], counter_rng.streams(3, 7))
+    assert not torch.equal(counter_rng.streams(4, 7), counter_rng.streams(3, 7))
 
 
 def test_counters_may_be_integers_or_tensors():
     stream = torch.tensor([1, 2, 3])
     counters = torch.tensor([0, 5, -1])
-    folded = streams.fold(stream, counters)
-    each = [streams.fold(stream[i], int(c)) for i, c in enumerate(counters)]
+    folded = counter_rng.fold(stream, counters)
+    each = [counter_rng.fold(stream[i], int(c)) for i, c in enumerate(counters)]
     assert folded.tolist() == [int(f) for f in each]
 
 
@@ -107,16 +107,16 @@ def test_the_numbers_themselves():
     golden = 0x9E3779B97F4A7C15
     for stream, counter in [(0, 0), (1, 2), (-3, 4), (2**62, 2**40)]:
         expected = mix((mix((stream + golden) % 2**64) + (counter + 1) * golden) % 2**64)
-        got = streams.fold(torch.tensor(stream), counter).item()
+        got = counter_rng.fold(torch.tensor(stream), counter).item()
         assert got % 2**64 == expected
 
 
 @pytest.mark.parametrize("limit", [1, 2, 6, 1000, 166_667, 2**31])
 def test_integers_are_uniform_below_their_limit(limit):
-    drawn = streams.integers(streams.streams(0, 4), 25_000, limit)
+    drawn = counter_rng.integers(counter_rng.streams(0, 4), 25_000, limit)
     assert drawn.shape == (4, 25_000)
     assert 0 <= drawn.min() <= drawn.max() < limit
-    assert drawn.equal(streams.integers(streams.streams(0, 4), 25_000, torch.tensor(limit)))
+    assert drawn.equal(counter_rng.integers(counter_rng.streams(0, 4), 25_000, torch.tensor(limit)))
     unit = (drawn.double() + 0.5) / limit
     assert abs(unit.mean().item() - 0.5) < 0.004
     if 1 < limit <= 6:

@@ -10,9 +10,9 @@ from contextlib import nullcontext
 import pytest
 from rich.console import Console
 
-from emberlink.trainers.cli import main
-from emberlink.trainers.run_folder import RunFolder
-from emberlink.trainers.sweep import jobs_of, sweep
+from emberlink.trainers.cli.main import main
+from emberlink.trainers.runs.run_folder import RunFolder
+from emberlink.trainers.sweep.command import jobs_of, sweep
 
 SMALL = [
     "setup=tuned",
@@ -101,7 +101,7 @@ def test_what_is_finished_is_skipped_and_the_rest_made(tmp_path, capsys):
 
 
 def test_a_stopped_sweep_goes_on_and_ends_where_an_unbroken_one_does(tmp_path):
-    program = "from emberlink.trainers.cli import main; raise SystemExit(main())"
+    program = "from emberlink.trainers.cli.main import main; raise SystemExit(main())"
     broken, whole = tmp_path / "broken", tmp_path / "whole"
     # Long enough to be met in the middle of it.
     arguments = ["sweep", *SMALL, "consensus", "episodes=12", "checkpoint_steps=20", "seed=5"]

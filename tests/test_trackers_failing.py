@@ -15,9 +15,10 @@ import pytest
 import wandb
 from tiny_run import PROGRAM
 
-from emberlink.trainers import cli, tracking
-from emberlink.trainers.config import resolve
-from emberlink.trainers.loop import Progress, Trainer
+from emberlink.trainers.cli import main
+from emberlink.trainers.config.compose import resolve
+from emberlink.trainers.runs import loggers
+from emberlink.trainers.training.trainer import Progress, Trainer
 
 EPISODES = 4
 SHORT = [
@@ -57,11 +58,11 @@ def _elsewhere(tmp_path, monkeypatch):
     for name in ("WANDB_MODE", "WANDB_API_KEY", "WANDB_BASE_URL"):
         monkeypatch.setenv(name, "")
         monkeypatch.delenv(name)
-    monkeypatch.setattr(tracking, "PATIENCE", 1.5)
+    monkeypatch.setattr(loggers, "PATIENCE", 1.5)
     forget()
     yield
     for thread in threading.enumerate():
-        if thread.name == tracking.ENDING:
+        if thread.name == loggers.ENDING:
             thread.join(30)
     forget()
 
@@ -114,8 +115,8 @@ def test_it_fails_or_never_answers(moment, how, tmp_path, monkeypatch):
         made.append(Fragile(moment, how))
         return made[-1]
 
-    monkeypatch.setitem(tracking._TRACKERS, "csv", make)
-    monkeypatch.setattr(tracking, "_finish", lambda logger: logger.meet("finish"))
+    monkeypatch.setitem(loggers._TRACKERS, "csv", make)
+    monkeypatch.setattr(loggers, "_finish", lambda logger: logger.meet("finish"))
     expected = {fail: "No space left", leave: "SystemExit", wait: "no answer within 1.5 s"}[how]
     # A stack of two seeds: two trackers, and still one warning.
     only(train("csv", tmp_path, lambda _: None, "seeds=[3,4]"), "logger=csv", expected)
@@ -159,7 +160,7 @@ def test_wandb_cannot_reach_its_server(tmp_path, monkeypatch):
     monkeypatch.setenv("WANDB_MODE", "online")
     monkeypatch.setenv("WANDB_BASE_URL", "http://127.0.0.1:9")
     monkeypatch.setenv("WANDB_API_KEY", "0" * 40)
-    monkeypatch.setattr(tracking, "_CONNECTING", 1.0)
+    monkeypatch.setattr(loggers, "_CONNECTING", 1.0)
     only(train("wandb", tmp_path), "logger=wandb")
 
 
@@ -233,4 +234,4 @@ def test_a_program_whose_wandb_was_killed_ends_in_peace(tmp_path):
 
 def test_none_at_all(tmp_path):
     assert train("none", tmp_path) == []
-    assert cli.main(["train", "independent", *SHORT, "logger=mlflow", f"output={tmp_path}/x"]) == 2
+    assert main.main(["train", "independent", *SHORT, "logger=mlflow", f"output={tmp_path}/x"]) == 2

@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 from wandb.proto import wandb_internal_pb2
 
-from emberlink.trainers.config import resolve, to_values
-from emberlink.trainers.loop import Trainer
+from emberlink.trainers.config.compose import resolve, to_values
+from emberlink.trainers.training.trainer import Trainer
 
 SHORT = [
     *("setup=tuned", "seed=3", "episodes=4", "env.horizon=12", "env.num_uavs=2", "num_envs=2"),

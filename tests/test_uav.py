@@ -5,14 +5,14 @@ import math
 import pytest
 import torch
 
-from emberlink.envs import uav
+from emberlink.envs.world import motion
 
 LOW = torch.tensor([0.0, 0, 1], dtype=torch.float64)
 HIGH = torch.tensor([29.0, 19, 4], dtype=torch.float64)
 
 
 def move(position, action, displacement=1.0):
-    where, beyond = uav.move(
+    where, beyond = motion.move(
         torch.tensor(position), torch.tensor(action), displacement=displacement, low=LOW, high=HIGH
     )
     assert where.dtype == torch.float32
@@ -39,29 +39,29 @@ def test_move(position, action, displacement, expected, beyond):
 
 def test_move_takes_any_batch():
     position = torch.rand(2, 3, 4, 3) + 2
-    where, beyond = uav.move(position, position, displacement=0.1, low=LOW, high=HIGH)
+    where, beyond = motion.move(position, position, displacement=0.1, low=LOW, high=HIGH)
     assert where.shape == beyond.shape == (2, 3, 4, 3)
 
 
 def test_distance():
     points = torch.tensor([[1.0, 2, 3], [1, 2, 3]])
     others = torch.tensor([[3.0, 5, 9], [1, 2, 3]])
-    assert uav.distance(points, others).tolist() == [7, 0]
+    assert motion.distance(points, others).tolist() == [7, 0]
 
 
 def test_scale_to_box():
     points = torch.tensor([[0.0, 0, 1], [29, 19, 4], [14.5, 9.5, 2.5], [7.25, 19, 1.75]])
     expected = [[-1, -1, -1], [1, 1, 1], [0, 0, 0], [-0.5, 1, -0.5]]
-    assert uav.scale_to_box(points, LOW, HIGH).tolist() == expected
+    assert motion.scale_to_box(points, LOW, HIGH).tolist() == expected
 
 
 def test_scale_to_a_box_of_no_height():
     flat = torch.tensor([29.0, 19, 1], dtype=torch.float64)
-    assert uav.scale_to_box(torch.tensor([0.0, 0, 1]), LOW, flat).tolist() == [-1, -1, -1]
+    assert motion.scale_to_box(torch.tensor([0.0, 0, 1]), LOW, flat).tolist() == [-1, -1, -1]
 
 
 def test_random_points_fill_the_box():
-    points = uav.random_points(torch.arange(500), 4, LOW, HIGH)
+    points = motion.random_points(torch.arange(500), 4, LOW, HIGH)
     assert points.shape == (500, 4, 3)
     assert points.dtype == torch.float32
     flat = points.flatten(0, 1)
@@ -74,15 +74,15 @@ def test_random_points_fill_the_box():
 def test_next_waypoint_changes_only_those_that_are_reached():
     position = torch.tensor([[[5.0, 5, 2], [5, 5, 2], [5, 5, 2]]])
     waypoint = torch.tensor([[[5.0, 5.99, 2], [5, 6, 2], [20, 1, 3]]])
-    new = uav.next_waypoint(waypoint, position, torch.tensor([7]), LOW, HIGH)
+    new = motion.next_waypoint(waypoint, position, torch.tensor([7]), LOW, HIGH)
     assert torch.equal(new[0, 1:], waypoint[0, 1:])
-    assert torch.equal(new[0, 0], uav.random_points(torch.tensor([7]), 3, LOW, HIGH)[0, 0])
+    assert torch.equal(new[0, 0], motion.random_points(torch.tensor([7]), 3, LOW, HIGH)[0, 0])
 
 
 def test_what_is_no_number_does_not_move_the_uav():
     position = torch.tensor([[5.0, 6.0, 2.0]])
     action = torch.tensor([[math.nan, math.inf, -math.inf]])
     low, high = torch.zeros(3).double(), torch.full((3,), 9.0).double()
-    moved, beyond = uav.move(position, action, displacement=1.5, low=low, high=high)
+    moved, beyond = motion.move(position, action, displacement=1.5, low=low, high=high)
     assert moved.tolist() == [[5.0, 7.5, 0.5]]
     assert not beyond.any()

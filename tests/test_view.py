@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from emberlink.envs.view import View, view_radius
+from emberlink.envs.world.sensor import View, view_radius
 
 
 @pytest.mark.parametrize(("altitude", "radius"), [(1, 0.57735), (2, 1.15470), (4, 2.30940)])

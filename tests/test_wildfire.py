@@ -10,7 +10,7 @@ from tensordict import TensorDict
 from torchrl.envs import check_env_specs, step_mdp
 
 from emberlink.envs import WildfireConfig, WildfireEnv, keys
-from emberlink.envs.fire import load_scenario, make_fires
+from emberlink.envs.fire.generator import load_scenario, make_fires
 from emberlink.trainers import make_env
 
 METHODS = ("independent", "shared_memory", "positional", "consensus")

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from emberlink.trainers import cli
+from emberlink.trainers.cli import main
 
 TINY = [
     *("episodes=2", "env.horizon=15", "env.num_uavs=2", "num_envs=2"),
@@ -12,13 +12,13 @@ PROGRAM = (
     "import signal, sys\n"
     # A program started in the background may have inherited that Ctrl-C is ignored.
     "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
-    "from emberlink.trainers.cli import main\n"
+    "from emberlink.trainers.cli.main import main\n"
     "sys.exit(main())"
 )
 
 
 def train_tiny(output: Path) -> Path:
     """The run folder that `emberlink train` leaves in an empty folder."""
-    assert cli.main(["train", "consensus", *TINY, f"output={output}"]) == 0
+    assert main.main(["train", "consensus", *TINY, f"output={output}"]) == 0
     (folder,) = output.iterdir()
     return folder

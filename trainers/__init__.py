@@ -3,7 +3,7 @@
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from .build import make_env
+    from emberlink.trainers.build import make_env
 
 __all__ = ["make_env"]
 
@@ -11,7 +11,7 @@ __all__ = ["make_env"]
 def __getattr__(name: str) -> Any:
     # Imported when asked for, so that `emberlink --help` need not wait for torch.
     if name == "make_env":
-        from .build import make_env
+        from emberlink.trainers.build import make_env
 
         return make_env
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

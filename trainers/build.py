@@ -9,13 +9,12 @@ from torch import Tensor
 from torchrl.envs import TransformedEnv
 
 from emberlink.comm.base import Communication
-from emberlink.envs.scenario import ScenarioConfig
+from emberlink.envs.scenarios import ScenarioConfig
 from emberlink.envs.wildfire import WildfireEnv
-from emberlink.policies.actor_critic import make_actor, make_critic
-from emberlink.policies.networks import Generators
-
-from .config import resolve
-from .schema import RunConfig, build_comm, check_device
+from emberlink.policies.networks.actor_critic import make_actor, make_critic
+from emberlink.policies.networks.stacked import Generators
+from emberlink.trainers.config.compose import resolve
+from emberlink.trainers.config.schema import RunConfig, build_comm, check_device
 
 
 def make_env(

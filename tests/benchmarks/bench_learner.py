@@ -5,8 +5,8 @@ import time
 import pytest
 from workloads import MATRIX_FLOPS, METHODS, batch_of, in_turns, matrix_product, update_flops
 
-from emberlink.trainers.config import resolve
-from emberlink.trainers.loop import Trainer
+from emberlink.trainers.config.compose import resolve
+from emberlink.trainers.training.trainer import Trainer
 
 
 @pytest.mark.parametrize("method", METHODS)

@@ -9,9 +9,9 @@ import pytest
 from tensordict import TensorDict
 from workloads import METHODS, make
 
-from emberlink.trainers.config import resolve
-from emberlink.trainers.loop import Trainer
-from emberlink.trainers.memory import make_memory, to_rows
+from emberlink.trainers.config.compose import resolve
+from emberlink.trainers.learners.replay_buffer import make_memory, to_rows
+from emberlink.trainers.training.trainer import Trainer
 
 MILLION = 1_000_000
 

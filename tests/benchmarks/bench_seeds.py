@@ -4,8 +4,8 @@ import pytest
 import torch
 from workloads import in_turns
 
-from emberlink.trainers.config import resolve
-from emberlink.trainers.loop import Trainer
+from emberlink.trainers.config.compose import resolve
+from emberlink.trainers.training.trainer import Trainer
 
 STEPS = 20
 

@@ -22,9 +22,9 @@ import torch
 from scipy.optimize import minimize
 from torch import Tensor
 
-from emberlink.envs.ascii_grids import read_ascii
-from emberlink.envs.spread import Distance, arrival_times
-from emberlink.envs.wavelet import MAX_LENGTH_TO_BREADTH, ellipse_rates
+from emberlink.envs.fire.ellipse import MAX_LENGTH_TO_BREADTH, ellipse_rates
+from emberlink.envs.fire.level_set import Distance, arrival_times
+from emberlink.envs.fire_files.esri_ascii import read_ascii
 
 SUFFIX = "_ArrivalTime.asc"
 PARTS = (0.25, 0.5, 0.75, 1.0)

@@ -17,8 +17,8 @@ from pathlib import Path
 import torch
 from workloads import batch_of, flying, in_turns, make, matrix_product
 
-from emberlink.trainers.config import resolve
-from emberlink.trainers.loop import Trainer
+from emberlink.trainers.config.compose import resolve
+from emberlink.trainers.training.trainer import Trainer
 
 BASELINE = Path(__file__).with_name("guard.json")
 TOLERANCE = 0.30

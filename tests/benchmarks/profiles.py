@@ -8,8 +8,8 @@ from collections.abc import Callable
 from torch.profiler import profile
 from workloads import batch_of, flying, make
 
-from emberlink.trainers.config import resolve
-from emberlink.trainers.loop import Trainer
+from emberlink.trainers.config.compose import resolve
+from emberlink.trainers.training.trainer import Trainer
 
 KINDS = {
     "matrix products": ("addmm", "baddbmm", "mm", "bmm"),

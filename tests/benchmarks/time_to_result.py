@@ -14,12 +14,12 @@ import sys
 import time
 from pathlib import Path
 
-from emberlink.envs.fire import load_scenario
-from emberlink.envs.fire_bank import fire_bank
-from emberlink.trainers import evaluate
+from emberlink.envs.fire.cache import fire_bank
+from emberlink.envs.fire.generator import load_scenario
 from emberlink.trainers.build import build_env
-from emberlink.trainers.config import resolve
-from emberlink.trainers.loop import Trainer
+from emberlink.trainers.config.compose import resolve
+from emberlink.trainers.evaluation import evaluate
+from emberlink.trainers.training.trainer import Trainer
 
 EVERY, FIRES = 500, 32
 

@@ -12,11 +12,11 @@ import torch
 from tensordict import TensorDict
 
 from emberlink.envs import keys
-from emberlink.envs.validation import known
+from emberlink.envs.utils.validation import known
 from emberlink.envs.wildfire import WildfireEnv
 from emberlink.trainers import make_env
-from emberlink.trainers.config import resolve
-from emberlink.trainers.loop import Trainer
+from emberlink.trainers.config.compose import resolve
+from emberlink.trainers.training.trainer import Trainer
 
 METHODS = known("method")
 MATRIX = 2048

@@ -9,10 +9,10 @@ import traceback
 from collections.abc import Callable
 from pathlib import Path
 
-from emberlink.trainers import checkpoint
-from emberlink.trainers.config import resolve
-from emberlink.trainers.loop import Trainer
-from emberlink.trainers.resume import resume
+from emberlink.trainers.config.compose import resolve
+from emberlink.trainers.runs import checkpoint_file
+from emberlink.trainers.training.resume import resume
+from emberlink.trainers.training.trainer import Trainer
 
 HORIZON, EPISODES, EVERY = 20, 4, 3
 SMALL = [
@@ -100,7 +100,7 @@ def watch_saves(say: Callable[[str], None], die_at: tuple[str, int] | None) -> N
         return call
 
     for name in ("save_file", "_digest", "flush_folder"):
-        setattr(checkpoint, name, dying(name, getattr(checkpoint, name)))
+        setattr(checkpoint_file, name, dying(name, getattr(checkpoint_file, name)))
     os.fsync = dying("fsync", os.fsync)
     Path.replace = dying("replace", Path.replace)
     Path.unlink = dying("unlink", Path.unlink)
@@ -185,7 +185,7 @@ def kill_until_finished(
         for path in output.rglob("checkpoints/*.safetensors"):
             if not path.name.startswith(".tmp"):
                 try:
-                    checkpoint.read(path)
+                    checkpoint_file.read(path)
                 except ValueError as error:
                     wrong.append(str(error))
         if status == -signal.SIGKILL:

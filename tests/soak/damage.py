@@ -8,7 +8,7 @@ from pathlib import Path
 import torch
 from safetensors.torch import load_file, save_file
 
-from emberlink.trainers import checkpoint
+from emberlink.trainers.runs import checkpoint_file
 
 
 def truncated(path: Path, draw: random.Random) -> None:
@@ -42,15 +42,15 @@ def lengthened(path: Path, draw: random.Random) -> None:
 
 def sealed_again(path: Path, change: Callable[[dict, dict[str, torch.Tensor]], None]) -> None:
     """As a program that knows the format would have written it."""
-    header, content = checkpoint.read(path)
+    header, content = checkpoint_file.read(path)
     assert header is not None
     change(header, content)
     version, rest = header.pop("format"), {k: v for k, v in header.items() if k != "sha256"}
-    before, checkpoint.FORMAT = checkpoint.FORMAT, version
+    before, checkpoint_file.FORMAT = checkpoint_file.FORMAT, version
     try:
-        checkpoint.write(path, content, rest)
+        checkpoint_file.write(path, content, rest)
     finally:
-        checkpoint.FORMAT = before
+        checkpoint_file.FORMAT = before
 
 
 def of_another_method(path: Path, draw: random.Random) -> None:

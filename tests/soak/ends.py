@@ -20,9 +20,10 @@ from children import (
     training,
 )
 
-from emberlink.trainers import checkpoint, cli
-from emberlink.trainers.resume import resume
-from emberlink.trainers.run_folder import RunFolder, step_of
+from emberlink.trainers.cli import main
+from emberlink.trainers.runs import checkpoint_file
+from emberlink.trainers.runs.run_folder import RunFolder, step_of
+from emberlink.trainers.training.resume import resume
 
 
 def command(arguments: list[str], before: Callable[[], None] = lambda: None):
@@ -32,7 +33,7 @@ def command(arguments: list[str], before: Callable[[], None] = lambda: None):
         signal.signal(signal.SIGINT, signal.default_int_handler)
         before()
         say("here")
-        return cli.main(arguments)
+        return main.main(arguments)
 
     return work
 
@@ -52,7 +53,7 @@ def signal_trial(number: int, folder: Path, draw: random.Random) -> list[str]:
     if f"resume with: emberlink train resume={path}" not in text or "Traceback" in text:
         wrong.append(text)
     newest, run = RunFolder(path).states()[-1], RunFolder(path)
-    header = checkpoint.read(newest)[0] or {}
+    header = checkpoint_file.read(newest)[0] or {}
     lines = (path / "metrics.jsonl").read_bytes() if (path / "metrics.jsonl").exists() else b""
     if header["files"][0]["metrics.jsonl"] != len(lines):
         wrong.append("metrics.jsonl and the checkpoint are of different moments")

@@ -20,10 +20,10 @@ from children import METHODS, SMALL, kill_trials
 from damage import damage_trials
 from ends import full_disk_trial, signal_trial
 
-from emberlink.trainers import report
-from emberlink.trainers.config import resolve
-from emberlink.trainers.loop import Trainer
-from emberlink.trainers.resume import resume
+from emberlink.trainers.config.compose import resolve
+from emberlink.trainers.evaluation import report
+from emberlink.trainers.training.resume import resume
+from emberlink.trainers.training.trainer import Trainer
 
 Result = tuple[int, list[str]]
 

@@ -1,0 +1,291 @@
+"""Wildfires as data: a scenario is a set of ranges, a fire is what one seed draws from them.
+
+A fire is a time of arrival per cell, in steps; a cell burns from then on. It starts as a ring, the
+edge of a disc whose inside is burnt out and never counts as fire, and spreads by `spread`. Other
+waves, such as oil on water, are scenarios too: "fire" stands for whatever spreads.
+Lengths of a scenario are in cells of a grid whose shorter side has 30 cells (`BASE_SIDE`); on
+another grid lengths, and with them rates, are scaled by min(X, Y)/30, so that it fits any grid.
+"""
+
+import dataclasses
+import math
+from importlib import resources
+from typing import Annotated, Any, Literal, get_args
+
+import torch
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+from pydantic import AfterValidator, ConfigDict, Field, Strict, ValidationError
+from pydantic.dataclasses import dataclass
+from torch import Tensor
+from yaml import YAMLError
+
+from emberlink.envs.config import check_grid
+from emberlink.envs.utils.counter_rng import fold, uniform
+from emberlink.envs.utils.validation import Name, describe, known
+
+from .advection import current, longest_step, tide_speed
+from .ellipse import MAX_LENGTH_TO_BREADTH
+from .level_set import arrival_times, disc
+
+BASE_SIDE = 30
+HELD_OUT_FROM = 1_000_000
+Split = Literal["train", "heldout"]
+
+_STREAM = 0xF12E  # keeps a fire's draws apart from other uses of the same seed
+_NODES = 60  # nodes along the shorter side at least: twice the resolution of 30 cells
+_CHUNK = 200_000  # nodes computed at a time, so that the work stays in the processor's cache
+_LEAST = 1e-6  # radius of a patch, cells: its square is no number below some 1e-19
+
+
+def _ordered(pair: tuple[float, float]) -> tuple[float, float]:
+    if pair[0] > pair[1]:
+        raise ValueError(f"a range is (low, high), got {pair}")
+    return pair
+
+
+_Ordered = AfterValidator(_ordered)
+_Pair = Strict(False)  # a list, as YAML has it, will do for a tuple
+_Degrees = Annotated[float, Field(ge=-360, le=360)]
+_Turn = Annotated[float, Field(ge=-3600, le=3600)]
+_Length = Annotated[float, Field(gt=0, le=30)]
+_Signed = Annotated[float, Field(ge=-30, le=30)]
+_Rate = Annotated[float, Field(gt=0, le=1)]
+_Fraction = Annotated[float, Field(ge=0, le=1)]
+_Ratio = Annotated[float, Field(ge=1, le=MAX_LENGTH_TO_BREADTH)]
+_Drift = Annotated[float, Field(ge=0, le=1)]
+_Reach = Annotated[float, Field(ge=0, le=30)]
+_Period = Annotated[float, Field(ge=100, le=1e6)]
+_Count = Annotated[int, Field(ge=0, le=32)]
+
+
+@dataclass(
+    frozen=True,
+    kw_only=True,
+    config=ConfigDict(extra="forbid", strict=True, use_attribute_docstrings=True),
+)
+class FireConfig:
+    """A distribution of fires: each pair (low, high) is the range of a uniform draw."""
+
+    name: Name
+    """Name of the scenario, that of its file."""
+    bank: Annotated[int, Field(ge=1, lt=HELD_OUT_FROM)]
+    """Number of fires to train on."""
+    head_rate: Annotated[tuple[_Rate, _Rate], _Pair, _Ordered]
+    """Rate of spread of the head, cells per step."""
+    length_to_breadth: Annotated[tuple[_Ratio, _Ratio], _Pair, _Ordered]
+    """Length-to-breadth ratio of the elliptical wavelet, 1 without wind."""
+    azimuth: Annotated[tuple[_Degrees, _Degrees], _Pair, _Ordered]
+    """Direction towards which the head runs at step 0, degrees counter-clockwise from +x."""
+    turning: Annotated[tuple[_Turn, _Turn], _Pair, _Ordered]
+    """Steady turning of that direction, degrees per 1000 steps, counter-clockwise."""
+    centre_x: Annotated[tuple[_Fraction, _Fraction], _Pair, _Ordered]
+    """Centre of the initial disc along x, as a fraction of the box (0 to X - 1)."""
+    centre_y: Annotated[tuple[_Fraction, _Fraction], _Pair, _Ordered]
+    """Centre of the initial disc along y, as a fraction of the box (0 to Y - 1)."""
+    core_radius: Annotated[tuple[_Length, _Length], _Pair, _Ordered]
+    """Radius of the initial disc, cells."""
+    ring_width: Annotated[tuple[_Length, _Length], _Pair, _Ordered]
+    """Width of the part of the disc that burns at step 0, cells; the rest is burnt out."""
+    patches: Annotated[tuple[_Count, _Count], _Pair, _Ordered]
+    """Number of patches of slow fuel."""
+    patch_bearing: Annotated[tuple[_Degrees, _Degrees], _Pair, _Ordered]
+    """Where a patch lies as seen from the disc's centre, degrees from the initial azimuth."""
+    patch_distance: Annotated[tuple[_Signed, _Signed], _Pair, _Ordered]
+    """How far a patch's centre lies outside the initial disc, cells, negative inside."""
+    patch_radius: Annotated[tuple[_Length, _Length], _Pair, _Ordered]
+    """Distance from a patch's centre at which its effect has fallen to 1/e, cells."""
+    patch_rate: Annotated[tuple[_Fraction, _Fraction], _Pair, _Ordered]
+    """Multiplier of the rate of spread at a patch's centre; 1 is no effect."""
+    drift_rate: Annotated[tuple[_Drift, _Drift], _Pair, _Ordered] = (0.0, 0.0)
+    """Steady drift of the medium towards the azimuth, cells per step."""
+    tide_reach: Annotated[tuple[_Reach, _Reach], _Pair, _Ordered] = (0.0, 0.0)
+    """How far the medium swings to and fro along one axis, from turn to turn, cells."""
+    tide_period: Annotated[tuple[_Period, _Period], _Pair, _Ordered] = (1000.0, 1000.0)
+    """Steps from flood to flood."""
+    tide_phase: Annotated[tuple[_Degrees, _Degrees], _Pair, _Ordered] = (0.0, 0.0)
+    """Where in its period the tide is at step 0, degrees; at 0 it runs strongest."""
+    tide_bearing: Annotated[tuple[_Degrees, _Degrees], _Pair, _Ordered] = (0.0, 0.0)
+    """Axis of the tide, degrees counter-clockwise from +x: whereto it runs at phase 0."""
+    two_sided: bool = False
+    """Whether the back of the wavelet runs as fast as its head."""
+
+
+_FIXED = {"name", "bank", "two_sided"}
+# The position is part of a draw's key: append new fields, never reorder.
+_DRAWN = tuple(f.name for f in dataclasses.fields(FireConfig) if f.name not in _FIXED)
+
+
+def scenarios() -> list[str]:
+    """Names of the generator's scenarios: the files in `configs/fire` that have no `kind`."""
+    return [name for name in known("fire") if "kind" not in _values(name)]
+
+
+def load_scenario(name: str) -> FireConfig:
+    """The scenario in `configs/fire/<name>.yaml`.
+
+    Raises:
+        ValueError: no such file, or a value in it that `FireConfig` does not take.
+    """
+    values = _values(name) if name in known("fire") else None
+    if values is None or "kind" in values:
+        raise ValueError(f"unknown fire {name!r}; known: {', '.join(scenarios())}")
+    try:
+        return FireConfig(**values)
+    except ValidationError as error:
+        raise ValueError(f"configs/fire/{name}.yaml: {describe(error)}") from None
+
+
+def _values(name: str) -> dict[str, Any]:
+    file = resources.files("emberlink.configs").joinpath("fire", f"{name}.yaml")
+    try:
+        values: Any = OmegaConf.to_container(OmegaConf.create(file.read_text(encoding="utf-8")))
+    except (YAMLError, OmegaConfBaseException) as error:
+        reason = " ".join(str(error).split())[:200]
+        raise ValueError(f"configs/fire/{name}.yaml: cannot be read: {reason}") from None
+    if not isinstance(values, dict):
+        raise ValueError(f"configs/fire/{name}.yaml: expected keys and values")
+    return values
+
+
+def fire_seeds(split: Split, count: int, start: int = 0) -> Tensor:
+    """Seeds of the first `count` fires of a split, int64 [count].
+
+    Training seeds lie below `HELD_OUT_FROM`, held-out seeds from it on, so no fire is in both.
+
+    Args:
+        split: "train" or "heldout".
+        count: how many.
+        start: first training seed, to train on another bank; the held-out fires never change.
+    """
+    if split not in get_args(Split):
+        raise ValueError(f"unknown split {split!r}; known: {', '.join(get_args(Split))}")
+    if count < 1 or start < 0:
+        raise ValueError(f"expected count >= 1 and start >= 0, got {count} and {start}")
+    if split == "heldout" and start:
+        raise ValueError(f"held-out fires are the same for everyone: start must be 0, got {start}")
+    if split == "train" and start + count > HELD_OUT_FROM:
+        raise ValueError(f"training seeds end before {HELD_OUT_FROM}, got {start} + {count}")
+    first = HELD_OUT_FROM if split == "heldout" else start
+    return torch.arange(first, first + count)
+
+
+def make_fires(
+    config: FireConfig,
+    seeds: Tensor,
+    grid: tuple[int, int],
+    horizon: int,
+    device: torch.device | str | None = None,
+) -> Tensor:
+    """Times of arrival of one fire per seed; each depends on its own seed alone.
+
+    Args:
+        config: the scenario.
+        seeds: int64 [fires].
+        grid: (X, Y), each 8 to 256 cells.
+        horizon: steps; later arrivals are inf. A longer horizon continues the same fires.
+        device: where to compute.
+
+    Returns:
+        float32 [fires, X, Y], steps: 0 burns from the start, inf never burns.
+    """
+    check_grid(grid)
+    refine = math.ceil(_NODES / min(grid))
+    sides = (side + 2 * _margin(config, grid) for side in grid)
+    chunk = max(1, _CHUNK // (math.prod(sides) * refine**2))
+    parts = seeds.to(device=device, dtype=torch.int64).split(chunk)
+    return torch.cat([_spread(config, part, grid, horizon, refine) for part in parts])
+
+
+def _margin(config: FireConfig, grid: tuple[int, int]) -> int:
+    """Cells around the grid from which a tide can bring something back."""
+    return math.ceil(config.tide_reach[1] * min(grid) / BASE_SIDE)
+
+
+def _spread(
+    config: FireConfig, seeds: Tensor, grid: tuple[int, int], horizon: int, refine: int
+) -> Tensor:
+    """`make_fires` for seeds that are computed together."""
+    scale = min(grid) / BASE_SIDE
+    draw = {field: _draw(config, field, seeds)[:, 0] for field in _DRAWN if "patch" not in field}
+    fractions = torch.stack([draw["centre_x"], draw["centre_y"]], 1)
+    centre = fractions * (torch.tensor(grid, device=seeds.device) - 1)
+    distance = disc(centre, draw["core_radius"] * scale)
+    start, turning = draw["azimuth"].deg2rad(), draw["turning"].deg2rad()
+
+    def azimuth(time: float) -> Tensor:
+        return start + turning * (time / 1000)
+
+    fastest = config.drift_rate[1] + tide_speed(config.tide_reach[1], config.tide_period[0])
+    arrival = arrival_times(
+        distance,
+        grid,
+        draw["head_rate"] * scale,
+        draw["length_to_breadth"],
+        azimuth,
+        horizon=horizon,
+        two_sided=config.two_sided,
+        drift=current(draw, azimuth, scale) if fastest > 0 else None,
+        margin=_margin(config, grid),
+        max_step=longest_step(config.tide_period[0]) if config.tide_reach[1] > 0 else math.inf,
+        refine=refine,
+        rate_field=_fuel(config, seeds, centre, draw["core_radius"], start, grid),
+        max_rate=(config.head_rate[1] + fastest) * scale,
+        device=seeds.device,
+    )
+    depth = -distance(*_axes(grid, seeds.device))
+    return arrival.masked_fill(depth > draw["ring_width"][:, None, None] * scale, math.inf)
+
+
+def _unit(field: str, seeds: Tensor, lanes: int) -> Tensor:
+    """Uniform draws on (0, 1), float32 [fires, lanes], from the stream of a seed and a field."""
+    key = torch.tensor([_STREAM, _DRAWN.index(field)], device=seeds.device)
+    return uniform(fold(fold(seeds, key[0]), key[1]), lanes)
+
+
+def _draw(config: FireConfig, field: str, seeds: Tensor, lanes: int = 1) -> Tensor:
+    """Uniform draws from the range of a field, float32 [fires, lanes]."""
+    low, high = getattr(config, field)
+    return low + (high - low) * _unit(field, seeds, lanes)
+
+
+def _axes(grid: tuple[int, int], device: torch.device) -> tuple[Tensor, Tensor]:
+    x, y = (torch.arange(side, dtype=torch.float32, device=device) for side in grid)
+    return x[None, :, None], y[None, None, :]
+
+
+def _fuel(
+    config: FireConfig,
+    seeds: Tensor,
+    centre: Tensor,
+    radius: Tensor,
+    azimuth: Tensor,
+    grid: tuple[int, int],
+) -> Tensor | None:
+    """Multiplier of the rates, [fires, X, Y]: a product of smooth round patches."""
+    most = config.patches[1]
+    if most == 0:
+        return None
+    scale = min(grid) / BASE_SIDE
+    low = config.patches[0]
+    count = low + (_unit("patches", seeds, 1) * (most - low + 1)).floor()
+    bearing, distance, width, rate = (
+        _draw(config, f"patch_{part}", seeds, most)
+        for part in ("bearing", "distance", "radius", "rate")
+    )
+    angle = azimuth[:, None] + bearing.deg2rad()
+    reach = (radius[:, None] + distance) * scale
+    px = (centre[:, :1] + reach * angle.cos())[..., None, None]
+    py = (centre[:, 1:] + reach * angle.sin())[..., None, None]
+    loss = (1 - rate) * (torch.arange(most, device=seeds.device) < count)
+    x, y = _axes(grid, seeds.device)
+    wide = (width * scale).clamp_min(_LEAST)[..., None, None]
+    apart = ((x - px) ** 2 + (y - py) ** 2) / wide**2
+    return (1 - loss[..., None, None] * torch.exp(-apart)).prod(1)
+
+
+def burning_cells(arrival: Tensor, horizon: int) -> Tensor:
+    """Number of cells that burn at the steps 0 to `horizon`, int64 [fires, horizon + 1]."""
+    step = arrival.flatten(1).ceil().clamp(0, horizon + 1).long()
+    zeros = step.new_zeros(len(step), horizon + 2)
+    return zeros.scatter_add(1, step, torch.ones_like(step)).cumsum(1)[:, :-1]

@@ -1,0 +1,254 @@
+"""Fires from files: what a scenario of kind `file` is, and its grids of arrival times."""
+
+import dataclasses
+import hashlib
+import json
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+import torch
+from pydantic import BeforeValidator, ConfigDict, Field, model_validator
+from pydantic.dataclasses import dataclass
+from torch import Tensor
+
+from emberlink.envs.config import check_grid
+from emberlink.envs.utils.validation import Name, printable
+
+from . import detect
+from .arrival_raster import Source, Units
+from .bank_reader import is_bank, read_bands, read_npy
+from .episode_crop import on_grid
+from .esri_ascii import read_ascii
+from .front_points import read_front_points
+from .geotiff import read_geotiff
+from .perimeters import read_perimeters
+from .projection import one_line, quiet
+
+READER_VERSION = 3  # raise it whenever the same file gives another grid
+KEPT = "fires.npz"
+"""the file of a run folder that holds the run's own copy of its grids"""
+_EVERY, _HELD_OUT = 5, 4  # of several fires, those whose number has this remainder are held out
+_Number = Annotated[float, Field(allow_inf_nan=False)]
+_Time = _Number | Annotated[str, Field(min_length=1, max_length=40)]
+_Digest = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
+_Text = Annotated[str, Field(min_length=1, max_length=1000)]
+
+
+def _given(value: Any) -> Any:
+    if value is None:
+        raise ValueError("a file is needed, such as fire.path=ArrivalTime.asc")
+    return value
+
+
+@dataclass(
+    frozen=True,
+    kw_only=True,
+    config=ConfigDict(extra="forbid", strict=True, use_attribute_docstrings=True),
+)
+class FileFireConfig:
+    """Fires read from a file: a raster, perimeters, points of the front, or a bank."""
+
+    kind: Literal["file"] = "file"
+    """What tells it from the scenarios of the generator."""
+    name: Name = "file"
+    """Name of the scenario, that of its file in configs/fire."""
+    path: Annotated[_Text, BeforeValidator(_given)]
+    """The file; a relative path is relative to the working directory."""
+    heldout: _Text | None = None
+    """A second file, of the fires to evaluate on; else every fifth fire of the file is held out."""
+    units: Units | None = None
+    """Of the numbers in the file, and of `start` and `end`."""
+    start: _Time | None = None
+    """Time of step 0, in `units`, or ISO text for calendar times; when the fire began if None."""
+    end: _Time | None = None
+    """Time of the last step, as `start`; the last arrival if None."""
+    minutes_per_step: Annotated[float, Field(gt=0, le=1e9)] | None = None
+    """In place of `end`: minutes of the fire per step of the episode."""
+    margin: Annotated[float, Field(ge=0, le=0.45)] | None = 0.1
+    """Part of the grid left free on each side of the burnt area; None takes the file's extent."""
+    ring_width: Annotated[float, Field(gt=0, le=30)] | None = 3.0
+    """Width of the burning edge at step 0, cells of a 30-cell side; None burns nothing out."""
+    crs: _Text | None = None
+    """Projection of a file that carries none, else the one to project it to."""
+    time_field: _Text | None = None
+    """Column of the perimeters' times; None looks for one that is known."""
+    layer: _Text | None = None
+    """Layer of a GeoPackage that has several."""
+    sha256: _Digest | None = None
+    """Of the file's content; a run fills it in when it begins, and then the file must be that."""
+    heldout_sha256: _Digest | None = None
+    """Of `heldout`, likewise."""
+    kept: Annotated[str | None, Field(exclude=True)] = dataclasses.field(
+        default=None, compare=False
+    )
+    """A run's own copy of the grids, known where a run folder is opened, never written."""
+
+    @model_validator(mode="after")
+    def _one_end(self) -> "FileFireConfig":
+        if self.end is not None and self.minutes_per_step is not None:
+            raise ValueError("end and minutes_per_step: give one of them")
+        return self
+
+
+def read_fires(config: FileFireConfig, grid: tuple[int, int], horizon: int) -> Tensor:
+    """The fires of `config.path` on a grid.
+
+    Args:
+        config: the scenario.
+        grid: (X, Y), each 8 to 256 cells.
+        horizon: steps of an episode.
+
+    Returns:
+        float32 [fires, X, Y], steps: 0 burns from the start, inf never burns.
+
+    Raises:
+        ValueError: one line that names the file and what is wrong with it.
+    """
+    check_grid(grid)
+    path = Path(config.path).expanduser()
+    try:
+        with quiet():
+            found = _gridded(path, config, grid, horizon)
+    except ValueError as error:
+        raise ValueError(f"{printable(str(path))}: {one_line(str(error))}") from None
+    except OSError as error:
+        reason = error.strerror or error
+        raise ValueError(f"{printable(str(path))}: cannot be read: {reason}") from None
+    except MemoryError:
+        raise ValueError(f"{printable(str(path))}: not enough memory to read it") from None
+    return torch.from_numpy(np.stack(found))
+
+
+def _gridded(
+    path: Path, config: FileFireConfig, grid: tuple[int, int], horizon: int
+) -> list[np.ndarray]:
+    """The fires in a file, [X, Y] each."""
+    kind = detect.find_format(path)
+    bank = read_npy if kind is detect.NUMPY else read_bands
+    if bank is read_bands and not (kind is detect.GEOTIFF and is_bank(path)):
+        return [on_grid(_single(path, kind, config), config, grid, horizon)]
+    found: list[np.ndarray] = []
+    for source in bank(path):
+        try:
+            found.append(on_grid(source, config, grid, horizon))
+        except ValueError as error:
+            raise ValueError(f"fire {len(found)}: {error}") from None
+    return found
+
+
+def _single(path: Path, kind: detect.Format, config: FileFireConfig) -> Source:
+    """The fire of a file that holds one."""
+    if kind is detect.GEOTIFF:
+        return read_geotiff(path, config.units, config.crs)
+    if kind is detect.ASCII:
+        return read_ascii(path, config.units, config.crs)
+    if kind is detect.POINTS:
+        return read_front_points(path, config.units or "steps")
+    return read_perimeters(path, config.units, config.crs, config.time_field, config.layer)
+
+
+def pinned(config: FileFireConfig) -> FileFireConfig:
+    """The scenario with the content of its files written down.
+
+    Raises:
+        ValueError: a file is missing, or is not the one that is written down.
+    """
+    return dataclasses.replace(
+        config,
+        sha256=_checked(config.path, config.sha256),
+        heldout_sha256=config.heldout and _checked(config.heldout, config.heldout_sha256),
+    )
+
+
+def _checked(file: str, expected: str | None) -> str:
+    path = Path(file).expanduser()
+    try:
+        found = detect.digest(path)
+    except ValueError as error:
+        raise ValueError(f"{printable(str(path))}: {error}") from None
+    if expected not in (None, found):
+        raise ValueError(
+            f"{printable(str(path))}: has changed: its content has sha256 {found[:12]}..., that of "
+            f"the run {str(expected)[:12]}..."
+        )
+    return found
+
+
+def splits(
+    config: FileFireConfig, grid: tuple[int, int], horizon: int
+) -> dict[Literal["train", "heldout"], Tensor]:
+    """The fires to train on and those to evaluate on, float32 [fires, X, Y] each.
+
+    Read from the run's own copy where there is one for this grid and horizon, else from the files.
+
+    Raises:
+        ValueError: one line that names the file and what is wrong with it.
+    """
+    stored = _read_kept(config, grid, horizon)
+    if stored is not None:
+        return stored
+    if config.sha256 is not None:
+        pinned(config)
+    fires = read_fires(config, grid, horizon)
+    if config.heldout is not None:
+        other = dataclasses.replace(config, path=config.heldout)
+        return {"train": fires, "heldout": read_fires(other, grid, horizon)}
+    held_out = _held_out(len(fires))
+    return {"train": fires[~held_out] if len(fires) > 1 else fires, "heldout": fires[held_out]}
+
+
+def _held_out(count: int) -> Tensor:
+    """Which of several fires are held out; a single one is used for both."""
+    numbers = torch.arange(count)
+    if count < _EVERY:
+        return numbers == count - 1
+    return numbers % _EVERY == _HELD_OUT
+
+
+def keep(config: FileFireConfig, folder: Path, grid: tuple[int, int], horizon: int) -> None:
+    """Writes the run's own copy of its grids, for which the files are not needed any more.
+
+    Raises:
+        ValueError: it cannot be written.
+    """
+    fires = splits(config, grid, horizon)
+    partial = folder / (KEPT + ".part")
+    try:
+        with partial.open("wb") as file:
+            np.savez_compressed(
+                file,
+                key=np.array(_key(config, grid, horizon)),
+                train=fires["train"].numpy(),
+                heldout=fires["heldout"].numpy(),
+            )
+        partial.replace(folder / KEPT)
+    except OSError as error:
+        raise ValueError(f"{folder / KEPT}: cannot be written: {error.strerror or error}") from None
+
+
+def _key(config: FileFireConfig, grid: tuple[int, int], horizon: int) -> str:
+    """A hash of everything that the grids depend on."""
+    values = {name: value for name, value in dataclasses.asdict(config).items() if name != "kept"}
+    parts = [READER_VERSION, values, *grid, horizon]
+    return hashlib.sha256(json.dumps(parts).encode()).hexdigest()
+
+
+def _read_kept(
+    config: FileFireConfig, grid: tuple[int, int], horizon: int
+) -> dict[Literal["train", "heldout"], Tensor] | None:
+    """The run's own copy, or None if there is none, or it is damaged or of another grid."""
+    if config.kept is None or config.sha256 is None or not Path(config.kept).is_file():
+        return None
+    try:
+        with np.load(config.kept, allow_pickle=False) as found:
+            if str(found["key"]) != _key(config, grid, horizon):
+                return None
+            fires = found["train"], found["heldout"]
+    except Exception:  # numpy and zipfile raise what they like on a damaged file
+        return None
+    for one in fires:
+        fits = one.ndim == 3 and one.shape[1:] == tuple(grid) and len(one) > 0
+        if not fits or one.dtype != np.float32 or not (one >= 0).all():
+            return None
+    return {"train": torch.from_numpy(fires[0]), "heldout": torch.from_numpy(fires[1])}

@@ -1,0 +1,162 @@
+"""Pictures of an episode in the paper's colours (section IV.A)."""
+
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw
+
+from emberlink.envs.world.sensor import view_radius
+
+NO_FIRE = (0, 0, 0)
+FIRE = (255, 255, 255)
+FIELD_OF_VIEW = (255, 255, 0)
+UAV = (0, 0, 255)
+MAX_COLOURS = 256
+"""that a GIF can hold"""
+
+
+class Chart:
+    """The map as a picture to draw on: no fire black, fire white, field of view yellow.
+
+    Args:
+        fire_map: [X, Y], 0 where nothing burns, 1 fire that was seen, 2 fire that was not.
+        position: [n, 3], cells.
+        view_angle: half the opening angle of the cameras, degrees.
+        scale: pixels per cell.
+        seen_fire: the colour of fire that was seen.
+    """
+
+    def __init__(
+        self,
+        fire_map: NDArray[np.uint8],
+        position: NDArray[np.float32],
+        *,
+        view_angle: float,
+        scale: int,
+        seen_fire: tuple[int, int, int] = FIRE,
+    ):
+        self.scale = scale
+        self._rows = fire_map.shape[1]
+        self.image = Image.new("RGB", (fire_map.shape[0] * scale, self._rows * scale), NO_FIRE)
+        self.draw = ImageDraw.Draw(self.image)
+        views = [self.square(x, y, view_radius(z, view_angle)) for x, y, z in position.tolist()]
+        for box in views:
+            self.draw.rectangle(box, fill=FIELD_OF_VIEW)
+        for value, colour in ((1, seen_fire), (2, FIRE)):
+            cells = Image.fromarray(np.uint8(255) * (fire_map.T[::-1] == value))
+            mask = cells.resize(self.image.size, Image.Resampling.NEAREST)
+            self.image.paste(colour, mask=mask)
+        line = max(2, scale // 6)
+        for left, top, right, bottom in views:
+            # The black line shows the edge where yellow alone would not, over fire and other views.
+            self.draw.rectangle((left - 1, top - 1, right + 1, bottom + 1), outline=NO_FIRE)
+            self.draw.rectangle((left, top, right, bottom), outline=FIELD_OF_VIEW, width=line)
+
+    def point(self, x: float, y: float) -> tuple[float, float]:
+        """The pixel at a place in cells; x grows to the right and y upwards."""
+        return (x + 0.5) * self.scale, (self._rows - 0.5 - y) * self.scale
+
+    def square(self, x: float, y: float, half: float) -> tuple[float, float, float, float]:
+        """The box of pixels around a place, `half` cells to each side; a pixel at least."""
+        (across, down), reach = self.point(x, y), max(half * self.scale, 0.5)
+        return across - reach, down - reach, across + reach - 1, down + reach - 1
+
+    def uav(self, x: float, y: float) -> None:
+        """A blue disc."""
+        self.draw.ellipse(self.square(x, y, max(0.45, 4 / self.scale)), fill=UAV)
+
+
+def frame(
+    fire_map: NDArray[np.uint8],
+    position: NDArray[np.float32],
+    *,
+    view_angle: float,
+    size: int = 360,
+) -> NDArray[np.uint8]:
+    """One picture: no fire black, fire white, field of view yellow, UAV blue.
+
+    Args:
+        fire_map: [X, Y], 0 where nothing burns.
+        position: [n, 3], cells.
+        view_angle: half the opening angle of the cameras, degrees.
+        size: about how many pixels the longer side of the grid gets.
+
+    Returns:
+        uint8 [Y * scale, X * scale, 3]; x grows to the right and y upwards.
+    """
+    scale = max(2, size // max(fire_map.shape))
+    chart = Chart(fire_map, position, view_angle=view_angle, scale=scale)
+    for x, y, _ in position.tolist():
+        chart.uav(x, y)
+    return np.asarray(chart.image)
+
+
+def write_gif(path: Path, frames: Iterable[NDArray[np.uint8]], *, fps: int = 20) -> None:
+    """Writes frames, uint8 [height, width, 3] each, as an animation that repeats.
+
+    Raises:
+        ValueError: there is no frame.
+    """
+    images = [Image.fromarray(picture).quantize(MAX_COLOURS) for picture in frames]
+    if not images:
+        raise ValueError(f"{path}: an animation needs at least one frame")
+    images = _one_palette(images)
+    duration = round(1000 / fps)
+    images[0].save(
+        path,
+        "GIF",
+        save_all=True,
+        append_images=images[1:],
+        duration=duration,
+        loop=0,
+        optimize=False,
+    )
+
+
+def _one_palette(images: list[Image.Image]) -> list[Image.Image]:
+    """The same pictures with one palette for all, where their colours fit into one.
+
+    What does not change from one to the next then costs next to nothing.
+    """
+    colours: dict[bytes, int] = {}
+    tables: list[list[int]] = []
+    for image in images:
+        palette = bytes(image.getpalette() or ())
+        entries = (palette[i : i + 3] for i in range(0, len(palette), 3))
+        tables.append([colours.setdefault(entry, len(colours)) for entry in entries])
+    # One place is left for what stays as it was.
+    if len(colours) >= MAX_COLOURS:
+        return images
+    shared = []
+    for image, table in zip(images, tables, strict=True):
+        numbers = np.array(table, np.uint8)[np.asarray(image)]
+        renumbered = Image.fromarray(numbers, "P")
+        renumbered.putpalette(b"".join(colours))
+        shared.append(renumbered)
+    return shared
+
+
+class Window:
+    """A window that shows pictures; it stays invisible where matplotlib has no screen."""
+
+    def __init__(self, title: str):
+        from matplotlib import pyplot  # imported here: only a window needs it
+
+        self._pyplot = pyplot
+        self._figure = pyplot.figure(num=title)
+        self._image = None
+
+    def show(self, picture: NDArray[np.uint8]) -> None:
+        """Shows a picture, uint8 [height, width, 3], in place of the last one."""
+        if self._image is None:
+            axes = self._figure.add_axes((0, 0, 1, 1), frame_on=False, xticks=[], yticks=[])
+            self._image = axes.imshow(picture)
+            self._figure.show(warn=False)
+        self._image.set_data(picture)
+        self._figure.canvas.draw_idle()
+        self._figure.canvas.flush_events()
+
+    def close(self) -> None:
+        self._pyplot.close(self._figure)

@@ -1,0 +1,194 @@
+"""Episodes side by side: a titled panel for each, and a legend of the marks that occur."""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw, ImageFont
+
+from . import marks
+from .frame import FIELD_OF_VIEW, FIRE, NO_FIRE, Chart
+from .marks import ROLE_COLOURS, ROLES, TARGET, Moment
+
+SEEN_FIRE = (140, 140, 140)
+"""of fire that was seen, where it is told apart (paper, figure 2)"""
+PAPER = (40, 40, 44)
+INK = (240, 240, 240)
+GAP = 10
+LINE = 20
+HEADER = 2 * LINE + 4
+NARROWEST = 250
+"""pixels that a panel's title needs"""
+_TEXT = 15
+_SAMPLE = 30  # width of what stands before a word of the legend
+
+Sample = Callable[[ImageDraw.ImageDraw, float, float], None]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Episode:
+    """What one panel shows."""
+
+    title: str
+    view_angle: float
+    """half the opening angle of the cameras, degrees"""
+    moments: Sequence[Moment]
+
+
+class Screen:
+    """Draws the same moment of several episodes into one picture.
+
+    Args:
+        episodes: on grids of the same size, as many moments each.
+        size: about how many pixels the longer side of a map gets.
+        tell_seen: whether fire that was seen is grey.
+    """
+
+    def __init__(self, episodes: Sequence[Episode], *, size: int, tell_seen: bool = False):
+        self._episodes, self._tell_seen = episodes, tell_seen
+        grid = episodes[0].moments[0].fire_map.shape
+        self.scale = scale_of(grid, size)
+        self.map_size = grid[0] * self.scale, grid[1] * self.scale
+        self._font = ImageFont.load_default(_TEXT)
+        panel = max(self.map_size[0], NARROWEST) + GAP, self.map_size[1] + HEADER + GAP
+        columns = _columns(len(episodes), *panel)
+        rows = math.ceil(len(episodes) / columns)
+        self._corners = [
+            (GAP + i % columns * panel[0], GAP + i // columns * panel[1])
+            for i in range(len(episodes))
+        ]
+        self.width = _even(columns * panel[0] + GAP)
+        top = rows * panel[1] + GAP
+        legend = list(self._legend())
+        places, used = self._wrap([word for word, _ in legend])
+        self.height = _even(top + used + GAP)
+        self._blank = Image.new("RGB", (self.width, self.height), PAPER)
+        draw = ImageDraw.Draw(self._blank)
+        for (x, y), (word, sample) in zip(places, legend, strict=True):
+            sample(draw, x + 10, top + y + LINE / 2)
+            self._write(draw, x + _SAMPLE, top + y, word)
+        for (x, y), episode in zip(self._corners, episodes, strict=True):
+            self._write(draw, x, y, self._cut(episode.title, panel[0] - GAP))
+
+    def map_corner(self, panel: int) -> tuple[int, int]:
+        """The left and upper pixel of a panel's map."""
+        x, y = self._corners[panel]
+        return x, y + HEADER
+
+    def picture(self, index: int) -> NDArray[np.uint8]:
+        """Moment `index` of all episodes, uint8 [height, width, 3], both sides even."""
+        image = self._blank.copy()
+        draw = ImageDraw.Draw(image)
+        for panel, episode in enumerate(self._episodes):
+            moment = episode.moments[index]
+            chart = Chart(
+                moment.fire_map,
+                moment.position,
+                view_angle=episode.view_angle,
+                scale=self.scale,
+                seen_fire=SEEN_FIRE if self._tell_seen else FIRE,
+            )
+            marks.mark(chart, moment)
+            image.paste(chart.image, self.map_corner(panel))
+            x, y = self._corners[panel]
+            text = f"step {moment.step}   coverage {moment.coverage:.1f} %"
+            self._write(draw, x, y + LINE, text)
+        return np.asarray(image)
+
+    def _write(self, draw: ImageDraw.ImageDraw, x: float, y: float, text: str) -> None:
+        draw.text((x, y + LINE / 2), text, fill=INK, font=self._font, anchor="lm")
+
+    def _cut(self, text: str, width: float) -> str:
+        """The text, or as much of its beginning as fits."""
+        if self._font.getlength(text) <= width:
+            return text
+        while text and self._font.getlength(text + "…") > width:
+            text = text[:-1]
+        return text + "…"
+
+    def _wrap(self, words: Sequence[str]) -> tuple[list[tuple[float, float]], int]:
+        """Where each word of the legend goes, and the height that all need."""
+        places: list[tuple[float, float]] = []
+        x, y = GAP, 0
+        for word in words:
+            width = _SAMPLE + math.ceil(self._font.getlength(word)) + 2 * GAP
+            if x > GAP and x + width > self.width + GAP:
+                x, y = GAP, y + LINE
+            places.append((x, y))
+            x += width
+        return places, y + LINE
+
+    def _legend(self) -> Sequence[tuple[str, Sample]]:
+        """A word and a sample for each mark that occurs."""
+
+        def occurs(name: str) -> list[bool]:
+            return [getattr(e.moments[0], name) is not None for e in self._episodes]
+
+        half = marks.mark_size(self.scale)
+        shown: list[tuple[str, Sample]] = []
+        if self._tell_seen:
+            shown += [("fire", _box(FIRE)), ("fire, seen", _box(SEEN_FIRE))]
+        else:
+            shown += [("fire", _box(FIRE))]
+        shown += [("field of view", _box(FIELD_OF_VIEW))]
+        roles, links, target = occurs("roles"), occurs("links"), occurs("target")
+        if not all(roles):
+            shown.append(("UAV", _uav(half, None)))
+        if any(roles):
+            shown += [(name, _uav(half, role)) for role, name in enumerate(ROLES)]
+        if any(links):
+            shown.append(("hear each other", _link))
+        if any(target):
+            shown.append(("target", _cross(ROLE_COLOURS[0] if any(roles) else TARGET)))
+        return shown
+
+
+def scale_of(grid: Sequence[int], size: int) -> int:
+    """Pixels per cell: `size` for the longer side; up to twice that for a map that is narrow."""
+    longer, shorter = max(grid), min(grid)
+    wide = min(2 * size // longer, math.ceil(size / 4 / shorter))
+    return max(2, size // longer, wide)
+
+
+def _columns(count: int, width: int, height: int) -> int:
+    """In how many columns as many panels fit into the smallest square."""
+
+    def side(columns: int) -> int:
+        return max(columns * width, math.ceil(count / columns) * height)
+
+    return min(range(1, count + 1), key=lambda columns: (side(columns), -columns))
+
+
+def _even(pixels: int) -> int:
+    return pixels + pixels % 2
+
+
+def _box(colour: tuple[int, int, int]) -> Sample:
+    def sample(draw: ImageDraw.ImageDraw, x: float, y: float) -> None:
+        draw.rectangle((x - 8, y - 6, x + 8, y + 6), fill=colour, outline=NO_FIRE)
+
+    return sample
+
+
+def _uav(half: float, role: int | None) -> Sample:
+    def sample(draw: Any, x: float, y: float) -> None:
+        draw.rectangle((x - 9, y - 9, x + 9, y + 9), fill=FIELD_OF_VIEW)
+        marks.uav(draw, (x, y), half, role)
+
+    return sample
+
+
+def _link(draw: ImageDraw.ImageDraw, x: float, y: float) -> None:
+    for colour, width in marks.LINK_WIDTHS.items():
+        draw.line((x - 8, y, x + 10, y), fill=colour, width=width)
+
+
+def _cross(colour: tuple[int, int, int]) -> Sample:
+    def sample(draw: Any, x: float, y: float) -> None:
+        marks.dashes(draw, (x - 8, y), (x + 5, y), colour)
+        marks.cross(draw, (x + 5, y), 4, colour)
+
+    return sample

@@ -1,0 +1,195 @@
+"""Scenarios of either kind, made by the generator or read from files, behind one interface."""
+
+import dataclasses
+from pathlib import Path
+from typing import Annotated, Any, Protocol
+
+import torch
+from pydantic import Discriminator, Tag
+from torch import Tensor
+
+from emberlink.envs.fire.cache import fire_bank
+from emberlink.envs.fire.generator import FireConfig, fire_seeds, load_scenario, make_fires
+from emberlink.envs.fire_files import reader
+from emberlink.envs.fire_files.reader import FileFireConfig
+from emberlink.envs.utils.validation import TAG
+
+from .config import WildfireConfig
+
+Grid = tuple[int, int]
+
+
+class Fires(Protocol):
+    """The fires of a scenario."""
+
+    def train(self, grid: Grid, horizon: int) -> Tensor:
+        """Those to train on: arrival times in steps, float32 [fires, X, Y]."""
+        ...
+
+    def heldout(self, count: int, grid: Grid, horizon: int) -> Tensor:
+        """The first held-out ones, float32 [count, X, Y]; where there are fewer, they repeat."""
+        ...
+
+    def one_heldout(self, index: int, grid: Grid, horizon: int) -> Tensor:
+        """One of them, float32 [1, X, Y]."""
+        ...
+
+    def about(self, count: int) -> dict[str, Any]:
+        """What tells the first held-out fires from any others, plain values."""
+        ...
+
+    def pinned(self) -> "ScenarioConfig":
+        """The scenario with the content of its files written down."""
+        ...
+
+    def kept(self, folder: Path, grid: Grid, horizon: int) -> "ScenarioConfig":
+        """The scenario of a run folder, where a copy of what is read is put."""
+        ...
+
+    def opened(self, folder: Path) -> "ScenarioConfig":
+        """The scenario of a run folder, with its copy of what was read."""
+        ...
+
+
+@dataclasses.dataclass(frozen=True)
+class Generated:
+    """Fires from seeds."""
+
+    config: FireConfig
+
+    def train(self, grid: Grid, horizon: int) -> Tensor:
+        """See `Fires`."""
+        return fire_bank(self.config, "train", self.config.bank, grid, horizon)
+
+    def heldout(self, count: int, grid: Grid, horizon: int) -> Tensor:
+        """See `Fires`."""
+        return fire_bank(self.config, "heldout", count, grid, horizon)
+
+    def one_heldout(self, index: int, grid: Grid, horizon: int) -> Tensor:
+        """See `Fires`."""
+        return make_fires(self.config, fire_seeds("heldout", index + 1)[index:], grid, horizon)
+
+    def about(self, count: int) -> dict[str, Any]:
+        """Their seeds."""
+        seeds = fire_seeds("heldout", count).tolist()
+        # Not what is as by default: a field that is new makes no other fires of the old ones.
+        scenario = {
+            field.name: getattr(self.config, field.name)
+            for field in dataclasses.fields(self.config)
+            if getattr(self.config, field.name) != field.default
+        }
+        return {"fire_seeds": seeds, "scenario": scenario}
+
+    def pinned(self) -> "ScenarioConfig":
+        """Nothing is to be written down."""
+        return self.config
+
+    def kept(self, folder: Path, grid: Grid, horizon: int) -> "ScenarioConfig":
+        """Nothing is to be kept."""
+        return self.config
+
+    def opened(self, folder: Path) -> "ScenarioConfig":
+        """Nothing was kept."""
+        return self.config
+
+
+@dataclasses.dataclass(frozen=True)
+class FromFile:
+    """Fires of files."""
+
+    config: FileFireConfig
+
+    def train(self, grid: Grid, horizon: int) -> Tensor:
+        """See `Fires`."""
+        return reader.splits(self.config, grid, horizon)["train"]
+
+    def heldout(self, count: int, grid: Grid, horizon: int) -> Tensor:
+        """See `Fires`."""
+        fires = reader.splits(self.config, grid, horizon)["heldout"]
+        return fires[torch.arange(count) % len(fires)]
+
+    def one_heldout(self, index: int, grid: Grid, horizon: int) -> Tensor:
+        """See `Fires`."""
+        return self.heldout(index + 1, grid, horizon)[index:]
+
+    def about(self, count: int) -> dict[str, Any]:
+        """How many, and of which content."""
+        values = {k: v for k, v in dataclasses.asdict(self.config).items() if k != "kept"}
+        return {"fires": count, "scenario": values}
+
+    def pinned(self) -> "ScenarioConfig":
+        """See `Fires`."""
+        return reader.pinned(self.config)
+
+    def kept(self, folder: Path, grid: Grid, horizon: int) -> "ScenarioConfig":
+        """See `Fires`."""
+        reader.keep(self.config, folder, grid, horizon)
+        return self.opened(folder)
+
+    def opened(self, folder: Path) -> "ScenarioConfig":
+        """See `Fires`."""
+        return dataclasses.replace(self.config, kept=str(folder / reader.KEPT))
+
+
+_KINDS: dict[type, Any] = {FireConfig: Generated, FileFireConfig: FromFile}
+
+
+def _kind(value: Any) -> str:
+    """The tag of a scenario; one without a `kind` is of the generator, as it always was."""
+    kind = value.get("kind") if isinstance(value, dict) else getattr(value, "kind", None)
+    return f"{TAG}file" if kind == "file" else f"{TAG}spread"
+
+
+ScenarioConfig = FireConfig | FileFireConfig
+Scenario = Annotated[
+    Annotated[FireConfig, Tag(f"{TAG}spread")] | Annotated[FileFireConfig, Tag(f"{TAG}file")],
+    Discriminator(_kind),
+]
+"""a scenario as a field of a configuration"""
+
+
+def fires_of(scenario: ScenarioConfig) -> Fires:
+    """The fires of a scenario of either kind."""
+    return _KINDS[type(scenario)](scenario)
+
+
+def arrival_times(
+    fire: str | ScenarioConfig | Tensor, config: WildfireConfig, num_envs: int
+) -> tuple[Tensor, bool]:
+    """The fires that a `WildfireEnv` is given, whatever form they are given in.
+
+    Args:
+        fire: a scenario's name, a config, or arrival times.
+        config: of the environment.
+        num_envs: environments.
+
+    Returns:
+        Arrival times, float32 [fires, X, Y], and whether environment i always has fire i, or the
+        only one.
+
+    Raises:
+        ValueError: an unknown scenario, a file that cannot be read, or arrival times whose shape
+            or values do not fit.
+    """
+    if isinstance(fire, str):
+        fire = load_scenario(fire)
+    if isinstance(fire, ScenarioConfig):
+        return fires_of(fire).train(config.grid, config.horizon), False
+    # A copy, in order in memory: what the caller does to theirs later is not our fire.
+    try:
+        bank = torch.as_tensor(fire, dtype=torch.float32)
+    except (TypeError, ValueError, RuntimeError):
+        raise ValueError(
+            f"fire: a scenario's name, a FireConfig or arrival times, not {type(fire).__name__}"
+        ) from None
+    bank = bank.clone(memory_format=torch.contiguous_format)
+    shape = list(bank.shape)
+    bank = bank.unsqueeze(0) if bank.ndim == 2 else bank
+    if bank.shape not in ((1, *config.grid), (num_envs, *config.grid)):
+        raise ValueError(
+            f"fire: arrival times of shape {shape}; expected {list(config.grid)} or "
+            f"{[num_envs, *config.grid]} (the grid of the config, num_envs={num_envs})"
+        )
+    if bank.isnan().any():
+        raise ValueError("fire: arrival times hold NaN; a cell that never burns is inf")
+    return bank, True

@@ -1,0 +1,146 @@
+"""The command line of `emberlink fire`: preview, make, import."""
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from .parser import command, positive
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+_KEYS = "keys of setup, env. and fire., as for train, such as setup=tuned, env.grid=[60,60]"
+
+
+def add_fire(commands: Any) -> None:
+    """Adds the group of commands."""
+    group = command(
+        commands,
+        "fire",
+        lambda options, console: _help(group),
+        "look at fires, write them to files, read them from files",
+        "Draws a fire and says whether UAVs can keep up with it, writes generated fires to a file "
+        "for use elsewhere, and turns files of fires into one.",
+        "emberlink fire preview huygens:3",
+    )
+    actions = group.add_subparsers(dest="action", metavar="ACTION")
+    _add_preview(actions)
+    _add_make(actions)
+    _add_import(actions)
+
+
+def _help(group: argparse.ArgumentParser) -> int:
+    group.print_help()
+    return 0
+
+
+def _add_preview(actions: Any) -> None:
+    preview = command(
+        actions,
+        "preview",
+        _preview,
+        "draw a fire and say whether UAVs can keep up",
+        "Draws a fire's times of arrival with contours and prints how many cells burn, how fast "
+        "that grows, and whether the setup's UAVs can keep up with it. The picture gets a name "
+        "that is free.",
+        "emberlink fire preview ArrivalTime.asc fire.units=minutes env.grid=[40,40] setup=tuned",
+    )
+    preview.add_argument(
+        "source",
+        metavar="SOURCE",
+        help="a scenario (huygens, or huygens:3 for its held-out fire 3) or a file "
+        "(or bank.tif:3 for fire 3 in it)",
+    )
+    preview.add_argument("overrides", metavar="key=value", nargs="*", help=_KEYS)
+    preview.add_argument(
+        "--output", metavar="PATH", type=Path, help="a folder, or a new file that ends in .png"
+    )
+    preview.set_defaults(command="fire preview")
+
+
+def _add_make(actions: Any) -> None:
+    make = command(
+        actions,
+        "make",
+        _make,
+        "write generated fires to a GeoTIFF or NumPy file",
+        "Makes fires of a scenario and writes their times of arrival, in steps, to a new file: a "
+        "GeoTIFF with a band per fire, or NumPy [fires, x, y] with a .json beside it.",
+        "emberlink fire make huygens --count 64 --split heldout --output fires.tif "
+        "env.grid=[60,60]",
+    )
+    make.add_argument("scenario", metavar="SCENARIO", help="a file in configs/fire: huygens, ...")
+    make.add_argument("overrides", metavar="key=value", nargs="*", help=_KEYS)
+    make.add_argument(
+        "--count",
+        metavar="N",
+        type=positive,
+        help="fires; as many as are trained on or evaluated with if left out",
+    )
+    make.add_argument(
+        "--split",
+        choices=("train", "heldout"),
+        default="train",
+        help="fires to train on (default), or those that evaluations are made with",
+    )
+    make.add_argument(
+        "--output",
+        metavar="FILE",
+        type=Path,
+        help="a new file that ends in .npy, .tif or .tiff; SCENARIO_SPLIT_N.npy if left out",
+    )
+    make.set_defaults(command="fire make")
+
+
+def _add_import(actions: Any) -> None:
+    imported = command(
+        actions,
+        "import",
+        _import,
+        "turn files of fires into one that trains quickly",
+        "Reads rasters, perimeters, the paper's text or banks and writes the fires on the grid of "
+        "the configuration, in steps, to a new file for fire=file fire.path=BANK.",
+        "emberlink fire import ArrivalTime.asc fire.units=minutes --output fires.npy",
+    )
+    imported.add_argument(
+        "arguments",
+        metavar="FILE | key=value",
+        nargs="+",
+        help="files, a fire or more each; " + _KEYS,
+    )
+    imported.add_argument(
+        "--output",
+        metavar="BANK",
+        type=Path,
+        required=True,
+        help="a new file that ends in .npy, .tif or .tiff",
+    )
+    imported.set_defaults(command="fire import")
+
+
+# The commands import what they need when they run: `emberlink --help` need not wait for torch.
+
+
+def _preview(options: argparse.Namespace, console: "Console") -> int:
+    from emberlink.trainers.fires.preview import preview
+
+    return preview(options.source, options.overrides, console, options.output)
+
+
+def _make(options: argparse.Namespace, console: "Console") -> int:
+    from emberlink.trainers.fires.banks import make
+
+    return make(
+        options.scenario,
+        options.overrides,
+        console,
+        count=options.count,
+        split=options.split,
+        output=options.output,
+    )
+
+
+def _import(options: argparse.Namespace, console: "Console") -> int:
+    from emberlink.trainers.fires.banks import import_files
+
+    return import_files(options.arguments, console, options.output)

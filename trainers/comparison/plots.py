@@ -1,0 +1,172 @@
+"""The paper's figures 5 to 9 for several methods and seeds."""
+
+import textwrap
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import MaxNLocator, StrMethodFormatter
+
+from emberlink.trainers.evaluation.results import CURVES
+
+from .rankings import Curve, Numbers
+
+FIGURES = {
+    5: (("score",), "Averaged rewards collected by all UAVs at each episode."),
+    6: (("coverage",), "The share of the fire region that was seen, of all that burns."),
+    7: (
+        ("tracking_first", "tracking_last"),
+        "The fastest (solid) and slowest (dotted) time taken by the UAVs to track the fire.",
+    ),
+    8: (("boundary_exits",), "Attempted moves out of the box, mean over UAVs."),
+    9: (("fire_exits",), "Times a UAV fell out of the fire region, mean over UAVs."),
+}
+"""the paper's number -> a measure per panel, and what it shows"""
+COLOURS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#D55E00", "#56B4E9", "#8C6D00", "#000000")
+"""of methods; told apart by the colour-blind (Okabe and Ito, 2008; a dark yellow in place of the
+yellow that white paper hides)"""
+DASHES = (
+    *((0, (7, 3)), (0, (7, 2, 1, 2)), (0, (3, 2)), (0, (7, 2, 1, 2, 1, 2)), (0, (12, 4))),
+    *((0, (3, 2, 1, 2)), (0, (12, 2, 3, 2)), (0, (1, 1))),
+)
+"""of scripted policies"""
+FROZEN = ("coverage", "tracking_first", "tracking_last", "boundary_exits")
+"""measures of the figure of frozen policies; its rows are ranked by the first"""
+LOGARITHMIC = {"tracking_first": 1.0, "boundary_exits": 0.1}
+"""measures of that figure whose axis is logarithmic -> below which number it is linear"""
+DOTTED = "tracking_last"
+"""drawn dotted, as in the paper's figure 7"""
+
+
+def figure(path: Path, numbers: Numbers, measures: tuple[str, ...]) -> None:
+    """One of the paper's figures: over training, a line per method and a band over its seeds.
+
+    Args:
+        path: a .png file.
+        numbers: of a setup.
+        measures: a panel each.
+    """
+    figure = Figure(figsize=(9.2, 3.8), layout="constrained")
+    colours = _colours(numbers)
+    policies = _policies(numbers)
+    panels = figure.subplots(1, len(measures), squeeze=False)[0]
+    for axes, measure in zip(panels, measures, strict=True):
+        _scripted_lines(axes, numbers, measure, policies, colours)
+        _curves(axes, numbers.curves[measure], measure, colours)
+        axes.set(xlabel="episode of training", ylabel=CURVES[measure])
+        axes.xaxis.set_major_locator(MaxNLocator(nbins=6, integer=True))
+        axes.grid(alpha=0.3)
+    _legend(figure, colours, policies)
+    figure.savefig(path, dpi=120, metadata={"Software": None})
+
+
+def frozen(path: Path, numbers: Numbers, fire: str) -> None:
+    """Frozen policies on one evaluation fire: a row per method, a panel per measure.
+
+    Args:
+        path: a .png file.
+        numbers: of a setup.
+        fire: one of `numbers.fires`.
+    """
+    rankings = {one.measure: one for one in numbers.fires[fire]}
+    order = [row.method for row in rankings[FROZEN[0]].rows][::-1]
+    colours = _colours(numbers)
+    policies = _policies(numbers)
+    names = [textwrap.fill(name, 34, break_on_hyphens=False) for name in order]
+    tall = sum(0.14 + 0.2 * (1 + name.count("\n")) for name in names)
+    figure = Figure(figsize=(3.4 * len(FROZEN), 1.5 + max(tall, 1.4)), layout="constrained")
+    panels = figure.subplots(1, len(FROZEN), sharey=True)
+    for axes, measure in zip(panels, FROZEN, strict=True):
+        ranking = rankings[measure]
+        for row in ranking.rows:
+            y, colour = order.index(row.method), colours.get(row.method, "0.45")
+            axes.plot(row.values, [y] * len(row.values), "o", ms=3, color=colour, alpha=0.5)
+            axes.plot([row.iqm], [y], "o", ms=6, color=colour)
+            if row.interval is not None:
+                axes.plot(row.interval, [y, y], "|-", lw=2, ms=9, mew=1.5, color=colour)
+        for policy, each in ranking.scripted.items():
+            for one in each:
+                dash = policies[policy]
+                for low, high in _stretches([order.index(name) for name in one.methods or order]):
+                    ends = [low - 0.5, high + 0.5]
+                    axes.plot([one.value] * 2, ends, color="0.3", ls=dash, lw=1.3, zorder=1)
+        if measure in LOGARITHMIC:
+            axes.set_xscale("symlog", linthresh=LOGARITHMIC[measure])
+            axes.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+            axes.set_xlim(left=0)
+        better = "more" if ranking.higher_is_better else "less"
+        axes.set(xlabel=f"{CURVES[measure]}\n({better} is better)")
+        axes.set_ylim(-0.5, len(order) - 0.5)
+        axes.grid(alpha=0.3, axis="x")
+    panels[0].set_yticks(range(len(order)), names, parse_math=False)
+    _legend(figure, {}, policies)
+    figure.savefig(path, dpi=120, metadata={"Software": None})
+
+
+def _stretches(places: Sequence[int]) -> Iterator[tuple[int, int]]:
+    """First and last of each stretch of rows that lie next to each other."""
+    ordered = sorted(places)
+    starts = [i for i in ordered if i - 1 not in ordered]
+    ends = [i for i in ordered if i + 1 not in ordered]
+    yield from zip(starts, ends, strict=True)
+
+
+def _colours(numbers: Numbers) -> dict[str, str]:
+    groups = enumerate(numbers.section.as_trained)
+    return {group.label: COLOURS[i % len(COLOURS)] for i, group in groups}
+
+
+def _legend(
+    figure: Figure,
+    colours: Mapping[str, str],
+    policies: Mapping[str, tuple[int, tuple[int, ...]]],
+) -> None:
+    handles = [Line2D([], [], color=colour, lw=2, label=name) for name, colour in colours.items()]
+    handles += [
+        Line2D([], [], color="0.3", ls=dash, lw=1.3, label=f"scripted: {name.replace('_', ' ')}")
+        for name, dash in policies.items()
+    ]
+    if not handles:
+        return
+    legend = figure.legend(
+        handles=handles, loc="outside right upper", frameon=False, handlelength=3
+    )
+    for text in legend.get_texts():  # a name is no formula
+        text.set_parse_math(False)
+
+
+def _curves(
+    axes: Axes, curves: Mapping[str, Curve], measure: str, colours: Mapping[str, str]
+) -> None:
+    for label, curve in curves.items():
+        episodes = range(1, len(curve.iqm) + 1)
+        colour, style = colours[label], ":" if measure == DOTTED else "-"
+        marker = "o" if len(episodes) == 1 else ""
+        axes.plot(episodes, curve.iqm, color=colour, ls=style, lw=2, marker=marker)
+        if curve.low is not None and curve.high is not None:
+            axes.fill_between(episodes, curve.low, curve.high, color=colour, alpha=0.18, lw=0)
+
+
+def _policies(numbers: Numbers) -> dict[str, tuple[int, tuple[int, ...]]]:
+    """The scripted policies and their dashes."""
+    names = sorted({policy for one in numbers.on_trained for policy in one.scripted})
+    return {name: DASHES[i % len(DASHES)] for i, name in enumerate(names)}
+
+
+def _scripted_lines(
+    axes: Axes,
+    numbers: Numbers,
+    measure: str,
+    policies: Mapping[str, tuple[int, tuple[int, ...]]],
+    colours: Mapping[str, str],
+) -> None:
+    """A line per scripted policy; where its number is one method's own, in that method's colour."""
+    for ranking in (one for one in numbers.on_trained if one.measure == measure):
+        for policy, each in ranking.scripted.items():
+            for one in each:
+                shown = [name for name in one.methods if name in colours]
+                if shown or not one.methods:
+                    colour = colours[shown[0]] if len(shown) == 1 else "0.3"
+                    axes.axhline(one.value, color=colour, ls=policies[policy], lw=1.3, zorder=1)

@@ -1,0 +1,206 @@
+"""The schema of a run's configuration."""
+
+from collections.abc import Mapping
+from dataclasses import asdict, fields
+from typing import Annotated, Any, Literal
+
+import torch
+from pydantic import (
+    ConfigDict,
+    Field,
+    Strict,
+    field_validator,
+    model_validator,
+)
+from pydantic.dataclasses import dataclass
+
+from emberlink.comm import registry
+from emberlink.envs.config import WildfireConfig
+from emberlink.envs.scenarios import Scenario
+from emberlink.envs.utils.validation import Name, from_plain, shown
+
+_STRICT = ConfigDict(extra="forbid", strict=True)
+
+
+NOT_LEARNT_WITH = (
+    *("device", "logger", "on_nan"),
+    *("checkpoint_interval", "checkpoint_steps", "keep"),
+)
+"""keys that change nothing of what is learnt, so that runs that differ in them are the same"""
+
+
+Positive = Annotated[float, Field(gt=0, le=1e30)]
+
+
+NotNegative = Annotated[float, Field(ge=0, le=1e30)]
+
+
+Count = Annotated[int, Field(ge=1, le=1_000_000_000)]
+
+
+Units = Annotated[int, Field(ge=1, le=8192)]
+
+
+Side = Annotated[int, Field(ge=1, le=65_536)]
+
+
+MaybeCount = Annotated[int, Field(ge=0)]
+
+
+Seed = Annotated[int, Field(ge=0, lt=2**31)]
+
+
+@dataclass(frozen=True, kw_only=True, config=_STRICT)
+class LearnerConfig:
+    """DDPG for every UAV (paper, section III.C)."""
+
+    hidden: Annotated[tuple[Units, Units], Strict(False)]
+    """units of the two hidden layers"""
+    gamma: Annotated[float, Field(ge=0, lt=1)]
+    """discount per step"""
+    actor_lr: Positive
+    """Adam's learning rate of the actors"""
+    critic_lr: Positive
+    """Adam's learning rate of the critics"""
+    critic_weight_decay: NotNegative
+    """L2 penalty in the critics' Adam"""
+    tau: Annotated[float, Field(gt=0, le=0.5)]
+    """share of the networks in their targets per update"""
+    updates: Count
+    """updates of every UAV's networks per step of all environments side by side"""
+    batch: Annotated[int, Field(ge=1, le=1_000_000)]
+    """transitions per UAV and update"""
+    capacity: Count
+    """transitions that a replay memory holds"""
+
+    @model_validator(mode="after")
+    def _a_batch_fits(self) -> "LearnerConfig":
+        if self.batch > self.capacity:
+            raise ValueError(f"batch={self.batch} is more than capacity={self.capacity} holds")
+        return self
+
+
+@dataclass(frozen=True, kw_only=True, config=_STRICT)
+class ExplorationConfig:
+    """Ornstein-Uhlenbeck noise: x += theta * (0 - x) * dt + sigma * sqrt(dt) * N(0, 1)."""
+
+    theta: NotNegative
+    """pull towards 0"""
+    sigma: NotNegative
+    """strength of the noise"""
+    dt: Positive
+    """length of a step"""
+
+
+@dataclass(frozen=True, kw_only=True, config=_STRICT)
+class EvaluationConfig:
+    """Frozen policies on held-out fires."""
+
+    fires: Side
+    """held-out fires, one episode each, of the evaluation at the end"""
+    interval: MaybeCount
+    """episodes between evaluations during training; 0 for none"""
+    interval_fires: Side
+    """held-out fires of the evaluations during training"""
+
+
+@dataclass(frozen=True, kw_only=True, config=_STRICT)
+class RunConfig:
+    """Everything that a run depends on."""
+
+    method: Name
+    """the recipe: a file in configs/method"""
+    setup: Name
+    """the constants: a file in configs/setup"""
+    memory: Literal["private", "shared"]
+    """one replay memory per UAV, or one for all"""
+    comm: dict[str, Any]
+    """the communication module's name and its settings"""
+    env: WildfireConfig
+    fire: Scenario
+    learner: LearnerConfig
+    exploration: ExplorationConfig
+    evaluation: EvaluationConfig
+    episodes: Count
+    """episodes of training, counted per environment: all run theirs side by side"""
+    num_envs: Side
+    """environments that collect side by side, for each seed"""
+    seeds: Annotated[tuple[Seed, ...], Strict(False)] = ()
+    """several seeds, trained side by side as one stack, a run folder each; `seed` is then this
+    run's; none for `seed` alone"""
+    seed: Seed
+    """of everything random in the run"""
+    device: str
+    """where environment, memory and networks live"""
+    logger: Literal["wandb", "tensorboard", "csv", "none"]
+    """the tracker beside metrics.jsonl"""
+    output: Annotated[str, Field(min_length=1)]
+    """the folder in which the run folder is made"""
+    checkpoint_interval: Count
+    """episodes between checkpoints"""
+    checkpoint_steps: MaybeCount = 0
+    """steps between further checkpoints, counted through the whole run; 0 for none"""
+    keep: Count = 5
+    """checkpoints of which the networks stay; the two newest hold what a resumed run needs too"""
+    on_nan: Literal["stop", "rollback"] = "stop"
+    """what is done where a number is not finite: the run ends, or goes back to its last checkpoint
+    with smaller learning rates"""
+
+    @field_validator("device")
+    @classmethod
+    def _device_is_there(cls, value: str) -> str:
+        return check_device(value)
+
+    @field_validator("seeds")
+    @classmethod
+    def _seeds_differ(cls, value: tuple[int, ...]) -> tuple[int, ...]:
+        if len(set(value)) < len(value):
+            raise ValueError(f"seeds={list(value)}: each seed at most once")
+        return value
+
+    @field_validator("comm")
+    @classmethod
+    def _comm_is_known(cls, value: dict[str, Any]) -> dict[str, Any]:
+        if "name" not in value:
+            raise ValueError(f"name is missing; known: {', '.join(registry.known())}")
+        config_type = registry.find(value["name"]).config_type
+        settings, names = _without_name(value), [field.name for field in fields(config_type)]
+        for key in settings.keys() - names:
+            listed = ", ".join(names) or "none"
+            raise ValueError(f"comm.{key} is not a setting of {value['name']}; known: {listed}")
+        from_plain(config_type, settings)
+        return value
+
+
+def _without_name(comm: Mapping[str, Any]) -> dict[str, Any]:
+    return {key: value for key, value in comm.items() if key != "name"}
+
+
+def build_comm(config: RunConfig):
+    """The communication module of a configuration."""
+    return registry.build(config.comm["name"], config.env, _without_name(config.comm))
+
+
+def comm_settings(config: RunConfig) -> dict[str, Any]:
+    """All settings of a configuration's communication module, defaults included."""
+    config_type = registry.find(config.comm["name"]).config_type
+    return asdict(from_plain(config_type, _without_name(config.comm)))
+
+
+def check_device(name: str) -> str:
+    """The name, if it is a device of this machine.
+
+    Raises:
+        ValueError: it is none; the message lists those there are.
+    """
+    present = ["cpu", *(f"cuda:{i}" for i in range(torch.cuda.device_count()))]
+    try:
+        device = torch.device(name)
+    except RuntimeError:
+        device = None
+    there = device is not None and (
+        str(device) == "cpu" or (device.type == "cuda" and (device.index or 0) < len(present) - 1)
+    )
+    if not there:
+        raise ValueError(f"device={shown(name)} is not there; known: {', '.join(present)}")
+    return name

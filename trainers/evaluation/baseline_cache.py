@@ -1,0 +1,125 @@
+"""What scripted policies reach, computed once and then read from a file.
+
+They do not depend on a run but for its constants, so runs that share those share a file.
+"""
+
+import hashlib
+import json
+import math
+import os
+import tempfile
+import time
+import warnings
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+import emberlink.comm.base
+import emberlink.envs.wildfire
+import emberlink.policies
+from emberlink.envs import metrics
+from emberlink.envs.fire.cache import cache_folder
+from emberlink.trainers.config.schema import RunConfig
+from emberlink.trainers.runs.safe_read import LONGEST_JSON, parse_json, read_text
+
+from .results import Measured
+
+_SOURCES = (emberlink.envs.wildfire, emberlink.comm.base, emberlink.policies)
+_IMPORTED = time.time_ns()
+
+
+class ScriptedResults:
+    """The file of one policy on the fires of one evaluation.
+
+    Its name is a hash of everything that the numbers depend on: environment, communication,
+    fires, start seeds, the version of torch, the kind of device, and the source of this package.
+    Where that source has changed since it was imported, nothing is read and nothing is written.
+
+    Args:
+        policy: its name.
+        config: of the environment that it is played in.
+        arrival: the fires, float32 [count, X, Y].
+        protocol: what else the numbers depend on, as plain values.
+    """
+
+    def __init__(
+        self, policy: str, config: RunConfig, arrival: Tensor, protocol: Mapping[str, Any]
+    ):
+        self._episodes, source = len(arrival), source_digest()
+        parts = {
+            "policy": policy,
+            "env": asdict(config.env),
+            "comm": config.comm,
+            "fires": hashlib.sha256(arrival.cpu().contiguous().numpy().tobytes()).hexdigest(),
+            "protocol": dict(protocol),
+            "torch": torch.__version__,
+            "device": torch.device(config.device).type,
+            "source": source,
+        }
+        key = hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:32]
+        self.file = cache_folder() / f"scripted-{key}.json" if source else None
+
+    def read(self) -> Measured | None:
+        """The numbers, or None where there is no such file or it is damaged."""
+        if self.file is None:
+            return None
+        try:
+            stored = parse_json(read_text(self.file, LONGEST_JSON))
+        except (OSError, ValueError):
+            return None
+        return stored if _whole(stored, self._episodes) else None
+
+    def write(self, measured: Measured) -> None:
+        """Writes the file whole; a folder that cannot be written to costs a warning."""
+        if self.file is None:
+            return
+        temporary = None
+        try:
+            self.file.parent.mkdir(parents=True, exist_ok=True)
+            with tempfile.NamedTemporaryFile(
+                "w", dir=self.file.parent, suffix=".tmp", delete=False
+            ) as handle:
+                temporary = handle.name
+                json.dump(measured, handle)
+            os.replace(temporary, self.file)
+        except OSError as error:
+            if temporary is not None:
+                Path(temporary).unlink(missing_ok=True)
+            message = f"scripted results are not cached: cannot write {self.file}: {error}"
+            warnings.warn(message, stacklevel=2)
+
+
+def sources() -> list[Path]:
+    """The files that what is played depends on."""
+    folders = [Path(str(module.__file__)).parent for module in _SOURCES]
+    files = [file for folder in folders for file in sorted(folder.rglob("*.py"))]
+    here = Path(__file__)
+    return [*files, here.with_name("evaluate.py"), here.parents[1] / "build.py"]
+
+
+def source_digest() -> str | None:
+    """A hash of `sources`, or None if they are not what this process has imported."""
+    files = sources()
+    if max(file.stat().st_mtime_ns for file in files) > _IMPORTED:
+        return None
+    digest = hashlib.sha256()
+    for file in files:
+        content = file.read_bytes()
+        digest.update(f"{file.parent.name}/{file.name} {len(content)}\n".encode() + content)
+    return digest.hexdigest()
+
+
+def _whole(stored: Any, episodes: int) -> bool:
+    """Whether these are all measures of as many episodes."""
+    return (
+        isinstance(stored, dict)
+        and list(stored) == list(metrics.NAMES)
+        and all(isinstance(column, list) and len(column) == episodes for column in stored.values())
+        and all(
+            isinstance(x, float) and math.isfinite(x) for column in stored.values() for x in column
+        )
+    )

@@ -1,0 +1,137 @@
+"""What `emberlink fire make` and `emberlink fire import` do: fires in files for use elsewhere."""
+
+import os
+import re
+from collections.abc import Iterator, Sequence
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import torch
+from rich.console import Console
+from rich.progress import track
+from torch import Tensor
+
+from emberlink.envs.fire.cache import GENERATOR_VERSION
+from emberlink.envs.fire.generator import FireConfig, Split, fire_seeds, make_fires
+from emberlink.envs.fire_files.bank_writer import check_bank, write_bank
+from emberlink.envs.utils.atomic_io import free_name
+from emberlink.trainers.config.compose import to_values
+from emberlink.trainers.config.schema import RunConfig
+
+from .select import from_file, generated, read
+
+_AT_A_TIME = 16  # fires between two movements of the progress bar
+
+
+def make(
+    scenario: str,
+    overrides: Sequence[str],
+    console: Console,
+    *,
+    count: int | None = None,
+    split: Split = "train",
+    output: Path | None = None,
+) -> int:
+    """Makes fires of a scenario and writes them to a file.
+
+    Args:
+        scenario: a file in configs/fire.
+        overrides: `key=value` of setup, env. and fire.
+        console: told the progress and, last, where the file is.
+        count: fires; as many as are trained on or evaluated with if None.
+        split: "train" or "heldout".
+        output: a new .npy, .tif or .tiff file; a name that is free if None.
+
+    Raises:
+        ValueError: one line for whatever is not known or cannot be written.
+    """
+    config = generated(scenario, overrides)
+    fire, world = config.fire, config.env
+    assert isinstance(fire, FireConfig)
+    count = count or (fire.bank if split == "train" else config.evaluation.fires)
+    path = output or _free(f"{scenario}_{split}_{count}")
+    check_bank(path, count, world.grid)
+    seeds = fire_seeds(split, count)
+    parts = track(
+        seeds.split(_AT_A_TIME),
+        "making fires",
+        console=console,
+        transient=True,
+        disable=not console.is_terminal,
+    )
+    made = [make_fires(fire, part, world.grid, world.horizon) for part in parts]
+    facts = {
+        "scenario": scenario,
+        "split": split,
+        "seeds": f"{seeds[0]} to {seeds[-1]}",
+        **_facts(config),
+        "generator_version": GENERATOR_VERSION,
+    }
+    names = [f"{scenario} {split} {seed}" for seed in seeds.tolist()]
+    _write(path, torch.cat(made), facts, names, console)
+    return 0
+
+
+def import_files(arguments: Sequence[str], console: Console, output: Path) -> int:
+    """Reads files of fires and writes them to one.
+
+    Args:
+        arguments: paths, and `key=value` of setup, env. and fire.
+        console: told what was read and, last, where the file is.
+        output: a new .npy, .tif or .tiff file.
+
+    Raises:
+        ValueError: one line for whatever cannot be read or written.
+    """
+    # Who has a file of that name means the file.
+    overrides = [text for text in arguments if "=" in text and not os.path.exists(text)]
+    paths = [Path(text) for text in arguments if text not in overrides]
+    if not paths:
+        raise ValueError("which file? FILE, such as ArrivalTime.asc, is missing")
+    configs = [from_file(path, overrides) for path in paths]
+    check_bank(output, len(paths), configs[0].env.grid)
+    fires, names = [], []
+    for path, config in zip(paths, configs, strict=True):
+        fires.append(read(config))
+        names += list(_names(path, len(fires[-1])))
+    facts = _facts(configs[0])
+    del facts["fire"]["path"], facts["fire"]["sha256"]  # of the first file alone
+    digests = [to_values(config)["fire"]["sha256"] for config in configs]
+    facts["sources"] = [
+        {"file": path.name, "sha256": digest} for path, digest in zip(paths, digests, strict=True)
+    ]
+    _write(output, torch.cat(fires), facts, names, console)
+    return 0
+
+
+def _names(path: Path, count: int) -> Iterator[str]:
+    for number in range(count):
+        yield path.name if count == 1 else f"{path.name}, fire {number}"
+
+
+def _facts(config: RunConfig) -> dict[str, Any]:
+    """What the fires depend on."""
+    return {
+        "horizon": config.env.horizon,
+        "grid": list(config.env.grid),
+        "fire": to_values(config)["fire"],
+        "emberlink_version": version("emberlink"),
+    }
+
+
+def _free(stem: str) -> Path:
+    name = free_name(Path(), re.sub(r"[^\w.+-]", "-", stem), [".npy", ".json"])
+    return name.with_name(f"{name.name}.npy")
+
+
+def _write(
+    path: Path, fires: Tensor, facts: dict[str, Any], names: Sequence[str], console: Console
+) -> None:
+    write_bank(path, fires, facts=facts, names=names)
+    cells = " x ".join(map(str, fires.shape[1:]))
+    word = "fire" if len(fires) == 1 else "fires"
+    console.print(
+        f"{len(fires)} {word} of {cells} cells, {facts['horizon']} steps", highlight=False
+    )
+    console.print(str(path), soft_wrap=True, highlight=False)

@@ -1,0 +1,142 @@
+"""Which fire is meant: a scenario's held-out fire or one of a file, under the keys of training."""
+
+import difflib
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from torch import Tensor
+
+from emberlink.envs.fire.generator import scenarios
+from emberlink.envs.fire_files.reader import FileFireConfig, read_fires
+from emberlink.envs.scenarios import fires_of
+from emberlink.envs.utils.validation import shown
+from emberlink.trainers.config.compose import resolve
+from emberlink.trainers.config.schema import RunConfig
+
+HELD_OUT = 65_536
+"""held-out fires of a scenario: as many as an evaluation can have"""
+FILE = "file"
+"""the scenario of fires that are read, not made"""
+_METHOD = "independent"  # any: a fire depends on no method
+_KEYS = ("env.", "fire.")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Source:
+    """A fire and where it is from."""
+
+    title: str
+    stem: str
+    """begins the names of files about it"""
+    config: RunConfig
+    arrival: Tensor
+    """float32 [X, Y], steps"""
+
+
+def find(text: str, overrides: Sequence[str]) -> Source:
+    """The fire that NAME, NAME:INDEX, FILE or FILE:INDEX means.
+
+    Args:
+        text: the name of a scenario or a path; a scenario comes first.
+        overrides: `key=value` of setup, env. and fire.
+
+    Raises:
+        ValueError: there is no such fire, or a key or value is wrong.
+    """
+    name, _, index = text.rpartition(":") if ":" in text else (text, "", "0")
+    if name in scenarios():
+        config = generated(name, overrides)
+        return Source(
+            title=f"{name}, held-out fire {index}",
+            stem=f"fire_{name}_{index}",
+            config=config,
+            arrival=_held_out(config, text, index),
+        )
+    if os.path.exists(text) or not os.path.exists(name):
+        name, index = text, "0"
+    if not name or not os.path.exists(name):
+        raise ValueError(_unknown(text))
+    path = Path(name)
+    config = from_file(path, overrides)
+    fires = read(config)
+    if not index.isdecimal() or int(index) >= len(fires):
+        raise ValueError(f"{shown(text)}: there is no fire {index!r}; known: 0 to {len(fires) - 1}")
+    several, shortened = len(fires) > 1, shown(path.name)
+    return Source(
+        title=f"{shortened}, fire {index} of {len(fires)}" if several else shortened,
+        stem=f"fire_{path.stem}_{index}" if several else f"fire_{path.stem}",
+        config=config,
+        arrival=fires[int(index)],
+    )
+
+
+def _held_out(config: RunConfig, text: str, index: str) -> Tensor:
+    if not index.isdecimal() or int(index) >= HELD_OUT:
+        raise ValueError(
+            f"{shown(text)}: there is no held-out fire {index!r}; known: 0 to {HELD_OUT - 1}"
+        )
+    return fires_of(config.fire).one_heldout(int(index), config.env.grid, config.env.horizon)[0]
+
+
+def generated(scenario: str, overrides: Sequence[str]) -> RunConfig:
+    """The configuration with which a scenario's fires are made.
+
+    Raises:
+        ValueError: there is no such scenario, its fires are read, or a key or value is wrong.
+    """
+    known = scenarios()
+    if scenario not in known:
+        hint = _near(scenario, known)
+        raise ValueError(f"fire {shown(scenario)!r} is not known{hint} known: {', '.join(known)}")
+    return _resolve([f"fire={scenario}", *overrides], overrides)
+
+
+def from_file(path: Path, overrides: Sequence[str]) -> RunConfig:
+    """The configuration with which a file is read.
+
+    Raises:
+        ValueError: a key or value is wrong.
+    """
+    if any(text.partition("=")[0] == "fire.path" for text in overrides):
+        raise ValueError("fire.path: the file stands without a key here")
+    # The name is set past the parser of overrides, to which some characters mean something.
+    return _resolve([f"fire={FILE}", "fire.path=_", *overrides], overrides, path=str(path))
+
+
+def _resolve(texts: Sequence[str], overrides: Sequence[str], path: str | None = None) -> RunConfig:
+    settings: dict[str, Any] = {} if path is None else {"fire.path": path}
+    config = resolve(_METHOD, texts, **settings)
+    for text in overrides:
+        key = text.partition("=")[0]
+        if key == "fire":
+            raise ValueError(f"{shown(text)!r}: the fire is named without a key here")
+        if key != "setup" and not key.startswith(_KEYS):
+            raise ValueError(
+                f"{shown(text)!r}: a fire depends on keys of setup, env. and fire. only"
+            )
+    return config
+
+
+def read(config: RunConfig) -> Tensor:
+    """The fires of a file, float32 [fires, X, Y], steps.
+
+    Raises:
+        ValueError: one line that names the file and what is wrong with it.
+    """
+    assert isinstance(config.fire, FileFireConfig)
+    return read_fires(config.fire, config.env.grid, config.env.horizon)
+
+
+def _unknown(text: str) -> str:
+    known = scenarios()
+    hint = _near(text.rpartition(":")[0] or text, known)
+    return f"{shown(text)}: no file or scenario is so called{hint} known: {', '.join(known)}"
+
+
+def _near(name: str, known: Sequence[str]) -> str:
+    """What may have been meant; it ends as the known names are to follow."""
+    near = difflib.get_close_matches(name, known, n=1)
+    return f"; did you mean {near[0]}?" if near else ";"

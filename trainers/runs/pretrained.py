@@ -1,0 +1,151 @@
+"""Trained policies that come with emberlink: `pretrained:consensus` in place of a run folder.
+
+Each is a run folder without what only its training needs: policies/pretrained/SETUP/METHOD/sSEED
+with config.yaml, metrics.jsonl, eval.json and a checkpoint that holds the actors alone.
+
+    python -m emberlink.trainers.runs.pretrained RUN... --into policies/pretrained
+
+makes them from finished runs.
+"""
+
+import argparse
+import shutil
+import sys
+import tempfile
+from collections.abc import Sequence
+from dataclasses import replace
+from importlib.resources import files
+from pathlib import Path
+
+from emberlink.envs.fire_files.reader import KEPT
+
+from . import checkpoint_file
+from emberlink.trainers.evaluation.report import ACTOR
+from .run_folder import RunFolder
+
+PREFIX = "pretrained:"
+USUAL_SETUP = "tuned"
+
+
+def is_name(text: str) -> bool:
+    """Whether a trained policy is meant that comes with emberlink, not a folder."""
+    return text.startswith(PREFIX)
+
+
+def open_run(text: str, output: Path | str = "runs") -> RunFolder:
+    """The run that is meant by what stands on the command line.
+
+    Args:
+        text: a run folder, or `pretrained:METHOD`, `pretrained:SETUP/METHOD` or
+            `pretrained:SETUP/METHOD/SEED`. These are copied to a folder of their own in `output`,
+            where what is made of them goes; a copy that is there is used.
+        output: the folder of run folders.
+
+    Raises:
+        ValueError: there is no such policy, or several; the message names those that there are.
+    """
+    if not is_name(text):
+        return RunFolder(text)
+    found = find(text)
+    recipes = sorted({"/".join(one.parts[-3:-1]) for one in found})
+    if len(recipes) > 1:
+        raise ValueError(f"{text}: one is needed, and there are {', '.join(recipes)}")
+    source = found[0]
+    target = Path(output) / "_".join(["pretrained", *source.parts[-3:]])
+    if not target.exists():
+        try:
+            _copy(source, target)
+        except OSError as error:
+            raise ValueError(f"{target}: cannot be made: {error.strerror or error}") from None
+    return RunFolder(target)
+
+
+def find(text: str) -> list[Path]:
+    """The folders of the trained policies that a name means, lowest seed first.
+
+    Args:
+        text: as for `open_run`; `pretrained:SETUP` are all of a setup.
+
+    Raises:
+        ValueError: there are none.
+    """
+    folders = sorted((file.parent for file in _shipped().glob("*/*/*/config.yaml")), key=_order)
+    name = text.removeprefix(PREFIX).strip("/")
+    wanted = name.split("/")
+    if len(wanted) == 3:
+        wanted[2] = f"s{wanted[2].removeprefix('s')}"
+    found = [one for one in folders if one.parts[-3:][: len(wanted)] == tuple(wanted)]
+    found = found or [one for one in folders if list(one.parts[-3:-1]) == [USUAL_SETUP, name]]
+    if not found:
+        there = ", ".join(sorted({"/".join(one.parts[-3:-1]) for one in folders})) or "none"
+        raise ValueError(f"{text}: no such trained policy; there are {there}")
+    return found
+
+
+def pack(run: RunFolder, into: Path) -> Path:
+    """Takes from a finished run what is shipped.
+
+    Args:
+        run: trained and evaluated.
+        into: the folder of trained policies.
+
+    Returns:
+        The new folder.
+
+    Raises:
+        ValueError: the run is not finished, or the folder is there.
+    """
+    config = replace(run.config(), output="runs", logger="none", device="cpu")
+    if len(run.lines()) < config.episodes or not (run.path / "eval.json").exists():
+        raise ValueError(f"{run.path}: not finished, or not evaluated")
+    target = into / config.setup / config.method / f"s{config.seed}"
+    if target.exists():
+        raise ValueError(f"{target}: is there already")
+    newest = run.checkpoint()
+    header, weights = checkpoint_file.read(newest)
+    actors = {name: value for name, value in weights.items() if name.startswith(ACTOR)}
+    about = {k: v for k, v in (header or {}).items() if k not in ("sha256", "format", "config")}
+    (target / "checkpoints").mkdir(parents=True)
+    checkpoint_file.write(target / "checkpoints" / newest.name, actors, about)
+    RunFolder(target).write_config(config)
+    for file in ("metrics.jsonl", "eval.json", KEPT):
+        if (run.path / file).is_file():
+            shutil.copyfile(run.path / file, target / file)
+    return target
+
+
+def _shipped() -> Path:
+    return Path(str(files("emberlink.policies"))) / "pretrained"
+
+
+def _order(folder: Path) -> tuple[str, str, int]:
+    setup, method, seed = folder.parts[-3:]
+    return setup, method, int(seed.removeprefix("s"))
+
+
+def _copy(source: Path, target: Path) -> None:
+    """Copies a folder whole, or leaves nothing."""
+    target.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=target.parent, prefix=".pretrained") as partial:
+        # Not the modes: what is installed may be read-only.
+        shutil.copytree(source, Path(partial) / "run", copy_function=shutil.copyfile)
+        (Path(partial) / "run").rename(target)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Packs runs."""
+    parser = argparse.ArgumentParser(prog="python -m emberlink.trainers.runs.pretrained")
+    parser.add_argument("runs", metavar="RUN", nargs="+", type=Path)
+    parser.add_argument("--into", type=Path, required=True, help="policies/pretrained")
+    options = parser.parse_args(arguments)
+    try:
+        for run in options.runs:
+            print(pack(RunFolder(run), options.into))
+    except ValueError as error:
+        print(error, file=sys.stderr)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
