@@ -7,7 +7,7 @@ WORKERS ?= 2
 # but stands still where something else wants a core
 THREADS ?= 1
 # settings of the demo; `make demo DEMO="episodes=10 seed=1"` chooses others
-DEMO ?= episodes=7 evaluation.fires=32
+DEMO ?= episodes=7 evaluation.episodes=32
 
 VENV := .venv
 BIN := $(VENV)/bin

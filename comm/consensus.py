@@ -189,7 +189,7 @@ class Consensus(CommModule):
         return counter_rng.at(tensordict.get(keys.STREAM), tensordict.get(keys.STEP), use)
 
     def _scaled(self, told: Tensor) -> Tensor:
-        if self.world.observation == "raw":
+        if self.world.observation_scale == "raw":
             return told
         if self.config.target == "relative":
             return told / ((self.high - self.low) / 2).clamp(min=1e-6).float()

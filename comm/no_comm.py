@@ -14,7 +14,7 @@ class SilentConfig:
     """There is nothing to set."""
 
 
-class Silent(CommModule):
+class NoComm(CommModule):
     """Leaves every UAV with its own 6 numbers (paper, section IV.C)."""
 
     config_type: ClassVar[type] = SilentConfig

@@ -11,20 +11,20 @@ from torch import Tensor
 from . import keys
 
 NAMES = (
-    "score",
+    "mean_reward",
     "coverage",
     "coverage_auc",
-    "coverage_time",
+    "time_to_full_coverage",
     "tracking_first",
     "tracking_last",
     "boundary_exits",
-    "fire_exits",
+    "fire_losses",
 )
-HIGHER_IS_BETTER = frozenset({"score", "coverage", "coverage_auc"})
+HIGHER_IS_BETTER = frozenset({"mean_reward", "coverage", "coverage_auc"})
 """The measures of which more is better; of the others less is."""
 
 
-def score(reward: Tensor) -> Tensor:
+def mean_reward(reward: Tensor) -> Tensor:
     """Mean reward over UAVs and steps (figure 5). reward [..., T, n] -> [...]."""
     return reward.float().mean((-2, -1))
 
@@ -46,7 +46,7 @@ def coverage_auc(seen: Tensor, burning: Tensor) -> Tensor:
     return _ratio(seen, burning).mean(-1)
 
 
-def coverage_time(seen: Tensor, burning: Tensor) -> Tensor:
+def time_to_full_coverage(seen: Tensor, burning: Tensor) -> Tensor:
     """The first step at which every burning cell has been seen. Arguments as `coverage`."""
     return _first_step(seen == burning)
 
@@ -66,7 +66,7 @@ def boundary_exits(left: Tensor) -> Tensor:
     return left.sum(-2).float().mean(-1)
 
 
-def fire_exits(on_fire: Tensor) -> Tensor:
+def fire_losses(on_fire: Tensor) -> Tensor:
     """Times a UAV that saw fire no longer does, mean over UAVs (figure 9). bool [..., T, n]."""
     lost = on_fire[..., :-1, :] & ~on_fire[..., 1:, :]
     return lost.sum(-2).float().mean(-1)
@@ -86,14 +86,14 @@ def episode_metrics(steps: TensorDictBase) -> dict[str, Tensor]:
     on_fire = steps[keys.NEW_FIRE] + steps[keys.OLD_FIRE] > 0
     left = steps.get(keys.BEYOND).any(-1)
     return {
-        "score": score(reward),
+        "mean_reward": mean_reward(reward),
         "coverage": coverage(seen, burning),
         "coverage_auc": coverage_auc(seen, burning),
-        "coverage_time": coverage_time(seen, burning),
+        "time_to_full_coverage": time_to_full_coverage(seen, burning),
         "tracking_first": tracking_first(on_fire),
         "tracking_last": tracking_last(on_fire),
         "boundary_exits": boundary_exits(left),
-        "fire_exits": fire_exits(on_fire),
+        "fire_losses": fire_losses(on_fire),
     }
 
 

@@ -177,7 +177,7 @@ def _bounds(config: WildfireConfig, features: int) -> tuple[Array, Array]:
     if features != len(keys.FEATURES):
         limit = np.full(features, np.inf, np.float32)
         return -limit, limit
-    if config.observation == "box":
+    if config.observation_scale == "box":
         low, high = [-1, -1, -1, 0, 0, 0], [1, 1, 1, 1, 1, 1]
     else:
         low, high = [*config.low, 0, 0, 0], [*config.high, 1, 1, config.horizon]

@@ -59,7 +59,7 @@ class Generated:
 
     def train(self, grid: Grid, horizon: int) -> Tensor:
         """See `Fires`."""
-        return fire_bank(self.config, "train", self.config.bank, grid, horizon)
+        return fire_bank(self.config, "train", self.config.num_train_fires, grid, horizon)
 
     def heldout(self, count: int, grid: Grid, horizon: int) -> Tensor:
         """See `Fires`."""

@@ -241,7 +241,7 @@ class WildfireEnv(Buffers, EnvBase):
     def _observe(self, position: Tensor, counts: Tensor, time: Tensor) -> Tensor:
         """x, y, z, new-fire flag, old-fire flag, timestep: float32 [num_envs, n, 6]."""
         clock = time.view(-1, 1, 1).expand(-1, position.shape[1], 1)
-        if self.config.observation == "box":
+        if self.config.observation_scale == "box":
             position = motion.scale_to_box(position, self._low, self._high)
             clock = clock / self.config.horizon
         return torch.cat((position, counts[..., :2] > 0, clock), -1)

@@ -46,8 +46,8 @@ SETUPS = "known: paper, released, tuned"
         (["consensus", "method=independent"], ["'method'"]),
         (["consensus", "setup=papr"], ["setup 'papr'", "did you mean paper?", SETUPS]),
         (["consensus", "fire=zzz"], ["fire 'zzz'", "known: file, huygens, oil_slick, paper"]),
-        (["consensus", "learner.batch=big"], ["learner.batch=big", "integer"]),
-        (["consensus", "learner.batch=1.5"], ["learner.batch=1.5", "integer"]),
+        (["consensus", "learner.batch_size=big"], ["learner.batch_size=big", "integer"]),
+        (["consensus", "learner.batch_size=1.5"], ["learner.batch_size=1.5", "integer"]),
         (["consensus", "env.reward.exit=true"], ["env.reward.exit=True", "number"]),
         (["consensus", "env.grid=30"], ["env.grid=30"]),
         (["consensus", "env=3"], ["env=3"]),
@@ -58,20 +58,20 @@ SETUPS = "known: paper, released, tuned"
         (["consensus", "env.altitude=[4,1]"], ["altitude (4.0, 1.0)", "lowest"]),
         (["consensus", "learner.gamma=1.5"], ["learner.gamma=1.5", "less than 1"]),
         (["consensus", "learner.gamma=nan"], ["learner.gamma=nan"]),
-        (["consensus", "learner.capacity=5"], ["batch=8", "capacity=5"]),
+        (["consensus", "learner.buffer_size=5"], ["batch_size=8", "buffer_size=5"]),
         (["consensus", "seed=-1"], ["seed=-1", "greater than or equal to 0"]),
         (["consensus", "num_envs=0"], ["num_envs=0"]),
         (["consensus", "learner=[1]"], ["learner=[1]"]),
         (["consensus", "logger=mlflow"], ["logger=mlflow", "'wandb', 'tensorboard', 'csv'"]),
-        (["consensus", "memory=both"], ["memory=both", "'private' or 'shared'"]),
+        (["consensus", "replay=both"], ["replay=both", "'per_agent' or 'shared'"]),
         (["consensus", "comm.rnge=3"], ["'comm.rnge'", "did you mean comm.range?"]),
         (["consensus", "comm.range=-1"], ["comm.range=-1", "greater than or equal to 0"]),
         (["consensus", "comm.heading.form=cubic"], ["comm.heading.form=cubic", "'folded_linear'"]),
         (
             ["consensus", "comm.name=telepathy"],
-            ["comm.name='telepathy'", "known: consensus, positional, silent"],
+            ["comm.name='telepathy'", "known: consensus, positional, no_comm"],
         ),
-        (["consensus", "comm.name=silent"], ["comm.", "not a setting of silent; known: none"]),
+        (["consensus", "comm.name=no_comm"], ["comm.", "not a setting of silent; known: none"]),
         (["consensus", "learner.hidden=[10000000,8]"], ["learner.hidden.0=10000000", "8192"]),
         (["consensus", "num_envs=100000000"], ["num_envs=100000000", "65536"]),
         (["consensus", "device=cuda:99"], ["device=cuda:99 is not there", "known: cpu"]),
@@ -199,5 +199,8 @@ def test_a_line_that_was_not_finished_is_no_line(run):
 
 
 def test_a_batch_that_is_never_reached_is_said(tmp_path, capsys):
-    assert main.main(["train", "consensus", *TINY, "learner.batch=500", f"output={tmp_path}"]) == 0
+    assert (
+        main.main(["train", "consensus", *TINY, "learner.batch_size=500", f"output={tmp_path}"])
+        == 0
+    )
     assert "nothing will be learnt" in capsys.readouterr().out

@@ -37,7 +37,7 @@ class Flops(TorchDispatchMode):
 @pytest.mark.parametrize("shared", [False, True])
 def test_flops_of_an_update_are_what_torch_counts(method, features, hidden, batch, shared):
     settings = ["env.horizon=200", "episodes=1", "env.num_uavs=4"]
-    sizes = [f"learner.hidden={list(hidden)}", f"learner.batch={batch}"]
+    sizes = [f"learner.hidden={list(hidden)}", f"learner.batch_size={batch}"]
     trainer = Trainer(resolve(method, [*settings, *sizes]))
     sample = workloads.batch_of(trainer)
     if not shared:

@@ -1,7 +1,6 @@
 """Checkpoint files: written whole or not at all, and nothing damaged is read."""
 
 import errno
-import json
 import os
 import shutil
 from collections.abc import Callable
@@ -18,13 +17,9 @@ from test_recipes import METHODS
 from test_resume import until
 
 from emberlink.trainers.cli import main
-from emberlink.trainers.evaluation import report
 from emberlink.trainers.runs import checkpoint_file
-from emberlink.trainers.runs.run_folder import RunFolder, load_weights
+from emberlink.trainers.runs.run_folder import RunFolder
 from emberlink.trainers.training.resume import resume
-
-RELEASED = Path(__file__).parent / "released"
-"""run folders as earlier versions left them"""
 
 
 @settings(max_examples=30, deadline=None)
@@ -245,29 +240,6 @@ def test_networks_from_before_there_was_a_seal(run, capsys):
     capsys.readouterr()
     assert main.main(["train", f"resume={run}"]) == 2
     assert "holds networks alone" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("folder", sorted(RELEASED.iterdir()), ids=lambda folder: folder.name)
-def test_files_of_earlier_versions(folder, tmp_path):
-    """They evaluate, and those that hold a state are resumed to the numbers of then.
-
-    To a few digits: another machine adds up in another order.
-    """
-    here = RunFolder(shutil.copytree(folder, tmp_path / "run"))
-    for path in here.networks():
-        report.load_actor(here.config(), path)
-    expected = json.loads((folder / "expected.json").read_text())
-    assert load_weights(here.checkpoint(), {}) == {}
-    if not here.states():
-        with pytest.raises(ValueError, match="holds networks alone"):
-            resume(here.path)
-        return
-    trainer = resume(here.path)
-    assert trainer.step == expected["step"]
-    until(trainer, None)
-    assert len(here.lines()) == len(expected["lines"])
-    for line, then in zip(here.lines(), expected["lines"], strict=True):
-        assert line == pytest.approx(then, rel=1e-3, abs=1e-3)
 
 
 @pytest.mark.parametrize("part", ["save_file", "fsync", "replace"])

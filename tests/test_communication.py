@@ -122,7 +122,7 @@ def test_a_partial_reset_leaves_the_memory_of_others_alone():
 
 def test_known_modules_are_the_files_on_disk():
     files = {file.stem for file in (ROOT / "comm").glob("*.py")} - {"base", "registry"}
-    assert registry.known() == sorted(files) == ["consensus", "positional", "silent"]
+    assert registry.known() == sorted(files) == ["consensus", "positional", "no_comm"]
     for name in registry.known():
         module = registry.find(name)
         assert issubclass(module, base.CommModule)
@@ -136,12 +136,12 @@ def test_every_recipe_names_a_module():
     assert used == set(registry.known())
 
 
-@pytest.mark.parametrize("name", ["consensu", "", "base", "../silent"])
+@pytest.mark.parametrize("name", ["consensu", "", "base", "../no_comm"])
 def test_an_unknown_module_is_an_error_that_lists_the_known(name):
     with pytest.raises(ValueError, match=r"known: consensus, positional, silent$") as error:
         registry.find(name)
     assert repr(name) in str(error.value)
-    with pytest.raises(ValueError, match="known: consensus, positional, silent"):
+    with pytest.raises(ValueError, match="known: consensus, positional, no_comm"):
         resolve("independent", [f"comm.name='{name}'"])
 
 
@@ -167,7 +167,7 @@ def test_a_fifth_method_is_one_file_and_one_yaml(tmp_path):
     (package / "comm" / "headcount.py").write_text(module)
     (package / "configs" / "method" / "headcount.yaml").write_text(recipe)
     overrides = ["episodes=2", "env.horizon=12", "env.num_uavs=2", "learner.hidden=[8,8]"]
-    overrides += ["learner.batch=8", "evaluation.fires=1", "evaluation.interval=0"]
+    overrides += ["learner.batch_size=8", "evaluation.episodes=1", "evaluation.interval=0"]
     done = subprocess.run(
         [sys.executable, "-c", TRAIN, str(package), *overrides, f"output={tmp_path / 'runs'}"],
         # First on the path, and so before an installed copy.

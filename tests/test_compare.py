@@ -81,7 +81,7 @@ def test_less_is_better_where_it_is(tmp_path):
 
 def test_every_measure_has_a_direction():
     assert set(metrics.NAMES) >= metrics.HIGHER_IS_BETTER
-    assert {"tracking_first", "boundary_exits", "fire_exits", "coverage_time"}.isdisjoint(
+    assert {"tracking_first", "boundary_exits", "fire_losses", "time_to_full_coverage"}.isdisjoint(
         metrics.HIGHER_IS_BETTER
     )
 
@@ -167,11 +167,16 @@ def test_where_scripted_policies_are_drawn(tmp_path, monkeypatch):
     for seed, keys in enumerate([(), own, ("comm.loss=0.5",)]):
         coverage = {"coverage": 90.0 - 10 * seed}
         run = write_run(
-            tmp_path, "consensus", seed, overrides=keys, scripted=("pursuit",), learned=coverage
+            tmp_path,
+            "consensus",
+            seed,
+            overrides=keys,
+            scripted=("follow_target",),
+            learned=coverage,
         )
         content = read_evaluation(run)
-        content["communication"] = {"pursuit": {"name": str(seed % 2)}}
-        content["results"]["huygens"]["pursuit"]["coverage"] = [40.0 - 20 * (seed % 2)] * 4
+        content["communication"] = {"follow_target": {"name": str(seed % 2)}}
+        content["results"]["huygens"]["follow_target"]["coverage"] = [40.0 - 20 * (seed % 2)] * 4
         write_evaluation(run, content)
     one = only(tmp_path)
     assert [row.method for row in ranking(one, "coverage").rows][1].count(", ") == 1
@@ -181,7 +186,7 @@ def test_where_scripted_policies_are_drawn(tmp_path, monkeypatch):
         for args, about in drawn
         if about.get("zorder") == 1 and args[0][0] in (20.0, 40.0)
     ]
-    # From the top: 90, 80 and 70 %; the middle one's pursuit comes to 20 %, the others' to 40 %.
+    # From the top: 90, 80 and 70 %. follow_target has 20 % in the middle row, else 40 %.
     assert sorted(lines)[:3] == [(20.0, 0.5, 1.5), (40.0, -0.5, 0.5), (40.0, 1.5, 2.5)]
 
 
@@ -279,8 +284,8 @@ def test_any_number_of_methods_and_seeds(tmp_path_factory, counts, start):
 
 def test_setups_fires_and_configurations_are_kept_apart(tmp_path):
     write_run(tmp_path, "consensus", 0)
-    write_run(tmp_path, "consensus", 1, overrides=("learner.batch=64",))
-    write_run(tmp_path, "consensus", 2, overrides=("learner.batch=64", "device=cpu"))
+    write_run(tmp_path, "consensus", 1, overrides=("learner.batch_size=64",))
+    write_run(tmp_path, "consensus", 2, overrides=("learner.batch_size=64", "device=cpu"))
     write_run(tmp_path, "consensus", 0, name="r", overrides=("setup=released",))
     both = ("huygens", "paper")
     write_run(tmp_path, "consensus", 0, name="p", overrides=("fire=paper",), scenarios=both)
@@ -289,12 +294,12 @@ def test_setups_fires_and_configurations_are_kept_apart(tmp_path):
         ("setup released, trained on paper", [("consensus", [0])]),
         (
             "setup tuned, trained on huygens",
-            [("consensus", [0]), ("consensus (learner.batch=64)", [1, 2])],
+            [("consensus", [0]), ("consensus (learner.batch_size=64)", [1, 2])],
         ),
         ("setup tuned, trained on paper", [("consensus", [0])]),
     ]
     assert [s.trained_on for s in sections] == ["", "huygens", "paper"]
-    assert any("not all methods have the same learner.batch" in note for note in notes)
+    assert any("not all methods have the same learner.batch_size" in note for note in notes)
 
 
 def test_groups_are_named_as_one_types_their_settings(tmp_path):
@@ -354,20 +359,27 @@ def test_evaluations_in_other_worlds_are_no_trainings(tmp_path, capsys):
 
 
 def test_who_hears_something_else_may_fly_otherwise(tmp_path):
-    """Scripted pursuit follows the messages: no note, and a number for each group."""
+    """Scripted follow_target follows the messages: no note, and a number for each group."""
     for seed, (loss, coverage) in enumerate([(0.0, 40.0), (0.5, 20.0)]):
         run = write_run(
-            tmp_path, "consensus", seed, overrides=(f"comm.loss={loss}",), scripted=("pursuit",)
+            tmp_path,
+            "consensus",
+            seed,
+            overrides=(f"comm.loss={loss}",),
+            scripted=("follow_target",),
         )
         content = read_evaluation(run)
-        content["communication"] = {"pursuit": {"name": "consensus", "loss": loss}}
-        content["results"]["huygens"]["pursuit"]["coverage"] = [coverage] * 4
+        content["communication"] = {"follow_target": {"name": "consensus", "loss": loss}}
+        content["results"]["huygens"]["follow_target"]["coverage"] = [coverage] * 4
         write_evaluation(run, content)
     one = only(tmp_path)
     assert ranking(one, "coverage").scripted == {
-        "pursuit": [Scripted(["consensus"], 40.0), Scripted(["consensus (comm.loss=0.5)"], 20.0)]
+        "follow_target": [
+            Scripted(["consensus"], 40.0),
+            Scripted(["consensus (comm.loss=0.5)"], 20.0),
+        ]
     }
-    assert not [note for note in one.notes if "pursuit" in note]
+    assert not [note for note in one.notes if "follow_target" in note]
 
 
 def test_what_does_not_change_the_training_is_said_and_does_not_part_runs(tmp_path):
@@ -407,10 +419,10 @@ def test_scripted_policies_have_rows_of_their_own(tmp_path):
     for seed in range(2):
         run = tmp_path / f"positional_tuned_s{seed}"
         content = read_evaluation(run)
-        content["results"]["huygens"]["random_actions"]["score"] = [7.0] * 4
+        content["results"]["huygens"]["random_actions"]["mean_reward"] = [7.0] * 4
         write_evaluation(run, content)
     one = only(tmp_path)
-    consensus, positional = ranking(one, "score").scripted["random_actions"]
+    consensus, positional = ranking(one, "mean_reward").scripted["random_actions"]
     assert positional == Scripted(["positional"], 7.0)
     assert consensus.methods == ["consensus"]
     assert consensus.value != 7
@@ -538,7 +550,7 @@ def spoil(run, change):
 
 
 def lacking(content):
-    del content["results"]["huygens"]["learned"]["fire_exits"]
+    del content["results"]["huygens"]["learned"]["fire_losses"]
 
 
 def shorter(content):
@@ -559,7 +571,7 @@ SPOILT = {
     "text": (lambda run: (run / "eval.json").write_text("{"), ("eval.json", "JSON")),
     "a list": (lambda run: (run / "eval.json").write_text("[]"), ("eval.json",)),
     "binary": (lambda run: (run / "eval.json").write_bytes(b"\xff\xfe"), ("eval.json",)),
-    "a measure": (lambda run: spoil(run, lacking), ("eval.json", "learned lacks fire_exits")),
+    "a measure": (lambda run: spoil(run, lacking), ("eval.json", "learned lacks fire_losses")),
     "an episode": (lambda run: spoil(run, shorter), ("coverage has 3 episodes; fires=4",)),
     "nan": (lambda run: spoil(run, not_a_number), ("eval.json", "coverage.1=nan", "finite")),
     "no fire": (lambda run: spoil(run, lambda c: c["results"].clear()), ("no fire",)),
@@ -603,7 +615,7 @@ SPOILT = {
         ("metrics.jsonl: line 2 is not that of episode 2",),
     ),
     "a curve": (
-        lambda run: (run / "metrics.jsonl").write_text('{"episode": 1, "score": null}\n'),
+        lambda run: (run / "metrics.jsonl").write_text('{"episode": 1, "mean_reward": null}\n'),
         ("metrics.jsonl: ", "number"),
     ),
 }

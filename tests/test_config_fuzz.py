@@ -40,12 +40,12 @@ CAPS = {
     "env.grid": 17,
     "env.num_uavs": 4,
     "env.horizon": 12,
-    "fire.bank": 2,
-    "fire.patches": 2,
+    "fire.num_train_fires": 2,
+    "fire.fuel_patches": 2,
     "learner.hidden": 12,
-    "learner.capacity": 400,
-    "learner.batch": 30,
-    "learner.updates": 2,
+    "learner.buffer_size": 400,
+    "learner.batch_size": 30,
+    "learner.updates_per_step": 2,
     "episodes": 3,
     "num_envs": 3,
 }
@@ -176,7 +176,7 @@ def valid_values(draw) -> dict:
     for key, schema in {**KEYS, **COMM_KEYS[values["comm"]["name"]]}.items():
         values = put(values, key, draw(fitting(key, schema)))
     learner = values["learner"]
-    learner["capacity"] = max(learner["capacity"], learner["batch"])
+    learner["buffer_size"] = max(learner["buffer_size"], learner["batch_size"])
     return values
 
 

@@ -223,7 +223,7 @@ def test_relative_targets_are_the_way_there():
     centre = [[3.25, 4.5], [0.0, 0.0]]
     raw = told(position, [2, 0], centre=centre, config=config)
     assert raw[keys.OBSERVATION][0, :, 6:].tolist() == [[0.25, 0.5, 0], [-5, 0, 1]]
-    world = WildfireConfig(grid=(21, 11), observation="box")
+    world = WildfireConfig(grid=(21, 11), observation_scale="box")
     scaled = told(position, [2, 0], centre=centre, config=config, world=world)
     expected = torch.tensor([[0.25 / 10, 0.5 / 5, 0], [-5 / 10, 0, 1 / 1.5]])
     torch.testing.assert_close(scaled[keys.OBSERVATION][0, :, 6:], expected)
@@ -232,7 +232,7 @@ def test_relative_targets_are_the_way_there():
 
 @pytest.mark.parametrize("target", ["absolute", "relative"])
 def test_a_box_without_height_leaves_no_nan(target):
-    world = WildfireConfig(grid=(21, 11), altitude=(2.0, 2.0), observation="box")
+    world = WildfireConfig(grid=(21, 11), altitude=(2.0, 2.0), observation_scale="box")
     config = ConsensusConfig(target=target)
     rewritten = told([[3.0, 4.0, 2.0], [8.0, 4.0, 2.0]], [2, 0], config=config, world=world)
     assert rewritten[keys.OBSERVATION].isfinite().all()

@@ -16,7 +16,7 @@ from emberlink.trainers.rollout.cuda_graphs import LockstepCollector, graphed
 from emberlink.trainers.training.trainer import Trainer
 
 SMALL = [
-    *("env.horizon=12", "env.num_uavs=3", "num_envs=2", "episodes=3", "learner.batch=8"),
+    *("env.horizon=12", "env.num_uavs=3", "num_envs=2", "episodes=3", "learner.batch_size=8"),
     *("learner.hidden=[8,8]", "fire=huygens", "exploration.sigma=0.4", "exploration.dt=1"),
 ]
 

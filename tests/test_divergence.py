@@ -30,8 +30,8 @@ HORIZON, UAVS, ENVS, BATCH = 20, 3, 2, 16
 STEP, UAV, ENV = 33, 1, 1
 SMALL = [
     *(f"env.horizon={HORIZON}", "episodes=3", f"env.num_uavs={UAVS}", f"num_envs={ENVS}"),
-    *("learner.hidden=[8,8]", f"learner.batch={BATCH}", "checkpoint_steps=10"),
-    *("evaluation.interval=0", "evaluation.fires=1"),
+    *("learner.hidden=[8,8]", f"learner.batch_size={BATCH}", "checkpoint_steps=10"),
+    *("evaluation.interval=0", "evaluation.episodes=1"),
 ]
 PLACES = ["observation", "reward", "gradient", "weight"]
 

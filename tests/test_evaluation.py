@@ -55,7 +55,7 @@ def played(monkeypatch):
 
 
 def test_every_evaluation_plays_a_hundred_fires():
-    assert resolve("consensus").evaluation.fires == 100
+    assert resolve("consensus").evaluation.episodes == 100
 
 
 @pytest.mark.parametrize("method", ["consensus", "independent"])
@@ -100,14 +100,14 @@ def test_all_policies_start_alike_on_the_same_fires(cache, monkeypatch):
 
 def test_pursuit_is_played_with_the_consensus_of_the_setup():
     own = small("consensus", "comm.range=3")
-    assert evaluate.scripted_config(own, "pursuit") == own
+    assert evaluate.scripted_config(own, "follow_target") == own
     for method in ("independent", "shared_memory", "positional"):
         for setup in ("paper", "released", "tuned"):
             config = resolve(method, [f"setup={setup}", "env.num_uavs=4"])
-            changed = evaluate.scripted_config(config, "pursuit")
+            changed = evaluate.scripted_config(config, "follow_target")
             assert changed.comm == resolve("consensus", [f"setup={setup}"]).comm
             assert replace(changed, comm=config.comm) == config
-            for name in SCRIPTED.keys() - {"pursuit"}:
+            for name in SCRIPTED.keys() - {"follow_target"}:
                 assert evaluate.scripted_config(config, name) is config
 
 
@@ -160,7 +160,7 @@ def lawnmower(config, fires: int = 2):
 def test_a_scripted_policy_is_played_once(cache, played):
     first = lawnmower(small())
     assert len(played) == 1
-    assert lawnmower(small("consensus", "seed=3", "episodes=7", "learner.batch=9")) == first
+    assert lawnmower(small("consensus", "seed=3", "episodes=7", "learner.batch_size=9")) == first
     assert len(played) == 1
     (file,) = cache.glob("scripted-*")
     assert json.loads(file.read_text()) == first
@@ -196,7 +196,7 @@ def test_other_fires_policies_protocols_and_sources_have_files_of_their_own(
 
 
 @pytest.mark.parametrize(
-    "content", ["", "{", "[]", '{"score": [1.0]}', "whole with NaN", "one episode less"]
+    "content", ["", "{", "[]", '{"mean_reward": [1.0]}', "whole with NaN", "one episode less"]
 )
 def test_a_damaged_file_is_replaced(content, cache, played):
     first = lawnmower(small())
@@ -240,7 +240,7 @@ def test_a_cache_that_cannot_be_written_costs_a_warning(cache, monkeypatch):
 def test_the_table_fits_a_terminal(width):
     config = resolve("shared_memory", ["setup=released"])
     measured = {name: [1000.0] for name in metrics.NAMES}
-    measured |= {"score": [-123.456], "fire_exits": [499.5]}
+    measured |= {"mean_reward": [-123.456], "fire_losses": [499.5]}
     results = {"huygens": dict.fromkeys(("learned", *SCRIPTED), measured)}
     console = Console(width=width, record=True, file=io.StringIO())
     report.print_table(console, results, config)
@@ -248,7 +248,7 @@ def test_the_table_fits_a_terminal(width):
     assert "…" not in text
     assert max(map(len, text.splitlines())) <= width
     lines = text.splitlines()
-    for policy in ("shared_memory", "stationary", "lawnmower", "pursuit", "oracle"):
+    for policy in ("shared_memory", "stationary", "lawnmower", "follow_target", "oracle"):
         (row,) = (line for line in lines if line.startswith(policy))
         assert row.split() == [policy, "-123.5", *["1000.0"] * 6, "499.5"]
     words = [word for line in lines[:4] for word in line.split()]

@@ -28,7 +28,9 @@ from emberlink.envs.fire.generator import (
 
 GRID, HORIZON = (30, 30), 1000
 RANGES = [
-    f.name for f in dataclasses.fields(FireConfig) if f.name not in {"name", "bank", "two_sided"}
+    f.name
+    for f in dataclasses.fields(FireConfig)
+    if f.name not in {"name", "num_train_fires", "two_sided"}
 ]
 
 
@@ -133,8 +135,8 @@ def test_burning_cells_by_hand():
 
 
 def test_fuel_slows_the_front():
-    even = FireConfig(**settings_of(patches=(0, 0)))
-    slow = FireConfig(**settings_of(patches=(4, 4), patch_rate=(0.0, 0.0)))
+    even = FireConfig(**settings_of(fuel_patches=(0, 0)))
+    slow = FireConfig(**settings_of(fuel_patches=(4, 4), patch_rate=(0.0, 0.0)))
     seeds = fire_seeds("train", 20)
     fast, slowed = (make_fires(c, seeds, GRID, HORIZON) for c in (even, slow))
     assert torch.equal(fast == 0, slowed == 0)
@@ -166,7 +168,9 @@ def test_a_scenario_scales_with_the_shorter_side(grid, fires: int, tolerance: fl
 
 
 def test_the_centre_is_a_fraction_of_the_box():
-    still = settings_of(azimuth=(0, 0), turning=(0, 0), patches=(0, 0), length_to_breadth=(1, 1))
+    still = settings_of(
+        azimuth=(0, 0), wind_shift=(0, 0), fuel_patches=(0, 0), length_to_breadth=(1, 1)
+    )
     config = FireConfig(**{**still, "centre_x": (0.5, 0.5), "centre_y": (0.4, 0.4)})
     arrival = make_fires(config, fire_seeds("train", 1), (61, 31), HORIZON)[0]
     burning = arrival.isfinite().nonzero().double()
@@ -176,14 +180,14 @@ def test_the_centre_is_a_fraction_of_the_box():
 
 
 def test_the_wind_is_in_degrees_and_turns_with_time():
-    still = settings_of(centre_x=(0.5, 0.5), centre_y=(0.5, 0.5), patches=(0, 0))
+    still = settings_of(centre_x=(0.5, 0.5), centre_y=(0.5, 0.5), fuel_patches=(0, 0))
     for azimuth, turning, want in (
         (90, 0, (0, 1)),
         (180, 0, (-1, 0)),
         (0, 90, (1, 1)),
         (0, -90, (1, -1)),
     ):
-        fixed = {"azimuth": (azimuth, azimuth), "turning": (turning, turning)}
+        fixed = {"azimuth": (azimuth, azimuth), "wind_shift": (turning, turning)}
         config = FireConfig(**{**still, **fixed})
         arrival = make_fires(config, fire_seeds("train", 1), (31, 31), HORIZON)[0]
         drift = arrival.isfinite().nonzero().double().mean(0) - 15
@@ -343,7 +347,7 @@ def test_the_key_changes_with_everything(monkeypatch: pytest.MonkeyPatch):
     keys.append(key({**base, "two_sided": True}))
     for field in RANGES:
         low, high = base[field]
-        more = 1 if field == "patches" else 0.001
+        more = 1 if field == "fuel_patches" else 0.001
         other = (low, low) if low < high else (low, high + more)
         keys.append(key({**base, field: other}))
     monkeypatch.setattr(bank_module, "GENERATOR_VERSION", 999)
@@ -380,16 +384,16 @@ def test_ranges_are_checked(field: str):
 def test_a_config_is_frozen_complete_and_closed():
     config = load_scenario("paper")
     with pytest.raises(dataclasses.FrozenInstanceError):
-        config.bank = 3  # pyright: ignore[reportAttributeAccessIssue]
+        config.num_train_fires = 3  # pyright: ignore[reportAttributeAccessIssue]
     with pytest.raises(ValidationError, match="wind"):
         FireConfig(**settings_of(wind=3))
     with pytest.raises(ValidationError, match="bank"):
-        FireConfig(**settings_of(bank=0))
+        FireConfig(**settings_of(num_train_fires=0))
     with pytest.raises(ValidationError, match="bank"):
         FireConfig(**settings_of(bank="4"))
     missing = settings_of()
-    del missing["turning"]
-    with pytest.raises(ValidationError, match="turning"):
+    del missing["wind_shift"]
+    with pytest.raises(ValidationError, match="wind_shift"):
         FireConfig(**missing)
 
 
@@ -399,18 +403,18 @@ def test_a_config_is_frozen_complete_and_closed():
     high=st.floats(1e-6, 1),
     ratio=st.floats(1, 8),
     radius=st.floats(0.05, 30),
-    patches=st.integers(0, 32),
+    fuel_patches=st.integers(0, 32),
     seed=st.integers(0, 2**40),
 )
 def test_every_valid_config_gives_a_fire(low, high, ratio, radius, patches, seed):
     values = settings_of(
-        head_rate=(low, high),
+        head_ros=(low, high),
         length_to_breadth=(1, ratio),
         core_radius=(radius, radius),
-        patches=(0, patches),
+        fuel_patches=(0, patches),
     )
     if low > high:
-        with pytest.raises(ValidationError, match="head_rate"):
+        with pytest.raises(ValidationError, match="head_ros"):
             FireConfig(**values)
         return
     arrival = make_fires(FireConfig(**values), torch.tensor([seed]), (8, 9), 20)

@@ -185,16 +185,16 @@ def test_make_writes_the_scenarios_fires(suffix, capsys, tmp_path):
     lines = ran(
         capsys,
         *("make", "--count", 5, "huygens", "--split", "heldout", "env.grid=[20,34]"),
-        *("env.horizon=300", "fire.head_rate=[0.01,0.02]", "--output", file),
+        *("env.horizon=300", "fire.head_ros=[0.01,0.02]", "--output", file),
     )
     assert lines == ["5 fires of 20 x 34 cells, 300 steps", str(file)]
     config = load_scenario("huygens")
-    object.__setattr__(config, "head_rate", (0.01, 0.02))
+    object.__setattr__(config, "head_ros", (0.01, 0.02))
     expected = make_fires(config, fire_seeds("heldout", 5), (20, 34), 300).numpy()
     assert np.isinf(expected).any()
     if suffix == ".npy":
         fires, about = np.load(file), json.loads(file.with_suffix(".json").read_text())
-        names, rate = about["fires"], about["fire"]["head_rate"]
+        names, rate = about["fires"], about["fire"]["head_ros"]
         assert about["axes"] == ["fire", "x", "y"]
     else:
         with rasterio.open(file) as raster:
@@ -207,7 +207,7 @@ def test_make_writes_the_scenarios_fires(suffix, capsys, tmp_path):
                 wanted = expected[:, i, j]
                 assert np.array_equal(values, np.where(np.isinf(wanted), -9999, wanted))
         fires = np.where(rows == -9999, np.inf, rows)[:, ::-1].transpose(0, 2, 1)
-        rate = json.loads(about["fire"])["head_rate"]
+        rate = json.loads(about["fire"])["head_ros"]
     assert fires.dtype == np.float32
     assert np.array_equal(fires, expected)
     assert names == [f"huygens heldout {seed}" for seed in range(1_000_000, 1_000_005)]
@@ -224,7 +224,7 @@ def test_make_writes_the_scenarios_fires(suffix, capsys, tmp_path):
 def test_make_without_more_writes_what_is_trained_on(capsys, tmp_path):
     assert ran(capsys, "make", "paper")[-1] == "paper_train_1.npy"
     assert ran(capsys, "make", "paper")[-1] == "paper_train_1_2.npy"
-    assert ran(capsys, "make", "huygens", "env.horizon=9", "fire.bank=3")[-1] == (
+    assert ran(capsys, "make", "huygens", "env.horizon=9", "fire.num_train_fires=3")[-1] == (
         "huygens_train_3.npy"
     )
     expected = make_fires(HUYGENS, fire_seeds("train", 3), (30, 30), 9).numpy()
@@ -303,7 +303,7 @@ KNOWN = "known: huygens, oil_slick, paper"
         (["preview", "folder"], ["folder", "expected a file"]),
         (["preview", "empty.tif"], ["empty.tif", "empty"]),
         (["preview", "paper", "env.gird=[9,9]"], ["'env.gird'", "did you mean env.grid?"]),
-        (["preview", "paper", "fire.heat_rate=[1,1]"], ["did you mean fire.head_rate?"]),
+        (["preview", "paper", "fire.heat_rate=[1,1]"], ["did you mean fire.head_ros?"]),
         (["preview", "paper", "fire.units=minutes"], ["'fire.units'"]),
         (["preview", "paper", "seed=3"], ["'seed=3'", "keys of setup, env. and fire. only"]),
         (["preview", "paper", "fire=huygens"], ["'fire=huygens'", "without a key"]),
@@ -316,7 +316,7 @@ KNOWN = "known: huygens, oil_slick, paper"
         (["make", "zzz"], ["'zzz'", KNOWN]),
         (["make", "file"], ["'file'", KNOWN]),
         (["make", "paper:1"], ["'paper:1'", "did you mean paper?"]),
-        (["make", "paper", "fire.bank=0"], ["fire.bank=0"]),
+        (["make", "paper", "fire.num_train_fires=0"], ["fire.num_train_fires=0"]),
         (["make", "paper", "--count", "5000", "--output", "a.tif"], ["5000 fires", "4096", ".npy"]),
         (["make", "paper", "--count", "300000"], ["300000 fires", "1073741824"]),
         (["make", "paper", "--count", "9" * 30], ["at most"]),

@@ -87,7 +87,7 @@ def test_keys_come_in_any_order_and_setup_keeps_its_own(source):
         ("fire.ring_width=0", "fire.ring_width"),
         ("fire.start=nan", "fire.start"),
         ("fire.minutes_per_step=-1", "fire.minutes_per_step"),
-        ("fire.bank=3", "fire.bank"),
+        ("fire.num_train_fires=3", "fire.num_train_fires"),
         ("fire.kind=spread", "chosen with fire=NAME"),
         ("fire.sha256=abc", "fire.sha256"),
         ("fire.kept=abc", "fire.kept"),
@@ -191,7 +191,7 @@ def test_old_runs_load_as_they_were():
     values = to_values(resolve("consensus", ["setup=tuned"]))
     assert "kind" not in values["fire"]
     assert from_values(values) == resolve("consensus", ["setup=tuned"])
-    with pytest.raises(ValueError, match=r"^fire\.bank=0: "):
+    with pytest.raises(ValueError, match=r"^fire\.num_train_fires=0: "):
         from_values({**values, "fire": {**values["fire"], "bank": 0}})
     with pytest.raises(ValueError, match=r"key 'fire\.kind' is not known"):
         from_values({**values, "fire": {**values["fire"], "kind": "other"}})

@@ -208,10 +208,10 @@ def re_keyed(text: str) -> str:
 LINES = {
     "no mapping": "[1]\n",
     "text": '{"episode": "__import__(\'os\')"}\n',
-    "nested": '{"episode": 1, "score": {"a": 1}}\n',
+    "nested": '{"episode": 1, "mean_reward": {"a": 1}}\n',
     "the same key twice": '{"episode": 1, "episode": 2}\n',
     "deep": "[" * 100_000 + "\n",
-    "no episode": '{"score": 1}\n',
+    "no episode": '{"mean_reward": 1}\n',
     "no text": "\x00\x01\n",
 }
 
@@ -225,10 +225,11 @@ def test_the_lines_of_a_run(kind, run, mark, capsys):
 def test_numbers_of_a_run_without_bounds(run, capsys):
     many = "9" * 5000
     (run / "metrics.jsonl").write_text(
-        f'{{"episode": 1, "score": NaN, "coverage": 1e999}}\n{{"episode": 2, "score": {many}}}\n'
+        '{"episode": 1, "mean_reward": NaN, "coverage": 1e999}\n'
+        f'{{"episode": 2, "mean_reward": {many}}}\n'
     )
     assert main.main(["eval", str(run), "--fires", "1"]) == 0
-    assert RunFolder(run).lines()[1]["score"] == float("inf")
+    assert RunFolder(run).lines()[1]["mean_reward"] == float("inf")
 
 
 EVALUATIONS = {
@@ -286,7 +287,7 @@ OVERRIDES = [
     "hydra.run.dir=mark",
     "hydra.searchpath=[file:///tmp]",
     "hydra/launcher=basic",
-    "special=../../mark",
+    "setup_method=../../mark",
     "setup=../../mark",
     "fire=/etc/passwd",
     "fire@env=paper",
@@ -312,7 +313,7 @@ def test_an_override(text, tmp_path, mark, monkeypatch, capsys):
 
 def test_a_method_that_is_a_path(tmp_path, mark, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "mine.yaml").write_text("# @package _global_\nmemory: shared\n")
+    (tmp_path / "mine.yaml").write_text("# @package _global_\nreplay: shared\n")
     for method in ("./mine", "../mine", str(tmp_path / "mine"), "consensus.yaml", "base"):
         refused(["train", method], capsys, mark)
 

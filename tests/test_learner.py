@@ -27,7 +27,9 @@ RATES = {
 def make_learner() -> Learner:
     observation = Composite({keys.OBSERVATION: Unbounded((1, UAVS, FEATURES))}, shape=(1,))
     action = Composite({keys.ACTION: Bounded(-1, 1, (1, UAVS, ACTIONS))}, shape=(1,))
-    config = LearnerConfig(hidden=HIDDEN, updates=1, batch=BATCH, capacity=100, **RATES)
+    config = LearnerConfig(
+        hidden=HIDDEN, updates_per_step=1, batch_size=BATCH, buffer_size=100, **RATES
+    )
     generator = torch.Generator().manual_seed(5)
     networks = (
         make(observation, action, HIDDEN, generator=generator) for make in (make_actor, make_critic)

@@ -11,7 +11,7 @@ YES, NO = True, False
 
 def test_score_is_the_mean_over_uavs_and_steps():
     reward = torch.tensor([[1.0, -4], [-10, 0], [-100, 2]])
-    assert metrics.score(reward).item() == pytest.approx(-111 / 6)
+    assert metrics.mean_reward(reward).item() == pytest.approx(-111 / 6)
 
 
 def test_coverage_is_of_the_last_step():
@@ -33,7 +33,7 @@ def test_coverage_is_of_the_last_step():
     ],
 )
 def test_coverage_time(seen, burning, time):
-    assert metrics.coverage_time(torch.tensor(seen), torch.tensor(burning)).item() == time
+    assert metrics.time_to_full_coverage(torch.tensor(seen), torch.tensor(burning)).item() == time
 
 
 def test_where_nothing_burns_all_is_covered():
@@ -69,7 +69,7 @@ def test_fire_exits_count_every_loss():
         "thrice": [YES, NO, YES, NO, YES, NO],
     }
     on_fire = torch.tensor(list(track.values())).T
-    assert metrics.fire_exits(on_fire).item() == (2 + 0 + 0 + 3) / 4
+    assert metrics.fire_losses(on_fire).item() == (2 + 0 + 0 + 3) / 4
 
 
 def test_every_measure_takes_any_batch():
@@ -78,14 +78,14 @@ def test_every_measure_takes_any_batch():
     burning = torch.arange(5, 12).expand(2, 3, 7)
     seen = (torch.rand(2, 3, 7, generator=generator) * burning).round().long()
     cases = {
-        metrics.score: (flags.float(),),
+        metrics.mean_reward: (flags.float(),),
         metrics.coverage: (seen, burning),
         metrics.coverage_auc: (seen, burning),
-        metrics.coverage_time: (seen, burning),
+        metrics.time_to_full_coverage: (seen, burning),
         metrics.tracking_first: (flags,),
         metrics.tracking_last: (flags,),
         metrics.boundary_exits: (flags,),
-        metrics.fire_exits: (flags,),
+        metrics.fire_losses: (flags,),
     }
     assert [measure.__name__ for measure in cases] == list(metrics.NAMES)
     for measure, data in cases.items():
@@ -110,14 +110,14 @@ def by_hand(steps) -> dict[str, float]:
     left = sum(any(steps[keys.BEYOND][t, n]) for t in range(horizon) for n in range(uavs))
     lost = sum(bool(on[t - 1][n] and not on[t][n]) for t in range(1, horizon) for n in range(uavs))
     return {
-        "score": sum(steps[keys.REWARD].flatten().tolist()) / horizon / uavs,
+        "mean_reward": sum(steps[keys.REWARD].flatten().tolist()) / horizon / uavs,
         "coverage": share[-1],
         "coverage_auc": sum(share) / horizon,
-        "coverage_time": next((t + 1 for t, s in enumerate(share) if s == 100), horizon),
+        "time_to_full_coverage": next((t + 1 for t, s in enumerate(share) if s == 100), horizon),
         "tracking_first": min(found),
         "tracking_last": max(found),
         "boundary_exits": left / uavs,
-        "fire_exits": lost / uavs,
+        "fire_losses": lost / uavs,
     }
 
 
@@ -139,8 +139,8 @@ def test_episode_metrics_equal_a_count_by_loops(method):
     for e in range(2):
         expected = by_hand(steps[e])
         assert {k: v[e].item() for k, v in measured.items()} == pytest.approx(expected, rel=1e-5)
-    assert measured["coverage_time"][0] < 60, "coverage_time is to fire"
-    assert measured["coverage_time"][1] == 60
+    assert measured["time_to_full_coverage"][0] < 60, "time_to_full_coverage is to fire"
+    assert measured["time_to_full_coverage"][1] == 60
 
 
 def test_step_keys_are_all_that_is_read():

@@ -25,10 +25,10 @@ from emberlink.envs.fire.level_set import arrival_times, disc
 GRID, HORIZON = (30, 30), 1000
 NEW = ("drift_rate", "tide_reach", "tide_period", "tide_phase", "tide_bearing", "two_sided")
 PLAIN: dict[str, Any] = {
-    "head_rate": 0.003,
+    "head_ros": 0.003,
     "length_to_breadth": 2.0,
     "azimuth": 25.0,
-    "turning": 40.0,
+    "wind_shift": 40.0,
     "centre_x": 0.5,
     "centre_y": 0.45,
     "core_radius": 4.7,
@@ -59,7 +59,7 @@ def expected(config: FireConfig, grid: tuple[int, int] = GRID, horizon: int = HO
     scale = min(grid) / 30
 
     def azimuth(times):
-        return value["azimuth"] + value["turning"] * times / 1000
+        return value["azimuth"] + value["wind_shift"] * times / 1000
 
     def velocity(times):
         waves = np.cos(2 * math.pi * times / value["tide_period"] + value["tide_phase"])
@@ -69,14 +69,14 @@ def expected(config: FireConfig, grid: tuple[int, int] = GRID, horizon: int = HO
         x = steady * np.cos(along) + tide * np.cos(axis)
         return np.stack([x, steady * np.sin(along) + tide * np.sin(axis)], -1)
 
-    head, ratio = value["head_rate"] * scale, value["length_to_breadth"]
+    head, ratio = value["head_ros"] * scale, value["length_to_breadth"]
     rates = [float(rate) for rate in ellipse_rates(head, ratio, config.two_sided)]
     centre = [value[f"centre_{axis}"] * (side - 1) for axis, side in zip("xy", grid, strict=True)]
     radius = value["core_radius"] * scale
     return torch.from_numpy(exact_arrival(grid, centre, radius, rates, azimuth, velocity, horizon))
 
 
-DEGREES = ("azimuth", "turning", "tide_phase", "tide_bearing")
+DEGREES = ("azimuth", "wind_shift", "tide_phase", "tide_bearing")
 CASES = {
     "slick": {},
     "tide alone": {"drift_rate": 0.0, "tide_reach": 6.0, "tide_period": 1000.0},
@@ -86,7 +86,7 @@ CASES = {
     "a tide much faster than the front": {
         "tide_period": 100.0,
         "tide_reach": 0.0318,
-        "head_rate": 0.001,
+        "head_ros": 0.001,
         "drift_rate": 0.0,
     },
 }
@@ -171,7 +171,7 @@ def test_two_sided_by_hand():
 
 
 def test_two_sides_are_alike_and_one_side_is_not():
-    calm = {"drift_rate": 0.0, "tide_reach": 0.0, "turning": 0.0, "centre_y": 0.5}
+    calm = {"drift_rate": 0.0, "tide_reach": 0.0, "wind_shift": 0.0, "centre_y": 0.5}
     both, one = (computed(slick(side, **calm), (31, 31)) for side in (True, False))
     torch.testing.assert_close(both.rot90(2), both, atol=0.05, rtol=0)
     assert (one.rot90(2).isfinite() != one.isfinite()).sum() > 10
@@ -179,7 +179,7 @@ def test_two_sides_are_alike_and_one_side_is_not():
 
 def test_mirror():
     there = computed(slick(centre_y=0.5))
-    mirrored = {key: -PLAIN[key] for key in ("azimuth", "turning", "tide_bearing")}
+    mirrored = {key: -PLAIN[key] for key in ("azimuth", "wind_shift", "tide_bearing")}
     back = computed(slick(centre_y=0.5, **mirrored))
     torch.testing.assert_close(back.flip(1), there, atol=0.05, rtol=0)
 
@@ -193,7 +193,7 @@ def test_half_a_period_later_the_tide_runs_the_other_way():
 def swept(period: float) -> Tensor:
     """A disc of radius 3 that hardly grows and swings along x, by 4 cells to either side."""
     tide = {"tide_reach": 8.0, "tide_period": period, "tide_phase": 0.0}
-    still = {"head_rate": 1e-6, "length_to_breadth": 1.0, "drift_rate": 0.0, "tide_bearing": 0.0}
+    still = {"head_ros": 1e-6, "length_to_breadth": 1.0, "drift_rate": 0.0, "tide_bearing": 0.0}
     middle = {"centre_x": 0.5, "centre_y": 0.5, "core_radius": 3.0}
     return computed(slick(**tide, **still, **middle), (31, 31), 2 * int(period))
 
@@ -261,14 +261,14 @@ def lehr(minutes: float, knots: float) -> tuple[float, float]:
 
 def test_the_numbers_are_those_of_the_sources():
     config, episode = load_scenario("oil_slick"), 12.42 * 60 / 2
-    rounded = {"core_radius": [], "head_rate": [], "length_to_breadth": [], "drift_rate": []}
+    rounded = {"core_radius": [], "head_ros": [], "length_to_breadth": [], "drift_rate": []}
     for age in (120, 180):
         for knots in (4, 8):
             start, end = lehr(age, knots), lehr(age + episode, knots)
             radius = math.sqrt(math.prod(start)) / 2
             along, across = (side / 2 - radius for side in end)
             rounded["core_radius"].append(round(radius, 1))
-            rounded["head_rate"].append(round(along / 1000, 4))
+            rounded["head_ros"].append(round(along / 1000, 4))
             rounded["length_to_breadth"].append(round(along / across, 1))
             metres = 0.03 * knots * 1852 / 3600 * episode * 60 / 1000
             rounded["drift_rate"].append(round(metres / 500, 4))

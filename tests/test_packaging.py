@@ -127,7 +127,7 @@ def test_wheel_holds_the_package_and_nothing_else(wheel: Path):
     assert {f"{folder}/py.typed" for folder in FOLDERS} <= held
     assert {"configs/__init__.py", "configs/method/consensus.yaml"} <= held
     assert {path.split("/")[1] for path in held if path.endswith(".yaml")} >= {
-        *("base.yaml", "method", "setup", "fire", "special")
+        *("base.yaml", "method", "setup", "fire", "setup_method")
     }
     # Jupyter's own package is called comm: with this file, tools started here would import ours.
     assert "comm/__init__.py" not in held
@@ -186,8 +186,8 @@ def test_console_script_starts(installed: Path, elsewhere):
 
 def test_console_script_trains(installed: Path, elsewhere):
     cwd, env = elsewhere
-    tiny = ("env.horizon=20", "env.num_uavs=2", "learner.batch=8", "learner.hidden=[8,8]")
-    tiny = (*tiny, "episodes=1", "evaluation.fires=1", "evaluation.interval=0")
+    tiny = ("env.horizon=20", "env.num_uavs=2", "learner.batch_size=8", "learner.hidden=[8,8]")
+    tiny = (*tiny, "episodes=1", "evaluation.episodes=1", "evaluation.interval=0")
     printed = run(installed / "emberlink", "train", "independent", *tiny, cwd=cwd, env=env)
     (folder,) = (cwd / "runs").iterdir()
     assert Path(printed.strip().splitlines()[-1]) == folder.relative_to(cwd)

@@ -114,7 +114,9 @@ def test_spaces():
 @pytest.mark.parametrize("observation", ["raw", "box"])
 @pytest.mark.parametrize("altitude", [(1.0, 4.0), (3.3, 4.1), (255.3, 255.9), (2.0, 2.0)])
 def test_every_observation_is_in_its_space(observation, altitude):
-    config = WildfireConfig(num_uavs=4, horizon=25, observation=observation, altitude=altitude)
+    config = WildfireConfig(
+        num_uavs=4, horizon=25, observation_scale=observation, altitude=altitude
+    )
     env = parallel_env(config=config)
     observations, _ = env.reset()
     while True:

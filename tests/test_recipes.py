@@ -25,7 +25,7 @@ def short(method: str, output, *more: str, setup: str = "paper", seed: int = 0):
         [
             *(f"setup={setup}", f"seed={seed}", f"output={output}"),
             *(f"episodes={EPISODES}", f"env.horizon={HORIZON}", f"num_envs={ENVS}"),
-            *(f"learner.batch={BATCH}", "learner.hidden=[32,32]", "evaluation.interval=0"),
+            *(f"learner.batch_size={BATCH}", "learner.hidden=[32,32]", "evaluation.interval=0"),
             *more,
         ],
     )
@@ -66,7 +66,7 @@ def check_lines(run: RunFolder, config) -> None:
     text = (run.path / "metrics.jsonl").read_text()
     lines = [json.loads(line) for line in text.splitlines()]
     assert len(lines) == EPISODES
-    shared = config.memory == "shared"
+    shared = config.replay == "shared"
     rows = rows_needed(config.env.num_uavs, shared=shared, batch=BATCH)
     without = math.ceil(rows / ENVS) - 1
     for episode, line in enumerate(lines, start=1):
@@ -110,7 +110,7 @@ def test_evaluations_and_checkpoints_come_at_their_intervals(tmp_path):
         "consensus",
         tmp_path,
         *("episodes=5", "env.horizon=20", "checkpoint_interval=2"),
-        *("evaluation.interval=2", "evaluation.interval_fires=2"),
+        *("evaluation.interval=2", "evaluation.interval_episodes=2"),
     )
     run = trained(config).run
     frozen = {f"{fire}/{name}" for fire in ("huygens", "paper") for name in metrics.NAMES}
@@ -123,7 +123,9 @@ def test_evaluations_and_checkpoints_come_at_their_intervals(tmp_path):
 
 
 def test_several_updates_a_step(tmp_path):
-    config = short("shared_memory", tmp_path, "episodes=1", "env.horizon=20", "learner.updates=3")
+    config = short(
+        "shared_memory", tmp_path, "episodes=1", "env.horizon=20", "learner.updates_per_step=3"
+    )
     trainer = trained(config)
     assert trainer.updates == 3 * (20 - 2)  # 32 of 12 transitions a step: from step 3 on
 

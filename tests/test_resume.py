@@ -21,8 +21,8 @@ HORIZON, EPISODES = 20, 4
 SMALL = [
     *(f"env.horizon={HORIZON}", f"episodes={EPISODES}", "env.num_uavs=2", "num_envs=2"),
     # A memory of 60 rows comes round after 30 of the 80 steps.
-    *("learner.hidden=[8,8]", "learner.batch=16", "learner.capacity=60"),
-    *("evaluation.interval=0", "evaluation.interval_fires=1", "evaluation.fires=1"),
+    *("learner.hidden=[8,8]", "learner.batch_size=16", "learner.buffer_size=60"),
+    *("evaluation.interval=0", "evaluation.interval_episodes=1", "evaluation.episodes=1"),
 ]
 
 
@@ -115,7 +115,7 @@ def test_every_step_can_be_the_last_one(whole, tmp_path):
 
 
 def test_several_updates_a_step_and_the_released_setup(whole, tmp_path):
-    more = ["setup=released", "learner.updates=3"]
+    more = ["setup=released", "learner.updates_per_step=3"]
     assert_same(whole("consensus", *more), stopped_at([9, 50], "consensus", tmp_path, *more))
 
 
@@ -162,7 +162,7 @@ def test_a_run_without_a_checkpoint_begins_again(whole, tmp_path):
 
 def test_more_episodes_are_those_of_a_run_that_had_them_from_the_start(whole, tmp_path):
     """Also of a memory that was full to the last row, and is larger now."""
-    roomy = "learner.capacity=100000"
+    roomy = "learner.buffer_size=100000"
     short = until(begun("shared_memory", tmp_path, roomy, "episodes=2"), None)
     assert len(short.memory) == short.memory.sampler.rows == 2 * 2 * HORIZON
     again = resume(short.run.path, overrides=[f"episodes={EPISODES}"])
@@ -181,7 +181,7 @@ def test_more_episodes_are_those_of_a_run_that_had_them_from_the_start(whole, tm
         (["fire=huygens"], "fire=huygens: the run has fire=paper"),
         (["episodes=1"], "episodes=1: the run has done 1.5"),
         (["keap=3"], "'keap' is not known; did you mean keep?"),
-        (["keep=0"], "keep=0"),
+        (["keep_checkpoints=0"], "keep_checkpoints=0"),
     ],
 )
 def test_what_was_learnt_with_is_kept(overrides, message, paused, capsys):
@@ -209,7 +209,7 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 
 def test_the_command_goes_on_and_says_when_nothing_is_left(paused, whole, capsys):
-    quiet = ["evaluation.fires=2", "checkpoint_interval=1", "keep=2", "setup=paper"]
+    quiet = ["evaluation.episodes=2", "checkpoint_interval=1", "keep_checkpoints=2", "setup=paper"]
     assert main.main(["train", "positional", f"resume={paused}"]) == 2
     assert "the run is of method 'consensus'" in capsys.readouterr().err
     assert main.main(["train", "consensus", f"resume={paused}", *quiet]) == 0
@@ -255,11 +255,11 @@ def test_a_tracker_goes_on_where_the_checkpoint_was_made(tmp_path):
     for path in [two.run.state(70), *two.run.networks()[-1:]]:
         path.unlink()  # stands for a run that was killed: csv knows of later episodes
     assert rows(one) == rows(until(resume(two.run.path), None))
-    assert len(rows(one)["score.csv"].splitlines()) == EPISODES
+    assert len(rows(one)["mean_reward.csv"].splitlines()) == EPISODES
 
 
 def test_old_checkpoints_go_and_the_best_stays(tmp_path):
-    more = ["checkpoint_steps=9", "keep=3", "evaluation.interval=1"]
+    more = ["checkpoint_steps=9", "keep_checkpoints=3", "evaluation.interval=1"]
     trainer = until(begun("consensus", tmp_path, *more), None)
     run = trainer.run
     assert [path.stem[-3:] for path in run.networks()] == ["063", "072", "080"]
@@ -278,7 +278,7 @@ def test_tensorboard_forgets_what_comes_again(tmp_path):
     until(resume(trainer.run.path), None)
     events = EventAccumulator(str(trainer.run.path / "tensorboard"))
     events.Reload()
-    assert [event.step for event in events.Scalars("score")] == [1, 2, 3, 4]
+    assert [event.step for event in events.Scalars("mean_reward")] == [1, 2, 3, 4]
 
 
 def test_wandb_keeps_the_name_of_the_run(tmp_path, monkeypatch):

@@ -13,7 +13,7 @@ from emberlink.comm import consensus
 from emberlink.envs import WildfireConfig, WildfireEnv, keys, metrics
 from emberlink.envs.world.sensor import view_radius
 from emberlink.policies.scripted.base import Scripted
-from emberlink.policies.scripted.follow_target import Pursuit
+from emberlink.policies.scripted.follow_target import FollowTarget
 from emberlink.policies.scripted.lawnmower import Lawnmower, stops
 from emberlink.policies.scripted.oracle import Oracle
 from emberlink.policies.scripted.registry import SCRIPTED
@@ -113,18 +113,18 @@ def test_the_lawnmower_sees_every_cell(grid, uavs, angle, ceiling, displacement)
     pytest.fail(f"{moment[keys.SEEN].item()} of {grid[0] * grid[1]} cells were seen")
 
 
-# Pursuit
+# FollowTarget
 
 
 def test_pursuit_reads_what_consensus_writes():
-    assert Pursuit.TARGET == consensus.TARGET
+    assert FollowTarget.TARGET == consensus.TARGET
 
 
 def test_pursuit_flies_straight_at_the_target_by_hand():
     env = WildfireEnv(1, world(uavs=3, displacement=0.5), torch.full((9, 9), NEVER))
     moment = env.reset(position=torch.tensor([[1.0, 1, 2], [5, 5, 4], [3, 3, 3]]))
-    moment[Pursuit.TARGET] = torch.tensor([[[5.0, 3, 1], [5, 5, 3.75], [3, 3, 3]]])
-    action = Pursuit(env)(moment)[keys.ACTION].mul(1e4).round() / 1e4
+    moment[FollowTarget.TARGET] = torch.tensor([[[5.0, 3, 1], [5, 5, 3.75], [3, 3, 3]]])
+    action = FollowTarget(env)(moment)[keys.ACTION].mul(1e4).round() / 1e4
     # By (4, 2, -1) cells: 8, 4, -2 units. By (0, 0, -0.25): half a unit, and there it stops.
     assert action.tolist() == [[[1, 0.5, -0.25], [0, 0, -0.5], [0, 0, 0]]]
 
@@ -285,7 +285,7 @@ def test_what_each_policy_covers():
         "random_actions": (12, 28),
         "random_waypoints": (82, 96),
         "lawnmower": (86, 98),
-        "pursuit": (8, 35),
+        "follow_target": (8, 35),
         "oracle": (99, 100),
     }
     assert bounds.keys() == SCRIPTED.keys()

@@ -28,7 +28,7 @@ def test_a_seed_of_a_stack_learns_what_it_learns_alone(method, setup, tmp_path):
     """Some two hundred updates; both work in float32, in another order."""
     settings = [
         *(f"setup={setup}", "env.horizon=60", "episodes=4", "num_envs=2", "env.num_uavs=3"),
-        *("learner.batch=24", "learner.hidden=[24,16]", "evaluation.interval=0"),
+        *("learner.batch_size=24", "learner.hidden=[24,16]", "evaluation.interval=0"),
     ]
     together = trained(resolve(method, [*settings, f"seeds={SEEDS}", f"output={tmp_path / 'a'}"]))
     assert together.updates > 200
@@ -49,7 +49,7 @@ def test_a_stack_of_networks_learns_as_each_does_to_the_last_digits(tmp_path):
 
     In float32 these rates let Adam blow rounding errors up where a gradient all but vanishes.
     """
-    settings = ["setup=tuned", "env.horizon=50", "learner.batch=16", "learner.hidden=[24,16]"]
+    settings = ["setup=tuned", "env.horizon=50", "learner.batch_size=16", "learner.hidden=[24,16]"]
 
     def learner(seeds: str, samples: int = 0) -> tuple[Trainer, list]:
         trainer = Trainer(resolve("consensus", [*settings, seeds]))
@@ -90,7 +90,7 @@ def next_of(batch: TensorDict, uavs: slice) -> TensorDict:
 
 def test_seeds_of_a_stack_differ_in_all_that_is_random():
     """Weights, start positions, fires, noise, and what is drawn from the memory."""
-    settings = ["fire=huygens", "env.horizon=30", "learner.batch=24", "learner.hidden=[8,8]"]
+    settings = ["fire=huygens", "env.horizon=30", "learner.batch_size=24", "learner.hidden=[8,8]"]
     trainer = Trainer(resolve("consensus", [*settings, f"seeds={SEEDS}"]))
     first, second = (trainer.weights(team) for team in range(2))
     assert not any(first[name].equal(second[name]) for name in first if "norm" not in name)
@@ -126,8 +126,8 @@ def test_seeds_that_cannot_share_the_environments_out(seeds):
 def test_every_seed_gets_a_run_folder_that_evaluates(tmp_path, capsys):
     small = [
         *("episodes=2", "env.horizon=15", "env.num_uavs=2", "learner.hidden=[8,8]"),
-        *("learner.batch=8", "evaluation.fires=2", "evaluation.interval=1"),
-        "evaluation.interval_fires=2",
+        *("learner.batch_size=8", "evaluation.episodes=2", "evaluation.interval=1"),
+        "evaluation.interval_episodes=2",
     ]
     arguments = ["train", "positional", *small, "seeds=[7,8]", f"output={tmp_path}"]
     assert main.main(arguments) == 0
@@ -183,9 +183,9 @@ def test_a_configuration_from_before_there_were_seeds():
 
 
 def test_every_seed_has_a_tracker_of_its_own(tmp_path):
-    small = ["env.horizon=8", "episodes=2", "learner.batch=8", "learner.hidden=[4,4]"]
+    small = ["env.horizon=8", "episodes=2", "learner.batch_size=8", "learner.hidden=[4,4]"]
     more = [f"seeds={SEEDS}", "logger=csv", f"output={tmp_path}", "evaluation.interval=0"]
     for run in trained(resolve("independent", [*small, *more])).runs:
-        (scores,) = (run.path / "csv").rglob("score.csv")
+        (scores,) = (run.path / "csv").rglob("mean_reward.csv")
         logged = [float(line.split(",")[1]) for line in scores.read_text().splitlines()]
-        assert logged == pytest.approx([line["score"] for line in run.lines()])
+        assert logged == pytest.approx([line["mean_reward"] for line in run.lines()])

@@ -28,15 +28,15 @@ TABLE = {
     "env.reward.no_fire": (-10.0, -4.0),
     "env.reward.exit": (-100.0, -150.0),
     "env.reward.exit_axes": ("xyz", "xy"),
-    "env.observation": ("raw", "raw"),
+    "env.observation_scale": ("raw", "raw"),
     "learner.hidden": ((400, 300), (400, 300)),
     "learner.actor_lr": (1e-4, 1e-4),
     "learner.critic_lr": (1e-3, 1e-3),
     "learner.critic_weight_decay": (0.01, 0.01),
     "learner.tau": (0.001, 0.001),
-    "learner.capacity": (1_000_000, 1_000_000),
-    "learner.batch": (512, 512),
-    "learner.updates": (1, 1),
+    "learner.buffer_size": (1_000_000, 1_000_000),
+    "learner.batch_size": (512, 512),
+    "learner.updates_per_step": (1, 1),
     "num_envs": (1, 1),
     "exploration.theta": (0.2, 0.2),
     "exploration.sigma": (0.15, 0.15),
@@ -47,8 +47,8 @@ GAMMA = {(method, setup): 0.95 for method in METHODS for setup in (PAPER, RELEAS
 GAMMA["independent", RELEASED] = 0.92
 # What a method is: whose memory, and what is heard.
 SWITCHES = {
-    "independent": ("private", "silent"),
-    "shared_memory": ("shared", "silent"),
+    "independent": ("private", "no_comm"),
+    "shared_memory": ("shared", "no_comm"),
     "positional": ("shared", "positional"),
     "consensus": ("shared", "consensus"),
 }
@@ -104,7 +104,7 @@ def test_methods_differ_in_two_switches_and_in_what_is_listed(setup):
     every = {method: resolve(method, [f"setup={setup}"]) for method in METHODS}
     common: dict[str, set[str]] = {}
     for method, config in every.items():
-        assert (config.memory, config.comm["name"]) == SWITCHES[method]
+        assert (config.replay, config.comm["name"]) == SWITCHES[method]
         own = OWN[setup].get(method, {})
         values = flat(to_values(config))
         assert {key: values[key] for key in own} == own

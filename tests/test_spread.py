@@ -98,7 +98,7 @@ def test_front_speed_supports_the_wavelet(ratio: float):
 ACCURACY = [
     pytest.param(1.0, STRAIGHT, (0.977, 0.992, 0.999), id="circle"),
     pytest.param(3.0, STRAIGHT, (0.992, 0.992, 0.998), id="ellipse"),
-    pytest.param(3.0, TURNING, (0.985, 0.994, 0.998), id="turning"),
+    pytest.param(3.0, TURNING, (0.985, 0.994, 0.998), id="wind_shift"),
 ]
 
 

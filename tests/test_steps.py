@@ -91,7 +91,7 @@ def test_equals_the_scalar_environment(case):
         lambda pair: tuple(sorted(pair))
     ),
     displacement=st.floats(0.01, 20),
-    observation=st.sampled_from(["raw", "box"]),
+    observation_scale=st.sampled_from(["raw", "box"]),
     seed=st.integers(0, 2**31 - 1),
 )
 def test_what_holds_at_every_step(seed, grid, uavs, **changes):

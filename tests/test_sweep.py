@@ -19,8 +19,8 @@ SMALL = [
     "env.horizon=40",
     "num_envs=2",
     "learner.hidden=[4,4]",
-    "learner.batch=16",
-    "evaluation.fires=2",
+    "learner.batch_size=16",
+    "evaluation.episodes=2",
     "evaluation.interval=0",
 ]
 

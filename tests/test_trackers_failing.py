@@ -23,7 +23,7 @@ from emberlink.trainers.training.trainer import Progress, Trainer
 EPISODES = 4
 SHORT = [
     *(f"episodes={EPISODES}", "env.horizon=8", "env.num_uavs=2", "fire=paper"),
-    *("learner.hidden=[8,8]", "learner.batch=8", "evaluation.interval=0"),
+    *("learner.hidden=[8,8]", "learner.batch_size=8", "evaluation.interval=0"),
 ]
 
 
@@ -214,7 +214,7 @@ def test_a_program_whose_wandb_was_killed_ends_in_peace(tmp_path):
         "    return measure(self, *rest)\n"
         "loop.Trainer._measure = strike\n" + PROGRAM
     )
-    arguments = ["train", "independent", *SHORT, "evaluation.fires=1", "logger=wandb"]
+    arguments = ["train", "independent", *SHORT, "evaluation.episodes=1", "logger=wandb"]
     done = subprocess.run(
         [sys.executable, "-c", program, *arguments, f"output={tmp_path / 'runs'}"],
         capture_output=True,

@@ -17,8 +17,8 @@ from emberlink.trainers.training.trainer import Trainer
 
 SHORT = [
     *("setup=tuned", "seed=3", "episodes=4", "env.horizon=12", "env.num_uavs=2", "num_envs=2"),
-    *("learner.hidden=[8,8]", "learner.batch=16"),
-    *("evaluation.interval=2", "evaluation.interval_fires=1"),
+    *("learner.hidden=[8,8]", "learner.batch_size=16"),
+    *("evaluation.interval=2", "evaluation.interval_episodes=1"),
 ]
 
 

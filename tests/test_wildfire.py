@@ -89,7 +89,7 @@ def test_flags_are_of_the_moment_and_time_counts():
 
 
 def test_box_observation_is_scaled():
-    env = world(grid=(12, 12), observation="box")
+    env = world(grid=(12, 12), observation_scale="box")
     moment = start(env, [0.0, 5.5, 4])
     assert moment[keys.OBSERVATION][0, 0].tolist() == [-1, 0, 1, 0, 0, 0]
     assert act(env)[keys.OBSERVATION][0, 0].tolist() == pytest.approx([-1, 0, 1, 1, 0, 1 / 20])
@@ -227,7 +227,7 @@ def test_arrival_times_may_lie_in_memory_as_they_like_and_are_copied(layout):
 
 
 def test_fires_of_a_bank_are_drawn_anew():
-    scenario = dataclasses.replace(load_scenario("huygens"), bank=3)
+    scenario = dataclasses.replace(load_scenario("huygens"), num_train_fires=3)
     env = world(scenario, 64)
     fires = []
     for _ in range(4):
@@ -265,7 +265,7 @@ def test_other_bad_input_is_named():
 
 
 def test_an_environment_does_not_depend_on_how_many_run_beside_it():
-    scenario = dataclasses.replace(load_scenario("huygens"), bank=5)
+    scenario = dataclasses.replace(load_scenario("huygens"), num_train_fires=5)
     one, five = world(scenario, 1, seed=3), world(scenario, 5, seed=3)
     action = torch.rand(5, 1, 3, generator=torch.Generator().manual_seed(0)) * 2 - 1
     for _ in range(3):

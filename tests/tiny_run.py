@@ -6,7 +6,12 @@ from emberlink.trainers.cli import main
 
 TINY = [
     *("episodes=2", "env.horizon=15", "env.num_uavs=2", "num_envs=2"),
-    *("learner.hidden=[8,8]", "learner.batch=8", "evaluation.fires=2", "evaluation.interval=0"),
+    *(
+        "learner.hidden=[8,8]",
+        "learner.batch_size=8",
+        "evaluation.episodes=2",
+        "evaluation.interval=0",
+    ),
 ]
 PROGRAM = (
     "import signal, sys\n"

@@ -28,19 +28,19 @@ def length_to_breadth(wind: float | Tensor) -> Tensor:
 
 
 def ellipse_rates(
-    head_rate: float | Tensor, length_to_breadth: float | Tensor, two_sided: bool = False
+    head_ros: float | Tensor, length_to_breadth: float | Tensor, two_sided: bool = False
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Rates of the wavelet of a point source, which stands in a focus of its ellipse.
 
     Args:
-        head_rate: rate of the head, cells per step.
-        length_to_breadth: at least 1, broadcast against `head_rate`.
+        head_ros: rate of the head, cells per step.
+        length_to_breadth: at least 1, broadcast against `head_ros`.
         two_sided: the source stands in the centre instead: the back runs as fast as the head.
 
     Returns:
         (a, b, c): growth of the half length, of the half breadth, and speed of the centre.
     """
-    head, ratio = torch.as_tensor(head_rate), torch.as_tensor(length_to_breadth)
+    head, ratio = torch.as_tensor(head_ros), torch.as_tensor(length_to_breadth)
     if (ratio < 1).any():
         raise ValueError(f"length_to_breadth must be at least 1, got {ratio.min().item()}")
     if two_sided:

@@ -69,15 +69,15 @@ class FireConfig:
 
     name: Name
     """Name of the scenario, that of its file."""
-    bank: Annotated[int, Field(ge=1, lt=HELD_OUT_FROM)]
+    num_train_fires: Annotated[int, Field(ge=1, lt=HELD_OUT_FROM)]
     """Number of fires to train on."""
-    head_rate: Annotated[tuple[_Rate, _Rate], _Pair, _Ordered]
+    head_ros: Annotated[tuple[_Rate, _Rate], _Pair, _Ordered]
     """Rate of spread of the head, cells per step."""
     length_to_breadth: Annotated[tuple[_Ratio, _Ratio], _Pair, _Ordered]
     """Length-to-breadth ratio of the elliptical wavelet, 1 without wind."""
     azimuth: Annotated[tuple[_Degrees, _Degrees], _Pair, _Ordered]
     """Direction towards which the head runs at step 0, degrees counter-clockwise from +x."""
-    turning: Annotated[tuple[_Turn, _Turn], _Pair, _Ordered]
+    wind_shift: Annotated[tuple[_Turn, _Turn], _Pair, _Ordered]
     """Steady turning of that direction, degrees per 1000 steps, counter-clockwise."""
     centre_x: Annotated[tuple[_Fraction, _Fraction], _Pair, _Ordered]
     """Centre of the initial disc along x, as a fraction of the box (0 to X - 1)."""
@@ -87,7 +87,7 @@ class FireConfig:
     """Radius of the initial disc, cells."""
     ring_width: Annotated[tuple[_Length, _Length], _Pair, _Ordered]
     """Width of the part of the disc that burns at step 0, cells; the rest is burnt out."""
-    patches: Annotated[tuple[_Count, _Count], _Pair, _Ordered]
+    fuel_patches: Annotated[tuple[_Count, _Count], _Pair, _Ordered]
     """Number of patches of slow fuel."""
     patch_bearing: Annotated[tuple[_Degrees, _Degrees], _Pair, _Ordered]
     """Where a patch lies as seen from the disc's centre, degrees from the initial azimuth."""
@@ -111,7 +111,7 @@ class FireConfig:
     """Whether the back of the wavelet runs as fast as its head."""
 
 
-_FIXED = {"name", "bank", "two_sided"}
+_FIXED = {"name", "num_train_fires", "two_sided"}
 # The position is part of a draw's key: append new fields, never reorder.
 _DRAWN = tuple(f.name for f in dataclasses.fields(FireConfig) if f.name not in _FIXED)
 
@@ -211,7 +211,7 @@ def _spread(
     fractions = torch.stack([draw["centre_x"], draw["centre_y"]], 1)
     centre = fractions * (torch.tensor(grid, device=seeds.device) - 1)
     distance = disc(centre, draw["core_radius"] * scale)
-    start, turning = draw["azimuth"].deg2rad(), draw["turning"].deg2rad()
+    start, turning = draw["azimuth"].deg2rad(), draw["wind_shift"].deg2rad()
 
     def azimuth(time: float) -> Tensor:
         return start + turning * (time / 1000)
@@ -220,7 +220,7 @@ def _spread(
     arrival = arrival_times(
         distance,
         grid,
-        draw["head_rate"] * scale,
+        draw["head_ros"] * scale,
         draw["length_to_breadth"],
         azimuth,
         horizon=horizon,
@@ -230,7 +230,7 @@ def _spread(
         max_step=longest_step(config.tide_period[0]) if config.tide_reach[1] > 0 else math.inf,
         refine=refine,
         rate_field=_fuel(config, seeds, centre, draw["core_radius"], start, grid),
-        max_rate=(config.head_rate[1] + fastest) * scale,
+        max_rate=(config.head_ros[1] + fastest) * scale,
         device=seeds.device,
     )
     depth = -distance(*_axes(grid, seeds.device))
@@ -262,13 +262,13 @@ def _fuel(
     azimuth: Tensor,
     grid: tuple[int, int],
 ) -> Tensor | None:
-    """Multiplier of the rates, [fires, X, Y]: a product of smooth round patches."""
-    most = config.patches[1]
+    """Multiplier of the rates, [fires, X, Y]: a product of smooth round fuel_patches."""
+    most = config.fuel_patches[1]
     if most == 0:
         return None
     scale = min(grid) / BASE_SIDE
-    low = config.patches[0]
-    count = low + (_unit("patches", seeds, 1) * (most - low + 1)).floor()
+    low = config.fuel_patches[0]
+    count = low + (_unit("fuel_patches", seeds, 1) * (most - low + 1)).floor()
     bearing, distance, width, rate = (
         _draw(config, f"patch_{part}", seeds, most)
         for part in ("bearing", "distance", "radius", "rate")

@@ -47,7 +47,7 @@ def disc(centre: Tensor, radius: Tensor) -> Distance:
 def arrival_times(
     distance: Distance,
     grid: tuple[int, int],
-    head_rate: Varying,
+    head_ros: Varying,
     length_to_breadth: Varying,
     azimuth: Varying,
     *,
@@ -72,7 +72,7 @@ def arrival_times(
     Args:
         distance: the initial front; use `disc` or a function of your own.
         grid: (X, Y), cells.
-        head_rate, length_to_breadth, azimuth: [fires], or a function of time returning it.
+        head_ros, length_to_breadth, azimuth: [fires], or a function of time returning it.
         horizon: steps.
         two_sided: as in `ellipse_rates`.
         drift: velocity of the medium, cells per step, [fires, 2] or a function of time: it carries
@@ -83,7 +83,7 @@ def arrival_times(
         rate_field: multiplier of all rates at the cells, [fires, X, Y] or [1, X, Y], not
             negative; linear in between. A cell with 0 never burns and lets nothing through.
         max_rate: upper bound of (head rate + speed of the drift) · multiplier, cells per step;
-            needed if `head_rate` or `drift` is a function.
+            needed if `head_ros` or `drift` is a function.
         max_step: upper bound of a time step, steps; needed if a function of time varies faster
             than the front crosses a node.
         device: where to compute.
@@ -99,7 +99,7 @@ def arrival_times(
     x, y = (_nodes(cells, pad, refine, device, dtype) for cells in grid)
     phi = distance(x[None, :, None], y[None, None, :])
     rates = None if rate_field is None else _refined(rate_field.to(phi), grid, x, y)
-    step = COURANT / refine / max(_rate_bound(head_rate, drift, rates, max_rate), 1e-12)
+    step = COURANT / refine / max(_rate_bound(head_ros, drift, rates, max_rate), 1e-12)
     step = min(step, max_step)
     cells = (slice(None), *(slice(pad * refine, -pad * refine, refine) for _ in grid))
 
@@ -107,7 +107,7 @@ def arrival_times(
         def now(value: Varying) -> Tensor:
             return (value(time) if callable(value) else value).to(phi)
 
-        wavelet = ellipse_rates(now(head_rate), now(length_to_breadth), two_sided)
+        wavelet = ellipse_rates(now(head_ros), now(length_to_breadth), two_sided)
         current = None if drift is None else now(drift)
         decay = _hamiltonian(field * refine, wavelet, now(azimuth), current)
         return decay if rates is None else decay * rates
@@ -136,15 +136,15 @@ def _nodes(
 
 
 def _rate_bound(
-    head_rate: Varying, drift: Varying | None, rates: Tensor | None, max_rate: float | None
+    head_ros: Varying, drift: Varying | None, rates: Tensor | None, max_rate: float | None
 ) -> float:
     if max_rate is not None:
         return max_rate
     still = drift is None
-    if not isinstance(head_rate, Tensor) or not (still or isinstance(drift, Tensor)):
-        which = "drift" if isinstance(head_rate, Tensor) else "head_rate"
+    if not isinstance(head_ros, Tensor) or not (still or isinstance(drift, Tensor)):
+        which = "drift" if isinstance(head_ros, Tensor) else "head_ros"
         raise ValueError(f"max_rate is needed when {which} is a function, got None")
-    fastest = float(head_rate.max() if still else (head_rate + drift.norm(dim=1)).max())
+    fastest = float(head_ros.max() if still else (head_ros + drift.norm(dim=1)).max())
     return fastest * (1.0 if rates is None else max(float(rates.max()), 0.0))
 
 

@@ -10,7 +10,7 @@ from emberlink.envs.wildfire import WildfireEnv
 from .base import Scripted
 
 
-class Pursuit(Scripted):
+class FollowTarget(Scripted):
     """Flies straight at the target that the network agrees on, altitude included."""
 
     recipe: ClassVar[str | None] = "consensus"

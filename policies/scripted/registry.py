@@ -1,7 +1,7 @@
 """The scripted policies that there are: what a learned one has to beat."""
 
 from .base import Scripted
-from .follow_target import Pursuit
+from .follow_target import FollowTarget
 from .lawnmower import Lawnmower
 from .oracle import Oracle
 from .random_policies import RandomActions, RandomWaypoints, Stationary
@@ -11,7 +11,7 @@ SCRIPTED: dict[str, type[Scripted]] = {
     "random_actions": RandomActions,
     "random_waypoints": RandomWaypoints,
     "lawnmower": Lawnmower,
-    "pursuit": Pursuit,
+    "follow_target": FollowTarget,
     "oracle": Oracle,
 }
 """The policies that every evaluation reports, by name and in this order."""

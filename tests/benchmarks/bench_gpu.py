@@ -35,7 +35,7 @@ def test_the_environment_is_the_same(method, setup):
 @pytest.mark.parametrize("method", METHODS)
 def test_a_recipe_learns_the_same(method, seeds, tmp_path):
     """60 updates, most of them by a graph, against the CPU's."""
-    small = ["env.horizon=40", "episodes=2", "num_envs=2", "learner.batch=32"]
+    small = ["env.horizon=40", "episodes=2", "num_envs=2", "learner.batch_size=32"]
     weights = []
     for device in ("cpu", "cuda"):
         trainer = Trainer(

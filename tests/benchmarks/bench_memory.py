@@ -48,7 +48,7 @@ def test_a_million_transitions(tell, method):
 
 def test_a_long_run_does_not_grow(tell, tmp_path):
     """100 episodes of 1000 steps of `consensus` with small networks, a memory of a million."""
-    small = ["learner.hidden=[16,16]", "learner.batch=32", "evaluation.interval=0"]
+    small = ["learner.hidden=[16,16]", "learner.batch_size=32", "evaluation.interval=0"]
     trainer = Trainer(resolve("consensus", ["episodes=101", *small, f"output={tmp_path}"]))
     trainer.start()
     seen = []

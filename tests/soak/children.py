@@ -17,8 +17,8 @@ from emberlink.trainers.training.trainer import Trainer
 HORIZON, EPISODES, EVERY = 20, 4, 3
 SMALL = [
     *(f"env.horizon={HORIZON}", "env.num_uavs=2", "num_envs=2", f"checkpoint_steps={EVERY}"),
-    *("learner.hidden=[8,8]", "learner.batch=16", "learner.capacity=60", "fire=paper"),
-    *("evaluation.interval=0", "evaluation.fires=1", "keep=3"),
+    *("learner.hidden=[8,8]", "learner.batch_size=16", "learner.buffer_size=60", "fire=paper"),
+    *("evaluation.interval=0", "evaluation.episodes=1", "keep_checkpoints=3"),
 ]
 METHODS = ("independent", "shared_memory", "positional", "consensus")
 

@@ -15,7 +15,7 @@ from emberlink.trainers.training.trainer import Trainer
 
 _PACKAGES = ("emberlink", "torch", "torchrl", "tensordict", "pettingzoo", "wandb", "hydra-core")
 _GEO = ("rasterio", "geopandas", "pyogrio", "shapely", "pyproj")
-_TINY = ("env.horizon=40", "env.num_uavs=3", "episodes=1", "num_envs=2", "learner.batch=32")
+_TINY = ("env.horizon=40", "env.num_uavs=3", "episodes=1", "num_envs=2", "learner.batch_size=32")
 
 
 def doctor(console: Console) -> int:

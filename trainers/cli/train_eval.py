@@ -48,7 +48,7 @@ def train(method: str | None, overrides: Sequence[str], console: Console) -> int
         return 0
     if trainer.enough > trainer.steps * config.num_envs:
         console.print(
-            f"note: learner.batch={config.learner.batch} is more than this run collects: "
+            f"note: learner.batch_size={config.learner.batch_size} is more than this run collects: "
             "nothing will be learnt",
             style="yellow",
         )
@@ -60,7 +60,7 @@ def train(method: str | None, overrides: Sequence[str], console: Console) -> int
             if interruption.received:
                 raise Interrupted
             for team, (one, run) in enumerate(zip(trainer.configs, trainer.runs, strict=True)):
-                actor, fires = trainer.team_actor(team), config.evaluation.fires
+                actor, fires = trainer.team_actor(team), config.evaluation.episodes
                 if not run.evaluated():
                     _evaluate(run, one, actor, run.checkpoint(), fires, console)
     except KeyboardInterrupt:
@@ -148,9 +148,9 @@ def _train_with_bar(trainer: Trainer, console: Console) -> bool:
             if moment.lines:
                 coverage, score = (
                     sum(line[name] for line in moment.lines) / len(moment.lines)
-                    for name in ("coverage", "score")
+                    for name in ("coverage", "mean_reward")
                 )
-                shown |= {"coverage": f"{coverage:.1f}%", "score": f"{score:.2f}"}
+                shown |= {"coverage": f"{coverage:.1f}%", "mean_reward": f"{score:.2f}"}
             bar.update(task, **shown)
             if moment.note:
                 console.print(moment.note, style="yellow", soft_wrap=True)
@@ -191,7 +191,7 @@ def evaluate_folder(
         config = override(config, [text])
         label += "_" + re.sub(r"[^\w.=+-]", "-", text)
     actor = report.load_actor(config, checkpoint)
-    _evaluate(run, config, actor, checkpoint, fires or config.evaluation.fires, console, label)
+    _evaluate(run, config, actor, checkpoint, fires or config.evaluation.episodes, console, label)
     return 0
 
 

@@ -18,7 +18,7 @@ from .rankings import Numbers, Ranking, Verdict
 NONE = "-"
 FLAG = "*"
 """behind a number of seeds that is too small for an interval"""
-DIGITS = {"score": 3, "boundary_exits": 2, "fire_exits": 2}
+DIGITS = {"mean_reward": 3, "boundary_exits": 2, "fire_losses": 2}
 """behind the point; of other measures one"""
 
 
@@ -178,7 +178,7 @@ def _chapter(numbers: Numbers) -> dict[str, Any]:
                 "num_envs": run.config.num_envs,
                 "evaluated_with": dict(run.evaluated_with),
                 "checkpoint": run.evaluation.checkpoint,
-                "held_out_fires": run.evaluation.fires,
+                "held_out_fires": run.evaluation.episodes,
             }
             for group in section.groups
             for run in group.runs

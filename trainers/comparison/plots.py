@@ -14,14 +14,14 @@ from emberlink.trainers.evaluation.results import CURVES
 from .rankings import Curve, Numbers
 
 FIGURES = {
-    5: (("score",), "Averaged rewards collected by all UAVs at each episode."),
+    5: (("mean_reward",), "Averaged rewards collected by all UAVs at each episode."),
     6: (("coverage",), "The share of the fire region that was seen, of all that burns."),
     7: (
         ("tracking_first", "tracking_last"),
         "The fastest (solid) and slowest (dotted) time taken by the UAVs to track the fire.",
     ),
     8: (("boundary_exits",), "Attempted moves out of the box, mean over UAVs."),
-    9: (("fire_exits",), "Times a UAV fell out of the fire region, mean over UAVs."),
+    9: (("fire_losses",), "Times a UAV fell out of the fire region, mean over UAVs."),
 }
 """the paper's number -> a measure per panel, and what it shows"""
 COLOURS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#D55E00", "#56B4E9", "#8C6D00", "#000000")

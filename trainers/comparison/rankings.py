@@ -18,7 +18,7 @@ from .runs import Group, Section
 
 SAME = 1e-5
 """Scripted policies on the same fires differ by less than this share, on whatever device."""
-BY_METHOD = frozenset({"score"})
+BY_METHOD = frozenset({"mean_reward"})
 """The measures that a scripted policy may have another number of for each method: a method's
 reward may differ."""
 

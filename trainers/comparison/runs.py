@@ -253,10 +253,10 @@ def _check_evaluation(file: Path, evaluation: Evaluation, config: RunConfig) -> 
             for name in metrics.NAMES:
                 if name not in measured:
                     raise ValueError(f"{file}: results.{fire}.{policy} lacks {name}")
-                if len(measured[name]) != evaluation.fires:
+                if len(measured[name]) != evaluation.episodes:
                     raise ValueError(
                         f"{file}: results.{fire}.{policy}.{name} has {len(measured[name])} "
-                        f"episodes; fires={evaluation.fires}"
+                        f"episodes; fires={evaluation.episodes}"
                     )
 
 
@@ -311,7 +311,7 @@ def _groups(section: str, runs: Sequence[Run], notes: list[str]) -> list[Group]:
             notes.append(f"{section}, {label}: taken together though {', '.join(differing)} differ")
         groups.append(Group(label, kept))
     first = [group.runs[0] for group in groups]
-    what = ("method", "memory", "comm", *NOT_COMPARED)
+    what = ("method", "replay", "comm", *NOT_COMPARED)
     for key in _differing(first):
         if key.split(".")[0] not in what:
             each = ", ".join(f"{g.label} {g.runs[0].values.get(key)}" for g in groups)
@@ -375,7 +375,7 @@ def _check_alike(runs: Sequence[Run]) -> None:
     facts = {
         "env.horizon": lambda run: run.config.env.horizon,
         "env.grid": lambda run: list(run.config.env.grid),
-        "the number of held-out fires": lambda run: run.evaluation.fires,
+        "the number of held-out fires": lambda run: run.evaluation.episodes,
         "start_seed of the evaluation": lambda run: run.evaluation.start_seed,
     }
     for name, fact in facts.items():

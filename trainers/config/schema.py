@@ -24,7 +24,7 @@ _STRICT = ConfigDict(extra="forbid", strict=True)
 
 NOT_LEARNT_WITH = (
     *("device", "logger", "on_nan"),
-    *("checkpoint_interval", "checkpoint_steps", "keep"),
+    *("checkpoint_interval", "checkpoint_steps", "keep_checkpoints"),
 )
 """keys that change nothing of what is learnt, so that runs that differ in them are the same"""
 
@@ -66,17 +66,19 @@ class LearnerConfig:
     """L2 penalty in the critics' Adam"""
     tau: Annotated[float, Field(gt=0, le=0.5)]
     """share of the networks in their targets per update"""
-    updates: Count
+    updates_per_step: Count
     """updates of every UAV's networks per step of all environments side by side"""
-    batch: Annotated[int, Field(ge=1, le=1_000_000)]
+    batch_size: Annotated[int, Field(ge=1, le=1_000_000)]
     """transitions per UAV and update"""
-    capacity: Count
+    buffer_size: Count
     """transitions that a replay memory holds"""
 
     @model_validator(mode="after")
     def _a_batch_fits(self) -> "LearnerConfig":
-        if self.batch > self.capacity:
-            raise ValueError(f"batch={self.batch} is more than capacity={self.capacity} holds")
+        if self.batch_size > self.buffer_size:
+            raise ValueError(
+                f"batch_size={self.batch_size} is more than buffer_size={self.buffer_size} holds"
+            )
         return self
 
 
@@ -96,11 +98,11 @@ class ExplorationConfig:
 class EvaluationConfig:
     """Frozen policies on held-out fires."""
 
-    fires: Side
+    episodes: Side
     """held-out fires, one episode each, of the evaluation at the end"""
     interval: MaybeCount
     """episodes between evaluations during training; 0 for none"""
-    interval_fires: Side
+    interval_episodes: Side
     """held-out fires of the evaluations during training"""
 
 
@@ -112,7 +114,7 @@ class RunConfig:
     """the recipe: a file in configs/method"""
     setup: Name
     """the constants: a file in configs/setup"""
-    memory: Literal["private", "shared"]
+    replay: Literal["per_agent", "shared"]
     """one replay memory per UAV, or one for all"""
     comm: dict[str, Any]
     """the communication module's name and its settings"""
@@ -140,7 +142,7 @@ class RunConfig:
     """episodes between checkpoints"""
     checkpoint_steps: MaybeCount = 0
     """steps between further checkpoints, counted through the whole run; 0 for none"""
-    keep: Count = 5
+    keep_checkpoints: Count = 5
     """checkpoints of which the networks stay; the two newest hold what a resumed run needs too"""
     on_nan: Literal["stop", "rollback"] = "stop"
     """what is done where a number is not finite: the run ends, or goes back to its last checkpoint

@@ -159,5 +159,5 @@ def print_table(console: Console, results: evaluate.Results, config: RunConfig) 
 
 def _short(measure: str, value: float) -> str:
     """One decimal; of a score, which may be a small reward, as many as make four digits."""
-    digits = max(1, 4 - len(str(int(abs(value))))) if measure == "score" else 1
+    digits = max(1, 4 - len(str(int(abs(value))))) if measure == "mean_reward" else 1
     return f"{value:.{digits}f}"

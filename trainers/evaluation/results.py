@@ -1,12 +1,12 @@
 """The form of an evaluation's results."""
 
 CURVES = {
-    "score": "score (mean reward)",
+    "mean_reward": "score (mean reward)",
     "coverage": "coverage, %",
     "tracking_first": "first UAV on fire, step",
     "tracking_last": "last UAV on fire, step",
     "boundary_exits": "boundary exits per UAV",
-    "fire_exits": "fire exits per UAV",
+    "fire_losses": "fire exits per UAV",
 }
 """measure -> axis label, in the order of the paper's figures 5 to 9"""
 

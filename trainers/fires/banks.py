@@ -49,7 +49,7 @@ def make(
     config = generated(scenario, overrides)
     fire, world = config.fire, config.env
     assert isinstance(fire, FireConfig)
-    count = count or (fire.bank if split == "train" else config.evaluation.fires)
+    count = count or (fire.num_train_fires if split == "train" else config.evaluation.episodes)
     path = output or _free(f"{scenario}_{split}_{count}")
     check_bank(path, count, world.grid)
     seeds = fire_seeds(split, count)

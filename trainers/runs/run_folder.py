@@ -238,7 +238,7 @@ class RunFolder:
         return found[-1]
 
     def rotate(self, keep: int, states: int) -> None:
-        """Takes all but the newest `keep` networks and `states` states away."""
+        """Takes all but the newest `keep_checkpoints` networks and `states` states away."""
         for path in self.networks()[:-keep] + self.states()[:-states]:
             path.unlink(missing_ok=True)
 

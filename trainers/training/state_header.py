@@ -107,4 +107,4 @@ def _updates(trainer: "Trainer", step: int) -> int:
     if trainer.sampler.rows < trainer.enough:
         return 0
     first = -(-trainer.enough // trainer.config.num_envs)
-    return max(0, step - first + 1) * trainer.config.learner.updates
+    return max(0, step - first + 1) * trainer.config.learner.updates_per_step

@@ -91,17 +91,17 @@ class Trainer:
         self.learner = Learner(self.actor, critic, config.learner)
         self.learner.slow_down(self.rate)
         divergence.listen(self.env, self.learner.watch)
-        uavs, shared = config.env.num_uavs, config.memory == "shared"
+        uavs, shared = config.env.num_uavs, config.replay == "shared"
         self.memory = make_memory(
             uavs,
             shared=shared,
-            capacity=config.learner.capacity,
-            batch=config.learner.batch,
+            capacity=config.learner.buffer_size,
+            batch=config.learner.batch_size,
             most=self.steps * config.num_envs,
             seeds=seeds,
             device=config.device,
         )
-        self.enough = rows_needed(uavs, shared=shared, batch=config.learner.batch)
+        self.enough = rows_needed(uavs, shared=shared, batch=config.learner.batch_size)
         self.collector = make_collector(
             config, self.env, self.actor, envs=self.envs, steps=self.steps
         )
@@ -227,7 +227,7 @@ class Trainer:
         checkpoint_file.write(self.run.state(self.step), tensors, header)
         self.save_networks()
         for run in self.runs:
-            run.rotate(self.config.keep, states=2)
+            run.rotate(self.config.keep_checkpoints, states=2)
         self.saved = self.step
 
     def save_networks(self) -> None:
@@ -311,7 +311,7 @@ class Trainer:
         self.memory.extend(rows)
         if len(self.memory) < self.enough:
             return []
-        count = self.config.learner.updates
+        count = self.config.learner.updates_per_step
         self.updates += count
         return [self._update().clone() for _ in range(count)]
 
@@ -372,7 +372,7 @@ class Trainer:
         """A seed's frozen policy on held-out fires: "fire/measure" -> mean."""
         config = self.configs[team]
         results = evaluate.evaluate(
-            config, self.team_actor(team), fires=config.evaluation.interval_fires, scripted=False
+            config, self.team_actor(team), fires=config.evaluation.interval_episodes, scripted=False
         )
         return {
             f"{fire}/{name}": value
