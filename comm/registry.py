@@ -7,6 +7,7 @@ from pkgutil import iter_modules
 from typing import Any
 
 from emberlink.envs.config import WildfireConfig
+from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import from_plain
 
 from .base import CommModule
@@ -31,7 +32,7 @@ def find(name: str) -> type[CommModule]:
         ValueError: there is no such file; the message lists those there are.
     """
     if name not in known():
-        raise ValueError(f"comm.name={name!r} is not known; known: {', '.join(known())}")
+        raise UserError(f"comm.name={name!r} is not known; known: {', '.join(known())}")
     file = importlib.import_module(f"{__package__}.{name}")
     found = [
         item
@@ -41,7 +42,7 @@ def find(name: str) -> type[CommModule]:
         and item.__module__ == file.__name__
     ]
     if len(found) != 1:
-        raise ValueError(f"comm/{name}.py defines {len(found)} communication modules; 1 is needed")
+        raise UserError(f"comm/{name}.py defines {len(found)} communication modules; 1 is needed")
     return found[0]
 
 

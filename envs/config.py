@@ -5,6 +5,8 @@ from typing import Annotated, Literal
 from pydantic import ConfigDict, Field, Strict, model_validator
 from pydantic.dataclasses import dataclass
 
+from emberlink.envs.utils.errors import UserError
+
 Number = Annotated[float, Field(ge=-1e12, le=1e12)]
 """so far below the largest float32 that no square of a sum over a view gets there"""
 
@@ -57,7 +59,7 @@ class WildfireConfig:
     @model_validator(mode="after")
     def _altitudes_in_order(self) -> "WildfireConfig":
         if self.altitude[0] > self.altitude[1]:
-            raise ValueError(f"altitude {self.altitude}: the lowest is above the highest")
+            raise UserError(f"altitude {self.altitude}: the lowest is above the highest")
         return self
 
     @property
@@ -78,4 +80,4 @@ def check_grid(grid: tuple[int, int]) -> None:
         ValueError: it has not.
     """
     if not all(SIDES[0] <= side <= SIDES[1] for side in grid):
-        raise ValueError(f"grid must have {SIDES[0]} to {SIDES[1]} cells a side, got {grid}")
+        raise UserError(f"grid must have {SIDES[0]} to {SIDES[1]} cells a side, got {grid}")

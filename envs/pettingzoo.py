@@ -11,6 +11,7 @@ from tensordict import TensorDictBase
 from torchrl.envs import EnvBase, TransformedEnv, step_mdp
 
 from emberlink.envs.rendering.frame import Window
+from emberlink.envs.utils.errors import UserError
 
 from . import keys
 from .config import WildfireConfig
@@ -37,7 +38,7 @@ def parallel_env(
             what `WildfireEnv` does not take.
     """
     if env is not None and kwargs:
-        raise ValueError(f"a ready environment takes no further settings, got {sorted(kwargs)}")
+        raise UserError(f"a ready environment takes no further settings, got {sorted(kwargs)}")
     if env is None:
         env = WildfireEnv(**{"num_envs": 1, **kwargs})
     return WildfireParallelEnv(env, render_mode)
@@ -60,12 +61,12 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
     def __init__(self, env: EnvBase, render_mode: str | None = None):
         known = self.metadata["render_modes"]
         if render_mode is not None and render_mode not in known:
-            raise ValueError(f"render_mode {render_mode!r} is not known; known: {known}")
+            raise UserError(f"render_mode {render_mode!r} is not known; known: {known}")
         core = env.base_env if isinstance(env, TransformedEnv) else env
         if not isinstance(core, WildfireEnv):
-            raise ValueError(f"env: a WildfireEnv is needed, got {type(core).__name__}")
+            raise UserError(f"env: a WildfireEnv is needed, got {type(core).__name__}")
         if env.batch_size != (1,):
-            raise ValueError(f"env: a batch size of [1] is needed, got {list(env.batch_size)}")
+            raise UserError(f"env: a batch size of [1] is needed, got {list(env.batch_size)}")
         self.render_mode = render_mode
         self._env, self._core, self._window = env, core, None
         self._moment: TensorDictBase | None = None
@@ -111,14 +112,14 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
             ValueError: not one action of three numbers for each live agent, or no episode runs.
         """
         if self._moment is None or not self.agents:
-            raise ValueError("no episode is running: call reset() before step()")
+            raise UserError("no episode is running: call reset() before step()")
         if set(actions) != set(self.agents):
-            raise ValueError(f"actions for {sorted(actions)}; the agents are {self.agents}")
+            raise UserError(f"actions for {sorted(actions)}; the agents are {self.agents}")
         action = np.stack(
             [np.asarray(actions[agent], np.float32) for agent in self.possible_agents]
         )
         if action.shape != (len(self.possible_agents), 3):
-            raise ValueError(f"an action is an array of shape (3,), got {action.shape[1:]}")
+            raise UserError(f"an action is an array of shape (3,), got {action.shape[1:]}")
         self._moment.set(keys.ACTION, torch.from_numpy(action[None]).to(self._core.device))
         moment = self._env.step(self._moment)
         self._moment = step_mdp(moment, keep_other=True)
@@ -143,7 +144,7 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
         """
         if self.render_mode is None:
             known = self.metadata["render_modes"]
-            raise ValueError(f"render() needs a render_mode; known: {known}")
+            raise UserError(f"render() needs a render_mode; known: {known}")
         if self.render_mode == "rgb_array":
             return self._core.render()
         self._window = self._window or Window(self.metadata["name"])

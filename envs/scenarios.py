@@ -12,6 +12,7 @@ from emberlink.envs.fire.cache import fire_bank
 from emberlink.envs.fire.generator import FireConfig, fire_seeds, load_scenario, make_fires
 from emberlink.envs.fire_files import reader
 from emberlink.envs.fire_files.reader import FileFireConfig
+from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import TAG
 
 from .config import WildfireConfig
@@ -179,17 +180,17 @@ def arrival_times(
     try:
         bank = torch.as_tensor(fire, dtype=torch.float32)
     except (TypeError, ValueError, RuntimeError):
-        raise ValueError(
+        raise UserError(
             f"fire: a scenario's name, a FireConfig or arrival times, not {type(fire).__name__}"
         ) from None
     bank = bank.clone(memory_format=torch.contiguous_format)
     shape = list(bank.shape)
     bank = bank.unsqueeze(0) if bank.ndim == 2 else bank
     if bank.shape not in ((1, *config.grid), (num_envs, *config.grid)):
-        raise ValueError(
+        raise UserError(
             f"fire: arrival times of shape {shape}; expected {list(config.grid)} or "
             f"{[num_envs, *config.grid]} (the grid of the config, num_envs={num_envs})"
         )
     if bank.isnan().any():
-        raise ValueError("fire: arrival times hold NaN; a cell that never burns is inf")
+        raise UserError("fire: arrival times hold NaN; a cell that never burns is inf")
     return bank, True

@@ -10,6 +10,7 @@ from torchrl.envs import EnvBase
 from emberlink.envs.rendering import frame
 from emberlink.envs.utils import counter_rng
 from emberlink.envs.utils.buffers import Buffers
+from emberlink.envs.utils.errors import UserError
 from emberlink.envs.world import motion
 from emberlink.envs.world.coverage_map import Discovery
 from emberlink.envs.world.reward import view_reward
@@ -60,12 +61,12 @@ class WildfireEnv(Buffers, EnvBase):
         device: torch.device | str = "cpu",
     ):
         if num_envs < 1:
-            raise ValueError(f"num_envs={num_envs}: at least 1 is needed")
+            raise UserError(f"num_envs={num_envs}: at least 1 is needed")
         seeds = list(seed) if isinstance(seed, Sequence) else [int(seed)]
         if min(seeds, default=-1) < 0:
-            raise ValueError(f"seed={seed}: a number that is not negative is needed")
+            raise UserError(f"seed={seed}: a number that is not negative is needed")
         if num_envs % len(seeds):
-            raise ValueError(f"num_envs={num_envs} is no multiple of the {len(seeds)} seeds")
+            raise UserError(f"num_envs={num_envs} is no multiple of the {len(seeds)} seeds")
         super().__init__(device=device, batch_size=torch.Size([num_envs]))
         if config is None:
             config = WildfireConfig()
@@ -112,7 +113,7 @@ class WildfireEnv(Buffers, EnvBase):
             ValueError: another mode than "rgb_array".
         """
         if mode != "rgb_array":
-            raise ValueError(f"render mode {mode!r} is not known; known: 'rgb_array'")
+            raise UserError(f"render mode {mode!r} is not known; known: 'rgb_array'")
         return frame.frame(
             self.fire_map[env].cpu().numpy(),
             self._position[env].cpu().numpy(),
@@ -165,7 +166,7 @@ class WildfireEnv(Buffers, EnvBase):
         given = torch.as_tensor(given, dtype=torch.float32, device=self.device)
         outside = (given < self._low) | (given > self._high)
         if given.shape[-2:] != self._position.shape[-2:] or outside.any() or given.isnan().any():
-            raise ValueError(
+            raise UserError(
                 f"position: {tuple(given.shape)} with values {given.min():g} to {given.max():g}; "
                 f"expected [..., {self.config.num_uavs}, 3] inside the box "
                 f"{self.config.low} to {self.config.high}"

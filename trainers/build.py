@@ -10,6 +10,7 @@ from torchrl.envs import TransformedEnv
 
 from emberlink.comm.base import Communication
 from emberlink.envs.scenarios import ScenarioConfig
+from emberlink.envs.utils.errors import UserError
 from emberlink.envs.wildfire import WildfireEnv
 from emberlink.policies.networks.actor_critic import make_actor, make_critic
 from emberlink.policies.networks.stacked import Generators
@@ -48,7 +49,7 @@ def make_env(
         overrides["grid"] = grid
     config = resolve(method, [f"setup={setup}"], **overrides)
     if config.seeds:
-        raise ValueError(f"seeds={list(config.seeds)}: of a training; an environment takes seed=")
+        raise UserError(f"seeds={list(config.seeds)}: of a training; an environment takes seed=")
     fire = config.fire if fire is None else fire
     return build_env(config, num_envs=num_envs, fire=fire, seed=seed, device=device)
 

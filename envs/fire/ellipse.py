@@ -8,6 +8,8 @@ from +x, and point towards where the head runs.
 import torch
 from torch import Tensor
 
+from emberlink.envs.utils.errors import UserError
+
 MAX_LENGTH_TO_BREADTH = 8.0
 
 
@@ -22,7 +24,7 @@ def length_to_breadth(wind: float | Tensor) -> Tensor:
     """
     speed = torch.as_tensor(wind)
     if (speed < 0).any():
-        raise ValueError(f"wind speed must not be negative, got {speed.min().item()}")
+        raise UserError(f"wind speed must not be negative, got {speed.min().item()}")
     ratio = 0.936 * torch.exp(0.2566 * speed) + 0.461 * torch.exp(-0.1548 * speed) - 0.397
     return ratio.clamp(1.0, MAX_LENGTH_TO_BREADTH)
 
@@ -42,7 +44,7 @@ def ellipse_rates(
     """
     head, ratio = torch.as_tensor(head_ros), torch.as_tensor(length_to_breadth)
     if (ratio < 1).any():
-        raise ValueError(f"length_to_breadth must be at least 1, got {ratio.min().item()}")
+        raise UserError(f"length_to_breadth must be at least 1, got {ratio.min().item()}")
     if two_sided:
         return head, head / ratio, torch.zeros_like(head)
     eccentricity = torch.sqrt(ratio**2 - 1) / ratio

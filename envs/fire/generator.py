@@ -22,6 +22,7 @@ from yaml import YAMLError
 
 from emberlink.envs.config import check_grid
 from emberlink.envs.utils.counter_rng import fold, uniform
+from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import Name, describe, known
 
 from .advection import current, longest_step, tide_speed
@@ -40,7 +41,7 @@ _LEAST = 1e-6  # radius of a patch, cells: its square is no number below some 1e
 
 def _ordered(pair: tuple[float, float]) -> tuple[float, float]:
     if pair[0] > pair[1]:
-        raise ValueError(f"a range is (low, high), got {pair}")
+        raise UserError(f"a range is (low, high), got {pair}")
     return pair
 
 
@@ -129,11 +130,11 @@ def load_scenario(name: str) -> FireConfig:
     """
     values = _values(name) if name in known("fire") else None
     if values is None or "kind" in values:
-        raise ValueError(f"unknown fire {name!r}; known: {', '.join(scenarios())}")
+        raise UserError(f"unknown fire {name!r}; known: {', '.join(scenarios())}")
     try:
         return FireConfig(**values)
     except ValidationError as error:
-        raise ValueError(f"configs/fire/{name}.yaml: {describe(error)}") from None
+        raise UserError(f"configs/fire/{name}.yaml: {describe(error)}") from None
 
 
 def _values(name: str) -> dict[str, Any]:
@@ -142,9 +143,9 @@ def _values(name: str) -> dict[str, Any]:
         values: Any = OmegaConf.to_container(OmegaConf.create(file.read_text(encoding="utf-8")))
     except (YAMLError, OmegaConfBaseException) as error:
         reason = " ".join(str(error).split())[:200]
-        raise ValueError(f"configs/fire/{name}.yaml: cannot be read: {reason}") from None
+        raise UserError(f"configs/fire/{name}.yaml: cannot be read: {reason}") from None
     if not isinstance(values, dict):
-        raise ValueError(f"configs/fire/{name}.yaml: expected keys and values")
+        raise UserError(f"configs/fire/{name}.yaml: expected keys and values")
     return values
 
 
@@ -159,13 +160,13 @@ def fire_seeds(split: Split, count: int, start: int = 0) -> Tensor:
         start: first training seed, to train on another bank; the held-out fires never change.
     """
     if split not in get_args(Split):
-        raise ValueError(f"unknown split {split!r}; known: {', '.join(get_args(Split))}")
+        raise UserError(f"unknown split {split!r}; known: {', '.join(get_args(Split))}")
     if count < 1 or start < 0:
-        raise ValueError(f"expected count >= 1 and start >= 0, got {count} and {start}")
+        raise UserError(f"expected count >= 1 and start >= 0, got {count} and {start}")
     if split == "heldout" and start:
-        raise ValueError(f"held-out fires are the same for everyone: start must be 0, got {start}")
+        raise UserError(f"held-out fires are the same for everyone: start must be 0, got {start}")
     if split == "train" and start + count > HELD_OUT_FROM:
-        raise ValueError(f"training seeds end before {HELD_OUT_FROM}, got {start} + {count}")
+        raise UserError(f"training seeds end before {HELD_OUT_FROM}, got {start} + {count}")
     first = HELD_OUT_FROM if split == "heldout" else start
     return torch.arange(first, first + count)
 

@@ -22,6 +22,8 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from emberlink.envs.utils.errors import UserError
+
 from .ellipse import ellipse_rates
 
 Varying = Tensor | Callable[[float], Tensor]
@@ -94,7 +96,7 @@ def arrival_times(
         does not arrive within the horizon.
     """
     if refine < 1 or horizon <= 0 or min(grid) < 1:
-        raise ValueError(f"expected refine, horizon, grid > 0; got {refine}, {horizon}, {grid}")
+        raise UserError(f"expected refine, horizon, grid > 0; got {refine}, {horizon}, {grid}")
     pad = _PAD + margin
     x, y = (_nodes(cells, pad, refine, device, dtype) for cells in grid)
     phi = distance(x[None, :, None], y[None, None, :])
@@ -143,7 +145,7 @@ def _rate_bound(
     still = drift is None
     if not isinstance(head_ros, Tensor) or not (still or isinstance(drift, Tensor)):
         which = "drift" if isinstance(head_ros, Tensor) else "head_ros"
-        raise ValueError(f"max_rate is needed when {which} is a function, got None")
+        raise UserError(f"max_rate is needed when {which} is a function, got None")
     fastest = float(head_ros.max() if still else (head_ros + drift.norm(dim=1)).max())
     return fastest * (1.0 if rates is None else max(float(rates.max()), 0.0))
 
@@ -155,9 +157,9 @@ def _refined(field: Tensor, grid: tuple[int, int], x: Tensor, y: Tensor) -> Tens
     belongs to all of them, or the front would slip between two barriers that touch at a corner.
     """
     if field.dim() != 3 or tuple(field.shape[1:]) != tuple(grid):
-        raise ValueError(f"rate_field must be [fires, {grid[0]}, {grid[1]}], got {field.shape}")
+        raise UserError(f"rate_field must be [fires, {grid[0]}, {grid[1]}], got {field.shape}")
     if not (field >= 0).all():
-        raise ValueError(f"rate_field must not be negative, got {field.min().item()}")
+        raise UserError(f"rate_field must not be negative, got {field.min().item()}")
     free = (field > 0).to(field)
     u, v = x.clamp(0, grid[0] - 1), y.clamp(0, grid[1] - 1)
 

@@ -7,6 +7,8 @@ from typing import Literal, Protocol
 import numpy as np
 from scipy.ndimage import minimum_filter
 
+from emberlink.envs.utils.errors import UserError
+
 from .projection import Bounds, Move, same
 
 Units = Literal["steps", "seconds", "minutes", "hours", "days"]
@@ -165,7 +167,7 @@ class RasterSource:
             ValueError: a single cell has burnt.
         """
         if (self.times <= until).sum() < 2:
-            raise ValueError(
+            raise UserError(
                 f"from {self.clock.shown(self.first)} to {self.clock.shown(until)} a single cell "
                 "burns: no fire spreads; expected a later end"
             )

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from emberlink.envs.config import SIDES
+from emberlink.envs.utils.errors import UserError
 
 from .arrival_raster import Clock, RasterSource
 from .gdal_open import opened
@@ -26,13 +27,13 @@ def read_npy(path: Path) -> Iterator[RasterSource]:
         # Mapped, so that a header that promises more than there is costs no memory.
         found = np.load(path, mmap_mode="r", allow_pickle=False)
     except Exception as error:  # numpy raises what it likes on a damaged header
-        raise ValueError(f"{first_line(error)}; expected an array in NumPy's format") from None
+        raise UserError(f"{first_line(error)}; expected an array in NumPy's format") from None
     if not isinstance(found, np.ndarray) or found.dtype.kind not in "iuf":
         kind = getattr(found, "dtype", type(found).__name__)
-        raise ValueError(f"values of type {kind}; expected numbers")
+        raise UserError(f"values of type {kind}; expected numbers")
     fires = found[None] if found.ndim == 2 else found
     if fires.ndim != 3 or len(fires) == 0:
-        raise ValueError(f"an array of shape {list(found.shape)}; expected [fires, X, Y]")
+        raise UserError(f"an array of shape {list(found.shape)}; expected [fires, X, Y]")
     _check_size(fires.shape)
     for index, fire in enumerate(fires):
         # Rows of a raster run north to south.
@@ -54,7 +55,7 @@ def read_bands(path: Path) -> Iterator[RasterSource]:
     with opened(path) as dataset:
         _check_size((dataset.count, dataset.width, dataset.height))
         if np.dtype(dataset.dtypes[0]).kind not in "iuf":
-            raise ValueError(f"values of type {dataset.dtypes[0]}; expected numbers")
+            raise UserError(f"values of type {dataset.dtypes[0]}; expected numbers")
         nodata, bands = dataset.nodata, dataset.read()
     for index, band in enumerate(bands):
         yield _fire(index, band if nodata is None else np.where(band == nodata, np.inf, band))
@@ -63,13 +64,11 @@ def read_bands(path: Path) -> Iterator[RasterSource]:
 def _check_size(shape: tuple[int, ...]) -> None:
     fires, width, height = shape
     if not all(SIDES[0] <= side <= SIDES[1] for side in (width, height)):
-        raise ValueError(
+        raise UserError(
             f"fires of {width} x {height} cells; expected {SIDES[0]} to {SIDES[1]} a side"
         )
     if fires * width * height > MOST_CELLS:
-        raise ValueError(
-            f"{fires} fires of {width} x {height}; at most {MOST_CELLS} cells are read"
-        )
+        raise UserError(f"{fires} fires of {width} x {height}; at most {MOST_CELLS} cells are read")
 
 
 def _fire(index: int, times: np.ndarray) -> RasterSource:
@@ -78,6 +77,6 @@ def _fire(index: int, times: np.ndarray) -> RasterSource:
         times = clean(times)
         check_spreads(times, may_stand=True)
     except ValueError as error:
-        raise ValueError(f"fire {index}: {error}") from None
+        raise UserError(f"fire {index}: {error}") from None
     affine = (1.0, 0.0, 0.0, 0.0, -1.0, float(len(times)))
     return RasterSource(times, affine, Clock("steps"), whole=True)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from emberlink.envs.utils.atomic_io import new_file, published
+from emberlink.envs.utils.errors import UserError
 
 SUFFIXES = (".npy", ".tif", ".tiff")
 NODATA = -9999.0
@@ -31,14 +32,14 @@ def check_bank(path: Path, count: int, grid: Sequence[int]) -> None:
     new_file(path, SUFFIXES)
     size = 4 * count * grid[0] * grid[1]
     if size > MOST_BYTES:
-        raise ValueError(
+        raise UserError(
             f"{path}: {count} fires of {grid[0]} x {grid[1]} cells are {size} bytes; at most "
             f"{MOST_BYTES} are written"
         )
     if path.suffix == ".npy":
         new_file(path.with_suffix(".json"), [".json"])
     elif count > MOST_BANDS:
-        raise ValueError(f"{path}: {count} fires; a GeoTIFF gets at most {MOST_BANDS}, .npy more")
+        raise UserError(f"{path}: {count} fires; a GeoTIFF gets at most {MOST_BANDS}, .npy more")
     else:
         _rasterio()
 
@@ -61,7 +62,7 @@ def write_bank(
     check_bank(path, len(fires), fires.shape[1:])
     array = np.ascontiguousarray(fires.cpu().numpy(), dtype="<f4")
     if not (array >= 0).all():
-        raise ValueError(f"{path}: arrival times are 0 or more, or inf; got NaN or a negative one")
+        raise UserError(f"{path}: arrival times are 0 or more, or inf; got NaN or a negative one")
     known = {"units": "steps", **(facts or {})}
     names = names or [f"fire {number}" for number in range(len(array))]
     if path.suffix == ".npy":
@@ -123,6 +124,6 @@ def _rasterio() -> Any:
     try:
         return importlib.import_module("rasterio")
     except ImportError:
-        raise ValueError(
+        raise UserError(
             "a GeoTIFF needs the extra geo: pip install 'emberlink[geo]'; .npy needs nothing more"
         ) from None

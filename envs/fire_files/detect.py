@@ -10,6 +10,8 @@ from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 
+from emberlink.envs.utils.errors import UserError
+
 LONGEST_TEXT = 300_000_000
 """bytes of a file that is read as a whole"""
 _BESIDE = {
@@ -49,7 +51,7 @@ def _points(head: bytes) -> bool:
 def _check_length(path: Path) -> None:
     if path.stat().st_size > LONGEST_TEXT:
         size = path.stat().st_size
-        raise ValueError(f"{size} bytes; a file of this kind may have {LONGEST_TEXT}")
+        raise UserError(f"{size} bytes; a file of this kind may have {LONGEST_TEXT}")
 
 
 def _check_json(path: Path) -> None:
@@ -58,13 +60,13 @@ def _check_json(path: Path) -> None:
     try:
         found = json.loads(path.read_bytes().decode("utf-8-sig"))
     except RecursionError:
-        raise ValueError("too many levels; expected GeoJSON") from None
+        raise UserError("too many levels; expected GeoJSON") from None
     except UnicodeDecodeError as error:
-        raise ValueError(f"no text at byte {error.start}; expected GeoJSON in UTF-8") from None
+        raise UserError(f"no text at byte {error.start}; expected GeoJSON in UTF-8") from None
     except ValueError as error:
-        raise ValueError(f"{error}; expected GeoJSON") from None
+        raise UserError(f"{error}; expected GeoJSON") from None
     if found.get("type") not in ("FeatureCollection", "Feature"):
-        raise ValueError(f"type {str(found.get('type'))[:40]!r}; expected a FeatureCollection")
+        raise UserError(f"type {str(found.get('type'))[:40]!r}; expected a FeatureCollection")
 
 
 def _check_sqlite(path: Path) -> None:
@@ -74,9 +76,9 @@ def _check_sqlite(path: Path) -> None:
         with closing(sqlite3.connect(uri, uri=True)) as database:
             found = database.execute("PRAGMA integrity_check(1)").fetchone()
     except sqlite3.Error as error:
-        raise ValueError(f"{error}; expected a GeoPackage") from None
+        raise UserError(f"{error}; expected a GeoPackage") from None
     if found != ("ok",):
-        raise ValueError(f"{str(found[0])[:100]}; expected a whole GeoPackage")
+        raise UserError(f"{str(found[0])[:100]}; expected a whole GeoPackage")
 
 
 def _check_shapefile(path: Path) -> None:
@@ -84,7 +86,7 @@ def _check_shapefile(path: Path) -> None:
     for suffix in (".shp", ".shx", ".dbf"):
         part = beside(path, suffix)
         if part is None:
-            raise ValueError(f"{path.with_suffix(suffix).name} is missing beside it")
+            raise UserError(f"{path.with_suffix(suffix).name} is missing beside it")
         _check_regular(part)
     counts: list[int] = []
     for suffix in (".shp", ".shx"):
@@ -92,19 +94,19 @@ def _check_shapefile(path: Path) -> None:
         head, size = _head(part, 100), part.stat().st_size
         said = 2 * struct.unpack(">I", head[24:28])[0] if len(head) == 100 else -1
         if head[:4] != b"\0\0\x27\x0a" or said != size:
-            raise ValueError(f"{part.name} has {size} bytes; by its header {said}: damaged")
+            raise UserError(f"{part.name} has {size} bytes; by its header {said}: damaged")
         counts.append((size - 100) // 8)
     part = beside(path, ".dbf") or path
     head, size = _head(part, 32), part.stat().st_size
     if len(head) < 32:
-        raise ValueError(f"{part.name} has {size} bytes; expected a header of 32: damaged")
+        raise UserError(f"{part.name} has {size} bytes; expected a header of 32: damaged")
     records, start, length = struct.unpack("<IHH", head[4:12])
     if start + records * length > size:
-        raise ValueError(
+        raise UserError(
             f"{part.name} has {size} bytes; by its header {start + records * length}: cut off"
         )
     if records != counts[1]:
-        raise ValueError(f"{part.name} has {records} records, the .shx {counts[1]}: damaged")
+        raise UserError(f"{part.name} has {records} records, the .shx {counts[1]}: damaged")
 
 
 def _head(path: Path, count: int) -> bytes:
@@ -138,14 +140,14 @@ def find_format(path: Path) -> Format:
     _check_regular(path)
     head = _head(path, 4096)
     if not head:
-        raise ValueError("the file is empty")
+        raise UserError("the file is empty")
     suffix = path.suffix.lower()
     if suffix in (".shx", ".dbf", ".prj"):
-        raise ValueError(
+        raise UserError(
             f"a part of a shapefile; expected the .shp: {path.with_suffix('.shp').name}"
         )
     if suffix in (".zip", ".kmz", ".gz") or head[:4] == b"PK\3\4":
-        raise ValueError("an archive; expected the files in it")
+        raise UserError("an archive; expected the files in it")
     named = [one for one in FORMATS if suffix in one.suffixes]
     found = next((one for one in named or FORMATS if one.begins(head)), None)
     if found is None and named and named[0] is POINTS:  # what ends in .txt may be anything
@@ -153,7 +155,7 @@ def find_format(path: Path) -> Format:
     if found is None:
         start = head[:16].decode("latin-1").encode("unicode_escape").decode()
         what = f"{named[0].name}, as its name says" if named else ", ".join(o.name for o in FORMATS)
-        raise ValueError(f"begins with {start!r}; expected {what}")
+        raise UserError(f"begins with {start!r}; expected {what}")
     found.check(path)
     return found
 
@@ -163,15 +165,15 @@ def _check_regular(path: Path) -> None:
     try:
         path.stat()
     except FileNotFoundError:
-        raise ValueError("there is no such file") from None
+        raise UserError("there is no such file") from None
     except (OSError, ValueError) as error:
-        raise ValueError(f"cannot be read: {getattr(error, 'strerror', None) or error}") from None
+        raise UserError(f"cannot be read: {getattr(error, 'strerror', None) or error}") from None
     if path.is_dir():
-        raise ValueError("a folder; expected a file")
+        raise UserError("a folder; expected a file")
     if not path.is_file():
-        raise ValueError("no regular file")
+        raise UserError("no regular file")
     if not os.access(path, os.R_OK):
-        raise ValueError("cannot be read: permission denied")
+        raise UserError("cannot be read: permission denied")
 
 
 def beside(path: Path, suffix: str) -> Path | None:
@@ -197,5 +199,5 @@ def digest(path: Path) -> str:
                     while block := file.read(1 << 20):
                         found.update(block)
     except OSError as error:
-        raise ValueError(f"cannot be read: {error.strerror or error}") from None
+        raise UserError(f"cannot be read: {error.strerror or error}") from None
     return found.hexdigest()

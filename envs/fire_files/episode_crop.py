@@ -6,6 +6,8 @@ from typing import Any, Protocol
 import numpy as np
 from scipy import ndimage
 
+from emberlink.envs.utils.errors import UserError
+
 from .arrival_raster import SECONDS, Clock, Source, Units, Window
 from .perimeter_times import parse_time
 
@@ -61,7 +63,7 @@ def on_grid(source: Source, choices: Choices, grid: tuple[int, int], horizon: in
     burning = steps[np.isfinite(steps)]
     if len(burning) < 2 or (not as_it_is and burning.min() == burning.max()):
         shown = source.clock.shown
-        raise ValueError(
+        raise UserError(
             f"from {shown(start)} to {shown(end)} no fire spreads; it burns from "
             f"{shown(source.first)} to {shown(source.last)}"
         )
@@ -75,19 +77,19 @@ def _span(source: Source, choices: Choices, horizon: int) -> tuple[float, float]
     end = _moment(choices.end, "end", source, choices.units)
     if choices.minutes_per_step is not None:
         if source.clock.unit == "steps":
-            raise ValueError(
+            raise UserError(
                 "fire.minutes_per_step: the file's times are in steps; expected fire.units in time"
             )
         end = start + horizon * choices.minutes_per_step * 60 / SECONDS[source.clock.unit]
     end = source.last if end is None else end
     shown = source.clock.shown
     if end < source.first or start >= source.last:
-        raise ValueError(
+        raise UserError(
             f"from {shown(start)} to {shown(end)} no fire spreads; it burns from "
             f"{shown(source.first)} to {shown(source.last)}"
         )
     if not start < end:
-        raise ValueError(f"from {shown(start)} to {shown(end)}: the end must be after the start")
+        raise UserError(f"from {shown(start)} to {shown(end)}: the end must be after the start")
     return start, end
 
 
@@ -100,14 +102,14 @@ def _moment(
         return None
     if isinstance(value, str):
         if clock.origin is None:
-            raise ValueError(
+            raise UserError(
                 f"fire.{key}={value}: the file's times are {clock.unit}; expected a number of them"
             )
         return _calendar(value, key, clock)
     if clock.origin is None:
         return float(value)
     if units is None or units == "steps":
-        raise ValueError(
+        raise UserError(
             f"fire.{key}={value:g}: the file's times are dates; expected such as "
             f"{clock.shown(source.first)}, or fire.units for a number"
         )
@@ -119,7 +121,7 @@ def _calendar(text: str, key: str, clock: Clock) -> float:
     try:
         moment = parse_time(text)
     except ValueError:
-        raise ValueError(
+        raise UserError(
             f"fire.{key}={text[:40]}: no calendar time; expected such as {clock.shown(0)}"
         ) from None
     moment = moment if moment.tzinfo else moment.replace(tzinfo=clock.origin.tzinfo)

@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from emberlink.envs.utils.errors import UserError
+
 from .arrival_raster import RasterSource, Units
 from .detect import beside
 from .gdal_open import opened
@@ -37,7 +39,7 @@ def read_ascii(path: Path, unit: Units | None, crs: str | None) -> RasterSource:
         header, rows = _header(file)
         columns, count = (_whole(header, key) for key in ("ncols", "nrows"))
         if columns * count > MOST_CELLS:
-            raise ValueError(
+            raise UserError(
                 f"{columns} x {count} cells; an .asc may have {MOST_CELLS}; expected a GeoTIFF, as "
                 "gdal_translate makes of it"
             )
@@ -61,7 +63,7 @@ def _header(file: Any) -> tuple[dict[str, float], bytes]:
         key = words[0].decode("latin-1").lower()
         number = len(header) + 1
         if key not in _KEYS:
-            raise ValueError(
+            raise UserError(
                 f"line {number}: {key[:30]!r} is no key of ESRI ASCII; expected {', '.join(_KEYS)}"
             )
         try:
@@ -69,19 +71,19 @@ def _header(file: Any) -> tuple[dict[str, float], bytes]:
         except ValueError:
             value = None
         if value is None or key in header:
-            raise ValueError(f"line {number}: expected {key} once, with one number")
+            raise UserError(f"line {number}: expected {key} once, with one number")
         header[key] = value
     for needed in (("ncols",), ("nrows",), ("cellsize", "dx"), ("cellsize", "dy")):
         if not any(key in header for key in needed):
-            raise ValueError(f"the header has no {needed[0]}; expected ESRI ASCII")
+            raise UserError(f"the header has no {needed[0]}; expected ESRI ASCII")
     for needed in _KEYS[2:4], _KEYS[4:6]:
         if sum(key in header for key in needed) != 1:
-            raise ValueError(f"the header must have one of {' and '.join(needed)}")
+            raise UserError(f"the header must have one of {' and '.join(needed)}")
     for key, value in header.items():
         if key in ("cellsize", "dx", "dy") and not 0 < value < math.inf:
-            raise ValueError(f"{key}={value:g}; expected a size above 0")
+            raise UserError(f"{key}={value:g}; expected a size above 0")
         if key[0] in "xy" and not math.isfinite(value):
-            raise ValueError(f"{key}={value:g}; expected a coordinate")
+            raise UserError(f"{key}={value:g}; expected a coordinate")
     return header, line
 
 
@@ -104,7 +106,7 @@ def _crs(path: Path) -> Any:
 def _whole(header: dict[str, float], key: str) -> int:
     value = header[key]
     if not 1 <= value < 1e12 or value != int(value):
-        raise ValueError(f"{key}={value:g}; expected a whole number above 0")
+        raise UserError(f"{key}={value:g}; expected a whole number above 0")
     return int(value)
 
 
@@ -115,17 +117,17 @@ def _rows(file: Any, line: bytes, columns: int, count: int, number: int) -> Iter
         if line.strip():
             if line.translate(None, _ALLOWED):
                 strange = line.translate(None, _ALLOWED)[:20].decode("latin-1")
-                raise ValueError(f"line {number}: {strange!r}; expected numbers")
+                raise UserError(f"line {number}: {strange!r}; expected numbers")
             words = line.split()
             if len(words) != columns:
-                raise ValueError(f"line {number}: {len(words)} numbers; expected ncols={columns}")
+                raise UserError(f"line {number}: {len(words)} numbers; expected ncols={columns}")
             if rows == count:
-                raise ValueError(f"line {number}: a row too many; expected nrows={count}")
+                raise UserError(f"line {number}: a row too many; expected nrows={count}")
             try:
                 yield np.array(words, dtype=np.float64)
             except ValueError as error:
-                raise ValueError(f"line {number}: {error}; expected numbers") from None
+                raise UserError(f"line {number}: {error}; expected numbers") from None
             rows += 1
         line, number = file.readline(), number + 1
     if rows < count:
-        raise ValueError(f"{rows} rows; expected nrows={count}: the file is cut off")
+        raise UserError(f"{rows} rows; expected nrows={count}: the file is cut off")

@@ -4,6 +4,8 @@ from pathlib import Path
 
 import numpy as np
 
+from emberlink.envs.utils.errors import UserError
+
 from .arrival_raster import Clock, RasterSource, Units
 from .geotiff import check_spreads
 
@@ -36,11 +38,11 @@ def read_front_points(path: Path, unit: Units = "steps") -> RasterSource:
                 _stamp(times, _points(line, count + 1), count - SKIPPED)
             count += 1
     if count <= SKIPPED:
-        raise ValueError(
+        raise UserError(
             f"{count} lines; expected more than {SKIPPED}, as the first {SKIPPED} are skipped"
         )
     if not np.isfinite(times).any():
-        raise ValueError(f"no point lies on the map of {SIDE} x {SIDE} cells: there is no fire")
+        raise UserError(f"no point lies on the map of {SIDE} x {SIDE} cells: there is no fire")
     check_spreads(times)
     # Rows run north to south, as in every raster.
     return RasterSource(
@@ -59,15 +61,15 @@ def _points(line: bytes, number: int) -> np.ndarray:
         values = np.array([float(text) for text in texts])
     except ValueError:
         wrong = repr((line.translate(None, _ALLOWED) or line)[:20].decode("latin-1"))
-        raise ValueError(
+        raise UserError(
             f"line {number}: {wrong}; expected numbers: x,y,intensity, of each point"
         ) from None
     if len(values) % 3:
-        raise ValueError(
+        raise UserError(
             f"line {number}: {len(values)} numbers; expected three for each point: x,y,intensity,"
         )
     if not np.isfinite(values).all() or np.abs(values).max(initial=0) > 1e9:
-        raise ValueError(f"line {number}: a number is not finite; expected x,y,intensity,")
+        raise UserError(f"line {number}: a number is not finite; expected x,y,intensity,")
     return values.reshape(-1, 3)
 
 

@@ -11,6 +11,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from emberlink.envs.utils.errors import UserError
+
 from .projection import first_line, library
 
 _CACHE = 100_000_000  # bytes that GDAL keeps of what it decoded; its default is 5 % of the memory
@@ -40,9 +42,9 @@ def opened(path: Path, driver: str = "GTiff") -> Iterator[Any]:
         ):
             yield dataset
     except (rasterio.errors.RasterioError, OSError) as error:
-        raise ValueError(f"{first_line(error)}; expected a whole raster") from None
+        raise UserError(f"{first_line(error)}; expected a whole raster") from None
     if heard:
-        raise ValueError(f"damaged: {heard[0][:200]}; expected a whole raster")
+        raise UserError(f"damaged: {heard[0][:200]}; expected a whole raster")
 
 
 @contextmanager

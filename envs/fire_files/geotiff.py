@@ -6,6 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from emberlink.envs.utils.errors import UserError
+
 from .arrival_raster import Clock, RasterSource, Units
 from .gdal_open import opened
 from .projection import Bounds, library, to_plane
@@ -33,7 +35,7 @@ def read_geotiff(path: Path, unit: Units | None, crs: str | None) -> RasterSourc
     with opened(path) as dataset:
         _check_band(dataset)
         if dataset.transform.is_identity:
-            raise ValueError(
+            raise UserError(
                 "no geotransform: it does not say where its cells are, or has lost it; expected "
                 "one, as gdal_translate -a_ullr gives it"
             )
@@ -70,7 +72,7 @@ def clean(times: np.ndarray, never: np.ndarray | None = None) -> np.ndarray:
     values = times[odd]
     wrong = ~(np.isnan(values) | (np.abs(values) > _VOID) | np.isin(values, NEVER))
     if wrong.any():
-        raise ValueError(
+        raise UserError(
             f"{values[wrong][0]:g} is no time of arrival; expected 0 or more, or NODATA (-9999, "
             "-1, NaN or what the file declares)"
         )
@@ -91,11 +93,11 @@ def check_spreads(times: np.ndarray, *, may_stand: bool = False) -> None:
     """
     burning = times[np.isfinite(times)]
     if len(burning) == 0:
-        raise ValueError("no cell burns: NODATA everywhere; expected times of arrival")
+        raise UserError("no cell burns: NODATA everywhere; expected times of arrival")
     if len(burning) == 1:
-        raise ValueError("a single cell burns; expected a fire that spreads")
+        raise UserError("a single cell burns; expected a fire that spreads")
     if burning.min() == burning.max() and not (may_stand and len(burning) < times.size):
-        raise ValueError(
+        raise UserError(
             f"all {len(burning)} cells burn at once, at {burning[0]:g}; "
             "expected a fire that spreads"
         )
@@ -113,9 +115,9 @@ def raster_source(
     affine = tuple(float(value) for value in transform[:6])
     area = abs(affine[0] * affine[4] - affine[1] * affine[3])
     if not all(map(math.isfinite, affine)) or not 1e-20 < area < 1e12:
-        raise ValueError(f"cells of {affine[0]:g} x {affine[4]:g}; expected a size above 0")
+        raise UserError(f"cells of {affine[0]:g} x {affine[4]:g}; expected a size above 0")
     if unit is None:
-        raise ValueError(
+        raise UserError(
             "a raster does not say in what its times are: expected fire.units=minutes (FARSITE, "
             "FlamMap), seconds (ELMFIRE), hours, days or steps"
         )
@@ -133,25 +135,25 @@ def _corners(affine: tuple[float, ...], shape: tuple[int, ...]) -> Bounds:
 
 def _check_band(dataset: Any) -> None:
     if dataset.count != 1:
-        raise ValueError(
+        raise UserError(
             f"{dataset.count} bands; expected one, or a bank of fires, tagged units=steps"
         )
     kind = np.dtype(dataset.dtypes[0])
     if kind.kind not in "iuf":
-        raise ValueError(f"values of type {dataset.dtypes[0]}; expected real numbers")
+        raise UserError(f"values of type {dataset.dtypes[0]}; expected real numbers")
     if kind.itemsize == 1 and dataset.nodata is None:
-        raise ValueError(
+        raise UserError(
             f"values of type {dataset.dtypes[0]} without NODATA, as of a picture; expected times"
         )
     if dataset.width * dataset.height > MOST_CELLS:
-        raise ValueError(
+        raise UserError(
             f"{dataset.width} x {dataset.height} cells; at most {MOST_CELLS} are read: expected a "
             "part of it, as gdalwarp -te cuts out"
         )
     rows, columns = dataset.block_shapes[0]
     size = rows * max(columns, dataset.width) * kind.itemsize
     if size > _MOST_BYTES:
-        raise ValueError(
+        raise UserError(
             f"blocks of {columns} x {rows} cells, {size} bytes in a row of them; at most "
             f"{_MOST_BYTES} are decoded at a time: expected smaller ones, as gdal_translate -co "
             "TILED=YES writes"

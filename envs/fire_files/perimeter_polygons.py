@@ -4,6 +4,8 @@ from typing import Any
 
 import numpy as np
 
+from emberlink.envs.utils.errors import UserError
+
 from .projection import library
 
 _GAP = 0.01  # of a line's length: a gap that small between its ends is closed
@@ -29,7 +31,7 @@ def enclosed(geometries: Any, names: list[int]) -> Any:
     drawn: list[int] = []  # the feature of each line
     for geometry, name in zip(geometries, names, strict=True):
         if geometry is None or geometry.is_empty:
-            raise ValueError(f"feature {name} has no geometry; expected a perimeter")
+            raise UserError(f"feature {name} has no geometry; expected a perimeter")
         before = len(areas) + len(lines)
         parts = _parts(shapely.force_2d(geometry))
         if any(part.geom_type == "Polygon" for part in parts):  # open lines beside it are left over
@@ -41,14 +43,14 @@ def enclosed(geometries: Any, names: list[int]) -> Any:
                 lines.append(part)
                 drawn.append(name)
         if len(areas) + len(lines) == before:
-            raise ValueError(
+            raise UserError(
                 f"feature {name} is of {geometry.geom_type}; expected polygons or lines"
             )
     if lines:
         areas.append(_within_lines(shapely, lines, drawn))
     area = shapely.union_all(areas)
     if not area.area > 0:
-        raise ValueError(f"feature {names[0]} encloses no area; expected a perimeter")
+        raise UserError(f"feature {names[0]} encloses no area; expected a perimeter")
     return area
 
 
@@ -113,7 +115,7 @@ def _within_lines(shapely: Any, lines: list[Any], names: list[int]) -> Any:
         ends = np.asarray(line.coords)[[0, -1]]
         gap = float(np.hypot(*(ends[1] - ends[0])))
         if len(line.coords) < 3 or gap > _GAP * line.length:
-            raise ValueError(
+            raise UserError(
                 f"feature {_drawn_in(line, lines, names)}: a line of {len(line.coords)} points is "
                 f"not closed, {gap:g} of its length of {line.length:g} is missing; expected "
                 "closed lines"
@@ -122,7 +124,7 @@ def _within_lines(shapely: Any, lines: list[Any], names: list[int]) -> Any:
         rings.setdefault(shapely.normalize(area).wkb, area)
     areas = sorted(rings.values(), key=lambda area: -area.area)
     if len(areas) > MOST_RINGS:
-        raise ValueError(f"{len(areas)} closed lines of one time; at most {MOST_RINGS} are read")
+        raise UserError(f"{len(areas)} closed lines of one time; at most {MOST_RINGS} are read")
     tree = shapely.STRtree(areas)
     inner, outer = tree.query(areas, predicate="covered_by")
     depth = np.bincount(inner[outer < inner], minlength=len(areas))

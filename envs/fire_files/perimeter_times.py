@@ -6,6 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from emberlink.envs.utils.errors import UserError
+
 from .arrival_raster import Clock, Units
 
 ELAPSED: dict[str, Units] = {
@@ -60,7 +62,7 @@ def perimeter_times(frame: Any, wanted: str | None, unit: Units | None) -> Times
     lower = {name.lower(): name for name in names}
     if wanted is not None:
         if wanted not in names and wanted.lower() not in lower:
-            raise ValueError(f"no column {wanted!r} (fire.time_field); there are {_listed(names)}")
+            raise UserError(f"no column {wanted!r} (fire.time_field); there are {_listed(names)}")
         name = wanted if wanted in names else lower[wanted.lower()]
         return _column(frame, name, unit)
     for known in (*ELAPSED, *(one for name in CALENDAR for one in (name, name[:_DBF]))):
@@ -71,7 +73,7 @@ def perimeter_times(frame: Any, wanted: str | None, unit: Units | None) -> Times
     dates = [name for name in names if _all_dates(frame[name])]
     if len(dates) == 1:
         return _column(frame, dates[0], unit)
-    raise ValueError(
+    raise UserError(
         f"which column holds the times is not known; expected fire.time_field, one of "
         f"{_listed(names)}"
     )
@@ -85,7 +87,7 @@ def _column(frame: Any, name: str, unit: Units | None) -> Times:
     column = frame[name]
     empty = np.flatnonzero(column.isna().to_numpy())
     if len(empty):
-        raise ValueError(f"feature {empty[0]} has no time in {name}; expected one in each")
+        raise UserError(f"feature {empty[0]} has no time in {name}; expected one in each")
     if column.dtype.kind in "iuf":
         return _numbers(column.to_numpy(dtype=np.float64), name, unit)
     values = [str(value).strip() for value in column]
@@ -100,24 +102,22 @@ def _numbers(values: np.ndarray, name: str, unit: Units | None) -> Times:
     """Elapsed time, or milliseconds since 1970, as ESRI's services give dates."""
     wrong = np.flatnonzero(~np.isfinite(values) | (values < 0))
     if len(wrong):
-        raise ValueError(
+        raise UserError(
             f"feature {wrong[0]} has {name}={values[wrong[0]]:g}; expected a time of 0 or more"
         )
     if name.lower() not in ELAPSED and (form := _date_form(values)):
         return _calendar([_written(v, form, i, name) for i, v in enumerate(values)], name)
     if (values > _EPOCH_MS).all() and name.lower() not in ELAPSED:
         if values.max() > _LATEST_MS:
-            raise ValueError(
-                f"{name}={values.max():g} is no time; expected milliseconds since 1970"
-            )
+            raise UserError(f"{name}={values.max():g} is no time; expected milliseconds since 1970")
         return _calendar([datetime.fromtimestamp(value / 1000, UTC) for value in values], name)
     if values.max() > _LATEST:
-        raise ValueError(f"{name}={values.max():g} is no time; expected less than {_LATEST:g}")
+        raise UserError(f"{name}={values.max():g} is no time; expected less than {_LATEST:g}")
     said = ELAPSED.get(name.lower())
     if said and unit and unit != said:
-        raise ValueError(f"{name} is in {said}; expected fire.units={said}, not {unit}")
+        raise UserError(f"{name} is in {said}; expected fire.units={said}, not {unit}")
     if not (said or unit):
-        raise ValueError(
+        raise UserError(
             f"{name} does not say in what its times are: expected fire.units=minutes, seconds, "
             "hours, days or steps"
         )
@@ -140,7 +140,7 @@ def _written(value: float, form: str, feature: int, name: str) -> datetime:
     try:
         return datetime.strptime(f"{value:.0f}", form)
     except ValueError:
-        raise ValueError(
+        raise UserError(
             f"feature {feature} has {name}={value:.0f}, which is no date as others in it are; "
             "expected such as 20200819"
         ) from None
@@ -150,14 +150,14 @@ def _calendar(moments: list[datetime], name: str) -> Times:
     """Minutes since the first."""
     aware = [moment.tzinfo is not None for moment in moments]
     if any(aware) and not all(aware):
-        raise ValueError(
+        raise UserError(
             f"{name}: feature {aware.index(True)} has a time zone and feature "
             f"{aware.index(False)} has none; expected all or none"
         )
     try:
         moments = [m.astimezone(UTC) if m.tzinfo else m.replace(tzinfo=UTC) for m in moments]
     except OverflowError:
-        raise ValueError(f"{name} has a time before year 1 or after 9999") from None
+        raise UserError(f"{name} has a time before year 1 or after 9999") from None
     first = min(moments)
     values = [(moment - first) / timedelta(minutes=1) for moment in moments]
     return Times(np.array(values), Clock("minutes", first))
@@ -178,7 +178,7 @@ def _parsed(text: str, feature: int, name: str) -> datetime:
     try:
         return parse_time(text)
     except ValueError:
-        raise ValueError(
+        raise UserError(
             f"feature {feature} has {name}={text[:40]!r}; expected such as 2020-08-19T13:00"
         ) from None
 
@@ -191,7 +191,7 @@ def parse_time(text: str) -> datetime:
     """
     text = text.strip().replace("/", "-")
     if len(text) > 40:
-        raise ValueError(f"{text[:40]!r} is no calendar time")
+        raise UserError(f"{text[:40]!r} is no calendar time")
     return datetime.fromisoformat(text)
 
 
@@ -209,7 +209,7 @@ def _farsite(frame: Any, lower: dict[str, str]) -> Times:
                 raise ValueError
             moments.append(datetime(year, int(month), int(day)) + timedelta(minutes=minutes))
         except (ValueError, OverflowError):
-            raise ValueError(
+            raise UserError(
                 f"feature {feature} has Month={month:g}, Day={day:g}, Hour={hour:g}; expected a "
                 "date and a time such as 1300"
             ) from None
@@ -222,7 +222,7 @@ def _whole_numbers(frame: Any, name: str) -> np.ndarray:
         try:
             values.append(int(float(value)))
         except (TypeError, ValueError, OverflowError):
-            raise ValueError(
+            raise UserError(
                 f"feature {feature} has {name}={str(value)[:40]}; expected a whole number"
             ) from None
     return np.array(values, np.float64)

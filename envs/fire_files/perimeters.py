@@ -7,6 +7,8 @@ from typing import Any
 import numpy as np
 from scipy.ndimage import distance_transform_edt
 
+from emberlink.envs.utils.errors import UserError
+
 from .arrival_raster import Clock, Units, Window, within
 from .perimeter_polygons import enclosed, ignition, polygons
 from .perimeter_times import perimeter_times
@@ -51,12 +53,12 @@ def read_perimeters(
     except Exception as error:  # of GDAL, of text that is none, of geometries that are none
         if isinstance(error, pyogrio.errors.CRSError):
             check_projection(path, None)
-        raise ValueError(f"{first_line(error)}; expected perimeters") from None
+        raise UserError(f"{first_line(error)}; expected perimeters") from None
     if not hasattr(frame, "geometry") or len(frame) == 0:
-        raise ValueError("no feature with a geometry; expected perimeters")
+        raise UserError("no feature with a geometry; expected perimeters")
     missing = np.flatnonzero((frame.geometry.isna() | frame.geometry.is_empty).to_numpy())
     if len(missing):
-        raise ValueError(f"feature {missing[0]} has no geometry; expected a perimeter in each")
+        raise UserError(f"feature {missing[0]} has no geometry; expected a perimeter in each")
     if not json:
         check_projection(path, frame.crs)
     times = perimeter_times(frame, time_field, unit)
@@ -68,7 +70,7 @@ def read_perimeters(
     project, _ = to_plane(source_crs, crs, bounds, None)
     moments = np.unique(times.values)
     if len(moments) > MOST_TIMES:
-        raise ValueError(f"{len(moments)} times; at most {MOST_TIMES} are read")
+        raise UserError(f"{len(moments)} times; at most {MOST_TIMES} are read")
     shapely = library("shapely", "perimeters")
     areas: list[Any] = []
     for moment in moments:
@@ -88,10 +90,10 @@ def _layer(pyogrio: Any, path: Path, wanted: str | None) -> str:
         return str(wanted)
     listed = ", ".join(layers[:30])
     if not layers:
-        raise ValueError("no layer has geometries; expected perimeters")
+        raise UserError("no layer has geometries; expected perimeters")
     if wanted is None:
-        raise ValueError(f"{len(layers)} layers; expected fire.layer, one of {listed}")
-    raise ValueError(f"no layer {wanted!r} (fire.layer); there are {listed}")
+        raise UserError(f"{len(layers)} layers; expected fire.layer, one of {listed}")
+    raise UserError(f"no layer {wanted!r} (fire.layer); there are {listed}")
 
 
 def _too_large(bounds: Bounds) -> bool:
@@ -115,7 +117,7 @@ class PerimeterSource:
 
     def __init__(self, areas: Sequence[Any], times: np.ndarray, clock: Clock):
         if len(times) < 2:
-            raise ValueError(
+            raise UserError(
                 f"one perimeter, of {clock.shown(times[0])}; expected two times or more"
             )
         self.clock, self.first, self.last = clock, float(times[0]), float(times[-1])
@@ -191,7 +193,7 @@ class PerimeterSource:
                 self._check_shrinks(k)
             burnt, largest = burnt | area, max(largest, exact)
         if first.sum() == burnt.sum():
-            raise ValueError("all cells burn at once: no perimeter adds to the first; expected two")
+            raise UserError("all cells burn at once: no perimeter adds to the first; expected two")
 
     def _check_shrinks(self, k: int) -> None:
         """That a perimeter is not but a part of what had burnt before."""
@@ -199,7 +201,7 @@ class PerimeterSource:
         area, before = self._areas[k], shapely.union_all(self._areas[:k])
         within = area.intersection(before).area >= _WITHIN * area.area
         if within and area.area < _SHRUNK * before.area:
-            raise ValueError(
+            raise UserError(
                 f"the perimeter of {self.clock.shown(self._times[k])} lies within what had "
                 f"burnt before and is {100 * area.area / before.area:.0f} % of it: times go "
                 "backwards; expected areas that grow"

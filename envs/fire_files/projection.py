@@ -11,6 +11,8 @@ from typing import Any
 
 import numpy as np
 
+from emberlink.envs.utils.errors import UserError
+
 from .detect import beside
 
 Move = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
@@ -34,7 +36,7 @@ def library(name: str, what: str) -> Any:
     try:
         return importlib.import_module(name)
     except ImportError:
-        raise ValueError(
+        raise UserError(
             f"reading {what} needs the extra geo: pip install 'emberlink[geo]' ({name} is missing)"
         ) from None
 
@@ -89,7 +91,7 @@ def to_plane(crs: Any, wanted: str | None, bounds: Bounds, cell: float | None) -
         ValueError: degrees without a projection, an unknown projection, or coordinates outside it.
     """
     if not all(map(math.isfinite, bounds)) or max(map(abs, bounds)) > _FARTHEST:
-        raise ValueError(f"coordinates from {bounds[:2]} to {bounds[2:]} are not on the Earth")
+        raise UserError(f"coordinates from {bounds[:2]} to {bounds[2:]} are not on the Earth")
     if crs is None and wanted is None:
         _refuse_degrees(bounds, cell)
         return same, same
@@ -97,14 +99,14 @@ def to_plane(crs: Any, wanted: str | None, bounds: Bounds, cell: float | None) -
     if crs is not None and wanted is None and not source.is_geographic:
         return same, same
     if source.is_geographic and not _in_degrees(bounds):
-        raise ValueError(
+        raise UserError(
             f"coordinates from {bounds[:2]} to {bounds[2:]} are not degrees, which "
             f"{source.name} is in; expected longitude and latitude, or another fire.crs"
         )
     if crs is not None and wanted is not None:
         target = _crs(wanted)
         if target.is_geographic:
-            raise ValueError(f"fire.crs={wanted} is in degrees; expected one in metres, as UTM is")
+            raise UserError(f"fire.crs={wanted} is in degrees; expected one in metres, as UTM is")
     elif source.is_geographic:
         target = _utm(bounds)
     else:
@@ -126,7 +128,7 @@ def _moves(source: Any, target: Any, bounds: Bounds) -> tuple[Move, Move]:
 
     corners = there(np.array(bounds[0::2]), np.array(bounds[1::2]))
     if not np.isfinite(corners).all() or np.abs(corners).max() > _FARTHEST:
-        raise ValueError(
+        raise UserError(
             f"coordinates from {bounds[:2]} to {bounds[2:]} cannot be projected from "
             f"{source.name} to {target.name}; expected another fire.crs"
         )
@@ -138,7 +140,7 @@ def _crs(value: Any) -> Any:
     try:
         return pyproj.CRS.from_user_input(value)
     except pyproj.exceptions.CRSError:
-        raise ValueError(
+        raise UserError(
             f"the projection {str(value)[:100]!r} is not known; expected such as EPSG:32611"
         ) from None
 
@@ -150,7 +152,7 @@ def _in_degrees(bounds: Bounds) -> bool:
 def _refuse_degrees(bounds: Bounds, cell: float | None) -> None:
     small = max(bounds[2] - bounds[0], bounds[3] - bounds[1]) < _DEGREE_EXTENT
     if _in_degrees(bounds) and (small if cell is None else cell < _DEGREE_CELL):
-        raise ValueError(
+        raise UserError(
             f"coordinates from {bounds[:2]} to {bounds[2:]} look like degrees, and no projection "
             "is given; expected fire.crs, such as fire.crs=EPSG:4326 for longitude and latitude"
         )
@@ -168,7 +170,7 @@ def check_projection(path: Path, crs: Any) -> None:
     """
     prj = beside(path, ".prj")
     if crs is None and prj is not None and prj.stat().st_size:
-        raise ValueError(
+        raise UserError(
             f"{prj.name}, beside it, holds no projection that is known; expected one, or no such "
             "file and fire.crs, such as fire.crs=EPSG:32611"
         )
@@ -178,7 +180,7 @@ def _utm(bounds: Bounds) -> Any:
     """The UTM zone around the middle."""
     width, height = bounds[2] - bounds[0], bounds[3] - bounds[1]
     if max(width, height) > _WIDEST:
-        raise ValueError(
+        raise UserError(
             f"{width:g} x {height:g} degrees: a UTM zone is no plane for them; expected fire.crs, "
             "a projection in metres, or a file of the fire alone"
         )
@@ -188,7 +190,7 @@ def _utm(bounds: Bounds) -> Any:
     area = importlib.import_module("pyproj.aoi").AreaOfInterest(x, y, x, y)
     found = importlib.import_module("pyproj.database").query_utm_crs_info("WGS 84", area)
     if not found:
-        raise ValueError(
+        raise UserError(
             f"there is no UTM zone at longitude {x:g}, latitude {y:g}; expected fire.crs, a "
             "projection in metres"
         )

@@ -13,6 +13,7 @@ from pydantic.dataclasses import dataclass
 from torch import Tensor
 
 from emberlink.envs.config import check_grid
+from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import Name, printable
 
 from . import detect
@@ -37,7 +38,7 @@ _Text = Annotated[str, Field(min_length=1, max_length=1000)]
 
 def _given(value: Any) -> Any:
     if value is None:
-        raise ValueError("a file is needed, such as fire.path=ArrivalTime.asc")
+        raise UserError("a file is needed, such as fire.path=ArrivalTime.asc")
     return value
 
 
@@ -87,7 +88,7 @@ class FileFireConfig:
     @model_validator(mode="after")
     def _one_end(self) -> "FileFireConfig":
         if self.end is not None and self.minutes_per_step is not None:
-            raise ValueError("end and minutes_per_step: give one of them")
+            raise UserError("end and minutes_per_step: give one of them")
         return self
 
 
@@ -111,12 +112,12 @@ def read_fires(config: FileFireConfig, grid: tuple[int, int], horizon: int) -> T
         with quiet():
             found = _gridded(path, config, grid, horizon)
     except ValueError as error:
-        raise ValueError(f"{printable(str(path))}: {one_line(str(error))}") from None
+        raise UserError(f"{printable(str(path))}: {one_line(str(error))}") from None
     except OSError as error:
         reason = error.strerror or error
-        raise ValueError(f"{printable(str(path))}: cannot be read: {reason}") from None
+        raise UserError(f"{printable(str(path))}: cannot be read: {reason}") from None
     except MemoryError:
-        raise ValueError(f"{printable(str(path))}: not enough memory to read it") from None
+        raise UserError(f"{printable(str(path))}: not enough memory to read it") from None
     return torch.from_numpy(np.stack(found))
 
 
@@ -133,7 +134,7 @@ def _gridded(
         try:
             found.append(on_grid(source, config, grid, horizon))
         except ValueError as error:
-            raise ValueError(f"fire {len(found)}: {error}") from None
+            raise UserError(f"fire {len(found)}: {error}") from None
     return found
 
 
@@ -166,9 +167,9 @@ def _checked(file: str, expected: str | None) -> str:
     try:
         found = detect.digest(path)
     except ValueError as error:
-        raise ValueError(f"{printable(str(path))}: {error}") from None
+        raise UserError(f"{printable(str(path))}: {error}") from None
     if expected not in (None, found):
-        raise ValueError(
+        raise UserError(
             f"{printable(str(path))}: has changed: its content has sha256 {found[:12]}..., that of "
             f"the run {str(expected)[:12]}..."
         )
@@ -224,7 +225,7 @@ def keep(config: FileFireConfig, folder: Path, grid: tuple[int, int], horizon: i
             )
         partial.replace(folder / KEPT)
     except OSError as error:
-        raise ValueError(f"{folder / KEPT}: cannot be written: {error.strerror or error}") from None
+        raise UserError(f"{folder / KEPT}: cannot be written: {error.strerror or error}") from None
 
 
 def _key(config: FileFireConfig, grid: tuple[int, int], horizon: int) -> str:

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
+from emberlink.envs.utils.errors import UserError
 from emberlink.envs.world.sensor import view_radius
 
 NO_FIRE = (0, 0, 0)
@@ -101,7 +102,7 @@ def write_gif(path: Path, frames: Iterable[NDArray[np.uint8]], *, fps: int = 20)
     """
     images = [Image.fromarray(picture).quantize(MAX_COLOURS) for picture in frames]
     if not images:
-        raise ValueError(f"{path}: an animation needs at least one frame")
+        raise UserError(f"{path}: an animation needs at least one frame")
     images = _one_palette(images)
     duration = round(1000 / fps)
     images[0].save(

@@ -8,6 +8,8 @@ import imageio_ffmpeg
 import numpy as np
 from numpy.typing import NDArray
 
+from emberlink.envs.utils.errors import UserError
+
 _COLOURS = (
     "scale=out_color_matrix=bt709:out_range=tv,"
     "setparams=color_primaries=bt709:color_trc=bt709:colorspace=bt709:range=tv"
@@ -43,11 +45,11 @@ def write_mp4(path: Path, frames: Iterable[NDArray[np.uint8]], *, fps: int = 20)
         whole = written > 0 and imageio_ffmpeg.count_frames_and_secs(path)[0] == written
     except (OSError, RuntimeError) as error:
         reason = str(error).strip().splitlines()[0]
-        raise ValueError(f"{path.name}: ffmpeg failed: {reason}") from None
+        raise UserError(f"{path.name}: ffmpeg failed: {reason}") from None
     if written == 0:
-        raise ValueError(f"{path}: a video needs at least one frame")
+        raise UserError(f"{path}: a video needs at least one frame")
     if not whole:
-        raise ValueError(f"{path.name}: ffmpeg failed: not all {written} frames were written")
+        raise UserError(f"{path.name}: ffmpeg failed: not all {written} frames were written")
 
 
 def _start(path: Path, picture: NDArray[np.uint8], fps: int):

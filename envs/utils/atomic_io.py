@@ -6,6 +6,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+from .errors import UserError
 from .validation import shown
 
 _NO_LINKS = {errno.EPERM, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS, errno.EMLINK}
@@ -29,9 +30,9 @@ def published(path: Path) -> Iterator[Path]:
             os.fsync(file.fileno())
         _take(partial, path)
     except FileExistsError:
-        raise ValueError(f"{path} is there already; nothing is overwritten") from None
+        raise UserError(f"{path} is there already; nothing is overwritten") from None
     except OSError as error:
-        raise ValueError(f"{shown(str(path))}: {error.strerror or error}") from None
+        raise UserError(f"{shown(str(path))}: {error.strerror or error}") from None
     finally:
         with suppress(OSError):
             partial.unlink(missing_ok=True)
@@ -60,15 +61,15 @@ def new_file(output: Path, suffixes: Sequence[str]) -> Path:
         ValueError: it is there, ends otherwise, or its folder is not there.
     """
     if os.path.isdir(output):
-        raise ValueError(f"{output} is a folder; a file ends in {', '.join(suffixes)}")
+        raise UserError(f"{output} is a folder; a file ends in {', '.join(suffixes)}")
     if output.suffix not in suffixes:
-        raise ValueError(
+        raise UserError(
             f"{shown(str(output))}: the file's name must end in {' or '.join(suffixes)}"
         )
     if os.path.lexists(output):
-        raise ValueError(f"{output} is there already; nothing is overwritten")
+        raise UserError(f"{output} is there already; nothing is overwritten")
     if not os.path.isdir(output.parent):
-        raise ValueError(f"{shown(str(output.parent))}: there is no such folder")
+        raise UserError(f"{shown(str(output.parent))}: there is no such folder")
     return output
 
 
@@ -82,4 +83,4 @@ def free_name(folder: Path, stem: str, suffixes: Sequence[str]) -> Path:
         name = folder / (stem if attempt == 1 else f"{stem}_{attempt}")
         if not any(os.path.lexists(f"{name}{suffix}") for suffix in suffixes):
             return name
-    raise ValueError(f"{folder}: {stem} and 9999 more are there already")
+    raise UserError(f"{folder}: {stem} and 9999 more are there already")

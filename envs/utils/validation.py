@@ -9,6 +9,8 @@ from typing import Annotated, Any, TypeVar
 import numpy as np
 from pydantic import Field, TypeAdapter, ValidationError
 
+from .errors import UserError
+
 T = TypeVar("T")
 
 
@@ -51,21 +53,21 @@ def plain(value: Any, key: str = "", deepest: int = 16) -> Any:
     if isinstance(value, np.generic | np.ndarray):
         value = value.tolist()
     if isinstance(value, Mapping | list | tuple) and deepest == 0:
-        raise ValueError(f"{key[:60]}: lists or mappings within each other, too many levels")
+        raise UserError(f"{key[:60]}: lists or mappings within each other, too many levels")
     if isinstance(value, Mapping):
         for name in value:
             if not isinstance(name, str) or not name.isprintable():
-                raise ValueError(f"key {shown(name)} in {key or 'the configuration'} is no name")
+                raise UserError(f"key {shown(name)} in {key or 'the configuration'} is no name")
         prefix = f"{key}." if key else ""
         return {name: plain(item, prefix + name, deepest - 1) for name, item in value.items()}
     if isinstance(value, list | tuple):
         return [plain(item, f"{key}.{place}", deepest - 1) for place, item in enumerate(value)]
     if isinstance(value, str) and not value.isprintable():
-        raise ValueError(f"{key}={shown(value)}: holds characters that cannot be printed")
+        raise UserError(f"{key}={shown(value)}: holds characters that cannot be printed")
     if isinstance(value, int) and value.bit_length() > 1024:
-        raise ValueError(f"{key}: a whole number of {value.bit_length()} bits is too large")
+        raise UserError(f"{key}: a whole number of {value.bit_length()} bits is too large")
     if not isinstance(value, str | int | float | None):
-        raise ValueError(f"{key}={shown(value)}: {type(value).__name__} is no number, text or list")
+        raise UserError(f"{key}={shown(value)}: {type(value).__name__} is no number, text or list")
     return value
 
 

@@ -18,6 +18,7 @@ from emberlink.envs.rendering.panels import Episode, Screen
 from emberlink.envs.rendering.video import write_mp4
 from emberlink.envs.scenarios import ScenarioConfig, fires_of
 from emberlink.envs.utils.atomic_io import free_name, published
+from emberlink.envs.utils.errors import UserError
 from emberlink.envs.wildfire import WildfireEnv
 from emberlink.policies.scripted.registry import SCRIPTED
 from emberlink.trainers.build import build_env
@@ -126,9 +127,9 @@ def find_fire(text: str | None, trained: ScenarioConfig) -> tuple[ScenarioConfig
     )
     known = dict.fromkeys([*scenarios(), trained.name])
     if name not in known:
-        raise ValueError(f"fire {name!r} is not known; known: {', '.join(known)}")
+        raise UserError(f"fire {name!r} is not known; known: {', '.join(known)}")
     if not index.isdecimal() or int(index) >= FIRES:
-        raise ValueError(
+        raise UserError(
             f"fire {text!r}: there is no held-out fire {index!r}; known: 0 to {FIRES - 1}"
         )
     return load_scenario(name) if name in scenarios() else trained, int(index)
@@ -137,7 +138,7 @@ def find_fire(text: str | None, trained: ScenarioConfig) -> tuple[ScenarioConfig
 def _learned(folders: Sequence[RunFolder], checkpoints: Sequence[Path]) -> Iterator[Panel]:
     """A panel for each run."""
     if checkpoints and len(checkpoints) != len(folders):
-        raise ValueError(f"{len(checkpoints)} checkpoints for {len(folders)} runs: one each")
+        raise UserError(f"{len(checkpoints)} checkpoints for {len(folders)} runs: one each")
     for place, run in enumerate(folders):
         config = run.config(device="cpu")
         checkpoint = checkpoints[place] if checkpoints else run.checkpoint()
@@ -152,7 +153,7 @@ def _scripted(folders: Sequence[RunFolder], names: Sequence[str]) -> Iterator[Pa
     """A panel for each scripted policy, in the world of the first run."""
     for name in names:
         if name not in SCRIPTED:
-            raise ValueError(f"policy {name!r} is not known; known: {', '.join(SCRIPTED)}")
+            raise UserError(f"policy {name!r} is not known; known: {', '.join(SCRIPTED)}")
         config = scripted_config(folders[0].config(device="cpu"), name)
         yield Panel(f"{name.replace('_', ' ')} (scripted)", config, SCRIPTED[name])
 
@@ -163,7 +164,7 @@ def _check_comparable(panels: Sequence[Panel]) -> None:
         for name in SHARED:
             one, two = (getattr(panel.config.env, name) for panel in (first, other))
             if one != two:
-                raise ValueError(
+                raise UserError(
                     f"{other.title} has env.{name}={_plain(two)}, {first.title} has "
                     f"{_plain(one)}: side by side, {', '.join(SHARED)} must be the same"
                 )
@@ -177,12 +178,12 @@ def _steps(choices: Choices, horizon: int, suffixes: Sequence[str]) -> list[int]
     """The moments that are drawn."""
     if suffixes != [".png"]:
         if choices.step is not None:
-            raise ValueError(f"step={choices.step}: only of a picture, --output FILE.png")
+            raise UserError(f"step={choices.step}: only of a picture, --output FILE.png")
         frames = min(choices.frames, horizon + 1)
         return np.linspace(0, horizon, frames).round().astype(int).tolist()
     step = horizon if choices.step is None else choices.step
     if step > horizon:
-        raise ValueError(f"step={step}: the episode has the steps 0 to {horizon}")
+        raise UserError(f"step={step}: the episode has the steps 0 to {horizon}")
     return [step]
 
 
@@ -229,18 +230,18 @@ def _free_paths(output: Path | None, run: RunFolder, stem: str) -> list[Path]:
     """
     if output is not None and not output.is_dir():
         if output.suffix not in _WRITERS:
-            raise ValueError(
+            raise UserError(
                 f"{output}: there is no such folder, and a file ends in {', '.join(_WRITERS)}"
             )
         if os.path.lexists(output):
-            raise ValueError(f"{output} is there already; nothing is overwritten")
+            raise UserError(f"{output} is there already; nothing is overwritten")
         if not output.parent.is_dir():
-            raise ValueError(f"{output.parent}: there is no such folder")
+            raise UserError(f"{output.parent}: there is no such folder")
         return [output]
     try:
         folder = run.figure(stem).parent if output is None else output
     except OSError as error:
-        raise ValueError(f"{run.path}: {error.strerror or error}") from None
+        raise UserError(f"{run.path}: {error.strerror or error}") from None
     suffixes = (".gif", ".mp4")
     name = free_name(folder, stem, suffixes)
     return [name.with_name(f"{name.name}{suffix}") for suffix in suffixes]

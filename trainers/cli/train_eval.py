@@ -14,6 +14,7 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
+from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import known
 from emberlink.trainers.config.compose import override, resolve
 from emberlink.trainers.config.schema import RunConfig, check_device
@@ -67,7 +68,7 @@ def train(method: str | None, overrides: Sequence[str], console: Console) -> int
         _say_where(trainer, console)
         return interruption.status
     except ValueError as error:
-        raise ValueError(f"{error}; {_newest(trainer, _with(error, config))}") from None
+        raise UserError(f"{error}; {_newest(trainer, _with(error, config))}") from None
     finally:
         trainer.close()
     return 0
@@ -80,11 +81,11 @@ def _trainer(method: str | None, overrides: Sequence[str], console: Console) -> 
     folders = [text.partition("=")[2] for text in overrides if text.startswith("resume=")]
     if not folders:
         if method is None:
-            raise ValueError(f"{overrides[0]!r} is no method; known: {', '.join(known('method'))}")
+            raise UserError(f"{overrides[0]!r} is no method; known: {', '.join(known('method'))}")
         trainer = Trainer(resolve(method, overrides))
         trainer.start()
     elif len(folders) > 1 or not folders[0]:
-        raise ValueError("resume=RUN: one run folder is needed")
+        raise UserError("resume=RUN: one run folder is needed")
     else:
         others = [text for text in overrides if not text.startswith("resume=")]
         trainer = resume(Path(folders[0]), method, others)
@@ -185,7 +186,7 @@ def evaluate_folder(
     checkpoint = checkpoint or run.checkpoint()
     for text in overrides:
         if not text.startswith(_EVALUATED_WITH):
-            raise ValueError(
+            raise UserError(
                 f"{text!r}: an evaluation can be given keys of {' and '.join(_EVALUATED_WITH)} only"
             )
         config = override(config, [text])

@@ -10,6 +10,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from emberlink.envs.utils.errors import UserError
 from emberlink.trainers.evaluation import evaluate
 from emberlink.trainers.evaluation.plots import timelapse
 from emberlink.trainers.evaluation.report import load_actor
@@ -40,7 +41,7 @@ def compare(paths: Sequence[Path], console: Console, output: Path | None = None)
         return _compare(paths, console, _free(output))
     except OSError as error:
         place = "" if output is None else f"--output {output}: "
-        raise ValueError(f"{place}cannot be written: {error.strerror or error}") from None
+        raise UserError(f"{place}cannot be written: {error.strerror or error}") from None
 
 
 def _compare(paths: Sequence[Path], console: Console, folder: Path) -> int:
@@ -48,7 +49,7 @@ def _compare(paths: Sequence[Path], console: Console, folder: Path) -> int:
     for path, why in left_out:
         console.print(Text(f"note: {path} is left out: {why}", style="yellow"))
     if not runs:
-        raise ValueError(f"no finished run among {len(left_out)}: nothing to compare")
+        raise UserError(f"no finished run among {len(left_out)}: nothing to compare")
     sections, notes = gather(runs)
     everything = [numbers(section) for section in sections]
     notes += [note for one in everything for note in one.notes]
@@ -78,9 +79,9 @@ def _free(output: Path | None) -> Path:
         tried = (Path("compare" if i == 1 else f"compare_{i}") for i in range(1, 10_000))
         return next(path for path in tried if not path.exists())
     if output.is_symlink() and not output.exists():
-        raise ValueError(f"--output {output}: a link to what is not there; name a new folder")
+        raise UserError(f"--output {output}: a link to what is not there; name a new folder")
     if output.exists() and (not output.is_dir() or any(output.iterdir())):
-        raise ValueError(f"--output {output}: is there and not an empty folder; name a new one")
+        raise UserError(f"--output {output}: is there and not an empty folder; name a new one")
     return output
 
 

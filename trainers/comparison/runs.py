@@ -12,6 +12,7 @@ from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 from pydantic.dataclasses import dataclass as checked
 
 from emberlink.envs import metrics
+from emberlink.envs.utils.errors import UserError
 from emberlink.trainers.config.compose import describe, flat, resolve, to_values
 from emberlink.trainers.config.schema import NOT_LEARNT_WITH, RunConfig
 from emberlink.trainers.evaluation.results import CURVES, LEARNED
@@ -139,9 +140,9 @@ def find(paths: Iterable[Path]) -> list[Path]:
         elif path.is_dir():
             folders = [folder.parent for folder in path.glob("*/config.yaml")]
         else:
-            raise ValueError(f"{path}: there is no such run folder")
+            raise UserError(f"{path}: there is no such run folder")
         if not folders:
-            raise ValueError(f"{path}: neither a run folder nor a folder that holds runs")
+            raise UserError(f"{path}: neither a run folder nor a folder that holds runs")
         for folder in sorted(folders):
             known = found.setdefault(folder.resolve(), folder)
             found[folder.resolve()] = min(known, folder)
@@ -205,7 +206,7 @@ def _evaluation(file: Path, config: RunConfig) -> Evaluation:
     try:
         evaluation = TypeAdapter(Evaluation).validate_json(read_text(file, LONGEST_JSON))
     except ValidationError as error:
-        raise ValueError(f"{file}: {' '.join(describe(error).split())[:300]}") from None
+        raise UserError(f"{file}: {' '.join(describe(error).split())[:300]}") from None
     _check_evaluation(file, evaluation, config)
     return evaluation
 
@@ -223,17 +224,17 @@ def _lines(folder: RunFolder) -> list[dict[str, Any]]:
     try:
         lines = folder.lines()
     except (OSError, UnicodeDecodeError) as error:
-        raise ValueError(f"{file}: cannot be read: {error}") from None
+        raise UserError(f"{file}: cannot be read: {error}") from None
     for number, line in enumerate(lines, 1):
         episode = line.get("episode") if isinstance(line, dict) else None
         if episode != number:
-            raise ValueError(f"{file}: line {number} is not that of episode {number}")
+            raise UserError(f"{file}: line {number} is not that of episode {number}")
         for name in CURVES:
             value = line.get(name)
             try:
                 _MEASURE.validate_python(value, strict=True)
             except ValidationError:
-                raise ValueError(
+                raise UserError(
                     f"{file}: line {number}: {name}={value} is no finite number up to {LARGEST:g}"
                 ) from None
     return lines
@@ -243,18 +244,18 @@ def _check_evaluation(file: Path, evaluation: Evaluation, config: RunConfig) -> 
     for key in ("method", "setup", "seed"):
         found, expected = getattr(evaluation, key), getattr(config, key)
         if found != expected:
-            raise ValueError(f"{file}: {key}={found}, but the run's config.yaml says {expected}")
+            raise UserError(f"{file}: {key}={found}, but the run's config.yaml says {expected}")
     if not evaluation.results:
-        raise ValueError(f"{file}: results holds no fire")
+        raise UserError(f"{file}: results holds no fire")
     for fire, policies in evaluation.results.items():
         if LEARNED not in policies:
-            raise ValueError(f"{file}: results.{fire} holds no policy {LEARNED!r}")
+            raise UserError(f"{file}: results.{fire} holds no policy {LEARNED!r}")
         for policy, measured in policies.items():
             for name in metrics.NAMES:
                 if name not in measured:
-                    raise ValueError(f"{file}: results.{fire}.{policy} lacks {name}")
+                    raise UserError(f"{file}: results.{fire}.{policy} lacks {name}")
                 if len(measured[name]) != evaluation.episodes:
-                    raise ValueError(
+                    raise UserError(
                         f"{file}: results.{fire}.{policy}.{name} has {len(measured[name])} "
                         f"episodes; fires={evaluation.episodes}"
                     )
@@ -381,7 +382,7 @@ def _check_alike(runs: Sequence[Run]) -> None:
     for name, fact in facts.items():
         for run in runs:
             if fact(run) != fact(runs[0]):
-                raise ValueError(
+                raise UserError(
                     f"{runs[0].path} and {run.path} cannot be compared: {name} is "
                     f"{fact(runs[0])} and {fact(run)}"
                 )
@@ -392,13 +393,13 @@ def _check_same_fires(section: str, runs: Sequence[Run]) -> None:
     for run in runs:
         one, other = (sorted(r.evaluation.results) for r in (first, run))
         if one != other:
-            raise ValueError(
+            raise UserError(
                 f"{section}: {first.path} was evaluated on {', '.join(one)}, "
                 f"{run.path} on {', '.join(other)}; evaluate them alike (emberlink eval RUN)"
             )
         for fire in one:
             if run.evaluation.held_out.get(fire) != first.evaluation.held_out.get(fire):
-                raise ValueError(
+                raise UserError(
                     f"{section}: {first.path} and {run.path} were not evaluated on the same fires "
                     f"of {fire} (held_out in eval.json); evaluate them alike (emberlink eval RUN)"
                 )

@@ -17,6 +17,7 @@ from pydantic import (
 )
 
 from emberlink.envs.scenarios import fires_of
+from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import describe, from_plain, known, plain, shown
 
 from .schema import RunConfig
@@ -37,7 +38,7 @@ def resolve(method: str, overrides: Sequence[str] = (), **settings: Any) -> RunC
         ValueError: one line that names the method, key or value that is wrong, and what is known.
     """
     if not isinstance(method, str) or method not in known("method"):
-        raise ValueError(f"method {_quote(str(method), known('method'))}")
+        raise UserError(f"method {_quote(str(method), known('method'))}")
     choices = {"method": method, "setup": "paper"}
     with initialize_config_module(config_module="emberlink.configs", version_base="1.3"):
         _check_overrides(method, overrides, choices)
@@ -45,18 +46,18 @@ def resolve(method: str, overrides: Sequence[str] = (), **settings: Any) -> RunC
             composed = compose("base", overrides=[f"method={method}", *overrides])
             values: Any = OmegaConf.to_container(composed, resolve=True, throw_on_missing=True)
         except (HydraException, OmegaConfBaseException) as error:
-            raise ValueError(" ".join(str(error).split())[:300]) from None
+            raise UserError(" ".join(str(error).split())[:300]) from None
     if "method" in values:  # then its content did not go to the top
-        raise ValueError(f"configs/method/{method}.yaml must begin with '# @package _global_'")
+        raise UserError(f"configs/method/{method}.yaml must begin with '# @package _global_'")
     values = {**values, **choices}
     for key, value in settings.items():
         if key in choices:
-            raise ValueError(f"{key}={shown(value)}: not a setting but a choice of several")
+            raise UserError(f"{key}={shown(value)}: not a setting but a choice of several")
         several = isinstance(value, Iterable) and not isinstance(value, str | bytes | Mapping)
         _set(values, key, plain(list(value) if key == "seeds" and several else value, key))
     if values["seeds"]:
         if "seed" in settings or any(text.startswith("seed=") for text in overrides):
-            raise ValueError(f"seed={values['seed']} and seeds={values['seeds']}: give one of them")
+            raise UserError(f"seed={values['seed']} and seeds={values['seeds']}: give one of them")
         if isinstance(values["seeds"], list | tuple):
             values["seed"] = values["seeds"][0]
     config = from_values(values)
@@ -80,9 +81,9 @@ def override(config: RunConfig, overrides: Sequence[str]) -> RunConfig:
         if key in _GROUPS:
             there = config.setup if key == "setup" else config.fire.name
             if str(value) != there:
-                raise ValueError(f"{text}: the run has {key}={there}")
+                raise UserError(f"{text}: the run has {key}={there}")
         elif key not in known_keys:
-            raise ValueError(f"key {_quote(key, known_keys, listed=False)}")
+            raise UserError(f"key {_quote(key, known_keys, listed=False)}")
         else:
             _set(values, key, value)
     changed = from_values(values)
@@ -102,10 +103,10 @@ def _override(text: str) -> Override:
     try:
         parsed = OverridesParser.create().parse_override(text)
     except (HydraException, ValueError, RecursionError):
-        raise ValueError(f"{shown(text)!r} is not of the form key=value") from None
+        raise UserError(f"{shown(text)!r} is not of the form key=value") from None
     adds = parsed.is_add() or parsed.is_force_add()
     if parsed.is_delete() or adds or parsed.is_sweep_override():
-        raise ValueError(f"{shown(text)!r}: only key=value with one value is understood here")
+        raise UserError(f"{shown(text)!r}: only key=value with one value is understood here")
     return parsed
 
 
@@ -121,7 +122,7 @@ def _set(values: dict[str, Any], key: str, value: Any) -> None:
     ]
     if len(found) != 1:
         among = f" is one of {', '.join(found)}: say which" if found else ""
-        raise ValueError(f"key {key!r}{among}" if found else f"key {_quote(key, names)}")
+        raise UserError(f"key {key!r}{among}" if found else f"key {_quote(key, names)}")
     *path, last = found[0].split(".")
     for part in path:
         values = values[part]
@@ -132,7 +133,7 @@ def _set(values: dict[str, Any], key: str, value: Any) -> None:
         return
     for name, one in value.items():
         if name not in there:
-            raise ValueError(f"key {_quote(f'{found[0]}.{name}', names)}")
+            raise UserError(f"key {_quote(f'{found[0]}.{name}', names)}")
         _set(values, f"{last}.{name}", one)
 
 
@@ -145,7 +146,7 @@ def from_values(values: Mapping[str, Any]) -> RunConfig:
     try:
         return from_plain(RunConfig, values)
     except ValidationError as error:
-        raise ValueError(describe(error)) from None
+        raise UserError(describe(error)) from None
 
 
 def to_values(config: RunConfig) -> dict[str, Any]:
@@ -167,20 +168,20 @@ def _check_overrides(method: str, overrides: Sequence[str], choices: dict[str, s
         parsed = _override(text)
         key = parsed.key_or_group
         if isinstance(parsed.value(), dict):
-            raise ValueError(f"{shown(text)!r}: give its keys one by one, as {key}.KEY=VALUE")
+            raise UserError(f"{shown(text)!r}: give its keys one by one, as {key}.KEY=VALUE")
         if key in ("fire.name", "fire.kind"):
-            raise ValueError(f"{shown(text)!r}: a scenario is chosen with fire=NAME")
+            raise UserError(f"{shown(text)!r}: a scenario is chosen with fire=NAME")
         if key in _GROUPS:
             chosen = str(parsed.value())
             if chosen not in known(key):
-                raise ValueError(f"{key} {_quote(chosen, known(key))}")
+                raise UserError(f"{key} {_quote(chosen, known(key))}")
             choices[key] = chosen
         else:
             others.append(key)
     keys = _known_keys(method, choices) if others else []
     for key in others:
         if key not in keys:
-            raise ValueError(f"key {_quote(key, keys, listed=False)}")
+            raise UserError(f"key {_quote(key, keys, listed=False)}")
     choices.pop("fire", None)
 
 

@@ -17,6 +17,7 @@ from pydantic.dataclasses import dataclass
 from emberlink.comm import registry
 from emberlink.envs.config import WildfireConfig
 from emberlink.envs.scenarios import Scenario
+from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import Name, from_plain, shown
 
 _STRICT = ConfigDict(extra="forbid", strict=True)
@@ -76,7 +77,7 @@ class LearnerConfig:
     @model_validator(mode="after")
     def _a_batch_fits(self) -> "LearnerConfig":
         if self.batch_size > self.buffer_size:
-            raise ValueError(
+            raise UserError(
                 f"batch_size={self.batch_size} is more than buffer_size={self.buffer_size} holds"
             )
         return self
@@ -157,19 +158,19 @@ class RunConfig:
     @classmethod
     def _seeds_differ(cls, value: tuple[int, ...]) -> tuple[int, ...]:
         if len(set(value)) < len(value):
-            raise ValueError(f"seeds={list(value)}: each seed at most once")
+            raise UserError(f"seeds={list(value)}: each seed at most once")
         return value
 
     @field_validator("comm")
     @classmethod
     def _comm_is_known(cls, value: dict[str, Any]) -> dict[str, Any]:
         if "name" not in value:
-            raise ValueError(f"name is missing; known: {', '.join(registry.known())}")
+            raise UserError(f"name is missing; known: {', '.join(registry.known())}")
         config_type = registry.find(value["name"]).config_type
         settings, names = _without_name(value), [field.name for field in fields(config_type)]
         for key in settings.keys() - names:
             listed = ", ".join(names) or "none"
-            raise ValueError(f"comm.{key} is not a setting of {value['name']}; known: {listed}")
+            raise UserError(f"comm.{key} is not a setting of {value['name']}; known: {listed}")
         from_plain(config_type, settings)
         return value
 
@@ -204,5 +205,5 @@ def check_device(name: str) -> str:
         str(device) == "cpu" or (device.type == "cuda" and (device.index or 0) < len(present) - 1)
     )
     if not there:
-        raise ValueError(f"device={shown(name)} is not there; known: {', '.join(present)}")
+        raise UserError(f"device={shown(name)} is not there; known: {', '.join(present)}")
     return name

@@ -16,6 +16,7 @@ from tensordict.nn import TensorDictModule
 from emberlink.envs import metrics
 from emberlink.envs.rendering.frame import write_gif
 from emberlink.envs.scenarios import fires_of
+from emberlink.envs.utils.errors import UserError
 from emberlink.policies.scripted.registry import SCRIPTED
 from emberlink.trainers.build import build_env, build_networks
 from emberlink.trainers.config.schema import RunConfig
@@ -78,7 +79,7 @@ def evaluate_run(
     try:
         _draw(run, config, actor, results, report, label)
     except OSError as error:
-        raise ValueError(
+        raise UserError(
             f"{run.path / 'figures'}: cannot be written: {error.strerror or error}"
         ) from None
     # Last: with it, an evaluation is whole.

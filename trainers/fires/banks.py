@@ -16,6 +16,7 @@ from emberlink.envs.fire.cache import GENERATOR_VERSION
 from emberlink.envs.fire.generator import FireConfig, Split, fire_seeds, make_fires
 from emberlink.envs.fire_files.bank_writer import check_bank, write_bank
 from emberlink.envs.utils.atomic_io import free_name
+from emberlink.envs.utils.errors import UserError
 from emberlink.trainers.config.compose import to_values
 from emberlink.trainers.config.schema import RunConfig
 
@@ -88,7 +89,7 @@ def import_files(arguments: Sequence[str], console: Console, output: Path) -> in
     overrides = [text for text in arguments if "=" in text and not os.path.exists(text)]
     paths = [Path(text) for text in arguments if text not in overrides]
     if not paths:
-        raise ValueError("which file? FILE, such as ArrivalTime.asc, is missing")
+        raise UserError("which file? FILE, such as ArrivalTime.asc, is missing")
     configs = [from_file(path, overrides) for path in paths]
     check_bank(output, len(paths), configs[0].env.grid)
     fires, names = [], []

@@ -12,6 +12,7 @@ from torch import Tensor
 from emberlink.envs.fire.generator import scenarios
 from emberlink.envs.fire_files.reader import FileFireConfig, read_fires
 from emberlink.envs.scenarios import fires_of
+from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import shown
 from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.config.schema import RunConfig
@@ -58,12 +59,12 @@ def find(text: str, overrides: Sequence[str]) -> Source:
     if os.path.exists(text) or not os.path.exists(name):
         name, index = text, "0"
     if not name or not os.path.exists(name):
-        raise ValueError(_unknown(text))
+        raise UserError(_unknown(text))
     path = Path(name)
     config = from_file(path, overrides)
     fires = read(config)
     if not index.isdecimal() or int(index) >= len(fires):
-        raise ValueError(f"{shown(text)}: there is no fire {index!r}; known: 0 to {len(fires) - 1}")
+        raise UserError(f"{shown(text)}: there is no fire {index!r}; known: 0 to {len(fires) - 1}")
     several, shortened = len(fires) > 1, shown(path.name)
     return Source(
         title=f"{shortened}, fire {index} of {len(fires)}" if several else shortened,
@@ -75,7 +76,7 @@ def find(text: str, overrides: Sequence[str]) -> Source:
 
 def _held_out(config: RunConfig, text: str, index: str) -> Tensor:
     if not index.isdecimal() or int(index) >= HELD_OUT:
-        raise ValueError(
+        raise UserError(
             f"{shown(text)}: there is no held-out fire {index!r}; known: 0 to {HELD_OUT - 1}"
         )
     return fires_of(config.fire).one_heldout(int(index), config.env.grid, config.env.horizon)[0]
@@ -90,7 +91,7 @@ def generated(scenario: str, overrides: Sequence[str]) -> RunConfig:
     known = scenarios()
     if scenario not in known:
         hint = _near(scenario, known)
-        raise ValueError(f"fire {shown(scenario)!r} is not known{hint} known: {', '.join(known)}")
+        raise UserError(f"fire {shown(scenario)!r} is not known{hint} known: {', '.join(known)}")
     return _resolve([f"fire={scenario}", *overrides], overrides)
 
 
@@ -101,7 +102,7 @@ def from_file(path: Path, overrides: Sequence[str]) -> RunConfig:
         ValueError: a key or value is wrong.
     """
     if any(text.partition("=")[0] == "fire.path" for text in overrides):
-        raise ValueError("fire.path: the file stands without a key here")
+        raise UserError("fire.path: the file stands without a key here")
     # The name is set past the parser of overrides, to which some characters mean something.
     return _resolve([f"fire={FILE}", "fire.path=_", *overrides], overrides, path=str(path))
 
@@ -112,9 +113,9 @@ def _resolve(texts: Sequence[str], overrides: Sequence[str], path: str | None = 
     for text in overrides:
         key = text.partition("=")[0]
         if key == "fire":
-            raise ValueError(f"{shown(text)!r}: the fire is named without a key here")
+            raise UserError(f"{shown(text)!r}: the fire is named without a key here")
         if key != "setup" and not key.startswith(_KEYS):
-            raise ValueError(
+            raise UserError(
                 f"{shown(text)!r}: a fire depends on keys of setup, env. and fire. only"
             )
     return config

@@ -13,6 +13,7 @@ import torch
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor
+from emberlink.envs.utils.errors import UserError
 
 FORMAT = 1
 """of the files; a reader accepts its own alone, and files from before there was a number"""
@@ -51,7 +52,7 @@ def write(path: Path, tensors: Mapping[str, Tensor], header: Mapping[str, Any]) 
     except (OSError, SafetensorError) as error:
         with suppress(OSError):
             partial.unlink(missing_ok=True)
-        raise ValueError(f"{path}: cannot be written: {_reason(error)}") from None
+        raise UserError(f"{path}: cannot be written: {_reason(error)}") from None
 
 
 def read(path: Path) -> tuple[dict[str, Any] | None, dict[str, Tensor]]:
@@ -69,13 +70,13 @@ def read(path: Path) -> tuple[dict[str, Any] | None, dict[str, Tensor]]:
             with path.open("rb") as file:
                 digest, _ = _digest(file)
             if digest.decode() != header.get("sha256"):
-                raise ValueError(
+                raise UserError(
                     f"{path}: not a readable checkpoint: damaged, its bytes are not those that "
                     "were written"
                 )
         return header, load_file(path)
     except (OSError, SafetensorError) as error:
-        raise ValueError(f"{path}: not a readable checkpoint: {_reason(error)}") from None
+        raise UserError(f"{path}: not a readable checkpoint: {_reason(error)}") from None
 
 
 def read_header(path: Path) -> dict[str, Any] | None:
@@ -85,25 +86,25 @@ def read_header(path: Path) -> dict[str, Any] | None:
         ValueError: there is no such file, it is no checkpoint, or it is of another format.
     """
     if path.exists() and not path.is_file():
-        raise ValueError(f"{path}: not a readable checkpoint: no regular file")
+        raise UserError(f"{path}: not a readable checkpoint: no regular file")
     try:
         with path.open("rb") as file:
             whole = json.loads(_head(file))
         if not isinstance(whole, dict):
-            raise ValueError("its header holds no names")
+            raise UserError("its header holds no names")
         if "__metadata__" not in whole:
             return None
         header = json.loads(whole["__metadata__"][_KEY])
         found = header["format"]
     except OSError as error:
-        raise ValueError(f"{path}: not a readable checkpoint: {_reason(error)}") from None
+        raise UserError(f"{path}: not a readable checkpoint: {_reason(error)}") from None
     except (KeyError, TypeError, ValueError, RecursionError) as error:
         reason = " ".join(str(error).split())[:100]
-        raise ValueError(
+        raise UserError(
             f"{path}: not a readable checkpoint: damaged, or of another program ({reason})"
         ) from None
     if found != FORMAT:
-        raise ValueError(f"{path}: a checkpoint of format {found}; this version reads {FORMAT}")
+        raise UserError(f"{path}: a checkpoint of format {found}; this version reads {FORMAT}")
     return header
 
 
@@ -115,7 +116,7 @@ def check_finite(path: Path, tensors: Mapping[str, Tensor]) -> None:
     """
     for name, value in tensors.items():
         if value.is_floating_point() and not torch.isfinite(value).all():
-            raise ValueError(f"{path}: {name} holds NaN or infinite numbers")
+            raise UserError(f"{path}: {name} holds NaN or infinite numbers")
 
 
 def flush_folder(folder: Path) -> None:
@@ -131,7 +132,7 @@ def _head(file: BinaryIO) -> bytes:
     """The JSON that a safetensors file begins with, after its length."""
     length = int.from_bytes(file.read(8), "little")
     if length > _LONGEST_HEADER:
-        raise ValueError("its header has no end")
+        raise UserError("its header has no end")
     return file.read(length)
 
 

@@ -5,6 +5,7 @@ import os
 import socket
 from contextlib import suppress
 from pathlib import Path
+from emberlink.envs.utils.errors import UserError
 
 
 class Lock:
@@ -28,9 +29,9 @@ class Lock:
         try:
             self._handle = self._take()
         except BlockingIOError:
-            raise ValueError(f"{folder}: {self._holder()} is training here") from None
+            raise UserError(f"{folder}: {self._holder()} is training here") from None
         except OSError as error:
-            raise ValueError(f"{self.path}: cannot be locked: {error.strerror}") from None
+            raise UserError(f"{self.path}: cannot be locked: {error.strerror}") from None
 
     def release(self) -> None:
         """Takes the file away and gives the lock up; a second time does nothing."""

@@ -22,6 +22,7 @@ from emberlink.envs.fire_files.reader import KEPT
 from . import checkpoint_file
 from emberlink.trainers.evaluation.report import ACTOR
 from .run_folder import RunFolder
+from emberlink.envs.utils.errors import UserError
 
 PREFIX = "pretrained:"
 USUAL_SETUP = "tuned"
@@ -49,14 +50,14 @@ def open_run(text: str, output: Path | str = "runs") -> RunFolder:
     found = find(text)
     recipes = sorted({"/".join(one.parts[-3:-1]) for one in found})
     if len(recipes) > 1:
-        raise ValueError(f"{text}: one is needed, and there are {', '.join(recipes)}")
+        raise UserError(f"{text}: one is needed, and there are {', '.join(recipes)}")
     source = found[0]
     target = Path(output) / "_".join(["pretrained", *source.parts[-3:]])
     if not target.exists():
         try:
             _copy(source, target)
         except OSError as error:
-            raise ValueError(f"{target}: cannot be made: {error.strerror or error}") from None
+            raise UserError(f"{target}: cannot be made: {error.strerror or error}") from None
     return RunFolder(target)
 
 
@@ -78,7 +79,7 @@ def find(text: str) -> list[Path]:
     found = found or [one for one in folders if list(one.parts[-3:-1]) == [USUAL_SETUP, name]]
     if not found:
         there = ", ".join(sorted({"/".join(one.parts[-3:-1]) for one in folders})) or "none"
-        raise ValueError(f"{text}: no such trained policy; there are {there}")
+        raise UserError(f"{text}: no such trained policy; there are {there}")
     return found
 
 
@@ -97,10 +98,10 @@ def pack(run: RunFolder, into: Path) -> Path:
     """
     config = replace(run.config(), output="runs", logger="none", device="cpu")
     if len(run.lines()) < config.episodes or not (run.path / "eval.json").exists():
-        raise ValueError(f"{run.path}: not finished, or not evaluated")
+        raise UserError(f"{run.path}: not finished, or not evaluated")
     target = into / config.setup / config.method / f"s{config.seed}"
     if target.exists():
-        raise ValueError(f"{target}: is there already")
+        raise UserError(f"{target}: is there already")
     newest = run.checkpoint()
     header, weights = checkpoint_file.read(newest)
     actors = {name: value for name, value in weights.items() if name.startswith(ACTOR)}

@@ -21,6 +21,7 @@ from . import checkpoint_file as files
 from emberlink.trainers.config.compose import flat, from_values, to_values
 from .safe_read import LONGEST_JSON, parse_json, read_text, read_yaml
 from emberlink.trainers.config.schema import RunConfig, comm_settings
+from emberlink.envs.utils.errors import UserError
 
 _NOT_FROM_THE_START = ("comm.agree", "comm.follow", "comm.wander", "comm.loss")
 """settings that runs of the first release were made without; their defaults change nothing"""
@@ -51,7 +52,7 @@ class RunFolder:
             (path / "checkpoints").mkdir()
             (path / "figures").mkdir()
         except OSError as error:
-            raise ValueError(f"output={config.output}: {error.strerror or error}") from None
+            raise UserError(f"output={config.output}: {error.strerror or error}") from None
         return cls(path)
 
     def write_config(self, config: RunConfig) -> None:
@@ -73,18 +74,18 @@ class RunFolder:
         """
         file = self.path / "config.yaml"
         if not self.path.is_dir():
-            raise ValueError(f"{self.path}: there is no such run folder")
+            raise UserError(f"{self.path}: there is no such run folder")
         try:
             values = read_yaml(file)
         except FileNotFoundError:
-            raise ValueError(f"{self.path}: not a run folder, config.yaml is missing") from None
+            raise UserError(f"{self.path}: not a run folder, config.yaml is missing") from None
         if not isinstance(values, dict):
-            raise ValueError(f"{file}: expected keys and values, found {type(values).__name__}")
+            raise UserError(f"{file}: expected keys and values, found {type(values).__name__}")
         try:
             config = from_values({**values, **changes})
             _check_whole(values, config)
         except ValueError as error:
-            raise ValueError(f"{file}: {error}") from None
+            raise UserError(f"{file}: {error}") from None
         return replace(config, fire=fires_of(config.fire).opened(self.path))
 
     def append(self, file: str, line: Mapping[str, Any]) -> None:
@@ -97,7 +98,7 @@ class RunFolder:
         try:
             handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
         except OSError as error:
-            raise ValueError(f"{path}: cannot be written: {error.strerror}") from None
+            raise UserError(f"{path}: cannot be written: {error.strerror}") from None
         before = os.fstat(handle).st_size
         try:
             left = (json.dumps(line) + "\n").encode()
@@ -105,7 +106,7 @@ class RunFolder:
                 left = left[os.write(handle, left) :]
         except OSError as error:
             os.ftruncate(handle, before)
-            raise ValueError(f"{path}: cannot be written: {error.strerror}") from None
+            raise UserError(f"{path}: cannot be written: {error.strerror}") from None
         finally:
             os.close(handle)
 
@@ -133,10 +134,10 @@ class RunFolder:
         try:
             kept = path.read_bytes()[:size] if path.exists() else b""
         except OSError as error:
-            raise ValueError(f"{path}: cannot be read: {error.strerror}") from None
+            raise UserError(f"{path}: cannot be read: {error.strerror}") from None
         found = kept.count(b"\n") if kept.endswith(b"\n") else -1
         if len(kept) < size or found != (lines if lines else -1):
-            raise ValueError(
+            raise UserError(
                 f"{path}: the checkpoint was made when it had {lines} lines in {size} bytes; its "
                 f"first {len(kept)} bytes are not those"
             )
@@ -148,7 +149,7 @@ class RunFolder:
             if path.exists() and path.stat().st_size > size:
                 os.truncate(path, size)
         except OSError as error:
-            raise ValueError(f"{path}: cannot be cut: {error.strerror}") from None
+            raise UserError(f"{path}: cannot be cut: {error.strerror}") from None
 
     def write(self, file: str, content: Mapping[str, Any]) -> None:
         """Writes a JSON file whole, or leaves what was there."""
@@ -168,7 +169,7 @@ class RunFolder:
         except OSError as error:
             with suppress(OSError):
                 partial.unlink(missing_ok=True)
-            raise ValueError(f"{path}: cannot be written: {error.strerror or error}") from None
+            raise UserError(f"{path}: cannot be written: {error.strerror or error}") from None
 
     def lines(self, file: str = "metrics.jsonl") -> list[dict[str, Any]]:
         """The lines of a .jsonl file; none where there is no such file."""
@@ -180,12 +181,12 @@ class RunFolder:
             found = [parse_json(line) for line in whole]
             for line in found:
                 if not isinstance(line, dict) or "episode" not in line:
-                    raise ValueError("a line is not of the form {episode: ..., ...}")
+                    raise UserError("a line is not of the form {episode: ..., ...}")
                 if not all(isinstance(value, int | float) for value in line.values()):
-                    raise ValueError("a line holds what is no number")
+                    raise UserError("a line holds what is no number")
             return found
         except ValueError as error:
-            raise ValueError(f"{path}: not a file of JSON lines: {error}") from None
+            raise UserError(f"{path}: not a file of JSON lines: {error}") from None
 
     def figure(self, file: str) -> Path:
         """Where a figure goes; its folder is made if it is not there."""
@@ -234,7 +235,7 @@ class RunFolder:
         """
         found = self.networks()
         if not found:
-            raise ValueError(f"{self.path}: holds no checkpoint (checkpoints/*.safetensors)")
+            raise UserError(f"{self.path}: holds no checkpoint (checkpoints/*.safetensors)")
         return found[-1]
 
     def rotate(self, keep: int, states: int) -> None:
@@ -268,7 +269,7 @@ class RunFolder:
                 if path.is_dir() and not path.is_symlink():
                     shutil.rmtree(path)
         except OSError as error:
-            raise ValueError(f"{error.filename}: cannot be taken away: {error.strerror}") from None
+            raise UserError(f"{error.filename}: cannot be taken away: {error.strerror}") from None
 
 
 def _is_ours(path: Path) -> bool:
@@ -284,7 +285,7 @@ def _check_whole(values: Mapping[str, Any], config: RunConfig) -> None:
     written, whole = flat(values), {"env": to_values(config)["env"], "comm": comm_settings(config)}
     for key in flat(whole):
         if key not in written and key not in _NOT_FROM_THE_START:
-            raise ValueError(f"key {key!r} is missing")
+            raise UserError(f"key {key!r} is missing")
 
 
 def step_of(checkpoint: Path) -> int:
@@ -323,16 +324,16 @@ def load_weights(
         wanted = _network_header(config, 0)
         for name in ("method", "uavs"):
             if header.get(name, wanted[name]) != wanted[name]:
-                raise ValueError(
+                raise UserError(
                     f"{path}: a checkpoint of {name}={header[name]}; "
                     f"this configuration has {name}={wanted[name]}"
                 )
     for name, tensor in expected.items():
         if name not in weights:
-            raise ValueError(f"{path}: holds no {name}")
+            raise UserError(f"{path}: holds no {name}")
         found = weights[name]
         if found.shape != tensor.shape or found.dtype != tensor.dtype:
-            raise ValueError(
+            raise UserError(
                 f"{path}: {name} has shape {list(found.shape)}, {found.dtype}; this configuration "
                 f"needs {list(tensor.shape)}, {tensor.dtype}"
             )

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import yaml
+from emberlink.envs.utils.errors import UserError
 
 LONGEST_YAML = 100_000
 """bytes of a config.yaml; ours have two thousand"""
@@ -24,16 +25,16 @@ def read_text(path: Path, longest: int) -> str:
     """
     try:
         if path.exists() and not path.is_file():
-            raise ValueError(f"{path}: cannot be read: no regular file")
+            raise UserError(f"{path}: cannot be read: no regular file")
         with path.open("rb") as file:
             content = file.read(longest + 1)
         if len(content) > longest:
-            raise ValueError(f"{path}: cannot be read: more than {longest} bytes")
+            raise UserError(f"{path}: cannot be read: more than {longest} bytes")
         return content.decode()
     except FileNotFoundError:
         raise
     except (OSError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path}: cannot be read: {error}") from None
+        raise UserError(f"{path}: cannot be read: {error}") from None
 
 
 def read_yaml(path: Path) -> Any:
@@ -48,7 +49,7 @@ def read_yaml(path: Path) -> Any:
         return yaml.load(text, _PlainLoader)
     except (yaml.YAMLError, TypeError, ValueError, RecursionError) as error:
         reason = " ".join(str(error).split())[:200]
-        raise ValueError(f"{path}: cannot be read: {reason}") from None
+        raise UserError(f"{path}: cannot be read: {reason}") from None
 
 
 def parse_json(text: str) -> Any:
@@ -60,7 +61,7 @@ def parse_json(text: str) -> Any:
     try:
         return json.loads(text, object_pairs_hook=_once, parse_int=_integer)
     except RecursionError:
-        raise ValueError("lists or mappings within each other, too many levels") from None
+        raise UserError("lists or mappings within each other, too many levels") from None
 
 
 class _PlainLoader(yaml.SafeLoader):
@@ -69,10 +70,10 @@ class _PlainLoader(yaml.SafeLoader):
 
     def compose_node(self, parent: Any, index: Any) -> Any:
         if self.check_event(yaml.AliasEvent):
-            raise ValueError("aliases (*name) are not read here")
+            raise UserError("aliases (*name) are not read here")
         event: Any = self.peek_event()
         if event.tag is not None or event.anchor is not None:
-            raise ValueError("tags (!!name) and anchors (&name) are not read here")
+            raise UserError("tags (!!name) and anchors (&name) are not read here")
         return super().compose_node(parent, index)
 
     def construct_mapping(self, node: Any, deep: bool = False) -> dict[Hashable, Any]:
@@ -80,7 +81,7 @@ class _PlainLoader(yaml.SafeLoader):
         for key, _ in node.value:
             name = self.construct_object(key, deep=True)
             if name in names:
-                raise ValueError(f"key {str(name)[:100]!r} stands twice")
+                raise UserError(f"key {str(name)[:100]!r} stands twice")
             names.add(name)
         return super().construct_mapping(node, deep=deep)
 
@@ -88,7 +89,7 @@ class _PlainLoader(yaml.SafeLoader):
 def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     found = dict(pairs)
     if len(found) < len(pairs):
-        raise ValueError("a key stands twice")
+        raise UserError("a key stands twice")
     return found
 
 

@@ -15,6 +15,7 @@ from rich.console import Console
 from rich.table import Table
 
 from emberlink.envs.utils.atomic_io import free_name
+from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import known
 from emberlink.trainers.config.compose import flat, resolve, to_values
 from emberlink.trainers.config.schema import NOT_LEARNT_WITH, RunConfig
@@ -178,7 +179,7 @@ class _Team:
                     start_new_session=True,
                 )
         except OSError as error:
-            raise ValueError(f"output={config.output}: {error.strerror or error}") from None
+            raise UserError(f"output={config.output}: {error.strerror or error}") from None
         self._progress.begin(job)
 
     def _look(self) -> None:

@@ -14,6 +14,7 @@ from torchrl.envs import TransformedEnv
 
 from emberlink.envs import keys
 from emberlink.envs.utils.atomic_io import free_name
+from emberlink.envs.utils.errors import UserError
 from emberlink.trainers.config.compose import to_values
 from emberlink.trainers.learners.nan_guard import CARRIED, COLLECTED, LEARNT, WEIGHTS, Watch
 from emberlink.trainers.runs import checkpoint_file
@@ -171,7 +172,7 @@ def replay(bundle: Path | str, device: str = "cpu") -> Culprit | None:
             trainer.learner.update(batch)
             place = int(watch.found[0]) or place
     except (AssertionError, KeyError, TypeError) as error:
-        raise ValueError(f"{folder}: not a bundle of a divergence: {error}") from None
+        raise UserError(f"{folder}: not a bundle of a divergence: {error}") from None
     return _search(trainer, place, batch, step, update) if watch.look(wait=True) else None
 
 

@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import shown
 from emberlink.trainers.config.compose import flat, from_values, override, to_values
 from emberlink.trainers.config.schema import NOT_LEARNT_WITH, RunConfig
@@ -77,13 +78,13 @@ def _runs(folder: Path) -> list[RunFolder]:
         runs = [RunFolder(folder.resolve().parent / Path(name).name) for name in names]
         missing = [run.path for run in runs if not run.path.is_dir()]
         if folder.resolve() not in [run.path for run in runs]:
-            raise ValueError(folder)
+            raise UserError(folder)
     except PermissionError as error:
-        raise ValueError(f"{file}: cannot be read: {error.strerror}") from None
+        raise UserError(f"{file}: cannot be read: {error.strerror}") from None
     except (OSError, ValueError, TypeError, KeyError):
-        raise ValueError(f"{file}: does not name the folders of the other seeds") from None
+        raise UserError(f"{file}: does not name the folders of the other seeds") from None
     for path in missing:
-        raise ValueError(f"{path}: is missing; its seed trains side by side with {folder}")
+        raise UserError(f"{path}: is missing; its seed trains side by side with {folder}")
     return runs
 
 
@@ -91,7 +92,7 @@ def _check_siblings(runs: Sequence[RunFolder], config: RunConfig) -> None:
     """That each seed's folder is of this training, as far as it has got to say so."""
     seeds = config.seeds or (config.seed,)
     if len(runs) != len(seeds):
-        raise ValueError(
+        raise UserError(
             f"{runs[0].path}: is of {len(seeds)} seeds, {SIBLINGS} names {len(runs)} folders"
         )
     for run, seed in zip(runs, seeds, strict=True):
@@ -99,9 +100,9 @@ def _check_siblings(runs: Sequence[RunFolder], config: RunConfig) -> None:
             continue
         own = run.config()
         if replace(own, seed=config.seed) != config:
-            raise ValueError(f"{run.path / 'config.yaml'}: not of the run of {runs[0].path}")
+            raise UserError(f"{run.path / 'config.yaml'}: not of the run of {runs[0].path}")
         if own.seed != seed:
-            raise ValueError(f"{run.path / 'config.yaml'}: seed={own.seed}, not {seed}")
+            raise UserError(f"{run.path / 'config.yaml'}: seed={own.seed}, not {seed}")
 
 
 def _check_beginning(runs: Sequence[RunFolder], config: RunConfig) -> None:
@@ -112,7 +113,7 @@ def _check_beginning(runs: Sequence[RunFolder], config: RunConfig) -> None:
     for run in runs:
         lines = run.lines()
         if len(lines) > most or (run.path / "eval.json").exists():
-            raise ValueError(
+            raise UserError(
                 f"{run.path}: has metrics of {len(lines)} episodes and no checkpoint "
                 "(checkpoints/state_*.safetensors): nothing to go on from, and nothing was changed"
             )
@@ -121,11 +122,11 @@ def _check_beginning(runs: Sequence[RunFolder], config: RunConfig) -> None:
 
 def _changed(config: RunConfig, method: str | None, overrides: Sequence[str]) -> RunConfig:
     if method is not None and method != config.method:
-        raise ValueError(f"method {method!r}: the run is of method {config.method!r}")
+        raise UserError(f"method {method!r}: the run is of method {config.method!r}")
     changed = override(config, overrides)
     for key, (new, old) in _differences(changed, config).items():
         if key not in MAY_CHANGE and not key.startswith("evaluation."):
-            raise ValueError(f"{key}={new}: the run has {key}={old}; a resumed run keeps it")
+            raise UserError(f"{key}={new}: the run has {key}={old}; a resumed run keeps it")
     return changed
 
 
@@ -146,7 +147,7 @@ def _restore(
     states = first.states()
     if chosen is None and not states:
         if first.networks():
-            raise ValueError(
+            raise UserError(
                 f"{first.path}: holds networks alone (checkpoints/state_*.safetensors is missing); "
                 f"they can be evaluated: emberlink eval {first.path}"
             )
@@ -157,23 +158,23 @@ def _restore(
     except ValueError as error:
         older = [one for one in states if 0 <= step_of(one) < step_of(path)]
         hint = f"; the one before it: emberlink train resume={older[-1]}" if older else ""
-        raise ValueError(f"{error}{hint}") from None
+        raise UserError(f"{error}{hint}") from None
     if header.folders != [run.path.name for run in runs] and len(runs) > 1:
-        raise ValueError(f"{path}: of the folders {shown(', '.join(header.folders))}")
+        raise UserError(f"{path}: of the folders {shown(', '.join(header.folders))}")
     return [*header.files]
 
 
 def _restore_from(trainer: Trainer, path: Path) -> state_header.Header:
     found, content = checkpoint_file.read(path)
     if found is None or found.get("kind") != "state":
-        raise ValueError(f"{path}: holds networks alone; nothing can be resumed from it")
+        raise UserError(f"{path}: holds networks alone; nothing can be resumed from it")
     header = state_header.parse(path, found)
     if step_of(path) not in (-1, header.step):
-        raise ValueError(f"{path}: its header: step={header.step}: should be its name's")
+        raise UserError(f"{path}: its header: step={header.step}: should be its name's")
     _check_config(trainer.config, path, header.config)
     if header.step > trainer.steps:
         done = header.step / trainer.config.env.horizon
-        raise ValueError(f"episodes={trainer.config.episodes}: the run has done {done:g}")
+        raise UserError(f"episodes={trainer.config.episodes}: the run has done {done:g}")
     state.restore(trainer, path, found, content)
     return header
 
@@ -184,6 +185,6 @@ def _check_config(config: RunConfig, path: Path, values: Mapping[str, Any]) -> N
     try:
         made = from_values({**values, "device": config.device})
     except ValueError as error:
-        raise ValueError(f"{path}: made with a configuration that is none: {error}") from None
+        raise UserError(f"{path}: made with a configuration that is none: {error}") from None
     for key, (found, wanted) in _differences(replace(made, **free), config).items():
-        raise ValueError(f"{path}: made with {key}={found}; the run has {key}={wanted}")
+        raise UserError(f"{path}: made with {key}={found}; the run has {key}={wanted}")

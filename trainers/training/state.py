@@ -13,6 +13,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from emberlink.envs import keys, metrics
+from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import shown
 from emberlink.policies.exploration import NOISE
 
@@ -101,7 +102,7 @@ def restore(trainer: "Trainer", path: Path, header: Mapping[str, Any], content: 
     state_header.check(path, made, trainer)
     groups = _grouped(path, content)
     if name := not_finite(content):
-        raise ValueError(f"{path}: {shown(name)} holds NaN or infinite numbers")
+        raise UserError(f"{path}: {shown(name)} holds NaN or infinite numbers")
     trainer.step, trainer.updates = made.step, made.updates
     begun: Any = (made.step, made.updates)
     trainer.begun = begun
@@ -127,7 +128,7 @@ def _grouped(path: Path, content: Mapping[str, Tensor]) -> dict[str, dict[str, T
     for name, value in content.items():
         group, _, rest = name.partition("/")
         if group not in groups:
-            raise ValueError(f"{path}: holds {shown(name)}, which no state has")
+            raise UserError(f"{path}: holds {shown(name)}, which no state has")
         groups[group][rest] = value
     return groups
 
@@ -157,7 +158,7 @@ def restore_learner(
         header.get(name, value) for name, value in (("rate", 1.0), ("tries", 0), ("furthest", 0))
     )
     if not 0 < rate <= 1 or not all(isinstance(one, int) and one >= 0 for one in (tries, furthest)):
-        raise ValueError(f"{path}: rate={rate}, tries={tries}, furthest={furthest}: out of range")
+        raise UserError(f"{path}: rate={rate}, tries={tries}, furthest={furthest}: out of range")
     trainer.rate, trainer.tries, trainer.furthest = float(rate), tries, furthest
     trainer.learner.slow_down(trainer.rate)
 
@@ -226,9 +227,9 @@ def _check_adam(trainer: "Trainer", path: Path, found: Mapping[str, Tensor]) -> 
     counted = min(trainer.updates, _LARGEST_STEP)
     for name, value in found.items():
         if name.endswith(".step") and value.item() != counted:
-            raise ValueError(f"{path}: optimizer/{name} is not {counted}, the number of updates")
+            raise UserError(f"{path}: optimizer/{name} is not {counted}, the number of updates")
         if name.endswith(".exp_avg_sq") and (value < 0).any():
-            raise ValueError(f"{path}: optimizer/{name} holds a number below 0")
+            raise UserError(f"{path}: optimizer/{name} holds a number below 0")
 
 
 def _check_shapes(
@@ -237,13 +238,13 @@ def _check_shapes(
     """That a group holds what it must, and nothing else."""
     for name in found:
         if name not in places:
-            raise ValueError(f"{path}: holds {shown(f'{group}/{name}')}, which this state has not")
+            raise UserError(f"{path}: holds {shown(f'{group}/{name}')}, which this state has not")
     for name, place in places.items():
         if name not in found:
-            raise ValueError(f"{path}: holds no {group}/{name}")
+            raise UserError(f"{path}: holds no {group}/{name}")
         new = found[name]
         if new.shape != place.shape or new.dtype != place.dtype:
-            raise ValueError(
+            raise UserError(
                 f"{path}: {group}/{name} has shape {list(new.shape)}, {new.dtype}; this version "
                 f"needs {list(place.shape)}, {place.dtype}"
             )

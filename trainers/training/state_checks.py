@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from emberlink.envs.utils.errors import UserError
+
 if TYPE_CHECKING:
     from .trainer import Trainer
 
@@ -60,7 +62,7 @@ def check(path: Path, found: Mapping[str, Tensor], trainer: "Trainer") -> None:
     }
     for name, fits in right.items():
         if not fits:
-            raise ValueError(f"{path}: world/{name} is not one of step {trainer.step}")
+            raise UserError(f"{path}: world/{name} is not one of step {trainer.step}")
 
 
 def check_carried(path: Path, carried: Mapping[str, Tensor], world: Mapping[str, Tensor]) -> None:
@@ -71,4 +73,4 @@ def check_carried(path: Path, carried: Mapping[str, Tensor], world: Mapping[str,
     """
     for name, of in _OF_MOMENT.items():
         if not carried[name].equal(world[of]):
-            raise ValueError(f"{path}: carried/{name} is not world/{of}")
+            raise UserError(f"{path}: carried/{name} is not world/{of}")

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from pydantic import ConfigDict, Field, ValidationError
 from pydantic.dataclasses import dataclass
 
+from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import describe, from_plain, shown
 
 if TYPE_CHECKING:
@@ -66,7 +67,7 @@ def parse(path: Path, header: Mapping[str, Any]) -> Header:
         return from_plain(Header, header)
     except ValueError as error:
         reason = describe(error) if isinstance(error, ValidationError) else str(error)
-        raise ValueError(f"{path}: its header: {reason}") from None
+        raise UserError(f"{path}: its header: {reason}") from None
 
 
 def check(path: Path, header: Header, trainer: "Trainer") -> None:
@@ -83,7 +84,7 @@ def check(path: Path, header: Header, trainer: "Trainer") -> None:
     for name in ("folders", "files", "best"):
         found = getattr(header, name)
         if len(found) != trainer.teams:
-            raise ValueError(
+            raise UserError(
                 f"{path}: its header: {name}={shown(found)}: should hold {trainer.teams}, "
                 "one for each seed"
             )
@@ -97,7 +98,7 @@ def check(path: Path, header: Header, trainer: "Trainer") -> None:
     }
     for name, value in wanted.items():
         if (found := getattr(header, name)) != value:
-            raise ValueError(
+            raise UserError(
                 f"{path}: its header: {name}={shown(found)}: should be {value} after {step} steps"
             )
 
