@@ -33,6 +33,14 @@ NEW_CENTRE: Final = (AGENTS, "new_centre")
 """float32 [..., 2]: mean x and y of the new fire in view, 0 where there is none."""
 OLD_CENTRE: Final = (AGENTS, "old_centre")
 """float32 [..., 2]: mean x and y of the old fire in view, 0 where there is none."""
+HEARS: Final = (AGENTS, "hears")
+"""bool [..., n]: the UAVs whose messages the UAV received at this step, False for itself. Written
+by communication."""
+TARGET: Final = (AGENTS, "target")
+"""float32 [..., 3]: the point that the UAV is told to fly to, cells. Written by communication."""
+FOLLOWS: Final = (AGENTS, "follows")
+"""int64 [...]: the discoverer that the UAV follows, itself for a discoverer, -1 for nobody. Written
+by communication."""
 BEYOND: Final = (AGENTS, "beyond")
 """bool [..., 3]: the axes along which the last move would have left the box."""
 
