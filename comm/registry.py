@@ -46,11 +46,19 @@ def find(name: str) -> type[CommModule]:
     return found[0]
 
 
-def build(name: str, world: WildfireConfig, settings: Mapping[str, Any]) -> CommModule:
-    """A communication module with its settings.
+def build(
+    name: str, world: WildfireConfig, settings: Mapping[str, Any], num_envs: int = 1
+) -> CommModule:
+    """Returns a communication module with its settings.
+
+    Args:
+        name: of the communication method.
+        world: the environment's constants.
+        settings: what stands under `comm` but the name.
+        num_envs: environments that run side by side.
 
     Raises:
         ValueError: an unknown name or setting, or a value out of range.
     """
     module = find(name)
-    return module(world, from_plain(module.config_type, settings))
+    return module(world, from_plain(module.config_type, settings), num_envs)

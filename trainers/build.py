@@ -64,7 +64,7 @@ def build_env(
 ) -> TransformedEnv:
     """The environment of a configuration: the wildfire and communication; see `WildfireEnv`."""
     world = WildfireEnv(num_envs, config.env, fire, seed, device)
-    return TransformedEnv(world, Communication(build_comm(config).to(world.device)))
+    return TransformedEnv(world, Communication(build_comm(config, num_envs).to(world.device)))
 
 
 def build_networks(

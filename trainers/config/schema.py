@@ -179,9 +179,9 @@ def _without_name(comm: Mapping[str, Any]) -> dict[str, Any]:
     return {key: value for key, value in comm.items() if key != "name"}
 
 
-def build_comm(config: RunConfig):
-    """The communication module of a configuration."""
-    return registry.build(config.comm["name"], config.env, _without_name(config.comm))
+def build_comm(config: RunConfig, num_envs: int):
+    """Returns the communication module of a configuration."""
+    return registry.build(config.comm["name"], config.env, _without_name(config.comm), num_envs)
 
 
 def comm_settings(config: RunConfig) -> dict[str, Any]:
