@@ -37,7 +37,7 @@ class ConsensusConfig(RadioConfig):
     agree: bool = True
     """whether sub-networks agree; if not, a UAV only knows the discoverers that it hears itself"""
     follow: Literal["best", "nearest"] = "best"
-    """the discoverer that a UAV follows, of those it knows: the one of highest rank or the nearest"""
+    """the discoverer that a UAV follows, of those it knows: that of highest rank or the nearest"""
     wander: bool = True
     """whether UAVs with nobody to follow get random targets; if not, they have no target"""
     heading: HeadingConfig = HeadingConfig()

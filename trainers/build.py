@@ -13,7 +13,7 @@ from emberlink.envs.scenarios import ScenarioConfig
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.wildfire import WildfireEnv
 from emberlink.policies.networks.actor_critic import make_actor, make_critic
-from emberlink.policies.networks.stacked import Generators
+from emberlink.policies.networks.layers import Generators
 from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.config.schema import RunConfig, build_comm, check_device
 
