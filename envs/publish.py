@@ -3,9 +3,10 @@
 import errno
 import os
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 
+from .atomic_io import sync, temporary
 from .config import shown
 
 _NO_LINKS = {errno.EPERM, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS, errno.EMLINK}
@@ -22,19 +23,15 @@ def published(path: Path) -> Iterator[Path]:
         ValueError: the name is taken, or the file cannot be written, such as to a full disk;
             nothing is left of it then.
     """
-    partial = path.with_name(f".{os.getpid()}-{path.name}")
     try:
-        yield partial
-        with partial.open("rb") as file:
-            os.fsync(file.fileno())
-        _take(partial, path)
+        with temporary(path) as partial:
+            yield partial
+            sync(partial)
+            _take(partial, path)
     except FileExistsError:
         raise ValueError(f"{path} is there already; nothing is overwritten") from None
     except OSError as error:
         raise ValueError(f"{shown(str(path))}: {error.strerror or error}") from None
-    finally:
-        with suppress(OSError):
-            partial.unlink(missing_ok=True)
 
 
 def _take(partial: Path, path: Path) -> None:

@@ -301,7 +301,7 @@ def test_what_is_written_is_flushed_before_it_gets_its_name(tmp_path, monkeypatc
     monkeypatch.setattr(Path, "replace", renaming)
     path = tmp_path.resolve() / "one.safetensors"
     checkpoint.write(path, {"a": torch.ones(3)}, {})
-    assert done == [f"{path}.part", "rename", str(path.parent)]
+    assert done == [f"{path}.{os.getpid()}.part", "rename", str(path.parent)]
 
 
 def test_a_line_is_written_whole_or_not_at_all(tmp_path, monkeypatch):

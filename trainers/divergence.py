@@ -283,7 +283,8 @@ def _by_team(own: Tensor, teams: int) -> Tensor:
 
 def _write(trainer: "Trainer", place: int, batch: TensorDictBase, culprit: Culprit) -> Path:
     """Writes a bundle to a new folder of the first seed's run."""
-    whole = free_name(trainer.run.path, f"divergence_step_{culprit.step}", [""])
+    stem = f"divergence_step_{culprit.step}"
+    whole = free_name(trainer.run.path, stem, ["", ".part"])
     folder = whole.with_name(whole.name + ".part")
     folder.mkdir()
     watch = trainer.learner.watch

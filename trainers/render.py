@@ -234,7 +234,7 @@ def _free_paths(output: Path | None, run: RunFolder, stem: str) -> list[Path]:
             raise ValueError(f"{output.parent}: there is no such folder")
         return [output]
     try:
-        folder = run.figure(stem).parent if output is None else output
+        folder = run.figures() if output is None else output
     except OSError as error:
         raise ValueError(f"{run.path}: {error.strerror or error}") from None
     suffixes = (".gif", ".mp4")

@@ -48,6 +48,7 @@ def resume(path: Path, method: str | None = None, overrides: Sequence[str] = ())
         trainer = Trainer(config)
         sizes = _restore(trainer, runs, chosen)
         for run, of in zip(runs, sizes, strict=True):
+            run.own_checkpoints()
             for file in LINES:
                 run.check_lines(file, of[file], trainer.episode)
         # From here on everything is known to fit.
@@ -76,10 +77,13 @@ def _runs(folder: Path) -> list[RunFolder]:
         missing = [run.path for run in runs if not run.path.is_dir()]
         if folder.resolve() not in [run.path for run in runs]:
             raise ValueError(folder)
+        linked = [run.path for run in runs if run.path.is_symlink()]
     except PermissionError as error:
         raise ValueError(f"{file}: cannot be read: {error.strerror}") from None
     except (OSError, ValueError, TypeError, KeyError):
         raise ValueError(f"{file}: does not name the folders of the other seeds") from None
+    for path in linked:
+        raise ValueError(f"{path}: cannot be resumed: it is a link, named by {file}")
     for path in missing:
         raise ValueError(f"{path}: is missing; its seed trains side by side with {folder}")
     return runs
@@ -114,7 +118,7 @@ def _check_beginning(runs: Sequence[RunFolder], config: RunConfig) -> None:
                 f"{run.path}: has metrics of {len(lines)} episodes and no checkpoint "
                 "(checkpoints/state_*.safetensors): nothing to go on from, and nothing was changed"
             )
-        run.checkpoints.mkdir(exist_ok=True)
+        run.own_checkpoints()
 
 
 def _changed(config: RunConfig, method: str | None, overrides: Sequence[str]) -> RunConfig:
