@@ -26,6 +26,7 @@ from .loop import Trainer
 from .pretrained import open_run
 from .resume import resume
 from .run_folder import RunFolder
+from .seal import check_trained_with
 
 _EVALUATED_WITH = ("comm.", "env.")
 """beginnings of keys that an evaluation may be given in place of the run's"""
@@ -183,6 +184,7 @@ def evaluate_folder(
     config = run.config(**({} if device is None else {"device": device}))
     label = f"_{checkpoint.stem}" if checkpoint else ""
     checkpoint = checkpoint or run.checkpoint()
+    check_trained_with(checkpoint, config)
     for text in overrides:
         if not text.startswith(_EVALUATED_WITH):
             raise ValueError(

@@ -28,6 +28,7 @@ from .pretrained import open_run
 from .recording import record
 from .report import load_actor
 from .run_folder import RunFolder
+from .seal import check_trained_with
 
 FIRES = 65_536
 """held-out fires of a scenario: as many as an evaluation can have"""
@@ -137,6 +138,7 @@ def _learned(folders: Sequence[RunFolder], checkpoints: Sequence[Path]) -> Itera
     for place, run in enumerate(folders):
         config = run.config(device="cpu")
         checkpoint = checkpoints[place] if checkpoints else run.checkpoint()
+        check_trained_with(checkpoint, config)
         actor = load_actor(config, checkpoint)
         title = f"{config.method}, setup {config.setup}, seed {config.seed}"
         if checkpoints:

@@ -9,14 +9,13 @@ from typing import Any
 from emberlink.envs.config import shown
 
 from . import checkpoint, state, state_header
-from .config import NOT_LEARNT_WITH, RunConfig, flat, from_values, override, to_values
+from .config import RunConfig, override
 from .lock import Lock
 from .loop import LINES, SIBLINGS, Trainer
 from .reading import LONGEST_YAML, parse_json, read_text
 from .run_folder import RunFolder, step_of
+from .seal import MAY_CHANGE, check_same, differences
 
-MAY_CHANGE = ("episodes", *NOT_LEARNT_WITH)
-"""keys that a resumed run may be given anew, beside those of `evaluation`"""
 
 
 def resume(path: Path, method: str | None = None, overrides: Sequence[str] = ()) -> Trainer:
@@ -125,19 +124,10 @@ def _changed(config: RunConfig, method: str | None, overrides: Sequence[str]) ->
     if method is not None and method != config.method:
         raise ValueError(f"method {method!r}: the run is of method {config.method!r}")
     changed = override(config, overrides)
-    for key, (new, old) in _differences(changed, config).items():
+    for key, (new, old) in differences(changed, config).items():
         if key not in MAY_CHANGE and not key.startswith("evaluation."):
             raise ValueError(f"{key}={new}: the run has {key}={old}; a resumed run keeps it")
     return changed
-
-
-def _differences(one: RunConfig, other: RunConfig) -> dict[str, tuple[Any, Any]]:
-    first, second = flat(to_values(one)), flat(to_values(other))
-    return {
-        key: (first.get(key), second.get(key))
-        for key in [*first, *(key for key in second if key not in first)]
-        if first.get(key) != second.get(key)
-    }
 
 
 def _restore(
@@ -172,20 +162,9 @@ def _restore_from(trainer: Trainer, path: Path) -> state_header.Header:
     header = state_header.parse(path, found)
     if step_of(path) not in (-1, header.step):
         raise ValueError(f"{path}: its header: step={header.step}: should be its name's")
-    _check_config(trainer.config, path, header.config)
+    check_same(path, header.config, trainer.config)
     if header.step > trainer.steps:
         done = header.step / trainer.config.env.horizon
         raise ValueError(f"episodes={trainer.config.episodes}: the run has done {done:g}")
     state.restore(trainer, path, found, content)
     return header
-
-
-def _check_config(config: RunConfig, path: Path, values: Mapping[str, Any]) -> None:
-    """That the checkpoint's configuration is the run's, but for what may change."""
-    free = {key: getattr(config, key) for key in (*MAY_CHANGE, "output", "evaluation")}
-    try:
-        made = from_values({**values, "device": config.device})
-    except ValueError as error:
-        raise ValueError(f"{path}: made with a configuration that is none: {error}") from None
-    for key, (found, wanted) in _differences(replace(made, **free), config).items():
-        raise ValueError(f"{path}: made with {key}={found}; the run has {key}={wanted}")

@@ -322,6 +322,7 @@ def _network_header(config: RunConfig, step: int) -> dict[str, Any]:
         "method": config.method,
         "uavs": config.env.num_uavs,
         "seed": config.seed,
+        "config": to_values(config),
     }
 
 
