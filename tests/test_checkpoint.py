@@ -237,10 +237,10 @@ def test_networks_from_before_there_was_a_seal(run, capsys):
     path = RunFolder(run).checkpoint()
     save_file(load_file(path), path)
     assert checkpoint.read_header(path) is None
-    assert cli.main(["eval", str(run)]) == 0
+    assert cli.main(["eval", str(run)]) == 2
+    assert "does not hold the configuration" in capsys.readouterr().err
     for state in RunFolder(run).states():
         state.unlink()
-    capsys.readouterr()
     assert cli.main(["train", f"resume={run}"]) == 2
     assert "holds networks alone" in capsys.readouterr().err
 
