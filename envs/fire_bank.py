@@ -51,7 +51,8 @@ def fire_bank(
         config, grid, horizon: as in `make_fires`.
         split, count: as in `fire_seeds`, with `base` as its `start`.
         cache_dir: folder of the file, `cache_folder()` by default. The file begins with the
-            SHA-256 of the rest, and a damaged one is replaced. A folder that cannot be written to costs a warning and the time to compute.
+            SHA-256 of the rest, and a damaged one is replaced. A folder that cannot be written to
+            costs a warning and the time to compute.
 
     Returns:
         float32 [count, X, Y] on the CPU, so that every device trains on the same fires.
