@@ -7,6 +7,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
+from emberlink.envs.config import WildfireConfig
 from emberlink.envs.rendering import frame
 from emberlink.envs.utils import counter_rng
 from emberlink.envs.utils.buffers import Buffers
@@ -17,7 +18,6 @@ from emberlink.envs.world.reward import view_reward
 from emberlink.envs.world.sensor import View
 
 from . import keys, specs
-from .config import WildfireConfig
 from .scenarios import ScenarioConfig, arrival_times
 
 _POSITIONS, _FIRE, _STEPS = range(3)  # what an episode's random stream is split into

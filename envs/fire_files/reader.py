@@ -13,6 +13,8 @@ from pydantic.dataclasses import dataclass
 from torch import Tensor
 
 from emberlink.envs.config import check_grid
+from emberlink.envs.fire_files.bank_reader import MOST_CELLS
+from emberlink.envs.utils.atomic_io import open_regular, replaced
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import Name, printable
 
@@ -29,6 +31,8 @@ from .projection import one_line, quiet
 READER_VERSION = 3  # raise it whenever the same file gives another grid
 KEPT = "fires.npz"
 """the file of a run folder that holds the run's own copy of its grids"""
+_MOST_KEPT = 8 * MOST_CELLS + 1_000_000
+"""bytes of that copy, unpacked: float32 of the cells to train on and of those held out"""
 _EVERY, _HELD_OUT = 5, 4  # of several fires, those whose number has this remainder are held out
 _Number = Annotated[float, Field(allow_inf_nan=False)]
 _Time = _Number | Annotated[str, Field(min_length=1, max_length=40)]
@@ -214,16 +218,14 @@ def keep(config: FileFireConfig, folder: Path, grid: tuple[int, int], horizon: i
         ValueError: it cannot be written.
     """
     fires = splits(config, grid, horizon)
-    partial = folder / (KEPT + ".part")
     try:
-        with partial.open("wb") as file:
+        with replaced(folder / KEPT) as partial, partial.open("wb") as file:
             np.savez_compressed(
                 file,
                 key=np.array(_key(config, grid, horizon)),
                 train=fires["train"].numpy(),
                 heldout=fires["heldout"].numpy(),
             )
-        partial.replace(folder / KEPT)
     except OSError as error:
         raise UserError(f"{folder / KEPT}: cannot be written: {error.strerror or error}") from None
 
@@ -239,10 +241,15 @@ def _read_kept(
     config: FileFireConfig, grid: tuple[int, int], horizon: int
 ) -> dict[Literal["train", "heldout"], Tensor] | None:
     """The run's own copy, or None if there is none, or it is damaged or of another grid."""
-    if config.kept is None or config.sha256 is None or not Path(config.kept).is_file():
+    if config.kept is None or config.sha256 is None:
         return None
     try:
-        with np.load(config.kept, allow_pickle=False) as found:
+        with (
+            open_regular(Path(config.kept), _MOST_KEPT) as file,
+            np.load(file, allow_pickle=False) as found,
+        ):
+            if sum(part.file_size for part in found.zip.filelist) > _MOST_KEPT:
+                return None
             if str(found["key"]) != _key(config, grid, horizon):
                 return None
             fires = found["train"], found["heldout"]

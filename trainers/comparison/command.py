@@ -1,5 +1,6 @@
 """`emberlink compare`: several runs in one report."""
 
+import os
 import re
 import shlex
 import tempfile
@@ -77,7 +78,7 @@ def _free(output: Path | None) -> Path:
     """A folder that holds nothing, or is not there yet."""
     if output is None:
         tried = (Path("compare" if i == 1 else f"compare_{i}") for i in range(1, 10_000))
-        return next(path for path in tried if not path.exists())
+        return next(path for path in tried if not os.path.lexists(path))
     if output.is_symlink() and not output.exists():
         raise UserError(f"--output {output}: a link to what is not there; name a new folder")
     if output.exists() and (not output.is_dir() or any(output.iterdir())):

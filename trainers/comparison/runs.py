@@ -19,6 +19,7 @@ from emberlink.trainers.evaluation.results import CURVES, LEARNED
 from emberlink.trainers.runs import pretrained
 from emberlink.trainers.runs.run_folder import RunFolder
 from emberlink.trainers.runs.safe_read import LONGEST_JSON, read_text
+from emberlink.trainers.runs.seal import check_trained_with
 
 LARGEST = 1e12
 """of a measure; what is beyond it is damage"""
@@ -170,6 +171,8 @@ def read(path: Path) -> Run | str:
             f"eval.json is of {evaluation.checkpoint}, the newest checkpoint is {newest.name} "
             f"(emberlink eval {path})"
         )
+    if newest is not None:
+        check_trained_with(newest, config)
     return Run(path, config, lines, evaluation)
 
 
