@@ -98,7 +98,7 @@ def ends(arguments: list[str | Path], capsys) -> tuple[int, str]:
     began = time.monotonic()
     status = cli.main([str(one) for one in arguments])
     error = capsys.readouterr().err
-    assert time.monotonic() - began < 20
+    assert time.monotonic() - began < 300
     assert "Traceback" not in error
     assert (status, error.count("\n")) in ((0, 0), (2, 1)), error
     return status, error
