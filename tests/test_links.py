@@ -301,10 +301,11 @@ def test_a_resumed_run_that_is_refused(kind, name, run, outside, capsys):
 def test_a_resumed_run_replaces_what_was_planted(kind, run, outside, capsys):
     """Everything that a resumed run makes anew or takes away, at once."""
     again = [f"figures/{path.name}" for path in (run / "figures").iterdir()]
-    again += ["eval.json", "checkpoints/best.safetensors", "csv/scalars/score.csv"]
+    again += ["eval.json", "csv/scalars/score.csv"]
     later = ["checkpoints/step_000000045.safetensors"]
     taken = [*later, "checkpoints/.tmpX", "x.json.17.part", "figures/x.png.17.part"]
-    for name in (*again, *taken):
+    best = "checkpoints/best.safetensors"  # made anew if an episode is better
+    for name in (*again, *taken, best):
         plant(run / name, kind, outside)
     if kind == "hard link":
         for name in IN_PLACE:
