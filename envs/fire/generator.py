@@ -21,7 +21,7 @@ from torch import Tensor
 from yaml import YAMLError
 
 from emberlink.envs.config import check_grid
-from emberlink.envs.utils.counter_rng import fold, uniform
+from emberlink.envs.utils.counter_rng import Use, fold_in, uniform
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import Name, describe, known
 
@@ -33,7 +33,6 @@ BASE_SIDE = 30
 HELD_OUT_FROM = 1_000_000
 Split = Literal["train", "heldout"]
 
-_STREAM = 0xF12E  # keeps a fire's draws apart from other uses of the same seed
 _NODES = 60  # nodes along the shorter side at least: twice the resolution of 30 cells
 _CHUNK = 200_000  # nodes computed at a time, so that the work stays in the processor's cache
 _LEAST = 1e-6  # radius of a patch, cells: its square is no number below some 1e-19
@@ -238,16 +237,16 @@ def _spread(
     return arrival.masked_fill(depth > draw["ring_width"][:, None, None] * scale, math.inf)
 
 
-def _unit(field: str, seeds: Tensor, lanes: int) -> Tensor:
-    """Uniform draws on (0, 1), float32 [fires, lanes], from the stream of a seed and a field."""
-    key = torch.tensor([_STREAM, _DRAWN.index(field)], device=seeds.device)
-    return uniform(fold(fold(seeds, key[0]), key[1]), lanes)
+def _unit(field: str, seeds: Tensor, count: int) -> Tensor:
+    """Uniform draws on (0, 1), float32 [fires, count], from the key of a seed and a field."""
+    key = torch.tensor([Use.FIRE_PARAMETER, _DRAWN.index(field)], device=seeds.device)
+    return uniform(fold_in(fold_in(seeds, key[0]), key[1]), count)
 
 
-def _draw(config: FireConfig, field: str, seeds: Tensor, lanes: int = 1) -> Tensor:
-    """Uniform draws from the range of a field, float32 [fires, lanes]."""
+def _draw(config: FireConfig, field: str, seeds: Tensor, count: int = 1) -> Tensor:
+    """Uniform draws from the range of a field, float32 [fires, count]."""
     low, high = getattr(config, field)
-    return low + (high - low) * _unit(field, seeds, lanes)
+    return low + (high - low) * _unit(field, seeds, count)
 
 
 def _axes(grid: tuple[int, int], device: torch.device) -> tuple[Tensor, Tensor]:
