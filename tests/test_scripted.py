@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from torchrl.envs import step_mdp
 
 from emberlink.comm import consensus
+from emberlink.configs import known
 from emberlink.envs import WildfireConfig, WildfireEnv, keys, metrics
 from emberlink.envs.world.sensor import view_radius
 from emberlink.policies.scripted.base import Scripted
@@ -18,7 +19,7 @@ from emberlink.policies.scripted.lawnmower import Lawnmower, stops
 from emberlink.policies.scripted.oracle import Oracle
 from emberlink.policies.scripted.registry import SCRIPTED
 from emberlink.trainers.build import build_env
-from emberlink.trainers.config.compose import known, resolve
+from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.evaluation.evaluate import play, scripted_config
 
 NEVER = math.inf

@@ -9,21 +9,18 @@ another grid lengths, and with them rates, are scaled by min(X, Y)/30, so that i
 
 import dataclasses
 import math
-from importlib import resources
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Literal, get_args
 
 import torch
-from omegaconf import OmegaConf
-from omegaconf.errors import OmegaConfBaseException
 from pydantic import AfterValidator, ConfigDict, Field, Strict, ValidationError
 from pydantic.dataclasses import dataclass
 from torch import Tensor
-from yaml import YAMLError
 
+from emberlink.configs import known, read
 from emberlink.envs.config import check_grid
 from emberlink.envs.utils.counter_rng import Use, fold_in, uniform
 from emberlink.envs.utils.errors import UserError
-from emberlink.envs.utils.validation import Name, describe, known
+from emberlink.envs.utils.validation import Name, describe
 
 from .advection import current, longest_step, tide_speed
 from .ellipse import MAX_LENGTH_TO_BREADTH
@@ -119,7 +116,7 @@ _DRAWN = tuple(f.name for f in dataclasses.fields(FireConfig) if f.name not in _
 
 def scenarios() -> list[str]:
     """Names of the generator's scenarios: the files in `configs/fire` that have no `kind`."""
-    return [name for name in known("fire") if "kind" not in _values(name)]
+    return [name for name in known("fire") if "kind" not in read("fire", name)]
 
 
 def load_scenario(name: str) -> FireConfig:
@@ -128,25 +125,13 @@ def load_scenario(name: str) -> FireConfig:
     Raises:
         ValueError: no such file, or a value in it that `FireConfig` does not take.
     """
-    values = _values(name) if name in known("fire") else None
+    values = read("fire", name) if name in known("fire") else None
     if values is None or "kind" in values:
         raise UserError(f"unknown fire {name!r}; known: {', '.join(scenarios())}")
     try:
         return FireConfig(**values)
     except ValidationError as error:
         raise UserError(f"configs/fire/{name}.yaml: {describe(error)}") from None
-
-
-def _values(name: str) -> dict[str, Any]:
-    file = resources.files("emberlink.configs").joinpath("fire", f"{name}.yaml")
-    try:
-        values: Any = OmegaConf.to_container(OmegaConf.create(file.read_text(encoding="utf-8")))
-    except (YAMLError, OmegaConfBaseException) as error:
-        reason = " ".join(str(error).split())[:200]
-        raise UserError(f"configs/fire/{name}.yaml: cannot be read: {reason}") from None
-    if not isinstance(values, dict):
-        raise UserError(f"configs/fire/{name}.yaml: expected keys and values")
-    return values
 
 
 def fire_seeds(split: Split, count: int, start: int = 0) -> Tensor:

@@ -14,8 +14,8 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
+from emberlink.configs import known
 from emberlink.envs.utils.errors import UserError
-from emberlink.envs.utils.validation import known
 from emberlink.trainers.config.compose import override, resolve
 from emberlink.trainers.config.schema import RunConfig, check_device
 from emberlink.trainers.evaluation import report

@@ -13,7 +13,8 @@ from pydantic.dataclasses import dataclass as checked
 
 from emberlink.envs import metrics
 from emberlink.envs.utils.errors import UserError
-from emberlink.trainers.config.compose import describe, flat, resolve, to_values
+from emberlink.envs.utils.validation import describe
+from emberlink.trainers.config.compose import flat, resolve, to_values
 from emberlink.trainers.config.schema import NOT_LEARNT_WITH, RunConfig
 from emberlink.trainers.evaluation.results import CURVES, LEARNED
 from emberlink.trainers.runs import pretrained
