@@ -14,10 +14,10 @@ from hydra.errors import HydraException
 from rich.console import Console
 from rich.table import Table
 
+from emberlink.configs import known
 from emberlink.envs.utils.atomic_io import inner_folder
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.publish import free_name
-from emberlink.envs.utils.validation import known
 from emberlink.trainers.config.compose import flat, resolve, to_values
 from emberlink.trainers.config.schema import NOT_LEARNT_WITH, RunConfig
 from emberlink.trainers.runs.run_folder import RunFolder
