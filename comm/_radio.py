@@ -10,9 +10,8 @@ from torch import Tensor
 
 from emberlink.envs import keys
 from emberlink.envs.utils import counter_rng
+from emberlink.envs.utils.counter_rng import Use
 from emberlink.envs.world import motion
-
-_LOST = 102  # use number of the random numbers that decide which messages are lost
 
 
 @dataclass(frozen=True, kw_only=True, config=ConfigDict(extra="forbid", strict=True))
@@ -41,16 +40,18 @@ class Radio:
     def links(self, tensordict: TensorDictBase) -> Tensor:
         """Returns who hears whom, bool [..., n, n]: row i holds the UAVs that UAV i hears.
 
-        The lost messages are a function of the episode's random stream and the step.
+        The lost messages are a function of the episode's random key and the step.
 
         Args:
-            tensordict: positions, random stream and step of one time step.
+            tensordict: positions, random key and step of one time step.
         """
         links = neighbours(tensordict.get(keys.POSITION), self.config.range)
         if self.config.loss:
             uavs = links.shape[-1]
-            stream = counter_rng.at(tensordict.get(keys.STREAM), tensordict.get(keys.STEP), _LOST)
-            unit = counter_rng.uniform(stream, uavs * uavs).unflatten(-1, (uavs, uavs))
+            key = counter_rng.step_key(
+                tensordict.get(keys.RNG_KEY), tensordict.get(keys.STEP), Use.MESSAGE_LOSS
+            )
+            unit = counter_rng.uniform(key, uavs * uavs).unflatten(-1, (uavs, uavs))
             links = links & (unit >= self.config.loss)
         return links
 

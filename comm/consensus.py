@@ -12,6 +12,7 @@ from torchrl.data import Bounded, Composite, Unbounded
 from emberlink.envs import keys
 from emberlink.envs.config import WildfireConfig
 from emberlink.envs.utils import counter_rng
+from emberlink.envs.utils.counter_rng import Use
 from emberlink.envs.world import motion
 from emberlink.envs.world.reward import left_box
 
@@ -19,9 +20,6 @@ from ._agreement import choose_leader, known_discoverers
 from ._heading import HeadingConfig, circling, heading_reward
 from ._radio import RadioConfig, pairwise_distance
 from .base import CommModule
-
-# Use numbers of the random numbers of a step; 102 is the radio's.
-_WAYPOINTS, _JITTER, _FIRST_REDRAW = 100, 101, 103
 
 
 @dataclass(frozen=True, kw_only=True, config=ConfigDict(extra="forbid", strict=True))
@@ -74,7 +72,7 @@ class Consensus(CommModule):
     def __init__(self, world: WildfireConfig, config: ConsensusConfig, num_envs: int = 1):
         super().__init__(world, config, num_envs)
         fire: list[Any] = [keys.NEW_FIRE, keys.OLD_FIRE, keys.NEW_CENTRE, keys.OLD_CENTRE]
-        inputs: list[Any] = [keys.OBSERVATION, keys.POSITION, keys.HEARS, keys.STREAM, keys.STEP]
+        inputs: list[Any] = [keys.OBSERVATION, keys.POSITION, keys.HEARS, keys.RNG_KEY, keys.STEP]
         outputs: list[Any] = [keys.OBSERVATION, keys.TARGET, keys.FOLLOWS]
         self.in_keys, self.out_keys = inputs + fire, outputs
         low, high = motion.corners(world.low, world.high)
@@ -104,8 +102,8 @@ class Consensus(CommModule):
 
     def reset(self, tensordict: TensorDictBase, mask: Tensor) -> None:
         """Ends the streaks and draws a random point for each UAV."""
-        stream = self._stream(tensordict, _WAYPOINTS)
-        points = motion.random_points(stream, self.world.num_uavs, self.low, self.high)
+        key = self._step_key(tensordict, Use.WAYPOINT)
+        points = motion.random_points(key, self.world.num_uavs, self.low, self.high)
         self.waypoint.copy_(torch.where(mask[:, None, None], points, self.waypoint))
         for record in (self.streak, self.fire_score, self.altitude_sum):
             record.masked_fill_(mask[:, None], 0)
@@ -134,7 +132,7 @@ class Consensus(CommModule):
             term = torch.where(self.old_fire_only, heading.circle * circling(*flight), term)
         if not self.config.wander:
             term = term.masked_fill(self.leaderless, 0.0)
-        left = left_box(tensordict.get(keys.BEYOND), self.world.reward.exit_axes)
+        left = left_box(tensordict.get(keys.HIT_BOUNDARY), self.world.reward.exit_axes)
         return term.masked_fill(left, 0.0)
 
     def _keep_for_shaping(
@@ -171,9 +169,8 @@ class Consensus(CommModule):
         """Returns the targets, float32 [num_envs, n, 3], and redraws the wanderers' waypoints."""
         position = tensordict.get(keys.POSITION)
         wanders = (follows < 0).unsqueeze(-1)
-        other = motion.next_waypoint(
-            self.waypoint, position, self._redraw_stream(tensordict), self.low, self.high
-        )
+        key = self._redraw_key(tensordict)
+        other = motion.next_waypoint(self.waypoint, position, key, self.low, self.high)
         self.waypoint.copy_(torch.where(wanders, other, self.waypoint))
         new = (tensordict.get(keys.NEW_FIRE) > 0).unsqueeze(-1)
         centre = torch.where(new, tensordict.get(keys.NEW_CENTRE), tensordict.get(keys.OLD_CENTRE))
@@ -184,23 +181,23 @@ class Consensus(CommModule):
         target = torch.where(discovers.unsqueeze(-1), over_fire, target)
         return self._jittered(tensordict, target) if self.config.jitter else target
 
-    def _redraw_stream(self, tensordict: TensorDictBase) -> Tensor:
-        """Returns the random stream of new waypoints, at step 0 another one than in `reset`."""
+    def _redraw_key(self, tensordict: TensorDictBase) -> Tensor:
+        """Returns the random key of new waypoints, at step 0 another one than in `reset`."""
         step = tensordict.get(keys.STEP)
-        use = _WAYPOINTS + (step == 0) * (_FIRST_REDRAW - _WAYPOINTS)
-        return counter_rng.at(tensordict.get(keys.STREAM), step, use)
+        use = Use.WAYPOINT + (step == 0) * (Use.FIRST_WAYPOINT_REDRAW - Use.WAYPOINT)
+        return counter_rng.step_key(tensordict.get(keys.RNG_KEY), step, use)
 
     def _jittered(self, tensordict: TensorDictBase, target: Tensor) -> Tensor:
         """Adds clipped noise to x and y of targets closer than 1, within the box."""
-        stream = self._stream(tensordict, _JITTER)
-        noise = counter_rng.normal(stream, 2 * target.shape[-2]).unflatten(-1, (-1, 2))
+        key = self._step_key(tensordict, Use.TARGET_JITTER)
+        noise = counter_rng.normal(key, 2 * target.shape[-2]).unflatten(-1, (-1, 2))
         noise = (self.config.jitter * noise).clamp(-1, 1)
         near = motion.distance(tensordict.get(keys.POSITION), target) < 1
         moved = target + torch.nn.functional.pad(noise, (0, 1)) * near[..., None]
         return moved.clamp(self.low.float(), self.high.float())
 
-    def _stream(self, tensordict: TensorDictBase, use: int) -> Tensor:
-        return counter_rng.at(tensordict.get(keys.STREAM), tensordict.get(keys.STEP), use)
+    def _step_key(self, tensordict: TensorDictBase, use: int) -> Tensor:
+        return counter_rng.step_key(tensordict.get(keys.RNG_KEY), tensordict.get(keys.STEP), use)
 
     def _scaled(self, shown: Tensor) -> Tensor:
         """Returns targets or vectors to them in the scale of the observation."""
