@@ -13,7 +13,8 @@ from pydantic.dataclasses import dataclass as checked
 
 from emberlink.envs import metrics
 from emberlink.envs.utils.errors import UserError
-from emberlink.trainers.config.compose import describe, flat, resolve, to_values
+from emberlink.envs.utils.validation import describe
+from emberlink.trainers.config.compose import flat, resolve, to_values
 from emberlink.trainers.config.schema import NOT_LEARNT_WITH, RunConfig
 from emberlink.trainers.evaluation.results import CURVES, LEARNED
 from emberlink.trainers.runs import pretrained
@@ -26,7 +27,7 @@ Measured = Annotated[float, Field(ge=-LARGEST, le=LARGEST, allow_inf_nan=False)]
 _MEASURE = TypeAdapter(Measured)
 NOT_COMPARED = ("seed", "seeds", "output", "evaluation", *NOT_LEARNT_WITH)
 """keys in which the runs of a group may differ: none changes what is trained"""
-NAMELESS = ("seed", "seeds", "output")
+NAMELESS = ("seed", "seeds", "output", "baseline_comm")
 """those of them that nobody need be told of"""
 
 
