@@ -116,9 +116,9 @@ def test_a_file_of_a_name_that_is_taken_is_an_error(folder):
     write(folder, {"setup/paper.yaml": SETUP})
     with pytest.raises(UserError, match=r"setup 'paper' is in several folders: .*folder/setup"):
         resolve("consensus")
-    write(folder, {"setup_method/tuned_consensus.yaml": SETUP})
-    with pytest.raises(UserError, match="'tuned_consensus' is in several folders"):
-        resolve("consensus", ["setup=tuned"])
+    write(folder, {"setup_method/tuned_independent.yaml": SETUP})
+    with pytest.raises(UserError, match="'tuned_independent' is in several folders"):
+        resolve("independent", ["setup=tuned"])
     assert resolve("positional", ["setup=tuned"]).setup == "tuned"
 
 
