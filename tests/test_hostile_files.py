@@ -349,7 +349,7 @@ def test_what_is_no_regular_file(name, kind, run, mark, capsys, tmp_path):
 def test_links_out_of_a_run_folder_are_not_written_through(run, tmp_path):
     mine = tmp_path / "mine"
     mine.write_text("mine")
-    for name in ("eval.json.part", "config.yaml.part"):
+    for name in (f"eval.json.{os.getpid()}.part", f"config.yaml.{os.getpid()}.part"):
         (run / name).symlink_to(mine)
     assert main.main(["eval", str(run), "--fires", "1"]) == 0
     RunFolder(run).write_config(resolve("consensus"))
