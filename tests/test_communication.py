@@ -1,15 +1,9 @@
 """What the communication modules write, on an environment and off it, and how they are found."""
 
-import os
-import re
-import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 import torch
-import yaml
 from torchrl.envs import step_mdp
 
 from emberlink.comm import base, registry
@@ -109,45 +103,3 @@ def test_an_unknown_module_is_an_error_that_lists_the_known(name):
     assert repr(name) in str(error.value)
     with pytest.raises(ValueError, match="known: consensus, no_comm, positional"):
         resolve("independent", [f"comm.name='{name}'"])
-
-
-TRAIN = """
-import sys
-from pathlib import Path
-from emberlink.comm import registry
-from emberlink.trainers.cli.main import main
-assert Path(registry.__file__).is_relative_to(sys.argv[1]), registry.__file__
-raise SystemExit(main(["train", "headcount", "comm.scale=0.5", *sys.argv[2:]]))
-"""
-
-
-def test_a_fifth_method_is_one_file_and_one_yaml(tmp_path):
-    package = tmp_path / "copy" / "emberlink"
-    for folder in ("envs", "comm", "policies", "trainers", "configs"):
-        ignored = shutil.ignore_patterns("__pycache__")
-        shutil.copytree(ROOT / folder, package / folder, ignore=ignored)
-    # The example of the README, as printed.
-    readme = (ROOT / "README.md").read_text()
-    (module,) = re.findall(r"```python\n(# comm/headcount\.py\n.*?)```", readme, re.DOTALL)
-    (recipe,) = re.findall(r"```yaml\n(.*?)```", readme, re.DOTALL)
-    (package / "comm" / "headcount.py").write_text(module)
-    (package / "configs" / "method" / "headcount.yaml").write_text(recipe)
-    overrides = ["episodes=2", "env.horizon=12", "env.num_uavs=2", "learner.hidden=[8,8]"]
-    overrides += ["learner.batch_size=8", "evaluation.episodes=1", "evaluation.interval=0"]
-    done = subprocess.run(
-        [sys.executable, "-c", TRAIN, str(package), *overrides, f"output={tmp_path / 'runs'}"],
-        # First on the path, and so before an installed copy.
-        env={**os.environ, "PYTHONPATH": str(package.parent)},
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
-    (run,) = (tmp_path / "runs").iterdir()
-    assert yaml.safe_load((run / "config.yaml").read_text())["comm"] == {
-        "name": "headcount",
-        "scale": 0.5,
-    }
-    assert len((run / "metrics.jsonl").read_text().splitlines()) == 2
-    assert (run / "eval.json").exists()
