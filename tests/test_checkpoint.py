@@ -128,14 +128,14 @@ def test_nan_is_refused_wherever_it_is(stopped):
 
 def test_a_fire_that_is_of_no_episode_is_refused(stopped):
     def margin(_, content: dict) -> None:
-        content["world/_map._arrival"][0, 0] = 3.0  # where NaN is right
+        content["world/_map._arrival_time"][0, 0] = 3.0  # where NaN is right
 
     def later(_, content: dict) -> None:
-        arrival = content["world/_map._arrival"]
+        arrival = content["world/_map._arrival_time"]
         arrival[arrival.isfinite()] += 1
 
     for change in (margin, later):
-        assert refused(stopped, change) == "world/_map._arrival is not one of step 33"
+        assert refused(stopped, change) == "world/_map._arrival_time is not one of step 33"
 
 
 # 8 rows are a batch for two UAVs, so each step from the 4th has an update.
@@ -189,7 +189,7 @@ def test_a_tensor_that_no_state_has_is_refused(group, stopped):
 
 
 @pytest.mark.parametrize(
-    "name", ["_episode", "_time", "_seen", "_stream", "_map._growth_start", "_map._stamp"]
+    "name", ["_episode", "_time", "_seen", "_episode_key", "_map._burning_start", "_map._stamp"]
 )
 @pytest.mark.parametrize("value", [-1, 1000, 2**31 - 2])
 def test_a_counter_of_the_world_out_of_range_is_refused(name, value, stopped):
@@ -204,7 +204,7 @@ def test_what_the_world_cannot_hold_is_refused(name, value, stopped):
     assert refused(stopped, lambda _, content: content[name].fill_(value)).startswith(name)
 
 
-@pytest.mark.parametrize("name", ["step", "seen", "stream"])
+@pytest.mark.parametrize("name", ["step", "seen", "rng_key"])
 def test_a_carried_moment_of_another_world_is_refused(name, stopped):
     reason = refused(stopped, lambda _, content: content[f"carried/{name}"].add_(1))
     assert reason.startswith(f"carried/{name} is not world/")

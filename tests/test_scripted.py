@@ -204,7 +204,7 @@ def test_the_oracle_against_its_rule_with_loops(seed, grid, uavs, angle):
     for step in range(4):
         seen = (env.fire_map == 1).tolist()
         expected = [
-            scalar_oracle(moment[keys.POSITION][e].tolist(), env.arrival[e].tolist(), *rest)
+            scalar_oracle(moment[keys.POSITION][e].tolist(), env.arrival_time[e].tolist(), *rest)
             for e, rest in enumerate(zip(seen, [step] * envs, [config] * envs, strict=True))
         ]
         assert (sent(env, oracle, moment) - torch.tensor(expected)).abs().max() < 1e-4
@@ -250,7 +250,7 @@ def test_every_policy_in_every_recipe(name, method, shape):
         assert action.isfinite().all()
         assert action.abs().max() <= 1
         if name != "random_actions":  # who flies to a point of the box does not leave it
-            assert not moment[keys.BEYOND].any()
+            assert not moment[keys.HIT_BOUNDARY].any()
     # The second environment alone is what it is between the others.
     env, policy = build(method, name, shape, seeds=[6], fire=arrival[1:2])
     for alone, moment in zip(episode(env, policy, 25), moments, strict=True):

@@ -123,7 +123,7 @@ def _for_a_file(name: str) -> str:
 
 
 def _frozen_caption(one: Numbers, fire: str) -> str:
-    count = one.section.runs[0].evaluation.episodes
+    count = one.section.runs[0].evaluation.fires
     return (
         f"Frozen policies on {count} held-out fires of {fire}. Small dots: a run's mean over its "
         "episodes, one a seed. Large dot: interquartile mean over seeds; line: 95 % bootstrap "
@@ -143,7 +143,7 @@ def _caption(one: Numbers, number: int, what: str) -> str:
     if one.on_trained:
         text += (
             " Dashed: scripted policies, mean over the frozen evaluation's "
-            f"{one.section.runs[0].evaluation.episodes} episodes on {one.section.trained_on}, the "
+            f"{one.section.runs[0].evaluation.fires} episodes on {one.section.trained_on}, the "
             "fire trained on; in a method's colour where the number is that method's alone."
         )
     return text

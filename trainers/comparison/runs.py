@@ -257,10 +257,10 @@ def _check_evaluation(file: Path, evaluation: Evaluation, config: RunConfig) -> 
             for name in metrics.NAMES:
                 if name not in measured:
                     raise UserError(f"{file}: results.{fire}.{policy} lacks {name}")
-                if len(measured[name]) != evaluation.episodes:
+                if len(measured[name]) != evaluation.fires:
                     raise UserError(
                         f"{file}: results.{fire}.{policy}.{name} has {len(measured[name])} "
-                        f"episodes; fires={evaluation.episodes}"
+                        f"episodes; fires={evaluation.fires}"
                     )
 
 
@@ -379,7 +379,7 @@ def _check_alike(runs: Sequence[Run]) -> None:
     facts = {
         "env.horizon": lambda run: run.config.env.horizon,
         "env.grid": lambda run: list(run.config.env.grid),
-        "the number of held-out fires": lambda run: run.evaluation.episodes,
+        "the number of held-out fires": lambda run: run.evaluation.fires,
         "start_seed of the evaluation": lambda run: run.evaluation.start_seed,
     }
     for name, fact in facts.items():
