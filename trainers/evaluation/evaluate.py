@@ -1,6 +1,6 @@
 """Frozen policies on held-out fires, beside scripted ones."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, cast
 
@@ -203,11 +203,6 @@ def play_blocks(
         for name, values in play(env, policy(world)).items():
             measured[name] += values[: count - start].tolist()
     return measured
-
-
-def means(results: Mapping[str, list[float]]) -> dict[str, float]:
-    """The mean over episodes of each measure."""
-    return {name: float(np.mean(values)) for name, values in results.items()}
 
 
 def film(

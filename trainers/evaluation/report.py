@@ -7,47 +7,16 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-import torch
-from rich import box
-from rich.console import Console
-from rich.table import Table
-from tensordict.nn import TensorDictModule
-
-from emberlink.envs import metrics
 from emberlink.envs.rendering.frame import write_gif
 from emberlink.envs.scenarios import fires_of
 from emberlink.envs.utils.errors import UserError
 from emberlink.policies.scripted.registry import SCRIPTED
-from emberlink.trainers.build import build_env, build_networks
 from emberlink.trainers.config.schema import RunConfig
-from emberlink.trainers.runs.run_folder import RunFolder, load_weights
+from emberlink.trainers.runs.run_folder import RunFolder
 
 from . import evaluate, plots
 
 _PACKAGES = ("emberlink", "torch", "torchrl", "tensordict", "numpy")
-ACTOR = "actor_network_params.module."
-"""what the actor's weights are called in a checkpoint, before the name within the network"""
-
-
-def load_actor(config: RunConfig, checkpoint: Path) -> TensorDictModule:
-    """The frozen policy of a run.
-
-    Raises:
-        ValueError: the checkpoint can't be read or is of another shape.
-    """
-    env = build_env(
-        config,
-        num_envs=1,
-        fire=torch.full(config.env.grid, torch.inf),
-        seed=0,
-        device=config.device,
-    )
-    actor, _ = build_networks(config, env)
-    network: Any = actor.module
-    expected = {ACTOR + name: value for name, value in network.state_dict().items()}
-    weights = load_weights(checkpoint, expected, config)
-    network.load_state_dict({name.removeprefix(ACTOR): v for name, v in weights.items()})
-    return actor.requires_grad_(False)
 
 
 def evaluate_run(
@@ -131,34 +100,3 @@ def record(config: RunConfig, results: evaluate.Results, **about: Any) -> dict[s
         },
         "results": results,
     }
-
-
-def print_table(console: Console, results: evaluate.Results, config: RunConfig) -> None:
-    """The means over episodes: a table per fire, a row per policy, a column per measure."""
-    for fire, by_policy in results.items():
-        episodes = len(next(iter(by_policy.values()))["coverage"])
-        table = Table(
-            title=f"held-out fires: {fire} ({episodes} episodes, mean; setup {config.setup})",
-            box=box.SIMPLE_HEAD,
-            padding=0,
-            show_edge=False,
-        )
-        # One word below the other: names and all measures fit a terminal of 80 columns.
-        table.add_column(min_width=13)
-        for name in metrics.NAMES:
-            table.add_column(name.replace("_", "\n"), justify="right", no_wrap=True)
-        for policy, measured in by_policy.items():
-            learned = policy == evaluate.LEARNED
-            means = evaluate.means(measured)
-            table.add_row(
-                config.method if learned else policy.replace("_", " "),
-                *(_short(name, means[name]) for name in metrics.NAMES),
-                style="bold" if learned else None,
-            )
-        console.print(table)
-
-
-def _short(measure: str, value: float) -> str:
-    """One decimal; of a score, which may be a small reward, as many as make four digits."""
-    digits = max(1, 4 - len(str(int(abs(value))))) if measure == "mean_reward" else 1
-    return f"{value:.{digits}f}"

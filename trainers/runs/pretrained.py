@@ -20,8 +20,7 @@ from pathlib import Path
 from emberlink.envs.fire_files.reader import KEPT
 
 from . import checkpoint_file
-from emberlink.trainers.evaluation.report import ACTOR
-from .run_folder import RunFolder
+from .run_folder import ACTOR, RunFolder
 from emberlink.envs.utils.errors import UserError
 
 PREFIX = "pretrained:"

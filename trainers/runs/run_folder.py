@@ -28,6 +28,10 @@ _NOT_FROM_THE_START = ("comm.agree", "comm.follow", "comm.wander", "comm.loss")
 _NUMBERED = re.compile(r"(state|step)_\d{9,18}\.safetensors")
 
 
+ACTOR = "actor_network_params.module."
+"""begins the names of the actors' weights in a checkpoint"""
+
+
 class RunFolder:
     """One training run's files.
 
@@ -154,6 +158,10 @@ class RunFolder:
     def write(self, file: str, content: Mapping[str, Any]) -> None:
         """Writes a JSON file whole, or leaves what was there."""
         self._replace(file, json.dumps(content, indent=1) + "\n")
+
+    def write_text(self, file: str, text: str) -> None:
+        """Writes a text file whole, or leaves what was there."""
+        self._replace(file, text)
 
     def _replace(self, file: str, text: str) -> None:
         # Not the name of another process's, such as an evaluation beside a training.

@@ -21,9 +21,10 @@ from emberlink.trainers.learners.replay_buffer import TeamSampler, make_memory, 
 from emberlink.trainers.rollout.allocator import keep_freed_memory
 from emberlink.trainers.rollout.collectors import make_collector
 from emberlink.trainers.rollout.cuda_graphs import graphed
-from emberlink.trainers.runs import checkpoint_file, loggers
+from emberlink.trainers.runs import checkpoint_file
 from emberlink.trainers.runs.lock import Lock
 from emberlink.trainers.runs.run_folder import RunFolder
+from emberlink.trainers.runs.tracking import Trackers
 
 from . import divergence, rollback, state
 
@@ -259,7 +260,7 @@ class Trainer:
         """Trains to the end, until `stop`, or until a number is not finite."""
         # After a rollback, one that has failed is not tried again.
         configs = [replace(one, logger="none") if self._untracked else one for one in self.configs]
-        trackers = loggers.Trackers(configs, self.runs, episode=self.episode)
+        trackers = Trackers(configs, self.runs, episode=self.episode)
         try:
             self._loop(trackers, report)
             if self.saved != self.step:
@@ -274,7 +275,7 @@ class Trainer:
         if self.learner.watch.look(wait=wait):
             raise divergence.found(self)
 
-    def _loop(self, trackers: loggers.Trackers, report: Callable[[Progress], None]) -> None:
+    def _loop(self, trackers: Trackers, report: Callable[[Progress], None]) -> None:
         horizon = self.config.env.horizon
         progress = self._progress()
         self._began = time.monotonic()
@@ -318,7 +319,7 @@ class Trainer:
     def _sample_and_update(self) -> torch.Tensor:
         return torch.stack(self.learner.update(self.memory.sample()))
 
-    def _finish_episode(self, trackers: loggers.Trackers) -> list[dict[str, Any]]:
+    def _finish_episode(self, trackers: Trackers) -> list[dict[str, Any]]:
         """Measures an episode, evaluates where it is due, writes the lines."""
         config = self.config
         lines = self._measure(self.moments, self.losses)
@@ -332,7 +333,7 @@ class Trainer:
             self._keep_best(team, line)
             run.append("metrics.jsonl", line)
             run.append("timing.jsonl", {"episode": self.episode, "seconds": seconds})
-        trackers.log(lines, step=self.episode)
+        trackers.log(lines, self.episode)
         return lines
 
     def _keep_best(self, team: int, line: dict[str, Any]) -> None:
