@@ -86,7 +86,8 @@ class WildfireEnv(Buffers, EnvBase):
         position = torch.zeros(num_envs, config.num_uavs, 3, dtype=torch.float64)
         self.register_buffer("_position", position)
         team = num_envs, config.num_uavs
-        self.observation_spec = specs.observation_spec(*team)
+        self._side = view.side if config.observation == "window" else None
+        self.observation_spec = specs.observation_spec(*team, self._side)
         self.action_spec = specs.action_spec(*team)
         self.reward_spec = specs.reward_spec(*team)
         self.done_spec = specs.done_spec(num_envs)
@@ -141,7 +142,14 @@ class WildfireEnv(Buffers, EnvBase):
         nothing = torch.zeros_like(self._position, dtype=torch.int64)
         nowhere = nothing.new_zeros((*nothing.shape, 2), dtype=torch.float32)
         inside = torch.zeros_like(nothing, dtype=torch.bool)
-        return self._snapshot(self._position.float(), nothing, nowhere, inside)
+        return self._snapshot(self._position.float(), nothing, nowhere, inside, self._unseen())
+
+    def _unseen(self) -> Tensor | None:
+        """Returns the window of UAVs that have not looked: bool [num_envs, n, 3, W, W], False."""
+        if self._side is None:
+            return None
+        shape = *self._position.shape, self._side, self._side
+        return torch.zeros(shape, dtype=torch.bool, device=self.device)
 
     def _begin_episodes(self, mask: Tensor) -> None:
         """The next episode, bool [num_envs] says where: its stream, its fire, nothing seen."""
@@ -184,11 +192,12 @@ class WildfireEnv(Buffers, EnvBase):
             high=self._high,
         )
         self._position.copy_(position)
-        counts, centres = self._map.look(self._position, self._time.float())
+        counts, centres, classes = self._map.look(self._position, self._time.float())
+        window = None if self._side is None else classes.unflatten(-1, (self._side, self._side))
         reward = view_reward(*counts.unbind(-1), beyond=beyond, config=config.reward)
         counts = counts.long()
         self._seen.add_(counts[..., 0].sum(-1))
-        return self._snapshot(position, counts, centres, beyond, reward)
+        return self._snapshot(position, counts, centres, beyond, window, reward)
 
     def _step_proc_data(self, next_tensordict_out: TensorDictBase) -> TensorDictBase:
         """TorchRL completes here what a step has left out; ours leaves nothing out."""
@@ -200,6 +209,7 @@ class WildfireEnv(Buffers, EnvBase):
         counts: Tensor,
         centres: Tensor,
         beyond: Tensor,
+        window: Tensor | None = None,
         reward: Tensor | None = None,
     ) -> TensorDict:
         """The TensorDict of a moment.
@@ -209,6 +219,7 @@ class WildfireEnv(Buffers, EnvBase):
             counts: int64 [num_envs, n, 3], cells in view that are new, old and no fire.
             centres: float32 [num_envs, n, 3, 2], their means.
             beyond: bool [num_envs, n, 3].
+            window: bool [num_envs, n, 3, W, W]; None where it is not observed.
             reward: float32 [num_envs, n]; a reset has none.
         """
         time = self._time.clone()
@@ -224,6 +235,8 @@ class WildfireEnv(Buffers, EnvBase):
             keys.OLD_CENTRE[1]: old_centre,
             keys.BEYOND[1]: beyond,
         }
+        if window is not None:
+            agents[keys.WINDOW[1]] = window
         if reward is not None:
             agents[keys.REWARD[1]] = reward.unsqueeze(-1)
         truncated = (time >= self.config.horizon).unsqueeze(-1)

@@ -81,7 +81,7 @@ class Discovery(Buffers):
         """Cells that burn at a step, int64 [envs] both."""
         return self._growth.take(step.clamp(max=self._horizon).add_(self._growth_start))
 
-    def look(self, position: Tensor, step: Tensor) -> tuple[Tensor, Tensor]:
+    def look(self, position: Tensor, step: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """All UAVs look at once, one step after they did last.
 
         Args:
@@ -90,7 +90,8 @@ class Discovery(Buffers):
 
         Returns:
             Cells in view that are new fire, old fire and no fire: how many, float64
-            [envs, uavs, 3], and their mean (i, j), float32 [envs, uavs, 3, 2].
+            [envs, uavs, 3], their mean (i, j), float32 [envs, uavs, 3, 2], and which cells of the
+            window they are, bool [envs, uavs, 3, W * W].
         """
         centre, cells, near = self._view.look(position, self._start)
         stamp, first_seen, now = self._stamp, self._first_seen, step.view(-1, 1, 1)
@@ -101,4 +102,4 @@ class Discovery(Buffers):
         first_seen.view(-1).scatter_reduce_(0, cells.view(-1), claims.view(-1), "amin")
         new = first_seen.take(cells) == stamp
         classes = torch.stack((new, burning ^ new, near & (arrival > now)), -2)
-        return self._view.tally(classes, centre)
+        return *self._view.tally(classes, centre), classes

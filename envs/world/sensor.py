@@ -36,6 +36,8 @@ class View(Buffers):
         self._inner = tuple(slice(reach, reach + side) for side in grid)
         self._padded = grid[0] + 2 * reach, grid[1] + 2 * reach
         self._slope = math.tan(math.radians(view_angle))
+        self.side = 2 * reach + 1
+        """cells along a side of the window"""
         offsets = torch.arange(-reach, reach + 1)
         i, j = torch.meshgrid(offsets, offsets, indexing="ij")
         self.register_buffer("_offsets", offsets.double(), persistent=False)
