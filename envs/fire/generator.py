@@ -30,8 +30,9 @@ from .ellipse import MAX_LENGTH_TO_BREADTH
 from .level_set import arrival_times, disc
 
 BASE_SIDE = 30
-HELD_OUT_FROM = 1_000_000
-Split = Literal["train", "heldout"]
+TEST_FROM = 1_000_000
+VALIDATION_FROM = 2_000_000
+Split = Literal["train", "validation", "test"]
 
 _STREAM = 0xF12E  # keeps a fire's draws apart from other uses of the same seed
 _NODES = 60  # nodes along the shorter side at least: twice the resolution of 30 cells
@@ -70,7 +71,7 @@ class FireConfig:
 
     name: Name
     """Name of the scenario, that of its file."""
-    num_train_fires: Annotated[int, Field(ge=1, lt=HELD_OUT_FROM)]
+    num_train_fires: Annotated[int, Field(ge=1, lt=TEST_FROM)]
     """Number of fires to train on."""
     head_ros: Annotated[tuple[_Rate, _Rate], _Pair, _Ordered]
     """Rate of spread of the head, cells per step."""
@@ -150,24 +151,28 @@ def _values(name: str) -> dict[str, Any]:
 
 
 def fire_seeds(split: Split, count: int, start: int = 0) -> Tensor:
-    """Seeds of the first `count` fires of a split, int64 [count].
+    """Returns the seeds of the first `count` fires of a split, int64 [count].
 
-    Training seeds lie below `HELD_OUT_FROM`, held-out seeds from it on, so no fire is in both.
+    Training seeds are 0 to 999,999, test seeds 1,000,000 to 1,999,999 and validation seeds
+    2,000,000 to 2,999,999, so the three sets are disjoint for every `start`.
 
     Args:
-        split: "train" or "heldout".
-        count: how many.
-        start: first training seed, to train on another bank; the held-out fires never change.
+        split: "train", "validation" or "test".
+        count: number of seeds.
+        start: the first training seed. Validation and test fires are the same for everyone.
+
+    Raises:
+        UserError: the split is not known, or the seeds would not lie in its interval.
     """
     if split not in get_args(Split):
         raise UserError(f"unknown split {split!r}; known: {', '.join(get_args(Split))}")
     if count < 1 or start < 0:
         raise UserError(f"expected count >= 1 and start >= 0, got {count} and {start}")
-    if split == "heldout" and start:
-        raise UserError(f"held-out fires are the same for everyone: start must be 0, got {start}")
-    if split == "train" and start + count > HELD_OUT_FROM:
-        raise UserError(f"training seeds end before {HELD_OUT_FROM}, got {start} + {count}")
-    first = HELD_OUT_FROM if split == "heldout" else start
+    if split != "train" and start:
+        raise UserError(f"{split} fires are the same for everyone: start must be 0, got {start}")
+    if start + count > TEST_FROM:
+        raise UserError(f"a split has {TEST_FROM} seeds, got start {start} and count {count}")
+    first = {"train": start, "test": TEST_FROM, "validation": VALIDATION_FROM}[split]
     return torch.arange(first, first + count)
 
 

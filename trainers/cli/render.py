@@ -96,7 +96,7 @@ def render(runs: Sequence[str], console: Console, choices: Choices) -> int:
     stem = "_".join([shown, scenario.name, str(index), *(p.stem for p in choices.checkpoints)])
     paths = _free_paths(choices.output, folders[0], stem)
     steps = _steps(choices, config.horizon, [path.suffix for path in paths])
-    arrival = fires_of(scenario).one_heldout(index, config.grid, config.horizon)
+    arrival = fires_of(scenario).test_fire(index, config.grid, config.horizon)
     episodes = [_play(panel, arrival, index, steps, console) for panel in panels]
     least, most = _ALONE if len(panels) == 1 else _BESIDE
     size = min(max(_CELL * max(config.grid), least), most)
