@@ -97,14 +97,14 @@ class ExplorationConfig:
 
 @dataclass(frozen=True, kw_only=True, config=_STRICT)
 class EvaluationConfig:
-    """Frozen policies on held-out fires."""
+    """Evaluations of the frozen policies."""
 
     episodes: Side
-    """held-out fires, one episode each, of the evaluation at the end"""
+    """number of test fires, one episode each, of the evaluation at the end"""
     interval: MaybeCount
     """episodes between evaluations during training; 0 for none"""
     interval_episodes: Side
-    """held-out fires of the evaluations during training"""
+    """number of validation fires, one episode each, of an evaluation during training"""
 
 
 @dataclass(frozen=True, kw_only=True, config=_STRICT)

@@ -1,4 +1,4 @@
-"""Evaluates a run's frozen policy and leaves table, eval.json, figures and an animation."""
+"""Evaluates the frozen policy of a run and writes eval.json, figures and an animation."""
 
 import platform
 from collections.abc import Callable
@@ -13,8 +13,10 @@ from emberlink.envs.utils.errors import UserError
 from emberlink.policies.scripted.registry import SCRIPTED
 from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.runs.run_folder import RunFolder
+from emberlink.trainers.terminal import OutputError
 
 from . import evaluate, plots
+from .results import LEARNED, Results
 
 _PACKAGES = ("emberlink", "torch", "torchrl", "tensordict", "numpy")
 
@@ -28,7 +30,7 @@ def evaluate_run(
     fires: int,
     report: Callable[[str], None],
     label: str = "",
-) -> evaluate.Results:
+) -> Results:
     """Evaluates a frozen policy and writes eval.json, the figures and one animation.
 
     Args:
@@ -36,9 +38,9 @@ def evaluate_run(
         config: of the run.
         actor: the frozen policy.
         checkpoint: where it is from.
-        fires: episodes, each on a held-out fire of its own.
-        report: told what is being done.
-        label: ends the names of the files, to keep them apart from those of the newest checkpoint.
+        fires: number of test fires, one episode each.
+        report: called with a line about each thing that is done.
+        label: ends the names of the files.
     """
 
     def say(fire: str, policy: str) -> None:
@@ -47,11 +49,13 @@ def evaluate_run(
     results = evaluate.evaluate(config, actor, fires=fires, report=say)
     try:
         _draw(run, config, actor, results, report, label)
+    except OutputError:
+        raise
     except OSError as error:
         raise UserError(
             f"{run.path / 'figures'}: cannot be written: {error.strerror or error}"
         ) from None
-    # Last: with it, an evaluation is whole.
+    # Written last: an evaluation with this file is complete.
     run.write(f"eval{label}.json", record(config, results, checkpoint=checkpoint.name, fires=fires))
     return results
 
@@ -60,7 +64,7 @@ def _draw(
     run: RunFolder,
     config: RunConfig,
     actor: evaluate.Policy,
-    results: evaluate.Results,
+    results: Results,
     report: Callable[[str], None],
     label: str,
 ) -> None:
@@ -76,10 +80,10 @@ def _draw(
     plots.timelapse(run.figure(f"timelapse_{name}{label}.png"), pictures, steps)
 
 
-def record(config: RunConfig, results: evaluate.Results, **about: Any) -> dict[str, Any]:
-    """What eval.json holds: enough to redo any statistics without running anything."""
+def record(config: RunConfig, results: Results, **about: Any) -> dict[str, Any]:
+    """Returns the content of eval.json: all measures of all episodes, and what was played."""
     configs = evaluate.evaluation_scenarios(config)
-    count = len(next(iter(results.values()))[evaluate.LEARNED]["coverage"])
+    count = len(next(iter(results.values()))[LEARNED]["coverage"])
     return {
         "method": config.method,
         "setup": config.setup,
@@ -90,7 +94,7 @@ def record(config: RunConfig, results: evaluate.Results, **about: Any) -> dict[s
         "held_out": {name: fires_of(configs[name]).about(count) for name in results},
         "environment": asdict(config.env),
         "communication": {
-            evaluate.LEARNED: config.comm,
+            LEARNED: config.comm,
             **{name: evaluate.scripted_config(config, name).comm for name in SCRIPTED},
         },
         "device": config.device,

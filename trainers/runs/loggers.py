@@ -70,7 +70,7 @@ class Wandb:
             exp_name=run.path.name,
             project=os.environ.get("WANDB_PROJECT", "emberlink"),
             id=before[-1].name.rpartition("-")[2] if before else None,
-            save_dir=str(run.path),
+            save_dir=str(run.path.absolute()),
             offline=offline,
             log_env_packages=False,  # it would stand in the configuration as "env"
             settings=wandb.Settings(

@@ -327,7 +327,7 @@ class Trainer:
         interval = config.evaluation.interval
         if interval and self.episode % interval == 0:
             for team, line in enumerate(lines):
-                line |= self._evaluate(team)
+                line |= evaluate.validate(self.configs[team], self.team_actor(team))
         seconds = round(self.elapsed(), 3)
         for team, (line, run) in enumerate(zip(lines, self.runs, strict=True)):
             self._keep_best(team, line)
@@ -339,7 +339,7 @@ class Trainer:
     def _keep_best(self, team: int, line: dict[str, Any]) -> None:
         """Writes the networks whose coverage is the highest so far.
 
-        On held-out fires, where there are evaluations during training; else the episode's own.
+        On validation fires, where there are evaluations during training; else the episode's own.
         """
         frozen = [value for name, value in line.items() if name.endswith("/coverage")]
         if self.config.evaluation.interval and not frozen:
@@ -368,15 +368,3 @@ class Trainer:
             counted | {name: column[team] for name, column in values.items()}
             for team in range(self.teams)
         ]
-
-    def _evaluate(self, team: int) -> dict[str, float]:
-        """A seed's frozen policy on held-out fires: "fire/measure" -> mean."""
-        config = self.configs[team]
-        results = evaluate.evaluate(
-            config, self.team_actor(team), fires=config.evaluation.interval_episodes, scripted=False
-        )
-        return {
-            f"{fire}/{name}": value
-            for fire, by_policy in results.items()
-            for name, value in evaluate.means(by_policy[evaluate.LEARNED]).items()
-        }
