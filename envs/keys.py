@@ -41,11 +41,11 @@ TARGET: Final = (AGENTS, "target")
 FOLLOWS: Final = (AGENTS, "follows")
 """int64 [...]: the discoverer that the UAV follows, itself for a discoverer, -1 for nobody. Written
 by communication."""
-BEYOND: Final = (AGENTS, "beyond")
+HIT_BOUNDARY: Final = (AGENTS, "hit_boundary")
 """bool [..., 3]: the axes along which the last move would have left the box."""
 
-STREAM: Final = "stream"
-"""int64 [num_envs]: this episode's random stream, see `emberlink.envs.utils.counter_rng`."""
+RNG_KEY: Final = "rng_key"
+"""int64 [num_envs]: the key of this episode's random numbers (`envs.utils.counter_rng`)."""
 STEP: Final = "step"
 """int64 [num_envs]: steps since the episode began."""
 SEEN: Final = "seen"

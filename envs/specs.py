@@ -30,12 +30,12 @@ def observation_spec(envs: int, uavs: int, window: int | None = None) -> Composi
         keys.NO_FIRE[1]: whole(*agents),
         keys.NEW_CENTRE[1]: real(*agents, 2),
         keys.OLD_CENTRE[1]: real(*agents, 2),
-        keys.BEYOND[1]: Binary(shape=torch.Size((*agents, 3)), dtype=torch.bool),
+        keys.HIT_BOUNDARY[1]: Binary(shape=torch.Size((*agents, 3)), dtype=torch.bool),
     }
     if window is not None:
         shape = torch.Size((*agents, 3, window, window))
         per_uav[keys.WINDOW[1]] = Binary(shape=shape, dtype=torch.bool)
-    per_env = {key: whole(envs) for key in (keys.STREAM, keys.STEP, keys.SEEN, keys.BURNING)}
+    per_env = {key: whole(envs) for key in (keys.RNG_KEY, keys.STEP, keys.SEEN, keys.BURNING)}
     return Composite({keys.AGENTS: Composite(per_uav, shape=agents), **per_env}, shape=(envs,))
 
 

@@ -77,7 +77,7 @@ def test_all_policies_start_alike_on_the_same_fires(cache, monkeypatch):
     def play(env, policy):
         moment = env.reset()
         world = env.base_env
-        seen = moment["agents", "position"].tolist(), world.arrival.tolist()
+        seen = moment["agents", "position"].tolist(), world.arrival_time.tolist()
         begun.setdefault(len(begun), seen)
         return {name: torch.zeros(evaluate.BLOCK) for name in metrics.NAMES}
 

@@ -18,7 +18,7 @@ from emberlink.envs.fire.generator import burning_cells, fire_seeds, load_scenar
 from emberlink.envs.fire_files import bank_writer
 from emberlink.envs.fire_files.bank_writer import write_bank
 from emberlink.envs.scenarios import fires_of
-from emberlink.envs.utils.atomic_io import published
+from emberlink.envs.utils.publish import published
 from emberlink.trainers.cli import main
 from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.fires import plot

@@ -9,21 +9,18 @@ another grid lengths, and with them rates, are scaled by min(X, Y)/30, so that i
 
 import dataclasses
 import math
-from importlib import resources
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Literal, get_args
 
 import torch
-from omegaconf import OmegaConf
-from omegaconf.errors import OmegaConfBaseException
 from pydantic import AfterValidator, ConfigDict, Field, Strict, ValidationError
 from pydantic.dataclasses import dataclass
 from torch import Tensor
-from yaml import YAMLError
 
+from emberlink.configs import known, read
 from emberlink.envs.config import check_grid
-from emberlink.envs.utils.counter_rng import fold, uniform
+from emberlink.envs.utils.counter_rng import Use, fold_in, uniform
 from emberlink.envs.utils.errors import UserError
-from emberlink.envs.utils.validation import Name, describe, known
+from emberlink.envs.utils.validation import Name, describe
 
 from .advection import current, longest_step, tide_speed
 from .ellipse import MAX_LENGTH_TO_BREADTH
@@ -34,7 +31,6 @@ TEST_FROM = 1_000_000
 VALIDATION_FROM = 2_000_000
 Split = Literal["train", "validation", "test"]
 
-_STREAM = 0xF12E  # keeps a fire's draws apart from other uses of the same seed
 _NODES = 60  # nodes along the shorter side at least: twice the resolution of 30 cells
 _CHUNK = 200_000  # nodes computed at a time, so that the work stays in the processor's cache
 _LEAST = 1e-6  # radius of a patch, cells: its square is no number below some 1e-19
@@ -120,7 +116,7 @@ _DRAWN = tuple(f.name for f in dataclasses.fields(FireConfig) if f.name not in _
 
 def scenarios() -> list[str]:
     """Names of the generator's scenarios: the files in `configs/fire` that have no `kind`."""
-    return [name for name in known("fire") if "kind" not in _values(name)]
+    return [name for name in known("fire") if "kind" not in read("fire", name)]
 
 
 def load_scenario(name: str) -> FireConfig:
@@ -129,25 +125,13 @@ def load_scenario(name: str) -> FireConfig:
     Raises:
         ValueError: no such file, or a value in it that `FireConfig` does not take.
     """
-    values = _values(name) if name in known("fire") else None
+    values = read("fire", name) if name in known("fire") else None
     if values is None or "kind" in values:
         raise UserError(f"unknown fire {name!r}; known: {', '.join(scenarios())}")
     try:
         return FireConfig(**values)
     except ValidationError as error:
         raise UserError(f"configs/fire/{name}.yaml: {describe(error)}") from None
-
-
-def _values(name: str) -> dict[str, Any]:
-    file = resources.files("emberlink.configs").joinpath("fire", f"{name}.yaml")
-    try:
-        values: Any = OmegaConf.to_container(OmegaConf.create(file.read_text(encoding="utf-8")))
-    except (YAMLError, OmegaConfBaseException) as error:
-        reason = " ".join(str(error).split())[:200]
-        raise UserError(f"configs/fire/{name}.yaml: cannot be read: {reason}") from None
-    if not isinstance(values, dict):
-        raise UserError(f"configs/fire/{name}.yaml: expected keys and values")
-    return values
 
 
 def fire_seeds(split: Split, count: int, start: int = 0) -> Tensor:
@@ -243,16 +227,16 @@ def _spread(
     return arrival.masked_fill(depth > draw["ring_width"][:, None, None] * scale, math.inf)
 
 
-def _unit(field: str, seeds: Tensor, lanes: int) -> Tensor:
-    """Uniform draws on (0, 1), float32 [fires, lanes], from the stream of a seed and a field."""
-    key = torch.tensor([_STREAM, _DRAWN.index(field)], device=seeds.device)
-    return uniform(fold(fold(seeds, key[0]), key[1]), lanes)
+def _unit(field: str, seeds: Tensor, count: int) -> Tensor:
+    """Uniform draws on (0, 1), float32 [fires, count], from the key of a seed and a field."""
+    key = torch.tensor([Use.FIRE_PARAMETER, _DRAWN.index(field)], device=seeds.device)
+    return uniform(fold_in(fold_in(seeds, key[0]), key[1]), count)
 
 
-def _draw(config: FireConfig, field: str, seeds: Tensor, lanes: int = 1) -> Tensor:
-    """Uniform draws from the range of a field, float32 [fires, lanes]."""
+def _draw(config: FireConfig, field: str, seeds: Tensor, count: int = 1) -> Tensor:
+    """Uniform draws from the range of a field, float32 [fires, count]."""
     low, high = getattr(config, field)
-    return low + (high - low) * _unit(field, seeds, lanes)
+    return low + (high - low) * _unit(field, seeds, count)
 
 
 def _axes(grid: tuple[int, int], device: torch.device) -> tuple[Tensor, Tensor]:

@@ -14,6 +14,8 @@ from torch import Tensor
 
 from emberlink.envs.config import check_grid
 from emberlink.envs.fire.generator import Split
+from emberlink.envs.fire_files.bank_reader import MOST_CELLS
+from emberlink.envs.utils.atomic_io import open_regular, replaced
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import Name, printable
 
@@ -30,6 +32,8 @@ from .projection import one_line, quiet
 READER_VERSION = 3  # raise it whenever the same file gives another grid
 KEPT = "fires.npz"
 """the file of a run folder that holds the run's own copy of its grids"""
+_MOST_KEPT = 8 * MOST_CELLS + 1_000_000
+"""bytes of that copy, unpacked: float32 of the cells of every set"""
 _EVERY, _VALIDATION, _TEST = 5, 3, 4  # remainders of the numbers of validation and test fires
 _Number = Annotated[float, Field(allow_inf_nan=False)]
 _Time = _Number | Annotated[str, Field(min_length=1, max_length=40)]
@@ -227,15 +231,13 @@ def keep(config: FileFireConfig, folder: Path, grid: tuple[int, int], horizon: i
         ValueError: it cannot be written.
     """
     fires = splits(config, grid, horizon)
-    partial = folder / (KEPT + ".part")
     try:
-        with partial.open("wb") as file:
+        with replaced(folder / KEPT) as partial, partial.open("wb") as file:
             np.savez_compressed(
                 file,
                 key=np.array(_key(config, grid, horizon)),
                 **{split: values.numpy() for split, values in fires.items()},
             )
-        partial.replace(folder / KEPT)
     except OSError as error:
         raise UserError(f"{folder / KEPT}: cannot be written: {error.strerror or error}") from None
 
@@ -251,10 +253,15 @@ def _read_kept(
     config: FileFireConfig, grid: tuple[int, int], horizon: int
 ) -> dict[Split, Tensor] | None:
     """The run's own copy, or None if there is none, or it is damaged or of another grid."""
-    if config.kept is None or config.sha256 is None or not Path(config.kept).is_file():
+    if config.kept is None or config.sha256 is None:
         return None
     try:
-        with np.load(config.kept, allow_pickle=False) as found:
+        with (
+            open_regular(Path(config.kept), _MOST_KEPT) as file,
+            np.load(file, allow_pickle=False) as found,
+        ):
+            if sum(part.file_size for part in found.zip.filelist) > _MOST_KEPT:
+                return None
             if str(found["key"]) != _key(config, grid, horizon):
                 return None
             fires: dict[Split, Any] = {split: found[split] for split in get_args(Split)}

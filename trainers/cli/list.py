@@ -44,7 +44,7 @@ def _list(options: argparse.Namespace, console: "Console") -> int:
 
 
 def _names(kind: str) -> list[str]:
-    from emberlink.envs.utils.validation import known
+    from emberlink.configs import known
     from emberlink.policies.scripted.registry import SCRIPTED
 
     return list(SCRIPTED) if kind == "policies" else known(_GROUPS[kind])

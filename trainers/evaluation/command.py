@@ -11,6 +11,7 @@ from emberlink.trainers.config.compose import override
 from emberlink.trainers.config.schema import RunConfig, check_device
 from emberlink.trainers.runs.pretrained import open_run
 from emberlink.trainers.runs.run_folder import RunFolder
+from emberlink.trainers.runs.seal import check_trained_with
 
 from .actor import load_actor
 from .evaluate import Policy
@@ -50,6 +51,7 @@ def evaluate_folder(
     config = run.config(**({} if device is None else {"device": device}))
     label = f"_{checkpoint.stem}" if checkpoint else ""
     checkpoint = checkpoint or run.checkpoint()
+    check_trained_with(checkpoint, config)
     for text in overrides:
         if "=" not in text:
             raise UserError(f"{text!r}: one run is evaluated at a time; compare takes several runs")

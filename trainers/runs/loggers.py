@@ -16,6 +16,7 @@ import numpy as np
 from PIL import Image
 from torchrl.record.loggers import TensorboardLogger, WandbLogger
 
+from emberlink.envs.utils.atomic_io import inner_folder, remove_links
 from emberlink.envs.utils.errors import UserError
 from emberlink.trainers.config.compose import to_values
 from emberlink.trainers.config.schema import RunConfig
@@ -61,7 +62,9 @@ class Wandb:
 
     def __init__(self, config: RunConfig, run: RunFolder, episode: int):
         # The id is the last part of the name of the folder that wandb made.
-        before = sorted((run.path / "wandb").glob("*run-*-*"))
+        folder = inner_folder(run.path, "wandb")
+        remove_links(folder)  # wandb makes its own again
+        before = sorted(folder.glob("*run-*-*"))
         import wandb
 
         offline = os.environ.get("WANDB_MODE", "offline") in ("", "offline", "dryrun")
@@ -106,8 +109,11 @@ class Tensorboard:
 
     def __init__(self, config: RunConfig, run: RunFolder, episode: int):
         self._episodes = config.episodes
+        folder = inner_folder(run.path, "tensorboard")
+        remove_links(folder)
+        is_resumed = episode > 0 or any(folder.glob("events*"))
         self._logger = TensorboardLogger(exp_name="tensorboard", log_dir=str(run.path))
-        if episode or any((run.path / "tensorboard").glob("events*")):
+        if is_resumed:
             self._purge(episode + 1)
 
     def _purge(self, step: int) -> None:

@@ -6,13 +6,14 @@ from pathlib import Path
 
 from rich.console import Console
 
+from emberlink.configs import known
 from emberlink.envs.utils.errors import UserError
-from emberlink.envs.utils.validation import known
 from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.evaluation.command import evaluate_and_print
 from emberlink.trainers.evaluation.results import learned_means
 from emberlink.trainers.runs import loggers
+from emberlink.trainers.runs.run_folder import RunFolder
 from emberlink.trainers.runs.signals import Interrupted, Interruption
 from emberlink.trainers.runs.tracking import Trackers
 from emberlink.trainers.terminal import OutputError, TrainingProgress
@@ -168,9 +169,14 @@ def _evaluate(trainer: Trainer, console: Console) -> None:
     trackers = Trackers([config for _, config, *_ in seeds], runs, episode=trainer.config.episodes)
     trackers.log_evaluation(
         [learned_means(result) for result in results],
-        [sorted((run.path / "figures").glob("*.png")) for run in runs],
+        [_figures(run) for run in runs],
     )
     trackers.close()
+
+
+def _figures(run: RunFolder) -> list[Path]:
+    files = sorted((run.path / "figures").glob("*.png"))
+    return [file for file in files if file.is_file() and not file.is_symlink()]
 
 
 def _print_how_to_resume(trainer: Trainer, console: Console) -> None:
