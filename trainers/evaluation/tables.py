@@ -4,10 +4,12 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 from rich.console import Console
+from rich.table import Table
+from rich.text import Text
 
 from emberlink.envs import metrics
 from emberlink.trainers.config.schema import RunConfig
-from emberlink.trainers.terminal import Column, Row, Table, print_table
+from emberlink.trainers.terminal import print_table
 
 from .results import LEARNED, Results, means
 
@@ -28,39 +30,36 @@ def print_results(
     method, setup = configs[0].method, configs[0].setup
     for fire, by_policy in results[0].items():
         episodes = len(by_policy[LEARNED]["coverage"])
-        # One word below the other, so that all measures fit 80 columns.
-        columns = [Column(name.replace("_", "\n")) for name in metrics.NAMES]
-        table = Table(
-            f"test fires: {fire} ({episodes} episodes, mean; setup {setup})",
-            [Column("", right=False), *columns],
-        )
+        table = Table(title=Text(f"test fires: {fire} ({episodes} episodes, mean; setup {setup})"))
+        table.add_column()
+        for name in metrics.NAMES:
+            # One word below the other, so that all measures fit 80 columns.
+            table.add_column(name.replace("_", "\n"), justify="right")
         learned = [means(one[fire][LEARNED]) for one in results]
         if len(results) == 1:
-            table.rows.append(_row(method, learned[0], "bold"))
+            _add_row(table, method, learned[0], "bold")
         else:
-            table.rows += _rows_of_seeds(method, learned, [config.seed for config in configs])
+            _add_seeds(table, method, learned, [config.seed for config in configs])
         for policy, measured in by_policy.items():
             if policy != LEARNED:
-                table.rows.append(_row(policy, means(measured)))
+                _add_row(table, policy, means(measured))
         print_table(console, table)
 
 
-def _rows_of_seeds(
-    method: str, learned: Sequence[Mapping[str, float]], seeds: Sequence[int]
-) -> list[Row]:
-    """Returns a row per seed, their mean and their standard deviation."""
-    table = {name: [one[name] for one in learned] for name in metrics.NAMES}
-    mean = {name: float(np.mean(values)) for name, values in table.items()}
-    deviation = {name: float(np.std(values, ddof=1)) for name, values in table.items()}
-    return [
-        _row(method, mean, "bold"),
-        *(_row(f"  seed {seed}", one) for seed, one in zip(seeds, learned, strict=True)),
-        _row("  std. dev.", deviation),
-    ]
+def _add_seeds(
+    table: Table, method: str, learned: Sequence[Mapping[str, float]], seeds: Sequence[int]
+) -> None:
+    """Adds the mean over the seeds, a row per seed, and the standard deviation."""
+    values = {name: [one[name] for one in learned] for name in metrics.NAMES}
+    _add_row(table, method, {name: float(np.mean(of)) for name, of in values.items()}, "bold")
+    for seed, one in zip(seeds, learned, strict=True):
+        _add_row(table, f"  seed {seed}", one)
+    deviation = {name: float(np.std(of, ddof=1)) for name, of in values.items()}
+    _add_row(table, "  std. dev.", deviation)
 
 
-def _row(name: str, measured: Mapping[str, float], style: str = "") -> Row:
-    return Row([name, *(_number(one, measured[one]) for one in metrics.NAMES)], style)
+def _add_row(table: Table, name: str, measured: Mapping[str, float], style: str = "") -> None:
+    table.add_row(name, *(_number(one, measured[one]) for one in metrics.NAMES), style=style)
 
 
 def _number(measure: str, value: float) -> str:

@@ -2,14 +2,11 @@
 
 from .console import OutputError, SafeConsole
 from .progress import TrainingProgress
-from .table import Column, Row, Table, print_table
+from .table import print_table
 
 __all__ = [
-    "Column",
     "OutputError",
-    "Row",
     "SafeConsole",
-    "Table",
     "TrainingProgress",
     "print_table",
 ]

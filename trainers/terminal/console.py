@@ -7,6 +7,9 @@ from typing import Any
 
 from rich.console import Console, ConsoleOptions, RenderableType
 from rich.segment import Segment
+from rich.table import Table
+
+from .table import print_table
 
 _CONTROL_CODES = (
     *(code for code in range(0x20) if chr(code) not in "\t\n"),
@@ -35,6 +38,7 @@ class SafeConsole(Console):
     - Control characters in the text, such as escape sequences in a file's name, are replaced.
     - Brackets and colons in the text are printed as they are.
     - A width of 0 (`COLUMNS=0`) is ignored.
+    - A table that is wider than the output is printed in parts, see `print_table`.
     - An output that cannot be written to raises `OutputError`.
     """
 
@@ -50,6 +54,13 @@ class SafeConsole(Console):
     def line_width(self) -> int | None:
         """Columns of a line; None in a pipe or a file, unless `COLUMNS` sets them."""
         return self.width if self._is_limited else None
+
+    def print(self, *objects: Any, **options: Any) -> None:
+        """Prints as rich does; a table as `print_table` does."""
+        if len(objects) == 1 and isinstance(objects[0], Table):
+            print_table(self, objects[0])
+        else:
+            super().print(*objects, **options)
 
     def render(
         self, renderable: RenderableType, options: ConsoleOptions | None = None
