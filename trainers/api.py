@@ -19,8 +19,9 @@ from emberlink.trainers.comparison.report import (
 )
 from emberlink.trainers.config.compose import override, resolve
 from emberlink.trainers.config.schema import RunConfig
+from emberlink.trainers.evaluation.actor import load_actor
 from emberlink.trainers.evaluation.evaluate import evaluate as evaluate_policy
-from emberlink.trainers.evaluation.report import evaluate_run, load_actor
+from emberlink.trainers.evaluation.report import evaluate_run
 from emberlink.trainers.evaluation.results import Results
 from emberlink.trainers.runs import pretrained
 from emberlink.trainers.runs.run_folder import RunFolder

@@ -23,9 +23,9 @@ from emberlink.envs.scenarios import fires_of
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import from_plain, plain, shown, unknown
 from emberlink.policies.scripted.registry import SCRIPTED
+from emberlink.trainers.config.schema import RunConfig
 
 from .overrides import all_keys, flat, full_key, parse, put
-from .schema import RunConfig
 
 GROUPS = ("setup", "fire")
 """groups of which a user chooses a file by `GROUP=NAME`, beside the method"""

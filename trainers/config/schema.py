@@ -87,7 +87,7 @@ class EvaluationConfig:
     interval: CountOrZero
     """episodes between evaluations during training; 0 for none"""
     interval_episodes: Many
-    """episodes of an evaluation during training"""
+    """episodes of an evaluation during training, each on a validation fire of its own"""
 
 
 @dataclass(frozen=True, kw_only=True, config=_STRICT)

@@ -20,11 +20,10 @@ from pathlib import Path
 from emberlink.envs.fire_files.reader import KEPT
 from emberlink.envs.utils.errors import UserError
 from emberlink.trainers.config.compose import to_values
-from emberlink.trainers.evaluation.report import ACTOR
 from emberlink.trainers.runs.seal import check_trained_with
 
 from . import checkpoint_file
-from .run_folder import RunFolder
+from .run_folder import ACTOR, RunFolder
 
 PREFIX = "pretrained:"
 USUAL_SETUP = "tuned"
