@@ -8,12 +8,12 @@ from pydantic.dataclasses import dataclass
 from emberlink.envs.utils.errors import UserError
 
 Number = Annotated[float, Field(ge=-1e12, le=1e12)]
-"""so far below the largest float32 that no square of a sum over a view gets there"""
+"""bounded so that the square of a sum over a view cannot overflow float32"""
 
 
 @dataclass(frozen=True, kw_only=True, config=ConfigDict(extra="forbid", strict=True))
 class RewardConfig:
-    """What a UAV earns in one step (paper, section IV.C); the defaults are the paper's text."""
+    """The reward of a UAV in one step (paper, section IV.C); the defaults are the paper's."""
 
     new_fire: Number = 1.0
     """per cell in view that burns and was not seen before"""
@@ -28,13 +28,13 @@ class RewardConfig:
 
 
 SIDES = (8, 256)
-"""least and most cells along a side of a grid"""
+"""minimum and maximum cells along a side of a grid"""
 _Side = Annotated[int, Field(ge=SIDES[0], le=SIDES[1])]
 
 
 @dataclass(frozen=True, kw_only=True, config=ConfigDict(extra="forbid", strict=True))
 class WildfireConfig:
-    """The world and the team; the defaults are the paper's text."""
+    """The world and the team; the defaults are the paper's."""
 
     grid: Annotated[tuple[_Side, _Side], Strict(False)] = (30, 30)
     """cells along x and y"""
@@ -56,7 +56,7 @@ class WildfireConfig:
     observation_scale: Literal["raw", "box"] = "raw"
     """cells and steps as they are, or scaled: the box to [-1, 1], the horizon to [0, 1]"""
     reward: RewardConfig = RewardConfig()
-    """what a UAV earns"""
+    """the reward of a UAV"""
 
     @model_validator(mode="after")
     def _altitudes_in_order(self) -> "WildfireConfig":
@@ -76,10 +76,10 @@ class WildfireConfig:
 
 
 def check_grid(grid: tuple[int, int]) -> None:
-    """That a map has as many cells along each side as fires are made and read for.
+    """Checks that each side of a grid has a number of cells that fires are made and read for.
 
     Raises:
-        ValueError: it has not.
+        UserError: a side has fewer or more.
     """
     if not all(SIDES[0] <= side <= SIDES[1] for side in grid):
         raise UserError(f"grid must have {SIDES[0]} to {SIDES[1]} cells a side, got {grid}")

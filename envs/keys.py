@@ -1,7 +1,7 @@
 """The TensorDict keys of the environment, and the layout of one UAV's observation.
 
-Everything a UAV has stands under "agents", with batch size [num_envs, num_uavs]; everything an
-environment has stands at the root, with batch size [num_envs].
+Tensors per UAV stand under "agents", with batch size [num_envs, num_uavs]; tensors per environment
+stand at the root, with batch size [num_envs].
 """
 
 from typing import Final
@@ -24,15 +24,15 @@ REWARD: Final = (AGENTS, "reward")
 POSITION: Final = (AGENTS, "position")
 """float32 [..., 3]: x, y and z in cells."""
 NEW_FIRE: Final = (AGENTS, "new_fire")
-"""int64 [...]: cells in view that burn and that nobody had seen before."""
+"""int64 [...]: cells in view that burn and that no UAV had seen before."""
 OLD_FIRE: Final = (AGENTS, "old_fire")
-"""int64 [...]: cells in view that burn and that some UAV had seen before."""
+"""int64 [...]: cells in view that burn and that a UAV had seen before."""
 NO_FIRE: Final = (AGENTS, "no_fire")
 """int64 [...]: cells in view that do not burn."""
 NEW_CENTRE: Final = (AGENTS, "new_centre")
-"""float32 [..., 2]: mean x and y of the new fire in view, 0 where there is none."""
+"""float32 [..., 2]: mean x and y of the new fire in view, 0 without any."""
 OLD_CENTRE: Final = (AGENTS, "old_centre")
-"""float32 [..., 2]: mean x and y of the old fire in view, 0 where there is none."""
+"""float32 [..., 2]: mean x and y of the old fire in view, 0 without any."""
 HEARS: Final = (AGENTS, "hears")
 """bool [..., n]: the UAVs whose messages the UAV received at this step, False for itself. Written
 by communication."""
@@ -49,12 +49,12 @@ RNG_KEY: Final = "rng_key"
 STEP: Final = "step"
 """int64 [num_envs]: steps since the episode began."""
 SEEN: Final = "seen"
-"""int64 [num_envs]: burning cells that some UAV has seen this episode."""
+"""int64 [num_envs]: burning cells that any UAV has seen this episode."""
 BURNING: Final = "burning"
 """int64 [num_envs]: cells that burn now."""
 
 FEATURES: Final = ("x", "y", "z", "new_fire", "old_fire", "timestep")
-"""What each number of a UAV's own observation is, in order (paper, section IV.C)."""
+"""the numbers of a UAV's own observation, in order (paper, section IV.C)"""
 
 
 def observation_keys(spec: Composite) -> list[tuple[str, str]]:

@@ -1,54 +1,77 @@
-"""The environment for PettingZoo: a `ParallelEnv` over the same core."""
+"""The environment for PettingZoo: a `ParallelEnv` over `WildfireEnv`."""
 
+import dataclasses
 from typing import Any, ClassVar
 
 import numpy as np
 import torch
-from gymnasium.spaces import Box
+from gymnasium.spaces import Box, Dict, Space
 from numpy.typing import NDArray
-from pettingzoo import ParallelEnv
+from pettingzoo import AECEnv, ParallelEnv
+from pettingzoo.utils.conversions import parallel_to_aec
 from tensordict import TensorDictBase
 from torchrl.envs import EnvBase, TransformedEnv, step_mdp
 
-from emberlink.envs.config import WildfireConfig
-from emberlink.envs.rendering.frame import Window
+from emberlink.envs.rendering.window import Window
 from emberlink.envs.utils.errors import UserError
 
 from . import keys
-from .wildfire import WildfireEnv
+from .config import WildfireConfig
+from .wildfire import WildfireEnv, default_config
 
 Array = NDArray[np.float32]
+Observation = Array | dict[str, NDArray[Any]]
 
-_NOT_INFO = (keys.OBSERVATION[1], keys.ACTION[1], keys.REWARD[1])
+_NOT_INFO = (keys.OBSERVATION[1], keys.WINDOW[1], keys.ACTION[1], keys.REWARD[1])
 
 
 def parallel_env(
-    env: EnvBase | None = None, *, render_mode: str | None = None, **kwargs: Any
+    env: EnvBase | None = None,
+    *,
+    render_mode: str | None = None,
+    max_cycles: int | None = None,
+    **kwargs: Any,
 ) -> "WildfireParallelEnv":
-    """The wildfire environment with PettingZoo's parallel API.
+    """Returns the wildfire environment with PettingZoo's parallel API.
 
     Args:
         env: a TorchRL environment of batch size [1] over a `WildfireEnv`, such as
             `emberlink.trainers.make_env` returns; without it, a `WildfireEnv` is made.
         render_mode: "rgb_array", "human" (a window) or None.
+        max_cycles: steps of an episode, in place of the config's horizon.
         kwargs: for `WildfireEnv`, if there is no `env`.
 
     Raises:
-        ValueError: another render mode, more than one environment, `env` beside `kwargs`, or
-            what `WildfireEnv` does not take.
+        UserError: another render mode, more than one environment, `env` beside other settings, or
+            an argument that `WildfireEnv` does not take.
     """
-    if env is not None and kwargs:
-        raise UserError(f"a ready environment takes no further settings, got {sorted(kwargs)}")
+    if env is not None and (kwargs or max_cycles is not None):
+        given = sorted([*kwargs, *(["max_cycles"] if max_cycles is not None else [])])
+        raise UserError(f"a ready environment takes no further settings, got {given}")
+    if max_cycles is not None:
+        config = kwargs.get("config") or default_config(kwargs.get("fire"))
+        kwargs["config"] = dataclasses.replace(config, horizon=max_cycles)
     if env is None:
         env = WildfireEnv(**{"num_envs": 1, **kwargs})
     return WildfireParallelEnv(env, render_mode)
 
 
+def env(**kwargs: Any) -> AECEnv:
+    """Returns the environment with PettingZoo's AEC API; arguments as for `parallel_env`."""
+    return parallel_to_aec(parallel_env(**kwargs))
+
+
 class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
-    """One environment's UAVs as PettingZoo's agents "uav_0", "uav_1", ...; see `parallel_env`.
+    """The UAVs of one environment as PettingZoo's agents "uav_0", "uav_1", ...
 
     All agents are truncated together at the horizon, and never terminated. `infos` hold, for each
-    agent, what the TorchRL environment has under ("agents", ...), and the cells seen and burning.
+    agent, the other tensors under ("agents", ...) of the TorchRL environment, and the numbers of
+    cells seen and burning. With `observation: window` an observation is a dictionary of
+    "observation", float32 [6], and "window", uint8 [3, W, W].
+
+    Args:
+        env: see `parallel_env`.
+        render_mode: "rgb_array", "human" or None.
     """
 
     metadata: ClassVar[dict[str, Any]] = {  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -69,78 +92,99 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
             raise UserError(f"env: a batch size of [1] is needed, got {list(env.batch_size)}")
         self.render_mode = render_mode
         self._env, self._core, self._window = env, core, None
-        self._moment: TensorDictBase | None = None
-        self.possible_agents = [f"uav_{i}" for i in range(core.config.num_uavs)]
+        self._now: TensorDictBase | None = None
+        self.possible_agents = core.group_map[keys.AGENTS]
         self.agents: list[str] = []
-        features = env.observation_spec[keys.OBSERVATION].shape[-1]
-        low, high = _bounds(core.config, features)
+        vector, window = _spaces(env, core)
         # One space object per agent, kept: PettingZoo seeds and compares them by identity.
-        self._observation_spaces = {
-            a: Box(low, high, dtype=np.float32) for a in self.possible_agents
+        self.observation_spaces: dict[str, Space] = {
+            agent: _observation_space(vector, window) for agent in self.possible_agents
         }
-        self._action_spaces = {a: Box(-1.0, 1.0, (3,), np.float32) for a in self.possible_agents}
+        self.action_spaces: dict[str, Space] = {
+            agent: Box(-1.0, 1.0, (3,), np.float32) for agent in self.possible_agents
+        }
+        team = len(self.possible_agents)
+        self.state_space = Box(np.tile(vector.low, team), np.tile(vector.high, team))
 
-    def observation_space(self, agent: str) -> Box:
-        return self._observation_spaces[agent]
+    def observation_space(self, agent: str) -> Space:
+        """Returns the space of an agent's observations, the same object at each call."""
+        return self.observation_spaces[agent]
 
-    def action_space(self, agent: str) -> Box:
-        return self._action_spaces[agent]
+    def action_space(self, agent: str) -> Space:
+        """Returns the space of an agent's actions, the same object at each call."""
+        return self.action_spaces[agent]
 
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[dict[str, Array], dict[str, dict[str, Any]]]:
-        """A new episode: the first one of `seed` if there is one, else the next one."""
+    ) -> tuple[dict[str, Observation], dict[str, dict[str, Any]]]:
+        """Starts an episode: the first of `seed` if it is given, else the next.
+
+        Args:
+            seed: of all random numbers from here on.
+            options: "position", start positions in cells, [num_uavs, 3].
+
+        Raises:
+            UserError: another option, or positions outside of the box.
+        """
+        options = dict(options or {})
+        options.pop("options", None)  # PettingZoo's own tests pass {"options": 1}
+        if unknown := sorted(set(options) - {"position"}):
+            raise UserError(f"options: {', '.join(unknown)} not known; known: position")
         if seed is not None:
             self._env.set_seed(seed)
-        self._moment = self._env.reset()
+        self._now = self._env.reset(**options)
         self.agents = list(self.possible_agents)
         self._show()
-        return self._observations(self._moment), self._infos(self._moment)
+        return self._observations(self._now), self._infos(self._now)
 
     def step(
         self, actions: dict[str, Array]
     ) -> tuple[
-        dict[str, Array],
+        dict[str, Observation],
         dict[str, float],
         dict[str, bool],
         dict[str, bool],
         dict[str, dict[str, Any]],
     ]:
-        """All UAVs act at once.
+        """Moves all UAVs at once.
 
         Raises:
-            ValueError: not one action of three numbers for each live agent, or no episode runs.
+            UserError: not one action of three numbers for each live agent, or no episode runs.
         """
-        if self._moment is None or not self.agents:
+        if self._now is None or not self.agents:
             raise UserError("no episode is running: call reset() before step()")
-        if set(actions) != set(self.agents):
-            raise UserError(f"actions for {sorted(actions)}; the agents are {self.agents}")
-        action = np.stack(
-            [np.asarray(actions[agent], np.float32) for agent in self.possible_agents]
-        )
-        if action.shape != (len(self.possible_agents), 3):
-            raise UserError(f"an action is an array of shape (3,), got {action.shape[1:]}")
-        self._moment.set(keys.ACTION, torch.from_numpy(action[None]).to(self._core.device))
-        moment = self._env.step(self._moment)
-        self._moment = step_mdp(moment, keep_other=True)
-        following = moment.get("next")
-        rewards = following.get(keys.REWARD)[0, :, 0].tolist()
-        terminated, truncated = bool(following["terminated"]), bool(following["truncated"])
+        action = self._stacked(actions)
+        self._now.set(keys.ACTION, torch.from_numpy(action[None]).to(self._core.device))
+        stepped = self._env.step(self._now)
+        self._now = step_mdp(stepped, keep_other=True)
+        after = stepped.get("next")
+        rewards = after.get(keys.REWARD)[0, :, 0].tolist()
+        terminated, truncated = bool(after.get("terminated")), bool(after.get("truncated"))
         self.agents = [] if terminated or truncated else list(self.possible_agents)
         self._show()
         return (
-            self._observations(following),
+            self._observations(after),
             dict(zip(self.possible_agents, rewards, strict=True)),
             dict.fromkeys(self.possible_agents, terminated),
             dict.fromkeys(self.possible_agents, truncated),
-            self._infos(following),
+            self._infos(after),
         )
 
-    def render(self) -> NDArray[np.uint8] | None:
-        """The picture, uint8 [height, width, 3], or None when it is shown in a window.
+    def state(self) -> Array:
+        """Returns the vectors of all UAVs one after another, float32 [n * features].
 
         Raises:
-            ValueError: the environment was made without a render mode.
+            UserError: no episode has been started.
+        """
+        if self._now is None:
+            raise UserError("no episode is running: call reset() before state()")
+        return self._now.get(keys.OBSERVATION)[0].flatten().cpu().numpy().copy()
+
+    def render(self) -> NDArray[np.uint8] | None:
+        """Returns the picture, uint8 [height, width, 3], or None if it is shown in a window.
+
+        Raises:
+            UserError: the environment was made without a render mode.
         """
         if self.render_mode is None:
             known = self.metadata["render_modes"]
@@ -156,25 +200,67 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
             self._window.close()
             self._window = None
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Returns the state for copies, which have no window until they are rendered."""
+        return {**self.__dict__, "_window": None}
+
     def _show(self) -> None:
         if self.render_mode == "human":
             self.render()
 
-    def _observations(self, moment: TensorDictBase) -> dict[str, Array]:
-        rows = moment.get(keys.OBSERVATION)[0].cpu().numpy()
-        return {agent: row.copy() for agent, row in zip(self.possible_agents, rows, strict=True)}
+    def _stacked(self, actions: dict[str, Array]) -> Array:
+        """Returns the actions in the order of the agents, float32 [n, 3]."""
+        if set(actions) != set(self.agents):
+            raise UserError(f"actions for {sorted(actions)}; the agents are {self.agents}")
+        rows = [np.asarray(actions[agent], np.float32) for agent in self.possible_agents]
+        for agent, row in zip(self.possible_agents, rows, strict=True):
+            if row.shape != (3,):
+                raise UserError(f"an action is an array of shape (3,), got {row.shape} for {agent}")
+        return np.stack(rows)
 
-    def _infos(self, moment: TensorDictBase) -> dict[str, dict[str, Any]]:
-        per_uav = moment.get(keys.AGENTS)[0].exclude(*_NOT_INFO).cpu().numpy()
-        shared = {key: int(moment.get(key)) for key in (keys.SEEN, keys.BURNING)}
+    def _observations(self, td: TensorDictBase) -> dict[str, Observation]:
+        vectors = td.get(keys.OBSERVATION)[0].cpu().numpy().copy()
+        if keys.WINDOW not in td.keys(True):
+            return dict(zip(self.possible_agents, vectors, strict=True))
+        windows = td.get(keys.WINDOW)[0].to(torch.uint8).cpu().numpy().copy()
         return {
-            agent: {key: value[i].copy() for key, value in per_uav.items()} | shared
+            agent: {keys.OBSERVATION[1]: vector, keys.WINDOW[1]: window}
+            for agent, vector, window in zip(self.possible_agents, vectors, windows, strict=True)
+        }
+
+    def _infos(self, td: TensorDictBase) -> dict[str, dict[str, Any]]:
+        agents = td.get(keys.AGENTS)
+        values = {
+            key: agents.get(key)[0].cpu().numpy().copy()
+            for key in agents.keys()  # noqa: SIM118  (a TensorDict iterates over its rows)
+            if key not in _NOT_INFO
+        }
+        shared = {key: int(td.get(key)) for key in (keys.SEEN, keys.BURNING)}
+        return {
+            agent: {key: value[i] for key, value in values.items()} | shared
             for i, agent in enumerate(self.possible_agents)
         }
 
 
+def _spaces(env: EnvBase, core: WildfireEnv) -> tuple[Box, Box | None]:
+    """Returns the spaces of the vector and of the window, if there is one."""
+    low, high = _bounds(core.config, env.observation_spec[keys.OBSERVATION].shape[-1])
+    window = None
+    if keys.WINDOW in keys.observation_keys(env.observation_spec):
+        window = Box(0, 1, env.observation_spec[keys.WINDOW].shape[-3:], np.uint8)
+    return Box(low, high, dtype=np.float32), window
+
+
+def _observation_space(vector: Box, window: Box | None) -> Space:
+    """Returns a new space of one agent's observations."""
+    copied = Box(vector.low, vector.high, dtype=np.float32)
+    if window is None:
+        return copied
+    return Dict({keys.OBSERVATION[1]: copied, keys.WINDOW[1]: Box(0, 1, window.shape, np.uint8)})
+
+
 def _bounds(config: WildfireConfig, features: int) -> tuple[Array, Array]:
-    """The smallest and largest observation; infinite where communication wrote more numbers."""
+    """Returns the smallest and largest vector; infinite where communication added numbers."""
     if features != len(keys.FEATURES):
         limit = np.full(features, np.inf, np.float32)
         return -limit, limit

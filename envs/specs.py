@@ -1,18 +1,20 @@
-"""What the environment reads and writes, as TorchRL specs."""
+"""The tensors that the environment reads and writes, as TorchRL specs."""
 
 import torch
 from torchrl.data import Binary, Bounded, Composite, TensorSpec, Unbounded
 
 from . import keys
 
+DONE_NAMES = ("done", "terminated", "truncated")
+
 
 def observation_spec(envs: int, uavs: int, window: int | None = None) -> Composite:
-    """Everything that a moment holds but reward and done, batch size [envs]; see `keys`.
+    """Returns the spec of all that a reset writes but done, batch size [envs]; see `keys`.
 
     Args:
-        envs: environments.
-        uavs: UAVs in each.
-        window: cells along a side of the window that is observed; None without it.
+        envs: number of environments.
+        uavs: UAVs per environment.
+        window: cells along a side of the observed window; None without a window.
     """
     agents = (envs, uavs)
 
@@ -40,21 +42,33 @@ def observation_spec(envs: int, uavs: int, window: int | None = None) -> Composi
 
 
 def action_spec(envs: int, uavs: int) -> Composite:
-    """A displacement per UAV in [-1, 1] along x, y and z."""
+    """Returns the spec of the actions: a displacement per UAV in [-1, 1] along x, y and z."""
     action = Bounded(-1.0, 1.0, torch.Size((envs, uavs, 3)), dtype=torch.float32)
     agents = Composite({keys.ACTION[1]: action}, shape=(envs, uavs))
     return Composite({keys.AGENTS: agents}, shape=(envs,))
 
 
 def reward_spec(envs: int, uavs: int) -> Composite:
-    """A reward per UAV."""
+    """Returns the spec of the rewards, one per UAV."""
     reward = Unbounded(torch.Size((envs, uavs, 1)), dtype=torch.float32)
     agents = Composite({keys.REWARD[1]: reward}, shape=(envs, uavs))
     return Composite({keys.AGENTS: agents}, shape=(envs,))
 
 
-def done_spec(envs: int) -> Composite:
-    """Done, terminated (never) and truncated (at the horizon) per environment."""
-    names = ("done", "terminated", "truncated")
-    flags = {name: Binary(shape=torch.Size((envs, 1)), dtype=torch.bool) for name in names}
-    return Composite(flags, shape=(envs,))
+def done_spec(envs: int, uavs: int | None = None) -> Composite:
+    """Returns the spec of done, terminated (never true) and truncated (at the horizon).
+
+    Args:
+        envs: number of environments.
+        uavs: UAVs per environment where each has flags too; None for one set per environment.
+    """
+
+    def flags(*shape: int) -> dict[str, TensorSpec]:
+        return {
+            name: Binary(shape=torch.Size((*shape, 1)), dtype=torch.bool) for name in DONE_NAMES
+        }
+
+    root = flags(envs)
+    if uavs is not None:
+        root[keys.AGENTS] = Composite(flags(envs, uavs), shape=(envs, uavs))
+    return Composite(root, shape=(envs,))

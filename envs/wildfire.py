@@ -1,44 +1,50 @@
-"""The wildfire environment: glue between fire, motion, view and reward."""
+"""The wildfire environment: it joins fire, motion, sensor and reward."""
 
+import secrets
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from emberlink.envs.config import WildfireConfig
-from emberlink.envs.rendering import frame
 from emberlink.envs.utils import counter_rng
 from emberlink.envs.utils.buffers import Buffers
 from emberlink.envs.utils.counter_rng import Use
+from emberlink.envs.utils.device import check_device
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.world import motion
-from emberlink.envs.world.coverage_map import CoverageMap
+from emberlink.envs.world.coverage_map import CoverageMap, Sighting
 from emberlink.envs.world.reward import view_reward
 from emberlink.envs.world.sensor import Sensor
 
 from . import keys, specs
+from .config import WildfireConfig
 from .scenarios import ScenarioConfig, arrival_times
+from .team_view import TeamView
 
 
-class WildfireEnv(Buffers, EnvBase):
+class WildfireEnv(TeamView, Buffers, EnvBase):
     """A team of UAVs over a spreading fire, batched over environments.
 
     Args:
-        num_envs: environments that run side by side; the batch size is [num_envs].
-        config: the world and the team.
-        fire: a scenario's name, its config (training fires are drawn anew at each reset), or
-            arrival times in steps, inf where it never burns: [X, Y] for all environments or
+        num_envs: number of environments; the batch size is [num_envs].
+        config: constants of the world and the team.
+        fire: a scenario's name, its config (each reset draws one of its training fires), or
+            arrival times in steps, inf where a cell never burns: [X, Y] for all environments or
             [num_envs, X, Y] for one each.
-        seed: of everything random here. Environment i's randomness depends on (seed, i) alone.
-            Several seeds share the environments out between them, in order: each has as many, and
-            they are what they would be with that seed alone.
+        seed: of all random numbers; the first reset draws a fresh one if None. Environment i's
+            randomness depends on (seed, i) alone. Several seeds share the environments in order,
+            the same number for each, which are what they are with that seed alone.
         device: where all tensors live.
+        agent_done: whether done, terminated and truncated stand under "agents" too, per UAV.
+        staggered: whether environments are out of phase: the first episode of environment i after
+            seeding is truncated after horizon * (i + 1) / num_envs steps, rounded up.
 
     Raises:
-        ValueError: an unknown scenario, arrival times whose shape does not fit, or a number of
-            environments that the seeds cannot share out.
+        UserError: an unknown scenario or device, arrival times whose shape does not fit, or a
+            number of environments that is no multiple of the number of seeds.
     """
 
     _low: Tensor
@@ -50,33 +56,44 @@ class WildfireEnv(Buffers, EnvBase):
     _time: Tensor
     _position: Tensor
     _seen: Tensor
+    _first_length: Tensor
 
     def __init__(
         self,
         num_envs: int = 1,
         config: WildfireConfig | None = None,
         fire: str | ScenarioConfig | Tensor = "paper",
-        seed: int | Sequence[int] = 0,
+        seed: int | Sequence[int] | None = None,
         device: torch.device | str = "cpu",
+        *,
+        agent_done: bool = False,
+        staggered: bool = False,
     ):
         if num_envs < 1:
             raise UserError(f"num_envs={num_envs}: at least 1 is needed")
-        seeds = list(seed) if isinstance(seed, Sequence) else [int(seed)]
-        if min(seeds, default=-1) < 0:
-            raise UserError(f"seed={seed}: a number that is not negative is needed")
-        if num_envs % len(seeds):
-            raise UserError(f"num_envs={num_envs} is no multiple of the {len(seeds)} seeds")
+        check_device(str(device))
         super().__init__(device=device, batch_size=torch.Size([num_envs]))
-        if config is None:
-            config = WildfireConfig()
-            if isinstance(fire, Tensor) and fire.ndim in (2, 3):
-                config = WildfireConfig(grid=(fire.shape[-2], fire.shape[-1]))
-        self.config = config
+        self.config = default_config(fire) if config is None else config
+        self._agent_done, self._staggered = agent_done, staggered
+        self._fire_name = fire if isinstance(fire, str) else getattr(fire, "name", None)
+        self._make_world(fire)
+        self._make_specs()
+        self.to(self.device)
+        self._seeded = seed is not None
+        if seed is not None:
+            seeds = counter_rng.check_seeds(seed, num_envs)
+            parts = [counter_rng.seed_keys(s, num_envs // len(seeds), self.device) for s in seeds]
+            self._seed_key.copy_(torch.cat(parts))
+
+    def _make_world(self, fire: str | ScenarioConfig | Tensor) -> None:
+        """Registers the buffers: constants, and the state of all environments."""
+        config, num_envs = self.config, self.num_envs
         low, high = motion.corners(config.low, config.high)
         self.register_buffer("_low", low, persistent=False)
         self.register_buffer("_high", high, persistent=False)
         sensor = Sensor(config.grid, view_angle=config.view_angle, ceiling=high[2].item())
-        fires, self._fire_each = arrival_times(fire, config, num_envs)
+        self._side = sensor.side if config.observation == "window" else None
+        fires, self._one_fire_each = arrival_times(fire, config, num_envs)
         self._map = CoverageMap(
             sensor, fires, horizon=config.horizon, envs=num_envs, uavs=config.num_uavs
         )
@@ -84,73 +101,55 @@ class WildfireEnv(Buffers, EnvBase):
             self.register_buffer(name, torch.zeros(num_envs, dtype=torch.int64))
         position = torch.zeros(num_envs, config.num_uavs, 3, dtype=torch.float64)
         self.register_buffer("_position", position)
-        team = num_envs, config.num_uavs
-        self._side = sensor.side if config.observation == "window" else None
-        self.observation_spec = specs.observation_spec(*team, self._side)
-        self.action_spec = specs.action_spec(*team)
-        self.reward_spec = specs.reward_spec(*team)
-        self.done_spec = specs.done_spec(num_envs)
-        self.to(self.device)
-        self.set_seed(seeds[0])
-        each = [counter_rng.seed_keys(one, num_envs // len(seeds), self.device) for one in seeds]
-        self._seed_key.copy_(torch.cat(each))
+        place = torch.arange(1, num_envs + 1)
+        first_length = (place * config.horizon + num_envs - 1) // num_envs
+        self.register_buffer("_first_length", first_length, persistent=False)
 
-    @property
-    def fire_map(self) -> Tensor:
-        """The paper's map, uint8 [num_envs, X, Y]: 0 no fire, 1 seen, 2 not yet seen."""
-        burning = self.arrival_time <= self._time[:, None, None]
-        return burning.to(torch.uint8) * (2 - self._map.seen.to(torch.uint8))
+    def _make_specs(self) -> None:
+        envs, uavs = self.num_envs, self.n_agents
+        self.observation_spec = specs.observation_spec(envs, uavs, self._side)
+        self.action_spec = specs.action_spec(envs, uavs)
+        self.reward_spec = specs.reward_spec(envs, uavs)
+        self.done_spec = specs.done_spec(envs, uavs if self._agent_done else None)
 
-    @property
-    def arrival_time(self) -> Tensor:
-        """The fire of each environment: arrival times in steps, float32 [num_envs, X, Y]."""
-        return self._map.arrival_time
-
-    def render(self, mode: str = "rgb_array", *, env: int = 0):
-        """A picture of one environment in the paper's colours, uint8 [height, width, 3].
-
-        Raises:
-            ValueError: another mode than "rgb_array".
-        """
-        if mode != "rgb_array":
-            raise UserError(f"render mode {mode!r} is not known; known: 'rgb_array'")
-        return frame.frame(
-            self.fire_map[env].cpu().numpy(),
-            self._position[env].cpu().numpy(),
-            view_angle=self.config.view_angle,
-        )
+    def load_state_dict(self, *args: Any, **kwargs: Any):
+        """Restores a state, its seeds included; see `torch.nn.Module.load_state_dict`."""
+        self._seeded = True
+        return super().load_state_dict(*args, **kwargs)
 
     def _set_seed(self, seed: int | None) -> None:
-        count = self.batch_size[0]
-        self._seed_key.copy_(counter_rng.seed_keys(seed or 0, count, self.device))
+        seed = secrets.randbelow(2**62) if seed is None else seed
+        self._seed_key.copy_(counter_rng.seed_keys(seed, self.num_envs, self.device))
         self._episode.zero_()
+        self._seeded = True
 
-    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs) -> TensorDictBase:
-        """New positions and a new fire where "_reset" says so, else everywhere.
+    def _reset(
+        self,
+        tensordict: TensorDictBase | None = None,
+        *,
+        position: Tensor | None = None,
+        **unknown: Any,
+    ) -> TensorDictBase:
+        """Starts an episode in the environments that "_reset" names, else in all.
 
         Keyword Args:
             position: start positions in cells, [num_envs, num_uavs, 3] or [num_uavs, 3], in
                 place of random ones.
         """
+        if unknown:
+            raise UserError(f"reset: {', '.join(sorted(unknown))} not known; known: position")
+        if not self._seeded:
+            # Not before the first reset: copies of an unseeded environment draw their own seeds.
+            self._set_seed(None)
         mask = None if tensordict is None else tensordict.get("_reset", None)
         mask = torch.ones_like(self._time, dtype=torch.bool) if mask is None else mask.view(-1)
-        self._begin_episodes(mask)
-        start = self._start_positions(kwargs.get("position"))
+        self._start_episodes(mask)
+        start = self._start_positions(position)
         self._position.copy_(torch.where(mask[:, None, None], start, self._position))
-        # Nobody has looked yet: the first step counts what is in view.
-        nothing = torch.zeros_like(self._position, dtype=torch.int64)
-        nowhere = nothing.new_zeros((*nothing.shape, 2), dtype=torch.float32)
-        inside = torch.zeros_like(nothing, dtype=torch.bool)
-        return self._snapshot(self._position.float(), nothing, nowhere, inside, self._unseen())
+        hit_boundary = torch.zeros_like(self._position, dtype=torch.bool)
+        return self._snapshot(self._position.float(), self._no_sighting(), hit_boundary)
 
-    def _unseen(self) -> Tensor | None:
-        """Returns the window of UAVs that have not looked: bool [num_envs, n, 3, W, W], False."""
-        if self._side is None:
-            return None
-        shape = *self._position.shape, self._side, self._side
-        return torch.zeros(shape, dtype=torch.bool, device=self.device)
-
-    def _begin_episodes(self, mask: Tensor) -> None:
+    def _start_episodes(self, mask: Tensor) -> None:
         """Starts the next episode where a mask, bool [num_envs], is true."""
         self._episode.add_(mask)
         self._episode_key.copy_(counter_rng.fold_in(self._seed_key, self._episode))
@@ -160,27 +159,33 @@ class WildfireEnv(Buffers, EnvBase):
         self._map.start_episodes(mask, self._draw_fire())
 
     def _draw_fire(self) -> Tensor:
-        envs, fires = self.batch_size[0], len(self._map)
-        if self._fire_each:
-            return torch.arange(envs, device=self.device) % fires
-        unit = counter_rng.uniform(
-            counter_rng.fold_in(self._episode_key, Use.EPISODE_FIRE), 1
-        ).squeeze(-1)
-        return (unit.double() * fires).long()
+        """Returns the index of each environment's next fire, int64 [num_envs]."""
+        fires = len(self._map)
+        if self._one_fire_each:
+            return torch.arange(self.num_envs, device=self.device) % fires
+        key = counter_rng.fold_in(self._episode_key, Use.EPISODE_FIRE)
+        return (counter_rng.uniform(key, 1).squeeze(-1).double() * fires).long()
 
     def _start_positions(self, given: Tensor | None) -> Tensor:
+        """Returns start positions, float32 [num_envs, num_uavs, 3], random or as given."""
         if given is None:
             key = counter_rng.fold_in(self._episode_key, Use.START_POSITION)
-            return motion.random_points(key, self.config.num_uavs, self._low, self._high)
+            return motion.random_points(key, self.n_agents, self._low, self._high)
         given = torch.as_tensor(given, dtype=torch.float32, device=self.device)
         outside = (given < self._low) | (given > self._high)
         if given.shape[-2:] != self._position.shape[-2:] or outside.any() or given.isnan().any():
             raise UserError(
                 f"position: {tuple(given.shape)} with values {given.min():g} to {given.max():g}; "
-                f"expected [..., {self.config.num_uavs}, 3] inside the box "
+                f"expected [..., {self.n_agents}, 3] inside the box "
                 f"{self.config.low} to {self.config.high}"
             )
         return given.expand_as(self._position)
+
+    def _no_sighting(self) -> Sighting:
+        """Returns the sighting at reset: no UAV has looked yet."""
+        none = torch.zeros_like(self._position)
+        classes = none.new_zeros((*none.shape, (self._side or 0) ** 2), dtype=torch.bool)
+        return Sighting(none, none.new_zeros((*none.shape, 2), dtype=torch.float32), classes)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         config = self.config
@@ -193,39 +198,26 @@ class WildfireEnv(Buffers, EnvBase):
             high=self._high,
         )
         self._position.copy_(position)
-        counts, centres, classes = self._map.look(self._position, self._time.float())
-        window = None if self._side is None else classes.unflatten(-1, (self._side, self._side))
-        reward = view_reward(*counts.unbind(-1), hit_boundary=hit_boundary, config=config.reward)
-        counts = counts.long()
-        self._seen.add_(counts[..., 0].sum(-1))
-        return self._snapshot(position, counts, centres, hit_boundary, window, reward)
+        sighting = self._map.look(self._position, self._time.float())
+        reward = view_reward(*sighting.counts.unbind(-1), hit_boundary, config.reward)
+        self._seen.add_(sighting.counts[..., 0].sum(-1).long())
+        return self._snapshot(position, sighting, hit_boundary, reward)
 
     def _step_proc_data(self, next_tensordict_out: TensorDictBase) -> TensorDictBase:
-        """TorchRL completes here what a step has left out; ours leaves nothing out."""
+        """Returns its argument: TorchRL would add missing entries here, and there are none."""
         return next_tensordict_out
 
     def _snapshot(
         self,
         position: Tensor,
-        counts: Tensor,
-        centres: Tensor,
+        sighting: Sighting,
         hit_boundary: Tensor,
-        window: Tensor | None = None,
         reward: Tensor | None = None,
     ) -> TensorDict:
-        """The TensorDict of a moment.
-
-        Args:
-            position: float32 [num_envs, n, 3].
-            counts: int64 [num_envs, n, 3], cells in view that are new, old and no fire.
-            centres: float32 [num_envs, n, 3, 2], their means.
-            hit_boundary: bool [num_envs, n, 3].
-            window: bool [num_envs, n, 3, W, W]; None where it is not observed.
-            reward: float32 [num_envs, n]; a reset has none.
-        """
-        time = self._time.clone()
+        """Returns the TensorDict of a reset (without reward) or of a step."""
+        counts, time = sighting.counts.long(), self._time.clone()
         new, old, none = counts.unbind(-1)
-        new_centre, old_centre, _ = centres.unbind(-2)
+        new_centre, old_centre, _ = sighting.centres.unbind(-2)
         agents = {
             keys.OBSERVATION[1]: self._observe(position, counts, time),
             keys.POSITION[1]: position,
@@ -236,35 +228,51 @@ class WildfireEnv(Buffers, EnvBase):
             keys.OLD_CENTRE[1]: old_centre,
             keys.HIT_BOUNDARY[1]: hit_boundary,
         }
-        if window is not None:
-            agents[keys.WINDOW[1]] = window
+        if self._side is not None:
+            agents[keys.WINDOW[1]] = sighting.classes.unflatten(-1, (self._side, self._side))
         if reward is not None:
             agents[keys.REWARD[1]] = reward.unsqueeze(-1)
-        truncated = (time >= self.config.horizon).unsqueeze(-1)
-        whole = {
+        done = self._done(time)
+        if self._agent_done:
+            agents |= {k: v.unsqueeze(-1).repeat(1, self.n_agents, 1) for k, v in done.items()}
+        root = {
             keys.AGENTS: _tensordict(agents, position.shape[:-1], self.device),
             keys.RNG_KEY: self._step_key.clone(),
             keys.STEP: time,
             keys.SEEN: self._seen.clone(),
             keys.BURNING: self._map.count_burning(time),
-            "done": truncated,
-            "terminated": torch.zeros_like(truncated),
-            "truncated": truncated.clone(),
+            **done,
         }
-        return _tensordict(whole, self.batch_size, self.device)
+        return _tensordict(root, self.batch_size, self.device)
+
+    def _done(self, time: Tensor) -> dict[str, Tensor]:
+        """Returns the flags of each environment, bool [num_envs, 1]."""
+        length = self.config.horizon
+        if self._staggered:
+            length = torch.where(self._episode == 1, self._first_length, length)
+        truncated = (time >= length).unsqueeze(-1)
+        flags = truncated, torch.zeros_like(truncated), truncated.clone()
+        return dict(zip(specs.DONE_NAMES, flags, strict=True))
 
     def _observe(self, position: Tensor, counts: Tensor, time: Tensor) -> Tensor:
-        """x, y, z, new-fire flag, old-fire flag, timestep: float32 [num_envs, n, 6]."""
-        clock = time.view(-1, 1, 1).expand(-1, position.shape[1], 1)
+        """Returns x, y, z, new-fire flag, old-fire flag, timestep: float32 [num_envs, n, 6]."""
+        clock = time.float().view(-1, 1, 1).expand(-1, position.shape[1], 1)
         if self.config.observation_scale == "box":
             position = motion.scale_to_box(position, self._low, self._high)
             clock = clock / self.config.horizon
         return torch.cat((position, counts[..., :2] > 0, clock), -1)
 
 
-def _tensordict(source: dict, batch_size: torch.Size, device: torch.device | None) -> TensorDict:
-    """A TensorDict of tensors whose shapes and device are known to be right.
+def default_config(fire: Any) -> WildfireConfig:
+    """Returns the default config, on the grid of the fire where that is a tensor."""
+    if isinstance(fire, Tensor) and fire.ndim in (2, 3):
+        return WildfireConfig(grid=(fire.shape[-2], fire.shape[-1]))
+    return WildfireConfig()
 
-    Checking them one by one takes a quarter of a step of one environment.
+
+def _tensordict(source: dict, batch_size: torch.Size, device: torch.device | None) -> TensorDict:
+    """Returns a TensorDict of tensors whose shapes and device are known to be right.
+
+    Checking them takes a quarter of a step of one environment.
     """
     return TensorDict._new_unsafe(source, batch_size=batch_size, device=device)

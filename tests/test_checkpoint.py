@@ -189,7 +189,7 @@ def test_a_tensor_that_no_state_has_is_refused(group, stopped):
 
 
 @pytest.mark.parametrize(
-    "name", ["_episode", "_time", "_seen", "_episode_key", "_map._burning_start", "_map._stamp"]
+    "name", ["_episode", "_time", "_seen", "_episode_key", "_map._fire_index", "_map._stamp"]
 )
 @pytest.mark.parametrize("value", [-1, 1000, 2**31 - 2])
 def test_a_counter_of_the_world_out_of_range_is_refused(name, value, stopped):

@@ -137,6 +137,7 @@ def test_uses_have_the_numbers_that_results_were_made_with():
         "WAYPOINT": 100,
         "TARGET_JITTER": 101,
         "MESSAGE_LOSS": 102,
+        "FIRST_WAYPOINT_REDRAW": 103,
         "SCRIPTED_WAYPOINT": 200,
         "SCRIPTED_ACTION": 201,
         "EXPLORATION_NOISE": 300,

@@ -10,6 +10,7 @@ from typing import Any, get_args
 import numpy as np
 import pytest
 import torch
+from burning import burning_cells
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
@@ -20,7 +21,6 @@ from emberlink.envs.fire.generator import (
     TEST_FROM,
     FireConfig,
     Split,
-    burning_cells,
     fire_seeds,
     load_scenario,
     make_fires,

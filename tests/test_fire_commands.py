@@ -11,10 +11,11 @@ import numpy as np
 import pytest
 import rasterio
 import torch
+from burning import burning_cells
 from PIL import Image
 
 from emberlink.envs.fire.cache import GENERATOR_VERSION
-from emberlink.envs.fire.generator import burning_cells, fire_seeds, load_scenario, make_fires
+from emberlink.envs.fire.generator import fire_seeds, load_scenario, make_fires
 from emberlink.envs.fire_files import bank_writer
 from emberlink.envs.fire_files.bank_writer import write_bank
 from emberlink.envs.scenarios import fires_of

@@ -8,14 +8,14 @@ from tensordict import TensorDict
 from emberlink.envs import keys
 from emberlink.envs.rendering import marks, panels
 from emberlink.envs.rendering.frame import UAV
-from emberlink.envs.rendering.marks import LINK, ROLE_COLOURS, ROLES, Moment
+from emberlink.envs.rendering.marks import LINK, ROLE_COLOURS, ROLES, FrameData
 from emberlink.envs.rendering.panels import Episode, Screen
 from emberlink.trainers.evaluation import record_episode
 
 WHERE = [(2, 2, 1), (12, 2, 1), (22, 12, 1)]
 
 
-def moment(**changes) -> Moment:
+def moment(**changes) -> FrameData:
     values = {
         "step": 4,
         "seen": 3,
@@ -23,17 +23,17 @@ def moment(**changes) -> Moment:
         "fire_map": np.zeros((30, 20), np.uint8),
         "position": np.array(WHERE, np.float32),
     }
-    return Moment(**{**values, **changes})
+    return FrameData(**{**values, **changes})
 
 
-def screen(*moments: Moment, size: int = 360, **options) -> Screen:
-    shown = [Episode(title="one", view_angle=30.0, moments=[each]) for each in moments]
+def screen(*frames: FrameData, size: int = 360, **options) -> Screen:
+    shown = [Episode(title="one", view_angle=30.0, frames=[each]) for each in frames]
     return Screen(shown, size=size, **options)
 
 
-def drawn(*moments: Moment, panel: int = 0, **options) -> np.ndarray:
+def drawn(*frames: FrameData, panel: int = 0, **options) -> np.ndarray:
     """The map of one panel."""
-    made = screen(*moments, **options)
+    made = screen(*frames, **options)
     (x, y), (width, height) = made.map_corner(panel), made.map_size
     return made.picture(0)[y : y + height, x : x + width]
 
@@ -119,22 +119,22 @@ def test_each_panel_shows_its_own_episode():
 
 
 def test_the_legend_names_what_occurs_and_nothing_else():
-    def words(*moments, **options):
-        return [word for word, _ in screen(*moments, **options)._legend()]
+    def words(*frames, **options):
+        return [word for word, _ in screen(*frames, **options)._legend()]
 
     whole = moment(roles=np.zeros(3, int), links=linked(), target=np.zeros((3, 3)))
     ends = [*ROLES, "hear each other", "target"]
     assert words(moment()) == ["fire", "field of view", "UAV"]
     assert words(whole) == ["fire", "field of view", *ends]
     assert words(moment(), whole) == ["fire", "field of view", "UAV", *ends]
-    assert words(moment(), tell_seen=True)[:2] == ["fire", "fire, seen"]
+    assert words(moment(), grey_seen=True)[:2] == ["fire", "fire, seen"]
 
 
 def test_seen_fire_is_told_apart_only_where_asked():
     fire = np.zeros((30, 20), np.uint8)
     fire[25, 5], fire[27, 5] = 1, 2
     assert around(drawn(moment(fire_map=fire)), 25, 5) == {(255, 255, 255)}
-    told = drawn(moment(fire_map=fire), tell_seen=True)
+    told = drawn(moment(fire_map=fire), grey_seen=True)
     assert around(told, 25, 5) == {panels.SEEN_FIRE}
     assert around(told, 27, 5) == {(255, 255, 255)}
 
@@ -192,15 +192,15 @@ def test_links_roles_and_targets_are_drawn_where_the_tensordict_holds_them():
         keys.FOLLOWS[1]: torch.tensor([0, 0, -1]),
         keys.TARGET[1]: torch.ones(3, 3),
     }
-    seen = record_episode.moment(tensordict(9, **told), nothing, hears=True)
+    seen = record_episode.frame_data(tensordict(9, **told), nothing, hears=True)
     assert np.array_equal(seen.links, hears)
     assert seen.roles.tolist() == [0, 1, 2]
     assert np.array_equal(seen.target, np.ones((3, 3)))
-    links_alone = record_episode.moment(tensordict(18, hears=hears), nothing, hears=True)
+    links_alone = record_episode.frame_data(tensordict(18, hears=hears), nothing, hears=True)
     assert np.array_equal(links_alone.links, hears)
     assert links_alone.roles is links_alone.target is None
     for silent in (
-        record_episode.moment(tensordict(6), nothing, hears=True),
-        record_episode.moment(tensordict(9, **told), nothing, hears=False),
+        record_episode.frame_data(tensordict(6), nothing, hears=True),
+        record_episode.frame_data(tensordict(9, **told), nothing, hears=False),
     ):
         assert silent.links is silent.roles is silent.target is None

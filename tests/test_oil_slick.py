@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from burning import burning_cells
 from exact_front import exact_arrival
 from pydantic import ValidationError
 from torch import Tensor
@@ -15,7 +16,6 @@ from emberlink.envs.fire import generator
 from emberlink.envs.fire.ellipse import ellipse_rates
 from emberlink.envs.fire.generator import (
     FireConfig,
-    burning_cells,
     fire_seeds,
     load_scenario,
     make_fires,

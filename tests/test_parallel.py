@@ -1,15 +1,24 @@
 """The PettingZoo environment: its own tests, and equality with the TorchRL environment."""
 
+import copy
+
 import numpy as np
 import pytest
 import torch
 from pettingzoo import ParallelEnv
-from pettingzoo.test import api_test, parallel_api_test, parallel_seed_test, render_test
+from pettingzoo.test import (
+    api_test,
+    max_cycles_test,
+    parallel_api_test,
+    parallel_seed_test,
+    render_test,
+)
+from pettingzoo.test.state_test import state_test
 from pettingzoo.utils.conversions import parallel_to_aec
 from tensordict import TensorDict
 from torchrl.envs import EnvBase, SerialEnv, step_mdp
 
-from emberlink.envs import WildfireConfig, WildfireEnv, keys, parallel_env
+from emberlink.envs import WildfireConfig, WildfireEnv, keys, parallel_env, pettingzoo
 from emberlink.trainers import make_env
 
 pytestmark = pytest.mark.filterwarnings("error")
@@ -35,6 +44,11 @@ def test_pettingzoo_parallel_api():
 
 def test_pettingzoo_seeds():
     parallel_seed_test(small, num_cycles=100)
+
+
+def test_pettingzoo_max_cycles_and_state():
+    max_cycles_test(pettingzoo)
+    state_test(parallel_to_aec(small()), small(), num_cycles=20)
 
 
 def test_pettingzoo_rendering(monkeypatch):
@@ -140,6 +154,70 @@ def test_rendering(monkeypatch):
     assert window.render() is None
     window.close()
     window.close()
+
+
+def test_a_copy_with_an_open_window_goes_on_alone(monkeypatch):
+    monkeypatch.setenv("MPLBACKEND", "agg")
+    env = small(render_mode="human", seed=2)
+    env.reset()
+    other = copy.deepcopy(env)
+    assert other._window is None
+    actions = {agent: np.ones(3, np.float32) for agent in env.agents}
+    (here, *_), (there, *_) = env.step(actions), other.step(actions)
+    assert np.array_equal(here["uav_1"], there["uav_1"])
+    env.close()
+    other.close()
+
+
+def test_start_positions_are_an_option():
+    env = small()
+    position = np.array([[0.0, 9, 1], [11, 0, 4], [5, 5, 2]], np.float32)
+    observations, _ = env.reset(seed=1, options={"position": position})
+    assert np.array_equal(np.stack(list(observations.values()))[:, :3], position)
+    assert np.array_equal(env.state(), np.concatenate(list(observations.values())))
+    for options, message in (
+        ({"positions": position}, "positions not known; known: position"),
+        ({"position": position + 9}, "inside the box"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            env.reset(options=options)
+    with pytest.raises(ValueError, match=r"state\(\)"):
+        small().state()
+
+
+def test_spaces_are_listed():
+    env = small()
+    assert list(env.observation_spaces) == list(env.action_spaces) == env.possible_agents
+    assert env.observation_spaces["uav_1"] is env.observation_space("uav_1")
+    assert env.action_spaces["uav_1"] is env.action_space("uav_1")
+
+
+def test_max_cycles_is_the_horizon():
+    env = parallel_env(fire=FIRE, max_cycles=3)
+    assert env.unwrapped._core.config.horizon == 3
+    assert env.unwrapped._core.config.grid == (12, 10)
+    with pytest.raises(ValueError, match="max_cycles"):
+        parallel_env(recipe("independent"), max_cycles=3)
+
+
+def test_windows_are_a_dictionary():
+    config = WildfireConfig(grid=(12, 10), num_uavs=3, horizon=30, observation="window")
+    env = parallel_env(config=config, fire=FIRE, seed=4)
+    core = WildfireEnv(1, config, FIRE, seed=4)
+    parallel_api_test(parallel_env(config=config, fire=FIRE), num_cycles=40)
+    parallel_seed_test(lambda: parallel_env(config=config, fire=FIRE), num_cycles=20)
+    env.reset()
+    core.reset()
+    for _ in range(10):
+        push = {agent: env.action_space(agent).sample() for agent in env.agents}
+        observations, *_ = env.step(push)
+        action = torch.from_numpy(np.stack(list(push.values())))[None]
+        after = core.step(TensorDict({keys.ACTION: action}, [1]))["next"]
+        for i, agent in enumerate(env.agents):
+            assert env.observation_space(agent).contains(observations[agent])
+            assert np.array_equal(observations[agent]["window"], after[keys.WINDOW][0, i].numpy())
+            vector = after[keys.OBSERVATION][0, i].numpy()
+            assert np.array_equal(observations[agent]["observation"], vector)
 
 
 def test_what_was_handed_out_does_not_change_later():

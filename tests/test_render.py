@@ -7,6 +7,7 @@ from PIL import Image
 
 from emberlink.envs import WildfireConfig, WildfireEnv
 from emberlink.envs.rendering import frame
+from emberlink.envs.rendering.window import Window
 
 BLACK, WHITE, YELLOW, BLUE = (0, 0, 0), (255, 255, 255), (255, 255, 0), (0, 0, 255)
 
@@ -127,7 +128,7 @@ def test_an_animation_needs_a_frame(tmp_path):
 @pytest.mark.filterwarnings("error")
 def test_window_shows_the_last_picture(monkeypatch):
     monkeypatch.setenv("MPLBACKEND", "agg")
-    window = frame.Window("test")
+    window = Window("test")
     first, last = picture(positions=[(3, 3, 4)]), picture(positions=[(9, 9, 4)])
     assert window.show(first) is None
     assert window.show(last) is None

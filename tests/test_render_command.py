@@ -246,7 +246,7 @@ def test_a_video_needs_a_frame(tmp_path):
 def test_nothing_that_is_shared_is_forgotten():
     """Start positions and fires differ where one of these does, and nowhere else."""
     base = resolve("independent", SHORT).env
-    other = {"reward", "observation", "displacement", "view_angle"}
+    other = {"reward", "observation", "observation_scale", "displacement", "view_angle"}
     assert {field.name for field in dataclasses.fields(base)} == other | set(render.SHARED)
 
 

@@ -24,7 +24,7 @@ def make_env(
     *,
     num_envs: int = 1,
     fire: str | ScenarioConfig | Tensor | None = None,
-    seed: int = 0,
+    seed: int | None = None,
     device: torch.device | str = "cpu",
     **settings: Any,
 ) -> TransformedEnv:
@@ -36,7 +36,7 @@ def make_env(
         setup: paper (if None), released, tuned, or one of yours; not with a configuration.
         num_envs: environments side by side.
         fire: as for `WildfireEnv`; the scenario of the setup or of the run if None.
-        seed: of everything random in the environment.
+        seed: of everything random in the environment; a fresh one if None.
         device: where all tensors live.
         settings: any other setting, by the last part of its key (`horizon=50`, `num_uavs=3`) or by
             all of it (`**{"env.reward.exit": -10.0}`).
@@ -64,7 +64,7 @@ def build_env(
     *,
     num_envs: int,
     fire: str | ScenarioConfig | Tensor,
-    seed: int | Sequence[int],
+    seed: int | Sequence[int] | None,
     device: torch.device | str,
 ) -> TransformedEnv:
     """Returns the wildfire and the communication of a configuration; see `WildfireEnv`."""

@@ -272,10 +272,3 @@ def _fuel(
     wide = (width * scale).clamp_min(_LEAST)[..., None, None]
     apart = ((x - px) ** 2 + (y - py) ** 2) / wide**2
     return (1 - loss[..., None, None] * torch.exp(-apart)).prod(1)
-
-
-def burning_cells(arrival: Tensor, horizon: int) -> Tensor:
-    """Number of cells that burn at the steps 0 to `horizon`, int64 [fires, horizon + 1]."""
-    step = arrival.flatten(1).ceil().clamp(0, horizon + 1).long()
-    zeros = step.new_zeros(len(step), horizon + 2)
-    return zeros.scatter_add(1, step, torch.ones_like(step)).cumsum(1)[:, :-1]

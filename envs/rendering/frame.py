@@ -1,4 +1,4 @@
-"""Pictures of an episode in the paper's colours (section IV.A)."""
+"""Pictures of an episode in the paper's colours (section IV.A), and animations of them."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -7,7 +7,6 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
-from emberlink.envs.utils.errors import UserError
 from emberlink.envs.world.sensor import view_radius
 
 NO_FIRE = (0, 0, 0)
@@ -15,18 +14,18 @@ FIRE = (255, 255, 255)
 FIELD_OF_VIEW = (255, 255, 0)
 UAV = (0, 0, 255)
 MAX_COLOURS = 256
-"""that a GIF can hold"""
+"""of a GIF"""
 
 
 class Chart:
-    """The map as a picture to draw on: no fire black, fire white, field of view yellow.
+    """A picture of the map to draw on: no fire black, fire white, fields of view yellow.
 
     Args:
-        fire_map: [X, Y], 0 where nothing burns, 1 fire that was seen, 2 fire that was not.
+        fire_map: [X, Y], 0 no fire, 1 seen fire, 2 unseen fire.
         position: [n, 3], cells.
         view_angle: half the opening angle of the cameras, degrees.
         scale: pixels per cell.
-        seen_fire: the colour of fire that was seen.
+        seen_fire: the colour of seen fire.
     """
 
     def __init__(
@@ -51,21 +50,21 @@ class Chart:
             self.image.paste(colour, mask=mask)
         line = max(2, scale // 6)
         for left, top, right, bottom in views:
-            # The black line shows the edge where yellow alone would not, over fire and other views.
+            # The black line keeps the edge visible over fire and over other views.
             self.draw.rectangle((left - 1, top - 1, right + 1, bottom + 1), outline=NO_FIRE)
             self.draw.rectangle((left, top, right, bottom), outline=FIELD_OF_VIEW, width=line)
 
     def point(self, x: float, y: float) -> tuple[float, float]:
-        """The pixel at a place in cells; x grows to the right and y upwards."""
+        """Returns the pixel of a point in cells; x grows to the right and y upwards."""
         return (x + 0.5) * self.scale, (self._rows - 0.5 - y) * self.scale
 
     def square(self, x: float, y: float, half: float) -> tuple[float, float, float, float]:
-        """The box of pixels around a place, `half` cells to each side; a pixel at least."""
+        """Returns the box of pixels `half` cells around a point, at least one pixel."""
         (across, down), reach = self.point(x, y), max(half * self.scale, 0.5)
         return across - reach, down - reach, across + reach - 1, down + reach - 1
 
     def uav(self, x: float, y: float) -> None:
-        """A blue disc."""
+        """Draws a UAV: a blue disc."""
         self.draw.ellipse(self.square(x, y, max(0.45, 4 / self.scale)), fill=UAV)
 
 
@@ -76,13 +75,13 @@ def frame(
     view_angle: float,
     size: int = 360,
 ) -> NDArray[np.uint8]:
-    """One picture: no fire black, fire white, field of view yellow, UAV blue.
+    """Draws one picture: no fire black, fire white, field of view yellow, UAV blue.
 
     Args:
         fire_map: [X, Y], 0 where nothing burns.
         position: [n, 3], cells.
         view_angle: half the opening angle of the cameras, degrees.
-        size: about how many pixels the longer side of the grid gets.
+        size: approximate pixels of the longer side of the grid.
 
     Returns:
         uint8 [Y * scale, X * scale, 3]; x grows to the right and y upwards.
@@ -95,14 +94,10 @@ def frame(
 
 
 def write_gif(path: Path, frames: Iterable[NDArray[np.uint8]], *, fps: int = 20) -> None:
-    """Writes frames, uint8 [height, width, 3] each, as an animation that repeats.
-
-    Raises:
-        ValueError: there is no frame.
-    """
+    """Writes frames, uint8 [height, width, 3] each, as an animation that repeats."""
     images = [Image.fromarray(picture).quantize(MAX_COLOURS) for picture in frames]
     if not images:
-        raise UserError(f"{path}: an animation needs at least one frame")
+        raise ValueError(f"{path}: an animation needs at least one frame")
     images = _one_palette(images)
     duration = round(1000 / fps)
     images[0].save(
@@ -117,9 +112,9 @@ def write_gif(path: Path, frames: Iterable[NDArray[np.uint8]], *, fps: int = 20)
 
 
 def _one_palette(images: list[Image.Image]) -> list[Image.Image]:
-    """The same pictures with one palette for all, where their colours fit into one.
+    """Gives all pictures one palette, if their colours fit into one.
 
-    What does not change from one to the next then costs next to nothing.
+    Pixels that do not change between pictures then take almost no space in the file.
     """
     colours: dict[bytes, int] = {}
     tables: list[list[int]] = []
@@ -127,7 +122,7 @@ def _one_palette(images: list[Image.Image]) -> list[Image.Image]:
         palette = bytes(image.getpalette() or ())
         entries = (palette[i : i + 3] for i in range(0, len(palette), 3))
         tables.append([colours.setdefault(entry, len(colours)) for entry in entries])
-    # One place is left for what stays as it was.
+    # One entry is left for pixels that do not change.
     if len(colours) >= MAX_COLOURS:
         return images
     shared = []
@@ -137,27 +132,3 @@ def _one_palette(images: list[Image.Image]) -> list[Image.Image]:
         renumbered.putpalette(b"".join(colours))
         shared.append(renumbered)
     return shared
-
-
-class Window:
-    """A window that shows pictures; it stays invisible where matplotlib has no screen."""
-
-    def __init__(self, title: str):
-        from matplotlib import pyplot  # imported here: only a window needs it
-
-        self._pyplot = pyplot
-        self._figure = pyplot.figure(num=title)
-        self._image = None
-
-    def show(self, picture: NDArray[np.uint8]) -> None:
-        """Shows a picture, uint8 [height, width, 3], in place of the last one."""
-        if self._image is None:
-            axes = self._figure.add_axes((0, 0, 1, 1), frame_on=False, xticks=[], yticks=[])
-            self._image = axes.imshow(picture)
-            self._figure.show(warn=False)
-        self._image.set_data(picture)
-        self._figure.canvas.draw_idle()
-        self._figure.canvas.flush_events()
-
-    def close(self) -> None:
-        self._pyplot.close(self._figure)

@@ -1,4 +1,4 @@
-"""What is drawn over the map: who hears whom, who has which role, and where each is to go."""
+"""Marks over the map: links between UAVs, their roles and their targets."""
 
 from dataclasses import dataclass
 from itertools import pairwise
@@ -11,15 +11,15 @@ from .frame import NO_FIRE, UAV, Chart
 
 LINK = (0, 200, 255)
 LINK_WIDTHS = {NO_FIRE: 4, LINK: 2}
-"""pixels by colour: a dark edge first"""
+"""pixels by colour; the dark edge is drawn first"""
 TARGET = (255, 140, 0)
 ROLES = ("discoverer", "seeker", "wanderer")
-"""what a UAV can be in a network that agrees whom to follow (paper, section IV.F)"""
+"""the roles of UAVs in a consensus network (paper, section IV.F)"""
 ROLE_COLOURS = ((230, 0, 60), (0, 150, 60), (215, 215, 215))
 MANY = 16
-"""UAVs above which links are thin, and targets have no lines that lead to them"""
+"""Above this number of UAVs links are thin, and no lines lead to the targets."""
 
-# Corners of a UAV's mark by its role, in half widths to the right and downwards.
+# Corners of a UAV's mark by role, in half widths to the right and downwards.
 _DIAMOND = ((0, -1.3), (1.3, 0), (0, 1.3), (-1.3, 0))
 _TRIANGLE = ((0, -1.4), (1.35, 1), (-1.35, 1))
 _SQUARE = ((-1, -1), (1, -1), (1, 1), (-1, 1))
@@ -27,59 +27,59 @@ _SHAPES = (_DIAMOND, _TRIANGLE, _SQUARE)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Moment:
-    """One moment of an episode, as far as it can be drawn."""
+class FrameData:
+    """The data of one picture: one environment at one step."""
 
     step: int
     """steps since the episode began"""
     seen: int
-    """burning cells that some UAV has seen"""
+    """burning cells that any UAV has seen"""
     burning: int
     """cells that burn"""
     fire_map: NDArray[np.uint8]
-    """[X, Y]: 0 no fire, 1 fire that was seen, 2 fire that was not"""
+    """[X, Y]: 0 no fire, 1 seen fire, 2 unseen fire"""
     position: NDArray[np.float32]
     """[n, 3], cells"""
     links: NDArray[np.bool_] | None = None
-    """[n, n], who hears whom, where anyone hears anything"""
+    """[n, n], the UAVs (columns) whose messages a UAV (row) received; None without communication"""
     roles: NDArray[np.int64] | None = None
-    """[n], places in `ROLES`, where UAVs have roles"""
+    """[n], indices into `ROLES`; None without roles"""
     target: NDArray[np.float32] | None = None
-    """[n, 3], where each UAV is told to go, cells, where it is told"""
+    """[n, 3], the point that each UAV is told to fly to, cells; None without targets"""
 
     @property
     def coverage(self) -> float:
-        """Cells seen / cells that burn so far, in %; 100 where nothing burns."""
+        """Cells seen / cells burning, in %; 100 where nothing burns."""
         return 100 * self.seen / self.burning if self.burning else 100.0
 
 
-def mark(chart: Chart, moment: Moment) -> None:
-    """Draws links, ways to the targets and UAVs over the map."""
-    places = [chart.point(x, y) for x, y, _ in moment.position.tolist()]
+def draw_marks(chart: Chart, data: FrameData) -> None:
+    """Draws links, lines to targets, and UAVs over the map."""
+    places = [chart.point(x, y) for x, y, _ in data.position.tolist()]
     half = mark_size(chart.scale)
-    if moment.links is not None:
-        pairs = np.argwhere(np.triu(moment.links | moment.links.T, 1)).tolist()
+    if data.links is not None:
+        pairs = np.argwhere(np.triu(data.links | data.links.T, 1)).tolist()
         # The edges of very many links would black out the map.
         widths = LINK_WIDTHS if len(places) <= MANY else {LINK: 1}
         for colour, width in widths.items():
             for i, j in pairs:
                 chart.draw.line((places[i], places[j]), fill=colour, width=width)
-    if moment.target is not None:
-        for index, (x, y, _) in enumerate(moment.target.tolist()):
-            role = None if moment.roles is None else int(moment.roles[index])
+    if data.target is not None:
+        for index, (x, y, _) in enumerate(data.target.tolist()):
+            role = None if data.roles is None else int(data.roles[index])
             end, colour = chart.point(x, y), TARGET if role is None else ROLE_COLOURS[role]
             if len(places) <= MANY:
                 dashes(chart.draw, places[index], end, colour)
             cross(chart.draw, end, half * 0.6, colour)
-    for index, (x, y, _) in enumerate(moment.position.tolist()):
-        if moment.roles is None:
+    for index, (x, y, _) in enumerate(data.position.tolist()):
+        if data.roles is None:
             chart.uav(x, y)
         else:
-            uav(chart.draw, places[index], half, int(moment.roles[index]))
+            uav(chart.draw, places[index], half, int(data.roles[index]))
 
 
 def mark_size(scale: int) -> float:
-    """Half the width of a UAV's mark, pixels, on a chart of `scale` pixels per cell."""
+    """Returns half the width of a UAV's mark, pixels, on a chart of `scale` pixels per cell."""
     return min(max(0.55 * scale, 6.0), 9.0)
 
 
@@ -89,13 +89,13 @@ def dashes(
     end: tuple[float, float],
     colour: tuple[int, int, int],
 ) -> None:
-    """A thin dashed line, 4 pixels and 4 pixels without."""
-    way = np.subtract(end, start)
-    length = float(np.hypot(*way))
+    """Draws a thin line with dashes and gaps of 4 pixels."""
+    offset = np.subtract(end, start)
+    length = float(np.hypot(*offset))
     stops = np.arange(0, length, 4)
     for dash, (near, far) in enumerate(pairwise([*stops, length])):
         if dash % 2 == 0:
-            points = (tuple(np.add(start, way * (stop / length))) for stop in (near, far))
+            points = (tuple(np.add(start, offset * (stop / length))) for stop in (near, far))
             draw.line(tuple(points), fill=colour)
 
 
@@ -105,7 +105,7 @@ def cross(
     half: float,
     colour: tuple[int, int, int],
 ) -> None:
-    """A cross with dark edges, at a target."""
+    """Draws a cross with dark edges, at a target."""
     x, y = place
     for width, fill in ((4, NO_FIRE), (2, colour)):
         for turn in (1, -1):
@@ -116,7 +116,7 @@ def cross(
 def uav(
     draw: ImageDraw.ImageDraw, place: tuple[float, float], half: float, role: int | None
 ) -> None:
-    """A UAV: a blue disc, within a shape in its role's colour if it has one."""
+    """Draws a UAV: a blue disc, inside a shape in the colour of its role if it has one."""
     x, y = place
     if role is not None:
         corners = [(x + half * right, y + half * down) for right, down in _SHAPES[role]]

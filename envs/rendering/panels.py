@@ -1,4 +1,4 @@
-"""Episodes side by side: a titled panel for each, and a legend of the marks that occur."""
+"""Episodes side by side: a panel with a title for each, and a legend."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -11,45 +11,45 @@ from PIL import Image, ImageDraw, ImageFont
 
 from . import marks
 from .frame import FIELD_OF_VIEW, FIRE, NO_FIRE, Chart
-from .marks import ROLE_COLOURS, ROLES, TARGET, Moment
+from .marks import ROLE_COLOURS, ROLES, TARGET, FrameData
 
 SEEN_FIRE = (140, 140, 140)
-"""of fire that was seen, where it is told apart (paper, figure 2)"""
+"""of seen fire, where it is shown in another colour (paper, figure 2)"""
 PAPER = (40, 40, 44)
 INK = (240, 240, 240)
 GAP = 10
 LINE = 20
 HEADER = 2 * LINE + 4
 NARROWEST = 250
-"""pixels that a panel's title needs"""
+"""pixels; a panel's title needs as many"""
 _TEXT = 15
-_SAMPLE = 30  # width of what stands before a word of the legend
+_SAMPLE = 30  # width of the sample before a word of the legend
 
 Sample = Callable[[ImageDraw.ImageDraw, float, float], None]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Episode:
-    """What one panel shows."""
+    """The content of one panel."""
 
     title: str
     view_angle: float
     """half the opening angle of the cameras, degrees"""
-    moments: Sequence[Moment]
+    frames: Sequence[FrameData]
 
 
 class Screen:
-    """Draws the same moment of several episodes into one picture.
+    """Draws the same frame of several episodes into one picture.
 
     Args:
-        episodes: on grids of the same size, as many moments each.
-        size: about how many pixels the longer side of a map gets.
-        tell_seen: whether fire that was seen is grey.
+        episodes: on grids of the same size, with the same number of frames.
+        size: approximate pixels of a map's longer side.
+        grey_seen: whether seen fire is grey.
     """
 
-    def __init__(self, episodes: Sequence[Episode], *, size: int, tell_seen: bool = False):
-        self._episodes, self._tell_seen = episodes, tell_seen
-        grid = episodes[0].moments[0].fire_map.shape
+    def __init__(self, episodes: Sequence[Episode], *, size: int, grey_seen: bool = False):
+        self._episodes, self._grey_seen = episodes, grey_seen
+        grid = episodes[0].frames[0].fire_map.shape
         self.scale = scale_of(grid, size)
         self.map_size = grid[0] * self.scale, grid[1] * self.scale
         self._font = ImageFont.load_default(_TEXT)
@@ -74,27 +74,27 @@ class Screen:
             self._write(draw, x, y, self._cut(episode.title, panel[0] - GAP))
 
     def map_corner(self, panel: int) -> tuple[int, int]:
-        """The left and upper pixel of a panel's map."""
+        """Returns the left and upper pixel of a panel's map."""
         x, y = self._corners[panel]
         return x, y + HEADER
 
     def picture(self, index: int) -> NDArray[np.uint8]:
-        """Moment `index` of all episodes, uint8 [height, width, 3], both sides even."""
+        """Draws frame `index` of all episodes, uint8 [height, width, 3], both sides even."""
         image = self._blank.copy()
         draw = ImageDraw.Draw(image)
         for panel, episode in enumerate(self._episodes):
-            moment = episode.moments[index]
+            data = episode.frames[index]
             chart = Chart(
-                moment.fire_map,
-                moment.position,
+                data.fire_map,
+                data.position,
                 view_angle=episode.view_angle,
                 scale=self.scale,
-                seen_fire=SEEN_FIRE if self._tell_seen else FIRE,
+                seen_fire=SEEN_FIRE if self._grey_seen else FIRE,
             )
-            marks.mark(chart, moment)
+            marks.draw_marks(chart, data)
             image.paste(chart.image, self.map_corner(panel))
             x, y = self._corners[panel]
-            text = f"step {moment.step}   coverage {moment.coverage:.1f} %"
+            text = f"step {data.step}   coverage {data.coverage:.1f} %"
             self._write(draw, x, y + LINE, text)
         return np.asarray(image)
 
@@ -102,7 +102,7 @@ class Screen:
         draw.text((x, y + LINE / 2), text, fill=INK, font=self._font, anchor="lm")
 
     def _cut(self, text: str, width: float) -> str:
-        """The text, or as much of its beginning as fits."""
+        """Returns the text, cut at its end to fit a width."""
         if self._font.getlength(text) <= width:
             return text
         while text and self._font.getlength(text + "…") > width:
@@ -110,7 +110,7 @@ class Screen:
         return text + "…"
 
     def _wrap(self, words: Sequence[str]) -> tuple[list[tuple[float, float]], int]:
-        """Where each word of the legend goes, and the height that all need."""
+        """Returns the place of each word of the legend, and the height of all."""
         places: list[tuple[float, float]] = []
         x, y = GAP, 0
         for word in words:
@@ -122,18 +122,17 @@ class Screen:
         return places, y + LINE
 
     def _legend(self) -> Sequence[tuple[str, Sample]]:
-        """A word and a sample for each mark that occurs."""
+        """Returns a word and a sample for each mark that occurs."""
 
         def occurs(name: str) -> list[bool]:
-            return [getattr(e.moments[0], name) is not None for e in self._episodes]
+            return [getattr(e.frames[0], name) is not None for e in self._episodes]
 
         half = marks.mark_size(self.scale)
         shown: list[tuple[str, Sample]] = []
-        if self._tell_seen:
-            shown += [("fire", _box(FIRE)), ("fire, seen", _box(SEEN_FIRE))]
-        else:
-            shown += [("fire", _box(FIRE))]
-        shown += [("field of view", _box(FIELD_OF_VIEW))]
+        shown.append(("fire", _box(FIRE)))
+        if self._grey_seen:
+            shown.append(("fire, seen", _box(SEEN_FIRE)))
+        shown.append(("field of view", _box(FIELD_OF_VIEW)))
         roles, links, target = occurs("roles"), occurs("links"), occurs("target")
         if not all(roles):
             shown.append(("UAV", _uav(half, None)))
@@ -147,14 +146,14 @@ class Screen:
 
 
 def scale_of(grid: Sequence[int], size: int) -> int:
-    """Pixels per cell: `size` for the longer side; up to twice that for a map that is narrow."""
+    """Returns pixels per cell: `size` for the longer side, up to twice that for a narrow map."""
     longer, shorter = max(grid), min(grid)
     wide = min(2 * size // longer, math.ceil(size / 4 / shorter))
     return max(2, size // longer, wide)
 
 
 def _columns(count: int, width: int, height: int) -> int:
-    """In how many columns as many panels fit into the smallest square."""
+    """Returns the number of columns with which the panels fit into the smallest square."""
 
     def side(columns: int) -> int:
         return max(columns * width, math.ceil(count / columns) * height)

@@ -1,4 +1,4 @@
-"""Videos that browsers play, written by ffmpeg."""
+"""Writes videos that browsers play, with ffmpeg."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -15,9 +15,9 @@ _COLOURS = (
     "setparams=color_primaries=bt709:color_trc=bt709:colorspace=bt709:range=tv"
 )
 
-# H.264 in 4:2:0, as every browser has it. Flat colours stay clean at a constant rate factor of 18,
-# and the tune for drawings keeps edges sharp; the matrix is written down so that players do not
-# guess it; with the index at the front a video starts before all of it has come.
+# H.264 in 4:2:0, which every browser plays. A constant rate factor of 18 keeps flat colours clean,
+# and the tune for drawings keeps edges sharp. The colour matrix is stated, so that players do not
+# guess it. With the index at the front a video starts before it is loaded as a whole.
 _OPTIONS = [
     *("-crf", "18", "-preset", "medium", "-tune", "animation"),
     *("-vf", _COLOURS),
@@ -29,10 +29,10 @@ def write_mp4(path: Path, frames: Iterable[NDArray[np.uint8]], *, fps: int = 20)
     """Writes frames, uint8 [height, width, 3] each, both sides even, as a video.
 
     Raises:
-        ValueError: there is no frame, or ffmpeg did not write them all.
-        OSError: the file can't be written.
+        UserError: ffmpeg failed, or did not write all frames.
+        OSError: the file cannot be written.
     """
-    path.touch()  # says better than ffmpeg what is wrong with a path
+    path.touch()  # its error names the path, that of ffmpeg does not
     written, writer = 0, None
     try:
         for picture in frames:
@@ -47,12 +47,13 @@ def write_mp4(path: Path, frames: Iterable[NDArray[np.uint8]], *, fps: int = 20)
         reason = str(error).strip().splitlines()[0]
         raise UserError(f"{path.name}: ffmpeg failed: {reason}") from None
     if written == 0:
-        raise UserError(f"{path}: a video needs at least one frame")
+        raise ValueError(f"{path}: a video needs at least one frame")
     if not whole:
         raise UserError(f"{path.name}: ffmpeg failed: not all {written} frames were written")
 
 
 def _start(path: Path, picture: NDArray[np.uint8], fps: int):
+    """Starts ffmpeg for frames of the size of a picture."""
     height, width = picture.shape[:2]
     writer = imageio_ffmpeg.write_frames(
         path,

@@ -6,10 +6,13 @@ every device and for any batch, without a state to carry or to save. Keys are in
 is derived from another with `fold_in`.
 """
 
+from collections.abc import Sequence
 from enum import IntEnum, unique
 
 import torch
 from torch import Tensor
+
+from .errors import UserError
 
 _GOLDEN = -0x61C8864680B583EB  # 0x9E3779B97F4A7C15 as a signed 64-bit integer
 _MIX_A = -0x40A7B892E31B1A47  # 0xBF58476D1CE4E5B9
@@ -89,6 +92,20 @@ def seed_keys(seed: int, count: int, device: torch.device | str | None = None) -
     """Returns one key per environment: int64 [count], of which key i depends on (seed, i) alone."""
     root = torch.full((count,), seed, dtype=torch.int64, device=device)
     return fold_in(root, torch.arange(count, device=device))
+
+
+def check_seeds(seed: int | Sequence[int], num_envs: int) -> list[int]:
+    """Returns one or several seeds as a list.
+
+    Raises:
+        UserError: a negative seed, or a number of environments that the seeds cannot share evenly.
+    """
+    seeds = list(seed) if isinstance(seed, Sequence) else [int(seed)]
+    if min(seeds, default=-1) < 0:
+        raise UserError(f"seed={seed}: a number that is not negative is needed")
+    if num_envs % len(seeds):
+        raise UserError(f"num_envs={num_envs} is no multiple of the {len(seeds)} seeds")
+    return seeds
 
 
 def _bits(key: Tensor, count: int) -> Tensor:

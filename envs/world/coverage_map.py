@@ -1,14 +1,27 @@
 """The fires of all environments, and the UAV and step at which each cell was first seen."""
 
+from typing import NamedTuple
+
 import torch
 from torch import Tensor
 
-from emberlink.envs.fire.generator import burning_cells
 from emberlink.envs.utils.buffers import Buffers
 
+from .burning import BurningCounts
 from .sensor import Sensor
 
 _NEVER = torch.iinfo(torch.int32).max
+
+
+class Sighting(NamedTuple):
+    """The cells in view by class: new fire, old fire and no fire."""
+
+    counts: Tensor
+    """float64 [..., 3]: number of cells"""
+    centres: Tensor
+    """float32 [..., 3, 2]: their mean (i, j), 0 without any"""
+    classes: Tensor
+    """bool [..., 3, W * W]: the cells of the UAV's window that belong to the class"""
 
 
 class CoverageMap(Buffers):
@@ -28,19 +41,18 @@ class CoverageMap(Buffers):
     """
 
     _fires: Tensor
-    _burning: Tensor
     _start: Tensor
     _uav: Tensor
     _never: Tensor
     _arrival_time: Tensor
-    _burning_start: Tensor
+    _fire_index: Tensor
     _first_seen: Tensor
     _stamp: Tensor
 
     def __init__(self, sensor: Sensor, fires: Tensor, *, horizon: int, envs: int, uavs: int):
         super().__init__()
-        self._sensor, self._horizon, self._uavs = sensor, horizon, uavs
-        self.register_buffer("_burning", burning_cells(fires, horizon).flatten(), persistent=False)
+        self._sensor, self._uavs = sensor, uavs
+        self._burning = BurningCounts(fires, horizon)
         # Padding is NaN, so that comparisons with it are false: it neither burns nor does not burn.
         self.register_buffer("_fires", sensor.pad(fires, torch.nan), persistent=False)
         self.register_buffer(
@@ -51,7 +63,7 @@ class CoverageMap(Buffers):
         )
         self.register_buffer("_never", torch.tensor(_NEVER, dtype=torch.int32), persistent=False)
         self.register_buffer("_arrival_time", self._fires[:1].repeat(envs, 1))
-        self.register_buffer("_burning_start", torch.zeros(envs, dtype=torch.int64))
+        self.register_buffer("_fire_index", torch.zeros(envs, dtype=torch.int64))
         first_seen = torch.full((envs, sensor.area), _NEVER, dtype=torch.int32)
         self.register_buffer("_first_seen", first_seen)
         self.register_buffer("_stamp", self._uav.repeat(envs, 1, 1))
@@ -78,16 +90,15 @@ class CoverageMap(Buffers):
             fire: int64 [envs], the index of each environment's fire.
         """
         self._arrival_time.copy_(torch.where(mask[:, None], self._fires[fire], self._arrival_time))
-        start = fire * (self._horizon + 1)
-        self._burning_start.copy_(torch.where(mask, start, self._burning_start))
+        self._fire_index.copy_(torch.where(mask, fire, self._fire_index))
         self._first_seen.masked_fill_(mask[:, None], _NEVER)
         self._stamp.copy_(torch.where(mask[:, None, None], self._uav, self._stamp))
 
     def count_burning(self, step: Tensor) -> Tensor:
         """Returns the number of cells that burn at a step, int64 [envs] both."""
-        return self._burning.take(step.clamp(max=self._horizon).add_(self._burning_start))
+        return self._burning.at(self._fire_index, step)
 
-    def look(self, position: Tensor, step: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def look(self, position: Tensor, step: Tensor) -> Sighting:
         """Classifies the cells in view of all UAVs, and marks the burning ones as seen.
 
         It must be called once per step.
@@ -97,9 +108,7 @@ class CoverageMap(Buffers):
             step: float32 [envs], steps since the episode began.
 
         Returns:
-            Three tensors about the cells in view that are new fire, old fire and no fire: counts,
-            float64 [envs, uavs, 3]; mean (i, j), float32 [envs, uavs, 3, 2]; and the cells of the
-            window, bool [envs, uavs, 3, W * W].
+            What each UAV sees, batch size [envs, uavs].
         """
         centre, cells, in_view = self._sensor.look(position, self._start)
         stamp, first_seen, time = self._stamp, self._first_seen, step.view(-1, 1, 1)
@@ -110,4 +119,4 @@ class CoverageMap(Buffers):
         first_seen.view(-1).scatter_reduce_(0, cells.view(-1), claims.view(-1), "amin")
         new = first_seen.take(cells) == stamp
         classes = torch.stack((new, burning ^ new, in_view & (arrival_time > time)), -2)
-        return *self._sensor.count_classes(classes, centre), classes
+        return Sighting(*self._sensor.count_classes(classes, centre), classes)

@@ -1,4 +1,4 @@
-"""What `emberlink render` does: episodes of runs as GIF and MP4, side by side."""
+"""The command `emberlink render`: episodes of runs as GIF and MP4, side by side."""
 
 import dataclasses
 import os
@@ -30,7 +30,7 @@ from emberlink.trainers.evaluation.evaluate import (
     scripted_config,
     shown_scenario,
 )
-from emberlink.trainers.evaluation.record_episode import record
+from emberlink.trainers.evaluation.record_episode import record_episode
 from emberlink.trainers.runs.pretrained import open_run
 from emberlink.trainers.runs.run_folder import RunFolder
 from emberlink.trainers.runs.seal import check_trained_with
@@ -38,31 +38,31 @@ from emberlink.trainers.runs.seal import check_trained_with
 FIRES = 65_536
 """held-out fires of a scenario: as many as an evaluation can have"""
 SHARED = ("grid", "num_uavs", "horizon", "altitude")
-"""what the fires and the start positions depend on: panels side by side have it in common"""
-_ALONE, _BESIDE = (480, 800), (360, 600)  # pixels of a map's longer side, least and most
-_CELL = 8  # pixels that a cell gets as far as that allows
+"""settings that fires and start positions depend on; panels must have them in common"""
+_ALONE, _BESIDE = (480, 800), (360, 600)  # minimum and maximum pixels of a map's longer side
+_CELL = 8  # pixels of a cell, within those limits
 
 Write = Callable[[Path, Screen, int], None]
 
 
 @dataclasses.dataclass(frozen=True)
 class Panel:
-    """Who plays one of the episodes."""
+    """The policy and the title of one panel."""
 
     title: str
     config: RunConfig
     policy: Callable[[WildfireEnv], TensorDictModuleBase]
-    """makes the policy for an environment"""
+    """returns the policy for an environment"""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Choices:
-    """What the command can be told; the defaults are those of the command line."""
+    """The options of the command, with the defaults of the command line."""
 
     fire: str | None = None
     """NAME, INDEX or NAME:INDEX of a held-out fire; see `find_fire`"""
     policies: Sequence[str] = ()
-    """scripted policies that play beside the runs"""
+    """names of scripted policies, shown beside the runs"""
     checkpoints: Sequence[Path] = ()
     """one for each run; the newest of each if empty"""
     output: Path | None = None
@@ -82,11 +82,11 @@ def render(runs: Sequence[str], console: Console, choices: Choices) -> int:
 
     Args:
         runs: run folders.
-        console: told what is being done and, last, the paths.
-        choices: see there.
+        console: shows the progress and, last, the paths.
+        choices: the options.
 
     Raises:
-        ValueError: one line for whatever cannot be played, drawn or written.
+        UserError: a run, a fire or an output that cannot be used.
     """
     folders = [open_run(name) for name in runs]
     scenario, index = find_fire(choices.fire, folders[0].config(device="cpu").fire)
@@ -101,7 +101,7 @@ def render(runs: Sequence[str], console: Console, choices: Choices) -> int:
     episodes = [_play(panel, arrival, index, steps, console) for panel in panels]
     least, most = _ALONE if len(panels) == 1 else _BESIDE
     size = min(max(_CELL * max(config.grid), least), most)
-    screen = Screen(episodes, size=choices.size or size, tell_seen=choices.seen)
+    screen = Screen(episodes, size=choices.size or size, grey_seen=choices.seen)
     for path in paths:
         with published(path) as partial:
             _WRITERS[path.suffix](partial, screen, len(steps), choices.fps)
@@ -110,14 +110,15 @@ def render(runs: Sequence[str], console: Console, choices: Choices) -> int:
 
 
 def find_fire(text: str | None, trained: ScenarioConfig) -> tuple[ScenarioConfig, int]:
-    """The scenario and the number of the held-out fire that NAME, INDEX or NAME:INDEX means.
+    """Returns the scenario and the index of a held-out fire.
 
     Args:
-        text: of the command line; what is not said of it is as for `shown_scenario`, and 0.
-        trained: what the run was trained on: its name is known too.
+        text: NAME, INDEX or NAME:INDEX; the default name is that of `shown_scenario`, the default
+            index 0.
+        trained: the scenario that the run was trained on; its name is known too.
 
     Raises:
-        ValueError: there is no such scenario or fire.
+        UserError: there is no such scenario or fire.
     """
     usual = shown_scenario(trained)
     text = usual if text is None else text
@@ -137,7 +138,7 @@ def find_fire(text: str | None, trained: ScenarioConfig) -> tuple[ScenarioConfig
 
 
 def _learned(folders: Sequence[RunFolder], checkpoints: Sequence[Path]) -> Iterator[Panel]:
-    """A panel for each run."""
+    """Yields a panel for each run."""
     if checkpoints and len(checkpoints) != len(folders):
         raise UserError(f"{len(checkpoints)} checkpoints for {len(folders)} runs: one each")
     for place, run in enumerate(folders):
@@ -152,7 +153,7 @@ def _learned(folders: Sequence[RunFolder], checkpoints: Sequence[Path]) -> Itera
 
 
 def _scripted(folders: Sequence[RunFolder], names: Sequence[str]) -> Iterator[Panel]:
-    """A panel for each scripted policy, in the world of the first run."""
+    """Yields a panel for each scripted policy, in the world of the first run."""
     for name in names:
         if name not in SCRIPTED:
             raise UserError(f"policy {name!r} is not known; known: {', '.join(SCRIPTED)}")
@@ -177,7 +178,7 @@ def _plain(value: Any) -> str:
 
 
 def _steps(choices: Choices, horizon: int, suffixes: Sequence[str]) -> list[int]:
-    """The moments that are drawn."""
+    """Returns the steps that are drawn."""
     if suffixes != [".png"]:
         if choices.step is not None:
             raise UserError(f"step={choices.step}: only of a picture, --output FILE.png")
@@ -204,9 +205,9 @@ def _play(
     )
     world: Any = env.base_env
     policy, comm = panel.policy(world), build_comm(config, 1)
-    moments = record(env, policy, comm, steps=set(steps), member=index % BLOCK)
-    console.print(f"  {panel.title}: coverage {moments[-1].coverage:.1f} %", style="dim")
-    return Episode(title=panel.title, view_angle=config.env.view_angle, moments=moments)
+    frames = record_episode(env, policy, comm, steps=set(steps), member=index % BLOCK)
+    console.print(f"  {panel.title}: coverage {frames[-1].coverage:.1f} %", style="dim")
+    return Episode(title=panel.title, view_angle=config.env.view_angle, frames=frames)
 
 
 def _gif(path: Path, screen: Screen, count: int, fps: int) -> None:
@@ -225,10 +226,10 @@ _WRITERS = {".gif": _gif, ".mp4": _mp4, ".png": _png}
 
 
 def _free_paths(output: Path | None, run: RunFolder, stem: str) -> list[Path]:
-    """Where the files go; nothing is there yet.
+    """Returns the paths of the new files.
 
     Raises:
-        ValueError: the named file is there, or its folder is not.
+        UserError: the named file exists, or its folder does not.
     """
     if output is not None and not output.is_dir():
         if output.suffix not in _WRITERS:

@@ -3,7 +3,6 @@
 from dataclasses import asdict
 from typing import Annotated, Any, Literal
 
-import torch
 from pydantic import ConfigDict, Field, Strict, field_validator, model_validator
 from pydantic.dataclasses import dataclass
 
@@ -11,8 +10,9 @@ from emberlink.comm import registry
 from emberlink.comm.base import CommModule
 from emberlink.envs.config import WildfireConfig
 from emberlink.envs.scenarios import Scenario
+from emberlink.envs.utils.device import check_device as check_device
 from emberlink.envs.utils.errors import UserError
-from emberlink.envs.utils.validation import Name, shown
+from emberlink.envs.utils.validation import Name
 
 from . import choice
 
@@ -173,22 +173,3 @@ def build_comm(config: RunConfig, num_envs: int) -> CommModule:
 def comm_settings(config: RunConfig) -> dict[str, Any]:
     """Returns all settings of a configuration's communication module, defaults included."""
     return asdict(choice.settings("comm", config.comm, registry))
-
-
-def check_device(name: str) -> str:
-    """Returns the name of a device, after checking that this machine has it.
-
-    Raises:
-        UserError: there is no such device; the message lists those that there are.
-    """
-    present = ["cpu", *(f"cuda:{i}" for i in range(torch.cuda.device_count()))]
-    try:
-        device = torch.device(name)
-    except RuntimeError:
-        device = None
-    found = device is not None and (
-        str(device) == "cpu" or (device.type == "cuda" and (device.index or 0) < len(present) - 1)
-    )
-    if not found:
-        raise UserError(f"device={shown(name)} is not there; known: {', '.join(present)}")
-    return name

@@ -1,4 +1,4 @@
-"""Plays one episode and keeps what can be drawn of it."""
+"""Plays one episode and keeps the data of its pictures."""
 
 from collections.abc import Collection
 from typing import Any
@@ -12,59 +12,59 @@ from torchrl.envs.utils import ExplorationType
 
 from emberlink.comm.base import CommModule
 from emberlink.envs import keys
-from emberlink.envs.rendering.marks import ROLES, Moment
+from emberlink.envs.rendering.marks import ROLES, FrameData
 
 
-def record(
+def record_episode(
     env: TransformedEnv,
     policy: TensorDictModuleBase,
     comm: CommModule,
     *,
     steps: Collection[int],
     member: int = 0,
-) -> list[Moment]:
-    """One episode without noise, as `evaluate.play` plays it.
+) -> list[FrameData]:
+    """Plays one episode without exploration, as `evaluate.play` does.
 
     Args:
         env: a recipe's environment.
         policy: writes ("agents", "action").
         comm: the environment's communication.
-        steps: the moments to keep, 0 ... horizon.
-        member: the environment that is kept.
+        steps: the steps to keep, from 0 to the horizon.
+        member: the index of the environment to keep.
     """
     world: Any = env.base_env
     hears = any(key in comm.out_keys for key in policy.in_keys)
-    kept: list[Moment] = []
+    frames: list[FrameData] = []
     with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
-        now = env.reset()
+        td = env.reset()
         for step in range(world.config.horizon + 1):
             if step > 0:
-                now = step_mdp(env.step(policy(now)), keep_other=True)
+                td = step_mdp(env.step(policy(td)), keep_other=True)
             if step in steps:
                 fire_map = world.fire_map[member]
-                kept.append(moment(now[member], fire_map, hears=hears))
-    return kept
+                frames.append(frame_data(td[member], fire_map, hears=hears))
+    return frames
 
 
-def moment(now: TensorDictBase, fire_map: Tensor, *, hears: bool) -> Moment:
-    """What can be drawn of one moment of one environment, by the keys that it holds.
+def frame_data(td: TensorDictBase, fire_map: Tensor, *, hears: bool) -> FrameData:
+    """Returns the data of a picture of one environment.
 
-    Links, roles and targets are drawn where the communication writes them.
+    It has links, roles and targets where the communication writes them.
 
     Args:
-        now: the moment, batch size [].
+        td: of a reset or a step, batch size [].
         fire_map: uint8 [X, Y], see `WildfireEnv.fire_map`.
         hears: whether the policy reads anything that the communication writes.
     """
-    links = now.get(keys.HEARS, None) if hears else None
-    follows = now.get(keys.FOLLOWS, None) if hears else None
-    target = now.get(keys.TARGET, None) if hears else None
-    return Moment(
-        step=int(now.get(keys.STEP)),
-        seen=int(now.get(keys.SEEN)),
-        burning=int(now.get(keys.BURNING)),
+    links = td.get(keys.HEARS, None) if hears else None
+    follows = td.get(keys.FOLLOWS, None) if hears else None
+    target = td.get(keys.TARGET, None) if hears else None
+    return FrameData(
+        step=int(td.get(keys.STEP)),
+        seen=int(td.get(keys.SEEN)),
+        burning=int(td.get(keys.BURNING)),
         fire_map=_array(fire_map),
-        position=_array(now.get(keys.POSITION)),
+        position=_array(td.get(keys.POSITION)),
         links=None if links is None else _array(links),
         roles=None if follows is None else _array(roles(follows)),
         target=None if target is None else _array(target),
@@ -72,7 +72,7 @@ def moment(now: TensorDictBase, fire_map: Tensor, *, hears: bool) -> Moment:
 
 
 def roles(follows: Tensor) -> Tensor:
-    """The role of each UAV, its place in `marks.ROLES`, int64 [..., n].
+    """Returns the role of each UAV, its index in `marks.ROLES`, int64 [..., n].
 
     Args:
         follows: int64 [..., n]: the discoverer that it follows, itself for a discoverer, -1 for

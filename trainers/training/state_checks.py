@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 ARRIVAL = "_map._arrival_time"
 """the fire of each environment: infinite where it never burns, NaN in the margin"""
-_OF_EPISODE = ("_seed_key", "_episode", "_episode_key", "_step_key", "_map._burning_start")
+_OF_EPISODE = ("_seed_key", "_episode", "_episode_key", "_step_key", "_map._fire_index")
 """what is a function of the seeds and of the number of the episode"""
 _OF_MOMENT = {"step": "_time", "seen": "_seen", "rng_key": "_step_key"}
 """what the carried moment repeats of the world"""

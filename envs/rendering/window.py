@@ -1,0 +1,35 @@
+"""A window that shows pictures, by matplotlib."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+class Window:
+    """Shows pictures in a window; it stays invisible where matplotlib has no screen.
+
+    Args:
+        title: of the window.
+    """
+
+    def __init__(self, title: str):
+        from matplotlib import pyplot  # takes a second to import, and only a window needs it
+
+        self._pyplot = pyplot
+        self._figure = pyplot.figure(num=title)
+        self._image: Any = None
+
+    def show(self, picture: NDArray[np.uint8]) -> None:
+        """Shows a picture, uint8 [height, width, 3], in place of the last one."""
+        if self._image is None:
+            axes = self._figure.add_axes((0, 0, 1, 1), frame_on=False, xticks=[], yticks=[])
+            self._image = axes.imshow(picture)
+            self._figure.show(warn=False)
+        self._image.set_data(picture)
+        self._figure.canvas.draw_idle()
+        self._figure.canvas.flush_events()
+
+    def close(self) -> None:
+        """Closes the window."""
+        self._pyplot.close(self._figure)

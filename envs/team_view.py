@@ -1,0 +1,77 @@
+"""What can be read of a `WildfireEnv` without changing it."""
+
+import torch
+from torch import Tensor
+
+from emberlink.envs.rendering import frame
+from emberlink.envs.utils.errors import UserError
+from emberlink.envs.world.coverage_map import CoverageMap
+
+from . import keys
+from .config import WildfireConfig
+
+
+class TeamView:
+    """Sizes, names, maps and pictures of the environments; a base class of `WildfireEnv`."""
+
+    config: WildfireConfig
+    batch_size: torch.Size
+    device: torch.device
+    _fire_name: str | None
+    _map: CoverageMap
+    _time: Tensor
+    _position: Tensor
+
+    def __repr__(self) -> str:
+        config = self.config
+        fire = self._fire_name or f"{len(self._map)} given"
+        return (
+            f"WildfireEnv(num_envs={self.num_envs}, grid={config.grid}, "
+            f"num_uavs={config.num_uavs}, horizon={config.horizon}, fire={fire}, "
+            f"device={self.device})"
+        )
+
+    @property
+    def num_envs(self) -> int:
+        """The number of environments."""
+        return self.batch_size[0]
+
+    @property
+    def n_agents(self) -> int:
+        """The number of UAVs in the team."""
+        return self.config.num_uavs
+
+    @property
+    def max_steps(self) -> int:
+        """The steps of an episode."""
+        return self.config.horizon
+
+    @property
+    def group_map(self) -> dict[str, list[str]]:
+        """The UAVs' names under the key that their tensors stand under."""
+        return {keys.AGENTS: [f"uav_{i}" for i in range(self.n_agents)]}
+
+    @property
+    def fire_map(self) -> Tensor:
+        """The paper's map, uint8 [num_envs, X, Y]: 0 no fire, 1 seen fire, 2 unseen fire."""
+        burning = self.arrival_time <= self._time[:, None, None]
+        return burning.to(torch.uint8) * (2 - self._map.seen.to(torch.uint8))
+
+    @property
+    def arrival_time(self) -> Tensor:
+        """The fire of each environment: arrival times in steps, float32 [num_envs, X, Y]."""
+        return self._map.arrival_time
+
+    def render(self, mode: str = "rgb_array", *, env: int = 0):
+        """Draws one environment in the paper's colours, uint8 [height, width, 3].
+
+        Raises:
+            UserError: another mode than "rgb_array".
+        """
+        if mode != "rgb_array":
+            raise UserError(f"render mode {mode!r} is not known; known: 'rgb_array'")
+        return frame.frame(
+            self.fire_map[env].cpu().numpy(),
+            self._position[env].cpu().numpy(),
+            view_angle=self.config.view_angle,
+        )

@@ -1,0 +1,155 @@
+"""The environment beside other programs: seeds of copies, names and sizes, options, Gymnasium."""
+
+import copy
+import pickle
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium.utils.env_checker import check_env
+from tensordict import TensorDict
+from torchrl.envs import ParallelEnv, SerialEnv, check_env_specs
+
+from emberlink.envs import WildfireConfig, WildfireEnv, keys
+from emberlink.envs.metrics import episode_metrics
+from emberlink.trainers import make_env
+
+CONFIG = WildfireConfig(grid=(12, 10), num_uavs=3, horizon=10)
+FIRE = torch.linspace(0, 20, 120).view(12, 10)
+
+
+def make(num_envs=2, **options) -> WildfireEnv:
+    return WildfireEnv(num_envs, options.pop("config", CONFIG), FIRE, **options)
+
+
+def starts(env) -> torch.Tensor:
+    return env.reset()[keys.POSITION]
+
+
+def test_unseeded_environments_are_different_worlds():
+    assert not starts(make()).equal(starts(make()))
+    assert not starts(make_env("consensus")).equal(starts(make_env("consensus")))
+    unused = make()
+    first, second = copy.deepcopy(unused), pickle.loads(pickle.dumps(unused))
+    assert not starts(first).equal(starts(second))
+    workers = starts(SerialEnv(2, make))
+    assert not workers[0].equal(workers[1])
+
+
+def test_seeds_given_in_either_way_are_the_same_world():
+    made, set_later = make(seed=4), make()
+    set_later.set_seed(4)
+    assert starts(made).equal(starts(set_later))
+    assert starts(made).equal(starts(set_later)), "the next episode too"
+    set_later.set_seed(None)
+    assert not starts(make(seed=4)).equal(starts(set_later))
+
+
+def test_a_state_that_is_loaded_keeps_its_seed():
+    old, new = make(seed=4), make()
+    old.reset()
+    new.load_state_dict(old.state_dict())
+    assert starts(new).equal(starts(old))
+
+
+def test_the_workers_of_a_parallel_environment_differ():
+    workers = ParallelEnv(2, make)
+    try:
+        first = starts(workers)
+    finally:
+        workers.close()
+    assert not first[0].equal(first[1])
+
+
+def test_sizes_and_names():
+    env = make(4)
+    assert (env.num_envs, env.n_agents, env.max_steps) == (4, 3, 10)
+    assert env.group_map == {"agents": ["uav_0", "uav_1", "uav_2"]}
+    wrapped = make_env("consensus", num_envs=4, fire=FIRE, horizon=10)
+    assert (wrapped.num_envs, wrapped.n_agents, wrapped.max_steps) == (4, 6, 10)
+    assert repr(env) == (
+        "WildfireEnv(num_envs=4, grid=(12, 10), num_uavs=3, horizon=10, fire=1 given, device=cpu)"
+    )
+    assert "fire=huygens" in repr(WildfireEnv(1, WildfireConfig(grid=(8, 8)), "huygens"))
+
+
+@pytest.mark.filterwarnings("error")
+def test_done_per_agent():
+    env = make(agent_done=True)
+    check_env_specs(env)
+    steps = env.rollout(20)["next"]
+    for name in ("done", "terminated", "truncated"):
+        assert steps["agents", name].shape == (2, 10, 3, 1)
+        assert steps["agents", name].equal(steps[name].unsqueeze(-2).expand(-1, -1, 3, -1))
+    assert steps["truncated"][:, -1].all()
+    assert ("agents", "done") not in make().reset().keys(True)
+
+
+def test_staggered_first_episodes_put_environments_out_of_phase():
+    env = make(4, staggered=True, seed=0)
+    steps = env.rollout(30, break_when_any_done=False)["next"]
+    ends = [(row.squeeze(-1).nonzero().flatten() + 1).tolist() for row in steps["truncated"]]
+    # 10 steps shared by 4: the first episodes have 3, 5, 8 and 10 steps, all later ones 10.
+    assert ends == [[3, 13, 23], [5, 15, 25], [8, 18, 28], [10, 20, 30]]
+    assert steps[keys.STEP][0, :5].tolist() == [1, 2, 3, 1, 2]
+    assert starts(make(4, staggered=True, seed=0)).equal(starts(make(4, seed=0)))
+
+
+def test_observations_are_float32_whatever_the_default_is():
+    torch.set_default_dtype(torch.float64)
+    try:
+        for scale in ("raw", "box"):
+            config = WildfireConfig(grid=(12, 10), num_uavs=3, horizon=10, observation_scale=scale)
+            env = make(config=config, seed=1)
+            check_env_specs(env)
+            steps = env.rollout(10)["next"]
+            assert steps[keys.OBSERVATION].dtype == torch.float32
+            assert {value.dtype for value in episode_metrics(steps).values()} == {torch.float32}
+    finally:
+        torch.set_default_dtype(torch.float32)
+
+
+def test_a_device_that_is_not_there_and_unknown_options_are_named():
+    if not torch.cuda.is_available():
+        with pytest.raises(ValueError, match="device=cuda is not there; known: cpu"):
+            WildfireEnv(device="cuda")
+    with pytest.raises(ValueError, match="device=abacus"):
+        WildfireEnv(device="abacus")
+    with pytest.raises(ValueError, match=r"positions not known; known: position"):
+        make().reset(positions=torch.ones(3, 3))
+
+
+def test_a_long_horizon_costs_little_memory():
+    fires = torch.rand(64, 12, 10) * 2e6
+    env = WildfireEnv(64, WildfireConfig(grid=(12, 10), horizon=1_000_000), fires)
+    assert sum(buffer.nbytes for buffer in env.buffers()) < 2**20
+    env.reset()
+    assert env.step(env.rand_action(env.reset()))["next"][keys.BURNING].equal(
+        (fires <= 1).sum((1, 2))
+    )
+
+
+@pytest.mark.filterwarnings("error")
+def test_the_team_as_one_agent_of_gymnasium():
+    name = "emberlink.envs.gymnasium:emberlink/WildfireTeam-v0"
+    env = gymnasium.make(name, config=CONFIG, fire=FIRE)
+    assert env.observation_space.shape == (18,)
+    assert env.action_space.shape == (9,)
+    check_env(env.unwrapped, skip_render_check=True)
+    first, info = env.reset(seed=3, options={"position": np.full((3, 3), 2.0)})
+    assert first.reshape(3, 6)[:, :3].tolist() == [[2, 2, 2]] * 3
+    assert set(info) == {"seen", "burning"}
+    core = make(1, seed=3)
+    core.reset(position=torch.full((3, 3), 2.0))
+    for step in range(1, 11):
+        action = env.action_space.sample()
+        observation, reward, terminated, truncated, info = env.step(action)
+        acts = TensorDict({keys.ACTION: torch.from_numpy(action).view(1, 3, 3)}, [1])
+        after = core.step(acts)["next"]
+        assert np.array_equal(observation, after[keys.OBSERVATION].flatten().numpy())
+        assert reward == pytest.approx(after[keys.REWARD].mean().item())
+        assert (terminated, truncated) == (False, step == 10)
+        assert info["seen"] == after[keys.SEEN].item()
+    with pytest.raises(ValueError, match="observation=window"):
+        gymnasium.make(name, config=WildfireConfig(observation="window"))
