@@ -38,16 +38,16 @@ TABLE = {
     "learner.batch_size": (512, 512),
     "learner.updates_per_step": (1, 1),
     "num_envs": (1, 1),
-    "exploration.theta": (0.2, 0.2),
-    "exploration.sigma": (0.15, 0.15),
-    "exploration.dt": (0.01, 0.01),
+    "learner.exploration.theta": (0.2, 0.2),
+    "learner.exploration.sigma": (0.15, 0.15),
+    "learner.exploration.dt": (0.01, 0.01),
     "fire.name": ("paper", "paper"),
 }
 GAMMA = {(method, setup): 0.95 for method in METHODS for setup in (PAPER, RELEASED)}
 GAMMA["independent", RELEASED] = 0.92
 # What a method is: whose memory, and what is heard.
 SWITCHES = {
-    "independent": ("private", "no_comm"),
+    "independent": ("per_agent", "no_comm"),
     "shared_memory": ("shared", "no_comm"),
     "positional": ("shared", "positional"),
     "consensus": ("shared", "consensus"),
@@ -85,7 +85,7 @@ def test_every_row_of_the_table(method, column):
         assert dataclasses.fields(settings) == ()
 
 
-CORRELATED = {"exploration.theta": 0.1, "exploration.sigma": 0.15}
+CORRELATED = {"learner.exploration.theta": 0.1, "learner.exploration.sigma": 0.15}
 OWN = {
     PAPER: {},
     RELEASED: {"independent": {"learner.gamma": 0.92}},

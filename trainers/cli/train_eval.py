@@ -23,7 +23,7 @@ from emberlink.trainers.evaluation.evaluate import Policy
 from emberlink.trainers.runs.pretrained import open_run
 from emberlink.trainers.runs.run_folder import RunFolder
 from emberlink.trainers.runs.signals import Interrupted, Interruption
-from emberlink.trainers.training.divergence import Divergence
+from emberlink.trainers.training.non_finite import NonFiniteError
 from emberlink.trainers.training.resume import resume
 from emberlink.trainers.training.trainer import Progress as Moment
 from emberlink.trainers.training.trainer import Trainer
@@ -39,7 +39,8 @@ def train(method: str | None, overrides: Sequence[str], console: Console) -> int
     """
     trainer = _trainer(method, overrides, console)
     config = trainer.config
-    if trainer.step == trainer.steps and all(run.evaluated() for run in trainer.runs):
+    setup = trainer.setup
+    if setup.step == setup.total_steps and all(run.evaluated() for run in trainer.runs):
         trainer.close()
         console.print(
             f"{trainer.run.path} is finished, {config.episodes} episodes; nothing is left to do. "
@@ -47,10 +48,9 @@ def train(method: str | None, overrides: Sequence[str], console: Console) -> int
             soft_wrap=True,
         )
         return 0
-    if trainer.enough > trainer.steps * config.num_envs:
+    if setup.learner.learning_starts > setup.total_steps:
         console.print(
-            f"note: learner.batch_size={config.learner.batch_size} is more than this run collects: "
-            "nothing will be learnt",
+            "note: a first batch is more than this run collects: nothing will be learnt",
             style="yellow",
         )
     interruption = Interruption(trainer.stop)
@@ -61,7 +61,7 @@ def train(method: str | None, overrides: Sequence[str], console: Console) -> int
             if interruption.received:
                 raise Interrupted
             for team, (one, run) in enumerate(zip(trainer.configs, trainer.runs, strict=True)):
-                actor, fires = trainer.team_actor(team), config.evaluation.episodes
+                actor, fires = trainer.setup.team_actor(team), config.evaluation.episodes
                 if not run.evaluated():
                     _evaluate(run, one, actor, run.checkpoint(), fires, console)
     except KeyboardInterrupt:
@@ -89,8 +89,9 @@ def _trainer(method: str | None, overrides: Sequence[str], console: Console) -> 
     else:
         others = [text for text in overrides if not text.startswith("resume=")]
         trainer = resume(Path(folders[0]), method, others)
-        rate = "" if trainer.rate == 1 else f", learning rates x {trainer.rate:g}"
-        console.print(f"resumed at step {trainer.step} of {trainer.steps}{rate}")
+        setup, scale = trainer.setup, trainer.rollbacks.lr_scale
+        rate = "" if scale == 1 else f", learning rates x {scale:g}"
+        console.print(f"resumed at step {setup.step} of {setup.total_steps}{rate}")
     config = trainer.config
     for run in trainer.runs:
         text = f"{config.method}, setup {config.setup}, fire {config.fire.name} -> {run.path}"
@@ -120,7 +121,9 @@ def _newest(trainer: Trainer, more: str) -> str:
 
 def _with(error: ValueError, config: RunConfig) -> str:
     """What a run that an error ended is to be resumed with, so that it does not end there again."""
-    return " on_nan=rollback" if isinstance(error, Divergence) and config.on_nan == "stop" else ""
+    return (
+        " on_nan=rollback" if isinstance(error, NonFiniteError) and config.on_nan == "stop" else ""
+    )
 
 
 def _train_with_bar(trainer: Trainer, console: Console) -> bool:
@@ -136,9 +139,9 @@ def _train_with_bar(trainer: Trainer, console: Console) -> bool:
     with Progress(*columns, console=console) as bar:
         task = bar.add_task(
             "",
-            total=trainer.steps,
-            completed=trainer.step,
-            episode=trainer.episode,
+            total=trainer.setup.total_steps,
+            completed=trainer.setup.step,
+            episode=trainer.setup.episode,
             episodes=trainer.config.episodes,
             coverage="-",
             score="-",

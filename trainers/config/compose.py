@@ -22,7 +22,7 @@ from emberlink.envs.utils.validation import describe, from_plain, known, plain, 
 
 from .schema import RunConfig
 
-_GROUPS = ("setup", "fire")
+_GROUPS = ("setup", "fire", "learner")
 
 
 def resolve(method: str, overrides: Sequence[str] = (), **settings: Any) -> RunConfig:
@@ -79,7 +79,12 @@ def override(config: RunConfig, overrides: Sequence[str]) -> RunConfig:
     for text in overrides:
         key, value = _parsed(text)
         if key in _GROUPS:
-            there = config.setup if key == "setup" else config.fire.name
+            names = {
+                "setup": config.setup,
+                "fire": config.fire.name,
+                "learner": config.learner.name,
+            }
+            there = names[key]
             if str(value) != there:
                 raise UserError(f"{text}: the run has {key}={there}")
         elif key not in known_keys:
@@ -171,6 +176,8 @@ def _check_overrides(method: str, overrides: Sequence[str], choices: dict[str, s
             raise UserError(f"{shown(text)!r}: give its keys one by one, as {key}.KEY=VALUE")
         if key in ("fire.name", "fire.kind"):
             raise UserError(f"{shown(text)!r}: a scenario is chosen with fire=NAME")
+        if key == "learner.name":
+            raise UserError(f"{shown(text)!r}: a learner is chosen with learner=NAME")
         if key in _GROUPS:
             chosen = str(parsed.value())
             if chosen not in known(key):
@@ -182,7 +189,8 @@ def _check_overrides(method: str, overrides: Sequence[str], choices: dict[str, s
     for key in others:
         if key not in keys:
             raise UserError(f"key {_quote(key, keys, listed=False)}")
-    choices.pop("fire", None)
+    for group in ("fire", "learner"):
+        choices.pop(group, None)
 
 
 def _known_keys(method: str, choices: dict[str, str]) -> list[str]:

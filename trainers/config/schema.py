@@ -8,9 +8,10 @@ import torch
 from pydantic import (
     ConfigDict,
     Field,
+    PlainValidator,
+    SerializeAsAny,
     Strict,
     field_validator,
-    model_validator,
 )
 from pydantic.dataclasses import dataclass
 
@@ -19,6 +20,8 @@ from emberlink.envs.config import WildfireConfig
 from emberlink.envs.scenarios import Scenario
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import Name, from_plain, shown
+from emberlink.trainers.learners.base import LearnerConfig
+from emberlink.trainers.learners.registry import parse_config as parse_learner
 
 _STRICT = ConfigDict(extra="forbid", strict=True)
 
@@ -30,16 +33,7 @@ NOT_LEARNT_WITH = (
 """keys that change nothing of what is learnt, so that runs that differ in them are the same"""
 
 
-Positive = Annotated[float, Field(gt=0, le=1e30)]
-
-
-NotNegative = Annotated[float, Field(ge=0, le=1e30)]
-
-
 Count = Annotated[int, Field(ge=1, le=1_000_000_000)]
-
-
-Units = Annotated[int, Field(ge=1, le=8192)]
 
 
 Side = Annotated[int, Field(ge=1, le=65_536)]
@@ -51,48 +45,8 @@ MaybeCount = Annotated[int, Field(ge=0)]
 Seed = Annotated[int, Field(ge=0, lt=2**31)]
 
 
-@dataclass(frozen=True, kw_only=True, config=_STRICT)
-class LearnerConfig:
-    """DDPG for every UAV (paper, section III.C)."""
-
-    hidden: Annotated[tuple[Units, Units], Strict(False)]
-    """units of the two hidden layers"""
-    gamma: Annotated[float, Field(ge=0, lt=1)]
-    """discount per step"""
-    actor_lr: Positive
-    """Adam's learning rate of the actors"""
-    critic_lr: Positive
-    """Adam's learning rate of the critics"""
-    critic_weight_decay: NotNegative
-    """L2 penalty in the critics' Adam"""
-    tau: Annotated[float, Field(gt=0, le=0.5)]
-    """share of the networks in their targets per update"""
-    updates_per_step: Count
-    """updates of every UAV's networks per step of all environments side by side"""
-    batch_size: Annotated[int, Field(ge=1, le=1_000_000)]
-    """transitions per UAV and update"""
-    buffer_size: Count
-    """transitions that a replay memory holds"""
-
-    @model_validator(mode="after")
-    def _a_batch_fits(self) -> "LearnerConfig":
-        if self.batch_size > self.buffer_size:
-            raise UserError(
-                f"batch_size={self.batch_size} is more than buffer_size={self.buffer_size} holds"
-            )
-        return self
-
-
-@dataclass(frozen=True, kw_only=True, config=_STRICT)
-class ExplorationConfig:
-    """Ornstein-Uhlenbeck noise: x += theta * (0 - x) * dt + sigma * sqrt(dt) * N(0, 1)."""
-
-    theta: NotNegative
-    """pull towards 0"""
-    sigma: NotNegative
-    """strength of the noise"""
-    dt: Positive
-    """length of a step"""
+LearnerChoice = Annotated[SerializeAsAny[LearnerConfig], PlainValidator(parse_learner)]
+"""the configuration of the learner that `learner.name` says"""
 
 
 @dataclass(frozen=True, kw_only=True, config=_STRICT)
@@ -121,8 +75,7 @@ class RunConfig:
     """the communication module's name and its settings"""
     env: WildfireConfig
     fire: Scenario
-    learner: LearnerConfig
-    exploration: ExplorationConfig
+    learner: LearnerChoice
     evaluation: EvaluationConfig
     episodes: Count
     """episodes of training, counted per environment: all run theirs side by side"""

@@ -18,15 +18,14 @@ from emberlink.envs.rendering.frame import write_gif
 from emberlink.envs.scenarios import fires_of
 from emberlink.envs.utils.errors import UserError
 from emberlink.policies.scripted.registry import SCRIPTED
-from emberlink.trainers.build import build_env, build_networks
+from emberlink.trainers.build import build_actor, build_env
 from emberlink.trainers.config.schema import RunConfig
+from emberlink.trainers.learners.base import ACTOR
 from emberlink.trainers.runs.run_folder import RunFolder, load_weights
 
 from . import evaluate, plots
 
 _PACKAGES = ("emberlink", "torch", "torchrl", "tensordict", "numpy")
-ACTOR = "actor_network_params.module."
-"""what the actor's weights are called in a checkpoint, before the name within the network"""
 
 
 def load_actor(config: RunConfig, checkpoint: Path) -> TensorDictModule:
@@ -42,7 +41,7 @@ def load_actor(config: RunConfig, checkpoint: Path) -> TensorDictModule:
         seed=0,
         device=config.device,
     )
-    actor, _ = build_networks(config, env)
+    actor = build_actor(config, env)
     network: Any = actor.module
     expected = {ACTOR + name: value for name, value in network.state_dict().items()}
     weights = load_weights(checkpoint, expected, config)

@@ -20,7 +20,7 @@ from pathlib import Path
 from emberlink.envs.fire_files.reader import KEPT
 
 from . import checkpoint_file
-from emberlink.trainers.evaluation.report import ACTOR
+from emberlink.trainers.learners.base import ACTOR
 from .run_folder import RunFolder
 from emberlink.envs.utils.errors import UserError
 
