@@ -12,6 +12,7 @@ from torchrl.data import Bounded, Composite, Unbounded
 from emberlink.envs import keys
 from emberlink.envs.config import WildfireConfig
 from emberlink.envs.utils import counter_rng
+from emberlink.envs.utils.counter_rng import Use
 from emberlink.envs.world import motion
 from emberlink.envs.world.reward import left_box
 
@@ -30,8 +31,6 @@ FIRE_SCORE = (keys.AGENTS, "fire_score")
 """int64 [...]: fire points discovered over the streak."""
 ALTITUDE_SUM = (keys.AGENTS, "altitude_sum")
 """float64 [...]: the altitudes of the streak added up; divided by the streak it is Avg_Alt."""
-
-_WAYPOINTS, _JITTER, _LOST = range(100, 103)  # what a moment's random stream is split into
 
 
 @dataclass(frozen=True, kw_only=True, config=ConfigDict(extra="forbid", strict=True))
@@ -70,7 +69,7 @@ class Consensus(CommModule):
         super().__init__(world, config)
         memory: list[Any] = list(self.memory_keys)
         seen: list[Any] = [keys.NEW_FIRE, keys.OLD_FIRE, keys.NEW_CENTRE, keys.OLD_CENTRE]
-        moment: list[Any] = [keys.OBSERVATION, keys.POSITION, keys.STREAM, keys.STEP]
+        moment: list[Any] = [keys.OBSERVATION, keys.POSITION, keys.RNG_KEY, keys.STEP]
         told: list[Any] = [keys.OBSERVATION, TARGET, FOLLOWS]
         self.in_keys, self.out_keys = moment + seen + memory, told + memory
         low, high = motion.corners(world.low, world.high)
@@ -97,7 +96,7 @@ class Consensus(CommModule):
         position = tensordict.get(keys.POSITION)
         nothing = torch.zeros_like(tensordict.get(keys.NEW_FIRE))
         points = motion.random_points(
-            self._stream(tensordict, _WAYPOINTS), position.shape[-2], self.low, self.high
+            self._step_key(tensordict, Use.WAYPOINT), position.shape[-2], self.low, self.high
         )
         tensordict.set(WAYPOINT, points)
         tensordict.set(STREAK, nothing)
@@ -128,7 +127,7 @@ class Consensus(CommModule):
             term = torch.where(old_alone, heading.circle * circling(*flight), term)
         if not self.config.wander:
             term = term.masked_fill(before.get(FOLLOWS) < 0, 0.0)
-        left = left_box(after.get(keys.BEYOND), self.world.reward.exit_axes)
+        left = left_box(after.get(keys.HIT_BOUNDARY), self.world.reward.exit_axes)
         return term.masked_fill(left, 0.0)
 
     def _hears(self, tensordict: TensorDictBase) -> Tensor:
@@ -136,7 +135,7 @@ class Consensus(CommModule):
         heard = neighbours(tensordict.get(keys.POSITION), self.config.range)
         if self.config.loss:
             uavs = heard.shape[-1]
-            unit = counter_rng.uniform(self._stream(tensordict, _LOST), uavs * uavs)
+            unit = counter_rng.uniform(self._step_key(tensordict, Use.MESSAGE_LOSS), uavs * uavs)
             heard = heard & (unit.unflatten(-1, (uavs, uavs)) >= self.config.loss)
         return heard
 
@@ -163,8 +162,8 @@ class Consensus(CommModule):
         """Where each UAV is to go, float32 [..., n, 3]; renews the wanderers' waypoints."""
         position = tensordict.get(keys.POSITION)
         waypoint, wanders = tensordict.get(WAYPOINT), follows < 0
-        stream = self._stream(tensordict, _WAYPOINTS)
-        other = motion.next_waypoint(waypoint, position, stream, self.low, self.high)
+        key = self._step_key(tensordict, Use.WAYPOINT)
+        other = motion.next_waypoint(waypoint, position, key, self.low, self.high)
         waypoint = torch.where(wanders[..., None], other, waypoint)
         tensordict.set(WAYPOINT, waypoint)
         new = (tensordict.get(keys.NEW_FIRE) > 0).unsqueeze(-1)
@@ -178,15 +177,15 @@ class Consensus(CommModule):
 
     def _jittered(self, tensordict: TensorDictBase, target: Tensor) -> Tensor:
         """Moves the x and y of targets closer than 1 by clipped noise, within the box."""
-        stream = self._stream(tensordict, _JITTER)
-        noise = counter_rng.normal(stream, 2 * target.shape[-2]).unflatten(-1, (-1, 2))
+        key = self._step_key(tensordict, Use.TARGET_JITTER)
+        noise = counter_rng.normal(key, 2 * target.shape[-2]).unflatten(-1, (-1, 2))
         noise = (self.config.jitter * noise).clamp(-1, 1)
         near = motion.distance(tensordict.get(keys.POSITION), target) < 1
         moved = target + torch.nn.functional.pad(noise, (0, 1)) * near[..., None]
         return moved.clamp(self.low.float(), self.high.float())
 
-    def _stream(self, tensordict: TensorDictBase, use: int) -> Tensor:
-        return counter_rng.at(tensordict.get(keys.STREAM), tensordict.get(keys.STEP), use)
+    def _step_key(self, tensordict: TensorDictBase, use: int) -> Tensor:
+        return counter_rng.step_key(tensordict.get(keys.RNG_KEY), tensordict.get(keys.STEP), use)
 
     def _scaled(self, told: Tensor) -> Tensor:
         if self.world.observation_scale == "raw":

@@ -12,11 +12,10 @@ from torchrl.envs.utils import ExplorationType, exploration_type
 
 from emberlink.envs import keys
 from emberlink.envs.utils import counter_rng
+from emberlink.envs.utils.counter_rng import Use
 
 NOISE = (keys.AGENTS, "noise")
 """float32 [..., 3]: the noise process, carried from step to step"""
-
-_SHOCKS = 300  # the use number of the noise in an environment's random stream
 
 
 @dataclass(frozen=True, kw_only=True, config=ConfigDict(extra="forbid", strict=True))
@@ -48,7 +47,7 @@ class OrnsteinUhlenbeck(TensorDictModuleBase):
         super().__init__()
         self.keep = 1 - config.theta * config.dt
         self.shock = config.sigma * math.sqrt(config.dt)
-        reads: list[Any] = [keys.ACTION, keys.STREAM, keys.STEP]
+        reads: list[Any] = [keys.ACTION, keys.RNG_KEY, keys.STEP]
         writes: list[Any] = [keys.ACTION, NOISE]
         self.in_keys, self.out_keys = reads, writes
 
@@ -56,8 +55,8 @@ class OrnsteinUhlenbeck(TensorDictModuleBase):
         if exploration_type() not in (None, ExplorationType.RANDOM):
             return tensordict
         action, step = tensordict.get(keys.ACTION), tensordict.get(keys.STEP)
-        stream = counter_rng.at(tensordict.get(keys.STREAM), step, _SHOCKS)
-        normal = counter_rng.normal(stream, action.shape[-2] * action.shape[-1]).view_as(action)
+        key = counter_rng.step_key(tensordict.get(keys.RNG_KEY), step, Use.EXPLORATION_NOISE)
+        normal = counter_rng.normal(key, action.shape[-2] * action.shape[-1]).view_as(action)
         before = tensordict.get(NOISE, None)
         if before is None:
             before = torch.zeros_like(action)

@@ -79,7 +79,7 @@ def test_communication_leaves_the_world_as_it_is(method):
             env.step(one.set(keys.ACTION, action)),
             plain.step(other.set(keys.ACTION, action)),
         )
-        for key in (keys.POSITION, keys.NEW_FIRE, keys.SEEN, keys.BEYOND):
+        for key in (keys.POSITION, keys.NEW_FIRE, keys.SEEN, keys.HIT_BOUNDARY):
             assert one["next"].get(key).equal(other["next"].get(key)), key
         bonus = (one["next", *keys.REWARD] - other["next", *keys.REWARD]).abs().max()
         assert (bonus > 0) == (method == "consensus")

@@ -16,6 +16,7 @@ from emberlink.comm.consensus import Consensus, ConsensusConfig
 from emberlink.envs import keys
 from emberlink.envs.config import WildfireConfig
 from emberlink.envs.utils import counter_rng
+from emberlink.envs.utils.counter_rng import Use
 
 FORMS = ["folded_linear", "folded_exponential", "linear"]
 
@@ -62,12 +63,12 @@ def test_random_networks_equal_plain_python(uavs):
             (draw() * 3).long() * sees,
             centre=position[..., :2] + draw(2) - 0.5,
             old_centre=position[..., :2] + draw(2) - 0.5,
-            beyond=draw(3) < 0.1,
+            hit_boundary=draw(3) < 0.1,
             step=step,
         )
         now = talk._reset(now, now) if before is None else talk._step(before, now)
         unit = counter_rng.uniform(
-            counter_rng.at(now[keys.STREAM], now[keys.STEP], 102), uavs * uavs
+            counter_rng.step_key(now[keys.RNG_KEY], now[keys.STEP], Use.MESSAGE_LOSS), uavs * uavs
         )
         lost = (unit < config.loss).unflatten(-1, (uavs, uavs))
         for env in range(envs):
@@ -104,6 +105,6 @@ def compare(scalar: ScalarConsensus, now, before, config: ConsensusConfig) -> in
             start = tuple(before[keys.POSITION][i].tolist())
             aim = tuple(before[consensus.TARGET][i].tolist())
             term = heading_term(config.heading.form, start, position[i], aim)
-            term *= not now[keys.BEYOND][i].any()
+            term *= not now[keys.HIT_BOUNDARY][i].any()
             assert reward == pytest.approx(term, abs=1e-4)
     return sum(leader not in (-1, i) for i, leader in enumerate(follows))

@@ -78,7 +78,7 @@ def test_all_policies_start_alike_on_the_same_fires(cache, monkeypatch):
     def play(env, policy):
         moment = env.reset()
         world = env.base_env
-        seen = moment["agents", "position"].tolist(), world.arrival.tolist()
+        seen = moment["agents", "position"].tolist(), world.arrival_time.tolist()
         begun.setdefault(len(begun), seen)
         return {name: torch.zeros(evaluate.BLOCK) for name in metrics.NAMES}
 
@@ -86,7 +86,7 @@ def test_all_policies_start_alike_on_the_same_fires(cache, monkeypatch):
     evaluate.evaluate(config, untrained(config), fires=4)
     policies = 1 + len(SCRIPTED)
     assert len(begun) == 2 * policies
-    seeds = fire_seeds("heldout", 4)
+    seeds = fire_seeds("test", 4)
     for panel, scenario in enumerate(("huygens", "paper")):
         fires = make_fires(load_scenario(scenario), seeds, (12, 10), 12).tolist()
         for place in range(policies):

@@ -54,7 +54,7 @@ def test_the_heading_term_is_added_unless_the_uav_left_the_box(axes, exits):
         [[10.0 * i + 1, 5.0, 2.0] for i in range(4)],
         [1] * 4,
         centre=[[0.0, 60.0]] * 4,
-        beyond=[INSIDE, (True, False, False), (False, True, False), (False, False, True)],
+        hit_boundary=[INSIDE, (True, False, False), (False, True, False), (False, False, True)],
     )
     after.set(keys.REWARD, torch.full((1, 4, 1), -7.0))
     reward = talk._step(before, after)[keys.REWARD]

@@ -147,7 +147,7 @@ def test_what_came_after_the_checkpoint_is_cut_off_and_made_again(whole, tmp_pat
     trainer = until(begun("positional", tmp_path, "checkpoint_steps=7"), 45)
     run = trainer.run
     (run.checkpoints / "state_000000045.safetensors").unlink()
-    (run.checkpoints / "state_000000049.safetensors.part").write_bytes(b"half a file")
+    (run.checkpoints / "state_000000049.safetensors.17.part").write_bytes(b"half a file")
     (run.checkpoints / ".tmpQ3x9Zk").write_bytes(b"half a file of safetensors'")
     (run.path / "metrics.jsonl").open("a").write('{"episode": 3, "upd')
     again = resume(run.path)

@@ -97,7 +97,7 @@ def test_seeds_of_a_stack_differ_in_all_that_is_random():
     first, second = (learner.weights(team) for team in range(2))
     assert not any(first[name].equal(second[name]) for name in first if "norm" not in name)
     world: Any = setup.env.base_env
-    assert not world.arrival[0].equal(world.arrival[1])
+    assert not world.arrival_time[0].equal(world.arrival_time[1])
     collected = next(iter(setup.collector))
     for key in (keys.POSITION, NOISE):
         assert not collected[key][0].isclose(collected[key][1]).any(), key
@@ -117,8 +117,8 @@ def test_environments_of_several_seeds_are_those_of_each():
     for team, moment in enumerate(moments):
         own = slice(3 * team, 3 * team + 3)
         assert whole[own][keys.POSITION].equal(moment[keys.POSITION])
-        assert whole[own][keys.STREAM].equal(moment[keys.STREAM])
-        assert together.arrival[own].equal(singles[team].arrival)
+        assert whole[own][keys.RNG_KEY].equal(moment[keys.RNG_KEY])
+        assert together.arrival_time[own].equal(singles[team].arrival_time)
 
 
 @pytest.mark.parametrize("seeds", [[], [1, -1], [1, 2]])
@@ -175,7 +175,7 @@ def test_seeds_from_python():
     for seeds in ([1, 2], (1, 2), range(1, 3)):
         assert resolve("consensus", seeds=seeds).seeds == (1, 2)
     assert resolve("consensus", seeds=[4, 2]).seed == 4
-    assert WildfireEnv(2, seed=torch.tensor(3)).reset()[keys.STREAM].shape == (2,)
+    assert WildfireEnv(2, seed=torch.tensor(3)).reset()[keys.RNG_KEY].shape == (2,)
     with pytest.raises(ValueError, match="an environment takes seed="):
         make_env("consensus", seeds=[1, 2])
 

@@ -9,10 +9,11 @@ import pytest
 from tensordict import TensorDict
 from workloads import METHODS, make
 
+from emberlink.envs import keys
 from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.learners.base import LearnerContext
 from emberlink.trainers.learners.nan_guard import NonFiniteGuard
-from emberlink.trainers.learners.replay_buffer import ReplayMemory, observation_keys, to_rows
+from emberlink.trainers.learners.replay_buffer import ReplayMemory, to_rows
 from emberlink.trainers.training.trainer import Trainer
 
 MILLION = 1_000_000
@@ -29,7 +30,7 @@ def test_a_million_transitions(tell, method):
     """Resident bytes against those of the numbers: both observations, action and reward."""
     env = make(method, 1)
     shared = resolve(method).replay == "shared"
-    rows = to_rows(env.rollout(1), 1, observation_keys(env.observation_spec))
+    rows = to_rows(env.rollout(1), 1, keys.observation_keys(env.observation_spec))
     uavs, features = rows["observation"].shape[-2:]
     # Private memories hold a million each; one that is shared holds a million in all.
     numbers = 4 * (2 * features + 3 + 1) * MILLION * (1 if shared else uavs)

@@ -8,9 +8,10 @@ import torch
 from rich.console import Console
 from torchrl.envs.utils import check_env_specs
 
+from emberlink.configs import known
 from emberlink.envs.fire.generator import load_scenario, make_fires
 from emberlink.trainers.build import make_env
-from emberlink.trainers.config.compose import known, resolve
+from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.training.setup import TrainingSetup
 
 _PACKAGES = ("emberlink", "torch", "torchrl", "tensordict", "pettingzoo", "wandb", "hydra-core")

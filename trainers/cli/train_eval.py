@@ -14,14 +14,15 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
+from emberlink.configs import known
 from emberlink.envs.utils.errors import UserError
-from emberlink.envs.utils.validation import known
 from emberlink.trainers.config.compose import override, resolve
 from emberlink.trainers.config.schema import RunConfig, check_device
 from emberlink.trainers.evaluation import report
 from emberlink.trainers.evaluation.evaluate import Policy
 from emberlink.trainers.runs.pretrained import open_run
 from emberlink.trainers.runs.run_folder import RunFolder
+from emberlink.trainers.runs.seal import check_trained_with
 from emberlink.trainers.runs.signals import Interrupted, Interruption
 from emberlink.trainers.training.non_finite import NonFiniteError
 from emberlink.trainers.training.resume import resume
@@ -187,6 +188,7 @@ def evaluate_folder(
     config = run.config(**({} if device is None else {"device": device}))
     label = f"_{checkpoint.stem}" if checkpoint else ""
     checkpoint = checkpoint or run.checkpoint()
+    check_trained_with(checkpoint, config)
     for text in overrides:
         if not text.startswith(_EVALUATED_WITH):
             raise UserError(

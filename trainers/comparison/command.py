@@ -1,5 +1,6 @@
 """`emberlink compare`: several runs in one report."""
 
+import os
 import re
 import shlex
 import tempfile
@@ -77,7 +78,7 @@ def _free(output: Path | None) -> Path:
     """A folder that holds nothing, or is not there yet."""
     if output is None:
         tried = (Path("compare" if i == 1 else f"compare_{i}") for i in range(1, 10_000))
-        return next(path for path in tried if not path.exists())
+        return next(path for path in tried if not os.path.lexists(path))
     if output.is_symlink() and not output.exists():
         raise UserError(f"--output {output}: a link to what is not there; name a new folder")
     if output.exists() and (not output.is_dir() or any(output.iterdir())):
@@ -122,7 +123,7 @@ def _for_a_file(name: str) -> str:
 
 
 def _frozen_caption(one: Numbers, fire: str) -> str:
-    count = one.section.runs[0].evaluation.episodes
+    count = one.section.runs[0].evaluation.fires
     return (
         f"Frozen policies on {count} held-out fires of {fire}. Small dots: a run's mean over its "
         "episodes, one a seed. Large dot: interquartile mean over seeds; line: 95 % bootstrap "
@@ -142,7 +143,7 @@ def _caption(one: Numbers, number: int, what: str) -> str:
     if one.on_trained:
         text += (
             " Dashed: scripted policies, mean over the frozen evaluation's "
-            f"{one.section.runs[0].evaluation.episodes} episodes on {one.section.trained_on}, the "
+            f"{one.section.runs[0].evaluation.fires} episodes on {one.section.trained_on}, the "
             "fire trained on; in a method's colour where the number is that method's alone."
         )
     return text

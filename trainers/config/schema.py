@@ -1,27 +1,22 @@
 """The schema of a run's configuration."""
 
-from collections.abc import Mapping
-from dataclasses import asdict, fields
+from dataclasses import asdict
 from typing import Annotated, Any, Literal
 
 import torch
-from pydantic import (
-    ConfigDict,
-    Field,
-    PlainValidator,
-    SerializeAsAny,
-    Strict,
-    field_validator,
-)
+from pydantic import ConfigDict, Field, PlainValidator, SerializeAsAny, Strict, field_validator
 from pydantic.dataclasses import dataclass
 
 from emberlink.comm import registry
+from emberlink.comm.base import CommModule
 from emberlink.envs.config import WildfireConfig
 from emberlink.envs.scenarios import Scenario
 from emberlink.envs.utils.errors import UserError
-from emberlink.envs.utils.validation import Name, from_plain, shown
+from emberlink.envs.utils.validation import Name, shown
 from emberlink.trainers.learners.base import LearnerConfig
 from emberlink.trainers.learners.registry import parse_config as parse_learner
+
+from . import choice
 
 _STRICT = ConfigDict(extra="forbid", strict=True)
 
@@ -117,46 +112,35 @@ class RunConfig:
     @field_validator("comm")
     @classmethod
     def _comm_is_known(cls, value: dict[str, Any]) -> dict[str, Any]:
-        if "name" not in value:
-            raise UserError(f"name is missing; known: {', '.join(registry.known())}")
-        config_type = registry.find(value["name"]).config_type
-        settings, names = _without_name(value), [field.name for field in fields(config_type)]
-        for key in settings.keys() - names:
-            listed = ", ".join(names) or "none"
-            raise UserError(f"comm.{key} is not a setting of {value['name']}; known: {listed}")
-        from_plain(config_type, settings)
+        choice.check("comm", value, registry)
         return value
 
 
-def _without_name(comm: Mapping[str, Any]) -> dict[str, Any]:
-    return {key: value for key, value in comm.items() if key != "name"}
-
-
-def build_comm(config: RunConfig):
-    """The communication module of a configuration."""
-    return registry.build(config.comm["name"], config.env, _without_name(config.comm))
+def build_comm(config: RunConfig) -> CommModule:
+    """Returns a new communication module of a configuration."""
+    settings = {key: value for key, value in config.comm.items() if key != "name"}
+    return registry.build(config.comm["name"], config.env, settings)
 
 
 def comm_settings(config: RunConfig) -> dict[str, Any]:
-    """All settings of a configuration's communication module, defaults included."""
-    config_type = registry.find(config.comm["name"]).config_type
-    return asdict(from_plain(config_type, _without_name(config.comm)))
+    """Returns all settings of a configuration's communication module, defaults included."""
+    return asdict(choice.settings("comm", config.comm, registry))
 
 
 def check_device(name: str) -> str:
-    """The name, if it is a device of this machine.
+    """Returns the name of a device, after checking that this machine has it.
 
     Raises:
-        ValueError: it is none; the message lists those there are.
+        UserError: there is no such device; the message lists those that there are.
     """
     present = ["cpu", *(f"cuda:{i}" for i in range(torch.cuda.device_count()))]
     try:
         device = torch.device(name)
     except RuntimeError:
         device = None
-    there = device is not None and (
+    found = device is not None and (
         str(device) == "cpu" or (device.type == "cuda" and (device.index or 0) < len(present) - 1)
     )
-    if not there:
+    if not found:
         raise UserError(f"device={shown(name)} is not there; known: {', '.join(present)}")
     return name

@@ -88,7 +88,7 @@ def evaluation_fires(config: RunConfig, count: int) -> dict[str, Tensor]:
     """
     grid, horizon = config.env.grid, config.env.horizon
     return {
-        name: fires_of(scenario).heldout(count, grid, horizon)
+        name: fires_of(scenario).test(count, grid, horizon)
         for name, scenario in evaluation_scenarios(config).items()
     }
 
@@ -97,7 +97,7 @@ def shown_fire(config: RunConfig) -> tuple[str, Tensor]:
     """The evaluation's fire to draw: its scenario's name, and arrival times, float32 [X, Y]."""
     name = shown_scenario(config.fire)
     fires = fires_of(evaluation_scenarios(config)[name])
-    return name, fires.one_heldout(0, config.env.grid, config.env.horizon)[0]
+    return name, fires.test_fire(0, config.env.grid, config.env.horizon)[0]
 
 
 def evaluate(

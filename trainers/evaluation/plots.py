@@ -34,7 +34,7 @@ def training_curves(path: Path, lines: Sequence[Mapping[str, Any]], title: str) 
         axes.xaxis.set_major_locator(MaxNLocator(integer=True))
         axes.grid(alpha=0.3)
     figure.axes[0].legend(fontsize="small")
-    figure.savefig(path, dpi=120)
+    figure.savefig(path, format="png", dpi=120)
 
 
 def coverage_bars(path: Path, results: Results) -> None:
@@ -65,7 +65,7 @@ def coverage_bars(path: Path, results: Results) -> None:
         axes.grid(axis="y", alpha=0.3)
         axes.set_axisbelow(True)
     panels[0].set_ylabel("coverage, % (mean above)")
-    figure.savefig(path, dpi=120)
+    figure.savefig(path, format="png", dpi=120)
 
 
 def timelapse(
@@ -80,4 +80,4 @@ def timelapse(
         axes.set_axis_off()
     if title:
         figure.suptitle(title, parse_math=False)
-    figure.savefig(path, dpi=120)
+    figure.savefig(path, format="png", dpi=120)

@@ -74,8 +74,9 @@ def evaluate_run(
     def say(fire: str, policy: str) -> None:
         report(f"{policy} on {fires} fires of {fire}")
 
-    results = evaluate.evaluate(config, actor, fires=fires, report=say)
     try:
+        run.figures()  # refused before the episodes are played, not after
+        results = evaluate.evaluate(config, actor, fires=fires, report=say)
         _draw(run, config, actor, results, report, label)
     except OSError as error:
         raise UserError(
@@ -94,16 +95,20 @@ def _draw(
     report: Callable[[str], None],
     label: str,
 ) -> None:
-    plots.coverage_bars(run.figure(f"coverage{label}.png"), results)
+    with run.figure(f"coverage{label}.png") as path:
+        plots.coverage_bars(path, results)
     lines = run.lines()
     if lines:
         title = f"{config.method}, setup {config.setup}, fire {config.fire.name}"
-        plots.training_curves(run.figure("training.png"), lines, title)
+        with run.figure("training.png") as path:
+            plots.training_curves(path, lines, title)
     report("one episode for the animation")
     name, arrival = evaluate.shown_fire(config)
     pictures, steps = evaluate.film(config, actor, fire=arrival)
-    write_gif(run.figure(f"episode_{name}{label}.gif"), pictures)
-    plots.timelapse(run.figure(f"timelapse_{name}{label}.png"), pictures, steps)
+    with run.figure(f"episode_{name}{label}.gif") as path:
+        write_gif(path, pictures)
+    with run.figure(f"timelapse_{name}{label}.png") as path:
+        plots.timelapse(path, pictures, steps)
 
 
 def record(config: RunConfig, results: evaluate.Results, **about: Any) -> dict[str, Any]:

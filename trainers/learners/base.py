@@ -73,8 +73,8 @@ class Learner(ABC):
     """Trains the networks of all UAVs, of one seed or of several side by side.
 
     A subclass in a file of its own, `trainers/learners/<name>.py`, is a new learner; its defaults
-    are in `configs/learner/<name>.yaml`. It owns the networks, how they are updated, the transitions it learns from,
-    the exploration policy, its named losses and its state.
+    are in `configs/learner/<name>.yaml`. It owns the networks, how they are updated, the
+    transitions it learns from, the exploration policy, its named losses and its state.
 
     Args:
         config: an instance of `config_type`.

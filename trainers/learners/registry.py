@@ -53,8 +53,8 @@ def parse_config(values: Any) -> LearnerConfig:
     if isinstance(values, LearnerConfig):
         return values
     if not isinstance(values, Mapping) or not isinstance(values.get("name"), str):
-        raise UserError(f"learner: name is missing; known: {', '.join(known())}")
-    return from_plain(find(values["name"]).config_type, values)
+        raise UserError(f"learner.name is missing; known: {', '.join(known())}")
+    return from_plain(find(values["name"]).config_type, values, "learner")
 
 
 def build(config: LearnerConfig, context: LearnerContext) -> Learner:

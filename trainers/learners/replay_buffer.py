@@ -7,12 +7,13 @@ from typing import Any
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.data import Composite, LazyTensorStorage, ReplayBuffer, RoundRobinWriter
+from torchrl.data import LazyTensorStorage, ReplayBuffer, RoundRobinWriter
 from torchrl.data.replay_buffers.samplers import RandomSampler
 from torchrl.data.replay_buffers.storages import TensorStorage
 
 from emberlink.envs import keys
 from emberlink.envs.utils import counter_rng
+from emberlink.envs.utils.counter_rng import Use
 
 from .base import LearnerContext
 from .tensors import flatten, group, prefixed, unflatten
@@ -20,7 +21,6 @@ from .tensors import flatten, group, prefixed, unflatten
 DONE = (keys.AGENTS, "done")
 TERMINATED = (keys.AGENTS, "terminated")
 
-_SAMPLES = 2**40  # the number of the samples in a seed's random stream; environments count from 0
 _ROWS, _COLUMNS = range(2)
 
 
@@ -39,7 +39,7 @@ class ReplayMemory:
     def __init__(self, context: LearnerContext, *, batch_size: int, buffer_size: int):
         uavs, shared = context.num_uavs, context.shared_replay
         self.teams, self.device = len(context.seeds), context.device
-        self._keys = observation_keys(context.observation_spec)
+        self._keys = keys.observation_keys(context.observation_spec)
         size = -(-buffer_size // uavs) if shared else buffer_size
         # No more is allocated than a run can fill.
         self.capacity = min(size, context.total_steps * context.num_envs)
@@ -143,7 +143,7 @@ class TeamSampler(RandomSampler):
         # On the device, so that a recorded graph reads their present values.
         self.draws = torch.zeros((), dtype=torch.int64, device=device)
         self.filled = torch.zeros((), dtype=torch.int64, device=device)
-        self._streams = counter_rng.fold(torch.tensor(seeds, device=device), _SAMPLES)
+        self._keys = counter_rng.fold_in(torch.tensor(seeds, device=device), Use.REPLAY_SAMPLE)
         self._team = torch.arange(len(seeds), device=device)[:, None, None] * uavs
         self._own = torch.arange(uavs, device=device)
 
@@ -155,12 +155,12 @@ class TeamSampler(RandomSampler):
         """Returns rows and columns, int64 [batch_size, teams * uavs] each; column k is UAV k's."""
         if len(storage) == 0:
             raise RuntimeError("cannot sample from an empty replay memory")
-        stream = counter_rng.fold(self._streams, self.draws)
+        key = counter_rng.fold_in(self._keys, self.draws)
         self.draws += 1
 
         def draw(use: int, limit: int | Tensor) -> Tensor:
             numbers = counter_rng.integers(
-                counter_rng.fold(stream, use), batch_size * self.uavs, limit
+                counter_rng.fold_in(key, use), batch_size * self.uavs, limit
             )
             return numbers.view(-1, batch_size, self.uavs)
 
@@ -186,11 +186,6 @@ class _ClaimedStorage(LazyTensorStorage):
         from as many rows as there were when it was recorded.
         """
         return self._storage[index]
-
-
-def observation_keys(spec: Composite) -> list[Any]:
-    """Returns the keys of the agents' tensors that the networks read."""
-    return keys.observation_keys(spec) if hasattr(keys, "observation_keys") else [keys.OBSERVATION]
 
 
 def to_rows(rollout: TensorDictBase, teams: int, observations: Sequence[Any]) -> TensorDict:

@@ -12,6 +12,7 @@ from torchrl.objectives import TD3Loss
 
 from emberlink.envs import keys
 from emberlink.envs.utils import counter_rng
+from emberlink.envs.utils.counter_rng import Use
 from emberlink.policies.networks.actor_critic import make_critic
 
 from .base import STRICT, Count, LearnerContext, Losses, NotNegative, sharing
@@ -19,8 +20,6 @@ from .off_policy import OffPolicyConfig, OffPolicyLearner
 
 _TARGET_NOISE = (keys.AGENTS, "target_noise")
 """float32 [batch, uavs, 3]: added to the target's actions; part of the next observation's level"""
-_NOISE_STREAM = 2**40 + 1
-"""the number of the target noise in a seed's random stream; the replay memory has 2**40"""
 _CRITICS = 2
 
 
@@ -46,7 +45,7 @@ class TD3(OffPolicyLearner):
     def __init__(self, config: TD3Config, context: LearnerContext):
         super().__init__(config, context)
         seeds = torch.tensor(context.seeds, device=context.device)
-        self._streams = counter_rng.fold(seeds, _NOISE_STREAM)
+        self._keys = counter_rng.fold_in(seeds, Use.TARGET_NOISE)
 
     def make_loss(self, context: LearnerContext, generators: list[torch.Generator]) -> TD3Loss:
         specs, config = (context.observation_spec, context.action_spec), self.config
@@ -77,8 +76,8 @@ class TD3(OffPolicyLearner):
         batch, config = self.replay.sample(), self.config
         action = batch.get(keys.ACTION)
         size, _, features = action.shape
-        streams = counter_rng.fold(self._streams, self.replay.draws)
-        normal = counter_rng.normal(streams, action.numel() // self.teams)
+        key = counter_rng.fold_in(self._keys, self.replay.draws)
+        normal = counter_rng.normal(key, action.numel() // self.teams)
         noise = normal.view(self.teams, size, -1, features).transpose(0, 1).reshape(action.shape)
         clip = config.target_noise_clip
         batch.set(("next", *_TARGET_NOISE), (noise * config.target_noise).clamp(-clip, clip))

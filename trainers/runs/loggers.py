@@ -5,6 +5,7 @@ A tracker is a guest: whatever becomes of it, the training goes on and metrics.j
 
 import os
 import queue
+import re
 import sys
 import threading
 import warnings
@@ -14,14 +15,18 @@ from typing import Any
 
 from torchrl.record.loggers import CSVLogger, Logger, TensorboardLogger, WandbLogger
 
+from emberlink.envs.utils.atomic_io import inner_folder, remove_files, remove_links
 from emberlink.trainers.config.compose import to_values
-from .run_folder import RunFolder
 from emberlink.trainers.config.schema import RunConfig
+
+from .run_folder import RunFolder
 
 PATIENCE = 60.0
 """seconds that the end of a training waits for its tracker"""
 _CONNECTING = 20.0
 """seconds that wandb may take to reach its server, where WANDB_MODE=online"""
+_MEASURE = re.compile(r"\w[\w.+-]*(/\w[\w.+-]*)?")
+"""names of measures, "coverage" or "fire/coverage"; each is also the path of a .csv file"""
 
 
 def _wandb(config: RunConfig, run: RunFolder, episode: int) -> Logger:
@@ -29,7 +34,9 @@ def _wandb(config: RunConfig, run: RunFolder, episode: int) -> Logger:
 
     A resumed run keeps its name there: the last part of the folder that wandb made for it.
     """
-    before = sorted((run.path / "wandb").glob("*run-*-*"))
+    folder = inner_folder(run.path, "wandb")
+    remove_links(folder)  # wandb makes its own anew
+    before = sorted(folder.glob("*run-*-*"))
     import wandb
 
     offline = os.environ.get("WANDB_MODE", "offline") in ("", "offline", "dryrun")
@@ -55,8 +62,11 @@ def _wandb(config: RunConfig, run: RunFolder, episode: int) -> Logger:
 
 
 def _tensorboard(config: RunConfig, run: RunFolder, episode: int) -> Logger:
+    folder = inner_folder(run.path, "tensorboard")
+    remove_links(folder)
+    before = any(folder.glob("events*"))
     logger = TensorboardLogger(exp_name="tensorboard", log_dir=str(run.path))
-    if episode or any((run.path / "tensorboard").glob("events*")):
+    if episode or before:
         _purge(logger, episode + 1)
     return logger
 
@@ -72,8 +82,8 @@ def _purge(logger: Logger, step: int) -> None:
 
 def _csv(config: RunConfig, run: RunFolder, episode: int) -> Logger:
     """Written anew from metrics.jsonl for a resumed run: what was cut or lost there is here too."""
-    for file in (run.path / "csv" / "scalars").rglob("*.csv"):
-        file.unlink()
+    for part in ("scalars", "videos", "texts"):
+        remove_files(inner_folder(run.path, "csv", part), ".csv")
     logger = CSVLogger(exp_name="csv", log_dir=str(run.path))
     for line in run.lines()[:episode]:
         _log(logger, line, line["episode"])
@@ -174,6 +184,8 @@ def _log(logger: Logger, line: Mapping[str, Any], step: int) -> None:
         logger.log_metrics(dict(line), step=step, override_global_step=True)
         return
     for name, value in line.items():
+        if isinstance(logger, CSVLogger) and not _MEASURE.fullmatch(name):
+            raise ValueError(f"{name!r} is no name of a measure")  # it would be a file's
         logger.log_scalar(name, float(value), step=step)
 
 

@@ -18,11 +18,13 @@ from importlib.resources import files
 from pathlib import Path
 
 from emberlink.envs.fire_files.reader import KEPT
+from emberlink.envs.utils.errors import UserError
+from emberlink.trainers.config.compose import to_values
+from emberlink.trainers.learners.base import ACTOR
+from emberlink.trainers.runs.seal import check_trained_with
 
 from . import checkpoint_file
-from emberlink.trainers.learners.base import ACTOR
 from .run_folder import RunFolder
-from emberlink.envs.utils.errors import UserError
 
 PREFIX = "pretrained:"
 USUAL_SETUP = "tuned"
@@ -96,16 +98,19 @@ def pack(run: RunFolder, into: Path) -> Path:
     Raises:
         ValueError: the run is not finished, or the folder is there.
     """
-    config = replace(run.config(), output="runs", logger="none", device="cpu")
+    trained = run.config()
+    config = replace(trained, output="runs", logger="none", device="cpu")
     if len(run.lines()) < config.episodes or not (run.path / "eval.json").exists():
         raise UserError(f"{run.path}: not finished, or not evaluated")
     target = into / config.setup / config.method / f"s{config.seed}"
     if target.exists():
         raise UserError(f"{target}: is there already")
     newest = run.checkpoint()
+    check_trained_with(newest, trained)
     header, weights = checkpoint_file.read(newest)
     actors = {name: value for name, value in weights.items() if name.startswith(ACTOR)}
-    about = {k: v for k, v in (header or {}).items() if k not in ("sha256", "format", "config")}
+    about = {k: v for k, v in (header or {}).items() if k not in ("sha256", "format")}
+    about["config"] = to_values(config)
     (target / "checkpoints").mkdir(parents=True)
     checkpoint_file.write(target / "checkpoints" / newest.name, actors, about)
     RunFolder(target).write_config(config)

@@ -14,9 +14,10 @@ from hydra.errors import HydraException
 from rich.console import Console
 from rich.table import Table
 
-from emberlink.envs.utils.atomic_io import free_name
+from emberlink.configs import known
+from emberlink.envs.utils.atomic_io import inner_folder
 from emberlink.envs.utils.errors import UserError
-from emberlink.envs.utils.validation import known
+from emberlink.envs.utils.publish import free_name
 from emberlink.trainers.config.compose import flat, resolve, to_values
 from emberlink.trainers.config.schema import NOT_LEARNT_WITH, RunConfig
 from emberlink.trainers.runs.run_folder import RunFolder
@@ -163,9 +164,10 @@ class _Team:
 
     def _start(self, job: Job) -> None:
         config = job.configs[0]
-        logs = Path(config.output) / "logs"
+        output = Path(config.output)
         try:
-            logs.mkdir(parents=True, exist_ok=True)
+            output.mkdir(parents=True, exist_ok=True)
+            logs = inner_folder(output, "logs")
             stem = f"{config.setup}_{job.method}_s" + "-".join(str(c.seed) for c in job.configs)
             job.log = Path(f"{free_name(logs, stem, ['.txt'])}.txt")
             with job.log.open("x") as log:

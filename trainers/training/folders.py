@@ -67,6 +67,7 @@ class RunFolders:
     def check_lines(self, sizes: Iterable[Sizes], episode: int) -> None:
         """Checks that the files of lines begin as they were when a checkpoint was made."""
         for run, size in zip(self.runs, sizes, strict=True):
+            run.own_checkpoints()
             for file in LINES:
                 run.check_lines(file, size[file], episode)
 
@@ -109,10 +110,13 @@ def find_runs(folder: Path) -> list[RunFolder]:
         missing = [run.path for run in runs if not run.path.is_dir()]
         if folder.resolve() not in [run.path for run in runs]:
             raise UserError(folder)
+        linked = [run.path for run in runs if run.path.is_symlink()]
     except PermissionError as error:
         raise UserError(f"{file}: cannot be read: {error.strerror}") from None
     except (OSError, ValueError, TypeError, KeyError):
         raise UserError(f"{file}: does not name the folders of the other seeds") from None
+    for path in linked:
+        raise UserError(f"{path}: cannot be resumed: it is a link, named by {file}")
     for path in missing:
         raise UserError(f"{path}: is missing; its seed trains side by side with {folder}")
     return runs

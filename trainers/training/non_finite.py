@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from emberlink.envs import keys
-from emberlink.envs.utils.atomic_io import free_name
 from emberlink.envs.utils.errors import UserError
+from emberlink.envs.utils.publish import free_name
 from emberlink.trainers.learners.nan_guard import ROLLOUT
 from emberlink.trainers.learners.tensors import flatten, group, prefixed, unflatten
 from emberlink.trainers.runs import checkpoint_file
@@ -128,7 +128,7 @@ def _in_rollout(setup: TrainingSetup, steps: int) -> NonFiniteReport:
 def first_non_finite(state: Mapping[str, Tensor]) -> str | None:
     """Returns the name of the first tensor of a setup's state that is not finite, if any."""
     for name, value in state.items():
-        fires = name.endswith("arrival")  # infinite where nothing burns, NaN in the margin
+        fires = "arrival_time" in name  # infinite where nothing burns, NaN in the margin
         if not fires and value.is_floating_point() and not value.isfinite().all():
             return name
     return None
@@ -159,7 +159,7 @@ def error_of(setup: TrainingSetup, run: RunFolder) -> NonFiniteError:
 
 def _write(setup: TrainingSetup, run: RunFolder, report: NonFiniteReport) -> Path:
     """Writes the rollout or batch, the learner before the update, and the report."""
-    whole = free_name(run.path, f"divergence_step_{report.step}", [""])
+    whole = free_name(run.path, f"divergence_step_{report.step}", ["", ".part"])
     folder = whole.with_name(whole.name + ".part")
     folder.mkdir()
     place, steps, _ = setup.guard.found()

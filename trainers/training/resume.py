@@ -1,22 +1,19 @@
 """Continues a run that was stopped, as if it had not been."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import shown
-from emberlink.trainers.config.compose import flat, from_values, override, to_values
-from emberlink.trainers.config.schema import NOT_LEARNT_WITH, RunConfig
+from emberlink.trainers.config.compose import override
+from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.runs.run_folder import RunFolder, step_of
+from emberlink.trainers.runs.seal import MAY_CHANGE, check_same, differences
 
 from . import checkpoints
 from .folders import RunFolders, Sizes, check_seeds, empty, find_runs
 from .trainer import Trainer
-
-MAY_CHANGE = ("episodes", *NOT_LEARNT_WITH)
-"""keys that a resumed run may be given anew, beside those of `evaluation`"""
 
 
 def resume(path: Path, method: str | None = None, overrides: Sequence[str] = ()) -> Trainer:
@@ -76,7 +73,7 @@ def _check_beginning(runs: Sequence[RunFolder], config: RunConfig) -> None:
                 f"{run.path}: has metrics of {len(lines)} episodes and no checkpoint "
                 "(checkpoints/state_*.safetensors): it cannot be resumed, and nothing was changed"
             )
-        run.checkpoints.mkdir(exist_ok=True)
+        run.own_checkpoints()
 
 
 def _changed(config: RunConfig, method: str | None, overrides: Sequence[str]) -> RunConfig:
@@ -84,20 +81,10 @@ def _changed(config: RunConfig, method: str | None, overrides: Sequence[str]) ->
     if method is not None and method != config.method:
         raise UserError(f"method {method!r}: the run is of method {config.method!r}")
     changed = override(config, overrides)
-    for key, (new, old) in _differences(changed, config).items():
+    for key, (new, old) in differences(changed, config).items():
         if key not in MAY_CHANGE and not key.startswith("evaluation."):
             raise UserError(f"{key}={new}: the run has {key}={old}; a resumed run keeps it")
     return changed
-
-
-def _differences(one: RunConfig, other: RunConfig) -> dict[str, tuple[Any, Any]]:
-    """Returns the values of the keys in which two configurations differ."""
-    first, second = flat(to_values(one)), flat(to_values(other))
-    return {
-        key: (first.get(key), second.get(key))
-        for key in dict.fromkeys([*first, *second])
-        if first.get(key) != second.get(key)
-    }
 
 
 def _restore(trainer: Trainer, runs: Sequence[RunFolder], chosen: Path | None) -> Sequence[Sizes]:
@@ -113,7 +100,7 @@ def _restore(trainer: Trainer, runs: Sequence[RunFolder], chosen: Path | None) -
     path = chosen or states[-1]
     try:
         state, tensors = checkpoints.read(path)
-        _check_config(trainer.config, path, state.config)
+        check_same(path, state.config, trainer.config)
         if state.step > trainer.setup.total_steps:
             done = state.step / trainer.config.env.horizon
             raise UserError(f"episodes={trainer.config.episodes}: the run has done {done:g}")
@@ -125,14 +112,3 @@ def _restore(trainer: Trainer, runs: Sequence[RunFolder], chosen: Path | None) -
     if len(runs) > 1 and state.folders != [run.path.name for run in runs]:
         raise UserError(f"{path}: of the folders {shown(', '.join(state.folders))}")
     return state.sizes
-
-
-def _check_config(config: RunConfig, path: Path, values: Mapping[str, Any]) -> None:
-    """Checks that a checkpoint's configuration is the run's, but for what may change."""
-    free = {key: getattr(config, key) for key in (*MAY_CHANGE, "output", "evaluation")}
-    try:
-        made = from_values({**values, "device": config.device})
-    except ValueError as error:
-        raise UserError(f"{path}: its configuration is not valid: {error}") from None
-    for key, (found, wanted) in _differences(replace(made, **free), config).items():
-        raise UserError(f"{path}: made with {key}={found}; the run has {key}={wanted}")

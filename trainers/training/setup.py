@@ -14,7 +14,6 @@ from emberlink.policies.networks.actor_critic import team_of
 from emberlink.trainers.build import build_env, build_learner
 from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.learners.nan_guard import NonFiniteGuard
-from emberlink.trainers.learners.replay_buffer import observation_keys
 from emberlink.trainers.learners.tensors import copy_into, flatten, group, prefixed, unflatten
 from emberlink.trainers.rollout.allocator import keep_freed_memory
 from emberlink.trainers.rollout.collector import StepCollector
@@ -63,7 +62,7 @@ class TrainingSetup:
             rollout_steps=self.learner.rollout_steps,
         )
         self.record = EpisodeRecord(self.teams)
-        observed = observation_keys(self.env.observation_spec)
+        observed = keys.observation_keys(self.env.observation_spec)
         following = [keys.POSITION, keys.REWARD, *observed]
         self._checked = [*observed, keys.ACTION, *(("next", *key) for key in following)]
 
