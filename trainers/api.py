@@ -112,7 +112,7 @@ def train(
     Raises:
         UserError: an unknown name or setting, a value out of range, or a file that cannot be
             written.
-        Divergence: a number was not finite, and `on_nan` is not rollback or did not help.
+        NonFiniteError: a number was not finite, and `on_nan` is not rollback or did not help.
     """
     chosen = [f"setup={setup}", *([] if fire is None else [f"fire={fire}"])]
     several = {} if seeds is None else {"seeds": list(seeds)}
@@ -121,7 +121,7 @@ def train(
         trainer.start()
         try:
             trainer.train(progress or (lambda _: None), hold=True)
-            runs = [_finished(trainer, team, evaluate_after) for team in range(trainer.teams)]
+            runs = [_finished(trainer, team, evaluate_after) for team in range(trainer.setup.teams)]
         finally:
             trainer.close()
     return runs[0] if seeds is None else runs
@@ -215,7 +215,7 @@ def _finished(trainer: Trainer, team: int, evaluate_after: bool) -> Run:
         results = evaluate_run(
             run,
             config,
-            trainer.team_actor(team),
+            trainer.setup.team_actor(team),
             checkpoint=run.checkpoint(),
             fires=config.evaluation.episodes,
             report=lambda _: None,

@@ -27,7 +27,7 @@ from emberlink.trainers.config.schema import RunConfig
 
 from .overrides import all_keys, flat, full_key, parse, put
 
-GROUPS = ("setup", "fire")
+GROUPS = ("setup", "fire", "learner")
 """groups of which a user chooses a file by `GROUP=NAME`, beside the method"""
 _HYDRA = threading.RLock()
 
