@@ -9,7 +9,7 @@ import yaml
 
 from emberlink.envs import keys, metrics
 from emberlink.trainers.config.compose import resolve
-from emberlink.trainers.evaluation import report
+from emberlink.trainers.evaluation.actor import load_actor
 from emberlink.trainers.runs.run_folder import RunFolder
 from emberlink.trainers.training.trainer import Trainer
 
@@ -81,7 +81,7 @@ def check_actor(run: RunFolder, config, trainer: Trainer) -> None:
     """The checkpoint's actor acts as the trained one does."""
     checkpoint = run.checkpoint()
     assert checkpoint.name == f"step_{EPISODES * HORIZON:09d}.safetensors"
-    loaded = report.load_actor(config, checkpoint)
+    loaded = load_actor(config, checkpoint)
     rollout = trainer.setup.env.rollout(5, trainer.setup.learner.actor)
     for step in range(5):
         again = loaded(rollout[:, step].select(keys.OBSERVATION))

@@ -1,5 +1,6 @@
 """Several seeds as one stack: each learns what it learns alone."""
 
+import csv
 import json
 from typing import Any
 
@@ -190,6 +191,6 @@ def test_every_seed_has_a_tracker_of_its_own(tmp_path):
     small = ["env.horizon=8", "episodes=2", "learner.batch_size=8", "learner.hidden=[4,4]"]
     more = [f"seeds={SEEDS}", "logger=csv", f"output={tmp_path}", "evaluation.interval=0"]
     for run in trained(resolve("independent", [*small, *more])).runs:
-        (scores,) = (run.path / "csv").rglob("mean_reward.csv")
-        logged = [float(line.split(",")[1]) for line in scores.read_text().splitlines()]
+        with (run.path / "metrics.csv").open(newline="") as file:
+            logged = [float(row["mean_reward"]) for row in csv.DictReader(file)]
         assert logged == pytest.approx([line["mean_reward"] for line in run.lines()])

@@ -96,7 +96,10 @@ def describe(error: ValidationError, prefix: str = "") -> str:
         error: of a validation by pydantic.
         prefix: the key of what was validated.
     """
-    first = error.errors()[0]
+    errors = error.errors()
+    # A key that is mistyped is also a key that is missing.
+    mistyped = [found for found in errors if found["type"] == "unexpected_keyword_argument"]
+    first = (mistyped or errors)[0]
     parts = [str(part) for part in first["loc"] if not str(part).startswith(TAG)]
     key = ".".join([prefix, *parts] if prefix else parts)
     if isinstance(cause := first.get("ctx", {}).get("error"), ValidationError):

@@ -23,6 +23,7 @@ from emberlink.envs.wildfire import WildfireEnv
 from emberlink.policies.scripted.registry import SCRIPTED
 from emberlink.trainers.build import build_env
 from emberlink.trainers.config.schema import RunConfig, build_comm
+from emberlink.trainers.evaluation.actor import load_actor
 from emberlink.trainers.evaluation.evaluate import (
     BLOCK,
     START_SEED,
@@ -30,7 +31,6 @@ from emberlink.trainers.evaluation.evaluate import (
     shown_scenario,
 )
 from emberlink.trainers.evaluation.record_episode import record
-from emberlink.trainers.evaluation.report import load_actor
 from emberlink.trainers.runs.pretrained import open_run
 from emberlink.trainers.runs.run_folder import RunFolder
 from emberlink.trainers.runs.seal import check_trained_with
@@ -203,7 +203,7 @@ def _play(
         device=config.device,
     )
     world: Any = env.base_env
-    policy, comm = panel.policy(world), build_comm(config)
+    policy, comm = panel.policy(world), build_comm(config, 1)
     moments = record(env, policy, comm, steps=set(steps), member=index % BLOCK)
     console.print(f"  {panel.title}: coverage {moments[-1].coverage:.1f} %", style="dim")
     return Episode(title=panel.title, view_angle=config.env.view_angle, moments=moments)

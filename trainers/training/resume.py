@@ -10,10 +10,10 @@ from emberlink.trainers.config.compose import override
 from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.runs.run_folder import RunFolder, step_of
 from emberlink.trainers.runs.seal import MAY_CHANGE, check_same, differences
+from emberlink.trainers.training.trainer import Trainer
 
 from . import checkpoints
 from .folders import RunFolders, Sizes, check_seeds, empty, find_runs
-from .trainer import Trainer
 
 
 def resume(path: Path, method: str | None = None, overrides: Sequence[str] = ()) -> Trainer:

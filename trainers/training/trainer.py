@@ -11,8 +11,8 @@ from torch import Tensor
 from emberlink.trainers.config.compose import to_values
 from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.evaluation import evaluate
-from emberlink.trainers.runs import loggers
 from emberlink.trainers.runs.run_folder import RunFolder
+from emberlink.trainers.runs.tracking import Trackers
 
 from . import checkpoints, non_finite, rollback
 from .folders import RunFolders, empty
@@ -131,7 +131,7 @@ class Trainer:
         # A tracker that has failed is not tried again after a rollback.
         quiet = [replace(config, logger="none") for config in self.configs]
         configs = quiet if self._untracked else self.configs
-        trackers = loggers.Trackers(configs, self.runs, episode=self.setup.episode)
+        trackers = Trackers(configs, self.runs, episode=self.setup.episode)
         try:
             self._loop(trackers, report)
             if self.saved != self.setup.step:
@@ -141,7 +141,7 @@ class Trainer:
             trackers.close()
             self._untracked = self._untracked or trackers.given_up
 
-    def _loop(self, trackers: loggers.Trackers, report: Callable[[Progress], None]) -> None:
+    def _loop(self, trackers: Trackers, report: Callable[[Progress], None]) -> None:
         setup, lines = self.setup, []
         self._began = time.monotonic()
         for rollout in setup.collector:
@@ -172,7 +172,7 @@ class Trainer:
         if self.setup.guard.poll(wait=wait):
             raise non_finite.error_of(self.setup, self.run)
 
-    def _finish_episode(self, trackers: loggers.Trackers) -> list[dict[str, Any]]:
+    def _finish_episode(self, trackers: Trackers) -> list[dict[str, Any]]:
         """Measures an episode, evaluates if that is due, and writes the lines."""
         setup, interval = self.setup, self.config.evaluation.interval
         counted = {"episode": setup.episode, "updates": setup.learner.updates}
@@ -180,31 +180,20 @@ class Trainer:
         setup.record.clear()
         if interval and setup.episode % interval == 0:
             for team, line in enumerate(lines):
-                line |= self._evaluate(team)
+                line |= evaluate.validate(self.configs[team], setup.team_actor(team))
         seconds = round(self.elapsed(), 3)
         for team, (line, run) in enumerate(zip(lines, self.runs, strict=True)):
             self._keep_best(team, line)
             run.append("metrics.jsonl", line)
             run.append("timing.jsonl", {"episode": setup.episode, "seconds": seconds})
-        trackers.log(lines, step=setup.episode)
+        trackers.log(lines, setup.episode)
         return lines
-
-    def _evaluate(self, team: int) -> dict[str, float]:
-        """Returns a seed's measures on held-out fires, "fire/measure" -> mean."""
-        config = self.configs[team]
-        fires = config.evaluation.interval_episodes
-        actor = self.setup.team_actor(team)
-        results = evaluate.evaluate(config, actor, fires=fires, scripted=False)
-        return {
-            f"{fire}/{name}": value
-            for fire, by_policy in results.items()
-            for name, value in evaluate.means(by_policy[evaluate.LEARNED]).items()
-        }
 
     def _keep_best(self, team: int, line: dict[str, Any]) -> None:
         """Writes the networks whose coverage is the highest so far.
 
-        The coverage is that of the evaluations during training, or, without any, the episode's own.
+        The coverage is that on validation fires, or, without evaluations during training, the
+        episode's own.
         """
         evaluated = [value for name, value in line.items() if name.endswith("/coverage")]
         if self.config.evaluation.interval and not evaluated:
