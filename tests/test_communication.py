@@ -6,7 +6,7 @@ import pytest
 import torch
 from torchrl.envs import step_mdp
 
-from emberlink.comm import base, consensus, registry
+from emberlink.comm import base, registry
 from emberlink.envs import keys
 from emberlink.envs.wildfire import WildfireEnv
 from emberlink.trainers import make_env
@@ -39,7 +39,7 @@ def own_numbers(moment) -> torch.Tensor:
 def expected(method: str, moment) -> torch.Tensor:
     own = own_numbers(moment)
     if method == "consensus":
-        return torch.cat((own, moment[consensus.TARGET]), -1)
+        return torch.cat((own, moment[keys.TARGET]), -1)
     if method == "positional":
         everyone = torch.cat([own[..., uav, :] for uav in range(UAVS)], -1)
         return torch.stack([everyone] * UAVS, -2)
@@ -78,40 +78,6 @@ def test_communication_leaves_the_world_as_it_is(method):
         bonus = (one["next", *keys.REWARD] - other["next", *keys.REWARD]).abs().max()
         assert (bonus > 0) == (method == "consensus")
         one, other = step_mdp(one, keep_other=True), step_mdp(other, keep_other=True)
-
-
-def played(*, reset_at: int | None):
-    """Consensus for some steps with fixed actions; environment 1 starts anew in between."""
-    env = recipe("consensus", horizon=100)
-    moment, moments = env.reset(), []
-    for step in range(8):
-        if step == reset_at:
-            moment["_reset"] = torch.tensor([[False], [True], [False]])
-            moment = env.reset(moment)
-            moments.append(moment.clone())
-        action = torch.rand(ENVS, UAVS, 3, generator=torch.Generator().manual_seed(step)) * 2 - 1
-        moment = env.step(moment.set(keys.ACTION, action))
-        moment = step_mdp(moment, keep_other=True)
-        moments.append(moment.clone())
-    return moments
-
-
-def test_a_partial_reset_leaves_the_memory_of_others_alone():
-    whole, interrupted = played(reset_at=None), played(reset_at=5)
-    at_reset = interrupted.pop(5)
-    memory = *consensus.Consensus.memory_keys, consensus.TARGET, consensus.FOLLOWS
-    others = [0, 2]
-    assert (whole[4][consensus.STREAK][others] > 1).any()
-    for key in (*memory, keys.OBSERVATION):
-        assert at_reset[key][others].equal(whole[4][key][others]), key
-    for key in (consensus.STREAK, consensus.FIRE_SCORE, consensus.ALTITUDE_SUM):
-        assert (whole[4][key][1] > 0).any()
-        assert not at_reset[key][1].any()
-    assert not at_reset[consensus.WAYPOINT][1].equal(whole[4][consensus.WAYPOINT][1])
-    for one, other in zip(whole, interrupted, strict=True):
-        for key in (*memory, keys.OBSERVATION):
-            assert one[key][others].equal(other[key][others]), key
-    assert not whole[-1][keys.OBSERVATION][1].equal(interrupted[-1][keys.OBSERVATION][1])
 
 
 def test_known_modules_are_the_files_on_disk():

@@ -13,7 +13,7 @@ from emberlink.envs.scenarios import ScenarioConfig
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.wildfire import WildfireEnv
 from emberlink.policies.networks.actor_critic import make_actor, make_critic
-from emberlink.policies.networks.stacked import Generators
+from emberlink.policies.networks.layers import Generators
 from emberlink.trainers.config.compose import override, resolve
 from emberlink.trainers.config.schema import RunConfig, build_comm, check_device
 
@@ -69,7 +69,7 @@ def build_env(
 ) -> TransformedEnv:
     """Returns the wildfire and the communication of a configuration; see `WildfireEnv`."""
     world = WildfireEnv(num_envs, config.env, fire, seed, device)
-    return TransformedEnv(world, Communication(build_comm(config).to(world.device)))
+    return TransformedEnv(world, Communication(build_comm(config, num_envs).to(world.device)))
 
 
 def build_networks(

@@ -164,10 +164,10 @@ class RunConfig:
         return value
 
 
-def build_comm(config: RunConfig) -> CommModule:
+def build_comm(config: RunConfig, num_envs: int) -> CommModule:
     """Returns a new communication module of a configuration."""
     settings = {key: value for key, value in config.comm.items() if key != "name"}
-    return registry.build(config.comm["name"], config.env, settings)
+    return registry.build(config.comm["name"], config.env, settings, num_envs)
 
 
 def comm_settings(config: RunConfig) -> dict[str, Any]:

@@ -18,13 +18,13 @@ from importlib.resources import files
 from pathlib import Path
 
 from emberlink.envs.fire_files.reader import KEPT
-
-from . import checkpoint_file
-from emberlink.trainers.evaluation.report import ACTOR
-from .run_folder import RunFolder
 from emberlink.envs.utils.errors import UserError
 from emberlink.trainers.config.compose import to_values
+from emberlink.trainers.evaluation.report import ACTOR
 from emberlink.trainers.runs.seal import check_trained_with
+
+from . import checkpoint_file
+from .run_folder import RunFolder
 
 PREFIX = "pretrained:"
 USUAL_SETUP = "tuned"

@@ -17,12 +17,13 @@ from torch import Tensor
 
 from emberlink.envs.scenarios import fires_of
 from emberlink.envs.utils import atomic_io
+from emberlink.envs.utils.errors import UserError
+from emberlink.trainers.config.compose import flat, from_values, to_values
+from emberlink.trainers.config.schema import RunConfig, comm_settings
 
 from . import checkpoint_file as files
-from emberlink.trainers.config.compose import flat, from_values, to_values
+from . import compact_json
 from .safe_read import LONGEST_JSON, parse_json, read_text, read_yaml
-from emberlink.trainers.config.schema import RunConfig, comm_settings
-from emberlink.envs.utils.errors import UserError
 
 _NOT_FROM_THE_START = ("comm.agree", "comm.follow", "comm.wander", "comm.loss")
 """settings that runs of the first release were made without; their defaults change nothing"""
@@ -58,7 +59,9 @@ class RunFolder:
 
     def write_config(self, config: RunConfig) -> None:
         """Writes the resolved configuration whole, or leaves what was there."""
-        self._replace("config.yaml", yaml.safe_dump(to_values(config), sort_keys=False))
+        values = to_values(config)
+        text = yaml.safe_dump(values, sort_keys=False, default_flow_style=None, width=100)
+        self._replace("config.yaml", text)
 
     def has_config(self) -> bool:
         """Whether there is a configuration: it is written last when a folder is made."""
@@ -161,7 +164,7 @@ class RunFolder:
 
     def write(self, file: str, content: Mapping[str, Any]) -> None:
         """Writes a JSON file whole, or leaves what was there."""
-        self._replace(file, json.dumps(content, indent=1) + "\n")
+        self._replace(file, compact_json.dumps(content) + "\n")
 
     def _replace(self, file: str, text: str) -> None:
         path = self.path / file
