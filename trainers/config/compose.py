@@ -47,7 +47,7 @@ def resolve(method: str, overrides: Sequence[str] = (), **settings: Any) -> RunC
     """
     given = [parse(text) for text in overrides]
     chosen = {"setup": "paper"} | {key: str(value) for key, value in given if key in GROUPS}
-    values = _composed(method, chosen)
+    values = _composed(str(method), chosen)
     known = list(dict.fromkeys([*GROUPS, *all_keys(values)]))
     for key, value in given:
         if key in (*(f"{group}.name" for group in GROUPS), "fire.kind"):
