@@ -191,7 +191,7 @@ def test_too_little_memory_is_one_line(capsys, monkeypatch):
     def full(*_):
         raise RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried 99 bytes\nmore")
 
-    monkeypatch.setattr("emberlink.trainers.cli.train_eval.Trainer", full)
+    monkeypatch.setattr("emberlink.trainers.training.command.Trainer", full)
     refused(["train", "consensus", *TINY], capsys, "not enough memory", "99 bytes")
 
 

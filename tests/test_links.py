@@ -21,8 +21,8 @@ from emberlink.envs.utils import atomic_io
 from emberlink.envs.utils.publish import published
 from emberlink.trainers.cli import main
 from emberlink.trainers.runs.lock import Lock
-from emberlink.trainers.runs.loggers import Trackers
 from emberlink.trainers.runs.run_folder import RunFolder
+from emberlink.trainers.runs.tracking import Trackers
 from emberlink.trainers.training import rollback
 
 
@@ -157,7 +157,7 @@ def test_a_file_is_not_changed_through_a_link(kind, create, tmp_path, outside):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("names", [("figures",), ("csv", "scalars")])
+@pytest.mark.parametrize("names", [("figures",), ("a", "b")])
 def test_a_folder_on_the_way_is_no_link(kind, names, tmp_path, outside):
     run = tmp_path / "run"
     run.joinpath(*names[:-1]).mkdir(parents=True)
@@ -177,15 +177,14 @@ def test_the_run_folder_itself_may_be_a_link(tmp_path):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_only_files_and_links_are_removed(kind, tmp_path, outside):
-    path = tmp_path / "scalars" / "one.csv"
-    path.parent.mkdir()
+    path = tmp_path / "one.part"
     plant(path, kind, outside)
     if kind in REMOVED:
-        atomic_io.remove_files(path.parent, ".csv")
+        atomic_io.remove(path)
         assert not os.path.lexists(path)
     else:
         with pytest.raises(OSError, match="no regular file"):
-            atomic_io.remove_files(path.parent, ".csv")
+            atomic_io.remove(path)
         assert os.path.lexists(path)
 
 
@@ -302,7 +301,7 @@ def test_a_resumed_run_that_is_refused(kind, name, run, outside, capsys):
 def test_a_resumed_run_replaces_what_was_planted(kind, run, outside, capsys):
     """Everything that a resumed run makes anew or takes away, at once."""
     again = [f"figures/{path.name}" for path in (run / "figures").iterdir()]
-    again += ["eval.json", "csv/scalars/score.csv"]
+    again += ["eval.json", "metrics.csv"]
     later = ["checkpoints/step_000000045.safetensors"]
     taken = [*later, "checkpoints/.tmpX", "x.json.17.part", "figures/x.png.17.part"]
     best = "checkpoints/best.safetensors"  # made anew if an episode is better
@@ -323,7 +322,7 @@ def test_a_resumed_run_replaces_what_was_planted(kind, run, outside, capsys):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("folder", ["csv", "csv/scalars", "csv/videos", "tensorboard", "wandb"])
+@pytest.mark.parametrize("folder", ["tensorboard", "wandb"])
 def test_folders_of_trackers(kind, folder, run, outside):
     logger = folder.partition("/")[0]
     plant(run / folder, kind, outside)
@@ -334,31 +333,18 @@ def test_folders_of_trackers(kind, folder, run, outside):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("file", ["scalars/score.csv", "scalars/x/y.csv", "texts/a.csv"])
-def test_files_of_the_csv_tracker(kind, file, run, outside):
-    path = run / "csv" / file
-    path.parent.mkdir(exist_ok=True)
+def test_the_table_of_the_csv_tracker(kind, run, outside):
+    path = run / "metrics.csv"
     plant(path, kind, outside)
     here = RunFolder(run)
     trackers = Trackers([here.config()], [here], episode=2)
-    if kind not in REMOVED:
-        with pytest.warns(UserWarning, match="logger=csv has stopped.*no regular file"):
+    if path.is_dir() and not path.is_symlink():
+        with pytest.warns(UserWarning, match="logger=csv has stopped"):
             trackers.close()
         return
     trackers.close()
-    assert len((run / "csv" / "scalars" / "score.csv").read_text().splitlines()) == 2
-
-
-@pytest.mark.parametrize("name", ["../../x", "a/../../x", "fire/../x", "/tmp/x", ".x", "a/b/c"])
-def test_a_measure_whose_name_is_a_path(name, run, outside):
-    """The csv tracker makes a file of each measure in metrics.jsonl."""
-    text = (run / "metrics.jsonl").read_text()
-    (run / "metrics.jsonl").write_text(text.replace('"score"', f'"{name}"'))
-    folder = RunFolder(run)
-    trackers = Trackers([folder.config()], [folder], episode=2)
-    with pytest.warns(UserWarning, match="is no name of a measure"):
-        trackers.close()
-    assert not [path for path in run.parent.rglob("*x*") if path.suffix == ".csv"]
+    assert own(path)
+    assert len(path.read_text().splitlines()) == 1 + 2
 
 
 def test_a_seed_beside_that_is_a_link(tmp_path, outside, capsys):
@@ -436,7 +422,14 @@ def test_every_file_is_opened_by_the_one_place(tmp_path, capsys, monkeypatch):
 
     sys.addaudithook(look)
     runs = tmp_path / "runs"
-    arguments = ["train", "independent", *TINY, "logger=csv", "keep=1", f"output={runs}"]
+    arguments = [
+        "train",
+        "independent",
+        *TINY,
+        "logger=csv",
+        "keep_checkpoints=1",
+        f"output={runs}",
+    ]
     try:
         assert main.main([*arguments, "checkpoint_interval=1"]) == 0
         (run,) = runs.iterdir()
@@ -447,7 +440,7 @@ def test_every_file_is_opened_by_the_one_place(tmp_path, capsys, monkeypatch):
         watching = False
     part = re.compile(rf".*\.{os.getpid()}\.part|\.tmp.*")
     known = re.compile(
-        r"lock|metrics\.jsonl|timing\.jsonl|csv/scalars/[\w/]+\.csv"
+        r"lock|metrics\.jsonl|timing\.jsonl"
         r"|checkpoints/(step|state)_\d+\.safetensors"
     )
     names = [Path(path).relative_to(run).as_posix() for path in opened if str(run) in path]

@@ -19,8 +19,9 @@ from emberlink.trainers.comparison.report import (
 )
 from emberlink.trainers.config.compose import override, resolve
 from emberlink.trainers.config.schema import RunConfig
+from emberlink.trainers.evaluation.actor import load_actor
 from emberlink.trainers.evaluation.evaluate import evaluate as evaluate_policy
-from emberlink.trainers.evaluation.report import evaluate_run, load_actor
+from emberlink.trainers.evaluation.report import evaluate_run
 from emberlink.trainers.evaluation.results import Results
 from emberlink.trainers.runs import pretrained
 from emberlink.trainers.runs.run_folder import RunFolder
@@ -112,7 +113,7 @@ def train(
     Raises:
         UserError: an unknown name or setting, a value out of range, or a file that cannot be
             written.
-        Divergence: a number was not finite, and `on_nan` is not rollback or did not help.
+        NonFiniteError: a number was not finite, and `on_nan` is not rollback or did not help.
     """
     chosen = [f"setup={setup}", *([] if fire is None else [f"fire={fire}"])]
     several = {} if seeds is None else {"seeds": list(seeds)}
@@ -121,7 +122,7 @@ def train(
         trainer.start()
         try:
             trainer.train(progress or (lambda _: None), hold=True)
-            runs = [_finished(trainer, team, evaluate_after) for team in range(trainer.teams)]
+            runs = [_finished(trainer, team, evaluate_after) for team in range(trainer.setup.teams)]
         finally:
             trainer.close()
     return runs[0] if seeds is None else runs
@@ -216,7 +217,7 @@ def _finished(trainer: Trainer, team: int, evaluate_after: bool) -> Run:
         results = evaluate_run(
             run,
             config,
-            trainer.team_actor(team),
+            trainer.setup.team_actor(team),
             checkpoint=run.checkpoint(),
             fires=config.evaluation.episodes,
             report=lambda _: None,

@@ -193,20 +193,6 @@ def remove_links(folder: Path) -> None:
             remove(path)
 
 
-def remove_files(folder: Path, suffix: str) -> None:
-    """Removes the files of a suffix and all links below a folder; links are not followed.
-
-    Raises:
-        OSError: something there is neither a file, a link nor a folder.
-    """
-    for path in folder.iterdir():
-        mode = path.lstat().st_mode
-        if stat.S_ISDIR(mode):
-            remove_files(path, suffix)
-        elif path.name.endswith(suffix) or not stat.S_ISREG(mode):
-            remove(path)
-
-
 def sync(path: Path) -> None:
     """Flushes a file, or the names in a folder, so that they outlive a loss of power."""
     handle = os.open(path, os.O_RDONLY | os.O_CLOEXEC)

@@ -23,6 +23,7 @@ from emberlink.envs.wildfire import WildfireEnv
 from emberlink.policies.scripted.registry import SCRIPTED
 from emberlink.trainers.build import build_env
 from emberlink.trainers.config.schema import RunConfig, build_comm
+from emberlink.trainers.evaluation.actor import load_actor
 from emberlink.trainers.evaluation.evaluate import (
     BLOCK,
     START_SEED,
@@ -30,7 +31,6 @@ from emberlink.trainers.evaluation.evaluate import (
     shown_scenario,
 )
 from emberlink.trainers.evaluation.record_episode import record
-from emberlink.trainers.evaluation.report import load_actor
 from emberlink.trainers.runs.pretrained import open_run
 from emberlink.trainers.runs.run_folder import RunFolder
 from emberlink.trainers.runs.seal import check_trained_with

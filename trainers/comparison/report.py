@@ -10,8 +10,8 @@ from pathlib import Path
 
 from emberlink.envs.utils.errors import UserError
 from emberlink.trainers.evaluation import evaluate
+from emberlink.trainers.evaluation.actor import load_actor
 from emberlink.trainers.evaluation.plots import timelapse
-from emberlink.trainers.evaluation.report import load_actor
 
 from . import plots
 from .page import Chapter, Picture, Report, html, record

@@ -20,7 +20,7 @@ from pathlib import Path
 from emberlink.envs.fire_files.reader import KEPT
 from emberlink.envs.utils.errors import UserError
 from emberlink.trainers.config.compose import to_values
-from emberlink.trainers.evaluation.report import ACTOR
+from emberlink.trainers.learners.base import ACTOR
 from emberlink.trainers.runs.seal import check_trained_with
 
 from . import checkpoint_file

@@ -30,6 +30,10 @@ _NOT_FROM_THE_START = ("comm.agree", "comm.follow", "comm.wander", "comm.loss")
 _NUMBERED = re.compile(r"(state|step)_\d{9,18}\.safetensors")
 
 
+ACTOR = "actor_network_params.module."
+"""begins the names of the actors' weights in a checkpoint"""
+
+
 class RunFolder:
     """One training run's files.
 
@@ -165,6 +169,10 @@ class RunFolder:
     def write(self, file: str, content: Mapping[str, Any]) -> None:
         """Writes a JSON file whole, or leaves what was there."""
         self._replace(file, compact_json.dumps(content) + "\n")
+
+    def write_text(self, file: str, text: str) -> None:
+        """Writes a text file whole, or leaves what was there."""
+        self._replace(file, text)
 
     def _replace(self, file: str, text: str) -> None:
         path = self.path / file
