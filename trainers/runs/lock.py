@@ -7,9 +7,9 @@ import socket
 import stat
 from contextlib import suppress
 from pathlib import Path
-from emberlink.envs.utils.errors import UserError
 
 from emberlink.envs.utils.atomic_io import read_bytes
+from emberlink.envs.utils.errors import UserError
 
 _FLAGS = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC
 

@@ -18,12 +18,12 @@ from importlib.resources import files
 from pathlib import Path
 
 from emberlink.envs.fire_files.reader import KEPT
-
-from . import checkpoint_file
-from .run_folder import ACTOR, RunFolder
 from emberlink.envs.utils.errors import UserError
 from emberlink.trainers.config.compose import to_values
 from emberlink.trainers.runs.seal import check_trained_with
+
+from . import checkpoint_file
+from .run_folder import ACTOR, RunFolder
 
 PREFIX = "pretrained:"
 USUAL_SETUP = "tuned"

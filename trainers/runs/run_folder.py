@@ -17,12 +17,12 @@ from torch import Tensor
 
 from emberlink.envs.scenarios import fires_of
 from emberlink.envs.utils import atomic_io
+from emberlink.envs.utils.errors import UserError
+from emberlink.trainers.config.compose import flat, from_values, to_values
+from emberlink.trainers.config.schema import RunConfig, comm_settings
 
 from . import checkpoint_file as files
-from emberlink.trainers.config.compose import flat, from_values, to_values
 from .safe_read import LONGEST_JSON, parse_json, read_text, read_yaml
-from emberlink.trainers.config.schema import RunConfig, comm_settings
-from emberlink.envs.utils.errors import UserError
 
 _NOT_FROM_THE_START = ("comm.agree", "comm.follow", "comm.wander", "comm.loss")
 """settings that runs of the first release were made without; their defaults change nothing"""

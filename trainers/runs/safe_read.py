@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import Any
 
 import yaml
-from emberlink.envs.utils.errors import UserError
 
 from emberlink.envs.utils.atomic_io import read_bytes
+from emberlink.envs.utils.errors import UserError
 
 LONGEST_YAML = 100_000
 """bytes of a config.yaml; ours have two thousand"""

@@ -10,13 +10,9 @@ from typing import Any
 
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import shown
-
+from emberlink.trainers.config.compose import flat, from_values, to_values
+from emberlink.trainers.config.schema import NOT_LEARNT_WITH, RunConfig
 from emberlink.trainers.runs import checkpoint_file
-from emberlink.trainers.config.schema import NOT_LEARNT_WITH
-from emberlink.trainers.config.schema import RunConfig
-from emberlink.trainers.config.compose import flat
-from emberlink.trainers.config.compose import from_values
-from emberlink.trainers.config.compose import to_values
 
 MAY_CHANGE = ("episodes", *NOT_LEARNT_WITH)
 """keys that a resumed run may be given anew, beside those of `evaluation`"""
