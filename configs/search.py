@@ -4,6 +4,7 @@ A group is a folder such as `method` or `fire`; each file in it is one choice of
 """
 
 import os
+from collections.abc import Sequence
 from importlib.metadata import EntryPoint
 from importlib.util import find_spec
 from pathlib import Path
@@ -37,28 +38,33 @@ def folders() -> list[Path]:
     return [path for path in dict.fromkeys(every) if path.is_dir()]
 
 
-def known(group: str) -> list[str]:
+def known(group: str, within: Sequence[Path] | None = None) -> list[str]:
     """Returns the choices of a group, in alphabetical order.
 
     Args:
         group: such as "method", "setup", "setup_method" or "fire".
+        within: the folders to look in; `folders()` if None.
     """
-    return sorted({file.stem for folder in folders() for file in (folder / group).glob("*.yaml")})
+    searched = folders() if within is None else within
+    return sorted({file.stem for folder in searched for file in (folder / group).glob("*.yaml")})
 
 
-def find(group: str, name: str) -> Path:
+def find(group: str, name: str, within: Sequence[Path] | None = None) -> Path:
     """Returns the file of a choice.
 
     Args:
         group: as for `known`.
         name: the file's name without `.yaml`.
+        within: as for `known`.
 
     Raises:
         UserError: there is no such file, or there are several; the message lists them.
     """
-    if name not in (names := known(group)):
+    searched = folders() if within is None else within
+    if name not in (names := known(group, searched)):
         raise UserError(f"{group} {unknown(name, names)}")
-    found = [path for folder in folders() if (path := folder / group / f"{name}.yaml").is_file()]
+    files = [folder / group / f"{name}.yaml" for folder in searched]
+    found = [file for file in files if file.is_file()]
     if len(found) > 1:
         raise UserError(f"{group} {name!r} is in several folders: {', '.join(map(str, found))}")
     return found[0]

@@ -1,9 +1,16 @@
-"""Moments of an environment made by hand."""
+"""Time steps of an environment made by hand, and the consensus on them."""
+
+from dataclasses import replace
 
 import torch
 from tensordict import TensorDict
 
+from emberlink.comm.base import Communication
+from emberlink.comm.consensus import Consensus, ConsensusConfig
 from emberlink.envs import keys
+from emberlink.envs.config import WildfireConfig
+
+WORLD = WildfireConfig(grid=(64, 64))
 
 
 def moment(
@@ -34,3 +41,10 @@ def moment(
         },
         batch_size=[envs],
     )
+
+
+def communication(now: TensorDict, config=None, world=WORLD) -> Communication:
+    """Returns the consensus for as many environments and UAVs as a time step has."""
+    envs, uavs = now[keys.POSITION].shape[:2]
+    module = Consensus(replace(world, num_uavs=uavs), config or ConsensusConfig(), envs)
+    return Communication(module)

@@ -16,7 +16,7 @@ from emberlink.envs import metrics
 from emberlink.envs.fire.cache import cache_folder
 from emberlink.envs.fire.generator import fire_seeds, load_scenario, make_fires
 from emberlink.policies.scripted.registry import SCRIPTED
-from emberlink.trainers.build import build_env, build_networks
+from emberlink.trainers.build import build_actor, build_env
 from emberlink.trainers.cli import main
 from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.evaluation import baseline_cache, evaluate, tables
@@ -33,7 +33,7 @@ def small(method: str = "consensus", *more: str):
 def untrained(config):
     """An actor that answers large actions."""
     env = build_env(config, num_envs=1, fire="paper", seed=0, device="cpu")
-    actor, _ = build_networks(config, env, torch.Generator().manual_seed(0))
+    actor = build_actor(config, env, torch.Generator().manual_seed(0))
     draw = torch.Generator().manual_seed(1)
     weight = actor.module.action.weight
     weight.data = torch.randn(weight.shape, generator=draw)

@@ -1,7 +1,9 @@
 """A run that was stopped and resumed is, bit for bit, the run that was not."""
 
 import shutil
+from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 from weakref import WeakKeyDictionary
 
 import pytest
@@ -11,9 +13,9 @@ from test_recipes import METHODS
 
 from emberlink.trainers.cli import main
 from emberlink.trainers.config.compose import resolve
+from emberlink.trainers.learners.replay_buffer import ReplayMemory
 from emberlink.trainers.runs import checkpoint_file
 from emberlink.trainers.runs.run_folder import RunFolder
-from emberlink.trainers.training import state
 from emberlink.trainers.training.resume import resume
 from emberlink.trainers.training.trainer import Progress, Trainer
 
@@ -24,6 +26,11 @@ SMALL = [
     *("learner.hidden=[8,8]", "learner.batch_size=16", "learner.buffer_size=60"),
     *("evaluation.interval=0", "evaluation.interval_episodes=1", "evaluation.episodes=1"),
 ]
+
+
+def replay(trainer: Trainer) -> ReplayMemory:
+    learner: Any = trainer.setup.learner
+    return learner.replay
 
 
 def begun(method: str, output: Path, *more: str) -> Trainer:
@@ -57,8 +64,9 @@ def stopped_at(steps: list[int], method: str, output: Path, *more: str) -> Train
 
 
 def everything(trainer: Trainer) -> dict[str, torch.Tensor]:
-    found = {name: value.clone() for name, value in state.tensors(trainer).items()}
-    return found | {name: torch.tensor(value) for name, value in state.counters(trainer).items()}
+    rollbacks = {name: torch.tensor(value) for name, value in asdict(trainer.rollbacks).items()}
+    state = trainer.setup.state_dict().items()
+    return rollbacks | {name: value.clone() for name, value in state}
 
 
 def assert_same(one: Trainer, other: Trainer) -> None:
@@ -123,7 +131,7 @@ def test_whichever_seeds_folder_is_named(tmp_path):
     trainer = until(begun("independent", tmp_path, "seeds=[4,5]"), 25)
     again = resume(trainer.runs[1].path)
     assert [run.path for run in again.runs] == [run.path.absolute() for run in trainer.runs]
-    assert again.step == 25
+    assert again.setup.step == 25
     again.close()
     moved = tmp_path / "elsewhere"
     moved.mkdir()
@@ -143,7 +151,7 @@ def test_what_came_after_the_checkpoint_is_cut_off_and_made_again(whole, tmp_pat
     (run.checkpoints / ".tmpQ3x9Zk").write_bytes(b"half a file of safetensors'")
     (run.path / "metrics.jsonl").open("a").write('{"episode": 3, "upd')
     again = resume(run.path)
-    assert again.step == 42
+    assert again.setup.step == 42
     left = {path.name for path in run.checkpoints.iterdir()}
     assert "step_000000045.safetensors" not in left
     assert not [name for name in left if name.endswith(".part") or name.startswith(".tmp")]
@@ -156,7 +164,7 @@ def test_a_run_without_a_checkpoint_begins_again(whole, tmp_path):
     for path in trainer.run.states() + trainer.run.networks():
         path.unlink()
     again = resume(trainer.run.path)
-    assert (again.step, trainer.run.lines()) == (0, [])
+    assert (again.setup.step, trainer.run.lines()) == (0, [])
     assert_same(whole("consensus"), until(again, None))
 
 
@@ -164,7 +172,7 @@ def test_more_episodes_are_those_of_a_run_that_had_them_from_the_start(whole, tm
     """Also of a memory that was full to the last row, and is larger now."""
     roomy = "learner.buffer_size=100000"
     short = until(begun("shared_memory", tmp_path, roomy, "episodes=2"), None)
-    assert len(short.memory) == short.memory.sampler.rows == 2 * 2 * HORIZON
+    assert len(replay(short)) == replay(short).capacity == 2 * 2 * HORIZON
     again = resume(short.run.path, overrides=[f"episodes={EPISODES}"])
     assert_same(whole("shared_memory", roomy), until(again, None))
     assert RunFolder(short.run.path).config().episodes == EPISODES

@@ -9,7 +9,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torchrl.envs import step_mdp
 
-from emberlink.comm import consensus
 from emberlink.configs import known
 from emberlink.envs import WildfireConfig, WildfireEnv, keys, metrics
 from emberlink.envs.world.sensor import view_radius
@@ -117,14 +116,10 @@ def test_the_lawnmower_sees_every_cell(grid, uavs, angle, ceiling, displacement)
 # FollowTarget
 
 
-def test_pursuit_reads_what_consensus_writes():
-    assert FollowTarget.TARGET == consensus.TARGET
-
-
-def test_pursuit_flies_straight_at_the_target_by_hand():
+def test_follow_target_flies_straight_at_the_target_by_hand():
     env = WildfireEnv(1, world(uavs=3, displacement=0.5), torch.full((9, 9), NEVER))
     moment = env.reset(position=torch.tensor([[1.0, 1, 2], [5, 5, 4], [3, 3, 3]]))
-    moment[FollowTarget.TARGET] = torch.tensor([[[5.0, 3, 1], [5, 5, 3.75], [3, 3, 3]]])
+    moment[keys.TARGET] = torch.tensor([[[5.0, 3, 1], [5, 5, 3.75], [3, 3, 3]]])
     action = FollowTarget(env)(moment)[keys.ACTION].mul(1e4).round() / 1e4
     # By (4, 2, -1) cells: 8, 4, -2 units. By (0, 0, -0.25): half a unit, and there it stops.
     assert action.tolist() == [[[1, 0.5, -0.25], [0, 0, -0.5], [0, 0, 0]]]

@@ -31,6 +31,7 @@ class Use(IntEnum):
     WAYPOINT = 100
     TARGET_JITTER = 101
     MESSAGE_LOSS = 102
+    FIRST_WAYPOINT_REDRAW = 103
     SCRIPTED_WAYPOINT = 200
     SCRIPTED_ACTION = 201
     EXPLORATION_NOISE = 300
@@ -73,7 +74,7 @@ def fold_in(key: Tensor, counter: Tensor | int) -> Tensor:
     return _mix(_mix(key + _GOLDEN) + offset)
 
 
-def step_key(key: Tensor, step: Tensor, use: int) -> Tensor:
+def step_key(key: Tensor, step: Tensor, use: int | Tensor) -> Tensor:
     """Returns the key for one purpose at one step of an episode.
 
     Args:

@@ -96,7 +96,10 @@ def describe(error: ValidationError, prefix: str = "") -> str:
         error: of a validation by pydantic.
         prefix: the key of what was validated.
     """
-    first = error.errors()[0]
+    errors = error.errors()
+    # A key that is mistyped is also a key that is missing.
+    mistyped = [found for found in errors if found["type"] == "unexpected_keyword_argument"]
+    first = (mistyped or errors)[0]
     parts = [str(part) for part in first["loc"] if not str(part).startswith(TAG)]
     key = ".".join([prefix, *parts] if prefix else parts)
     if isinstance(cause := first.get("ctx", {}).get("error"), ValidationError):
@@ -105,7 +108,7 @@ def describe(error: ValidationError, prefix: str = "") -> str:
     if first["type"] in ("missing", "unexpected_keyword_argument"):
         wrong = "missing" if first["type"] == "missing" else "not known"
         return f"key {shown(key)!r} is {wrong}"
-    if message.startswith((f"{key}=", f"{key}.")):
+    if message.startswith((f"{key}=", f"{key}.", f"{key}: ")):
         return message
     value = "" if isinstance(first["input"], dict) else f"={shown(first['input'])}"
     return f"{key}{value}: {message}"

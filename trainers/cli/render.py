@@ -203,7 +203,7 @@ def _play(
         device=config.device,
     )
     world: Any = env.base_env
-    policy, comm = panel.policy(world), build_comm(config)
+    policy, comm = panel.policy(world), build_comm(config, 1)
     moments = record(env, policy, comm, steps=set(steps), member=index % BLOCK)
     console.print(f"  {panel.title}: coverage {moments[-1].coverage:.1f} %", style="dim")
     return Episode(title=panel.title, view_angle=config.env.view_angle, moments=moments)

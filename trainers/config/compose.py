@@ -3,7 +3,10 @@
 import threading
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from copy import deepcopy
 from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
 from typing import Any
 
 from hydra import compose, initialize_config_module
@@ -13,18 +16,18 @@ from hydra.version import VersionBase
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from pydantic import TypeAdapter
+from yaml import YAMLError
 
 from emberlink import configs
 from emberlink.envs.scenarios import fires_of
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import from_plain, plain, shown, unknown
+from emberlink.policies.scripted.registry import SCRIPTED
+from emberlink.trainers.config.schema import RunConfig
 
 from .overrides import all_keys, flat, full_key, parse, put
-from .schema import RunConfig
 
-__all__ = ["flat", "from_values", "override", "resolve", "to_values"]
-
-GROUPS = ("setup", "fire")
+GROUPS = ("setup", "fire", "learner")
 """groups of which a user chooses a file by `GROUP=NAME`, beside the method"""
 _HYDRA = threading.RLock()
 
@@ -43,9 +46,6 @@ def resolve(method: str, overrides: Sequence[str] = (), **settings: Any) -> RunC
     """
     given = [parse(text) for text in overrides]
     chosen = {"setup": "paper"} | {key: str(value) for key, value in given if key in GROUPS}
-    configs.find("method", method)
-    for group, name in chosen.items():
-        configs.find(group, name)
     values = _composed(method, chosen)
     known = list(dict.fromkeys([*GROUPS, *all_keys(values)]))
     for key, value in given:
@@ -57,26 +57,26 @@ def resolve(method: str, overrides: Sequence[str] = (), **settings: Any) -> RunC
         if key not in GROUPS:
             put(values, key, value)
     values = _interpolated(values) | {"method": method, "setup": chosen["setup"]}
-    for key, value in settings.items():
-        if key in ("method", *GROUPS):
-            raise UserError(f"{key}={shown(value)}: not a setting but a choice of several")
-        put(values, full_key(values, key), plain(value, key))
+    _put_settings(values, settings)
     _choose_seed(values, any(key == "seed" for key in [*dict(given), *settings]))
+    values["baseline_comm"] = _baseline_comm(chosen["setup"])
     config = from_values(values)
     return replace(config, fire=fires_of(config.fire).pinned())
 
 
-def override(config: RunConfig, overrides: Sequence[str]) -> RunConfig:
+def override(config: RunConfig, overrides: Sequence[str] = (), **settings: Any) -> RunConfig:
     """Returns a run's configuration with some values changed; no YAML file is read.
 
     Args:
         config: of a run.
         overrides: `key=value`, as on the command line; `setup` and `fire` must be the run's.
+        settings: as for `resolve`.
 
     Raises:
         UserError: a key is not known, or a value does not fit.
     """
     values = to_values(config)
+    baseline_comm = values.pop("baseline_comm")
     known = list(flat(values))
     for key, value in map(parse, overrides):
         if key in GROUPS:
@@ -87,7 +87,8 @@ def override(config: RunConfig, overrides: Sequence[str]) -> RunConfig:
             raise UserError(f"key {unknown(key, known, listed=False)}")
         else:
             put(values, key, value)
-    changed = from_values(values)
+    _put_settings(values, settings)
+    changed = from_values({**values, "baseline_comm": baseline_comm})
     # Equal fires are the run's own, which know where the run keeps its copy of their file.
     return replace(changed, fire=config.fire) if changed.fire == config.fire else changed
 
@@ -114,23 +115,45 @@ def _lists(value: Any) -> Any:
 
 
 def _composed(method: str, chosen: Mapping[str, str]) -> dict[str, Any]:
-    """Returns what Hydra composes of the chosen files, `${...}` as they are."""
-    *others, _ = configs.folders()  # the last folder is emberlink's, which Hydra searches first
-    paths = ",".join("'file://" + str(path).replace("'", "\\'") + "'" for path in others)
-    wanted = {"method": method, **chosen, "hydra.searchpath": f"[{paths}]"}
-    name = f"{chosen['setup']}_{method}"
-    if name in configs.known("setup_method"):
-        configs.find("setup_method", name)
-    try:
-        with _own_hydra():
-            found = compose("base", overrides=[f"{key}={value}" for key, value in wanted.items()])
-            values: Any = OmegaConf.to_container(found)
-    except (HydraException, OmegaConfBaseException) as error:
-        raise UserError(" ".join(str(error).split())[:300]) from None
+    """Returns what Hydra composes of the chosen files, with every `${...}` as it is.
+
+    Args:
+        method: a file in configs/method.
+        chosen: files of `GROUPS`, of which `setup` is one.
+
+    Raises:
+        UserError: a file is not known or not a configuration.
+    """
+    folders = configs.folders()
+    chosen = {"method": method, **chosen}
+    for group, name in chosen.items():
+        configs.find(group, name, folders)
+    if (name := f"{chosen['setup']}_{method}") in configs.known("setup_method", folders):
+        configs.find("setup_method", name, folders)
+    files = sorted(file for folder in folders for file in folder.glob("**/*.yaml"))
+    stamps = tuple((file, file.stat().st_mtime_ns) for file in files)
+    values = deepcopy(_compose(tuple(chosen.items()), tuple(folders), stamps))
     for group in ("method", "setup"):
         if group in values:  # then Hydra did not put its content at the top
-            file = configs.find(group, {"method": method, **chosen}[group])
+            file = configs.find(group, chosen[group])
             raise UserError(f"{file} must begin with '# @package _global_'")
+    return values
+
+
+@lru_cache(maxsize=64)
+def _compose(
+    chosen: tuple[tuple[str, str], ...], folders: tuple[Path, ...], stamps: tuple
+) -> dict[str, Any]:
+    """Calls Hydra, once for the same choices and the same times of change of all files."""
+    # Emberlink's own folder is the last, and Hydra searches it anyway.
+    paths = ["'file://" + str(folder).replace("'", "\\'") + "'" for folder in folders[:-1]]
+    overrides = [f"{group}={name}" for group, name in chosen]
+    try:
+        with _own_hydra():
+            composed = compose("base", [*overrides, f"hydra.searchpath=[{','.join(paths)}]"])
+            values: Any = OmegaConf.to_container(composed)
+    except (HydraException, OmegaConfBaseException, YAMLError) as error:
+        raise UserError(" ".join(str(error).split())[:300]) from None
     return values
 
 
@@ -157,6 +180,23 @@ def _interpolated(values: dict[str, Any]) -> dict[str, Any]:
     except OmegaConfBaseException as error:
         raise UserError(" ".join(str(error).split())[:300]) from None
     return whole
+
+
+def _put_settings(values: dict[str, Any], settings: Mapping[str, Any]) -> None:
+    """Sets what a Python caller gave by keyword."""
+    for key, value in settings.items():
+        if key in ("method", *GROUPS):
+            raise UserError(f"{key}={shown(value)}: not a setting but a choice of several")
+        put(values, full_key(values, key), plain(value, key))
+
+
+def _baseline_comm(setup: str) -> dict[str, Any]:
+    """Returns the `comm` of each method that a scripted policy is played with."""
+    methods = {policy.recipe for policy in SCRIPTED.values() if policy.recipe}
+    return {
+        method: _interpolated(_composed(method, {"setup": setup}))["comm"]
+        for method in sorted(methods)
+    }
 
 
 def _choose_seed(values: dict[str, Any], seed_is_given: bool) -> None:

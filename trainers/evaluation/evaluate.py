@@ -200,7 +200,7 @@ def scripted_config(config: RunConfig, name: str) -> RunConfig:
     recipe = SCRIPTED[name].recipe
     if recipe is None:
         return config
-    comm = resolve(recipe, [f"setup={config.setup}"]).comm
+    comm = config.baseline_comm.get(recipe) or resolve(recipe, [f"setup={config.setup}"]).comm
     return config if comm["name"] == config.comm["name"] else replace(config, comm=comm)
 
 

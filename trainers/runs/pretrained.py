@@ -20,10 +20,11 @@ from pathlib import Path
 from emberlink.envs.fire_files.reader import KEPT
 from emberlink.envs.utils.errors import UserError
 from emberlink.trainers.config.compose import to_values
+from emberlink.trainers.learners.base import ACTOR
 from emberlink.trainers.runs.seal import check_trained_with
 
 from . import checkpoint_file
-from .run_folder import ACTOR, RunFolder
+from .run_folder import RunFolder
 
 PREFIX = "pretrained:"
 USUAL_SETUP = "tuned"
@@ -48,11 +49,7 @@ def open_run(text: str, output: Path | str = "runs") -> RunFolder:
     """
     if not is_name(text):
         return RunFolder(text)
-    found = find(text)
-    recipes = sorted({"/".join(one.parts[-3:-1]) for one in found})
-    if len(recipes) > 1:
-        raise UserError(f"{text}: one is needed, and there are {', '.join(recipes)}")
-    source = found[0]
+    source = find_one(text)
     target = Path(output) / "_".join(["pretrained", *source.parts[-3:]])
     if not target.exists():
         try:
@@ -82,6 +79,22 @@ def find(text: str) -> list[Path]:
         there = ", ".join(sorted({"/".join(one.parts[-3:-1]) for one in folders})) or "none"
         raise UserError(f"{text}: no such trained policy; there are {there}")
     return found
+
+
+def find_one(text: str) -> Path:
+    """Returns the folder of the trained policy that a name means, of the lowest seed.
+
+    Args:
+        text: as for `open_run`.
+
+    Raises:
+        UserError: there is none, or of several methods or setups.
+    """
+    found = find(text)
+    recipes = sorted({"/".join(folder.parts[-3:-1]) for folder in found})
+    if len(recipes) > 1:
+        raise UserError(f"{text}: one is needed, and there are {', '.join(recipes)}")
+    return found[0]
 
 
 def pack(run: RunFolder, into: Path) -> Path:

@@ -22,15 +22,12 @@ from emberlink.trainers.config.compose import flat, from_values, to_values
 from emberlink.trainers.config.schema import RunConfig, comm_settings
 
 from . import checkpoint_file as files
+from . import compact_json
 from .safe_read import LONGEST_JSON, parse_json, read_text, read_yaml
 
 _NOT_FROM_THE_START = ("comm.agree", "comm.follow", "comm.wander", "comm.loss")
 """settings that runs of the first release were made without; their defaults change nothing"""
 _NUMBERED = re.compile(r"(state|step)_\d{9,18}\.safetensors")
-
-
-ACTOR = "actor_network_params.module."
-"""begins the names of the actors' weights in a checkpoint"""
 
 
 class RunFolder:
@@ -62,7 +59,9 @@ class RunFolder:
 
     def write_config(self, config: RunConfig) -> None:
         """Writes the resolved configuration whole, or leaves what was there."""
-        self._replace("config.yaml", yaml.safe_dump(to_values(config), sort_keys=False))
+        values = to_values(config)
+        text = yaml.safe_dump(values, sort_keys=False, default_flow_style=None, width=100)
+        self._replace("config.yaml", text)
 
     def has_config(self) -> bool:
         """Whether there is a configuration: it is written last when a folder is made."""
@@ -165,7 +164,7 @@ class RunFolder:
 
     def write(self, file: str, content: Mapping[str, Any]) -> None:
         """Writes a JSON file whole, or leaves what was there."""
-        self._replace(file, json.dumps(content, indent=1) + "\n")
+        self._replace(file, compact_json.dumps(content) + "\n")
 
     def write_text(self, file: str, text: str) -> None:
         """Writes a text file whole, or leaves what was there."""
