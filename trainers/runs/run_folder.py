@@ -30,10 +30,6 @@ _NOT_FROM_THE_START = ("comm.agree", "comm.follow", "comm.wander", "comm.loss")
 _NUMBERED = re.compile(r"(state|step)_\d{9,18}\.safetensors")
 
 
-ACTOR = "actor_network_params.module."
-"""begins the names of the actors' weights in a checkpoint"""
-
-
 class RunFolder:
     """One training run's files.
 
