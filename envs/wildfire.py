@@ -18,7 +18,7 @@ from emberlink.envs.world.sensor import View
 
 from . import keys, specs
 from .config import WildfireConfig
-from .scenarios import ScenarioConfig, arrival_times
+from .scenarios import ScenarioConfig, load_fires
 
 _POSITIONS, _FIRE, _STEPS = range(3)  # what an episode's random stream is split into
 
@@ -77,7 +77,7 @@ class WildfireEnv(Buffers, EnvBase):
         self.register_buffer("_low", low, persistent=False)
         self.register_buffer("_high", high, persistent=False)
         view = View(config.grid, view_angle=config.view_angle, ceiling=high[2].item())
-        fires, self._fire_each = arrival_times(fire, config, num_envs)
+        fires, self._fire_each = load_fires(fire, config, num_envs)
         self._map = Discovery(
             view, fires, horizon=config.horizon, envs=num_envs, uavs=config.num_uavs
         )

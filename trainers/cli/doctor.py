@@ -45,7 +45,7 @@ def _geo() -> str:
     try:
         return ", ".join(f"{name} {version(name)}" for name in _GEO)
     except PackageNotFoundError as error:
-        return f"{error.name} is not installed: pip install 'emberlink[geo]'"
+        return f"{error.name} is not installed: pip install '.[geo]'"
 
 
 def _fire() -> str:

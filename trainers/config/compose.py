@@ -61,7 +61,7 @@ def resolve(method: str, overrides: Sequence[str] = (), **settings: Any) -> RunC
         if isinstance(values["seeds"], list | tuple):
             values["seed"] = values["seeds"][0]
     config = from_values(values)
-    return replace(config, fire=fires_of(config.fire).pinned())
+    return replace(config, fire=fires_of(config.fire).with_checksum())
 
 
 def override(config: RunConfig, overrides: Sequence[str]) -> RunConfig:

@@ -139,7 +139,7 @@ class Trainer:
             run.write_config(config)
         grid, horizon = self.config.env.grid, self.config.env.horizon
         self.configs = [
-            replace(one, fire=fires_of(one.fire).kept(run.path, grid, horizon))
+            replace(one, fire=fires_of(one.fire).save_copy(run.path, grid, horizon))
             for one, run in zip(self.configs, runs, strict=True)
         ]
         self.config = replace(self.config, fire=self.configs[0].fire)
