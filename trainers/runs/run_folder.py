@@ -90,7 +90,7 @@ class RunFolder:
             _check_whole(values, config)
         except ValueError as error:
             raise UserError(f"{file}: {error}") from None
-        return replace(config, fire=fires_of(config.fire).opened(self.path))
+        return replace(config, fire=fires_of(config.fire).load_copy(self.path))
 
     def append(self, file: str, line: Mapping[str, Any]) -> None:
         """Adds a line of JSON and hands it to the system at once, whole or not at all.
