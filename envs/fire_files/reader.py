@@ -16,7 +16,7 @@ from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import printable
 
 from . import formats
-from .banks import is_bank, read_bands, read_npy
+from .banks import MAX_CELLS, is_bank, read_bands, read_npy
 from .config import FileFireConfig
 from .episode_crop import on_grid
 from .front_points import read_front_points
