@@ -21,7 +21,7 @@ from emberlink.envs.world.sensor import Sensor
 
 from . import keys, specs
 from .config import WildfireConfig
-from .scenarios import ScenarioConfig, arrival_times
+from .scenarios import ScenarioConfig, load_fires
 from .team_view import TeamView
 
 
@@ -93,7 +93,7 @@ class WildfireEnv(TeamView, Buffers, EnvBase):
         self.register_buffer("_high", high, persistent=False)
         sensor = Sensor(config.grid, view_angle=config.view_angle, ceiling=high[2].item())
         self._side = sensor.side if config.observation == "window" else None
-        fires, self._one_fire_each = arrival_times(fire, config, num_envs)
+        fires, self._one_fire_each = load_fires(fire, config, num_envs)
         self._map = CoverageMap(
             sensor, fires, horizon=config.horizon, envs=num_envs, uavs=config.num_uavs
         )

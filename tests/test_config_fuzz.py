@@ -26,7 +26,8 @@ from emberlink.trainers.build import build_env
 from emberlink.trainers.cli import main
 from emberlink.trainers.config.compose import from_values, resolve, to_values
 from emberlink.trainers.config.schema import RunConfig
-from emberlink.trainers.training.trainer import Trainer
+from emberlink.trainers.learners.ddpg import DDPGConfig
+from emberlink.trainers.training.setup import TrainingSetup
 
 EXAMPLES = 5000 if SOAK else 500
 FUZZ = settings(
@@ -64,16 +65,18 @@ def entered(schema: dict, root: dict) -> dict:
 
 
 def leaves(schema: dict, root: dict, prefix: str = "") -> Iterator[tuple[str, dict]]:
-    """Every key that holds a value, with its schema, but those of communication."""
+    """Every key that holds a value, with its schema; not those of `comm` and `learner`."""
     for name, below in schema["properties"].items():
         below = entered(below, root)
         if "properties" in below:
             yield from leaves(below, root, f"{prefix}{name}.")
-        elif prefix + name not in ("comm", "baseline_comm"):
+        elif prefix + name not in ("comm", "baseline_comm", "learner"):
             yield prefix + name, below
 
 
-KEYS = dict(leaves(SCHEMA, SCHEMA))
+LEARNER = TypeAdapter(DDPGConfig).json_schema()
+LEARNER["properties"].pop("name")
+KEYS = dict(leaves(SCHEMA, SCHEMA)) | dict(leaves(LEARNER, LEARNER, "learner."))
 COMM_KEYS = {
     name: {f"comm.{key}": below for key, below in leaves({"properties": {}, **one}, one)}
     for name, one in COMM.items()
@@ -206,7 +209,7 @@ def test_what_fits_collects_and_learns(values):
     for name in ("episodes", "num_envs"):
         values[name] = 2
     values["env"]["horizon"] = max(values["env"]["horizon"], 3)
-    Trainer(from_values(values)).rehearse(steps=3)
+    TrainingSetup(from_values(values)).dry_run(steps=3)
 
 
 def refused(key: str, build) -> str:

@@ -15,7 +15,7 @@ def test_a_seed_repeats_its_run_byte_for_byte(method, tmp_path):
     def lines(folder: str, seed: int) -> bytes:
         torch.manual_seed(len(folder))  # whatever was drawn before must not matter
         trainer = until(begun(method, tmp_path / folder, "episodes=2", f"seed={seed}"), None)
-        assert trainer.updates > 0
+        assert trainer.setup.learner.updates > 0
         return (trainer.run.path / "metrics.jsonl").read_bytes()
 
     first = lines("one", 7)

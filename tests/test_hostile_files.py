@@ -138,7 +138,7 @@ def resumed(run: Path):
     from emberlink.trainers.training.resume import resume
 
     trainer = resume(run, overrides=["episodes=3"])
-    trainer.collector.shutdown()
+    trainer.close()
     return trainer
 
 

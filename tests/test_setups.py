@@ -39,9 +39,9 @@ TABLE = {
     "learner.batch_size": (512, 512),
     "learner.updates_per_step": (1, 1),
     "num_envs": (1, 1),
-    "exploration.theta": (0.2, 0.2),
-    "exploration.sigma": (0.15, 0.15),
-    "exploration.dt": (0.01, 0.01),
+    "learner.exploration.theta": (0.2, 0.2),
+    "learner.exploration.sigma": (0.15, 0.15),
+    "learner.exploration.dt": (0.01, 0.01),
     "fire.name": ("paper", "paper"),
 }
 GAMMA = {(method, setup): 0.95 for method in METHODS for setup in (PAPER, RELEASED)}
@@ -86,7 +86,7 @@ def test_every_row_of_the_table(method, column):
         assert dataclasses.fields(settings) == ()
 
 
-CORRELATED = {"exploration.theta": 0.1, "exploration.sigma": 0.15}
+CORRELATED = {"learner.exploration.theta": 0.1, "learner.exploration.sigma": 0.15}
 OWN = {
     PAPER: {},
     RELEASED: {"independent": {"learner.gamma": 0.92}},

@@ -216,14 +216,14 @@ def test_a_program_whose_wandb_was_killed_ends_in_peace(tmp_path):
     program = (
         "import os, signal, time\n"
         "from test_trackers_failing import service\n"
-        "from emberlink.trainers.training import trainer as loop\n"
-        "measure = loop.Trainer._measure\n"
+        "from emberlink.trainers.training.trainer import Trainer\n"
+        "finish = Trainer._finish_episode\n"
         "def strike(self, *rest):\n"
-        "    if self.episode == 2:\n"
+        "    if self.setup.episode == 2:\n"
         "        os.kill(service(), signal.SIGKILL)\n"
         "        time.sleep(0.3)\n"
-        "    return measure(self, *rest)\n"
-        "loop.Trainer._measure = strike\n" + PROGRAM
+        "    return finish(self, *rest)\n"
+        "Trainer._finish_episode = strike\n" + PROGRAM
     )
     arguments = ["train", "independent", *SHORT, "evaluation.episodes=1", "logger=wandb"]
     done = subprocess.run(

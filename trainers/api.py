@@ -25,6 +25,7 @@ from emberlink.trainers.evaluation.report import evaluate_run
 from emberlink.trainers.evaluation.results import Results
 from emberlink.trainers.runs import pretrained
 from emberlink.trainers.runs.run_folder import RunFolder
+from emberlink.trainers.runs.seal import check_trained_with
 from emberlink.trainers.training.trainer import Progress, Trainer
 
 Reference = str | os.PathLike[str]
@@ -112,7 +113,7 @@ def train(
     Raises:
         UserError: an unknown name or setting, a value out of range, or a file that cannot be
             written.
-        Divergence: a number was not finite, and `on_nan` is not rollback or did not help.
+        NonFiniteError: a number was not finite, and `on_nan` is not rollback or did not help.
     """
     chosen = [f"setup={setup}", *([] if fire is None else [f"fire={fire}"])]
     several = {} if seeds is None else {"seeds": list(seeds)}
@@ -121,7 +122,7 @@ def train(
         trainer.start()
         try:
             trainer.train(progress or (lambda _: None), hold=True)
-            runs = [_finished(trainer, team, evaluate_after) for team in range(trainer.teams)]
+            runs = [_finished(trainer, team, evaluate_after) for team in range(trainer.setup.teams)]
         finally:
             trainer.close()
     return runs[0] if seeds is None else runs
@@ -181,10 +182,11 @@ def load(
     """
     folder = RunFolder(pretrained.find_one(str(run)) if pretrained.is_name(str(run)) else run)
     trained = folder.config(**({} if device is None else {"device": device}))
+    file = folder.checkpoint() if checkpoint is None else Path(checkpoint)
+    check_trained_with(file, trained)
     config = override(trained, **settings)
     if replace(trained, env=config.env, comm=config.comm) != config:
         raise UserError(f"{', '.join(settings)}: only keys of env and comm can be changed")
-    file = folder.checkpoint() if checkpoint is None else Path(checkpoint)
     return TrainedPolicy(load_actor(config, file), config, file)
 
 
@@ -215,7 +217,7 @@ def _finished(trainer: Trainer, team: int, evaluate_after: bool) -> Run:
         results = evaluate_run(
             run,
             config,
-            trainer.team_actor(team),
+            trainer.setup.team_actor(team),
             checkpoint=run.checkpoint(),
             fires=config.evaluation.episodes,
             report=lambda _: None,

@@ -12,10 +12,12 @@ from emberlink.comm.base import Communication
 from emberlink.envs.scenarios import ScenarioConfig
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.wildfire import WildfireEnv
-from emberlink.policies.networks.actor_critic import make_actor, make_critic
 from emberlink.policies.networks.layers import Generators
 from emberlink.trainers.config.compose import override, resolve
 from emberlink.trainers.config.schema import RunConfig, build_comm, check_device
+from emberlink.trainers.learners import registry
+from emberlink.trainers.learners.base import Learner, LearnerContext
+from emberlink.trainers.learners.nan_guard import NonFiniteGuard
 
 
 def make_env(
@@ -72,10 +74,32 @@ def build_env(
     return TransformedEnv(world, Communication(build_comm(config, num_envs).to(world.device)))
 
 
-def build_networks(
+def build_actor(
     config: RunConfig, env: TransformedEnv, generator: Generators = None
-) -> tuple[TensorDictModule, TensorDictModule]:
-    """Returns actors and critics of all UAVs; several generators make those of as many seeds."""
-    specs = env.observation_spec, env.full_action_spec, config.learner.hidden
-    actor = make_actor(*specs, generator=generator)
-    return actor, make_critic(*specs, generator=generator)
+) -> TensorDictModule:
+    """Returns new actors of the configuration's learner for an environment."""
+    learner = registry.find(config.learner.name)
+    specs = env.observation_spec, env.full_action_spec
+    return learner.make_actor(config.learner, *specs, generator)
+
+
+def build_learner(config: RunConfig, env: TransformedEnv, guard: NonFiniteGuard) -> Learner:
+    """Returns the learner of a configuration, for all its seeds.
+
+    Args:
+        config: of the run.
+        env: the environments of all seeds, side by side.
+        guard: told of all that the learner computes.
+    """
+    context = LearnerContext(
+        observation_spec=env.observation_spec,
+        action_spec=env.full_action_spec,
+        num_uavs=config.env.num_uavs,
+        num_envs=config.num_envs,
+        seeds=config.seeds or (config.seed,),
+        shared_replay=config.replay == "shared",
+        total_steps=config.episodes * config.env.horizon,
+        guard=guard,
+        device=config.device,
+    )
+    return registry.build(config.learner, context)

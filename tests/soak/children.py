@@ -109,9 +109,9 @@ def watch_saves(say: Callable[[str], None], die_at: tuple[str, int] | None) -> N
     save = Trainer.save
 
     def saying(trainer: Trainer) -> None:
-        say(f"saving {trainer.step}")
+        say(f"saving {trainer.setup.step}")
         save(trainer)
-        say(f"saved {trainer.step}")
+        say(f"saved {trainer.setup.step}")
 
     Trainer.save = saying
 
@@ -127,7 +127,7 @@ def training(method: str, output: Path, die_at: tuple[str, int] | None = None):
         else:
             trainer = Trainer(resolve(method, [*SMALL, f"episodes={EPISODES}", f"output={output}"]))
             trainer.start()
-        say(f"at {trainer.step} {','.join(temporary(output))}")
+        say(f"at {trainer.setup.step} {','.join(temporary(output))}")
         trainer.train()
         return 0
 

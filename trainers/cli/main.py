@@ -7,8 +7,9 @@ import sys
 from collections.abc import Sequence
 from contextlib import suppress
 
+from emberlink.trainers.cli.doctor import add_doctor
+
 from .compare import add_compare
-from .doctor import add_doctor
 from .eval import add_eval
 from .fire import add_fire
 from .list import add_list

@@ -12,7 +12,7 @@ from emberlink.configs import known
 from emberlink.envs.fire.generator import load_scenario, make_fires
 from emberlink.trainers.build import make_env
 from emberlink.trainers.config.compose import resolve
-from emberlink.trainers.training.trainer import Trainer
+from emberlink.trainers.training.setup import TrainingSetup
 
 _PACKAGES = ("emberlink", "torch", "torchrl", "tensordict", "pettingzoo", "wandb", "hydra-core")
 _GEO = ("rasterio", "geopandas", "pyogrio", "shapely", "pyproj")
@@ -59,8 +59,8 @@ def _fire() -> str:
 def _recipe(method: str):
     def check() -> str:
         check_env_specs(make_env(method, num_envs=2, horizon=5, num_uavs=3))
-        trainer = Trainer(resolve(method, _TINY))
-        trainer.rehearse(steps=20)
-        return f"environment and {trainer.updates} updates"
+        setup = TrainingSetup(resolve(method, _TINY))
+        setup.dry_run(steps=20)
+        return f"environment and {setup.learner.updates} updates"
 
     return check

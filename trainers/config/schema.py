@@ -3,7 +3,7 @@
 from dataclasses import asdict
 from typing import Annotated, Any, Literal
 
-from pydantic import ConfigDict, Field, Strict, field_validator, model_validator
+from pydantic import ConfigDict, Field, PlainValidator, SerializeAsAny, Strict, field_validator
 from pydantic.dataclasses import dataclass
 
 from emberlink.comm import registry
@@ -13,6 +13,8 @@ from emberlink.envs.scenarios import Scenario
 from emberlink.envs.utils.device import check_device as check_device
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import Name
+from emberlink.trainers.learners.base import LearnerConfig
+from emberlink.trainers.learners.registry import parse_config as parse_learner
 
 from . import choice
 
@@ -20,62 +22,17 @@ _STRICT = ConfigDict(extra="forbid", strict=True)
 
 
 NOT_LEARNT_WITH = (
-    *("device", "logger", "on_nan", "baseline_comm"),
+    *("device", "logger", "on_nan"),
     *("checkpoint_interval", "checkpoint_steps", "keep_checkpoints"),
 )
 """keys that do not change what is learnt: runs that differ only in them are the same run"""
 
-Positive = Annotated[float, Field(gt=0, le=1e30)]
-NotNegative = Annotated[float, Field(ge=0, le=1e30)]
 Count = Annotated[int, Field(ge=1, le=1_000_000_000)]
 CountOrZero = Annotated[int, Field(ge=0)]
-Units = Annotated[int, Field(ge=1, le=8192)]
 Many = Annotated[int, Field(ge=1, le=65_536)]
 Seed = Annotated[int, Field(ge=0, lt=2**31)]
-
-
-@dataclass(frozen=True, kw_only=True, config=_STRICT)
-class LearnerConfig:
-    """Settings of DDPG (paper, section III.C)."""
-
-    hidden: Annotated[tuple[Units, Units], Strict(False)]
-    """units of the two hidden layers"""
-    gamma: Annotated[float, Field(ge=0, lt=1)]
-    """discount factor per step"""
-    actor_lr: Positive
-    """Adam's learning rate of the actors"""
-    critic_lr: Positive
-    """Adam's learning rate of the critics"""
-    critic_weight_decay: NotNegative
-    """L2 penalty of the critics' Adam"""
-    tau: Annotated[float, Field(gt=0, le=0.5)]
-    """step of the target networks towards the networks per update, between 0 and 1"""
-    updates_per_step: Count
-    """updates of all networks per step of all environments"""
-    batch_size: Annotated[int, Field(ge=1, le=1_000_000)]
-    """transitions per UAV and update"""
-    buffer_size: Count
-    """capacity of a replay buffer, transitions"""
-
-    @model_validator(mode="after")
-    def _check_batch_size(self) -> "LearnerConfig":
-        if self.batch_size > self.buffer_size:
-            raise UserError(
-                f"batch_size={self.batch_size} is more than buffer_size={self.buffer_size}"
-            )
-        return self
-
-
-@dataclass(frozen=True, kw_only=True, config=_STRICT)
-class ExplorationConfig:
-    """Ornstein-Uhlenbeck noise: x += theta * (0 - x) * dt + sigma * sqrt(dt) * N(0, 1)."""
-
-    theta: NotNegative
-    """rate of the return to 0"""
-    sigma: NotNegative
-    """strength of the noise"""
-    dt: Positive
-    """length of a step"""
+LearnerChoice = Annotated[SerializeAsAny[LearnerConfig], PlainValidator(parse_learner)]
+"""the settings of the learner that `learner.name` names"""
 
 
 @dataclass(frozen=True, kw_only=True, config=_STRICT)
@@ -108,10 +65,8 @@ class RunConfig:
     """the environment"""
     fire: Scenario
     """the fires to train on"""
-    learner: LearnerConfig
+    learner: LearnerChoice
     """the learning algorithm"""
-    exploration: ExplorationConfig
-    """the noise on the actions during training"""
     evaluation: EvaluationConfig
     """the evaluations"""
     episodes: Count

@@ -6,9 +6,10 @@ from typing import Any
 import torch
 from tensordict.nn import TensorDictModule
 
-from emberlink.trainers.build import build_env, build_networks
+from emberlink.trainers.build import build_actor, build_env
 from emberlink.trainers.config.schema import RunConfig
-from emberlink.trainers.runs.run_folder import ACTOR, load_weights
+from emberlink.trainers.learners.base import ACTOR
+from emberlink.trainers.runs.run_folder import load_weights
 
 
 def load_actor(config: RunConfig, checkpoint: Path) -> TensorDictModule:
@@ -24,7 +25,7 @@ def load_actor(config: RunConfig, checkpoint: Path) -> TensorDictModule:
         seed=0,
         device=config.device,
     )
-    actor, _ = build_networks(config, env)
+    actor = build_actor(config, env)
     network: Any = actor.module
     expected = {ACTOR + name: value for name, value in network.state_dict().items()}
     weights = load_weights(checkpoint, expected, config)

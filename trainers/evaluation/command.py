@@ -9,13 +9,13 @@ from rich.console import Console
 from emberlink.envs.utils.errors import UserError
 from emberlink.trainers.config.compose import override
 from emberlink.trainers.config.schema import RunConfig, check_device
+from emberlink.trainers.evaluation.report import evaluate_run
 from emberlink.trainers.runs.pretrained import open_run
 from emberlink.trainers.runs.run_folder import RunFolder
 from emberlink.trainers.runs.seal import check_trained_with
 
 from .actor import load_actor
 from .evaluate import Policy
-from .report import evaluate_run
 from .results import Results
 from .tables import print_results
 

@@ -17,10 +17,10 @@ from emberlink.trainers.runs.run_folder import RunFolder
 from emberlink.trainers.runs.signals import Interrupted, Interruption
 from emberlink.trainers.runs.tracking import Trackers
 from emberlink.trainers.terminal import OutputError, TrainingProgress
+from emberlink.trainers.training.non_finite import NonFiniteError
+from emberlink.trainers.training.trainer import Progress, Trainer
 
-from .divergence import Divergence
 from .resume import resume
-from .trainer import Progress, Trainer
 
 
 def train(method: str | None, overrides: Sequence[str], console: Console) -> int:
@@ -57,7 +57,7 @@ def train(method: str | None, overrides: Sequence[str], console: Console) -> int
         return interruption.status
     except OutputError as error:
         raise UserError(f"{error.filename}: {error.strerror}; {_resume_hint(trainer)}") from None
-    except (UserError, Divergence) as error:
+    except (UserError, NonFiniteError) as error:
         raise UserError(f"{error}; {_resume_hint(trainer, error)}") from None
     finally:
         trainer.close()
@@ -86,9 +86,10 @@ def _trainer(method: str | None, overrides: Sequence[str]) -> Trainer:
 def _announce(trainer: Trainer, console: Console) -> None:
     """Prints what will be trained and where."""
     config = trainer.config
-    if trainer.step:
-        rate = "" if trainer.rate == 1 else f", learning rates x {trainer.rate:g}"
-        console.print(f"resumed at step {trainer.step} of {trainer.steps}{rate}")
+    setup, scale = trainer.setup, trainer.rollbacks.lr_scale
+    if setup.step:
+        rate = "" if scale == 1 else f", learning rates x {scale:g}"
+        console.print(f"resumed at step {setup.step} of {setup.total_steps}{rate}")
     for run in trainer.runs:
         text = f"{config.method}, setup {config.setup}, fire {config.fire.name} -> {run.path}"
         console.print(text, soft_wrap=True)
@@ -100,7 +101,7 @@ def _announce(trainer: Trainer, console: Console) -> None:
         )
     elif not _learns(trainer):
         console.print(
-            f"note: learner.batch_size={config.learner.batch_size} is more than this run collects: "
+            "note: a first batch needs more transitions than this run collects: "
             "nothing will be learnt",
             style="yellow",
             soft_wrap=True,
@@ -108,11 +109,12 @@ def _announce(trainer: Trainer, console: Console) -> None:
 
 
 def _is_finished(trainer: Trainer) -> bool:
-    return trainer.step == trainer.steps and all(run.evaluated() for run in trainer.runs)
+    setup = trainer.setup
+    return setup.step == setup.total_steps and all(run.evaluated() for run in trainer.runs)
 
 
 def _learns(trainer: Trainer) -> bool:
-    return trainer.enough <= trainer.steps * trainer.config.num_envs
+    return trainer.setup.learner.learning_starts <= trainer.setup.total_steps
 
 
 def _train(trainer: Trainer, console: Console) -> None:
@@ -121,14 +123,15 @@ def _train(trainer: Trainer, console: Console) -> None:
     Raises:
         OutputError: the progress cannot be written. The training has been stopped and saved.
     """
-    if trainer.step == trainer.steps:
+    setup = trainer.setup
+    if setup.step == setup.total_steps:
         return
     failures: list[OutputError] = []
     progress = TrainingProgress(
         console,
-        steps=trainer.steps,
+        steps=setup.total_steps,
         episodes=trainer.config.episodes,
-        step=trainer.step,
+        step=setup.step,
         learns=_learns(trainer),
     )
 
@@ -150,7 +153,7 @@ def _train(trainer: Trainer, console: Console) -> None:
 def _show(progress: TrainingProgress, state: Progress, trainer: Trainer) -> None:
     if state.note:
         progress.note(state.note, "yellow")
-    progress.step(state.step, state.episode, trainer.updates)
+    progress.step(state.step, state.episode, trainer.setup.learner.updates)
     if state.lines and state.step % trainer.config.env.horizon == 0:
         progress.episode(state.episode, state.lines)
 
@@ -158,7 +161,7 @@ def _show(progress: TrainingProgress, state: Progress, trainer: Trainer) -> None
 def _evaluate(trainer: Trainer, console: Console) -> None:
     """Evaluates the seeds that were not evaluated yet, and prints the results."""
     seeds = [
-        (run, config, trainer.team_actor(team), run.checkpoint())
+        (run, config, trainer.setup.team_actor(team), run.checkpoint())
         for team, (config, run) in enumerate(zip(trainer.configs, trainer.runs, strict=True))
         if not run.evaluated()
     ]
@@ -195,7 +198,7 @@ def _resume_hint(trainer: Trainer, error: Exception | None = None) -> str:
     """Returns the newest checkpoint of a run that an error ended, and how to resume it."""
     # Without this key, the run would end at the same step again.
     config: RunConfig = trainer.config
-    diverged = isinstance(error, Divergence) and config.on_nan == "stop"
+    diverged = isinstance(error, NonFiniteError) and config.on_nan == "stop"
     command = f"emberlink train resume={trainer.run.path}" + (
         " on_nan=rollback" if diverged else ""
     )
