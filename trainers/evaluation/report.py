@@ -20,13 +20,12 @@ from emberlink.envs.utils.errors import UserError
 from emberlink.policies.scripted.registry import SCRIPTED
 from emberlink.trainers.build import build_env, build_networks
 from emberlink.trainers.config.schema import RunConfig
-from emberlink.trainers.runs.run_folder import RunFolder, load_weights
+from emberlink.trainers.runs.checkpoints import ACTOR, load_weights
+from emberlink.trainers.runs.run_folder import RunFolder
 
 from . import evaluate, plots
 
 _PACKAGES = ("emberlink", "torch", "torchrl", "tensordict", "numpy")
-ACTOR = "actor_network_params.module."
-"""what the actor's weights are called in a checkpoint, before the name within the network"""
 
 
 def load_actor(config: RunConfig, checkpoint: Path) -> TensorDictModule:

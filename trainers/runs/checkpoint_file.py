@@ -11,9 +11,9 @@ import torch
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor
-from emberlink.envs.utils.errors import UserError
 
 from emberlink.envs.utils.atomic_io import open_regular, replaced
+from emberlink.envs.utils.errors import UserError
 
 FORMAT = 1
 """of the files; a reader accepts its own alone, and files from before there was a number"""

@@ -15,11 +15,10 @@ from typing import Any
 
 from torchrl.record.loggers import CSVLogger, Logger, TensorboardLogger, WandbLogger
 
+from emberlink.envs.utils.atomic_io import inner_folder, remove_files, remove_links
 from emberlink.trainers.config.compose import to_values
-from emberlink.envs.utils.atomic_io import inner_folder
-from emberlink.envs.utils.atomic_io import remove_files
-from emberlink.envs.utils.atomic_io import remove_links
 from emberlink.trainers.config.schema import RunConfig
+
 from .run_folder import RunFolder
 
 PATIENCE = 60.0

@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM: the step is finished first."""
+"""Lets a training finish its step before Ctrl-C or SIGTERM ends it."""
 
 import signal
 from collections.abc import Callable
@@ -8,35 +8,35 @@ _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 class Interrupted(KeyboardInterrupt):
-    """A signal ended what was being done."""
+    """Is raised by a signal that does not wait for the end of the step."""
 
 
 class Interruption:
-    """Within, a first SIGINT or SIGTERM calls `stop`; a second one raises `Interrupted`.
+    """Calls `stop` at the first SIGINT or SIGTERM and raises `Interrupted` at the second.
 
     Args:
-        stop: asks for an end between two steps.
+        stop: requests an end between two steps.
     """
 
     def __init__(self, stop: Callable[[], None]):
         self._stop = stop
         self._before: dict[signal.Signals, signal._HANDLER] = {}
         self.received: int | None = None
-        """the first signal that came"""
+        """number of the first signal; None before it"""
         self.at_once = False
-        """whether the first one is not to wait either"""
+        """raise `Interrupted` at the first signal too"""
 
     def __enter__(self) -> "Interruption":
-        self._before = {one: signal.signal(one, self._handle) for one in _SIGNALS}
+        self._before = {number: signal.signal(number, self._handle) for number in _SIGNALS}
         return self
 
     def __exit__(self, *_: object) -> None:
-        for one, handler in self._before.items():
-            signal.signal(one, handler)
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
 
     @property
     def status(self) -> int:
-        """The exit status of a program that the signal ended: 130 or 143."""
+        """The exit status after the signal: 130 for SIGINT, 143 for SIGTERM."""
         return 128 + (self.received or signal.SIGINT)
 
     def _handle(self, number: int, _: FrameType | None) -> None:

@@ -10,9 +10,10 @@ from emberlink.envs.utils.validation import shown
 from emberlink.trainers.config.compose import override
 from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.runs import checkpoint_file
+from emberlink.trainers.runs.checkpoints import step_of
 from emberlink.trainers.runs.lock import Lock
-from emberlink.trainers.runs.run_folder import RunFolder, step_of
-from emberlink.trainers.runs.safe_read import LONGEST_YAML, parse_json, read_text
+from emberlink.trainers.runs.run_folder import RunFolder
+from emberlink.trainers.runs.safe_read import MAX_YAML, parse_json, read_text
 from emberlink.trainers.runs.seal import MAY_CHANGE, check_same, differences
 
 from . import state, state_header
@@ -72,7 +73,7 @@ def _runs(folder: Path) -> list[RunFolder]:
     try:
         if not file.exists():
             return [RunFolder(folder)]
-        names = parse_json(read_text(file, LONGEST_YAML))["folders"]
+        names = parse_json(read_text(file, MAX_YAML))["folders"]
         runs = [RunFolder(folder.resolve().parent / Path(name).name) for name in names]
         missing = [run.path for run in runs if not run.path.is_dir()]
         if folder.resolve() not in [run.path for run in runs]:
