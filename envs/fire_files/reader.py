@@ -2,6 +2,7 @@
 
 import dataclasses
 import hashlib
+import io
 import json
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
@@ -15,7 +16,7 @@ from torch import Tensor
 from emberlink.envs.config import check_grid
 from emberlink.envs.fire.generator import Split
 from emberlink.envs.fire_files.bank_reader import MOST_CELLS
-from emberlink.envs.utils.atomic_io import open_regular, replaced
+from emberlink.envs.utils.atomic_io import read_sealed, write_sealed
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import Name, printable
 
@@ -232,12 +233,13 @@ def keep(config: FileFireConfig, folder: Path, grid: tuple[int, int], horizon: i
     """
     fires = splits(config, grid, horizon)
     try:
-        with replaced(folder / KEPT) as partial, partial.open("wb") as file:
-            np.savez_compressed(
-                file,
-                key=np.array(_key(config, grid, horizon)),
-                **{split: values.numpy() for split, values in fires.items()},
-            )
+        content = io.BytesIO()
+        np.savez_compressed(
+            content,
+            key=np.array(_key(config, grid, horizon)),
+            **{split: values.numpy() for split, values in fires.items()},
+        )
+        write_sealed(folder / KEPT, content.getbuffer())
     except OSError as error:
         raise UserError(f"{folder / KEPT}: cannot be written: {error.strerror or error}") from None
 
@@ -255,11 +257,11 @@ def _read_kept(
     """The run's own copy, or None if there is none, or it is damaged or of another grid."""
     if config.kept is None or config.sha256 is None:
         return None
+    content = read_sealed(Path(config.kept), _MOST_KEPT)
+    if content is None:
+        return None
     try:
-        with (
-            open_regular(Path(config.kept), _MOST_KEPT) as file,
-            np.load(file, allow_pickle=False) as found,
-        ):
+        with np.load(io.BytesIO(content), allow_pickle=False) as found:
             if sum(part.file_size for part in found.zip.filelist) > _MOST_KEPT:
                 return None
             if str(found["key"]) != _key(config, grid, horizon):

@@ -23,7 +23,7 @@ from emberlink.envs import metrics
 from emberlink.envs.fire.cache import cache_folder
 from emberlink.envs.utils.atomic_io import read_sealed, write_sealed
 from emberlink.trainers.config.schema import RunConfig
-from emberlink.trainers.runs.safe_read import LONGEST_JSON, parse_json
+from emberlink.trainers.runs.safe_read import MAX_JSON, parse_json
 
 from .results import Measured
 
@@ -66,7 +66,7 @@ class ScriptedResults:
         """The numbers, or None where there is no such file or it is damaged."""
         if self.file is None:
             return None
-        content = read_sealed(self.file, LONGEST_JSON)
+        content = read_sealed(self.file, MAX_JSON)
         if content is None:
             return None
         try:
