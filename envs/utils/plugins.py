@@ -27,20 +27,21 @@ class Registry(Generic[T]):
 
     Attributes:
         base: the class.
-        package: whose files define them, a file's name being the class's; also the group of the
-            entry points, which name a class.
+        package: the package whose files define them; the name is that of the file.
+        group: of the entry points, each of which names a class.
         key: of the name in a configuration, for messages.
         other_files: of the package, without those that begin with an underscore.
     """
 
     base: type[T]
     package: str
+    group: str
     key: str
     other_files: Collection[str] = ("base", "registry")
 
     def known(self) -> list[str]:
         """Returns the names in alphabetical order."""
-        return sorted({*self._files(), *registered(self.package)})
+        return sorted({*self._files(), *registered(self.group)})
 
     def find(self, name: str) -> type[T]:
         """Returns the class of a name.
@@ -49,9 +50,9 @@ class Registry(Generic[T]):
             UserError: the name is not known, or several classes have it; or the package of an
                 entry point cannot be imported or does not hold such a class.
         """
-        points, files = registered(self.package), self._files()
+        points, files = registered(self.group), self._files()
         if name in points and name in files:
-            raise UserError(f"{self.key}={name}: also an entry point of {self.package}; rename it")
+            raise UserError(f"{self.key}={name}: also an entry point of {self.group}; rename it")
         if name in points:
             return self._load(points[name])
         if name in files:
@@ -75,7 +76,7 @@ class Registry(Generic[T]):
         return classes[0]
 
     def _load(self, point: EntryPoint) -> type[T]:
-        where = f"entry point {point.name!r} of {self.package}, {point.value}"
+        where = f"entry point {point.name!r} of {self.group}, {point.value}"
         try:
             found = point.load()
         except (ImportError, AttributeError) as error:

@@ -26,7 +26,7 @@ LARGEST = 1e12
 """of a measure; what is beyond it is damage"""
 Measured = Annotated[float, Field(ge=-LARGEST, le=LARGEST, allow_inf_nan=False)]
 _MEASURE = TypeAdapter(Measured)
-NOT_COMPARED = ("seed", "seeds", "output", "evaluation", *NOT_LEARNT_WITH)
+NOT_COMPARED = ("seed", "seeds", "output", "evaluation", "baseline_comm", *NOT_LEARNT_WITH)
 """keys in which the runs of a group may differ: none changes what is trained"""
 NAMELESS = ("seed", "seeds", "output", "baseline_comm")
 """those of them that nobody need be told of"""
