@@ -2,6 +2,7 @@
 
 import dataclasses
 import hashlib
+import io
 import json
 from pathlib import Path
 from typing import NamedTuple
@@ -11,7 +12,7 @@ import torch
 from torch import Tensor
 
 from emberlink.envs.config import check_grid
-from emberlink.envs.utils.atomic_io import open_regular, replaced
+from emberlink.envs.utils.atomic_io import read_sealed, write_sealed
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import printable
 
@@ -175,9 +176,10 @@ def save_copy(config: FileFireConfig, folder: Path, grid: tuple[int, int], horiz
     """
     fires = fire_sets(config, grid, horizon)
     try:
-        with replaced(folder / COPY_FILE) as partial, partial.open("wb") as file:
-            arrays = {name: values.numpy() for name, values in fires._asdict().items()}
-            np.savez_compressed(file, key=np.array(_key(config, grid, horizon)), **arrays)
+        content = io.BytesIO()
+        arrays = {name: values.numpy() for name, values in fires._asdict().items()}
+        np.savez_compressed(content, key=np.array(_key(config, grid, horizon)), **arrays)
+        write_sealed(folder / COPY_FILE, content.getbuffer())
     except OSError as error:
         reason = error.strerror or error
         raise UserError(f"{folder / COPY_FILE}: cannot be written: {reason}") from None
@@ -195,11 +197,11 @@ def _read_copy(config: FileFireConfig, grid: tuple[int, int], horizon: int) -> F
     """Returns the run's own copy, None if there is none or it is damaged or of another grid."""
     if config.saved_copy is None or config.sha256 is None:
         return None
+    content = read_sealed(Path(config.saved_copy), _MAX_COPY)
+    if content is None:
+        return None
     try:
-        with (
-            open_regular(Path(config.saved_copy), _MAX_COPY) as file,
-            np.load(file, allow_pickle=False) as arrays,
-        ):
+        with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
             if sum(part.file_size for part in arrays.zip.filelist) > _MAX_COPY:
                 return None
             if str(arrays["key"]) != _key(config, grid, horizon):
