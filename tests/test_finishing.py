@@ -233,12 +233,12 @@ def test_copies_that_a_user_keeps_are_not_the_runs(run, capsys):
         ('{"folders": 3}', "does not name the folders"),
     ],
 )
-def test_siblings_that_are_none(content, said, run, capsys):
-    (run.path / "siblings.json").write_text(content)
+def test_folders_of_seeds_that_are_none(content, said, run, capsys):
+    (run.path / "seed_runs.json").write_text(content)
     status, _, error = trained(capsys, f"resume={run.path}")
     assert status == 2
     assert error.count("\n") == 1
-    assert f"{run.path / 'siblings.json'}: {said}" in error
+    assert f"{run.path / 'seed_runs.json'}: {said}" in error
 
 
 def test_a_seed_of_another_training_is_refused(tmp_path, capsys):

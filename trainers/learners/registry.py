@@ -8,7 +8,7 @@ _REGISTRY = Registry(
     Learner,
     "emberlink.trainers.learners",
     "learner.name",
-    ("base", "nan_guard", "off_policy", "registry", "replay_buffer", "tensors"),
+    other_files=("base", "nan_guard", "off_policy", "registry", "replay_buffer", "tensors"),
     group="emberlink.learners",
 )
 known, find = _REGISTRY.known, _REGISTRY.find

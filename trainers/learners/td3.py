@@ -13,9 +13,9 @@ from torchrl.objectives import TD3Loss
 from emberlink.envs import keys
 from emberlink.envs.utils import counter_rng
 from emberlink.envs.utils.counter_rng import Use
-from emberlink.policies.networks.actor_critic import make_critic
+from emberlink.policies.networks import make_critic
 
-from .base import STRICT, Count, LearnerContext, Losses, NotNegative, sharing
+from .base import STRICT, Count, LearnerContext, Losses, NotNegative
 from .off_policy import OffPolicyConfig, OffPolicyLearner
 
 _TARGET_NOISE = (keys.AGENTS, "target_noise")
@@ -51,7 +51,12 @@ class TD3(OffPolicyLearner):
         specs, config = (context.observation_spec, context.action_spec), self.config
         self.actor = self.make_actor(config, *specs, generators)
         critics: list[TensorDictModule] = [
-            make_critic(*specs, config.hidden, generator=generators, **sharing(config))
+            make_critic(
+                *specs,
+                config.hidden,
+                generator=generators,
+                share_parameters=config.share_parameters,
+            )
             for _ in range(_CRITICS)
         ]
         actor: Any = _SmoothedActor(self.actor)

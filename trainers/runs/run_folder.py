@@ -30,10 +30,6 @@ _NOT_FROM_THE_START = ("comm.agree", "comm.follow", "comm.wander", "comm.loss")
 _NUMBERED = re.compile(r"(state|step)_\d{9,18}\.safetensors")
 
 
-ACTOR = "actor_network_params.module."
-"""begins the names of the actors' weights in a checkpoint"""
-
-
 class RunFolder:
     """One training run's files.
 
@@ -94,7 +90,7 @@ class RunFolder:
             _check_whole(values, config)
         except ValueError as error:
             raise UserError(f"{file}: {error}") from None
-        return replace(config, fire=fires_of(config.fire).opened(self.path))
+        return replace(config, fire=fires_of(config.fire).load_copy(self.path))
 
     def append(self, file: str, line: Mapping[str, Any]) -> None:
         """Adds a line of JSON and hands it to the system at once, whole or not at all.

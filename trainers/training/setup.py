@@ -10,7 +10,7 @@ from torch import Tensor
 
 from emberlink.envs import keys
 from emberlink.envs.utils.errors import UserError
-from emberlink.policies.networks.actor_critic import team_of
+from emberlink.policies.networks import team_of
 from emberlink.trainers.build import build_env, build_learner
 from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.learners.nan_guard import NonFiniteGuard
