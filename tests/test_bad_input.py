@@ -64,7 +64,7 @@ SETUPS = "known: paper, released, tuned"
         (["consensus", "learner.buffer_size=5"], ["batch_size=8", "buffer_size=5"]),
         (["consensus", "seed=-1"], ["seed=-1", "greater than or equal to 0"]),
         (["consensus", "num_envs=0"], ["num_envs=0"]),
-        (["consensus", "learner=[1]"], ["learner=[1]"]),
+        (["consensus", "learner=[1]"], ["learner '[1]' is not known"]),
         (["consensus", "logger=mlflow"], ["logger=mlflow", "'wandb', 'tensorboard', 'csv'"]),
         (["consensus", "replay=both"], ["replay=both", "'per_agent' or 'shared'"]),
         (["consensus", "comm.rnge=3"], ["'comm.rnge'", "did you mean comm.range?"]),

@@ -1,11 +1,6 @@
 """Finds learners by name: the files of this folder and entry points of other packages."""
 
-from collections.abc import Mapping
-from typing import Any
-
-from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.plugins import Registry
-from emberlink.envs.utils.validation import from_plain
 
 from .base import Learner, LearnerConfig, LearnerContext
 
@@ -17,19 +12,6 @@ _REGISTRY = Registry(
     group="emberlink.learners",
 )
 known, find = _REGISTRY.known, _REGISTRY.find
-
-
-def parse_config(values: Any) -> LearnerConfig:
-    """Returns the configuration of the learner that `name` says, from plain values.
-
-    Raises:
-        ValueError: the name or a value is wrong.
-    """
-    if isinstance(values, LearnerConfig):
-        return values
-    if not isinstance(values, Mapping) or not isinstance(values.get("name"), str):
-        raise UserError(f"learner.name is missing; known: {', '.join(known())}")
-    return from_plain(find(values["name"]).config_type, values, "learner")
 
 
 def build(config: LearnerConfig, context: LearnerContext) -> Learner:
