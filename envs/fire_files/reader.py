@@ -15,7 +15,7 @@ from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import printable
 
 from . import formats
-from .banks import is_bank, read_bands, read_npy
+from .banks import bank_horizon, is_bank, read_bands, read_npy
 from .config import FileFireConfig
 from .episode_crop import on_grid
 from .front_points import read_front_points
@@ -70,6 +70,7 @@ def _read(
         bank = read_bands(path)
     else:
         return [on_grid(_read_one(path, kind, config), config, grid, horizon)]
+    _check_horizon(path, config, horizon)
     fires: list[np.ndarray] = []
     for source in bank:
         try:
@@ -77,6 +78,17 @@ def _read(
         except UserError as error:
             raise UserError(f"fire {len(fires)}: {error}") from None
     return fires
+
+
+def _check_horizon(path: Path, config: FileFireConfig, horizon: int) -> None:
+    """Checks that a bank whose times stay steps was written for this horizon."""
+    written = bank_horizon(path)
+    in_steps = config.start is config.end is config.minutes_per_step is None
+    if in_steps and written not in (None, horizon):
+        raise UserError(
+            f"its fires are of {written} steps, env.horizon is {horizon}; expected "
+            f"env.horizon={written}, or fire.end={written} to stretch them over {horizon} steps"
+        )
 
 
 def _read_one(path: Path, kind: formats.Format, config: FileFireConfig) -> Source:

@@ -1,4 +1,4 @@
-"""Which fire is meant: a scenario's test fire or one of a file, under the keys of training."""
+"""Finds the fire that a command names: a scenario's test fire, or one of a file."""
 
 import difflib
 import os
@@ -26,31 +26,31 @@ _KEYS = ("env.", "fire.")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Source:
-    """A fire and where it is from."""
+class SelectedFire:
+    """A fire and its origin."""
 
     title: str
     stem: str
-    """begins the names of files about it"""
+    """Begins the names of files about it."""
     config: RunConfig
     arrival: Tensor
     """float32 [X, Y], steps"""
 
 
-def find(text: str, overrides: Sequence[str]) -> Source:
-    """The fire that NAME, NAME:INDEX, FILE or FILE:INDEX means.
+def find_fire(text: str, overrides: Sequence[str]) -> SelectedFire:
+    """Returns the fire that NAME, NAME:INDEX, FILE or FILE:INDEX names.
 
     Args:
         text: the name of a scenario or a path; a scenario comes first.
         overrides: `key=value` of setup, env. and fire.
 
     Raises:
-        ValueError: there is no such fire, or a key or value is wrong.
+        UserError: there is no such fire, or a key or value is wrong.
     """
     name, _, index = text.rpartition(":") if ":" in text else (text, "", "0")
     if name in scenarios():
         config = generated(name, overrides)
-        return Source(
+        return SelectedFire(
             title=f"{name}, test fire {index}",
             stem=f"fire_{name}_{index}",
             config=config,
@@ -66,7 +66,7 @@ def find(text: str, overrides: Sequence[str]) -> Source:
     if not index.isdecimal() or int(index) >= len(fires):
         raise UserError(f"{shown(text)}: there is no fire {index!r}; known: 0 to {len(fires) - 1}")
     several, shortened = len(fires) > 1, shown(path.name)
-    return Source(
+    return SelectedFire(
         title=f"{shortened}, fire {index} of {len(fires)}" if several else shortened,
         stem=f"fire_{path.stem}_{index}" if several else f"fire_{path.stem}",
         config=config,
@@ -83,10 +83,10 @@ def _test_fire(config: RunConfig, text: str, index: str) -> Tensor:
 
 
 def generated(scenario: str, overrides: Sequence[str]) -> RunConfig:
-    """The configuration with which a scenario's fires are made.
+    """Returns the configuration with which a scenario's fires are made.
 
     Raises:
-        ValueError: there is no such scenario, its fires are read, or a key or value is wrong.
+        UserError: there is no such scenario, its fires are read, or a key or value is wrong.
     """
     known = scenarios()
     if scenario not in known:
@@ -96,13 +96,13 @@ def generated(scenario: str, overrides: Sequence[str]) -> RunConfig:
 
 
 def from_file(path: Path, overrides: Sequence[str]) -> RunConfig:
-    """The configuration with which a file is read.
+    """Returns the configuration with which a file is read.
 
     Raises:
-        ValueError: a key or value is wrong.
+        UserError: a key or value is wrong.
     """
     if any(text.partition("=")[0] == "fire.path" for text in overrides):
-        raise UserError("fire.path: the file stands without a key here")
+        raise UserError("fire.path: the file is given without a key here")
     # The name is set past the parser of overrides, to which some characters mean something.
     return _resolve([f"fire={FILE}", "fire.path=_", *overrides], overrides, path=str(path))
 
@@ -113,7 +113,7 @@ def _resolve(texts: Sequence[str], overrides: Sequence[str], path: str | None = 
     for text in overrides:
         key = text.partition("=")[0]
         if key == "fire":
-            raise UserError(f"{shown(text)!r}: the fire is named without a key here")
+            raise UserError(f"{shown(text)!r}: the fire is given without a key here")
         if key != "setup" and not key.startswith(_KEYS):
             raise UserError(
                 f"{shown(text)!r}: a fire depends on keys of setup, env. and fire. only"
@@ -122,10 +122,10 @@ def _resolve(texts: Sequence[str], overrides: Sequence[str], path: str | None = 
 
 
 def read(config: RunConfig) -> Tensor:
-    """The fires of a file, float32 [fires, X, Y], steps.
+    """Returns the fires of a file, float32 [fires, X, Y], steps.
 
     Raises:
-        ValueError: one line that names the file and what is wrong with it.
+        UserError: one line that names the file and what is wrong with it.
     """
     assert isinstance(config.fire, FileFireConfig)
     return read_fires(config.fire, config.env.grid, config.env.horizon)
@@ -134,10 +134,10 @@ def read(config: RunConfig) -> Tensor:
 def _unknown(text: str) -> str:
     known = scenarios()
     hint = _near(text.rpartition(":")[0] or text, known)
-    return f"{shown(text)}: no file or scenario is so called{hint} known: {', '.join(known)}"
+    return f"{shown(text)}: there is no such file or scenario{hint} known: {', '.join(known)}"
 
 
 def _near(name: str, known: Sequence[str]) -> str:
-    """What may have been meant; it ends as the known names are to follow."""
+    """Returns a suggestion; the known names follow it in the message."""
     near = difflib.get_close_matches(name, known, n=1)
     return f"; did you mean {near[0]}?" if near else ";"
