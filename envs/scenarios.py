@@ -8,14 +8,13 @@ import torch
 from pydantic import Discriminator, Tag
 from torch import Tensor
 
+from emberlink.envs.config import WildfireConfig
 from emberlink.envs.fire.cache import fire_bank
 from emberlink.envs.fire.generator import FireConfig, fire_seeds, load_scenario, make_fires
 from emberlink.envs.fire_files import FileFireConfig, fire_sets, save_copy, with_checksum
 from emberlink.envs.fire_files.reader import COPY_FILE
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import TAG
-
-from .config import WildfireConfig
 
 Grid = tuple[int, int]
 

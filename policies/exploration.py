@@ -1,41 +1,53 @@
 """Exploration: Ornstein-Uhlenbeck noise on the actions."""
 
 import math
-from typing import Any
+from typing import Annotated, Any
 
 import torch
+from pydantic import ConfigDict, Field
+from pydantic.dataclasses import dataclass
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs.utils import ExplorationType, exploration_type
 
 from emberlink.envs import keys
 from emberlink.envs.utils import counter_rng
+from emberlink.envs.utils.counter_rng import Use
 
 NOISE = (keys.AGENTS, "noise")
-"""float32 [..., 3]: the process, carried from step to step."""
+"""float32 [..., 3]: the noise process, carried from step to step"""
 
-_SHOCKS = 300  # what a moment's random stream is used for
+
+@dataclass(frozen=True, kw_only=True, config=ConfigDict(extra="forbid", strict=True))
+class ExplorationConfig:
+    """Ornstein-Uhlenbeck noise: x += theta * (0 - x) * dt + sigma * sqrt(dt) * N(0, 1)."""
+
+    theta: Annotated[float, Field(ge=0, le=1e30)]
+    """pull towards 0"""
+    sigma: Annotated[float, Field(ge=0, le=1e30)]
+    """strength of the noise"""
+    dt: Annotated[float, Field(gt=0, le=1e30)]
+    """length of a step"""
 
 
 class OrnsteinUhlenbeck(TensorDictModuleBase):
-    """x += theta * (0 - x) * dt + sigma * sqrt(dt) * N(0, 1), added to the action and clipped.
+    """Adds Ornstein-Uhlenbeck noise to the actions and clips them to [-1, 1].
 
-    It starts from 0 with each episode and does not fade: the paper anneals nothing. Its numbers
-    come from the environment's own random stream, so that an environment's noise does not depend
-    on how many run beside it, nor on the device. (TorchRL's module draws from the global generator
-    and steps back through it for one batch as a whole.) Where exploration is off
-    (`torchrl.envs.set_exploration_type`), actions are left as they are.
+    The process starts from 0 with each episode and is not annealed (the paper anneals nothing).
+    Random numbers come from each environment's own stream, so the noise of an environment depends
+    neither on the number of environments nor on the device. (TorchRL's module draws from the global
+    generator.) Where exploration is off (`torchrl.envs.set_exploration_type`), actions are
+    unchanged.
 
     Args:
-        theta: pull towards 0.
-        sigma: strength of the noise.
-        dt: length of a step.
+        config: constants of the process.
     """
 
-    def __init__(self, *, theta: float, sigma: float, dt: float):
+    def __init__(self, config: ExplorationConfig):
         super().__init__()
-        self.keep, self.shock = 1 - theta * dt, sigma * math.sqrt(dt)
-        reads: list[Any] = [keys.ACTION, keys.STREAM, keys.STEP]
+        self.keep = 1 - config.theta * config.dt
+        self.shock = config.sigma * math.sqrt(config.dt)
+        reads: list[Any] = [keys.ACTION, keys.RNG_KEY, keys.STEP]
         writes: list[Any] = [keys.ACTION, NOISE]
         self.in_keys, self.out_keys = reads, writes
 
@@ -43,8 +55,8 @@ class OrnsteinUhlenbeck(TensorDictModuleBase):
         if exploration_type() not in (None, ExplorationType.RANDOM):
             return tensordict
         action, step = tensordict.get(keys.ACTION), tensordict.get(keys.STEP)
-        moment = counter_rng.at(tensordict.get(keys.STREAM), step, _SHOCKS)
-        normal = counter_rng.normal(moment, action.shape[-2] * action.shape[-1]).view_as(action)
+        key = counter_rng.step_key(tensordict.get(keys.RNG_KEY), step, Use.EXPLORATION_NOISE)
+        normal = counter_rng.normal(key, action.shape[-2] * action.shape[-1]).view_as(action)
         before = tensordict.get(NOISE, None)
         if before is None:
             before = torch.zeros_like(action)

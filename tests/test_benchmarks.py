@@ -1,6 +1,7 @@
 """What the benchmarks count, and when the guard fails."""
 
 from contextlib import nullcontext
+from typing import Any
 
 import guard
 import pytest
@@ -10,7 +11,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils.flop_counter import flop_registry
 
 from emberlink.trainers.config.compose import resolve
-from emberlink.trainers.training.trainer import Trainer
+from emberlink.trainers.training.setup import TrainingSetup
 
 
 class Flops(TorchDispatchMode):
@@ -38,13 +39,14 @@ class Flops(TorchDispatchMode):
 def test_flops_of_an_update_are_what_torch_counts(method, features, hidden, batch, shared):
     settings = ["env.horizon=200", "episodes=1", "env.num_uavs=4"]
     sizes = [f"learner.hidden={list(hidden)}", f"learner.batch_size={batch}"]
-    trainer = Trainer(resolve(method, [*settings, *sizes]))
-    sample = workloads.batch_of(trainer)
+    setup = TrainingSetup(resolve(method, [*settings, *sizes]))
+    sample = workloads.batch_of(setup)
     if not shared:
-        critic = trainer.learner.loss.value_network.module
+        learner: Any = setup.learner
+        critic = learner.loss.value_network.module
         critic.sharing = nullcontext
     with Flops() as counter:
-        trainer.learner.update(sample)
+        setup.learner.update(sample)
     assert counter.total == workloads.update_flops(4, features, 3, hidden, batch, shared=shared)
 
 

@@ -646,7 +646,8 @@ def test_no_runs(tmp_path, capsys):
     (run / "eval.json").unlink()
     assert main.main(["compare", str(run)]) == 2
     assert capsys.readouterr().err == (
-        "emberlink compare: no finished run among 1: nothing to compare\n"
+        "emberlink compare: no finished run among 1: nothing to compare; "
+        f"{run}: not evaluated: there is no eval.json (emberlink eval {run})\n"
     )
 
 

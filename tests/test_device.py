@@ -1,42 +1,45 @@
 """What a GPU needs, checked without one: nothing waits, and one step is the same as TorchRL's."""
 
-from dataclasses import asdict
-
 import pytest
 import torch
-from tensordict.nn import TensorDictSequential
 from test_recipes import METHODS
 from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
+from torchrl.collectors import Collector
 
-from emberlink.policies.exploration import OrnsteinUhlenbeck
 from emberlink.trainers.build import build_env
 from emberlink.trainers.config.compose import resolve
-from emberlink.trainers.rollout.cuda_graphs import LockstepCollector, graphed
-from emberlink.trainers.training.trainer import Trainer
+from emberlink.trainers.rollout.cuda_graphs import graphed
+from emberlink.trainers.training.setup import TrainingSetup
 
 SMALL = [
     *("env.horizon=12", "env.num_uavs=3", "num_envs=2", "episodes=3", "learner.batch_size=8"),
-    *("learner.hidden=[8,8]", "fire=huygens", "exploration.sigma=0.4", "exploration.dt=1"),
+    *("learner.hidden=[8,8]", "fire=huygens"),
+    *("learner.exploration.sigma=0.4", "learner.exploration.dt=1"),
 ]
 
 
-def lockstep(trainer: Trainer) -> LockstepCollector:
-    """Another collector over an environment like the trainer's."""
-    config = trainer.config
-    seeds = config.seeds or (config.seed,)
-    env = build_env(config, num_envs=trainer.envs, fire=config.fire, seed=seeds, device="cpu")
-    noise = OrnsteinUhlenbeck(**asdict(config.exploration))
-    policy = TensorDictSequential(trainer.actor, noise)
-    return LockstepCollector(env, policy, horizon=12, steps=trainer.steps)
+def torchrls(setup: TrainingSetup) -> Collector:
+    """TorchRL's collector over an environment like the setup's."""
+    config, envs = setup.config, len(setup.collector.carried)
+    env = build_env(config, num_envs=envs, fire=config.fire, seed=setup.seeds, device="cpu")
+    return Collector(
+        env,
+        setup.learner.explorer,
+        frames_per_batch=envs,
+        total_frames=setup.total_steps * envs,
+        trust_policy=True,
+        track_traj_ids=False,
+        auto_register_policy_transforms=False,
+    )
 
 
 @pytest.mark.parametrize("seeds", ["seed=5", "seeds=[5,6]"])
 @pytest.mark.parametrize("method", METHODS)
-def test_the_lockstep_collector_collects_what_torchrls_does(method, seeds):
-    trainer = Trainer(resolve(method, [*SMALL, seeds, "exploration.theta=0.2"]))
-    torch.nn.init.normal_(trainer.actor.module.action.weight, std=0.3)
-    pairs = zip(trainer.collector, lockstep(trainer), strict=True)
+def test_our_collector_collects_what_torchrls_does(method, seeds):
+    setup = TrainingSetup(resolve(method, [*SMALL, seeds, "learner.exploration.theta=0.2"]))
+    torch.nn.init.normal_(setup.learner.actor.module.action.weight, std=0.3)
+    pairs = zip(torchrls(setup), setup.collector, strict=True)
     count = 0
     for theirs, ours in pairs:
         count += 1
@@ -96,18 +99,21 @@ class Elsewhere(TorchFunctionMode):
 @pytest.mark.parametrize(
     ("watch", "seeds"), [(Waiting, "seed=5"), (Elsewhere, "seeds=[5,6]")], ids=["waits", "moves"]
 )
-@pytest.mark.parametrize("setup", ["paper", "released", "tuned"])
+@pytest.mark.parametrize(
+    ("setup", "learner"), [("paper", "ddpg"), ("released", "ddpg"), ("tuned", "td3")]
+)
 @pytest.mark.parametrize("method", METHODS)
-def test_no_step_leaves_the_device(method, setup, watch, seeds):
+def test_no_step_leaves_the_device(method, setup, learner, watch, seeds):
     """Environment, communication, noise, memory and update, within an episode."""
-    trainer = Trainer(resolve(method, [f"setup={setup}", *SMALL, seeds]))
-    collected = iter(lockstep(trainer))
+    settings = [f"setup={setup}", f"learner={learner}", *SMALL, seeds]
+    training = TrainingSetup(resolve(method, settings))
+    rollouts = iter(training.collector)
     for _ in range(6):
-        trainer._learn(next(collected))
+        training.learn(next(rollouts))
     with watch() as watched:
         for _ in range(4):
-            trainer._learn(next(collected))
-    assert trainer.updates > 4
+            training.learn(next(rollouts))
+    assert training.learner.updates > 4
     assert watched.found == []
 
 

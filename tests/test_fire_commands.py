@@ -18,7 +18,7 @@ from emberlink.envs.fire.generator import burning_cells, fire_seeds, load_scenar
 from emberlink.envs.fire_files import banks
 from emberlink.envs.fire_files.banks import write_bank
 from emberlink.envs.scenarios import fires_of
-from emberlink.envs.utils.atomic_io import published
+from emberlink.envs.utils.publish import published
 from emberlink.trainers.cli import main
 from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.fires import plot
@@ -374,7 +374,7 @@ def cli_actions() -> tuple[str, ...]:
         ["preview"],
         ["make", "paper", "--count", "0"],
         ["make", "paper", "--count", "x"],
-        ["make", "paper", "--split", "test"],
+        ["make", "paper", "--split", "heldout"],
         ["import", "x.asc"],
         ["import", "--output", "x.npy"],
     ],
@@ -472,6 +472,6 @@ def test_what_is_no_time_is_not_written(wrong, tmp_path):
     fires = torch.zeros(1, 8, 8)
     fires[0, 2, 3] = wrong
     for suffix in banks.SUFFIXES:
-        with pytest.raises(ValueError, match="NaN or a negative"):
+        with pytest.raises(AssertionError, match="arrival times are 0 or more"):
             write_bank(tmp_path / f"a{suffix}", fires)
     assert list(tmp_path.iterdir()) == []

@@ -14,11 +14,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tiny_run import TINY
 
+from emberlink.configs import known
 from emberlink.envs.fire.generator import load_scenario, make_fires, scenarios
 from emberlink.envs.fire_files.reader import COPY_FILE, FileFireConfig, fire_sets, read_fires
 from emberlink.envs.scenarios import fires_of
 from emberlink.envs.utils.errors import UserError
-from emberlink.envs.utils.validation import known
 from emberlink.envs.wildfire import WildfireEnv
 from emberlink.trainers.cli import main
 from emberlink.trainers.config.compose import from_values, override, resolve, to_values

@@ -9,9 +9,10 @@ from tensordict import TensorDict
 from torchrl.data import Bounded, Composite, Unbounded
 
 from emberlink.envs import keys
-from emberlink.policies.networks.actor_critic import make_actor, make_critic
-from emberlink.trainers.config.schema import LearnerConfig
-from emberlink.trainers.learners.ddpg import Learner
+from emberlink.policies.exploration import ExplorationConfig
+from emberlink.trainers.learners.base import LearnerContext
+from emberlink.trainers.learners.ddpg import DDPG, DDPGConfig
+from emberlink.trainers.learners.nan_guard import NonFiniteGuard
 from emberlink.trainers.learners.replay_buffer import DONE, TERMINATED
 
 UAVS, FEATURES, ACTIONS, HIDDEN, BATCH = 3, 9, 3, (16, 12), 24
@@ -24,17 +25,30 @@ RATES = {
 }
 
 
-def make_learner() -> Learner:
+def make_learner() -> DDPG:
     observation = Composite({keys.OBSERVATION: Unbounded((1, UAVS, FEATURES))}, shape=(1,))
     action = Composite({keys.ACTION: Bounded(-1, 1, (1, UAVS, ACTIONS))}, shape=(1,))
-    config = LearnerConfig(
-        hidden=HIDDEN, updates_per_step=1, batch_size=BATCH, buffer_size=100, **RATES
+    config = DDPGConfig(
+        name="ddpg",
+        hidden=HIDDEN,
+        updates_per_step=1,
+        batch_size=BATCH,
+        buffer_size=100,
+        exploration=ExplorationConfig(theta=0.2, sigma=0.15, dt=0.01),
+        **RATES,
     )
-    generator = torch.Generator().manual_seed(5)
-    networks = (
-        make(observation, action, HIDDEN, generator=generator) for make in (make_actor, make_critic)
+    context = LearnerContext(
+        observation_spec=observation,
+        action_spec=action,
+        num_uavs=UAVS,
+        num_envs=1,
+        seeds=(5,),
+        shared_replay=False,
+        total_steps=100,
+        guard=NonFiniteGuard("cpu"),
+        device="cpu",
     )
-    return Learner(*networks, config)
+    return DDPG(config, context)
 
 
 def make_batch(seed: int, size: int = BATCH, *, done=False, terminated=False) -> TensorDict:
@@ -70,7 +84,7 @@ def of_uav(batch: TensorDict, uav: int) -> tuple[torch.Tensor, ...]:
     return tuple(t[:, uav] for t in tensors)
 
 
-def networks(learner: Learner) -> dict[str, torch.nn.Module]:
+def networks(learner: DDPG) -> dict[str, torch.nn.Module]:
     """Copies of the actors, the critics and their targets, with their present weights."""
     copies = {}
     for name in ("actor", "value"):
@@ -81,20 +95,20 @@ def networks(learner: Learner) -> dict[str, torch.nn.Module]:
     return copies
 
 
-def single(learner: Learner, uav: int) -> SingleDDPG:
+def single(learner: DDPG, uav: int) -> SingleDDPG:
     stacks = networks(learner)
     actor = copy_uav(stacks["actor"], SingleActor(FEATURES, ACTIONS, HIDDEN), uav)
     critic = copy_uav(stacks["value"], SingleCritic(FEATURES, ACTIONS, HIDDEN), uav)
     return SingleDDPG(actor, critic, **RATES)
 
 
-@pytest.mark.parametrize("which", [0, 1])
+@pytest.mark.parametrize("which", ["actor", "critic"])
 @pytest.mark.parametrize("uav", range(UAVS))
 def test_no_gradient_crosses_uavs(which, uav):
     learner = make_learner()
     learner.losses(make_batch(0))[which][uav].backward()
-    trained = "actor_network_params", "value_network_params"
-    for place, network in enumerate(trained):
+    trained = {"actor": "actor_network_params", "critic": "value_network_params"}
+    for place, network in trained.items():
         for name, weight in getattr(learner.loss, network).items(True, True):
             gradient = weight.grad
             if place != which:
@@ -128,12 +142,11 @@ def test_each_uav_of_the_stack_equals_a_single_ddpg():
     singles = [single(learner, uav) for uav in range(UAVS)]
     for step in range(10):
         batch = make_batch(step)
-        actor_losses, critic_losses = learner.update(batch)
+        losses = learner.update(batch)
         for uav, ddpg in enumerate(singles):
             expected = ddpg.update(*of_uav(batch, uav))
-            assert (actor_losses[uav].item(), critic_losses[uav].item()) == pytest.approx(
-                expected, rel=1e-4, abs=1e-5
-            )
+            found = losses["actor"][uav].item(), losses["critic"][uav].item()
+            assert found == pytest.approx(expected, rel=1e-4, abs=1e-5)
     hand = {
         "actor": "actor",
         "value": "critic",
@@ -174,7 +187,7 @@ def test_the_time_limit_is_bootstrapped(terminated):
     for seed in range(5):  # targets that differ from the networks
         learner.update(make_batch(seed))
     batch = make_batch(9, size=1, done=True, terminated=terminated)
-    _, losses = learner.losses(batch)
+    losses = learner.losses(batch)["critic"]
     stacks = networks(learner)
     following = batch["next", *keys.OBSERVATION]
     value = stacks["value"](batch[keys.OBSERVATION], batch[keys.ACTION])

@@ -3,30 +3,31 @@
 import pytest
 import torch
 from tensordict import TensorDict
+from torchrl.data import Composite, Unbounded
 
 from emberlink.envs import keys
 from emberlink.trainers import make_env
-from emberlink.trainers.learners.replay_buffer import (
-    DONE,
-    TERMINATED,
-    make_memory,
-    rows_needed,
-    to_rows,
-)
+from emberlink.trainers.learners.base import LearnerContext
+from emberlink.trainers.learners.nan_guard import NonFiniteGuard
+from emberlink.trainers.learners.replay_buffer import DONE, TERMINATED, ReplayMemory, to_rows
 
 UAVS = 4
 
 
 def memory(*, shared: bool, capacity: int = 4000, batch: int = 64, most: int = 10**9, uavs=UAVS):
-    return make_memory(
-        uavs,
-        shared=shared,
-        capacity=capacity,
-        batch=batch,
-        most=most,
-        seeds=[0],
+    spec = Composite({keys.OBSERVATION: Unbounded((1, uavs, 2))}, shape=(1,))
+    context = LearnerContext(
+        observation_spec=spec,
+        action_spec=spec,
+        num_uavs=uavs,
+        num_envs=1,
+        seeds=(0,),
+        shared_replay=shared,
+        total_steps=most,
+        guard=NonFiniteGuard("cpu"),
         device="cpu",
     )
+    return ReplayMemory(context, batch_size=batch, buffer_size=capacity)
 
 
 def labelled(first: int, count: int, uavs: int = UAVS) -> TensorDict:
@@ -52,7 +53,7 @@ def drawn(buffer, samples: int) -> torch.Tensor:
 
 def test_private_memory_samples_a_uavs_own_transitions():
     buffer = memory(shared=False)
-    buffer.extend(labelled(0, 50))
+    buffer.extend_rows(labelled(0, 50))
     sample = drawn(buffer, 40)
     assert sample.shape == (40 * 64, UAVS, 2)
     assert (sample[..., 1] == torch.arange(UAVS)).all()
@@ -63,7 +64,7 @@ def test_private_memory_samples_a_uavs_own_transitions():
 
 def test_shared_memory_samples_everyones_about_equally():
     buffer = memory(shared=True)
-    buffer.extend(labelled(0, 50))
+    buffer.extend_rows(labelled(0, 50))
     sample = drawn(buffer, 200)
     for reader in range(UAVS):
         whose = sample[:, reader, 1].bincount(minlength=UAVS) / len(sample)
@@ -76,7 +77,7 @@ def test_shared_memory_samples_everyones_about_equally():
 @pytest.mark.parametrize("shared", [False, True])
 def test_each_uav_has_its_own_draws(shared):
     buffer = memory(shared=shared)
-    buffer.extend(labelled(0, 1000))
+    buffer.extend_rows(labelled(0, 1000))
     rows = drawn(buffer, 1)[..., 0]
     for other in range(1, UAVS):
         assert (rows[:, 0] == rows[:, other]).float().mean() < 0.1
@@ -86,7 +87,7 @@ def test_each_uav_has_its_own_draws(shared):
 @pytest.mark.parametrize("shared", [False, True])
 def test_a_sampled_transition_is_one_that_was_stored(shared):
     buffer = memory(shared=shared)
-    buffer.extend(labelled(0, 300))
+    buffer.extend_rows(labelled(0, 300))
     sample = buffer.sample()
     assert sample.batch_size == (64,)
     label, following = sample[keys.OBSERVATION], sample["next"]
@@ -98,17 +99,17 @@ def test_a_sampled_transition_is_one_that_was_stored(shared):
 
 def test_capacity_counts_uav_transitions():
     million = {"capacity": 1_000_000, "uavs": 6}
-    assert memory(shared=True, **million)._storage.max_size == 166_667
-    assert memory(shared=False, **million)._storage.max_size == 1_000_000
+    assert memory(shared=True, **million).capacity == 166_667
+    assert memory(shared=False, **million).capacity == 1_000_000
     # Nothing is allocated that a run cannot fill.
-    assert memory(shared=False, most=300, **million)._storage.max_size == 300
+    assert memory(shared=False, most=300, **million).capacity == 300
 
 
 @pytest.mark.parametrize(("shared", "rows"), [(True, 10), (False, 40)])
 def test_the_oldest_transitions_are_overwritten(shared, rows):
     buffer = memory(shared=shared, capacity=40, batch=500)
     for first in range(0, 100, 5):
-        buffer.extend(labelled(first, 5))
+        buffer.extend_rows(labelled(first, 5))
     assert len(buffer) == rows
     assert drawn(buffer, 2)[..., 0].unique().tolist() == list(range(100 - rows, 100))
 
@@ -117,13 +118,13 @@ def test_the_oldest_transitions_are_overwritten(shared, rows):
     ("uavs", "shared", "rows"), [(6, True, 86), (6, False, 512), (1, True, 512), (64, True, 8)]
 )
 def test_a_full_batch_is_counted_in_transitions(uavs, shared, rows):
-    assert rows_needed(uavs, shared=shared, batch=512) == rows
+    assert memory(shared=shared, batch=512, uavs=uavs).needed == rows
 
 
 def test_rows_are_what_the_environment_did():
     env = make_env("consensus", num_envs=2, horizon=3, num_uavs=UAVS)
     rollout = env.rollout(3, break_when_any_done=False)
-    rows = to_rows(rollout)
+    rows = to_rows(rollout, 1, [keys.OBSERVATION])
     assert rows.batch_size == (6, UAVS)
     for at in range(6):
         step = rollout[at // 3, at % 3]
@@ -141,17 +142,53 @@ def test_rows_are_what_the_environment_did():
 def test_a_million_transitions_take_little_more_than_their_numbers(shared):
     """Both observations, action and reward; the rest is two flags."""
     buffer = memory(shared=shared, capacity=1_000_000, uavs=6)
-    row = to_rows(make_env("consensus", horizon=2).rollout(1))
-    buffer.extend(row)
+    row = to_rows(make_env("consensus", horizon=2).rollout(1), 1, [keys.OBSERVATION])
+    buffer.extend_rows(row)
     transitions = 1_000_002 if shared else 6_000_000  # rows of six
-    assert len(buffer._storage._storage) * 6 == transitions
+    assert len(buffer._buffer.storage._storage) * 6 == transitions
     numbers = 4 * (9 + 9 + 3 + 1) * transitions
-    assert buffer._storage._storage.bytes() <= 1.2 * numbers
+    assert buffer._buffer.storage._storage.bytes() <= 1.2 * numbers
 
 
-def test_an_emptied_memory_forgets():
-    buffer = memory(shared=True)
-    buffer.extend(labelled(0, 50))
-    buffer.empty()
-    buffer.extend(labelled(900, 20))
-    assert drawn(buffer, 3)[..., 0].min() >= 900
+def test_several_tensors_of_any_shape_are_stored():
+    """A vector and a window of bits, for two seeds of two environments."""
+    observation, window = (keys.AGENTS, "observation"), (keys.AGENTS, "window")
+    agents = {
+        "observation": torch.rand(4, 3, UAVS, 6),
+        "window": torch.rand(4, 3, UAVS, 3, 5, 5) < 0.5,
+        "action": torch.rand(4, 3, UAVS, 3),
+    }
+    following = {
+        keys.AGENTS: {name: agents[name].clone() for name in ("observation", "window")}
+        | {"reward": torch.rand(4, 3, UAVS, 1)},
+        "done": torch.zeros(4, 3, 1, dtype=torch.bool),
+        "terminated": torch.zeros(4, 3, 1, dtype=torch.bool),
+    }
+    rollout = TensorDict({keys.AGENTS: agents, "next": following}, batch_size=[4, 3])
+    rows = to_rows(rollout, 2, [observation, window])
+    assert rows["window"].shape == (6, 2 * UAVS, 3, 5, 5)
+    assert rows["window"].dtype == torch.bool
+    # Row 4 is the second environment's second step; the second seed's UAVs come last.
+    assert rows["window"][4, UAVS:].equal(agents["window"][3, 1])
+    assert rows["next", "window"][4, :UAVS].equal(agents["window"][1, 1])
+    assert rows["next", "reward"][2].equal(
+        torch.cat([following[keys.AGENTS]["reward"][seed, 2] for seed in (0, 2)])
+    )
+
+
+@pytest.mark.parametrize("written", [20, 40, 55])
+def test_a_restored_memory_goes_on_as_the_one_that_was_saved(written):
+    def filled(rows: int) -> ReplayMemory:
+        buffer = memory(shared=False, capacity=40, batch=10)
+        for first in range(rows):
+            buffer.extend_rows(labelled(first, 1))
+        return buffer
+
+    one, other = filled(written), memory(shared=False, capacity=40, batch=10)
+    one.sample()
+    other.load_state_dict({name: value.clone() for name, value in one.state_dict().items()})
+    for buffer in (one, other):
+        for first in range(written, written + 15):
+            buffer.extend_rows(labelled(first, 1))
+    assert (one.sample() == other.sample()).all()
+    assert len(one) == len(other)

@@ -11,12 +11,12 @@ from torchrl.envs import ExplorationType, set_exploration_type
 
 from emberlink.envs import keys
 from emberlink.envs.utils import counter_rng
-from emberlink.policies.exploration import OrnsteinUhlenbeck
+from emberlink.policies.exploration import ExplorationConfig, OrnsteinUhlenbeck
 from emberlink.policies.networks.actor_critic import make_actor
 from emberlink.trainers import make_env
 from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.evaluation import evaluate
-from emberlink.trainers.training.trainer import Trainer
+from emberlink.trainers.training.setup import TrainingSetup
 
 UAVS, ENVS = 2, 4000
 
@@ -33,7 +33,8 @@ def explorer(*, theta: float, sigma: float, dt: float, envs: int = ENVS, network
     action = Composite({keys.ACTION: Bounded(-1.0, 1.0, (envs, UAVS, 3))}, shape=(envs,))
     actor = make_actor(observation, action, (8, 8))
     actor.module = network or Still()
-    return TensorDictSequential(actor, OrnsteinUhlenbeck(theta=theta, sigma=sigma, dt=dt))
+    noise = OrnsteinUhlenbeck(ExplorationConfig(theta=theta, sigma=sigma, dt=dt))
+    return TensorDictSequential(actor, noise)
 
 
 def play(policy, starts: list[torch.Tensor | bool], envs: int = ENVS) -> torch.Tensor:
@@ -44,7 +45,7 @@ def play(policy, starts: list[torch.Tensor | bool], envs: int = ENVS) -> torch.T
     for start in starts:
         fresh = torch.as_tensor(start).flatten().expand(envs)
         episode, step = episode + fresh, torch.where(fresh, 0, step + 1)
-        moment[keys.STREAM] = counter_rng.fold(counter_rng.streams(0, envs), episode)
+        moment[keys.RNG_KEY] = counter_rng.fold_in(counter_rng.seed_keys(0, envs), episode)
         moment[keys.STEP] = step
         moment = policy(moment)
         actions.append(moment[keys.ACTION].clone())
@@ -92,14 +93,13 @@ def test_training_resets_the_noise_with_each_episode(tmp_path):
         "num_envs=300",
         "learner.hidden=[4,4]",
     ]
-    noise = ["exploration.theta=0", "exploration.sigma=0.2", "exploration.dt=0.25"]
+    noise = [f"learner.exploration.{one}" for one in ("theta=0", "sigma=0.2", "dt=0.25")]
     config = resolve("independent", [*short, *noise, f"output={tmp_path}"])
-    trainer = Trainer(config)
+    setup = TrainingSetup(config)
     with torch.no_grad():  # an actor that answers 0
-        trainer.actor.module.action.weight.zero_()
-        trainer.actor.module.action.bias.zero_()
-    spread = [collected[keys.ACTION].std().item() for collected in trainer.collector]
-    trainer.collector.shutdown()
+        setup.learner.actor.module.action.weight.zero_()
+        setup.learner.actor.module.action.bias.zero_()
+    spread = [collected[keys.ACTION].std().item() for collected in setup.collector]
     expected = [0.1 * math.sqrt(step) for step in range(1, 7)] * 3
     assert spread == pytest.approx(expected, rel=0.06)
 

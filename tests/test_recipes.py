@@ -9,8 +9,7 @@ import yaml
 
 from emberlink.envs import keys, metrics
 from emberlink.trainers.config.compose import resolve
-from emberlink.trainers.evaluation import report
-from emberlink.trainers.learners.replay_buffer import rows_needed
+from emberlink.trainers.evaluation.actor import load_actor
 from emberlink.trainers.runs.run_folder import RunFolder
 from emberlink.trainers.training.trainer import Trainer
 
@@ -43,7 +42,7 @@ def trained(config) -> Trainer:
 def test_a_recipe_trains(method, setup, tmp_path):
     config = short(method, tmp_path, setup=setup)
     trainer = Trainer(config)
-    initial = {name: weight.clone() for name, weight in trainer.weights().items()}
+    initial = {name: weight.clone() for name, weight in trainer.setup.learner.weights().items()}
     trainer.start()
     seen = []
     trainer.train(lambda progress: seen.append((progress.step, progress.episode)))
@@ -53,7 +52,7 @@ def test_a_recipe_trains(method, setup, tmp_path):
     assert list(tmp_path.iterdir()) == [run.path]
     assert RunFolder(run.path).config() == config
     check_lines(run, config)
-    networks = {name: weight for name, weight in trainer.weights().items() if "_params" in name}
+    networks = trainer.setup.learner.weights()
     assert len(networks) == 2 * (10 + 12)  # actor and critic, and the target of each
     for name, weight in networks.items():
         assert weight.isfinite().all(), name
@@ -67,7 +66,7 @@ def check_lines(run: RunFolder, config) -> None:
     lines = [json.loads(line) for line in text.splitlines()]
     assert len(lines) == EPISODES
     shared = config.replay == "shared"
-    rows = rows_needed(config.env.num_uavs, shared=shared, batch=BATCH)
+    rows = math.ceil(BATCH / config.env.num_uavs) if shared else BATCH
     without = math.ceil(rows / ENVS) - 1
     for episode, line in enumerate(lines, start=1):
         assert line["episode"] == episode
@@ -82,8 +81,8 @@ def check_actor(run: RunFolder, config, trainer: Trainer) -> None:
     """The checkpoint's actor acts as the trained one does."""
     checkpoint = run.checkpoint()
     assert checkpoint.name == f"step_{EPISODES * HORIZON:09d}.safetensors"
-    loaded = report.load_actor(config, checkpoint)
-    rollout = trainer.env.rollout(5, trainer.actor)
+    loaded = load_actor(config, checkpoint)
+    rollout = trainer.setup.env.rollout(5, trainer.setup.learner.actor)
     for step in range(5):
         again = loaded(rollout[:, step].select(keys.OBSERVATION))
         assert again[keys.ACTION].equal(rollout[:, step][keys.ACTION])
@@ -96,7 +95,7 @@ def test_a_seed_repeats_a_run_byte_for_byte(method, tmp_path):
         torch.manual_seed(len(name))  # whatever went on before must not matter
         config = short(method, tmp_path / name, "episodes=2", "env.horizon=40", seed=seed)
         trainer = trained(config)
-        return (trainer.run.path / "metrics.jsonl").read_bytes(), trainer.weights()
+        return (trainer.run.path / "metrics.jsonl").read_bytes(), trainer.setup.learner.weights()
 
     (first, weights), (again, same), (other, _) = run("one", 7), run("again", 7), run("other", 8)
     assert first == again
@@ -127,7 +126,9 @@ def test_several_updates_a_step(tmp_path):
         "shared_memory", tmp_path, "episodes=1", "env.horizon=20", "learner.updates_per_step=3"
     )
     trainer = trained(config)
-    assert trainer.updates == 3 * (20 - 2)  # 32 of 12 transitions a step: from step 3 on
+    assert trainer.setup.learner.updates == 3 * (
+        20 - 2
+    )  # 32 of 12 transitions a step: from step 3 on
 
 
 def test_two_runs_in_the_same_second_get_folders_of_their_own(tmp_path):

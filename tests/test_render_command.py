@@ -12,11 +12,11 @@ from PIL import Image
 from rich.console import Console
 from safetensors.torch import save_file
 
+from emberlink.configs import known
 from emberlink.envs.rendering import marks, video
-from emberlink.envs.utils.atomic_io import published
-from emberlink.envs.utils.validation import known
+from emberlink.envs.utils.publish import published
 from emberlink.policies.scripted.registry import SCRIPTED
-from emberlink.trainers.build import build_env, build_networks
+from emberlink.trainers.build import build_actor, build_env
 from emberlink.trainers.cli import main, render
 from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.evaluation import evaluate
@@ -30,7 +30,7 @@ def make_run(folder, method="consensus", *overrides):
     config = resolve(method, [*SHORT, *overrides, f"output={folder}"])
     nowhere = torch.full(config.env.grid, torch.inf)
     env = build_env(config, num_envs=1, fire=nowhere, seed=0, device="cpu")
-    actor, _ = build_networks(config, env, torch.Generator().manual_seed(config.seed))
+    actor = build_actor(config, env, torch.Generator().manual_seed(config.seed))
     weights = {
         f"actor_network_params.module.{name}": value.contiguous()
         for name, value in actor.module.state_dict().items()

@@ -1,6 +1,8 @@
 """Several seeds as one stack: each learns what it learns alone."""
 
+import csv
 import json
+from typing import Any
 
 import pytest
 import torch
@@ -14,8 +16,7 @@ from emberlink.trainers import make_env
 from emberlink.trainers.cli import main
 from emberlink.trainers.config.compose import from_values, resolve, to_values
 from emberlink.trainers.evaluation import report
-from emberlink.trainers.learners.replay_buffer import to_rows
-from emberlink.trainers.training.trainer import Trainer
+from emberlink.trainers.training.setup import TrainingSetup
 
 SEEDS = [3, 11]
 
@@ -31,13 +32,13 @@ def test_a_seed_of_a_stack_learns_what_it_learns_alone(method, setup, tmp_path):
         *("learner.batch_size=24", "learner.hidden=[24,16]", "evaluation.interval=0"),
     ]
     together = trained(resolve(method, [*settings, f"seeds={SEEDS}", f"output={tmp_path / 'a'}"]))
-    assert together.updates > 200
+    assert together.setup.learner.updates > 200
     assert len(together.runs) == len(SEEDS)
     for team, seed in enumerate(SEEDS):
         alone = trained(resolve(method, [*settings, f"seed={seed}", f"output={tmp_path / 'b'}"]))
-        weights = together.weights(team)
-        assert weights.keys() == alone.weights().keys()
-        for name, weight in alone.weights().items():
+        weights, expected = together.setup.learner.weights(team), alone.setup.learner.weights()
+        assert weights.keys() == expected.keys()
+        for name, weight in expected.items():
             torch.testing.assert_close(weights[name], weight, rtol=1e-3, atol=1e-4)
         lines = zip(together.runs[team].lines(), alone.run.lines(), strict=True)
         for line, single in lines:
@@ -51,22 +52,23 @@ def test_a_stack_of_networks_learns_as_each_does_to_the_last_digits(tmp_path):
     """
     settings = ["setup=tuned", "env.horizon=50", "learner.batch_size=16", "learner.hidden=[24,16]"]
 
-    def learner(seeds: str, samples: int = 0) -> tuple[Trainer, list]:
-        trainer = Trainer(resolve("consensus", [*settings, seeds]))
-        for _, collected in zip(range(samples), trainer.collector, strict=False):
-            trainer.memory.extend(to_rows(collected, trainer.teams))
-        batches = [trainer.memory.sample().apply(widened) for _ in range(samples)]
-        trainer.learner.loss.double()
-        return trainer, batches
+    def learner(seeds: str, samples: int = 0) -> tuple[Any, list]:
+        setup = TrainingSetup(resolve("consensus", [*settings, seeds]))
+        learner: Any = setup.learner
+        for _, rollout in zip(range(samples), setup.collector, strict=False):
+            learner.replay.extend(rollout)
+        batches = [learner.sample().apply(widened) for _ in range(samples)]
+        learner.loss.double()
+        return learner, batches
 
     together, batches = learner("seeds=[3,11]", samples=40)
     singles = [learner(f"seed={seed}")[0] for seed in (3, 11)]
     for update in range(300):
         batch = batches[update % len(batches)]
-        together.learner.update(batch)
+        together.update(batch)
         for team, single in enumerate(singles):
             uavs = slice(6 * team, 6 * team + 6)
-            single.learner.update(
+            single.update(
                 TensorDict(
                     {"agents": batch["agents"][:, uavs], "next": next_of(batch, uavs)},
                     batch_size=batch.batch_size,
@@ -91,16 +93,19 @@ def next_of(batch: TensorDict, uavs: slice) -> TensorDict:
 def test_seeds_of_a_stack_differ_in_all_that_is_random():
     """Weights, start positions, fires, noise, and what is drawn from the memory."""
     settings = ["fire=huygens", "env.horizon=30", "learner.batch_size=24", "learner.hidden=[8,8]"]
-    trainer = Trainer(resolve("consensus", [*settings, f"seeds={SEEDS}"]))
-    first, second = (trainer.weights(team) for team in range(2))
+    setup = TrainingSetup(resolve("consensus", [*settings, f"seeds={SEEDS}"]))
+    learner: Any = setup.learner
+    first, second = (learner.weights(team) for team in range(2))
     assert not any(first[name].equal(second[name]) for name in first if "norm" not in name)
-    assert not trainer.env.base_env.arrival[0].equal(trainer.env.base_env.arrival[1])
-    collected = next(iter(trainer.collector))
+    world: Any = setup.env.base_env
+    assert not world.arrival_time[0].equal(world.arrival_time[1])
+    collected = next(iter(setup.collector))
     for key in (keys.POSITION, NOISE):
         assert not collected[key][0].isclose(collected[key][1]).any(), key
-    trainer.memory.extend(to_rows(collected, 2))
-    trainer.memory._sampler.filled.fill_(1000)
-    (rows, columns), _ = trainer.memory._sampler.sample(trainer.memory._storage, 24)
+    learner.replay.extend(collected)
+    sampler, storage = learner.replay._sampler, learner.replay._buffer.storage
+    sampler.filled.fill_(1000)
+    (rows, columns), _ = sampler.sample(storage, 24)
     assert (rows[:, :6] == rows[:, 6:]).float().mean() < 0.05
     assert columns[:, :6].max() < 6 <= columns[:, 6:].min()
 
@@ -113,8 +118,8 @@ def test_environments_of_several_seeds_are_those_of_each():
     for team, moment in enumerate(moments):
         own = slice(3 * team, 3 * team + 3)
         assert whole[own][keys.POSITION].equal(moment[keys.POSITION])
-        assert whole[own][keys.STREAM].equal(moment[keys.STREAM])
-        assert together.arrival[own].equal(singles[team].arrival)
+        assert whole[own][keys.RNG_KEY].equal(moment[keys.RNG_KEY])
+        assert together.arrival_time[own].equal(singles[team].arrival_time)
 
 
 @pytest.mark.parametrize("seeds", [[], [1, -1], [1, 2]])
@@ -171,7 +176,7 @@ def test_seeds_from_python():
     for seeds in ([1, 2], (1, 2), range(1, 3)):
         assert resolve("consensus", seeds=seeds).seeds == (1, 2)
     assert resolve("consensus", seeds=[4, 2]).seed == 4
-    assert WildfireEnv(2, seed=torch.tensor(3)).reset()[keys.STREAM].shape == (2,)
+    assert WildfireEnv(2, seed=torch.tensor(3)).reset()[keys.RNG_KEY].shape == (2,)
     with pytest.raises(ValueError, match="an environment takes seed="):
         make_env("consensus", seeds=[1, 2])
 
@@ -186,6 +191,6 @@ def test_every_seed_has_a_tracker_of_its_own(tmp_path):
     small = ["env.horizon=8", "episodes=2", "learner.batch_size=8", "learner.hidden=[4,4]"]
     more = [f"seeds={SEEDS}", "logger=csv", f"output={tmp_path}", "evaluation.interval=0"]
     for run in trained(resolve("independent", [*small, *more])).runs:
-        (scores,) = (run.path / "csv").rglob("mean_reward.csv")
-        logged = [float(line.split(",")[1]) for line in scores.read_text().splitlines()]
+        with (run.path / "metrics.csv").open(newline="") as file:
+            logged = [float(row["mean_reward"]) for row in csv.DictReader(file)]
         assert logged == pytest.approx([line["mean_reward"] for line in run.lines()])

@@ -5,10 +5,11 @@ import dataclasses
 import pytest
 
 from emberlink.comm.consensus import ConsensusConfig
+from emberlink.configs import known
 from emberlink.envs.config import RewardConfig, WildfireConfig
 from emberlink.envs.fire.generator import scenarios
 from emberlink.envs.utils.validation import from_plain
-from emberlink.trainers.config.compose import flat, known, resolve, to_values
+from emberlink.trainers.config.compose import flat, resolve, to_values
 from emberlink.trainers.config.schema import build_comm
 
 METHODS = ["independent", "shared_memory", "positional", "consensus"]
@@ -38,16 +39,16 @@ TABLE = {
     "learner.batch_size": (512, 512),
     "learner.updates_per_step": (1, 1),
     "num_envs": (1, 1),
-    "exploration.theta": (0.2, 0.2),
-    "exploration.sigma": (0.15, 0.15),
-    "exploration.dt": (0.01, 0.01),
+    "learner.exploration.theta": (0.2, 0.2),
+    "learner.exploration.sigma": (0.15, 0.15),
+    "learner.exploration.dt": (0.01, 0.01),
     "fire.name": ("paper", "paper"),
 }
 GAMMA = {(method, setup): 0.95 for method in METHODS for setup in (PAPER, RELEASED)}
 GAMMA["independent", RELEASED] = 0.92
 # What a method is: whose memory, and what is heard.
 SWITCHES = {
-    "independent": ("private", "no_comm"),
+    "independent": ("per_agent", "no_comm"),
     "shared_memory": ("shared", "no_comm"),
     "positional": ("shared", "positional"),
     "consensus": ("shared", "consensus"),
@@ -85,7 +86,7 @@ def test_every_row_of_the_table(method, column):
         assert dataclasses.fields(settings) == ()
 
 
-CORRELATED = {"exploration.theta": 0.1, "exploration.sigma": 0.15}
+CORRELATED = {"learner.exploration.theta": 0.1, "learner.exploration.sigma": 0.15}
 OWN = {
     PAPER: {},
     RELEASED: {"independent": {"learner.gamma": 0.92}},
@@ -109,7 +110,7 @@ def test_methods_differ_in_two_switches_and_in_what_is_listed(setup):
         values = flat(to_values(config))
         assert {key: values[key] for key in own} == own
         for key in values.keys() - own.keys():
-            if key.split(".")[0] not in ("method", "memory", "comm"):
+            if key.split(".")[0] not in ("method", "replay", "comm"):
                 common.setdefault(key, set()).add(repr(values[key]))
     assert all(len(values) == 1 for values in common.values())
     for own in OWN[setup].values():  # and what is listed is not what the others have

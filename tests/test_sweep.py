@@ -1,18 +1,24 @@
 """emberlink sweep: every combination once, and the same command again does what is left."""
 
+import multiprocessing
 import os
 import signal
 import subprocess
 import sys
 import time
 from contextlib import nullcontext
+from dataclasses import replace
+from pathlib import Path
 
 import pytest
 from rich.console import Console
 
 from emberlink.trainers.cli.main import main
+from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.runs.run_folder import RunFolder
-from emberlink.trainers.sweep.command import jobs_of, sweep
+from emberlink.trainers.sweep import claims, executors
+from emberlink.trainers.sweep.command import sweep
+from emberlink.trainers.sweep.jobs import identity, jobs_of
 
 SMALL = [
     "setup=tuned",
@@ -86,18 +92,289 @@ def test_mistakes_are_named_before_anything_is_trained(arguments, said, capsys, 
     assert not any(tmp_path.iterdir())
 
 
+CHECKPOINT = "step_000000040.safetensors"
+
+
+def begin(config) -> RunFolder:
+    """Makes the run folder of a training that has just started."""
+    run = RunFolder.create(config)
+    run.write_config(config)
+    return run
+
+
+def finish(run: RunFolder, episodes: int = 15) -> None:
+    """Adds what a training and its evaluation leave."""
+    for episode in range(len(run.lines()) + 1, episodes + 1):
+        run.append("metrics.jsonl", {"episode": episode, "coverage": 50.0})
+    (run.checkpoints / CHECKPOINT).touch()
+    run.write("eval.json", {"checkpoint": CHECKPOINT})
+
+
+def configs_of(arguments) -> list:
+    """Returns the configuration of each seed of a new training."""
+    config = resolve(arguments[0], arguments[1:])
+    return [replace(config, seed=seed) for seed in config.seeds or (config.seed,)]
+
+
+class Instant(executors.Executor):
+    """Finishes each task at once: a second executor beside that of the processes."""
+
+    def __init__(self, fails=lambda arguments: False):
+        self.submitted: list[list[str]] = []
+        self._fails = fails
+
+    def slots(self, tasks):
+        return 2
+
+    def submit(self, task):
+        arguments = list(task.arguments)
+        self.submitted.append(arguments)
+        if self._fails(arguments):
+            task.log.write_text("\nemberlink train: no such thing\n\n")
+            return 2
+        if arguments[0].startswith("resume="):
+            first = RunFolder(arguments[0].removeprefix("resume="))
+            seeds = first.config(device="cpu").seeds or (first.config(device="cpu").seed,)
+            for run in runs_in(first.path.parent):
+                if run.config(device="cpu").seed in seeds:
+                    finish(run)
+        else:
+            for config in configs_of(arguments):
+                finish(begin(config), config.episodes)
+        return 0
+
+    def poll(self, handle):
+        return handle
+
+    def cancel(self, handle):
+        pass
+
+
+def swept(arguments, executor=None) -> list[list[str]]:
+    """Returns the arguments of the trainings that a sweep submits, without the settings."""
+    executor = executor or Instant()
+    assert sweep([*SMALL, *arguments], Console(width=200), executor=executor) == 0
+    return [[text for text in task if text not in SMALL] for task in executor.submitted]
+
+
 def test_what_is_finished_is_skipped_and_the_rest_made(tmp_path, capsys):
-    console = Console(width=200)
-    arguments = [*SMALL, "independent", "episodes=1", f"output={tmp_path}"]
-    assert sweep([*arguments, "seed=0"], console) == 0
+    output = f"output={tmp_path}"
+    assert swept(["independent", "episodes=1", output, "seed=0"]) == [
+        ["independent", "episodes=1", output, "seed=0"]
+    ]
     (first,) = runs_in(tmp_path)
     before = {file: file.stat().st_mtime_ns for file in first.path.rglob("*")}
-    assert sweep([*arguments, "seed=0,1"], console) == 0
-    runs = runs_in(tmp_path)
-    assert [run.config().seed for run in runs] == [0, 1]
-    assert all((run.path / "eval.json").exists() for run in runs)
+    assert len(swept(["independent", "episodes=1", output, "seed=0,1"])) == 1
+    assert [run.config().seed for run in runs_in(tmp_path)] == [0, 1]
     assert {file: file.stat().st_mtime_ns for file in first.path.rglob("*")} == before
     assert "2 runs, of which 1 are finished" in capsys.readouterr().out
+
+
+def test_one_run_that_fails_does_not_end_the_others(tmp_path, capsys):
+    executor = Instant(fails=lambda arguments: "seed=0" in arguments)
+    arguments = [*SMALL, "independent", f"output={tmp_path}", "seed=0,1,2"]
+    assert sweep(arguments, Console(width=300), executor=executor) == 1
+    assert len(runs_in(tmp_path)) == 2
+    said = capsys.readouterr().out
+    assert "exit status 2: emberlink train: no such thing (log: " in said
+    assert "compare them with" not in said
+
+
+def test_a_run_folder_is_read_once(tmp_path, monkeypatch):
+    output = f"output={tmp_path}"
+    swept(["independent", output, "seed=range(0,3)"])
+    read = []
+    config = RunFolder.config
+    monkeypatch.setattr(
+        RunFolder, "config", lambda self, **about: read.append(self.path) or config(self, **about)
+    )
+    jobs = [*SMALL, "independent", output, "seed=range(0,6)"]
+
+    class Slow(Instant):
+        looks = 0
+
+        def poll(self, handle):
+            self.looks += 1
+            return handle if self.looks % 4 == 0 else None
+
+    assert sweep(jobs, Console(), executor=Slow()) == 0
+    assert sorted(read) == sorted({*read})
+    assert len(read) == 6
+
+
+def test_a_run_of_another_device_is_the_same_run(tmp_path):
+    """It is resumed on the device that is wanted now."""
+    output = f"output={tmp_path}"
+    (config,) = configs_of(["independent", *SMALL, output])
+    done, stopped = begin(config), begin(replace(config, seed=1))
+    finish(done)
+    for run in (done, stopped):
+        file = run.path / "config.yaml"
+        file.write_text(file.read_text().replace("device: cpu", "device: cuda:7"))
+    assert swept(["independent", output, "seed=0,1"]) == [[f"resume={stopped.path}", "device=cpu"]]
+
+
+def test_a_resumed_run_is_given_what_may_change(tmp_path):
+    output = f"output={tmp_path}"
+    (config,) = configs_of(["independent", *SMALL, output])
+    run = begin(config)
+    more = ["logger=csv", "checkpoint_interval=3", "device=cpu"]
+    assert swept(["independent", output, *more]) == [[f"resume={run.path}", *more]]
+
+
+def test_a_config_that_cannot_be_read_is_named(tmp_path, capsys):
+    (tmp_path / "old").mkdir()
+    (tmp_path / "old" / "config.yaml").write_text("method: [")
+    swept(["independent", f"output={tmp_path}"])
+    said = "".join(capsys.readouterr().out.split("\n"))
+    assert f"note: {tmp_path / 'old'} is left out: " in said
+
+
+def test_a_run_without_metrics_is_not_finished(tmp_path):
+    output = f"output={tmp_path}"
+    swept(["independent", output])
+    (run,) = runs_in(tmp_path)
+    (run.path / "metrics.jsonl").write_text("")
+    assert swept(["independent", output]) == [[f"resume={run.path}", "device=cpu"]]
+
+
+def test_a_seed_of_two_stacks_is_trained_once(tmp_path):
+    output = f"output={tmp_path}"
+    assert swept(["independent", output, "seeds=[0,1],[1,2]"]) == [
+        ["independent", output, "seeds=[0,1]"],
+        ["independent", output, "seeds=[2]"],
+    ]
+    assert [run.config().seed for run in runs_in(tmp_path)] == [0, 1, 2]
+
+
+def test_a_stack_knows_the_runs_that_were_trained_one_by_one(tmp_path):
+    output = f"output={tmp_path}"
+    swept(["independent", output, "seed=0,1"])
+    assert swept(["independent", output, "seeds=[0,1,2,3]"]) == [
+        ["independent", output, "seeds=[2,3]"]
+    ]
+    assert swept(["independent", output, "seed=range(0,4)"]) == []
+
+
+def test_a_stack_is_resumed_as_a_whole(tmp_path):
+    """Also where its seeds are wanted one by one, some of them finished."""
+    output = f"output={tmp_path}"
+    stack = [begin(one) for one in configs_of(["independent", *SMALL, output, "seeds=[0,1,2]"])]
+    finish(stack[0])
+    assert swept(["independent", output, "seed=range(0,4)"]) == [
+        [f"resume={stack[1].path}", "device=cpu"],
+        ["independent", output, "seed=3"],
+    ]
+
+
+class Later(Instant):
+    """Takes a second for a task and leaves no run folder until then."""
+
+    def submit(self, task):
+        with (task.log.parent / "submitted").open("a") as file:
+            file.write(f"{task.arguments[-1]}\n")
+        return time.monotonic() + 1, configs_of(task.arguments)
+
+    def poll(self, handle):
+        if time.monotonic() < handle[0]:
+            return None
+        for config in handle[1]:
+            finish(begin(config), config.episodes)
+        return 0
+
+
+def test_two_sweeps_at_once_train_everything_once(tmp_path):
+    """The second takes what the first has not begun, and waits for the rest."""
+    arguments = [*SMALL, "independent", f"output={tmp_path}", "seed=range(0,4)"]
+
+    def work():
+        raise SystemExit(sweep(arguments, Console(quiet=True), executor=Later()))
+
+    both = [multiprocessing.get_context("fork").Process(target=work) for _ in range(2)]
+    for process in both:
+        process.start()
+    for process in both:
+        process.join()
+    assert [process.exitcode for process in both] == [0, 0]
+    submitted = (tmp_path / "logs" / "submitted").read_text().split()
+    assert sorted(submitted) == [f"seed={seed}" for seed in range(4)]
+
+
+PARENT = """
+import os, sys
+from pathlib import Path
+from emberlink.trainers.sweep.executors import Task, make
+task = Task(sys.argv[2:], Path(sys.argv[1]), [int(os.environ["LOCK"])])
+print(make("local", {}).submit(task).pid, flush=True)
+os.read(0, 1)
+"""
+
+
+def test_a_killed_sweep_takes_its_trainings_along(tmp_path):
+    """And a run stays claimed until the training has ended."""
+    (job,) = jobs_of(["independent", *SMALL, "episodes=10000", f"output={tmp_path}"])
+    own = claims.claim(tmp_path, job.identities)
+    assert own is not None
+    arguments = [tmp_path / "log.txt", *job.arguments]
+    parent = subprocess.Popen(
+        [sys.executable, "-c", PARENT, *arguments],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        pass_fds=own.handles,
+        env={**os.environ, "LOCK": str(own.handles[0])},
+    )
+    assert parent.stdout is not None
+    child = int(parent.stdout.readline())
+    own.release()
+    assert claims.claim(tmp_path, job.identities) is None
+    os.kill(child, 0)
+    parent.kill()
+    parent.wait()
+    deadline = time.monotonic() + 60
+    while (again := claims.claim(tmp_path, job.identities)) is None:
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    again.release()
+    # A process that nobody waits for may stay in the table, but holds nothing.
+    status = Path(f"/proc/{child}/stat")
+    assert not status.exists() or status.read_text().split()[2] == "Z"
+
+
+def test_claims_are_for_a_run_and_not_for_a_job(tmp_path):
+    one, other = (identity(c) for c in configs_of(["independent", *SMALL, "seeds=[0,1]"]))
+    first = claims.claim(tmp_path, [one])
+    assert first is not None
+    assert claims.claim(tmp_path, [other, one]) is None
+    free = claims.claim(tmp_path, [other])
+    assert free is not None
+    first.release()
+    free.release()
+    both = claims.claim(tmp_path, [other, one])
+    assert both is not None
+    both.release()
+
+
+@pytest.mark.parametrize(
+    ("argument", "said"),
+    [
+        ("executor=slurm", "executor='slurm' is not known; known: local"),
+        ("executor.cores=2", "'executor.cores' is not known; known: executor.workers"),
+        ("executor.workers=0", "executor.workers=0"),
+        ("executor.workers=two", "executor.workers=two"),
+        ("output=a,b", "a sweep has one output folder"),
+    ],
+)
+def test_executors_are_chosen_and_checked(argument, said, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(["sweep", *SMALL, "independent", argument]) == 2
+    assert said in capsys.readouterr().err
+    assert not any(tmp_path.iterdir())
+
+
+def test_every_executor_has_a_file_and_its_keys():
+    assert executors.known() == ["local"]
+    executor = executors.make("local", {"workers": 3})
+    assert (executor.slots(9), executor.slots(2)) == (3, 2)
 
 
 def test_a_stopped_sweep_goes_on_and_ends_where_an_unbroken_one_does(tmp_path):
@@ -124,16 +401,3 @@ def test_a_stopped_sweep_goes_on_and_ends_where_an_unbroken_one_does(tmp_path):
     (run,), (unbroken,) = runs_in(broken), runs_in(whole)
     for file in ("metrics.jsonl", "eval.json"):
         assert (run.path / file).read_bytes() == (unbroken.path / file).read_bytes()
-
-
-def test_one_run_that_fails_does_not_end_the_others(tmp_path, capsys):
-    arguments = [*SMALL, "independent", "episodes=1", f"output={tmp_path}", "seed=0"]
-    assert sweep(arguments, Console(width=300)) == 0
-    (run,) = runs_in(tmp_path)
-    (run.path / "eval.json").unlink()
-    for file in (run.path / "checkpoints").iterdir():
-        file.write_bytes(b"damaged")
-    assert main(["sweep", *arguments[:-1], "seed=0,1"]) == 1
-    printed = " ".join(capsys.readouterr().out.split())
-    assert "exit status 2" in printed
-    assert len([run for run in runs_in(tmp_path) if (run.path / "eval.json").exists()]) == 1

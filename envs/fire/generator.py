@@ -9,21 +9,19 @@ another grid lengths and rates are scaled by min(X, Y)/30.
 
 import dataclasses
 import math
-from importlib import resources
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Literal, get_args
 
 import torch
-from omegaconf import OmegaConf
-from omegaconf.errors import OmegaConfBaseException
 from pydantic import AfterValidator, ConfigDict, Field, Strict, ValidationError
 from pydantic.dataclasses import dataclass
 from torch import Tensor
-from yaml import YAMLError
 
+from emberlink.configs import known
 from emberlink.envs.config import BASE_SIDE, check_grid
-from emberlink.envs.utils.counter_rng import fold, uniform
+from emberlink.envs.utils.config_files import read
+from emberlink.envs.utils.counter_rng import Use, fold_in, uniform
 from emberlink.envs.utils.errors import UserError
-from emberlink.envs.utils.validation import Name, describe, known
+from emberlink.envs.utils.validation import Name, describe
 
 from .advection import current, max_time_step, tide_speed
 from .ellipse import MAX_LENGTH_TO_BREADTH
@@ -33,7 +31,6 @@ TEST_FROM = 1_000_000
 VALIDATION_FROM = 2_000_000
 Split = Literal["train", "validation", "test"]
 
-_RNG_KEY = 0xF12E  # separates a fire's draws from other uses of the same seed
 _MIN_NODES = 60  # along the shorter side: twice the resolution of 30 cells
 _MAX_NODES = 200_000  # computed at a time, so that the work stays in the processor's cache
 _MIN_RADIUS = 1e-6  # of a patch, cells, so that its square does not underflow
@@ -119,7 +116,7 @@ _DRAWN = tuple(f.name for f in dataclasses.fields(FireConfig) if f.name not in _
 
 def scenarios() -> list[str]:
     """Returns the names of the generator's scenarios: files in `configs/fire` without `kind`."""
-    return [name for name in known("fire") if "kind" not in _values(name)]
+    return [name for name in known("fire") if "kind" not in read("fire", name)]
 
 
 def load_scenario(name: str) -> FireConfig:
@@ -128,25 +125,13 @@ def load_scenario(name: str) -> FireConfig:
     Raises:
         UserError: there is no such file, or a value in it is not valid.
     """
-    values = _values(name) if name in known("fire") else None
+    values = read("fire", name) if name in known("fire") else None
     if values is None or "kind" in values:
         raise UserError(f"unknown fire {name!r}; known: {', '.join(scenarios())}")
     try:
         return FireConfig(**values)
     except ValidationError as error:
         raise UserError(f"configs/fire/{name}.yaml: {describe(error)}") from None
-
-
-def _values(name: str) -> dict[str, Any]:
-    file = resources.files("emberlink.configs").joinpath("fire", f"{name}.yaml")
-    try:
-        values: Any = OmegaConf.to_container(OmegaConf.create(file.read_text(encoding="utf-8")))
-    except (YAMLError, OmegaConfBaseException) as error:
-        reason = " ".join(str(error).split())[:200]
-        raise UserError(f"configs/fire/{name}.yaml: cannot be read: {reason}") from None
-    if not isinstance(values, dict):
-        raise UserError(f"configs/fire/{name}.yaml: expected keys and values")
-    return values
 
 
 def fire_seeds(split: Split, count: int, start: int = 0) -> Tensor:
@@ -244,8 +229,8 @@ def _spread(
 
 def _unit(field: str, seeds: Tensor, count: int) -> Tensor:
     """Returns uniform draws on (0, 1) for a field, float32 [fires, count]."""
-    key = torch.tensor([_RNG_KEY, _DRAWN.index(field)], device=seeds.device)
-    return uniform(fold(fold(seeds, key[0]), key[1]), count)
+    key = torch.tensor([Use.FIRE_PARAMETER, _DRAWN.index(field)], device=seeds.device)
+    return uniform(fold_in(fold_in(seeds, key[0]), key[1]), count)
 
 
 def _draw(config: FireConfig, field: str, seeds: Tensor, count: int = 1) -> Tensor:

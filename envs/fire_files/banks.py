@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from emberlink.envs.config import SIDES
-from emberlink.envs.utils.atomic_io import new_file, published
 from emberlink.envs.utils.errors import UserError
+from emberlink.envs.utils.publish import new_file, published
 
 from .projection import first_line
 from .raster_source import RasterSource, check_spreads

@@ -11,11 +11,12 @@ import torch
 from torch import Tensor
 
 from emberlink.envs.config import check_grid
+from emberlink.envs.utils.atomic_io import open_regular, replaced
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import printable
 
 from . import formats
-from .banks import bank_horizon, is_bank, read_bands, read_npy
+from .banks import MAX_CELLS, bank_horizon, is_bank, read_bands, read_npy
 from .config import FileFireConfig
 from .episode_crop import on_grid
 from .front_points import read_front_points
@@ -27,6 +28,7 @@ from .rasters import read_ascii, read_geotiff
 READER_VERSION = 4  # raise it whenever the same file gives another grid
 COPY_FILE = "fires.npz"
 """The file of a run folder that holds the run's own copy of its grids."""
+_MAX_COPY = 12 * MAX_CELLS + 1_000_000  # bytes of it, unpacked: float32 of the cells of every set
 _EVERY, _VALIDATION, _TEST = 5, 3, 4  # remainders of the numbers of validation and test fires
 
 
@@ -182,13 +184,12 @@ def save_copy(config: FileFireConfig, folder: Path, grid: tuple[int, int], horiz
     Raises:
         UserError: it cannot be written.
     """
-    fires = fire_sets(config, grid, horizon)
-    partial = folder / (COPY_FILE + ".part")
+    arrays = {
+        name: fires.numpy() for name, fires in fire_sets(config, grid, horizon)._asdict().items()
+    }
     try:
-        with partial.open("wb") as file:
-            arrays = {name: values.numpy() for name, values in fires._asdict().items()}
+        with replaced(folder / COPY_FILE) as partial, partial.open("wb") as file:
             np.savez_compressed(file, key=np.array(_key(config, grid, horizon)), **arrays)
-        partial.replace(folder / COPY_FILE)
     except OSError as error:
         reason = error.strerror or error
         raise UserError(f"{folder / COPY_FILE}: cannot be written: {reason}") from None
@@ -204,10 +205,15 @@ def _key(config: FileFireConfig, grid: tuple[int, int], horizon: int) -> str:
 
 def _read_copy(config: FileFireConfig, grid: tuple[int, int], horizon: int) -> FireSets | None:
     """Returns the run's own copy, None if there is none or it is damaged or of another grid."""
-    if config.saved_copy is None or config.sha256 is None or not Path(config.saved_copy).is_file():
+    if config.saved_copy is None or config.sha256 is None:
         return None
     try:
-        with np.load(config.saved_copy, allow_pickle=False) as arrays:
+        with (
+            open_regular(Path(config.saved_copy), _MAX_COPY) as file,
+            np.load(file, allow_pickle=False) as arrays,
+        ):
+            if sum(part.file_size for part in arrays.zip.filelist) > _MAX_COPY:
+                return None
             if str(arrays["key"]) != _key(config, grid, horizon):
                 return None
             fires = [arrays[name] for name in FireSets._fields]

@@ -9,6 +9,7 @@ from workloads import METHODS
 from emberlink.envs import keys
 from emberlink.trainers import make_env
 from emberlink.trainers.config.compose import resolve
+from emberlink.trainers.training.setup import TrainingSetup
 from emberlink.trainers.training.trainer import Trainer
 
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")
@@ -43,7 +44,7 @@ def test_a_recipe_learns_the_same(method, seeds, tmp_path):
         )
         trainer.start()
         trainer.train()
-        weights.append([trainer.weights(team) for team in range(trainer.teams)])
+        weights.append([trainer.setup.learner.weights(team) for team in range(trainer.setup.teams)])
     for cpu, gpu in zip(*weights, strict=True):
         for name, value in cpu.items():
             torch.testing.assert_close(gpu[name].cpu(), value, rtol=1e-2, atol=1e-3)
@@ -78,15 +79,16 @@ def test_four_methods_five_seeds(tell, tmp_path):
     tell(f"four methods x 5 seeds, the same each: {seconds / 60:.1f} min (goal: at most 20)")
 
 
-def test_nothing_waits_for_the_device(tmp_path):
+def test_nothing_waits_for_the_device():
     """torch itself raises where a step would wait for the GPU."""
-    trainer = Trainer(resolve("consensus", ["device=cuda", "episodes=1", f"output={tmp_path}"]))
+    setup = TrainingSetup(resolve("consensus", ["device=cuda", "episodes=1"]))
+    starts = setup.learner.learning_starts
     try:
-        for step, collected in enumerate(trainer.collector):
-            if step == trainer.enough + 10:
+        for step, collected in enumerate(setup.collector):
+            if step == starts + 10:
                 torch.cuda.set_sync_debug_mode("error")
-            if step == trainer.enough + 60:
+            if step == starts + 60:
                 break
-            trainer._learn(collected)
+            setup.learn(collected)
     finally:
         torch.cuda.set_sync_debug_mode("default")

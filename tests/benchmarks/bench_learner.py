@@ -1,26 +1,27 @@
 """How near the learner comes to what the machine can do, and what a training step spends on it."""
 
 import time
+from typing import Any
 
 import pytest
 from workloads import MATRIX_FLOPS, METHODS, batch_of, in_turns, matrix_product, update_flops
 
 from emberlink.trainers.config.compose import resolve
-from emberlink.trainers.training.trainer import Trainer
+from emberlink.trainers.training.setup import TrainingSetup
 
 
 @pytest.mark.parametrize("method", METHODS)
 def test_update(benchmark, tell, method):
     """Operations a second of an update with the paper's networks and batch: goal 65 %."""
-    trainer = Trainer(resolve(method, ["env.horizon=1000", "episodes=1"]))
-    batch = batch_of(trainer)
+    setup = TrainingSetup(resolve(method, ["env.horizon=1000", "episodes=1"]))
+    batch = batch_of(setup)
     uavs, features = batch["agents", "observation"].shape[-2:]
-    sizes = uavs, features, 3, trainer.config.learner.hidden, len(batch)
+    sizes = uavs, features, 3, setup.config.learner.hidden, len(batch)
     flops, done = update_flops(*sizes), update_flops(*sizes, shared=True)
-    update, product = in_turns(15, lambda: trainer.learner.update(batch), matrix_product())
+    update, product = in_turns(15, lambda: setup.learner.update(batch), matrix_product())
     share = (flops / update) / (MATRIX_FLOPS / product)
     benchmark.extra_info["share_of_matrix_rate"] = share
-    benchmark.pedantic(lambda: trainer.learner.update(batch), rounds=5)
+    benchmark.pedantic(lambda: setup.learner.update(batch), rounds=5)
     tell(
         f"update, {method:13}: {1000 * update:6.1f} ms, {flops / update / 1e9:5.1f} Gflop/s = "
         f"{100 * share:4.1f} % of a 2048^3 product's {MATRIX_FLOPS / product / 1e9:5.1f} "
@@ -32,26 +33,26 @@ def test_update(benchmark, tell, method):
 @pytest.mark.parametrize("setup", ["paper", "tuned"])
 def test_share_of_what_is_not_the_update(tell, method, setup):
     """Environment, communication, noise, buffer, sampling and logging: goal 15 % in `paper`."""
-    trainer = Trainer(resolve(method, [f"setup={setup}", "env.horizon=1000"]))
-    inside, update = 0.0, trainer.learner.update
+    training = TrainingSetup(resolve(method, [f"setup={setup}", "env.horizon=1000"]))
+    learner: Any = training.learner
+    inside, update = 0.0, learner._update
 
-    def timed(batch):
+    def timed(batch, actor):
         nonlocal inside
         began = time.perf_counter()
-        losses = update(batch)
+        losses = update(batch, actor)
         inside += time.perf_counter() - began
         return losses
 
-    trainer.learner.update = timed
+    learner._update = timed
     steps, began = 0, 0.0
-    for steps, collected in enumerate(trainer.collector):
-        if len(trainer.memory) > trainer.enough + 20 and not began:
+    for steps, collected in enumerate(training.collector):
+        if steps > learner.learning_starts + 20 and not began:
             began, inside, first = time.perf_counter(), 0.0, steps
-        trainer._learn(collected)
+        training.learn(collected)
         if began and steps == first + 99:
             break
     whole = time.perf_counter() - began
-    trainer.collector.shutdown()
     rest, goal = whole - inside, " (goal: at most 15 %)" if setup == "paper" else ""
     tell(
         f"step, {setup}, {method:13}: {10 * whole:6.2f} ms, of which "

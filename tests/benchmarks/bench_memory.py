@@ -9,8 +9,11 @@ import pytest
 from tensordict import TensorDict
 from workloads import METHODS, make
 
+from emberlink.envs import keys
 from emberlink.trainers.config.compose import resolve
-from emberlink.trainers.learners.replay_buffer import make_memory, to_rows
+from emberlink.trainers.learners.base import LearnerContext
+from emberlink.trainers.learners.nan_guard import NonFiniteGuard
+from emberlink.trainers.learners.replay_buffer import ReplayMemory, to_rows
 from emberlink.trainers.training.trainer import Trainer
 
 MILLION = 1_000_000
@@ -26,18 +29,27 @@ def resident() -> int:
 def test_a_million_transitions(tell, method):
     """Resident bytes against those of the numbers: both observations, action and reward."""
     env = make(method, 1)
-    shared = resolve(method).memory == "shared"
-    rows = to_rows(env.rollout(1))
+    shared = resolve(method).replay == "shared"
+    rows = to_rows(env.rollout(1), 1, keys.observation_keys(env.observation_spec))
     uavs, features = rows["observation"].shape[-2:]
     # Private memories hold a million each; one that is shared holds a million in all.
     numbers = 4 * (2 * features + 3 + 1) * MILLION * (1 if shared else uavs)
     gc.collect()
     ctypes.CDLL(None).malloc_trim(0)  # what earlier benchmarks freed is not to be used again
     before = resident()
-    memory = make_memory(
-        uavs, shared=shared, capacity=MILLION, batch=512, most=10**9, seeds=[0], device="cpu"
+    context = LearnerContext(
+        observation_spec=env.observation_spec,
+        action_spec=env.full_action_spec,
+        num_uavs=uavs,
+        num_envs=1,
+        seeds=(0,),
+        shared_replay=shared,
+        total_steps=10**9,
+        guard=NonFiniteGuard("cpu"),
+        device="cpu",
     )
-    memory.extend(rows)
+    memory = ReplayMemory(context, batch_size=512, buffer_size=MILLION)
+    memory.extend_rows(rows)
     used = resident() - before
     tell(
         f"{method:13}: {used / 1e6:6.1f} MB for {numbers / 1e6:6.1f} MB of numbers = "

@@ -5,22 +5,22 @@ import torch
 from workloads import in_turns
 
 from emberlink.trainers.config.compose import resolve
-from emberlink.trainers.training.trainer import Trainer
+from emberlink.trainers.training.setup import TrainingSetup
 
 STEPS = 20
 
 
 def learning(overrides: list[str]):
     """Some steps of a training whose memory is filled, updates included."""
-    trainer = Trainer(resolve("consensus", ["episodes=1000", *overrides]))
-    collected = iter(trainer.collector)
-    while len(trainer.memory) < trainer.enough + 5:
-        trainer._learn(next(collected))
+    setup = TrainingSetup(resolve("consensus", ["episodes=1000", *overrides]))
+    collected = iter(setup.collector)
+    while setup.step < setup.learner.learning_starts + 5:
+        setup.learn(next(collected))
 
     def learn() -> None:
         for _ in range(STEPS):
-            trainer._learn(next(collected))
-        if trainer.config.device == "cuda":
+            setup.learn(next(collected))
+        if setup.config.device == "cuda":
             torch.cuda.synchronize()
 
     return learn

@@ -18,7 +18,7 @@ import torch
 from workloads import batch_of, flying, in_turns, make, matrix_product
 
 from emberlink.trainers.config.compose import resolve
-from emberlink.trainers.training.trainer import Trainer
+from emberlink.trainers.training.setup import TrainingSetup
 
 BASELINE = Path(__file__).with_name("guard.json")
 TOLERANCE = 0.30
@@ -47,14 +47,14 @@ def gathers() -> Callable[[], object]:
 
 def works() -> dict[str, tuple[Callable[[], object], Callable[[], object]]]:
     """Name -> (our work, the loop beside it)."""
-    learner = Trainer(resolve("consensus", ["episodes=1", "env.horizon=200"]))
-    batch = batch_of(learner)
+    setup = TrainingSetup(resolve("consensus", ["episodes=1", "env.horizon=200"]))
+    batch = batch_of(setup)
     return {
         "one environment": (flying(make(None, 1), 40), small_calls),
         "one environment, consensus": (flying(make("consensus", 1), 20), small_calls),
         "1024 environments": (flying(make(None, 1024), 3), gathers()),
         "1024 environments, consensus": (flying(make("consensus", 1024), 2), gathers()),
-        "update": (lambda: learner.learner.update(batch), matrix_product()),
+        "update": (lambda: setup.learner.update(batch), matrix_product()),
     }
 
 

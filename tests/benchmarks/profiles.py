@@ -9,7 +9,7 @@ from torch.profiler import profile
 from workloads import batch_of, flying, make
 
 from emberlink.trainers.config.compose import resolve
-from emberlink.trainers.training.trainer import Trainer
+from emberlink.trainers.training.setup import TrainingSetup
 
 KINDS = {
     "matrix products": ("addmm", "baddbmm", "mm", "bmm"),
@@ -44,9 +44,9 @@ def show(title: str, work: Callable[[], object], units: int, calls: int = 10) ->
 
 
 def main() -> None:
-    trainer = Trainer(resolve("shared_memory", ["env.horizon=1000", "episodes=1"]))
-    batch = batch_of(trainer)
-    show("an update, paper's networks", lambda: trainer.learner.update(batch), 1)
+    setup = TrainingSetup(resolve("shared_memory", ["env.horizon=1000", "episodes=1"]))
+    batch = batch_of(setup)
+    show("an update, paper's networks", lambda: setup.learner.update(batch), 1)
     for envs in (1, 1024):
         for method in (None, "consensus"):
             env = make(method, envs)

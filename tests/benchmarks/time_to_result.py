@@ -42,7 +42,7 @@ def train(file: Path, overrides: list[str]) -> None:
         env = build_env(
             config, num_envs=FIRES, fire=fires, seed=evaluate.START_SEED, device=config.device
         )
-        coverage = evaluate.play(env, trainer.actor)["coverage"].mean().item()
+        coverage = evaluate.play(env, trainer.setup.learner.actor)["coverage"].mean().item()
         line = {
             "seed": config.seed,
             "step": progress.step,

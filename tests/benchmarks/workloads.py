@@ -7,16 +7,17 @@ Every rate is taken over whole calls of the public interface: an environment's s
 import time
 from collections.abc import Callable, Sequence
 from statistics import median
+from typing import Any
 
 import torch
 from tensordict import TensorDict
 
+from emberlink.configs import known
 from emberlink.envs import keys
-from emberlink.envs.utils.validation import known
 from emberlink.envs.wildfire import WildfireEnv
 from emberlink.trainers import make_env
 from emberlink.trainers.config.compose import resolve
-from emberlink.trainers.training.trainer import Trainer
+from emberlink.trainers.training.setup import TrainingSetup
 
 METHODS = known("method")
 MATRIX = 2048
@@ -121,7 +122,8 @@ def update_flops(
     return 2 * batch * members * (forward + weights + inputs)
 
 
-def batch_of(trainer: Trainer) -> TensorDict:
-    """A sample of a memory that holds some hundred steps."""
-    trainer.rehearse(-(-trainer.enough // trainer.config.num_envs) + 20)
-    return trainer.memory.sample()
+def batch_of(setup: TrainingSetup) -> TensorDict:
+    """Returns a sample of a memory that holds some hundred steps."""
+    learner: Any = setup.learner
+    setup.dry_run(learner.learning_starts + 20)
+    return learner.sample()

@@ -9,6 +9,7 @@ import traceback
 from collections.abc import Callable
 from pathlib import Path
 
+from emberlink.envs.utils import atomic_io
 from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.runs import checkpoint_file
 from emberlink.trainers.training.resume import resume
@@ -99,17 +100,18 @@ def watch_saves(say: Callable[[str], None], die_at: tuple[str, int] | None) -> N
 
         return call
 
-    for name in ("save_file", "_digest", "flush_folder"):
+    for name in ("save_file", "_digest"):
         setattr(checkpoint_file, name, dying(name, getattr(checkpoint_file, name)))
+    atomic_io.sync = dying("sync", atomic_io.sync)
     os.fsync = dying("fsync", os.fsync)
     Path.replace = dying("replace", Path.replace)
     Path.unlink = dying("unlink", Path.unlink)
     save = Trainer.save
 
     def saying(trainer: Trainer) -> None:
-        say(f"saving {trainer.step}")
+        say(f"saving {trainer.setup.step}")
         save(trainer)
-        say(f"saved {trainer.step}")
+        say(f"saved {trainer.setup.step}")
 
     Trainer.save = saying
 
@@ -125,14 +127,14 @@ def training(method: str, output: Path, die_at: tuple[str, int] | None = None):
         else:
             trainer = Trainer(resolve(method, [*SMALL, f"episodes={EPISODES}", f"output={output}"]))
             trainer.start()
-        say(f"at {trainer.step} {','.join(temporary(output))}")
+        say(f"at {trainer.setup.step} {','.join(temporary(output))}")
         trainer.train()
         return 0
 
     return work
 
 
-PARTS = ("save_file", "_digest", "fsync", "replace", "flush_folder", "unlink")
+PARTS = ("save_file", "_digest", "fsync", "replace", "sync", "unlink")
 
 
 def kill_until_finished(

@@ -55,7 +55,7 @@ def signal_trial(number: int, folder: Path, draw: random.Random) -> list[str]:
     newest, run = RunFolder(path).states()[-1], RunFolder(path)
     header = checkpoint_file.read(newest)[0] or {}
     lines = (path / "metrics.jsonl").read_bytes() if (path / "metrics.jsonl").exists() else b""
-    if header["files"][0]["metrics.jsonl"] != len(lines):
+    if header["sizes"][0]["metrics.jsonl"] != len(lines):
         wrong.append("metrics.jsonl and the checkpoint are of different moments")
     if step_of(run.checkpoint()) != header["step"] or temporary(path) or (path / "lock").exists():
         wrong.append(f"left: {sorted(p.name for p in path.rglob('*'))}")

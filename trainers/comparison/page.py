@@ -178,7 +178,7 @@ def _chapter(numbers: Numbers) -> dict[str, Any]:
                 "num_envs": run.config.num_envs,
                 "evaluated_with": dict(run.evaluated_with),
                 "checkpoint": run.evaluation.checkpoint,
-                "held_out_fires": run.evaluation.episodes,
+                "held_out_fires": run.evaluation.fires,
             }
             for group in section.groups
             for run in group.runs

@@ -13,20 +13,22 @@ from pydantic.dataclasses import dataclass as checked
 
 from emberlink.envs import metrics
 from emberlink.envs.utils.errors import UserError
-from emberlink.trainers.config.compose import describe, flat, resolve, to_values
+from emberlink.envs.utils.validation import describe
+from emberlink.trainers.config.compose import flat, resolve, to_values
 from emberlink.trainers.config.schema import NOT_LEARNT_WITH, RunConfig
 from emberlink.trainers.evaluation.results import CURVES, LEARNED
 from emberlink.trainers.runs import pretrained
 from emberlink.trainers.runs.run_folder import RunFolder
 from emberlink.trainers.runs.safe_read import LONGEST_JSON, read_text
+from emberlink.trainers.runs.seal import check_trained_with
 
 LARGEST = 1e12
 """of a measure; what is beyond it is damage"""
 Measured = Annotated[float, Field(ge=-LARGEST, le=LARGEST, allow_inf_nan=False)]
 _MEASURE = TypeAdapter(Measured)
-NOT_COMPARED = ("seed", "seeds", "output", "evaluation", *NOT_LEARNT_WITH)
+NOT_COMPARED = ("seed", "seeds", "output", "evaluation", "baseline_comm", *NOT_LEARNT_WITH)
 """keys in which the runs of a group may differ: none changes what is trained"""
-NAMELESS = ("seed", "seeds", "output")
+NAMELESS = ("seed", "seeds", "output", "baseline_comm")
 """those of them that nobody need be told of"""
 
 
@@ -170,6 +172,8 @@ def read(path: Path) -> Run | str:
             f"eval.json is of {evaluation.checkpoint}, the newest checkpoint is {newest.name} "
             f"(emberlink eval {path})"
         )
+    if newest is not None:
+        check_trained_with(newest, config)
     return Run(path, config, lines, evaluation)
 
 
@@ -254,10 +258,10 @@ def _check_evaluation(file: Path, evaluation: Evaluation, config: RunConfig) -> 
             for name in metrics.NAMES:
                 if name not in measured:
                     raise UserError(f"{file}: results.{fire}.{policy} lacks {name}")
-                if len(measured[name]) != evaluation.episodes:
+                if len(measured[name]) != evaluation.fires:
                     raise UserError(
                         f"{file}: results.{fire}.{policy}.{name} has {len(measured[name])} "
-                        f"episodes; fires={evaluation.episodes}"
+                        f"episodes; fires={evaluation.fires}"
                     )
 
 
@@ -376,7 +380,7 @@ def _check_alike(runs: Sequence[Run]) -> None:
     facts = {
         "env.horizon": lambda run: run.config.env.horizon,
         "env.grid": lambda run: list(run.config.env.grid),
-        "the number of held-out fires": lambda run: run.evaluation.episodes,
+        "the number of held-out fires": lambda run: run.evaluation.fires,
         "start_seed of the evaluation": lambda run: run.evaluation.start_seed,
     }
     for name, fact in facts.items():

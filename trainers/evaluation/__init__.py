@@ -1,0 +1,8 @@
+"""Evaluates frozen policies beside scripted ones: numbers, figures, eval.json."""
+
+from emberlink.trainers.evaluation.report import evaluate_run
+
+from .actor import load_actor
+from .results import Results
+
+__all__ = ["Results", "evaluate_run", "load_actor"]

@@ -15,8 +15,8 @@ from torch import Tensor
 from emberlink.envs.fire.cache import GENERATOR_VERSION
 from emberlink.envs.fire.generator import FireConfig, Split, fire_seeds, make_fires
 from emberlink.envs.fire_files.banks import check_bank, write_bank
-from emberlink.envs.utils.atomic_io import free_name
 from emberlink.envs.utils.errors import UserError
+from emberlink.envs.utils.publish import free_name
 from emberlink.trainers.config.compose import to_values
 from emberlink.trainers.config.schema import RunConfig
 

@@ -1,6 +1,5 @@
 """Finds the fire that a command names: a scenario's test fire, or one of a file."""
 
-import difflib
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,7 +12,7 @@ from emberlink.envs.fire.generator import scenarios
 from emberlink.envs.fire_files.reader import FileFireConfig, read_fires
 from emberlink.envs.scenarios import fires_of
 from emberlink.envs.utils.errors import UserError
-from emberlink.envs.utils.validation import shown
+from emberlink.envs.utils.validation import shown, unknown
 from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.config.schema import RunConfig
 
@@ -59,7 +58,8 @@ def find_fire(text: str, overrides: Sequence[str]) -> SelectedFire:
     if os.path.exists(text) or not os.path.exists(name):
         name, index = text, "0"
     if not name or not os.path.exists(name):
-        raise UserError(_unknown(text))
+        known = unknown(text.rpartition(":")[0] or text, scenarios())
+        raise UserError(f"{shown(text)}: there is no such file; as a scenario {known}")
     path = Path(name)
     config = from_file(path, overrides)
     fires = read(config)
@@ -88,10 +88,8 @@ def generated(scenario: str, overrides: Sequence[str]) -> RunConfig:
     Raises:
         UserError: there is no such scenario, its fires are read, or a key or value is wrong.
     """
-    known = scenarios()
-    if scenario not in known:
-        hint = _near(scenario, known)
-        raise UserError(f"fire {shown(scenario)!r} is not known{hint} known: {', '.join(known)}")
+    if scenario not in scenarios():
+        raise UserError(f"fire {unknown(scenario, scenarios())}")
     return _resolve([f"fire={scenario}", *overrides], overrides)
 
 
@@ -129,15 +127,3 @@ def read(config: RunConfig) -> Tensor:
     """
     assert isinstance(config.fire, FileFireConfig)
     return read_fires(config.fire, config.env.grid, config.env.horizon)
-
-
-def _unknown(text: str) -> str:
-    known = scenarios()
-    hint = _near(text.rpartition(":")[0] or text, known)
-    return f"{shown(text)}: there is no such file or scenario{hint} known: {', '.join(known)}"
-
-
-def _near(name: str, known: Sequence[str]) -> str:
-    """Returns a suggestion; the known names follow it in the message."""
-    near = difflib.get_close_matches(name, known, n=1)
-    return f"; did you mean {near[0]}?" if near else ";"

@@ -1,0 +1,1 @@
+"""Learners: how the UAVs' networks are trained from the transitions that are collected."""

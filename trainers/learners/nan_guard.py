@@ -1,7 +1,7 @@
-"""Notices the first number of a training that is not finite, without waiting for the device.
+"""Detects the first NaN or Inf in training without waiting for the device.
 
-Everything here is a tensor operation on the device, so that it is part of a recorded graph. From
-the moment that something was found, the learner changes nothing any more, whenever the host looks.
+All checks are tensor operations on the device, so a recorded CUDA graph contains them. Once
+something was found, the learner changes nothing any more, however late the host reads the flag.
 """
 
 from collections.abc import Mapping, Sequence
@@ -11,95 +11,93 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-NOTHING, COLLECTED, LEARNT, WEIGHTS, CARRIED = range(5)
-"""where something was found: in a collected step, in losses and gradients, in what they made; in
-what the next step begins with, which is looked at before it is saved"""
+NOTHING, ROLLOUT, UPDATE = range(3)
+"""where the first number that is not finite was found"""
 
 
-class Watch:
-    """What a training looks like where it is no longer one.
+class NonFiniteGuard:
+    """Flags rollouts, losses and gradients that are not finite, and keeps the first of them.
 
-    Finite means here that the sum of a tensor's squares is: Adam squares gradients.
+    A tensor counts as finite where the sum of its squares is, because Adam squares gradients.
 
     Args:
-        trained: the networks' tensors by name, one row per UAV of all teams.
+        device: of the training.
     """
 
-    def __init__(self, trained: Mapping[str, Tensor]):
-        self.trained = dict(trained)
-        self._tensors = list(trained.values())
-        device = self._tensors[0].device
+    def __init__(self, device: torch.device | str):
         self.bad = torch.zeros((), device=device)
-        """1 from when something was found, else 0; Adam skips a step where its `found_inf` is 1"""
-        self.found = torch.zeros(3, dtype=torch.int64, device=device)
-        """where, and the steps and updates that were good before it"""
-        self._place, self._steps, self._updates = self.found.unbind()
+        """1 once something was found, else 0; Adam skips a step where its `found_inf` is 1"""
+        self._counts = torch.zeros(3, dtype=torch.int64, device=device)
+        self._place, self._steps, self._updates = self._counts.unbind()
+        self.rollout: TensorDictBase | None = None
+        """the first bad rollout; the newest while there is none"""
         self.batch: TensorDictBase | None = None
-        """of the first bad update; of the newest before there is one"""
-        self.losses: Tensor | None = None
-        """of the same, [2, uavs]: actors, critics"""
-        self.gradients: Tensor | None = None
-        """their norms in the same, [tensors, uavs]"""
-        self.own: Tensor | None = None
-        """bool [environments, uavs of a team]: whose observation was not finite before the UAVs
-        communicated"""
+        """the batch of the first bad update; of the newest while there is none"""
+        self.losses: dict[str, Tensor] = {}
+        """the losses of that update, [uavs] each"""
+        self.gradients: dict[str, Tensor] = {}
+        """the norms of its gradients, one per row of the parameter"""
         self._arriving: tuple[Any, Tensor] | None = None
 
-    def share(self, of: float) -> Tensor:
-        """A share, float64 []; 0 from when something was found."""
-        return (1 - self.bad).double() * of
+    def start(self, steps: int, updates: int) -> None:
+        """Sets how many steps and updates are done, from which those found are counted."""
+        self._steps.fill_(steps)
+        self._updates.fill_(updates)
 
-    def heard(self, observation: Tensor) -> None:
-        """The UAVs' own observations, [environments, uavs, features], before they communicate."""
-        wrong = ~observation.isfinite().all(-1)
-        if self.own is None:
-            self.own = torch.zeros_like(wrong)
-        self.own.logical_or_(wrong & (self.bad == 0))
+    def share(self, value: float) -> Tensor:
+        """Returns the value, float64 []; 0 once something was found."""
+        return (1 - self.bad).double() * value
 
-    def collected(self, rows: TensorDictBase) -> None:
-        """A step, as it is remembered."""
-        values = [one for one in rows.values(True, True) if one.is_floating_point()]
-        self._flag(torch.stack([torch.linalg.vector_norm(value) for value in values]), COLLECTED)
-        self._steps.add_(self.bad == 0)
+    def record_rollout(self, rollout: TensorDictBase, steps: int) -> None:
+        """Checks a rollout of so many steps and keeps it."""
+        self.rollout = self._keep(self.rollout, rollout)
+        values = [value for value in rollout.values(True, True) if value.is_floating_point()]
+        self._flag(torch.stack([torch.linalg.vector_norm(value) for value in values]), ROLLOUT)
+        self._steps.add_((self.bad == 0) * steps)
 
-    def drawn(self, batch: TensorDictBase) -> None:
-        """What an update is about to learn from."""
-        if self.batch is None or self.batch.shape != batch.shape:
-            self.batch = batch.clone()
-            return
-        for key, place in self.batch.items(True, True):
-            self._keep(place, batch.get(key))
+    def record_batch(self, batch: TensorDictBase) -> None:
+        """Keeps the batch of the next update."""
+        self.batch = self._keep(self.batch, batch)
 
-    def learnt(self, losses: Tensor) -> None:
-        """An update's losses, [2, uavs], and the gradients that are there now."""
-        gradients = norms([one.grad for one in self._tensors if one.grad is not None])
-        if self.losses is None or self.gradients is None:
-            self.losses, self.gradients = losses.clone(), gradients.clone()
-        else:
-            self._keep(self.losses, losses)
-            self._keep(self.gradients, gradients)
-        self._flag(torch.cat((losses, gradients)), LEARNT)
-
-    def updated(self) -> None:
-        """The networks have made their step."""
-        self._flag(norms(self._tensors), WEIGHTS)
-        self._updates.add_(self.bad == 0)
-
-    def look(self, *, wait: bool = False) -> bool:
-        """Whether something was found: by now, or on a GPU as far as it has got word of.
+    def check_gradients(
+        self, losses: Mapping[str, Tensor], gradients: Mapping[str, Tensor]
+    ) -> None:
+        """Checks an update's losses and gradients and counts the update.
 
         Args:
-            wait: by now on a GPU as well, for which it is waited.
+            losses: by name, [uavs] each, detached.
+            gradients: by parameter, [rows, ...] each, where a row is a UAV's or a network's.
+        """
+        norms = dict(zip(gradients, row_norms(list(gradients.values())), strict=True))
+        for kept, new in ((self.losses, losses), (self.gradients, norms)):
+            for name, value in new.items():
+                if name in kept:
+                    kept[name].copy_(torch.where(self.bad > 0, kept[name], value))
+                else:
+                    kept[name] = value.clone()
+        self._flag(torch.cat([*losses.values(), *norms.values()]), UPDATE)
+        self._updates.add_(self.bad == 0)
+
+    def poll(self, *, wait: bool = False) -> bool:
+        """Returns whether something was found.
+
+        Args:
+            wait: whether to wait for a GPU; else the answer may be some steps old.
         """
         if wait or not self.bad.is_cuda:
             return bool(self.bad)
         if self._arriving is None:
             self._arriving = self._send()
         event, arrived = self._arriving
-        if not event.query():  # on its way, and nothing is waited for
+        if not event.query():
             return False
         self._arriving = None
         return bool(arrived)
+
+    def found(self) -> tuple[int, int, int]:
+        """Returns where it was found, and the steps and updates that were finite before it."""
+        place, steps, updates = self._counts.tolist()
+        return place, steps, updates
 
     def _send(self) -> tuple[Any, Tensor]:
         with torch.cuda.device(self.bad.device):
@@ -109,9 +107,13 @@ class Watch:
             event.record()
         return event, arriving
 
-    def _keep(self, place: Tensor, value: Tensor) -> None:
-        """Writes a value, unless something was found before."""
-        place.copy_(torch.where(self.bad > 0, place, value))
+    def _keep(self, place: TensorDictBase | None, value: TensorDictBase) -> TensorDictBase:
+        """Writes a TensorDict in place, unless something was found before."""
+        if place is None or place.shape != value.shape:
+            return value.clone()
+        for key, tensor in place.items(True, True):
+            tensor.copy_(torch.where(self.bad > 0, tensor, value.get(key)))
+        return place
 
     def _flag(self, values: Tensor, place: int) -> None:
         wrong = ~values.isfinite().all()
@@ -119,9 +121,10 @@ class Watch:
         self.bad.masked_fill_(wrong, 1.0)
 
 
-def norms(tensors: Sequence[Tensor]) -> Tensor:
-    """The Euclidean norm of each UAV's part of each tensor [uavs, ...]: [tensors, uavs]."""
-    if tensors[0].is_cuda:  # a few launches for all, where a CPU is faster one after another
-        parts = [part for one in tensors for part in one.detach().unbind(0)]
-        return torch.stack(torch._foreach_norm(parts)).view(len(tensors), -1)  # pyright: ignore[reportPrivateImportUsage]
-    return torch.stack([torch.linalg.vector_norm(one.detach(), dim=(1, 2)) for one in tensors])
+def row_norms(tensors: Sequence[Tensor]) -> list[Tensor]:
+    """Returns the Euclidean norm of each row of each tensor [rows, ...]: [rows] each."""
+    if tensors and tensors[0].is_cuda:  # few launches for all; a CPU is faster one by one
+        rows = [row for tensor in tensors for row in tensor.detach().unbind(0)]
+        norms = torch.stack(torch._foreach_norm(rows))  # pyright: ignore[reportPrivateImportUsage]
+        return list(norms.split([len(tensor) for tensor in tensors]))
+    return [torch.linalg.vector_norm(tensor.detach().flatten(1), dim=1) for tensor in tensors]

@@ -1,0 +1,1 @@
+"""Collects transitions: steps the environments with the exploring policy."""

@@ -1,4 +1,4 @@
-"""Where freed memory goes."""
+"""Settings of the C library's memory allocator."""
 
 import ctypes
 
@@ -7,13 +7,13 @@ _KEPT = 2**30
 
 
 def keep_freed_memory() -> bool:
-    """Lets the process keep blocks of up to a gigabyte that it frees, instead of giving them back.
+    """Lets the process keep freed blocks of up to a gigabyte instead of returning them.
 
-    An update frees and takes blocks of some megabytes dozens of times; given back, each is handed
-    out anew page by page, zeroed. It changes the whole process.
+    An update frees and allocates blocks of some megabytes dozens of times. Returned to the system,
+    each is handed out again page by page, filled with zeros. The setting is process-wide.
 
     Returns:
-        Whether it could be done: glibc's allocator alone has it.
+        Whether it was applied; only glibc's allocator has this setting.
     """
     try:
         mallopt = ctypes.CDLL(None).mallopt

@@ -1,31 +1,25 @@
-"""Going on with a run that was stopped, as if it had not been."""
+"""Continues a run that was stopped, as if it had not been."""
 
-from collections.abc import Mapping, Sequence
-from contextlib import ExitStack
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import shown
-from emberlink.trainers.config.compose import flat, from_values, override, to_values
-from emberlink.trainers.config.schema import NOT_LEARNT_WITH, RunConfig
-from emberlink.trainers.runs import checkpoint_file
-from emberlink.trainers.runs.lock import Lock
+from emberlink.trainers.config.compose import override
+from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.runs.run_folder import RunFolder, step_of
-from emberlink.trainers.runs.safe_read import LONGEST_YAML, parse_json, read_text
+from emberlink.trainers.runs.seal import MAY_CHANGE, check_same, differences
+from emberlink.trainers.training.trainer import Trainer
 
-from . import state, state_header
-from .trainer import LINES, SIBLINGS, Trainer
-
-MAY_CHANGE = ("episodes", *NOT_LEARNT_WITH)
-"""keys that a resumed run may be given anew, beside those of `evaluation`"""
+from . import checkpoints
+from .folders import RunFolders, Sizes, check_seeds, empty, find_runs
 
 
 def resume(path: Path, method: str | None = None, overrides: Sequence[str] = ()) -> Trainer:
-    """The training of a run folder, where its newest checkpoint was made.
+    """Returns the training of a run folder, where its newest checkpoint was made.
 
-    Metrics of later steps are cut off, and later or half-written checkpoints taken away: the
+    Metrics of later steps are cut off, and later or half-written checkpoints are removed: the
     training makes them again. A run that has no checkpoint yet begins again.
 
     Args:
@@ -35,78 +29,40 @@ def resume(path: Path, method: str | None = None, overrides: Sequence[str] = ())
         overrides: `key=value`, of keys that change nothing that was learnt.
 
     Raises:
-        ValueError: one line that says what cannot be resumed and why. Nothing was changed.
+        UserError: the run cannot be resumed. Nothing was changed.
     """
     chosen = path if path.suffix == ".safetensors" else None
-    runs = _runs(path.absolute().parent.parent if chosen else path)
-    before = runs[0].config()
-    _check_siblings(runs, before)
+    runs = find_runs(path.absolute().parent.parent if chosen else path)
+    # The run's own device may not be there: it is replaced before it is checked.
+    devices = [text.partition("=")[2] for text in overrides if text.startswith("device=")]
+    before = runs[0].config(**({"device": devices[-1]} if devices else {}))
+    check_seeds(runs, before)
     config = _changed(before, method, overrides)
-    with ExitStack() as stack:
-        locks = [Lock(run.path) for run in runs]
-        for lock in locks:
-            stack.callback(lock.release)
+    seeds = config.seeds or (config.seed,)
+    folders = RunFolders(runs, [replace(config, seed=seed) for seed in seeds])
+    try:
         if chosen is None and not (runs[0].states() or runs[0].networks()):
             _check_beginning(runs, config)
         trainer = Trainer(config)
         sizes = _restore(trainer, runs, chosen)
-        for run, of in zip(runs, sizes, strict=True):
-            for file in LINES:
-                run.check_lines(file, of[file], trainer.episode)
+        folders.check_lines(sizes, trainer.setup.episode)
         # From here on everything is known to fit.
-        for run, of, one in zip(runs, sizes, trainer.configs, strict=True):
-            for file in LINES:
-                run.cut(file, of[file])
-            run.take_away_after(trainer.step)
-            if config != before or not run.has_config():
-                run.write_config(one)
-        trainer.take(runs, locks)
-        if trainer.step:
-            trainer.saved = trainer.step
+        folders.cut_back(sizes, trainer.setup.step)
+        for run, own in zip(runs, folders.configs, strict=True):
+            if overrides or not run.has_config():
+                run.write_config(own)
+        trainer.folders = folders
+        if trainer.setup.step:
+            trainer.saved = trainer.setup.step
             trainer.save_networks()
-        stack.pop_all()
+    except BaseException:
+        folders.close()
+        raise
     return trainer
 
 
-def _runs(folder: Path) -> list[RunFolder]:
-    """The folders of all seeds that train with the one whose folder this is, in order."""
-    file = folder / SIBLINGS
-    try:
-        if not file.exists():
-            return [RunFolder(folder)]
-        names = parse_json(read_text(file, LONGEST_YAML))["folders"]
-        runs = [RunFolder(folder.resolve().parent / Path(name).name) for name in names]
-        missing = [run.path for run in runs if not run.path.is_dir()]
-        if folder.resolve() not in [run.path for run in runs]:
-            raise UserError(folder)
-    except PermissionError as error:
-        raise UserError(f"{file}: cannot be read: {error.strerror}") from None
-    except (OSError, ValueError, TypeError, KeyError):
-        raise UserError(f"{file}: does not name the folders of the other seeds") from None
-    for path in missing:
-        raise UserError(f"{path}: is missing; its seed trains side by side with {folder}")
-    return runs
-
-
-def _check_siblings(runs: Sequence[RunFolder], config: RunConfig) -> None:
-    """That each seed's folder is of this training, as far as it has got to say so."""
-    seeds = config.seeds or (config.seed,)
-    if len(runs) != len(seeds):
-        raise UserError(
-            f"{runs[0].path}: is of {len(seeds)} seeds, {SIBLINGS} names {len(runs)} folders"
-        )
-    for run, seed in zip(runs, seeds, strict=True):
-        if not run.has_config():
-            continue
-        own = run.config()
-        if replace(own, seed=config.seed) != config:
-            raise UserError(f"{run.path / 'config.yaml'}: not of the run of {runs[0].path}")
-        if own.seed != seed:
-            raise UserError(f"{run.path / 'config.yaml'}: seed={own.seed}, not {seed}")
-
-
 def _check_beginning(runs: Sequence[RunFolder], config: RunConfig) -> None:
-    """That a run without a checkpoint never had one: its lines are few, and it begins again."""
+    """Checks that a run without a checkpoint never had one: then it has few lines."""
     most = config.checkpoint_interval
     if config.checkpoint_steps:
         most = min(most, -(-config.checkpoint_steps // config.env.horizon))
@@ -115,76 +71,44 @@ def _check_beginning(runs: Sequence[RunFolder], config: RunConfig) -> None:
         if len(lines) > most or (run.path / "eval.json").exists():
             raise UserError(
                 f"{run.path}: has metrics of {len(lines)} episodes and no checkpoint "
-                "(checkpoints/state_*.safetensors): nothing to go on from, and nothing was changed"
+                "(checkpoints/state_*.safetensors): it cannot be resumed, and nothing was changed"
             )
-        run.checkpoints.mkdir(exist_ok=True)
+        run.own_checkpoints()
 
 
 def _changed(config: RunConfig, method: str | None, overrides: Sequence[str]) -> RunConfig:
+    """Returns the configuration with the overrides, which must be of keys that may change."""
     if method is not None and method != config.method:
         raise UserError(f"method {method!r}: the run is of method {config.method!r}")
     changed = override(config, overrides)
-    for key, (new, old) in _differences(changed, config).items():
+    for key, (new, old) in differences(changed, config).items():
         if key not in MAY_CHANGE and not key.startswith("evaluation."):
             raise UserError(f"{key}={new}: the run has {key}={old}; a resumed run keeps it")
     return changed
 
 
-def _differences(one: RunConfig, other: RunConfig) -> dict[str, tuple[Any, Any]]:
-    first, second = flat(to_values(one)), flat(to_values(other))
-    return {
-        key: (first.get(key), second.get(key))
-        for key in [*first, *(key for key in second if key not in first)]
-        if first.get(key) != second.get(key)
-    }
-
-
-def _restore(
-    trainer: Trainer, runs: Sequence[RunFolder], chosen: Path | None
-) -> list[Mapping[str, int]]:
-    """Puts the training where the checkpoint was made: bytes of each run's files by then."""
-    first = runs[0]
-    states = first.states()
+def _restore(trainer: Trainer, runs: Sequence[RunFolder], chosen: Path | None) -> Sequence[Sizes]:
+    """Puts the training where the checkpoint was made; returns the sizes of files until then."""
+    states = runs[0].states()
     if chosen is None and not states:
-        if first.networks():
+        if runs[0].networks():
             raise UserError(
-                f"{first.path}: holds networks alone (checkpoints/state_*.safetensors is missing); "
-                f"they can be evaluated: emberlink eval {first.path}"
+                f"{runs[0].path}: holds networks alone (checkpoints/state_*.safetensors is "
+                f"missing); they can be evaluated: emberlink eval {runs[0].path}"
             )
-        return [dict.fromkeys(LINES, 0) for _ in runs]
+        return empty(runs)
     path = chosen or states[-1]
     try:
-        header = _restore_from(trainer, path)
-    except ValueError as error:
+        state, tensors = checkpoints.read(path)
+        check_same(path, state.config, trainer.config)
+        if state.step > trainer.setup.total_steps:
+            done = state.step / trainer.config.env.horizon
+            raise UserError(f"episodes={trainer.config.episodes}: the run has done {done:g}")
+        trainer.restore(path, state, tensors)
+    except UserError as error:
         older = [one for one in states if 0 <= step_of(one) < step_of(path)]
         hint = f"; the one before it: emberlink train resume={older[-1]}" if older else ""
         raise UserError(f"{error}{hint}") from None
-    if header.folders != [run.path.name for run in runs] and len(runs) > 1:
-        raise UserError(f"{path}: of the folders {shown(', '.join(header.folders))}")
-    return [*header.files]
-
-
-def _restore_from(trainer: Trainer, path: Path) -> state_header.Header:
-    found, content = checkpoint_file.read(path)
-    if found is None or found.get("kind") != "state":
-        raise UserError(f"{path}: holds networks alone; nothing can be resumed from it")
-    header = state_header.parse(path, found)
-    if step_of(path) not in (-1, header.step):
-        raise UserError(f"{path}: its header: step={header.step}: should be its name's")
-    _check_config(trainer.config, path, header.config)
-    if header.step > trainer.steps:
-        done = header.step / trainer.config.env.horizon
-        raise UserError(f"episodes={trainer.config.episodes}: the run has done {done:g}")
-    state.restore(trainer, path, found, content)
-    return header
-
-
-def _check_config(config: RunConfig, path: Path, values: Mapping[str, Any]) -> None:
-    """That the checkpoint's configuration is the run's, but for what may change."""
-    free = {key: getattr(config, key) for key in (*MAY_CHANGE, "output", "evaluation")}
-    try:
-        made = from_values({**values, "device": config.device})
-    except ValueError as error:
-        raise UserError(f"{path}: made with a configuration that is none: {error}") from None
-    for key, (found, wanted) in _differences(replace(made, **free), config).items():
-        raise UserError(f"{path}: made with {key}={found}; the run has {key}={wanted}")
+    if len(runs) > 1 and state.folders != [run.path.name for run in runs]:
+        raise UserError(f"{path}: of the folders {shown(', '.join(state.folders))}")
+    return state.sizes

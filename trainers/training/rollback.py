@@ -1,74 +1,49 @@
-"""Going back to the last checkpoint with smaller learning rates, where a number is not finite."""
+"""How often and with what learning rates training returns to a checkpoint after a NaN or Inf."""
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
 
-from emberlink.trainers.runs import checkpoint_file
-
-from . import state
-from .divergence import Divergence
-
-if TYPE_CHECKING:
-    from .trainer import Trainer
+from .non_finite import NonFiniteError
 
 FACTOR = 0.5
-"""by which both learning rates are multiplied at each rollback"""
-TRIES = 5
-"""rollbacks from steps that no checkpoint lies beyond, before it is given up"""
+"""by which the learning rates are multiplied at each rollback"""
+MAX_ROLLBACKS = 5
+"""maximum rollbacks without progress"""
 FILE = "rollbacks.jsonl"
-"""has a line for each; unlike metrics.jsonl, it is never cut"""
+"""has a line for each rollback; unlike metrics.jsonl, it is never cut"""
 
 
-def roll_back(trainer: "Trainer", found: Divergence, files: Sequence[str]) -> str:
-    """Puts a training where its last checkpoint was made, or at the beginning.
+@dataclass(frozen=True, kw_only=True)
+class Rollbacks:
+    """The rollbacks of a run so far."""
 
-    A checkpoint with the smaller rates is made there at once, so that a run that is stopped now
-    goes on with them.
+    lr_scale: float = 1.0
+    """share of the configuration's learning rates that is left"""
+    count: int = 0
+    """rollbacks since training last passed `worst_step`"""
+    worst_step: int = 0
+    """the latest step that failed"""
 
-    Args:
-        trainer: of which nothing later than the checkpoint is kept but its best networks.
-        found: why.
-        files: of each run folder, that have a line for each episode.
+    def passed(self, step: int) -> "Rollbacks":
+        """Returns the rollbacks after a step was saved: beyond the worst one, counting restarts."""
+        if step <= self.worst_step:
+            return self
+        return Rollbacks(lr_scale=self.lr_scale, worst_step=self.worst_step)
 
-    Returns:
-        What the user is to be told.
+    def after(self, error: NonFiniteError) -> "Rollbacks":
+        """Returns the rollbacks with one more.
 
-    Raises:
-        Divergence: `on_nan` is not rollback, or this has been tried often enough.
-        ValueError: a file cannot be read or written.
-    """
-    if trainer.config.on_nan != "rollback":
-        raise found
-    rate, tries, bad = trainer.rate * FACTOR, trainer.tries + 1, found.culprit.step
-    if tries > TRIES:
-        text = f"{found}; given up after {TRIES} rollbacks, learning rates x {trainer.rate:g}"
-        raise Divergence(text, found.culprit, found.bundle)
-    furthest = max(bad, trainer.furthest)
-    seconds, best = trainer.elapsed(), trainer.best
-    states = trainer.run.states()
-    sizes = [dict[str, int]() for _ in trainer.runs]
-    trainer.collector.shutdown()
-    trainer.build()
-    if states:
-        header, content = checkpoint_file.read(states[-1])
-        assert header is not None, "a state has a header"
-        state.restore(trainer, states[-1], header, content)
-        sizes = header["files"]
-    trainer.rate, trainer.tries, trainer.furthest = rate, tries, furthest
-    trainer.seconds, trainer.best = seconds, best
-    trainer.learner.slow_down(rate)
-    line = {
-        "step": bad,
-        "to": trainer.step,
-        "rate": rate,
-        "culprit": str(found.culprit),
-        "bundle": found.bundle.name if found.bundle else None,
-    }
-    for run, of in zip(trainer.runs, sizes, strict=True):
-        for file in files:
-            run.cut(file, of.get(file, 0))
-        run.take_away_after(trainer.step)
-        run.append(FILE, line)
-    trainer.save()
-    where = f"on from step {trainer.step} with learning rates x {rate:g}"
-    return f"{found}; rollback {tries} of {TRIES}: {where}"
+        Raises:
+            NonFiniteError: it would be one too many.
+        """
+        if self.count == MAX_ROLLBACKS:
+            raise NonFiniteError(
+                f"{error}; given up after {MAX_ROLLBACKS} rollbacks, learning rates x "
+                f"{self.lr_scale:g}",
+                error.report,
+                error.dump,
+            )
+        return Rollbacks(
+            lr_scale=self.lr_scale * FACTOR,
+            count=self.count + 1,
+            worst_step=max(error.report.step, self.worst_step),
+        )

@@ -1,0 +1,52 @@
+"""Finds the YAML files of configuration groups, installed with emberlink or added by a user.
+
+A group is a folder such as `method` or `fire`; each file in it is one choice of the group.
+"""
+
+import os
+import warnings
+from collections.abc import Sequence
+from importlib.metadata import entry_points
+from importlib.util import find_spec
+from pathlib import Path
+
+VARIABLE = "EMBERLINK_CONFIGS"
+"""the environment variable that lists folders of groups, separated as in PATH"""
+ENTRY_POINTS = "emberlink.configs"
+"""the entry points of other packages; each names a package whose folder holds groups"""
+
+
+def folders() -> list[Path]:
+    """Returns the folders that hold groups: of the environment, of other packages, emberlink's.
+
+    Folders that do not exist are left out, as in PATH. An entry point that names no package is left
+    out with a warning.
+    """
+    listed = [Path(text) for text in os.environ.get(VARIABLE, "").split(os.pathsep) if text]
+    plugins = [path for point in entry_points(group=ENTRY_POINTS) for path in _package(point.value)]
+    every = [path.resolve() for path in (*listed, *plugins, Path(__file__).parent)]
+    return [path for path in dict.fromkeys(every) if path.is_dir()]
+
+
+def known(group: str, within: Sequence[Path] | None = None) -> list[str]:
+    """Returns the choices of a group, in alphabetical order.
+
+    Args:
+        group: such as "method", "setup", "setup_method" or "fire".
+        within: the folders to look in; `folders()` if None.
+    """
+    searched = folders() if within is None else within
+    files = (file for folder in searched for file in (folder / group).glob("*.yaml"))
+    return sorted({file.stem for file in files if file.is_file()})
+
+
+def _package(name: str) -> list[Path]:
+    """Returns the folders of a package, without importing it."""
+    try:
+        spec = find_spec(name)
+    except ModuleNotFoundError:
+        spec = None
+    if spec is None or not spec.submodule_search_locations:
+        warnings.warn(f"entry point of {ENTRY_POINTS}: there is no package {name}", stacklevel=4)
+        return []
+    return [Path(folder) for folder in spec.submodule_search_locations]

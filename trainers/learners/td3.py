@@ -1,0 +1,128 @@
+"""TD3 for all UAVs at once (Fujimoto, van Hoof and Meger 2018, ICML)."""
+
+from typing import Annotated, Any
+
+import torch
+from pydantic import Field
+from pydantic.dataclasses import dataclass
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModule, TensorDictModuleBase
+from torch import Tensor
+from torchrl.objectives import TD3Loss
+
+from emberlink.envs import keys
+from emberlink.envs.utils import counter_rng
+from emberlink.envs.utils.counter_rng import Use
+from emberlink.policies.networks.actor_critic import make_critic
+
+from .base import STRICT, Count, LearnerContext, Losses, NotNegative, sharing
+from .off_policy import OffPolicyConfig, OffPolicyLearner
+
+_TARGET_NOISE = (keys.AGENTS, "target_noise")
+"""float32 [batch, uavs, 3]: added to the target's actions; part of the next observation's level"""
+_CRITICS = 2
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class TD3Config(OffPolicyConfig):
+    """TD3 for every UAV."""
+
+    policy_delay: Count
+    """updates of the critics per update of the actors and of all targets"""
+    target_noise: NotNegative
+    """standard deviation of the noise on the target's actions"""
+    target_noise_clip: Annotated[float, Field(ge=0, le=2)]
+    """largest absolute value of that noise; actions are in [-1, 1]"""
+
+
+class TD3(OffPolicyLearner):
+    """Updates every UAV's actor and two critics, with smoothed targets and delayed actors."""
+
+    config_type = TD3Config
+    critic_name = "qvalue"
+    config: TD3Config
+
+    def __init__(self, config: TD3Config, context: LearnerContext):
+        super().__init__(config, context)
+        seeds = torch.tensor(context.seeds, device=context.device)
+        self._keys = counter_rng.fold_in(seeds, Use.TARGET_NOISE)
+
+    def make_loss(self, context: LearnerContext, generators: list[torch.Generator]) -> TD3Loss:
+        specs, config = (context.observation_spec, context.action_spec), self.config
+        self.actor = self.make_actor(config, *specs, generators)
+        critics: list[TensorDictModule] = [
+            make_critic(*specs, config.hidden, generator=generators, **sharing(config))
+            for _ in range(_CRITICS)
+        ]
+        actor: Any = _SmoothedActor(self.actor)
+        loss = TD3Loss(
+            actor,
+            critics,  # two, initialised apart; TorchRL would draw the second's weights itself
+            bounds=(-1.0, 1.0),
+            policy_noise=0.0,  # ours is in the batch, from a stream of its own
+            noise_clip=0.0,
+            loss_function="l2",
+            reduction="none",
+            deactivate_vmap=True,
+        )
+        loss.set_keys(action=keys.ACTION)
+        return loss
+
+    def moves_actor(self, update: int) -> bool:
+        return update % self.config.policy_delay == 0
+
+    def sample(self) -> TensorDictBase:
+        """Draws a batch and the noise on the target's actions."""
+        batch, config = self.replay.sample(), self.config
+        action = batch.get(keys.ACTION)
+        size, _, features = action.shape
+        key = counter_rng.fold_in(self._keys, self.replay.draws)
+        normal = counter_rng.normal(key, action.numel() // self.teams)
+        noise = normal.view(self.teams, size, -1, features).transpose(0, 1).reshape(action.shape)
+        clip = config.target_noise_clip
+        batch.set(("next", *_TARGET_NOISE), (noise * config.target_noise).clamp(-clip, clip))
+        return batch
+
+    def losses(self, batch: TensorDictBase, *, actor: bool = True) -> Losses:
+        critic_loss, _ = self.loss.value_loss(batch)
+        losses = {"critic": critic_loss.mean(0)}
+        if actor:
+            actor_loss, _ = self.loss.actor_loss(batch)
+            losses["actor"] = actor_loss.mean(0)
+        return losses
+
+    def gradients(self) -> dict[str, Tensor]:
+        """Returns the gradients by parameter, those of the two critics apart."""
+        gradients: dict[str, Tensor] = {}
+        for name, value in super().gradients().items():
+            network, _, rest = name.partition(".")
+            if network == "actor":
+                gradients[name] = value
+            else:
+                gradients |= {f"critic_{k}.{rest}": part for k, part in enumerate(value)}
+        return gradients
+
+    def weights(self, team: int = 0) -> dict[str, Tensor]:
+        """Returns one seed's weights; the first dimension of the critics is the two critics."""
+        weights: dict[str, Tensor] = {}
+        for name, value in self.networks().items():
+            dim = int("qvalue" in name)
+            own = value.detach().unflatten(dim, (self.teams, -1)).select(dim, team)
+            weights[name.replace("params.actor.module.", "params.module.")] = own
+        return weights
+
+
+class _SmoothedActor(TensorDictModuleBase):
+    """The actors; where a batch carries noise for the target's actions, it is added and clipped."""
+
+    def __init__(self, actor: TensorDictModule):
+        super().__init__()
+        self.actor = actor
+        self.in_keys, self.out_keys = [*actor.in_keys, _TARGET_NOISE], actor.out_keys
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        acted = self.actor(tensordict)
+        noise = acted.get(_TARGET_NOISE, None)
+        if noise is None:
+            return acted
+        return acted.set(keys.ACTION, (acted.get(keys.ACTION) + noise).clamp(-1, 1))

@@ -1,0 +1,35 @@
+"""Finds executors: the files beside this one, each with a YAML file in configs/executor."""
+
+from typing import Any
+
+from emberlink.envs.utils.config_files import read
+from emberlink.envs.utils.errors import UserError
+from emberlink.envs.utils.plugins import Registry
+from emberlink.envs.utils.validation import from_plain
+
+from .base import Executor
+
+_REGISTRY = Registry(
+    Executor, "emberlink.trainers.sweep.executors", "emberlink.executors", "executor"
+)
+known = _REGISTRY.known
+
+
+def make(name: str, settings: dict[str, Any]) -> Executor:
+    """Returns an executor.
+
+    Args:
+        name: a file of this folder, or an entry point of `emberlink.executors`.
+        settings: values in place of those in configs/executor/NAME.yaml.
+
+    Raises:
+        UserError: the name or a key is not known, or a value does not fit.
+    """
+    executor = _REGISTRY.find(name)
+    values = {key: value for key, value in read("executor", name).items() if key != "name"}
+    for key, value in settings.items():
+        if key not in values:
+            listed = ", ".join(f"executor.{other}" for other in values)
+            raise UserError(f"key 'executor.{key}' is not known; known: {listed}")
+        values[key] = value
+    return executor(from_plain(executor.config_type, values, "executor"))

@@ -1,0 +1,62 @@
+"""Fits the jobs of a sweep to the runs that are on disk."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+from emberlink.trainers.config.schema import RunConfig
+
+from .jobs import FoundRun, Identity, Job, identity, is_finished, job_for
+
+
+def plan(jobs: Sequence[Job], runs: Mapping[Identity, FoundRun]) -> list[Job]:
+    """Returns jobs for the same runs, each of which is finished, to be resumed, or new as a whole.
+
+    A stack of seeds is split where some of its seeds are finished, stopped or missing. Seeds that
+    were trained side by side and stopped become one job, since they are resumed together.
+
+    Args:
+        jobs: jobs with one seed or several.
+        runs: the runs of the output folder.
+    """
+    planned: list[Job] = []
+    stacks: dict[tuple, Job] = {}
+    for job in jobs:
+        job.find_runs(runs)
+        for configs in _parts(job):
+            part = job if len(configs) == len(job.configs) else job_for(configs, job.overrides)
+            part.find_runs(runs)
+            stack = _stack(part)
+            if stack is not None and stack in stacks:
+                stacks[stack].configs += part.configs
+                stacks[stack].find_runs(runs)
+                continue
+            if stack is not None:
+                stacks[stack] = part
+            planned.append(part)
+    return planned
+
+
+def _parts(job: Job) -> list[list[RunConfig]]:
+    """Returns the seeds of a job in groups: finished, of one training to resume, or new."""
+    if len(job.configs) == 1:
+        return [job.configs]
+    groups: dict[str, list[RunConfig]] = {}
+    for config in job.configs:
+        run = job.found.get(config.seed)
+        if run is None:
+            name = "new"
+        elif is_finished(run.folder, config):
+            name = "finished"
+        else:
+            name = f"resume {run.stack or config.seed}"
+        groups.setdefault(name, []).append(config)
+    return [groups[name] for name in sorted(groups)]
+
+
+def _stack(job: Job) -> tuple | None:
+    """Returns what two jobs have in common that resume the same stack; None for any other job."""
+    first = job.configs[0]
+    run = job.found.get(first.seed)
+    if run is None or len(run.stack) < 2 or job.finished:
+        return None
+    return run.stack, identity(replace(first, seed=run.stack[0]))

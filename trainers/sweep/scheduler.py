@@ -1,0 +1,172 @@
+"""Runs the jobs of a sweep on an executor."""
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from emberlink.envs.utils.errors import UserError
+from emberlink.envs.utils.publish import free_name
+from emberlink.trainers.runs.signals import Interruption
+
+from .claims import Claim, claim
+from .executors import Executor, Task
+from .jobs import Job
+from .plan import plan
+from .progress import SweepProgress
+from .run_index import RunIndex
+
+_INTERVAL = 0.5
+"""seconds between two looks at the processes and the run folders"""
+
+
+@dataclass
+class _Running:
+    """A job that was submitted.
+
+    Attributes:
+        handle: what the executor returned.
+        claim: keeps other sweeps from training the same runs.
+    """
+
+    handle: Any
+    claim: Claim
+
+
+class Scheduler:
+    """Submits jobs as slots become free, follows them, and cancels them when it is interrupted.
+
+    A job whose runs another sweep has claimed waits until that sweep has ended or finished them.
+
+    Args:
+        jobs: all jobs of the sweep; a job that is partly done is replaced by its parts.
+        index: the run folders of the output folder.
+        executor: where the jobs run.
+        progress: the display.
+    """
+
+    def __init__(
+        self, jobs: list[Job], index: RunIndex, executor: Executor, progress: SweepProgress
+    ):
+        self.jobs = jobs
+        self._index, self._executor, self._progress = index, executor, progress
+        self._waiting = [job for job in jobs if not job.finished]
+        self._slots = executor.slots(len(self._waiting))
+        self._running: dict[Job, _Running] = {}
+        self._blocked: set[Job] = set()
+        self._planned_with = index.size
+        self._stopping = False
+
+    def work(self) -> int:
+        """Runs all jobs and returns the exit status of the sweep.
+
+        Returns:
+            0; 1 if a job failed; 130 or 143 after a signal.
+        """
+        interruption = Interruption(self._stop)
+        try:
+            with interruption, self._progress:
+                while self._running or (self._waiting and not self._stopping):
+                    self._submit()
+                    time.sleep(_INTERVAL)
+                    self._look()
+        finally:
+            self._stop()  # after a second signal: a training that is told twice does not wait
+            self._wait()
+        if interruption.received:
+            return interruption.status
+        return int(any(job.failed for job in self.jobs))
+
+    def _wait(self) -> None:
+        """Waits for the jobs that still run, and gives up what they claim."""
+        for running in self._running.values():
+            while self._executor.poll(running.handle) is None:
+                time.sleep(_INTERVAL / 10)
+            running.claim.release()
+
+    def _submit(self) -> None:
+        """Fills the free slots with jobs that no other sweep has claimed."""
+        while not self._stopping and len(self._running) < self._slots:
+            taken = self._claim_next()
+            if taken is None:
+                return
+            job, own = taken
+            if job.finished:
+                own.release()
+                self._progress.end(job, "finished by another sweep")
+            else:
+                self._start(job, own)
+
+    def _claim_next(self) -> tuple[Job, Claim] | None:
+        """Takes the first waiting job that no other sweep has claimed; None if there is none."""
+        for job in self._waiting:
+            own = claim(_logs(job), job.identities)
+            if own is None:
+                if job not in self._blocked:
+                    self._progress.wait(job)
+                self._blocked.add(job)
+                continue
+            # Another sweep may have trained some of it since the last look.
+            self._index.update()
+            if self._index.size != self._planned_with:
+                own.release()
+                self._plan_again()
+                return self._claim_next()
+            self._waiting.remove(job)
+            return job, own
+        return None
+
+    def _plan_again(self) -> None:
+        """Fits the waiting jobs to the runs that other sweeps have begun."""
+        self._planned_with = self._index.size
+        others = [job for job in self.jobs if job not in self._waiting]
+        self._waiting = plan(self._waiting, self._index.runs)
+        self.jobs = [*others, *self._waiting]
+
+    def _start(self, job: Job, own: Claim) -> None:
+        logs = _logs(job)
+        seeds = "-".join(str(config.seed) for config in job.configs)
+        stem = f"{job.configs[0].setup}_{job.method}_s{seeds}"
+        try:
+            job.log = Path(f"{free_name(logs, stem, ['.txt'])}.txt")
+            handle = self._executor.submit(Task(job.arguments, job.log, own.handles))
+        except OSError as error:
+            own.release()
+            raise UserError(f"output={job.output}: {error.strerror or error}") from None
+        self._running[job] = _Running(handle, own)
+        self._progress.begin(job)
+
+    def _look(self) -> None:
+        """Shows how far the jobs are, and removes those that have ended."""
+        if any(len(job.found) < len(job.configs) for job in self._running):
+            self._index.update()
+        for job, running in list(self._running.items()):
+            job.find_runs(self._index.runs)
+            self._progress.follow(job)
+            status = self._executor.poll(running.handle)
+            if status is not None:
+                del self._running[job]
+                running.claim.release()
+                self._end(job, status)
+
+    def _end(self, job: Job, status: int) -> None:
+        self._index.update()
+        job.find_runs(self._index.runs)
+        finished = job.finished
+        if not finished and not self._stopping:
+            job.failed = f"exit status {status}: {_last_line(job.log)} (log: {job.log})"
+        self._progress.end(job, job.failed or ("finished" if finished else "stopped"))
+
+    def _stop(self) -> None:
+        self._stopping = True
+        for running in self._running.values():
+            self._executor.cancel(running.handle)
+
+
+def _logs(job: Job) -> Path:
+    return job.output / "logs"
+
+
+def _last_line(log: Path) -> str:
+    lines = [line.strip() for line in log.read_text(errors="replace").splitlines()]
+    return next((line for line in reversed(lines) if line), "the log is empty")

@@ -1,0 +1,83 @@
+"""Checkpoints of a training: everything that a resumed run needs, in one file."""
+
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any
+
+from torch import Tensor
+
+from emberlink.envs.utils.errors import UserError
+from emberlink.trainers.runs import checkpoint_file
+
+from .non_finite import first_non_finite
+from .rollback import Rollbacks
+from .setup import TrainingSetup
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunState:
+    """The numbers of a run that go with the tensors of its setup."""
+
+    step: int
+    """steps of all environments"""
+    config: dict[str, Any]
+    """of the run"""
+    folders: list[str]
+    """names of the run folders, one per seed"""
+    sizes: list[dict[str, int]]
+    """bytes of each folder's files of lines"""
+    best: list[float | None]
+    """highest coverage of each seed so far, percent"""
+    seconds: float
+    """of training"""
+    rollbacks: dict[str, Any]
+    """see `Rollbacks`"""
+    tensors: int
+    """how many tensors the checkpoint holds"""
+
+
+def write(path: Path, run: RunState, tensors: dict[str, Tensor]) -> None:
+    """Writes a checkpoint whole or not at all.
+
+    Raises:
+        UserError: it cannot be written, such as to a full disk.
+    """
+    checkpoint_file.write(path, tensors, {"kind": "state", **asdict(run)})
+
+
+def read(path: Path) -> tuple[RunState, dict[str, Tensor]]:
+    """Returns the numbers and tensors of a checkpoint.
+
+    Raises:
+        UserError: it cannot be read, is damaged, or is no checkpoint of a training.
+    """
+    header, tensors = checkpoint_file.read(path)
+    if header is None or header.get("kind") != "state":
+        raise UserError(f"{path}: holds networks alone; nothing can be resumed from it")
+    try:
+        run = RunState(**{field.name: header[field.name] for field in fields(RunState)})
+    except KeyError as error:
+        raise UserError(f"{path}: a checkpoint of another version: it has no {error}") from None
+    if len(tensors) != run.tensors:
+        raise UserError(f"{path}: holds {len(tensors)} tensors; expected {run.tensors}")
+    return run, tensors
+
+
+def restore(
+    path: Path, setup: TrainingSetup, run: RunState, tensors: dict[str, Tensor]
+) -> Rollbacks:
+    """Puts a new setup where a checkpoint was made and returns the rollbacks until then.
+
+    Raises:
+        UserError: the tensors do not fit the setup, or hold NaN or Inf.
+    """
+    if name := first_non_finite(tensors):
+        raise UserError(f"{path}: {name} holds NaN or infinite numbers")
+    try:
+        setup.load_state_dict(tensors, run.step)
+        rollbacks = Rollbacks(**run.rollbacks)
+    except (ValueError, KeyError, RuntimeError, TypeError, IndexError) as error:
+        reason = " ".join(str(error).split())[:200]
+        raise UserError(f"{path}: does not fit this training: {reason}") from None
+    setup.learner.scale_lr(rollbacks.lr_scale)
+    return rollbacks

@@ -1,0 +1,215 @@
+"""Reports the first NaN or Inf in training, and leaves a dump that reproduces it."""
+
+import platform
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from importlib.metadata import version
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from emberlink.envs import keys
+from emberlink.envs.utils.errors import UserError
+from emberlink.envs.utils.publish import free_name
+from emberlink.trainers.learners.nan_guard import ROLLOUT
+from emberlink.trainers.learners.tensors import flatten, group, prefixed, unflatten
+from emberlink.trainers.runs import checkpoint_file
+from emberlink.trainers.runs.run_folder import RunFolder
+
+from .setup import TrainingSetup
+
+_PACKAGES = ("emberlink", "torch", "torchrl", "tensordict")
+_TENSORS = "tensors.safetensors"
+
+
+@dataclass(frozen=True)
+class NonFiniteReport:
+    """The first number in training that is not finite, and where it was."""
+
+    tensor: str
+    """such as "reward" or "gradient of critic.second.weight\""""
+    uav: int | None
+    """whose, counted from 0; None where it belongs to no single one"""
+    seed: int | None
+    """of whose team; likewise"""
+    environment: int | None
+    """of that seed, counted from 0; None for a loss or a gradient"""
+    step: int
+    """of the environments, counted through the run from 1"""
+    update: int | None
+    """counted through the run from 1; None for a number that was collected"""
+    value: str
+    """nan, inf, -inf, or a number whose square is too large"""
+
+    def __str__(self) -> str:
+        whose = "" if self.uav is None else f" of UAV {self.uav}"
+        whose += "" if self.seed is None else f", seed {self.seed}"
+        whose += "" if self.environment is None else f", environment {self.environment}"
+        when = f"step {self.step}" + ("" if self.update is None else f", update {self.update}")
+        return f"{self.tensor}{whose}{',' if whose else ''} is {self.value} at {when}"
+
+
+class NonFiniteError(UserError):
+    """A training cannot continue because a number is not finite.
+
+    Args:
+        message: one line.
+        report: which number.
+        dump: the folder that reproduces it; None where it could not be written.
+    """
+
+    def __init__(self, message: str, report: NonFiniteReport, dump: Path | None):
+        super().__init__(message)
+        self.report, self.dump = report, dump
+
+
+def report_of(setup: TrainingSetup) -> NonFiniteReport:
+    """Returns the number that a setup's guard has found."""
+    place, steps, updates = setup.guard.found()
+    if place == ROLLOUT:
+        return _in_rollout(setup, steps)
+    named = {f"{name}'s loss": value for name, value in setup.guard.losses.items()}
+    # From the last layer to the first, as gradients are computed.
+    gradients = list(setup.guard.gradients.items())[::-1]
+    named |= {f"gradient of {name}": value for name, value in gradients}
+    uavs = setup.config.env.num_uavs
+    for name, value in named.items():
+        if value.isfinite().all():
+            continue
+        row = int((~value.isfinite()).nonzero()[0])
+        of_uavs, of_seeds = len(value) == uavs * setup.teams, len(value) == setup.teams
+        team = row // uavs if of_uavs else row
+        return NonFiniteReport(
+            tensor=name,
+            uav=row % uavs if of_uavs else None,
+            seed=setup.seeds[team] if of_uavs or of_seeds else None,
+            environment=None,
+            step=steps,
+            update=updates + 1,
+            value=f"{float(value[row]):g}",
+        )
+    raise AssertionError("the guard has found a number that is finite")
+
+
+def _in_rollout(setup: TrainingSetup, steps: int) -> NonFiniteReport:
+    """Finds the first number of a rollout in the order of cause and effect."""
+    assert setup.guard.rollout is not None, "a rollout was recorded"
+    tensors = {
+        name.replace(f"{keys.AGENTS}.", ""): value
+        for name, value in flatten(setup.guard.rollout).items()
+        if value.is_floating_point()
+    }
+    order = ("observation", "action", "next.position", "next.reward")
+    for name in sorted(tensors, key=lambda name: order.index(name) if name in order else 9):
+        wrong = ~tensors[name].isfinite()
+        if not wrong.any():
+            if torch.linalg.vector_norm(tensors[name]).isfinite():
+                continue
+            wrong = tensors[name].abs() == tensors[name].abs().amax()
+        # Dimensions: environments, steps, UAVs. The earliest step comes first.
+        first = wrong.transpose(0, 1).nonzero()[0].tolist()
+        step, environment, uav = first[:3]
+        team, environment = divmod(environment, setup.config.num_envs)
+        value = tensors[name].transpose(0, 1)[tuple(first)]
+        text = f"{name} before the step" if name == "observation" else name.removeprefix("next.")
+        return NonFiniteReport(
+            tensor=text,
+            uav=uav,
+            seed=setup.seeds[team],
+            environment=environment,
+            step=steps + 1 + step,
+            update=None,
+            value=f"{float(value):g}",
+        )
+    raise AssertionError("the guard has found a number that is finite")
+
+
+def first_non_finite(state: Mapping[str, Tensor]) -> str | None:
+    """Returns the name of the first tensor of a setup's state that is not finite, if any."""
+    for name, value in state.items():
+        fires = "arrival_time" in name  # infinite where nothing burns, NaN in the margin
+        if not fires and value.is_floating_point() and not value.isfinite().all():
+            return name
+    return None
+
+
+def check_state(setup: TrainingSetup, state: Mapping[str, Tensor]) -> None:
+    """Checks that everything that is about to be saved is finite.
+
+    Raises:
+        NonFiniteError: a tensor is not; there is no dump of it.
+    """
+    if name := first_non_finite(state):
+        value = state[name]
+        bad = float(value[~value.isfinite()][0])
+        report = NonFiniteReport(name, None, None, None, setup.step, None, f"{bad:g}")
+        raise NonFiniteError(f"{report}; no checkpoint was made", report, None)
+
+
+def error_of(setup: TrainingSetup, run: RunFolder) -> NonFiniteError:
+    """Returns the error that ends a training, after its dump was written to a run folder."""
+    report = report_of(setup)
+    try:
+        dump = _write(setup, run, report)
+    except (OSError, UserError) as error:
+        return NonFiniteError(f"{report}; its dump cannot be written: {error}", report, None)
+    return NonFiniteError(f"{report}; what reproduces it is in {dump}", report, dump)
+
+
+def _write(setup: TrainingSetup, run: RunFolder, report: NonFiniteReport) -> Path:
+    """Writes the rollout or batch, the learner before the update, and the report."""
+    whole = free_name(run.path, f"divergence_step_{report.step}", ["", ".part"])
+    folder = whole.with_name(whole.name + ".part")
+    folder.mkdir()
+    place, steps, _ = setup.guard.found()
+    bad = setup.guard.rollout if place == ROLLOUT else setup.guard.batch
+    assert bad is not None, "what was found has been recorded"
+    learner = setup.learner.state_dict(transitions=False)
+    updates = setup.learner.updates if report.update is None else report.update - 1
+    header = {"kind": "divergence", "place": place, "steps": steps, "updates": updates}
+    content = prefixed(learner=learner, bad=flatten(bad))
+    checkpoint_file.write(folder / _TENSORS, content, header)
+    RunFolder(folder).write_config(setup.config)
+    about = {
+        "report": asdict(report),
+        "message": str(report),
+        "versions": {name: version(name) for name in _PACKAGES}
+        | {"python": platform.python_version(), "platform": platform.platform()},
+        "device": str(setup.config.device),
+    }
+    RunFolder(folder).write("report.json", about)
+    folder.rename(whole)
+    return whole
+
+
+def replay(dump: Path | str, device: str = "cpu") -> NonFiniteReport | None:
+    """Repeats the update of a dump, or checks its rollout again.
+
+    Args:
+        dump: a folder that a training has left.
+        device: where it is repeated.
+
+    Returns:
+        The number that is not finite; None where everything is finite this time.
+
+    Raises:
+        UserError: the folder holds no dump.
+    """
+    folder = Path(dump)
+    setup = TrainingSetup(RunFolder(folder).config(device=device))
+    header, content = checkpoint_file.read(folder / _TENSORS)
+    try:
+        assert header is not None
+        setup.learner.load_state_dict(group(content, "learner"))
+        setup.learner.updates = header["updates"]
+        setup.guard.start(header["steps"], header["updates"])
+        rollout = header["place"] == ROLLOUT
+        bad = unflatten(group(content, "bad"), 2 if rollout else 1, device)
+    except (AssertionError, KeyError, TypeError, ValueError) as error:
+        raise UserError(f"{folder}: not a dump of a divergence: {error}") from None
+    if rollout:
+        setup.guard.record_rollout(bad, bad.shape[1])
+    else:
+        setup.learner.update(bad)
+    return report_of(setup) if setup.guard.poll(wait=True) else None
