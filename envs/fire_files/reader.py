@@ -17,7 +17,7 @@ from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import printable
 
 from . import formats
-from .banks import MAX_CELLS, is_bank, read_bands, read_npy
+from .banks import MAX_CELLS, bank_horizon, is_bank, read_bands, read_npy
 from .config import FileFireConfig
 from .episode_crop import on_grid
 from .front_points import read_front_points
@@ -29,8 +29,7 @@ from .rasters import read_ascii, read_geotiff
 READER_VERSION = 4  # raise it whenever the same file gives another grid
 COPY_FILE = "fires.npz"
 """The file of a run folder that holds the run's own copy of its grids."""
-_MAX_COPY = 8 * MAX_CELLS + 1_000_000
-"""Bytes of that copy, unpacked: float32 of the cells of every set."""
+_MAX_COPY = 12 * MAX_CELLS + 1_000_000  # bytes of it, unpacked: float32 of the cells of every set
 _EVERY, _VALIDATION, _TEST = 5, 3, 4  # remainders of the numbers of validation and test fires
 
 
@@ -74,6 +73,7 @@ def _read(
         bank = read_bands(path)
     else:
         return [on_grid(_read_one(path, kind, config), config, grid, horizon)]
+    _check_horizon(path, config, horizon)
     fires: list[np.ndarray] = []
     for source in bank:
         try:
@@ -81,6 +81,17 @@ def _read(
         except UserError as error:
             raise UserError(f"fire {len(fires)}: {error}") from None
     return fires
+
+
+def _check_horizon(path: Path, config: FileFireConfig, horizon: int) -> None:
+    """Checks that a bank whose times stay steps was written for this horizon."""
+    written = bank_horizon(path)
+    in_steps = config.start is config.end is config.minutes_per_step is None
+    if in_steps and written not in (None, horizon):
+        raise UserError(
+            f"its fires are of {written} steps, env.horizon is {horizon}; expected "
+            f"env.horizon={written}, or fire.end={written} to stretch them over {horizon} steps"
+        )
 
 
 def _read_one(path: Path, kind: formats.Format, config: FileFireConfig) -> Source:

@@ -19,10 +19,10 @@ from emberlink.envs.fire_files.reader import COPY_FILE
 from emberlink.envs.utils.errors import UserError
 from emberlink.trainers.config.compose import to_values
 from emberlink.trainers.learners.base import ACTOR
+from emberlink.trainers.runs.seal import check_trained_with
 
 from . import checkpoint_file
 from .run_folder import RunFolder
-from .seal import check_trained_with
 
 PREFIX = "pretrained:"
 USUAL_SETUP = "tuned"
