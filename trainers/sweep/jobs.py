@@ -75,8 +75,8 @@ class Job:
 
     @property
     def state(self) -> str:
-        """The state in a word or two: finished, stopped or new."""
-        return "finished" if self.finished else "stopped" if self.found else "new"
+        """The state in a word or two: finished, unfinished or new."""
+        return "finished" if self.finished else "unfinished" if self.found else "new"
 
     @property
     def identities(self) -> set[Identity]:
