@@ -38,9 +38,10 @@ bench: $(INSTALLED)  ## run the benchmarks (about half an hour; BENCH="-k update
 guard: $(INSTALLED)  ## check that nothing has become slower (a few seconds)
 	@$(BIN)/python tests/benchmarks/guard.py
 
-lint: $(INSTALLED)  ## check style and layout
+lint: $(INSTALLED)  ## check style, layout and the direction of imports
 	@$(BIN)/ruff check .
 	@$(BIN)/ruff format --check .
+	@PYTHONPATH=.typing $(BIN)/lint-imports
 
 typecheck: $(INSTALLED)  ## check the types
 	@$(BIN)/basedpyright --pythonpath $(BIN)/python

@@ -1,87 +1,149 @@
-"""What a communication module is, and the adaptor that puts one on an environment."""
+"""The base class of communication modules, and the transform that adds one to an environment."""
 
 from typing import Any, ClassVar
 
+import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
-from torchrl.data import Composite
+from torchrl.data import Binary, Composite
 from torchrl.envs import Transform
 
 from emberlink.envs import keys
 from emberlink.envs.config import WildfireConfig
 from emberlink.envs.utils.buffers import Buffers
+from emberlink.envs.utils.errors import UserError
+
+from ._radio import Radio, RadioConfig
 
 
 class CommModule(Buffers, TensorDictModuleBase):
-    """Rewrites the UAVs' observations from what they can hear of each other.
+    """Rewrites the UAVs' observations from what they hear of each other.
 
-    A subclass in a file of its own, `comm/<name>.py`, is a new way to communicate: its file name
-    is its name. It keeps no state of its own; what it must remember from step to step it writes
-    under `memory_keys`, and finds it there at the next step.
+    A subclass in its own file, `comm/<name>.py`, is a new communication method; the file name is
+    its name.
+
+    A module keeps its state, such as a map per UAV, in buffers of shape [num_envs, ...], which
+    `forward` and `reset` write in place (`self.map.copy_(...)`). Buffers are saved with a
+    checkpoint and must hold finite numbers. Constants are registered with `persistent=False`.
+
+    Where `config` inherits from `RadioConfig`, or where a subclass sets `radio`, the links of each
+    step stand under `keys.HEARS` before `shaping` and `forward` are called.
 
     Args:
         world: the environment's constants.
         config: an instance of `config_type`.
+        num_envs: environments that run side by side.
     """
 
     config_type: ClassVar[type]
-    """a pydantic dataclass: the settings that stand under `comm` in a recipe's YAML"""
-    memory_keys: ClassVar[tuple[tuple[str, str], ...]] = ()
-    """what is handed from one step to the next; all of it is in `specs`"""
+    """a pydantic dataclass: the settings under `comm` in a method's YAML file"""
 
-    def __init__(self, world: WildfireConfig, config: Any):
+    def __init__(self, world: WildfireConfig, config: Any, num_envs: int = 1):
         super().__init__()
-        self.world, self.config = world, config
-        own: list[Any] = [keys.OBSERVATION]
-        self.in_keys, self.out_keys = own, own
+        self.world, self.config, self.num_envs = world, config, num_envs
+        self.radio = Radio(config) if isinstance(config, RadioConfig) else None
+        default: list[Any] = [keys.OBSERVATION]
+        self.in_keys = getattr(self, "_in_keys", default)  # those of the class, if it has some
+        self.out_keys = getattr(self, "_out_keys", default)
 
     def specs(self, observation: Composite) -> Composite:
-        """The observation spec of the environment with everything that `forward` writes."""
+        """Returns the environment's observation spec with everything that `forward` writes."""
         return observation
 
-    def start(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes the memory that an episode begins with."""
-        return tensordict
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Rewrites ("agents", "observation"), and the memory, of one moment."""
-        raise NotImplementedError
-
-    def shaping(self, before: TensorDictBase, after: TensorDictBase) -> Tensor | None:
-        """What is added to the reward of the step between two moments, float32 [..., n], if any.
+    def reset(self, tensordict: TensorDictBase, mask: Tensor) -> None:
+        """Starts the state of new episodes; called before the first `forward` of an episode.
 
         Args:
-            before: the moment on which the UAVs acted, as rewritten.
-            after: the moment after the step, not yet rewritten.
+            tensordict: the first time step of the new episodes, as the environment wrote it.
+            mask: bool [num_envs], the environments that begin a new episode. The state of the
+                others must not change.
+        """
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Rewrites ("agents", "observation") of one time step and updates the state."""
+        raise NotImplementedError
+
+    def shaping(self, tensordict: TensorDictBase) -> Tensor | None:
+        """Returns the term that is added to the reward of a step, float32 [num_envs, n], if any.
+
+        It is called before `forward`; the state is that of the time step before.
+
+        Args:
+            tensordict: the time step after the move, not yet rewritten.
         """
         return None
 
 
 class Communication(Transform):
-    """Puts a communication module on an environment.
+    """Adds a communication module to an environment.
 
-    A transform and no part of the policy, so that the next observation, from which the value is
-    bootstrapped, is rewritten exactly as the first is.
+    It is a transform and not part of the policy, so that the next observation of a transition is
+    rewritten exactly as the first one is. It reads nothing from the time step before: the memory
+    is in the module.
+
+    Args:
+        module: the communication module, made for as many environments.
     """
 
     def __init__(self, module: CommModule):
         super().__init__()
         self.module = module
+        for name, buffer in module.state_dict().items():
+            if buffer.shape[:1] != (module.num_envs,):
+                raise ValueError(
+                    f"{type(module).__name__}: buffer {name!r} of shape {list(buffer.shape)}; the "
+                    f"first dimension of state must be num_envs={module.num_envs} (register "
+                    "constants with persistent=False)"
+                )
 
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
-        return self.module(self.module.start(tensordict_reset))
+        self._check_keys(tensordict_reset)
+        mask = tensordict.get("_reset", None)
+        if mask is None:
+            everywhere = torch.ones(
+                self.module.num_envs, dtype=torch.bool, device=tensordict_reset.device
+            )
+            self.module.reset(tensordict_reset, everywhere)
+            return self._communicate(tensordict_reset)
+        mask = mask.flatten()
+        self.module.reset(tensordict_reset, mask)
+        state = self.module.state_dict()
+        before = {name: buffer.clone() for name, buffer in state.items()}
+        result = self._communicate(tensordict_reset)
+        # For the other environments the time step is no new one: their state stays.
+        for name, buffer in state.items():
+            began = mask.view(-1, *[1] * (buffer.ndim - 1))
+            buffer.copy_(torch.where(began, buffer, before[name]))
+        return result
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        bonus = self.module.shaping(tensordict, next_tensordict)
+        bonus = self.module.shaping(next_tensordict)
         if bonus is not None:
             reward = next_tensordict.get(keys.REWARD) + bonus.unsqueeze(-1)
             next_tensordict.set(keys.REWARD, reward)
-        for key in self.module.memory_keys:
-            next_tensordict.set(key, tensordict.get(key))
-        return self.module(next_tensordict)
+        return self._communicate(next_tensordict)
+
+    def _communicate(self, tensordict: TensorDictBase) -> TensorDictBase:
+        if self.module.radio is not None:
+            tensordict.set(keys.HEARS, self.module.radio.links(tensordict))
+        return self.module(tensordict)
+
+    def _check_keys(self, tensordict: TensorDictBase) -> None:
+        """Checks that the environment, with the transforms before this one, gives every input."""
+        for key in self.module.in_keys:
+            if key != keys.HEARS and tensordict.get(key, None) is None:
+                raise UserError(
+                    f"key {key} is missing: {type(self.module).__name__} reads it, and the "
+                    "environment or a transform before the communication does not give it"
+                )
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        return self.module.specs(observation_spec.clone())
+        spec = observation_spec.clone()
+        if self.module.radio is not None:
+            *batch, uavs = spec[keys.AGENTS].shape
+            shape = torch.Size((*batch, uavs, uavs))
+            spec[keys.HEARS] = Binary(shape=shape, device=spec.device, dtype=torch.bool)
+        return self.module.specs(spec)

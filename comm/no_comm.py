@@ -10,14 +10,14 @@ from .base import CommModule
 
 
 @dataclass(frozen=True, kw_only=True, config=ConfigDict(extra="forbid", strict=True))
-class SilentConfig:
-    """There is nothing to set."""
+class NoCommConfig:
+    """No settings."""
 
 
 class NoComm(CommModule):
     """Leaves every UAV with its own 6 numbers (paper, section IV.C)."""
 
-    config_type: ClassVar[type] = SilentConfig
+    config_type: ClassVar[type] = NoCommConfig
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         return tensordict

@@ -1,5 +1,6 @@
 """Everyone hears everyone: method 3 of the paper (section IV.E, algorithm 2)."""
 
+import math
 from typing import ClassVar
 
 import torch
@@ -9,23 +10,29 @@ from tensordict import TensorDictBase
 from torchrl.data import Composite, Unbounded
 
 from emberlink.envs import keys
+from emberlink.envs.config import WildfireConfig
 
+from ._radio import Radio, RadioConfig
 from .base import CommModule
 
 
 @dataclass(frozen=True, kw_only=True, config=ConfigDict(extra="forbid", strict=True))
 class PositionalConfig:
-    """There is nothing to set."""
+    """No settings."""
 
 
 class Positional(CommModule):
     """Gives every UAV the concatenation of all UAVs' vectors, UAV 0 first: 6 n numbers.
 
-    The order is the same for all, as in algorithm 2: a UAV tells its own place by its networks,
-    which are its own.
+    The order is the same for all UAVs, as in algorithm 2. Only the weights of a UAV's networks
+    distinguish its own numbers from those of the others.
     """
 
     config_type: ClassVar[type] = PositionalConfig
+
+    def __init__(self, world: WildfireConfig, config: PositionalConfig, num_envs: int = 1):
+        super().__init__(world, config, num_envs)
+        self.radio = Radio(RadioConfig(range=math.inf))
 
     def specs(self, observation: Composite) -> Composite:
         *batch, uavs, features = observation[keys.OBSERVATION].shape

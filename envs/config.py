@@ -51,6 +51,8 @@ class WildfireConfig:
     """half the opening angle of the camera, degrees"""
     displacement: Annotated[float, Field(gt=0, le=256)] = 1.0
     """cells per unit of action"""
+    observation: Literal["vector", "window"] = "vector"
+    """six numbers per UAV, or also the classes of the cells in view (see `keys.WINDOW`)"""
     observation_scale: Literal["raw", "box"] = "raw"
     """cells and steps as they are, or scaled: the box to [-1, 1], the horizon to [0, 1]"""
     reward: RewardConfig = RewardConfig()

@@ -84,7 +84,7 @@ def episode_metrics(steps: TensorDictBase) -> dict[str, Tensor]:
     reward = steps[keys.REWARD].squeeze(-1)
     seen, burning = steps[keys.SEEN], steps[keys.BURNING]
     on_fire = steps[keys.NEW_FIRE] + steps[keys.OLD_FIRE] > 0
-    left = steps.get(keys.BEYOND).any(-1)
+    left = steps.get(keys.HIT_BOUNDARY).any(-1)
     return {
         "mean_reward": mean_reward(reward),
         "coverage": coverage(seen, burning),
@@ -103,7 +103,7 @@ STEP_KEYS = (
     keys.BURNING,
     keys.NEW_FIRE,
     keys.OLD_FIRE,
-    keys.BEYOND,
+    keys.HIT_BOUNDARY,
 )
 """The keys that `episode_metrics` reads."""
 

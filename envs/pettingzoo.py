@@ -10,11 +10,11 @@ from pettingzoo import ParallelEnv
 from tensordict import TensorDictBase
 from torchrl.envs import EnvBase, TransformedEnv, step_mdp
 
+from emberlink.envs.config import WildfireConfig
 from emberlink.envs.rendering.frame import Window
 from emberlink.envs.utils.errors import UserError
 
 from . import keys
-from .config import WildfireConfig
 from .wildfire import WildfireEnv
 
 Array = NDArray[np.float32]

@@ -8,6 +8,7 @@ import torch
 from pydantic import Discriminator, Tag
 from torch import Tensor
 
+from emberlink.envs.config import WildfireConfig
 from emberlink.envs.fire.cache import fire_bank
 from emberlink.envs.fire.generator import FireConfig, fire_seeds, load_scenario, make_fires
 from emberlink.envs.fire_files import reader
@@ -15,28 +16,34 @@ from emberlink.envs.fire_files.reader import FileFireConfig
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import TAG
 
-from .config import WildfireConfig
-
 Grid = tuple[int, int]
 
 
 class Fires(Protocol):
-    """The fires of a scenario."""
+    """The fires of a scenario, in three sets: `train`, `validation` and `test`.
+
+    The validation fires choose among the checkpoints of a training, the test fires measure its
+    result. Generated fires of different sets never have a seed in common.
+    """
 
     def train(self, grid: Grid, horizon: int) -> Tensor:
-        """Those to train on: arrival times in steps, float32 [fires, X, Y]."""
+        """Returns the training fires: arrival times in steps, float32 [fires, X, Y]."""
         ...
 
-    def heldout(self, count: int, grid: Grid, horizon: int) -> Tensor:
-        """The first held-out ones, float32 [count, X, Y]; where there are fewer, they repeat."""
+    def validation(self, count: int, grid: Grid, horizon: int) -> Tensor:
+        """Returns the first validation fires, float32 [count, X, Y]; fewer are repeated."""
         ...
 
-    def one_heldout(self, index: int, grid: Grid, horizon: int) -> Tensor:
-        """One of them, float32 [1, X, Y]."""
+    def test(self, count: int, grid: Grid, horizon: int) -> Tensor:
+        """Returns the first test fires, float32 [count, X, Y]; fewer are repeated."""
+        ...
+
+    def test_fire(self, index: int, grid: Grid, horizon: int) -> Tensor:
+        """Returns the test fire of that index, float32 [1, X, Y]."""
         ...
 
     def about(self, count: int) -> dict[str, Any]:
-        """What tells the first held-out fires from any others, plain values."""
+        """Returns plain values that identify the first `count` test fires."""
         ...
 
     def pinned(self) -> "ScenarioConfig":
@@ -62,17 +69,21 @@ class Generated:
         """See `Fires`."""
         return fire_bank(self.config, "train", self.config.num_train_fires, grid, horizon)
 
-    def heldout(self, count: int, grid: Grid, horizon: int) -> Tensor:
+    def validation(self, count: int, grid: Grid, horizon: int) -> Tensor:
         """See `Fires`."""
-        return fire_bank(self.config, "heldout", count, grid, horizon)
+        return fire_bank(self.config, "validation", count, grid, horizon)
 
-    def one_heldout(self, index: int, grid: Grid, horizon: int) -> Tensor:
+    def test(self, count: int, grid: Grid, horizon: int) -> Tensor:
         """See `Fires`."""
-        return make_fires(self.config, fire_seeds("heldout", index + 1)[index:], grid, horizon)
+        return fire_bank(self.config, "test", count, grid, horizon)
+
+    def test_fire(self, index: int, grid: Grid, horizon: int) -> Tensor:
+        """See `Fires`."""
+        return make_fires(self.config, fire_seeds("test", index + 1)[index:], grid, horizon)
 
     def about(self, count: int) -> dict[str, Any]:
         """Their seeds."""
-        seeds = fire_seeds("heldout", count).tolist()
+        seeds = fire_seeds("test", count).tolist()
         # Not what is as by default: a field that is new makes no other fires of the old ones.
         scenario = {
             field.name: getattr(self.config, field.name)
@@ -104,14 +115,19 @@ class FromFile:
         """See `Fires`."""
         return reader.splits(self.config, grid, horizon)["train"]
 
-    def heldout(self, count: int, grid: Grid, horizon: int) -> Tensor:
+    def validation(self, count: int, grid: Grid, horizon: int) -> Tensor:
         """See `Fires`."""
-        fires = reader.splits(self.config, grid, horizon)["heldout"]
+        fires = reader.splits(self.config, grid, horizon)["validation"]
         return fires[torch.arange(count) % len(fires)]
 
-    def one_heldout(self, index: int, grid: Grid, horizon: int) -> Tensor:
+    def test(self, count: int, grid: Grid, horizon: int) -> Tensor:
         """See `Fires`."""
-        return self.heldout(index + 1, grid, horizon)[index:]
+        fires = reader.splits(self.config, grid, horizon)["test"]
+        return fires[torch.arange(count) % len(fires)]
+
+    def test_fire(self, index: int, grid: Grid, horizon: int) -> Tensor:
+        """See `Fires`."""
+        return self.test(index + 1, grid, horizon)[index:]
 
     def about(self, count: int) -> dict[str, Any]:
         """How many, and of which content."""

@@ -1,13 +1,19 @@
 """What the environment reads and writes, as TorchRL specs."""
 
 import torch
-from torchrl.data import Binary, Bounded, Composite, Unbounded
+from torchrl.data import Binary, Bounded, Composite, TensorSpec, Unbounded
 
 from . import keys
 
 
-def observation_spec(envs: int, uavs: int) -> Composite:
-    """Everything that a moment holds but reward and done, batch size [envs]; see `keys`."""
+def observation_spec(envs: int, uavs: int, window: int | None = None) -> Composite:
+    """Everything that a moment holds but reward and done, batch size [envs]; see `keys`.
+
+    Args:
+        envs: environments.
+        uavs: UAVs in each.
+        window: cells along a side of the window that is observed; None without it.
+    """
     agents = (envs, uavs)
 
     def real(*shape: int) -> Unbounded:
@@ -16,7 +22,7 @@ def observation_spec(envs: int, uavs: int) -> Composite:
     def whole(*shape: int) -> Unbounded:
         return Unbounded(torch.Size(shape), dtype=torch.int64)
 
-    per_uav = {
+    per_uav: dict[str, TensorSpec] = {
         keys.OBSERVATION[1]: real(*agents, len(keys.FEATURES)),
         keys.POSITION[1]: real(*agents, 3),
         keys.NEW_FIRE[1]: whole(*agents),
@@ -24,9 +30,12 @@ def observation_spec(envs: int, uavs: int) -> Composite:
         keys.NO_FIRE[1]: whole(*agents),
         keys.NEW_CENTRE[1]: real(*agents, 2),
         keys.OLD_CENTRE[1]: real(*agents, 2),
-        keys.BEYOND[1]: Binary(shape=torch.Size((*agents, 3)), dtype=torch.bool),
+        keys.HIT_BOUNDARY[1]: Binary(shape=torch.Size((*agents, 3)), dtype=torch.bool),
     }
-    per_env = {key: whole(envs) for key in (keys.STREAM, keys.STEP, keys.SEEN, keys.BURNING)}
+    if window is not None:
+        shape = torch.Size((*agents, 3, window, window))
+        per_uav[keys.WINDOW[1]] = Binary(shape=shape, dtype=torch.bool)
+    per_env = {key: whole(envs) for key in (keys.RNG_KEY, keys.STEP, keys.SEEN, keys.BURNING)}
     return Composite({keys.AGENTS: Composite(per_uav, shape=agents), **per_env}, shape=(envs,))
 
 

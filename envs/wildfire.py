@@ -7,20 +7,19 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
+from emberlink.envs.config import WildfireConfig
 from emberlink.envs.rendering import frame
 from emberlink.envs.utils import counter_rng
 from emberlink.envs.utils.buffers import Buffers
+from emberlink.envs.utils.counter_rng import Use
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.world import motion
-from emberlink.envs.world.coverage_map import Discovery
+from emberlink.envs.world.coverage_map import CoverageMap
 from emberlink.envs.world.reward import view_reward
-from emberlink.envs.world.sensor import View
+from emberlink.envs.world.sensor import Sensor
 
 from . import keys, specs
-from .config import WildfireConfig
 from .scenarios import ScenarioConfig, arrival_times
-
-_POSITIONS, _FIRE, _STEPS = range(3)  # what an episode's random stream is split into
 
 
 class WildfireEnv(Buffers, EnvBase):
@@ -44,10 +43,10 @@ class WildfireEnv(Buffers, EnvBase):
 
     _low: Tensor
     _high: Tensor
-    _seed_stream: Tensor
+    _seed_key: Tensor
     _episode: Tensor
-    _stream: Tensor
-    _step_stream: Tensor
+    _episode_key: Tensor
+    _step_key: Tensor
     _time: Tensor
     _position: Tensor
     _seen: Tensor
@@ -76,35 +75,36 @@ class WildfireEnv(Buffers, EnvBase):
         low, high = motion.corners(config.low, config.high)
         self.register_buffer("_low", low, persistent=False)
         self.register_buffer("_high", high, persistent=False)
-        view = View(config.grid, view_angle=config.view_angle, ceiling=high[2].item())
+        sensor = Sensor(config.grid, view_angle=config.view_angle, ceiling=high[2].item())
         fires, self._fire_each = arrival_times(fire, config, num_envs)
-        self._map = Discovery(
-            view, fires, horizon=config.horizon, envs=num_envs, uavs=config.num_uavs
+        self._map = CoverageMap(
+            sensor, fires, horizon=config.horizon, envs=num_envs, uavs=config.num_uavs
         )
-        for name in ("_seed_stream", "_episode", "_stream", "_step_stream", "_time", "_seen"):
+        for name in ("_seed_key", "_episode", "_episode_key", "_step_key", "_time", "_seen"):
             self.register_buffer(name, torch.zeros(num_envs, dtype=torch.int64))
         position = torch.zeros(num_envs, config.num_uavs, 3, dtype=torch.float64)
         self.register_buffer("_position", position)
         team = num_envs, config.num_uavs
-        self.observation_spec = specs.observation_spec(*team)
+        self._side = sensor.side if config.observation == "window" else None
+        self.observation_spec = specs.observation_spec(*team, self._side)
         self.action_spec = specs.action_spec(*team)
         self.reward_spec = specs.reward_spec(*team)
         self.done_spec = specs.done_spec(num_envs)
         self.to(self.device)
         self.set_seed(seeds[0])
-        each = [counter_rng.streams(one, num_envs // len(seeds), self.device) for one in seeds]
-        self._seed_stream.copy_(torch.cat(each))
+        each = [counter_rng.seed_keys(one, num_envs // len(seeds), self.device) for one in seeds]
+        self._seed_key.copy_(torch.cat(each))
 
     @property
     def fire_map(self) -> Tensor:
         """The paper's map, uint8 [num_envs, X, Y]: 0 no fire, 1 seen, 2 not yet seen."""
-        burning = self.arrival <= self._time[:, None, None]
+        burning = self.arrival_time <= self._time[:, None, None]
         return burning.to(torch.uint8) * (2 - self._map.seen.to(torch.uint8))
 
     @property
-    def arrival(self) -> Tensor:
+    def arrival_time(self) -> Tensor:
         """The fire of each environment: arrival times in steps, float32 [num_envs, X, Y]."""
-        return self._map.arrival
+        return self._map.arrival_time
 
     def render(self, mode: str = "rgb_array", *, env: int = 0):
         """A picture of one environment in the paper's colours, uint8 [height, width, 3].
@@ -122,7 +122,7 @@ class WildfireEnv(Buffers, EnvBase):
 
     def _set_seed(self, seed: int | None) -> None:
         count = self.batch_size[0]
-        self._seed_stream.copy_(counter_rng.streams(seed or 0, count, self.device))
+        self._seed_key.copy_(counter_rng.seed_keys(seed or 0, count, self.device))
         self._episode.zero_()
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs) -> TensorDictBase:
@@ -141,28 +141,37 @@ class WildfireEnv(Buffers, EnvBase):
         nothing = torch.zeros_like(self._position, dtype=torch.int64)
         nowhere = nothing.new_zeros((*nothing.shape, 2), dtype=torch.float32)
         inside = torch.zeros_like(nothing, dtype=torch.bool)
-        return self._snapshot(self._position.float(), nothing, nowhere, inside)
+        return self._snapshot(self._position.float(), nothing, nowhere, inside, self._unseen())
+
+    def _unseen(self) -> Tensor | None:
+        """Returns the window of UAVs that have not looked: bool [num_envs, n, 3, W, W], False."""
+        if self._side is None:
+            return None
+        shape = *self._position.shape, self._side, self._side
+        return torch.zeros(shape, dtype=torch.bool, device=self.device)
 
     def _begin_episodes(self, mask: Tensor) -> None:
-        """The next episode, bool [num_envs] says where: its stream, its fire, nothing seen."""
+        """Starts the next episode where a mask, bool [num_envs], is true."""
         self._episode.add_(mask)
-        self._stream.copy_(counter_rng.fold(self._seed_stream, self._episode))
-        self._step_stream.copy_(counter_rng.fold(self._stream, _STEPS))
+        self._episode_key.copy_(counter_rng.fold_in(self._seed_key, self._episode))
+        self._step_key.copy_(counter_rng.fold_in(self._episode_key, Use.STEPS))
         self._time.masked_fill_(mask, 0)
         self._seen.masked_fill_(mask, 0)
-        self._map.begin(mask, self._draw_fire())
+        self._map.start_episodes(mask, self._draw_fire())
 
     def _draw_fire(self) -> Tensor:
         envs, fires = self.batch_size[0], len(self._map)
         if self._fire_each:
             return torch.arange(envs, device=self.device) % fires
-        unit = counter_rng.uniform(counter_rng.fold(self._stream, _FIRE), 1).squeeze(-1)
+        unit = counter_rng.uniform(
+            counter_rng.fold_in(self._episode_key, Use.EPISODE_FIRE), 1
+        ).squeeze(-1)
         return (unit.double() * fires).long()
 
     def _start_positions(self, given: Tensor | None) -> Tensor:
         if given is None:
-            stream = counter_rng.fold(self._stream, _POSITIONS)
-            return motion.random_points(stream, self.config.num_uavs, self._low, self._high)
+            key = counter_rng.fold_in(self._episode_key, Use.START_POSITION)
+            return motion.random_points(key, self.config.num_uavs, self._low, self._high)
         given = torch.as_tensor(given, dtype=torch.float32, device=self.device)
         outside = (given < self._low) | (given > self._high)
         if given.shape[-2:] != self._position.shape[-2:] or outside.any() or given.isnan().any():
@@ -176,7 +185,7 @@ class WildfireEnv(Buffers, EnvBase):
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         config = self.config
         self._time.add_(1)
-        position, beyond = motion.move(
+        position, hit_boundary = motion.move(
             self._position,
             tensordict.get(keys.ACTION),
             displacement=config.displacement,
@@ -184,11 +193,12 @@ class WildfireEnv(Buffers, EnvBase):
             high=self._high,
         )
         self._position.copy_(position)
-        counts, centres = self._map.look(self._position, self._time.float())
-        reward = view_reward(*counts.unbind(-1), beyond=beyond, config=config.reward)
+        counts, centres, classes = self._map.look(self._position, self._time.float())
+        window = None if self._side is None else classes.unflatten(-1, (self._side, self._side))
+        reward = view_reward(*counts.unbind(-1), hit_boundary=hit_boundary, config=config.reward)
         counts = counts.long()
         self._seen.add_(counts[..., 0].sum(-1))
-        return self._snapshot(position, counts, centres, beyond, reward)
+        return self._snapshot(position, counts, centres, hit_boundary, window, reward)
 
     def _step_proc_data(self, next_tensordict_out: TensorDictBase) -> TensorDictBase:
         """TorchRL completes here what a step has left out; ours leaves nothing out."""
@@ -199,7 +209,8 @@ class WildfireEnv(Buffers, EnvBase):
         position: Tensor,
         counts: Tensor,
         centres: Tensor,
-        beyond: Tensor,
+        hit_boundary: Tensor,
+        window: Tensor | None = None,
         reward: Tensor | None = None,
     ) -> TensorDict:
         """The TensorDict of a moment.
@@ -208,7 +219,8 @@ class WildfireEnv(Buffers, EnvBase):
             position: float32 [num_envs, n, 3].
             counts: int64 [num_envs, n, 3], cells in view that are new, old and no fire.
             centres: float32 [num_envs, n, 3, 2], their means.
-            beyond: bool [num_envs, n, 3].
+            hit_boundary: bool [num_envs, n, 3].
+            window: bool [num_envs, n, 3, W, W]; None where it is not observed.
             reward: float32 [num_envs, n]; a reset has none.
         """
         time = self._time.clone()
@@ -222,17 +234,19 @@ class WildfireEnv(Buffers, EnvBase):
             keys.NO_FIRE[1]: none,
             keys.NEW_CENTRE[1]: new_centre,
             keys.OLD_CENTRE[1]: old_centre,
-            keys.BEYOND[1]: beyond,
+            keys.HIT_BOUNDARY[1]: hit_boundary,
         }
+        if window is not None:
+            agents[keys.WINDOW[1]] = window
         if reward is not None:
             agents[keys.REWARD[1]] = reward.unsqueeze(-1)
         truncated = (time >= self.config.horizon).unsqueeze(-1)
         whole = {
             keys.AGENTS: _tensordict(agents, position.shape[:-1], self.device),
-            keys.STREAM: self._step_stream.clone(),
+            keys.RNG_KEY: self._step_key.clone(),
             keys.STEP: time,
             keys.SEEN: self._seen.clone(),
-            keys.BURNING: self._map.burning(time),
+            keys.BURNING: self._map.count_burning(time),
             "done": truncated,
             "terminated": torch.zeros_like(truncated),
             "truncated": truncated.clone(),

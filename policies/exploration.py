@@ -10,11 +10,10 @@ from torchrl.envs.utils import ExplorationType, exploration_type
 
 from emberlink.envs import keys
 from emberlink.envs.utils import counter_rng
+from emberlink.envs.utils.counter_rng import Use
 
 NOISE = (keys.AGENTS, "noise")
 """float32 [..., 3]: the process, carried from step to step."""
-
-_SHOCKS = 300  # what a moment's random stream is used for
 
 
 class OrnsteinUhlenbeck(TensorDictModuleBase):
@@ -35,7 +34,7 @@ class OrnsteinUhlenbeck(TensorDictModuleBase):
     def __init__(self, *, theta: float, sigma: float, dt: float):
         super().__init__()
         self.keep, self.shock = 1 - theta * dt, sigma * math.sqrt(dt)
-        reads: list[Any] = [keys.ACTION, keys.STREAM, keys.STEP]
+        reads: list[Any] = [keys.ACTION, keys.RNG_KEY, keys.STEP]
         writes: list[Any] = [keys.ACTION, NOISE]
         self.in_keys, self.out_keys = reads, writes
 
@@ -43,7 +42,7 @@ class OrnsteinUhlenbeck(TensorDictModuleBase):
         if exploration_type() not in (None, ExplorationType.RANDOM):
             return tensordict
         action, step = tensordict.get(keys.ACTION), tensordict.get(keys.STEP)
-        moment = counter_rng.at(tensordict.get(keys.STREAM), step, _SHOCKS)
+        moment = counter_rng.step_key(tensordict.get(keys.RNG_KEY), step, Use.EXPLORATION_NOISE)
         normal = counter_rng.normal(moment, action.shape[-2] * action.shape[-1]).view_as(action)
         before = tensordict.get(NOISE, None)
         if before is None:

@@ -1,12 +1,21 @@
-"""Moments of an environment made by hand."""
+"""Time steps of an environment made by hand, and the consensus on them."""
+
+from dataclasses import replace
 
 import torch
 from tensordict import TensorDict
 
+from emberlink.comm.base import Communication
+from emberlink.comm.consensus import Consensus, ConsensusConfig
 from emberlink.envs import keys
+from emberlink.envs.config import WildfireConfig
+
+WORLD = WildfireConfig(grid=(64, 64))
 
 
-def moment(position, new, old=None, *, centre=None, old_centre=None, beyond=None, step=0, seed=1):
+def moment(
+    position, new, old=None, *, centre=None, old_centre=None, hit_boundary=None, step=0, seed=1
+):
     """What the environment writes; lists per UAV, or per environment and UAV."""
     position = torch.as_tensor(position, dtype=torch.float32)
     position = position.unsqueeze(0) if position.ndim == 2 else position
@@ -25,10 +34,17 @@ def moment(position, new, old=None, *, centre=None, old_centre=None, beyond=None
             keys.OLD_FIRE: of_uavs(old, dtype=torch.int64),
             keys.NEW_CENTRE: of_uavs(centre, 2),
             keys.OLD_CENTRE: of_uavs(old_centre, 2),
-            keys.BEYOND: of_uavs(beyond, 3, dtype=torch.bool),
+            keys.HIT_BOUNDARY: of_uavs(hit_boundary, 3, dtype=torch.bool),
             keys.REWARD: torch.zeros(envs, uavs, 1),
-            keys.STREAM: torch.arange(envs) + seed,
+            keys.RNG_KEY: torch.arange(envs) + seed,
             keys.STEP: torch.full((envs,), step),
         },
         batch_size=[envs],
     )
+
+
+def communication(now: TensorDict, config=None, world=WORLD) -> Communication:
+    """Returns the consensus for as many environments and UAVs as a time step has."""
+    envs, uavs = now[keys.POSITION].shape[:2]
+    module = Consensus(replace(world, num_uavs=uavs), config or ConsensusConfig(), envs)
+    return Communication(module)

@@ -6,12 +6,8 @@ from collections.abc import Iterator
 import torch
 from torch import Tensor, nn
 
-from emberlink.policies.networks.stacked import (
-    StackedActor,
-    StackedCritic,
-    StackedLayerNorm,
-    StackedLinear,
-)
+from emberlink.policies.networks.layers import StackedLayerNorm, StackedLinear
+from emberlink.policies.networks.stacked import StackedActor, StackedCritic
 
 
 class SingleActor(nn.Module):
@@ -48,7 +44,10 @@ def matched(
     stack: StackedActor | StackedCritic, single: nn.Module, uav: int
 ) -> Iterator[tuple[str, Tensor, Tensor]]:
     """Name, the UAV's slice of the stack, and the single network's parameter of that shape."""
+    assert not list(stack.encoder.parameters())  # of a vector
     for name, layer in stack.named_children():
+        if name == "encoder":
+            continue
         assert isinstance(layer, StackedLinear | StackedLayerNorm)
         own = single.get_submodule(name)
         weight = layer.weight[uav]

@@ -41,7 +41,10 @@ SETUPS = "known: paper, released, tuned"
         ([""], ["''", METHODS]),
         (["consensus", "learner.gama=0.9"], ["'learner.gama'", "did you mean learner.gamma?"]),
         (["consensus", "horizon=10"], ["'horizon'", "did you mean env.horizon?"]),
-        (["independent", "comm.range=5"], ["'comm.range'"]),
+        (
+            ["independent", "comm.range=5"],
+            ["'comm.range'", "a setting of method consensus, not of independent"],
+        ),
         (["consensus", "zzz=1"], ["'zzz'", "known: setup, fire, env", "num_envs"]),
         (["consensus", "method=independent"], ["'method'"]),
         (["consensus", "setup=papr"], ["setup 'papr'", "did you mean paper?", SETUPS]),
@@ -69,9 +72,9 @@ SETUPS = "known: paper, released, tuned"
         (["consensus", "comm.heading.form=cubic"], ["comm.heading.form=cubic", "'folded_linear'"]),
         (
             ["consensus", "comm.name=telepathy"],
-            ["comm.name='telepathy'", "known: consensus, positional, no_comm"],
+            ["comm.name='telepathy'", "known: consensus, no_comm, positional"],
         ),
-        (["consensus", "comm.name=no_comm"], ["comm.", "not a setting of silent; known: none"]),
+        (["consensus", "comm.name=no_comm"], ["comm.", "not a setting of no_comm; known: none"]),
         (["consensus", "learner.hidden=[10000000,8]"], ["learner.hidden.0=10000000", "8192"]),
         (["consensus", "num_envs=100000000"], ["num_envs=100000000", "65536"]),
         (["consensus", "device=cuda:99"], ["device=cuda:99 is not there", "known: cpu"]),
@@ -82,7 +85,11 @@ SETUPS = "known: paper, released, tuned"
         (["consensus", "=3"], ["key ''"]),
         (["consensus", "+new=1"], ["'+new=1'", "key=value"]),
         (["consensus", "~env"], ["'~env'", "key=value"]),
-        (["consensus", "seed=1,2"], ["'seed=1,2'", "one value"]),
+        (["consensus", "seed=1,2"], ["'seed=1,2'", "one value", "seeds=[1,2]"]),
+        (["consensus", "seeds=0,1"], ["'seeds=0,1'", "one value", "seeds=[0,1]"]),
+        (["consensus", "env.grid=30,20"], ["one value", "env.grid=[30,20]"]),
+        (["consensus", "fire.kind=file"], ["fire.kind", "chosen with fire=NAME"]),
+        (["consensus", "comm={range: 3}"], ["give its keys one by one", "comm.KEY=VALUE"]),
         (["consensus", "env.horizon=${nope}"], ["nope", "env.horizon"]),
     ],
     ids=lambda value: " ".join(value) if value and len(value) < 3 else "",
@@ -184,7 +191,7 @@ def test_too_little_memory_is_one_line(capsys, monkeypatch):
     def full(*_):
         raise RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried 99 bytes\nmore")
 
-    monkeypatch.setattr("emberlink.trainers.cli.train_eval.Trainer", full)
+    monkeypatch.setattr("emberlink.trainers.training.command.Trainer", full)
     refused(["train", "consensus", *TINY], capsys, "not enough memory", "99 bytes")
 
 

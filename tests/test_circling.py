@@ -2,13 +2,11 @@
 
 import pytest
 import torch
-from moments import moment
+from moments import communication, moment
 
 from emberlink.comm._heading import HeadingConfig, circling
-from emberlink.comm.base import Communication
-from emberlink.comm.consensus import FOLLOWS, Consensus, ConsensusConfig
+from emberlink.comm.consensus import ConsensusConfig
 from emberlink.envs import keys
-from emberlink.envs.config import WildfireConfig
 
 
 @pytest.mark.parametrize(
@@ -33,10 +31,8 @@ def test_circling_by_hand(target, move, bonus):
 
 
 def test_only_a_discoverer_over_old_fire_alone_circles():
-    world = WildfireConfig(grid=(64, 64))
     heading = HeadingConfig(form="approach", weight=2.0, circle=5.0)
     config = ConsensusConfig(discoverer="any_fire", heading=heading, range=5.0)
-    talk = Communication(Consensus(world, config))
     # UAV 0 sees old fire alone, UAV 1 both, UAV 2 hears UAV 1, UAV 3 nobody.
     places = [[10.0, 10.0, 2.0], [30.0, 10.0, 2.0], [33.0, 10.0, 2.0], [50.0, 50.0, 2.0]]
     before = moment(
@@ -46,8 +42,9 @@ def test_only_a_discoverer_over_old_fire_alone_circles():
         centre=[[0.0, 0.0], [31.0, 10.0], [0.0, 0.0], [0.0, 0.0]],
         old_centre=[[9.0, 10.0], [28.0, 10.0], [0.0, 0.0], [0.0, 0.0]],
     )
+    talk = communication(before, config)
     before = talk._reset(before, before)
-    assert before[FOLLOWS].flatten().tolist() == [0, 1, 1, -1]
+    assert before[keys.FOLLOWS].flatten().tolist() == [0, 1, 1, -1]
     after = moment([[x, y + 0.5, z] for x, y, z in places], [0] * 4)
     waypoint = before["agents", "target"][0, 3]
     start = torch.tensor(places[3])

@@ -63,7 +63,7 @@ def check_evaluation(folder: Path, out: str, *, episodes: int = 2) -> None:
     assert out.rstrip().splitlines()[-1] == str(folder)
     words = set(out.split())
     assert {word for name in (*metrics.NAMES, *SCRIPTED) for word in name.split("_")} <= words
-    assert "held-out fires: huygens" in out
+    assert "test fires: huygens" in out
     results = json.loads((folder / "eval.json").read_text())["results"]
     for by_policy in results.values():
         assert list(by_policy) == ["learned", *SCRIPTED]

@@ -15,8 +15,9 @@ from matplotlib.axes import Axes
 from synthetic_runs import read_evaluation, write_evaluation, write_run
 
 from emberlink.envs import metrics
+from emberlink.trainers import compare
 from emberlink.trainers.cli import main
-from emberlink.trainers.comparison import compare, plots
+from emberlink.trainers.comparison import plots
 from emberlink.trainers.comparison.groups import gather
 from emberlink.trainers.comparison.rankings import numbers
 from emberlink.trainers.comparison.runs import Run, find, read
@@ -326,7 +327,7 @@ def test_runs_that_were_evaluated_otherwise_are_in_sections_of_their_own(tmp_pat
     spoil(write_run(tmp_path, "consensus", 0, name="few"), fewer_fires)
     spoil(write_run(tmp_path, "consensus", 0, name="starts"), lambda c: c.update(start_seed=2))
     assert main.main(["compare", str(tmp_path), "--output", str(tmp_path / "out")]) == 0
-    sections = {one.section.label: one.section.runs for one in compare(tmp_path).sections}
+    sections = {one.section.label: one.section.runs for one in compare([tmp_path]).sections}
     usual = "setup tuned, trained on huygens (env.horizon="
     assert {label: [run.path.name for run in runs] for label, runs in sections.items()} == {
         f"{usual}40), 2 held-out fires, start_seed 1": ["few"],
@@ -344,7 +345,7 @@ def test_numbers_without_printing(runs, tmp_path, capsys, monkeypatch):
     assert capsys.readouterr().out == ""
     assert not any(tmp_path.iterdir())
     with pytest.raises(ValueError, match="there is no such run folder"):
-        compare(tmp_path / "missing")
+        compare([tmp_path / "missing"])
 
 
 def test_rewards_that_differ_are_not_ranked(tmp_path, capsys):
@@ -724,8 +725,8 @@ def test_no_runs(tmp_path, capsys):
     (run / "eval.json").unlink()
     assert main.main(["compare", str(run)]) == 2
     assert capsys.readouterr().err == (
-        f"emberlink compare: no finished run among 1: {run}: not evaluated: there is no eval.json "
-        f"(emberlink eval {run})\n"
+        "emberlink compare: no finished run among 1: nothing to compare; "
+        f"{run}: not evaluated: there is no eval.json (emberlink eval {run})\n"
     )
 
 

@@ -4,24 +4,16 @@ import math
 
 import pytest
 import torch
-from moments import moment
+from moments import WORLD, communication, moment
 from tensordict import TensorDict
 from torch import Tensor
 
-from emberlink.comm import consensus
+from emberlink.comm._agreement import choose_leader, known_discoverers
 from emberlink.comm._heading import HeadingConfig
-from emberlink.comm.base import Communication
-from emberlink.comm.consensus import (
-    Consensus,
-    ConsensusConfig,
-    first_choice,
-    known_discoverers,
-    neighbours,
-)
+from emberlink.comm._radio import Radio, RadioConfig, neighbours
+from emberlink.comm.consensus import Consensus, ConsensusConfig
 from emberlink.envs import keys
 from emberlink.envs.config import WildfireConfig
-
-WORLD = WildfireConfig(grid=(64, 64))
 
 
 def in_a_row(count: int, gap: float = 9.0) -> list[list[float]]:
@@ -30,12 +22,12 @@ def in_a_row(count: int, gap: float = 9.0) -> list[list[float]]:
 
 def told(position, new, *, config=None, world=WORLD, **more) -> TensorDict:
     """A moment as an episode's first, rewritten by consensus."""
-    module = Consensus(world, config or ConsensusConfig())
-    return module(module.start(moment(position, new, **more)))
+    now = moment(position, new, **more)
+    return communication(now, config, world)._reset(now, now)
 
 
 def follows(position, new, **more) -> list[int]:
-    return told(position, new, **more)[consensus.FOLLOWS][0].tolist()
+    return told(position, new, **more)[keys.FOLLOWS][0].tolist()
 
 
 @pytest.mark.parametrize("mirrored", [False, True])
@@ -70,9 +62,11 @@ def test_a_discoverer_does_not_join_two_networks_of_others():
 
 
 def test_without_a_discoverer_all_wander():
-    rewritten = told(in_a_row(5), [0] * 5)
-    assert rewritten[consensus.FOLLOWS].tolist() == [[-1] * 5]
-    assert rewritten[consensus.TARGET].equal(rewritten[consensus.WAYPOINT])
+    now = moment(in_a_row(5), [0] * 5)
+    talk = communication(now)
+    rewritten = talk._reset(now, now)
+    assert rewritten[keys.FOLLOWS].tolist() == [[-1] * 5]
+    assert rewritten[keys.TARGET].equal(talk.module.waypoint)
 
 
 def test_everyone_may_discover():
@@ -110,7 +104,7 @@ def test_the_choice_reads_the_ranks_of_discoverers_only():
     discovers = torch.tensor([False, True, False])
     rank = torch.tensor([math.inf, -1.0, 99.0])
     known = known_discoverers(everyone, discovers)
-    assert first_choice(known, -rank.unsqueeze(-2), discovers).tolist() == [1, 1, 1]
+    assert choose_leader(known, -rank.unsqueeze(-2), discovers).tolist() == [1, 1, 1]
 
 
 def test_without_agreement_only_neighbours_are_known():
@@ -130,13 +124,13 @@ def test_without_wandering_there_is_no_target_and_no_bonus():
     still = ConsensusConfig(
         wander=False, target="relative", heading=HeadingConfig(form="approach", weight=2.0)
     )
-    talk = Communication(Consensus(WORLD, still))
     start = [[5.0, 5.0, 2.0], [30.0, 30.0, 2.0], [33.0, 34.0, 2.0]]
     moved = [[5.0, 6.0, 2.0], [30.0, 30.0, 2.0], [33.0, 33.0, 2.0]]
     first = moment(start, [0, 4, 0], centre=[[0.0, 0.0], [30.0, 30.0], [0.0, 0.0]])
+    talk = communication(first, still)
     first = talk._reset(first, first)
-    assert first[consensus.FOLLOWS].tolist() == [[-1, 1, 1]]
-    assert first[consensus.TARGET][0, 0].tolist() == start[0]
+    assert first[keys.FOLLOWS].tolist() == [[-1, 1, 1]]
+    assert first[keys.TARGET][0, 0].tolist() == start[0]
     assert first[keys.OBSERVATION][0, 0, -3:].tolist() == [0.0, 0.0, 0.0]
     second = talk._step(first, moment(moved, [0, 0, 0], step=1))
     # The first has no target; the third came from 5 to sqrt(18) of the second.
@@ -147,11 +141,11 @@ def test_without_wandering_there_is_no_target_and_no_bonus():
 @pytest.mark.parametrize("loss", [0.0, 0.2, 0.5, 1.0])
 def test_messages_are_lost_as_often_as_they_are_said_to_be(loss):
     envs, uavs = 500, 6
-    module = Consensus(WORLD, ConsensusConfig(loss=loss, range=math.inf))
+    radio = Radio(RadioConfig(loss=loss, range=math.inf))
     position = torch.rand(envs, uavs, 3) * 20 + 1
     heard = torch.stack(
         [
-            module._hears(moment(position, torch.zeros(envs, uavs).long(), step=step))
+            radio.links(moment(position, torch.zeros(envs, uavs).long(), step=step))
             for step in range(3)
         ]
     )
@@ -165,13 +159,13 @@ def test_messages_are_lost_as_often_as_they_are_said_to_be(loss):
         assert not heard[0].equal(heard[1])
 
 
-def walk(module: Consensus, *moments: TensorDict) -> TensorDict:
-    """The last of consecutive moments of an episode, each rewritten as on an environment."""
-    talk = Communication(module)
+def walk(*moments: TensorDict) -> tuple[Consensus, TensorDict]:
+    """The module and the last of an episode's moments, each rewritten as on an environment."""
+    talk = communication(moments[0])
     now = talk._reset(moments[0], moments[0])
     for following in moments[1:]:
         now = talk._step(now, following)
-    return now
+    return talk.module, now
 
 
 def test_streak_score_and_altitude_add_up_and_start_anew():
@@ -179,17 +173,16 @@ def test_streak_score_and_altitude_add_up_and_start_anew():
         return moment([[5.0, 5.0, z]], [new])
 
     def record(*moments: TensorDict) -> tuple[float, ...]:
-        now = walk(Consensus(WORLD, ConsensusConfig()), *moments)
-        memory = consensus.STREAK, consensus.FIRE_SCORE, consensus.ALTITUDE_SUM
-        return tuple(now[key].item() for key in memory)
+        module, _ = walk(*(now.clone() for now in moments))
+        return module.streak.item(), module.fire_score.item(), module.altitude_sum.item()
 
     first, second, third = at(1.5, 3), at(2.0, 4), at(4.0, 1)
     assert record(at(3.0, 0)) == (0, 0, 0)
-    assert record(at(3.0, 0), first.clone()) == (1, 3, 1.5)
-    assert record(at(3.0, 0), first.clone(), second.clone()) == (2, 7, 3.5)
-    assert record(at(3.0, 0), first.clone(), second.clone(), third.clone()) == (3, 8, 7.5)
-    assert record(at(3.0, 0), first.clone(), second.clone(), at(4.0, 0)) == (0, 0, 0)
-    assert record(first.clone(), second.clone(), at(4.0, 0), third.clone()) == (1, 1, 4.0)
+    assert record(at(3.0, 0), first) == (1, 3, 1.5)
+    assert record(at(3.0, 0), first, second) == (2, 7, 3.5)
+    assert record(at(3.0, 0), first, second, third) == (3, 8, 7.5)
+    assert record(at(3.0, 0), first, second, at(4.0, 0)) == (0, 0, 0)
+    assert record(first, second, at(4.0, 0), third) == (1, 1, 4.0)
 
 
 def test_rank_by_hand():
@@ -198,23 +191,25 @@ def test_rank_by_hand():
     # The latest step alone would put 2 first: 2 / 3 < 4 / 3.5.
     before = [[0.0, 0.0, 1.0], [9.0, 0.0, 2.0], [18.0, 0.0, 3.5]]
     after = [[0.0, 0.0, 3.0], [9.0, 0.0, 2.0], [18.0, 0.0, 3.5]]
-    module = Consensus(WORLD, ConsensusConfig())
-    now = walk(module, moment(before, [6, 0, 0]), moment(after, [2, 0, 4]))
-    assert now[consensus.FOLLOWS].tolist() == [[0, 0, 2]]
-    rank = module._track_record(module.start(moment(after, [2, 0, 4])), torch.tensor([True] * 3))
+    _, now = walk(moment(before, [6, 0, 0]), moment(after, [2, 0, 4]))
+    assert now[keys.FOLLOWS].tolist() == [[0, 0, 2]]
+    now = moment(after, [2, 0, 4])
+    rank = communication(now).module._update_track_record(now, torch.tensor([True] * 3))
     torch.testing.assert_close(rank[0, [0, 2]], torch.tensor([4 / 9, 16 / 3.5**2]).double())
 
 
 def test_targets_by_role():
     position = [[3.0, 4.0, 2.5], [8.0, 4.0, 1.5], [40.0, 40.0, 3.0]]
-    rewritten = told(position, [2, 0, 0], centre=[[3.25, 4.5], [0, 0], [0, 0]])
-    target = rewritten[consensus.TARGET][0]
+    now = moment(position, [2, 0, 0], centre=[[3.25, 4.5], [0, 0], [0, 0]])
+    talk = communication(now)
+    rewritten = talk._reset(now, now)
+    target = rewritten[keys.TARGET][0]
     assert target[0].tolist() == [3.25, 4.5, 2.5]  # the mean of the new fire, at its own z
     assert target[1].tolist() == position[0]  # where the discoverer is, not where it goes
-    assert target[2].equal(rewritten[consensus.WAYPOINT][0, 2])
+    assert target[2].equal(talk.module.waypoint[0, 2])
     observed = rewritten[keys.OBSERVATION]
     assert observed.shape == (1, 3, 9)
-    assert observed[..., 6:].equal(rewritten[consensus.TARGET])
+    assert observed[..., 6:].equal(rewritten[keys.TARGET])
 
 
 def test_relative_targets_are_the_way_there():
@@ -227,7 +222,7 @@ def test_relative_targets_are_the_way_there():
     scaled = told(position, [2, 0], centre=centre, config=config, world=world)
     expected = torch.tensor([[0.25 / 10, 0.5 / 5, 0], [-5 / 10, 0, 1 / 1.5]])
     torch.testing.assert_close(scaled[keys.OBSERVATION][0, :, 6:], expected)
-    assert scaled[consensus.TARGET].equal(raw[consensus.TARGET])
+    assert scaled[keys.TARGET].equal(raw[keys.TARGET])
 
 
 @pytest.mark.parametrize("target", ["absolute", "relative"])
@@ -244,19 +239,37 @@ def test_a_waypoint_is_redrawn_only_by_a_wanderer_closer_than_one():
     waypoint = torch.tensor(
         [[[5.0, 5.9, 2.0], [30.0, 6.0, 2.0], [50.0, 50.5, 2.0], [55.0, 50.0, 2.5]]]
     )
-    module = Consensus(WORLD, ConsensusConfig())
-    now = module.start(moment(position, [0, 0, 1, 0])).set(consensus.WAYPOINT, waypoint.clone())
-    now = module(now)
-    assert now[consensus.FOLLOWS].tolist() == [[-1, -1, 2, 2]]
-    kept = (now[consensus.WAYPOINT] == waypoint).all(-1)
+    now = moment(position, [0, 0, 1, 0], step=3)
+    talk = communication(now)
+    talk.module.waypoint.copy_(waypoint)
+    now = talk._step(now, now)
+    assert now[keys.FOLLOWS].tolist() == [[-1, -1, 2, 2]]
+    kept = (talk.module.waypoint == waypoint).all(-1)
     assert kept.tolist() == [[False, True, True, True]]
-    assert now[consensus.TARGET][0, :2].equal(now[consensus.WAYPOINT][0, :2])
+    assert now[keys.TARGET][0, :2].equal(talk.module.waypoint[0, :2])
+
+
+def test_a_first_waypoint_closer_than_one_is_drawn_again():
+    # At each UAV's first waypoint, as the module draws it for an episode of this random stream.
+    first = moment([[32.0, 32.0, 2.0]] * 6, [0] * 6)
+    module = communication(first).module
+    module.reset(first, torch.tensor([True]))
+    points = module.waypoint.clone()
+    now = moment(points[0], [0] * 6)
+    target = communication(now)._reset(now, now)[keys.TARGET]
+    assert (torch.linalg.vector_norm(target - points, dim=-1) >= 1).all()
 
 
 def test_waypoints_are_uniform_in_the_box_and_differ():
-    module = Consensus(WORLD, ConsensusConfig())
     here = torch.full((500, 4, 3), 2.0)
-    points = module.start(moment(here, [0] * 4))[consensus.WAYPOINT]
+
+    def drawn(step: int) -> Tensor:
+        now = moment(here, [0] * 4, step=step)
+        module = communication(now).module
+        module.reset(now, torch.ones(500, dtype=torch.bool))
+        return module.waypoint
+
+    points = drawn(0)
     low, high = torch.tensor(WORLD.low), torch.tensor(WORLD.high)
     assert (points >= low).all()
     assert (points <= high).all()
@@ -264,8 +277,7 @@ def test_waypoints_are_uniform_in_the_box_and_differ():
     torch.testing.assert_close(unit.mean(0), torch.full((3,), 0.5), atol=0.03, rtol=0)
     torch.testing.assert_close(unit.std(0), torch.full((3,), 12**-0.5), atol=0.02, rtol=0)
     assert len(unit.unique(dim=0)) == len(unit)
-    later = module.start(moment(here, [0] * 4, step=1))[consensus.WAYPOINT]
-    assert not (later == points).all(-1).any()
+    assert not (drawn(1) == points).all(-1).any()
 
 
 RELEASED = ConsensusConfig(discoverer="any_fire", jitter=0.75)
@@ -278,9 +290,9 @@ def test_any_fire_makes_a_discoverer_in_released():
     calm = ConsensusConfig(discoverer="any_fire")
     where = {"centre": [[3.0, 1.0], [0.0, 0.0]], "old_centre": [[7.0, 2.0], [0.0, 0.0]]}
     old_only = told(position, [0, 0], old=[5, 0], config=calm, **where)
-    assert old_only[consensus.TARGET][0, 0].tolist() == [7.0, 2.0, 2.0]
+    assert old_only[keys.TARGET][0, 0].tolist() == [7.0, 2.0, 2.0]
     both = told(position, [1, 0], old=[5, 0], config=calm, **where)
-    assert both[consensus.TARGET][0, 0].tolist() == [3.0, 1.0, 2.0]
+    assert both[keys.TARGET][0, 0].tolist() == [3.0, 1.0, 2.0]
 
 
 def test_jitter_moves_x_and_y_of_near_targets_only():
@@ -291,8 +303,8 @@ def test_jitter_moves_x_and_y_of_near_targets_only():
         "new": [9, 9, 0],
         "centre": [[20.0, 20.5], [41.0, 40.0], [0.0, 0.0]],
     }
-    calm = told(**more)[consensus.TARGET]
-    noise = told(config=ConsensusConfig(jitter=0.75), **more)[consensus.TARGET] - calm
+    calm = told(**more)[keys.TARGET]
+    noise = told(config=ConsensusConfig(jitter=0.75), **more)[keys.TARGET] - calm
     assert noise[:, 1:].abs().max() == 0
     assert noise[..., 2].abs().max() == 0
     near = noise[:, 0, :2]
@@ -302,7 +314,7 @@ def test_jitter_moves_x_and_y_of_near_targets_only():
     assert near.var().item() == pytest.approx(0.396, abs=0.02)
     assert (near.abs() > 1 - 1e-5).float().mean().item() == pytest.approx(0.182, abs=0.02)
     assert abs(torch.corrcoef(near.T)[0, 1]) < 0.05
-    later = told(config=ConsensusConfig(jitter=0.75), step=1, **more)[consensus.TARGET] - calm
+    later = told(config=ConsensusConfig(jitter=0.75), step=1, **more)[keys.TARGET] - calm
     assert abs(torch.corrcoef(torch.stack((near[:, 0], later[:, 0, 0])))[0, 1]) < 0.05
 
 
@@ -316,18 +328,21 @@ def test_the_result_does_not_depend_on_the_order_of_uavs():
     order = torch.randperm(9, generator=generator)
     centre = position[..., :2] + 0.5
     waypoint = torch.full((200, 9, 3), 60.0)  # far from everyone: nobody draws another
-    module = Consensus(WORLD, ConsensusConfig())
 
-    def run(order: Tensor) -> TensorDict:
-        now = moment(position[:, order], new[:, order], centre=centre[:, order])
-        return module(module.start(now).set(consensus.WAYPOINT, waypoint.clone()))
+    def run(order: Tensor) -> tuple[dict[str, Tensor], TensorDict]:
+        now = moment(position[:, order], new[:, order], centre=centre[:, order], step=1)
+        talk = communication(now)
+        talk.module.waypoint.copy_(waypoint)
+        return dict(talk.module.named_buffers()), talk._step(now, now)
 
-    plain, permuted = run(torch.arange(9)), run(order)
-    for key in (consensus.TARGET, consensus.STREAK, consensus.FIRE_SCORE, keys.OBSERVATION):
+    (state, plain), (permuted_state, permuted) = run(torch.arange(9)), run(order)
+    for key in (keys.TARGET, keys.OBSERVATION):
         assert permuted[key].equal(plain[key][:, order]), key
-    chosen = permuted[consensus.FOLLOWS]
+    for name in ("streak", "fire_score", "altitude_sum"):
+        assert permuted_state[name].equal(state[name][:, order]), name
+    chosen = permuted[keys.FOLLOWS]
     named = torch.where(chosen < 0, -1, order[chosen.clamp(min=0)])
-    assert named.equal(plain[consensus.FOLLOWS][:, order])
-    roles = plain[consensus.FOLLOWS]
+    assert named.equal(plain[keys.FOLLOWS][:, order])
+    roles = plain[keys.FOLLOWS]
     assert (roles < 0).any()
     assert ((roles >= 0) & (roles != torch.arange(9))).any()

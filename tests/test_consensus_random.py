@@ -4,18 +4,18 @@ import random
 
 import pytest
 import torch
-from moments import moment
+from moments import communication, moment
 from scalar_consensus import ScalarConsensus, heading_term
 from tensordict import TensorDict
 from torch import Tensor
 
-from emberlink.comm import consensus
 from emberlink.comm._heading import HeadingConfig
 from emberlink.comm.base import Communication
 from emberlink.comm.consensus import Consensus, ConsensusConfig
 from emberlink.envs import keys
 from emberlink.envs.config import WildfireConfig
 from emberlink.envs.utils import counter_rng
+from emberlink.envs.utils.counter_rng import Use
 
 FORMS = ["folded_linear", "folded_exponential", "linear"]
 
@@ -34,7 +34,7 @@ def test_random_networks_equal_plain_python(uavs):
         loss=0.3 if uavs % 3 == 0 else 0.0,
     )
     world = WildfireConfig()
-    talk = Communication(Consensus(world, config))
+    talk: Communication | None = None
     scalars = [
         ScalarConsensus(
             config.range,
@@ -62,19 +62,23 @@ def test_random_networks_equal_plain_python(uavs):
             (draw() * 3).long() * sees,
             centre=position[..., :2] + draw(2) - 0.5,
             old_centre=position[..., :2] + draw(2) - 0.5,
-            beyond=draw(3) < 0.1,
+            hit_boundary=draw(3) < 0.1,
             step=step,
         )
-        now = talk._reset(now, now) if before is None else talk._step(before, now)
+        if talk is None or before is None:
+            talk = communication(now, config, world)
+            now = talk._reset(now, now)
+        else:
+            now = talk._step(before, now)
         unit = counter_rng.uniform(
-            counter_rng.at(now[keys.STREAM], now[keys.STEP], 102), uavs * uavs
+            counter_rng.step_key(now[keys.RNG_KEY], now[keys.STEP], Use.MESSAGE_LOSS), uavs * uavs
         )
         lost = (unit < config.loss).unflatten(-1, (uavs, uavs))
         for env in range(envs):
             scalars[env].lost = {tuple(pair) for pair in lost[env].nonzero().tolist()}
-            followed += compare(
-                scalars[env], now[env], None if before is None else before[env], config
-            )
+            was = None if before is None else before[env]
+            followed += compare(scalars[env], now[env], was, config)
+            compare_streaks(scalars[env], talk.module, env)
         before = now
         position = (position + 2 * draw(3) - 1).clamp(low, high)
     if uavs > 1:
@@ -86,15 +90,10 @@ def compare(scalar: ScalarConsensus, now, before, config: ConsensusConfig) -> in
     position = [tuple(p) for p in now[keys.POSITION].tolist()]
     new, old = now[keys.NEW_FIRE].tolist(), now[keys.OLD_FIRE].tolist()
     follows = scalar.step(position, new, old, scalar.lost)
-    assert now[consensus.FOLLOWS].tolist() == follows
-    streaks = now[consensus.STREAK].tolist()
-    target = now[consensus.TARGET].tolist()
+    assert now[keys.FOLLOWS].tolist() == follows
+    target = now[keys.TARGET].tolist()
     for i, leader in enumerate(follows):
-        assert streaks[i] == scalar.streak(i)
-        assert now[consensus.FIRE_SCORE][i] == scalar.fire_score(i)
         if leader == i:
-            mean = now[consensus.ALTITUDE_SUM][i].item() / streaks[i]
-            assert mean == pytest.approx(scalar.average_altitude(i), abs=1e-12)
             centre = now[keys.NEW_CENTRE if new[i] else keys.OLD_CENTRE][i].tolist()
             assert target[i] == [*centre, position[i][2]]
         elif leader >= 0:
@@ -102,8 +101,18 @@ def compare(scalar: ScalarConsensus, now, before, config: ConsensusConfig) -> in
     if before is not None:
         for i, reward in enumerate(now[keys.REWARD].flatten().tolist()):
             start = tuple(before[keys.POSITION][i].tolist())
-            aim = tuple(before[consensus.TARGET][i].tolist())
+            aim = tuple(before[keys.TARGET][i].tolist())
             term = heading_term(config.heading.form, start, position[i], aim)
-            term *= not now[keys.BEYOND][i].any()
+            term *= not now[keys.HIT_BOUNDARY][i].any()
             assert reward == pytest.approx(term, abs=1e-4)
     return sum(leader not in (-1, i) for i, leader in enumerate(follows))
+
+
+def compare_streaks(scalar: ScalarConsensus, module: Consensus, env: int) -> None:
+    """Asserts that the track records of one environment are as plain Python has them."""
+    for i, streak in enumerate(module.streak[env].tolist()):
+        assert streak == scalar.streak(i)
+        assert module.fire_score[env, i] == scalar.fire_score(i)
+        if streak:
+            mean = module.altitude_sum[env, i].item() / streak
+            assert mean == pytest.approx(scalar.average_altitude(i), abs=1e-12)

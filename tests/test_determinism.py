@@ -34,9 +34,9 @@ def test_an_environment_does_not_know_how_many_others_there_are(fire):
         moments = [env.reset() for env in (few, many)]
         for _ in range(15):
             one, other = moments
-            for key in (keys.OBSERVATION, keys.POSITION, keys.STREAM, keys.BURNING):
+            for key in (keys.OBSERVATION, keys.POSITION, keys.RNG_KEY, keys.BURNING):
                 assert one[key].equal(other[key][:2]), key
-            assert not other[keys.STREAM][2:].unsqueeze(1).eq(one[keys.STREAM]).any()
+            assert not other[keys.RNG_KEY][2:].unsqueeze(1).eq(one[keys.RNG_KEY]).any()
             action = torch.rand(5, *one[keys.POSITION].shape[1:], generator=generator) * 2 - 1
             moments = [
                 env.step(moment.set(keys.ACTION, action[: len(moment)]))["next"]

@@ -13,6 +13,7 @@ import torch
 from test_recipes import METHODS
 from test_resume import assert_same, until
 
+from emberlink.envs import keys
 from emberlink.envs.wildfire import WildfireEnv
 from emberlink.trainers.cli import main
 from emberlink.trainers.config.compose import resolve
@@ -78,15 +79,15 @@ class Poison:
         self.monkeypatch.setattr(WildfireEnv, "_observe", poisoned)
 
     def reward(self) -> None:
-        snapshot = WildfireEnv._snapshot
+        step = WildfireEnv._step
 
-        def poisoned(world, position, counts, centres, beyond, reward=None):
-            if reward is not None and self.is_due(world, world._time):
-                reward = reward.clone()
-                reward[self.env, self.uav % UAVS] = -math.inf
-            return snapshot(world, position, counts, centres, beyond, reward)
+        def poisoned(world, tensordict):
+            after = step(world, tensordict)
+            if self.is_due(world, world._time):
+                after[keys.REWARD][self.env, self.uav % UAVS] = -math.inf
+            return after
 
-        self.monkeypatch.setattr(WildfireEnv, "_snapshot", poisoned)
+        self.monkeypatch.setattr(WildfireEnv, "_step", poisoned)
 
     def gradient(self) -> None:
         losses = Learner.losses
@@ -397,14 +398,15 @@ def test_a_rollback_goes_on_and_resumes_as_if_it_had_not_stopped(seeds, tmp_path
 
 def test_a_rollback_that_does_not_help_is_given_up(tmp_path, monkeypatch, capsys):
     """An environment's NaN, before there is a checkpoint."""
-    snapshot = WildfireEnv._snapshot
+    step = WildfireEnv._step
 
-    def poisoned(world, position, counts, centres, beyond, reward=None):
-        if reward is not None and int(world._time[0]) == 13:
-            reward = reward + math.nan
-        return snapshot(world, position, counts, centres, beyond, reward)
+    def poisoned(world, tensordict):
+        after = step(world, tensordict)
+        if int(world._time[0]) == 13:
+            after[keys.REWARD] += math.nan
+        return after
 
-    monkeypatch.setattr(WildfireEnv, "_snapshot", poisoned)
+    monkeypatch.setattr(WildfireEnv, "_step", poisoned)
     command = ["train", "consensus", *SMALL, *ROLLBACK, "checkpoint_steps=0", f"output={tmp_path}"]
     assert main.main(command) == 2
     out, err = capsys.readouterr()

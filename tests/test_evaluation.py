@@ -1,6 +1,5 @@
 """The protocol: the same fires and starts for everyone, and the same numbers every time."""
 
-import io
 import itertools
 import json
 import math
@@ -9,7 +8,6 @@ from dataclasses import replace
 
 import pytest
 import torch
-from rich.console import Console
 
 from emberlink.envs import metrics
 from emberlink.envs.fire.cache import cache_folder
@@ -18,8 +16,9 @@ from emberlink.policies.scripted.registry import SCRIPTED
 from emberlink.trainers.build import build_env, build_networks
 from emberlink.trainers.cli import main
 from emberlink.trainers.config.compose import resolve
-from emberlink.trainers.evaluation import baseline_cache, evaluate, report
+from emberlink.trainers.evaluation import baseline_cache, evaluate, tables
 from emberlink.trainers.runs.run_folder import RunFolder
+from emberlink.trainers.terminal import SafeConsole
 
 SMALL = ["env.horizon=12", "env.num_uavs=2", "learner.hidden=[8,8]", "env.grid=[12,10]"]
 
@@ -78,7 +77,7 @@ def test_all_policies_start_alike_on_the_same_fires(cache, monkeypatch):
     def play(env, policy):
         moment = env.reset()
         world = env.base_env
-        seen = moment["agents", "position"].tolist(), world.arrival.tolist()
+        seen = moment["agents", "position"].tolist(), world.arrival_time.tolist()
         begun.setdefault(len(begun), seen)
         return {name: torch.zeros(evaluate.BLOCK) for name in metrics.NAMES}
 
@@ -86,7 +85,7 @@ def test_all_policies_start_alike_on_the_same_fires(cache, monkeypatch):
     evaluate.evaluate(config, untrained(config), fires=4)
     policies = 1 + len(SCRIPTED)
     assert len(begun) == 2 * policies
-    seeds = fire_seeds("heldout", 4)
+    seeds = fire_seeds("test", 4)
     for panel, scenario in enumerate(("huygens", "paper")):
         fires = make_fires(load_scenario(scenario), seeds, (12, 10), 12).tolist()
         for place in range(policies):
@@ -236,21 +235,55 @@ def test_a_cache_that_cannot_be_written_costs_a_warning(cache, monkeypatch):
     assert not list(cache_folder().glob("*.tmp"))
 
 
-@pytest.mark.parametrize("width", [80, 100])
-def test_the_table_fits_a_terminal(width):
+RESULTS = {
+    "huygens": {
+        name: {measure: [1000.0, 1000.0] for measure in metrics.NAMES}
+        | {"mean_reward": [-123.456, -123.456], "fire_losses": [499.5, 499.5]}
+        for name in ("learned", *SCRIPTED)
+    }
+}
+NUMBERS = ["-123.5", *["1000.0"] * 6, "499.5"]
+
+
+def printed(monkeypatch, capsys, columns: str | None, results, configs) -> str:
+    """The table as it is printed to a pipe of that many columns."""
+    monkeypatch.setenv("COLUMNS", columns or "")
+    if columns is None:
+        monkeypatch.delenv("COLUMNS")
+    tables.print_results(SafeConsole(), results, configs)
+    return capsys.readouterr().out
+
+
+@pytest.mark.parametrize("columns", ["40", "64", "72", "80", "120", "0", None])
+def test_no_table_loses_a_number(columns, monkeypatch, capsys):
     config = resolve("shared_memory", ["setup=released"])
-    measured = {name: [1000.0] for name in metrics.NAMES}
-    measured |= {"mean_reward": [-123.456], "fire_losses": [499.5]}
-    results = {"huygens": dict.fromkeys(("learned", *SCRIPTED), measured)}
-    console = Console(width=width, record=True, file=io.StringIO())
-    report.print_table(console, results, config)
-    text = console.export_text()
-    assert "…" not in text
-    assert max(map(len, text.splitlines())) <= width
-    lines = text.splitlines()
-    for policy in ("shared_memory", "stationary", "lawnmower", "follow_target", "oracle"):
-        (row,) = (line for line in lines if line.startswith(policy))
-        assert row.split() == [policy, "-123.5", *["1000.0"] * 6, "499.5"]
-    words = [word for line in lines[:4] for word in line.split()]
+    lines = printed(monkeypatch, capsys, columns, [RESULTS], [config]).splitlines()
+    parts = sum(line.startswith("test fires") for line in lines)
+    assert (parts > 1) == (columns in ("40", "64", "72"))
+    if columns not in ("0", None):
+        assert max(map(len, lines)) <= int(columns)
+    for policy in ("shared_memory", *SCRIPTED):
+        # At 80 columns, a name may be on two lines.
+        heads = (f"{policy} ", f"{policy.partition('_')[0]}_ ")
+        rows = [line.split() for line in lines if line.startswith(heads)]
+        assert len(rows) in (parts, 2 * parts)  # two of the names begin with "random_"
+        rows = rows[:: len(rows) // parts]
+        assert [number for row in rows for number in row[1:]] == NUMBERS
+    words = " ".join(lines).split()
     for name in metrics.NAMES:
         assert set(name.split("_")) <= set(words), name
+
+
+def test_several_seeds_make_one_table(monkeypatch, capsys):
+    configs = [resolve("consensus", [f"seed={seed}"]) for seed in (3, 4, 5)]
+    results = [
+        {"huygens": {**RESULTS["huygens"], "learned": {key: [value] for key in metrics.NAMES}}}
+        for value in (1.0, 2.0, 3.0)
+    ]
+    text = printed(monkeypatch, capsys, None, results, configs)
+    rows = {line[:16].strip(): line[16:].split() for line in text.splitlines()}
+    assert rows["seed 3"] == ["1.000", *["1.0"] * 7]
+    assert rows["seed 5"] == ["3.000", *["3.0"] * 7]
+    assert rows["consensus"] == ["2.000", *["2.0"] * 7]  # the mean
+    assert rows["std. dev."] == ["1.000", *["1.0"] * 7]
+    assert text.count("test fires: huygens") == text.count("oracle") == 1

@@ -104,7 +104,11 @@ def test_a_run_whose_checkpoints_are_gone_is_not_begun_again(run, capsys):
 
 
 def test_only_what_is_emberlinks_own_is_taken_away(run, capsys):
-    own = [run.path / "eval.json.part", run.checkpoints / "step_000000099.safetensors.part"]
+    own = [
+        run.path / "eval.json.17.part",
+        run.path / "figures" / "coverage.png.17.part",
+        run.checkpoints / "step_000000099.safetensors.17.part",
+    ]
     others = [run.path / "thesis.part", run.path / "figures" / "mine.png.part"]
     for path in (*own, *others):
         path.write_text("half")
@@ -254,7 +258,7 @@ def test_a_seed_of_another_training_is_refused(tmp_path, capsys):
 
 
 def test_folders_with_the_names_of_half_written_files_stay(run, capsys):
-    for name in ("eval.json.part", "checkpoints/x.safetensors.part", "checkpoints/.tmpx"):
+    for name in ("eval.json.17.part", "checkpoints/x.safetensors.17.part", "checkpoints/.tmpx"):
         (run.path / name).mkdir()
     (run.checkpoints / "step_999999999.safetensors").mkdir()
     (run.path / "divergence_step_3.part").write_text("mine")
@@ -301,7 +305,7 @@ def test_metrics_are_on_the_disk_before_the_state_that_counts_them(tmp_path, mon
     monkeypatch.setattr(os, "fsync", note)
     trainer.train()
     names = [Path(path).name for path in synced]
-    state = names.index("state_000000015.safetensors.part")
+    state = names.index(f"state_000000015.safetensors.{os.getpid()}.part")
     assert {"metrics.jsonl", "timing.jsonl"} <= set(names[:state])
     del synced[:]
     run.write("eval.json", {})

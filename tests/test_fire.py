@@ -5,7 +5,7 @@ import math
 import warnings
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import pytest
@@ -17,8 +17,9 @@ from pydantic import ValidationError
 from emberlink.envs.fire import cache as bank_module
 from emberlink.envs.fire.cache import bank_key, cache_folder, fire_bank
 from emberlink.envs.fire.generator import (
-    HELD_OUT_FROM,
+    TEST_FROM,
     FireConfig,
+    Split,
     burning_cells,
     fire_seeds,
     load_scenario,
@@ -61,8 +62,8 @@ def paper() -> torch.Tensor:
 
 
 @pytest.fixture(scope="module")
-def heldout() -> torch.Tensor:
-    return make_fires(load_scenario("huygens"), fire_seeds("heldout", 200), GRID, HORIZON)
+def test_fires() -> torch.Tensor:
+    return make_fires(load_scenario("huygens"), fire_seeds("test", 200), GRID, HORIZON)
 
 
 def test_paper_is_the_measured_fire(paper: torch.Tensor):
@@ -82,51 +83,51 @@ def test_paper_is_the_measured_fire(paper: torch.Tensor):
 
 
 def test_paper_is_one_fire(paper: torch.Tensor):
-    seeds = torch.tensor([3, 77, HELD_OUT_FROM + 5])
+    seeds = torch.tensor([3, 77, TEST_FROM + 5])
     assert torch.equal(
         make_fires(load_scenario("paper"), seeds, GRID, HORIZON), paper.expand(3, -1, -1)
     )
 
 
-def test_huygens_counts(heldout: torch.Tensor):
-    count = burning_cells(heldout, HORIZON)
+def test_huygens_counts(test_fires: torch.Tensor):
+    count = burning_cells(test_fires, HORIZON)
     start, end = count[:, 0], count[:, -1]
     good = (start >= 60) & (start <= 120) & (end >= 110) & (end <= 190)
     assert good.double().mean() >= 0.95
     assert end.double().std() > 10
-    assert len(heldout.flatten(1).unique(dim=0)) == 200
-    edge = torch.cat([heldout[:, [0, -1]].flatten(1), heldout[:, :, [0, -1]].flatten(1)], 1)
+    assert len(test_fires.flatten(1).unique(dim=0)) == 200
+    edge = torch.cat([test_fires[:, [0, -1]].flatten(1), test_fires[:, :, [0, -1]].flatten(1)], 1)
     assert (edge > 0).all()  # every fire starts inside the box,
     assert 0.15 < edge.isfinite().any(1).double().mean() < 0.3  # and some heads leave it
 
 
-def test_a_fire_depends_on_its_seed_alone(heldout: torch.Tensor):
-    config, seeds = load_scenario("huygens"), fire_seeds("heldout", 200)
+def test_a_fire_depends_on_its_seed_alone(test_fires: torch.Tensor):
+    config, seeds = load_scenario("huygens"), fire_seeds("test", 200)
     some = torch.tensor([150, 0, 7])
     state = torch.get_rng_state()
-    assert torch.equal(make_fires(config, seeds[some], GRID, HORIZON), heldout[some])
-    assert torch.equal(make_fires(config, seeds[7:8], GRID, HORIZON), heldout[7:8])
+    assert torch.equal(make_fires(config, seeds[some], GRID, HORIZON), test_fires[some])
+    assert torch.equal(make_fires(config, seeds[7:8], GRID, HORIZON), test_fires[7:8])
     assert torch.equal(torch.get_rng_state(), state)
 
 
-def test_no_fire_is_in_both_splits(heldout: torch.Tensor):
+def test_no_fire_is_in_both_splits(test_fires: torch.Tensor):
     train = make_fires(load_scenario("huygens"), fire_seeds("train", 50), GRID, HORIZON)
-    both = torch.cat([train, heldout[:50]]).flatten(1)
+    both = torch.cat([train, test_fires[:50]]).flatten(1)
     assert len(both.unique(dim=0)) == 100
 
 
-def test_a_longer_horizon_continues_the_same_fire(heldout: torch.Tensor):
-    seeds = fire_seeds("heldout", 5)
+def test_a_longer_horizon_continues_the_same_fire(test_fires: torch.Tensor):
+    seeds = fire_seeds("test", 5)
     short = make_fires(load_scenario("huygens"), seeds, GRID, 400)
-    assert torch.equal(short, heldout[:5].masked_fill(heldout[:5] > 400, math.inf))
+    assert torch.equal(short, test_fires[:5].masked_fill(test_fires[:5] > 400, math.inf))
 
 
-def test_arrivals(heldout: torch.Tensor):
-    assert heldout.dtype == torch.float32
-    finite = heldout[heldout.isfinite()]
+def test_arrivals(test_fires: torch.Tensor):
+    assert test_fires.dtype == torch.float32
+    finite = test_fires[test_fires.isfinite()]
     assert finite.min() == 0
     assert finite.max() <= HORIZON
-    assert not heldout.isnan().any()
+    assert not test_fires.isnan().any()
 
 
 def test_burning_cells_by_hand():
@@ -209,19 +210,23 @@ def test_grid_out_of_range(grid: tuple[int, int]):
 def test_seeds_are_disjoint_by_construction():
     assert fire_seeds("train", 3).tolist() == [0, 1, 2]
     assert fire_seeds("train", 2, 500).tolist() == [500, 501]
-    assert fire_seeds("heldout", 2).tolist() == [HELD_OUT_FROM, HELD_OUT_FROM + 1]
-    assert fire_seeds("train", 1, HELD_OUT_FROM - 1).max() < HELD_OUT_FROM
+    assert fire_seeds("test", 2).tolist() == [TEST_FROM, TEST_FROM + 1]
+    assert fire_seeds("train", 1, TEST_FROM - 1).max() < TEST_FROM
+    every = [fire_seeds(split, TEST_FROM) for split in get_args(Split)]
+    assert len(torch.cat(every).unique()) == 3 * TEST_FROM
 
 
 @pytest.mark.parametrize(
     ("args", "message"),
     [
-        (("train", 2, HELD_OUT_FROM - 1), "training seeds end before 1000000"),
-        (("train", HELD_OUT_FROM + 1), "1000001"),
-        (("heldout", 2, 1), "got 1"),
+        (("train", 2, TEST_FROM - 1), "start 999999 and count 2"),
+        (("test", TEST_FROM + 1), "1000001"),
+        (("train", TEST_FROM + 1), "1000001"),
+        (("test", 2, 1), "got 1"),
+        (("validation", 2, 7), "validation fires .* got 7"),
         (("train", 0), "got 0"),
         (("train", 1, -1), "-1"),
-        (("test", 1), "'test'; known: train, heldout"),
+        (("heldout", 1), "'heldout'; known: train, validation, test"),
     ],
 )
 def test_seed_errors(args, message: str):
@@ -342,8 +347,8 @@ def test_the_key_changes_with_everything(monkeypatch: pytest.MonkeyPatch):
     def key(config=base, **changes):
         return bank_key(FireConfig(**config), **{**args, **changes})
 
-    keys = [key(), key(split="heldout"), key(count=3), key(grid=(10, 12)), key(horizon=51)]
-    keys += [key(base=1), key({**base, "name": "other"}), key({**base, "bank": 3})]
+    keys = [key(), key(split="test"), key(count=3), key(grid=(10, 12)), key(horizon=51)]
+    keys += [key(base=1), key({**base, "name": "other"}), key({**base, "num_train_fires": 3})]
     keys.append(key({**base, "two_sided": True}))
     for field in RANGES:
         low, high = base[field]
@@ -387,10 +392,10 @@ def test_a_config_is_frozen_complete_and_closed():
         config.num_train_fires = 3  # pyright: ignore[reportAttributeAccessIssue]
     with pytest.raises(ValidationError, match="wind"):
         FireConfig(**settings_of(wind=3))
-    with pytest.raises(ValidationError, match="bank"):
+    with pytest.raises(ValidationError, match="num_train_fires"):
         FireConfig(**settings_of(num_train_fires=0))
-    with pytest.raises(ValidationError, match="bank"):
-        FireConfig(**settings_of(bank="4"))
+    with pytest.raises(ValidationError, match="num_train_fires"):
+        FireConfig(**settings_of(num_train_fires="4"))
     missing = settings_of()
     del missing["wind_shift"]
     with pytest.raises(ValidationError, match="wind_shift"):

@@ -18,7 +18,7 @@ from emberlink.envs.fire.generator import burning_cells, fire_seeds, load_scenar
 from emberlink.envs.fire_files import bank_writer
 from emberlink.envs.fire_files.bank_writer import write_bank
 from emberlink.envs.scenarios import fires_of
-from emberlink.envs.utils.atomic_io import published
+from emberlink.envs.utils.publish import published
 from emberlink.trainers.cli import main
 from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.fires import plot
@@ -90,11 +90,11 @@ def disc(side: int = 40, speed: float = 0.05, at: tuple[int, int] = (15, 22)) ->
     return np.where(times <= 250, times, np.inf)
 
 
-def test_preview_prints_the_numbers_of_the_held_out_fire(capsys):
-    (fire,) = make_fires(HUYGENS, fire_seeds("heldout", 4)[3:], (40, 30), 400)
+def test_preview_prints_the_numbers_of_the_test_fire(capsys):
+    (fire,) = make_fires(HUYGENS, fire_seeds("test", 4)[3:], (40, 30), 400)
     burning = burning_cells(fire[None], 400)[0]
     lines = ran(capsys, "preview", "huygens:3", "env.grid=[40,30]", "env.horizon=400")
-    assert lines[0] == "huygens, held-out fire 3: 40 x 30 cells, 400 steps, setup paper"
+    assert lines[0] == "huygens, test fire 3: 40 x 30 cells, 400 steps, setup paper"
     found = numbers(lines)
     assert found["burning at the start"] == burning[0]
     assert found["burning at the end"] == burning[-1]
@@ -184,13 +184,13 @@ def test_make_writes_the_scenarios_fires(suffix, capsys, tmp_path):
     file = tmp_path / f"bank{suffix}"
     lines = ran(
         capsys,
-        *("make", "--count", 5, "huygens", "--split", "heldout", "env.grid=[20,34]"),
+        *("make", "--count", 5, "huygens", "--split", "test", "env.grid=[20,34]"),
         *("env.horizon=300", "fire.head_ros=[0.01,0.02]", "--output", file),
     )
     assert lines == ["5 fires of 20 x 34 cells, 300 steps", str(file)]
     config = load_scenario("huygens")
     object.__setattr__(config, "head_ros", (0.01, 0.02))
-    expected = make_fires(config, fire_seeds("heldout", 5), (20, 34), 300).numpy()
+    expected = make_fires(config, fire_seeds("test", 5), (20, 34), 300).numpy()
     assert np.isinf(expected).any()
     if suffix == ".npy":
         fires, about = np.load(file), json.loads(file.with_suffix(".json").read_text())
@@ -210,11 +210,11 @@ def test_make_writes_the_scenarios_fires(suffix, capsys, tmp_path):
         rate = json.loads(about["fire"])["head_ros"]
     assert fires.dtype == np.float32
     assert np.array_equal(fires, expected)
-    assert names == [f"huygens heldout {seed}" for seed in range(1_000_000, 1_000_005)]
+    assert names == [f"huygens test {seed}" for seed in range(1_000_000, 1_000_005)]
     assert rate == [0.01, 0.02]
     told = {key: str(about[key]) for key in ("units", "scenario", "split", "seeds", "horizon")}
     assert told == {
-        **{"units": "steps", "scenario": "huygens", "split": "heldout", "horizon": "300"},
+        **{"units": "steps", "scenario": "huygens", "split": "test", "horizon": "300"},
         "seeds": "1000000 to 1000004",
     }
     assert int(about["generator_version"]) == GENERATOR_VERSION
@@ -229,7 +229,7 @@ def test_make_without_more_writes_what_is_trained_on(capsys, tmp_path):
     )
     expected = make_fires(HUYGENS, fire_seeds("train", 3), (30, 30), 9).numpy()
     assert np.array_equal(np.load("huygens_train_3.npy"), expected)
-    assert ran(capsys, "make", "paper", "--split", "heldout", "env.horizon=9")[0].startswith("100")
+    assert ran(capsys, "make", "paper", "--split", "test", "env.horizon=9")[0].startswith("100")
     assert not list(tmp_path.glob(".*"))
 
 
@@ -241,13 +241,13 @@ def test_a_bank_comes_back_bit_for_bit(suffix, count, capsys, tmp_path):
     fires = make_fires(HUYGENS, fire_seeds("train", count), (24, 40), 1000)
     ran(capsys, "import", file, "env.grid=[24,40]", "--output", again)
     assert torch.equal(torch.from_numpy(np.load(again)), fires)
-    # What is trained on: all but every fifth, if there are several.
+    # Of several fires every fifth is a validation fire and every fifth a test fire.
     keys = ["fire=file", f"fire.path={file}", "env.grid=[24,40]"]
     scenario = fires_of(resolve("consensus", keys).fire)
-    held_out = [4] if count == 7 else [0]
-    trained = [i for i in range(count) if i not in held_out or count == 1]
-    assert torch.equal(scenario.train((24, 40), 1000), fires[trained])
-    assert torch.equal(scenario.heldout(1, (24, 40), 1000), fires[held_out])
+    train, validation, test = ([0, 1, 2, 5, 6], [3], [4]) if count == 7 else ([0], [0], [0])
+    assert torch.equal(scenario.train((24, 40), 1000), fires[train])
+    assert torch.equal(scenario.validation(1, (24, 40), 1000), fires[validation])
+    assert torch.equal(scenario.test(1, (24, 40), 1000), fires[test])
 
 
 def test_import_of_several_files_is_each_of_them(capsys, tmp_path):
@@ -277,7 +277,7 @@ def test_import_of_several_files_is_each_of_them(capsys, tmp_path):
 
 def test_a_file_with_the_name_of_a_scenario_is_found_by_its_path(capsys, tmp_path):
     ascii_raster(tmp_path / "huygens.asc", disc()).rename(tmp_path / "huygens")
-    assert ran(capsys, "preview", "huygens")[0].startswith("huygens, held-out fire 0: ")
+    assert ran(capsys, "preview", "huygens")[0].startswith("huygens, test fire 0: ")
     assert ran(capsys, "preview", "./huygens", "fire.units=minutes")[0].startswith("huygens: 30")
 
 

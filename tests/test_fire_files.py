@@ -14,10 +14,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tiny_run import TINY
 
+from emberlink.configs import known
 from emberlink.envs.fire.generator import load_scenario, make_fires, scenarios
 from emberlink.envs.fire_files.reader import KEPT, FileFireConfig, read_fires, splits
 from emberlink.envs.scenarios import fires_of
-from emberlink.envs.utils.validation import known
 from emberlink.envs.wildfire import WildfireEnv
 from emberlink.trainers.cli import main
 from emberlink.trainers.config.compose import from_values, override, resolve, to_values
@@ -120,8 +120,8 @@ def test_a_run_tells_what_it_was_trained_on(trained):
     assert evaluation["held_out"]["file"]["scenario"] == fire
     with np.load(run / KEPT) as kept:
         expected = read_fires(RunFolder(run).config().fire, GRID, HORIZON)
-        assert np.array_equal(kept["train"], expected.numpy())
-        assert np.array_equal(kept["heldout"], expected.numpy())
+        for split in ("train", "validation", "test"):
+            assert np.array_equal(kept[split], expected.numpy())
 
 
 def test_a_run_is_evaluated_rendered_and_resumed_without_its_file(run, trained, tmp_path, capfd):
@@ -192,41 +192,45 @@ def test_old_runs_load_as_they_were():
     assert "kind" not in values["fire"]
     assert from_values(values) == resolve("consensus", ["setup=tuned"])
     with pytest.raises(ValueError, match=r"^fire\.num_train_fires=0: "):
-        from_values({**values, "fire": {**values["fire"], "bank": 0}})
+        from_values({**values, "fire": {**values["fire"], "num_train_fires": 0}})
     with pytest.raises(ValueError, match=r"key 'fire\.kind' is not known"):
         from_values({**values, "fire": {**values["fire"], "kind": "other"}})
 
 
-def test_of_several_fires_every_fifth_is_held_out(tmp_path):
-    for count, train, heldout in (
-        (1, [0], [0]),
-        (3, [0, 1], [2]),
-        (5, [0, 1, 2, 3], [4]),
-        (12, [0, 1, 2, 3, 5, 6, 7, 8, 10, 11], [4, 9]),
-    ):
-        fires = bank_of(count)
-        path = tmp_path / f"{count}.npy"
-        np.save(path, fires.numpy())
-        found = fires_of(FileFireConfig(path=str(path)))
-        assert torch.equal(found.train(GRID, HORIZON), fires[train])
-        repeated = (heldout * 7)[:7]
-        assert torch.equal(found.heldout(7, GRID, HORIZON), fires[repeated])
-        assert torch.equal(found.one_heldout(3, GRID, HORIZON), fires[repeated[3:4]])
+@pytest.mark.parametrize(
+    ("count", "train", "validation", "test"),
+    [
+        (1, [0], [0], [0]),
+        (2, [0], [0], [1]),
+        (3, [0], [1], [2]),
+        (5, [0, 1, 2], [3], [4]),
+        (12, [0, 1, 2, 5, 6, 7, 10, 11], [3, 8], [4, 9]),
+    ],
+)
+def test_the_fires_of_a_file_are_divided_into_three_sets(count, train, validation, test, tmp_path):
+    fires = bank_of(count)
+    np.save(tmp_path / "bank.npy", fires.numpy())
+    found = fires_of(FileFireConfig(path=str(tmp_path / "bank.npy")))
+    assert torch.equal(found.train(GRID, HORIZON), fires[train])
+    assert torch.equal(found.validation(7, GRID, HORIZON), fires[(validation * 7)[:7]])
+    repeated = (test * 7)[:7]
+    assert torch.equal(found.test(7, GRID, HORIZON), fires[repeated])
+    assert torch.equal(found.test_fire(3, GRID, HORIZON), fires[repeated[3:4]])
 
 
-def test_a_second_file_is_held_out(tmp_path, source):
+def test_a_second_file_holds_the_test_fires(tmp_path, source):
     fires = bank_of(7)
     np.save(tmp_path / "bank.npy", fires.numpy())
-    keys = {"units": "minutes", "heldout": str(source)}
-    config = FileFireConfig(path=str(tmp_path / "bank.npy"), **keys)
+    config = FileFireConfig(path=str(tmp_path / "bank.npy"), units="minutes", test=str(source))
     found = fires_of(config)
-    assert torch.equal(found.train(GRID, HORIZON), fires)
+    assert torch.equal(found.train(GRID, HORIZON), fires[[0, 1, 2, 4, 5, 6]])
+    assert torch.equal(found.validation(1, GRID, HORIZON), fires[[3]])
     other = read_fires(FileFireConfig(path=str(source), units="minutes"), GRID, HORIZON)
-    assert torch.equal(found.heldout(2, GRID, HORIZON), other.expand(2, -1, -1))
+    assert torch.equal(found.test(2, GRID, HORIZON), other.expand(2, -1, -1))
     pinned = found.pinned()
-    assert pinned.sha256 != pinned.heldout_sha256
+    assert pinned.sha256 != pinned.test_sha256
     with pytest.raises(ValueError, match=r"nothing\.asc: there is no such file"):
-        fires_of(FileFireConfig(path=str(source), heldout="nothing.asc")).pinned()
+        fires_of(FileFireConfig(path=str(source), test="nothing.asc")).pinned()
 
 
 def test_a_bank_is_taken_as_it_is(tmp_path):

@@ -4,12 +4,10 @@ import math
 
 import pytest
 import torch
-from moments import moment
+from moments import communication, moment
 from torch import Tensor
 
 from emberlink.comm._heading import HeadingConfig, heading_reward
-from emberlink.comm.base import Communication
-from emberlink.comm.consensus import Consensus, ConsensusConfig
 from emberlink.envs import keys
 from emberlink.envs.config import RewardConfig, WildfireConfig
 
@@ -46,15 +44,15 @@ def test_standing_still_earns_nothing_by_the_true_angle():
 @pytest.mark.parametrize(("axes", "exits"), [("xyz", [18, 0, 0, 0]), ("xy", [18, 0, 0, 18])])
 def test_the_heading_term_is_added_unless_the_uav_left_the_box(axes, exits):
     world = WildfireConfig(grid=(64, 64), reward=RewardConfig(exit_axes=axes))
-    talk = Communication(Consensus(world, ConsensusConfig()))
     before = moment([[10.0 * i, 5.0, 2.0] for i in range(4)], [1] * 4, centre=[[60.0, 5.0]] * 4)
+    talk = communication(before, world=world)
     before = talk._reset(before, before)
     # All fly straight at the target they were told; the next target is elsewhere.
     after = moment(
         [[10.0 * i + 1, 5.0, 2.0] for i in range(4)],
         [1] * 4,
         centre=[[0.0, 60.0]] * 4,
-        beyond=[INSIDE, (True, False, False), (False, True, False), (False, False, True)],
+        hit_boundary=[INSIDE, (True, False, False), (False, True, False), (False, False, True)],
     )
     after.set(keys.REWARD, torch.full((1, 4, 1), -7.0))
     reward = talk._step(before, after)[keys.REWARD]

@@ -6,7 +6,6 @@ import json
 import os
 import pickle
 import resource
-import shutil
 import struct
 import subprocess
 import sys
@@ -22,6 +21,7 @@ from tiny_run import TINY
 
 from emberlink.envs.fire.cache import bank_key, fire_bank
 from emberlink.envs.fire.generator import load_scenario
+from emberlink.envs.utils.errors import UserError
 from emberlink.trainers.cli import main
 from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.runs.run_folder import RunFolder
@@ -319,15 +319,12 @@ def test_a_method_that_is_a_path(tmp_path, mark, monkeypatch, capsys):
 
 
 def test_a_scenario_with_a_tag(tmp_path, mark, monkeypatch):
-    import emberlink.envs.fire.generator as module
-
-    with module.resources.as_file(module.resources.files("emberlink.configs")) as ours:
-        shutil.copytree(ours / "fire", tmp_path / "fire")
     text = f"name: !!python/object/apply:os.mkdir [{mark}]\n"
-    (tmp_path / "fire" / "paper.yaml").write_text(text)
-    monkeypatch.setattr(module.resources, "files", lambda _: tmp_path)
-    with pytest.raises(ValueError, match=r"^configs/fire/paper.yaml: .*python/object/apply"):
-        load_scenario("paper")
+    (tmp_path / "fire").mkdir()
+    (tmp_path / "fire" / "own.yaml").write_text(text)
+    monkeypatch.setenv("EMBERLINK_CONFIGS", str(tmp_path))
+    with pytest.raises(UserError, match=r"fire/own.yaml: .*python/object/apply"):
+        load_scenario("own")
     assert not mark.exists()
 
 
@@ -352,7 +349,7 @@ def test_what_is_no_regular_file(name, kind, run, mark, capsys, tmp_path):
 def test_links_out_of_a_run_folder_are_not_written_through(run, tmp_path):
     mine = tmp_path / "mine"
     mine.write_text("mine")
-    for name in ("eval.json.part", "config.yaml.part"):
+    for name in (f"eval.json.{os.getpid()}.part", f"config.yaml.{os.getpid()}.part"):
         (run / name).symlink_to(mine)
     assert main.main(["eval", str(run), "--fires", "1"]) == 0
     RunFolder(run).write_config(resolve("consensus"))

@@ -9,8 +9,8 @@ import pytest
 import torch
 from robustness import SOAK
 
+from emberlink.configs import known
 from emberlink.envs import keys
-from emberlink.envs.utils.validation import known
 from emberlink.trainers.build import build_env
 from emberlink.trainers.config.compose import from_values, resolve, to_values
 
@@ -116,7 +116,7 @@ def check(moment, before, env, config, looked: torch.Tensor) -> None:
     assert (none >= 0).all()
     total = footprint(position, config) * looked[:, None]
     assert torch.equal(new + old + none, total)
-    burning = world.arrival <= moment[keys.STEP][:, None, None]
+    burning = world.arrival_time <= moment[keys.STEP][:, None, None]
     seen = world._map.seen
     assert not (seen & ~burning).any()
     assert torch.equal(moment[keys.SEEN], seen.sum((1, 2)))

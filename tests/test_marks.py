@@ -5,7 +5,6 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from emberlink.comm.consensus import FOLLOWS, TARGET
 from emberlink.envs import keys
 from emberlink.envs.rendering import marks, panels
 from emberlink.envs.rendering.frame import UAV
@@ -185,21 +184,23 @@ def test_roles_follow_from_whom_a_uav_follows():
     ]
 
 
-def test_what_is_drawn_goes_by_what_the_tensordict_holds():
+def test_links_roles_and_targets_are_drawn_where_the_tensordict_holds_them():
     nothing = torch.zeros(30, 20, dtype=torch.uint8)
-    told = {FOLLOWS[1]: torch.tensor([0, 0, -1]), TARGET[1]: torch.ones(3, 3)}
-    seen = record_episode.moment(tensordict(9, **told), nothing, hears=True, limit=10.5)
-    # UAVs 0 and 1 are 10 cells apart, 1 and 2 are 14.1.
-    assert np.array_equal(seen.links, linked((0, 1)))
+    hears = torch.from_numpy(linked((0, 1)))
+    told = {
+        keys.HEARS[1]: hears,
+        keys.FOLLOWS[1]: torch.tensor([0, 0, -1]),
+        keys.TARGET[1]: torch.ones(3, 3),
+    }
+    seen = record_episode.moment(tensordict(9, **told), nothing, hears=True)
+    assert np.array_equal(seen.links, hears)
     assert seen.roles.tolist() == [0, 1, 2]
     assert np.array_equal(seen.target, np.ones((3, 3)))
-    at_limit = record_episode.moment(tensordict(9, **told), nothing, hears=True, limit=10.0)
-    assert not at_limit.links.any()
-    everyone = record_episode.moment(tensordict(18), nothing, hears=True, limit=torch.inf)
-    assert everyone.links.sum() == 6
-    assert everyone.roles is everyone.target is None
+    links_alone = record_episode.moment(tensordict(18, hears=hears), nothing, hears=True)
+    assert np.array_equal(links_alone.links, hears)
+    assert links_alone.roles is links_alone.target is None
     for silent in (
-        record_episode.moment(tensordict(6), nothing, hears=True, limit=10),
-        record_episode.moment(tensordict(9, **told), nothing, hears=False, limit=10),
+        record_episode.moment(tensordict(6), nothing, hears=True),
+        record_episode.moment(tensordict(9, **told), nothing, hears=False),
     ):
         assert silent.links is silent.roles is silent.target is None

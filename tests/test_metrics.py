@@ -107,7 +107,7 @@ def by_hand(steps) -> dict[str, float]:
     share = [
         100 * int(s) / int(b) for s, b in zip(steps[keys.SEEN], steps[keys.BURNING], strict=True)
     ]
-    left = sum(any(steps[keys.BEYOND][t, n]) for t in range(horizon) for n in range(uavs))
+    left = sum(any(steps[keys.HIT_BOUNDARY][t, n]) for t in range(horizon) for n in range(uavs))
     lost = sum(bool(on[t - 1][n] and not on[t][n]) for t in range(1, horizon) for n in range(uavs))
     return {
         "mean_reward": sum(steps[keys.REWARD].flatten().tolist()) / horizon / uavs,

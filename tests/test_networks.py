@@ -13,7 +13,8 @@ from emberlink.policies.networks.actor_critic import STATE_ACTION_VALUE, make_ac
 from emberlink.policies.networks.stacked import StackedActor, StackedCritic
 
 UAVS, FEATURES, ACTIONS, HIDDEN = 4, 9, 3, (20, 12)
-SIZES = UAVS, FEATURES, ACTIONS, HIDDEN
+SIZES = UAVS, [(FEATURES,)], ACTIONS, HIDDEN
+SINGLE = FEATURES, ACTIONS, HIDDEN
 
 
 def scrambled(network):
@@ -32,7 +33,7 @@ def test_each_actor_of_the_stack_equals_its_own_network(batch):
     actions = stack(observation)
     assert actions.shape == (*batch, UAVS, ACTIONS)
     for uav in range(UAVS):
-        single = copy_uav(stack, SingleActor(*SIZES[1:]), uav)
+        single = copy_uav(stack, SingleActor(*SINGLE), uav)
         expected = single(observation[..., uav, :])
         torch.testing.assert_close(actions[..., uav, :], expected, atol=1e-6, rtol=1e-5)
 
@@ -44,13 +45,13 @@ def test_each_critic_of_the_stack_equals_its_own_network(batch):
     values = stack(observation, action)
     assert values.shape == (*batch, UAVS, 1)
     for uav in range(UAVS):
-        single = copy_uav(stack, SingleCritic(*SIZES[1:]), uav)
+        single = copy_uav(stack, SingleCritic(*SINGLE), uav)
         expected = single(observation[..., uav, :], action[..., uav, :])
         torch.testing.assert_close(values[..., uav, :], expected, atol=1e-5, rtol=1e-5)
 
 
 def test_initial_weights_are_those_of_the_ddpg_paper():
-    critic = StackedCritic(6, 9, 3, generator=torch.Generator().manual_seed(0))
+    critic = StackedCritic(6, [(9,)], 3, generator=torch.Generator().manual_seed(0))
     bounds = {
         "first": 1 / math.sqrt(9),
         "second": 1 / math.sqrt(400),
@@ -67,7 +68,7 @@ def test_initial_weights_are_those_of_the_ddpg_paper():
     for norm in (critic.first_norm, critic.second_norm):
         assert (norm.weight == 1).all()
         assert (norm.bias == 0).all()
-    actor = StackedActor(6, 9, 3)
+    actor = StackedActor(6, [(9,)], 3)
     assert actor.action.weight.abs().max() <= 3e-3
     assert actor.first.weight.shape[2:] == (400,)
     assert actor.second.weight.shape[1:] == (400, 300)
@@ -104,14 +105,14 @@ def test_modules_read_and_write_the_keys_of_the_environment():
 def test_networks_one_by_one_are_the_stack(hidden, monkeypatch):
     """Values and gradients, with inputs of one team and of two."""
     generator = torch.Generator().manual_seed(3)
-    actor = StackedActor(4, 5, 3, hidden, generator=generator)
-    critic = StackedCritic(4, 5, 3, hidden, generator=generator)
+    actor = StackedActor(2, [(5,)], 3, hidden, generator=[generator, generator])
+    critic = StackedCritic(2, [(5,)], 3, hidden, generator=[generator, generator])
     for network in (actor, critic):
         for weight in network.parameters():
             torch.nn.init.normal_(weight, std=0.5, generator=generator)
 
     def evaluate(large: int, uavs: int) -> list[torch.Tensor]:
-        monkeypatch.setattr(stacked, "_LARGE", large)
+        monkeypatch.setattr(stacked, "MAX_BATCHED", large)
         observation = torch.randn(6, uavs, 5, generator=torch.Generator().manual_seed(4))
         action = actor(observation)
         value = critic(observation, action)
@@ -128,11 +129,13 @@ def test_networks_one_by_one_are_the_stack(hidden, monkeypatch):
 def test_a_team_reads_its_own_environments():
     """Rows 0 to 2 are team 0's, rows 3 to 5 team 1's; each as alone."""
     generators = [torch.Generator().manual_seed(seed) for seed in (1, 2)]
-    both = StackedActor(4, 5, 3, (8, 8), generator=generators)
+    both = StackedActor(2, [(5,)], 3, (8, 8), generator=generators)
     observation = torch.randn(6, 2, 5)
     actions = both(observation)
     for team in range(2):
-        alone = StackedActor(2, 5, 3, (8, 8), generator=torch.Generator().manual_seed(team + 1))
+        alone = StackedActor(
+            2, [(5,)], 3, (8, 8), generator=torch.Generator().manual_seed(team + 1)
+        )
         own = slice(3 * team, 3 * team + 3)
         torch.testing.assert_close(actions[own], alone(observation[own]))
 
@@ -140,15 +143,15 @@ def test_a_team_reads_its_own_environments():
 @pytest.mark.parametrize("large", [1, 10**9], ids=["one by one", "stack"])
 def test_critics_share_what_the_action_has_no_part_in(large, monkeypatch):
     """Values and gradients are those without; what another network or observation has is not."""
-    monkeypatch.setattr(stacked, "_LARGE", large)
+    monkeypatch.setattr(stacked, "MAX_BATCHED", large)
     critic, other = scrambled(StackedCritic(*SIZES)), StackedCritic(*SIZES)
     observation, following = torch.randn(2, 5, UAVS, FEATURES)
     taken, chosen = torch.randn(2, 5, UAVS, ACTIONS).requires_grad_()
     fixed = {name: weight.detach() for name, weight in critic.named_parameters()}
     target = {name: weight.detach() for name, weight in other.named_parameters()}
     made = []
-    trunk = stacked._trunk
-    monkeypatch.setattr(stacked, "_trunk", lambda *layers: made.append(1) or trunk(*layers))
+    features = stacked._features
+    monkeypatch.setattr(stacked, "_features", lambda *given: made.append(1) or features(*given))
 
     def values() -> list[torch.Tensor]:
         call = torch.func.functional_call

@@ -44,7 +44,7 @@ def play(policy, starts: list[torch.Tensor | bool], envs: int = ENVS) -> torch.T
     for start in starts:
         fresh = torch.as_tensor(start).flatten().expand(envs)
         episode, step = episode + fresh, torch.where(fresh, 0, step + 1)
-        moment[keys.STREAM] = counter_rng.fold(counter_rng.streams(0, envs), episode)
+        moment[keys.RNG_KEY] = counter_rng.fold_in(counter_rng.seed_keys(0, envs), episode)
         moment[keys.STEP] = step
         moment = policy(moment)
         actions.append(moment[keys.ACTION].clone())

@@ -137,7 +137,7 @@ def test_no_drift_is_a_drift_of_zero():
 
 
 def test_a_tide_of_no_strength_is_none():
-    config, seeds = load_scenario("huygens"), fire_seeds("heldout", 5)
+    config, seeds = load_scenario("huygens"), fire_seeds("test", 5)
     other = {"tide_period": (300, 900), "tide_phase": (-9, 9), "tide_bearing": (0, 90)}
     same = make_fires(dataclasses.replace(config, **other), seeds, GRID, 300)
     assert torch.equal(same, make_fires(config, seeds, GRID, 300))
@@ -146,7 +146,7 @@ def test_a_tide_of_no_strength_is_none():
 # Cells that burn, and the sum of their arrivals, as computed before there was a drift.
 UNCHANGED = [
     ("paper", fire_seeds("train", 1), (30, 30), 1000, 141, 33533.2004),
-    ("huygens", fire_seeds("heldout", 20), (30, 30), 1000, 3161, 840003.0796),
+    ("huygens", fire_seeds("test", 20), (30, 30), 1000, 3161, 840003.0796),
     ("huygens", fire_seeds("train", 20), (45, 30), 600, 2390, 265218.5284),
 ]
 
@@ -281,34 +281,34 @@ def test_the_numbers_are_those_of_the_sources():
 
 
 @pytest.fixture(scope="module")
-def heldout() -> Tensor:
-    return make_fires(load_scenario("oil_slick"), fire_seeds("heldout", 100), GRID, HORIZON)
+def test_fires() -> Tensor:
+    return make_fires(load_scenario("oil_slick"), fire_seeds("test", 100), GRID, HORIZON)
 
 
-def test_slicks_are_a_task_of_the_size_of_the_fires(heldout: Tensor):
-    count = burning_cells(heldout, HORIZON)
+def test_slicks_are_a_task_of_the_size_of_the_fires(test_fires: Tensor):
+    count = burning_cells(test_fires, HORIZON)
     assert ((count[:, 0] >= 55) & (count[:, 0] <= 90)).all()
     assert ((count[:, -1] >= 110) & (count[:, -1] <= 230)).all()
     assert (count.diff() >= 0).all()
-    assert len(heldout.flatten(1).unique(dim=0)) == 100
-    edge = torch.cat([heldout[:, [0, -1]].flatten(1), heldout[:, :, [0, -1]].flatten(1)], 1)
+    assert len(test_fires.flatten(1).unique(dim=0)) == 100
+    edge = torch.cat([test_fires[:, [0, -1]].flatten(1), test_fires[:, :, [0, -1]].flatten(1)], 1)
     assert (edge > 0).all()
 
 
-def test_all_of_the_disc_is_oil(heldout: Tensor):
+def test_all_of_the_disc_is_oil(test_fires: Tensor):
     """A ring as wide as its radius leaves no hole."""
     x, y = torch.meshgrid(torch.arange(30.0), torch.arange(30.0), indexing="ij")
-    for arrival in heldout[:10]:
+    for arrival in test_fires[:10]:
         oil = (arrival == 0).nonzero().float()
         cx, cy = (oil.amax(0) + oil.amin(0)) / 2
         assert (arrival[torch.hypot(x - cx, y - cy) < 3.5] == 0).all()
 
 
-def test_a_slick_depends_on_its_seed_alone(heldout: Tensor):
-    config, seeds = load_scenario("oil_slick"), fire_seeds("heldout", 100)
-    assert torch.equal(make_fires(config, seeds[37:39], GRID, HORIZON), heldout[37:39])
+def test_a_slick_depends_on_its_seed_alone(test_fires: Tensor):
+    config, seeds = load_scenario("oil_slick"), fire_seeds("test", 100)
+    assert torch.equal(make_fires(config, seeds[37:39], GRID, HORIZON), test_fires[37:39])
     short = make_fires(config, seeds[:3], GRID, 350)
-    assert torch.equal(short, heldout[:3].masked_fill(heldout[:3] > 350, math.inf))
+    assert torch.equal(short, test_fires[:3].masked_fill(test_fires[:3] > 350, math.inf))
 
 
 @pytest.mark.parametrize(

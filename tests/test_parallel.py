@@ -52,7 +52,7 @@ def compare(moment: TensorDict, observations, infos, agents) -> None:
     for i, agent in enumerate(agents):
         assert observations[agent].dtype == np.float32
         assert np.array_equal(observations[agent], moment[keys.OBSERVATION][0, i].numpy())
-        for key in ("position", "new_fire", "old_fire", "no_fire", "beyond"):
+        for key in ("position", "new_fire", "old_fire", "no_fire", "hit_boundary"):
             assert np.array_equal(infos[agent][key], moment[keys.AGENTS, key][0, i].numpy())
         assert infos[agent]["seen"] == moment[keys.SEEN].item()
 

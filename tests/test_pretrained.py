@@ -10,7 +10,7 @@ import yaml
 from tiny_run import TINY
 
 from emberlink.trainers.cli.main import main
-from emberlink.trainers.evaluation.report import load_actor
+from emberlink.trainers.evaluation.actor import load_actor
 from emberlink.trainers.runs import pretrained
 from emberlink.trainers.runs.run_folder import RunFolder
 

@@ -9,7 +9,7 @@ import yaml
 
 from emberlink.envs import keys, metrics
 from emberlink.trainers.config.compose import resolve
-from emberlink.trainers.evaluation import report
+from emberlink.trainers.evaluation.actor import load_actor
 from emberlink.trainers.learners.replay_buffer import rows_needed
 from emberlink.trainers.runs.run_folder import RunFolder
 from emberlink.trainers.training.trainer import Trainer
@@ -82,7 +82,7 @@ def check_actor(run: RunFolder, config, trainer: Trainer) -> None:
     """The checkpoint's actor acts as the trained one does."""
     checkpoint = run.checkpoint()
     assert checkpoint.name == f"step_{EPISODES * HORIZON:09d}.safetensors"
-    loaded = report.load_actor(config, checkpoint)
+    loaded = load_actor(config, checkpoint)
     rollout = trainer.env.rollout(5, trainer.actor)
     for step in range(5):
         again = loaded(rollout[:, step].select(keys.OBSERVATION))

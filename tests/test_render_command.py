@@ -12,9 +12,9 @@ from PIL import Image
 from rich.console import Console
 from safetensors.torch import save_file
 
+from emberlink.configs import known
 from emberlink.envs.rendering import marks, video
-from emberlink.envs.utils.atomic_io import published
-from emberlink.envs.utils.validation import known
+from emberlink.envs.utils.publish import published
 from emberlink.policies.scripted.registry import SCRIPTED
 from emberlink.trainers.build import build_env, build_networks
 from emberlink.trainers.cli import main, render

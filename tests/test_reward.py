@@ -16,7 +16,7 @@ RELEASED = RewardConfig(new_fire=12.0, old_fire=6.0, no_fire=-4.0, exit=-150.0, 
 
 
 @pytest.mark.parametrize(
-    ("counts", "beyond", "paper", "released"),
+    ("counts", "hit_boundary", "paper", "released"),
     [
         ((0, 0, 0), INSIDE, 0, 0),
         ((1, 0, 0), INSIDE, 1, 12),
@@ -29,8 +29,8 @@ RELEASED = RewardConfig(new_fire=12.0, old_fire=6.0, no_fire=-4.0, exit=-150.0, 
         ((3, 5, 17), [True, True, True], -100, -150),
     ],
 )
-def test_view_reward(counts, beyond, paper, released):
-    classes, out = [torch.tensor([count]) for count in counts], torch.tensor([beyond])
+def test_view_reward(counts, hit_boundary, paper, released):
+    classes, out = [torch.tensor([count]) for count in counts], torch.tensor([hit_boundary])
     assert view_reward(*classes, out, RewardConfig()).tolist() == [paper]
     assert view_reward(*classes, out, RELEASED).tolist() == [released]
     assert view_reward(*classes, out, RELEASED).dtype == torch.float32
@@ -38,18 +38,18 @@ def test_view_reward(counts, beyond, paper, released):
 
 def test_view_reward_is_elementwise():
     new, old, none = torch.randint(0, 9, (3, 5, 4))
-    beyond = torch.rand(5, 4, 3) < 0.3
-    together = view_reward(new, old, none, beyond, RELEASED)
+    hit_boundary = torch.rand(5, 4, 3) < 0.3
+    together = view_reward(new, old, none, hit_boundary, RELEASED)
     assert together.shape == (5, 4)
     for at in [(0, 0), (2, 3), (4, 1)]:
-        alone = view_reward(new[at], old[at], none[at], beyond[at], RELEASED)
+        alone = view_reward(new[at], old[at], none[at], hit_boundary[at], RELEASED)
         assert together[at] == alone
 
 
 def test_left_box():
-    beyond = torch.tensor([INSIDE, [False, False, True], [False, True, False]])
-    assert left_box(beyond, "xyz").tolist() == [False, True, True]
-    assert left_box(beyond, "xy").tolist() == [False, False, True]
+    hit_boundary = torch.tensor([INSIDE, [False, False, True], [False, True, False]])
+    assert left_box(hit_boundary, "xyz").tolist() == [False, True, True]
+    assert left_box(hit_boundary, "xy").tolist() == [False, False, True]
 
 
 def point(degrees: float, length: float = 1.0) -> list[float]:

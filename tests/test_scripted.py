@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torchrl.envs import step_mdp
 
-from emberlink.comm import consensus
+from emberlink.configs import known
 from emberlink.envs import WildfireConfig, WildfireEnv, keys, metrics
 from emberlink.envs.world.sensor import view_radius
 from emberlink.policies.scripted.base import Scripted
@@ -18,7 +18,7 @@ from emberlink.policies.scripted.lawnmower import Lawnmower, stops
 from emberlink.policies.scripted.oracle import Oracle
 from emberlink.policies.scripted.registry import SCRIPTED
 from emberlink.trainers.build import build_env
-from emberlink.trainers.config.compose import known, resolve
+from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.evaluation.evaluate import play, scripted_config
 
 NEVER = math.inf
@@ -116,14 +116,10 @@ def test_the_lawnmower_sees_every_cell(grid, uavs, angle, ceiling, displacement)
 # FollowTarget
 
 
-def test_pursuit_reads_what_consensus_writes():
-    assert FollowTarget.TARGET == consensus.TARGET
-
-
-def test_pursuit_flies_straight_at_the_target_by_hand():
+def test_follow_target_flies_straight_at_the_target_by_hand():
     env = WildfireEnv(1, world(uavs=3, displacement=0.5), torch.full((9, 9), NEVER))
     moment = env.reset(position=torch.tensor([[1.0, 1, 2], [5, 5, 4], [3, 3, 3]]))
-    moment[FollowTarget.TARGET] = torch.tensor([[[5.0, 3, 1], [5, 5, 3.75], [3, 3, 3]]])
+    moment[keys.TARGET] = torch.tensor([[[5.0, 3, 1], [5, 5, 3.75], [3, 3, 3]]])
     action = FollowTarget(env)(moment)[keys.ACTION].mul(1e4).round() / 1e4
     # By (4, 2, -1) cells: 8, 4, -2 units. By (0, 0, -0.25): half a unit, and there it stops.
     assert action.tolist() == [[[1, 0.5, -0.25], [0, 0, -0.5], [0, 0, 0]]]
@@ -204,7 +200,7 @@ def test_the_oracle_against_its_rule_with_loops(seed, grid, uavs, angle):
     for step in range(4):
         seen = (env.fire_map == 1).tolist()
         expected = [
-            scalar_oracle(moment[keys.POSITION][e].tolist(), env.arrival[e].tolist(), *rest)
+            scalar_oracle(moment[keys.POSITION][e].tolist(), env.arrival_time[e].tolist(), *rest)
             for e, rest in enumerate(zip(seen, [step] * envs, [config] * envs, strict=True))
         ]
         assert (sent(env, oracle, moment) - torch.tensor(expected)).abs().max() < 1e-4
@@ -250,7 +246,7 @@ def test_every_policy_in_every_recipe(name, method, shape):
         assert action.isfinite().all()
         assert action.abs().max() <= 1
         if name != "random_actions":  # who flies to a point of the box does not leave it
-            assert not moment[keys.BEYOND].any()
+            assert not moment[keys.HIT_BOUNDARY].any()
     # The second environment alone is what it is between the others.
     env, policy = build(method, name, shape, seeds=[6], fire=arrival[1:2])
     for alone, moment in zip(episode(env, policy, 25), moments, strict=True):

@@ -1,5 +1,6 @@
 """Several seeds as one stack: each learns what it learns alone."""
 
+import csv
 import json
 
 import pytest
@@ -94,7 +95,7 @@ def test_seeds_of_a_stack_differ_in_all_that_is_random():
     trainer = Trainer(resolve("consensus", [*settings, f"seeds={SEEDS}"]))
     first, second = (trainer.weights(team) for team in range(2))
     assert not any(first[name].equal(second[name]) for name in first if "norm" not in name)
-    assert not trainer.env.base_env.arrival[0].equal(trainer.env.base_env.arrival[1])
+    assert not trainer.env.base_env.arrival_time[0].equal(trainer.env.base_env.arrival_time[1])
     collected = next(iter(trainer.collector))
     for key in (keys.POSITION, NOISE):
         assert not collected[key][0].isclose(collected[key][1]).any(), key
@@ -113,8 +114,8 @@ def test_environments_of_several_seeds_are_those_of_each():
     for team, moment in enumerate(moments):
         own = slice(3 * team, 3 * team + 3)
         assert whole[own][keys.POSITION].equal(moment[keys.POSITION])
-        assert whole[own][keys.STREAM].equal(moment[keys.STREAM])
-        assert together.arrival[own].equal(singles[team].arrival)
+        assert whole[own][keys.RNG_KEY].equal(moment[keys.RNG_KEY])
+        assert together.arrival_time[own].equal(singles[team].arrival_time)
 
 
 @pytest.mark.parametrize("seeds", [[], [1, -1], [1, 2]])
@@ -171,7 +172,7 @@ def test_seeds_from_python():
     for seeds in ([1, 2], (1, 2), range(1, 3)):
         assert resolve("consensus", seeds=seeds).seeds == (1, 2)
     assert resolve("consensus", seeds=[4, 2]).seed == 4
-    assert WildfireEnv(2, seed=torch.tensor(3)).reset()[keys.STREAM].shape == (2,)
+    assert WildfireEnv(2, seed=torch.tensor(3)).reset()[keys.RNG_KEY].shape == (2,)
     with pytest.raises(ValueError, match="an environment takes seed="):
         make_env("consensus", seeds=[1, 2])
 
@@ -186,6 +187,6 @@ def test_every_seed_has_a_tracker_of_its_own(tmp_path):
     small = ["env.horizon=8", "episodes=2", "learner.batch_size=8", "learner.hidden=[4,4]"]
     more = [f"seeds={SEEDS}", "logger=csv", f"output={tmp_path}", "evaluation.interval=0"]
     for run in trained(resolve("independent", [*small, *more])).runs:
-        (scores,) = (run.path / "csv").rglob("mean_reward.csv")
-        logged = [float(line.split(",")[1]) for line in scores.read_text().splitlines()]
+        with (run.path / "metrics.csv").open(newline="") as file:
+            logged = [float(row["mean_reward"]) for row in csv.DictReader(file)]
         assert logged == pytest.approx([line["mean_reward"] for line in run.lines()])

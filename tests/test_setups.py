@@ -5,10 +5,11 @@ import dataclasses
 import pytest
 
 from emberlink.comm.consensus import ConsensusConfig
+from emberlink.configs import known
 from emberlink.envs.config import RewardConfig, WildfireConfig
 from emberlink.envs.fire.generator import scenarios
 from emberlink.envs.utils.validation import from_plain
-from emberlink.trainers.config.compose import flat, known, resolve, to_values
+from emberlink.trainers.config.compose import flat, resolve, to_values
 from emberlink.trainers.config.schema import build_comm
 
 METHODS = ["independent", "shared_memory", "positional", "consensus"]
@@ -47,7 +48,7 @@ GAMMA = {(method, setup): 0.95 for method in METHODS for setup in (PAPER, RELEAS
 GAMMA["independent", RELEASED] = 0.92
 # What a method is: whose memory, and what is heard.
 SWITCHES = {
-    "independent": ("private", "no_comm"),
+    "independent": ("per_agent", "no_comm"),
     "shared_memory": ("shared", "no_comm"),
     "positional": ("shared", "positional"),
     "consensus": ("shared", "consensus"),
@@ -109,7 +110,7 @@ def test_methods_differ_in_two_switches_and_in_what_is_listed(setup):
         values = flat(to_values(config))
         assert {key: values[key] for key in own} == own
         for key in values.keys() - own.keys():
-            if key.split(".")[0] not in ("method", "memory", "comm"):
+            if key.split(".")[0] not in ("method", "replay", "comm"):
                 common.setdefault(key, set()).add(repr(values[key]))
     assert all(len(values) == 1 for values in common.values())
     for own in OWN[setup].values():  # and what is listed is not what the others have

@@ -75,7 +75,7 @@ def test_equals_the_scalar_environment(case):
             assert np.array_equal(moment[keys.POSITION][e].numpy(), scalar.position)
             assert np.array_equal(maps[e], scalar.fire)
             assert classes[e].tolist() == [list(c) for c in counts]
-            assert moment[keys.BEYOND][e].tolist() == exits
+            assert moment[keys.HIT_BOUNDARY][e].tolist() == exits
             assert moment[keys.REWARD][e, :, 0].tolist() == pytest.approx(rewards, abs=1e-5, rel=0)
             assert moment[keys.SEEN][e].item() == scalar.seen()
             assert moment[keys.BURNING][e].item() == scalar.burning()

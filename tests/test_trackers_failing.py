@@ -62,7 +62,7 @@ def _elsewhere(tmp_path, monkeypatch):
     forget()
     yield
     for thread in threading.enumerate():
-        if thread.name == loggers.ENDING:
+        if thread.name == loggers.WANDB_TEARDOWN:
             thread.join(30)
     forget()
 
@@ -88,10 +88,13 @@ class Fragile:
         if moment == self.moment:
             self.how()
 
-    def log_scalar(self, name: str, value: float, step: int) -> None:
-        if step == 2:
+    def log(self, line: dict[str, float], episode: int) -> None:
+        if episode == 2:
             self.meet("log")
-        self.told.append((name, step))
+        self.told += [(name, episode) for name in line]
+
+    def finish(self) -> None:
+        self.meet("finish")
 
 
 def fail() -> None:
@@ -115,8 +118,7 @@ def test_it_fails_or_never_answers(moment, how, tmp_path, monkeypatch):
         made.append(Fragile(moment, how))
         return made[-1]
 
-    monkeypatch.setitem(loggers._TRACKERS, "csv", make)
-    monkeypatch.setattr(loggers, "_finish", lambda logger: logger.meet("finish"))
+    monkeypatch.setitem(loggers.TRACKERS, "csv", make)
     expected = {fail: "No space left", leave: "SystemExit", wait: "no answer within 1.5 s"}[how]
     # A stack of two seeds: two trackers, and still one warning.
     only(train("csv", tmp_path, lambda _: None, "seeds=[3,4]"), "logger=csv", expected)
@@ -125,23 +127,32 @@ def test_it_fails_or_never_answers(moment, how, tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("logger", ["wandb", "tensorboard"])
-def test_its_package_is_not_there(logger, tmp_path, monkeypatch):
-    for name in (logger, "torch.utils.tensorboard"):
-        monkeypatch.setitem(sys.modules, name, None)  # importing it fails
-    only(train(logger, tmp_path), f"logger={logger}", "Error")
+def test_a_package_that_is_missing_is_said_before_training(logger, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(loggers, "find_spec", lambda name: None)
+    arguments = ["train", "independent", *SHORT, f"logger={logger}", f"output={tmp_path}/runs"]
+    assert main.main(arguments) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert f"logger={logger}: {logger} is not installed: pip install" in error
+    assert not (tmp_path / "runs").exists()
 
 
-@pytest.mark.parametrize("logger", ["csv", "tensorboard"])
-def test_its_folder_cannot_be_made(logger, tmp_path):
+@pytest.mark.parametrize(
+    ("logger", "name"), [("csv", "metrics.csv"), ("tensorboard", "tensorboard")]
+)
+def test_its_files_cannot_be_made(logger, name, tmp_path):
     config = resolve("independent", [*SHORT, f"logger={logger}", f"output={tmp_path}"])
     trainer = Trainer(config)
     run = trainer.start()
-    (run.path / logger).write_text("in the way")
+    if logger == "csv":
+        (run.path / name).mkdir()
+    else:
+        (run.path / name).write_text("in the way")
     with pytest.warns(UserWarning, match=f"logger={logger} has stopped") as caught:
         assert trainer.train()
     assert len([one for one in caught if "logger=" in str(one.message)]) == 1
     assert len(run.lines()) == EPISODES
-    assert (run.path / logger).read_text() == "in the way"
+    assert logger == "csv" or (run.path / name).read_text() == "in the way"
 
 
 def test_wandb_has_no_such_mode(tmp_path, monkeypatch):
@@ -205,7 +216,7 @@ def test_a_program_whose_wandb_was_killed_ends_in_peace(tmp_path):
     program = (
         "import os, signal, time\n"
         "from test_trackers_failing import service\n"
-        "from emberlink.trainers import loop\n"
+        "from emberlink.trainers.training import trainer as loop\n"
         "measure = loop.Trainer._measure\n"
         "def strike(self, *rest):\n"
         "    if self.episode == 2:\n"

@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 from wandb.proto import wandb_internal_pb2
 
+from emberlink.trainers.cli import main
 from emberlink.trainers.config.compose import resolve, to_values
 from emberlink.trainers.training.trainer import Trainer
 
@@ -126,13 +127,61 @@ def test_tensorboard_holds_every_number(tmp_path):
         assert logged == pytest.approx(truth, rel=1e-6), name
 
 
-def test_csv_holds_every_number(tmp_path):
+def test_csv_is_one_table_with_a_header(tmp_path):
     folder, _, lines = tracked("csv", tmp_path)
-    (scalars,) = folder.rglob("scalars")
-    for name in {name for line in lines for name in line}:
-        with (scalars / f"{name}.csv").open() as rows:
-            logged = {int(step): float(value) for step, value in csv.reader(rows)}
-        assert logged == {line["episode"]: line[name] for line in lines if name in line}, name
+    with (folder / "metrics.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert set(rows[0]) == {name for line in lines for name in line}
+    for row, line in zip(rows, lines, strict=True):
+        assert {name: float(value) for name, value in row.items() if value} == line
+    assert not [path for path in folder.iterdir() if path.name.startswith("csv")]
+
+
+def test_the_final_evaluation_reaches_tensorboard(tmp_path, capsys):
+    reader = importlib.import_module("tensorboard.backend.event_processing.event_accumulator")
+    assert main.main(["train", "consensus", *SHORT, *FINAL, "logger=tensorboard"]) == 0
+    (folder,) = (tmp_path / "runs").iterdir()
+    events = reader.EventAccumulator(str(folder / "tensorboard"))
+    events.Reload()
+    for name, value in final_means(folder).items():
+        (event,) = events.Scalars(name)
+        assert (event.step, event.value) == (4, pytest.approx(value, rel=1e-6))
+    assert [event.step for event in events.Scalars("coverage")] == [1, 2, 3, 4]
+    assert set(events.Tags()["images"]) == {f"figures/{f.stem}" for f in figures(folder)}
+
+
+def test_the_final_evaluation_reaches_wandb(tmp_path, capsys):
+    assert main.main(["train", "consensus", *SHORT, *FINAL, "logger=wandb"]) == 0
+    (folder,) = (tmp_path / "runs").iterdir()
+    files = sorted(folder.rglob("*.wandb"))
+    assert len({file.stem for file in files}) == 1  # of one run
+    rows = [
+        read_items(record.history.item)
+        for file in files
+        for record in finished(file)
+        if record.HasField("history")
+    ]
+    assert [row["_step"] for row in rows] == [1, 2, 3, 4, 5]
+    assert final_means(folder).items() <= rows[-1].items()
+    assert {f"figures/{f.stem}" for f in figures(folder)} <= {key.split(".")[0] for key in rows[-1]}
+
+
+FINAL = ["evaluation.episodes=2", "output=runs"]
+
+
+def figures(folder: Path) -> list[Path]:
+    found = sorted((folder / "figures").glob("*.png"))
+    assert len(found) >= 3
+    return found
+
+
+def final_means(folder: Path) -> dict[str, float]:
+    results = json.loads((folder / "eval.json").read_text())["results"]
+    return {
+        f"test/{fire}/{name}": sum(values) / len(values)
+        for fire, by_policy in results.items()
+        for name, values in by_policy["learned"].items()
+    }
 
 
 def test_without_a_tracker_there_are_the_runs_own_files_only(tmp_path):

@@ -124,21 +124,21 @@ def test_leaving_the_box_costs_on_the_tested_axes(axis, direction, exit_axes):
     push[axis] = direction
     moment = act(env, push)
     assert moment[keys.POSITION][0].tolist() == position
-    assert moment[keys.BEYOND][0, 0].tolist() == [a == axis for a in range(3)]
+    assert moment[keys.HIT_BOUNDARY][0, 0].tolist() == [a == axis for a in range(3)]
     tested = "xyz"[axis] in exit_axes
     assert (rewards(moment)[0] == -100) == tested
     # Reaching the edge exactly is not leaving.
     position[0][axis] -= direction
     start(env, *position)
-    assert not act(env, push)[keys.BEYOND].any()
+    assert not act(env, push)[keys.HIT_BOUNDARY].any()
 
 
 def test_standing_at_an_edge_that_float32_rounds_is_not_leaving():
     env = world(altitude=(3.3, 4.1))
     for z, push in ((3.5, -1.0), (4.0, 1.0)):
         start(env, [5.0, 5, z])
-        assert act(env, [0, 0, push])[keys.BEYOND].any()
-        assert not act(env)[keys.BEYOND].any()
+        assert act(env, [0, 0, push])[keys.HIT_BOUNDARY].any()
+        assert not act(env)[keys.HIT_BOUNDARY].any()
 
 
 def test_actions_are_clipped():
@@ -157,7 +157,14 @@ def test_reset_starts_in_the_box_and_has_seen_nothing():
     near = 0.02 * (high - low)  # 600 uniform points come this near to each side
     assert (position.flatten(0, 1).amin(0) < low + near).all()
     assert (position.flatten(0, 1).amax(0) > high - near).all()
-    for key in (keys.NEW_FIRE, keys.OLD_FIRE, keys.NO_FIRE, keys.SEEN, keys.STEP, keys.BEYOND):
+    for key in (
+        keys.NEW_FIRE,
+        keys.OLD_FIRE,
+        keys.NO_FIRE,
+        keys.SEEN,
+        keys.STEP,
+        keys.HIT_BOUNDARY,
+    ):
         assert not moment[key].any(), key
     assert not moment[keys.OBSERVATION][..., 3:].any()
     assert env.fire_map.eq(2).all()
@@ -183,7 +190,7 @@ def test_partial_reset_leaves_the_others_alone(method):
     assert (after[keys.POSITION][1] != before[keys.POSITION][1]).any()
     following = env.step(env.rand_action(after))["next"]
     assert following[keys.STEP].tolist() == [6, 1, 6]
-    same_stream = following[keys.STREAM] == before[keys.STREAM]
+    same_stream = following[keys.RNG_KEY] == before[keys.RNG_KEY]
     assert same_stream.tolist() == [True, False, True]
 
 
@@ -203,11 +210,11 @@ def test_fire_by_name_by_config_and_by_arrival_times():
     each = torch.stack([NOWHERE, EVERYWHERE, arrival[0]])
     for fire in ("paper", scenario, arrival[0], arrival.expand(3, -1, -1)):
         env = world(fire, 3)
-        assert torch.equal(env.arrival, arrival.expand(3, -1, -1))
+        assert torch.equal(env.arrival_time, arrival.expand(3, -1, -1))
     env = world(each, 3)
     for _ in range(2):
         env.reset()
-        assert torch.equal(env.arrival, each)
+        assert torch.equal(env.arrival_time, each)
     assert WildfireEnv(1, None, torch.zeros(9, 17)).config.grid == (9, 17)
 
 
@@ -223,7 +230,7 @@ def test_arrival_times_may_lie_in_memory_as_they_like_and_are_copied(layout):
     expected = fire.clone()
     env.rollout(2)
     fire.add_(1) if layout != "expanded" else plain.add_(1)
-    assert torch.equal(env.arrival, expected)
+    assert torch.equal(env.arrival_time, expected)
 
 
 def test_fires_of_a_bank_are_drawn_anew():
@@ -232,7 +239,7 @@ def test_fires_of_a_bank_are_drawn_anew():
     fires = []
     for _ in range(4):
         env.reset()
-        fires.append(env.arrival.clone())
+        fires.append(env.arrival_time.clone())
     kinds = torch.cat(fires).flatten(1).unique(dim=0)
     assert len(kinds) == 3
     assert not torch.equal(fires[0], fires[1])
@@ -271,7 +278,7 @@ def test_an_environment_does_not_depend_on_how_many_run_beside_it():
     for _ in range(3):
         alone, among = one.reset(), five.reset()
         assert (alone == among[:1]).all()
-        assert torch.equal(one.arrival, five.arrival[:1])
+        assert torch.equal(one.arrival_time, five.arrival_time[:1])
         for _ in range(4):
             alone = one.step(TensorDict({keys.ACTION: action[:1]}, [1]))["next"]
             among = five.step(TensorDict({keys.ACTION: action}, [5]))["next"]

@@ -1,4 +1,4 @@
-"""Puts the parts of a recipe together."""
+"""Builds environments and networks from a configuration."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -13,43 +13,48 @@ from emberlink.envs.scenarios import ScenarioConfig
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.wildfire import WildfireEnv
 from emberlink.policies.networks.actor_critic import make_actor, make_critic
-from emberlink.policies.networks.stacked import Generators
-from emberlink.trainers.config.compose import resolve
+from emberlink.policies.networks.layers import Generators
+from emberlink.trainers.config.compose import override, resolve
 from emberlink.trainers.config.schema import RunConfig, build_comm, check_device
 
 
 def make_env(
-    method: str,
-    setup: str = "paper",
+    method: str | RunConfig,
+    setup: str | None = None,
     *,
     num_envs: int = 1,
     fire: str | ScenarioConfig | Tensor | None = None,
     seed: int = 0,
     device: torch.device | str = "cpu",
-    **overrides: Any,
+    **settings: Any,
 ) -> TransformedEnv:
-    """A recipe's whole environment, communication included.
+    """Returns the environment of a method, communication included.
 
     Args:
-        method: a recipe: independent, shared_memory, positional, consensus, or one of yours.
-        setup: paper, released, tuned, or one of yours.
+        method: independent, shared_memory, positional, consensus, or one of yours; or the
+            configuration of a run, such as `load("pretrained:consensus").config`.
+        setup: paper (if None), released, tuned, or one of yours; not with a configuration.
         num_envs: environments side by side.
-        fire: as for `WildfireEnv`; the setup's own scenario if None.
-        seed: of everything random here.
+        fire: as for `WildfireEnv`; the scenario of the setup or of the run if None.
+        seed: of everything random in the environment.
         device: where all tensors live.
-        overrides: any other setting, by its name (`horizon=50`, `num_uavs=3`) or, through a
-            mapping, its full key (`**{"env.reward.exit": -10.0}`).
+        settings: any other setting, by the last part of its key (`horizon=50`, `num_uavs=3`) or by
+            all of it (`**{"env.reward.exit": -10.0}`).
 
     Raises:
-        ValueError: an unknown method, setup or setting, or a value out of range.
+        UserError: an unknown method, setup or setting, or a value out of range.
     """
     check_device(str(device))
-    grid = list(fire.shape[-2:]) if isinstance(fire, Tensor) and fire.ndim in (2, 3) else None
-    if grid and "grid" not in overrides:
-        overrides["grid"] = grid
-    config = resolve(method, [f"setup={setup}"], **overrides)
-    if config.seeds:
-        raise UserError(f"seeds={list(config.seeds)}: of a training; an environment takes seed=")
+    if isinstance(fire, Tensor) and fire.ndim in (2, 3):
+        settings.setdefault("grid", list(fire.shape[-2:]))
+    if "seeds" in settings:
+        raise UserError(f"seeds={settings['seeds']}: of a training; an environment takes seed=")
+    if isinstance(method, str):
+        config = resolve(method, [f"setup={setup or 'paper'}"], **settings)
+    elif isinstance(method, RunConfig) and setup is None:
+        config = override(method, **settings)
+    else:
+        raise UserError("expected a method and a setup, or a RunConfig alone")
     fire = config.fire if fire is None else fire
     return build_env(config, num_envs=num_envs, fire=fire, seed=seed, device=device)
 
@@ -62,15 +67,15 @@ def build_env(
     seed: int | Sequence[int],
     device: torch.device | str,
 ) -> TransformedEnv:
-    """The environment of a configuration: the wildfire and communication; see `WildfireEnv`."""
+    """Returns the wildfire and the communication of a configuration; see `WildfireEnv`."""
     world = WildfireEnv(num_envs, config.env, fire, seed, device)
-    return TransformedEnv(world, Communication(build_comm(config).to(world.device)))
+    return TransformedEnv(world, Communication(build_comm(config, num_envs).to(world.device)))
 
 
 def build_networks(
     config: RunConfig, env: TransformedEnv, generator: Generators = None
 ) -> tuple[TensorDictModule, TensorDictModule]:
-    """The UAVs' actors and critics for an environment; several generators make as many teams."""
+    """Returns actors and critics of all UAVs; several generators make those of as many seeds."""
     specs = env.observation_spec, env.full_action_spec, config.learner.hidden
     actor = make_actor(*specs, generator=generator)
     return actor, make_critic(*specs, generator=generator)

@@ -2,9 +2,10 @@
 
 import dataclasses
 import hashlib
+import io
 import json
+import math
 import os
-import tempfile
 import warnings
 from pathlib import Path
 
@@ -12,9 +13,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from emberlink.envs.utils.atomic_io import read_sealed, write_sealed
+
 from .generator import FireConfig, Split, fire_seeds, make_fires
 
 GENERATOR_VERSION = 1  # raise it whenever the same config and seed give another fire
+_LONGEST_HEADER = 10_000  # bytes of NumPy's format before the numbers
 
 
 def cache_folder() -> Path:
@@ -47,8 +51,9 @@ def fire_bank(
     Args:
         config, grid, horizon: as in `make_fires`.
         split, count: as in `fire_seeds`, with `base` as its `start`.
-        cache_dir: folder of the file, `cache_folder()` by default. A damaged file is replaced; a
-            folder that cannot be written to costs a warning and the time to compute.
+        cache_dir: folder of the file, `cache_folder()` by default. The file begins with the
+            SHA-256 of the rest, and a damaged one is replaced. A folder that cannot be written to
+            costs a warning and the time to compute.
 
     Returns:
         float32 [count, X, Y] on the CPU, so that every device trains on the same fires.
@@ -65,29 +70,24 @@ def fire_bank(
 
 
 def _read(file: Path, shape: tuple[int, ...]) -> Tensor | None:
-    """The bank in a file, or None if there is none or it is not one."""
-    if not file.is_file():  # a pipe would never end
+    """Returns the bank in a file, or None if there is none or a byte of it has changed."""
+    content = read_sealed(file, 4 * math.prod(shape) + _LONGEST_HEADER)
+    if content is None:
         return None
     try:
-        # Mapped, so that a header that promises more than there is costs no memory.
-        array = np.load(file, mmap_mode="r", allow_pickle=False)
-        if array.dtype != np.float32 or array.shape != shape or not (array >= 0).all():
-            return None
-        return torch.from_numpy(np.array(array))
-    except Exception:  # numpy raises what it likes on a damaged header, TokenError among others
+        array = np.load(io.BytesIO(content), allow_pickle=False)
+    except Exception:  # a seal can be forged, and numpy raises what it likes on a damaged header
         return None
+    if array.dtype != np.float32 or array.shape != shape or not (array >= 0).all():
+        return None
+    return torch.from_numpy(array)
 
 
 def _write(file: Path, fires: Tensor) -> None:
-    """Write under a temporary name first: a reader never meets half a file."""
-    temporary = None
+    """Writes a bank whole; a folder that cannot be written to costs a warning."""
+    content = io.BytesIO()
+    np.save(content, fires.numpy(), allow_pickle=False)
     try:
-        file.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile(dir=file.parent, suffix=".tmp", delete=False) as handle:
-            temporary = handle.name
-            np.save(handle, fires.numpy(), allow_pickle=False)
-        os.replace(temporary, file)
+        write_sealed(file, content.getbuffer())
     except OSError as error:
-        if temporary is not None:
-            Path(temporary).unlink(missing_ok=True)
         warnings.warn(f"fires are not cached: cannot write {file}: {error}", stacklevel=3)

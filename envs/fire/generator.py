@@ -9,31 +9,28 @@ another grid lengths, and with them rates, are scaled by min(X, Y)/30, so that i
 
 import dataclasses
 import math
-from importlib import resources
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Literal, get_args
 
 import torch
-from omegaconf import OmegaConf
-from omegaconf.errors import OmegaConfBaseException
 from pydantic import AfterValidator, ConfigDict, Field, Strict, ValidationError
 from pydantic.dataclasses import dataclass
 from torch import Tensor
-from yaml import YAMLError
 
+from emberlink.configs import known, read
 from emberlink.envs.config import check_grid
-from emberlink.envs.utils.counter_rng import fold, uniform
+from emberlink.envs.utils.counter_rng import Use, fold_in, uniform
 from emberlink.envs.utils.errors import UserError
-from emberlink.envs.utils.validation import Name, describe, known
+from emberlink.envs.utils.validation import Name, describe
 
 from .advection import current, longest_step, tide_speed
 from .ellipse import MAX_LENGTH_TO_BREADTH
 from .level_set import arrival_times, disc
 
 BASE_SIDE = 30
-HELD_OUT_FROM = 1_000_000
-Split = Literal["train", "heldout"]
+TEST_FROM = 1_000_000
+VALIDATION_FROM = 2_000_000
+Split = Literal["train", "validation", "test"]
 
-_STREAM = 0xF12E  # keeps a fire's draws apart from other uses of the same seed
 _NODES = 60  # nodes along the shorter side at least: twice the resolution of 30 cells
 _CHUNK = 200_000  # nodes computed at a time, so that the work stays in the processor's cache
 _LEAST = 1e-6  # radius of a patch, cells: its square is no number below some 1e-19
@@ -70,7 +67,7 @@ class FireConfig:
 
     name: Name
     """Name of the scenario, that of its file."""
-    num_train_fires: Annotated[int, Field(ge=1, lt=HELD_OUT_FROM)]
+    num_train_fires: Annotated[int, Field(ge=1, lt=TEST_FROM)]
     """Number of fires to train on."""
     head_ros: Annotated[tuple[_Rate, _Rate], _Pair, _Ordered]
     """Rate of spread of the head, cells per step."""
@@ -119,7 +116,7 @@ _DRAWN = tuple(f.name for f in dataclasses.fields(FireConfig) if f.name not in _
 
 def scenarios() -> list[str]:
     """Names of the generator's scenarios: the files in `configs/fire` that have no `kind`."""
-    return [name for name in known("fire") if "kind" not in _values(name)]
+    return [name for name in known("fire") if "kind" not in read("fire", name)]
 
 
 def load_scenario(name: str) -> FireConfig:
@@ -128,7 +125,7 @@ def load_scenario(name: str) -> FireConfig:
     Raises:
         ValueError: no such file, or a value in it that `FireConfig` does not take.
     """
-    values = _values(name) if name in known("fire") else None
+    values = read("fire", name) if name in known("fire") else None
     if values is None or "kind" in values:
         raise UserError(f"unknown fire {name!r}; known: {', '.join(scenarios())}")
     try:
@@ -137,37 +134,29 @@ def load_scenario(name: str) -> FireConfig:
         raise UserError(f"configs/fire/{name}.yaml: {describe(error)}") from None
 
 
-def _values(name: str) -> dict[str, Any]:
-    file = resources.files("emberlink.configs").joinpath("fire", f"{name}.yaml")
-    try:
-        values: Any = OmegaConf.to_container(OmegaConf.create(file.read_text(encoding="utf-8")))
-    except (YAMLError, OmegaConfBaseException) as error:
-        reason = " ".join(str(error).split())[:200]
-        raise UserError(f"configs/fire/{name}.yaml: cannot be read: {reason}") from None
-    if not isinstance(values, dict):
-        raise UserError(f"configs/fire/{name}.yaml: expected keys and values")
-    return values
-
-
 def fire_seeds(split: Split, count: int, start: int = 0) -> Tensor:
-    """Seeds of the first `count` fires of a split, int64 [count].
+    """Returns the seeds of the first `count` fires of a split, int64 [count].
 
-    Training seeds lie below `HELD_OUT_FROM`, held-out seeds from it on, so no fire is in both.
+    Training seeds are 0 to 999,999, test seeds 1,000,000 to 1,999,999 and validation seeds
+    2,000,000 to 2,999,999, so the three sets are disjoint for every `start`.
 
     Args:
-        split: "train" or "heldout".
-        count: how many.
-        start: first training seed, to train on another bank; the held-out fires never change.
+        split: "train", "validation" or "test".
+        count: number of seeds.
+        start: the first training seed. Validation and test fires are the same for everyone.
+
+    Raises:
+        UserError: the split is not known, or the seeds would not lie in its interval.
     """
     if split not in get_args(Split):
         raise UserError(f"unknown split {split!r}; known: {', '.join(get_args(Split))}")
     if count < 1 or start < 0:
         raise UserError(f"expected count >= 1 and start >= 0, got {count} and {start}")
-    if split == "heldout" and start:
-        raise UserError(f"held-out fires are the same for everyone: start must be 0, got {start}")
-    if split == "train" and start + count > HELD_OUT_FROM:
-        raise UserError(f"training seeds end before {HELD_OUT_FROM}, got {start} + {count}")
-    first = HELD_OUT_FROM if split == "heldout" else start
+    if split != "train" and start:
+        raise UserError(f"{split} fires are the same for everyone: start must be 0, got {start}")
+    if start + count > TEST_FROM:
+        raise UserError(f"a split has {TEST_FROM} seeds, got start {start} and count {count}")
+    first = {"train": start, "test": TEST_FROM, "validation": VALIDATION_FROM}[split]
     return torch.arange(first, first + count)
 
 
@@ -238,16 +227,16 @@ def _spread(
     return arrival.masked_fill(depth > draw["ring_width"][:, None, None] * scale, math.inf)
 
 
-def _unit(field: str, seeds: Tensor, lanes: int) -> Tensor:
-    """Uniform draws on (0, 1), float32 [fires, lanes], from the stream of a seed and a field."""
-    key = torch.tensor([_STREAM, _DRAWN.index(field)], device=seeds.device)
-    return uniform(fold(fold(seeds, key[0]), key[1]), lanes)
+def _unit(field: str, seeds: Tensor, count: int) -> Tensor:
+    """Uniform draws on (0, 1), float32 [fires, count], from the key of a seed and a field."""
+    key = torch.tensor([Use.FIRE_PARAMETER, _DRAWN.index(field)], device=seeds.device)
+    return uniform(fold_in(fold_in(seeds, key[0]), key[1]), count)
 
 
-def _draw(config: FireConfig, field: str, seeds: Tensor, lanes: int = 1) -> Tensor:
-    """Uniform draws from the range of a field, float32 [fires, lanes]."""
+def _draw(config: FireConfig, field: str, seeds: Tensor, count: int = 1) -> Tensor:
+    """Uniform draws from the range of a field, float32 [fires, count]."""
     low, high = getattr(config, field)
-    return low + (high - low) * _unit(field, seeds, lanes)
+    return low + (high - low) * _unit(field, seeds, count)
 
 
 def _axes(grid: tuple[int, int], device: torch.device) -> tuple[Tensor, Tensor]:

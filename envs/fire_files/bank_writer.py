@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from emberlink.envs.utils.atomic_io import new_file, published
 from emberlink.envs.utils.errors import UserError
+from emberlink.envs.utils.publish import new_file, published
 
 SUFFIXES = (".npy", ".tif", ".tiff")
 NODATA = -9999.0

@@ -4,7 +4,7 @@ import dataclasses
 import hashlib
 import json
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 import numpy as np
 import torch
@@ -13,6 +13,9 @@ from pydantic.dataclasses import dataclass
 from torch import Tensor
 
 from emberlink.envs.config import check_grid
+from emberlink.envs.fire.generator import Split
+from emberlink.envs.fire_files.bank_reader import MOST_CELLS
+from emberlink.envs.utils.atomic_io import open_regular, replaced
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import Name, printable
 
@@ -29,7 +32,9 @@ from .projection import one_line, quiet
 READER_VERSION = 3  # raise it whenever the same file gives another grid
 KEPT = "fires.npz"
 """the file of a run folder that holds the run's own copy of its grids"""
-_EVERY, _HELD_OUT = 5, 4  # of several fires, those whose number has this remainder are held out
+_MOST_KEPT = 8 * MOST_CELLS + 1_000_000
+"""bytes of that copy, unpacked: float32 of the cells of every set"""
+_EVERY, _VALIDATION, _TEST = 5, 3, 4  # remainders of the numbers of validation and test fires
 _Number = Annotated[float, Field(allow_inf_nan=False)]
 _Time = _Number | Annotated[str, Field(min_length=1, max_length=40)]
 _Digest = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
@@ -56,8 +61,8 @@ class FileFireConfig:
     """Name of the scenario, that of its file in configs/fire."""
     path: Annotated[_Text, BeforeValidator(_given)]
     """The file; a relative path is relative to the working directory."""
-    heldout: _Text | None = None
-    """A second file, of the fires to evaluate on; else every fifth fire of the file is held out."""
+    test: _Text | None = None
+    """A second file, of the test fires; without one every fifth fire of the file is a test fire."""
     units: Units | None = None
     """Of the numbers in the file, and of `start` and `end`."""
     start: _Time | None = None
@@ -78,8 +83,8 @@ class FileFireConfig:
     """Layer of a GeoPackage that has several."""
     sha256: _Digest | None = None
     """Of the file's content; a run fills it in when it begins, and then the file must be that."""
-    heldout_sha256: _Digest | None = None
-    """Of `heldout`, likewise."""
+    test_sha256: _Digest | None = None
+    """Of `test`, likewise."""
     kept: Annotated[str | None, Field(exclude=True)] = dataclasses.field(
         default=None, compare=False
     )
@@ -158,7 +163,7 @@ def pinned(config: FileFireConfig) -> FileFireConfig:
     return dataclasses.replace(
         config,
         sha256=_checked(config.path, config.sha256),
-        heldout_sha256=config.heldout and _checked(config.heldout, config.heldout_sha256),
+        test_sha256=config.test and _checked(config.test, config.test_sha256),
     )
 
 
@@ -176,10 +181,8 @@ def _checked(file: str, expected: str | None) -> str:
     return found
 
 
-def splits(
-    config: FileFireConfig, grid: tuple[int, int], horizon: int
-) -> dict[Literal["train", "heldout"], Tensor]:
-    """The fires to train on and those to evaluate on, float32 [fires, X, Y] each.
+def splits(config: FileFireConfig, grid: tuple[int, int], horizon: int) -> dict[Split, Tensor]:
+    """Returns the training, validation and test fires, float32 [fires, X, Y] each.
 
     Read from the run's own copy where there is one for this grid and horizon, else from the files.
 
@@ -192,19 +195,33 @@ def splits(
     if config.sha256 is not None:
         pinned(config)
     fires = read_fires(config, grid, horizon)
-    if config.heldout is not None:
-        other = dataclasses.replace(config, path=config.heldout)
-        return {"train": fires, "heldout": read_fires(other, grid, horizon)}
-    held_out = _held_out(len(fires))
-    return {"train": fires[~held_out] if len(fires) > 1 else fires, "heldout": fires[held_out]}
+    train, validation, test = _indices(len(fires), test_file=config.test is not None)
+    if config.test is None:
+        test_fires = fires[test]
+    else:
+        test_fires = read_fires(dataclasses.replace(config, path=config.test), grid, horizon)
+    return {"train": fires[train], "validation": fires[validation], "test": test_fires}
 
 
-def _held_out(count: int) -> Tensor:
-    """Which of several fires are held out; a single one is used for both."""
-    numbers = torch.arange(count)
-    if count < _EVERY:
-        return numbers == count - 1
-    return numbers % _EVERY == _HELD_OUT
+def _indices(count: int, *, test_file: bool) -> tuple[list[int], list[int], list[int]]:
+    """Divides the fires of a file into training, validation and test fires.
+
+    Of five or more fires every fifth is a test fire and every fifth a validation fire. Of fewer
+    the last is the test fire and the last but one the validation fire. Where no fire is left for
+    a set, the one before it shares its last: the only fire of a file is in all three sets.
+
+    Args:
+        count: number of fires in the file.
+        test_file: the test fires are those of another file, so none of this one.
+    """
+    rest = list(range(count))
+    test, several = ([] if test_file else [count - 1]), count >= _EVERY
+    if several and not test_file:
+        test = [i for i in rest if i % _EVERY == _TEST]
+    rest = [i for i in rest if i not in test] or rest
+    validation = [i for i in rest if i % _EVERY == _VALIDATION] if several else rest[-1:]
+    train = [i for i in rest if i not in validation] or rest
+    return train, validation, test
 
 
 def keep(config: FileFireConfig, folder: Path, grid: tuple[int, int], horizon: int) -> None:
@@ -214,16 +231,13 @@ def keep(config: FileFireConfig, folder: Path, grid: tuple[int, int], horizon: i
         ValueError: it cannot be written.
     """
     fires = splits(config, grid, horizon)
-    partial = folder / (KEPT + ".part")
     try:
-        with partial.open("wb") as file:
+        with replaced(folder / KEPT) as partial, partial.open("wb") as file:
             np.savez_compressed(
                 file,
                 key=np.array(_key(config, grid, horizon)),
-                train=fires["train"].numpy(),
-                heldout=fires["heldout"].numpy(),
+                **{split: values.numpy() for split, values in fires.items()},
             )
-        partial.replace(folder / KEPT)
     except OSError as error:
         raise UserError(f"{folder / KEPT}: cannot be written: {error.strerror or error}") from None
 
@@ -237,19 +251,24 @@ def _key(config: FileFireConfig, grid: tuple[int, int], horizon: int) -> str:
 
 def _read_kept(
     config: FileFireConfig, grid: tuple[int, int], horizon: int
-) -> dict[Literal["train", "heldout"], Tensor] | None:
+) -> dict[Split, Tensor] | None:
     """The run's own copy, or None if there is none, or it is damaged or of another grid."""
-    if config.kept is None or config.sha256 is None or not Path(config.kept).is_file():
+    if config.kept is None or config.sha256 is None:
         return None
     try:
-        with np.load(config.kept, allow_pickle=False) as found:
+        with (
+            open_regular(Path(config.kept), _MOST_KEPT) as file,
+            np.load(file, allow_pickle=False) as found,
+        ):
+            if sum(part.file_size for part in found.zip.filelist) > _MOST_KEPT:
+                return None
             if str(found["key"]) != _key(config, grid, horizon):
                 return None
-            fires = found["train"], found["heldout"]
+            fires: dict[Split, Any] = {split: found[split] for split in get_args(Split)}
     except Exception:  # numpy and zipfile raise what they like on a damaged file
         return None
-    for one in fires:
-        fits = one.ndim == 3 and one.shape[1:] == tuple(grid) and len(one) > 0
-        if not fits or one.dtype != np.float32 or not (one >= 0).all():
+    for values in fires.values():
+        fits = values.ndim == 3 and values.shape[1:] == tuple(grid) and len(values) > 0
+        if not fits or values.dtype != np.float32 or not (values >= 0).all():
             return None
-    return {"train": torch.from_numpy(fires[0]), "heldout": torch.from_numpy(fires[1])}
+    return {split: torch.from_numpy(values) for split, values in fires.items()}

@@ -18,6 +18,8 @@ class Buffers(nn.Module):
         self.__dict__[name] = tensor
 
     def __setattr__(self, name: str, value: Any) -> None:
+        if name in self.__dict__.get("_buffers", ()):
+            raise AttributeError(f"{name} is a buffer: write it in place, self.{name}.copy_(...)")
         super().__setattr__(name, value)
         if isinstance(value, nn.Module):
             self.__dict__[name] = value

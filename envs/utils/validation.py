@@ -1,9 +1,9 @@
 """Checks of configurations and plain values, and the messages about them."""
 
+import difflib
 import json
 import reprlib
-from collections.abc import Mapping
-from importlib.resources import files
+from collections.abc import Iterable, Mapping
 from typing import Annotated, Any, TypeVar
 
 import numpy as np
@@ -15,49 +15,54 @@ T = TypeVar("T")
 
 
 TAG = "kind:"
-"""begins the name of one of several types that a value may be of; no part of its key"""
-
+"""begins the tags of pydantic's unions, which are no part of a key"""
 
 Name = Annotated[str, Field(pattern=r"^\w[\w.+-]*$", max_length=100)]
-"""what may be part of a file's name, and of a measure's"""
+"""text that can be part of the names of files and measures"""
 
 
-def known(group: str) -> list[str]:
-    """The choices of a config group ("method", "setup" or "fire"), in alphabetical order."""
-    names = (entry.name for entry in files("emberlink.configs").joinpath(group).iterdir())
-    return sorted(name.removesuffix(".yaml") for name in names if name.endswith(".yaml"))
+def from_plain(config_type: type[T], values: Mapping[str, Any], key: str = "") -> T:
+    """Returns a configuration from plain values as YAML has them.
 
+    No key may be unknown, and no value is converted to another type.
 
-def from_plain(config_type: type[T], values: Mapping[str, Any]) -> T:
-    """A configuration from plain values as YAML has them: nothing unknown, nothing coerced.
+    Args:
+        config_type: a pydantic dataclass.
+        values: mappings, lists and tuples of text, numbers, bool and None.
+        key: of the values within a larger configuration, for messages.
 
     Raises:
-        pydantic.ValidationError: a ValueError that names what is wrong.
-        ValueError: a value that no YAML of ours holds, such as bytes, or a list within itself.
+        UserError: one line that names the first key that is wrong, its value and what is wrong.
     """
     # Through JSON, whose lists and mappings strict validation takes for tuples and dataclasses.
-    return TypeAdapter(config_type).validate_json(json.dumps(plain(values)))
+    text = json.dumps(plain(values, key))
+    try:
+        return TypeAdapter(config_type).validate_json(text)
+    except ValidationError as error:
+        raise UserError(describe(error, key)) from None
 
 
 def plain(value: Any, key: str = "", deepest: int = 16) -> Any:
-    """The value as JSON can hold it; numpy's numbers and arrays become Python's.
+    """Returns the value as JSON can hold it; ranges and NumPy's arrays become lists.
 
     Args:
         value: mappings, lists and tuples of text, numbers, bool and None.
-        key: where it stands, for messages.
-        deepest: levels that may be below it.
+        key: of the value, for messages.
+        deepest: levels that it may have.
 
     Raises:
-        ValueError: it holds something else; one line that names the key.
+        UserError: it holds something else; one line that names the key.
     """
     if isinstance(value, np.generic | np.ndarray):
         value = value.tolist()
+    if isinstance(value, range):
+        value = list(value)
     if isinstance(value, Mapping | list | tuple) and deepest == 0:
-        raise UserError(f"{key[:60]}: lists or mappings within each other, too many levels")
+        raise UserError(f"{key[:60]}: too many levels of lists or mappings")
     if isinstance(value, Mapping):
         for name in value:
             if not isinstance(name, str) or not name.isprintable():
-                raise UserError(f"key {shown(name)} in {key or 'the configuration'} is no name")
+                raise UserError(f"key {shown(name)} in {key or 'the configuration'} is not a name")
         prefix = f"{key}." if key else ""
         return {name: plain(item, prefix + name, deepest - 1) for name, item in value.items()}
     if isinstance(value, list | tuple):
@@ -67,24 +72,34 @@ def plain(value: Any, key: str = "", deepest: int = 16) -> Any:
     if isinstance(value, int) and value.bit_length() > 1024:
         raise UserError(f"{key}: a whole number of {value.bit_length()} bits is too large")
     if not isinstance(value, str | int | float | None):
-        raise UserError(f"{key}={shown(value)}: {type(value).__name__} is no number, text or list")
+        raise UserError(
+            f"{key}={shown(value)}: expected a number, text or list, not {type(value).__name__}"
+        )
     return value
 
 
 def shown(value: Any) -> str:
-    """A value in a message: as it is where it is short and can be printed, else cut and escaped."""
+    """Returns a value for a message: cut if it is long, escaped where it cannot be printed."""
     text = value if isinstance(value, str) else reprlib.repr(value)
     return printable(text if len(text) <= 100 else f"{text[:60]}...{text[-20:]}")
 
 
 def printable(text: str) -> str:
-    """The text on one line, what cannot be printed escaped."""
+    """Returns the text on one line, with characters that cannot be printed escaped."""
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 
 def describe(error: ValidationError, prefix: str = "") -> str:
-    """One line for what pydantic found first: the key, the value, and what was expected."""
-    first = error.errors()[0]
+    """Returns one line about the first error: the key, the value and the expected.
+
+    Args:
+        error: of a validation by pydantic.
+        prefix: the key of what was validated.
+    """
+    errors = error.errors()
+    # A key that is mistyped is also a key that is missing.
+    mistyped = [found for found in errors if found["type"] == "unexpected_keyword_argument"]
+    first = (mistyped or errors)[0]
     parts = [str(part) for part in first["loc"] if not str(part).startswith(TAG)]
     key = ".".join([prefix, *parts] if prefix else parts)
     if isinstance(cause := first.get("ctx", {}).get("error"), ValidationError):
@@ -97,3 +112,24 @@ def describe(error: ValidationError, prefix: str = "") -> str:
         return message
     value = "" if isinstance(first["input"], dict) else f"={shown(first['input'])}"
     return f"{key}{value}: {message}"
+
+
+def unknown(value: str, known: Iterable[str], *, listed: bool = True) -> str:
+    """Returns the part of a message that says that a name is not known, and the nearest one.
+
+    Args:
+        value: the name.
+        known: names that would do; of dotted keys the last part is compared too.
+        listed: appends all known names; else only where none is near, and dotted ones left out.
+    """
+    names = list(known)
+    last_parts = {name.rsplit(".", 1)[-1]: name for name in names}
+    near = difflib.get_close_matches(value, names, n=1) or [
+        last_parts[part] for part in difflib.get_close_matches(value, last_parts, n=1)
+    ]
+    hint = f"; did you mean {near[0]}?" if near else ""
+    if listed:
+        hint += f"{'' if hint else ';'} known: {', '.join(names)}"
+    elif not near:
+        hint = f"; known: {', '.join(name for name in names if '.' not in name)}"
+    return f"{shown(value)!r} is not known{hint}"

@@ -1,4 +1,4 @@
-"""What burns, and who saw it first: the maps of all environments side by side."""
+"""The fires of all environments, and the UAV and step at which each cell was first seen."""
 
 import torch
 from torch import Tensor
@@ -6,99 +6,108 @@ from torch import Tensor
 from emberlink.envs.fire.generator import burning_cells
 from emberlink.envs.utils.buffers import Buffers
 
-from .sensor import View
+from .sensor import Sensor
 
 _NEVER = torch.iinfo(torch.int32).max
 
 
-class Discovery(Buffers):
-    """The fire of every environment, and what its UAVs have seen of it.
+class CoverageMap(Buffers):
+    """The fire of every environment and the cells of it that its UAVs have seen.
 
-    UAV 0 looks first: a cell is new to the lowest UAV that sees it at the first step at which
-    anyone does, and old to all others from then on. A sighting is written down as one number,
-    step * uavs + UAV, of which the smallest settles that without a loop over UAVs.
+    At each step UAV 0 looks first: a burning cell is new to the lowest UAV that sees it at the
+    first step at which any UAV does, and old to all others and at all later steps. A sighting is
+    stored as one number, step * uavs + UAV; the minimum over sightings gives this order without a
+    loop over UAVs.
 
     Args:
-        view: what a window is.
-        fires: arrival times in steps, float32 [fires, X, Y], inf where it never burns.
+        sensor: the UAVs' camera.
+        fires: arrival times in steps, float32 [fires, X, Y], inf where a cell never burns.
         horizon: steps of an episode.
-        envs: environments side by side.
-        uavs: in each.
+        envs: number of environments.
+        uavs: UAVs per environment.
     """
 
     _fires: Tensor
-    _growth: Tensor
+    _burning: Tensor
     _start: Tensor
     _uav: Tensor
     _never: Tensor
-    _arrival: Tensor
-    _growth_start: Tensor
+    _arrival_time: Tensor
+    _burning_start: Tensor
     _first_seen: Tensor
     _stamp: Tensor
 
-    def __init__(self, view: View, fires: Tensor, *, horizon: int, envs: int, uavs: int):
+    def __init__(self, sensor: Sensor, fires: Tensor, *, horizon: int, envs: int, uavs: int):
         super().__init__()
-        self._view, self._horizon, self._uavs = view, horizon, uavs
-        self.register_buffer("_growth", burning_cells(fires, horizon).flatten(), persistent=False)
-        # Beyond the edge nothing burns and nothing does not: NaN is neither before nor after now.
-        self.register_buffer("_fires", view.pad(fires, torch.nan), persistent=False)
+        self._sensor, self._horizon, self._uavs = sensor, horizon, uavs
+        self.register_buffer("_burning", burning_cells(fires, horizon).flatten(), persistent=False)
+        # Padding is NaN, so that comparisons with it are false: it neither burns nor does not burn.
+        self.register_buffer("_fires", sensor.pad(fires, torch.nan), persistent=False)
         self.register_buffer(
-            "_start", torch.arange(envs).unsqueeze(-1) * view.area, persistent=False
+            "_start", torch.arange(envs).unsqueeze(-1) * sensor.area, persistent=False
         )
         self.register_buffer(
             "_uav", torch.arange(uavs, dtype=torch.int32).unsqueeze(-1), persistent=False
         )
         self.register_buffer("_never", torch.tensor(_NEVER, dtype=torch.int32), persistent=False)
-        self.register_buffer("_arrival", self._fires[:1].repeat(envs, 1))
-        self.register_buffer("_growth_start", torch.zeros(envs, dtype=torch.int64))
-        first_seen = torch.full((envs, view.area), _NEVER, dtype=torch.int32)
+        self.register_buffer("_arrival_time", self._fires[:1].repeat(envs, 1))
+        self.register_buffer("_burning_start", torch.zeros(envs, dtype=torch.int64))
+        first_seen = torch.full((envs, sensor.area), _NEVER, dtype=torch.int32)
         self.register_buffer("_first_seen", first_seen)
         self.register_buffer("_stamp", self._uav.repeat(envs, 1, 1))
 
     def __len__(self) -> int:
-        """How many fires there are."""
+        """Returns the number of fires."""
         return len(self._fires)
 
     @property
-    def arrival(self) -> Tensor:
+    def arrival_time(self) -> Tensor:
         """The fire of each environment: arrival times in steps, float32 [envs, X, Y]."""
-        return self._view.crop(self._arrival)
+        return self._sensor.crop(self._arrival_time)
 
     @property
     def seen(self) -> Tensor:
-        """The burning cells that some UAV has seen, bool [envs, X, Y]."""
-        return self._view.crop(self._first_seen < _NEVER)
+        """The burning cells that any UAV has seen, bool [envs, X, Y]."""
+        return self._sensor.crop(self._first_seen < _NEVER)
 
-    def begin(self, mask: Tensor, fire: Tensor) -> None:
-        """New episodes: bool [envs] says where, int64 [envs] with which fires."""
-        self._arrival.copy_(torch.where(mask[:, None], self._fires[fire], self._arrival))
-        first_growth = fire * (self._horizon + 1)
-        self._growth_start.copy_(torch.where(mask, first_growth, self._growth_start))
+    def start_episodes(self, mask: Tensor, fire: Tensor) -> None:
+        """Starts new episodes in the environments of a mask.
+
+        Args:
+            mask: bool [envs].
+            fire: int64 [envs], the index of each environment's fire.
+        """
+        self._arrival_time.copy_(torch.where(mask[:, None], self._fires[fire], self._arrival_time))
+        start = fire * (self._horizon + 1)
+        self._burning_start.copy_(torch.where(mask, start, self._burning_start))
         self._first_seen.masked_fill_(mask[:, None], _NEVER)
         self._stamp.copy_(torch.where(mask[:, None, None], self._uav, self._stamp))
 
-    def burning(self, step: Tensor) -> Tensor:
-        """Cells that burn at a step, int64 [envs] both."""
-        return self._growth.take(step.clamp(max=self._horizon).add_(self._growth_start))
+    def count_burning(self, step: Tensor) -> Tensor:
+        """Returns the number of cells that burn at a step, int64 [envs] both."""
+        return self._burning.take(step.clamp(max=self._horizon).add_(self._burning_start))
 
-    def look(self, position: Tensor, step: Tensor) -> tuple[Tensor, Tensor]:
-        """All UAVs look at once, one step after they did last.
+    def look(self, position: Tensor, step: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Classifies the cells in view of all UAVs, and marks the burning ones as seen.
+
+        It must be called once per step.
 
         Args:
             position: float64 [envs, uavs, 3], cells.
-            step: of this look, float32 [envs].
+            step: float32 [envs], steps since the episode began.
 
         Returns:
-            Cells in view that are new fire, old fire and no fire: how many, float64
-            [envs, uavs, 3], and their mean (i, j), float32 [envs, uavs, 3, 2].
+            Three tensors about the cells in view that are new fire, old fire and no fire: counts,
+            float64 [envs, uavs, 3]; mean (i, j), float32 [envs, uavs, 3, 2]; and the cells of the
+            window, bool [envs, uavs, 3, W * W].
         """
-        centre, cells, near = self._view.look(position, self._start)
-        stamp, first_seen, now = self._stamp, self._first_seen, step.view(-1, 1, 1)
+        centre, cells, in_view = self._sensor.look(position, self._start)
+        stamp, first_seen, time = self._stamp, self._first_seen, step.view(-1, 1, 1)
         stamp.add_(self._uavs)
-        arrival = self._arrival.take(cells)
-        burning = near & (arrival <= now)
+        arrival_time = self._arrival_time.take(cells)
+        burning = in_view & (arrival_time <= time)
         claims = torch.where(burning, stamp, self._never)
         first_seen.view(-1).scatter_reduce_(0, cells.view(-1), claims.view(-1), "amin")
         new = first_seen.take(cells) == stamp
-        classes = torch.stack((new, burning ^ new, near & (arrival > now)), -2)
-        return self._view.tally(classes, centre)
+        classes = torch.stack((new, burning ^ new, in_view & (arrival_time > time)), -2)
+        return *self._sensor.count_classes(classes, centre), classes

@@ -1,4 +1,4 @@
-"""The rewards: pure functions, and their constants."""
+"""The rewards: pure functions of what is in view and of the move."""
 
 from typing import Literal
 
@@ -7,25 +7,29 @@ from torch import Tensor
 from emberlink.envs.config import RewardConfig
 
 
-def left_box(beyond: Tensor, axes: Literal["xyz", "xy"]) -> Tensor:
-    """Whether the last move would have left the box on the tested axes, bool [...].
+def left_box(hit_boundary: Tensor, axes: Literal["xyz", "xy"]) -> Tensor:
+    """Returns whether the last move would have left the box on the tested axes, bool [...].
 
     Args:
-        beyond: bool [..., 3], per axis.
+        hit_boundary: bool [..., 3], per axis.
         axes: the axes that are tested.
     """
-    return beyond[..., : len(axes)].any(-1)
+    return hit_boundary[..., : len(axes)].any(-1)
 
 
 def view_reward(
-    new: Tensor, old: Tensor, none: Tensor, beyond: Tensor, config: RewardConfig
+    new: Tensor, old: Tensor, none: Tensor, hit_boundary: Tensor, config: RewardConfig
 ) -> Tensor:
-    """The reward for what is in view, or the penalty for leaving the box, float32 [...].
+    """Returns the reward for the cells in view, or the penalty for leaving the box.
 
     Args:
         new, old, none: whole numbers [...], cells in view of each class.
-        beyond: bool [..., 3], the axes along which the move would have left the box.
+        hit_boundary: bool [..., 3], the axes along which the move would have left the box.
+        config: the worth of each class, and the penalty.
+
+    Returns:
+        float32 [...].
     """
-    earned = config.new_fire * new
-    earned.add_(old, alpha=config.old_fire).add_(none, alpha=config.no_fire)
-    return earned.masked_fill_(left_box(beyond, config.exit_axes), config.exit).float()
+    reward = config.new_fire * new
+    reward.add_(old, alpha=config.old_fire).add_(none, alpha=config.no_fire)
+    return reward.masked_fill_(left_box(hit_boundary, config.exit_axes), config.exit).float()

@@ -1,6 +1,7 @@
-"""The networks as TensorDict modules, built from an environment's specs."""
+"""Actors and critics as TensorDict modules, built from an environment's specs."""
 
 import copy
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -10,64 +11,82 @@ from torchrl.modules import ValueOperator
 
 from emberlink.envs import keys
 
-from .stacked import Generators, StackedActor, StackedCritic, of_teams
+from .grouping import Grouping
+from .layers import Generators
+from .stacked import StackedActor, StackedCritic
 
 STATE_ACTION_VALUE = (keys.AGENTS, "state_action_value")
+"""float32 [..., uavs, 1]: the critics' output"""
 
 
 def make_actor(
-    observation: Composite,
-    action: Composite,
-    hidden: tuple[int, int],
+    observation_spec: Composite,
+    action_spec: Composite,
+    hidden: Sequence[int],
     *,
+    share_parameters: bool = False,
     generator: Generators = None,
 ) -> TensorDictModule:
-    """The UAVs' actors: ("agents", "observation") -> ("agents", "action").
+    """Returns the UAVs' actors: the tensors of the observation -> ("agents", "action").
 
     Args:
-        observation, action: specs of the environment, batch size [num_envs].
-        hidden: sizes of the two hidden layers.
-        generator: of the initial weights; several make as many teams, see `networks`.
+        observation_spec, action_spec: of the environment, batch size [num_envs].
+        hidden: units of the hidden layers.
+        share_parameters: whether all UAVs of a team use the same weights.
+        generator: of the initial weights. Several generators make as many teams, which share no
+            weights; see `Grouping`.
     """
-    network = _stacked(StackedActor, observation, action, hidden, generator)
-    return TensorDictModule(network, in_keys=[keys.OBSERVATION], out_keys=[keys.ACTION])
+    observations: list[Any] = keys.observation_keys(observation_spec)
+    sizes = _sizes(observation_spec, action_spec)
+    network = StackedActor(
+        *sizes,
+        hidden,
+        share_parameters=share_parameters,
+        device=observation_spec.device,
+        generator=generator,
+    )
+    return TensorDictModule(network, in_keys=observations, out_keys=[keys.ACTION])
 
 
 def make_critic(
-    observation: Composite,
-    action: Composite,
-    hidden: tuple[int, int],
+    observation_spec: Composite,
+    action_spec: Composite,
+    hidden: Sequence[int],
     *,
+    share_parameters: bool = False,
     generator: Generators = None,
 ) -> ValueOperator:
-    """The UAVs' critics; arguments as `make_actor`."""
-    network = _stacked(StackedCritic, observation, action, hidden, generator)
-    return ValueOperator(
-        network, in_keys=[keys.OBSERVATION, keys.ACTION], out_keys=[STATE_ACTION_VALUE]
+    """Returns the UAVs' critics: observation and action -> `STATE_ACTION_VALUE`.
+
+    Arguments as `make_actor`.
+    """
+    observations: list[Any] = keys.observation_keys(observation_spec)
+    sizes = _sizes(observation_spec, action_spec)
+    network = StackedCritic(
+        *sizes,
+        hidden,
+        share_parameters=share_parameters,
+        device=observation_spec.device,
+        generator=generator,
     )
+    in_keys = [*observations, keys.ACTION]
+    return ValueOperator(network, in_keys=in_keys, out_keys=[STATE_ACTION_VALUE])
 
 
-def _stacked(
-    kind: type[StackedActor] | type[StackedCritic],
-    observation: Composite,
-    action: Composite,
-    hidden: tuple[int, int],
-    generator: Generators,
-) -> StackedActor | StackedCritic:
-    uavs, features = observation[keys.OBSERVATION].shape[-2:]
-    device = torch.device(observation.device or "cpu")
-    actions = action[keys.ACTION].shape[-1]
-    uavs *= len(of_teams(generator))
-    return kind(uavs, features, actions, hidden, device=device, generator=generator)
+def _sizes(observation: Composite, action: Composite) -> tuple[int, list[torch.Size], int]:
+    """Returns the UAVs, the shapes of their observation's tensors, and the size of an action."""
+    *batch, actions = action[keys.ACTION].shape
+    shapes = [observation[key].shape[len(batch) :] for key in keys.observation_keys(observation)]
+    return batch[-1], shapes, actions
 
 
 def team_of(network: TensorDictModule, team: int, teams: int) -> TensorDictModule:
-    """One team's networks out of a stack; they share its memory, so that they learn with it."""
+    """Returns one team's networks out of several; they share memory, so that they learn with it."""
     if teams == 1:
         return network
     single = copy.deepcopy(network)
-    for own, stacked in zip(single.parameters(), network.parameters(), strict=True):
-        own.data = stacked.data.unflatten(0, (teams, -1))[team]
+    for part, stacked in zip(single.parameters(), network.parameters(), strict=True):
+        part.data = stacked.data.unflatten(0, (teams, -1))[team]
     stack: Any = single.module
-    stack.uavs //= teams
+    stack.grouping = Grouping(stack.grouping.uavs, shared=stack.grouping.shared)
     return single

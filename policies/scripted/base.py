@@ -34,7 +34,7 @@ class Scripted(TensorDictModuleBase):
     def __init__(self, env: WildfireEnv):
         super().__init__()
         self.world = env.config
-        reads: list[Any] = [keys.POSITION, keys.STREAM, keys.STEP]
+        reads: list[Any] = [keys.POSITION, keys.RNG_KEY, keys.STEP]
         writes: list[Any] = [keys.ACTION]
         self.in_keys, self.out_keys = reads, writes
         low, high = motion.corners(self.world.low, self.world.high)
@@ -49,9 +49,9 @@ class Scripted(TensorDictModuleBase):
         raise NotImplementedError
 
     @staticmethod
-    def moment(tensordict: TensorDictBase, use: int) -> torch.Tensor:
-        """A random stream for this step and this use, int64 [num_envs]."""
-        return counter_rng.at(tensordict.get(keys.STREAM), tensordict.get(keys.STEP), use)
+    def step_key(tensordict: TensorDictBase, use: int) -> torch.Tensor:
+        """Returns the key of the random numbers of this step for one use, int64 [num_envs]."""
+        return counter_rng.step_key(tensordict.get(keys.RNG_KEY), tensordict.get(keys.STEP), use)
 
     def fly(self, tensordict: TensorDictBase, target: torch.Tensor) -> TensorDictBase:
         """Writes the action that flies straight at a target at full speed and stops there.

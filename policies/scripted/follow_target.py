@@ -15,12 +15,9 @@ class FollowTarget(Scripted):
 
     recipe: ClassVar[str | None] = "consensus"
 
-    TARGET = (keys.AGENTS, "target")
-    """float32 [num_envs, n, 3], cells: what `comm/consensus.py` writes"""
-
     def __init__(self, env: WildfireEnv):
         super().__init__(env)
-        self.in_keys.append(self.TARGET)
+        self.in_keys.append(keys.TARGET)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        return self.fly(tensordict, tensordict.get(self.TARGET))
+        return self.fly(tensordict, tensordict.get(keys.TARGET))

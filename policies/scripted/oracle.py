@@ -58,7 +58,7 @@ class Oracle(Scripted):
     def _delay(self, step: Tensor) -> Tensor:
         """What the wait for each cell counts, float64 [num_envs, X, Y], cells; inf if not to do."""
         (env,) = self._env
-        arrival = env.arrival.double()
+        arrival = env.arrival_time.double()
         wait = (arrival - step.view(-1, 1, 1)).clamp_(min=0)
         done = (env.fire_map == 1) | (arrival > self.world.horizon)
         return (wait * _STEP_OF_WAITING).masked_fill_(done, math.inf)

@@ -5,12 +5,11 @@ from tensordict import TensorDictBase
 
 from emberlink.envs import keys
 from emberlink.envs.utils import counter_rng
+from emberlink.envs.utils.counter_rng import Use
 from emberlink.envs.wildfire import WildfireEnv
 from emberlink.envs.world import motion
 
 from .base import Scripted
-
-_POINTS, _ACTIONS = range(200, 202)  # what a moment's random stream is split into
 
 
 class Stationary(Scripted):
@@ -25,7 +24,9 @@ class RandomActions(Scripted):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         shape = tensordict.get(keys.POSITION).shape
-        unit = counter_rng.uniform(self.moment(tensordict, _ACTIONS), shape[-2] * shape[-1])
+        unit = counter_rng.uniform(
+            self.step_key(tensordict, Use.SCRIPTED_ACTION), shape[-2] * shape[-1]
+        )
         return tensordict.set(keys.ACTION, (2 * unit - 1).view(shape))
 
 
@@ -43,10 +44,10 @@ class RandomWaypoints(Scripted):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         position = tensordict.get(keys.POSITION)
-        stream = self.moment(tensordict, _POINTS)
+        key = self.step_key(tensordict, Use.SCRIPTED_WAYPOINT)
         low = torch.cat((self.low[:2], self.high[2:]))
         # At the first step the waypoint is where the UAV is, so that it draws one.
         old = self.remembered(tensordict, self.WAYPOINT, position)
-        waypoint = motion.next_waypoint(old, position, stream, low, self.high)
+        waypoint = motion.next_waypoint(old, position, key, low, self.high)
         tensordict.set(self.WAYPOINT, waypoint)
         return self.fly(tensordict, waypoint)

@@ -31,7 +31,7 @@ def train(file: Path, overrides: list[str]) -> None:
     trainer = Trainer(config)
     trainer.start()
     grid, horizon = config.env.grid, config.env.horizon
-    fires = fire_bank(load_scenario("huygens"), "heldout", FIRES, grid, horizon)
+    fires = fire_bank(load_scenario("huygens"), "test", FIRES, grid, horizon)
     began, paused = time.monotonic(), 0.0
 
     def measure(progress) -> None:

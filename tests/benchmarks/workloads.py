@@ -11,8 +11,8 @@ from statistics import median
 import torch
 from tensordict import TensorDict
 
+from emberlink.configs import known
 from emberlink.envs import keys
-from emberlink.envs.utils.validation import known
 from emberlink.envs.wildfire import WildfireEnv
 from emberlink.trainers import make_env
 from emberlink.trainers.config.compose import resolve

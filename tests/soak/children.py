@@ -9,6 +9,7 @@ import traceback
 from collections.abc import Callable
 from pathlib import Path
 
+from emberlink.envs.utils import atomic_io
 from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.runs import checkpoint_file
 from emberlink.trainers.training.resume import resume
@@ -99,8 +100,9 @@ def watch_saves(say: Callable[[str], None], die_at: tuple[str, int] | None) -> N
 
         return call
 
-    for name in ("save_file", "_digest", "flush_folder"):
+    for name in ("save_file", "_digest"):
         setattr(checkpoint_file, name, dying(name, getattr(checkpoint_file, name)))
+    atomic_io.sync = dying("sync", atomic_io.sync)
     os.fsync = dying("fsync", os.fsync)
     Path.replace = dying("replace", Path.replace)
     Path.unlink = dying("unlink", Path.unlink)
@@ -132,7 +134,7 @@ def training(method: str, output: Path, die_at: tuple[str, int] | None = None):
     return work
 
 
-PARTS = ("save_file", "_digest", "fsync", "replace", "flush_folder", "unlink")
+PARTS = ("save_file", "_digest", "fsync", "replace", "sync", "unlink")
 
 
 def kill_until_finished(

@@ -55,7 +55,7 @@ def sealed_again(path: Path, change: Callable[[dict, dict[str, torch.Tensor]], N
 
 def of_another_method(path: Path, draw: random.Random) -> None:
     def change(header: dict, _) -> None:
-        values = header.get("config", header)
+        values = header if "method" in header else header["config"]
         methods = {"independent", "positional", "shared_memory", "consensus"}
         values["method"] = draw.choice(sorted(methods - {values["method"]}))
 
@@ -65,10 +65,10 @@ def of_another_method(path: Path, draw: random.Random) -> None:
 def of_another_team(path: Path, draw: random.Random) -> None:
     def change(header: dict, _) -> None:
         other = draw.randint(3, 9)
-        if "config" in header:
-            header["config"]["env"]["num_uavs"] = other
-        else:
+        if "uavs" in header:
             header["uavs"] = other
+        else:
+            header["config"]["env"]["num_uavs"] = other
 
     sealed_again(path, change)
 

@@ -21,7 +21,7 @@ from damage import damage_trials
 from ends import full_disk_trial, signal_trial
 
 from emberlink.trainers.config.compose import resolve
-from emberlink.trainers.evaluation import report
+from emberlink.trainers.evaluation.actor import load_actor
 from emberlink.trainers.training.resume import resume
 from emberlink.trainers.training.trainer import Trainer
 
@@ -39,7 +39,7 @@ def readable(folder: Path, method: str) -> list[tuple[Path, Callable[[Path], obj
         resume(path).close()
 
     def loaded(path: Path) -> None:
-        report.load_actor(config, path)
+        load_actor(config, path)
 
     return [(trainer.run.states()[-1], resumed), (trainer.run.checkpoint(), loaded)]
 

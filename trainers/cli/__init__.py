@@ -1,0 +1,1 @@
+"""The command line: one file per command, run by `main.main`."""

@@ -48,7 +48,7 @@ def _add_preview(actions: Any) -> None:
     preview.add_argument(
         "source",
         metavar="SOURCE",
-        help="a scenario (huygens, or huygens:3 for its held-out fire 3) or a file "
+        help="a scenario (huygens, or huygens:3 for its test fire 3) or a file "
         "(or bank.tif:3 for fire 3 in it)",
     )
     preview.add_argument("overrides", metavar="key=value", nargs="*", help=_KEYS)
@@ -66,8 +66,7 @@ def _add_make(actions: Any) -> None:
         "write generated fires to a GeoTIFF or NumPy file",
         "Makes fires of a scenario and writes their times of arrival, in steps, to a new file: a "
         "GeoTIFF with a band per fire, or NumPy [fires, x, y] with a .json beside it.",
-        "emberlink fire make huygens --count 64 --split heldout --output fires.tif "
-        "env.grid=[60,60]",
+        "emberlink fire make huygens --count 64 --split test --output fires.tif env.grid=[60,60]",
     )
     make.add_argument("scenario", metavar="SCENARIO", help="a file in configs/fire: huygens, ...")
     make.add_argument("overrides", metavar="key=value", nargs="*", help=_KEYS)
@@ -75,13 +74,13 @@ def _add_make(actions: Any) -> None:
         "--count",
         metavar="N",
         type=positive,
-        help="fires; as many as are trained on or evaluated with if left out",
+        help="fires; by default as many as a training or an evaluation uses",
     )
     make.add_argument(
         "--split",
-        choices=("train", "heldout"),
+        choices=("train", "validation", "test"),
         default="train",
-        help="fires to train on (default), or those that evaluations are made with",
+        help="training fires (default), validation fires, or test fires",
     )
     make.add_argument(
         "--output",

@@ -1,31 +1,64 @@
-"""What the parsers of the command line share."""
+"""The parser of the command line, and what its commands share."""
 
 import argparse
+import difflib
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NoReturn
 
 
-class Parser(argparse.ArgumentParser):
-    """Says what is wrong in one line, where argparse would print the usage before it.
+class _Help(argparse.HelpFormatter):
+    """Wraps descriptions to the width of the terminal and leaves examples as they are."""
 
-    A command's options may stand before, among or behind its other arguments.
+    def _fill_text(self, text: str, width: int, indent: str) -> str:
+        return text if text.startswith("example:") else super()._fill_text(text, width, indent)
+
+
+class Parser(argparse.ArgumentParser):
+    """A parser whose errors are one line, without the usage before it.
+
+    Options of a command may stand before, among or behind its other arguments.
     """
 
-    _within = False
+    _is_intermixed = False
 
     def parse_known_args(self, args=None, namespace=None):  # pyright: ignore
-        if self._within or self._subparsers is not None:
+        """Parses as argparse does; an option that a command does not know is an error."""
+        if self._is_intermixed or self._subparsers is not None:
             return super().parse_known_args(args, namespace)
-        self._within = True  # the other parser calls this one
+        self._is_intermixed = True  # parse_known_intermixed_args calls this method
         try:
-            return self.parse_known_intermixed_args(args, namespace)
+            parsed, unknown = self.parse_known_intermixed_args(args, namespace)
         finally:
-            self._within = False
+            self._is_intermixed = False
+        for text in unknown:
+            if text.startswith("-"):
+                self.error(self._unknown_option(text, list(args or ())))
+        return parsed, unknown
 
     def error(self, message: str) -> NoReturn:
-        print(f"{self.prog}: {message} (see {self.prog} --help)", file=sys.stderr)
+        """Prints the message and exits with status 2."""
+        text = "".join(c if c.isprintable() else "?" for c in message)
+        print(f"{self.prog}: {text} (see {self.prog} --help)", file=sys.stderr)
         raise SystemExit(2)
+
+    def _unknown_option(self, text: str, arguments: Sequence[str]) -> str:
+        """Returns a message with the option, or the key=value, that was probably meant."""
+        name, _, value = text.partition("=")
+        options = [option for action in self._actions for option in action.option_strings]
+        near = difflib.get_close_matches(name, options, n=1)
+        message = f"option {name} is not known"
+        if near:
+            return f"{message}; did you mean {near[0]}?"
+        if self._takes_keys() and name.startswith("--"):
+            after = arguments[arguments.index(text) + 1 :] if text in arguments else []
+            value = value or next((one for one in after[:1] if "=" not in one), "VALUE")
+            key = name.removeprefix("--").replace("-", "_")
+            return f"{message}; keys are given as {key}={value}"
+        return message
+
+    def _takes_keys(self) -> bool:
+        return any("key=value" in str(action.metavar) for action in self._actions)
 
 
 def command(
@@ -35,37 +68,40 @@ def command(
     summary: str,
     description: str,
     example: str,
+    usage: str | None = None,
 ) -> argparse.ArgumentParser:
-    """Adds a command.
+    """Adds a command and returns its parser.
 
     Args:
         commands: as `add_subparsers` returns it.
-        name: of the command.
+        name: name of the command.
         run: called with the options and a console; returns the exit status.
         summary: its line in the list of commands.
         description: what it does, in a paragraph.
         example: a command line.
+        usage: its usage; made of its arguments if None.
     """
     parser = commands.add_parser(
         name,
         help=summary,
         description=description,
         epilog=f"example:\n  {example}",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        usage=usage,
+        formatter_class=_Help,
     )
     parser.set_defaults(run=run)
     return parser
 
 
 def positive(text: str) -> int:
-    """A whole number above 0."""
+    """Converts an argument to a whole number above 0."""
     if not text.isdecimal() or int(text) < 1:
         raise argparse.ArgumentTypeError(f"{text!r} is not a whole number above 0")
     return int(text)
 
 
 def between(low: int, high: int) -> Callable[[str], int]:
-    """A whole number from `low` to `high`."""
+    """Returns a converter of arguments to whole numbers from `low` to `high`."""
 
     def number(text: str) -> int:
         if not text.isdecimal() or not low <= int(text) <= high:

@@ -17,12 +17,13 @@ from emberlink.envs.rendering.frame import write_gif
 from emberlink.envs.rendering.panels import Episode, Screen
 from emberlink.envs.rendering.video import write_mp4
 from emberlink.envs.scenarios import ScenarioConfig, fires_of
-from emberlink.envs.utils.atomic_io import free_name, published
 from emberlink.envs.utils.errors import UserError
+from emberlink.envs.utils.publish import free_name, published
 from emberlink.envs.wildfire import WildfireEnv
 from emberlink.policies.scripted.registry import SCRIPTED
 from emberlink.trainers.build import build_env
 from emberlink.trainers.config.schema import RunConfig, build_comm
+from emberlink.trainers.evaluation.actor import load_actor
 from emberlink.trainers.evaluation.evaluate import (
     BLOCK,
     START_SEED,
@@ -30,9 +31,9 @@ from emberlink.trainers.evaluation.evaluate import (
     shown_scenario,
 )
 from emberlink.trainers.evaluation.record_episode import record
-from emberlink.trainers.evaluation.report import load_actor
 from emberlink.trainers.runs.pretrained import open_run
 from emberlink.trainers.runs.run_folder import RunFolder
+from emberlink.trainers.runs.seal import check_trained_with
 
 FIRES = 65_536
 """held-out fires of a scenario: as many as an evaluation can have"""
@@ -96,7 +97,7 @@ def render(runs: Sequence[str], console: Console, choices: Choices) -> int:
     stem = "_".join([shown, scenario.name, str(index), *(p.stem for p in choices.checkpoints)])
     paths = _free_paths(choices.output, folders[0], stem)
     steps = _steps(choices, config.horizon, [path.suffix for path in paths])
-    arrival = fires_of(scenario).one_heldout(index, config.grid, config.horizon)
+    arrival = fires_of(scenario).test_fire(index, config.grid, config.horizon)
     episodes = [_play(panel, arrival, index, steps, console) for panel in panels]
     least, most = _ALONE if len(panels) == 1 else _BESIDE
     size = min(max(_CELL * max(config.grid), least), most)
@@ -142,6 +143,7 @@ def _learned(folders: Sequence[RunFolder], checkpoints: Sequence[Path]) -> Itera
     for place, run in enumerate(folders):
         config = run.config(device="cpu")
         checkpoint = checkpoints[place] if checkpoints else run.checkpoint()
+        check_trained_with(checkpoint, config)
         actor = load_actor(config, checkpoint)
         title = f"{config.method}, setup {config.setup}, seed {config.seed}"
         if checkpoints:
@@ -201,7 +203,7 @@ def _play(
         device=config.device,
     )
     world: Any = env.base_env
-    policy, comm = panel.policy(world), build_comm(config)
+    policy, comm = panel.policy(world), build_comm(config, 1)
     moments = record(env, policy, comm, steps=set(steps), member=index % BLOCK)
     console.print(f"  {panel.title}: coverage {moments[-1].coverage:.1f} %", style="dim")
     return Episode(title=panel.title, view_angle=config.env.view_angle, moments=moments)
@@ -239,7 +241,7 @@ def _free_paths(output: Path | None, run: RunFolder, stem: str) -> list[Path]:
             raise UserError(f"{output.parent}: there is no such folder")
         return [output]
     try:
-        folder = run.figure(stem).parent if output is None else output
+        folder = run.figures() if output is None else output
     except OSError as error:
         raise UserError(f"{run.path}: {error.strerror or error}") from None
     suffixes = (".gif", ".mp4")

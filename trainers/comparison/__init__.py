@@ -3,9 +3,9 @@
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from .report import Comparison, compare
+    from .report import Comparison, compare_runs, write_report
 
-__all__ = ["Comparison", "compare"]
+__all__ = ["Comparison", "compare_runs", "write_report"]
 
 
 def __getattr__(name: str) -> Any:

@@ -1,15 +1,12 @@
 """Draws the pictures of a section of the report."""
 
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from rich.console import Console
-from rich.text import Text
-
 from emberlink.trainers.evaluation import evaluate
+from emberlink.trainers.evaluation.actor import load_actor
 from emberlink.trainers.evaluation.plots import timelapse
-from emberlink.trainers.evaluation.report import load_actor
 
 from . import plots
 from .page import Chapter, Picture
@@ -20,7 +17,9 @@ FRAMES = 5
 """frames of a timelapse"""
 
 
-def draw(folder: Path, place: int, numbers: Numbers, notes: list[str], console: Console) -> Chapter:
+def draw(
+    folder: Path, place: int, numbers: Numbers, notes: list[str], say: Callable[[str], None]
+) -> Chapter:
     """Draws the figures and timelapses of a section.
 
     Args:
@@ -28,10 +27,10 @@ def draw(folder: Path, place: int, numbers: Numbers, notes: list[str], console: 
         place: number of the section, with which the names of the files begin.
         numbers: the section's numbers.
         notes: gets a note for each method that has no timelapse.
-        console: told what is being drawn.
+        say: called with a line before each picture.
     """
     stem = f"{place}_{_in_a_file_name(numbers.section.runs[0].config.setup)}"
-    console.print(Text(f"  figures of {numbers.section.label}", style="dim"))
+    say(f"figures of {numbers.section.label}")
     frozen: list[Picture] = []
     for number, fire in enumerate(numbers.fires, 1):
         path = folder / f"{stem}_frozen_{number}_{_in_a_file_name(fire)}.png"
@@ -42,7 +41,7 @@ def draw(folder: Path, place: int, numbers: Numbers, notes: list[str], console: 
         path = folder / f"{stem}_figure_{number}.png"
         plots.figure(path, numbers, measures)
         pictures.append(Picture(path, _caption(numbers, number, caption)))
-    films = list(_timelapses(folder, stem, numbers, notes, console))
+    films = list(_timelapses(folder, stem, numbers, notes, say))
     return Chapter(numbers, frozen, pictures, films)
 
 
@@ -79,7 +78,7 @@ def _caption(numbers: Numbers, number: int, what: str) -> str:
 
 
 def _timelapses(
-    folder: Path, stem: str, numbers: Numbers, notes: list[str], console: Console
+    folder: Path, stem: str, numbers: Numbers, notes: list[str], say: Callable[[str], None]
 ) -> Iterator[Picture]:
     """Draws one episode of the first seed of each method as a row of frames."""
     for place, group in enumerate(numbers.section.as_trained, 1):
@@ -88,7 +87,7 @@ def _timelapses(
         if newest is None:
             notes.append(f"{run.path}: has no checkpoint, so there is no timelapse of it")
             continue
-        console.print(Text(f"  timelapse of {group.label}", style="dim"))
+        say(f"timelapse of {group.label}")
         actor = load_actor(run.config, newest)
         fire, arrival = evaluate.shown_fire(run.config)
         pictures, steps = evaluate.film(run.config, actor, fire=arrival, frames=FRAMES)

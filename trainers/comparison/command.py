@@ -1,7 +1,5 @@
 """`emberlink compare`: prints the tables of a comparison and leaves a folder with the report."""
 
-import shlex
-import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -9,13 +7,10 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from emberlink.envs.utils.errors import UserError
-
-from . import chapters, report
 from .bootstrap import FEW
-from .page import FLAG, Report, counts, decision, html, lines, ratio
+from .page import FLAG, counts, decision, lines, ratio
 from .rankings import Numbers, Ranking
-from .record import to_json
+from .report import compare_runs, free_folder, write_report
 
 
 def compare(paths: Sequence[Path], console: Console, output: Path | None = None) -> int:
@@ -30,53 +25,21 @@ def compare(paths: Sequence[Path], console: Console, output: Path | None = None)
         0, the exit status.
 
     Raises:
-        UserError: as `report.compare`; or the folder is not empty or cannot be written.
+        UserError: as `compare_runs`; or the folder is not empty or cannot be written.
     """
-    try:
-        folder = _new_folder(output)
-        comparison = report.compare(paths)
-        for path, why in comparison.left_out:
-            console.print(Text(f"note: {path} is left out: {why}", style="yellow"))
-        command = shlex.join(["emberlink", "compare", *sorted(map(str, paths))])
-        _write(folder, comparison, command, console)
-    except OSError as error:
-        place = "" if output is None else f"--output {output}: "
-        raise UserError(f"{place}cannot be written: {error.strerror or error}") from None
+    folder = free_folder(output)
+    comparison = compare_runs(paths)
+    for path, why in comparison.left_out:
+        console.print(Text(f"note: {path} is left out: {why}", style="yellow"))
+    comparison = write_report(
+        comparison, folder, lambda text: console.print(Text(f"  {text}", style="dim"))
+    )
     for note in comparison.notes:
         console.print(Text(f"note: {note}", style="yellow"))
     for numbers in comparison.sections:
         _print(console, numbers)
     console.print(Text(str(folder / "compare.html")), soft_wrap=True)
     return 0
-
-
-def _new_folder(output: Path | None) -> Path:
-    """Returns a folder that is empty or not there yet."""
-    if output is None:
-        tried = (Path("compare" if i == 1 else f"compare_{i}") for i in range(1, 10_000))
-        return next(path for path in tried if not path.exists())
-    if output.is_symlink() and not output.exists():
-        raise UserError(f"--output {output}: a link to what is not there; name a new folder")
-    if output.exists() and (not output.is_dir() or any(output.iterdir())):
-        raise UserError(f"--output {output}: is there and not an empty folder; name a new one")
-    return output
-
-
-def _write(folder: Path, comparison: report.Comparison, command: str, console: Console) -> None:
-    """Writes the report to a folder that gets its name when it is complete."""
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=folder.parent, prefix=".compare-") as partial:
-        path = Path(partial) / "report"
-        path.mkdir()
-        drawn = [
-            chapters.draw(path, place, numbers, comparison.notes, console)
-            for place, numbers in enumerate(comparison.sections, 1)
-        ]
-        page = html(Report(command, drawn, comparison.left_out, comparison.notes))
-        (path / "compare.html").write_text(page, encoding="utf-8")
-        values = {"command": command, **comparison.to_values()}
-        (path / "compare.json").write_text(to_json(values), encoding="utf-8")
-        path.replace(folder)
 
 
 def _print(console: Console, numbers: Numbers) -> None:

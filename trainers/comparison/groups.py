@@ -13,7 +13,7 @@ from .runs import Run
 
 NOT_COMPARED = ("seed", "seeds", "output", "evaluation", *NOT_LEARNT_WITH)
 """first parts of the keys in which the runs of a group may differ: none changes the training"""
-NOT_NOTED = ("seed", "seeds", "output")
+NOT_NOTED = ("seed", "seeds", "output", "baseline_comm")
 """those of them whose differences are not noted"""
 _OF_SECTION = ("env.horizon", "env.grid")
 """settings of the environment that the runs of a section have in common, beside the fire's"""

@@ -27,11 +27,15 @@ def settings() -> dict[str, Any]:
 
 
 def to_values(
-    sections: Sequence[Numbers], left_out: Sequence[LeftOut], notes: Sequence[str]
+    command: str,
+    sections: Sequence[Numbers],
+    left_out: Sequence[LeftOut],
+    notes: Sequence[str],
 ) -> dict[str, Any]:
-    """Returns the content of compare.json, but for the command line."""
+    """Returns the content of compare.json."""
     return {
         "settings": settings(),
+        "command": command,
         "left_out": [{"run": path, "why": why} for path, why in left_out],
         "notes": list(notes),
         "setups": [_section(section) for section in sections],

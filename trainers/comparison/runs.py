@@ -13,6 +13,7 @@ from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.evaluation.results import LEARNED
 from emberlink.trainers.runs import pretrained
 from emberlink.trainers.runs.run_folder import RunFolder
+from emberlink.trainers.runs.seal import check_trained_with
 
 from .evaluation_file import Evaluation, read_curves, read_evaluation
 
@@ -121,6 +122,8 @@ def read(path: Path) -> Run | str:
             f"eval.json is of {evaluation.checkpoint}, the newest checkpoint is {newest.name} "
             f"(emberlink eval {path})"
         )
+    if newest is not None:
+        check_trained_with(newest, config)
     return Run(path, config, lines, evaluation)
 
 

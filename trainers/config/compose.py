@@ -1,221 +1,222 @@
-"""Composes a run's configuration from YAML files and overrides."""
+"""Composes a run's configuration from YAML files and the settings that a user gives."""
 
-import difflib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+import threading
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from copy import deepcopy
 from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
 from typing import Any
 
 from hydra import compose, initialize_config_module
-from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import Override, QuotedString
+from hydra.core.global_hydra import GlobalHydra
 from hydra.errors import HydraException
+from hydra.version import VersionBase
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
-from pydantic import (
-    TypeAdapter,
-    ValidationError,
-)
+from pydantic import TypeAdapter
+from yaml import YAMLError
 
+from emberlink import configs
 from emberlink.envs.scenarios import fires_of
 from emberlink.envs.utils.errors import UserError
-from emberlink.envs.utils.validation import describe, from_plain, known, plain, shown
+from emberlink.envs.utils.validation import from_plain, plain, shown, unknown
+from emberlink.policies.scripted.registry import SCRIPTED
+from emberlink.trainers.config.schema import RunConfig
 
-from .schema import RunConfig
+from .overrides import all_keys, flat, full_key, parse, put
 
-_GROUPS = ("setup", "fire")
+GROUPS = ("setup", "fire")
+"""groups of which a user chooses a file by `GROUP=NAME`, beside the method"""
+_HYDRA = threading.RLock()
 
 
 def resolve(method: str, overrides: Sequence[str] = (), **settings: Any) -> RunConfig:
-    """The configuration of a recipe.
+    """Returns the configuration of a method.
 
     Args:
-        method: a file in configs/method.
+        method: a file in configs/method, without `.yaml`.
         overrides: `key=value`, as on the command line.
-        settings: the same from Python, a key's last part being enough where it is the only one
-            so called: `horizon=50` for `env.horizon`.
+        settings: other keys and their values; the last part of a key suffices where no other key
+            ends in it: `horizon=50` for `env.horizon`.
 
     Raises:
-        ValueError: one line that names the method, key or value that is wrong, and what is known.
+        UserError: one line that names the method, key or value that is wrong, and what is known.
     """
-    if not isinstance(method, str) or method not in known("method"):
-        raise UserError(f"method {_quote(str(method), known('method'))}")
-    choices = {"method": method, "setup": "paper"}
-    with initialize_config_module(config_module="emberlink.configs", version_base="1.3"):
-        _check_overrides(method, overrides, choices)
-        try:
-            composed = compose("base", overrides=[f"method={method}", *overrides])
-            values: Any = OmegaConf.to_container(composed, resolve=True, throw_on_missing=True)
-        except (HydraException, OmegaConfBaseException) as error:
-            raise UserError(" ".join(str(error).split())[:300]) from None
-    if "method" in values:  # then its content did not go to the top
-        raise UserError(f"configs/method/{method}.yaml must begin with '# @package _global_'")
-    values = {**values, **choices}
-    for key, value in settings.items():
-        if key in choices:
-            raise UserError(f"{key}={shown(value)}: not a setting but a choice of several")
-        several = isinstance(value, Iterable) and not isinstance(value, str | bytes | Mapping)
-        _set(values, key, plain(list(value) if key == "seeds" and several else value, key))
-    if values["seeds"]:
-        if "seed" in settings or any(text.startswith("seed=") for text in overrides):
-            raise UserError(f"seed={values['seed']} and seeds={values['seeds']}: give one of them")
-        if isinstance(values["seeds"], list | tuple):
-            values["seed"] = values["seeds"][0]
+    given = [parse(text) for text in overrides]
+    chosen = {"setup": "paper"} | {key: str(value) for key, value in given if key in GROUPS}
+    values = _composed(method, chosen)
+    known = list(dict.fromkeys([*GROUPS, *all_keys(values)]))
+    for key, value in given:
+        if key in (*(f"{group}.name" for group in GROUPS), "fire.kind"):
+            group = key.partition(".")[0]
+            raise UserError(f"{key}={shown(value)}: is chosen with {group}=NAME")
+        if key not in known:
+            raise UserError(_not_known(key, known, method))
+        if key not in GROUPS:
+            put(values, key, value)
+    values = _interpolated(values) | {"method": method, "setup": chosen["setup"]}
+    _put_settings(values, settings)
+    _choose_seed(values, any(key == "seed" for key in [*dict(given), *settings]))
+    values["baseline_comm"] = _baseline_comm(chosen["setup"])
     config = from_values(values)
     return replace(config, fire=fires_of(config.fire).pinned())
 
 
-def override(config: RunConfig, overrides: Sequence[str]) -> RunConfig:
-    """A configuration with some values changed.
+def override(config: RunConfig, overrides: Sequence[str] = (), **settings: Any) -> RunConfig:
+    """Returns a run's configuration with some values changed; no YAML file is read.
 
     Args:
         config: of a run.
-        overrides: `key=value`, as on the command line; `setup` and `fire` must be what they are.
+        overrides: `key=value`, as on the command line; `setup` and `fire` must be the run's.
+        settings: as for `resolve`.
 
     Raises:
-        ValueError: a key is not known, or a value does not fit.
+        UserError: a key is not known, or a value does not fit.
     """
     values = to_values(config)
-    known_keys = list(flat(values))
-    for text in overrides:
-        key, value = _parsed(text)
-        if key in _GROUPS:
-            there = config.setup if key == "setup" else config.fire.name
-            if str(value) != there:
-                raise UserError(f"{text}: the run has {key}={there}")
-        elif key not in known_keys:
-            raise UserError(f"key {_quote(key, known_keys, listed=False)}")
+    baseline_comm = values.pop("baseline_comm")
+    known = list(flat(values))
+    for key, value in map(parse, overrides):
+        if key in GROUPS:
+            name = values[key]["name"] if isinstance(values[key], dict) else values[key]
+            if str(value) != name:
+                raise UserError(f"{key}={shown(value)}: the run has {key}={name}")
+        elif key not in known:
+            raise UserError(f"key {unknown(key, known, listed=False)}")
         else:
-            _set(values, key, value)
-    changed = from_values(values)
-    # As it was opened: with the run's own copy of the fires.
+            put(values, key, value)
+    _put_settings(values, settings)
+    changed = from_values({**values, "baseline_comm": baseline_comm})
+    # Equal fires are the run's own, which know where the run keeps its copy of their file.
     return replace(changed, fire=config.fire) if changed.fire == config.fire else changed
 
 
-def _parsed(text: str) -> tuple[str, Any]:
-    """Key and value of one `key=value`."""
-    parsed = _override(text)
-    value: Any = parsed.value()
-    return parsed.key_or_group, value.text if isinstance(value, QuotedString) else value
-
-
-def _override(text: str) -> Override:
-    """What Hydra makes of one `key=value`."""
-    try:
-        parsed = OverridesParser.create().parse_override(text)
-    except (HydraException, ValueError, RecursionError):
-        raise UserError(f"{shown(text)!r} is not of the form key=value") from None
-    adds = parsed.is_add() or parsed.is_force_add()
-    if parsed.is_delete() or adds or parsed.is_sweep_override():
-        raise UserError(f"{shown(text)!r}: only key=value with one value is understood here")
-    return parsed
-
-
-def _set(values: dict[str, Any], key: str, value: Any) -> None:
-    """Sets the one value whose dotted key is, or ends in, `key`.
-
-    Of a mapping, what it holds and nothing else; but another communication module takes the place
-    of the one that was there.
-    """
-    names = list(_flat(values))
-    found = [name for name in names if name == key] or [
-        name for name in names if name.endswith("." + key)
-    ]
-    if len(found) != 1:
-        among = f" is one of {', '.join(found)}: say which" if found else ""
-        raise UserError(f"key {key!r}{among}" if found else f"key {_quote(key, names)}")
-    *path, last = found[0].split(".")
-    for part in path:
-        values = values[part]
-    there = values[last]
-    both = isinstance(there, dict) and isinstance(value, dict)
-    if not both or there.get("name") != value.get("name", there.get("name")):
-        values[last] = value
-        return
-    for name, one in value.items():
-        if name not in there:
-            raise UserError(f"key {_quote(f'{found[0]}.{name}', names)}")
-        _set(values, f"{last}.{name}", one)
-
-
 def from_values(values: Mapping[str, Any]) -> RunConfig:
-    """A configuration from plain values, such as a run folder's config.yaml.
+    """Returns a configuration from plain values, such as those of a run folder's config.yaml.
 
     Raises:
-        ValueError: one line that names the first key that is wrong, its value and what is wrong.
+        UserError: one line that names the first key that is wrong, its value and what is wrong.
     """
-    try:
-        return from_plain(RunConfig, values)
-    except ValidationError as error:
-        raise UserError(describe(error)) from None
+    return from_plain(RunConfig, values)
 
 
 def to_values(config: RunConfig) -> dict[str, Any]:
-    """The configuration as plain values, for YAML and trackers."""
+    """Returns the configuration as plain values, for YAML and trackers."""
     return _lists(TypeAdapter(RunConfig).dump_python(config))
 
 
 def _lists(value: Any) -> Any:
-    """Lists for tuples, within mappings too; infinite numbers stay, as they would not in JSON."""
+    """Returns the value with lists for tuples. Infinite numbers stay, as they would not in JSON."""
     if isinstance(value, Mapping):
-        return {key: _lists(one) for key, one in value.items()}
-    return [_lists(one) for one in value] if isinstance(value, list | tuple) else value
+        return {key: _lists(item) for key, item in value.items()}
+    return [_lists(item) for item in value] if isinstance(value, list | tuple) else value
 
 
-def _check_overrides(method: str, overrides: Sequence[str], choices: dict[str, str]) -> None:
-    """Finds what Hydra would explain at length, and writes down which groups were chosen."""
-    others: list[str] = []
-    for text in overrides:
-        parsed = _override(text)
-        key = parsed.key_or_group
-        if isinstance(parsed.value(), dict):
-            raise UserError(f"{shown(text)!r}: give its keys one by one, as {key}.KEY=VALUE")
-        if key in ("fire.name", "fire.kind"):
-            raise UserError(f"{shown(text)!r}: a scenario is chosen with fire=NAME")
-        if key in _GROUPS:
-            chosen = str(parsed.value())
-            if chosen not in known(key):
-                raise UserError(f"{key} {_quote(chosen, known(key))}")
-            choices[key] = chosen
-        else:
-            others.append(key)
-    keys = _known_keys(method, choices) if others else []
-    for key in others:
-        if key not in keys:
-            raise UserError(f"key {_quote(key, keys, listed=False)}")
-    choices.pop("fire", None)
+def _composed(method: str, chosen: Mapping[str, str]) -> dict[str, Any]:
+    """Returns what Hydra composes of the chosen files, with every `${...}` as it is.
+
+    Args:
+        method: a file in configs/method.
+        chosen: files of `GROUPS`, of which `setup` is one.
+
+    Raises:
+        UserError: a file is not known or not a configuration.
+    """
+    folders = configs.folders()
+    chosen = {"method": method, **chosen}
+    for group, name in chosen.items():
+        configs.find(group, name, folders)
+    if (name := f"{chosen['setup']}_{method}") in configs.known("setup_method", folders):
+        configs.find("setup_method", name, folders)
+    files = sorted(file for folder in folders for file in folder.glob("**/*.yaml"))
+    stamps = tuple((file, file.stat().st_mtime_ns) for file in files)
+    values = deepcopy(_compose(tuple(chosen.items()), tuple(folders), stamps))
+    for group in ("method", "setup"):
+        if group in values:  # then Hydra did not put its content at the top
+            file = configs.find(group, chosen[group])
+            raise UserError(f"{file} must begin with '# @package _global_'")
+    return values
 
 
-def _known_keys(method: str, choices: dict[str, str]) -> list[str]:
-    chosen = [f"{group}={choices[group]}" for group in _GROUPS if group in choices]
-    composed = compose("base", overrides=[f"method={method}", *chosen])
-    return list(dict.fromkeys([*_GROUPS, *_flat(OmegaConf.to_container(composed))]))
+@lru_cache(maxsize=64)
+def _compose(
+    chosen: tuple[tuple[str, str], ...], folders: tuple[Path, ...], stamps: tuple
+) -> dict[str, Any]:
+    """Calls Hydra, once for the same choices and the same times of change of all files."""
+    # Emberlink's own folder is the last, and Hydra searches it anyway.
+    paths = ["'file://" + str(folder).replace("'", "\\'") + "'" for folder in folders[:-1]]
+    overrides = [f"{group}={name}" for group, name in chosen]
+    try:
+        with _own_hydra():
+            composed = compose("base", [*overrides, f"hydra.searchpath=[{','.join(paths)}]"])
+            values: Any = OmegaConf.to_container(composed)
+    except (HydraException, OmegaConfBaseException, YAMLError) as error:
+        raise UserError(" ".join(str(error).split())[:300]) from None
+    return values
 
 
-def _flat(values: Any, prefix: str = "") -> Iterator[str]:
-    for key, value in values.items():
-        yield prefix + key
-        if isinstance(value, dict):
-            yield from _flat(value, f"{prefix}{key}.")
+@contextmanager
+def _own_hydra() -> Iterator[None]:
+    """Initialises Hydra for one composition; afterwards a Hydra of the caller's is as before."""
+    with _HYDRA:
+        callers, version = GlobalHydra.instance().hydra, VersionBase.instance().getbase()
+        GlobalHydra.instance().clear()
+        try:
+            with initialize_config_module(config_module="emberlink.configs", version_base="1.3"):
+                yield
+        finally:
+            GlobalHydra.instance().hydra = callers
+            VersionBase.instance().version_base = version
 
 
-def flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Nested values by dotted key."""
-    found: dict[str, Any] = {}
-    for key, value in values.items():
-        found |= (
-            flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {prefix + key: value}
+def _interpolated(values: dict[str, Any]) -> dict[str, Any]:
+    """Returns the values with every `${key}` replaced by the value that it refers to."""
+    try:
+        whole: Any = OmegaConf.to_container(
+            OmegaConf.create(values), resolve=True, throw_on_missing=True
         )
-    return found
+    except OmegaConfBaseException as error:
+        raise UserError(" ".join(str(error).split())[:300]) from None
+    return whole
 
 
-def _quote(value: str, among: Sequence[str], *, listed: bool = True) -> str:
-    """`value`, that it is unknown, and the near or all known ones."""
-    leaves = {name.rsplit(".", 1)[-1]: name for name in among}
-    near = difflib.get_close_matches(value, among, n=1)
-    near = near or [leaves[m] for m in difflib.get_close_matches(value, leaves, n=1)]
-    hint = f"; did you mean {near[0]}?" if near else ""
-    if listed:
-        hint += f" known: {', '.join(among)}" if hint else f"; known: {', '.join(among)}"
-    elif not near:
-        hint = f"; known: {', '.join(name for name in among if '.' not in name)}"
-    return f"{shown(value)!r} is not known{hint}"
+def _put_settings(values: dict[str, Any], settings: Mapping[str, Any]) -> None:
+    """Sets what a Python caller gave by keyword."""
+    for key, value in settings.items():
+        if key in ("method", *GROUPS):
+            raise UserError(f"{key}={shown(value)}: not a setting but a choice of several")
+        put(values, full_key(values, key), plain(value, key))
+
+
+def _baseline_comm(setup: str) -> dict[str, Any]:
+    """Returns the `comm` of each method that a scripted policy is played with."""
+    methods = {policy.recipe for policy in SCRIPTED.values() if policy.recipe}
+    return {
+        method: _interpolated(_composed(method, {"setup": setup}))["comm"]
+        for method in sorted(methods)
+    }
+
+
+def _choose_seed(values: dict[str, Any], seed_is_given: bool) -> None:
+    """Sets `seed` to the first of `seeds`, if there are any.
+
+    Raises:
+        UserError: both were given.
+    """
+    seeds = values["seeds"]
+    if seeds and seed_is_given:
+        raise UserError(f"seed={values['seed']} and seeds={seeds}: give one of them")
+    if seeds and isinstance(seeds, list):
+        values["seed"] = seeds[0]
+
+
+def _not_known(key: str, known: Sequence[str], method: str) -> str:
+    """Returns a message about a key that a method does not have, and the methods that have it."""
+    others = [
+        name for name in configs.known("method") if key in all_keys(configs.read("method", name))
+    ]
+    if others:
+        return f"key {key!r} is a setting of method {', '.join(others)}, not of {method}"
+    return f"key {unknown(key, known, listed=False)}"

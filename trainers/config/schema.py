@@ -1,84 +1,67 @@
 """The schema of a run's configuration."""
 
-from collections.abc import Mapping
-from dataclasses import asdict, fields
+from dataclasses import asdict
 from typing import Annotated, Any, Literal
 
 import torch
-from pydantic import (
-    ConfigDict,
-    Field,
-    Strict,
-    field_validator,
-    model_validator,
-)
+from pydantic import ConfigDict, Field, Strict, field_validator, model_validator
 from pydantic.dataclasses import dataclass
 
 from emberlink.comm import registry
+from emberlink.comm.base import CommModule
 from emberlink.envs.config import WildfireConfig
 from emberlink.envs.scenarios import Scenario
 from emberlink.envs.utils.errors import UserError
-from emberlink.envs.utils.validation import Name, from_plain, shown
+from emberlink.envs.utils.validation import Name, shown
+
+from . import choice
 
 _STRICT = ConfigDict(extra="forbid", strict=True)
 
 
 NOT_LEARNT_WITH = (
-    *("device", "logger", "on_nan"),
+    *("device", "logger", "on_nan", "baseline_comm"),
     *("checkpoint_interval", "checkpoint_steps", "keep_checkpoints"),
 )
-"""keys that change nothing of what is learnt, so that runs that differ in them are the same"""
-
+"""keys that do not change what is learnt: runs that differ only in them are the same run"""
 
 Positive = Annotated[float, Field(gt=0, le=1e30)]
-
-
 NotNegative = Annotated[float, Field(ge=0, le=1e30)]
-
-
 Count = Annotated[int, Field(ge=1, le=1_000_000_000)]
-
-
+CountOrZero = Annotated[int, Field(ge=0)]
 Units = Annotated[int, Field(ge=1, le=8192)]
-
-
-Side = Annotated[int, Field(ge=1, le=65_536)]
-
-
-MaybeCount = Annotated[int, Field(ge=0)]
-
-
+Many = Annotated[int, Field(ge=1, le=65_536)]
 Seed = Annotated[int, Field(ge=0, lt=2**31)]
 
 
 @dataclass(frozen=True, kw_only=True, config=_STRICT)
 class LearnerConfig:
-    """DDPG for every UAV (paper, section III.C)."""
+    """Settings of DDPG (paper, section III.C)."""
 
     hidden: Annotated[tuple[Units, Units], Strict(False)]
     """units of the two hidden layers"""
     gamma: Annotated[float, Field(ge=0, lt=1)]
-    """discount per step"""
+    """discount factor per step"""
     actor_lr: Positive
     """Adam's learning rate of the actors"""
     critic_lr: Positive
     """Adam's learning rate of the critics"""
     critic_weight_decay: NotNegative
-    """L2 penalty in the critics' Adam"""
+    """L2 penalty of the critics' Adam"""
     tau: Annotated[float, Field(gt=0, le=0.5)]
-    """share of the networks in their targets per update"""
+    """step of the target networks towards the networks per update, between 0 and 1"""
     updates_per_step: Count
-    """updates of every UAV's networks per step of all environments side by side"""
+    """updates of all networks per step of all environments"""
     batch_size: Annotated[int, Field(ge=1, le=1_000_000)]
     """transitions per UAV and update"""
     buffer_size: Count
-    """transitions that a replay memory holds"""
+    """capacity of a replay buffer, transitions"""
 
     @model_validator(mode="after")
-    def _a_batch_fits(self) -> "LearnerConfig":
+    def _check_batch_size(self) -> "LearnerConfig":
         if self.batch_size > self.buffer_size:
             raise UserError(
-                f"batch_size={self.batch_size} is more than buffer_size={self.buffer_size} holds"
+                f"batch_size={self.batch_size} is more than buffer_size={self.buffer_size}"
             )
         return self
 
@@ -88,7 +71,7 @@ class ExplorationConfig:
     """Ornstein-Uhlenbeck noise: x += theta * (0 - x) * dt + sigma * sqrt(dt) * N(0, 1)."""
 
     theta: NotNegative
-    """pull towards 0"""
+    """rate of the return to 0"""
     sigma: NotNegative
     """strength of the noise"""
     dt: Positive
@@ -97,113 +80,115 @@ class ExplorationConfig:
 
 @dataclass(frozen=True, kw_only=True, config=_STRICT)
 class EvaluationConfig:
-    """Frozen policies on held-out fires."""
+    """Evaluations of the frozen policies, on fires that are not trained on."""
 
-    episodes: Side
-    """held-out fires, one episode each, of the evaluation at the end"""
-    interval: MaybeCount
+    episodes: Many
+    """episodes of the evaluation after training, each on a test fire of its own"""
+    interval: CountOrZero
     """episodes between evaluations during training; 0 for none"""
-    interval_episodes: Side
-    """held-out fires of the evaluations during training"""
+    interval_episodes: Many
+    """episodes of an evaluation during training, each on a validation fire of its own"""
 
 
 @dataclass(frozen=True, kw_only=True, config=_STRICT)
 class RunConfig:
-    """Everything that a run depends on."""
+    """All settings of a run."""
 
     method: Name
-    """the recipe: a file in configs/method"""
+    """the method: a file in configs/method"""
     setup: Name
     """the constants: a file in configs/setup"""
     replay: Literal["per_agent", "shared"]
-    """one replay memory per UAV, or one for all"""
+    """a replay buffer for each UAV, or one for all"""
     comm: dict[str, Any]
-    """the communication module's name and its settings"""
+    """the communication module: `name` and its settings"""
+    baseline_comm: dict[str, dict[str, Any]] = Field(default_factory=dict)
+    """the `comm` of the methods that scripted policies are played with, in this setup; by method"""
     env: WildfireConfig
+    """the environment"""
     fire: Scenario
+    """the fires to train on"""
     learner: LearnerConfig
+    """the learning algorithm"""
     exploration: ExplorationConfig
+    """the noise on the actions during training"""
     evaluation: EvaluationConfig
+    """the evaluations"""
     episodes: Count
-    """episodes of training, counted per environment: all run theirs side by side"""
-    num_envs: Side
-    """environments that collect side by side, for each seed"""
+    """training episodes of each environment"""
+    num_envs: Many
+    """environments that are stepped together, for each seed"""
     seeds: Annotated[tuple[Seed, ...], Strict(False)] = ()
-    """several seeds, trained side by side as one stack, a run folder each; `seed` is then this
-    run's; none for `seed` alone"""
+    """seeds to train side by side, with a run folder for each; if empty, only `seed` is trained"""
     seed: Seed
-    """of everything random in the run"""
+    """seed of everything random in the run; with `seeds`, the one of this run folder"""
     device: str
-    """where environment, memory and networks live"""
+    """device of the environment, the replay buffer and the networks"""
     logger: Literal["wandb", "tensorboard", "csv", "none"]
-    """the tracker beside metrics.jsonl"""
+    """the tracker, in addition to metrics.jsonl"""
     output: Annotated[str, Field(min_length=1)]
-    """the folder in which the run folder is made"""
+    """the folder in which run folders are made"""
     checkpoint_interval: Count
     """episodes between checkpoints"""
-    checkpoint_steps: MaybeCount = 0
-    """steps between further checkpoints, counted through the whole run; 0 for none"""
+    checkpoint_steps: CountOrZero = 0
+    """steps between additional checkpoints; 0 for none"""
     keep_checkpoints: Count = 5
-    """checkpoints of which the networks stay; the two newest hold what a resumed run needs too"""
+    """checkpoints whose networks are kept; the two newest can be resumed from"""
     on_nan: Literal["stop", "rollback"] = "stop"
-    """what is done where a number is not finite: the run ends, or goes back to its last checkpoint
+    """reaction to a number that is not finite: stop, or return to the last checkpoint and continue
     with smaller learning rates"""
 
     @field_validator("device")
     @classmethod
-    def _device_is_there(cls, value: str) -> str:
+    def _check_device(cls, value: str) -> str:
         return check_device(value)
 
     @field_validator("seeds")
     @classmethod
-    def _seeds_differ(cls, value: tuple[int, ...]) -> tuple[int, ...]:
+    def _check_seeds(cls, value: tuple[int, ...]) -> tuple[int, ...]:
         if len(set(value)) < len(value):
             raise UserError(f"seeds={list(value)}: each seed at most once")
         return value
 
     @field_validator("comm")
     @classmethod
-    def _comm_is_known(cls, value: dict[str, Any]) -> dict[str, Any]:
-        if "name" not in value:
-            raise UserError(f"name is missing; known: {', '.join(registry.known())}")
-        config_type = registry.find(value["name"]).config_type
-        settings, names = _without_name(value), [field.name for field in fields(config_type)]
-        for key in settings.keys() - names:
-            listed = ", ".join(names) or "none"
-            raise UserError(f"comm.{key} is not a setting of {value['name']}; known: {listed}")
-        from_plain(config_type, settings)
+    def _check_comm(cls, value: dict[str, Any]) -> dict[str, Any]:
+        choice.check("comm", value, registry)
+        return value
+
+    @field_validator("baseline_comm")
+    @classmethod
+    def _check_baseline_comm(cls, value: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
+        for method, comm in value.items():
+            choice.check(f"baseline_comm.{method}", comm, registry)
         return value
 
 
-def _without_name(comm: Mapping[str, Any]) -> dict[str, Any]:
-    return {key: value for key, value in comm.items() if key != "name"}
-
-
-def build_comm(config: RunConfig):
-    """The communication module of a configuration."""
-    return registry.build(config.comm["name"], config.env, _without_name(config.comm))
+def build_comm(config: RunConfig, num_envs: int) -> CommModule:
+    """Returns a new communication module of a configuration."""
+    settings = {key: value for key, value in config.comm.items() if key != "name"}
+    return registry.build(config.comm["name"], config.env, settings, num_envs)
 
 
 def comm_settings(config: RunConfig) -> dict[str, Any]:
-    """All settings of a configuration's communication module, defaults included."""
-    config_type = registry.find(config.comm["name"]).config_type
-    return asdict(from_plain(config_type, _without_name(config.comm)))
+    """Returns all settings of a configuration's communication module, defaults included."""
+    return asdict(choice.settings("comm", config.comm, registry))
 
 
 def check_device(name: str) -> str:
-    """The name, if it is a device of this machine.
+    """Returns the name of a device, after checking that this machine has it.
 
     Raises:
-        ValueError: it is none; the message lists those there are.
+        UserError: there is no such device; the message lists those that there are.
     """
     present = ["cpu", *(f"cuda:{i}" for i in range(torch.cuda.device_count()))]
     try:
         device = torch.device(name)
     except RuntimeError:
         device = None
-    there = device is not None and (
+    found = device is not None and (
         str(device) == "cpu" or (device.type == "cuda" and (device.index or 0) < len(present) - 1)
     )
-    if not there:
+    if not found:
         raise UserError(f"device={shown(name)} is not there; known: {', '.join(present)}")
     return name

@@ -6,8 +6,6 @@ They do not depend on a run but for its constants, so runs that share those shar
 import hashlib
 import json
 import math
-import os
-import tempfile
 import time
 import warnings
 from collections.abc import Mapping
@@ -23,8 +21,9 @@ import emberlink.envs.wildfire
 import emberlink.policies
 from emberlink.envs import metrics
 from emberlink.envs.fire.cache import cache_folder
+from emberlink.envs.utils.atomic_io import read_sealed, write_sealed
 from emberlink.trainers.config.schema import RunConfig
-from emberlink.trainers.runs.safe_read import LONGEST_JSON, parse_json, read_text
+from emberlink.trainers.runs.safe_read import LONGEST_JSON, parse_json
 
 from .results import Measured
 
@@ -67,9 +66,12 @@ class ScriptedResults:
         """The numbers, or None where there is no such file or it is damaged."""
         if self.file is None:
             return None
+        content = read_sealed(self.file, LONGEST_JSON)
+        if content is None:
+            return None
         try:
-            stored = parse_json(read_text(self.file, LONGEST_JSON))
-        except (OSError, ValueError):
+            stored = parse_json(content.decode())
+        except ValueError:
             return None
         return stored if _whole(stored, self._episodes) else None
 
@@ -77,18 +79,9 @@ class ScriptedResults:
         """Writes the file whole; a folder that cannot be written to costs a warning."""
         if self.file is None:
             return
-        temporary = None
         try:
-            self.file.parent.mkdir(parents=True, exist_ok=True)
-            with tempfile.NamedTemporaryFile(
-                "w", dir=self.file.parent, suffix=".tmp", delete=False
-            ) as handle:
-                temporary = handle.name
-                json.dump(measured, handle)
-            os.replace(temporary, self.file)
+            write_sealed(self.file, json.dumps(measured).encode())
         except OSError as error:
-            if temporary is not None:
-                Path(temporary).unlink(missing_ok=True)
             message = f"scripted results are not cached: cannot write {self.file}: {error}"
             warnings.warn(message, stacklevel=2)
 

@@ -1,4 +1,4 @@
-"""The figures of a run."""
+"""Draws the figures of a run."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -12,33 +12,34 @@ from .results import CURVES, LEARNED, Results
 
 
 def training_curves(path: Path, lines: Sequence[Mapping[str, Any]], title: str) -> None:
-    """The paper's figures 5 to 9 for one run.
+    """Draws the paper's figures 5 to 9 for one run.
 
     Args:
         path: a .png file.
-        lines: of metrics.jsonl; the exploring policy, and "fire/measure" of frozen ones.
-        title: above the panels.
+        lines: lines of metrics.jsonl: measures of the policy with noise, and "fire/measure" of the
+            policy without noise on validation fires.
+        title: title of the figure.
     """
     figure = Figure(figsize=(11, 6), layout="constrained")
     figure.suptitle(title)
     for axes, (name, label) in zip(figure.subplots(2, 3).flat, CURVES.items(), strict=True):
         episodes = [line["episode"] for line in lines]
         axes.plot(
-            episodes, [line.get(name, np.nan) for line in lines], color="0.6", label="exploring"
+            episodes, [line.get(name, np.nan) for line in lines], color="0.6", label="with noise"
         )
         for key in sorted({k for line in lines for k in line if k.endswith("/" + name)}):
             points = [(line["episode"], line[key]) for line in lines if key in line]
             fire = key.split("/")[0]
-            axes.plot(*zip(*points, strict=True), marker="o", ms=3, label=f"frozen, {fire}")
+            axes.plot(*zip(*points, strict=True), marker="o", ms=3, label=f"without noise, {fire}")
         axes.set(xlabel="episode", ylabel=label)
         axes.xaxis.set_major_locator(MaxNLocator(integer=True))
         axes.grid(alpha=0.3)
     figure.axes[0].legend(fontsize="small")
-    figure.savefig(path, dpi=120)
+    figure.savefig(path, format="png", dpi=120)
 
 
 def coverage_bars(path: Path, results: Results) -> None:
-    """Coverage of each policy on each held-out fire: every episode a dot, the mean a bar."""
+    """Draws the coverage of each policy on the test fires: a dot per episode, a bar at the mean."""
     most = max(len(by_policy) for by_policy in results.values())
     size = (1.6 + 0.55 * most) * len(results), 3.9
     figure = Figure(figsize=size, layout="constrained")
@@ -60,18 +61,18 @@ def coverage_bars(path: Path, results: Results) -> None:
             axes.plot(spread, values, "k.", ms=2, alpha=0.4)
         names = [name.replace("_", " ") for name in by_policy]
         axes.set_xticks(range(len(by_policy)), names, rotation=35, ha="right")
-        axes.set_title(f"held-out fires: {fire}", pad=18)
+        axes.set_title(f"test fires: {fire}", pad=18)
         axes.set_ylim(0, 100)
         axes.grid(axis="y", alpha=0.3)
         axes.set_axisbelow(True)
     panels[0].set_ylabel("coverage, % (mean above)")
-    figure.savefig(path, dpi=120)
+    figure.savefig(path, format="png", dpi=120)
 
 
 def timelapse(
     path: Path, pictures: Sequence[np.ndarray], steps: Sequence[int], title: str = ""
 ) -> None:
-    """A row of frames of one episode, as the paper's figure 3."""
+    """Draws a row of frames of one episode, as the paper's figure 3."""
     chosen = np.linspace(0, len(pictures) - 1, min(5, len(pictures))).round().astype(int)
     figure = Figure(figsize=(2.4 * len(chosen), 2.7), layout="constrained")
     for axes, index in zip(figure.subplots(1, len(chosen), squeeze=False)[0], chosen, strict=True):
@@ -80,4 +81,4 @@ def timelapse(
         axes.set_axis_off()
     if title:
         figure.suptitle(title, parse_math=False)
-    figure.savefig(path, dpi=120)
+    figure.savefig(path, format="png", dpi=120)

@@ -11,7 +11,6 @@ from torchrl.envs import TransformedEnv, set_exploration_type, step_mdp
 from torchrl.envs.utils import ExplorationType
 
 from emberlink.comm.base import CommModule
-from emberlink.comm.consensus import FOLLOWS, TARGET, neighbours
 from emberlink.envs import keys
 from emberlink.envs.rendering.marks import ROLES, Moment
 
@@ -35,7 +34,6 @@ def record(
     """
     world: Any = env.base_env
     hears = any(key in comm.out_keys for key in policy.in_keys)
-    limit = getattr(comm.config, "range", torch.inf)
     kept: list[Moment] = []
     with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
         now = env.reset()
@@ -44,26 +42,23 @@ def record(
                 now = step_mdp(env.step(policy(now)), keep_other=True)
             if step in steps:
                 fire_map = world.fire_map[member]
-                kept.append(moment(now[member], fire_map, hears=hears, limit=limit))
+                kept.append(moment(now[member], fire_map, hears=hears))
     return kept
 
 
-def moment(now: TensorDictBase, fire_map: Tensor, *, hears: bool, limit: float) -> Moment:
+def moment(now: TensorDictBase, fire_map: Tensor, *, hears: bool) -> Moment:
     """What can be drawn of one moment of one environment, by the keys that it holds.
 
-    Links are drawn where a UAV's observation holds more than its own numbers, roles and targets
-    where the communication writes them.
+    Links, roles and targets are drawn where the communication writes them.
 
     Args:
         now: the moment, batch size [].
         fire_map: uint8 [X, Y], see `WildfireEnv.fire_map`.
         hears: whether the policy reads anything that the communication writes.
-        limit: the distance below which UAVs hear each other, cells.
     """
-    told = hears and now.get(keys.OBSERVATION).shape[-1] > len(keys.FEATURES)
-    links = neighbours(now.get(keys.POSITION), limit) if told else None
-    follows = now.get(FOLLOWS, None) if hears else None
-    target = now.get(TARGET, None) if hears else None
+    links = now.get(keys.HEARS, None) if hears else None
+    follows = now.get(keys.FOLLOWS, None) if hears else None
+    target = now.get(keys.TARGET, None) if hears else None
     return Moment(
         step=int(now.get(keys.STEP)),
         seen=int(now.get(keys.SEEN)),

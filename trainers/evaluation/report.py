@@ -1,4 +1,4 @@
-"""Evaluates a run's frozen policy and leaves table, eval.json, figures and an animation."""
+"""Evaluates the frozen policy of a run and writes eval.json, figures and an animation."""
 
 import platform
 from collections.abc import Callable
@@ -7,47 +7,18 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-import torch
-from rich import box
-from rich.console import Console
-from rich.table import Table
-from tensordict.nn import TensorDictModule
-
-from emberlink.envs import metrics
 from emberlink.envs.rendering.frame import write_gif
 from emberlink.envs.scenarios import fires_of
 from emberlink.envs.utils.errors import UserError
 from emberlink.policies.scripted.registry import SCRIPTED
-from emberlink.trainers.build import build_env, build_networks
 from emberlink.trainers.config.schema import RunConfig
-from emberlink.trainers.runs.run_folder import RunFolder, load_weights
+from emberlink.trainers.runs.run_folder import RunFolder
+from emberlink.trainers.terminal import OutputError
 
 from . import evaluate, plots
+from .results import LEARNED, Results
 
 _PACKAGES = ("emberlink", "torch", "torchrl", "tensordict", "numpy")
-ACTOR = "actor_network_params.module."
-"""what the actor's weights are called in a checkpoint, before the name within the network"""
-
-
-def load_actor(config: RunConfig, checkpoint: Path) -> TensorDictModule:
-    """The frozen policy of a run.
-
-    Raises:
-        ValueError: the checkpoint can't be read or is of another shape.
-    """
-    env = build_env(
-        config,
-        num_envs=1,
-        fire=torch.full(config.env.grid, torch.inf),
-        seed=0,
-        device=config.device,
-    )
-    actor, _ = build_networks(config, env)
-    network: Any = actor.module
-    expected = {ACTOR + name: value for name, value in network.state_dict().items()}
-    weights = load_weights(checkpoint, expected, config)
-    network.load_state_dict({name.removeprefix(ACTOR): v for name, v in weights.items()})
-    return actor.requires_grad_(False)
 
 
 def evaluate_run(
@@ -59,7 +30,7 @@ def evaluate_run(
     fires: int,
     report: Callable[[str], None],
     label: str = "",
-) -> evaluate.Results:
+) -> Results:
     """Evaluates a frozen policy and writes eval.json, the figures and one animation.
 
     Args:
@@ -67,22 +38,25 @@ def evaluate_run(
         config: of the run.
         actor: the frozen policy.
         checkpoint: where it is from.
-        fires: episodes, each on a held-out fire of its own.
-        report: told what is being done.
-        label: ends the names of the files, to keep them apart from those of the newest checkpoint.
+        fires: number of test fires, one episode each.
+        report: called with a line about each thing that is done.
+        label: ends the names of the files.
     """
 
     def say(fire: str, policy: str) -> None:
         report(f"{policy} on {fires} fires of {fire}")
 
-    results = evaluate.evaluate(config, actor, fires=fires, report=say)
     try:
+        run.figures()  # refused before the episodes are played, not after
+        results = evaluate.evaluate(config, actor, fires=fires, report=say)
         _draw(run, config, actor, results, report, label)
+    except OutputError:
+        raise
     except OSError as error:
         raise UserError(
             f"{run.path / 'figures'}: cannot be written: {error.strerror or error}"
         ) from None
-    # Last: with it, an evaluation is whole.
+    # Written last: an evaluation with this file is complete.
     run.write(f"eval{label}.json", record(config, results, checkpoint=checkpoint.name, fires=fires))
     return results
 
@@ -91,26 +65,30 @@ def _draw(
     run: RunFolder,
     config: RunConfig,
     actor: evaluate.Policy,
-    results: evaluate.Results,
+    results: Results,
     report: Callable[[str], None],
     label: str,
 ) -> None:
-    plots.coverage_bars(run.figure(f"coverage{label}.png"), results)
+    with run.figure(f"coverage{label}.png") as path:
+        plots.coverage_bars(path, results)
     lines = run.lines()
     if lines:
         title = f"{config.method}, setup {config.setup}, fire {config.fire.name}"
-        plots.training_curves(run.figure("training.png"), lines, title)
+        with run.figure("training.png") as path:
+            plots.training_curves(path, lines, title)
     report("one episode for the animation")
     name, arrival = evaluate.shown_fire(config)
     pictures, steps = evaluate.film(config, actor, fire=arrival)
-    write_gif(run.figure(f"episode_{name}{label}.gif"), pictures)
-    plots.timelapse(run.figure(f"timelapse_{name}{label}.png"), pictures, steps)
+    with run.figure(f"episode_{name}{label}.gif") as path:
+        write_gif(path, pictures)
+    with run.figure(f"timelapse_{name}{label}.png") as path:
+        plots.timelapse(path, pictures, steps)
 
 
-def record(config: RunConfig, results: evaluate.Results, **about: Any) -> dict[str, Any]:
-    """What eval.json holds: enough to redo any statistics without running anything."""
+def record(config: RunConfig, results: Results, **about: Any) -> dict[str, Any]:
+    """Returns the content of eval.json: all measures of all episodes, and what was played."""
     configs = evaluate.evaluation_scenarios(config)
-    count = len(next(iter(results.values()))[evaluate.LEARNED]["coverage"])
+    count = len(next(iter(results.values()))[LEARNED]["coverage"])
     return {
         "method": config.method,
         "setup": config.setup,
@@ -121,7 +99,7 @@ def record(config: RunConfig, results: evaluate.Results, **about: Any) -> dict[s
         "held_out": {name: fires_of(configs[name]).about(count) for name in results},
         "environment": asdict(config.env),
         "communication": {
-            evaluate.LEARNED: config.comm,
+            LEARNED: config.comm,
             **{name: evaluate.scripted_config(config, name).comm for name in SCRIPTED},
         },
         "device": config.device,
@@ -131,34 +109,3 @@ def record(config: RunConfig, results: evaluate.Results, **about: Any) -> dict[s
         },
         "results": results,
     }
-
-
-def print_table(console: Console, results: evaluate.Results, config: RunConfig) -> None:
-    """The means over episodes: a table per fire, a row per policy, a column per measure."""
-    for fire, by_policy in results.items():
-        episodes = len(next(iter(by_policy.values()))["coverage"])
-        table = Table(
-            title=f"held-out fires: {fire} ({episodes} episodes, mean; setup {config.setup})",
-            box=box.SIMPLE_HEAD,
-            padding=0,
-            show_edge=False,
-        )
-        # One word below the other: names and all measures fit a terminal of 80 columns.
-        table.add_column(min_width=13)
-        for name in metrics.NAMES:
-            table.add_column(name.replace("_", "\n"), justify="right", no_wrap=True)
-        for policy, measured in by_policy.items():
-            learned = policy == evaluate.LEARNED
-            means = evaluate.means(measured)
-            table.add_row(
-                config.method if learned else policy.replace("_", " "),
-                *(_short(name, means[name]) for name in metrics.NAMES),
-                style="bold" if learned else None,
-            )
-        console.print(table)
-
-
-def _short(measure: str, value: float) -> str:
-    """One decimal; of a score, which may be a small reward, as many as make four digits."""
-    digits = max(1, 4 - len(str(int(abs(value))))) if measure == "mean_reward" else 1
-    return f"{value:.{digits}f}"

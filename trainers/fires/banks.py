@@ -15,8 +15,8 @@ from torch import Tensor
 from emberlink.envs.fire.cache import GENERATOR_VERSION
 from emberlink.envs.fire.generator import FireConfig, Split, fire_seeds, make_fires
 from emberlink.envs.fire_files.bank_writer import check_bank, write_bank
-from emberlink.envs.utils.atomic_io import free_name
 from emberlink.envs.utils.errors import UserError
+from emberlink.envs.utils.publish import free_name
 from emberlink.trainers.config.compose import to_values
 from emberlink.trainers.config.schema import RunConfig
 
@@ -40,8 +40,8 @@ def make(
         scenario: a file in configs/fire.
         overrides: `key=value` of setup, env. and fire.
         console: told the progress and, last, where the file is.
-        count: fires; as many as are trained on or evaluated with if None.
-        split: "train" or "heldout".
+        count: fires; as many as a training or an evaluation uses if None.
+        split: "train", "validation" or "test".
         output: a new .npy, .tif or .tiff file; a name that is free if None.
 
     Raises:
@@ -50,7 +50,13 @@ def make(
     config = generated(scenario, overrides)
     fire, world = config.fire, config.env
     assert isinstance(fire, FireConfig)
-    count = count or (fire.num_train_fires if split == "train" else config.evaluation.episodes)
+    evaluation = config.evaluation
+    usual = {
+        "train": fire.num_train_fires,
+        "validation": evaluation.interval_episodes,
+        "test": evaluation.episodes,
+    }
+    count = count or usual[split]
     path = output or _free(f"{scenario}_{split}_{count}")
     check_bank(path, count, world.grid)
     seeds = fire_seeds(split, count)

@@ -59,7 +59,7 @@ def arrival_figure(path: Path, arrival: Arrival, horizon: int, team: Team, title
     figure.suptitle(short, parse_math=False, fontsize="medium")
     figure.colorbar(picture, ax=axes, label="time of arrival, steps", shrink=0.9)
     _legend(figure, bool(core.any()), team.width, max(across, up), 3 if wide else 1)
-    figure.savefig(path, dpi=120, metadata={"Software": None})
+    figure.savefig(path, format="png", dpi=120, metadata={"Software": None})
 
 
 def _legend(figure: Figure, core: bool, width: float, side: int, columns: int) -> None:

@@ -10,7 +10,7 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from emberlink.envs.utils.atomic_io import free_name, new_file, published
+from emberlink.envs.utils.publish import free_name, new_file, published
 
 from .plot import arrival_figure
 from .select import Source, find

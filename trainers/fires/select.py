@@ -1,4 +1,4 @@
-"""Which fire is meant: a scenario's held-out fire or one of a file, under the keys of training."""
+"""Which fire is meant: a scenario's test fire or one of a file, under the keys of training."""
 
 import difflib
 import os
@@ -17,8 +17,8 @@ from emberlink.envs.utils.validation import shown
 from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.config.schema import RunConfig
 
-HELD_OUT = 65_536
-"""held-out fires of a scenario: as many as an evaluation can have"""
+MAX_TEST_FIRES = 65_536
+"""test fires of a scenario, as many as an evaluation can have"""
 FILE = "file"
 """the scenario of fires that are read, not made"""
 _METHOD = "independent"  # any: a fire depends on no method
@@ -51,10 +51,10 @@ def find(text: str, overrides: Sequence[str]) -> Source:
     if name in scenarios():
         config = generated(name, overrides)
         return Source(
-            title=f"{name}, held-out fire {index}",
+            title=f"{name}, test fire {index}",
             stem=f"fire_{name}_{index}",
             config=config,
-            arrival=_held_out(config, text, index),
+            arrival=_test_fire(config, text, index),
         )
     if os.path.exists(text) or not os.path.exists(name):
         name, index = text, "0"
@@ -74,12 +74,12 @@ def find(text: str, overrides: Sequence[str]) -> Source:
     )
 
 
-def _held_out(config: RunConfig, text: str, index: str) -> Tensor:
-    if not index.isdecimal() or int(index) >= HELD_OUT:
+def _test_fire(config: RunConfig, text: str, index: str) -> Tensor:
+    if not index.isdecimal() or int(index) >= MAX_TEST_FIRES:
         raise UserError(
-            f"{shown(text)}: there is no held-out fire {index!r}; known: 0 to {HELD_OUT - 1}"
+            f"{shown(text)}: there is no test fire {index!r}; known: 0 to {MAX_TEST_FIRES - 1}"
         )
-    return fires_of(config.fire).one_heldout(int(index), config.env.grid, config.env.horizon)[0]
+    return fires_of(config.fire).test_fire(int(index), config.env.grid, config.env.horizon)[0]
 
 
 def generated(scenario: str, overrides: Sequence[str]) -> RunConfig:

@@ -11,12 +11,12 @@ from torchrl.data.replay_buffers.storages import TensorStorage
 
 from emberlink.envs import keys
 from emberlink.envs.utils import counter_rng
+from emberlink.envs.utils.counter_rng import Use
 
 DONE = (keys.AGENTS, "done")
 TERMINATED = (keys.AGENTS, "terminated")
 
 
-_SAMPLES = 2**40  # what a seed's random stream is used for; environments take the numbers from 0
 _ROWS, _COLUMNS = range(2)
 
 
@@ -48,7 +48,7 @@ class TeamSampler(RandomSampler):
         # On the device, so that a recorded graph reads what they are by then.
         self.draws = torch.zeros((), dtype=torch.int64, device=device)
         self.filled = torch.zeros((), dtype=torch.int64, device=device)
-        self._streams = counter_rng.fold(torch.tensor(seeds, device=device), _SAMPLES)
+        self._keys = counter_rng.fold_in(torch.tensor(seeds, device=device), Use.REPLAY_SAMPLE)
         self._team = torch.arange(len(seeds), device=device)[:, None, None] * uavs
         self._own = torch.arange(uavs, device=device)
 
@@ -66,12 +66,12 @@ class TeamSampler(RandomSampler):
         """Rows and columns, int64 [batch_size, teams * uavs] each; column k is for UAV k."""
         if len(storage) == 0:
             raise RuntimeError("cannot sample from an empty replay memory")
-        stream = counter_rng.fold(self._streams, self.draws)
+        key = counter_rng.fold_in(self._keys, self.draws)
         self.draws += 1
 
         def draw(use: int, limit: int | torch.Tensor) -> torch.Tensor:
             numbers = counter_rng.integers(
-                counter_rng.fold(stream, use), batch_size * self.uavs, limit
+                counter_rng.fold_in(key, use), batch_size * self.uavs, limit
             )
             return numbers.view(-1, batch_size, self.uavs)
 

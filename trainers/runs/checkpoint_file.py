@@ -2,10 +2,8 @@
 
 import hashlib
 import json
-import os
 import re
 from collections.abc import Mapping
-from contextlib import suppress
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -13,6 +11,8 @@ import torch
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor
+
+from emberlink.envs.utils.atomic_io import open_regular, replaced
 from emberlink.envs.utils.errors import UserError
 
 FORMAT = 1
@@ -22,6 +22,8 @@ _KEY = "emberlink"
 _BLANK = "0" * 64
 _SEAL = re.compile(rb'sha256\\": \\"([0-9a-f]{64})\\"')
 _LONGEST_HEADER = 100_000_000
+_LONGEST = 2**35
+"""bytes of a file; the largest state that was measured has 333 MB"""
 
 
 def write(path: Path, tensors: Mapping[str, Tensor], header: Mapping[str, Any]) -> None:
@@ -37,21 +39,15 @@ def write(path: Path, tensors: Mapping[str, Tensor], header: Mapping[str, Any]) 
     """
     content = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
     text = json.dumps({"sha256": _BLANK, "format": FORMAT, **header})
-    partial = path.with_name(path.name + ".part")
     try:
-        save_file(content, partial, metadata={_KEY: text})
-        partial.chmod(path.parent.stat().st_mode & 0o666)  # safetensors lets nobody else read
-        with partial.open("r+b") as file:
-            digest, place = _digest(file)
-            file.seek(place)
-            file.write(digest)
-            file.flush()
-            os.fsync(file.fileno())
-        partial.replace(path)
-        flush_folder(path.parent)
+        with replaced(path) as partial:
+            save_file(content, partial, metadata={_KEY: text})
+            partial.chmod(path.parent.stat().st_mode & 0o666)  # safetensors lets nobody else read
+            with partial.open("r+b") as file:
+                digest, place = _digest(file)
+                file.seek(place)
+                file.write(digest)
     except (OSError, SafetensorError) as error:
-        with suppress(OSError):
-            partial.unlink(missing_ok=True)
         raise UserError(f"{path}: cannot be written: {_reason(error)}") from None
 
 
@@ -67,7 +63,7 @@ def read(path: Path) -> tuple[dict[str, Any] | None, dict[str, Tensor]]:
     try:
         header = read_header(path)
         if header is not None:
-            with path.open("rb") as file:
+            with open_regular(path, _LONGEST) as file:
                 digest, _ = _digest(file)
             if digest.decode() != header.get("sha256"):
                 raise UserError(
@@ -85,10 +81,8 @@ def read_header(path: Path) -> dict[str, Any] | None:
     Raises:
         ValueError: there is no such file, it is no checkpoint, or it is of another format.
     """
-    if path.exists() and not path.is_file():
-        raise UserError(f"{path}: not a readable checkpoint: no regular file")
     try:
-        with path.open("rb") as file:
+        with open_regular(path, _LONGEST) as file:
             whole = json.loads(_head(file))
         if not isinstance(whole, dict):
             raise UserError("its header holds no names")
@@ -117,15 +111,6 @@ def check_finite(path: Path, tensors: Mapping[str, Tensor]) -> None:
     for name, value in tensors.items():
         if value.is_floating_point() and not torch.isfinite(value).all():
             raise UserError(f"{path}: {name} holds NaN or infinite numbers")
-
-
-def flush_folder(folder: Path) -> None:
-    """Makes the names in a folder outlive a loss of power."""
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
 
 
 def _head(file: BinaryIO) -> bytes:

@@ -1,11 +1,17 @@
 """One training a run folder: a lock that dies with its process."""
 
+import errno
 import fcntl
 import os
 import socket
+import stat
 from contextlib import suppress
 from pathlib import Path
+
+from emberlink.envs.utils.atomic_io import read_bytes
 from emberlink.envs.utils.errors import UserError
+
+_FLAGS = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC
 
 
 class Lock:
@@ -43,8 +49,9 @@ class Lock:
 
     def _take(self) -> int:
         while True:
-            handle = os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o644)
+            handle = os.open(self.path, _FLAGS, 0o644)
             try:
+                _check_own(handle)
                 fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 # Whoever had it may have taken the file away between the two calls.
                 if self.path.exists() and os.path.samestat(os.fstat(handle), self.path.stat()):
@@ -60,6 +67,18 @@ class Lock:
 
     def _holder(self) -> str:
         try:
-            return self.path.read_text(errors="replace").strip() or "another process"
+            text = read_bytes(self.path, 1000).decode(errors="replace").strip()
+            return text or "another process"
         except OSError:
             return "another process"
+
+
+def _check_own(handle: int) -> None:
+    """Checks that a lock is a regular file without a second name, which would be changed with it.
+
+    Raises:
+        OSError: it is not.
+    """
+    about = os.fstat(handle)
+    if not stat.S_ISREG(about.st_mode) or about.st_nlink > 1:
+        raise OSError(errno.EINVAL, "it is no regular file of its own")

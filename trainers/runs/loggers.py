@@ -1,198 +1,213 @@
-"""Trackers beside metrics.jsonl: wandb, tensorboard, csv, or none.
+"""The trackers that a training may report to beside metrics.jsonl: wandb, TensorBoard, CSV."""
 
-A tracker is a guest: whatever becomes of it, the training goes on and metrics.jsonl is whole.
-"""
-
+import csv
+import io
 import os
-import queue
 import sys
 import threading
-import warnings
-from collections.abc import Callable, Mapping, Sequence
+import time
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from typing import Any
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, Protocol
 
-from torchrl.record.loggers import CSVLogger, Logger, TensorboardLogger, WandbLogger
+import numpy as np
+from PIL import Image
+from torchrl.record.loggers import TensorboardLogger, WandbLogger
 
+from emberlink.envs.utils.atomic_io import inner_folder, remove_links
+from emberlink.envs.utils.errors import UserError
 from emberlink.trainers.config.compose import to_values
-from .run_folder import RunFolder
 from emberlink.trainers.config.schema import RunConfig
+
+from .run_folder import RunFolder
 
 PATIENCE = 60.0
 """seconds that the end of a training waits for its tracker"""
 _CONNECTING = 20.0
 """seconds that wandb may take to reach its server, where WANDB_MODE=online"""
+_BETWEEN_TABLES = 10.0
+"""seconds between two versions of metrics.csv"""
+WANDB_TEARDOWN = "emberlink-wandb-teardown"
+"""name of a thread that may outlive a wandb tracker that failed"""
 
 
-def _wandb(config: RunConfig, run: RunFolder, episode: int) -> Logger:
-    """Groups by setup and fire, tags by method and seed; offline unless WANDB_MODE says else.
+class Tracker(Protocol):
+    """Receives the numbers of one run."""
 
-    A resumed run keeps its name there: the last part of the folder that wandb made for it.
-    """
-    before = sorted((run.path / "wandb").glob("*run-*-*"))
-    import wandb
+    def log(self, line: Mapping[str, float], episode: int) -> None:
+        """Logs an episode's line of metrics.jsonl."""
+        ...
 
-    offline = os.environ.get("WANDB_MODE", "offline") in ("", "offline", "dryrun")
-    logger = WandbLogger(
-        exp_name=run.path.name,
-        project=os.environ.get("WANDB_PROJECT", "emberlink"),
-        id=before[-1].name.rpartition("-")[2] if before else None,
-        save_dir=str(run.path),
-        offline=offline,
-        log_env_packages=False,  # it would stand in the configuration as "env"
-        settings=wandb.Settings(
-            silent=offline,
-            console="off",
-            init_timeout=_CONNECTING,
-            finish_timeout=PATIENCE / 2,
-        ),
-        reinit="create_new",  # seeds that train side by side are runs of their own
-        group=f"{config.setup}-{config.fire.name}",
-        tags=[config.method, f"seed-{config.seed}"],
-    )
-    logger.log_hparams(to_values(config))
-    return logger
+    def log_evaluation(self, numbers: Mapping[str, float], figures: Sequence[Path]) -> None:
+        """Logs the final evaluation: its means by name, and PNG files."""
+        ...
+
+    def finish(self) -> None:
+        """Writes what is left; the tracker is not used afterwards."""
+        ...
 
 
-def _tensorboard(config: RunConfig, run: RunFolder, episode: int) -> Logger:
-    logger = TensorboardLogger(exp_name="tensorboard", log_dir=str(run.path))
-    if episode or any((run.path / "tensorboard").glob("events*")):
-        _purge(logger, episode + 1)
-    return logger
+class Wandb:
+    """Logs to wandb: grouped by setup and fire, tagged by method and seed.
 
-
-def _purge(logger: Logger, step: int) -> None:
-    """Tells TensorBoard to forget what an earlier process logged from a step on."""
-    from tensorboard.compat.proto import event_pb2
-
-    made: Any = event_pb2  # its classes are made when it is imported
-    start = made.Event(session_log=made.SessionLog(status=made.SessionLog.START))
-    logger.experiment.file_writer.add_event(start, step)
-
-
-def _csv(config: RunConfig, run: RunFolder, episode: int) -> Logger:
-    """Written anew from metrics.jsonl for a resumed run: what was cut or lost there is here too."""
-    for file in (run.path / "csv" / "scalars").rglob("*.csv"):
-        file.unlink()
-    logger = CSVLogger(exp_name="csv", log_dir=str(run.path))
-    for line in run.lines()[:episode]:
-        _log(logger, line, line["episode"])
-    return logger
-
-
-ENDING = "emberlink-ends-wandb"
-"""the name of a thread that may go on after a tracker was given up"""
-
-_Maker = Callable[[RunConfig, RunFolder, int], Logger]
-"""of a run's tracker, which is to know what came up to an episode and nothing later"""
-_TRACKERS: dict[str, _Maker] = {
-    "wandb": _wandb,
-    "tensorboard": _tensorboard,
-    "csv": _csv,
-}
-
-
-class Trackers:
-    """Hands each episode's numbers to the tracker that the configuration names, for every run.
-
-    It works in a thread of its own, for a tracker may wait for a network or for a process that is
-    gone. Where it fails, one warning says so and it is told nothing more.
+    Offline, unless WANDB_MODE says otherwise. A resumed run keeps its id.
 
     Args:
-        configs: of the runs; all name the same tracker.
-        runs: where each one's tracker writes.
-        episode: the last one that a resumed run has behind it.
+        config: of the run.
+        run: where wandb writes.
+        episode: number of episodes that were logged before.
     """
 
-    def __init__(
-        self, configs: Sequence[RunConfig], runs: Sequence[RunFolder], *, episode: int = 0
-    ):
-        self._name, self._episode = configs[0].logger, episode
-        self._pairs = list(zip(configs, runs, strict=True))
-        self._lines: queue.SimpleQueue[tuple[Sequence[Mapping[str, Any]], int] | None]
-        self._lines = queue.SimpleQueue()
-        self._failure: str | None = None
-        self._thread: threading.Thread | None = None
-        self.given_up = False
-        """whether it has failed, and a warning has said so"""
-        if make := _TRACKERS.get(self._name):
-            self._thread = threading.Thread(target=self._work, args=(make,), daemon=True)
-            self._thread.start()
+    def __init__(self, config: RunConfig, run: RunFolder, episode: int):
+        # The id is the last part of the name of the folder that wandb made.
+        folder = inner_folder(run.path, "wandb")
+        remove_links(folder)  # wandb makes its own again
+        before = sorted(folder.glob("*run-*-*"))
+        import wandb
 
-    def log(self, lines: Sequence[Mapping[str, Any]], step: int) -> None:
-        """One episode's line of metrics.jsonl of every run; numbers only."""
-        if self._thread is None:
-            return
-        self._lines.put(([dict(line) for line in lines], step))
-        if self._failure is not None:
-            self._give_up(self._failure)
-
-    def close(self) -> None:
-        """Writes what is left, if `PATIENCE` lasts; the trackers are not used afterwards."""
-        if self._thread is None:
-            return
-        self._lines.put(None)
-        self._thread.join(PATIENCE)
-        if self._thread.is_alive() and self._failure is None:
-            self._failure = f"no answer within {PATIENCE:g} s"
-        if self._failure is not None:
-            self._give_up(self._failure)
-        self._thread = None
-
-    def _work(self, make: _Maker) -> None:
-        loggers: list[Logger] = []
-        try:
-            for config, run in self._pairs:
-                loggers.append(make(config, run, self._episode))
-            while (episode := self._lines.get()) is not None:
-                lines, step = episode
-                for logger, line in zip(loggers, lines, strict=True):
-                    _log(logger, line, step)
-            while loggers:
-                _finish(loggers.pop())
-        except BaseException as error:  # none of a tracker's errors is the training's
-            self._failure = " ".join(f"{type(error).__name__}: {error}".split())
-            for logger in loggers:
-                with suppress(BaseException):
-                    _finish(logger)
-
-    def _give_up(self, reason: str) -> None:
-        self._thread, self.given_up = None, True
-        if self._name == "wandb":
-            _release_wandb()
-        shown = reason if len(reason) <= 200 else reason[:200] + " ..."
-        warnings.warn(
-            f"logger={self._name} has stopped ({shown}); "
-            "the training goes on, metrics.jsonl holds everything",
-            stacklevel=3,
+        offline = os.environ.get("WANDB_MODE", "offline") in ("", "offline", "dryrun")
+        self._episodes = config.episodes
+        self._logger = WandbLogger(
+            exp_name=run.path.name,
+            project=os.environ.get("WANDB_PROJECT", "emberlink"),
+            id=before[-1].name.rpartition("-")[2] if before else None,
+            save_dir=str(run.path.absolute()),
+            offline=offline,
+            log_env_packages=False,  # it would stand in the configuration as "env"
+            settings=wandb.Settings(
+                silent=offline,
+                console="off",
+                init_timeout=_CONNECTING,
+                finish_timeout=PATIENCE / 2,
+            ),
+            reinit="create_new",  # seeds that train side by side are runs of their own
+            group=f"{config.setup}-{config.fire.name}",
+            tags=[config.method, f"seed-{config.seed}"],
         )
+        self._logger.log_hparams(to_values(config))
+
+    def log(self, line: Mapping[str, float], episode: int) -> None:
+        """See `Tracker`; the step of wandb's history is the episode."""
+        self._logger.log_metrics(dict(line), step=episode, override_global_step=True)
+
+    def log_evaluation(self, numbers: Mapping[str, float], figures: Sequence[Path]) -> None:
+        """See `Tracker`; the step is the one after the last episode."""
+        import wandb
+
+        images = {f"figures/{path.stem}": wandb.Image(str(path)) for path in figures}
+        self._logger.experiment.log({**numbers, **images}, step=self._episodes + 1)
+
+    def finish(self) -> None:
+        """See `Tracker`."""
+        self._logger.experiment.finish()
 
 
-def _log(logger: Logger, line: Mapping[str, Any], step: int) -> None:
-    if isinstance(logger, WandbLogger):
-        # All in one row of the history, whose step is the episode.
-        logger.log_metrics(dict(line), step=step, override_global_step=True)
-        return
-    for name, value in line.items():
-        logger.log_scalar(name, float(value), step=step)
+class Tensorboard:
+    """Logs to TensorBoard; the arguments are those of `Wandb`."""
+
+    def __init__(self, config: RunConfig, run: RunFolder, episode: int):
+        self._episodes = config.episodes
+        folder = inner_folder(run.path, "tensorboard")
+        remove_links(folder)
+        is_resumed = episode > 0 or any(folder.glob("events*"))
+        self._logger = TensorboardLogger(exp_name="tensorboard", log_dir=str(run.path))
+        if is_resumed:
+            self._purge(episode + 1)
+
+    def _purge(self, step: int) -> None:
+        """Tells TensorBoard to forget what an earlier process logged from a step on."""
+        from tensorboard.compat.proto import event_pb2
+
+        made: Any = event_pb2  # its classes are made when it is imported
+        start = made.Event(session_log=made.SessionLog(status=made.SessionLog.START))
+        self._logger.experiment.file_writer.add_event(start, step)
+
+    def log(self, line: Mapping[str, float], episode: int) -> None:
+        """See `Tracker`; the step is the episode."""
+        for name, value in line.items():
+            self._logger.log_scalar(name, float(value), step=episode)
+
+    def log_evaluation(self, numbers: Mapping[str, float], figures: Sequence[Path]) -> None:
+        """See `Tracker`; the step is the last episode."""
+        self.log(numbers, self._episodes)
+        for path in figures:
+            pixels = np.asarray(Image.open(path).convert("RGB"))
+            self._logger.experiment.add_image(
+                f"figures/{path.stem}", pixels, self._episodes, dataformats="HWC"
+            )
+
+    def finish(self) -> None:
+        """See `Tracker`."""
+        self._logger.experiment.close()
 
 
-def _finish(logger: Logger) -> None:
-    if isinstance(logger, WandbLogger):
-        logger.experiment.finish()
-    elif isinstance(logger, TensorboardLogger):
-        logger.experiment.close()
+class Csv:
+    """Writes metrics.csv, with a header; the arguments are those of `Wandb`.
+
+    The file is made of metrics.jsonl, so that it is right after a run was resumed, too.
+    """
+
+    def __init__(self, config: RunConfig, run: RunFolder, episode: int):
+        self._run, self._next = run, 0.0
+        self._write(episode)
+
+    def log(self, line: Mapping[str, float], episode: int) -> None:
+        """See `Tracker`; the file is written again after some seconds."""
+        if time.monotonic() >= self._next:
+            self._write(episode)
+
+    def log_evaluation(self, numbers: Mapping[str, float], figures: Sequence[Path]) -> None:
+        """Does nothing: eval.json and figures/ are beside the file."""
+
+    def finish(self) -> None:
+        """See `Tracker`."""
+        self._write(None)
+
+    def _write(self, episodes: int | None) -> None:
+        lines = self._run.lines()[:episodes]
+        text = io.StringIO()
+        names = list(dict.fromkeys(name for line in lines for name in line))
+        table = csv.DictWriter(text, names, lineterminator="\n")
+        table.writeheader()
+        table.writerows(lines)
+        self._run.write_text("metrics.csv", text.getvalue())
+        self._next = time.monotonic() + _BETWEEN_TABLES
 
 
-def _release_wandb() -> None:
-    """Takes back what wandb would do when the program ends: wait for a process that is gone."""
+TRACKERS: dict[str, type[Wandb] | type[Tensorboard] | type[Csv]] = {
+    "wandb": Wandb,
+    "tensorboard": Tensorboard,
+    "csv": Csv,
+}
+"""the trackers by the value of the key `logger`"""
+
+
+def check_installed(config: RunConfig) -> None:
+    """Checks that the package of a configuration's tracker is installed.
+
+    Raises:
+        UserError: it is not; the message says how to install it.
+    """
+    name = config.logger
+    if name in ("wandb", "tensorboard") and find_spec(name) is None:
+        extra = ".[tensorboard]" if name == "tensorboard" else name
+        raise UserError(f"logger={name}: {name} is not installed: pip install '{extra}'")
+
+
+def release_wandb() -> None:
+    """Undoes wandb's hook at the end of the program, which would wait for a process that is gone.
+
+    The call itself may wait, so a thread makes it.
+    """
 
     def teardown() -> None:
         with suppress(BaseException):
             sys.modules["wandb"].teardown()
 
-    ending = threading.Thread(target=teardown, name=ENDING, daemon=True)
+    ending = threading.Thread(target=teardown, name=WANDB_TEARDOWN, daemon=True)
     ending.start()
     ending.join(2.0)
-    # By which a later run of this process would look for the one that is gone.
+    # By this variable, a later run of this process would look for the one that is gone.
     os.environ.pop("WANDB_SERVICE", None)

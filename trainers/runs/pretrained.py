@@ -18,11 +18,12 @@ from importlib.resources import files
 from pathlib import Path
 
 from emberlink.envs.fire_files.reader import KEPT
+from emberlink.envs.utils.errors import UserError
+from emberlink.trainers.config.compose import to_values
+from emberlink.trainers.runs.seal import check_trained_with
 
 from . import checkpoint_file
-from emberlink.trainers.evaluation.report import ACTOR
-from .run_folder import RunFolder
-from emberlink.envs.utils.errors import UserError
+from .run_folder import ACTOR, RunFolder
 
 PREFIX = "pretrained:"
 USUAL_SETUP = "tuned"
@@ -47,11 +48,7 @@ def open_run(text: str, output: Path | str = "runs") -> RunFolder:
     """
     if not is_name(text):
         return RunFolder(text)
-    found = find(text)
-    recipes = sorted({"/".join(one.parts[-3:-1]) for one in found})
-    if len(recipes) > 1:
-        raise UserError(f"{text}: one is needed, and there are {', '.join(recipes)}")
-    source = found[0]
+    source = find_one(text)
     target = Path(output) / "_".join(["pretrained", *source.parts[-3:]])
     if not target.exists():
         try:
@@ -83,6 +80,22 @@ def find(text: str) -> list[Path]:
     return found
 
 
+def find_one(text: str) -> Path:
+    """Returns the folder of the trained policy that a name means, of the lowest seed.
+
+    Args:
+        text: as for `open_run`.
+
+    Raises:
+        UserError: there is none, or of several methods or setups.
+    """
+    found = find(text)
+    recipes = sorted({"/".join(folder.parts[-3:-1]) for folder in found})
+    if len(recipes) > 1:
+        raise UserError(f"{text}: one is needed, and there are {', '.join(recipes)}")
+    return found[0]
+
+
 def pack(run: RunFolder, into: Path) -> Path:
     """Takes from a finished run what is shipped.
 
@@ -96,16 +109,19 @@ def pack(run: RunFolder, into: Path) -> Path:
     Raises:
         ValueError: the run is not finished, or the folder is there.
     """
-    config = replace(run.config(), output="runs", logger="none", device="cpu")
+    trained = run.config()
+    config = replace(trained, output="runs", logger="none", device="cpu")
     if len(run.lines()) < config.episodes or not (run.path / "eval.json").exists():
         raise UserError(f"{run.path}: not finished, or not evaluated")
     target = into / config.setup / config.method / f"s{config.seed}"
     if target.exists():
         raise UserError(f"{target}: is there already")
     newest = run.checkpoint()
+    check_trained_with(newest, trained)
     header, weights = checkpoint_file.read(newest)
     actors = {name: value for name, value in weights.items() if name.startswith(ACTOR)}
-    about = {k: v for k, v in (header or {}).items() if k not in ("sha256", "format", "config")}
+    about = {k: v for k, v in (header or {}).items() if k not in ("sha256", "format")}
+    about["config"] = to_values(config)
     (target / "checkpoints").mkdir(parents=True)
     checkpoint_file.write(target / "checkpoints" / newest.name, actors, about)
     RunFolder(target).write_config(config)

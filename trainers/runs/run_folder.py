@@ -4,8 +4,8 @@ import json
 import os
 import re
 import shutil
-from collections.abc import Mapping
-from contextlib import suppress
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from datetime import datetime
 from itertools import chain
@@ -16,17 +16,22 @@ import yaml
 from torch import Tensor
 
 from emberlink.envs.scenarios import fires_of
+from emberlink.envs.utils import atomic_io
+from emberlink.envs.utils.errors import UserError
+from emberlink.trainers.config.compose import flat, from_values, to_values
+from emberlink.trainers.config.schema import RunConfig, comm_settings
 
 from . import checkpoint_file as files
 from . import compact_json
-from emberlink.trainers.config.compose import flat, from_values, to_values
 from .safe_read import LONGEST_JSON, parse_json, read_text, read_yaml
-from emberlink.trainers.config.schema import RunConfig, comm_settings
-from emberlink.envs.utils.errors import UserError
 
 _NOT_FROM_THE_START = ("comm.agree", "comm.follow", "comm.wander", "comm.loss")
 """settings that runs of the first release were made without; their defaults change nothing"""
 _NUMBERED = re.compile(r"(state|step)_\d{9,18}\.safetensors")
+
+
+ACTOR = "actor_network_params.module."
+"""begins the names of the actors' weights in a checkpoint"""
 
 
 class RunFolder:
@@ -99,43 +104,47 @@ class RunFolder:
         """
         path = self.path / file
         try:
-            handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
+            with atomic_io.changed(path, create=True) as handle:
+                before = os.fstat(handle).st_size
+                left = (json.dumps(line) + "\n").encode()
+                try:
+                    while left:
+                        left = left[os.write(handle, left) :]
+                except OSError:
+                    os.ftruncate(handle, before)
+                    raise
         except OSError as error:
             raise UserError(f"{path}: cannot be written: {error.strerror}") from None
-        before = os.fstat(handle).st_size
-        try:
-            left = (json.dumps(line) + "\n").encode()
-            while left:
-                left = left[os.write(handle, left) :]
-        except OSError as error:
-            os.ftruncate(handle, before)
-            raise UserError(f"{path}: cannot be written: {error.strerror}") from None
-        finally:
-            os.close(handle)
 
     def size(self, file: str) -> int:
         """Bytes in a file, all of them flushed to the disk; 0 where there is none."""
         try:
-            with (self.path / file).open("rb") as content:
+            with atomic_io.open_regular(self.path / file, LONGEST_JSON) as content:
                 os.fsync(content.fileno())
                 return os.fstat(content.fileno()).st_size
         except FileNotFoundError:
             return 0
+        except OSError as error:
+            raise ValueError(
+                f"{self.path / file}: cannot be read: {error.strerror or error}"
+            ) from None
 
     def check_lines(self, file: str, size: int, lines: int) -> None:
-        """That a .jsonl file still begins as it was when a checkpoint was made.
+        """Checks that a .jsonl file still begins as it was when a checkpoint was made.
 
         Args:
-            file: its name.
+            file: its name; a link is refused, for lines are going to be added to it.
             size: bytes that it had.
             lines: that these hold.
 
         Raises:
-            ValueError: it holds less, or other lines.
+            ValueError: it is a link or no regular file, or holds less or other lines.
         """
         path = self.path / file
         try:
-            kept = path.read_bytes()[:size] if path.exists() else b""
+            kept = atomic_io.read_bytes(path, LONGEST_JSON, follow=False)[:size]
+        except FileNotFoundError:
+            kept = b""
         except OSError as error:
             raise UserError(f"{path}: cannot be read: {error.strerror}") from None
         found = kept.count(b"\n") if kept.endswith(b"\n") else -1
@@ -149,8 +158,11 @@ class RunFolder:
         """Cuts a file back to so many bytes, where it has more."""
         path = self.path / file
         try:
-            if path.exists() and path.stat().st_size > size:
-                os.truncate(path, size)
+            with atomic_io.changed(path) as handle:
+                if os.fstat(handle).st_size > size:
+                    os.ftruncate(handle, size)
+        except FileNotFoundError:
+            return
         except OSError as error:
             raise UserError(f"{path}: cannot be cut: {error.strerror}") from None
 
@@ -158,20 +170,15 @@ class RunFolder:
         """Writes a JSON file whole, or leaves what was there."""
         self._replace(file, compact_json.dumps(content) + "\n")
 
+    def write_text(self, file: str, text: str) -> None:
+        """Writes a text file whole, or leaves what was there."""
+        self._replace(file, text)
+
     def _replace(self, file: str, text: str) -> None:
-        # Not the name of another process's, such as an evaluation beside a training.
-        path, partial = self.path / file, self.path / f"{file}.{os.getpid()}.part"
+        path = self.path / file
         try:
-            partial.unlink(missing_ok=True)  # a link would lead to another's file
-            with partial.open("x") as content:
-                content.write(text)
-                content.flush()
-                os.fsync(content.fileno())
-            partial.replace(path)
-            files.flush_folder(self.path)
+            atomic_io.write_bytes(path, text.encode())
         except OSError as error:
-            with suppress(OSError):
-                partial.unlink(missing_ok=True)
             raise UserError(f"{path}: cannot be written: {error.strerror or error}") from None
 
     def lines(self, file: str = "metrics.jsonl") -> list[dict[str, Any]]:
@@ -191,31 +198,54 @@ class RunFolder:
         except ValueError as error:
             raise UserError(f"{path}: not a file of JSON lines: {error}") from None
 
-    def figure(self, file: str) -> Path:
-        """Where a figure goes; its folder is made if it is not there."""
-        folder = self.path / "figures"
-        folder.mkdir(exist_ok=True)
-        return folder / file
+    def figures(self) -> Path:
+        """Returns the folder of the figures, made if it is not there.
+
+        Raises:
+            OSError: it is a link or no folder, or cannot be made.
+        """
+        return atomic_io.inner_folder(self.path, "figures")
+
+    @contextmanager
+    def figure(self, file: str) -> Iterator[Path]:
+        """Yields the path to draw a figure to, which gets its name once it is whole.
+
+        Raises:
+            OSError: it cannot be written, or the folder is a link.
+        """
+        with atomic_io.replaced(self.figures() / file) as partial:
+            yield partial
 
     @property
     def checkpoints(self) -> Path:
         """The folder of the checkpoints."""
         return self.path / "checkpoints"
 
+    def own_checkpoints(self) -> Path:
+        """Returns the folder of the checkpoints to write to, made if it is not there.
+
+        Raises:
+            ValueError: it is a link or no folder, or cannot be made.
+        """
+        try:
+            return atomic_io.inner_folder(self.path, "checkpoints")
+        except OSError as error:
+            raise ValueError(f"{self.checkpoints}: cannot be written: {error.strerror}") from None
+
     def save(self, weights: Mapping[str, Tensor], config: RunConfig, step: int) -> Path:
         """Writes networks to a name of their own, whole or not at all."""
-        path = self.checkpoints / f"step_{step:09d}.safetensors"
+        path = self.own_checkpoints() / f"step_{step:09d}.safetensors"
         files.write(path, weights, _network_header(config, step))
         return path
 
     def save_best(self, weights: Mapping[str, Tensor], config: RunConfig, step: int) -> None:
         """Writes networks to best.safetensors, in place of those that were there."""
-        path = self.checkpoints / "best.safetensors"
+        path = self.own_checkpoints() / "best.safetensors"
         files.write(path, weights, _network_header(config, step))
 
     def state(self, step: int) -> Path:
-        """Where everything else that a resumed run needs is written."""
-        return self.checkpoints / f"state_{step:09d}.safetensors"
+        """Returns where everything else that a resumed run needs is written."""
+        return self.own_checkpoints() / f"state_{step:09d}.safetensors"
 
     def states(self) -> list[Path]:
         """What a run can be resumed from, oldest first."""
@@ -242,9 +272,10 @@ class RunFolder:
         return found[-1]
 
     def rotate(self, keep: int, states: int) -> None:
-        """Takes all but the newest `keep_checkpoints` networks and `states` states away."""
+        """Takes all but the newest `keep` networks and `states` states away."""
+        self.own_checkpoints()
         for path in self.networks()[:-keep] + self.states()[:-states]:
-            path.unlink(missing_ok=True)
+            atomic_io.remove(path)
 
     def evaluated(self) -> bool:
         """Whether eval.json is there, and of the newest checkpoint."""
@@ -256,18 +287,17 @@ class RunFolder:
 
     def take_away_after(self, step: int) -> None:
         """Takes away what a resumed run makes again, and what a killed one had begun to write."""
-        begun = [
-            self.path.glob(name + end)
-            for name in ("config.yaml", "*.json", "fires.npz")
-            for end in (".part", ".[0-9]*.part")
-        ]
+        names = ("config.yaml", "*.json", "*.jsonl", "fires.npz")
+        begun = [self.path.glob(f"{name}.[0-9]*.part") for name in names]
         # safetensors' own names begin with .tmp
-        begun += [self.checkpoints.glob(name) for name in ("*.safetensors.part", ".tmp*")]
+        written = ("*.safetensors.[0-9]*.part", ".tmp*")
+        begun += [self.own_checkpoints().glob(name) for name in written]
         later = [path for path in self.networks() + self.states() if step_of(path) > step]
         try:
+            begun += [self.figures().glob(f"*.{end}.[0-9]*.part") for end in ("png", "gif")]
             for path in chain(later, *begun):
                 if path.is_file() or path.is_symlink():  # what is none is not ours
-                    path.unlink()
+                    atomic_io.remove(path)
             for path in self.path.glob("divergence_step_*.part"):
                 if path.is_dir() and not path.is_symlink():
                     shutil.rmtree(path)
@@ -305,6 +335,7 @@ def _network_header(config: RunConfig, step: int) -> dict[str, Any]:
         "method": config.method,
         "uavs": config.env.num_uavs,
         "seed": config.seed,
+        "config": to_values(config),
     }
 
 

@@ -6,6 +6,8 @@ from pathlib import Path
 from typing import Any
 
 import yaml
+
+from emberlink.envs.utils.atomic_io import read_bytes
 from emberlink.envs.utils.errors import UserError
 
 LONGEST_YAML = 100_000
@@ -24,16 +26,12 @@ def read_text(path: Path, longest: int) -> str:
         ValueError: one line: it is something else, such as a pipe, longer, or no UTF-8.
     """
     try:
-        if path.exists() and not path.is_file():
-            raise UserError(f"{path}: cannot be read: no regular file")
-        with path.open("rb") as file:
-            content = file.read(longest + 1)
-        if len(content) > longest:
-            raise UserError(f"{path}: cannot be read: more than {longest} bytes")
-        return content.decode()
+        return read_bytes(path, longest).decode()
     except FileNotFoundError:
         raise
-    except (OSError, UnicodeDecodeError) as error:
+    except OSError as error:
+        raise UserError(f"{path}: cannot be read: {error.strerror or error}") from None
+    except UnicodeDecodeError as error:
         raise UserError(f"{path}: cannot be read: {error}") from None
 
 

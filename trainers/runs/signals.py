@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM: the step is finished first."""
+"""Ctrl-C, SIGTERM and SIGHUP: the step is finished first."""
 
 import signal
 from collections.abc import Callable
@@ -12,7 +12,7 @@ class Interrupted(KeyboardInterrupt):
 
 
 class Interruption:
-    """Within, a first SIGINT or SIGTERM calls `stop`; a second one raises `Interrupted`.
+    """Within, a first SIGINT, SIGTERM or SIGHUP calls `stop`; a second one raises `Interrupted`.
 
     Args:
         stop: asks for an end between two steps.
@@ -27,7 +27,10 @@ class Interruption:
         """whether the first one is not to wait either"""
 
     def __enter__(self) -> "Interruption":
-        self._before = {one: signal.signal(one, self._handle) for one in _SIGNALS}
+        signals = [*_SIGNALS]
+        if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # nohup ignores it
+            signals.append(signal.SIGHUP)
+        self._before = {one: signal.signal(one, self._handle) for one in signals}
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -36,7 +39,7 @@ class Interruption:
 
     @property
     def status(self) -> int:
-        """The exit status of a program that the signal ended: 130 or 143."""
+        """The exit status of a program that the signal ended: 130, 143 or 129."""
         return 128 + (self.received or signal.SIGINT)
 
     def _handle(self, number: int, _: FrameType | None) -> None:

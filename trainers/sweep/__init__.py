@@ -3,7 +3,8 @@
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from .command import sweep
+    from emberlink.trainers.sweep.command import sweep
+
     from .jobs import Job, jobs_of
 
 __all__ = ["Job", "jobs_of", "sweep"]
@@ -12,7 +13,7 @@ __all__ = ["Job", "jobs_of", "sweep"]
 def __getattr__(name: str) -> Any:
     # The process of a run imports this package too, and needs none of it.
     if name == "sweep":
-        from .command import sweep
+        from emberlink.trainers.sweep.command import sweep
 
         return sweep
     if name in __all__:

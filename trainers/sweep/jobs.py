@@ -8,13 +8,13 @@ from pathlib import Path
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
 
-from emberlink.envs.utils.validation import known
+from emberlink.configs import known
 from emberlink.trainers.config.compose import flat, resolve, to_values
 from emberlink.trainers.config.schema import NOT_LEARNT_WITH, RunConfig
 from emberlink.trainers.runs.run_folder import RunFolder
 
 _MAY_DIFFER = ("output", "seeds", *NOT_LEARNT_WITH)
-"""keys in which two configurations of the same run may differ"""
+"""first parts of the keys in which two configurations of the same run may differ"""
 
 Identity = tuple[tuple[str, str], ...]
 """keys and values that are equal for two configurations of the same run"""
@@ -143,7 +143,9 @@ def jobs_of(arguments: Sequence[str]) -> list[Job]:
 def identity(config: RunConfig) -> Identity:
     """Returns the keys and values that two configurations of the same run have in common."""
     values = flat(to_values(config))
-    return tuple(sorted((k, str(v)) for k, v in values.items() if k not in _MAY_DIFFER))
+    return tuple(
+        sorted((k, str(v)) for k, v in values.items() if k.split(".")[0] not in _MAY_DIFFER)
+    )
 
 
 def job_for(configs: list[RunConfig], overrides: Sequence[str]) -> Job:

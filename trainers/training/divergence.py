@@ -13,8 +13,8 @@ from torch import Tensor
 from torchrl.envs import TransformedEnv
 
 from emberlink.envs import keys
-from emberlink.envs.utils.atomic_io import free_name
 from emberlink.envs.utils.errors import UserError
+from emberlink.envs.utils.publish import free_name
 from emberlink.trainers.config.compose import to_values
 from emberlink.trainers.learners.nan_guard import CARRIED, COLLECTED, LEARNT, WEIGHTS, Watch
 from emberlink.trainers.runs import checkpoint_file
@@ -285,7 +285,8 @@ def _by_team(own: Tensor, teams: int) -> Tensor:
 
 def _write(trainer: "Trainer", place: int, batch: TensorDictBase, culprit: Culprit) -> Path:
     """Writes a bundle to a new folder of the first seed's run."""
-    whole = free_name(trainer.run.path, f"divergence_step_{culprit.step}", [""])
+    stem = f"divergence_step_{culprit.step}"
+    whole = free_name(trainer.run.path, stem, ["", ".part"])
     folder = whole.with_name(whole.name + ".part")
     folder.mkdir()
     watch = trainer.learner.watch

@@ -4,22 +4,19 @@ from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import shown
-from emberlink.trainers.config.compose import flat, from_values, override, to_values
-from emberlink.trainers.config.schema import NOT_LEARNT_WITH, RunConfig
+from emberlink.trainers.config.compose import override
+from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.runs import checkpoint_file
 from emberlink.trainers.runs.lock import Lock
 from emberlink.trainers.runs.run_folder import RunFolder, step_of
 from emberlink.trainers.runs.safe_read import LONGEST_YAML, parse_json, read_text
+from emberlink.trainers.runs.seal import MAY_CHANGE, check_same, differences
 
 from . import state, state_header
 from .trainer import LINES, SIBLINGS, Trainer
-
-MAY_CHANGE = ("episodes", *NOT_LEARNT_WITH)
-"""keys that a resumed run may be given anew, beside those of `evaluation`"""
 
 
 def resume(path: Path, method: str | None = None, overrides: Sequence[str] = ()) -> Trainer:
@@ -51,6 +48,7 @@ def resume(path: Path, method: str | None = None, overrides: Sequence[str] = ())
         trainer = Trainer(config)
         sizes = _restore(trainer, runs, chosen)
         for run, of in zip(runs, sizes, strict=True):
+            run.own_checkpoints()
             for file in LINES:
                 run.check_lines(file, of[file], trainer.episode)
         # From here on everything is known to fit.
@@ -79,10 +77,13 @@ def _runs(folder: Path) -> list[RunFolder]:
         missing = [run.path for run in runs if not run.path.is_dir()]
         if folder.resolve() not in [run.path for run in runs]:
             raise UserError(folder)
+        linked = [run.path for run in runs if run.path.is_symlink()]
     except PermissionError as error:
         raise UserError(f"{file}: cannot be read: {error.strerror}") from None
     except (OSError, ValueError, TypeError, KeyError):
         raise UserError(f"{file}: does not name the folders of the other seeds") from None
+    for path in linked:
+        raise UserError(f"{path}: cannot be resumed: it is a link, named by {file}")
     for path in missing:
         raise UserError(f"{path}: is missing; its seed trains side by side with {folder}")
     return runs
@@ -117,26 +118,17 @@ def _check_beginning(runs: Sequence[RunFolder], config: RunConfig) -> None:
                 f"{run.path}: has metrics of {len(lines)} episodes and no checkpoint "
                 "(checkpoints/state_*.safetensors): nothing to go on from, and nothing was changed"
             )
-        run.checkpoints.mkdir(exist_ok=True)
+        run.own_checkpoints()
 
 
 def _changed(config: RunConfig, method: str | None, overrides: Sequence[str]) -> RunConfig:
     if method is not None and method != config.method:
         raise UserError(f"method {method!r}: the run is of method {config.method!r}")
     changed = override(config, overrides)
-    for key, (new, old) in _differences(changed, config).items():
+    for key, (new, old) in differences(changed, config).items():
         if key not in MAY_CHANGE and not key.startswith("evaluation."):
             raise UserError(f"{key}={new}: the run has {key}={old}; a resumed run keeps it")
     return changed
-
-
-def _differences(one: RunConfig, other: RunConfig) -> dict[str, tuple[Any, Any]]:
-    first, second = flat(to_values(one)), flat(to_values(other))
-    return {
-        key: (first.get(key), second.get(key))
-        for key in [*first, *(key for key in second if key not in first)]
-        if first.get(key) != second.get(key)
-    }
 
 
 def _restore(
@@ -171,20 +163,9 @@ def _restore_from(trainer: Trainer, path: Path) -> state_header.Header:
     header = state_header.parse(path, found)
     if step_of(path) not in (-1, header.step):
         raise UserError(f"{path}: its header: step={header.step}: should be its name's")
-    _check_config(trainer.config, path, header.config)
+    check_same(path, header.config, trainer.config)
     if header.step > trainer.steps:
         done = header.step / trainer.config.env.horizon
         raise UserError(f"episodes={trainer.config.episodes}: the run has done {done:g}")
     state.restore(trainer, path, found, content)
     return header
-
-
-def _check_config(config: RunConfig, path: Path, values: Mapping[str, Any]) -> None:
-    """That the checkpoint's configuration is the run's, but for what may change."""
-    free = {key: getattr(config, key) for key in (*MAY_CHANGE, "output", "evaluation")}
-    try:
-        made = from_values({**values, "device": config.device})
-    except ValueError as error:
-        raise UserError(f"{path}: made with a configuration that is none: {error}") from None
-    for key, (found, wanted) in _differences(replace(made, **free), config).items():
-        raise UserError(f"{path}: made with {key}={found}; the run has {key}={wanted}")

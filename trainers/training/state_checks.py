@@ -12,11 +12,11 @@ from emberlink.envs.utils.errors import UserError
 if TYPE_CHECKING:
     from .trainer import Trainer
 
-ARRIVAL = "_map._arrival"
+ARRIVAL = "_map._arrival_time"
 """the fire of each environment: infinite where it never burns, NaN in the margin"""
-_OF_EPISODE = ("_seed_stream", "_episode", "_stream", "_step_stream", "_map._growth_start")
+_OF_EPISODE = ("_seed_key", "_episode", "_episode_key", "_step_key", "_map._burning_start")
 """what is a function of the seeds and of the number of the episode"""
-_OF_MOMENT = {"step": "_time", "seen": "_seen", "stream": "_step_stream"}
+_OF_MOMENT = {"step": "_time", "seen": "_seen", "rng_key": "_step_key"}
 """what the carried moment repeats of the world"""
 
 

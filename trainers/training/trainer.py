@@ -21,9 +21,10 @@ from emberlink.trainers.learners.replay_buffer import TeamSampler, make_memory, 
 from emberlink.trainers.rollout.allocator import keep_freed_memory
 from emberlink.trainers.rollout.collectors import make_collector
 from emberlink.trainers.rollout.cuda_graphs import graphed
-from emberlink.trainers.runs import checkpoint_file, loggers
+from emberlink.trainers.runs import checkpoint_file
 from emberlink.trainers.runs.lock import Lock
 from emberlink.trainers.runs.run_folder import RunFolder
+from emberlink.trainers.runs.tracking import Trackers
 
 from . import divergence, rollback, state
 
@@ -259,7 +260,7 @@ class Trainer:
         """Trains to the end, until `stop`, or until a number is not finite."""
         # After a rollback, one that has failed is not tried again.
         configs = [replace(one, logger="none") if self._untracked else one for one in self.configs]
-        trackers = loggers.Trackers(configs, self.runs, episode=self.episode)
+        trackers = Trackers(configs, self.runs, episode=self.episode)
         try:
             self._loop(trackers, report)
             if self.saved != self.step:
@@ -274,7 +275,7 @@ class Trainer:
         if self.learner.watch.look(wait=wait):
             raise divergence.found(self)
 
-    def _loop(self, trackers: loggers.Trackers, report: Callable[[Progress], None]) -> None:
+    def _loop(self, trackers: Trackers, report: Callable[[Progress], None]) -> None:
         horizon = self.config.env.horizon
         progress = self._progress()
         self._began = time.monotonic()
@@ -318,7 +319,7 @@ class Trainer:
     def _sample_and_update(self) -> torch.Tensor:
         return torch.stack(self.learner.update(self.memory.sample()))
 
-    def _finish_episode(self, trackers: loggers.Trackers) -> list[dict[str, Any]]:
+    def _finish_episode(self, trackers: Trackers) -> list[dict[str, Any]]:
         """Measures an episode, evaluates where it is due, writes the lines."""
         config = self.config
         lines = self._measure(self.moments, self.losses)
@@ -326,19 +327,19 @@ class Trainer:
         interval = config.evaluation.interval
         if interval and self.episode % interval == 0:
             for team, line in enumerate(lines):
-                line |= self._evaluate(team)
+                line |= evaluate.validate(self.configs[team], self.team_actor(team))
         seconds = round(self.elapsed(), 3)
         for team, (line, run) in enumerate(zip(lines, self.runs, strict=True)):
             self._keep_best(team, line)
             run.append("metrics.jsonl", line)
             run.append("timing.jsonl", {"episode": self.episode, "seconds": seconds})
-        trackers.log(lines, step=self.episode)
+        trackers.log(lines, self.episode)
         return lines
 
     def _keep_best(self, team: int, line: dict[str, Any]) -> None:
         """Writes the networks whose coverage is the highest so far.
 
-        On held-out fires, where there are evaluations during training; else the episode's own.
+        On validation fires, where there are evaluations during training; else the episode's own.
         """
         frozen = [value for name, value in line.items() if name.endswith("/coverage")]
         if self.config.evaluation.interval and not frozen:
@@ -367,15 +368,3 @@ class Trainer:
             counted | {name: column[team] for name, column in values.items()}
             for team in range(self.teams)
         ]
-
-    def _evaluate(self, team: int) -> dict[str, float]:
-        """A seed's frozen policy on held-out fires: "fire/measure" -> mean."""
-        config = self.configs[team]
-        results = evaluate.evaluate(
-            config, self.team_actor(team), fires=config.evaluation.interval_episodes, scripted=False
-        )
-        return {
-            f"{fire}/{name}": value
-            for fire, by_policy in results.items()
-            for name, value in evaluate.means(by_policy[evaluate.LEARNED]).items()
-        }

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from emberlink.envs.world.sensor import View, view_radius
+from emberlink.envs.world.sensor import Sensor, view_radius
 
 
 @pytest.mark.parametrize(("altitude", "radius"), [(1, 0.57735), (2, 1.15470), (4, 2.30940)])
@@ -13,7 +13,7 @@ def test_view_radius(altitude, radius):
 
 
 def seen(position, grid=(30, 20), view_angle=30.0, ceiling=4.0) -> set[tuple[int, int]]:
-    view = View(grid, view_angle=view_angle, ceiling=ceiling)
+    view = Sensor(grid, view_angle=view_angle, ceiling=ceiling)
     names = torch.arange(grid[0] * grid[1]).view(grid)  # of the cells, -1 in the margin
     flat = view.pad(names, -1)
     assert flat.shape == (view.area,)
@@ -54,13 +54,13 @@ def test_view_can_be_empty_between_cells():
     assert seen([5.5, 7.5, 0.5]) == set()
 
 
-def test_tally():
-    view = View((30, 20), view_angle=30.0, ceiling=4.0)  # a window of 5 x 5 cells
+def test_count_classes():
+    view = Sensor((30, 20), view_angle=30.0, ceiling=4.0)  # a window of 5 x 5 cells
     classes = torch.zeros(2, 3, 5, 5, dtype=torch.bool)
     classes[0, 0, 0, 4] = classes[0, 0, 1, 4] = classes[0, 0, 4, 1] = True
     classes[1, 1] = True
     centre = torch.tensor([[10.0, 7], [0, 19]], dtype=torch.float64)
-    counts, means = view.tally(classes.flatten(-2), centre)
+    counts, means = view.count_classes(classes.flatten(-2), centre)
     assert counts.tolist() == [[3, 0, 0], [0, 25, 0]]
     # (8, 9), (9, 9) and (12, 6); then the whole window
     expected = torch.tensor([[[29 / 3, 8], [0, 0], [0, 0]], [[0, 0], [0, 19], [0, 0]]])
@@ -68,12 +68,12 @@ def test_tally():
 
 
 @pytest.mark.parametrize(("grid", "ceiling"), [((256, 256), 4.0), ((256, 200), 256.0)])
-def test_tally_is_exact_in_a_window_of_any_size(grid, ceiling):
-    view = View(grid, view_angle=80.0, ceiling=ceiling)
+def test_count_classes_is_exact_in_a_window_of_any_size(grid, ceiling):
+    view = Sensor(grid, view_angle=80.0, ceiling=ceiling)
     where = torch.tensor([[grid[0] - 1.0, 0, ceiling]], dtype=torch.float64)
     centre, cells, near = view.look(where, torch.tensor([0]))
     inside = view.pad(torch.ones(grid), 0.0)[cells] > 0
-    counts, means = view.tally((near & inside).unsqueeze(-2), centre)
+    counts, means = view.count_classes((near & inside).unsqueeze(-2), centre)
     reach = int(view_radius(ceiling, 80.0))
     columns, rows = (min(side, reach + 1) for side in grid)
     assert counts.item() == columns * rows

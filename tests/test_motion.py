@@ -12,15 +12,15 @@ HIGH = torch.tensor([29.0, 19, 4], dtype=torch.float64)
 
 
 def move(position, action, displacement=1.0):
-    where, beyond = motion.move(
+    where, hit_boundary = motion.move(
         torch.tensor(position), torch.tensor(action), displacement=displacement, low=LOW, high=HIGH
     )
     assert where.dtype == torch.float32
-    return where.tolist(), beyond.tolist()
+    return where.tolist(), hit_boundary.tolist()
 
 
 @pytest.mark.parametrize(
-    ("position", "action", "displacement", "expected", "beyond"),
+    ("position", "action", "displacement", "expected", "hit_boundary"),
     [
         ([3.0, 4, 2], [0.5, -0.25, 1], 1.0, [3.5, 3.75, 3], [False, False, False]),
         ([3.0, 4, 2], [0.5, -0.25, 1], 0.1, [3.05, 3.975, 2.1], [False, False, False]),
@@ -31,16 +31,16 @@ def move(position, action, displacement=1.0):
         ([29.0, 0, 4], [0.01, -0.01, 0.01], 1.0, [29, 0, 4], [True, True, True]),
     ],
 )
-def test_move(position, action, displacement, expected, beyond):
+def test_move(position, action, displacement, expected, hit_boundary):
     where, out = move(position, action, displacement)
     assert where == pytest.approx(expected)
-    assert out == beyond
+    assert out == hit_boundary
 
 
 def test_move_takes_any_batch():
     position = torch.rand(2, 3, 4, 3) + 2
-    where, beyond = motion.move(position, position, displacement=0.1, low=LOW, high=HIGH)
-    assert where.shape == beyond.shape == (2, 3, 4, 3)
+    where, hit_boundary = motion.move(position, position, displacement=0.1, low=LOW, high=HIGH)
+    assert where.shape == hit_boundary.shape == (2, 3, 4, 3)
 
 
 def test_distance():
@@ -83,6 +83,6 @@ def test_what_is_no_number_does_not_move_the_uav():
     position = torch.tensor([[5.0, 6.0, 2.0]])
     action = torch.tensor([[math.nan, math.inf, -math.inf]])
     low, high = torch.zeros(3).double(), torch.full((3,), 9.0).double()
-    moved, beyond = motion.move(position, action, displacement=1.5, low=low, high=high)
+    moved, hit_boundary = motion.move(position, action, displacement=1.5, low=low, high=high)
     assert moved.tolist() == [[5.0, 7.5, 0.5]]
-    assert not beyond.any()
+    assert not hit_boundary.any()

@@ -1,0 +1,109 @@
+"""Encoders: they turn the tensors of an observation into one vector of features."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from .layers import Generators, StackedConv2d
+
+CHANNELS = 16
+"""channels of the convolutions"""
+MAX_SIDE = 15
+"""cells along a side above which a window is averaged down before the convolutions"""
+
+
+class VectorEncoder(nn.Module):
+    """Takes the numbers of a vector as they are.
+
+    Args:
+        groups: groups of weights; a vector needs none.
+        shape: [features].
+    """
+
+    def __init__(self, groups: int, shape: Sequence[int], **_: Any):
+        super().__init__()
+        (self.features,) = shape
+
+    def forward(self, x: Tensor) -> Tensor:
+        """float32 [groups, rows, features] -> the same."""
+        return x
+
+
+class WindowEncoder(nn.Module):
+    """Applies two 3 x 3 convolutions, the second with stride 2, each followed by a ReLU.
+
+    Args:
+        groups: groups of weights.
+        shape: [channels, W, W] of the window.
+        device: of the weights.
+        generator: of the initial weights.
+    """
+
+    def __init__(
+        self,
+        groups: int,
+        shape: Sequence[int],
+        *,
+        device: torch.device | str | None = None,
+        generator: Generators = None,
+    ):
+        super().__init__()
+        channels, side, _ = shape
+        self.pool = -(-side // MAX_SIDE)
+        more = {"device": device, "generator": generator}
+        self.first = StackedConv2d(groups, channels, CHANNELS, **more)
+        self.second = StackedConv2d(groups, CHANNELS, CHANNELS, stride=2, **more)
+        pooled = -(-side // self.pool)
+        self.features = CHANNELS * ((pooled + 1) // 2) ** 2
+
+    def forward(self, x: Tensor) -> Tensor:
+        """bool or float [groups, rows, channels, W, W] -> float32 [groups, rows, features]."""
+        groups = len(x)
+        x = x.transpose(0, 1).flatten(1, 2).to(self.first.weight.dtype)
+        if self.pool > 1:
+            x = nn.functional.avg_pool2d(x, self.pool, ceil_mode=True)
+        x = self.second(self.first(x).relu()).relu()
+        return x.unflatten(1, (groups, -1)).transpose(0, 1).flatten(2)
+
+
+ENCODERS = {1: VectorEncoder, 3: WindowEncoder}
+"""the encoder of a tensor by its number of dimensions per UAV"""
+
+
+class ObservationEncoder(nn.Module):
+    """Encodes each tensor of an observation and concatenates the features.
+
+    Args:
+        groups: groups of weights.
+        shapes: per UAV, of each tensor: [features] or [channels, W, W].
+        device: of the weights.
+        generator: of the initial weights.
+
+    Raises:
+        ValueError: there is no encoder for a tensor of such a shape.
+    """
+
+    def __init__(
+        self,
+        groups: int,
+        shapes: Sequence[Sequence[int]],
+        *,
+        device: torch.device | str | None = None,
+        generator: Generators = None,
+    ):
+        super().__init__()
+        for shape in shapes:
+            if len(shape) not in ENCODERS:
+                raise ValueError(f"no encoder for an observation of shape {list(shape)} per UAV")
+        self.parts = nn.ModuleList(
+            ENCODERS[len(shape)](groups, shape, device=device, generator=generator)
+            for shape in shapes
+        )
+        self.features: int = sum(part.features for part in self.parts)  # pyright: ignore[reportArgumentType, reportCallIssue]
+
+    def forward(self, tensors: Sequence[Tensor]) -> Tensor:
+        """[groups, rows, *shape] of each tensor -> float32 [groups, rows, features]."""
+        features = [part(x) for part, x in zip(self.parts, tensors, strict=True)]
+        return features[0] if len(features) == 1 else torch.cat(features, -1)

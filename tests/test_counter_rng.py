@@ -1,0 +1,146 @@
+"""Random numbers from keys: distribution, independence, reproducibility."""
+
+import math
+
+import pytest
+import torch
+
+from emberlink.envs.utils import counter_rng
+from emberlink.envs.utils.counter_rng import Use
+
+COUNT = 20_000
+
+
+def test_uniform_looks_uniform():
+    draws = counter_rng.uniform(torch.tensor([1, -5, 2**60]), COUNT).double()
+    assert ((draws > 0) & (draws < 1)).all()
+    # Five standard errors of the mean, the variance and each of ten bins.
+    assert (draws.mean(-1) - 0.5).abs().max() < 5 * math.sqrt(1 / 12 / COUNT)
+    assert (draws.var(-1) - 1 / 12).abs().max() < 5 * math.sqrt(1 / 180 / COUNT)
+    bins = torch.stack([torch.histc(row, 10, 0, 1) for row in draws]) / COUNT
+    assert (bins - 0.1).abs().max() < 5 * math.sqrt(0.09 / COUNT)
+
+
+def test_normal_looks_normal():
+    draws = counter_rng.normal(torch.tensor([3, 4]), COUNT).double()
+    assert draws.isfinite().all()
+    assert draws.mean(-1).abs().max() < 5 / math.sqrt(COUNT)
+    assert (draws.var(-1) - 1).abs().max() < 5 * math.sqrt(2 / COUNT)
+    assert (draws.pow(4).mean(-1) - 3).abs().max() < 5 * math.sqrt(96 / COUNT)
+
+
+@pytest.mark.parametrize(("bits", "end"), [(0, 2.0**-24), (-1, 1 - 2.0**-24)])
+def test_the_ends_are_left_out(monkeypatch, bits, end):
+    monkeypatch.setattr(counter_rng, "fold_in", lambda key, count: torch.full_like(count, bits))
+    assert counter_rng.uniform(torch.tensor(0), 1).item() == end
+    assert counter_rng.normal(torch.tensor(0), 1).isfinite().all()
+
+
+def correlation(one: torch.Tensor, other: torch.Tensor) -> float:
+    return torch.corrcoef(torch.stack((one.flatten(), other.flatten())).double())[0, 1].item()
+
+
+@pytest.mark.parametrize("seed", [0, 1, 12345])
+def test_neighbours_are_unrelated(seed):
+    limit = 5 / math.sqrt(COUNT)
+    envs = counter_rng.uniform(counter_rng.seed_keys(seed, 3), COUNT)
+    assert abs(correlation(envs[0], envs[1])) < limit
+    assert abs(correlation(envs[0], envs[2])) < limit
+    # The same position over environments, over episodes, and over seeds.
+    column = counter_rng.uniform(counter_rng.seed_keys(seed, COUNT), 2)
+    assert abs(correlation(column[:, 0], column[:, 1])) < limit
+    assert abs(correlation(column[1:, 0], column[:-1, 0])) < limit
+    key = counter_rng.seed_keys(seed, 1)
+    episodes = counter_rng.uniform(counter_rng.fold_in(key, torch.arange(COUNT)), 1)
+    assert abs(correlation(episodes[1:], episodes[:-1])) < limit
+    others = counter_rng.uniform(counter_rng.seed_keys(seed + 1, 3), COUNT)
+    assert abs(correlation(envs[0], others[0])) < limit
+    assert abs(correlation(envs[1], others[0])) < limit  # nor shifted by one
+
+
+def test_keys_never_collide():
+    every = [counter_rng.seed_keys(seed, 1000) for seed in range(20)]
+    folds = [counter_rng.fold_in(every[0], counter) for counter in range(20)]
+    twice = [counter_rng.fold_in(folds[0], counter) for counter in range(3)]
+    together = torch.cat(every + folds + twice)
+    assert len(together.unique()) == len(together)
+
+
+def test_order_of_counters_matters():
+    key = torch.tensor([7])
+    one = counter_rng.fold_in(counter_rng.fold_in(key, 1), 2)
+    other = counter_rng.fold_in(counter_rng.fold_in(key, 2), 1)
+    assert one != other
+
+
+def test_a_draw_is_a_function_of_its_key():
+    key = counter_rng.seed_keys(9, 4)
+    torch.manual_seed(0)
+    first = counter_rng.uniform(key, 5)
+    torch.manual_seed(1)
+    assert torch.equal(counter_rng.uniform(key, 5), first)
+    assert torch.equal(counter_rng.uniform(key, 50)[:, :5], first)
+    assert torch.equal(counter_rng.uniform(key[2], 5), first[2])
+    assert torch.equal(counter_rng.uniform(key.view(2, 2), 5).view(4, 5), first)
+
+
+def test_key_i_depends_on_the_seed_and_i_alone():
+    assert torch.equal(counter_rng.seed_keys(3, 100)[:7], counter_rng.seed_keys(3, 7))
+    assert not torch.equal(counter_rng.seed_keys(4, 7), counter_rng.seed_keys(3, 7))
+
+
+def test_counters_may_be_integers_or_tensors():
+    key = torch.tensor([1, 2, 3])
+    counters = torch.tensor([0, 5, -1])
+    folded = counter_rng.fold_in(key, counters)
+    each = [counter_rng.fold_in(key[i], int(c)) for i, c in enumerate(counters)]
+    assert folded.tolist() == [int(f) for f in each]
+
+
+def test_the_numbers_themselves():
+    """SplitMix64 in Python's unbounded integers."""
+
+    def mix(x: int) -> int:
+        x = (x ^ x >> 30) * 0xBF58476D1CE4E5B9 % 2**64
+        x = (x ^ x >> 27) * 0x94D049BB133111EB % 2**64
+        return x ^ x >> 31
+
+    golden = 0x9E3779B97F4A7C15
+    for key, counter in [(0, 0), (1, 2), (-3, 4), (2**62, 2**40)]:
+        expected = mix((mix((key + golden) % 2**64) + (counter + 1) * golden) % 2**64)
+        got = counter_rng.fold_in(torch.tensor(key), counter).item()
+        assert got % 2**64 == expected
+
+
+@pytest.mark.parametrize("limit", [1, 2, 6, 1000, 166_667, 2**31])
+def test_integers_are_uniform_below_their_limit(limit):
+    drawn = counter_rng.integers(counter_rng.seed_keys(0, 4), 25_000, limit)
+    assert drawn.shape == (4, 25_000)
+    assert 0 <= drawn.min() <= drawn.max() < limit
+    assert drawn.equal(
+        counter_rng.integers(counter_rng.seed_keys(0, 4), 25_000, torch.tensor(limit))
+    )
+    unit = (drawn.double() + 0.5) / limit
+    assert abs(unit.mean().item() - 0.5) < 0.004
+    if 1 < limit <= 6:
+        counts = drawn.flatten().bincount(minlength=limit)
+        assert (counts / 100_000 - 1 / limit).abs().max() < 0.006
+    if limit >= 1000:
+        assert abs(unit.std().item() - 12**-0.5) < 0.003
+
+
+def test_uses_have_the_numbers_that_results_were_made_with():
+    assert {use.name: use.value for use in Use} == {
+        "START_POSITION": 0,
+        "EPISODE_FIRE": 1,
+        "STEPS": 2,
+        "WAYPOINT": 100,
+        "TARGET_JITTER": 101,
+        "MESSAGE_LOSS": 102,
+        "SCRIPTED_WAYPOINT": 200,
+        "SCRIPTED_ACTION": 201,
+        "EXPLORATION_NOISE": 300,
+        "FIRE_PARAMETER": 0xF12E,
+        "REPLAY_SAMPLE": 2**40,
+        "TARGET_NOISE": 2**40 + 1,
+    }

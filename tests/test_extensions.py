@@ -1,0 +1,186 @@
+"""Methods, setups and fires of a user's own package or folder, beside the installed ones."""
+
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+from importlib import metadata
+from pathlib import Path
+
+import pytest
+import yaml
+from tiny_run import PROGRAM, TINY
+
+from emberlink import configs
+from emberlink.comm import registry
+from emberlink.comm.consensus import Consensus
+from emberlink.envs.fire.generator import load_scenario, scenarios
+from emberlink.envs.utils.errors import UserError
+from emberlink.trainers.cli import main
+from emberlink.trainers.config.compose import resolve
+
+ROOT = Path(__file__).parents[1]
+PAGE = (ROOT / "docs" / "extensions.md").read_text()
+MODULE, METHOD, PROJECT, SMALL = re.findall(r"```\w+\n(.*?)```", PAGE, re.DOTALL)
+SETUP = """# @package _global_
+defaults:
+  - paper
+  - override /fire: faint
+env:
+  horizon: 15
+"""
+
+
+def write(folder: Path, files: dict[str, str]) -> Path:
+    for name, text in files.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text(text)
+    return folder
+
+
+def faint_fire() -> str:
+    text = (configs.find("fire", "paper")).read_text()
+    return text.replace("name: paper", "name: faint")
+
+
+def yaml_files() -> dict[str, str]:
+    return {
+        "method/headcount.yaml": METHOD,
+        "setup/small.yaml": SETUP,
+        "fire/faint.yaml": faint_fire(),
+        "setup_method/small_headcount.yaml": "# @package _global_\ncomm:\n  scale: 0.5\n",
+    }
+
+
+def test_an_installed_package_adds_a_method_a_setup_and_a_fire(tmp_path):
+    files = {f"headcount/configs/{name}": text for name, text in yaml_files().items()}
+    files |= {"pyproject.toml": PROJECT, "headcount/module.py": MODULE}
+    files |= {"headcount/__init__.py": "", "headcount/configs/__init__.py": ""}
+    project, target = write(tmp_path / "project", files), tmp_path / "target"
+    pip = [sys.executable, "-m", "pip", "install", "-q", "--no-deps", "--no-index"]
+    pip += ["--no-build-isolation", "--target", str(target), str(project)]
+    subprocess.run(pip, check=True, cwd=tmp_path, capture_output=True)
+    here = {path: path.stat().st_mtime_ns for path in (ROOT / "comm").iterdir()}
+
+    path = os.pathsep.join([str(target), *os.environ.get("PYTHONPATH", "").split(os.pathsep)])
+    arguments = ["train", "headcount", "setup=small", *TINY, "output=runs"]
+    done = subprocess.run(
+        [sys.executable, "-c", PROGRAM, *arguments],
+        env={**os.environ, "PYTHONPATH": path.rstrip(os.pathsep)},
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    (run,) = (tmp_path / "runs").iterdir()
+    written = yaml.safe_load((run / "config.yaml").read_text())
+    assert written["comm"] == {"name": "headcount", "scale": 0.5}
+    assert (written["setup"], written["fire"]["name"]) == ("small", "faint")
+    assert len((run / "metrics.jsonl").read_text().splitlines()) == 2
+    assert {"huygens", "faint"} == set(yaml.safe_load((run / "eval.json").read_text())["results"])
+    assert here == {path: path.stat().st_mtime_ns for path in (ROOT / "comm").iterdir()}
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch) -> Path:
+    """A folder of YAML files that EMBERLINK_CONFIGS names after one that does not exist."""
+    folder = write(tmp_path / "a user's folder", yaml_files())
+    text = METHOD.replace("headcount", "no_comm").replace("  scale: 0.1\n", "")
+    write(folder, {"method/alone.yaml": text})
+    both = os.pathsep.join([str(tmp_path / "nowhere"), str(folder)])
+    monkeypatch.setenv("EMBERLINK_CONFIGS", both)
+    return folder
+
+
+def test_a_folder_adds_a_method_a_setup_and_a_fire(folder):
+    assert {"alone", "headcount"} < set(configs.known("method"))
+    assert configs.find("setup", "small") == folder / "setup" / "small.yaml"
+    config = resolve("alone", ["setup=small", "env.num_uavs=3"])
+    assert (config.env.horizon, config.env.num_uavs, config.fire.name) == (15, 3, "faint")
+    assert config.learner == resolve("shared_memory").learner
+    assert resolve("consensus", ["setup=small"]).env.horizon == 15
+    write(folder, {"setup/page.yaml": SMALL})
+    config = resolve("consensus", ["setup=page"])
+    assert (config.env.num_uavs, config.fire.name) == (3, "oil_slick")
+    assert config.env.reward == resolve("consensus", ["setup=tuned"]).env.reward
+    assert "faint" in scenarios()
+    assert load_scenario("faint").head_ros == load_scenario("paper").head_ros
+    with pytest.raises(UserError, match=r"comm.name='headcount' is not known; known: consensus"):
+        resolve("headcount")
+
+
+def test_a_file_of_a_name_that_is_taken_is_an_error(folder):
+    write(folder, {"setup/paper.yaml": SETUP})
+    with pytest.raises(UserError, match=r"setup 'paper' is in several folders: .*folder/setup"):
+        resolve("consensus")
+    write(folder, {"setup_method/tuned_independent.yaml": SETUP})
+    with pytest.raises(UserError, match="'tuned_independent' is in several folders"):
+        resolve("independent", ["setup=tuned"])
+    assert resolve("positional", ["setup=tuned"]).setup == "tuned"
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("replay: shared\n", r"mine.yaml must begin with '# @package _global_'"),
+        ("# @package _global_\na: [\n", r"mine.yaml"),
+        ("# @package _global_\nreplay: shared\nreplai: shared\n", "'replai' is not known"),
+        ("# @package _global_\nreplay: shared\ncomm:\n  name: no_comm\n  x: 1\n", "comm.x is not"),
+    ],
+)
+def test_a_users_file_with_a_mistake(text, message, folder):
+    write(folder, {"method/mine.yaml": text})
+    with pytest.raises(UserError, match=message) as error:
+        resolve("mine")
+    assert "\n" not in str(error.value)
+    assert resolve("consensus").method == "consensus"
+
+
+def entry_point(monkeypatch, group: str, name: str, value: str) -> None:
+    point = metadata.EntryPoint(name, value, group)
+    monkeypatch.setattr(
+        "emberlink.envs.utils.plugins.entry_points",
+        lambda *, group: [point] if point.group == group else [],
+    )
+
+
+def test_an_entry_point_that_does_not_fit_names_itself(monkeypatch):
+    for value, message in (
+        ("nowhere:Module", "cannot be imported: No module named 'nowhere'"),
+        ("emberlink.comm.consensus:Nothing", "cannot be imported"),
+        ("emberlink.comm.consensus:ConsensusConfig", "not a subclass of CommModule"),
+    ):
+        entry_point(monkeypatch, "emberlink.comm", "other", value)
+        with pytest.raises(UserError, match=f"entry point 'other' of emberlink.comm.*{message}"):
+            registry.find("other")
+    entry_point(monkeypatch, "emberlink.comm", "no_comm", "emberlink.comm.consensus:Consensus")
+    with pytest.raises(UserError, match="no_comm: also an entry point"):
+        registry.find("no_comm")
+    entry_point(monkeypatch, "emberlink.comm", "other", "emberlink.comm.consensus:Consensus")
+    assert registry.find("other") is Consensus
+    for value in ("nowhere.configs", "json.decoder"):
+        entry_point(monkeypatch, "emberlink.configs", "other", value)
+        with pytest.raises(UserError, match=f"'other' of emberlink.configs: no package {value}"):
+            configs.known("method")
+
+
+def test_a_run_folder_suffices_where_its_yaml_files_are_gone(folder, tmp_path, monkeypatch):
+    write(
+        folder, {"setup_method/small_consensus.yaml": "# @package _global_\ncomm:\n  range: 4.0\n"}
+    )
+    arguments = ["train", "alone", "setup=small", *TINY, f"output={tmp_path / 'runs'}"]
+    assert main.main(arguments) == 0
+    (run,) = (tmp_path / "runs").iterdir()
+    before = json.loads((run / "eval.json").read_text())
+    assert before["communication"]["follow_target"]["range"] == 4.0
+    shutil.rmtree(folder)
+    monkeypatch.delenv("EMBERLINK_CONFIGS")
+    monkeypatch.setenv("EMBERLINK_CACHE", str(tmp_path / "cache"))
+    assert "alone" not in configs.known("method")
+    assert main.main(["eval", str(run)]) == 0
+    assert json.loads((run / "eval.json").read_text()) == before
+    assert main.main(["train", f"resume={run}", "episodes=3"]) == 0
+    assert len((run / "metrics.jsonl").read_text().splitlines()) == 3

@@ -1,0 +1,235 @@
+"""What Python offers: as the commands do, but nothing is printed and the process goes on."""
+
+import json
+import re
+import threading
+from pathlib import Path
+
+import hydra
+import pytest
+import torch
+from hydra.core.global_hydra import GlobalHydra
+from tensordict.nn import TensorDictModule
+
+import emberlink.trainers as trainers
+from emberlink.envs import keys, metrics
+from emberlink.envs.utils.errors import UserError
+from emberlink.policies.scripted.registry import SCRIPTED
+from emberlink.trainers.runs.run_folder import RunFolder
+
+ROOT = Path(__file__).parents[1]
+SHORT = {
+    "episodes": 2,
+    "horizon": 15,
+    "num_uavs": 2,
+    "num_envs": 2,
+    "hidden": [8, 8],
+    "batch_size": 8,
+    "evaluation.episodes": 2,
+    "evaluation.interval": 0,
+}
+
+
+@pytest.fixture(autouse=True)
+def _silent(capfd):
+    """Checks that a test prints nothing, neither does what it calls."""
+    yield
+    assert capfd.readouterr().out == ""
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """A run that `train` leaves, called in a thread, and its progress."""
+    output, steps, runs = tmp_path_factory.mktemp("runs"), [], []
+
+    def work():
+        runs.append(
+            trainers.train(
+                "consensus",
+                setup="tuned",
+                fire="paper",
+                progress=lambda now: steps.append(now.step),
+                output=str(output),
+                **SHORT,
+            )
+        )
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    thread.join()
+    assert steps == list(range(1, 31))
+    return runs[0]
+
+
+def test_every_public_name_is_there_and_documented():
+    for name in trainers.__all__:
+        assert getattr(trainers, name).__doc__, name
+    with pytest.raises(AttributeError, match="nothing"):
+        trainers.nothing  # noqa: B018
+
+
+def test_train_leaves_the_folder_of_the_command(trained):
+    assert trained.config.setup == "tuned"
+    assert trained.config.fire.name == "paper"
+    assert RunFolder(trained.path).config() == trained.config
+    assert len(RunFolder(trained.path).lines()) == 2
+    written = json.loads((trained.path / "eval.json").read_text())
+    assert written["results"] == trained.results
+    assert list(trained.results) == ["huygens", "paper"]
+    for by_policy in trained.results.values():
+        assert list(by_policy) == ["learned", *SCRIPTED]
+        for measured in by_policy.values():
+            assert list(measured) == list(metrics.NAMES)
+            assert {len(values) for values in measured.values()} == {2}
+    # The folder is given up: the command could resume it.
+    assert trainers.train is trainers.train
+    assert not list(trained.path.glob("*.part"))
+
+
+def test_train_seeds_and_without_an_evaluation(tmp_path):
+    runs = trainers.train(
+        "independent", seeds=[3, 4], evaluate_after=False, output=str(tmp_path), **SHORT
+    )
+    assert [run.config.seed for run in runs] == [3, 4]
+    assert [run.results for run in runs] == [{}, {}]
+    assert not any((run.path / "eval.json").exists() for run in runs)
+
+
+def test_an_exception_in_the_progress_ends_the_training(tmp_path):
+    class Enough(Exception):
+        pass
+
+    def stop(progress):
+        raise Enough
+
+    with pytest.raises(Enough):
+        trainers.train("independent", progress=stop, output=str(tmp_path), **SHORT)
+    (folder,) = tmp_path.iterdir()
+    assert RunFolder(folder).networks() == []
+
+
+def test_evaluate_is_the_evaluation_of_the_training(trained):
+    before = sorted(trained.path.rglob("*"))
+    played = []
+    results = trainers.evaluate(trained.path, progress=lambda *now: played.append(now))
+    assert results == trained.results
+    assert ("paper", "learned") in played
+    alone = trainers.evaluate(str(trained.path), episodes=1, scripted=False, device="cpu")
+    assert alone["huygens"].keys() == {"learned"}
+    assert alone["huygens"]["learned"]["coverage"] == results["huygens"]["learned"]["coverage"][:1]
+    deaf = trainers.evaluate(trained.path, scripted=False, **{"comm.loss": 1.0})
+    assert deaf.keys() == results.keys()
+    assert sorted(trained.path.rglob("*")) == before
+
+
+def test_load_gives_the_trained_policy_and_its_environment(trained):
+    policy = trainers.load(trained.path)
+    assert isinstance(policy, TensorDictModule)
+    assert policy.in_keys == [keys.OBSERVATION]
+    assert policy.out_keys == [keys.ACTION]
+    assert policy.checkpoint == RunFolder(trained.path).checkpoint()
+    assert not any(weight.requires_grad for weight in policy.parameters())
+    env = trainers.make_env(policy.config, num_envs=3, seed=1)
+    rollout = env.rollout(5, policy)
+    assert rollout[keys.ACTION].shape == (3, 5, 2, 3)
+    assert rollout[keys.ACTION].abs().max() > 0
+    again = trainers.load(trained.path, checkpoint=policy.checkpoint)
+    assert again(rollout[:, 0].clone())[keys.ACTION].equal(rollout[:, 0][keys.ACTION])
+    larger = trainers.make_env(policy.config, grid=[40, 20], fire="huygens")
+    assert larger.rollout(1, policy)[keys.ACTION].shape == (1, 1, 2, 3)
+
+
+def test_load_a_policy_that_comes_with_emberlink(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    policy = trainers.load("pretrained:consensus")
+    assert (policy.config.method, policy.config.setup) == ("consensus", "tuned")
+    env = trainers.make_env(policy.config, num_envs=2)
+    assert env.rollout(3, policy)[keys.ACTION].shape == (2, 3, 6, 3)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_compare_gives_the_numbers(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    found = trainers.compare(["pretrained:tuned"])
+    (section,) = found.sections
+    assert list(section.fires) == ["huygens"]
+    coverage = next(r for r in section.fires["huygens"] if r.measure == "coverage")
+    assert coverage.rows[0].method == "consensus"
+    assert coverage.rows[0].iqm > 90
+    assert coverage.scripted["oracle"][0].value > coverage.rows[-1].iqm
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_compare_writes_the_report_of_the_command(trained, tmp_path):
+    found = trainers.compare([trained.path], output=tmp_path / "report")
+    assert (tmp_path / "report" / "compare.html").exists()
+    assert json.loads((tmp_path / "report" / "compare.json").read_text())["notes"] == list(
+        found.notes
+    )
+    with pytest.raises(UserError, match="not an empty folder"):
+        trainers.compare([trained.path], output=tmp_path / "report")
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda run: trainers.train("consensu"), "did you mean consensus"),
+        (lambda run: trainers.train("consensus", setup="papr"), "did you mean paper"),
+        (lambda run: trainers.train("consensus", fire="papr"), "did you mean paper"),
+        (lambda run: trainers.train("consensus", horizn=3), "'horizn' is not known"),
+        (lambda run: trainers.train("consensus", seeds=[1, 1]), "each seed at most once"),
+        (lambda run: trainers.train("consensus", device="cuda:99"), "device=cuda:99"),
+        (lambda run: trainers.evaluate("nowhere"), "there is no such run folder"),
+        (lambda run: trainers.evaluate(run, episodes=0), "episodes=0"),
+        (lambda run: trainers.evaluate(run, gamma=0.5), "gamma: only keys of env and comm"),
+        (lambda run: trainers.evaluate(run, num_uavs=3), "this configuration"),
+        (lambda run: trainers.load("pretrained:nothing"), "there are "),
+        (lambda run: trainers.load("pretrained:tuned"), "one is needed"),
+        (lambda run: trainers.load(run, checkpoint="nowhere.safetensors"), "nowhere.safetensors"),
+        (lambda run: trainers.compare(["nowhere"]), "there is no such run folder"),
+        (lambda run: trainers.make_env(None), "expected a method and a setup, or a RunConfig"),
+        (lambda run: trainers.make_env("consensus", seeds=[1]), "an environment takes seed="),
+    ],
+)
+def test_errors_are_those_of_the_commands(call, message, trained, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(UserError, match=message) as error:
+        call(trained.path)
+    assert "\n" not in str(error.value)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_program_that_has_initialised_hydra_keeps_it(tmp_path):
+    (tmp_path / "mine.yaml").write_text("answer: 42\n")
+    with hydra.initialize_config_dir(str(tmp_path), version_base="1.2"):
+        mine = GlobalHydra.instance().hydra
+        env = trainers.make_env("consensus", "tuned", horizon=3)
+        assert env.rollout(2).shape == (1, 2)
+        assert GlobalHydra.instance().hydra is mine
+        assert hydra.compose("mine").answer == 42
+    assert not GlobalHydra.instance().is_initialized()
+
+
+def test_configurations_are_resolved_in_several_threads():
+    found = {}
+
+    def work(method, setup):
+        found[method, setup] = trainers.resolve(method, [f"setup={setup}"])
+
+    pairs = [(m, s) for m in ("independent", "consensus") for s in ("paper", "released", "tuned")]
+    threads = [threading.Thread(target=work, args=pair) for pair in pairs]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert found == {(m, s): trainers.resolve(m, [f"setup={s}"]) for m, s in pairs}
+
+
+def test_the_examples_of_the_page_run(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    page = (ROOT / "docs" / "python.md").read_text()
+    names = {}
+    for block in re.findall(r"```python\n(.*?)```", page, re.DOTALL):
+        exec(block, names)  # the page's own text
+    assert names["run"].path.is_dir()
+    assert torch.is_tensor(names["reward"])

@@ -1,0 +1,139 @@
+"""What was changed on disk is noticed: cached files, and config.yaml beside its networks."""
+
+import re
+
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+from tiny_run import TINY
+
+from emberlink.envs import metrics
+from emberlink.envs.fire.cache import fire_bank
+from emberlink.envs.fire.generator import load_scenario
+from emberlink.envs.utils.atomic_io import read_sealed, write_sealed
+from emberlink.trainers.cli import main
+from emberlink.trainers.config.compose import resolve
+from emberlink.trainers.evaluation.baseline_cache import ScriptedResults
+from emberlink.trainers.runs.run_folder import RunFolder
+from emberlink.trainers.runs.seal import check_trained_with
+
+FREE = re.compile(
+    r"(evaluation\.|(episodes|output|device|logger|checkpoint_interval|checkpoint_steps|keep)$)"
+)
+"""keys that change nothing of what is learnt or of the world"""
+
+
+def flips(content: bytes):
+    """The content with each of its bits changed, one at a time."""
+    for place in range(len(content)):
+        for bit in range(8):
+            yield content[:place] + bytes([content[place] ^ 1 << bit]) + content[place + 1 :]
+
+
+def test_every_bit_of_a_cached_file_is_sealed(tmp_path):
+    path = tmp_path / "one"
+    write_sealed(path, b"some content")
+    whole = path.read_bytes()
+    assert read_sealed(path, 100) == b"some content"
+    for changed in (*flips(whole), *(whole[:length] for length in range(len(whole))), whole + b"x"):
+        path.write_bytes(changed)
+        assert read_sealed(path, 100) is None
+
+
+def test_a_cached_bank_with_a_changed_bit_is_made_anew(tmp_path):
+    arguments = load_scenario("paper"), "train", 1, (9, 9), 5
+    right = fire_bank(*arguments, cache_dir=tmp_path)
+    (file,) = tmp_path.iterdir()
+    whole = file.read_bytes()
+    for changed in list(flips(whole))[::61]:
+        file.write_bytes(changed)
+        assert torch.equal(fire_bank(*arguments, cache_dir=tmp_path), right)
+        assert file.read_bytes() == whole
+
+
+def test_cached_results_with_a_changed_bit_are_not_read(tmp_path, monkeypatch):
+    monkeypatch.setenv("EMBERLINK_CACHE", str(tmp_path))
+    results = ScriptedResults("oracle", resolve("independent", TINY), torch.ones(2, 9, 9), {})
+    measured = {name: [1.5, 2.25] for name in metrics.NAMES}
+    results.write(measured)
+    assert results.read() == measured
+    (file,) = tmp_path.iterdir()
+    for changed in flips(file.read_bytes()):
+        file.write_bytes(changed)
+        assert results.read() is None
+
+
+def keys_of(text: str) -> list[str]:
+    """The dotted key that each line of a YAML file belongs to."""
+    found, path = [], []
+    for line in text.splitlines():
+        key = re.match(r"( *)(\w+):", line)
+        if key:
+            path = [*path[: len(key[1]) // 2], key[2]]
+        found.append(".".join(path))
+    return found
+
+
+def test_every_digit_of_a_configuration(run):
+    """It is wrong, differs from the networks' or changes nothing of what was learnt."""
+    folder, file = RunFolder(run), run / "config.yaml"
+    text, checkpoint, refused, free = file.read_text(), RunFolder(run).checkpoint(), 0, 0
+    check_trained_with(checkpoint, folder.config())
+    keys = keys_of(text)
+    for digit in re.finditer(r"\d", text):
+        key = keys[text.count("\n", 0, digit.start())]
+        other = (int(digit[0]) + 1) % 10
+        file.write_text(f"{text[: digit.start()]}{other}{text[digit.end() :]}")
+        try:
+            check_trained_with(checkpoint, folder.config())
+        except ValueError as error:
+            refused += "\n" not in str(error)
+        else:
+            free += FREE.match(key) is not None
+    assert refused + free == len(re.findall(r"\d", text))
+    assert refused > 50
+    assert free > 5
+
+
+@pytest.mark.parametrize("command", ["eval", "render", "compare", "train"])
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("view_angle: 30.0", "view_angle: 31.0", "env.view_angle=30.0"),
+        ("range: 10.0", "range: 70.0", "comm.range=10.0"),
+        ("tau: 0.001", "tau: 0.002", "learner.tau=0.001"),
+    ],
+)
+def test_a_changed_configuration_is_refused(command, old, new, said, run, tmp_path, capsys):
+    file = run / "config.yaml"
+    assert old in file.read_text(), file.read_text()
+    file.write_text(file.read_text().replace(old, new))
+    before = {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
+    more = {
+        "eval": [str(run), "--fires", "1"],
+        "render": [str(run), "--output", str(tmp_path / "a.gif")],
+        "compare": [str(run), "--output", str(tmp_path / "out")],
+        "train": [f"resume={run}", "episodes=3"],
+    }
+    capsys.readouterr()
+    assert main.main([command, *more[command]]) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    key, value = said.split("=")
+    assert f"made with {said}; the run has {key}={new.split(': ')[1]}: put {value} back" in error
+    assert ("another world is played with: emberlink eval RUN" in error) == (key[0] != "l")
+    assert {path: path.read_bytes() for path in run.rglob("*") if path.is_file()} == before
+
+
+def test_another_world_is_said_on_the_command_line(run, capsys):
+    before = (run / "eval.json").read_bytes()
+    assert main.main(["eval", str(run), "env.view_angle=31.0", "--fires", "1"]) == 0
+    assert (run / "eval.json").read_bytes() == before
+    assert (run / "eval_env.view_angle=31.0.json").is_file()
+
+
+def test_networks_without_a_configuration_are_refused(run, capsys):
+    path = RunFolder(run).checkpoint()
+    save_file(load_file(path), path)
+    assert main.main(["eval", str(run)]) == 2
+    assert "does not hold the configuration that it was trained with" in capsys.readouterr().err

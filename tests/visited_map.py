@@ -1,0 +1,50 @@
+"""A communication method with a large state, for tests: the cells that a UAV knows as visited."""
+
+from typing import ClassVar
+
+import torch
+from pydantic import ConfigDict
+from pydantic.dataclasses import dataclass
+from torchrl.data import Unbounded
+
+from emberlink.comm._radio import RadioConfig
+from emberlink.comm.base import CommModule
+from emberlink.envs import keys
+
+
+@dataclass(frozen=True, kw_only=True, config=ConfigDict(extra="forbid", strict=True))
+class VisitedMapConfig(RadioConfig):
+    """The radio's settings."""
+
+
+class VisitedMap(CommModule):
+    """Each UAV marks its cell, joins the maps of those it hears, and observes its map's size."""
+
+    config_type: ClassVar[type] = VisitedMapConfig
+    in_keys: ClassVar = [keys.OBSERVATION, keys.POSITION, keys.HEARS]
+    out_keys: ClassVar = [keys.OBSERVATION]
+
+    def __init__(self, world, config, num_envs=1):
+        super().__init__(world, config, num_envs)
+        self.register_buffer("map", torch.zeros(num_envs, world.num_uavs, *world.grid))
+
+    def specs(self, observation):
+        *batch, features = observation[keys.OBSERVATION].shape
+        observation[keys.OBSERVATION] = Unbounded((*batch, features + 1), device=observation.device)
+        return observation
+
+    def reset(self, tensordict, mask):
+        self.map.masked_fill_(mask[:, None, None, None], 0)
+
+    def forward(self, tensordict):
+        cell = tensordict[keys.POSITION][..., :2].round().long()
+        index = (cell[..., 0] * self.world.grid[1] + cell[..., 1]).unsqueeze(-1)
+        self.map.flatten(2).scatter_(2, index, 1.0)
+        heard = tensordict[keys.HEARS][..., None, None] * self.map.unsqueeze(1)
+        self.map.copy_(torch.maximum(self.map, heard.amax(2)))
+        own = tensordict[keys.OBSERVATION]
+        size = self.map.sum((-1, -2)).unsqueeze(-1)
+        return tensordict.set(keys.OBSERVATION, torch.cat((own, size), -1))
+
+    def shaping(self, tensordict):
+        return 0.01 * self.map.sum((-1, -2))

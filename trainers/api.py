@@ -1,0 +1,236 @@
+"""Trains, evaluates, loads and compares from Python. Nothing is printed."""
+
+import logging
+import os
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, overload
+
+from tensordict.nn import TensorDictModule, TensorDictSequential
+
+from emberlink.envs.utils.errors import UserError
+from emberlink.trainers.comparison.report import (
+    Comparison,
+    compare_runs,
+    free_folder,
+    write_report,
+)
+from emberlink.trainers.config.compose import override, resolve
+from emberlink.trainers.config.schema import RunConfig
+from emberlink.trainers.evaluation.actor import load_actor
+from emberlink.trainers.evaluation.evaluate import evaluate as evaluate_policy
+from emberlink.trainers.evaluation.report import evaluate_run
+from emberlink.trainers.evaluation.results import Results
+from emberlink.trainers.runs import pretrained
+from emberlink.trainers.runs.run_folder import RunFolder
+from emberlink.trainers.training.trainer import Progress, Trainer
+
+Reference = str | os.PathLike[str]
+"""a run folder, or a trained policy that comes with emberlink: `pretrained:METHOD`,
+`pretrained:SETUP/METHOD` or `pretrained:SETUP/METHOD/SEED`"""
+
+
+@dataclass(frozen=True)
+class Run:
+    """A finished training."""
+
+    path: Path
+    """the run folder"""
+    config: RunConfig
+    """all settings"""
+    results: Results
+    """fire -> policy ("learned", or a scripted one) -> measure -> a number per episode; empty if
+    the run was not evaluated"""
+
+
+class TrainedPolicy(TensorDictSequential):
+    """The frozen policy of a run: reads the agents' observations, writes ("agents", "action").
+
+    Its environment is `make_env(policy.config)`.
+
+    Args:
+        actor: the networks.
+        config: of the run.
+        checkpoint: the file that the networks were read from.
+    """
+
+    def __init__(self, actor: TensorDictModule, config: RunConfig, checkpoint: Path):
+        super().__init__(actor)
+        self.config = config
+        self.checkpoint = checkpoint
+
+
+@overload
+def train(
+    method: str,
+    *,
+    setup: str = ...,
+    fire: str | None = ...,
+    seeds: None = ...,
+    progress: Callable[[Progress], None] | None = ...,
+    evaluate_after: bool = ...,
+    **settings: Any,
+) -> Run: ...
+@overload
+def train(
+    method: str,
+    *,
+    setup: str = ...,
+    fire: str | None = ...,
+    seeds: Sequence[int],
+    progress: Callable[[Progress], None] | None = ...,
+    evaluate_after: bool = ...,
+    **settings: Any,
+) -> list[Run]: ...
+def train(
+    method: str,
+    *,
+    setup: str = "paper",
+    fire: str | None = None,
+    seeds: Sequence[int] | None = None,
+    progress: Callable[[Progress], None] | None = None,
+    evaluate_after: bool = True,
+    **settings: Any,
+) -> Run | list[Run]:
+    """Trains a method, evaluates its frozen policy, and leaves a run folder as the command does.
+
+    Args:
+        method: independent, shared_memory, positional, consensus, or one of yours.
+        setup: paper, released, tuned, or one of yours.
+        fire: a scenario; the setup's if None.
+        seeds: seeds to train side by side, a run folder each, in place of `seed=`.
+        progress: called after each step of the environments; an exception in it ends the training.
+        evaluate_after: evaluates at the end, which leaves eval.json, figures and an animation.
+        settings: any other setting, by the last part of its key (`episodes=5`, `horizon=50`) or by
+            all of it (`**{"learner.gamma": 0.9}`); `output="runs"` holds the run folders.
+
+    Returns:
+        The run; with `seeds`, the run of each seed in their order.
+
+    Raises:
+        UserError: an unknown name or setting, a value out of range, or a file that cannot be
+            written.
+        Divergence: a number was not finite, and `on_nan` is not rollback or did not help.
+    """
+    chosen = [f"setup={setup}", *([] if fire is None else [f"fire={fire}"])]
+    several = {} if seeds is None else {"seeds": list(seeds)}
+    trainer = Trainer(resolve(method, chosen, **settings, **several))
+    with _quiet():
+        trainer.start()
+        try:
+            trainer.train(progress or (lambda _: None), hold=True)
+            runs = [_finished(trainer, team, evaluate_after) for team in range(trainer.teams)]
+        finally:
+            trainer.close()
+    return runs[0] if seeds is None else runs
+
+
+def evaluate(
+    run: Reference,
+    *,
+    episodes: int | None = None,
+    scripted: bool = True,
+    checkpoint: Reference | None = None,
+    device: str | None = None,
+    progress: Callable[[str, str], None] | None = None,
+    **settings: Any,
+) -> Results:
+    """Evaluates the frozen policy of a run on test fires; no file is written.
+
+    Args:
+        run: a run folder, or `pretrained:METHOD`.
+        episodes: one on each of as many fires; the run's `evaluation.episodes` if None.
+        scripted: whether the scripted policies are evaluated too.
+        checkpoint: a file of networks; the newest of the run if None.
+        device: where the episodes are played; the run's if None.
+        progress: called with the fire and the policy before each is played.
+        settings: of `env` or `comm`, in place of the run's, as for `train`; networks must fit.
+
+    Returns:
+        fire -> policy ("learned", or a scripted one) -> measure -> a number per episode.
+
+    Raises:
+        UserError: there is no such run, a file in it is damaged, or a setting does not fit.
+    """
+    policy = load(run, checkpoint=checkpoint, device=device, **settings)
+    count = policy.config.evaluation.episodes if episodes is None else episodes
+    if count < 1:
+        raise UserError(f"episodes={count}: expected at least 1")
+    return evaluate_policy(policy.config, policy, fires=count, scripted=scripted, report=progress)
+
+
+def load(
+    run: Reference,
+    *,
+    checkpoint: Reference | None = None,
+    device: str | None = None,
+    **settings: Any,
+) -> TrainedPolicy:
+    """Returns the frozen policy of a run.
+
+    Args:
+        run: a run folder, or `pretrained:METHOD`.
+        checkpoint: a file of networks; the newest of the run if None.
+        device: where the networks live; the run's if None.
+        settings: of `env` or `comm`, in place of the run's, as for `train`; networks must fit.
+
+    Raises:
+        UserError: there is no such run, a file in it is damaged, or a setting does not fit.
+    """
+    folder = RunFolder(pretrained.find_one(str(run)) if pretrained.is_name(str(run)) else run)
+    trained = folder.config(**({} if device is None else {"device": device}))
+    config = override(trained, **settings)
+    if replace(trained, env=config.env, comm=config.comm) != config:
+        raise UserError(f"{', '.join(settings)}: only keys of env and comm can be changed")
+    file = folder.checkpoint() if checkpoint is None else Path(checkpoint)
+    return TrainedPolicy(load_actor(config, file), config, file)
+
+
+def compare(paths: Sequence[Reference], output: Reference | None = None) -> Comparison:
+    """Compares finished runs by setup and method, as the command does.
+
+    Args:
+        paths: run folders, folders that hold some, or `pretrained:SETUP`.
+        output: a new or empty folder for compare.html, compare.json and the figures; if None, no
+            file is written.
+
+    Returns:
+        Interquartile means, intervals, rankings and the paper's claims, setup by setup.
+
+    Raises:
+        UserError: there is nothing to compare, the runs cannot be compared, a file is damaged, or
+            `output` holds something.
+    """
+    folder = None if output is None else free_folder(Path(output))
+    comparison = compare_runs([Path(path) for path in paths])
+    return comparison if folder is None else write_report(comparison, folder)
+
+
+def _finished(trainer: Trainer, team: int, evaluate_after: bool) -> Run:
+    """Evaluates a seed of a finished training and returns its run."""
+    run, config, results = trainer.runs[team], trainer.configs[team], {}
+    if evaluate_after:
+        results = evaluate_run(
+            run,
+            config,
+            trainer.team_actor(team),
+            checkpoint=run.checkpoint(),
+            fires=config.evaluation.episodes,
+            report=lambda _: None,
+        )
+    return Run(run.path, config, results)
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Keeps torchrl from printing notes, unless the user has chosen a level of them."""
+    logger = logging.getLogger("torchrl")
+    before = logger.level
+    if "RL_LOGGING_LEVEL" not in os.environ:
+        logger.setLevel(logging.WARNING)
+    try:
+        yield
+    finally:
+        logger.setLevel(before)

@@ -1,0 +1,55 @@
+"""The command `emberlink eval`."""
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from .parser import command, positive
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+
+def add_eval(commands: Any) -> None:
+    """Adds the command."""
+    evaluation = command(
+        commands,
+        "eval",
+        _eval,
+        "evaluate the frozen policies of a run",
+        "Loads the newest checkpoint of a run, plays the frozen policies and the scripted ones on "
+        "the same test fires, prints the table, and leaves eval.json, figures and a GIF in the "
+        "run folder.",
+        "emberlink eval runs/2026-01-31_12-00-00_consensus_tuned_s0 --fires 64",
+    )
+    evaluation.add_argument(
+        "folder", metavar="RUN", help="a run folder, or pretrained:METHOD, pretrained:SETUP/METHOD"
+    )
+    evaluation.add_argument(
+        "overrides",
+        metavar="key=value",
+        nargs="*",
+        default=[],
+        help="keys of comm. or env. in place of the run's, such as comm.loss=0.5; "
+        "the files are named after them",
+    )
+    evaluation.add_argument(
+        "--checkpoint", metavar="FILE", type=Path, help="a checkpoint (default: the newest)"
+    )
+    evaluation.add_argument(
+        "--fires", metavar="N", type=positive, help="number of episodes (default: the run's)"
+    )
+    evaluation.add_argument("--device", help="cpu, cuda, ... (default: the run's)")
+
+
+def _eval(options: argparse.Namespace, console: "Console") -> int:
+    from emberlink.trainers.evaluation.command import evaluate_folder
+
+    return evaluate_folder(
+        options.folder,
+        console,
+        overrides=options.overrides,
+        checkpoint=options.checkpoint,
+        fires=options.fires,
+        device=options.device,
+    )

@@ -1,0 +1,78 @@
+"""The command `emberlink render`."""
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from .parser import between, command, positive
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+
+def add_render(commands: Any) -> None:
+    """Adds the command."""
+    rendering = command(
+        commands,
+        "render",
+        _render,
+        "an episode as GIF and MP4; several runs side by side",
+        "Plays the frozen policies of one or more runs on the same held-out fire from the same "
+        "start positions, and draws fire, UAVs, their roles and the links of their network. Leaves "
+        "a GIF and an MP4 in the first run's figures, under names that are free.",
+        "emberlink render runs/2026-01-31_12-00-00_consensus_tuned_s0 --policy random_waypoints",
+    )
+    add = rendering.add_argument
+    add("runs", metavar="RUN", nargs="+", help="a run folder")
+    add(
+        "--policy",
+        metavar="NAME",
+        action="append",
+        default=[],
+        help="a scripted policy beside the runs; may be given several times",
+    )
+    add(
+        "--fire",
+        metavar="FIRE",
+        help="a held-out fire: NAME, INDEX or NAME:INDEX, such as huygens:3 (default: huygens:0, "
+        "or the first of the file that the first run was trained on)",
+    )
+    add(
+        "--checkpoint",
+        metavar="FILE",
+        type=Path,
+        action="append",
+        default=[],
+        help="another than the newest; as many as there are runs",
+    )
+    add(
+        "--output",
+        metavar="PATH",
+        type=Path,
+        help="a folder, or a new file that ends in .gif, .mp4 or .png (one picture)",
+    )
+    add("--step", metavar="STEP", type=_step, help="of a .png; the last if left out")
+    add("--frames", type=positive, default=126, help="at most (default: 126)")
+    add("--fps", type=_fps, default=12, help="frames per second, 1 to 50 (default: 12)")
+    add("--size", type=_size, help="pixels of a map's longer side, 100 to 2000")
+    add("--seen", action="store_true", help="draw fire that a UAV has seen grey")
+
+
+_step, _fps, _size = between(0, 1_000_000), between(1, 50), between(100, 2000)
+
+
+def _render(options: argparse.Namespace, console: "Console") -> int:
+    from .render import Choices, render
+
+    choices = Choices(
+        fire=options.fire,
+        policies=options.policy,
+        checkpoints=options.checkpoint,
+        output=options.output,
+        frames=options.frames,
+        fps=options.fps,
+        size=options.size,
+        step=options.step,
+        seen=options.seen,
+    )
+    return render(options.runs, console, choices)

@@ -1,0 +1,66 @@
+"""Checks an installation: versions, devices, and a self-test."""
+
+import platform
+import time
+from importlib.metadata import PackageNotFoundError, version
+
+import torch
+from rich.console import Console
+from torchrl.envs.utils import check_env_specs
+
+from emberlink.configs import known
+from emberlink.envs.fire.generator import load_scenario, make_fires
+from emberlink.trainers.build import make_env
+from emberlink.trainers.config.compose import resolve
+from emberlink.trainers.training.trainer import Trainer
+
+_PACKAGES = ("emberlink", "torch", "torchrl", "tensordict", "pettingzoo", "wandb", "hydra-core")
+_GEO = ("rasterio", "geopandas", "pyogrio", "shapely", "pyproj")
+_TINY = ("env.horizon=40", "env.num_uavs=3", "episodes=1", "num_envs=2", "learner.batch_size=32")
+
+
+def doctor(console: Console) -> int:
+    """Prints what is installed and tests it; returns 0 if every test passed, else 1."""
+    console.print(f"python {platform.python_version()} on {platform.platform()}")
+    console.print(", ".join(f"{name} {version(name)}" for name in _PACKAGES), soft_wrap=True)
+    gpus = [torch.cuda.get_device_name(i) for i in range(torch.cuda.device_count())]
+    console.print(
+        f"devices: cpu ({torch.get_num_threads()} threads), {', '.join(gpus) or 'no GPU'}"
+    )
+    console.print(f"fires from files: {_geo()}", soft_wrap=True)
+    checks = {"fire": _fire} | {method: _recipe(method) for method in known("method")}
+    began, failures = time.monotonic(), 0
+    for name, check in checks.items():
+        try:
+            console.print(f"  ok      {name}: {check()}")
+        except Exception as error:  # whatever is wrong, the other checks are made
+            failures += 1
+            text = f"  FAILED  {name}: {type(error).__name__}: {error}"
+            console.print(text, style="red", soft_wrap=True)
+    seconds = time.monotonic() - began
+    console.print(f"self-test: {failures} of {len(checks)} failed, {seconds:.1f} s")
+    return int(failures > 0)
+
+
+def _geo() -> str:
+    """Returns the versions of the packages of the extra `geo`."""
+    try:
+        return ", ".join(f"{name} {version(name)}" for name in _GEO)
+    except PackageNotFoundError as error:
+        return f"{error.name} is not installed: pip install '.[geo]' in the checkout"
+
+
+def _fire() -> str:
+    arrival = make_fires(load_scenario("paper"), torch.tensor([0]), (30, 30), 1000)
+    start, end = ((arrival <= step).sum().item() for step in (0, 1000))
+    return f"{start} cells burn at the start, {end} at the end"
+
+
+def _recipe(method: str):
+    def check() -> str:
+        check_env_specs(make_env(method, num_envs=2, horizon=5, num_uavs=3))
+        trainer = Trainer(resolve(method, _TINY))
+        trainer.rehearse(steps=20)
+        return f"environment and {trainer.updates} updates"
+
+    return check

@@ -1,0 +1,40 @@
+"""The command `emberlink sweep`."""
+
+import argparse
+from typing import TYPE_CHECKING, Any
+
+from .parser import command, positive
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+
+def add_sweep(commands: Any) -> None:
+    """Adds the command."""
+    sweep = command(
+        commands,
+        "sweep",
+        _sweep,
+        "train methods x seeds x setups",
+        "Trains and evaluates every combination, several runs at a time on the cores of the "
+        "machine. Finished runs in the output folder are skipped, and stopped ones are resumed: "
+        "the same command again does what is left.",
+        "emberlink sweep consensus positional setup=paper,tuned seed=0,1,2 output=runs",
+        usage="emberlink sweep [--jobs N] [--dry-run] [METHOD ...] [key=value,value ...]",
+    )
+    sweep.add_argument(
+        "arguments",
+        metavar="METHOD | key=value,value",
+        nargs="+",
+        help="methods (default: all); keys as for train, with one value or several",
+    )
+    sweep.add_argument(
+        "--jobs", metavar="N", type=positive, help="runs at a time (default: one per core)"
+    )
+    sweep.add_argument("--dry-run", action="store_true", help="only print what would be done")
+
+
+def _sweep(options: argparse.Namespace, console: "Console") -> int:
+    from emberlink.trainers.sweep.command import sweep
+
+    return sweep(options.arguments, console, at_a_time=options.jobs, dry=options.dry_run)

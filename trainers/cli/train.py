@@ -1,0 +1,45 @@
+"""The command `emberlink train`."""
+
+import argparse
+from typing import TYPE_CHECKING, Any
+
+from .parser import command
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+
+def add_train(commands: Any) -> None:
+    """Adds the command."""
+    train = command(
+        commands,
+        "train",
+        _train,
+        "train one of the methods and evaluate it",
+        "Trains a method, evaluates the frozen policies on test fires, and leaves a run folder "
+        "with config.yaml, metrics.jsonl, checkpoints, eval.json, figures and a GIF.",
+        "emberlink train consensus setup=tuned episodes=20 seed=1",
+        usage="emberlink train METHOD [key=value ...]\n"
+        "       emberlink train resume=RUN [key=value ...]",
+    )
+    train.add_argument(
+        "method",
+        metavar="METHOD",
+        help="a method: independent, shared_memory, positional, consensus, or one of yours "
+        "(emberlink list methods); or resume=RUN, to continue the training of a run folder",
+    )
+    train.add_argument(
+        "overrides",
+        metavar="key=value",
+        nargs="*",
+        default=[],
+        help="any key of configs/base.yaml or of the chosen setup, such as setup=tuned, "
+        "fire=huygens, seed=1, env.num_uavs=3, logger=csv",
+    )
+
+
+def _train(options: argparse.Namespace, console: "Console") -> int:
+    # Commands import what they need when they run, so that `--help` need not wait for torch.
+    from emberlink.trainers.training.command import train
+
+    return train(options.method, options.overrides, console)

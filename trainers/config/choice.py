@@ -1,0 +1,54 @@
+"""Settings of a choice by name: `{"name": NAME, ...}`, checked by the class of that name.
+
+`comm` is such a choice: each module in emberlink/comm has a class with settings of its own.
+"""
+
+from collections.abc import Mapping
+from dataclasses import fields
+from typing import Any, Protocol
+
+from emberlink.envs.utils.errors import UserError
+from emberlink.envs.utils.validation import from_plain
+
+
+class Registry(Protocol):
+    """Knows classes by name. Each has a `config_type`, a pydantic dataclass of its settings."""
+
+    def known(self) -> list[str]:
+        """Returns the names in alphabetical order."""
+        ...
+
+    def find(self, name: str) -> Any:
+        """Returns the class of a name, or raises a UserError that lists the names."""
+        ...
+
+
+def check(key: str, values: Mapping[str, Any], registry: Registry) -> None:
+    """Checks that the settings are those of the class that they name.
+
+    Args:
+        key: of the settings in the configuration, for messages.
+        values: the name and the settings, plain values.
+        registry: finds the class.
+
+    Raises:
+        UserError: the name or a setting is missing or not known, or a value does not fit.
+    """
+    if "name" not in values:
+        raise UserError(f"{key}.name is missing; known: {', '.join(registry.known())}")
+    settings(key, values, registry)
+
+
+def settings(key: str, values: Mapping[str, Any], registry: Registry) -> Any:
+    """Returns the settings as an instance of the named class's `config_type`.
+
+    Raises:
+        UserError: see `check`.
+    """
+    config_type = registry.find(values["name"]).config_type
+    given = {name: value for name, value in values.items() if name != "name"}
+    known = [field.name for field in fields(config_type)]
+    for name in given.keys() - set(known):
+        listed = ", ".join(known) or "none"
+        raise UserError(f"{key}.{name} is not a setting of {values['name']}; known: {listed}")
+    return from_plain(config_type, given, key)

@@ -1,0 +1,90 @@
+"""Reads `key=value` texts and puts values into nested mappings by their dotted key."""
+
+from collections.abc import Iterator, Mapping
+from functools import reduce
+from operator import getitem
+from typing import Any
+
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.errors import HydraException
+
+from emberlink.envs.utils.errors import UserError
+from emberlink.envs.utils.validation import shown, unknown
+
+
+def parse(text: str) -> tuple[str, Any]:
+    """Returns the key and the value of a `key=value`, read as Hydra reads it.
+
+    Raises:
+        UserError: the text is of another form, or gives several values or a mapping.
+    """
+    try:
+        parsed = OverridesParser.create().parse_override(text)
+    except (HydraException, ValueError, RecursionError):
+        raise UserError(f"{shown(text)!r} is not of the form key=value") from None
+    key, value = parsed.get_key_element(), parsed.value()
+    if parsed.is_sweep_override():
+        several = f"{'seeds' if key == 'seed' else key}=[{text.partition('=')[2]}]"
+        hint = f"; a list is written in brackets: {several}" if "," in text else ""
+        raise UserError(f"{shown(text)!r}: only one value is possible here{shown(hint)}")
+    if parsed.is_delete() or parsed.is_add() or parsed.is_force_add():
+        raise UserError(f"{shown(text)!r}: expected key=value without a sign before the key")
+    if isinstance(value, dict):
+        raise UserError(f"{shown(text)!r}: give its keys one by one, as {key}.KEY=VALUE")
+    return key, value
+
+
+def put(values: dict[str, Any], key: str, value: Any) -> None:
+    """Sets the value of a dotted key that is there.
+
+    A mapping changes those keys that it holds. It replaces all of a named choice, such as `comm`,
+    if it has another name.
+
+    Raises:
+        UserError: the value is a mapping with a key that is not known.
+    """
+    *path, last = key.split(".")
+    parent = reduce(getitem, path, values)
+    old = parent[last]
+    both = isinstance(old, dict) and isinstance(value, Mapping)
+    if not both or value.get("name", old.get("name")) != old.get("name"):
+        parent[last] = value
+        return
+    for name, item in value.items():
+        if name not in old:
+            raise UserError(f"key {unknown(f'{key}.{name}', all_keys(values))}")
+        put(values, f"{key}.{name}", item)
+
+
+def full_key(values: Mapping[str, Any], key: str) -> str:
+    """Returns the dotted key that equals `key` or, if only one does, ends in it.
+
+    Raises:
+        UserError: there is no such key, or there are several.
+    """
+    names = list(all_keys(values))
+    if key in names:
+        return key
+    found = [name for name in names if name.endswith(f".{key}")]
+    if len(found) > 1:
+        raise UserError(f"key {key!r} is one of {', '.join(found)}: say which")
+    if not found:
+        raise UserError(f"key {unknown(key, names)}")
+    return found[0]
+
+
+def all_keys(values: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
+    """Yields the dotted keys of nested mappings, those of the mappings included."""
+    for key, value in values.items():
+        yield prefix + key
+        if isinstance(value, Mapping):
+            yield from all_keys(value, f"{prefix}{key}.")
+
+
+def flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Returns the values of nested mappings by dotted key."""
+    result: dict[str, Any] = {}
+    for key, value in values.items():
+        below = flat(value, f"{prefix}{key}.") if isinstance(value, Mapping) else None
+        result |= {prefix + key: value} if below is None else below
+    return result

@@ -1,0 +1,179 @@
+"""The progress of a training: a bar at a terminal, and lines that stay."""
+
+import time
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from datetime import timedelta
+from typing import Any, Self
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn
+
+BETWEEN_LINES = 60.0
+"""seconds after which a line says how far an episode is, where there is no bar"""
+FIRST_LINE = 10.0
+"""seconds after which the first of these lines comes"""
+_BETWEEN_REFRESHES = 0.2
+"""seconds between two drawings of the bar"""
+
+
+class TimeLeft:
+    """Estimates speed and remaining time of a training.
+
+    Steps before the first update are much faster than those after it. So the remaining time
+    follows from the mean of all steps since the updates began, and is unknown before.
+
+    Args:
+        steps: of the whole training.
+        learns: whether there will be updates at all.
+    """
+
+    ENOUGH = 3.0
+    """seconds with updates before there is an estimate"""
+    WINDOW = 30.0
+    """seconds over which the speed is measured"""
+
+    def __init__(self, steps: int, *, learns: bool = True):
+        self._steps, self._learns = steps, learns
+        self._start: tuple[float, int] | None = None
+        self._recent: deque[tuple[float, int]] = deque()
+
+    def add(self, now: float, step: int, updates: int) -> None:
+        """Notes that a step ended.
+
+        Args:
+            now: seconds.
+            step: number of the step.
+            updates: number of updates so far.
+        """
+        if self._start is None and (updates > 0 or not self._learns):
+            self._start = now, step
+        self._recent.append((now, step))
+        while len(self._recent) > 2 and now - self._recent[1][0] > self.WINDOW:
+            self._recent.popleft()
+
+    @property
+    def speed(self) -> float | None:
+        """Recent steps per second."""
+        if not self._recent:
+            return None
+        (before, first), (now, last) = self._recent[0], self._recent[-1]
+        return (last - first) / (now - before) if now > before else None
+
+    @property
+    def seconds(self) -> float | None:
+        """Remaining seconds; None while there are too few steps with updates."""
+        if self._start is None or not self._recent:
+            return None
+        (before, first), (now, last) = self._start, self._recent[-1]
+        if last == first or now - before < self.ENOUGH:
+            return None
+        return (self._steps - last) * (now - before) / (last - first)
+
+
+class TrainingProgress:
+    """Shows how far a training is.
+
+    Prints a line for each episode, with its measures, and for each evaluation. A terminal also has
+    a bar; elsewhere a line a minute says how far a long episode is.
+
+    Args:
+        console: where all is printed.
+        steps: steps of the whole training.
+        episodes: episodes of the whole training.
+        step: steps that were made before.
+        learns: whether there will be updates at all.
+        clock: returns seconds.
+    """
+
+    def __init__(
+        self,
+        console: Console,
+        *,
+        steps: int,
+        episodes: int,
+        step: int = 0,
+        learns: bool = True,
+        clock: Callable[[], float] = time.monotonic,
+    ):
+        self._console, self._clock = console, clock
+        self._steps, self._episodes, self._learns = steps, episodes, learns
+        self._left = TimeLeft(steps, learns=learns)
+        self._left.add(clock(), step, 0)
+        self._next_line = clock() + FIRST_LINE
+        self._next_refresh = 0.0
+        self._bar: Progress | None = None
+        if console.is_terminal:
+            self._bar = Progress(
+                TextColumn("{task.description}"),
+                BarColumn(bar_width=None),
+                console=console,
+                auto_refresh=False,
+                redirect_stdout=False,
+                expand=True,
+            )
+            self._task = self._bar.add_task("", total=steps, completed=step)
+
+    def __enter__(self) -> Self:
+        if self._bar is not None:
+            self._bar.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._bar is not None:
+            self._bar.stop()
+
+    def step(self, step: int, episode: int, updates: int) -> None:
+        """Shows that a step of all environments ended.
+
+        Args:
+            step: its number.
+            episode: number of finished episodes.
+            updates: number of updates so far.
+        """
+        now = self._clock()
+        self._left.add(now, step, updates)
+        if self._bar is not None:
+            if now >= self._next_refresh or step == self._steps:
+                self._next_refresh = now + _BETWEEN_REFRESHES
+                text = f"step {step}/{self._steps} {self._pace(updates)}"
+                self._bar.update(self._task, completed=step, description=text)
+                self._bar.refresh()
+        elif now >= self._next_line:
+            running = min(episode + 1, self._episodes)
+            self.note(
+                f"episode {running}/{self._episodes}, step {step}/{self._steps}: "
+                f"{self._pace(updates)}"
+            )
+
+    def episode(self, episode: int, lines: Sequence[Mapping[str, Any]]) -> None:
+        """Prints the measures of an episode, and of the evaluation after it.
+
+        Args:
+            episode: its number.
+            lines: the episode's line of metrics.jsonl of every seed; means are printed.
+        """
+        means = {name: sum(line[name] for line in lines) / len(lines) for name in lines[0]}
+        self.note(
+            f"episode {episode}/{self._episodes}: coverage {means['coverage']:.1f} %, "
+            f"mean reward {means['mean_reward']:.2f}, {self._pace(means['updates'])}"
+        )
+        evaluated = [name.removesuffix("/coverage") for name in means if name.endswith("/coverage")]
+        if evaluated:
+            shown = ", ".join(f"{fire} {means[f'{fire}/coverage']:.1f} %" for fire in evaluated)
+            self.note(f"  without noise, on validation fires: coverage {shown}")
+
+    def note(self, text: str, style: str = "") -> None:
+        """Prints a line above the bar."""
+        self._console.print(text, style=style, soft_wrap=True)
+        self._next_line = self._clock() + BETWEEN_LINES
+
+    def _pace(self, updates: float) -> str:
+        """Returns speed and remaining time in words."""
+        speed, seconds = self._left.speed, self._left.seconds
+        parts = [] if speed is None else [f"{speed:.{0 if speed >= 100 else 1}f} steps/s"]
+        if seconds is not None:
+            parts.append(f"{timedelta(seconds=round(seconds))} left")
+        elif self._learns and updates == 0:
+            parts.append("no updates yet")
+        return ", ".join(parts)

@@ -1,0 +1,205 @@
+"""The command `emberlink train`: trains, shows the progress, evaluates."""
+
+from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
+
+from rich.console import Console
+
+from emberlink.configs import known
+from emberlink.envs.utils.errors import UserError
+from emberlink.trainers.config.compose import resolve
+from emberlink.trainers.config.schema import RunConfig
+from emberlink.trainers.evaluation.command import evaluate_and_print
+from emberlink.trainers.evaluation.results import learned_means
+from emberlink.trainers.runs import loggers
+from emberlink.trainers.runs.run_folder import RunFolder
+from emberlink.trainers.runs.signals import Interrupted, Interruption
+from emberlink.trainers.runs.tracking import Trackers
+from emberlink.trainers.terminal import OutputError, TrainingProgress
+
+from .divergence import Divergence
+from .resume import resume
+from .trainer import Progress, Trainer
+
+
+def train(method: str | None, overrides: Sequence[str], console: Console) -> int:
+    """Trains a method, or continues a run, then evaluates it.
+
+    Ctrl-C, SIGTERM, SIGHUP and an output that cannot be written to end the training after the
+    step, with a checkpoint.
+
+    Args:
+        method: the method; or `resume=RUN`.
+        overrides: `key=value`.
+        console: where progress and results are printed.
+
+    Returns:
+        The exit status: 0, or 128 and the number of the signal that ended the training.
+
+    Raises:
+        UserError: one line for whatever cannot be trained, resumed or written.
+    """
+    trainer = _trainer(method, overrides)
+    interruption = Interruption(trainer.stop)
+    try:
+        _announce(trainer, console)
+        with interruption:
+            _train(trainer, console)
+            # The run folders stay locked for the evaluation.
+            interruption.at_once = True
+            if interruption.received:
+                raise Interrupted
+            _evaluate(trainer, console)
+    except KeyboardInterrupt:
+        with suppress(OutputError):  # the terminal may be gone
+            _print_how_to_resume(trainer, console)
+        return interruption.status
+    except OutputError as error:
+        raise UserError(f"{error.filename}: {error.strerror}; {_resume_hint(trainer)}") from None
+    except (UserError, Divergence) as error:
+        raise UserError(f"{error}; {_resume_hint(trainer, error)}") from None
+    finally:
+        trainer.close()
+    return 0
+
+
+def _trainer(method: str | None, overrides: Sequence[str]) -> Trainer:
+    """Returns a new training, or that of the run folder that `resume=` names."""
+    if method is not None and "=" in method:
+        method, overrides = None, [method, *overrides]
+    folders = [text.partition("=")[2] for text in overrides if text.startswith("resume=")]
+    if not folders:
+        if method is None:
+            raise UserError(f"{overrides[0]!r} is no method; known: {', '.join(known('method'))}")
+        config = resolve(method, overrides)
+        loggers.check_installed(config)
+        trainer = Trainer(config)
+        trainer.start()
+        return trainer
+    if len(folders) > 1 or not folders[0]:
+        raise UserError("resume=RUN: one run folder is needed")
+    others = [text for text in overrides if not text.startswith("resume=")]
+    return resume(Path(folders[0]), method, others)
+
+
+def _announce(trainer: Trainer, console: Console) -> None:
+    """Prints what will be trained and where."""
+    config = trainer.config
+    if trainer.step:
+        rate = "" if trainer.rate == 1 else f", learning rates x {trainer.rate:g}"
+        console.print(f"resumed at step {trainer.step} of {trainer.steps}{rate}")
+    for run in trainer.runs:
+        text = f"{config.method}, setup {config.setup}, fire {config.fire.name} -> {run.path}"
+        console.print(text, soft_wrap=True)
+    if _is_finished(trainer):
+        console.print(
+            f"{trainer.run.path} is finished, {config.episodes} episodes; nothing is left to do. "
+            f"More: emberlink train resume={trainer.run.path} episodes={2 * config.episodes}",
+            soft_wrap=True,
+        )
+    elif not _learns(trainer):
+        console.print(
+            f"note: learner.batch_size={config.learner.batch_size} is more than this run collects: "
+            "nothing will be learnt",
+            style="yellow",
+            soft_wrap=True,
+        )
+
+
+def _is_finished(trainer: Trainer) -> bool:
+    return trainer.step == trainer.steps and all(run.evaluated() for run in trainer.runs)
+
+
+def _learns(trainer: Trainer) -> bool:
+    return trainer.enough <= trainer.steps * trainer.config.num_envs
+
+
+def _train(trainer: Trainer, console: Console) -> None:
+    """Trains and shows the progress.
+
+    Raises:
+        OutputError: the progress cannot be written. The training has been stopped and saved.
+    """
+    if trainer.step == trainer.steps:
+        return
+    failures: list[OutputError] = []
+    progress = TrainingProgress(
+        console,
+        steps=trainer.steps,
+        episodes=trainer.config.episodes,
+        step=trainer.step,
+        learns=_learns(trainer),
+    )
+
+    def report(state: Progress) -> None:
+        if failures:
+            return
+        try:
+            _show(progress, state, trainer)
+        except OutputError as error:
+            failures.append(error)
+            trainer.stop()
+
+    with progress:
+        trainer.train(report, hold=True)
+    if failures:
+        raise failures[0]
+
+
+def _show(progress: TrainingProgress, state: Progress, trainer: Trainer) -> None:
+    if state.note:
+        progress.note(state.note, "yellow")
+    progress.step(state.step, state.episode, trainer.updates)
+    if state.lines and state.step % trainer.config.env.horizon == 0:
+        progress.episode(state.episode, state.lines)
+
+
+def _evaluate(trainer: Trainer, console: Console) -> None:
+    """Evaluates the seeds that were not evaluated yet, and prints the results."""
+    seeds = [
+        (run, config, trainer.team_actor(team), run.checkpoint())
+        for team, (config, run) in enumerate(zip(trainer.configs, trainer.runs, strict=True))
+        if not run.evaluated()
+    ]
+    if not seeds:
+        return
+    results = evaluate_and_print(seeds, console)
+    runs = [run for run, *_ in seeds]
+    trackers = Trackers([config for _, config, *_ in seeds], runs, episode=trainer.config.episodes)
+    trackers.log_evaluation(
+        [learned_means(result) for result in results],
+        [_figures(run) for run in runs],
+    )
+    trackers.close()
+
+
+def _figures(run: RunFolder) -> list[Path]:
+    files = sorted((run.path / "figures").glob("*.png"))
+    return [file for file in files if file.is_file() and not file.is_symlink()]
+
+
+def _print_how_to_resume(trainer: Trainer, console: Console) -> None:
+    for run in trainer.runs:
+        networks = run.networks()
+        if networks:
+            console.print(
+                f"stopped; the newest networks are {networks[-1]}\n"
+                f"evaluate them with: emberlink eval {run.path}",
+                soft_wrap=True,
+            )
+    console.print(f"resume with: emberlink train resume={trainer.run.path}", soft_wrap=True)
+
+
+def _resume_hint(trainer: Trainer, error: Exception | None = None) -> str:
+    """Returns the newest checkpoint of a run that an error ended, and how to resume it."""
+    # Without this key, the run would end at the same step again.
+    config: RunConfig = trainer.config
+    diverged = isinstance(error, Divergence) and config.on_nan == "stop"
+    command = f"emberlink train resume={trainer.run.path}" + (
+        " on_nan=rollback" if diverged else ""
+    )
+    states = trainer.run.states()
+    if not states:
+        return f"there is no checkpoint: {command} begins again, if there has been none"
+    return f"the last good checkpoint is {states[-1]}, resume with: {command}"
