@@ -62,7 +62,7 @@ def resolve(method: str, overrides: Sequence[str] = (), **settings: Any) -> RunC
     _choose_seed(values, any(key == "seed" for key in [*dict(given), *settings]))
     values["baseline_comm"] = _baseline_comm(chosen["setup"])
     config = from_values(values)
-    return replace(config, fire=fires_of(config.fire).pinned())
+    return replace(config, fire=fires_of(config.fire).with_checksum())
 
 
 def override(config: RunConfig, overrides: Sequence[str] = (), **settings: Any) -> RunConfig:

@@ -15,7 +15,7 @@ from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
 
-from emberlink.envs.fire_files.reader import KEPT
+from emberlink.envs.fire_files.reader import COPY_FILE
 from emberlink.envs.utils.errors import UserError
 from emberlink.trainers.config.compose import to_values
 from emberlink.trainers.learners.base import ACTOR
@@ -124,7 +124,7 @@ def pack(run: RunFolder, into: Path) -> Path:
     (target / "checkpoints").mkdir(parents=True)
     checkpoint_file.write(target / "checkpoints" / newest.name, actors, about)
     RunFolder(target).write_config(config)
-    for file in ("metrics.jsonl", "eval.json", KEPT):
+    for file in ("metrics.jsonl", "eval.json", COPY_FILE):
         if (run.path / file).is_file():
             shutil.copyfile(run.path / file, target / file)
     return target

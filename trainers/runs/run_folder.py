@@ -90,7 +90,7 @@ class RunFolder(JsonLines, Checkpoints):
             _check_complete(values, config)
         except ValueError as error:
             raise UserError(f"{file}: {error}") from None
-        return replace(config, fire=fires_of(config.fire).opened(self.path))
+        return replace(config, fire=fires_of(config.fire).load_copy(self.path))
 
     def write(self, file: str, content: Mapping[str, Any]) -> None:
         """Writes a JSON file completely, or leaves the earlier one.

@@ -50,7 +50,7 @@ class RunFolders:
             run.write_config(config)
         grid, horizon = configs[0].env.grid, configs[0].env.horizon
         kept = [
-            replace(config, fire=fires_of(config.fire).kept(run.path, grid, horizon))
+            replace(config, fire=fires_of(config.fire).save_copy(run.path, grid, horizon))
             for config, run in zip(configs, runs, strict=True)
         ]
         return cls(runs, kept)
