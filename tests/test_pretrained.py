@@ -10,11 +10,10 @@ import yaml
 from tiny_run import TINY
 
 from emberlink.trainers.cli.main import main
-from emberlink.trainers.config.compose import from_values, to_values
+from emberlink.trainers.config.compose import to_values
 from emberlink.trainers.evaluation.actor import load_actor
 from emberlink.trainers.runs import pretrained
 from emberlink.trainers.runs.run_folder import RunFolder
-from emberlink.trainers.runs.safe_read import read_yaml
 from emberlink.trainers.runs.seal import check_trained_with
 
 DATA = Path(__file__).parent.parent / "docs" / "data"
@@ -136,9 +135,8 @@ def test_every_configuration_that_is_shipped_names_all_keys():
     files = [*pretrained._shipped().rglob("config.yaml"), *DATA.rglob("config.yaml")]
     assert len(files) > 50
     for file in files:
-        values = read_yaml(file)
-        assert to_values(from_values(values)) == values, file
-        RunFolder(file.parent).config()
+        values = yaml.load(file.read_text(), yaml.CSafeLoader)
+        assert to_values(RunFolder(file.parent).config()) == values, file
 
 
 def test_every_policy_that_is_shipped_loads():

@@ -12,7 +12,8 @@ from tiny_run import TINY
 from emberlink.envs import metrics
 from emberlink.envs.fire.cache import fire_bank
 from emberlink.envs.fire.generator import load_scenario
-from emberlink.envs.fire_files.reader import FileFireConfig, pinned
+from emberlink.envs.fire_files.config import FileFireConfig
+from emberlink.envs.fire_files.reader import with_checksum
 from emberlink.envs.scenarios import fires_of
 from emberlink.envs.utils.atomic_io import read_sealed, write_sealed
 from emberlink.trainers.cli import main
@@ -69,9 +70,9 @@ def test_cached_results_with_a_changed_bit_are_not_read(tmp_path, monkeypatch):
 
 def test_a_runs_copy_of_its_fires_with_a_changed_bit_is_not_read(tmp_path):
     raster = write_asc(tmp_path / "fire.asc", raster_of(Ellipses(), 300.0, cells=40, cell=75.0), 75)
-    config = fires_of(pinned(FileFireConfig(path=str(raster), units="minutes")))
+    config = fires_of(with_checksum(FileFireConfig(path=str(raster), units="minutes")))
     grid = (12, 10), 15
-    kept = config.kept(tmp_path, *grid)
+    kept = config.save_copy(tmp_path, *grid)
     right = config.train(*grid)
     raster.unlink()
     assert torch.equal(fires_of(kept).train(*grid), right)
