@@ -123,7 +123,9 @@ class _SmoothedActor(TensorDictModuleBase):
     def __init__(self, actor: TensorDictModule):
         super().__init__()
         self.actor = actor
-        self.in_keys, self.out_keys = [*actor.in_keys, _TARGET_NOISE], actor.out_keys
+        reads: list[Any] = [*actor.in_keys, _TARGET_NOISE]
+        writes: list[Any] = list(actor.out_keys)
+        self.in_keys, self.out_keys = reads, writes
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         acted = self.actor(tensordict)
