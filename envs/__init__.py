@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from emberlink.envs.config import RewardConfig, WildfireConfig
     from emberlink.envs.fire.generator import FireConfig
-    from emberlink.envs.fire_files.reader import FileFireConfig
+    from emberlink.envs.fire_files.config import FileFireConfig
     from emberlink.envs.pettingzoo import parallel_env
     from emberlink.envs.wildfire import WildfireEnv
 

@@ -13,9 +13,9 @@ from torchrl.envs import EnvBase, TransformedEnv, step_mdp
 from emberlink.envs.config import WildfireConfig
 from emberlink.envs.rendering.frame import Window
 from emberlink.envs.utils.errors import UserError
+from emberlink.envs.wildfire import WildfireEnv
 
 from . import keys
-from .wildfire import WildfireEnv
 
 Array = NDArray[np.float32]
 

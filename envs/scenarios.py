@@ -1,4 +1,4 @@
-"""Scenarios of either kind, made by the generator or read from files, behind one interface."""
+"""Scenarios, made by the generator or read from files, behind one interface."""
 
 import dataclasses
 from pathlib import Path
@@ -11,15 +11,15 @@ from torch import Tensor
 from emberlink.envs.config import WildfireConfig
 from emberlink.envs.fire.cache import fire_bank
 from emberlink.envs.fire.generator import FireConfig, fire_seeds, load_scenario, make_fires
-from emberlink.envs.fire_files import reader
-from emberlink.envs.fire_files.reader import FileFireConfig
+from emberlink.envs.fire_files import FileFireConfig, fire_sets, save_copy, with_checksum
+from emberlink.envs.fire_files.reader import COPY_FILE
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import TAG
 
 Grid = tuple[int, int]
 
 
-class Fires(Protocol):
+class FireSource(Protocol):
     """The fires of a scenario, in three sets: `train`, `validation` and `test`.
 
     The validation fires choose among the checkpoints of a training, the test fires measure its
@@ -42,20 +42,20 @@ class Fires(Protocol):
         """Returns the test fire of that index, float32 [1, X, Y]."""
         ...
 
-    def about(self, count: int) -> dict[str, Any]:
+    def describe(self, count: int) -> dict[str, Any]:
         """Returns plain values that identify the first `count` test fires."""
         ...
 
-    def pinned(self) -> "ScenarioConfig":
-        """The scenario with the content of its files written down."""
+    def with_checksum(self) -> "ScenarioConfig":
+        """Returns the scenario with the checksums of its files."""
         ...
 
-    def kept(self, folder: Path, grid: Grid, horizon: int) -> "ScenarioConfig":
-        """The scenario of a run folder, where a copy of what is read is put."""
+    def save_copy(self, folder: Path, grid: Grid, horizon: int) -> "ScenarioConfig":
+        """Copies the fires of files into a run folder and returns `load_copy(folder)`."""
         ...
 
-    def opened(self, folder: Path) -> "ScenarioConfig":
-        """The scenario of a run folder, with its copy of what was read."""
+    def load_copy(self, folder: Path) -> "ScenarioConfig":
+        """Returns the scenario that reads its fires from the copy in a run folder."""
         ...
 
 
@@ -66,42 +66,40 @@ class Generated:
     config: FireConfig
 
     def train(self, grid: Grid, horizon: int) -> Tensor:
-        """See `Fires`."""
+        """See `FireSource`."""
         return fire_bank(self.config, "train", self.config.num_train_fires, grid, horizon)
 
     def validation(self, count: int, grid: Grid, horizon: int) -> Tensor:
-        """See `Fires`."""
+        """See `FireSource`."""
         return fire_bank(self.config, "validation", count, grid, horizon)
 
     def test(self, count: int, grid: Grid, horizon: int) -> Tensor:
-        """See `Fires`."""
+        """See `FireSource`."""
         return fire_bank(self.config, "test", count, grid, horizon)
 
     def test_fire(self, index: int, grid: Grid, horizon: int) -> Tensor:
-        """See `Fires`."""
+        """See `FireSource`."""
         return make_fires(self.config, fire_seeds("test", index + 1)[index:], grid, horizon)
 
-    def about(self, count: int) -> dict[str, Any]:
-        """Their seeds."""
-        seeds = fire_seeds("test", count).tolist()
-        # Not what is as by default: a field that is new makes no other fires of the old ones.
-        scenario = {
+    def describe(self, count: int) -> dict[str, Any]:
+        """Returns their seeds, and the fields of the scenario that differ from their defaults."""
+        values = {
             field.name: getattr(self.config, field.name)
             for field in dataclasses.fields(self.config)
             if getattr(self.config, field.name) != field.default
         }
-        return {"fire_seeds": seeds, "scenario": scenario}
+        return {"fire_seeds": fire_seeds("test", count).tolist(), "scenario": values}
 
-    def pinned(self) -> "ScenarioConfig":
-        """Nothing is to be written down."""
+    def with_checksum(self) -> "ScenarioConfig":
+        """Returns the scenario: it has no files."""
         return self.config
 
-    def kept(self, folder: Path, grid: Grid, horizon: int) -> "ScenarioConfig":
-        """Nothing is to be kept."""
+    def save_copy(self, folder: Path, grid: Grid, horizon: int) -> "ScenarioConfig":
+        """Returns the scenario: it has no files."""
         return self.config
 
-    def opened(self, folder: Path) -> "ScenarioConfig":
-        """Nothing was kept."""
+    def load_copy(self, folder: Path) -> "ScenarioConfig":
+        """Returns the scenario: it has no files."""
         return self.config
 
 
@@ -112,47 +110,48 @@ class FromFile:
     config: FileFireConfig
 
     def train(self, grid: Grid, horizon: int) -> Tensor:
-        """See `Fires`."""
-        return reader.splits(self.config, grid, horizon)["train"]
+        """See `FireSource`."""
+        return fire_sets(self.config, grid, horizon).train
 
     def validation(self, count: int, grid: Grid, horizon: int) -> Tensor:
-        """See `Fires`."""
-        fires = reader.splits(self.config, grid, horizon)["validation"]
+        """See `FireSource`."""
+        fires = fire_sets(self.config, grid, horizon).validation
         return fires[torch.arange(count) % len(fires)]
 
     def test(self, count: int, grid: Grid, horizon: int) -> Tensor:
-        """See `Fires`."""
-        fires = reader.splits(self.config, grid, horizon)["test"]
+        """See `FireSource`."""
+        fires = fire_sets(self.config, grid, horizon).test
         return fires[torch.arange(count) % len(fires)]
 
     def test_fire(self, index: int, grid: Grid, horizon: int) -> Tensor:
-        """See `Fires`."""
+        """See `FireSource`."""
         return self.test(index + 1, grid, horizon)[index:]
 
-    def about(self, count: int) -> dict[str, Any]:
-        """How many, and of which content."""
-        values = {k: v for k, v in dataclasses.asdict(self.config).items() if k != "kept"}
+    def describe(self, count: int) -> dict[str, Any]:
+        """Returns how many they are, and the scenario with the checksum of its file."""
+        values = dataclasses.asdict(self.config)
+        del values["saved_copy"]
         return {"fires": count, "scenario": values}
 
-    def pinned(self) -> "ScenarioConfig":
-        """See `Fires`."""
-        return reader.pinned(self.config)
+    def with_checksum(self) -> "ScenarioConfig":
+        """See `FireSource`."""
+        return with_checksum(self.config)
 
-    def kept(self, folder: Path, grid: Grid, horizon: int) -> "ScenarioConfig":
-        """See `Fires`."""
-        reader.keep(self.config, folder, grid, horizon)
-        return self.opened(folder)
+    def save_copy(self, folder: Path, grid: Grid, horizon: int) -> "ScenarioConfig":
+        """See `FireSource`."""
+        save_copy(self.config, folder, grid, horizon)
+        return self.load_copy(folder)
 
-    def opened(self, folder: Path) -> "ScenarioConfig":
-        """See `Fires`."""
-        return dataclasses.replace(self.config, kept=str(folder / reader.KEPT))
+    def load_copy(self, folder: Path) -> "ScenarioConfig":
+        """See `FireSource`."""
+        return dataclasses.replace(self.config, saved_copy=str(folder / COPY_FILE))
 
 
 _KINDS: dict[type, Any] = {FireConfig: Generated, FileFireConfig: FromFile}
 
 
 def _kind(value: Any) -> str:
-    """The tag of a scenario; one without a `kind` is of the generator, as it always was."""
+    """Returns the tag of a scenario; one without a `kind` is of the generator."""
     kind = value.get("kind") if isinstance(value, dict) else getattr(value, "kind", None)
     return f"{TAG}file" if kind == "file" else f"{TAG}spread"
 
@@ -162,18 +161,18 @@ Scenario = Annotated[
     Annotated[FireConfig, Tag(f"{TAG}spread")] | Annotated[FileFireConfig, Tag(f"{TAG}file")],
     Discriminator(_kind),
 ]
-"""a scenario as a field of a configuration"""
+"""A scenario as a field of a configuration."""
 
 
-def fires_of(scenario: ScenarioConfig) -> Fires:
-    """The fires of a scenario of either kind."""
+def fires_of(scenario: ScenarioConfig) -> FireSource:
+    """Returns the fires of a scenario."""
     return _KINDS[type(scenario)](scenario)
 
 
-def arrival_times(
+def load_fires(
     fire: str | ScenarioConfig | Tensor, config: WildfireConfig, num_envs: int
 ) -> tuple[Tensor, bool]:
-    """The fires that a `WildfireEnv` is given, whatever form they are given in.
+    """Returns the fires of a `WildfireEnv`.
 
     Args:
         fire: a scenario's name, a config, or arrival times.
@@ -181,18 +180,18 @@ def arrival_times(
         num_envs: environments.
 
     Returns:
-        Arrival times, float32 [fires, X, Y], and whether environment i always has fire i, or the
-        only one.
+        Arrival times, float32 [fires, X, Y], and whether they are fixed: environment i always has
+        fire i, or the only one.
 
     Raises:
-        ValueError: an unknown scenario, a file that cannot be read, or arrival times whose shape
+        UserError: an unknown scenario, a file that cannot be read, or arrival times whose shape
             or values do not fit.
     """
     if isinstance(fire, str):
         fire = load_scenario(fire)
     if isinstance(fire, ScenarioConfig):
         return fires_of(fire).train(config.grid, config.horizon), False
-    # A copy, in order in memory: what the caller does to theirs later is not our fire.
+    # A copy, because the caller may change theirs later.
     try:
         bank = torch.as_tensor(fire, dtype=torch.float32)
     except (TypeError, ValueError, RuntimeError):

@@ -19,7 +19,7 @@ from emberlink.envs.world.reward import view_reward
 from emberlink.envs.world.sensor import Sensor
 
 from . import keys, specs
-from .scenarios import ScenarioConfig, arrival_times
+from .scenarios import ScenarioConfig, load_fires
 
 
 class WildfireEnv(Buffers, EnvBase):
@@ -76,7 +76,7 @@ class WildfireEnv(Buffers, EnvBase):
         self.register_buffer("_low", low, persistent=False)
         self.register_buffer("_high", high, persistent=False)
         sensor = Sensor(config.grid, view_angle=config.view_angle, ceiling=high[2].item())
-        fires, self._fire_each = arrival_times(fire, config, num_envs)
+        fires, self._fire_each = load_fires(fire, config, num_envs)
         self._map = CoverageMap(
             sensor, fires, horizon=config.horizon, envs=num_envs, uavs=config.num_uavs
         )

@@ -1,9 +1,12 @@
 """The protocol: the same fires and starts for everyone, and the same numbers every time."""
 
+import importlib
 import itertools
 import json
 import math
 import os
+import subprocess
+import sys
 from dataclasses import replace
 
 import pytest
@@ -189,7 +192,7 @@ def test_other_fires_policies_protocols_and_sources_have_files_of_their_own(
     monkeypatch.setattr(evaluate, "START_SEED", 5)
     lawnmower(config)
     assert len(played) == 4
-    monkeypatch.setattr(baseline_cache, "source_digest", lambda: "other")
+    monkeypatch.setattr(baseline_cache, "source_digest", lambda *_: "other")
     lawnmower(config)
     assert len(played) == 5
 
@@ -209,6 +212,41 @@ def test_a_damaged_file_is_replaced(content, cache, played):
     assert len(played) == 2
     assert json.loads(file.read_text()) == first
     assert not list(cache.glob("*.tmp"))
+
+
+LOADED = """
+import sys, torch
+from emberlink.trainers.evaluation import baseline_cache, evaluate
+from emberlink.trainers.config.compose import resolve
+config = resolve("consensus", ["setup=tuned", "env.horizon=3", "env.num_uavs=2"])
+for name in evaluate.SCRIPTED:
+    evaluate.play_scripted(config, name, torch.ones(1, 30, 30))
+known = {str(path.resolve()) for path in baseline_cache.sources()}
+for name, module in sys.modules.items():
+    if name.startswith(("emberlink.envs.", "emberlink.comm.", "emberlink.policies.")):
+        file = __import__("pathlib").Path(module.__file__).resolve()
+        if str(file) not in known:
+            print(name)
+"""
+
+
+def test_everything_that_is_played_is_in_the_name_of_the_file(cache):
+    done = subprocess.run(
+        [sys.executable, "-c", LOADED], capture_output=True, text=True, check=True
+    )
+    assert done.stdout == ""
+
+
+def test_the_source_of_a_policy_from_elsewhere_is_in_the_name_of_the_file(tmp_path, monkeypatch):
+    file = tmp_path / "elsewhere.py"
+    file.write_text("class Mine:\n    pass\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    mine = importlib.import_module("elsewhere").Mine
+    assert file in baseline_cache.sources(mine)
+    monkeypatch.setattr(baseline_cache, "_IMPORTED", 2**62)
+    before = baseline_cache.source_digest(mine)
+    file.write_text("class Mine:\n    speed = 2\n")
+    assert before != baseline_cache.source_digest(mine) is not None
 
 
 def test_changed_source_is_neither_read_nor_written(cache, played, monkeypatch):

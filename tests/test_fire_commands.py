@@ -15,8 +15,8 @@ from PIL import Image
 
 from emberlink.envs.fire.cache import GENERATOR_VERSION
 from emberlink.envs.fire.generator import burning_cells, fire_seeds, load_scenario, make_fires
-from emberlink.envs.fire_files import bank_writer
-from emberlink.envs.fire_files.bank_writer import write_bank
+from emberlink.envs.fire_files import banks
+from emberlink.envs.fire_files.banks import write_bank
 from emberlink.envs.scenarios import fires_of
 from emberlink.envs.utils.publish import published
 from emberlink.trainers.cli import main
@@ -303,7 +303,7 @@ KNOWN = "known: huygens, oil_slick, paper"
         (["preview", "folder"], ["folder", "expected a file"]),
         (["preview", "empty.tif"], ["empty.tif", "empty"]),
         (["preview", "paper", "env.gird=[9,9]"], ["'env.gird'", "did you mean env.grid?"]),
-        (["preview", "paper", "fire.heat_rate=[1,1]"], ["did you mean fire.head_ros?"]),
+        (["preview", "paper", "fire.head_rose=[1,1]"], ["did you mean fire.head_ros?"]),
         (["preview", "paper", "fire.units=minutes"], ["'fire.units'"]),
         (["preview", "paper", "seed=3"], ["'seed=3'", "keys of setup, env. and fire. only"]),
         (["preview", "paper", "fire=huygens"], ["'fire=huygens'", "without a key"]),
@@ -320,7 +320,7 @@ KNOWN = "known: huygens, oil_slick, paper"
         (["make", "paper", "--count", "5000", "--output", "a.tif"], ["5000 fires", "4096", ".npy"]),
         (["make", "paper", "--count", "300000"], ["300000 fires", "1073741824"]),
         (["make", "paper", "--count", "9" * 30], ["at most"]),
-        (["make", "paper", "--count", "1000001", "env.grid=[8,8]"], ["training seeds end"]),
+        (["make", "paper", "--count", "1000001", "env.grid=[8,8]"], ["1000001"]),
         (["make", "paper", "--output", "bank.npy"], ["bank.npy is there already"]),
         (["make", "paper", "--output", "beside.npy"], ["beside.json is there already"]),
         (["make", "paper", "--output", "folder"], ["folder", "is a folder", ".npy, .tif, .tiff"]),
@@ -396,7 +396,7 @@ def test_without_the_extra_one_line_says_which(capsys, tmp_path, monkeypatch):
         ["import", "bank.tif", "--output", "a.npy"],
         ["preview", "bank.tif"],
     ):
-        assert "pip install 'emberlink[geo]'" in refused(capsys, *arguments)
+        assert "pip install '.[geo]'" in refused(capsys, *arguments)
     assert ran(capsys, "make", "paper", "--output", "a.npy")[-1] == "a.npy"
     assert [path.name for path in sorted(tmp_path.iterdir())] == ["a.json", "a.npy", "bank.tif"]
 
@@ -459,7 +459,7 @@ def test_where_there_are_no_links_a_file_is_published_all_the_same(tmp_path, mon
 def test_what_is_no_time_is_not_written(wrong, tmp_path):
     fires = torch.zeros(1, 8, 8)
     fires[0, 2, 3] = wrong
-    for suffix in bank_writer.SUFFIXES:
+    for suffix in banks.SUFFIXES:
         with pytest.raises(ValueError, match="NaN or a negative"):
             write_bank(tmp_path / f"a{suffix}", fires)
     assert list(tmp_path.iterdir()) == []

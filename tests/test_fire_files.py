@@ -16,8 +16,10 @@ from tiny_run import TINY
 
 from emberlink.configs import known
 from emberlink.envs.fire.generator import load_scenario, make_fires, scenarios
-from emberlink.envs.fire_files.reader import KEPT, FileFireConfig, read_fires, splits
+from emberlink.envs.fire_files.config import FileFireConfig
+from emberlink.envs.fire_files.reader import COPY_FILE, fire_sets, read_fires
 from emberlink.envs.scenarios import fires_of
+from emberlink.envs.utils.errors import UserError
 from emberlink.envs.wildfire import WildfireEnv
 from emberlink.trainers.cli import main
 from emberlink.trainers.config.compose import from_values, override, resolve, to_values
@@ -90,7 +92,7 @@ def test_keys_come_in_any_order_and_setup_keeps_its_own(source):
         ("fire.num_train_fires=3", "fire.num_train_fires"),
         ("fire.kind=spread", "chosen with fire=NAME"),
         ("fire.sha256=abc", "fire.sha256"),
-        ("fire.kept=abc", "fire.kept"),
+        ("fire.saved_copy=abc", "fire.saved_copy"),
     ):
         with pytest.raises(ValueError, match=wrong):
             resolve("consensus", [*keys, text])
@@ -114,11 +116,11 @@ def test_a_run_tells_what_it_was_trained_on(trained):
     fire = yaml.safe_load((run / "config.yaml").read_text())["fire"]
     assert fire["path"] == f"{trained}/fire.asc"
     assert len(fire["sha256"]) == 64
-    assert "kept" not in fire
+    assert "saved_copy" not in fire
     evaluation = json.loads((run / "eval.json").read_text())
     assert set(evaluation["results"]) == {"huygens", "file"}
     assert evaluation["held_out"]["file"]["scenario"] == fire
-    with np.load(run / KEPT) as kept:
+    with np.load(run / COPY_FILE) as kept:
         expected = read_fires(RunFolder(run).config().fire, GRID, HORIZON)
         for split in ("train", "validation", "test"):
             assert np.array_equal(kept[split], expected.numpy())
@@ -140,7 +142,7 @@ def test_a_run_is_evaluated_rendered_and_resumed_without_its_file(run, trained, 
         # On another grid the file itself is needed.
         line = fails(["eval", run, "env.horizon=9"], capfd)
         assert line.endswith("fire.asc: there is no such file")
-        (run / KEPT).write_bytes((run / KEPT).read_bytes()[:300])
+        (run / COPY_FILE).write_bytes((run / COPY_FILE).read_bytes()[:300])
         assert fails(["eval", run], capfd).endswith("fire.asc: there is no such file")
     finally:
         (trained / "elsewhere.asc").rename(gone)
@@ -156,7 +158,7 @@ def test_a_file_that_changed_is_named(run, trained, capfd):
     before = file.read_text()
     file.write_text(before.replace("CELLSIZE 75.0", "CELLSIZE 74.0"))
     try:
-        (run / KEPT).unlink()
+        (run / COPY_FILE).unlink()
         for arguments in (["eval", run], ["train", f"resume={run}", "episodes=3"]):
             assert "fire.asc: has changed" in fails(arguments, capfd)
     finally:
@@ -166,12 +168,12 @@ def test_a_file_that_changed_is_named(run, trained, capfd):
 
 def test_a_copy_of_another_configuration_is_not_taken(run, trained):
     config = RunFolder(run).config()
-    assert config.fire.kept == str(run / KEPT)
+    assert config.fire.saved_copy == str(run / COPY_FILE)
     (trained / "fire.asc").rename(trained / "away.asc")
     try:
-        assert splits(config.fire, GRID, HORIZON)["train"].shape == (1, *GRID)
+        assert fire_sets(config.fire, GRID, HORIZON).train.shape == (1, *GRID)
         changed = override(config, ["env.reward.exit=-3"])
-        assert changed.fire.kept == config.fire.kept
+        assert changed.fire.saved_copy == config.fire.saved_copy
         for other in (
             splits_of(config.fire, (10, 12), HORIZON),
             splits_of(config.fire, GRID, HORIZON + 1),
@@ -184,7 +186,7 @@ def test_a_copy_of_another_configuration_is_not_taken(run, trained):
 
 
 def splits_of(*arguments):
-    return lambda: splits(*arguments)
+    return lambda: fire_sets(*arguments)
 
 
 def test_old_runs_load_as_they_were():
@@ -227,10 +229,10 @@ def test_a_second_file_holds_the_test_fires(tmp_path, source):
     assert torch.equal(found.validation(1, GRID, HORIZON), fires[[3]])
     other = read_fires(FileFireConfig(path=str(source), units="minutes"), GRID, HORIZON)
     assert torch.equal(found.test(2, GRID, HORIZON), other.expand(2, -1, -1))
-    pinned = found.pinned()
+    pinned = found.with_checksum()
     assert pinned.sha256 != pinned.test_sha256
     with pytest.raises(ValueError, match=r"nothing\.asc: there is no such file"):
-        fires_of(FileFireConfig(path=str(source), test="nothing.asc")).pinned()
+        fires_of(FileFireConfig(path=str(source), test="nothing.asc")).with_checksum()
 
 
 def test_a_bank_is_taken_as_it_is(tmp_path):
@@ -273,20 +275,17 @@ def test_the_name_of_a_scenario_needs_no_file():
         WildfireEnv(1, fire="file")
 
 
-@pytest.mark.parametrize(
-    ("suffix", "module"), [("asc", "rasterio"), ("tif", "rasterio"), ("shp", "pyogrio")]
-)
-def test_without_the_extra_the_message_says_so(tmp_path, monkeypatch, source, suffix, module):
+@pytest.mark.parametrize(("suffix", "module"), [("tif", "rasterio"), ("shp", "pyogrio")])
+def test_without_the_extra_the_message_says_so(tmp_path, monkeypatch, suffix, module):
     frame_of(Ellipses(), (60.0, 120.0)).to_file(tmp_path / "fire.shp")
     write_tif(tmp_path / "fire.tif", raster_of(Ellipses(), 300.0))
-    shutil.copy(source, tmp_path / "fire.asc")
     monkeypatch.setitem(sys.modules, module, None)
     config = FileFireConfig(path=str(tmp_path / f"fire.{suffix}"), units="minutes")
-    with pytest.raises(ValueError, match=r"needs the extra geo: pip install 'emberlink\[geo\]'"):
+    with pytest.raises(ValueError, match=r"needs the extra geo: pip install '\.\[geo\]'"):
         read_fires(config, GRID, HORIZON)
 
 
-def test_numpy_and_text_need_no_extra(tmp_path, monkeypatch):
+def test_numpy_and_text_need_no_extra(tmp_path, monkeypatch, source):
     fires = bank_of(2)
     np.save(tmp_path / "bank.npy", fires.numpy())
     (tmp_path / "fire.txt").write_text(points_text(Ellipses(), 6040, points=24))
@@ -296,6 +295,8 @@ def test_numpy_and_text_need_no_extra(tmp_path, monkeypatch):
     assert torch.equal(got, fires)
     text = FileFireConfig(path=str(tmp_path / "fire.txt"))
     assert torch.isfinite(read_fires(text, GRID, 1000)).any()
+    raster = FileFireConfig(path=str(source), units="minutes")
+    assert torch.isfinite(read_fires(raster, GRID, 1000)).any()
 
 
 @settings(max_examples=80, deadline=None)
@@ -331,9 +332,9 @@ def test_any_choice_gives_a_grid_or_a_line(source, grid, horizon, keys):
 
 def test_a_message_is_one_line_whatever_a_library_says(tmp_path, monkeypatch):
     def damaged(path):
-        raise ValueError("*** in database main ***\nPage 1: \x1b[31mcorruption")
+        raise UserError("*** in database main ***\nPage 1: \x1b[31mcorruption")
 
     np.save(tmp_path / "fire.npy", bank_of(1).numpy())
-    monkeypatch.setattr("emberlink.envs.fire_files.reader.detect.find_format", damaged)
-    with pytest.raises(ValueError, match=r"main \*\*\* Page 1:  \[31mcorruption$"):
+    monkeypatch.setattr("emberlink.envs.fire_files.reader.formats.find_format", damaged)
+    with pytest.raises(ValueError, match=r"main \*\*\*\\nPage 1: \\x1b\[31mcorruption$"):
         read_fires(FileFireConfig(path=str(tmp_path / "fire.npy")), GRID, HORIZON)

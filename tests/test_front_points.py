@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from emberlink.envs.fire_files.reader import FileFireConfig, read_fires
+from emberlink.envs.fire_files.config import FileFireConfig
+from emberlink.envs.fire_files.reader import read_fires
 
 
 def read(path, grid=(30, 30), horizon=1000, **keys):

@@ -14,7 +14,7 @@ ALLOWED = {
     "comm": {"comm", "envs"},
     "policies": {"policies", "envs"},
     "trainers": {"trainers", "comm", "policies", "envs", "configs"},
-    "configs": {"configs", "envs"},  # of envs only envs.utils
+    "configs": {"configs"},
 }
 
 

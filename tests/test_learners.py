@@ -1,6 +1,7 @@
 """What every learner must do, with every method, observation and sharing of weights."""
 
 import json
+from importlib.metadata import EntryPoint
 
 import pytest
 import torch
@@ -96,12 +97,8 @@ def test_wrong_settings_of_a_learner(values, message):
 
 
 def test_another_package_can_add_a_learner(monkeypatch):
-    class Point:
-        def load(self):
-            return TD3
-
-    monkeypatch.setattr(registry, "registered", lambda group: {"mine": Point()})
-    assert plugins.registered("emberlink.learners") == {}
+    point = EntryPoint("mine", "emberlink.trainers.learners.td3:TD3", "emberlink.learners")
+    monkeypatch.setattr(plugins, "registered", lambda group: {"mine": point})
     assert registry.known() == ["ddpg", "mine", "td3"]
     assert registry.find("mine") is TD3
 

@@ -10,7 +10,8 @@ import pytest
 import torch
 from malformed_fires import cases, keys_of, wholes
 
-from emberlink.envs.fire_files.reader import FileFireConfig, read_fires
+from emberlink.envs.fire_files.config import FileFireConfig
+from emberlink.envs.fire_files.reader import read_fires
 
 GRID, HORIZON = (12, 10), 50
 LONGEST = 5.0

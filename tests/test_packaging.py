@@ -1,5 +1,6 @@
 """The wheel, its metadata, and the console script that it brings, outside the checkout."""
 
+import json
 import os
 import re
 import subprocess
@@ -11,6 +12,9 @@ from email.parser import HeaderParser
 from pathlib import Path, PurePosixPath
 
 import pytest
+import yaml
+from own_package import write_package
+from tiny_run import TINY
 
 ROOT = Path(__file__).parents[1]
 FOLDERS = ("envs", "comm", "policies", "trainers", "configs")
@@ -33,7 +37,7 @@ def run(*command, cwd: Path, env: dict[str, str] | None = None, **options) -> st
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
-        timeout=120,
+        timeout=600,  # of a busy machine
         **options,
     )
     assert done.returncode == 0, f"{command}\n{done.stdout}"
@@ -193,6 +197,24 @@ def test_console_script_trains(installed: Path, elsewhere):
     assert Path(printed.strip().splitlines()[-1]) == folder.relative_to(cwd)
     assert {"config.yaml", "metrics.jsonl", "eval.json"} <= {p.name for p in folder.iterdir()}
     assert list((folder / "figures").glob("*.gif"))
+
+
+def test_a_package_of_a_users_own_adds_a_method_a_setup_and_a_fire(installed: Path, elsewhere):
+    cwd, env = elsewhere
+    python = installed / "python"
+    before = {file: file.stat().st_mtime_ns for file in installed.parent.rglob("emberlink/**/*.py")}
+    pip = (sys.executable, "-m", "pip", "--python", python, "install", "-q", "--no-deps")
+    source = write_package(cwd / "source")
+    run(*pip, "--no-index", "--no-build-isolation", source, cwd=cwd)
+    arguments = ("train", "headcount", "setup=small", *TINY)
+    run(installed / "emberlink", *arguments, cwd=cwd, env=env)
+    (folder,) = (cwd / "runs").iterdir()
+    written = yaml.safe_load((folder / "config.yaml").read_text())
+    assert written["comm"] == {"name": "headcount", "scale": 0.5}
+    assert (written["setup"], written["fire"]["name"]) == ("small", "faint")
+    assert len((folder / "metrics.jsonl").read_text().splitlines()) == 2
+    assert set(json.loads((folder / "eval.json").read_text())["results"]) == {"huygens", "faint"}
+    assert before == {file: file.stat().st_mtime_ns for file in before}
 
 
 def test_typing_links_show_the_package():

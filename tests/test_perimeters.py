@@ -10,7 +10,8 @@ import shapely
 import torch
 from fire_files import CORNER, KINDS, UTM, Ellipses, frame_of, raster_of, write_asc
 
-from emberlink.envs.fire_files.reader import FileFireConfig, read_fires
+from emberlink.envs.fire_files.config import FileFireConfig
+from emberlink.envs.fire_files.reader import read_fires
 
 GRID, HORIZON = (30, 30), 1000
 HOURS = (60.0, 120.0, 180.0, 240.0, 300.0)
@@ -233,13 +234,14 @@ COLUMNS = {
     "iso text": ("poly_DateCurrent", [d.isoformat() for d in DATED]),
     "text with slashes": ("date", [d.strftime("%Y/%m/%d %H:%M:%S+00") for d in DATED]),
     "milliseconds": ("poly_DateC", [int(d.timestamp() * 1000) for d in DATED]),
-    "timestamps": ("GDB_FROM_DA", pandas.to_datetime(DATED)),
-    "naive timestamps": ("when", pandas.to_datetime([d.replace(tzinfo=None) for d in DATED])),
+    "timestamps": ("GDB_FROM_DATE", pandas.to_datetime(DATED)),
+    "naive timestamps": ("timestamp", pandas.to_datetime([d.replace(tzinfo=None) for d in DATED])),
     "zones that differ": (
         "date",
         ["2020-08-19T22:00:00Z", "2020-08-19T16:00:00-07:00", "2020-08-20T02:00:00+02:00"],
     ),
-    "any name": ("seen", [d.isoformat() for d in DATED]),
+    "RFC 2822": ("date", [d.strftime("%a, %d %b %Y %H:%M:%S GMT") for d in DATED]),
+    "American": ("date", ["8/19/2020 10:00:00 PM", "8/19/2020 23:00", "8/20/2020 12:00 AM"]),
 }
 
 
@@ -269,8 +271,6 @@ def test_when_a_perimeter_was_mapped_counts_not_when_its_record_was_changed(tmp_
         "poly_PolygonDateTime": "poly_DateCurrent",
         "poly_Polyg": "poly_DateC",
         "perimeterdatetime": "datecurrent",
-        "perimeterd": "datecurren",
-        "GDB_FROM_D": "datecurren",
     }
     for number, (mapped, edited) in enumerate(columns.items()):
         frame = squares(200, 300, 400, column=edited, values=[d.isoformat() for d in changed])
@@ -278,6 +278,53 @@ def test_when_a_perimeter_was_mapped_counts_not_when_its_record_was_changed(tmp_
         suffix = "shp" if len(mapped) <= 10 else "gpkg"
         frame.to_file(tmp_path / f"{number}.{suffix}")
         assert torch.equal(read(tmp_path / f"{number}.{suffix}"), elapsed), mapped
+    frame = squares(200, 300, 400, column="poly_PolygonDateTime", values=[None, None, None])
+    frame["poly_DateCurrent"] = [d.isoformat() for d in DATED]
+    frame.to_file(tmp_path / "none.gpkg")
+    assert torch.equal(read(tmp_path / "none.gpkg"), elapsed)
+    frame.loc[0, "poly_PolygonDateTime"] = DATED[0].isoformat()
+    frame.loc[0, "poly_DateCurrent"] = "2021-01-01T00:00Z"
+    frame.to_file(tmp_path / "one.gpkg")
+    assert torch.equal(read(tmp_path / "one.gpkg"), elapsed)
+
+
+@pytest.mark.parametrize(
+    "times", [["2200", "2300", "0000"], [2200, 2300, 0], ["22:00", "23:00", "0:00"]]
+)
+def test_geomacs_date_and_time(tmp_path, times):
+    """Two columns; without the clock time all three would be of two dates."""
+    squares(200, 300, 400, column="Elapsed_Mi", values=[0, 60, 120]).to_file(tmp_path / "e.shp")
+    dates = pandas.to_datetime(["2020-08-19", "2020-08-19", "2020-08-20"])
+    for values in (dates.date, dates.strftime("%m/%d/%Y")):
+        frame = squares(200, 300, 400, column="DATE_", values=values)
+        frame["TIME_"] = times
+        frame.to_file(tmp_path / "fire.shp")
+        assert torch.equal(read(tmp_path / "fire.shp"), read(tmp_path / "e.shp"))
+    frame["TIME_"] = ["2200", "2365", "0000"]
+    frame.to_file(tmp_path / "wrong.shp")
+    with pytest.raises(ValueError, match=r"feature 1 has DATE_=.*TIME_=2365; expected a date and"):
+        read(tmp_path / "wrong.shp")
+
+
+def test_columns_that_may_both_hold_the_times_are_named(tmp_path):
+    frame = squares(200, 300, 400, column="date", values=[d.isoformat() for d in DATED])
+    frame["timestamp"] = ["2020-08-19", "2020-09-19", "2020-10-19"]
+    frame.to_file(tmp_path / "fire.gpkg")
+    with pytest.raises(ValueError, match=r"date, timestamp may hold .* fire\.time_field=date"):
+        read(tmp_path / "fire.gpkg")
+    squares(200, 300, 400, column="seen", values=[d.isoformat() for d in DATED]).to_file(
+        tmp_path / "seen.gpkg"
+    )
+    expected = read(tmp_path / "seen.gpkg", time_field="seen")
+    assert torch.equal(read(tmp_path / "fire.gpkg", time_field="date"), expected)
+
+
+def test_an_end_before_the_first_perimeter(tmp_path):
+    """The fire began at 0, so its first half hour is a span of time as well."""
+    squares(300, 400, 500, column="Elapsed_Mi", values=[60, 120, 180]).to_file(tmp_path / "f.shp")
+    early = read(tmp_path / "f.shp", end=30.0)
+    assert torch.equal(early, read(tmp_path / "f.shp", start=0.0, end=30.0))
+    assert torch.isfinite(early).any()
 
 
 def test_farsites_month_day_and_hour(tmp_path):
@@ -372,7 +419,7 @@ def test_dates_as_numbers(tmp_path, keys):
     squares(200, 300, 400, column="date", values=[20200830, 20200831, 20200832]).to_file(
         tmp_path / "wrong.gpkg"
     )
-    with pytest.raises(ValueError, match="feature 2 has date=20200832, which is no date"):
+    with pytest.raises(ValueError, match=r"feature 2 has date='?20200832'?, which is not a date"):
         read(tmp_path / "wrong.gpkg", **keys)
 
 
@@ -380,5 +427,5 @@ def test_a_month_in_words_is_named(tmp_path):
     frame = squares(200, 300, 400, column="Month", values=["4", "April", "4"])
     frame["Day"], frame["Hour"] = [1, 1, 1], [1200, 1300, 1400]
     frame.to_file(tmp_path / "fire.gpkg")
-    with pytest.raises(ValueError, match="feature 1 has Month=April; expected a whole number"):
+    with pytest.raises(ValueError, match="feature 1 has Month=April, Day=1, Hour=1300; "):
         read(tmp_path / "fire.gpkg")

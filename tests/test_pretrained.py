@@ -10,9 +10,14 @@ import yaml
 from tiny_run import TINY
 
 from emberlink.trainers.cli.main import main
+from emberlink.trainers.config.compose import from_values, to_values
 from emberlink.trainers.evaluation.actor import load_actor
 from emberlink.trainers.runs import pretrained
 from emberlink.trainers.runs.run_folder import RunFolder
+from emberlink.trainers.runs.safe_read import read_yaml
+from emberlink.trainers.runs.seal import check_trained_with
+
+DATA = Path(__file__).parent.parent / "docs" / "data"
 
 
 @pytest.fixture(scope="module")
@@ -126,6 +131,16 @@ def test_only_finished_runs_are_packed_and_nothing_is_overwritten(packed, tmp_pa
     assert not (tmp_path / "new").exists()
 
 
+def test_every_configuration_that_is_shipped_names_all_keys():
+    """A key that is new, with a default, is written into these files, too."""
+    files = [*pretrained._shipped().rglob("config.yaml"), *DATA.rglob("config.yaml")]
+    assert len(files) > 50
+    for file in files:
+        values = read_yaml(file)
+        assert to_values(from_values(values)) == values, file
+        RunFolder(file.parent).config()
+
+
 def test_every_policy_that_is_shipped_loads():
     folders = sorted(file.parent for file in pretrained._shipped().glob("*/*/*/config.yaml"))
     assert folders
@@ -133,6 +148,7 @@ def test_every_policy_that_is_shipped_loads():
         run = RunFolder(folder)
         config = run.config()
         assert folder.parts[-3:] == (config.setup, config.method, f"s{config.seed}")
+        check_trained_with(run.checkpoint(), config)
         actor = load_actor(config, run.checkpoint())
         assert all(torch.isfinite(weight).all() for weight in actor.parameters())
         assert len(run.lines()) == config.episodes

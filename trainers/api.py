@@ -25,6 +25,7 @@ from emberlink.trainers.evaluation.report import evaluate_run
 from emberlink.trainers.evaluation.results import Results
 from emberlink.trainers.runs import pretrained
 from emberlink.trainers.runs.run_folder import RunFolder
+from emberlink.trainers.runs.seal import check_trained_with
 from emberlink.trainers.training.trainer import Progress, Trainer
 
 Reference = str | os.PathLike[str]
@@ -181,10 +182,11 @@ def load(
     """
     folder = RunFolder(pretrained.find_one(str(run)) if pretrained.is_name(str(run)) else run)
     trained = folder.config(**({} if device is None else {"device": device}))
+    file = folder.checkpoint() if checkpoint is None else Path(checkpoint)
+    check_trained_with(file, trained)
     config = override(trained, **settings)
     if replace(trained, env=config.env, comm=config.comm) != config:
         raise UserError(f"{', '.join(settings)}: only keys of env and comm can be changed")
-    file = folder.checkpoint() if checkpoint is None else Path(checkpoint)
     return TrainedPolicy(load_actor(config, file), config, file)
 
 

@@ -16,8 +16,9 @@ from pydantic import AfterValidator, ConfigDict, Field, Strict, ValidationError
 from pydantic.dataclasses import dataclass
 from torch import Tensor
 
-from emberlink.configs import known, read
+from emberlink.configs import known
 from emberlink.envs.config import check_grid
+from emberlink.envs.utils.config_files import read
 from emberlink.envs.utils.counter_rng import Use, fold_in, uniform
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import Name, describe

@@ -1,0 +1,22 @@
+"""Fires from files: reads rasters, perimeters, the paper's text and banks onto a grid."""
+
+from emberlink.envs.fire_files.reader import (
+    FireSets,
+    fire_sets,
+    read_fires,
+    save_copy,
+    with_checksum,
+)
+
+from .banks import write_bank
+from .config import FileFireConfig
+
+__all__ = [
+    "FileFireConfig",
+    "FireSets",
+    "fire_sets",
+    "read_fires",
+    "save_copy",
+    "with_checksum",
+    "write_bank",
+]

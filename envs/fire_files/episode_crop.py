@@ -1,43 +1,28 @@
 """The part of a fire, in time and space, that an episode shows."""
 
 import math
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from scipy import ndimage
 
 from emberlink.envs.utils.errors import UserError
 
-from .arrival_raster import SECONDS, Clock, Source, Units, Window
-from .perimeter_times import parse_time
+from .config import FileFireConfig
+from .raster_source import Source, Window
+from .times import SECONDS, Clock, Units, in_utc, parse_time
 
-BASE_SIDE = 30
-"""cells of the side that `ring_width` is told for"""
-
-
-class Choices(Protocol):
-    """What a user chooses of it; see `FileFireConfig`."""
-
-    @property
-    def units(self) -> Units | None: ...
-    @property
-    def start(self) -> float | str | None: ...
-    @property
-    def end(self) -> float | str | None: ...
-    @property
-    def minutes_per_step(self) -> float | None: ...
-    @property
-    def margin(self) -> float | None: ...
-    @property
-    def ring_width(self) -> float | None: ...
+_BASE_SIDE = 30  # cells of the side that `ring_width` is told for
 
 
-def on_grid(source: Source, choices: Choices, grid: tuple[int, int], horizon: int) -> np.ndarray:
-    """A fire on the grid and in the steps of an episode.
+def on_grid(
+    source: Source, config: FileFireConfig, grid: tuple[int, int], horizon: int
+) -> np.ndarray:
+    """Crops a fire to a grid and stretches its times over an episode.
 
     Args:
         source: the fire.
-        choices: of the user.
+        config: its span of time, margin and ring.
         grid: (X, Y).
         horizon: steps.
 
@@ -45,58 +30,56 @@ def on_grid(source: Source, choices: Choices, grid: tuple[int, int], horizon: in
         float32 [X, Y], steps; 0 burns from the start, inf never burns.
 
     Raises:
-        ValueError: the chosen span of time or place shows no fire that spreads.
+        UserError: the chosen span of time or place shows no fire that spreads.
     """
-    untouched = choices.start is choices.end is choices.minutes_per_step is None
-    as_it_is = untouched and source.clock.unit == "steps"
-    start, end = (0.0, float(horizon)) if as_it_is else _span(source, choices, horizon)
-    margin = None if source.whole else choices.margin
+    no_span = config.start is config.end is config.minutes_per_step is None
+    in_steps = no_span and source.clock.unit == "steps"
+    start, end = (0.0, float(horizon)) if in_steps else _span(source, config, horizon)
+    margin = None if source.whole else config.margin
     bounds = source.extent if margin is None else source.burnt(end)
-    window = Window.around(bounds, grid, margin or 0)
-    times = source.on(window, end)
-    times[(times > end) | window.beyond(bounds)] = np.inf
-    if choices.start is None and not as_it_is and not (times <= start).any():
+    times = source.on(Window.around(bounds, grid, margin or 0), end)
+    times[times > end] = np.inf
+    if config.start is None and not in_steps and not (times <= start).any():
         times[times == times.min()] = start  # the first cell burns from the beginning
-    if choices.ring_width is not None and not (source.whole and as_it_is):
-        times[_burnt_out(times, start, choices.ring_width * min(grid) / BASE_SIDE)] = np.inf
+    if config.ring_width is not None and not (source.whole and in_steps):
+        times[_burnt_out(times, start, config.ring_width * min(grid) / _BASE_SIDE)] = np.inf
     steps = (np.maximum(times, start) - start) / (end - start) * horizon
     burning = steps[np.isfinite(steps)]
-    if len(burning) < 2 or (not as_it_is and burning.min() == burning.max()):
-        shown = source.clock.shown
-        raise UserError(
-            f"from {shown(start)} to {shown(end)} no fire spreads; it burns from "
-            f"{shown(source.first)} to {shown(source.last)}"
-        )
+    if len(burning) < 2 or (not in_steps and burning.min() == burning.max()):
+        raise _no_fire(source, start, end)
     return steps.astype(np.float32)
 
 
-def _span(source: Source, choices: Choices, horizon: int) -> tuple[float, float]:
-    """First and last moment of the episode, in the source's time."""
-    start = _moment(choices.start, "start", source, choices.units)
+def _no_fire(source: Source, start: float, end: float) -> UserError:
+    text = source.clock.format
+    return UserError(
+        f"from {text(start)} to {text(end)} no fire spreads; it burns from {text(source.first)} to "
+        f"{text(source.last)}"
+    )
+
+
+def _span(source: Source, config: FileFireConfig, horizon: int) -> tuple[float, float]:
+    """Returns the times of the first and the last step, in the source's unit."""
+    start = _time(config.start, "start", source, config.units)
     start = source.began if start is None else start
-    end = _moment(choices.end, "end", source, choices.units)
-    if choices.minutes_per_step is not None:
+    end = _time(config.end, "end", source, config.units)
+    if config.minutes_per_step is not None:
         if source.clock.unit == "steps":
             raise UserError(
                 "fire.minutes_per_step: the file's times are in steps; expected fire.units in time"
             )
-        end = start + horizon * choices.minutes_per_step * 60 / SECONDS[source.clock.unit]
+        end = start + horizon * config.minutes_per_step * 60 / SECONDS[source.clock.unit]
     end = source.last if end is None else end
-    shown = source.clock.shown
-    if end < source.first or start >= source.last:
-        raise UserError(
-            f"from {shown(start)} to {shown(end)} no fire spreads; it burns from "
-            f"{shown(source.first)} to {shown(source.last)}"
-        )
+    if end < source.began or start >= source.last:
+        raise _no_fire(source, start, end)
     if not start < end:
-        raise UserError(f"from {shown(start)} to {shown(end)}: the end must be after the start")
+        text = source.clock.format
+        raise UserError(f"from {text(start)} to {text(end)}: the end must be after the start")
     return start, end
 
 
-def _moment(
-    value: float | str | None, key: str, source: Source, units: Units | None
-) -> float | None:
-    """`fire.start` or `fire.end` in the source's time."""
+def _time(value: float | str | None, key: str, source: Source, units: Units | None) -> float | None:
+    """Returns `fire.start` or `fire.end` in the source's unit."""
     clock = source.clock
     if value is None:
         return None
@@ -111,7 +94,7 @@ def _moment(
     if units is None or units == "steps":
         raise UserError(
             f"fire.{key}={value:g}: the file's times are dates; expected such as "
-            f"{clock.shown(source.first)}, or fire.units for a number"
+            f"{clock.format(source.first)}, or fire.units for a number"
         )
     return source.first + float(value) * SECONDS[units] / SECONDS[clock.unit]
 
@@ -119,17 +102,16 @@ def _moment(
 def _calendar(text: str, key: str, clock: Clock) -> float:
     assert clock.origin is not None
     try:
-        moment = parse_time(text)
-    except ValueError:
+        time = in_utc(parse_time(text))
+    except UserError:
         raise UserError(
-            f"fire.{key}={text[:40]}: no calendar time; expected such as {clock.shown(0)}"
+            f"fire.{key}={text}: not a calendar time; expected such as {clock.format(0)}"
         ) from None
-    moment = moment if moment.tzinfo else moment.replace(tzinfo=clock.origin.tzinfo)
-    return (moment - clock.origin).total_seconds() / SECONDS[clock.unit]
+    return (time - clock.origin).total_seconds() / SECONDS[clock.unit]
 
 
 def _burnt_out(times: np.ndarray, start: float, width: float) -> np.ndarray:
-    """What lies deeper within the area burnt at the start than the ring, bool [X, Y].
+    """Returns which cells lie deeper inside the area burnt at the start than the ring, [X, Y].
 
     A hole in it that never burns, such as a lake or a core burnt out before, has no front.
     """

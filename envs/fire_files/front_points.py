@@ -6,37 +6,37 @@ import numpy as np
 
 from emberlink.envs.utils.errors import UserError
 
-from .arrival_raster import Clock, RasterSource, Units
-from .geotiff import check_spreads
+from .raster_source import RasterSource
+from .rasters import check_spreads
+from .times import Clock, Units
 
 SIDE = 30
-"""cells of the paper's map"""
+"""Cells along a side of the paper's map."""
 SKIPPED = 6000
-"""lines before the one that is step 0"""
-_ALLOWED = b"0123456789+-.eE, \t\r\n"
+"""Lines before step 0."""
+_MAX_COORDINATE = 1e9
 _PLUS = ((0, 0), (1, 0), (-1, 0), (0, 1), (0, -1))
 
 
 def read_front_points(path: Path, unit: Units = "steps") -> RasterSource:
-    """The paper's fire: each point of the front stamps a plus of five cells on a map of 30 x 30.
+    """Reads the paper's fire: each point of the front marks five cells on a map of 30 x 30.
 
-    A point's cell along x and y is int(v - (30 - 1) / 3). A cell burns from the first line that
-    stamps it; lines before the 6000th are skipped, and that one is time 0.
+    The cell of a point is int(v - (30 - 1) / 3) along x and y; the four beside it burn too. A cell
+    burns from the first line that marks it. The first 6000 lines are skipped; line 6000 is time 0.
 
     Args:
         path: the text.
         unit: time from one line to the next.
 
     Raises:
-        ValueError: one line that names the file's line that is wrong.
+        UserError: a line is not numbers in threes, or there is no fire.
     """
-    times = np.full((SIDE, SIDE), np.inf)
+    times = np.full((SIDE, SIDE), np.inf)  # [x, y]
     count = 0
     with path.open("rb") as lines:
-        for line in lines:
-            if count >= SKIPPED:
-                _stamp(times, _points(line, count + 1), count - SKIPPED)
-            count += 1
+        for count, line in enumerate(lines, 1):
+            if count > SKIPPED:
+                _mark(times, _points(line, count), count - 1 - SKIPPED)
     if count <= SKIPPED:
         raise UserError(
             f"{count} lines; expected more than {SKIPPED}, as the first {SKIPPED} are skipped"
@@ -44,37 +44,28 @@ def read_front_points(path: Path, unit: Units = "steps") -> RasterSource:
     if not np.isfinite(times).any():
         raise UserError(f"no point lies on the map of {SIDE} x {SIDE} cells: there is no fire")
     check_spreads(times)
-    # Rows run north to south, as in every raster.
-    return RasterSource(
-        times.T[::-1].copy(), (1.0, 0.0, 0.0, 0.0, -1.0, float(SIDE)), Clock(unit), whole=True
-    )
+    return RasterSource(times.T[::-1], (0.0, float(SIDE)), (1.0, 1.0), Clock(unit), whole=True)
 
 
 def _points(line: bytes, number: int) -> np.ndarray:
-    """The triples of a line, [points, 3]."""
-    texts = line.strip().split(b",")
-    if texts[-1].strip() == b"":
-        texts.pop()
+    """Returns the triples of a line, [points, 3]."""
+    texts = line.strip().removesuffix(b",").split(b",")
     try:
-        if line.translate(None, _ALLOWED):
-            raise ValueError
-        values = np.array([float(text) for text in texts])
+        values = np.array([float(text) for text in texts if texts != [b""]])
     except ValueError:
-        wrong = repr((line.translate(None, _ALLOWED) or line)[:20].decode("latin-1"))
-        raise UserError(
-            f"line {number}: {wrong}; expected numbers: x,y,intensity, of each point"
-        ) from None
+        text = line[:20].decode("latin-1")
+        raise UserError(f"line {number}: {text!r}; expected x,y,intensity, of each point") from None
     if len(values) % 3:
         raise UserError(
             f"line {number}: {len(values)} numbers; expected three for each point: x,y,intensity,"
         )
-    if not np.isfinite(values).all() or np.abs(values).max(initial=0) > 1e9:
+    if not (np.abs(values) < _MAX_COORDINATE).all():
         raise UserError(f"line {number}: a number is not finite; expected x,y,intensity,")
     return values.reshape(-1, 3)
 
 
-def _stamp(times: np.ndarray, points: np.ndarray, time: int) -> None:
-    """Marks the cells of the points, where no earlier line has, [x, y]."""
+def _mark(times: np.ndarray, points: np.ndarray, time: int) -> None:
+    """Marks the cells of the points that no earlier line has marked."""
     cells = np.trunc(points[:, :2] - (SIDE - 1) / 3).astype(np.int64)
     for x, y in _PLUS:
         i, j = cells[:, 0] + x, cells[:, 1] + y

@@ -9,48 +9,50 @@ from scipy.ndimage import distance_transform_edt
 
 from emberlink.envs.utils.errors import UserError
 
-from .arrival_raster import Clock, Units, Window, within
-from .perimeter_polygons import enclosed, ignition, polygons
+from .config import FileFireConfig
+from .perimeter_areas import enclosed, ignition, make_valid, polygons
 from .perimeter_times import perimeter_times
-from .projection import Bounds, check_projection, first_line, library, to_plane
+from .projection import Bounds, check_projection, first_line, library, projections
+from .raster_source import Window
+from .times import Clock
 
-MOST_TIMES = 500
-_SURVEY = 256  # cells along the longer side where only the extent is asked for
-_WITHIN, _SHRUNK = 0.99, 0.75  # see `_check_order`
+MAX_TIMES = 500
+_SHRUNK = 0.75  # a perimeter inside the burnt area must have that share of it
+_INSIDE = 0.99  # share of a perimeter that lies inside the burnt area
 
 
-def read_perimeters(
-    path: Path,
-    unit: Units | None,
-    crs: str | None,
-    time_field: str | None = None,
-    layer: str | None = None,
-) -> "PerimeterSource":
-    """Perimeters with the time of each, as a fire.
-
-    Args:
-        path: a .shp, .geojson or .gpkg.
-        unit: of elapsed times.
-        crs: `fire.crs`.
-        time_field: column of the times; None to look for one that is known.
-        layer: of a GeoPackage that has several.
+def read_perimeters(path: Path, config: FileFireConfig) -> "PerimeterSource":
+    """Reads perimeters with the time of each, as a fire.
 
     Raises:
-        ValueError: one line that names the feature or column that is wrong.
+        UserError: the file, a feature or a column is wrong.
     """
+    frame = _read_table(path, config.layer)
+    times = perimeter_times(frame, config.time_field, config.units)
+    distinct = np.unique(times.values)
+    if len(distinct) > MAX_TIMES:
+        raise UserError(f"{len(distinct)} times; at most {MAX_TIMES} are read")
+    areas: list[Any] = []
+    for time in distinct:
+        features = np.flatnonzero(times.values == time).tolist()
+        areas.append(enclosed(frame.geometry.iloc[features].tolist(), features))
+    return PerimeterSource(_project(path, frame, areas, config.crs), distinct, times.clock)
+
+
+def _read_table(path: Path, layer: str | None) -> Any:
+    """Reads the features, each of which has a geometry."""
     pyogrio = library("pyogrio", "perimeters")
     library("geopandas", "perimeters")
-    json = path.suffix.lower() in (".geojson", ".json")
     # As text: of dates in GeoJSON, GDAL loses some zones where not all are the same.
-    options = {"DATE_AS_STRING": "YES"} if json else {}
+    options = {"DATE_AS_STRING": "YES"} if _is_json(path) else {}
     try:
-        layer = _layer(pyogrio, path, layer)
+        layer = _choose_layer(pyogrio.list_layers(path.absolute()), layer)
         frame = pyogrio.read_dataframe(
             path.absolute(), layer=layer, datetime_as_string=True, **options
         )
-    except ValueError:
+    except UserError:
         raise
-    except Exception as error:  # of GDAL, of text that is none, of geometries that are none
+    except Exception as error:  # of many types: of GDAL, of text, of geometries
         if isinstance(error, pyogrio.errors.CRSError):
             check_projection(path, None)
         raise UserError(f"{first_line(error)}; expected perimeters") from None
@@ -59,58 +61,58 @@ def read_perimeters(
     missing = np.flatnonzero((frame.geometry.isna() | frame.geometry.is_empty).to_numpy())
     if len(missing):
         raise UserError(f"feature {missing[0]} has no geometry; expected a perimeter in each")
-    if not json:
+    if not _is_json(path):
         check_projection(path, frame.crs)
-    times = perimeter_times(frame, time_field, unit)
-    source_crs = frame.crs
-    x0, y0, x1, y1 = (float(value) for value in frame.total_bounds)
-    bounds = x0, y0, x1, y1
-    if json and source_crs is not None and source_crs.is_geographic and _too_large(bounds):
-        source_crs = None  # GeoJSON that names no projection is taken for degrees
-    project, _ = to_plane(source_crs, crs, bounds, None)
-    moments = np.unique(times.values)
-    if len(moments) > MOST_TIMES:
-        raise UserError(f"{len(moments)} times; at most {MOST_TIMES} are read")
-    shapely = library("shapely", "perimeters")
-    areas: list[Any] = []
-    for moment in moments:
-        which = np.flatnonzero(times.values == moment).tolist()
-        area = enclosed(frame.geometry.iloc[which], which)
-        area = shapely.transform(area, lambda at: np.stack(project(at[:, 0], at[:, 1]), 1))
-        areas.append(_valid(shapely, area))
-    return PerimeterSource(areas, moments, times.clock)
+    return frame
 
 
-def _layer(pyogrio: Any, path: Path, wanted: str | None) -> str:
-    """The layer to read: the one named, or the only one with geometries."""
-    layers = [str(name) for name, kind in pyogrio.list_layers(path.absolute()) if kind is not None]
-    if wanted is None and len(layers) == 1:
-        return layers[0]
-    if wanted in layers:
+def _is_json(path: Path) -> bool:
+    return path.suffix.lower() in (".geojson", ".json")
+
+
+def _choose_layer(layers: Sequence[Any], wanted: str | None) -> str:
+    """Returns the layer that is named, or the only one with geometries."""
+    names = [str(name) for name, kind in layers if kind is not None]
+    if wanted is None and len(names) == 1:
+        return names[0]
+    if wanted in names:
         return str(wanted)
-    listed = ", ".join(layers[:30])
-    if not layers:
-        raise UserError("no layer has geometries; expected perimeters")
+    known = ", ".join(names[:30]) or "none"
     if wanted is None:
-        raise UserError(f"{len(layers)} layers; expected fire.layer, one of {listed}")
-    raise UserError(f"no layer {wanted!r} (fire.layer); there are {listed}")
+        raise UserError(f"{len(names)} layers; expected fire.layer, one of {known}")
+    raise UserError(f"no layer {wanted!r} (fire.layer); there are {known}")
 
 
-def _too_large(bounds: Bounds) -> bool:
-    return max(map(abs, bounds)) > 360
+def _project(path: Path, frame: Any, areas: Sequence[Any], crs: str | None) -> list[Any]:
+    """Projects areas onto a plane."""
+    x0, y0, x1, y1 = (float(value) for value in frame.total_bounds)
+    source_crs = frame.crs
+    in_degrees = source_crs is not None and source_crs.is_geographic
+    if _is_json(path) and in_degrees and max(map(abs, (x0, y0, x1, y1))) > 360:
+        source_crs = None  # GDAL takes GeoJSON without a projection for degrees
+    chosen = projections(source_crs, crs, (x0, y0, x1, y1), None)
+    if chosen is None:
+        return list(areas)
+    geopandas = library("geopandas", "perimeters")
+    projected = geopandas.GeoSeries(areas, crs=chosen[0]).to_crs(chosen[1])
+    if not np.isfinite(projected.total_bounds).all():
+        raise UserError(
+            f"coordinates from {x0, y0} to {x1, y1} cannot be projected from {chosen[0].name} to "
+            f"{chosen[1].name}; expected another fire.crs"
+        )
+    return [make_valid(area) for area in projected]
 
 
 class PerimeterSource:
-    """A fire of which the burnt area is known at some times; between them fronts are interpolated.
-
-    Perimeters that were observed do not contain each other: what burnt once stays burnt. Of elapsed
-    times, the fire before the first perimeter is taken back to 0: the edges of the box around it
-    moved as fast as from the first to the second, from a point at most.
+    """A fire whose burnt area is known at some times; the front is interpolated in between.
 
     Args:
-        areas: shapely's, on the plane, one for each time.
+        areas: of shapely, on a plane, one for each time.
         times: float64, ascending.
         clock: of the times.
+
+    Raises:
+        UserError: there are not two times, or the areas shrink.
     """
 
     whole = False
@@ -118,98 +120,79 @@ class PerimeterSource:
     def __init__(self, areas: Sequence[Any], times: np.ndarray, clock: Clock):
         if len(times) < 2:
             raise UserError(
-                f"one perimeter, of {clock.shown(times[0])}; expected two times or more"
+                f"one perimeter, of {clock.format(times[0])}; expected two times or more"
             )
         self.clock, self.first, self.last = clock, float(times[0]), float(times[-1])
+        _check_growth(areas, times, clock)
         if clock.origin is None and times[0] > 0:
-            areas, times = [_began(areas, times), *areas], np.concatenate([[0.0], times])
+            areas, times = [_at_zero(areas, times), *areas], np.concatenate([[0.0], times])
         self._areas, self._times, self.began = areas, times, float(times[0])
         boxes = np.array([area.bounds for area in areas])
         low, high = np.minimum.accumulate(boxes[:, :2]), np.maximum.accumulate(boxes[:, 2:])
         self._boxes = np.concatenate([low, high], axis=1)
-        x0, y0, x1, y1 = (float(value) for value in self._boxes[-1])
-        self.extent = x0, y0, x1, y1
-        side = max(x1 - x0, y1 - y0) / _SURVEY
-        counts = int(np.ceil((x1 - x0) / side)), int(np.ceil((y1 - y0) / side))
-        self._window = Window(x0, y0, side, counts).finer(1, (1, 1))
-        self._check_order()
-        self._survey = self._interpolated(self._window, len(times))
+        self.extent = self.burnt(self.last)
 
     def burnt(self, until: float) -> Bounds:
-        """What the area burnt by a time covers."""
-        if until >= self.last:
-            return self.extent
-        burnt = self._survey <= until
-        i, j = np.flatnonzero(burnt.any(1)), np.flatnonzero(burnt.any(0))
-        at = self._window
-        return (
-            float(at.x + i[0] * at.side),
-            float(at.y + j[0] * at.side),
-            float(at.x + (i[-1] + 1) * at.side),
-            float(at.y + (j[-1] + 1) * at.side),
-        )
+        """Returns the bounds of the area burnt by a time, interpolated between perimeters."""
+        x0, y0, x1, y1 = (float(np.interp(until, self._times, edge)) for edge in self._boxes.T)
+        return x0, y0, x1, y1
 
     def on(self, window: Window, until: float) -> np.ndarray:
-        """The earliest arrival within each cell of a grid."""
+        """Returns the earliest arrival in each cell of a grid, float64 [X, Y]."""
         count = int(min(np.searchsorted(self._times, until), len(self._times) - 1)) + 1
-        # All of the last front that is looked at, as the distance to it is needed.
+        # The distance to the last front is needed, so all of it must lie in the window.
         x0, y0, x1, y1 = self._boxes[count - 1]
         right = window.x + window.grid[0] * window.side
         upper = window.y + window.grid[1] * window.side
-        beyond = max(window.x - x0, x1 - right), max(window.y - y0, y1 - upper)
-        cuts = window.cuts
-        around: list[int] = []
-        for past, cells in zip(beyond, window.grid, strict=True):
-            needed = int(np.ceil(max(past, 0) / window.side)) + 1
-            around.append(cuts * min(needed, 2 * cells))
-        fine = window.finer(cuts, (around[0], around[1]))
-        inner = self._interpolated(fine, count)[around[0] : -around[0], around[1] : -around[1]]
-        return window.earliest(inner)
+        outside = max(window.x - x0, x1 - right), max(window.y - y0, y1 - upper)
+        across, along = (
+            window.cuts * min(int(np.ceil(max(past, 0) / window.side)) + 1, 2 * cells)
+            for past, cells in zip(outside, window.grid, strict=True)
+        )
+        times = self._interpolate(window.samples((across, along)), count)
+        return window.earliest(times[across:-across, along:-along])
 
-    def _interpolated(self, window: Window, count: int) -> np.ndarray:
-        """Arrival times of the first perimeters: between two fronts by how near each of them is."""
-        before = _inside(self._areas[0], window)
+    def _interpolate(self, window: Window, count: int) -> np.ndarray:
+        """Returns the arrival times of the first perimeters at the centres of a window's cells.
+
+        Times between two fronts are interpolated by the distances to the two.
+        """
+        before = _rasterize(self._areas[0], window)
         times = np.where(before, self._times[0], np.inf)
         for k in range(1, count):
-            after = before | _inside(self._areas[k], window)
+            after = before | _rasterize(self._areas[k], window)
             new = after & ~before
             if new.any() and before.any():
                 from_last, to_next = _depth(~before), _depth(after)
                 share = from_last / (from_last + to_next)
                 between = self._times[k - 1] + (self._times[k] - self._times[k - 1]) * share
                 times[new] = between[new]
-            times[new & np.isinf(times)] = self._times[k]  # of a first front outside the window
+            times[new & np.isinf(times)] = self._times[k]  # the first front lies outside
             before = after
         return times
 
-    def _check_order(self) -> None:
-        """That areas do not shrink: then times go backwards, or are of another fire."""
-        burnt = first = _inside(self._areas[0], self._window)
-        largest = self._areas[0].area
-        for k in range(1, len(self._areas)):
-            area, exact = _inside(self._areas[k], self._window), self._areas[k].area
-            # By cells at first: areas of many perimeters take long to unite.
-            if area.sum() < _SHRUNK * burnt.sum() or exact < _SHRUNK * largest:
-                self._check_shrinks(k)
-            burnt, largest = burnt | area, max(largest, exact)
-        if first.sum() == burnt.sum():
-            raise UserError("all cells burn at once: no perimeter adds to the first; expected two")
 
-    def _check_shrinks(self, k: int) -> None:
-        """That a perimeter is not but a part of what had burnt before."""
-        shapely = library("shapely", "perimeters")
-        area, before = self._areas[k], shapely.union_all(self._areas[:k])
-        within = area.intersection(before).area >= _WITHIN * area.area
-        if within and area.area < _SHRUNK * before.area:
+def _check_growth(areas: Sequence[Any], times: np.ndarray, clock: Clock) -> None:
+    """Checks that areas do not shrink: then times go backwards, or are of another fire."""
+    shapely = library("shapely", "perimeters")
+    burnt, united, largest = areas[0], 1, areas[0].area
+    for k in range(1, len(areas)):
+        area = areas[k]
+        largest = max(largest, area.area)
+        if area.area >= _SHRUNK * max(largest, burnt.area):
+            continue
+        burnt, united = shapely.union_all([burnt, *areas[united:k]]), k
+        inside = area.intersection(burnt).area >= _INSIDE * area.area
+        if inside and area.area < _SHRUNK * burnt.area:
             raise UserError(
-                f"the perimeter of {self.clock.shown(self._times[k])} lies within what had "
-                f"burnt before and is {100 * area.area / before.area:.0f} % of it: times go "
-                "backwards; expected areas that grow"
+                f"the perimeter of {clock.format(times[k])} lies inside the area burnt before and "
+                f"is {100 * area.area / burnt.area:.0f} % of it: times go backwards; expected "
+                "areas that grow"
             )
 
 
-def _began(areas: Sequence[Any], times: np.ndarray) -> Any:
-    """The area that burnt at time 0."""
+def _at_zero(areas: Sequence[Any], times: np.ndarray) -> Any:
+    """Returns the area that burnt at time 0, from the speed between the first two perimeters."""
     first, second = (np.array(area.bounds) for area in areas[:2])
     grown = np.concatenate([np.minimum(second - first, 0)[:2], np.maximum(second - first, 0)[2:]])
     speed = grown / (times[1] - times[0])
@@ -218,28 +201,25 @@ def _began(areas: Sequence[Any], times: np.ndarray) -> Any:
     return ignition(areas[0], speed * back)
 
 
-def _valid(shapely: Any, area: Any) -> Any:
-    """An area that still does not cross itself after it was projected."""
-    return area if area.is_valid else shapely.make_valid(area)
-
-
 def _depth(area: np.ndarray) -> np.ndarray:
-    """How far each cell's centre is from the edge of the area that it lies in, cells."""
+    """Returns how far each cell's centre is from the edge of the area that it lies in, cells."""
     distance: Any = distance_transform_edt(area)
     return distance - 0.5
 
 
-def _inside(area: Any, window: Window) -> np.ndarray:
-    """Whether each cell's centre lies in an area, bool [X, Y]."""
+def _rasterize(area: Any, window: Window) -> np.ndarray:
+    """Returns whether each cell's centre lies in an area, bool [X, Y].
+
+    A polygon that covers no centre covers the cell of a point in it, so that none is lost.
+    """
     features = library("rasterio.features", "perimeters")
+    shapely = library("shapely", "perimeters")
     affine = library("rasterio.transform", "perimeters").from_origin(
         window.x, window.y + window.grid[1] * window.side, window.side, window.side
     )
     about = {"out_shape": window.grid[::-1], "transform": affine, "dtype": "uint8"}
     inside = features.rasterize([area], **about)[::-1].T.astype(bool)
-    # A polygon that covers no cell's centre is not to be lost.
-    shapely = library("shapely", "perimeters")
     i, j = window.cells(*shapely.get_coordinates(shapely.point_on_surface(polygons(area))).T)
-    there = within(i, j, window.grid)
+    there = (i >= 0) & (j >= 0) & (i < window.grid[0]) & (j < window.grid[1])
     inside[i[there], j[there]] = True
     return inside

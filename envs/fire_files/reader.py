@@ -1,104 +1,41 @@
-"""Fires from files: what a scenario of kind `file` is, and its grids of arrival times."""
+"""Reads the fires of a file onto a grid, in three sets, or from a run's own copy of them."""
 
 import dataclasses
 import hashlib
+import io
 import json
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args
+from typing import NamedTuple
 
 import numpy as np
 import torch
-from pydantic import BeforeValidator, ConfigDict, Field, model_validator
-from pydantic.dataclasses import dataclass
 from torch import Tensor
 
 from emberlink.envs.config import check_grid
-from emberlink.envs.fire.generator import Split
-from emberlink.envs.fire_files.bank_reader import MOST_CELLS
-from emberlink.envs.utils.atomic_io import open_regular, replaced
+from emberlink.envs.utils.atomic_io import read_sealed, write_sealed
 from emberlink.envs.utils.errors import UserError
-from emberlink.envs.utils.validation import Name, printable
+from emberlink.envs.utils.validation import printable
 
-from . import detect
-from .arrival_raster import Source, Units
-from .bank_reader import is_bank, read_bands, read_npy
+from . import formats
+from .banks import MAX_CELLS, is_bank, read_bands, read_npy
+from .config import FileFireConfig
 from .episode_crop import on_grid
-from .esri_ascii import read_ascii
 from .front_points import read_front_points
-from .geotiff import read_geotiff
 from .perimeters import read_perimeters
-from .projection import one_line, quiet
+from .projection import quiet
+from .raster_source import Source
+from .rasters import read_ascii, read_geotiff
 
-READER_VERSION = 3  # raise it whenever the same file gives another grid
-KEPT = "fires.npz"
-"""the file of a run folder that holds the run's own copy of its grids"""
-_MOST_KEPT = 8 * MOST_CELLS + 1_000_000
-"""bytes of that copy, unpacked: float32 of the cells of every set"""
+READER_VERSION = 4  # raise it whenever the same file gives another grid
+COPY_FILE = "fires.npz"
+"""The file of a run folder that holds the run's own copy of its grids."""
+_MAX_COPY = 8 * MAX_CELLS + 1_000_000
+"""Bytes of that copy, unpacked: float32 of the cells of every set."""
 _EVERY, _VALIDATION, _TEST = 5, 3, 4  # remainders of the numbers of validation and test fires
-_Number = Annotated[float, Field(allow_inf_nan=False)]
-_Time = _Number | Annotated[str, Field(min_length=1, max_length=40)]
-_Digest = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
-_Text = Annotated[str, Field(min_length=1, max_length=1000)]
-
-
-def _given(value: Any) -> Any:
-    if value is None:
-        raise UserError("a file is needed, such as fire.path=ArrivalTime.asc")
-    return value
-
-
-@dataclass(
-    frozen=True,
-    kw_only=True,
-    config=ConfigDict(extra="forbid", strict=True, use_attribute_docstrings=True),
-)
-class FileFireConfig:
-    """Fires read from a file: a raster, perimeters, points of the front, or a bank."""
-
-    kind: Literal["file"] = "file"
-    """What tells it from the scenarios of the generator."""
-    name: Name = "file"
-    """Name of the scenario, that of its file in configs/fire."""
-    path: Annotated[_Text, BeforeValidator(_given)]
-    """The file; a relative path is relative to the working directory."""
-    test: _Text | None = None
-    """A second file, of the test fires; without one every fifth fire of the file is a test fire."""
-    units: Units | None = None
-    """Of the numbers in the file, and of `start` and `end`."""
-    start: _Time | None = None
-    """Time of step 0, in `units`, or ISO text for calendar times; when the fire began if None."""
-    end: _Time | None = None
-    """Time of the last step, as `start`; the last arrival if None."""
-    minutes_per_step: Annotated[float, Field(gt=0, le=1e9)] | None = None
-    """In place of `end`: minutes of the fire per step of the episode."""
-    margin: Annotated[float, Field(ge=0, le=0.45)] | None = 0.1
-    """Part of the grid left free on each side of the burnt area; None takes the file's extent."""
-    ring_width: Annotated[float, Field(gt=0, le=30)] | None = 3.0
-    """Width of the burning edge at step 0, cells of a 30-cell side; None burns nothing out."""
-    crs: _Text | None = None
-    """Projection of a file that carries none, else the one to project it to."""
-    time_field: _Text | None = None
-    """Column of the perimeters' times; None looks for one that is known."""
-    layer: _Text | None = None
-    """Layer of a GeoPackage that has several."""
-    sha256: _Digest | None = None
-    """Of the file's content; a run fills it in when it begins, and then the file must be that."""
-    test_sha256: _Digest | None = None
-    """Of `test`, likewise."""
-    kept: Annotated[str | None, Field(exclude=True)] = dataclasses.field(
-        default=None, compare=False
-    )
-    """A run's own copy of the grids, known where a run folder is opened, never written."""
-
-    @model_validator(mode="after")
-    def _one_end(self) -> "FileFireConfig":
-        if self.end is not None and self.minutes_per_step is not None:
-            raise UserError("end and minutes_per_step: give one of them")
-        return self
 
 
 def read_fires(config: FileFireConfig, grid: tuple[int, int], horizon: int) -> Tensor:
-    """The fires of `config.path` on a grid.
+    """Returns the fires of `config.path` on a grid.
 
     Args:
         config: the scenario.
@@ -109,166 +46,171 @@ def read_fires(config: FileFireConfig, grid: tuple[int, int], horizon: int) -> T
         float32 [fires, X, Y], steps: 0 burns from the start, inf never burns.
 
     Raises:
-        ValueError: one line that names the file and what is wrong with it.
+        UserError: one line that names the file and what is wrong with it.
     """
     check_grid(grid)
     path = Path(config.path).expanduser()
     try:
         with quiet():
-            found = _gridded(path, config, grid, horizon)
-    except ValueError as error:
-        raise UserError(f"{printable(str(path))}: {one_line(str(error))}") from None
+            fires = _read(path, config, grid, horizon)
+    except UserError as error:
+        raise UserError(f"{printable(str(path))}: {printable(str(error))}") from None
     except OSError as error:
         reason = error.strerror or error
         raise UserError(f"{printable(str(path))}: cannot be read: {reason}") from None
     except MemoryError:
         raise UserError(f"{printable(str(path))}: not enough memory to read it") from None
-    return torch.from_numpy(np.stack(found))
+    return torch.from_numpy(np.stack(fires))
 
 
-def _gridded(
+def _read(
     path: Path, config: FileFireConfig, grid: tuple[int, int], horizon: int
 ) -> list[np.ndarray]:
-    """The fires in a file, [X, Y] each."""
-    kind = detect.find_format(path)
-    bank = read_npy if kind is detect.NUMPY else read_bands
-    if bank is read_bands and not (kind is detect.GEOTIFF and is_bank(path)):
-        return [on_grid(_single(path, kind, config), config, grid, horizon)]
-    found: list[np.ndarray] = []
-    for source in bank(path):
-        try:
-            found.append(on_grid(source, config, grid, horizon))
-        except ValueError as error:
-            raise UserError(f"fire {len(found)}: {error}") from None
-    return found
-
-
-def _single(path: Path, kind: detect.Format, config: FileFireConfig) -> Source:
-    """The fire of a file that holds one."""
-    if kind is detect.GEOTIFF:
-        return read_geotiff(path, config.units, config.crs)
-    if kind is detect.ASCII:
-        return read_ascii(path, config.units, config.crs)
-    if kind is detect.POINTS:
-        return read_front_points(path, config.units or "steps")
-    return read_perimeters(path, config.units, config.crs, config.time_field, config.layer)
-
-
-def pinned(config: FileFireConfig) -> FileFireConfig:
-    """The scenario with the content of its files written down.
-
-    Raises:
-        ValueError: a file is missing, or is not the one that is written down.
-    """
-    return dataclasses.replace(
-        config,
-        sha256=_checked(config.path, config.sha256),
-        test_sha256=config.test and _checked(config.test, config.test_sha256),
-    )
-
-
-def _checked(file: str, expected: str | None) -> str:
-    path = Path(file).expanduser()
-    try:
-        found = detect.digest(path)
-    except ValueError as error:
-        raise UserError(f"{printable(str(path))}: {error}") from None
-    if expected not in (None, found):
-        raise UserError(
-            f"{printable(str(path))}: has changed: its content has sha256 {found[:12]}..., that of "
-            f"the run {str(expected)[:12]}..."
-        )
-    return found
-
-
-def splits(config: FileFireConfig, grid: tuple[int, int], horizon: int) -> dict[Split, Tensor]:
-    """Returns the training, validation and test fires, float32 [fires, X, Y] each.
-
-    Read from the run's own copy where there is one for this grid and horizon, else from the files.
-
-    Raises:
-        ValueError: one line that names the file and what is wrong with it.
-    """
-    stored = _read_kept(config, grid, horizon)
-    if stored is not None:
-        return stored
-    if config.sha256 is not None:
-        pinned(config)
-    fires = read_fires(config, grid, horizon)
-    train, validation, test = _indices(len(fires), test_file=config.test is not None)
-    if config.test is None:
-        test_fires = fires[test]
+    """Returns the fires in a file, [X, Y] each."""
+    kind = formats.find_format(path)
+    if kind is formats.NUMPY:
+        bank = read_npy(path)
+    elif kind is formats.GEOTIFF and is_bank(path):
+        bank = read_bands(path)
     else:
-        test_fires = read_fires(dataclasses.replace(config, path=config.test), grid, horizon)
-    return {"train": fires[train], "validation": fires[validation], "test": test_fires}
+        return [on_grid(_read_one(path, kind, config), config, grid, horizon)]
+    fires: list[np.ndarray] = []
+    for source in bank:
+        try:
+            fires.append(on_grid(source, config, grid, horizon))
+        except UserError as error:
+            raise UserError(f"fire {len(fires)}: {error}") from None
+    return fires
 
 
-def _indices(count: int, *, test_file: bool) -> tuple[list[int], list[int], list[int]]:
+def _read_one(path: Path, kind: formats.Format, config: FileFireConfig) -> Source:
+    """Returns the fire of a file that holds one."""
+    if kind is formats.GEOTIFF:
+        return read_geotiff(path, config.units, config.crs)
+    if kind is formats.ASCII:
+        return read_ascii(path, config.units, config.crs)
+    if kind is formats.POINTS:
+        return read_front_points(path, config.units or "steps")
+    return read_perimeters(path, config)
+
+
+class FireSets(NamedTuple):
+    """Training, validation and test fires, float32 [fires, X, Y] each."""
+
+    train: Tensor
+    validation: Tensor
+    test: Tensor
+
+
+def fire_sets(config: FileFireConfig, grid: tuple[int, int], horizon: int) -> FireSets:
+    """Returns the fires from the run's own copy, if it is of this grid and horizon, else the files.
+
+    Raises:
+        UserError: one line that names the file and what is wrong with it.
+    """
+    saved = _read_copy(config, grid, horizon)
+    if saved is not None:
+        return saved
+    if config.sha256 is not None:
+        with_checksum(config)
+    fires = read_fires(config, grid, horizon)
+    train, validation, test = _divide(len(fires), test_file=config.test is not None)
+    if config.test is None:
+        return FireSets(fires[train], fires[validation], fires[test])
+    other = dataclasses.replace(config, path=config.test)
+    return FireSets(fires[train], fires[validation], read_fires(other, grid, horizon))
+
+
+def _divide(count: int, *, test_file: bool) -> tuple[list[int], list[int], list[int]]:
     """Divides the fires of a file into training, validation and test fires.
 
     Of five or more fires every fifth is a test fire and every fifth a validation fire. Of fewer
-    the last is the test fire and the last but one the validation fire. Where no fire is left for
-    a set, the one before it shares its last: the only fire of a file is in all three sets.
+    the last is the test fire and the last but one the validation fire. If too few fires are left
+    for a set, it shares the last one: the only fire of a file is in all three sets.
 
     Args:
         count: number of fires in the file.
         test_file: the test fires are those of another file, so none of this one.
     """
-    rest = list(range(count))
-    test, several = ([] if test_file else [count - 1]), count >= _EVERY
-    if several and not test_file:
-        test = [i for i in rest if i % _EVERY == _TEST]
-    rest = [i for i in rest if i not in test] or rest
-    validation = [i for i in rest if i % _EVERY == _VALIDATION] if several else rest[-1:]
+    fires = list(range(count))
+    many = count >= _EVERY
+    test = [i for i in fires if i % _EVERY == _TEST] if many else fires[-1:]
+    if test_file:
+        test = []
+    rest = [i for i in fires if i not in test] or fires
+    validation = [i for i in rest if i % _EVERY == _VALIDATION] if many else rest[-1:]
     train = [i for i in rest if i not in validation] or rest
     return train, validation, test
 
 
-def keep(config: FileFireConfig, folder: Path, grid: tuple[int, int], horizon: int) -> None:
-    """Writes the run's own copy of its grids, for which the files are not needed any more.
+def with_checksum(config: FileFireConfig) -> FileFireConfig:
+    """Returns the scenario with the checksums of its files.
 
     Raises:
-        ValueError: it cannot be written.
+        UserError: a file is missing, or has another checksum than the scenario.
     """
-    fires = splits(config, grid, horizon)
+    test = config.test and _checksum(config.test, config.test_sha256)
+    digest = _checksum(config.path, config.sha256)
+    return dataclasses.replace(config, sha256=digest, test_sha256=test)
+
+
+def _checksum(file: str, expected: str | None) -> str:
+    path = Path(file).expanduser()
     try:
-        with replaced(folder / KEPT) as partial, partial.open("wb") as file:
-            np.savez_compressed(
-                file,
-                key=np.array(_key(config, grid, horizon)),
-                **{split: values.numpy() for split, values in fires.items()},
-            )
+        digest = formats.digest(path)
+    except UserError as error:
+        raise UserError(f"{printable(str(path))}: {error}") from None
+    if expected not in (None, digest):
+        raise UserError(
+            f"{printable(str(path))}: has changed: its content has sha256 {digest[:12]}..., that "
+            f"of the run {str(expected)[:12]}..."
+        )
+    return digest
+
+
+def save_copy(config: FileFireConfig, folder: Path, grid: tuple[int, int], horizon: int) -> None:
+    """Writes the run's own copy of its grids; afterwards the run does not need the files.
+
+    Raises:
+        UserError: it cannot be written.
+    """
+    fires = fire_sets(config, grid, horizon)
+    try:
+        content = io.BytesIO()
+        arrays = {name: values.numpy() for name, values in fires._asdict().items()}
+        np.savez_compressed(content, key=np.array(_key(config, grid, horizon)), **arrays)
+        write_sealed(folder / COPY_FILE, content.getbuffer())
     except OSError as error:
-        raise UserError(f"{folder / KEPT}: cannot be written: {error.strerror or error}") from None
+        reason = error.strerror or error
+        raise UserError(f"{folder / COPY_FILE}: cannot be written: {reason}") from None
 
 
 def _key(config: FileFireConfig, grid: tuple[int, int], horizon: int) -> str:
-    """A hash of everything that the grids depend on."""
-    values = {name: value for name, value in dataclasses.asdict(config).items() if name != "kept"}
+    """Returns a hash of everything that the grids depend on."""
+    values = dataclasses.asdict(config)
+    del values["saved_copy"]
     parts = [READER_VERSION, values, *grid, horizon]
     return hashlib.sha256(json.dumps(parts).encode()).hexdigest()
 
 
-def _read_kept(
-    config: FileFireConfig, grid: tuple[int, int], horizon: int
-) -> dict[Split, Tensor] | None:
-    """The run's own copy, or None if there is none, or it is damaged or of another grid."""
-    if config.kept is None or config.sha256 is None:
+def _read_copy(config: FileFireConfig, grid: tuple[int, int], horizon: int) -> FireSets | None:
+    """Returns the run's own copy, None if there is none or it is damaged or of another grid."""
+    if config.saved_copy is None or config.sha256 is None:
+        return None
+    content = read_sealed(Path(config.saved_copy), _MAX_COPY)
+    if content is None:
         return None
     try:
-        with (
-            open_regular(Path(config.kept), _MOST_KEPT) as file,
-            np.load(file, allow_pickle=False) as found,
-        ):
-            if sum(part.file_size for part in found.zip.filelist) > _MOST_KEPT:
+        with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
+            if sum(part.file_size for part in arrays.zip.filelist) > _MAX_COPY:
                 return None
-            if str(found["key"]) != _key(config, grid, horizon):
+            if str(arrays["key"]) != _key(config, grid, horizon):
                 return None
-            fires: dict[Split, Any] = {split: found[split] for split in get_args(Split)}
-    except Exception:  # numpy and zipfile raise what they like on a damaged file
+            fires = [arrays[name] for name in FireSets._fields]
+    except Exception:  # of many types, if the file is damaged
         return None
-    for values in fires.values():
+    for values in fires:
         fits = values.ndim == 3 and values.shape[1:] == tuple(grid) and len(values) > 0
         if not fits or values.dtype != np.float32 or not (values >= 0).all():
             return None
-    return {split: torch.from_numpy(values) for split, values in fires.items()}
+    return FireSets(*(torch.from_numpy(values) for values in fires))

@@ -24,7 +24,7 @@ from torch import Tensor
 
 from emberlink.envs.fire.ellipse import MAX_LENGTH_TO_BREADTH, ellipse_rates
 from emberlink.envs.fire.level_set import Distance, arrival_times
-from emberlink.envs.fire_files.esri_ascii import read_ascii
+from emberlink.envs.fire_files.rasters import read_ascii
 
 SUFFIX = "_ArrivalTime.asc"
 PARTS = (0.25, 0.5, 0.75, 1.0)

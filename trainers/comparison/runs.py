@@ -19,14 +19,14 @@ from emberlink.trainers.config.schema import NOT_LEARNT_WITH, RunConfig
 from emberlink.trainers.evaluation.results import CURVES, LEARNED
 from emberlink.trainers.runs import pretrained
 from emberlink.trainers.runs.run_folder import RunFolder
-from emberlink.trainers.runs.safe_read import LONGEST_JSON, read_text
+from emberlink.trainers.runs.safe_read import MAX_JSON, read_text
 from emberlink.trainers.runs.seal import check_trained_with
 
 LARGEST = 1e12
 """of a measure; what is beyond it is damage"""
 Measured = Annotated[float, Field(ge=-LARGEST, le=LARGEST, allow_inf_nan=False)]
 _MEASURE = TypeAdapter(Measured)
-NOT_COMPARED = ("seed", "seeds", "output", "evaluation", *NOT_LEARNT_WITH)
+NOT_COMPARED = ("seed", "seeds", "output", "evaluation", "baseline_comm", *NOT_LEARNT_WITH)
 """keys in which the runs of a group may differ: none changes what is trained"""
 NAMELESS = ("seed", "seeds", "output", "baseline_comm")
 """those of them that nobody need be told of"""
@@ -208,7 +208,7 @@ def evaluated_otherwise(run: Run) -> tuple[list[Run], list[tuple[str, str]]]:
 
 def _evaluation(file: Path, config: RunConfig) -> Evaluation:
     try:
-        evaluation = TypeAdapter(Evaluation).validate_json(read_text(file, LONGEST_JSON))
+        evaluation = TypeAdapter(Evaluation).validate_json(read_text(file, MAX_JSON))
     except ValidationError as error:
         raise UserError(f"{file}: {' '.join(describe(error).split())[:300]}") from None
     _check_evaluation(file, evaluation, config)

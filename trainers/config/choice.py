@@ -46,8 +46,9 @@ def settings(key: str, values: Mapping[str, Any], registry: Registry) -> Any:
         UserError: see `check`.
     """
     config_type = registry.find(values["name"]).config_type
-    given = {name: value for name, value in values.items() if name != "name"}
     known = [field.name for field in fields(config_type)]
+    # Some types have the name among their fields.
+    given = {name: value for name, value in values.items() if name != "name" or name in known}
     for name in given.keys() - set(known):
         listed = ", ".join(known) or "none"
         raise UserError(f"{key}.{name} is not a setting of {values['name']}; known: {listed}")

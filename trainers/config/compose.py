@@ -20,6 +20,7 @@ from yaml import YAMLError
 
 from emberlink import configs
 from emberlink.envs.scenarios import fires_of
+from emberlink.envs.utils.config_files import find, read
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import from_plain, plain, shown, unknown
 from emberlink.policies.scripted.registry import SCRIPTED
@@ -46,7 +47,7 @@ def resolve(method: str, overrides: Sequence[str] = (), **settings: Any) -> RunC
     """
     given = [parse(text) for text in overrides]
     chosen = {"setup": "paper"} | {key: str(value) for key, value in given if key in GROUPS}
-    values = _composed(method, chosen)
+    values = _composed(str(method), chosen)
     known = list(dict.fromkeys([*GROUPS, *all_keys(values)]))
     for key, value in given:
         if key in (*(f"{group}.name" for group in GROUPS), "fire.kind"):
@@ -61,7 +62,7 @@ def resolve(method: str, overrides: Sequence[str] = (), **settings: Any) -> RunC
     _choose_seed(values, any(key == "seed" for key in [*dict(given), *settings]))
     values["baseline_comm"] = _baseline_comm(chosen["setup"])
     config = from_values(values)
-    return replace(config, fire=fires_of(config.fire).pinned())
+    return replace(config, fire=fires_of(config.fire).with_checksum())
 
 
 def override(config: RunConfig, overrides: Sequence[str] = (), **settings: Any) -> RunConfig:
@@ -127,15 +128,15 @@ def _composed(method: str, chosen: Mapping[str, str]) -> dict[str, Any]:
     folders = configs.folders()
     chosen = {"method": method, **chosen}
     for group, name in chosen.items():
-        configs.find(group, name, folders)
+        find(group, name, folders)
     if (name := f"{chosen['setup']}_{method}") in configs.known("setup_method", folders):
-        configs.find("setup_method", name, folders)
+        find("setup_method", name, folders)
     files = sorted(file for folder in folders for file in folder.glob("**/*.yaml"))
     stamps = tuple((file, file.stat().st_mtime_ns) for file in files)
     values = deepcopy(_compose(tuple(chosen.items()), tuple(folders), stamps))
     for group in ("method", "setup"):
         if group in values:  # then Hydra did not put its content at the top
-            file = configs.find(group, chosen[group])
+            file = find(group, chosen[group])
             raise UserError(f"{file} must begin with '# @package _global_'")
     return values
 
@@ -214,9 +215,7 @@ def _choose_seed(values: dict[str, Any], seed_is_given: bool) -> None:
 
 def _not_known(key: str, known: Sequence[str], method: str) -> str:
     """Returns a message about a key that a method does not have, and the methods that have it."""
-    others = [
-        name for name in configs.known("method") if key in all_keys(configs.read("method", name))
-    ]
+    others = [name for name in configs.known("method") if key in all_keys(read("method", name))]
     if others:
         return f"key {key!r} is a setting of method {', '.join(others)}, not of {method}"
     return f"key {unknown(key, known, listed=False)}"

@@ -22,7 +22,7 @@ _STRICT = ConfigDict(extra="forbid", strict=True)
 
 
 NOT_LEARNT_WITH = (
-    *("device", "logger", "on_nan", "baseline_comm"),
+    *("device", "logger", "on_nan"),
     *("checkpoint_interval", "checkpoint_steps", "keep_checkpoints"),
 )
 """keys that do not change what is learnt: runs that differ only in them are the same run"""

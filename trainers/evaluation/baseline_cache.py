@@ -1,9 +1,10 @@
-"""What scripted policies reach, computed once and then read from a file.
+"""Keeps the results of scripted policies in files, so that each is computed once.
 
-They do not depend on a run but for its constants, so runs that share those share a file.
+They depend on the constants of a run only, so runs with the same constants share a file.
 """
 
 import hashlib
+import inspect
 import json
 import math
 import time
@@ -19,11 +20,13 @@ from torch import Tensor
 import emberlink.comm.base
 import emberlink.envs.wildfire
 import emberlink.policies
+from emberlink.comm import registry
 from emberlink.envs import metrics
 from emberlink.envs.fire.cache import cache_folder
 from emberlink.envs.utils.atomic_io import read_sealed, write_sealed
+from emberlink.policies.scripted.registry import SCRIPTED
 from emberlink.trainers.config.schema import RunConfig
-from emberlink.trainers.runs.safe_read import LONGEST_JSON, parse_json
+from emberlink.trainers.runs.safe_read import MAX_JSON, parse_json
 
 from .results import Measured
 
@@ -32,23 +35,25 @@ _IMPORTED = time.time_ns()
 
 
 class ScriptedResults:
-    """The file of one policy on the fires of one evaluation.
+    """The file of one policy's results on the fires of one evaluation.
 
     Its name is a hash of everything that the numbers depend on: environment, communication,
-    fires, start seeds, the version of torch, the kind of device, and the source of this package.
-    Where that source has changed since it was imported, nothing is read and nothing is written.
+    fires, start seeds, the version of torch, the kind of device, and the source files, those of a
+    policy or a communication module from another package included. If a source file has changed
+    since it was imported, nothing is read and nothing is written.
 
     Args:
-        policy: its name.
-        config: of the environment that it is played in.
-        arrival: the fires, float32 [count, X, Y].
-        protocol: what else the numbers depend on, as plain values.
+        policy: name of the policy.
+        config: configuration of the environment that it is played in.
+        arrival: arrival times of the fires, float32 [count, X, Y].
+        protocol: other values that the numbers depend on, as plain values.
     """
 
     def __init__(
         self, policy: str, config: RunConfig, arrival: Tensor, protocol: Mapping[str, Any]
     ):
-        self._episodes, source = len(arrival), source_digest()
+        used = SCRIPTED[policy], registry.find(config.comm["name"])
+        self._episodes, source = len(arrival), source_digest(*used)
         parts = {
             "policy": policy,
             "env": asdict(config.env),
@@ -63,10 +68,10 @@ class ScriptedResults:
         self.file = cache_folder() / f"scripted-{key}.json" if source else None
 
     def read(self) -> Measured | None:
-        """The numbers, or None where there is no such file or it is damaged."""
+        """Returns the results, or None if there is no such file or it is damaged."""
         if self.file is None:
             return None
-        content = read_sealed(self.file, LONGEST_JSON)
+        content = read_sealed(self.file, MAX_JSON)
         if content is None:
             return None
         try:
@@ -76,7 +81,7 @@ class ScriptedResults:
         return stored if _whole(stored, self._episodes) else None
 
     def write(self, measured: Measured) -> None:
-        """Writes the file whole; a folder that cannot be written to costs a warning."""
+        """Writes the file; warns if the folder cannot be written to."""
         if self.file is None:
             return
         try:
@@ -86,17 +91,22 @@ class ScriptedResults:
             warnings.warn(message, stacklevel=2)
 
 
-def sources() -> list[Path]:
-    """The files that what is played depends on."""
+def sources(*used: type) -> list[Path]:
+    """Returns the source files that the results depend on.
+
+    Args:
+        used: classes of the policy and the communication, which may be of other packages.
+    """
     folders = [Path(str(module.__file__)).parent for module in _SOURCES]
     files = [file for folder in folders for file in sorted(folder.rglob("*.py"))]
     here = Path(__file__)
-    return [*files, here.with_name("evaluate.py"), here.parents[1] / "build.py"]
+    files += [here.with_name("evaluate.py"), here.parents[1] / "build.py"]
+    return list(dict.fromkeys([*files, *(Path(inspect.getfile(one)) for one in used)]))
 
 
-def source_digest() -> str | None:
-    """A hash of `sources`, or None if they are not what this process has imported."""
-    files = sources()
+def source_digest(*used: type) -> str | None:
+    """Returns a hash of `sources`, or None if one has changed since it was imported."""
+    files = sources(*used)
     if max(file.stat().st_mtime_ns for file in files) > _IMPORTED:
         return None
     digest = hashlib.sha256()
@@ -107,7 +117,7 @@ def source_digest() -> str | None:
 
 
 def _whole(stored: Any, episodes: int) -> bool:
-    """Whether these are all measures of as many episodes."""
+    """Returns whether these are all measures of so many episodes."""
     return (
         isinstance(stored, dict)
         and list(stored) == list(metrics.NAMES)

@@ -13,7 +13,7 @@ from torchrl.envs.utils import ExplorationType
 
 from emberlink.envs import metrics
 from emberlink.envs.fire.generator import load_scenario
-from emberlink.envs.fire_files.reader import FileFireConfig
+from emberlink.envs.fire_files.config import FileFireConfig
 from emberlink.envs.scenarios import ScenarioConfig, fires_of
 from emberlink.envs.wildfire import WildfireEnv
 from emberlink.policies.scripted.registry import SCRIPTED

@@ -96,7 +96,7 @@ def record(config: RunConfig, results: Results, **about: Any) -> dict[str, Any]:
         "start_seed": evaluate.START_SEED,
         **about,
         "start_seeds": list(range(evaluate.START_SEED, evaluate.START_SEED + count)),
-        "held_out": {name: fires_of(configs[name]).about(count) for name in results},
+        "held_out": {name: fires_of(configs[name]).describe(count) for name in results},
         "environment": asdict(config.env),
         "communication": {
             LEARNED: config.comm,

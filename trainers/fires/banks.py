@@ -14,7 +14,7 @@ from torch import Tensor
 
 from emberlink.envs.fire.cache import GENERATOR_VERSION
 from emberlink.envs.fire.generator import FireConfig, Split, fire_seeds, make_fires
-from emberlink.envs.fire_files.bank_writer import check_bank, write_bank
+from emberlink.envs.fire_files.banks import check_bank, write_bank
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.publish import free_name
 from emberlink.trainers.config.compose import to_values

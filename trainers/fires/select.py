@@ -10,7 +10,8 @@ from typing import Any
 from torch import Tensor
 
 from emberlink.envs.fire.generator import scenarios
-from emberlink.envs.fire_files.reader import FileFireConfig, read_fires
+from emberlink.envs.fire_files.config import FileFireConfig
+from emberlink.envs.fire_files.reader import read_fires
 from emberlink.envs.scenarios import fires_of
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import shown

@@ -1,0 +1,73 @@
+"""The configuration of fires that are read from files."""
+
+import dataclasses
+from typing import Annotated, Any, Literal
+
+from pydantic import BeforeValidator, ConfigDict, Field, model_validator
+from pydantic.dataclasses import dataclass
+
+from emberlink.envs.utils.errors import UserError
+from emberlink.envs.utils.validation import Name
+
+from .times import Units
+
+_Number = Annotated[float, Field(allow_inf_nan=False)]
+_Time = _Number | Annotated[str, Field(min_length=1, max_length=40)]
+_Digest = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
+_Text = Annotated[str, Field(min_length=1, max_length=1000)]
+
+
+def _required(value: Any) -> Any:
+    if value is None:
+        raise UserError("a file is needed, such as fire.path=ArrivalTime.asc")
+    return value
+
+
+@dataclass(
+    frozen=True,
+    kw_only=True,
+    config=ConfigDict(extra="forbid", strict=True, use_attribute_docstrings=True),
+)
+class FileFireConfig:
+    """Fires read from a file: a raster, perimeters, points of the front, or a bank."""
+
+    kind: Literal["file"] = "file"
+    """Distinguishes it from the scenarios of the generator."""
+    name: Name = "file"
+    """Name of the scenario, that of its file in configs/fire."""
+    path: Annotated[_Text, BeforeValidator(_required)]
+    """The file; a relative path is relative to the working directory."""
+    test: _Text | None = None
+    """A second file, of the test fires; without one every fifth fire of the file is a test fire."""
+    units: Units | None = None
+    """Of the numbers in the file, and of `start` and `end`."""
+    start: _Time | None = None
+    """Time of step 0, in `units`, or ISO text for calendar times; when the fire began if None."""
+    end: _Time | None = None
+    """Time of the last step, as `start`; the last arrival if None."""
+    minutes_per_step: Annotated[float, Field(gt=0, le=1e9)] | None = None
+    """In place of `end`: minutes of the fire per step of the episode."""
+    margin: Annotated[float, Field(ge=0, le=0.45)] | None = 0.1
+    """Part of the grid left free on each side of the burnt area; None takes the file's extent."""
+    ring_width: Annotated[float, Field(gt=0, le=30)] | None = 3.0
+    """Width of the burning edge at step 0, cells of a 30-cell side; None burns nothing out."""
+    crs: _Text | None = None
+    """Projection of a file that carries none, else the one to project it to."""
+    time_field: _Text | None = None
+    """Column of the perimeters' times; None takes the only column with a known name."""
+    layer: _Text | None = None
+    """Layer of a GeoPackage that has several."""
+    sha256: _Digest | None = None
+    """Of the file's content; a run writes it down when it begins and checks it afterwards."""
+    test_sha256: _Digest | None = None
+    """Of the content of `test`, likewise."""
+    saved_copy: Annotated[str | None, Field(exclude=True)] = dataclasses.field(
+        default=None, compare=False
+    )
+    """A run's own copy of the grids, set where a run folder is opened and never written."""
+
+    @model_validator(mode="after")
+    def _one_end(self) -> "FileFireConfig":
+        if self.end is not None and self.minutes_per_step is not None:
+            raise UserError("end and minutes_per_step: give one of them")
+        return self

@@ -1,0 +1,249 @@
+"""Arrival times on a raster, and how they are sampled on the cells of a grid."""
+
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+from scipy.ndimage import minimum_filter
+
+from emberlink.envs.utils.errors import UserError
+
+from .projection import Bounds
+from .times import Clock
+
+SAMPLES = 180
+"""Sample points along the grid's shorter side; a cell of the grid keeps the earliest of its own.
+Rasters and perimeters are sampled at the same points."""
+_EDGE = 1e-6  # cells: a centre on an edge belongs to the same side whatever is rounded
+
+
+@dataclass(frozen=True)
+class Window:
+    """A part of the plane that a grid covers with square cells."""
+
+    x: float
+    """of the left edge"""
+    y: float
+    """of the lower edge"""
+    side: float
+    """of a cell"""
+    grid: tuple[int, int]
+
+    @classmethod
+    def around(cls, bounds: Bounds, grid: tuple[int, int], margin: float) -> "Window":
+        """Returns the smallest window that leaves a part of the grid free around `bounds`."""
+        width, height = bounds[2] - bounds[0], bounds[3] - bounds[1]
+        side = max(width / grid[0], height / grid[1]) / (1 - 2 * margin)
+        x, y = (bounds[0] + bounds[2]) / 2, (bounds[1] + bounds[3]) / 2
+        return cls(x - side * grid[0] / 2, y - side * grid[1] / 2, side, grid)
+
+    @property
+    def cuts(self) -> int:
+        """Sample points along each side of a cell."""
+        return max(1, round(SAMPLES / min(self.grid)))
+
+    def samples(self, border: tuple[int, int] = (0, 0)) -> "Window":
+        """Returns the window of the sample points: cuts x cuts in a cell, and a border of them."""
+        side = self.side / self.cuts
+        grid = (
+            self.grid[0] * self.cuts + 2 * border[0],
+            self.grid[1] * self.cuts + 2 * border[1],
+        )
+        x, y = self.x - border[0] * side, self.y - border[1] * side
+        return replace(self, x=x, y=y, side=side, grid=grid)
+
+    def centres(self) -> tuple[np.ndarray, np.ndarray]:
+        """Returns x [X] and y [Y] of the cells' centres."""
+        columns, rows = (np.arange(count) + 0.5 for count in self.grid)
+        return self.x + columns * self.side, self.y + rows * self.side
+
+    def earliest(self, samples: np.ndarray) -> np.ndarray:
+        """Returns the minimum in each cell, [X, Y], of samples [X cuts, Y cuts]."""
+        columns, rows = self.grid
+        return samples.reshape(columns, self.cuts, rows, self.cuts).min((1, 3))
+
+    def cells(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Returns the indices of the cells that points lie in; they may be outside the grid."""
+        i, j = (x - self.x) / self.side, (y - self.y) / self.side
+        return np.floor(i + _EDGE).astype(np.int64), np.floor(j + _EDGE).astype(np.int64)
+
+
+class Source(Protocol):
+    """A fire as a file has it, on a plane."""
+
+    clock: Clock
+    began: float
+    """time at which the fire began, as far as is known"""
+    first: float
+    """earliest arrival in the file"""
+    last: float
+    """latest arrival in the file"""
+    extent: Bounds
+    """of everything that the file covers"""
+    whole: bool
+    """whether the file is a map of the whole grid, which is neither cropped nor burnt out"""
+
+    def burnt(self, until: float) -> Bounds:
+        """Returns the bounds of the area burnt by a time."""
+        ...
+
+    def on(self, window: Window, until: float) -> np.ndarray:
+        """Returns arrival times, float64 [X, Y], inf for never; exact up to `until`."""
+        ...
+
+
+class RasterSource:
+    """Arrival times on a raster whose rows run from north to south.
+
+    Args:
+        times: float [rows, columns], inf for never.
+        corner: x and y of the upper left corner of the raster.
+        cell: width and height of a cell.
+        clock: of the times.
+        whole: as of `Source`.
+    """
+
+    def __init__(
+        self,
+        times: np.ndarray,
+        corner: tuple[float, float],
+        cell: tuple[float, float],
+        clock: Clock,
+        whole: bool = False,
+    ):
+        rows, columns = times.shape
+        x, y = corner
+        self.extent: Bounds = x, y - rows * cell[1], x + columns * cell[0], y
+        self.times, self.clock, self.whole = times.astype(np.float64), clock, whole
+        self._corner, self._cell = corner, cell
+        burning = times[np.isfinite(times)]
+        self.first, self.last = float(burning.min()), float(burning.max())
+        self.began = 0.0 if self._from_zero() else self.first
+
+    def burnt(self, until: float) -> Bounds:
+        """Returns the bounds of the area burnt by a time: to the front, else to cells' edges.
+
+        Raises:
+            UserError: a single cell has burnt.
+        """
+        times = self.times
+        if (times <= until).sum() < 2:
+            raise UserError(
+                f"from {self.clock.format(self.first)} to {self.clock.format(until)} a single "
+                "cell burns: no fire spreads; expected a later end"
+            )
+        rows, columns = times.shape
+        left, right = _front(times, until), columns - _front(times[:, ::-1], until)
+        top, bottom = _front(times.T, until), rows - _front(times.T[:, ::-1], until)
+        (x, y), (width, height) = self._corner, self._cell
+        return x + left * width, y - bottom * height, x + right * width, y - top * height
+
+    def on(self, window: Window, until: float) -> np.ndarray:
+        """Returns the earliest arrival in each cell of a grid.
+
+        That is the earliest of the sample points in the cell, interpolated between the burnt cells
+        around them, and of the raster's own centres in the cell. On a grid finer than the raster
+        only those centres count that burn before all around them. A map of the whole grid, and a
+        raster whose cells are the grid's, are not interpolated.
+        """
+        fine = window.side < (1 - _EDGE) * min(self._cell)
+        if self.whole or self._is_aligned(window):
+            return self._nearest(window, fine)
+        samples = window.earliest(self._interpolate(*self._indices(window.samples())))
+        times = self.times
+        if fine:
+            times = np.where(times == minimum_filter(times, 3), times, np.inf)
+        return np.minimum(samples, self._earliest(times, window))
+
+    def _from_zero(self) -> bool:
+        """Tells whether the fire began at time 0, before the first centre of a cell burnt.
+
+        That is so if the first cell burns no later than the front takes to cross a cell there.
+        """
+        if self.whole or self.clock.unit == "steps" or self.clock.origin is not None:
+            return False
+        row, column = np.unravel_index(self.times.argmin(), self.times.shape)
+        around = self.times[max(row - 1, 0) : row + 2, max(column - 1, 0) : column + 2]
+        later = around[np.isfinite(around) & (around > self.first)]
+        return bool(0 <= self.first <= (later - self.first).max(initial=0.0))
+
+    def _centres(self, rows: np.ndarray, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Returns x and y of cells' centres."""
+        (x, y), (width, height) = self._corner, self._cell
+        return x + (columns + 0.5) * width, y - (rows + 0.5) * height
+
+    def _indices(self, window: Window) -> tuple[np.ndarray, np.ndarray]:
+        """Returns the rows [Y] and columns [X], with fractions, of a window's centres."""
+        (left, top), (width, height) = self._corner, self._cell
+        x, y = window.centres()
+        return (top - y) / height - 0.5, (x - left) / width - 0.5
+
+    def _is_aligned(self, window: Window) -> bool:
+        """Tells whether the grid's cells are cells of the raster."""
+        apart = [np.abs(at - np.rint(at)).max() for at in self._indices(window)]
+        same = all(abs(window.side / side - 1) < _EDGE for side in self._cell)
+        return same and max(apart) < 1e-3
+
+    def _nearest(self, window: Window, fine: bool) -> np.ndarray:
+        """Returns the earliest of the centres in each cell, else that of the nearest cell."""
+        near = self._at(*(np.rint(at).astype(np.int64) for at in self._indices(window)))
+        if fine:
+            return near
+        earliest = self._earliest(self.times, window)
+        x, y = window.centres()
+        rows, columns = (np.rint(at).astype(np.int64) for at in self._indices(window))
+        at_x, at_y = self._centres(rows, columns)
+        i, j = window.cells(at_x, at_y)
+        missed = (i != np.arange(len(x)))[:, None] | (j != np.arange(len(y)))[None, :]
+        return np.where(np.isinf(earliest) & missed, near, earliest)
+
+    def _earliest(self, times: np.ndarray, window: Window) -> np.ndarray:
+        """Returns the earliest arrival among the raster's centres in each cell of a grid."""
+        earliest = np.full(window.grid, np.inf)
+        rows, columns = np.nonzero(np.isfinite(times))
+        i, j = window.cells(*self._centres(rows, columns))
+        inside = (i >= 0) & (j >= 0) & (i < window.grid[0]) & (j < window.grid[1])
+        np.minimum.at(earliest, (i[inside], j[inside]), times[rows[inside], columns[inside]])
+        return earliest
+
+    def _at(self, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
+        """Returns the times of rows [Y] and columns [X], [X, Y]; inf outside the raster."""
+        height, width = self.times.shape
+        times = self.times[np.ix_(np.clip(rows, 0, height - 1), np.clip(columns, 0, width - 1))].T
+        times[:, (rows < 0) | (rows >= height)] = np.inf
+        times[(columns < 0) | (columns >= width)] = np.inf
+        return times
+
+    def _interpolate(self, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
+        """Interpolates among burnt cells, bilinear, [X, Y]; inf in a cell that never burns."""
+        height, width = self.times.shape
+        inside = self._at(np.rint(rows).astype(np.int64), np.rint(columns).astype(np.int64))
+        total, weights = np.zeros(inside.shape), np.zeros(inside.shape)
+        row, column = np.floor(rows).astype(np.int64), np.floor(columns).astype(np.int64)
+        for r in (row, row + 1):
+            for c in (column, column + 1):
+                times = self.times[np.ix_(np.clip(r, 0, height - 1), np.clip(c, 0, width - 1))].T
+                weight = (1 - np.abs(columns - c))[:, None] * (1 - np.abs(rows - r))[None, :]
+                weight = np.where(np.isfinite(times), weight, 0)
+                total += weight * np.where(np.isfinite(times), times, 0)
+                weights += weight
+        times = np.maximum(total / np.where(weights > 0, weights, 1), self.first)
+        return np.where(np.isinf(inside) | (weights == 0), inside, times)
+
+
+def _front(times: np.ndarray, until: float) -> float:
+    """Returns where the burnt area begins along the lines of cells, in cells from their start.
+
+    Between two cells that burn at some time the front is interpolated. Beyond the first cell of a
+    line it moves on at its last speed, if that does not take it to the next cell; else the burnt
+    area ends with the cell.
+    """
+    times = times[(times <= until).any(1)]
+    lines, last = np.arange(len(times)), times.shape[1] - 1
+    at = (times <= until).argmax(1)
+    inner, outer = times[lines, at], times[lines, np.maximum(at - 1, 0)]
+    before = times[lines, np.minimum(at + 1, last)]
+    between = (at > 0) & np.isfinite(outer)
+    step = np.where(between, outer - inner, inner - before)
+    share = np.where(step > 0, until - inner, 0.5) / np.where(step > 0, step, 1.0)
+    return float((at + 0.5 - np.where(between | (share < 1), share, 0.5)).min())

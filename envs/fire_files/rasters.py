@@ -1,0 +1,310 @@
+"""Rasters of arrival times: ESRI ASCII, as FARSITE, FlamMap and ELMFIRE write it, and GeoTIFF."""
+
+import logging
+import math
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, TextIO
+
+import numpy as np
+
+from emberlink.envs.utils.errors import UserError
+
+from .formats import beside
+from .projection import check_projection, first_line, library, projections
+from .raster_source import RasterSource
+from .times import Clock, Units
+
+MAX_CELLS = 50_000_000
+"""Cells of a raster, which is read as a whole."""
+MAX_TIME = 1e12
+"""A larger number is not a time."""
+_NEVER = (-9999.0, -1.0)  # NODATA of FARSITE and FlamMap, and of ELMFIRE
+_VOID = 1e30  # a number beyond it is NODATA that nobody declared, such as -3.4e38
+_KEYS = ("ncols", "nrows", "xllcorner", "xllcenter", "yllcorner", "yllcenter")
+_KEYS += ("cellsize", "dx", "dy", "nodata_value")
+_DAMAGE = re.compile(r"IO error|tag ignored|TIFFVSetField|(Null|Incorrect) count|_tiff\w+Proc:")
+Affine = tuple[float, float, float, float, float, float]
+"""(a, b, c, d, e, f): the outer corners of cells are at x = a column + b row + c and
+y = d column + e row + f."""
+
+
+def read_geotiff(path: Path, unit: Units | None, crs: str | None) -> RasterSource:
+    """Reads arrival times from a GeoTIFF of one band; its tag `units` may stand for `unit`.
+
+    Raises:
+        UserError: the file is damaged, not a raster of times, or without a place on the Earth.
+    """
+    with open_raster(path) as dataset:
+        _check_band(dataset)
+        declared = "all_valid" not in [flag.name for flag in dataset.mask_flag_enums[0]]
+        never = dataset.read_masks(1) == 0 if declared else None
+        times = clean(dataset.read(1), never) * dataset.scales[0] + dataset.offsets[0]
+        tagged: Units | None = "steps" if dataset.tags().get("units") == "steps" else None
+        affine, source_crs = dataset.transform[:6], dataset.crs
+    return _on_plane(times, affine, source_crs, unit or tagged, crs)
+
+
+def read_ascii(path: Path, unit: Units | None, crs: str | None) -> RasterSource:
+    """Reads arrival times from ESRI ASCII; a .prj beside it is its projection.
+
+    GDAL would read a word as 0 and wrap rows of another length, so NumPy reads the numbers.
+
+    Raises:
+        UserError: a line of the header or a number is wrong.
+    """
+    with path.open(encoding="utf-8-sig", errors="replace") as file:
+        header, lines = _read_header(file)
+        shape = int(header["nrows"]), int(header["ncols"])
+        if math.prod(shape) > MAX_CELLS:
+            raise UserError(f"{shape[1]} x {shape[0]} cells; at most {MAX_CELLS} are read")
+        try:
+            values = np.loadtxt(file, comments=None, ndmin=2)
+        except ValueError as error:
+            raise UserError(
+                f"after {lines} lines of header: {first_line(error).split(';')[0]}; expected "
+                f"rows of {shape[1]} numbers"
+            ) from None
+    if values.shape != shape:
+        raise UserError(
+            f"{values.shape[0]} rows of {values.shape[1]} numbers; expected nrows={shape[0]} rows "
+            f"of ncols={shape[1]}"
+        )
+    dx, dy = (header.get(key, header.get("cellsize", 0.0)) for key in ("dx", "dy"))
+    x = header.get("xllcorner", header.get("xllcenter", 0.0) - dx / 2)
+    y = header.get("yllcorner", header.get("yllcenter", 0.0) - dy / 2)
+    never = values == header["nodata_value"] if "nodata_value" in header else None
+    affine = dx, 0.0, x, 0.0, -dy, y + shape[0] * dy
+    return _on_plane(clean(values, never), affine, _prj(path), unit, crs)
+
+
+@contextmanager
+def open_raster(path: Path) -> Iterator[Any]:
+    """Opens a GeoTIFF with rasterio.
+
+    Raises:
+        UserError: the file is damaged, also where GDAL would go on with a part of it lost.
+    """
+    rasterio = library("rasterio", "GeoTIFF")
+    log = _DamageLog()
+    logger = logging.getLogger("rasterio._env")
+    level, propagate = logger.level, logger.propagate
+    logger.setLevel(logging.WARNING)
+    logger.propagate = False
+    logger.addHandler(log)
+    try:
+        with rasterio.open(path, driver="GTiff") as dataset:
+            yield dataset
+    except (rasterio.errors.RasterioError, OSError) as error:
+        raise UserError(f"{first_line(error)}; expected a whole raster") from None
+    finally:
+        logger.removeHandler(log)
+        logger.setLevel(level)
+        logger.propagate = propagate
+    if log.messages:
+        raise UserError(f"damaged: {log.messages[0][:200]}; expected a whole raster")
+
+
+class _DamageLog(logging.Handler):
+    """Collects what GDAL logs of damage."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.messages: list[str] = []
+
+    def emit(self, record: logging.LogRecord) -> None:
+        message = record.getMessage()
+        if record.levelno >= logging.ERROR or _DAMAGE.search(message):
+            self.messages.append(message)
+
+
+def clean(times: np.ndarray, never: np.ndarray | None = None) -> np.ndarray:
+    """Returns arrival times in which cells that never burn are inf, float32 or float64.
+
+    Args:
+        times: as in a file, any real type.
+        never: where the file declares NODATA. If it declares none, the greatest number of an
+            integer type is NODATA, and the least of one with a sign.
+
+    Raises:
+        UserError: a number is not a time.
+    """
+    if never is None and times.dtype.kind in "iu":
+        limits = np.iinfo(times.dtype)
+        never = (times == limits.max) | ((times == limits.min) & (limits.min < 0))
+    times = np.array(times, dtype=np.result_type(times, np.float32))
+    if never is not None:
+        times[never] = np.inf
+    odd = ~(times >= 0) | ((times > MAX_TIME) & (times < np.inf))
+    values = times[odd]
+    wrong = ~(np.isnan(values) | (np.abs(values) > _VOID) | np.isin(values, _NEVER))
+    if wrong.any():
+        raise UserError(
+            f"{values[wrong][0]:g} is not an arrival time; expected 0 or more, or NODATA (-9999, "
+            "-1, NaN or what the file declares)"
+        )
+    times[odd] = np.inf
+    return times
+
+
+def check_spreads(times: np.ndarray, *, may_stand: bool = False) -> None:
+    """Checks that arrival times are those of a fire that spreads.
+
+    Args:
+        times: with inf for never.
+        may_stand: whether a part of the map may burn at once and nothing after it, as a fire does
+            that was made for a few steps.
+
+    Raises:
+        UserError: no cell burns, only one does, or all at once.
+    """
+    burning = times[np.isfinite(times)]
+    if len(burning) == 0:
+        raise UserError("no cell burns: NODATA everywhere; expected arrival times")
+    if len(burning) == 1:
+        raise UserError("a single cell burns; expected a fire that spreads")
+    if burning.min() == burning.max() and not (may_stand and len(burning) < times.size):
+        raise UserError(
+            f"all {len(burning)} cells burn at once, at {burning[0]:g}; "
+            "expected a fire that spreads"
+        )
+
+
+def _check_band(dataset: Any) -> None:
+    if dataset.count != 1:
+        raise UserError(
+            f"{dataset.count} bands; expected one, or a bank of fires, tagged units=steps"
+        )
+    kind = np.dtype(dataset.dtypes[0])
+    if kind.kind not in "iuf":
+        raise UserError(f"values of type {kind}; expected real numbers")
+    if kind.itemsize == 1 and dataset.nodata is None:
+        raise UserError(f"values of type {kind} without NODATA, as of a picture; expected times")
+    if dataset.width * dataset.height > MAX_CELLS:
+        raise UserError(
+            f"{dataset.width} x {dataset.height} cells; at most {MAX_CELLS} are read: expected a "
+            "part of it, as gdalwarp -te cuts out"
+        )
+    if dataset.transform.is_identity:
+        raise UserError(
+            "no geotransform: it does not say where its cells are, or has lost it; expected one, "
+            "as gdal_translate -a_ullr gives it"
+        )
+
+
+def _read_header(file: TextIO) -> tuple[dict[str, float], int]:
+    """Reads the keys of ESRI ASCII; the file then stands at the first row. Returns their lines."""
+    header: dict[str, float] = {}
+    while True:
+        start = file.tell()
+        words = file.readline(1000).split()
+        key = words[0].lower() if words else ""
+        if not key[:1].isalpha() or key[:3] in ("nan", "inf"):
+            file.seek(start)
+            break
+        line = len(header) + 1
+        if key not in _KEYS:
+            raise UserError(
+                f"line {line}: {key[:30]!r} is not a key of ESRI ASCII; expected {', '.join(_KEYS)}"
+            )
+        try:
+            header[key] = float(words[1]) if key not in header and len(words) == 2 else math.nan
+        except ValueError:
+            header[key] = math.nan
+        if math.isnan(header[key]) and (key != "nodata_value" or words[1:] != ["nan"]):
+            raise UserError(f"line {line}: expected {key} once, with one number")
+    _check_header(header)
+    return header, len(header)
+
+
+def _check_header(header: dict[str, float]) -> None:
+    for needed in (("ncols",), ("nrows",), ("cellsize", "dx"), ("cellsize", "dy")):
+        if not any(key in header for key in needed):
+            raise UserError(f"the header has no {needed[0]}; expected ESRI ASCII")
+    for pair in _KEYS[2:4], _KEYS[4:6]:
+        if sum(key in header for key in pair) != 1:
+            raise UserError(f"the header must have one of {' and '.join(pair)}")
+    for key, value in header.items():
+        if key[0] == "n" and key != "nodata_value" and not (1 <= value < 1e12 and value % 1 == 0):
+            raise UserError(f"{key}={value:g}; expected a whole number above 0")
+        if key in ("cellsize", "dx", "dy") and not 0 < value < math.inf:
+            raise UserError(f"{key}={value:g}; expected a size above 0")
+        if key[0] in "xy" and not math.isfinite(value):
+            raise UserError(f"{key}={value:g}; expected a coordinate")
+
+
+def _prj(path: Path) -> Any:
+    """Returns the projection in the .prj beside a file, None if there is none."""
+    prj = beside(path, ".prj")
+    if prj is None:
+        return None
+    pyproj = library("pyproj", "a projection")
+    try:
+        return pyproj.CRS.from_user_input(prj.read_text(encoding="utf-8"))
+    except (pyproj.exceptions.CRSError, ValueError):
+        return check_projection(path, None)
+
+
+def _on_plane(
+    times: np.ndarray, affine: Affine, source_crs: Any, unit: Units | None, crs: str | None
+) -> RasterSource:
+    """Places cleaned times on a plane, north up.
+
+    Raises:
+        UserError: no fire spreads, there is no unit, or the raster has no place on the Earth.
+    """
+    check_spreads(times)
+    a, b, c, d, e, f = (float(value) for value in affine)
+    area = abs(a * e - b * d)
+    if not math.isfinite(c + f) or not 1e-20 < area < 1e12:
+        raise UserError(f"cells of {a:g} x {e:g}; expected a size above 0")
+    if unit is None:
+        raise UserError(
+            "a raster does not say the unit of its times: expected fire.units=minutes (FARSITE, "
+            "FlamMap), seconds (ELMFIRE), hours, days or steps"
+        )
+    rows, columns = times.shape
+    corners = [(a * u + b * v + c, d * u + e * v + f) for u in (0, columns) for v in (0, rows)]
+    x, y = zip(*corners, strict=True)
+    chosen = projections(source_crs or None, crs, (min(x), min(y), max(x), max(y)), math.sqrt(area))
+    if chosen or b or d or a < 0 or e > 0:
+        times, affine = _warp(times, (a, b, c, d, e, f), chosen)
+        a, b, c, d, e, f = affine
+    return RasterSource(times, (c, f), (a, -e), Clock(unit))
+
+
+def _warp(
+    times: np.ndarray, affine: Affine, chosen: tuple[Any, Any] | None
+) -> tuple[np.ndarray, Affine]:
+    """Projects times and turns the raster north up, on cells of half the size.
+
+    Times are interpolated between burnt cells; a point in a cell that never burns stays inf.
+    """
+    rasterio = library("rasterio", "a projection")
+    vrt = library("rasterio.vrt", "a projection").WarpedVRT
+    source, target = chosen or ("EPSG:3857", "EPSG:3857")  # any plane: only turned
+    about = {
+        "height": times.shape[0],
+        "width": times.shape[1],
+        "transform": rasterio.Affine(*affine),
+    }
+    with rasterio.MemoryFile() as memory:
+        with memory.open(
+            "GTiff", count=1, dtype="float64", crs=source, nodata=math.nan, **about
+        ) as dataset:
+            dataset.write(np.where(np.isfinite(times), times, np.nan), 1)
+        with memory.open() as dataset:
+            with vrt(dataset, crs=target) as warped:
+                size = {"width": 2 * warped.width, "height": 2 * warped.height}
+                transform = warped.transform @ rasterio.Affine.scale(0.5)
+            sampled = []
+            for method in ("nearest", "bilinear"):
+                resampling = rasterio.enums.Resampling[method]
+                with vrt(
+                    dataset, crs=target, transform=transform, resampling=resampling, **size
+                ) as warped:
+                    sampled.append(warped.read(1))
+    inside, between = (np.where(np.isnan(values), np.inf, values) for values in sampled)
+    return np.where(np.isinf(inside) | np.isinf(between), inside, between), transform[:6]

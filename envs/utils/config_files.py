@@ -1,0 +1,52 @@
+"""Reads one YAML file of a configuration group."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+from yaml import YAMLError
+
+from emberlink.configs import folders, known
+
+from .errors import UserError
+from .validation import unknown
+
+
+def find(group: str, name: str, within: Sequence[Path] | None = None) -> Path:
+    """Returns the file of a choice.
+
+    Args:
+        group: such as "method", "setup", "setup_method" or "fire".
+        name: the file's name without `.yaml`.
+        within: the folders to look in; those of `emberlink.configs.folders` if None.
+
+    Raises:
+        UserError: there is no such file, or there are several; the message lists them.
+    """
+    searched = folders() if within is None else within
+    if name not in (names := known(group, searched)):
+        raise UserError(f"{group} {unknown(name, names)}")
+    files = [folder / group / f"{name}.yaml" for folder in searched]
+    found = [file for file in files if file.is_file()]
+    if len(found) != 1:
+        raise UserError(f"{group} {name!r} is in several folders: {', '.join(map(str, found))}")
+    return found[0]
+
+
+def read(group: str, name: str) -> dict[str, Any]:
+    """Returns the content of a choice's file.
+
+    Raises:
+        UserError: see `find`; or the file is not YAML with keys and values.
+    """
+    file = find(group, name)
+    try:
+        values: Any = OmegaConf.to_container(OmegaConf.create(file.read_text(encoding="utf-8")))
+    except (OSError, UnicodeError, YAMLError, OmegaConfBaseException) as error:
+        reason = " ".join(str(error).split())[:200]
+        raise UserError(f"{file}: cannot be read: {reason}") from None
+    if not isinstance(values, dict):
+        raise UserError(f"{file}: expected keys and values")
+    return values

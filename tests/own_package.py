@@ -1,0 +1,43 @@
+"""The package of a user's own that docs/extensions.md prints, with a setup and a fire more."""
+
+import re
+from pathlib import Path
+
+from emberlink.envs.utils.config_files import find
+
+PAGE = (Path(__file__).parents[1] / "docs" / "extensions.md").read_text()
+MODULE, METHOD, PROJECT, SETUP_OF_PAGE = re.findall(r"```\w+\n(.*?)```", PAGE, re.DOTALL)
+SETUP = """# @package _global_
+defaults:
+  - paper
+  - override /fire: faint
+env:
+  horizon: 15
+"""
+
+
+def write(folder: Path, files: dict[str, str]) -> Path:
+    """Writes files by their name within a folder."""
+    for name, text in files.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text(text)
+    return folder
+
+
+def yaml_files() -> dict[str, str]:
+    """The method `headcount`, the setup `small`, its fire, and its change of that method."""
+    fire = find("fire", "paper").read_text().replace("name: paper", "name: faint")
+    return {
+        "method/headcount.yaml": METHOD,
+        "setup/small.yaml": SETUP,
+        "fire/faint.yaml": fire,
+        "setup_method/small_headcount.yaml": "# @package _global_\ncomm:\n  scale: 0.5\n",
+    }
+
+
+def write_package(folder: Path) -> Path:
+    """Writes the sources of a package that holds all of these."""
+    files = {f"headcount/configs/{name}": text for name, text in yaml_files().items()}
+    files |= {"pyproject.toml": PROJECT, "headcount/module.py": MODULE}
+    files |= {"headcount/__init__.py": "", "headcount/configs/__init__.py": ""}
+    return write(folder, files)

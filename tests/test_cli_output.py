@@ -1,0 +1,162 @@
+"""Outputs that cannot take what is printed, signals, and mistakes of the program itself."""
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from test_cli import wait_for
+from tiny_run import PROGRAM, TINY
+
+from emberlink.trainers.cli import main
+from emberlink.trainers.runs.run_folder import RunFolder
+
+ENDLESS = [*TINY, "episodes=100000"]
+
+
+def started(arguments: list[str], stdout: object, **more: str) -> subprocess.Popen:
+    return subprocess.Popen(
+        [sys.executable, "-c", PROGRAM, *arguments],
+        stdout=stdout,  # pyright: ignore
+        stderr=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "OMP_NUM_THREADS": "1", **more},
+    )
+
+
+def check_saved(output: Path) -> None:
+    """The training can be resumed: it was saved, and nothing holds the folder."""
+    (folder,) = output.iterdir()
+    run = RunFolder(folder)
+    assert run.states()
+    assert run.checkpoint().exists()
+    assert not (folder / "lock").exists()
+
+
+def test_a_reader_that_ends_ends_the_training_with_a_checkpoint(tmp_path):
+    process = started(["train", "independent", *ENDLESS, f"output={tmp_path}"], subprocess.PIPE)
+    try:
+        assert process.stdout is not None
+        process.stdout.readline()
+        process.stdout.close()  # as `| head -1` does
+        _, error = process.communicate(timeout=400)
+    finally:
+        process.kill()
+    assert process.returncode == 2
+    assert error.count("\n") == 1
+    assert "standard output: Broken pipe; the last good checkpoint is" in error
+    check_saved(tmp_path)
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs Linux's /dev/full")
+def test_a_full_output_is_named_and_frees_the_folder(tmp_path):
+    with open("/dev/full", "w") as full:
+        process = started(["train", "independent", *TINY, f"output={tmp_path}"], full)
+        _, error = process.communicate(timeout=400)
+    assert process.returncode == 2
+    assert error.count("\n") == 1
+    assert error.startswith("emberlink train: standard output: No space left on device; ")
+    (folder,) = tmp_path.iterdir()
+    assert not (folder / "lock").exists()
+
+
+def test_a_lost_terminal_ends_the_training_with_a_checkpoint(tmp_path):
+    process = started(["train", "independent", *ENDLESS, f"output={tmp_path}"], subprocess.PIPE)
+    try:
+        wait_for(lambda: any(tmp_path.glob("*/metrics.jsonl")), process)
+        process.send_signal(signal.SIGHUP)
+        out, error = process.communicate(timeout=400)
+    finally:
+        process.kill()
+    assert process.returncode == 129, error
+    assert "resume with: emberlink train resume=" in out
+    check_saved(tmp_path)
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "cp1252"])
+def test_no_encoding_makes_a_command_fail(encoding, run, tmp_path):
+    for arguments in (
+        ["compare", str(run), "--output", str(tmp_path / "report")],
+        ["list"],
+        ["fire", "preview", "huygens:0", "--output", str(tmp_path)],
+        ["--help"],
+    ):
+        process = started(arguments, subprocess.PIPE, PYTHONIOENCODING=encoding)
+        out, error = process.communicate(timeout=400)
+        assert process.returncode == 0, error
+        assert out
+    assert (tmp_path / "report" / "compare.html").exists()
+
+
+def test_a_mistake_of_the_program_keeps_its_traceback(monkeypatch):
+    def fail(*_):
+        raise ValueError("zip() argument 2 is longer than argument 1")
+
+    monkeypatch.setattr("emberlink.trainers.training.command.resolve", fail)
+    with pytest.raises(ValueError, match="longer than"):
+        main.main(["train", "independent"])
+
+
+def test_without_a_command_there_is_help(capsys):
+    assert main.main([]) == 0
+    assert capsys.readouterr().out.startswith("usage: emberlink")
+
+
+def test_the_version(capsys):
+    with pytest.raises(SystemExit) as ended:
+        main.main(["--version"])
+    assert ended.value.code == 0
+    assert capsys.readouterr().out.startswith("emberlink 0.")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["train"], ["required: METHOD ("]),
+        (["eval"], ["required: RUN ("]),
+        (["train", "independent", "--episodes", "5"], ["--episodes", "as episodes=5"]),
+        (["train", "independent", "--num-envs=3"], ["--num-envs", "as num_envs=3"]),
+        (["eval", "RUN", "--chekpoint", "x"], ["--chekpoint", "did you mean --checkpoint?"]),
+    ],
+)
+def test_usage_errors_say_what_was_meant(arguments, words, capsys):
+    with pytest.raises(SystemExit) as ended:
+        main.main(arguments)
+    assert ended.value.code == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    for word in words:
+        assert word in error
+
+
+def test_one_run_is_evaluated_at_a_time(run, capsys):
+    assert main.main(["eval", str(run), str(run)]) == 2
+    assert "one run is evaluated at a time; compare takes several" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("kind", "names"),
+    [
+        ("methods", ["consensus", "independent", "positional", "shared_memory"]),
+        ("setups", ["paper", "released", "tuned"]),
+        ("policies", ["stationary", "oracle"]),
+    ],
+)
+def test_names_are_listed_one_a_line(kind, names, capsys):
+    assert main.main(["list", kind]) == 0
+    assert set(names) <= set(capsys.readouterr().out.splitlines())
+
+
+def test_an_unknown_kind_is_one_line(capsys):
+    assert main.main(["list", "method"]) == 2
+    assert capsys.readouterr().err == (
+        "emberlink list: 'method' is not known; known: methods, setups, fires, learners, policies\n"
+    )
+
+
+def test_windows_is_told_in_one_line(monkeypatch, capsys):
+    monkeypatch.setattr(sys, "platform", "win32")
+    assert main.main(["doctor"]) == 2
+    assert capsys.readouterr().err == "emberlink: runs on Linux and macOS; on Windows, use WSL\n"
