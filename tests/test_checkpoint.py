@@ -76,7 +76,7 @@ def test_a_state_without_a_seal_is_refused_and_the_one_before_it_is_named(tmp_pa
     assert f"the one before it: emberlink train resume={run.states()[0]}" in error
     assert before == {one: one.read_bytes() for one in run.path.rglob("*") if one.is_file()}
     trainer = resume(run.states()[0])
-    assert trainer.step == 30
+    assert trainer.setup.step == 30
     assert not path.exists()
     until(trainer, None)
     with pytest.raises(ValueError, match="nothing can be resumed from it"):
