@@ -113,7 +113,7 @@ def test_nan_is_refused_wherever_it_is(stopped):
     _, content = checkpoint_file.read(stopped)
     floating = [name for name, value in content.items() if value.is_floating_point()]
     assert {name.partition("/")[0] for name in floating} == {
-        *("learner", "carried", "environments", "episode")
+        *("learner", "carried", "environments", "communication", "episode")
     }
     networks = "learner/networks/", "learner/optimizer/"
     others = [n for n in floating if not n.startswith(networks) and "arrival_time" not in n]

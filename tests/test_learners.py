@@ -97,8 +97,9 @@ def test_wrong_settings_of_a_learner(values, message):
 
 
 def test_another_package_can_add_a_learner(monkeypatch):
-    point = EntryPoint("mine", "emberlink.trainers.learners.td3:TD3", "emberlink.learners")
-    monkeypatch.setattr(plugins, "registered", lambda group: {"mine": point})
+    group = "emberlink.learners"
+    point = EntryPoint("mine", "emberlink.trainers.learners.td3:TD3", group)
+    monkeypatch.setattr(plugins, "registered", lambda of: {"mine": point} if of == group else {})
     assert registry.known() == ["ddpg", "mine", "td3"]
     assert registry.find("mine") is TD3
 

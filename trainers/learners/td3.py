@@ -60,10 +60,11 @@ class TD3(OffPolicyLearner):
             for _ in range(_CRITICS)
         ]
         actor: Any = _SmoothedActor(self.actor)
+        bounds: Any = (-1.0, 1.0)
         loss = TD3Loss(
             actor,
             critics,  # two, initialised apart; TorchRL would draw the second's weights itself
-            bounds=(-1.0, 1.0),
+            bounds=bounds,
             policy_noise=0.0,  # ours is in the batch, from a stream of its own
             noise_clip=0.0,
             loss_function="l2",
@@ -89,10 +90,11 @@ class TD3(OffPolicyLearner):
         return batch
 
     def losses(self, batch: TensorDictBase, *, actor: bool = True) -> Losses:
-        critic_loss, _ = self.loss.value_loss(batch)
+        loss: Any = self.loss
+        critic_loss, _ = loss.value_loss(batch)
         losses = {"critic": critic_loss.mean(0)}
         if actor:
-            actor_loss, _ = self.loss.actor_loss(batch)
+            actor_loss, _ = loss.actor_loss(batch)
             losses["actor"] = actor_loss.mean(0)
         return losses
 
@@ -123,7 +125,9 @@ class _SmoothedActor(TensorDictModuleBase):
     def __init__(self, actor: TensorDictModule):
         super().__init__()
         self.actor = actor
-        self.in_keys, self.out_keys = [*actor.in_keys, _TARGET_NOISE], actor.out_keys
+        reads: list[Any] = [*actor.in_keys, _TARGET_NOISE]
+        writes: list[Any] = list(actor.out_keys)
+        self.in_keys, self.out_keys = reads, writes
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         acted = self.actor(tensordict)

@@ -1,6 +1,7 @@
 """Collects transitions of all environments, step by step."""
 
 from collections.abc import Iterator
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -52,8 +53,9 @@ class StepCollector:
             if self.rollout_steps == 1:
                 yield self._collect().unsqueeze(-1)
             else:
-                steps = [self._collect().clone() for _ in range(self.rollout_steps)]
-                yield torch.stack(steps, dim=1)  # pyright: ignore[reportArgumentType]
+                steps: Any = [self._collect().clone() for _ in range(self.rollout_steps)]
+                rollout: Any = torch.stack(steps, dim=1)
+                yield rollout
 
     @property
     def carried(self) -> TensorDictBase:
