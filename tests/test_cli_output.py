@@ -65,7 +65,7 @@ def test_a_full_output_is_named_and_frees_the_folder(tmp_path):
 def test_a_lost_terminal_ends_the_training_with_a_checkpoint(tmp_path):
     process = started(["train", "independent", *ENDLESS, f"output={tmp_path}"], subprocess.PIPE)
     try:
-        wait_for(lambda: any(tmp_path.glob("*/metrics.jsonl")), process)
+        wait_for(lambda: any(tmp_path.glob("*/metrics.jsonl")), process, seconds=400)
         process.send_signal(signal.SIGHUP)
         out, error = process.communicate(timeout=400)
     finally:
