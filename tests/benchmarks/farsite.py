@@ -4,7 +4,8 @@
 
 FOLDER holds `RUN_ArrivalTime.asc`: ESRI ASCII grids of elapsed minutes, north up. The wind is read
 from the whole name RUN: in `3mph120deg7hr` it blows from 120° (0 is north, clockwise); in
-`clockwise1hr` and `counterClockwise3hr` it starts from 180° and turns by 60° in that sense every hour or three hours.
+`clockwise1hr` and `counterClockwise3hr` it starts from 180° and turns by 60° in that sense every
+hour or three hours.
 What is fitted, head rate and length-to-breadth ratio, holds for one wind speed and one fuel.
 Prints a Markdown table. The start is FARSITE's: the cells that burn at time 0. Needs the extra
 `geo`.
