@@ -9,7 +9,7 @@ from emberlink.envs.utils.validation import from_plain
 
 from .base import CommModule
 
-_REGISTRY = Registry(CommModule, "emberlink.comm", "emberlink.comm", "comm.name")
+_REGISTRY = Registry(CommModule, "emberlink.comm", "comm.name")
 known, find = _REGISTRY.known, _REGISTRY.find
 
 

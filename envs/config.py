@@ -27,6 +27,8 @@ class RewardConfig:
     """the axes on which leaving the box is tested"""
 
 
+BASE_SIDE = 30
+"""Cells of the shorter side for which lengths of a fire are given."""
 SIDES = (8, 256)
 """minimum and maximum cells along a side of a grid"""
 _Side = Annotated[int, Field(ge=SIDES[0], le=SIDES[1])]

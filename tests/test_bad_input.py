@@ -45,7 +45,7 @@ SETUPS = "known: paper, released, tuned"
             ["independent", "comm.range=5"],
             ["'comm.range'", "a setting of method consensus, not of independent"],
         ),
-        (["consensus", "zzz=1"], ["'zzz'", "known: setup, fire, env", "num_envs"]),
+        (["consensus", "zzz=1"], ["'zzz'", "known: setup, fire, learner, env", "num_envs"]),
         (["consensus", "method=independent"], ["'method'"]),
         (["consensus", "setup=papr"], ["setup 'papr'", "did you mean paper?", SETUPS]),
         (["consensus", "fire=zzz"], ["fire 'zzz'", "known: file, huygens, oil_slick, paper"]),
@@ -64,7 +64,7 @@ SETUPS = "known: paper, released, tuned"
         (["consensus", "learner.buffer_size=5"], ["batch_size=8", "buffer_size=5"]),
         (["consensus", "seed=-1"], ["seed=-1", "greater than or equal to 0"]),
         (["consensus", "num_envs=0"], ["num_envs=0"]),
-        (["consensus", "learner=[1]"], ["learner=[1]"]),
+        (["consensus", "learner=[1]"], ["learner '[1]' is not known"]),
         (["consensus", "logger=mlflow"], ["logger=mlflow", "'wandb', 'tensorboard', 'csv'"]),
         (["consensus", "replay=both"], ["replay=both", "'per_agent' or 'shared'"]),
         (["consensus", "comm.rnge=3"], ["'comm.rnge'", "did you mean comm.range?"]),
@@ -128,10 +128,10 @@ def test_a_run_folder_that_is_none(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"learner": {"gama": 0.9}}, ["config.yaml", "'learner.gama'"]),
+        ({"learner": {"gama": 0.9}}, ["config.yaml", "learner.gama is not a setting of ddpg"]),
         ({"env": {"num_uavs": 0}}, ["config.yaml", "env.num_uavs=0"]),
-        ({"learner": {"hidden": [8, 9]}}, ["has shape [2, 8, 8]", "needs [2, 8, 9]"]),
-        ({"env": {"num_uavs": 3}}, ["a checkpoint of uavs=2", "has uavs=3"]),
+        ({"learner": {"hidden": [8, 9]}}, ["made with learner.hidden=[8, 8]", "[8, 9]"]),
+        ({"env": {"num_uavs": 3}}, ["made with env.num_uavs=2", "has env.num_uavs=3"]),
         ({"comm": {"name": "positional"}}, ["config.yaml", "comm."]),
     ],
 )

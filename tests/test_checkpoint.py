@@ -76,7 +76,7 @@ def test_a_state_without_a_seal_is_refused_and_the_one_before_it_is_named(tmp_pa
     assert f"the one before it: emberlink train resume={run.states()[0]}" in error
     assert before == {one: one.read_bytes() for one in run.path.rglob("*") if one.is_file()}
     trainer = resume(run.states()[0])
-    assert trainer.step == 30
+    assert trainer.setup.step == 30
     assert not path.exists()
     until(trainer, None)
     with pytest.raises(ValueError, match="nothing can be resumed from it"):
@@ -113,7 +113,7 @@ def test_nan_is_refused_wherever_it_is(stopped):
     _, content = checkpoint_file.read(stopped)
     floating = [name for name, value in content.items() if value.is_floating_point()]
     assert {name.partition("/")[0] for name in floating} == {
-        *("learner", "carried", "environments", "episode")
+        *("learner", "carried", "environments", "communication", "episode")
     }
     networks = "learner/networks/", "learner/optimizer/"
     others = [n for n in floating if not n.startswith(networks) and "arrival_time" not in n]

@@ -41,7 +41,7 @@ def test_a_reader_that_ends_ends_the_training_with_a_checkpoint(tmp_path):
         assert process.stdout is not None
         process.stdout.readline()
         process.stdout.close()  # as `| head -1` does
-        _, error = process.communicate(timeout=120)
+        _, error = process.communicate(timeout=400)
     finally:
         process.kill()
     assert process.returncode == 2
@@ -54,7 +54,7 @@ def test_a_reader_that_ends_ends_the_training_with_a_checkpoint(tmp_path):
 def test_a_full_output_is_named_and_frees_the_folder(tmp_path):
     with open("/dev/full", "w") as full:
         process = started(["train", "independent", *TINY, f"output={tmp_path}"], full)
-        _, error = process.communicate(timeout=120)
+        _, error = process.communicate(timeout=400)
     assert process.returncode == 2
     assert error.count("\n") == 1
     assert error.startswith("emberlink train: standard output: No space left on device; ")
@@ -65,9 +65,9 @@ def test_a_full_output_is_named_and_frees_the_folder(tmp_path):
 def test_a_lost_terminal_ends_the_training_with_a_checkpoint(tmp_path):
     process = started(["train", "independent", *ENDLESS, f"output={tmp_path}"], subprocess.PIPE)
     try:
-        wait_for(lambda: any(tmp_path.glob("*/metrics.jsonl")), process)
+        wait_for(lambda: any(tmp_path.glob("*/metrics.jsonl")), process, seconds=400)
         process.send_signal(signal.SIGHUP)
-        out, error = process.communicate(timeout=120)
+        out, error = process.communicate(timeout=400)
     finally:
         process.kill()
     assert process.returncode == 129, error
@@ -84,7 +84,7 @@ def test_no_encoding_makes_a_command_fail(encoding, run, tmp_path):
         ["--help"],
     ):
         process = started(arguments, subprocess.PIPE, PYTHONIOENCODING=encoding)
-        out, error = process.communicate(timeout=200)
+        out, error = process.communicate(timeout=400)
         assert process.returncode == 0, error
         assert out
     assert (tmp_path / "report" / "compare.html").exists()

@@ -2,7 +2,9 @@
 
 import html.parser
 import json
+import re
 import shutil
+from importlib.resources import files
 from itertools import permutations
 
 import numpy as np
@@ -13,10 +15,13 @@ from matplotlib.axes import Axes
 from synthetic_runs import read_evaluation, write_evaluation, write_run
 
 from emberlink.envs import metrics
+from emberlink.trainers import compare
 from emberlink.trainers.cli import main
 from emberlink.trainers.comparison import plots
-from emberlink.trainers.comparison.rankings import Scripted, numbers
-from emberlink.trainers.comparison.runs import Run, find, gather, read
+from emberlink.trainers.comparison.groups import gather
+from emberlink.trainers.comparison.rankings import numbers
+from emberlink.trainers.comparison.runs import Run, find, read
+from emberlink.trainers.comparison.scripted import Scripted
 from emberlink.trainers.config.compose import to_values
 from emberlink.trainers.runs.run_folder import RunFolder
 
@@ -57,9 +62,9 @@ def test_numbers_by_hand(runs):
     assert (first.method, first.seeds, first.values) == ("consensus", [0, 1, 2], [50, 70, 60])
     assert (first.iqm, first.interval) == (60, (50, 70))
     # 50 beats 40; 70 beats both; 60 beats 40: 4 of 6 pairs.
-    assert (first.next, first.improvement) == ("independent", pytest.approx(4 / 6))
+    assert (first.next, first.probability_of_improvement) == ("independent", pytest.approx(4 / 6))
     assert (second.iqm, second.interval, second.next) == (52.5, (40, 65), None)
-    assert (second.improvement, second.improvement_interval) == (None, None)
+    assert (second.probability_of_improvement, second.probability_interval) == (None, None)
     (claim,) = (v for v in one.verdicts if v.measure == "coverage")
     assert claim.ratio == pytest.approx(60 / 52.5)
     assert claim.interval == pytest.approx((50 / 65, 70 / 40), abs=0.1)
@@ -72,7 +77,7 @@ def test_less_is_better_where_it_is(tmp_path):
         write_run(tmp_path, "positional", seed, learned={"tracking_first": 30 + seed})
     one = only(tmp_path)
     first, last = ranking(one, "tracking_first").rows
-    assert (first.method, first.improvement) == ("consensus", 1)
+    assert (first.method, first.probability_of_improvement) == ("consensus", 1)
     assert last.method == "positional"
     (claim,) = (v for v in one.verdicts if v.measure == "tracking_first")
     assert claim.ratio == pytest.approx(31 / 11)
@@ -124,8 +129,9 @@ def test_with_one_seed_there_is_no_interval(tmp_path, capsys):
     one = only(tmp_path)
     for rank in one.fires["huygens"]:
         assert [row.interval for row in rank.rows] == [None, None]
-        assert rank.rows[0].improvement_interval is None
-        assert rank.rows[0].improvement in (0, 0.5, 1)
+        assert rank.rows[0].probability_interval is None
+        if not rank.not_ranked:
+            assert rank.rows[0].probability_of_improvement in (0, 0.5, 1)
     assert {v.verdict for v in one.verdicts} == {"undecided"}
     assert all(c.low is None for by in one.curves.values() for c in by.values())
     assert main.main(["compare", str(tmp_path), "--output", str(tmp_path / "out")]) == 0
@@ -206,7 +212,8 @@ def summary(one):
     """Everything that statistics say of a section, as plain numbers."""
     rows = [row for rank in one.fires["huygens"] for row in rank.rows]
     return [
-        *((r.method, r.iqm, r.interval, r.improvement, r.improvement_interval) for r in rows),
+        *((r.method, r.iqm, r.interval) for r in rows),
+        *((r.probability_of_improvement, r.probability_interval) for r in rows),
         *((v.ratio, v.interval, v.verdict) for v in one.verdicts),
     ]
 
@@ -271,9 +278,13 @@ def test_any_number_of_methods_and_seeds(tmp_path_factory, counts, start):
     for rank in one.fires["huygens"]:
         rows = rank.rows
         assert {r.method: len(r.values) for r in rows} == dict(zip(METHODS, counts, strict=False))
-        ordered = sorted((r.iqm for r in rows), reverse=rank.measure in metrics.HIGHER_IS_BETTER)
-        assert [r.iqm for r in rows] == ordered
-        assert [r.next for r in rows] == [*(r.method for r in rows[1:]), None]
+        assert bool(rank.not_ranked) == (rank.measure == "mean_reward" and len(counts) > 1)
+        if rank.not_ranked:
+            assert [(r.method, r.next) for r in rows] == [(m, None) for m in METHODS[: len(rows)]]
+        else:
+            higher = rank.measure in metrics.HIGHER_IS_BETTER
+            assert [r.iqm for r in rows] == sorted((r.iqm for r in rows), reverse=higher)
+            assert [r.next for r in rows] == [*(r.method for r in rows[1:]), None]
         for row in rows:
             assert (row.interval is None) == (len(row.seeds) == 1)
             if row.interval:
@@ -300,6 +311,77 @@ def test_setups_fires_and_configurations_are_kept_apart(tmp_path):
     ]
     assert [s.trained_on for s in sections] == ["", "huygens", "paper"]
     assert any("not all methods have the same learner.batch_size" in note for note in notes)
+
+
+def fewer_fires(content):
+    content["fires"] = 2
+    for measured in content["results"]["huygens"].values():
+        measured |= {name: values[:2] for name, values in measured.items()}
+
+
+def test_runs_that_were_evaluated_otherwise_are_in_sections_of_their_own(tmp_path, capsys):
+    """Such as those of a smoke test, in the same folder."""
+    for seed in range(2):
+        write_run(tmp_path, "consensus", seed)
+    write_run(tmp_path, "consensus", 0, name="short", overrides=("env.horizon=50",))
+    spoil(write_run(tmp_path, "consensus", 0, name="few"), fewer_fires)
+    spoil(write_run(tmp_path, "consensus", 0, name="starts"), lambda c: c.update(start_seed=2))
+    assert main.main(["compare", str(tmp_path), "--output", str(tmp_path / "out")]) == 0
+    sections = {one.section.label: one.section.runs for one in compare([tmp_path]).sections}
+    usual = "setup tuned, trained on huygens (env.horizon="
+    assert {label: [run.path.name for run in runs] for label, runs in sections.items()} == {
+        f"{usual}40), 2 held-out fires, start_seed 1": ["few"],
+        f"{usual}40), 4 held-out fires, start_seed 1": ["consensus_tuned_s0", "consensus_tuned_s1"],
+        f"{usual}40), 4 held-out fires, start_seed 2": ["starts"],
+        f"{usual}50), 4 held-out fires, start_seed 1": ["short"],
+    }
+
+
+def test_numbers_without_printing(runs, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    comparison = compare([str(runs)])
+    (content,) = comparison.to_values()["setups"]
+    assert [run["seed"] for run in content["runs"]] == [0, 1, 2, 0, 1]
+    assert capsys.readouterr().out == ""
+    assert not any(tmp_path.iterdir())
+    with pytest.raises(ValueError, match="there is no such run folder"):
+        compare([tmp_path / "missing"])
+
+
+def test_rewards_that_differ_are_not_ranked(tmp_path, capsys):
+    """By their settings, or by what a scripted policy earns with them."""
+    for seed in range(2):
+        write_run(tmp_path / "settings", "consensus", seed)
+        write_run(tmp_path / "settings", "independent", seed)
+        write_run(tmp_path / "earned", "independent", seed)
+        run = write_run(tmp_path / "earned", "positional", seed)
+        content = read_evaluation(run)
+        content["results"]["huygens"]["random_actions"]["mean_reward"] = [7.0] * 4
+        write_evaluation(run, content)
+    why = "mean_reward (not ranked: the methods' rewards differ"
+    for name, because in (
+        ("settings", f"{why} in env.reward.new_fire)"),
+        ("earned", f"{why}: random_actions earns differently with them)"),
+    ):
+        rank = ranking(only(tmp_path / name), "mean_reward")
+        assert [(r.next, r.probability_of_improvement) for r in rank.rows] == [(None, None)] * 2
+        assert all(row.interval is not None for row in rank.rows)
+        assert ranking(only(tmp_path / name), "coverage").not_ranked == ""
+        out = tmp_path / f"out_{name}"
+        assert main.main(["compare", str(tmp_path / name), "--output", str(out)]) == 0
+        assert because in " ".join(page(out).text.split())
+        said = " ".join(capsys.readouterr().out.split())
+        assert "mean_reward is not ranked: the methods' rewards differ" in said
+    # Runs of one method have one reward.
+    assert (
+        ranking(only(tmp_path / "earned" / "positional_tuned_s0"), "mean_reward").not_ranked == ""
+    )
+
+
+def test_an_evaluation_without_the_fire_trained_on(tmp_path):
+    run = write_run(tmp_path, "consensus", overrides=("fire=paper",), scenarios=("elsewhere",))
+    assert main.main(["compare", str(run), "--output", str(tmp_path / "out")]) == 0
+    assert (tmp_path / "out" / "1_tuned_frozen_1_elsewhere.png").stat().st_size > 10_000
 
 
 def test_groups_are_named_as_one_types_their_settings(tmp_path):
@@ -349,7 +431,7 @@ def test_evaluations_in_other_worlds_are_no_trainings(tmp_path, capsys):
         ("independent", 30.5),
     ]
     # The same trainings twice are no two samples.
-    assert [r["improvement"] for r in coverage["rows"]] == [None, 1.0, None]
+    assert [r["probability_of_improvement"] for r in coverage["rows"]] == [None, 1.0, None]
     assert [r["evaluated_with"] for r in one["runs"]] == [{}] * 2 + [{"comm.loss": 0.5}] * 2 + [
         {}
     ] * 2
@@ -498,6 +580,17 @@ def test_the_page_holds_everything_and_loads_nothing(runs, tmp_path):
     assert content["settings"]["resamples"] == 10_000
 
 
+def test_words_of_a_table_are_not_broken_on_a_phone():
+    """A table scrolls in a box of its own; only paths may be broken anywhere."""
+    source = files("emberlink.trainers.comparison").joinpath("page.html").read_text("utf-8")
+    style = source.split("<style>")[1].split("</style>")[0]
+    rules = dict(re.findall(r"([^{}\n]+) \{([^{}]*)\}", style))
+    broken = {name for name, rule in rules.items() if "anywhere" in rule}
+    assert broken == {"td.path", ".notes", "pre"}
+    assert "overflow-x: auto" in rules[".wide"]
+    assert source.count("<table>") == source.count('<div class="wide"><table>') > 2
+
+
 HOSTILE = '<script>alert("1")</script>[red]$x_{/../'
 
 
@@ -561,12 +654,6 @@ def not_a_number(content):
     content["results"]["huygens"]["learned"]["coverage"][1] = float("nan")
 
 
-def fewer_fires(content):
-    content["fires"] = 2
-    for measured in content["results"]["huygens"].values():
-        measured |= {name: values[:2] for name, values in measured.items()}
-
-
 SPOILT = {
     "text": (lambda run: (run / "eval.json").write_text("{"), ("eval.json", "JSON")),
     "a list": (lambda run: (run / "eval.json").write_text("[]"), ("eval.json",)),
@@ -580,8 +667,6 @@ SPOILT = {
         ("holds no policy 'learned'",),
     ),
     "another's": (lambda run: spoil(run, lambda c: c.update(seed=5)), ("seed=5", "says 1")),
-    "fires": (lambda run: spoil(run, fewer_fires), ("number of held-out fires is 4 and 2",)),
-    "starts": (lambda run: spoil(run, lambda c: c.update(start_seed=2)), ("start_seed", "1 and 2")),
     "held-out": (
         lambda run: spoil(run, lambda c: c.update(held_out={"huygens": {"fire_seeds": [9]}})),
         ("were not evaluated on the same fires of huygens",),
@@ -589,12 +674,6 @@ SPOILT = {
     "scenario": (
         lambda run: spoil(run, lambda c: c.update(results={"x": c["results"]["huygens"]})),
         ("was evaluated on huygens", "on x"),
-    ),
-    "horizon": (
-        lambda run: (run / "config.yaml").write_text(
-            (run / "config.yaml").read_text().replace("horizon: 40", "horizon: 50")
-        ),
-        ("env.horizon is 40 and 50",),
     ),
     "config": (
         lambda run: (run / "config.yaml").write_text("seed: 1"),

@@ -88,7 +88,7 @@ def entry_point(monkeypatch, group: str, name: str, value: str) -> None:
 
 def test_an_entry_point_that_does_not_fit_names_itself(monkeypatch):
     for value, message in (
-        ("nowhere:Module", "cannot be imported: No module named 'nowhere'"),
+        ("nowhere:Module", "cannot be imported: ModuleNotFoundError: No module named 'nowhere'"),
         ("emberlink.comm.consensus:Nothing", "cannot be imported"),
         ("emberlink.comm.consensus:ConsensusConfig", "not a subclass of CommModule"),
     ):

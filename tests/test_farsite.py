@@ -115,6 +115,12 @@ def test_the_program(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture
     assert picture.read_bytes()[:4] == b"\x89PNG"
 
 
+def test_a_run_with_other_weather_has_no_wind_in_its_name():
+    for name in ("3mph0deg7hr_otherRAWS", "clockwise1hr_otherRAWS"):
+        with pytest.raises(ValueError, match="no wind in this name"):
+            farsite.wind_of(name)
+
+
 def test_mistakes_are_one_line(tmp_path: Path, folder: Path, capsys: pytest.CaptureFixture[str]):
     (tmp_path / "strange").mkdir()
     write(tmp_path / "strange" / "upwards_ArrivalTime.asc", np.array([[0.0, 1.0]]))

@@ -12,7 +12,7 @@ from tiny_run import TINY
 
 from emberlink.trainers.cli import main
 from emberlink.trainers.config.compose import resolve
-from emberlink.trainers.evaluation import report
+from emberlink.trainers.evaluation import command, plots
 from emberlink.trainers.runs.run_folder import RunFolder
 from emberlink.trainers.training.resume import resume
 from emberlink.trainers.training.trainer import Trainer
@@ -46,7 +46,7 @@ def test_a_disk_that_fills_up_in_the_evaluation(tmp_path, capsys, monkeypatch):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     with monkeypatch.context() as patch:
-        patch.setattr(report.figures, "timelapse", full)
+        patch.setattr(plots, "timelapse", full)
         status, _, error = trained(capsys, "consensus", *TINY, f"output={tmp_path / 'runs'}")
     run = run_of(tmp_path / "runs")
     assert status == 2
@@ -61,7 +61,7 @@ def test_a_disk_that_fills_up_in_the_evaluation(tmp_path, capsys, monkeypatch):
 
 
 def test_ctrl_c_in_the_evaluation_of_the_second_seed(tmp_path, capsys, monkeypatch):
-    played, evaluate = [], report.evaluate_run
+    played, evaluate = [], command.evaluate_run
 
     def stop(run, *arguments, **options):
         if len(played) == 1:
@@ -71,7 +71,7 @@ def test_ctrl_c_in_the_evaluation_of_the_second_seed(tmp_path, capsys, monkeypat
 
     more = ["seeds=[3,5]", f"output={tmp_path / 'runs'}"]
     with monkeypatch.context() as patch:
-        patch.setattr(report, "evaluate_run", stop)
+        patch.setattr(command, "evaluate_run", stop)
         status, said, _ = trained(capsys, "independent", *TINY, *more)
     first, second = (RunFolder(path) for path in sorted((tmp_path / "runs").iterdir()))
     assert status == 130
@@ -163,7 +163,7 @@ def test_settings_that_would_do_something_else_than_they_say(text, said, tmp_pat
 
 
 def test_the_folder_stays_locked_until_the_evaluation_is_written(tmp_path, capsys, monkeypatch):
-    seen, evaluate = [], report.evaluate_run
+    seen, evaluate = [], command.evaluate_run
 
     def look(run, *arguments, **options):
         with pytest.raises(ValueError, match="is training here"):
@@ -171,7 +171,7 @@ def test_the_folder_stays_locked_until_the_evaluation_is_written(tmp_path, capsy
         seen.append(run)
         return evaluate(run, *arguments, **options)
 
-    monkeypatch.setattr(report, "evaluate_run", look)
+    monkeypatch.setattr(command, "evaluate_run", look)
     more = ["seeds=[0,1]", f"output={tmp_path / 'runs'}"]
     assert trained(capsys, "independent", *TINY, *more)[0] == 0
     assert len(seen) == 2
@@ -233,12 +233,12 @@ def test_copies_that_a_user_keeps_are_not_the_runs(run, capsys):
         ('{"folders": 3}', "does not name the folders"),
     ],
 )
-def test_siblings_that_are_none(content, said, run, capsys):
-    (run.path / "siblings.json").write_text(content)
+def test_folders_of_seeds_that_are_none(content, said, run, capsys):
+    (run.path / "seed_runs.json").write_text(content)
     status, _, error = trained(capsys, f"resume={run.path}")
     assert status == 2
     assert error.count("\n") == 1
-    assert f"{run.path / 'siblings.json'}: {said}" in error
+    assert f"{run.path / 'seed_runs.json'}: {said}" in error
 
 
 def test_a_seed_of_another_training_is_refused(tmp_path, capsys):

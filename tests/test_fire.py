@@ -260,7 +260,7 @@ def test_a_bank_is_computed_once(tmp_path: Path, calls: list[int]):
     assert [file.suffix for file in tmp_path.iterdir()] == [".npy"]
     seeds = fire_seeds("train", 2)
     assert torch.equal(first, make_fires(load_scenario("huygens"), seeds, (12, 10), 50))
-    shifted = bank(tmp_path, base=1)
+    shifted = bank(tmp_path, start=1)
     assert torch.equal(shifted[0], first[1])
 
 
@@ -342,13 +342,13 @@ def test_the_cache_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
 
 def test_the_key_changes_with_everything(monkeypatch: pytest.MonkeyPatch):
     base = settings_of()
-    args = {"split": "train", "count": 2, "grid": (12, 10), "horizon": 50, "base": 0}
+    args = {"split": "train", "count": 2, "grid": (12, 10), "horizon": 50, "start": 0}
 
     def key(config=base, **changes):
         return bank_key(FireConfig(**config), **{**args, **changes})
 
     keys = [key(), key(split="test"), key(count=3), key(grid=(10, 12)), key(horizon=51)]
-    keys += [key(base=1), key({**base, "name": "other"}), key({**base, "num_train_fires": 3})]
+    keys += [key(start=1), key({**base, "name": "other"}), key({**base, "num_train_fires": 3})]
     keys.append(key({**base, "two_sided": True}))
     for field in RANGES:
         low, high = base[field]

@@ -76,7 +76,7 @@ def test_every_recipe_takes_a_file(source, method, setup):
     env = WildfireEnv(2, config.env, config.fire)
     expected = read_fires(config.fire, GRID, HORIZON)[0]
     env.reset()
-    assert torch.equal(env.arrival, expected.expand(2, -1, -1))
+    assert torch.equal(env.arrival_time, expected.expand(2, -1, -1))
 
 
 def test_keys_come_in_any_order_and_setup_keeps_its_own(source):

@@ -10,9 +10,13 @@ import yaml
 from tiny_run import TINY
 
 from emberlink.trainers.cli.main import main
+from emberlink.trainers.config.compose import to_values
 from emberlink.trainers.evaluation.actor import load_actor
 from emberlink.trainers.runs import pretrained
 from emberlink.trainers.runs.run_folder import RunFolder
+from emberlink.trainers.runs.seal import check_trained_with
+
+DATA = Path(__file__).parent.parent / "docs" / "data"
 
 
 @pytest.fixture(scope="module")
@@ -126,6 +130,15 @@ def test_only_finished_runs_are_packed_and_nothing_is_overwritten(packed, tmp_pa
     assert not (tmp_path / "new").exists()
 
 
+def test_every_configuration_that_is_shipped_names_all_keys():
+    """A key that is new, with a default, is written into these files, too."""
+    files = [*pretrained._shipped().rglob("config.yaml"), *DATA.rglob("config.yaml")]
+    assert len(files) > 50
+    for file in files:
+        values = yaml.load(file.read_text(), yaml.CSafeLoader)
+        assert to_values(RunFolder(file.parent).config()) == values, file
+
+
 def test_every_policy_that_is_shipped_loads():
     folders = sorted(file.parent for file in pretrained._shipped().glob("*/*/*/config.yaml"))
     assert folders
@@ -133,6 +146,7 @@ def test_every_policy_that_is_shipped_loads():
         run = RunFolder(folder)
         config = run.config()
         assert folder.parts[-3:] == (config.setup, config.method, f"s{config.seed}")
+        check_trained_with(run.checkpoint(), config)
         actor = load_actor(config, run.checkpoint())
         assert all(torch.isfinite(weight).all() for weight in actor.parameters())
         assert len(run.lines()) == config.episodes

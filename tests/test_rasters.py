@@ -270,6 +270,7 @@ def test_ascii_dialects(tmp_path):
             text.replace(" ", "\t"),
             text.replace("\n", " \n"),
             text.rstrip("\n"),
+            "\ufeff" + text,
             text + "\n\n",
             text.replace("CELLSIZE 30.0", "DX 30\nDY 30"),
             text.replace("XLLCORNER", "XLLCENTER").replace("YLLCORNER", "YLLCENTER"),

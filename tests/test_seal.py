@@ -2,14 +2,19 @@
 
 import re
 
+import numpy as np
 import pytest
 import torch
+from fire_files import Ellipses, raster_of, write_asc
 from safetensors.torch import load_file, save_file
 from tiny_run import TINY
 
 from emberlink.envs import metrics
 from emberlink.envs.fire.cache import fire_bank
 from emberlink.envs.fire.generator import load_scenario
+from emberlink.envs.fire_files.config import FileFireConfig
+from emberlink.envs.fire_files.reader import with_checksum
+from emberlink.envs.scenarios import fires_of
 from emberlink.envs.utils.atomic_io import read_sealed, write_sealed
 from emberlink.trainers.cli import main
 from emberlink.trainers.config.compose import resolve
@@ -18,7 +23,7 @@ from emberlink.trainers.runs.run_folder import RunFolder
 from emberlink.trainers.runs.seal import check_trained_with
 
 FREE = re.compile(
-    r"(evaluation\.|(episodes|output|device|logger|checkpoint_interval|checkpoint_steps|keep)$)"
+    r"(evaluation\.|(episodes|output|device|logger|checkpoint_interval|checkpoint_steps|keep_checkpoints)$)"
 )
 """keys that change nothing of what is learnt or of the world"""
 
@@ -58,9 +63,26 @@ def test_cached_results_with_a_changed_bit_are_not_read(tmp_path, monkeypatch):
     results.write(measured)
     assert results.read() == measured
     (file,) = tmp_path.iterdir()
-    for changed in flips(file.read_bytes()):
+    for changed in list(flips(file.read_bytes()))[::37]:
         file.write_bytes(changed)
         assert results.read() is None
+
+
+def test_a_runs_copy_of_its_fires_with_a_changed_bit_is_not_read(tmp_path):
+    raster = write_asc(tmp_path / "fire.asc", raster_of(Ellipses(), 300.0, cells=40, cell=75.0), 75)
+    config = fires_of(with_checksum(FileFireConfig(path=str(raster), units="minutes")))
+    grid = (12, 10), 15
+    kept = config.save_copy(tmp_path, *grid)
+    right = config.train(*grid)
+    raster.unlink()
+    assert torch.equal(fires_of(kept).train(*grid), right)
+    file = tmp_path / "fires.npz"
+    assert np.load(file)["train"].shape == right.shape
+    whole = file.read_bytes()
+    for changed in (*list(flips(whole))[::101], whole[:-1], whole + b"x"):
+        file.write_bytes(changed)
+        with pytest.raises(ValueError, match=r"fire.asc: there is no such file"):
+            fires_of(kept).train(*grid)
 
 
 def keys_of(text: str) -> list[str]:
@@ -121,7 +143,7 @@ def test_a_changed_configuration_is_refused(command, old, new, said, run, tmp_pa
     assert error.count("\n") == 1
     key, value = said.split("=")
     assert f"made with {said}; the run has {key}={new.split(': ')[1]}: put {value} back" in error
-    assert ("another world is played with: emberlink eval RUN" in error) == (key[0] != "l")
+    assert ("to evaluate in another world: emberlink eval RUN" in error) == (key[0] != "l")
     assert {path: path.read_bytes() for path in run.rglob("*") if path.is_file()} == before
 
 

@@ -9,12 +9,12 @@ from hypothesis import strategies as st
 
 from emberlink.trainers.comparison import bootstrap as statistics
 from emberlink.trainers.comparison.bootstrap import (
-    advantage,
     as_ratio,
     band,
-    improvement,
     interval,
     iqm,
+    iqm_ratio_share,
+    probability_of_improvement,
 )
 
 numbers = st.lists(st.integers(0, 40).map(float), min_size=1, max_size=9)
@@ -62,7 +62,7 @@ def test_iqm_of_few_seeds(values, expected):
     [([2], [1], 1), ([1], [2], 0), ([1], [1], 0.5), ([1, 3], [2, 2], 0.5), ([1, 3], [1, 2], 0.625)],
 )
 def test_probability_of_improvement_by_hand(one, other, expected):
-    assert improvement(np.asarray(one, float), np.asarray(other, float)) == expected
+    assert probability_of_improvement(np.asarray(one, float), np.asarray(other, float)) == expected
 
 
 @settings(deadline=None)
@@ -70,8 +70,8 @@ def test_probability_of_improvement_by_hand(one, other, expected):
 def test_statistics_equal_plain_ones(one, other):
     a, b = np.asarray(one), np.asarray(other)
     assert iqm(a) == pytest.approx(plain_iqm(one))
-    assert improvement(a, b) == pytest.approx(plain_improvement(one, other))
-    assert improvement(a, b) + improvement(b, a) == pytest.approx(1)
+    assert probability_of_improvement(a, b) == pytest.approx(plain_improvement(one, other))
+    assert probability_of_improvement(a, b) + probability_of_improvement(b, a) == pytest.approx(1)
 
 
 @pytest.mark.parametrize(
@@ -86,7 +86,7 @@ def test_statistics_equal_plain_ones(one, other):
     ],
 )
 def test_ratio_to_the_best_other(own, others, higher, ratio):
-    share = advantage(
+    share = iqm_ratio_share(
         np.asarray(own, float), *(np.asarray(o, float) for o in others), higher=higher
     )
     assert as_ratio(float(share)) == pytest.approx(ratio)
@@ -94,7 +94,7 @@ def test_ratio_to_the_best_other(own, others, higher, ratio):
 
 def test_one_seed_gives_no_interval_and_two_their_range():
     assert interval(iqm, [3.0]) is None
-    assert interval(improvement, [3.0, 4.0], [1.0]) is None
+    assert interval(probability_of_improvement, [3.0, 4.0], [1.0]) is None
     assert interval(iqm, [3.0, 5.0]) == (3, 5)
     assert interval(iqm, [3.0, 5.0, 4.0]) == (3, 5)
     assert interval(iqm, [4.0, 4.0, 4.0]) == (4, 4)
@@ -114,9 +114,9 @@ def test_interval_is_that_of_all_resamples(values):
 def test_interval_draws_within_each_method():
     one, other = [1.0, 4.0, 5.0], [2.0, 3.0, 6.0]
     expected = plain_interval(plain_improvement, one, other)
-    assert interval(improvement, one, other) == pytest.approx(expected, abs=1 / 9)
+    assert interval(probability_of_improvement, one, other) == pytest.approx(expected, abs=1 / 9)
     # Drawn from both together the ends would be 0 and 1.
-    apart = interval(improvement, [1.0, 2.0, 3.0], [7.0, 8.0, 9.0])
+    apart = interval(probability_of_improvement, [1.0, 2.0, 3.0], [7.0, 8.0, 9.0])
     assert apart == (0, 0)
 
 
@@ -124,11 +124,11 @@ def test_interval_draws_within_each_method():
 @given(several, several)
 def test_intervals_hold_the_statistic_and_do_not_depend_on_what_was_drawn_before(one, other):
     first = interval(iqm, one)
-    interval(improvement, one, other)
+    interval(probability_of_improvement, one, other)
     assert interval(iqm, one) == first
     assert first is not None
     assert min(one) <= first[0] <= first[1] <= max(one)
-    got = interval(improvement, one, other)
+    got = interval(probability_of_improvement, one, other)
     assert got is not None
     assert 0 <= got[0] <= got[1] <= 1
 

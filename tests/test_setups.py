@@ -78,7 +78,7 @@ def test_every_row_of_the_table(method, column):
     assert (config.method, config.setup) == (method, setup)
     assert {key: read(config, key) for key in TABLE} == {k: v[column] for k, v in TABLE.items()}
     assert config.learner.gamma == GAMMA[method, setup]
-    settings = build_comm(config).config
+    settings = build_comm(config, num_envs=1).config
     if method == "consensus":
         expected = {key: values[column] for key, values in CONSENSUS.items()}
         assert {key: read(settings, key) for key in CONSENSUS} == expected

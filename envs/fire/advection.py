@@ -1,4 +1,4 @@
-"""What carries a front along with the medium it spreads in: a steady drift and a tide."""
+"""The velocity of the medium that carries a front along: a steady drift and a tide."""
 
 import math
 from collections.abc import Callable, Mapping
@@ -10,19 +10,19 @@ _STEPS_PER_PERIOD = 32
 
 
 def tide_speed(tide_reach: float, tide_period: float) -> float:
-    """How fast a tide runs at its strongest, cells per step."""
+    """Returns the greatest speed of a tide, cells per step."""
     return math.pi * tide_reach / tide_period
 
 
-def longest_step(tide_period: float) -> float:
-    """Steps of time that a computation may take at once and still follow a tide."""
+def max_time_step(tide_period: float) -> float:
+    """Returns the longest time step, in steps, that still resolves a tide."""
     return tide_period / _STEPS_PER_PERIOD
 
 
 def current(
     draw: Mapping[str, Tensor], azimuth: Callable[[float], Tensor], scale: float
 ) -> Callable[[float], Tensor]:
-    """The velocity of the medium as a function of time.
+    """Returns the velocity of the medium as a function of time.
 
     u(t) = `drift_rate` · w(t) + s · cos(2π t / `tide_period` + `tide_phase`) · v, with w the unit
     vector along the azimuth, v that along `tide_bearing` and s = π `tide_reach` / `tide_period`.

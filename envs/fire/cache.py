@@ -1,4 +1,4 @@
-"""Banks of fires: computed once, then read from a file."""
+"""Caches banks of generated fires in files."""
 
 import dataclasses
 import hashlib
@@ -18,21 +18,26 @@ from emberlink.envs.utils.atomic_io import read_sealed, write_sealed
 from .generator import FireConfig, Split, fire_seeds, make_fires
 
 GENERATOR_VERSION = 1  # raise it whenever the same config and seed give another fire
-_LONGEST_HEADER = 10_000  # bytes of NumPy's format before the numbers
+_MAX_HEADER = 10_000  # bytes of NumPy's format before the numbers
 
 
 def cache_folder() -> Path:
-    """$EMBERLINK_CACHE, else $XDG_CACHE_HOME/emberlink, else ~/.cache/emberlink."""
+    """Returns $EMBERLINK_CACHE, else $XDG_CACHE_HOME/emberlink, else ~/.cache/emberlink."""
     if folder := os.environ.get("EMBERLINK_CACHE"):
         return Path(folder).expanduser()
     return Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "emberlink"
 
 
 def bank_key(
-    config: FireConfig, split: Split, count: int, grid: tuple[int, int], horizon: int, base: int = 0
+    config: FireConfig,
+    split: Split,
+    count: int,
+    grid: tuple[int, int],
+    horizon: int,
+    start: int = 0,
 ) -> str:
-    """A hash of everything that a bank of fires depends on."""
-    parts = [GENERATOR_VERSION, dataclasses.asdict(config), split, count, *grid, horizon, base]
+    """Returns a hash of everything that a bank of fires depends on."""
+    parts = [GENERATOR_VERSION, dataclasses.asdict(config), split, count, *grid, horizon, start]
     return hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:32]
 
 
@@ -43,14 +48,14 @@ def fire_bank(
     grid: tuple[int, int],
     horizon: int,
     *,
-    base: int = 0,
+    start: int = 0,
     cache_dir: str | os.PathLike[str] | None = None,
 ) -> Tensor:
-    """The first `count` fires of a split, computed once and then read from a file.
+    """Returns the first `count` fires of a split, computed once and then read from a file.
 
     Args:
         config, grid, horizon: as in `make_fires`.
-        split, count: as in `fire_seeds`, with `base` as its `start`.
+        split, count, start: as in `fire_seeds`.
         cache_dir: folder of the file, `cache_folder()` by default. The file begins with the
             SHA-256 of the rest, and a damaged one is replaced. A folder that cannot be written to
             costs a warning and the time to compute.
@@ -58,9 +63,9 @@ def fire_bank(
     Returns:
         float32 [count, X, Y] on the CPU, so that every device trains on the same fires.
     """
-    seeds = fire_seeds(split, count, base)
+    seeds = fire_seeds(split, count, start)
     folder = cache_folder() if cache_dir is None else Path(cache_dir)
-    file = folder / f"fire-{bank_key(config, split, count, grid, horizon, base)}.npy"
+    file = folder / f"fire-{bank_key(config, split, count, grid, horizon, start)}.npy"
     stored = _read(file, (count, *grid))
     if stored is not None:
         return stored
@@ -70,13 +75,13 @@ def fire_bank(
 
 
 def _read(file: Path, shape: tuple[int, ...]) -> Tensor | None:
-    """Returns the bank in a file, or None if there is none or a byte of it has changed."""
-    content = read_sealed(file, 4 * math.prod(shape) + _LONGEST_HEADER)
+    """Returns the bank in a file, None if there is none or a byte of it has changed."""
+    content = read_sealed(file, 4 * math.prod(shape) + _MAX_HEADER)
     if content is None:
         return None
     try:
         array = np.load(io.BytesIO(content), allow_pickle=False)
-    except Exception:  # a seal can be forged, and numpy raises what it likes on a damaged header
+    except Exception:  # of many types, if the header is damaged although sealed
         return None
     if array.dtype != np.float32 or array.shape != shape or not (array >= 0).all():
         return None

@@ -1,4 +1,4 @@
-"""The elliptical wavelet that every point of a front sends out: its rates and its shape.
+"""Rates and shape of the elliptical wavelet that spreads from every point of a front.
 
 A wavelet grows at the rate `a` along its axis and at `b` across, in half lengths, while its centre
 moves at `c` along the axis: (a, b, c), cells per step. Angles are in radians, counter-clockwise
@@ -14,7 +14,7 @@ MAX_LENGTH_TO_BREADTH = 8.0
 
 
 def length_to_breadth(wind: float | Tensor) -> Tensor:
-    """The length-to-breadth ratio of a wildfire in wind (Anderson 1983, USDA INT-305).
+    """Returns the length-to-breadth ratio of a wildfire in wind (Anderson 1983, USDA INT-305).
 
     Args:
         wind: mid-flame wind speed in m/s, not negative, any shape.
@@ -32,12 +32,12 @@ def length_to_breadth(wind: float | Tensor) -> Tensor:
 def ellipse_rates(
     head_ros: float | Tensor, length_to_breadth: float | Tensor, two_sided: bool = False
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Rates of the wavelet of a point source, which stands in a focus of its ellipse.
+    """Returns the rates of the ellipse of a point source, which lies in a focus of it.
 
     Args:
         head_ros: rate of the head, cells per step.
         length_to_breadth: at least 1, broadcast against `head_ros`.
-        two_sided: the source stands in the centre instead: the back runs as fast as the head.
+        two_sided: the source lies in the centre instead: the back runs as fast as the head.
 
     Returns:
         (a, b, c): growth of the half length, of the half breadth, and speed of the centre.
@@ -54,7 +54,7 @@ def ellipse_rates(
 
 
 def front_speed(normal: Tensor, a: Tensor, b: Tensor, c: Tensor, azimuth: float | Tensor) -> Tensor:
-    """Speed of a straight front along its outward normal, cells per step.
+    """Returns the speed of a straight front along its outward normal, cells per step.
 
     This is F(n) = c (n·w) + sqrt(b² + (a² − b²)(n·w)²), the support function of the wavelet.
 

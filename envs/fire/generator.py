@@ -1,10 +1,10 @@
-"""Wildfires as data: a scenario is a set of ranges, a fire is what one seed draws from them.
+"""Generates fires: a scenario is a set of ranges, from which a seed draws one fire.
 
-A fire is a time of arrival per cell, in steps; a cell burns from then on. It starts as a ring, the
-edge of a disc whose inside is burnt out and never counts as fire, and spreads by `spread`. Other
-waves, such as oil on water, are scenarios too: "fire" stands for whatever spreads.
-Lengths of a scenario are in cells of a grid whose shorter side has 30 cells (`BASE_SIDE`); on
-another grid lengths, and with them rates, are scaled by min(X, Y)/30, so that it fits any grid.
+A fire is an arrival time per cell, in steps; a cell burns once `step >= arrival_time`. It starts as
+a ring, the edge of a disc whose inside is burnt out and never counts as fire, and spreads by the
+level set of `level_set`. Other waves, such as oil on water, are scenarios too.
+Lengths of a scenario are in cells of a grid whose shorter side has 30 cells (`BASE_SIDE`). On
+another grid lengths and rates are scaled by min(X, Y)/30.
 """
 
 import dataclasses
@@ -17,24 +17,23 @@ from pydantic.dataclasses import dataclass
 from torch import Tensor
 
 from emberlink.configs import known
-from emberlink.envs.config import check_grid
+from emberlink.envs.config import BASE_SIDE, check_grid
 from emberlink.envs.utils.config_files import read
 from emberlink.envs.utils.counter_rng import Use, fold_in, uniform
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import Name, describe
 
-from .advection import current, longest_step, tide_speed
+from .advection import current, max_time_step, tide_speed
 from .ellipse import MAX_LENGTH_TO_BREADTH
 from .level_set import arrival_times, disc
 
-BASE_SIDE = 30
 TEST_FROM = 1_000_000
 VALIDATION_FROM = 2_000_000
 Split = Literal["train", "validation", "test"]
 
-_NODES = 60  # nodes along the shorter side at least: twice the resolution of 30 cells
-_CHUNK = 200_000  # nodes computed at a time, so that the work stays in the processor's cache
-_LEAST = 1e-6  # radius of a patch, cells: its square is no number below some 1e-19
+_MIN_NODES = 60  # along the shorter side: twice the resolution of 30 cells
+_MAX_NODES = 200_000  # computed at a time, so that the work stays in the processor's cache
+_MIN_RADIUS = 1e-6  # of a patch, cells, so that its square does not underflow
 
 
 def _ordered(pair: tuple[float, float]) -> tuple[float, float]:
@@ -44,7 +43,7 @@ def _ordered(pair: tuple[float, float]) -> tuple[float, float]:
 
 
 _Ordered = AfterValidator(_ordered)
-_Pair = Strict(False)  # a list, as YAML has it, will do for a tuple
+_Pair = Strict(False)  # a list, as in YAML, is valid for a tuple
 _Degrees = Annotated[float, Field(ge=-360, le=360)]
 _Turn = Annotated[float, Field(ge=-3600, le=3600)]
 _Length = Annotated[float, Field(gt=0, le=30)]
@@ -116,15 +115,15 @@ _DRAWN = tuple(f.name for f in dataclasses.fields(FireConfig) if f.name not in _
 
 
 def scenarios() -> list[str]:
-    """Names of the generator's scenarios: the files in `configs/fire` that have no `kind`."""
+    """Returns the names of the generator's scenarios: files in `configs/fire` without `kind`."""
     return [name for name in known("fire") if "kind" not in read("fire", name)]
 
 
 def load_scenario(name: str) -> FireConfig:
-    """The scenario in `configs/fire/<name>.yaml`.
+    """Returns the scenario in `configs/fire/<name>.yaml`.
 
     Raises:
-        ValueError: no such file, or a value in it that `FireConfig` does not take.
+        UserError: there is no such file, or a value in it is not valid.
     """
     values = read("fire", name) if name in known("fire") else None
     if values is None or "kind" in values:
@@ -168,7 +167,7 @@ def make_fires(
     horizon: int,
     device: torch.device | str | None = None,
 ) -> Tensor:
-    """Times of arrival of one fire per seed; each depends on its own seed alone.
+    """Returns the arrival times of one fire per seed; each depends on its own seed alone.
 
     Args:
         config: the scenario.
@@ -181,22 +180,22 @@ def make_fires(
         float32 [fires, X, Y], steps: 0 burns from the start, inf never burns.
     """
     check_grid(grid)
-    refine = math.ceil(_NODES / min(grid))
+    refine = math.ceil(_MIN_NODES / min(grid))
     sides = (side + 2 * _margin(config, grid) for side in grid)
-    chunk = max(1, _CHUNK // (math.prod(sides) * refine**2))
+    chunk = max(1, _MAX_NODES // (math.prod(sides) * refine**2))
     parts = seeds.to(device=device, dtype=torch.int64).split(chunk)
     return torch.cat([_spread(config, part, grid, horizon, refine) for part in parts])
 
 
 def _margin(config: FireConfig, grid: tuple[int, int]) -> int:
-    """Cells around the grid from which a tide can bring something back."""
+    """Returns the cells around the grid from which a tide can carry the front back."""
     return math.ceil(config.tide_reach[1] * min(grid) / BASE_SIDE)
 
 
 def _spread(
     config: FireConfig, seeds: Tensor, grid: tuple[int, int], horizon: int, refine: int
 ) -> Tensor:
-    """`make_fires` for seeds that are computed together."""
+    """Computes the fires of some seeds together; see `make_fires`."""
     scale = min(grid) / BASE_SIDE
     draw = {field: _draw(config, field, seeds)[:, 0] for field in _DRAWN if "patch" not in field}
     fractions = torch.stack([draw["centre_x"], draw["centre_y"]], 1)
@@ -218,7 +217,7 @@ def _spread(
         two_sided=config.two_sided,
         drift=current(draw, azimuth, scale) if fastest > 0 else None,
         margin=_margin(config, grid),
-        max_step=longest_step(config.tide_period[0]) if config.tide_reach[1] > 0 else math.inf,
+        max_step=max_time_step(config.tide_period[0]) if config.tide_reach[1] > 0 else math.inf,
         refine=refine,
         rate_field=_fuel(config, seeds, centre, draw["core_radius"], start, grid),
         max_rate=(config.head_ros[1] + fastest) * scale,
@@ -229,13 +228,13 @@ def _spread(
 
 
 def _unit(field: str, seeds: Tensor, count: int) -> Tensor:
-    """Uniform draws on (0, 1), float32 [fires, count], from the key of a seed and a field."""
+    """Returns uniform draws on (0, 1) for a field, float32 [fires, count]."""
     key = torch.tensor([Use.FIRE_PARAMETER, _DRAWN.index(field)], device=seeds.device)
     return uniform(fold_in(fold_in(seeds, key[0]), key[1]), count)
 
 
 def _draw(config: FireConfig, field: str, seeds: Tensor, count: int = 1) -> Tensor:
-    """Uniform draws from the range of a field, float32 [fires, count]."""
+    """Returns uniform draws from the range of a field, float32 [fires, count]."""
     low, high = getattr(config, field)
     return low + (high - low) * _unit(field, seeds, count)
 
@@ -253,23 +252,23 @@ def _fuel(
     azimuth: Tensor,
     grid: tuple[int, int],
 ) -> Tensor | None:
-    """Multiplier of the rates, [fires, X, Y]: a product of smooth round fuel_patches."""
-    most = config.fuel_patches[1]
-    if most == 0:
+    """Returns the multiplier of the rates, [fires, X, Y]: a product of smooth round patches."""
+    maximum = config.fuel_patches[1]
+    if maximum == 0:
         return None
     scale = min(grid) / BASE_SIDE
     low = config.fuel_patches[0]
-    count = low + (_unit("fuel_patches", seeds, 1) * (most - low + 1)).floor()
+    count = low + (_unit("fuel_patches", seeds, 1) * (maximum - low + 1)).floor()
     bearing, distance, width, rate = (
-        _draw(config, f"patch_{part}", seeds, most)
+        _draw(config, f"patch_{part}", seeds, maximum)
         for part in ("bearing", "distance", "radius", "rate")
     )
     angle = azimuth[:, None] + bearing.deg2rad()
     reach = (radius[:, None] + distance) * scale
     px = (centre[:, :1] + reach * angle.cos())[..., None, None]
     py = (centre[:, 1:] + reach * angle.sin())[..., None, None]
-    loss = (1 - rate) * (torch.arange(most, device=seeds.device) < count)
+    loss = (1 - rate) * (torch.arange(maximum, device=seeds.device) < count)
     x, y = _axes(grid, seeds.device)
-    wide = (width * scale).clamp_min(_LEAST)[..., None, None]
+    wide = (width * scale).clamp_min(_MIN_RADIUS)[..., None, None]
     apart = ((x - px) ** 2 + (y - py) ** 2) / wide**2
     return (1 - loss[..., None, None] * torch.exp(-apart)).prod(1)

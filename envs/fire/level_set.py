@@ -8,8 +8,8 @@ FARSITE, RMRS-RP-4). The same front is the zero contour of φ with
 
 where w is the unit vector of the direction of maximum spread, (a, b, c) the rates at which the
 wavelet's half length, half breadth and centre grow, u the drift of the medium (none for fire, the
-current for oil on water), and m ≥ 0 a multiplier in space (fuel; 0 is a barrier). Nothing here is
-about fire alone: any wave with an elliptical wavelet will do.
+current for oil on water), and m ≥ 0 a multiplier in space (fuel; 0 is a barrier). Any wave
+with an elliptical wavelet is described by it, not fire alone.
 
 Conventions: cell (i, j) has its centre at x = i, y = j; lengths are in cells, times in steps,
 rates in cells per step; an azimuth is in radians, counter-clockwise from the +x axis, and points
@@ -37,7 +37,7 @@ _PAD = 2  # cells around the grid, so that the ends of the stencil lie outside o
 
 
 def disc(centre: Tensor, radius: Tensor) -> Distance:
-    """The signed distance to circles: `centre` [fires, 2] and `radius` [fires], in cells."""
+    """Returns the signed distance to circles: `centre` [fires, 2] and `radius` [fires], cells."""
 
     def distance(x: Tensor, y: Tensor) -> Tensor:
         cx, cy = centre[:, 0, None, None], centre[:, 1, None, None]
@@ -64,7 +64,7 @@ def arrival_times(
     device: torch.device | str | None = None,
     dtype: torch.dtype = torch.float32,
 ) -> Tensor:
-    """When the front that starts at `distance` = 0 arrives at the centre of each cell.
+    """Computes when a front that starts at `distance` = 0 arrives at the centre of each cell.
 
     Heun's method (RK2) in time at a Courant number of 0.4; upwind differences in space, limited
     by superbee (Roe 1986, Annu. Rev. Fluid Mech. 18). The size of a time step follows from
@@ -132,7 +132,7 @@ def arrival_times(
 def _nodes(
     cells: int, pad: int, refine: int, device: torch.device | str | None, dtype: torch.dtype
 ) -> Tensor:
-    """Coordinates of the fine nodes of one axis; every `refine`-th is the centre of a cell."""
+    """Returns the fine nodes of one axis; every `refine`-th is the centre of a cell."""
     count = (cells - 1 + 2 * pad) * refine + 1
     return torch.arange(count, device=device, dtype=dtype) / refine - pad
 
@@ -151,7 +151,7 @@ def _rate_bound(
 
 
 def _refined(field: Tensor, grid: tuple[int, int], x: Tensor, y: Tensor) -> Tensor:
-    """The multiplier at the fine nodes: bilinear between cells, 0 on every cell that is a barrier.
+    """Returns the multiplier at the fine nodes: bilinear between cells, 0 on barriers.
 
     A barrier is sharp: it does not slow the cells beside it. A node on the edge between cells
     belongs to all of them, or the front would slip between two barriers that touch at a corner.
@@ -185,7 +185,7 @@ def _hamiltonian(
     azimuth: Tensor,
     drift: Tensor | None,
 ) -> Tensor:
-    """−φ_t of the equation with unit multiplier; `phi` is scaled to unit spacing of the nodes.
+    """Computes −φ_t with unit multiplier; `phi` is scaled to unit spacing of the nodes.
 
     H is convex and homogeneous of degree one, so H = V·∇φ with V = ∂H/∂∇φ the velocity of the
     characteristics in the medium: V from central differences, and the drift on top of it, tell
@@ -206,14 +206,14 @@ def _hamiltonian(
     ux, uy = (0.0, 0.0) if drift is None else drift[..., None, None].unbind(1)
     dx = torch.where(vx + ux > 0, x_left, x_right)
     dy = torch.where(vy + uy > 0, y_left, y_right)
-    # In its medium a front never runs backwards; limited differences of opposite signs could
-    # pretend it does. The medium itself may carry it back.
+    # In its medium a front never moves backwards, although limited differences of opposite signs
+    # could give that. The medium itself may carry it back.
     decay = (vx * dx + vy * dy).clamp_min(0)
     return decay if drift is None else decay + (ux * dx + uy * dy)
 
 
 def _differences(phi: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Left, right (second order, limited) and central differences along axis 1."""
+    """Returns left, right (second order, limited) and central differences along axis 1."""
     first, last = phi[:, 1:2] - phi[:, :1], phi[:, -1:] - phi[:, -2:-1]
     inner = phi[:, 1:] - phi[:, :-1]
     delta = torch.cat([first, first, inner, last, last], 1)  # d[k] lies between k−2 and k−1
@@ -224,7 +224,7 @@ def _differences(phi: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _superbee(left: Tensor, right: Tensor) -> Tensor:
-    """The limited slope of two neighbouring differences: 0 where their signs differ."""
+    """Returns the limited slope of two neighbouring differences: 0 if their signs differ."""
     l_abs, r_abs = left.abs(), right.abs()
     size = torch.maximum(torch.minimum(2 * l_abs, r_abs), torch.minimum(l_abs, 2 * r_abs))
     return torch.where(left * right > 0, torch.copysign(size, left), 0.0)

@@ -15,8 +15,8 @@ from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.publish import new_file, published
 
 from .projection import first_line
-from .raster_source import RasterSource
-from .rasters import check_spreads, clean, open_raster
+from .raster_source import RasterSource, check_spreads
+from .rasters import clean, open_raster
 from .times import Clock
 
 SUFFIXES = (".npy", ".tif", ".tiff")
@@ -26,6 +26,7 @@ MAX_BANDS = 4096
 """Of a GeoTIFF that is written: the time that GDAL takes grows with their square."""
 MAX_BYTES = 2**30
 """Of a bank that is written."""
+_MAX_FACTS = 50_000_000  # bytes of the .json beside an .npy
 _NODATA = -9999.0  # never burns, as in FARSITE and FlamMap
 
 
@@ -55,6 +56,21 @@ def is_bank(path: Path) -> bool:
     """Tells whether a GeoTIFF is a bank: tagged units=steps, and without a projection."""
     with open_raster(path) as dataset:
         return dataset.tags().get("units") == "steps" and dataset.crs is None
+
+
+def bank_horizon(path: Path) -> int | None:
+    """Returns the horizon for which a bank was written, steps; None if it does not say so."""
+    try:
+        if path.suffix.lower() == ".npy":
+            beside = path.with_suffix(".json")
+            known = beside.is_file() and beside.stat().st_size <= _MAX_FACTS
+            horizon = json.loads(beside.read_text(encoding="utf-8"))["horizon"] if known else None
+        else:
+            with open_raster(path) as dataset:
+                horizon = dataset.tags().get("horizon")
+        return None if horizon is None else int(horizon)
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        return None  # of another program, or damaged
 
 
 def read_bands(path: Path) -> Iterator[RasterSource]:

@@ -6,13 +6,12 @@ from typing import Any
 import numpy as np
 from scipy import ndimage
 
+from emberlink.envs.config import BASE_SIDE
 from emberlink.envs.utils.errors import UserError
 
 from .config import FileFireConfig
 from .raster_source import Source, Window
 from .times import SECONDS, Clock, Units, in_utc, parse_time
-
-_BASE_SIDE = 30  # cells of the side that `ring_width` is told for
 
 
 def on_grid(
@@ -42,7 +41,7 @@ def on_grid(
     if config.start is None and not in_steps and not (times <= start).any():
         times[times == times.min()] = start  # the first cell burns from the beginning
     if config.ring_width is not None and not (source.whole and in_steps):
-        times[_burnt_out(times, start, config.ring_width * min(grid) / _BASE_SIDE)] = np.inf
+        times[_burnt_out(times, start, config.ring_width * min(grid) / BASE_SIDE)] = np.inf
     steps = (np.maximum(times, start) - start) / (end - start) * horizon
     burning = steps[np.isfinite(steps)]
     if len(burning) < 2 or (not in_steps and burning.min() == burning.max()):

@@ -6,8 +6,7 @@ import numpy as np
 
 from emberlink.envs.utils.errors import UserError
 
-from .raster_source import RasterSource
-from .rasters import check_spreads
+from .raster_source import RasterSource, check_spreads
 from .times import Clock, Units
 
 SIDE = 30

@@ -78,7 +78,7 @@ def perimeter_times(frame: Any, wanted: str | None, unit: Units | None) -> Times
             "which column holds the times is not known; expected fire.time_field, one of "
             f"{_list(names)}"
         )
-    return _of_column(frame, *(found or edited[:1]), unit, instead=edited if found else [])
+    return _of_column(frame, (found or edited)[0], unit, instead=edited if found else [])
 
 
 def _present(names: dict[str, str], known: Sequence[str]) -> list[str]:

@@ -231,6 +231,29 @@ class RasterSource:
         return np.where(np.isinf(inside) | (weights == 0), inside, times)
 
 
+def check_spreads(times: np.ndarray, *, may_stand: bool = False) -> None:
+    """Checks that arrival times are those of a fire that spreads.
+
+    Args:
+        times: with inf for never.
+        may_stand: whether a part of the map may burn at once and nothing after it, as a fire does
+            that was made for a few steps.
+
+    Raises:
+        UserError: no cell burns, only one does, or all at once.
+    """
+    burning = times[np.isfinite(times)]
+    if len(burning) == 0:
+        raise UserError("no cell burns: NODATA everywhere; expected arrival times")
+    if len(burning) == 1:
+        raise UserError("a single cell burns; expected a fire that spreads")
+    if burning.min() == burning.max() and not (may_stand and len(burning) < times.size):
+        raise UserError(
+            f"all {len(burning)} cells burn at once, at {burning[0]:g}; "
+            "expected a fire that spreads"
+        )
+
+
 def _front(times: np.ndarray, until: float) -> float:
     """Returns where the burnt area begins along the lines of cells, in cells from their start.
 

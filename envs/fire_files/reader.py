@@ -2,6 +2,7 @@
 
 import dataclasses
 import hashlib
+import io
 import json
 from pathlib import Path
 from typing import NamedTuple
@@ -11,12 +12,12 @@ import torch
 from torch import Tensor
 
 from emberlink.envs.config import check_grid
-from emberlink.envs.utils.atomic_io import open_regular, replaced
+from emberlink.envs.utils.atomic_io import read_sealed, write_sealed
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import printable
 
 from . import formats
-from .banks import MAX_CELLS, is_bank, read_bands, read_npy
+from .banks import MAX_CELLS, bank_horizon, is_bank, read_bands, read_npy
 from .config import FileFireConfig
 from .episode_crop import on_grid
 from .front_points import read_front_points
@@ -28,8 +29,7 @@ from .rasters import read_ascii, read_geotiff
 READER_VERSION = 4  # raise it whenever the same file gives another grid
 COPY_FILE = "fires.npz"
 """The file of a run folder that holds the run's own copy of its grids."""
-_MAX_COPY = 8 * MAX_CELLS + 1_000_000
-"""Bytes of that copy, unpacked: float32 of the cells of every set."""
+_MAX_COPY = 12 * MAX_CELLS + 1_000_000  # bytes of it, unpacked: float32 of the cells of every set
 _EVERY, _VALIDATION, _TEST = 5, 3, 4  # remainders of the numbers of validation and test fires
 
 
@@ -73,6 +73,7 @@ def _read(
         bank = read_bands(path)
     else:
         return [on_grid(_read_one(path, kind, config), config, grid, horizon)]
+    _check_horizon(path, config, horizon)
     fires: list[np.ndarray] = []
     for source in bank:
         try:
@@ -80,6 +81,17 @@ def _read(
         except UserError as error:
             raise UserError(f"fire {len(fires)}: {error}") from None
     return fires
+
+
+def _check_horizon(path: Path, config: FileFireConfig, horizon: int) -> None:
+    """Checks that a bank whose times stay steps was written for this horizon."""
+    written = bank_horizon(path)
+    in_steps = config.start is config.end is config.minutes_per_step is None
+    if in_steps and written not in (None, horizon):
+        raise UserError(
+            f"its fires are of {written} steps, env.horizon is {horizon}; expected "
+            f"env.horizon={written}, or fire.end={written} to stretch them over {horizon} steps"
+        )
 
 
 def _read_one(path: Path, kind: formats.Format, config: FileFireConfig) -> Source:
@@ -175,9 +187,10 @@ def save_copy(config: FileFireConfig, folder: Path, grid: tuple[int, int], horiz
     """
     fires = fire_sets(config, grid, horizon)
     try:
-        with replaced(folder / COPY_FILE) as partial, partial.open("wb") as file:
-            arrays = {name: values.numpy() for name, values in fires._asdict().items()}
-            np.savez_compressed(file, key=np.array(_key(config, grid, horizon)), **arrays)
+        content = io.BytesIO()
+        arrays = {name: values.numpy() for name, values in fires._asdict().items()}
+        np.savez_compressed(content, key=np.array(_key(config, grid, horizon)), **arrays)
+        write_sealed(folder / COPY_FILE, content.getbuffer())
     except OSError as error:
         reason = error.strerror or error
         raise UserError(f"{folder / COPY_FILE}: cannot be written: {reason}") from None
@@ -195,11 +208,11 @@ def _read_copy(config: FileFireConfig, grid: tuple[int, int], horizon: int) -> F
     """Returns the run's own copy, None if there is none or it is damaged or of another grid."""
     if config.saved_copy is None or config.sha256 is None:
         return None
+    content = read_sealed(Path(config.saved_copy), _MAX_COPY)
+    if content is None:
+        return None
     try:
-        with (
-            open_regular(Path(config.saved_copy), _MAX_COPY) as file,
-            np.load(file, allow_pickle=False) as arrays,
-        ):
+        with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
             if sum(part.file_size for part in arrays.zip.filelist) > _MAX_COPY:
                 return None
             if str(arrays["key"]) != _key(config, grid, horizon):

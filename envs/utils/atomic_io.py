@@ -1,7 +1,6 @@
-"""Reads and writes files in folders that somebody else may have prepared.
+"""Reads and writes the files of run folders and caches, which another person may have prepared.
 
-Every file that a command leaves in a run folder, in the cache or under `--output` is opened here.
-Nothing is written, cut or deleted through a link, and only regular files are read.
+Nothing is written, truncated or deleted through a link, and only regular files are read.
 """
 
 import errno
@@ -14,53 +13,56 @@ from pathlib import Path
 from typing import BinaryIO
 
 PART = ".part"
-"""ends the names of files that are not whole yet"""
+"""suffix of files that are not complete yet"""
 _LINK = "it is a link, and nothing is written through links"
+_DIGEST = 64
+"""characters of a SHA-256"""
+_NOT_REGULAR = "it is not a regular file"
 _READ = os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC
 _CREATE = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
 _CHANGE = os.O_RDWR | os.O_APPEND | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC
 
 
-def open_regular(path: Path, longest: int, *, follow: bool = True) -> BinaryIO:
-    """Opens a regular file of bounded size for reading; a pipe or a device is never waited for.
+def open_regular(path: Path, max_bytes: int, *, follow: bool = True) -> BinaryIO:
+    """Opens a regular file for reading, without waiting for a pipe or a device.
 
     Args:
         path: of the file.
-        longest: bytes that it may have.
-        follow: whether it may be a link to such a file.
+        max_bytes: largest size that is accepted.
+        follow: accept a link to such a file.
 
     Raises:
-        OSError: it cannot be opened, is not regular, is larger, or is a link.
+        OSError: the file cannot be opened, is not regular, is larger, or is a link.
     """
-    handle = _opened(path, _READ if follow else _READ | os.O_NOFOLLOW)
+    handle = _open(path, _READ if follow else _READ | os.O_NOFOLLOW)
     try:
-        _check_regular(handle, path)
-        if os.fstat(handle).st_size > longest:
-            raise OSError(errno.EFBIG, f"it has more than {longest} bytes", str(path))
+        check_regular(handle, path)
+        if os.fstat(handle).st_size > max_bytes:
+            raise OSError(errno.EFBIG, f"it has more than {max_bytes} bytes", str(path))
         return os.fdopen(handle, "rb")
     except BaseException:
         os.close(handle)
         raise
 
 
-def read_bytes(path: Path, longest: int, *, follow: bool = True) -> bytes:
+def read_bytes(path: Path, max_bytes: int, *, follow: bool = True) -> bytes:
     """Returns the content of a regular file; see `open_regular`."""
-    with open_regular(path, longest, follow=follow) as file:
-        content = file.read(longest + 1)
-    if len(content) > longest:
-        raise OSError(errno.EFBIG, f"it has more than {longest} bytes", str(path))
+    with open_regular(path, max_bytes, follow=follow) as file:
+        content = file.read(max_bytes + 1)
+    if len(content) > max_bytes:
+        raise OSError(errno.EFBIG, f"it has more than {max_bytes} bytes", str(path))
     return content
 
 
 def inner_folder(root: Path, *names: str) -> Path:
-    """Returns a folder within another one, made where it is missing.
+    """Creates a folder below another one if it is missing, and returns its path.
 
     Args:
-        root: the user's own choice, which may be a link.
-        names: of the folders below it, none of which may be.
+        root: chosen by the user; it may be a link.
+        names: of the folders below `root`, outermost first; none of them may be a link.
 
     Raises:
-        OSError: a name is a link or not a folder, or cannot be made.
+        OSError: one of `names` is a link or not a folder, or cannot be created.
     """
     folder = root
     for name in names:
@@ -77,12 +79,12 @@ def inner_folder(root: Path, *names: str) -> Path:
 
 @contextmanager
 def temporary(path: Path) -> Iterator[Path]:
-    """Yields a new empty file beside `path`, and removes it at the end if it is still there.
+    """Yields a new empty file beside `path`; at the end it is removed if it is still there.
 
     Raises:
-        OSError: it cannot be made.
+        OSError: the file cannot be created.
     """
-    # The number keeps two processes apart, such as an evaluation beside a training.
+    # The process number keeps an evaluation and a training in one folder apart.
     partial = path.with_name(f"{path.name}.{os.getpid()}{PART}")
     remove(partial)
     os.close(os.open(partial, _CREATE, 0o666))
@@ -95,12 +97,12 @@ def temporary(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def replaced(path: Path) -> Iterator[Path]:
-    """Yields a new empty file, which takes the place of `path` once it is whole.
+    """Yields a new empty file, which is renamed to `path` when the block ends without an error.
 
-    A link, a pipe or a device of that name is replaced itself.
+    A link, a pipe or a device at `path` is replaced; the target of a link is not changed.
 
     Raises:
-        OSError: it cannot be written; what was there stays.
+        OSError: the file cannot be written; `path` is as before.
     """
     with temporary(path) as partial:
         yield partial
@@ -110,61 +112,63 @@ def replaced(path: Path) -> Iterator[Path]:
 
 
 def write_bytes(path: Path, content: bytes) -> None:
-    """Writes a file whole, in place of what is there; see `replaced`."""
+    """Writes a file completely or not at all, in place of an earlier one; see `replaced`."""
     with replaced(path) as partial:
         partial.write_bytes(content)
 
 
 def write_sealed(path: Path, content: bytes | memoryview) -> None:
-    """Writes a file of the cache: the SHA-256 of the content, a line break, the content.
+    """Writes a file followed by the SHA-256 of its content, 64 hexadecimal digits.
+
+    NumPy's readers ignore bytes after the end of an array or an archive.
 
     Raises:
-        OSError: it cannot be written; what was there stays.
+        OSError: the file cannot be written; `path` is as before.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     with replaced(path) as partial, partial.open("wb") as file:
-        file.write(f"{hashlib.sha256(content).hexdigest()}\n".encode())
         file.write(content)
+        file.write(hashlib.sha256(content).hexdigest().encode())
 
 
-def read_sealed(path: Path, longest: int) -> bytes | None:
-    """Returns the content of a file of the cache.
+def read_sealed(path: Path, max_bytes: int) -> bytes | None:
+    """Returns the content of a file of `write_sealed`.
 
     Args:
-        path: as for `write_sealed`.
-        longest: bytes that the content may have.
+        path: of the file.
+        max_bytes: largest content that is accepted.
 
     Returns:
-        None where there is no such file, or any of its bytes has changed.
+        None if there is no such file or any of its bits has changed.
     """
     try:
-        whole = read_bytes(path, longest + 65)
+        whole = read_bytes(path, max_bytes + _DIGEST)
     except OSError:
         return None
-    seal, content = whole[:65], whole[65:]
-    return content if seal == f"{hashlib.sha256(content).hexdigest()}\n".encode() else None
+    content, digest = whole[:-_DIGEST], whole[-_DIGEST:]
+    return content if digest == hashlib.sha256(content).hexdigest().encode() else None
 
 
 @contextmanager
-def changed(path: Path, *, create: bool = False) -> Iterator[int]:
-    """Yields a descriptor of a regular file to append to or to cut.
+def open_in_place(path: Path, *, create: bool = False) -> Iterator[int]:
+    """Yields a descriptor of a regular file to append to or to truncate.
 
-    A file that has a second name (a hard link) becomes a copy first, so that the other name keeps
-    its content.
+    A file with a second name (a hard link) is replaced by a copy first, so that the content under
+    the other name does not change.
 
     Raises:
-        OSError: it is a link, not a regular file, or cannot be opened.
+        OSError: the file is a link, is not regular, or cannot be opened.
     """
     flags = _CHANGE | os.O_CREAT if create else _CHANGE
-    handle = _opened(path, flags)
+    handle = _open(path, flags)
     try:
-        _check_regular(handle, path)
+        check_regular(handle, path)
         if os.fstat(handle).st_nlink > 1:
             _separate(handle, path)
             os.close(handle)
             handle = -1
-            handle = _opened(path, _CHANGE)
-            _check_regular(handle, path)
+            handle = _open(path, _CHANGE)
+            check_regular(handle, path)
         yield handle
     finally:
         if handle >= 0:
@@ -172,29 +176,29 @@ def changed(path: Path, *, create: bool = False) -> Iterator[int]:
 
 
 def remove(path: Path) -> None:
-    """Removes a regular file or a link, not what the link leads to; nothing where none is.
+    """Removes a regular file or a link if it exists; the target of a link is not changed.
 
     Raises:
-        OSError: it is something else, such as a folder or a pipe, or cannot be removed.
+        OSError: the path is a folder, a pipe, a socket or a device, or cannot be removed.
     """
     try:
         mode = path.lstat().st_mode
     except FileNotFoundError:
         return
     if not (stat.S_ISREG(mode) or stat.S_ISLNK(mode)):
-        raise OSError(errno.EINVAL, "it is no regular file", str(path))
+        raise OSError(errno.EINVAL, _NOT_REGULAR, str(path))
     path.unlink(missing_ok=True)
 
 
 def remove_links(folder: Path) -> None:
-    """Removes the links that lie directly in a folder."""
+    """Removes the links directly in a folder."""
     for path in folder.iterdir():
         if path.is_symlink():
             remove(path)
 
 
 def sync(path: Path) -> None:
-    """Flushes a file, or the names in a folder, so that they outlive a loss of power."""
+    """Flushes a file, or the list of names in a folder, to the disk."""
     handle = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
     try:
         os.fsync(handle)
@@ -202,29 +206,35 @@ def sync(path: Path) -> None:
         os.close(handle)
 
 
-def _opened(path: Path, flags: int) -> int:
+def check_regular(handle: int, path: Path) -> None:
+    """Checks that an open descriptor is of a regular file.
+
+    Raises:
+        OSError: it is of a folder, a pipe, a socket or a device.
+    """
+    mode = os.fstat(handle).st_mode
+    if stat.S_ISDIR(mode):
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+    if not stat.S_ISREG(mode):
+        raise OSError(errno.EINVAL, _NOT_REGULAR, str(path))
+
+
+def _open(path: Path, flags: int) -> int:
+    """Returns a new descriptor; the messages of its errors name links, pipes and sockets."""
     try:
         return os.open(path, flags, 0o666)
     except OSError as error:
         if error.errno == errno.ELOOP and path.is_symlink() and flags & os.O_NOFOLLOW:
             raise OSError(errno.ELOOP, _LINK, str(path)) from None
         if error.errno == errno.ENXIO:  # a pipe that nobody reads, or a socket
-            raise OSError(errno.EINVAL, "it is no regular file", str(path)) from None
+            raise OSError(errno.EINVAL, _NOT_REGULAR, str(path)) from None
         raise
 
 
-def _check_regular(handle: int, path: Path) -> None:
-    mode = os.fstat(handle).st_mode
-    if stat.S_ISDIR(mode):
-        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
-    if not stat.S_ISREG(mode):
-        raise OSError(errno.EINVAL, "it is no regular file", str(path))
-
-
 def _separate(handle: int, path: Path) -> None:
-    """Gives a name a copy of the file's content for its own."""
+    """Replaces a name of the open file by a copy of its content."""
     with replaced(path) as partial, partial.open("wb") as copy:
-        place = 0
-        while block := os.pread(handle, 1 << 20, place):
+        offset = 0
+        while block := os.pread(handle, 1 << 20, offset):
             copy.write(block)
-            place += len(block)
+            offset += len(block)

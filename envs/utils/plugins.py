@@ -27,21 +27,21 @@ class Registry(Generic[T]):
 
     Attributes:
         base: the class.
-        package: the package whose files define them; the name is that of the file.
-        group: of the entry points, each of which names a class.
+        package: whose files define them, a file's name being the class's.
         key: of the name in a configuration, for messages.
         other_files: of the package, without those that begin with an underscore.
+        group: of the entry points, which name a class; the package's name if empty.
     """
 
     base: type[T]
     package: str
-    group: str
     key: str
     other_files: Collection[str] = ("base", "registry")
+    group: str = ""
 
     def known(self) -> list[str]:
         """Returns the names in alphabetical order."""
-        return sorted({*self._files(), *registered(self.group)})
+        return sorted({*self._files(), *self._points()})
 
     def find(self, name: str) -> type[T]:
         """Returns the class of a name.
@@ -50,14 +50,19 @@ class Registry(Generic[T]):
             UserError: the name is not known, or several classes have it; or the package of an
                 entry point cannot be imported or does not hold such a class.
         """
-        points, files = registered(self.group), self._files()
+        points, files = self._points(), self._files()
         if name in points and name in files:
-            raise UserError(f"{self.key}={name}: also an entry point of {self.group}; rename it")
+            raise UserError(
+                f"{self.key}={name}: also an entry point, {points[name].value}; rename it"
+            )
         if name in points:
             return self._load(points[name])
         if name in files:
             return self._class_in(name)
         raise UserError(f"{self.key}={name!r} is not known; known: {', '.join(self.known())}")
+
+    def _points(self) -> dict[str, EntryPoint]:
+        return registered(self.group or self.package)
 
     def _files(self) -> set[str]:
         folders = importlib.import_module(self.package).__path__
@@ -76,11 +81,13 @@ class Registry(Generic[T]):
         return classes[0]
 
     def _load(self, point: EntryPoint) -> type[T]:
-        where = f"entry point {point.name!r} of {self.group}, {point.value}"
+        package = point.dist.name if point.dist else point.module
+        where = f"package {package}: entry point {point.name!r} of {point.group}, {point.value}"
         try:
             found = point.load()
-        except (ImportError, AttributeError) as error:
-            raise UserError(f"{where}: cannot be imported: {error}") from error
+        except Exception as error:  # whatever the code of another package does at its import
+            message = " ".join(f"{type(error).__name__}: {error}".split())
+            raise UserError(f"{where}: cannot be imported: {message}") from error
         if not self._fits(found):
             raise UserError(f"{where}: not a subclass of {self.base.__name__}")
         return found

@@ -1,4 +1,4 @@
-"""New files: a name that is free, and content that is whole before it gets that name."""
+"""Writes files that the user names or that get a new name; no existing file is replaced."""
 
 import errno
 import os
@@ -6,8 +6,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-from emberlink.envs.utils.atomic_io import sync, temporary
-
+from .atomic_io import sync, temporary
 from .errors import UserError
 from .validation import shown
 
@@ -16,14 +15,14 @@ _NO_LINKS = {errno.EPERM, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS, errno.E
 
 @contextmanager
 def published(path: Path) -> Iterator[Path]:
-    """A file to write, which gets its name once it is whole and if nobody else took that.
+    """Yields a new empty file, which is renamed to `path` when the block ends without an error.
 
     Args:
-        path: the name; what is written goes to the path that this yields.
+        path: a name that is not taken yet.
 
     Raises:
-        ValueError: the name is taken, or the file cannot be written, such as to a full disk;
-            nothing is left of it then.
+        UserError: the name is taken, or the file cannot be written, such as to a full disk. No
+            part of it is left.
     """
     try:
         with temporary(path) as partial:
@@ -37,26 +36,26 @@ def published(path: Path) -> Iterator[Path]:
 
 
 def _take(partial: Path, path: Path) -> None:
-    """Gives a file its name, if that is free."""
+    """Renames a file to `path` unless something exists there."""
     try:
         os.link(partial, path)
     except OSError as error:
         if error.errno not in _NO_LINKS:
             raise
-        # Memory cards and some network drives have no links: the name is reserved instead.
+        # Memory cards and some network drives have no links; an empty file reserves the name.
         path.open("x").close()
         partial.replace(path)
 
 
 def new_file(output: Path, suffixes: Sequence[str]) -> Path:
-    """A named file that is to be written and is not there yet.
+    """Checks the path of an output that the user named, and returns it.
 
     Args:
         output: as the user gave it.
-        suffixes: that it may end in.
+        suffixes: accepted endings of its name.
 
     Raises:
-        ValueError: it is there, ends otherwise, or its folder is not there.
+        UserError: the path exists, ends otherwise, or is in a folder that does not exist.
     """
     if os.path.isdir(output):
         raise UserError(f"{output} is a folder; a file ends in {', '.join(suffixes)}")
@@ -72,10 +71,15 @@ def new_file(output: Path, suffixes: Sequence[str]) -> Path:
 
 
 def free_name(folder: Path, stem: str, suffixes: Sequence[str]) -> Path:
-    """A name in a folder, without suffix, under which none of the files is there yet.
+    """Returns the first of `stem`, `stem_2`, ... in a folder that no file has yet.
+
+    Args:
+        folder: where the files are to be written.
+        stem: of the name; the returned path has no suffix.
+        suffixes: of all files that are to have this name.
 
     Raises:
-        ValueError: thousands are taken.
+        UserError: 9999 names are taken.
     """
     for attempt in range(1, 10_000):
         name = folder / (stem if attempt == 1 else f"{stem}_{attempt}")

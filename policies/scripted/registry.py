@@ -1,17 +1,33 @@
-"""The scripted policies that there are: what a learned one has to beat."""
+"""Finds scripted policies: the files beside this one, and those of other packages."""
+
+from collections.abc import Iterator, Mapping
+
+from emberlink.envs.utils.plugins import Registry
 
 from .base import Scripted
-from .follow_target import FollowTarget
-from .lawnmower import Lawnmower
-from .oracle import Oracle
-from .random_policies import RandomActions, RandomWaypoints, Stationary
 
-SCRIPTED: dict[str, type[Scripted]] = {
-    "stationary": Stationary,
-    "random_actions": RandomActions,
-    "random_waypoints": RandomWaypoints,
-    "lawnmower": Lawnmower,
-    "follow_target": FollowTarget,
-    "oracle": Oracle,
-}
+_REGISTRY = Registry(Scripted, "emberlink.policies.scripted", "policy", group="emberlink.scripted")
+_ORDER = (
+    *("stationary", "random_actions", "random_waypoints"),
+    *("lawnmower", "follow_target", "oracle"),
+)
+
+
+class _Policies(Mapping[str, type[Scripted]]):
+    """The scripted policies by name: emberlink's in a fixed order, then those of other packages."""
+
+    def __getitem__(self, name: str) -> type[Scripted]:
+        if name not in _REGISTRY.known():
+            raise KeyError(name)
+        return _REGISTRY.find(name)
+
+    def __iter__(self) -> Iterator[str]:
+        known = _REGISTRY.known()
+        return iter([*_ORDER, *(name for name in known if name not in _ORDER)])
+
+    def __len__(self) -> int:
+        return len(_REGISTRY.known())
+
+
+SCRIPTED: Mapping[str, type[Scripted]] = _Policies()
 """The policies that every evaluation reports, by name and in this order."""

@@ -3,8 +3,9 @@
     python tests/benchmarks/farsite.py FOLDER [--fit RUN] [--figure FILE.png]
 
 FOLDER holds `RUN_ArrivalTime.asc`: ESRI ASCII grids of elapsed minutes, north up. The wind is read
-from the name RUN: `3mph120deg…` blows from 120° (0 is north, clockwise); in `clockwise1hr` and
-`counterClockwise3hr` it starts from 180° and turns by 60° in that sense every hour or three hours.
+from the whole name RUN: in `3mph120deg7hr` it blows from 120° (0 is north, clockwise); in
+`clockwise1hr` and `counterClockwise3hr` it starts from 180° and turns by 60° in that sense every
+hour or three hours.
 What is fitted, head rate and length-to-breadth ratio, holds for one wind speed and one fuel.
 Prints a Markdown table. The start is FARSITE's: the cells that burn at time 0. Needs the extra
 `geo`.
@@ -47,9 +48,9 @@ class Run(NamedTuple):
 
 
 def wind_of(name: str) -> Callable[[float], Tensor]:
-    """The azimuth of a run's wind as a function of the minutes."""
-    steady = re.match(r"\d+mph(\d+)deg", name)
-    turning = re.match(r"(c|counterC)lockwise(\d+)hr", name)
+    """Returns the azimuth of a run's wind as a function of the minutes."""
+    steady = re.fullmatch(r"\d+mph(\d+)deg(\d+hr)?", name)
+    turning = re.fullmatch(r"(c|counterC)lockwise(\d+)hr", name)
     if not (steady or turning):
         raise ValueError(f"{name}: no wind in this name; known: 3mph120deg…, clockwise1hr, …")
 

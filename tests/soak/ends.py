@@ -22,7 +22,8 @@ from children import (
 
 from emberlink.trainers.cli import main
 from emberlink.trainers.runs import checkpoint_file
-from emberlink.trainers.runs.run_folder import RunFolder, step_of
+from emberlink.trainers.runs.checkpoints import step_of
+from emberlink.trainers.runs.run_folder import RunFolder
 from emberlink.trainers.training.resume import resume
 
 

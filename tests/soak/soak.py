@@ -19,6 +19,7 @@ os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")
 from children import METHODS, SMALL, kill_trials
 from damage import damage_trials
 from ends import full_disk_trial, signal_trial
+from strangers import cache_trial, config_trial, planted_trial
 
 from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.evaluation.actor import load_actor
@@ -67,6 +68,10 @@ def trials(folder: Path, counts: dict[str, int], seed: int) -> dict[str, tuple[C
         "file size limit": repeated(lambda here: full_disk_trial(here, draw)),
         "full file system": repeated(lambda here: full_disk_trial(here, draw, mount=True)),
         "damaged checkpoint": damaged,
+        "links in a run folder": repeated(lambda here: planted_trial(here, draw, pipes=False)),
+        "pipes and devices": repeated(lambda here: planted_trial(here, draw, pipes=True)),
+        "changed bit in a cache": repeated(lambda here: cache_trial(here, draw)),
+        "changed digit in config.yaml": repeated(lambda here: config_trial(here, draw)),
     }
     return {name: (every[name], count) for name, count in counts.items() if count}
 
@@ -98,6 +103,10 @@ def main() -> int:
         "file size limit": 50 // share,
         "full file system": 20 // share if os.geteuid() == 0 else 0,
         "damaged checkpoint": 1000 // share,
+        "links in a run folder": 100 // share,
+        "pipes and devices": 100 // share,
+        "changed bit in a cache": 100 // share,
+        "changed digit in config.yaml": 100 // share,
     }
     print("| trial | how many | failures | seconds |\n|---|---|---|---|", flush=True)
     with tempfile.TemporaryDirectory() as folder:

@@ -9,7 +9,7 @@ from .parser import command, positive
 if TYPE_CHECKING:
     from rich.console import Console
 
-_KEYS = "keys of setup, env. and fire., as for train, such as setup=tuned, env.grid=[60,60]"
+_KEYS = "keys of setup, env. and fire., as for train, such as setup=tuned, 'env.grid=[60,60]'"
 
 
 def add_fire(commands: Any) -> None:
@@ -43,7 +43,7 @@ def _add_preview(actions: Any) -> None:
         "Draws a fire's times of arrival with contours and prints how many cells burn, how fast "
         "that grows, and whether the setup's UAVs can keep up with it. The picture gets a name "
         "that is free.",
-        "emberlink fire preview ArrivalTime.asc fire.units=minutes env.grid=[40,40] setup=tuned",
+        "emberlink fire preview ArrivalTime.asc fire.units=minutes 'env.grid=[40,40]' setup=tuned",
     )
     preview.add_argument(
         "source",
@@ -66,7 +66,7 @@ def _add_make(actions: Any) -> None:
         "write generated fires to a GeoTIFF or NumPy file",
         "Makes fires of a scenario and writes their times of arrival, in steps, to a new file: a "
         "GeoTIFF with a band per fire, or NumPy [fires, x, y] with a .json beside it.",
-        "emberlink fire make huygens --count 64 --split test --output fires.tif env.grid=[60,60]",
+        "emberlink fire make huygens --count 64 --split test --output fires.tif 'env.grid=[60,60]'",
     )
     make.add_argument("scenario", metavar="SCENARIO", help="a file in configs/fire: huygens, ...")
     make.add_argument("overrides", metavar="key=value", nargs="*", help=_KEYS)

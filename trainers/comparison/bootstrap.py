@@ -1,4 +1,4 @@
-"""Statistics over training seeds: a run is one independent number, however many episodes it played.
+"""Statistics over training seeds. A run is one number, however many episodes it was evaluated on.
 
 The recipe of Agarwal et al., "Deep Reinforcement Learning at the Edge of the Statistical
 Precipice" (2021), with SciPy: interquartile mean, percentile bootstrap, probability of improvement.
@@ -12,45 +12,46 @@ from numpy.typing import NDArray
 from scipy import stats
 
 LEVEL = 0.95
-"""of every interval"""
+"""confidence level of an interval"""
 RESAMPLES = 10_000
-"""of every interval"""
+"""resamples of an interval"""
 BOOTSTRAP_SEED = 20_210_830
-"""of the generator that every interval starts anew, so that no interval depends on another"""
+"""seed of the resamples; each interval starts with it, so that none depends on another"""
 FEW = 5
-"""With fewer seeds an interval is flagged. Of 2, 3 or 4 it goes from the worst to the best, which
-holds the median of all possible seeds in 50 %, 75 % or 88 % of cases, not in 95 %."""
+"""Intervals of fewer seeds are flagged. With 2, 3 or 4 seeds an interval reaches from the worst to
+the best, which contains the median of all possible seeds in 50 %, 75 % or 88 % of cases."""
 
 Values = NDArray[np.float64]
 Interval = tuple[float, float]
 
 
 def iqm(values: Values, axis: int = -1) -> Any:
-    """Interquartile mean: of what remains without the lowest and the highest quarter.
+    """Returns the interquartile mean: the mean without the lowest and the highest quarter.
 
-    A quarter is rounded down: of 1 to 3 seeds it is the mean of all, of 4 that of the middle 2, of
-    5 that of the middle 3.
+    A quarter is rounded down: 1 to 3 values give the mean of all, 4 that of the middle 2, 5 that of
+    the middle 3.
     """
     return stats.trim_mean(values, 0.25, axis=axis)
 
 
-def improvement(one: Values, other: Values, axis: int = -1) -> Any:
-    """Probability that a run of `one` has the higher number than a run of `other`; a tie is half.
+def probability_of_improvement(one: Values, other: Values, axis: int = -1) -> Any:
+    """Returns the probability that a value of `one` is above a value of `other`; a tie counts half.
 
-    The Mann-Whitney statistic over the number of pairs, as in rliable.
+    This is the Mann-Whitney statistic divided by the number of pairs, as in rliable.
     """
     pairs = one.shape[axis] * other.shape[axis]
     return stats.mannwhitneyu(one, other, axis=axis, method="asymptotic").statistic / pairs
 
 
-def advantage(own: Values, *others: Values, higher: bool, axis: int = -1) -> Any:
-    """The ratio r of `own` IQM to the best of the `others`, as r / (1 + r); above 0.5 is better.
+def iqm_ratio_share(own: Values, *others: Values, higher: bool, axis: int = -1) -> Any:
+    """Returns r / (1 + r) for the ratio r of an IQM to the best IQM of others; better is above 0.5.
+
+    The share is finite where the ratio is not: it is 1 for a ratio to 0, and 0.5 for 0 to 0.
 
     Args:
         own, others: numbers from 0 up, one per run.
-        higher: whether more is better; where less is, the ratio is the other way around.
-
-    A ratio to 0 has no number, but its share is 1; that of 0 to 0 is 0.5, as of any two equals.
+        higher: whether more is better; the ratio is inverted where less is better.
+        axis: along which the runs lie.
     """
     mine = iqm(own, axis)
     rest = np.stack([iqm(other, axis) for other in others])
@@ -61,20 +62,20 @@ def advantage(own: Values, *others: Values, higher: bool, axis: int = -1) -> Any
 
 
 def as_ratio(share: float) -> float:
-    """r of r / (1 + r); infinite for 1."""
+    """Returns r for r / (1 + r); infinite for 1."""
     return share / (1 - share) if share < 1 else float("inf")
 
 
 def interval(statistic: Callable[..., Any], *samples: Sequence[float]) -> Interval | None:
-    """The 95 % stratified percentile bootstrap interval of a statistic.
+    """Returns the 95 % stratified percentile bootstrap interval of a statistic.
 
     Args:
-        statistic: of arrays, along `axis`.
-        samples: one number per run for each method. Each is a stratum: its runs are drawn with
-            replacement from itself alone, as many as it has.
+        statistic: a function of arrays with the keyword `axis`.
+        samples: one number per run, for each method. Runs are drawn with replacement within their
+            method, as many as it has.
 
     Returns:
-        Lower and upper end; None where a method has one run, from which nothing can be said.
+        Lower and upper end; None if a method has one run.
     """
     if min(map(len, samples)) < 2:
         return None
@@ -83,7 +84,7 @@ def interval(statistic: Callable[..., Any], *samples: Sequence[float]) -> Interv
 
 
 def band(values: Values) -> tuple[Values, Values] | None:
-    """`interval` of the IQM at every episode. values [seeds, episodes] -> [episodes] each."""
+    """Returns the interval of the IQM per episode: values [seeds, episodes] -> [episodes] each."""
     return _bootstrap(iqm, [values], 0) if len(values) > 1 else None
 
 

@@ -1,4 +1,4 @@
-"""The command `emberlink compare`: prints a comparison and writes its report."""
+"""`emberlink compare`: prints the tables of a comparison and leaves a folder with the report."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -9,21 +9,23 @@ from rich.text import Text
 
 from .bootstrap import FEW
 from .page import FLAG, counts, decision, lines, ratio
-from .rankings import Numbers
+from .rankings import Numbers, Ranking
 from .report import compare_runs, free_folder, write_report
 
 
 def compare(paths: Sequence[Path], console: Console, output: Path | None = None) -> int:
-    """Compares runs by setup and method, prints the tables, and leaves a folder with the report.
+    """Compares runs, prints the tables and writes the report.
 
     Args:
-        paths: run folders, or folders that hold some.
-        console: gets the tables.
-        output: a new or empty folder; `compare`, or `compare_2`, ... if left out.
+        paths: run folders, folders that hold some, or names such as `pretrained:tuned`.
+        console: shows the tables.
+        output: a new or empty folder; `compare`, or `compare_2`, ... if None.
+
+    Returns:
+        0, the exit status.
 
     Raises:
-        UserError: there is nothing to compare, the runs can't be compared, a file is damaged, or
-            the folder holds something.
+        UserError: as `compare_runs`; or the folder is not empty or cannot be written.
     """
     folder = free_folder(output)
     comparison = compare_runs(paths)
@@ -34,36 +36,46 @@ def compare(paths: Sequence[Path], console: Console, output: Path | None = None)
     )
     for note in comparison.notes:
         console.print(Text(f"note: {note}", style="yellow"))
-    for one in comparison.sections:
-        _print(console, one)
+    for numbers in comparison.sections:
+        _print(console, numbers)
     console.print(Text(str(folder / "compare.html")), soft_wrap=True)
     return 0
 
 
-def _print(console: Console, one: Numbers) -> None:
-    for fire, rankings in one.fires.items():
-        trained = ", the fire trained on" if fire == one.section.trained_on else ""
-        title = f"{one.section.label}: on {fire}{trained}"
-        caption = "↑ more is better, ↓ less is better"
-        if min(counts(one)) < FEW:
-            caption += f"; {FLAG} fewer than {FEW} seeds are too few for an interval"
-        table = Table(title=Text(title), caption=caption)
-        for column in ("policy", "seeds", "IQM", "95 % interval", "P(better than the next)"):
-            table.add_column(column, justify="left" if column == "policy" else "right")
-        for ranking in rankings:
-            table.add_section()
-            arrow = "↑" if ranking.higher_is_better else "↓"
-            table.add_row(Text(f"{ranking.measure} {arrow}", style="bold"))
-            for line in lines(ranking):
-                cells = (line.name, line.seeds, line.mean, line.interval, line.improvement)
-                table.add_row(*map(Text, cells), style="dim" if line.scripted else "")
+def _print(console: Console, numbers: Numbers) -> None:
+    """Prints a table for each fire, then the claims."""
+    for fire, rankings in numbers.fires.items():
+        trained = ", the fire trained on" if fire == numbers.section.trained_on else ""
+        table = _rankings_table(rankings, f"{numbers.section.label}: on {fire}{trained}")
+        if min(counts(numbers)) < FEW:
+            table.caption = (
+                f"{table.caption}; {FLAG} fewer than {FEW} seeds are too few for an interval"
+            )
         console.print(table)
-    if one.verdicts:
-        table = Table(title=Text(f"{one.section.label}: the paper's claims"))
+    if numbers.verdicts:
+        table = Table(title=Text(f"{numbers.section.label}: the paper's claims"))
         for column in ("on", "claim", "best other", "ratio", "95 % interval", "verdict"):
             table.add_column(column)
-        for verdict in one.verdicts:
-            about = f"{verdict.method}: {verdict.claim}"
-            cells = (verdict.fire, about, verdict.best_other, *ratio(verdict), decision(verdict))
+        for verdict in numbers.verdicts:
+            claim = f"{verdict.method}: {verdict.claim}"
+            cells = (verdict.fire, claim, verdict.best_other, *ratio(verdict), decision(verdict))
             table.add_row(*map(Text, cells))
         console.print(table)
+
+
+def _rankings_table(rankings: Sequence[Ranking], title: str) -> Table:
+    table = Table(title=Text(title), caption="↑ more is better, ↓ less is better")
+    for column in ("policy", "seeds", "IQM", "95 % interval", "P(better than the next)"):
+        table.add_column(column, justify="left" if column == "policy" else "right")
+    for ranking in rankings:
+        arrow = "↑" if ranking.higher_is_better else "↓"
+        if ranking.not_ranked:
+            arrow = ""
+            why = f"{ranking.measure} is not ranked: {ranking.not_ranked}"
+            table.caption = f"{table.caption}; {why}"
+        table.add_section()
+        table.add_row(Text(f"{ranking.measure} {arrow}", style="bold"))
+        for line in lines(ranking):
+            cells = (line.name, line.seeds, line.mean, line.interval, line.probability)
+            table.add_row(*map(Text, cells), style="dim" if line.scripted else "")
+    return table

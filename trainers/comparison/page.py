@@ -1,25 +1,25 @@
-"""A comparison as text: rows of tables, the HTML page and the JSON beside it."""
+"""A comparison as text: the rows of tables, and the HTML page."""
 
 import base64
-import json
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
-from importlib.metadata import version
+from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
 
 from jinja2 import Environment, StrictUndefined
 
-from . import bootstrap as statistics
-from .rankings import Numbers, Ranking, Verdict
+from . import bootstrap
+from .claims import Verdict
+from .rankings import Numbers, Ranking, Row
+from .record import settings
+from .runs import LeftOut
 
 NONE = "-"
 FLAG = "*"
-"""behind a number of seeds that is too small for an interval"""
+"""follows a number of seeds that is too small for an interval"""
 DIGITS = {"mean_reward": 3, "boundary_exits": 2, "fire_losses": 2}
-"""behind the point; of other measures one"""
+"""digits after the decimal point; 1 for other measures"""
 
 
 @dataclass(frozen=True)
@@ -30,114 +30,114 @@ class Line:
     seeds: str
     mean: str
     interval: str
-    improvement: str
+    probability: str
     next: str
     scripted: bool
 
 
 @dataclass(frozen=True)
 class Picture:
-    """A PNG file and what it shows."""
+    """A PNG file and its caption."""
 
     path: Path
     caption: str
 
     @property
     def uri(self) -> str:
-        """The picture as an address that holds it."""
+        """The picture as a data URI."""
         return "data:image/png;base64," + base64.b64encode(self.path.read_bytes()).decode()
 
 
 @dataclass(frozen=True)
 class Chapter:
-    """What the page says of one setup."""
+    """The part of the page about one section.
+
+    Attributes:
+        numbers: the section's numbers.
+        frozen: a figure of the frozen policies for each fire of the evaluation.
+        figures: the figures of the training.
+        timelapses: a row of frames for each method.
+    """
 
     numbers: Numbers
     frozen: Sequence[Picture]
-    """a figure for each evaluation fire"""
     figures: Sequence[Picture]
-    """of training"""
     timelapses: Sequence[Picture]
 
 
 @dataclass(frozen=True)
 class Report:
-    """Everything that is on the page."""
+    """The content of the page.
+
+    Attributes:
+        command: the command line that made it.
+        chapters: one for each section.
+        left_out: folders and files that are no part of it, with the reason.
+        notes: differences between runs.
+    """
 
     command: str
     chapters: Sequence[Chapter]
-    left_out: Sequence[tuple[str, str]]
-    """folder, why"""
+    left_out: Sequence[LeftOut]
     notes: Sequence[str]
 
 
 def lines(ranking: Ranking) -> Iterator[Line]:
-    """A ranking's rows: the methods, best first, then the scripted policies."""
+    """Yields the rows of a ranking: the methods, best first, then the scripted policies."""
     digits = DIGITS.get(ranking.measure, 1)
     for row in ranking.rows:
         yield Line(
             name=row.method,
-            seeds=f"{len(row.seeds)}{FLAG if len(row.seeds) < statistics.FEW else ''}",
+            seeds=f"{len(row.seeds)}{FLAG if len(row.seeds) < bootstrap.FEW else ''}",
             mean=f"{row.iqm:.{digits}f}",
             interval=_interval(row.interval, digits),
-            improvement=(
-                NONE
-                if row.improvement is None
-                else f"{row.improvement:.2f}"
-                + (f" {_interval(row.improvement_interval, 2)}" if row.improvement_interval else "")
-            ),
+            probability=_probability(row),
             next=row.next or NONE,
             scripted=False,
         )
-    for policy, each in ranking.scripted.items():
-        for one in each:
-            whose = f" ({', '.join(one.methods)})" if one.methods else ""
-            mean = f"{one.value:.{digits}f}"
+    for policy, values in ranking.scripted.items():
+        for value in values:
+            whose = f" ({', '.join(value.methods)})" if value.methods else ""
             name = policy.replace("_", " ") + whose
-            yield Line(name, NONE, mean, NONE, NONE, NONE, scripted=True)
+            yield Line(name, NONE, f"{value.value:.{digits}f}", NONE, NONE, NONE, scripted=True)
+
+
+def _probability(row: Row) -> str:
+    if row.probability_of_improvement is None:
+        return NONE
+    ends = row.probability_interval
+    return f"{row.probability_of_improvement:.2f}" + (f" {_interval(ends, 2)}" if ends else "")
 
 
 def heading(ranking: Ranking) -> str:
-    """The measure and which way is better."""
+    """Returns the measure, and which direction is better or why nothing is ranked."""
+    if ranking.not_ranked:
+        return f"{ranking.measure} (not ranked: {ranking.not_ranked})"
     return f"{ranking.measure} ({'more' if ranking.higher_is_better else 'less'} is better)"
 
 
 def ratio(verdict: Verdict) -> tuple[str, str]:
-    """A claim's ratio and its interval."""
+    """Returns a claim's ratio and its interval."""
     return _number(verdict.ratio, 2), _interval(verdict.interval, 2)
 
 
 def decision(verdict: Verdict) -> str:
-    """What the runs say to a claim, with a flag where they are few."""
+    """Returns a claim's verdict, with a flag where the seeds are few."""
     return verdict.verdict + few(verdict.fewest_seeds)
 
 
 def few(seeds: int) -> str:
-    """A flag behind what rests on too few seeds."""
-    return "" if seeds >= statistics.FEW else f" (only {seeds} seed{'s' if seeds > 1 else ''})"
+    """Returns a flag for results of too few seeds, else an empty text."""
+    return "" if seeds >= bootstrap.FEW else f" (only {seeds} seed{'s' if seeds > 1 else ''})"
 
 
 def counts(numbers: Numbers) -> list[int]:
-    """Seeds of each group."""
+    """Returns the number of seeds of each group."""
     return [len(group.runs) for group in numbers.section.groups]
 
 
-def settings() -> dict[str, Any]:
-    """What the statistics were made with."""
-    return {
-        "emberlink": version("emberlink"),
-        "scipy": version("scipy"),
-        "mean": "interquartile mean (scipy.stats.trim_mean, 0.25)",
-        "interval": "percentile bootstrap, stratified by method (scipy.stats.bootstrap)",
-        "level": statistics.LEVEL,
-        "resamples": statistics.RESAMPLES,
-        "bootstrap_seed": statistics.BOOTSTRAP_SEED,
-        "few_seeds": statistics.FEW,
-    }
-
-
 def html(report: Report) -> str:
-    """The page: it needs no other file and no address."""
+    """Returns the page, which loads no other file and no address."""
     source = files("emberlink.trainers.comparison").joinpath("page.html").read_text("utf-8")
     environment = Environment(
         autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
@@ -152,59 +152,11 @@ def html(report: Report) -> str:
     return environment.from_string(source).render(report=report, settings=settings())
 
 
-def record(report: Report) -> str:
-    """Every number of the page as JSON; what is infinite is the text "inf"."""
-    content = {
-        "settings": settings(),
-        "command": report.command,
-        "left_out": [{"run": path, "why": why} for path, why in report.left_out],
-        "notes": list(report.notes),
-        "setups": [_chapter(chapter.numbers) for chapter in report.chapters],
-    }
-    return json.dumps(_finite(content), indent=1, allow_nan=False) + "\n"
-
-
-def _chapter(numbers: Numbers) -> dict[str, Any]:
-    section = numbers.section
-    return {
-        "setup": section.label,
-        "trained_on": section.trained_on,
-        "runs": [
-            {
-                "run": str(run.path),
-                "method": group.label,
-                "seed": run.config.seed,
-                "episodes": run.config.episodes,
-                "num_envs": run.config.num_envs,
-                "evaluated_with": dict(run.evaluated_with),
-                "checkpoint": run.evaluation.checkpoint,
-                "held_out_fires": run.evaluation.fires,
-            }
-            for group in section.groups
-            for run in group.runs
-        ],
-        "fires": {fire: [asdict(one) for one in all_] for fire, all_ in numbers.fires.items()},
-        "claims": [asdict(verdict) for verdict in numbers.verdicts],
-        "curves": {
-            measure: {method: asdict(curve) for method, curve in by_method.items()}
-            for measure, by_method in numbers.curves.items()
-        },
-    }
-
-
-def _finite(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _finite(one) for key, one in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(one) for one in value]
-    return "inf" if isinstance(value, float) and math.isinf(value) else value
-
-
 def _number(value: float, digits: int) -> str:
     return "∞" if math.isinf(value) else f"{value:.{digits}f}"
 
 
-def _interval(ends: statistics.Interval | None, digits: int) -> str:
+def _interval(ends: bootstrap.Interval | None, digits: int) -> str:
     if ends is None:
         return NONE
     return f"[{_number(ends[0], digits)}, {_number(ends[1], digits)}]"

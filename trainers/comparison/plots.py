@@ -11,7 +11,7 @@ from matplotlib.ticker import MaxNLocator, StrMethodFormatter
 
 from emberlink.trainers.evaluation.results import CURVES
 
-from .rankings import Curve, Numbers
+from .rankings import Curve, Numbers, Ranking
 
 FIGURES = {
     5: (("mean_reward",), "Averaged rewards collected by all UAVs at each episode."),
@@ -23,34 +23,34 @@ FIGURES = {
     8: (("boundary_exits",), "Attempted moves out of the box, mean over UAVs."),
     9: (("fire_losses",), "Times a UAV fell out of the fire region, mean over UAVs."),
 }
-"""the paper's number -> a measure per panel, and what it shows"""
+"""number in the paper -> the measure of each panel, and the caption"""
 COLOURS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#D55E00", "#56B4E9", "#8C6D00", "#000000")
-"""of methods; told apart by the colour-blind (Okabe and Ito, 2008; a dark yellow in place of the
-yellow that white paper hides)"""
+"""colours of methods, which colour-blind readers can tell apart (Okabe and Ito, 2008; with a dark
+yellow, which is visible on white)"""
 DASHES = (
     *((0, (7, 3)), (0, (7, 2, 1, 2)), (0, (3, 2)), (0, (7, 2, 1, 2, 1, 2)), (0, (12, 4))),
     *((0, (3, 2, 1, 2)), (0, (12, 2, 3, 2)), (0, (1, 1))),
 )
-"""of scripted policies"""
+"""line styles of scripted policies"""
 FROZEN = ("coverage", "tracking_first", "tracking_last", "boundary_exits")
 """measures of the figure of frozen policies; its rows are ranked by the first"""
 LOGARITHMIC = {"tracking_first": 1.0, "boundary_exits": 0.1}
-"""measures of that figure whose axis is logarithmic -> below which number it is linear"""
+"""measures of that figure with a logarithmic axis -> the number below which it is linear"""
 DOTTED = "tracking_last"
-"""drawn dotted, as in the paper's figure 7"""
+"""the measure that is dotted, as in the paper's figure 7"""
 
 
 def figure(path: Path, numbers: Numbers, measures: tuple[str, ...]) -> None:
-    """One of the paper's figures: over training, a line per method and a band over its seeds.
+    """Draws one of the paper's figures: a line per method over training, a band over its seeds.
 
     Args:
         path: a .png file.
-        numbers: of a setup.
+        numbers: the numbers of a section.
         measures: a panel each.
     """
     figure = Figure(figsize=(9.2, 3.8), layout="constrained")
     colours = _colours(numbers)
-    policies = _policies(numbers)
+    policies = _policies(numbers) if numbers.on_trained else {}
     panels = figure.subplots(1, len(measures), squeeze=False)[0]
     for axes, measure in zip(panels, measures, strict=True):
         _scripted_lines(axes, numbers, measure, policies, colours)
@@ -63,11 +63,11 @@ def figure(path: Path, numbers: Numbers, measures: tuple[str, ...]) -> None:
 
 
 def frozen(path: Path, numbers: Numbers, fire: str) -> None:
-    """Frozen policies on one evaluation fire: a row per method, a panel per measure.
+    """Draws frozen policies on one evaluation fire: a row per method, a panel per measure.
 
     Args:
         path: a .png file.
-        numbers: of a setup.
+        numbers: the numbers of a section.
         fire: one of `numbers.fires`.
     """
     rankings = {one.measure: one for one in numbers.fires[fire]}
@@ -79,24 +79,13 @@ def frozen(path: Path, numbers: Numbers, fire: str) -> None:
     figure = Figure(figsize=(3.4 * len(FROZEN), 1.5 + max(tall, 1.4)), layout="constrained")
     panels = figure.subplots(1, len(FROZEN), sharey=True)
     for axes, measure in zip(panels, FROZEN, strict=True):
-        ranking = rankings[measure]
-        for row in ranking.rows:
-            y, colour = order.index(row.method), colours.get(row.method, "0.45")
-            axes.plot(row.values, [y] * len(row.values), "o", ms=3, color=colour, alpha=0.5)
-            axes.plot([row.iqm], [y], "o", ms=6, color=colour)
-            if row.interval is not None:
-                axes.plot(row.interval, [y, y], "|-", lw=2, ms=9, mew=1.5, color=colour)
-        for policy, each in ranking.scripted.items():
-            for one in each:
-                dash = policies[policy]
-                for low, high in _stretches([order.index(name) for name in one.methods or order]):
-                    ends = [low - 0.5, high + 0.5]
-                    axes.plot([one.value] * 2, ends, color="0.3", ls=dash, lw=1.3, zorder=1)
+        _frozen_rows(axes, rankings[measure], order, colours)
+        _frozen_scripted(axes, rankings[measure], order, policies)
         if measure in LOGARITHMIC:
             axes.set_xscale("symlog", linthresh=LOGARITHMIC[measure])
             axes.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
             axes.set_xlim(left=0)
-        better = "more" if ranking.higher_is_better else "less"
+        better = "more" if rankings[measure].higher_is_better else "less"
         axes.set(xlabel=f"{CURVES[measure]}\n({better} is better)")
         axes.set_ylim(-0.5, len(order) - 0.5)
         axes.grid(alpha=0.3, axis="x")
@@ -105,8 +94,35 @@ def frozen(path: Path, numbers: Numbers, fire: str) -> None:
     figure.savefig(path, dpi=120, metadata={"Software": None})
 
 
+def _frozen_rows(
+    axes: Axes, ranking: Ranking, order: Sequence[str], colours: Mapping[str, str]
+) -> None:
+    """Draws each group's seeds, IQM and interval in its row."""
+    for row in ranking.rows:
+        y, colour = order.index(row.method), colours.get(row.method, "0.45")
+        axes.plot(row.values, [y] * len(row.values), "o", ms=3, color=colour, alpha=0.5)
+        axes.plot([row.iqm], [y], "o", ms=6, color=colour)
+        if row.interval is not None:
+            axes.plot(row.interval, [y, y], "|-", lw=2, ms=9, mew=1.5, color=colour)
+
+
+def _frozen_scripted(
+    axes: Axes,
+    ranking: Ranking,
+    order: Sequence[str],
+    policies: Mapping[str, tuple[int, tuple[int, ...]]],
+) -> None:
+    """Draws a line per scripted policy through the rows of the groups whose number it is."""
+    for policy, values in ranking.scripted.items():
+        for one in values:
+            rows = [order.index(name) for name in one.methods or order]
+            for low, high in _stretches(rows):
+                ends = [low - 0.5, high + 0.5]
+                axes.plot([one.value] * 2, ends, color="0.3", ls=policies[policy], lw=1.3, zorder=1)
+
+
 def _stretches(places: Sequence[int]) -> Iterator[tuple[int, int]]:
-    """First and last of each stretch of rows that lie next to each other."""
+    """Yields the first and the last of each run of consecutive rows."""
     ordered = sorted(places)
     starts = [i for i in ordered if i - 1 not in ordered]
     ends = [i for i in ordered if i + 1 not in ordered]
@@ -150,8 +166,9 @@ def _curves(
 
 
 def _policies(numbers: Numbers) -> dict[str, tuple[int, tuple[int, ...]]]:
-    """The scripted policies and their dashes."""
-    names = sorted({policy for one in numbers.on_trained for policy in one.scripted})
+    """Returns the dashes of each scripted policy."""
+    rankings = [one for on_fire in numbers.fires.values() for one in on_fire]
+    names = sorted({policy for one in rankings for policy in one.scripted})
     return {name: DASHES[i % len(DASHES)] for i, name in enumerate(names)}
 
 
@@ -162,7 +179,7 @@ def _scripted_lines(
     policies: Mapping[str, tuple[int, tuple[int, ...]]],
     colours: Mapping[str, str],
 ) -> None:
-    """A line per scripted policy; where its number is one method's own, in that method's colour."""
+    """Draws a line per scripted policy, in a method's colour where the number is that method's."""
     for ranking in (one for one in numbers.on_trained if one.measure == measure):
         for policy, each in ranking.scripted.items():
             for one in each:

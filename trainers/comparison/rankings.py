@@ -1,279 +1,160 @@
-"""The numbers of a comparison: tables, claims and curves of the gathered runs."""
+"""The numbers of a section: rankings by each measure, claims and training curves."""
 
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from itertools import zip_longest
 
 import numpy as np
 
 from emberlink.envs import metrics
-from emberlink.policies.scripted.registry import SCRIPTED
 from emberlink.trainers.evaluation.evaluate import HELD_OUT_SCENARIO
 from emberlink.trainers.evaluation.results import CURVES, LEARNED
 
-from . import bootstrap as statistics
+from . import bootstrap
 from .bootstrap import Interval
-from .runs import Group, Section
+from .claims import Verdict, verdicts
+from .groups import Group, Section
+from .scripted import REWARD, Scripted, different_rewards, scripted
 
-SAME = 1e-5
-"""Scripted policies on the same fires differ by less than this share, on whatever device."""
-BY_METHOD = frozenset({"mean_reward"})
-"""The measures that a scripted policy may have another number of for each method: a method's
-reward may differ."""
-
-
-@dataclass(frozen=True)
-class Claim:
-    """A method is better than the best other by a factor."""
-
-    method: str
-    measure: str
-    factor: float
-    text: str
-
-
-CLAIMS = (
-    Claim("consensus", "coverage", 1.3, "1.3 times the coverage"),
-    Claim("consensus", "tracking_first", 1.4, "1.4 times faster tracking"),
-    Claim("consensus", "tracking_last", 1.4, "1.4 times faster tracking, by the slowest UAV"),
-    Claim("consensus", "boundary_exits", 2.0, "half the boundary exits"),
-)
-"""of the paper, sections V and VI, for method 4 against the next best"""
+MEASURES = (*(name for name in metrics.NAMES if name != REWARD), REWARD)
+"""coverage first, and last the measure that depends on a method's own reward"""
 
 
 @dataclass(frozen=True)
 class Row:
-    """A method's place in the ranking by one measure."""
+    """A group's number of one measure.
+
+    Attributes:
+        method: label of the group.
+        seeds: its training seeds.
+        values: a run's mean over its episodes, for each seed.
+        iqm: interquartile mean over seeds.
+        interval: of the IQM; None with one seed.
+        next: label of the group ranked next; None for the last, and where nothing is ranked.
+        probability_of_improvement: probability that a run is better than a run of the next group;
+            None for the last, and where both are the same trainings evaluated differently.
+        probability_interval: of that; None with one seed.
+    """
 
     method: str
     seeds: list[int]
     values: list[float]
-    """a run's mean over its episodes, for each seed"""
     iqm: float
     interval: Interval | None
-    """None with one seed"""
     next: str | None
-    """the method ranked next; None for the last"""
-    improvement: float | None
-    """probability that a run is better than a run of the next; None where these are the same
-    trainings, evaluated in another world"""
-    improvement_interval: Interval | None
-
-
-@dataclass(frozen=True)
-class Scripted:
-    """What a scripted policy comes to."""
-
-    methods: list[str]
-    """whose number it is; none where it is the same for all"""
-    value: float
-    """the mean over episodes"""
+    probability_of_improvement: float | None
+    probability_interval: Interval | None
 
 
 @dataclass(frozen=True)
 class Ranking:
-    """One measure on one fire."""
+    """One measure on one fire.
+
+    Attributes:
+        measure: one of `metrics.NAMES`.
+        higher_is_better: whether more is better.
+        rows: best first; by label where nothing is ranked.
+        scripted: the numbers of each scripted policy.
+        not_ranked: the reason where the groups cannot be compared by the measure, else empty.
+    """
 
     measure: str
     higher_is_better: bool
     rows: list[Row]
-    """best first"""
     scripted: dict[str, list[Scripted]]
-    """by policy"""
-
-
-@dataclass(frozen=True)
-class Verdict:
-    """What the runs say to a claim, on one fire."""
-
-    fire: str
-    method: str
-    claim: str
-    measure: str
-    factor: float
-    best_other: str
-    ratio: float
-    """of the IQMs, above 1 where the method is better; infinite for a ratio to 0"""
-    interval: Interval | None
-    verdict: str
-    """holds, does not hold, or undecided"""
-    fewest_seeds: int
+    not_ranked: str = ""
 
 
 @dataclass(frozen=True)
 class Curve:
-    """A measure of the exploring policy over training, at every episode."""
+    """A measure of the exploring policy at every episode of training.
+
+    Attributes:
+        iqm: interquartile mean over seeds.
+        low, high: its interval; None with one seed.
+    """
 
     iqm: list[float]
     low: list[float] | None
-    """None with one seed"""
     high: list[float] | None
 
 
 @dataclass(frozen=True)
 class Numbers:
-    """Everything that is known of a section."""
+    """The numbers of a section.
+
+    Attributes:
+        section: the groups.
+        fires: a ranking per measure, for each fire of the evaluation.
+        verdicts: the claims of the paper.
+        curves: measure -> group -> curve.
+        notes: differences that a reader should know of.
+    """
 
     section: Section
     fires: dict[str, list[Ranking]]
-    """by evaluation fire, a ranking per measure"""
     verdicts: list[Verdict]
     curves: dict[str, dict[str, Curve]]
-    """measure -> method -> curve"""
     notes: list[str] = field(default_factory=list)
 
     @property
     def on_trained(self) -> list[Ranking]:
-        """The rankings on the fire trained on, if it was evaluated."""
+        """The rankings on the fire trained on; none if it was not evaluated."""
         return self.fires.get(self.section.trained_on, [])
 
 
 def numbers(section: Section) -> Numbers:
-    """Tables, claims and curves of one section."""
+    """Computes the rankings, claims and curves of a section."""
     fires = sorted(
         section.runs[0].evaluation.results, key=lambda name: (name != HELD_OUT_SCENARIO, name)
     )
     notes: list[str] = []
-    rankings = {
-        fire: [_ranking(section, fire, name, notes) for name in metrics.NAMES] for fire in fires
+    rankings = {fire: [_ranking(section, fire, name, notes) for name in MEASURES] for fire in fires}
+    curves = {
+        name: {group.label: _curve(group, name) for group in section.as_trained} for name in CURVES
     }
-    verdicts = [
-        verdict
-        for fire in fires
-        for claim in CLAIMS
-        for group in section.as_trained
-        if group.method == claim.method
-        for verdict in _verdict(section, fire, claim, group)
-    ]
-    curves = {name: {g.label: _curve(g, name) for g in section.as_trained} for name in CURVES}
-    return Numbers(section, rankings, verdicts, curves, list(dict.fromkeys(notes)))
-
-
-def _of(group: Group, fire: str, measure: str) -> list[float]:
-    return [run.mean(fire, LEARNED, measure) for run in group.runs]
+    unique = list(dict.fromkeys(notes))
+    return Numbers(section, rankings, verdicts(section, fires), curves, unique)
 
 
 def _ranking(section: Section, fire: str, measure: str, notes: list[str]) -> Ranking:
     higher = measure in metrics.HIGHER_IS_BETTER
-    values = {group.label: _of(group, fire, measure) for group in section.groups}
-    means = {label: float(statistics.iqm(np.asarray(own))) for label, own in values.items()}
-    order = sorted(section.groups, key=lambda g: -means[g.label] if higher else means[g.label])
+    values = {g.label: [run.mean(fire, LEARNED, measure) for run in g.runs] for g in section.groups}
+    means = {label: float(bootstrap.iqm(np.asarray(own))) for label, own in values.items()}
+    why = different_rewards(section, fire) if measure == REWARD else ""
+    order = list(section.groups)
+    if not why:
+        order.sort(key=lambda g: -means[g.label] if higher else means[g.label])
     rows: list[Row] = []
-    for group, other in zip_longest(order, order[1:]):
+    for group, other in zip_longest(order, [] if why else order[1:]):
         own = values[group.label]
         probability = ends = None
         if other is not None and not _same_trainings(group, other):
             pair = (own, values[other.label]) if higher else (values[other.label], own)
-            probability = float(statistics.improvement(np.asarray(pair[0]), np.asarray(pair[1])))
-            ends = statistics.interval(statistics.improvement, *pair)
+            arrays = map(np.asarray, pair)
+            probability = float(bootstrap.probability_of_improvement(*arrays))
+            ends = bootstrap.interval(bootstrap.probability_of_improvement, *pair)
         rows.append(
             Row(
                 method=group.label,
                 seeds=group.seeds,
                 values=own,
                 iqm=means[group.label],
-                interval=statistics.interval(statistics.iqm, own),
+                interval=bootstrap.interval(bootstrap.iqm, own),
                 next=other and other.label,
-                improvement=probability,
-                improvement_interval=ends,
+                probability_of_improvement=probability,
+                probability_interval=ends,
             )
         )
-    return Ranking(measure, higher, rows, _scripted(section, fire, measure, notes))
+    return Ranking(measure, higher, rows, scripted(section, fire, measure, notes), why)
 
 
 def _same_trainings(one: Group, other: Group) -> bool:
+    """Returns whether two groups are evaluations of the same runs, so not two samples."""
     return not {run.path for run in one.runs}.isdisjoint(run.path for run in other.runs)
-
-
-def _scripted(
-    section: Section, fire: str, measure: str, notes: list[str]
-) -> dict[str, list[Scripted]]:
-    """A scripted policy's mean over episodes; for each method where theirs differ."""
-    policies = dict.fromkeys(p for run in section.runs for p in run.evaluation.results[fire])
-    found: dict[str, list[Scripted]] = {}
-    for policy in sorted(policies.keys() - {LEARNED}):
-        each = {
-            group.label: [
-                run.mean(fire, policy, measure)
-                for run in group.runs
-                if policy in run.evaluation.results[fire]
-            ]
-            for group in section.groups
-        }
-        seen = [number for own in each.values() for number in own]
-        if len(seen) < len(section.runs):
-            notes.append(f"{section.label}: {policy} was played for {len(seen)} of the runs only")
-        own_world = measure in BY_METHOD or _in_worlds_of_their_own(section, policy)
-        for own in each.values() if own_world else [seen]:
-            if own and not _same(own):
-                notes.append(
-                    f"{section.label}: {policy} does not have the same {measure} on {fire} in all "
-                    f"runs ({min(own):.6g} to {max(own):.6g}): they were not evaluated on the same "
-                    "fires and starts, or with another version"
-                )
-        found[policy] = _by_methods({label: own[0] for label, own in each.items() if own})
-    return found
-
-
-def _in_worlds_of_their_own(section: Section, policy: str) -> bool:
-    """Whether a policy that follows what it hears hears something else for each group."""
-    if policy not in SCRIPTED or SCRIPTED[policy].recipe is None:
-        return False
-    worlds = [run.evaluation.communication.get(policy) for run in section.runs]
-    return any(world != worlds[0] for world in worlds)
-
-
-def _by_methods(each: Mapping[str, float]) -> list[Scripted]:
-    """The numbers of several methods, equal ones once."""
-    alike: list[Scripted] = []
-    for method, value in each.items():
-        same = next((one for one in alike if _same([value, one.value])), None)
-        if same is None:
-            alike.append(Scripted([method], value))
-        else:
-            same.methods.append(method)
-    return alike if len(alike) > 1 else [Scripted([], one.value) for one in alike]
-
-
-def _same(values: Sequence[float]) -> bool:
-    return max(values) - min(values) <= SAME * max(1.0, *map(abs, values))
-
-
-def _verdict(section: Section, fire: str, claim: Claim, group: Group) -> list[Verdict]:
-    others = [other for other in section.as_trained if other.method != group.method]
-    if not others:
-        return []
-    higher = claim.measure in metrics.HIGHER_IS_BETTER
-    samples = [_of(one, fire, claim.measure) for one in (group, *others)]
-    share = partial(statistics.advantage, higher=higher)
-    ends = statistics.interval(share, *samples)
-    ratios = ends and (statistics.as_ratio(ends[0]), statistics.as_ratio(ends[1]))
-    means = [float(statistics.iqm(np.asarray(sample))) for sample in samples[1:]]
-    best = means.index(max(means) if higher else min(means))
-    verdict = "undecided"
-    if ratios is not None and ratios[0] >= claim.factor:
-        verdict = "holds"
-    elif ratios is not None and ratios[1] < claim.factor:
-        verdict = "does not hold"
-    return [
-        Verdict(
-            fire=fire,
-            method=group.label,
-            claim=claim.text,
-            measure=claim.measure,
-            factor=claim.factor,
-            best_other=others[best].label,
-            ratio=statistics.as_ratio(float(share(*map(np.asarray, samples)))),
-            interval=ratios,
-            verdict=verdict,
-            fewest_seeds=min(map(len, samples)),
-        )
-    ]
 
 
 def _curve(group: Group, measure: str) -> Curve:
     values = np.asarray([[line[measure] for line in run.lines] for run in group.runs], float)
-    ends = statistics.band(values)
+    ends = bootstrap.band(values)
     low, high = (None, None) if ends is None else (ends[0].tolist(), ends[1].tolist())
-    return Curve(statistics.iqm(values, 0).tolist(), low, high)
+    return Curve(bootstrap.iqm(values, 0).tolist(), low, high)

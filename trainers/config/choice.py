@@ -1,14 +1,15 @@
 """Settings of a choice by name: `{"name": NAME, ...}`, checked by the class of that name.
 
-`comm` is such a choice: each module in emberlink/comm has a class with settings of its own.
+`comm` and `learner` are such choices: each file in comm and in trainers/learners defines a
+class with settings of its own.
 """
 
 from collections.abc import Mapping
-from dataclasses import fields
+from dataclasses import fields, is_dataclass
 from typing import Any, Protocol
 
 from emberlink.envs.utils.errors import UserError
-from emberlink.envs.utils.validation import from_plain
+from emberlink.envs.utils.validation import from_plain, shown
 
 
 class Registry(Protocol):
@@ -23,31 +24,26 @@ class Registry(Protocol):
         ...
 
 
-def check(key: str, values: Mapping[str, Any], registry: Registry) -> None:
-    """Checks that the settings are those of the class that they name.
+def settings(key: str, values: Any, registry: Registry) -> Any:
+    """Returns the settings as an instance of the named class's `config_type`.
 
     Args:
         key: of the settings in the configuration, for messages.
-        values: the name and the settings, plain values.
+        values: the name and the settings, plain values; or such an instance.
         registry: finds the class.
 
     Raises:
         UserError: the name or a setting is missing or not known, or a value does not fit.
     """
-    if "name" not in values:
+    if not isinstance(values, Mapping):
+        if is_dataclass(values):
+            return values
+        raise UserError(f"{key}={shown(values)}: expected keys and values")
+    if not isinstance(values.get("name"), str):
         raise UserError(f"{key}.name is missing; known: {', '.join(registry.known())}")
-    settings(key, values, registry)
-
-
-def settings(key: str, values: Mapping[str, Any], registry: Registry) -> Any:
-    """Returns the settings as an instance of the named class's `config_type`.
-
-    Raises:
-        UserError: see `check`.
-    """
     config_type = registry.find(values["name"]).config_type
     known = [field.name for field in fields(config_type)]
-    # Some types have the name among their fields.
+    # A type may have the name among its fields.
     given = {name: value for name, value in values.items() if name != "name" or name in known}
     for name in given.keys() - set(known):
         listed = ", ".join(known) or "none"

@@ -13,8 +13,8 @@ from emberlink.envs.scenarios import Scenario
 from emberlink.envs.utils.device import check_device as check_device
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import Name
+from emberlink.trainers.learners import registry as learners
 from emberlink.trainers.learners.base import LearnerConfig
-from emberlink.trainers.learners.registry import parse_config as parse_learner
 
 from . import choice
 
@@ -31,7 +31,10 @@ Count = Annotated[int, Field(ge=1, le=1_000_000_000)]
 CountOrZero = Annotated[int, Field(ge=0)]
 Many = Annotated[int, Field(ge=1, le=65_536)]
 Seed = Annotated[int, Field(ge=0, lt=2**31)]
-LearnerChoice = Annotated[SerializeAsAny[LearnerConfig], PlainValidator(parse_learner)]
+LearnerChoice = Annotated[
+    SerializeAsAny[LearnerConfig],
+    PlainValidator(lambda values: choice.settings("learner", values, learners)),
+]
 """the settings of the learner that `learner.name` names"""
 
 
@@ -108,14 +111,14 @@ class RunConfig:
     @field_validator("comm")
     @classmethod
     def _check_comm(cls, value: dict[str, Any]) -> dict[str, Any]:
-        choice.check("comm", value, registry)
+        choice.settings("comm", value, registry)
         return value
 
     @field_validator("baseline_comm")
     @classmethod
     def _check_baseline_comm(cls, value: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
         for method, comm in value.items():
-            choice.check(f"baseline_comm.{method}", comm, registry)
+            choice.settings(f"baseline_comm.{method}", comm, registry)
         return value
 
 

@@ -9,7 +9,7 @@ from tensordict.nn import TensorDictModule
 from emberlink.trainers.build import build_actor, build_env
 from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.learners.base import ACTOR
-from emberlink.trainers.runs.run_folder import load_weights
+from emberlink.trainers.runs.checkpoints import load_weights
 
 
 def load_actor(config: RunConfig, checkpoint: Path) -> TensorDictModule:

@@ -26,7 +26,7 @@ from emberlink.envs.fire.cache import cache_folder
 from emberlink.envs.utils.atomic_io import read_sealed, write_sealed
 from emberlink.policies.scripted.registry import SCRIPTED
 from emberlink.trainers.config.schema import RunConfig
-from emberlink.trainers.runs.safe_read import LONGEST_JSON, parse_json
+from emberlink.trainers.runs.safe_read import MAX_JSON, parse_json
 
 from .results import Measured
 
@@ -71,7 +71,7 @@ class ScriptedResults:
         """Returns the results, or None if there is no such file or it is damaged."""
         if self.file is None:
             return None
-        content = read_sealed(self.file, LONGEST_JSON)
+        content = read_sealed(self.file, MAX_JSON)
         if content is None:
             return None
         try:

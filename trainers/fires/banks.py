@@ -1,4 +1,4 @@
-"""What `emberlink fire make` and `emberlink fire import` do: fires in files for use elsewhere."""
+"""`emberlink fire make` and `emberlink fire import`: write fires to a file."""
 
 import os
 import re
@@ -39,13 +39,13 @@ def make(
     Args:
         scenario: a file in configs/fire.
         overrides: `key=value` of setup, env. and fire.
-        console: told the progress and, last, where the file is.
+        console: prints the progress and, last, the path of the file.
         count: fires; as many as a training or an evaluation uses if None.
         split: "train", "validation" or "test".
-        output: a new .npy, .tif or .tiff file; a name that is free if None.
+        output: a new .npy, .tif or .tiff file; the next free name if None.
 
     Raises:
-        ValueError: one line for whatever is not known or cannot be written.
+        UserError: a name is not known, or the file cannot be written.
     """
     config = generated(scenario, overrides)
     fire, world = config.fire, config.env
@@ -85,13 +85,13 @@ def import_files(arguments: Sequence[str], console: Console, output: Path) -> in
 
     Args:
         arguments: paths, and `key=value` of setup, env. and fire.
-        console: told what was read and, last, where the file is.
+        console: prints what was read and, last, the path of the file.
         output: a new .npy, .tif or .tiff file.
 
     Raises:
-        ValueError: one line for whatever cannot be read or written.
+        UserError: a file cannot be read or written.
     """
-    # Who has a file of that name means the file.
+    # A file of that name comes before a key.
     overrides = [text for text in arguments if "=" in text and not os.path.exists(text)]
     paths = [Path(text) for text in arguments if text not in overrides]
     if not paths:
@@ -118,7 +118,7 @@ def _names(path: Path, count: int) -> Iterator[str]:
 
 
 def _facts(config: RunConfig) -> dict[str, Any]:
-    """What the fires depend on."""
+    """Returns the settings that the fires depend on."""
     return {
         "horizon": config.env.horizon,
         "grid": list(config.env.grid),

@@ -1,22 +1,20 @@
-"""The picture of a fire: when it comes to which cell."""
+"""The picture of a fire's arrival times."""
 
 import math
-from collections.abc import Iterator
 from itertools import product
 from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import ListedColormap
-from matplotlib.contour import QuadContourSet
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch, Rectangle
 from matplotlib.patheffects import AbstractPathEffect, withStroke
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
-from scipy.ndimage import distance_transform_edt, map_coordinates
+from scipy.ndimage import distance_transform_edt
 
-from .stats import Arrival, Team, burnt_out
+from .stats import Arrival, TeamCapability, burnt_out
 
 NEVER, BURNT_OUT = "0.9", "0.45"
 _COLOURS = "viridis"
@@ -27,8 +25,10 @@ _CELLS_PER_LINE = 8  # at least, that burn after step 0
 _VIEW = "#ffff00"  # as in animations
 
 
-def arrival_figure(path: Path, arrival: Arrival, horizon: int, team: Team, title: str) -> None:
-    """Times of arrival as colours with contours, and the view of a UAV to scale.
+def arrival_figure(
+    path: Path, arrival: Arrival, horizon: int, team: TeamCapability, title: str
+) -> None:
+    """Draws arrival times as colours with contours, and the view of a UAV to scale.
 
     Args:
         path: a .png file.
@@ -57,26 +57,26 @@ def arrival_figure(path: Path, arrival: Arrival, horizon: int, team: Team, title
     most = int(_LETTERS * size[0])
     short = title if len(title) <= most else f"{title[: most - 28]}...{title[-25:]}"
     figure.suptitle(short, parse_math=False, fontsize="medium")
-    figure.colorbar(picture, ax=axes, label="time of arrival, steps", shrink=0.9)
+    figure.colorbar(picture, ax=axes, label="arrival time, steps", shrink=0.9)
     _legend(figure, bool(core.any()), team.width, max(across, up), 3 if wide else 1)
     figure.savefig(path, format="png", dpi=120, metadata={"Software": None})
 
 
 def _legend(figure: Figure, core: bool, width: float, side: int, columns: int) -> None:
-    """What the greys and the square mean, below the map."""
+    """Adds the meaning of the greys and the square below the map."""
     view = f"view of one UAV, {width:.3g} cells wide"
     view += " (more than the map)" if width > side else ""
     samples = [
         *([Patch(fc=BURNT_OUT, label="burnt out before step 0")] if core else []),
         Patch(fc=NEVER, label="does not burn"),
-        Patch(fc="none", ec=_VIEW, lw=2, path_effects=_around(4), label=view),
+        Patch(fc="none", ec=_VIEW, lw=2, path_effects=_outline(4), label=view),
     ]
     place = "outside lower center"
     figure.legend(handles=samples, loc=place, ncols=columns, frameon=False, fontsize="small")
 
 
 def _contours(axes: Axes, arrival: Arrival, horizon: int) -> None:
-    """The front at round steps, fewer where little burns."""
+    """Draws the front at round steps, fewer if few cells burn."""
     lines = min(_LINES, int(((arrival > 0) & (arrival <= horizon)).sum()) // _CELLS_PER_LINE)
     if lines == 0:
         return
@@ -85,34 +85,16 @@ def _contours(axes: Axes, arrival: Arrival, horizon: int) -> None:
     levels = [t for t in round_steps.tick_values(0, horizon) if 0 < t < min(horizon, times.max())]
     x, y = (np.arange(side) for side in arrival.shape)
     contours = axes.contour(x, y, times.T, levels=levels, colors="white", linewidths=1.1)
-    contours.set_path_effects(_around(2.2))
-    for (x, y), level in _label_places(contours, times):
-        text = axes.text(x, y, f"{level:g}", fontsize="small", color="white")
-        text.set(ha="center", va="center", path_effects=_around(2.2))
-
-
-def _label_places(
-    contours: QuadContourSet, times: NDArray[np.float64]
-) -> Iterator[tuple[NDArray[np.float64], float]]:
-    """For each contour where its neighbours are far and no label or edge is near, if anywhere."""
-    along, up = np.gradient(times)
-    steep = np.sqrt(along**2 + up**2)
-    apart, taken = 0.09 * max(times.shape), []
-    for level, path in zip(contours.levels, contours.get_paths(), strict=True):
-        points = np.asarray(path.vertices)
-        inside = ((points > apart / 3) & (points < np.array(times.shape) - 1 - apart / 3)).all(1)
-        free = [p for p in points[inside] if all(math.dist(p, other) > apart for other in taken)]
-        if free:
-            slopes = map_coordinates(steep, np.transpose(free), order=1)
-            taken.append(free[int(slopes.argmin())])
-            yield taken[-1], float(level)
+    contours.set_path_effects(_outline(2.2))
+    for text in axes.clabel(contours, fmt="%g", fontsize="small", inline=False):
+        text.set_path_effects(_outline(2.2))
 
 
 def _continued(arrival: Arrival, horizon: int) -> NDArray[np.float64]:
-    """Times of arrival without gaps: contours would end where cells that never burn begin.
+    """Returns arrival times without gaps, at which contours would end.
 
-    Around the fire it arrives after the horizon, later the farther away; what is burnt out has
-    been reached at step 0.
+    Cells around the fire arrive after the horizon, the later the farther away; cells that are
+    burnt out arrive at step 0.
     """
     reached = arrival <= horizon
     times = np.where(reached, arrival, 0.0)
@@ -124,7 +106,7 @@ def _continued(arrival: Arrival, horizon: int) -> NDArray[np.float64]:
 
 
 def _view(axes: Axes, arrival: Arrival, width: float) -> None:
-    """A UAV's view, in the corner of the map where the fewest cells burn."""
+    """Draws a UAV's view in the corner of the map where the fewest cells burn."""
     free = 0.5  # between the square and the edge of the map
     corners = []
     for right, upper in product((True, False), repeat=2):
@@ -136,10 +118,10 @@ def _view(axes: Axes, arrival: Arrival, width: float) -> None:
         corners.append((np.isfinite(arrival[i, j]).sum(), not right, upper, x, y))
     *_, x, y = min(corners)
     square = Rectangle((x, y), width, width, fc="none", ec=_VIEW, lw=2)
-    square.set_path_effects(_around(4))
+    square.set_path_effects(_outline(4))
     axes.add_patch(square)
 
 
-def _around(width: float) -> list[AbstractPathEffect]:
-    """A dark edge, with which a light line is seen on any colour."""
+def _outline(width: float) -> list[AbstractPathEffect]:
+    """Returns a dark edge, which makes a light line visible on any colour."""
     return [withStroke(linewidth=width, foreground="black")]

@@ -1,4 +1,4 @@
-"""What `emberlink fire preview` does: a picture of a fire, and whether UAVs can keep up with it."""
+"""`emberlink fire preview`: draws a fire and tells whether UAVs can keep up with it."""
 
 import os
 import re
@@ -13,8 +13,8 @@ from rich.table import Table
 from emberlink.envs.utils.publish import free_name, new_file, published
 
 from .plot import arrival_figure
-from .select import Source, find
-from .stats import Growth, Team, comparisons, growth, short
+from .select import SelectedFire, find_fire
+from .stats import Growth, TeamCapability, comparisons, growth, short
 
 
 def preview(
@@ -25,16 +25,16 @@ def preview(
     Args:
         source: a scenario, SCENARIO:INDEX, a file, or FILE:INDEX.
         overrides: `key=value` of setup, env. and fire.
-        console: told the numbers and, last, where the picture is.
+        console: prints the numbers and, last, the path of the picture.
         output: a folder, or a new .png file; the working directory if None.
 
     Raises:
-        ValueError: one line for whatever cannot be found, read, drawn or written.
+        UserError: the fire cannot be found, read, drawn or written.
     """
     path = new_file(output, [".png"]) if output is not None and not os.path.isdir(output) else None
-    fire = find(source, overrides)
+    fire = find_fire(source, overrides)
     world, arrival = fire.config.env, fire.arrival.numpy()
-    team, numbers = Team.of(world), growth(arrival, world.horizon)
+    team, numbers = TeamCapability.of(world), growth(arrival, world.horizon)
     if path is None:
         stem = re.sub(r"[^\w.+-]", "-", fire.stem)[:100]
         name = free_name(output or Path(), stem, [".png"])
@@ -47,7 +47,7 @@ def preview(
     return 0
 
 
-def _print(console: Console, fire: Source, numbers: Growth, team: Team) -> None:
+def _print(console: Console, fire: SelectedFire, numbers: Growth, team: TeamCapability) -> None:
     horizon = fire.config.env.horizon
     grid = " x ".join(map(str, fire.config.env.grid))
     console.print(
@@ -69,15 +69,14 @@ def _print(console: Console, fire: Source, numbers: Growth, team: Team) -> None:
         console.print(f"  {'+' if enough else '-'} {text}", soft_wrap=True, highlight=False)
 
 
-def _rows(fire: Growth, team: Team) -> Iterator[tuple[str, str, str]]:
-    """What is measured, the number, and its unit and meaning."""
+def _rows(fire: Growth, team: TeamCapability) -> Iterator[tuple[str, str, str]]:
+    """Yields what is measured, the number, and its unit and meaning."""
     until = fire.since + fire.window
     yield "burning at the start", str(fire.start), "cells"
     yield "burning at the end", str(fire.end), "cells"
     yield "growth, mean", short(fire.mean), "cells/step"
-    yield "growth, most", short(fire.most), f"cells/step, steps {fire.since} to {until}"
-    yield "front, fastest", short(fire.speed), f"cells/step, over {fire.window} steps"
+    yield "growth, maximum", short(fire.maximum), f"cells/step, steps {fire.since} to {until}"
     yield "a UAV flies", short(team.flight), "cells/step"
     yield "a UAV sees", short(team.width), "cells across, from full altitude"
-    product = " x ".join(map(short, (team.uavs, team.width, team.flight)))
-    yield "the team sweeps", short(team.sweep), f"cells/step at most: {product}"
+    product = " x ".join(map(short, (team.num_uavs, team.width, team.flight)))
+    yield "the team uncovers", short(team.uncovered), f"cells/step at most: {product}"

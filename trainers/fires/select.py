@@ -1,6 +1,5 @@
-"""Which fire is meant: a scenario's test fire or one of a file, under the keys of training."""
+"""Finds the fire that a command names: a scenario's test fire, or one of a file."""
 
-import difflib
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,7 +13,7 @@ from emberlink.envs.fire_files.config import FileFireConfig
 from emberlink.envs.fire_files.reader import read_fires
 from emberlink.envs.scenarios import fires_of
 from emberlink.envs.utils.errors import UserError
-from emberlink.envs.utils.validation import shown
+from emberlink.envs.utils.validation import shown, unknown
 from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.config.schema import RunConfig
 
@@ -27,31 +26,31 @@ _KEYS = ("env.", "fire.")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Source:
-    """A fire and where it is from."""
+class SelectedFire:
+    """A fire and its origin."""
 
     title: str
     stem: str
-    """begins the names of files about it"""
+    """Begins the names of files about it."""
     config: RunConfig
     arrival: Tensor
     """float32 [X, Y], steps"""
 
 
-def find(text: str, overrides: Sequence[str]) -> Source:
-    """The fire that NAME, NAME:INDEX, FILE or FILE:INDEX means.
+def find_fire(text: str, overrides: Sequence[str]) -> SelectedFire:
+    """Returns the fire that NAME, NAME:INDEX, FILE or FILE:INDEX names.
 
     Args:
         text: the name of a scenario or a path; a scenario comes first.
         overrides: `key=value` of setup, env. and fire.
 
     Raises:
-        ValueError: there is no such fire, or a key or value is wrong.
+        UserError: there is no such fire, or a key or value is wrong.
     """
     name, _, index = text.rpartition(":") if ":" in text else (text, "", "0")
     if name in scenarios():
         config = generated(name, overrides)
-        return Source(
+        return SelectedFire(
             title=f"{name}, test fire {index}",
             stem=f"fire_{name}_{index}",
             config=config,
@@ -60,14 +59,15 @@ def find(text: str, overrides: Sequence[str]) -> Source:
     if os.path.exists(text) or not os.path.exists(name):
         name, index = text, "0"
     if not name or not os.path.exists(name):
-        raise UserError(_unknown(text))
+        known = unknown(text.rpartition(":")[0] or text, scenarios())
+        raise UserError(f"{shown(text)}: there is no such file; as a scenario {known}")
     path = Path(name)
     config = from_file(path, overrides)
     fires = read(config)
     if not index.isdecimal() or int(index) >= len(fires):
         raise UserError(f"{shown(text)}: there is no fire {index!r}; known: 0 to {len(fires) - 1}")
     several, shortened = len(fires) > 1, shown(path.name)
-    return Source(
+    return SelectedFire(
         title=f"{shortened}, fire {index} of {len(fires)}" if several else shortened,
         stem=f"fire_{path.stem}_{index}" if several else f"fire_{path.stem}",
         config=config,
@@ -84,26 +84,24 @@ def _test_fire(config: RunConfig, text: str, index: str) -> Tensor:
 
 
 def generated(scenario: str, overrides: Sequence[str]) -> RunConfig:
-    """The configuration with which a scenario's fires are made.
+    """Returns the configuration with which a scenario's fires are made.
 
     Raises:
-        ValueError: there is no such scenario, its fires are read, or a key or value is wrong.
+        UserError: there is no such scenario, its fires are read, or a key or value is wrong.
     """
-    known = scenarios()
-    if scenario not in known:
-        hint = _near(scenario, known)
-        raise UserError(f"fire {shown(scenario)!r} is not known{hint} known: {', '.join(known)}")
+    if scenario not in scenarios():
+        raise UserError(f"fire {unknown(scenario, scenarios())}")
     return _resolve([f"fire={scenario}", *overrides], overrides)
 
 
 def from_file(path: Path, overrides: Sequence[str]) -> RunConfig:
-    """The configuration with which a file is read.
+    """Returns the configuration with which a file is read.
 
     Raises:
-        ValueError: a key or value is wrong.
+        UserError: a key or value is wrong.
     """
     if any(text.partition("=")[0] == "fire.path" for text in overrides):
-        raise UserError("fire.path: the file stands without a key here")
+        raise UserError("fire.path: the file is given without a key here")
     # The name is set past the parser of overrides, to which some characters mean something.
     return _resolve([f"fire={FILE}", "fire.path=_", *overrides], overrides, path=str(path))
 
@@ -114,7 +112,7 @@ def _resolve(texts: Sequence[str], overrides: Sequence[str], path: str | None = 
     for text in overrides:
         key = text.partition("=")[0]
         if key == "fire":
-            raise UserError(f"{shown(text)!r}: the fire is named without a key here")
+            raise UserError(f"{shown(text)!r}: the fire is given without a key here")
         if key != "setup" and not key.startswith(_KEYS):
             raise UserError(
                 f"{shown(text)!r}: a fire depends on keys of setup, env. and fire. only"
@@ -123,22 +121,10 @@ def _resolve(texts: Sequence[str], overrides: Sequence[str], path: str | None = 
 
 
 def read(config: RunConfig) -> Tensor:
-    """The fires of a file, float32 [fires, X, Y], steps.
+    """Returns the fires of a file, float32 [fires, X, Y], steps.
 
     Raises:
-        ValueError: one line that names the file and what is wrong with it.
+        UserError: one line that names the file and what is wrong with it.
     """
     assert isinstance(config.fire, FileFireConfig)
     return read_fires(config.fire, config.env.grid, config.env.horizon)
-
-
-def _unknown(text: str) -> str:
-    known = scenarios()
-    hint = _near(text.rpartition(":")[0] or text, known)
-    return f"{shown(text)}: no file or scenario is so called{hint} known: {', '.join(known)}"
-
-
-def _near(name: str, known: Sequence[str]) -> str:
-    """What may have been meant; it ends as the known names are to follow."""
-    near = difflib.get_close_matches(name, known, n=1)
-    return f"; did you mean {near[0]}?" if near else ";"

@@ -14,8 +14,7 @@ from torch import Tensor
 from torchrl.data import Composite
 
 from emberlink.envs.utils.validation import Name
-from emberlink.policies.networks.actor_critic import make_actor
-from emberlink.policies.networks.stacked import Generators
+from emberlink.policies.networks import Generators, make_actor
 
 from .nan_guard import NonFiniteGuard
 
@@ -109,8 +108,8 @@ class Learner(ABC):
             observation_spec,
             action_spec,
             config.hidden,
+            share_parameters=config.share_parameters,
             generator=generator,
-            **sharing(config),
         )
 
     @abstractmethod
@@ -151,11 +150,6 @@ class Learner(ABC):
         Raises:
             ValueError: the state is not one of this configuration.
         """
-
-
-def sharing(config: LearnerConfig) -> dict[str, Any]:
-    """Returns the arguments of `make_actor` and `make_critic` that say who shares weights."""
-    return {"share_parameters": True} if config.share_parameters else {}
 
 
 def generators(seeds: tuple[int, ...]) -> list[torch.Generator]:

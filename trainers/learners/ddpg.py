@@ -7,9 +7,9 @@ from pydantic.dataclasses import dataclass
 from tensordict import TensorDictBase
 from torchrl.objectives import DDPGLoss
 
-from emberlink.policies.networks.actor_critic import make_critic
+from emberlink.policies.networks import make_critic
 
-from .base import STRICT, LearnerContext, Losses, sharing
+from .base import STRICT, LearnerContext, Losses
 from .off_policy import OffPolicyConfig, OffPolicyLearner
 
 
@@ -28,7 +28,10 @@ class DDPG(OffPolicyLearner):
         specs = context.observation_spec, context.action_spec
         self.actor = self.make_actor(self.config, *specs, generators)
         critic = make_critic(
-            *specs, self.config.hidden, generator=generators, **sharing(self.config)
+            *specs,
+            self.config.hidden,
+            generator=generators,
+            share_parameters=self.config.share_parameters,
         )
         return DDPGLoss(self.actor, critic, delay_actor=True, delay_value=True, reduction="none")
 

@@ -16,7 +16,7 @@ from torchrl.objectives import LossModule, SoftUpdate, group_optimizers
 from emberlink.envs import keys
 from emberlink.envs.utils.errors import UserError
 from emberlink.policies.exploration import ExplorationConfig, OrnsteinUhlenbeck
-from emberlink.policies.networks.actor_critic import STATE_ACTION_VALUE
+from emberlink.policies.networks import STATE_ACTION_VALUE
 from emberlink.trainers.rollout.cuda_graphs import graphed
 
 from .base import (

@@ -13,9 +13,9 @@ from torchrl.objectives import TD3Loss
 from emberlink.envs import keys
 from emberlink.envs.utils import counter_rng
 from emberlink.envs.utils.counter_rng import Use
-from emberlink.policies.networks.actor_critic import make_critic
+from emberlink.policies.networks import make_critic
 
-from .base import STRICT, Count, LearnerContext, Losses, NotNegative, sharing
+from .base import STRICT, Count, LearnerContext, Losses, NotNegative
 from .off_policy import OffPolicyConfig, OffPolicyLearner
 
 _TARGET_NOISE = (keys.AGENTS, "target_noise")
@@ -51,14 +51,20 @@ class TD3(OffPolicyLearner):
         specs, config = (context.observation_spec, context.action_spec), self.config
         self.actor = self.make_actor(config, *specs, generators)
         critics: list[TensorDictModule] = [
-            make_critic(*specs, config.hidden, generator=generators, **sharing(config))
+            make_critic(
+                *specs,
+                config.hidden,
+                generator=generators,
+                share_parameters=config.share_parameters,
+            )
             for _ in range(_CRITICS)
         ]
         actor: Any = _SmoothedActor(self.actor)
+        bounds: Any = (-1.0, 1.0)
         loss = TD3Loss(
             actor,
             critics,  # two, initialised apart; TorchRL would draw the second's weights itself
-            bounds=(-1.0, 1.0),
+            bounds=bounds,
             policy_noise=0.0,  # ours is in the batch, from a stream of its own
             noise_clip=0.0,
             loss_function="l2",
@@ -84,10 +90,11 @@ class TD3(OffPolicyLearner):
         return batch
 
     def losses(self, batch: TensorDictBase, *, actor: bool = True) -> Losses:
-        critic_loss, _ = self.loss.value_loss(batch)
+        loss: Any = self.loss
+        critic_loss, _ = loss.value_loss(batch)
         losses = {"critic": critic_loss.mean(0)}
         if actor:
-            actor_loss, _ = self.loss.actor_loss(batch)
+            actor_loss, _ = loss.actor_loss(batch)
             losses["actor"] = actor_loss.mean(0)
         return losses
 
@@ -118,7 +125,9 @@ class _SmoothedActor(TensorDictModuleBase):
     def __init__(self, actor: TensorDictModule):
         super().__init__()
         self.actor = actor
-        self.in_keys, self.out_keys = [*actor.in_keys, _TARGET_NOISE], actor.out_keys
+        reads: list[Any] = [*actor.in_keys, _TARGET_NOISE]
+        writes: list[Any] = list(actor.out_keys)
+        self.in_keys, self.out_keys = reads, writes
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         acted = self.actor(tensordict)

@@ -1,10 +1,12 @@
-"""Collects transitions of all environments, step by step."""
+"""Collects transitions of all environments: TorchRL's collector, and one for GPUs."""
 
 from collections.abc import Iterator
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
+from torchrl.collectors import Collector
 from torchrl.envs import EnvBase, ExplorationType, set_exploration_type, step_mdp
 
 from emberlink.envs import keys
@@ -12,7 +14,75 @@ from emberlink.envs import keys
 from .cuda_graphs import graphed
 
 
-class StepCollector:
+def make_collector(
+    env: EnvBase,
+    policy: TensorDictModuleBase,
+    *,
+    horizon: int,
+    total_steps: int,
+    rollout_steps: int = 1,
+) -> "ResumableCollector | LockstepCollector":
+    """Returns a collector of rollouts, batch size [environments, rollout_steps].
+
+    Args:
+        env: environments side by side, with their communication.
+        policy: the actors with exploration noise.
+        horizon: steps of an episode.
+        total_steps: steps of all environments, in the whole run.
+        rollout_steps: steps in a yielded rollout; divides the horizon.
+    """
+    if torch.device(env.device or "cpu").type == "cuda":
+        return LockstepCollector(
+            env, policy, horizon=horizon, total_steps=total_steps, rollout_steps=rollout_steps
+        )
+    return ResumableCollector(env, policy, total_steps=total_steps, rollout_steps=rollout_steps)
+
+
+class ResumableCollector(Collector):
+    """TorchRL's collector, whose input of the next step can be read and replaced.
+
+    TorchRL leaves that TensorDict out of the collector's state; resuming bit for bit needs it.
+    Arguments as `make_collector`.
+    """
+
+    def __init__(
+        self, env: EnvBase, policy: TensorDictModuleBase, *, total_steps: int, rollout_steps: int
+    ):
+        envs = env.batch_size.numel()
+        super().__init__(
+            env,
+            policy,
+            frames_per_batch=envs * rollout_steps,
+            total_frames=total_steps * envs,
+            device=env.device,
+            trust_policy=True,
+            track_traj_ids=False,
+            auto_register_policy_transforms=False,
+        )
+        _add_policy_state(self._carrier, env, policy)
+
+    @property
+    def carried(self) -> TensorDictBase:
+        """The input of the next step but its action: observations, communication and noise."""
+        return self._carrier.exclude(keys.ACTION)
+
+    def restore(self, carried: TensorDictBase, step: int) -> None:
+        """Continues from a TensorDict that `carried` gave, after so many steps of the run."""
+        self._carrier = carried
+        self._frames = step * carried.numel()
+
+
+def _add_policy_state(
+    tensordict: TensorDictBase, env: EnvBase, policy: TensorDictModuleBase
+) -> None:
+    """Adds zeros for what the policy carries from step to step, such as its noise."""
+    with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
+        acted = policy(tensordict.copy())
+    for key in set(policy.out_keys) - set(env.action_keys):
+        tensordict.set(key, torch.zeros_like(acted.get(key)))
+
+
+class LockstepCollector:
     """Yields rollouts as TorchRL's Collector does, but never waits for the device.
 
     All environments begin together and every episode lasts for the horizon, so the ends of episodes
@@ -40,10 +110,7 @@ class StepCollector:
         self.total_steps, self.rollout_steps = total_steps, rollout_steps
         self.step = 0
         self._td: TensorDictBase = env.reset()
-        with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
-            acted = policy(self._td.copy())
-        for key in set(policy.out_keys) - set(env.action_keys):
-            self._td.set(key, torch.zeros_like(acted.get(key)))
+        _add_policy_state(self._td, env, policy)
         self._advance = graphed(self._step, env.device or "cpu")
 
     def __iter__(self) -> Iterator[TensorDictBase]:
@@ -52,8 +119,9 @@ class StepCollector:
             if self.rollout_steps == 1:
                 yield self._collect().unsqueeze(-1)
             else:
-                steps = [self._collect().clone() for _ in range(self.rollout_steps)]
-                yield torch.stack(steps, dim=1)  # pyright: ignore[reportArgumentType]
+                steps: Any = [self._collect().clone() for _ in range(self.rollout_steps)]
+                rollout: Any = torch.stack(steps, dim=1)
+                yield rollout
 
     @property
     def carried(self) -> TensorDictBase:
@@ -67,6 +135,9 @@ class StepCollector:
         """
         self._td.update_(carried)
         self.step = step
+
+    def shutdown(self) -> None:
+        """Does nothing; TorchRL's collector closes its environments here."""
 
     def _collect(self) -> TensorDictBase:
         with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):

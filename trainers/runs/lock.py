@@ -1,84 +1,78 @@
-"""One training a run folder: a lock that dies with its process."""
+"""Locks a run folder, so that one process at a time trains in it."""
 
 import errno
-import fcntl
 import os
 import socket
-import stat
 from contextlib import suppress
 from pathlib import Path
 
-from emberlink.envs.utils.atomic_io import read_bytes
+from filelock import FileLock, Timeout
+
+from emberlink.envs.utils.atomic_io import check_regular, read_bytes
 from emberlink.envs.utils.errors import UserError
 
-_FLAGS = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC
+_NO_LOCKS = {errno.ENOLCK, errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP}
+_MAX_HOLDER = 1000
+"""bytes of a lock file that are read"""
 
 
 class Lock:
-    """The right to train in a run folder: an exclusive `flock` on its file `lock`.
+    """An exclusive lock on the file `lock` of a run folder, held until `release`.
 
-    The system gives it up when the process ends, however it ends, so that no number of a process
-    that has been given out again can be taken for it. The file holds the process's number and
-    machine, for the message.
+    The operating system releases the lock when the process ends, also by SIGKILL. The file holds
+    the process number and the machine of the holder for the error message.
 
     Args:
         folder: of the run.
 
     Raises:
-        ValueError: another process has it, or the file cannot be made.
+        UserError: another process holds the lock, `lock` is a link or not a regular file, or the
+            file system has no locks.
     """
 
     def __init__(self, folder: Path):
         self.path = folder / "lock"
-        self.stale: str | None = None
-        """what had locked the folder and is gone, if anything"""
+        # Nothing but the operating system's own lock: a file alone would outlive its process.
+        self._lock = FileLock(
+            self.path,
+            timeout=0,
+            thread_local=False,
+            fallback_to_soft=False,
+            on_acquired=self._write_holder,
+        )
         try:
-            self._handle = self._take()
-        except BlockingIOError:
+            folder.stat()  # FileLock would create a missing folder
+            self._lock.acquire()
+        except Timeout:
             raise UserError(f"{folder}: {self._holder()} is training here") from None
         except OSError as error:
-            raise UserError(f"{self.path}: cannot be locked: {error.strerror}") from None
+            raise UserError(f"{self.path}: cannot be locked: {_reason(error)}") from None
 
     def release(self) -> None:
-        """Takes the file away and gives the lock up; a second time does nothing."""
-        if self._handle >= 0:
-            with suppress(OSError):  # of a folder that has become read-only, the file stays
+        """Removes the file and releases the lock; does nothing the second time."""
+        if self._lock.is_locked:
+            with suppress(OSError):  # the folder may be read-only by now; the file stays then
                 self.path.unlink(missing_ok=True)
-            os.close(self._handle)
-            self._handle = -1
+            self._lock.release()
 
-    def _take(self) -> int:
-        while True:
-            handle = os.open(self.path, _FLAGS, 0o644)
-            try:
-                _check_own(handle)
-                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                # Whoever had it may have taken the file away between the two calls.
-                if self.path.exists() and os.path.samestat(os.fstat(handle), self.path.stat()):
-                    self.stale = os.pread(handle, 200, 0).decode(errors="replace").strip() or None
-                    os.ftruncate(handle, 0)
-                    text = f"process {os.getpid()} on {socket.gethostname()}\n"
-                    os.pwrite(handle, text.encode(), 0)
-                    return handle
-            except BaseException:
-                os.close(handle)
-                raise
-            os.close(handle)
+    def _write_holder(self, handle: int) -> None:
+        """Writes this process into the locked file, which must have no second name."""
+        check_regular(handle, self.path)
+        if os.fstat(handle).st_nlink > 1:
+            raise OSError(errno.EMLINK, "it is a hard link", str(self.path))
+        os.ftruncate(handle, 0)
+        os.pwrite(handle, f"process {os.getpid()} on {socket.gethostname()}\n".encode(), 0)
 
     def _holder(self) -> str:
         try:
-            text = read_bytes(self.path, 1000).decode(errors="replace").strip()
-            return text or "another process"
+            text = read_bytes(self.path, _MAX_HOLDER).decode(errors="replace").strip()
         except OSError:
-            return "another process"
+            text = ""
+        return text or "another process"
 
 
-def _check_own(handle: int) -> None:
-    """Checks that a lock is a regular file without a second name, which would be changed with it.
-
-    Raises:
-        OSError: it is not.
-    """
-    about = os.fstat(handle)
-    if not stat.S_ISREG(about.st_mode) or about.st_nlink > 1:
-        raise OSError(errno.EINVAL, "it is no regular file of its own")
+def _reason(error: OSError) -> str:
+    text = error.strerror or str(error)
+    if error.errno in _NO_LOCKS:
+        text += "; the file system has no locks, choose another one with output=FOLDER"
+    return text

@@ -1,11 +1,9 @@
-"""Trained policies that come with emberlink: `pretrained:consensus` in place of a run folder.
+"""Opens the trained policies of the package, named `pretrained:consensus` on the command line.
 
-Each is a run folder without what only its training needs: policies/pretrained/SETUP/METHOD/sSEED
-with config.yaml, metrics.jsonl, eval.json and a checkpoint that holds the actors alone.
+Each is a reduced run folder, policies/pretrained/SETUP/METHOD/sSEED: config.yaml, metrics.jsonl,
+eval.json, and a checkpoint with the actors alone. Finished runs are packed with
 
     python -m emberlink.trainers.runs.pretrained RUN... --into policies/pretrained
-
-makes them from finished runs.
 """
 
 import argparse
@@ -31,21 +29,21 @@ USUAL_SETUP = "tuned"
 
 
 def is_name(text: str) -> bool:
-    """Whether a trained policy is meant that comes with emberlink, not a folder."""
+    """Returns whether a text names a trained policy of the package rather than a folder."""
     return text.startswith(PREFIX)
 
 
 def open_run(text: str, output: Path | str = "runs") -> RunFolder:
-    """The run that is meant by what stands on the command line.
+    """Returns the run that an argument of the command line names.
 
     Args:
         text: a run folder, or `pretrained:METHOD`, `pretrained:SETUP/METHOD` or
-            `pretrained:SETUP/METHOD/SEED`. These are copied to a folder of their own in `output`,
-            where what is made of them goes; a copy that is there is used.
+            `pretrained:SETUP/METHOD/SEED`. A trained policy is copied to a folder in `output`,
+            where its figures are written; an existing copy is used.
         output: the folder of run folders.
 
     Raises:
-        ValueError: there is no such policy, or several; the message names those that there are.
+        UserError: there is no such policy, or several; the message lists the known ones.
     """
     if not is_name(text):
         return RunFolder(text)
@@ -60,25 +58,25 @@ def open_run(text: str, output: Path | str = "runs") -> RunFolder:
 
 
 def find(text: str) -> list[Path]:
-    """The folders of the trained policies that a name means, lowest seed first.
+    """Returns the folders of the trained policies that a name covers, lowest seed first.
 
     Args:
-        text: as for `open_run`; `pretrained:SETUP` are all of a setup.
+        text: as for `open_run`; `pretrained:SETUP` covers all policies of a setup.
 
     Raises:
-        ValueError: there are none.
+        UserError: there is none.
     """
     folders = sorted((file.parent for file in _shipped().glob("*/*/*/config.yaml")), key=_order)
     name = text.removeprefix(PREFIX).strip("/")
     wanted = name.split("/")
     if len(wanted) == 3:
         wanted[2] = f"s{wanted[2].removeprefix('s')}"
-    found = [one for one in folders if one.parts[-3:][: len(wanted)] == tuple(wanted)]
-    found = found or [one for one in folders if list(one.parts[-3:-1]) == [USUAL_SETUP, name]]
-    if not found:
-        there = ", ".join(sorted({"/".join(one.parts[-3:-1]) for one in folders})) or "none"
-        raise UserError(f"{text}: no such trained policy; there are {there}")
-    return found
+    matching = [path for path in folders if path.parts[-3:][: len(wanted)] == tuple(wanted)]
+    usual = [path for path in folders if path.parts[-3:-1] == (USUAL_SETUP, name)]
+    if not matching and not usual:
+        known = ", ".join(sorted({"/".join(path.parts[-3:-1]) for path in folders})) or "none"
+        raise UserError(f"{text}: no such trained policy; there are {known}")
+    return matching or usual
 
 
 def find_one(text: str) -> Path:
@@ -88,17 +86,17 @@ def find_one(text: str) -> Path:
         text: as for `open_run`.
 
     Raises:
-        UserError: there is none, or of several methods or setups.
+        UserError: there is none, or there are several methods or setups.
     """
-    found = find(text)
-    recipes = sorted({"/".join(folder.parts[-3:-1]) for folder in found})
+    policies = find(text)
+    recipes = sorted({"/".join(folder.parts[-3:-1]) for folder in policies})
     if len(recipes) > 1:
         raise UserError(f"{text}: one is needed, and there are {', '.join(recipes)}")
-    return found[0]
+    return policies[0]
 
 
 def pack(run: RunFolder, into: Path) -> Path:
-    """Takes from a finished run what is shipped.
+    """Copies a finished run to the trained policies, without the files of its training.
 
     Args:
         run: trained and evaluated.
@@ -108,7 +106,7 @@ def pack(run: RunFolder, into: Path) -> Path:
         The new folder.
 
     Raises:
-        ValueError: the run is not finished, or the folder is there.
+        UserError: the run is not finished, or the new folder exists.
     """
     trained = run.config()
     config = replace(trained, output="runs", logger="none", device="cpu")
@@ -142,16 +140,16 @@ def _order(folder: Path) -> tuple[str, str, int]:
 
 
 def _copy(source: Path, target: Path) -> None:
-    """Copies a folder whole, or leaves nothing."""
+    """Copies a folder completely or not at all."""
     target.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=target.parent, prefix=".pretrained") as partial:
-        # Not the modes: what is installed may be read-only.
+        # Modes are not copied: an installed package may be read-only.
         shutil.copytree(source, Path(partial) / "run", copy_function=shutil.copyfile)
         (Path(partial) / "run").rename(target)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Packs runs."""
+    """Packs the runs that are named on the command line; returns the exit status."""
     parser = argparse.ArgumentParser(prog="python -m emberlink.trainers.runs.pretrained")
     parser.add_argument("runs", metavar="RUN", nargs="+", type=Path)
     parser.add_argument("--into", type=Path, required=True, help="policies/pretrained")

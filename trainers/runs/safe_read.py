@@ -1,4 +1,4 @@
-"""Text files that anybody may have written: plain values or an error, within bounds."""
+"""Reads YAML and JSON of unknown origin: plain values of bounded size, or an error."""
 
 import json
 from collections.abc import Hashable
@@ -10,23 +10,27 @@ import yaml
 from emberlink.envs.utils.atomic_io import read_bytes
 from emberlink.envs.utils.errors import UserError
 
-LONGEST_YAML = 100_000
-"""bytes of a config.yaml; ours have two thousand"""
-LONGEST_JSON = 500_000_000
-"""bytes of eval.json and metrics.jsonl; the largest evaluation that can be set has a fifth"""
-_LONGEST_INTEGER = 20
+MAX_YAML = 100_000
+"""bytes of a config.yaml; usual ones have 2,000"""
+MAX_JSON = 500_000_000
+"""bytes of eval.json and metrics.jsonl; five times the largest evaluation that can be set"""
+_MAX_DIGITS = 20
 """digits"""
 
 
-def read_text(path: Path, longest: int) -> str:
-    """The text of a regular file, or of one that a link leads to.
+def read_text(path: Path, max_bytes: int) -> str:
+    """Returns the text of a regular file or of the target of a link.
+
+    Args:
+        path: of the file.
+        max_bytes: largest size that is accepted.
 
     Raises:
-        FileNotFoundError: there is none.
-        ValueError: one line: it is something else, such as a pipe, longer, or no UTF-8.
+        FileNotFoundError: there is no such file.
+        UserError: it is not a regular file, is larger, or is not UTF-8.
     """
     try:
-        return read_bytes(path, longest).decode()
+        return read_bytes(path, max_bytes).decode()
     except FileNotFoundError:
         raise
     except OSError as error:
@@ -36,13 +40,13 @@ def read_text(path: Path, longest: int) -> str:
 
 
 def read_yaml(path: Path) -> Any:
-    """Mappings, lists, text, numbers and dates; no tag makes an object, no key stands twice.
+    """Returns the mappings, lists, text, numbers and dates of a YAML file.
 
     Raises:
-        FileNotFoundError: there is none.
-        ValueError: one line: it cannot be read, or holds what is not read here.
+        FileNotFoundError: there is no such file.
+        UserError: it cannot be read, or holds a tag, an anchor, an alias or a repeated key.
     """
-    text = read_text(path, LONGEST_YAML)
+    text = read_text(path, MAX_YAML)
     try:
         return yaml.load(text, _PlainLoader)
     except (yaml.YAMLError, TypeError, ValueError, RecursionError) as error:
@@ -51,10 +55,10 @@ def read_yaml(path: Path) -> Any:
 
 
 def parse_json(text: str) -> Any:
-    """JSON; whole numbers of more digits than any of ours are float.
+    """Returns the value of a JSON text; integers of more than 20 digits become float.
 
     Raises:
-        ValueError: it is none, has a key twice, or too many levels.
+        ValueError: the text is not JSON, repeats a key, or has too many levels.
     """
     try:
         return json.loads(text, object_pairs_hook=_once, parse_int=_integer)
@@ -63,8 +67,7 @@ def parse_json(text: str) -> Any:
 
 
 class _PlainLoader(yaml.SafeLoader):
-    """SafeLoader without tags, which turn one value into another, and without aliases, with which
-    a short file can stand for an endless one."""
+    """Refuses tags, which convert values, and aliases, which make a short file very large."""
 
     def compose_node(self, parent: Any, index: Any) -> Any:
         if self.check_event(yaml.AliasEvent):
@@ -85,11 +88,11 @@ class _PlainLoader(yaml.SafeLoader):
 
 
 def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    found = dict(pairs)
-    if len(found) < len(pairs):
+    mapping = dict(pairs)
+    if len(mapping) < len(pairs):
         raise UserError("a key stands twice")
-    return found
+    return mapping
 
 
 def _integer(text: str) -> int | float:
-    return int(text) if len(text) <= _LONGEST_INTEGER else float(text)
+    return int(text) if len(text) <= _MAX_DIGITS else float(text)

@@ -1,6 +1,6 @@
-"""Compares a run's config.yaml with the configuration that its networks were trained with.
+"""Compares config.yaml with the configuration in the header of a checkpoint.
 
-Every checkpoint holds that configuration in its header, under a checksum.
+The header is covered by the checkpoint's checksum.
 """
 
 from collections.abc import Mapping
@@ -12,61 +12,64 @@ from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import shown
 from emberlink.trainers.config.compose import flat, from_values, to_values
 from emberlink.trainers.config.schema import NOT_LEARNT_WITH, RunConfig
-from emberlink.trainers.runs import checkpoint_file
+
+from . import checkpoint_file
 
 MAY_CHANGE = ("episodes", *NOT_LEARNT_WITH)
-"""keys that a resumed run may be given anew, beside those of `evaluation`"""
+"""keys that may be changed when a run is resumed, besides those of `evaluation`"""
 _FREE = (*MAY_CHANGE, "output", "evaluation")
 
 
 def check_trained_with(path: Path, config: RunConfig) -> None:
-    """Checks that networks were trained with a configuration, but for what may change.
+    """Checks that a checkpoint's networks were trained with the configuration of their run folder.
+
+    Keys that do not change the training, such as `device`, may differ.
 
     Args:
         path: of the checkpoint.
-        config: of the run folder, as its config.yaml says.
+        config: read from config.yaml.
 
     Raises:
-        ValueError: one line: the checkpoint holds no configuration, or another one; the message
-            names the first key that differs and both values.
+        UserError: the checkpoint holds no configuration or a different one. The message names the
+            first key that differs, and both values.
     """
     header = checkpoint_file.read_header(path)
     if header is None or "config" not in header:
         raise UserError(
-            f"{path}: does not hold the configuration that it was trained with: it was written by "
-            "an earlier version, or by another program"
+            f"{path}: does not hold the configuration that it was trained with; it was written by "
+            "another program"
         )
     check_same(path, header["config"], config)
 
 
 def check_same(path: Path, sealed: Mapping[str, Any], config: RunConfig) -> None:
-    """Checks that the configuration in a checkpoint's header is the run's.
+    """Checks that the configuration in a checkpoint's header is that of the run.
 
     Args:
         path: of the checkpoint, for the message.
-        sealed: plain values of its header.
+        sealed: the configuration in its header, as plain values.
         config: of the run.
 
     Raises:
-        ValueError: one line that names the first key that differs, and both values.
+        UserError: they differ; see `check_trained_with`.
     """
     free = {key: getattr(config, key) for key in _FREE}
     try:
-        made = from_values({**sealed, "device": config.device})
+        trained = from_values({**sealed, "device": config.device})
     except (ValueError, TypeError) as error:
-        raise UserError(f"{path}: made with a configuration that is none: {error}") from None
-    for key, (found, wanted) in differences(replace(made, **free), config).items():
-        other = ""
+        raise UserError(f"{path}: its configuration cannot be read: {error}") from None
+    for key, (before, now) in differences(replace(trained, **free), config).items():
+        hint = ""
         if key.startswith(("env.", "comm.")):
-            other = f"; another world is played with: emberlink eval RUN {key}=VALUE"
+            hint = f"; to evaluate in another world: emberlink eval RUN {key}=VALUE"
         raise UserError(
-            f"{path}: made with {key}={shown(str(found))}; the run has {key}={shown(str(wanted))}: "
-            f"put {shown(str(found))} back into config.yaml{other}"
+            f"{path}: made with {key}={shown(str(before))}; the run has {key}={shown(str(now))}: "
+            f"put {shown(str(before))} back into config.yaml{hint}"
         )
 
 
 def differences(one: RunConfig, other: RunConfig) -> dict[str, tuple[Any, Any]]:
-    """Returns the dotted keys in which two configurations differ, and both values."""
+    """Returns the dotted keys in which two configurations differ, with both values."""
     first, second = flat(to_values(one)), flat(to_values(other))
     return {
         key: (first.get(key), second.get(key))

@@ -1,4 +1,4 @@
-"""Ctrl-C, SIGTERM and SIGHUP: the step is finished first."""
+"""Lets a training finish its step before Ctrl-C, SIGTERM or SIGHUP ends it."""
 
 import signal
 from collections.abc import Callable
@@ -8,38 +8,38 @@ _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 class Interrupted(KeyboardInterrupt):
-    """A signal ended what was being done."""
+    """Is raised by a signal that does not wait for the end of the step."""
 
 
 class Interruption:
-    """Within, a first SIGINT, SIGTERM or SIGHUP calls `stop`; a second one raises `Interrupted`.
+    """Calls `stop` at the first SIGINT, SIGTERM or SIGHUP and raises `Interrupted` at the second.
 
     Args:
-        stop: asks for an end between two steps.
+        stop: requests an end between two steps.
     """
 
     def __init__(self, stop: Callable[[], None]):
         self._stop = stop
         self._before: dict[signal.Signals, signal._HANDLER] = {}
         self.received: int | None = None
-        """the first signal that came"""
+        """number of the first signal; None before it"""
         self.at_once = False
-        """whether the first one is not to wait either"""
+        """raise `Interrupted` at the first signal too"""
 
     def __enter__(self) -> "Interruption":
         signals = [*_SIGNALS]
         if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # nohup ignores it
             signals.append(signal.SIGHUP)
-        self._before = {one: signal.signal(one, self._handle) for one in signals}
+        self._before = {number: signal.signal(number, self._handle) for number in signals}
         return self
 
     def __exit__(self, *_: object) -> None:
-        for one, handler in self._before.items():
-            signal.signal(one, handler)
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
 
     @property
     def status(self) -> int:
-        """The exit status of a program that the signal ended: 130, 143 or 129."""
+        """The exit status after the signal: 130 for SIGINT, 143 for SIGTERM, 129 for SIGHUP."""
         return 128 + (self.received or signal.SIGINT)
 
     def _handle(self, number: int, _: FrameType | None) -> None:

@@ -4,15 +4,15 @@ import fcntl
 import hashlib
 import os
 from collections.abc import Iterable
-from contextlib import suppress
 from pathlib import Path
 
+from emberlink.envs.utils.atomic_io import inner_folder
 from emberlink.envs.utils.errors import UserError
 
 from .jobs import Identity
 
-FOLDER = "claims"
-"""the folder of the lock files, beside the logs of the sweep"""
+FOLDER = ("logs", "claims")
+"""where the lock files are, in the output folder"""
 
 
 class Claim:
@@ -35,20 +35,20 @@ class Claim:
         self.handles = []
 
 
-def claim(logs: Path, identities: Iterable[Identity]) -> Claim | None:
+def claim(output: Path, identities: Iterable[Identity]) -> Claim | None:
     """Locks runs, or returns None where another sweep has one of them.
 
     Args:
-        logs: the folder of the sweep's logs.
+        output: the folder of the run folders; it is made if it is not there.
         identities: of the runs.
 
     Raises:
         UserError: a lock file cannot be made.
     """
-    folder = logs / FOLDER
     taken = Claim([])
     try:
-        folder.mkdir(parents=True, exist_ok=True)
+        output.mkdir(parents=True, exist_ok=True)
+        folder = inner_folder(output, *FOLDER)
         for name in sorted(map(_file_name, identities)):
             flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW
             taken.handles.append(os.open(folder / name, flags, 0o644))
@@ -57,9 +57,8 @@ def claim(logs: Path, identities: Iterable[Identity]) -> Claim | None:
         taken.release()
         return None
     except OSError as error:
-        with suppress(OSError):
-            taken.release()
-        raise UserError(f"{folder}: a run cannot be claimed: {error.strerror or error}") from None
+        taken.release()
+        raise UserError(f"output={output}: {error.strerror or error}") from None
     return taken
 
 

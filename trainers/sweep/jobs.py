@@ -14,7 +14,7 @@ from emberlink.trainers.config.schema import NOT_LEARNT_WITH, RunConfig
 from emberlink.trainers.runs.run_folder import RunFolder
 
 _MAY_DIFFER = ("output", "seeds", *NOT_LEARNT_WITH)
-"""keys in which two configurations of the same run may differ"""
+"""first parts of the keys in which two configurations of the same run may differ"""
 
 Identity = tuple[tuple[str, str], ...]
 """keys and values that are equal for two configurations of the same run"""
@@ -75,8 +75,8 @@ class Job:
 
     @property
     def state(self) -> str:
-        """The state in a word or two: finished, stopped or new."""
-        return "finished" if self.finished else "stopped" if self.found else "new"
+        """The state in a word or two: finished, unfinished or new."""
+        return "finished" if self.finished else "unfinished" if self.found else "new"
 
     @property
     def identities(self) -> set[Identity]:
@@ -143,7 +143,9 @@ def jobs_of(arguments: Sequence[str]) -> list[Job]:
 def identity(config: RunConfig) -> Identity:
     """Returns the keys and values that two configurations of the same run have in common."""
     values = flat(to_values(config))
-    return tuple(sorted((k, str(v)) for k, v in values.items() if k not in _MAY_DIFFER))
+    return tuple(
+        sorted((k, str(v)) for k, v in values.items() if k.split(".")[0] not in _MAY_DIFFER)
+    )
 
 
 def job_for(configs: list[RunConfig], overrides: Sequence[str]) -> Job:

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from emberlink.envs.utils.atomic_io import inner_folder
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.publish import free_name
 from emberlink.trainers.runs.signals import Interruption
@@ -100,7 +101,7 @@ class Scheduler:
     def _claim_next(self) -> tuple[Job, Claim] | None:
         """Takes the first waiting job that no other sweep has claimed; None if there is none."""
         for job in self._waiting:
-            own = claim(_logs(job), job.identities)
+            own = claim(job.output, job.identities)
             if own is None:
                 if job not in self._blocked:
                     self._progress.wait(job)
@@ -124,10 +125,10 @@ class Scheduler:
         self.jobs = [*others, *self._waiting]
 
     def _start(self, job: Job, own: Claim) -> None:
-        logs = _logs(job)
         seeds = "-".join(str(config.seed) for config in job.configs)
         stem = f"{job.configs[0].setup}_{job.method}_s{seeds}"
         try:
+            logs = inner_folder(job.output, "logs")
             job.log = Path(f"{free_name(logs, stem, ['.txt'])}.txt")
             handle = self._executor.submit(Task(job.arguments, job.log, own.handles))
         except OSError as error:
@@ -161,10 +162,6 @@ class Scheduler:
         self._stopping = True
         for running in self._running.values():
             self._executor.cancel(running.handle)
-
-
-def _logs(job: Job) -> Path:
-    return job.output / "logs"
 
 
 def _last_line(log: Path) -> str:

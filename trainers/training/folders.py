@@ -10,7 +10,7 @@ from emberlink.envs.utils.errors import UserError
 from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.runs.lock import Lock
 from emberlink.trainers.runs.run_folder import RunFolder
-from emberlink.trainers.runs.safe_read import LONGEST_YAML, parse_json, read_text
+from emberlink.trainers.runs.safe_read import MAX_YAML, parse_json, read_text
 
 LINES = ("metrics.jsonl", "timing.jsonl")
 """the files of a run folder that have a line for each episode"""
@@ -105,7 +105,7 @@ def find_runs(folder: Path) -> list[RunFolder]:
     try:
         if not file.exists():
             return [RunFolder(folder)]
-        names = parse_json(read_text(file, LONGEST_YAML))["folders"]
+        names = parse_json(read_text(file, MAX_YAML))["folders"]
         runs = [RunFolder(folder.resolve().parent / Path(name).name) for name in names]
         missing = [run.path for run in runs if not run.path.is_dir()]
         if folder.resolve() not in [run.path for run in runs]:

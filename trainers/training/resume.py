@@ -8,7 +8,8 @@ from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import shown
 from emberlink.trainers.config.compose import override
 from emberlink.trainers.config.schema import RunConfig
-from emberlink.trainers.runs.run_folder import RunFolder, step_of
+from emberlink.trainers.runs.checkpoints import step_of
+from emberlink.trainers.runs.run_folder import RunFolder
 from emberlink.trainers.runs.seal import MAY_CHANGE, check_same, differences
 from emberlink.trainers.training.trainer import Trainer
 

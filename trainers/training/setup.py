@@ -10,13 +10,13 @@ from torch import Tensor
 
 from emberlink.envs import keys
 from emberlink.envs.utils.errors import UserError
-from emberlink.policies.networks.actor_critic import team_of
+from emberlink.policies.networks import team_of
 from emberlink.trainers.build import build_env, build_learner
 from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.learners.nan_guard import NonFiniteGuard
 from emberlink.trainers.learners.tensors import copy_into, flatten, group, prefixed, unflatten
 from emberlink.trainers.rollout.allocator import keep_freed_memory
-from emberlink.trainers.rollout.collector import StepCollector
+from emberlink.trainers.rollout.collector import make_collector
 
 from .episode import EpisodeRecord
 
@@ -54,7 +54,7 @@ class TrainingSetup:
                 f"env.horizon={self.horizon}: must be a multiple of the "
                 f"{self.learner.rollout_steps} steps that the learner takes at once"
             )
-        self.collector = StepCollector(
+        self.collector = make_collector(
             self.env,
             self.learner.explorer,
             horizon=self.horizon,

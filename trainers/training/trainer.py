@@ -123,6 +123,7 @@ class Trainer:
                     note = self.roll_back(error)
                 report(self._progress(note=note))
         finally:
+            self.setup.collector.shutdown()
             if not hold:
                 self.close()
 

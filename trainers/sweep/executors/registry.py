@@ -10,7 +10,7 @@ from emberlink.envs.utils.validation import from_plain
 from .base import Executor
 
 _REGISTRY = Registry(
-    Executor, "emberlink.trainers.sweep.executors", "emberlink.executors", "executor"
+    Executor, "emberlink.trainers.sweep.executors", "executor", group="emberlink.executors"
 )
 known = _REGISTRY.known
 

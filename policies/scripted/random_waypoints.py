@@ -1,33 +1,14 @@
-"""Scripted policies that look at nothing but where they are."""
+"""A scripted policy that flies to random points."""
 
 import torch
 from tensordict import TensorDictBase
 
 from emberlink.envs import keys
-from emberlink.envs.utils import counter_rng
 from emberlink.envs.utils.counter_rng import Use
 from emberlink.envs.wildfire import WildfireEnv
 from emberlink.envs.world import motion
 
 from .base import Scripted
-
-
-class Stationary(Scripted):
-    """Stays where it was put."""
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        return tensordict.set(keys.ACTION, torch.zeros_like(tensordict.get(keys.POSITION)))
-
-
-class RandomActions(Scripted):
-    """Every component of every action uniform in [-1, 1]."""
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        shape = tensordict.get(keys.POSITION).shape
-        unit = counter_rng.uniform(
-            self.step_key(tensordict, Use.SCRIPTED_ACTION), shape[-2] * shape[-1]
-        )
-        return tensordict.set(keys.ACTION, (2 * unit - 1).view(shape))
 
 
 class RandomWaypoints(Scripted):

@@ -1,0 +1,170 @@
+"""What every learner must do, with every method, observation and sharing of weights."""
+
+import json
+from importlib.metadata import EntryPoint
+
+import pytest
+import torch
+from test_recipes import METHODS
+
+from emberlink.envs.utils import plugins
+from emberlink.envs.utils.errors import UserError
+from emberlink.trainers.cli import main
+from emberlink.trainers.config.compose import from_values, resolve, to_values
+from emberlink.trainers.learners import registry
+from emberlink.trainers.learners.ddpg import DDPG
+from emberlink.trainers.learners.td3 import TD3
+from emberlink.trainers.training.setup import TrainingSetup
+from emberlink.trainers.training.trainer import Trainer
+
+SMALL = [
+    *("env.horizon=15", "env.num_uavs=3", "num_envs=2", "episodes=2", "learner.batch_size=8"),
+    *("learner.hidden=[8,8]", "evaluation.interval=0", "evaluation.episodes=1"),
+]
+LEARNERS = ["ddpg", "td3"]
+
+
+def made(learner: str, *more: str, method: str = "consensus") -> TrainingSetup:
+    return TrainingSetup(resolve(method, [f"learner={learner}", *SMALL, *more]))
+
+
+def test_the_files_are_the_learners():
+    assert registry.known() == LEARNERS
+    assert [registry.find(name) for name in LEARNERS] == [DDPG, TD3]
+    with pytest.raises(UserError, match=r"'sac' is not known; known: ddpg, td3"):
+        registry.find("sac")
+
+
+@pytest.mark.parametrize("learner", LEARNERS)
+@pytest.mark.parametrize("method", METHODS)
+def test_a_short_run_learns_and_evaluates(method, learner, tmp_path, capsys):
+    arguments = ["train", method, f"learner={learner}", *SMALL, f"output={tmp_path}"]
+    assert main.main(arguments) == 0
+    (run,) = tmp_path.iterdir()
+    lines = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
+    assert len(lines) == 2
+    assert lines[-1].keys() >= {"loss_actor", "loss_critic", "coverage"}
+    before = json.loads((run / "eval.json").read_text())["results"]
+    assert main.main(["eval", str(run)]) == 0
+    assert json.loads((run / "eval.json").read_text())["results"] == before
+    capsys.readouterr()
+
+
+@pytest.mark.parametrize("learner", LEARNERS)
+@pytest.mark.parametrize("more", [[], ["env.observation=window"], ["seeds=[1,2]"]])
+def test_all_uavs_of_a_seed_share_their_weights(learner, more, tmp_path):
+    """Trained, stopped and resumed; the weights move, and each seed has its own."""
+    settings = [f"learner={learner}", *SMALL, "learner.share_parameters=true", *more]
+    config = resolve("consensus", [*settings, f"output={tmp_path}"])
+    trainer = Trainer(config)
+    initial = {name: w.clone() for name, w in trainer.setup.learner.weights().items()}
+    trainer.start()
+    assert trainer.train()
+    name = "actor_network_params.module.second.weight"
+    weights = trainer.setup.learner.weights()
+    assert weights[name].shape[0] == 1
+    assert not weights[name].equal(initial[name])
+    state = trainer.setup.state_dict()
+    again = TrainingSetup(config)
+    again.load_state_dict({key: value.clone() for key, value in state.items()}, 30)
+    for key, value in again.state_dict().items():
+        assert value.numpy().tobytes() == state[key].numpy().tobytes(), key
+
+
+@pytest.mark.parametrize("learner", LEARNERS)
+def test_a_configuration_keeps_its_learner(learner):
+    config = resolve("consensus", [f"learner={learner}", "learner.gamma=0.5"])
+    assert type(config.learner) is registry.find(learner).config_type
+    assert config.learner.gamma == 0.5
+    assert from_values(to_values(config)) == config
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"hidden": [8, 8]}, "learner.name is missing; known: ddpg, td3"),
+        ({"name": "sac"}, "learner.name='sac' is not known; known: ddpg, td3"),
+        ({"policy_delay": 3}, "key 'learner.policy_delay' is not known"),
+        ({"gamma": 2.0}, "learner.gamma=2.0: should be less than 1"),
+    ],
+)
+def test_wrong_settings_of_a_learner(values, message):
+    plain = to_values(resolve("consensus"))
+    learner = values if "hidden" in values else {**plain["learner"], **values}
+    with pytest.raises(UserError) as error:
+        from_values({**plain, "learner": learner})
+    assert str(error.value).startswith(message)
+
+
+def test_another_package_can_add_a_learner(monkeypatch):
+    group = "emberlink.learners"
+    point = EntryPoint("mine", "emberlink.trainers.learners.td3:TD3", group)
+    monkeypatch.setattr(plugins, "registered", lambda of: {"mine": point} if of == group else {})
+    assert registry.known() == ["ddpg", "mine", "td3"]
+    assert registry.find("mine") is TD3
+
+
+def test_td3_delays_the_actors_and_all_targets():
+    setup = made("td3", "learner.policy_delay=3")
+    learner = setup.learner
+    rollouts = iter(setup.collector)
+    moved = []
+    while learner.updates < 7:
+        before = {name: value.clone() for name, value in learner.weights().items()}
+        updates = learner.updates
+        setup.learn(next(rollouts))
+        if learner.updates > updates:
+            after = learner.weights()
+            changed = {name for name, value in after.items() if not value.equal(before[name])}
+            assert any(name.startswith("qvalue") for name in changed)
+            moved.append({name.partition("_network")[0] for name in changed})
+    critics = {"qvalue"}
+    every = {"actor", "qvalue", "target_actor", "target_qvalue"}
+    assert moved == [critics, critics, every, critics, critics, every, critics]
+
+
+def test_td3s_target_noise_is_clipped_and_of_each_seed():
+    """The noise of a seed is the same in a stack and alone, whatever the global generator."""
+    options = "learner.target_noise=0.4", "learner.target_noise_clip=0.5", "learner.batch_size=512"
+    key = "next", "agents", "target_noise"
+    noise = {}
+    for seeds in ("seeds=[3,4]", "seeds=[4]"):
+        torch.manual_seed(len(seeds))
+        setup = made("td3", *options, seeds)
+        setup.learner.replay.extend(next(iter(setup.collector)))
+        noise[seeds] = setup.learner.sample()[key]
+    stacked, alone = noise["seeds=[3,4]"], noise["seeds=[4]"]
+    assert stacked.shape == (512, 6, 3)
+    assert stacked[:, 3:].equal(alone)
+    assert stacked.abs().max() == 0.5
+    inner = stacked[stacked.abs() < 0.5]
+    assert inner.std().item() == pytest.approx(0.27, abs=0.02)  # of N(0, 0.4) within 0.5
+    assert not stacked[:, :3].equal(alone)
+
+
+def test_td3s_target_is_the_lower_of_two_critics_at_the_smoothed_action():
+    setup = made("td3", "learner.gamma=0.5")
+    learner = setup.learner
+    setup.dry_run(12)
+    batch = learner.sample()
+    rows, loss = len(batch), learner.loss
+    following = batch["next", "agents"]
+    with torch.no_grad():
+        with loss.target_actor_network_params.to_module(loss.actor_network):
+            network = loss.actor_network.actor.module
+            action = (network(following["observation"]) + following["target_noise"]).clamp(-1, 1)
+        values = []
+        for params in (loss.target_qvalue_network_params, loss.qvalue_network_params):
+            for k in range(2):
+                with params[k].to_module(loss.qvalue_network):
+                    critic = loss.qvalue_network.module
+                    agents = batch["agents"]
+                    given = (following["observation"], action)
+                    if params is loss.qvalue_network_params:
+                        given = agents["observation"], agents["action"]
+                    values.append(critic(*given))
+        target = following["reward"] + 0.5 * torch.minimum(values[0], values[1])
+        wanted = sum((value - target).square() for value in values[2:])
+    found = learner.losses(batch)["critic"].detach()
+    assert rows == 8
+    torch.testing.assert_close(found, wanted.mean(0)[:, 0], rtol=1e-4, atol=1e-4)

@@ -1,0 +1,102 @@
+"""Communication and scripted policies of other packages, and state that is saved with a run."""
+
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from test_resume import SMALL, assert_same, stopped_at, until
+
+from emberlink.comm import registry
+from emberlink.envs.utils.errors import UserError
+from emberlink.policies.scripted.registry import SCRIPTED
+from emberlink.trainers.config.compose import resolve
+from emberlink.trainers.training.resume import resume
+from emberlink.trainers.training.trainer import Trainer
+
+STILL = """
+from emberlink.policies.scripted.base import Scripted
+from emberlink.policies.scripted.stationary import Stationary
+
+
+class Still(Stationary):
+    pass
+"""
+POINTS = """
+[emberlink.comm]
+visited_map = visited_map:VisitedMap
+broken = broken_on_import:Module
+number = still:STILL
+
+[emberlink.scripted]
+still = still:Still
+"""
+
+
+@pytest.fixture
+def installed(tmp_path, monkeypatch):
+    """A package in a folder of its own on the path, with what pip writes beside it."""
+    (tmp_path / "still.py").write_text(STILL + "\nSTILL = 3\n")
+    (tmp_path / "broken_on_import.py").write_text("raise RuntimeError('no such\\nsensor')\n")
+    about = tmp_path / "guests-1.0.dist-info"
+    about.mkdir()
+    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: guests\nVersion: 1.0\n")
+    (about / "entry_points.txt").write_text(POINTS)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    yield tmp_path
+    for name in ("still", "broken_on_import"):
+        sys.modules.pop(name, None)
+
+
+def test_files_of_the_folder_and_other_packages_are_known(installed):
+    folder = Path(sys.modules["emberlink.policies.scripted.registry"].__file__).parent
+    files = {file.stem for file in folder.glob("[!_]*.py")} - {"base", "registry"}
+    assert [*SCRIPTED][-1] == "still"
+    assert {*SCRIPTED} == {*files, "still"}
+    assert len(SCRIPTED) == len(files) + 1
+    assert SCRIPTED["still"].__name__ == "Still"
+    assert {"broken", "visited_map", "consensus"} <= {*registry.known()}
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("broken", "cannot be imported: RuntimeError: no such sensor"),
+        ("number", "not a subclass of CommModule"),
+    ],
+)
+def test_a_broken_package_is_named_in_one_line(installed, name, message):
+    with pytest.raises(UserError, match=r"^package guests: entry point ") as error:
+        registry.find(name)
+    assert message in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_a_map_of_another_package_is_restored_bit_for_bit(installed, tmp_path):
+    given = {"name": "visited_map", "range": 8.0, "loss": 0.1}
+
+    def begin() -> Trainer:
+        settings = [*SMALL, f"output={tmp_path / 'runs'}"]
+        trainer = Trainer(resolve("shared_memory", settings, comm=given))
+        trainer.start()
+        return trainer
+
+    whole = until(begin(), None)
+    stopped = until(begin(), 27)
+    saved = stopped.setup.env.transform.state_dict()["module.map"]
+    assert torch.count_nonzero(saved) > 0
+    assert_same(whole, until(resume(stopped.run.path), None))
+
+
+@pytest.mark.parametrize("shared", [False, True])
+def test_consensus_on_windows_trains_and_resumes(shared, tmp_path):
+    more = ["env.observation=window", f"learner.share_parameters={shared}", "episodes=2"]
+    trainer = Trainer(resolve("consensus", [*SMALL, *more, f"output={tmp_path}"]))
+    trainer.start()
+    before = [weight.detach().clone() for weight in trainer.setup.learner.actor.parameters()]
+    until(trainer, None)
+    weights = list(trainer.setup.learner.actor.parameters())
+    assert {len(weight) for weight in weights} == {1 if shared else 2}
+    assert weights[0].shape[1:] == (16, 3, 3, 3)
+    assert not any(one.equal(other) for one, other in zip(before, weights, strict=True))
+    assert_same(trainer, stopped_at([27], "consensus", tmp_path, *more))

@@ -1,0 +1,101 @@
+"""Draws the pictures of a section of the report."""
+
+import re
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+from emberlink.trainers.evaluation import evaluate
+from emberlink.trainers.evaluation.actor import load_actor
+from emberlink.trainers.evaluation.plots import timelapse
+
+from . import plots
+from .page import Chapter, Picture
+from .rankings import Numbers
+from .runs import newest_checkpoint
+
+FRAMES = 5
+"""frames of a timelapse"""
+
+
+def draw(
+    folder: Path, place: int, numbers: Numbers, notes: list[str], say: Callable[[str], None]
+) -> Chapter:
+    """Draws the figures and timelapses of a section.
+
+    Args:
+        folder: of the report; the files are written there.
+        place: number of the section, with which the names of the files begin.
+        numbers: the section's numbers.
+        notes: gets a note for each method that has no timelapse.
+        say: called with a line before each picture.
+    """
+    stem = f"{place}_{_in_a_file_name(numbers.section.runs[0].config.setup)}"
+    say(f"figures of {numbers.section.label}")
+    frozen: list[Picture] = []
+    for number, fire in enumerate(numbers.fires, 1):
+        path = folder / f"{stem}_frozen_{number}_{_in_a_file_name(fire)}.png"
+        plots.frozen(path, numbers, fire)
+        frozen.append(Picture(path, _frozen_caption(numbers, fire)))
+    pictures: list[Picture] = []
+    for number, (measures, caption) in plots.FIGURES.items():
+        path = folder / f"{stem}_figure_{number}.png"
+        plots.figure(path, numbers, measures)
+        pictures.append(Picture(path, _caption(numbers, number, caption)))
+    films = list(_timelapses(folder, stem, numbers, notes, say))
+    return Chapter(numbers, frozen, pictures, films)
+
+
+def _in_a_file_name(name: str) -> str:
+    return re.sub(r"[^A-Za-z0-9]+", "_", name)[:40]
+
+
+def _frozen_caption(numbers: Numbers, fire: str) -> str:
+    count = numbers.section.runs[0].evaluation.fires
+    return (
+        f"Frozen policies on {count} held-out fires of {fire}. Small dots: a run's mean over its "
+        "episodes, one a seed. Large dot: interquartile mean over seeds; line: 95 % bootstrap "
+        "interval over seeds, none with one seed. Dashed: scripted policies, in the rows of the "
+        "methods whose number it is. The first UAV's step and exits on a logarithmic scale, linear "
+        "near 0."
+    )
+
+
+def _caption(numbers: Numbers, number: int, what: str) -> str:
+    section = numbers.section
+    seeds = ", ".join(f"{group.label} {len(group.runs)}" for group in section.as_trained)
+    text = (
+        f"The paper's figure {number}. {what} The exploring policy in each episode of training, "
+        "mean over the environments side by side. Line: interquartile mean over seeds; band: 95 % "
+        f"bootstrap interval over seeds, none with one seed (seeds: {seeds})."
+    )
+    if numbers.on_trained:
+        text += (
+            " Dashed: scripted policies, mean over the frozen evaluation's "
+            f"{section.runs[0].evaluation.fires} episodes on {section.trained_on}, the fire "
+            "trained on; in a method's colour where the number is that method's alone."
+        )
+    return text
+
+
+def _timelapses(
+    folder: Path, stem: str, numbers: Numbers, notes: list[str], say: Callable[[str], None]
+) -> Iterator[Picture]:
+    """Draws one episode of the first seed of each method as a row of frames."""
+    for place, group in enumerate(numbers.section.as_trained, 1):
+        run = group.runs[0]
+        newest = newest_checkpoint(run.path)
+        if newest is None:
+            notes.append(f"{run.path}: has no checkpoint, so there is no timelapse of it")
+            continue
+        say(f"timelapse of {group.label}")
+        actor = load_actor(run.config, newest)
+        fire, arrival = evaluate.shown_fire(run.config)
+        pictures, steps = evaluate.film(run.config, actor, fire=arrival, frames=FRAMES)
+        path = folder / f"{stem}_timelapse_{place}.png"
+        timelapse(path, pictures, steps, group.label)
+        yield Picture(
+            path,
+            f"{group.label}, seed {run.config.seed}: the frozen policy of {newest.name} on the "
+            f"first held-out fire of {fire}, from the same start positions as every other method. "
+            "Fire white, field of view yellow, UAVs blue.",
+        )

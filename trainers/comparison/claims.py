@@ -1,0 +1,106 @@
+"""The claims of the paper, and whether the runs support them."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+
+from emberlink.envs import metrics
+from emberlink.trainers.evaluation.results import LEARNED
+
+from . import bootstrap
+from .bootstrap import Interval
+from .groups import Group, Section
+
+
+@dataclass(frozen=True)
+class Claim:
+    """A method is better than the best other method by a factor."""
+
+    method: str
+    measure: str
+    factor: float
+    text: str
+
+
+CLAIMS = (
+    Claim("consensus", "coverage", 1.3, "1.3 times the coverage"),
+    Claim("consensus", "tracking_first", 1.4, "1.4 times faster tracking"),
+    Claim("consensus", "tracking_last", 1.4, "1.4 times faster tracking, by the slowest UAV"),
+    Claim("consensus", "boundary_exits", 2.0, "half the boundary exits"),
+)
+"""the paper, sections V and VI: method 4 against the next best"""
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """The result of a claim on one fire.
+
+    Attributes:
+        fire: the fire of the evaluation.
+        method: label of the group that the claim is about.
+        claim: the claim in words.
+        measure: its measure.
+        factor: the factor claimed.
+        best_other: label of the best other group.
+        ratio: ratio of the IQMs, above 1 where the method is better; infinite for a ratio to 0.
+        interval: of the ratio; None with one seed.
+        verdict: "holds", "does not hold" or "undecided".
+        fewest_seeds: number of seeds of the group that has the fewest.
+    """
+
+    fire: str
+    method: str
+    claim: str
+    measure: str
+    factor: float
+    best_other: str
+    ratio: float
+    interval: Interval | None
+    verdict: str
+    fewest_seeds: int
+
+
+def verdicts(section: Section, fires: Sequence[str]) -> list[Verdict]:
+    """Returns the verdict of each claim on each fire, for each group that the claim is about."""
+    return [
+        _verdict(group, others, fire, claim)
+        for fire in fires
+        for claim in CLAIMS
+        for group in section.as_trained
+        if group.method == claim.method
+        and (others := [other for other in section.as_trained if other.method != group.method])
+    ]
+
+
+def _verdict(group: Group, others: Sequence[Group], fire: str, claim: Claim) -> Verdict:
+    higher = claim.measure in metrics.HIGHER_IS_BETTER
+    samples = [
+        [run.mean(fire, LEARNED, claim.measure) for run in one.runs] for one in (group, *others)
+    ]
+    share = partial(bootstrap.iqm_ratio_share, higher=higher)
+    shares = bootstrap.interval(share, *samples)
+    ratios = shares and (bootstrap.as_ratio(shares[0]), bootstrap.as_ratio(shares[1]))
+    means = [float(bootstrap.iqm(np.asarray(sample))) for sample in samples[1:]]
+    best = means.index(max(means) if higher else min(means))
+    return Verdict(
+        fire=fire,
+        method=group.label,
+        claim=claim.text,
+        measure=claim.measure,
+        factor=claim.factor,
+        best_other=others[best].label,
+        ratio=bootstrap.as_ratio(float(share(*map(np.asarray, samples)))),
+        interval=ratios,
+        verdict=_decision(ratios, claim.factor),
+        fewest_seeds=min(map(len, samples)),
+    )
+
+
+def _decision(interval: Interval | None, factor: float) -> str:
+    if interval is not None and interval[0] >= factor:
+        return "holds"
+    if interval is not None and interval[1] < factor:
+        return "does not hold"
+    return "undecided"

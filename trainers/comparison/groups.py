@@ -1,0 +1,246 @@
+"""Groups runs by setup, fire and method, and names the groups."""
+
+import json
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from emberlink.envs.utils.errors import UserError
+from emberlink.trainers.config.compose import flat, resolve, to_values
+from emberlink.trainers.config.schema import NOT_LEARNT_WITH, RunConfig
+
+from .runs import Run
+
+NOT_COMPARED = ("seed", "seeds", "output", "evaluation", *NOT_LEARNT_WITH)
+"""first parts of the keys in which the runs of a group may differ: none changes the training"""
+NOT_NOTED = ("seed", "seeds", "output", "baseline_comm")
+"""those of them whose differences are not noted"""
+_OF_SECTION = ("env.horizon", "env.grid")
+"""settings of the environment that the runs of a section have in common, beside the fire's"""
+
+
+@dataclass(frozen=True)
+class Group:
+    """Runs that differ in nothing but the seed.
+
+    Attributes:
+        label: the method, and the settings that tell it from other groups of the method.
+        runs: by seed, each seed once.
+    """
+
+    label: str
+    runs: tuple[Run, ...]
+
+    @property
+    def as_trained(self) -> bool:
+        """Whether the runs were evaluated with the settings of their training."""
+        return not self.runs[0].evaluated_with
+
+    @property
+    def method(self) -> str:
+        """The recipe."""
+        return self.runs[0].config.method
+
+    @property
+    def seeds(self) -> list[int]:
+        """The training seeds."""
+        return [run.config.seed for run in self.runs]
+
+
+@dataclass(frozen=True)
+class Section:
+    """The groups of one setup that were trained on the same fire and evaluated alike.
+
+    Attributes:
+        label: the setup, the fire, and the settings that tell it from other sections of these.
+        groups: by label.
+    """
+
+    label: str
+    groups: tuple[Group, ...]
+
+    @property
+    def as_trained(self) -> list[Group]:
+        """The groups that were evaluated with the settings of their training."""
+        return [group for group in self.groups if group.as_trained]
+
+    @property
+    def runs(self) -> list[Run]:
+        """The runs of all groups."""
+        return [run for group in self.groups for run in group.runs]
+
+    @property
+    def trained_on(self) -> str:
+        """The name in the evaluation of the fire trained on; empty if it was not evaluated."""
+        run = self.runs[0]
+        name = run.config.fire.name
+        fires = run.evaluation.results
+        return next((fire for fire in (f"{name}_as_trained", name) if fire in fires), "")
+
+
+def gather(runs: Sequence[Run]) -> tuple[list[Section], list[str]]:
+    """Groups runs by setup and fire trained on, and within these by method.
+
+    Runs with another horizon, grid, number of held-out fires or start positions are in a section of
+    their own. Of several runs with the same seed in a group, the last by name is taken.
+
+    Returns:
+        The sections by label, and notes about differences between runs.
+
+    Raises:
+        UserError: runs of a section were evaluated on different fires.
+    """
+    runs = sorted(runs, key=lambda run: (run.config.seed, run.path.name, run.path))
+    parts = _split(runs, _section_key)
+    names = [_section_name(part[0], [other[0] for other in parts]) for part in parts]
+    notes: list[str] = []
+    sections: list[Section] = []
+    for name, part in sorted(zip(names, parts, strict=True), key=lambda pair: pair[0]):
+        groups = _groups(name, part, notes)
+        _check_same_fires(name, part)
+        sections.append(Section(name, tuple(groups)))
+    return sections, notes
+
+
+def _section_key(run: Run) -> list[Any]:
+    fire = to_values(run.config)["fire"]
+    shared = [run.settings[key] for key in _OF_SECTION]
+    return [run.config.setup, fire, shared, run.evaluation.fires, run.evaluation.start_seed]
+
+
+def _section_name(run: Run, firsts: Sequence[Run]) -> str:
+    """Returns the name of a run's section.
+
+    Args:
+        run: a run of the section.
+        firsts: a run of each section.
+    """
+    setup, fire = run.config.setup, run.config.fire.name
+    alike = [r for r in firsts if (r.config.setup, r.config.fire.name) == (setup, fire)]
+    name = f"setup {setup}, trained on {fire}"
+    name += _settings_apart(run, alike, lambda k: k.startswith("fire.") or k in _OF_SECTION)
+    if len({other.evaluation.fires for other in alike}) > 1:
+        name += f", {run.evaluation.fires} held-out fires"
+    if len({other.evaluation.start_seed for other in alike}) > 1:
+        name += f", start_seed {run.evaluation.start_seed}"
+    return name
+
+
+def _groups(section: str, runs: Sequence[Run], notes: list[str]) -> list[Group]:
+    """Returns the groups of a section by label, and notes what is left out or differs."""
+    parts = _split(runs, lambda run: [run.config.method, _trained_with(run), run.evaluated_with])
+    names = [_group_name(part[0], [other[0] for other in parts]) for part in parts]
+    groups = [
+        Group(name, _one_run_per_seed(f"{section}, {name}", part, notes))
+        for name, part in sorted(zip(names, parts, strict=True), key=lambda pair: pair[0])
+    ]
+    for group in groups:
+        keys = [key for key in _differing(group.runs) if _first_part(key) not in NOT_NOTED]
+        if keys:
+            notes.append(
+                f"{section}, {group.label}: taken together though {', '.join(keys)} differ"
+            )
+    for key in _differing([group.runs[0] for group in groups]):
+        if _first_part(key) not in ("method", "replay", "comm", *NOT_COMPARED):
+            values = ", ".join(f"{g.label} {g.runs[0].settings.get(key)}" for g in groups)
+            notes.append(f"{section}: not all methods have the same {key}: {values}")
+    return groups
+
+
+def _group_name(run: Run, firsts: Sequence[Run]) -> str:
+    """Returns the name of a run's group, given a run of each group of the section."""
+    alike = [other for other in firsts if other.config.method == run.config.method]
+    apart = (*NOT_COMPARED, "method")
+    name = run.config.method + _settings_apart(run, alike, lambda k: _first_part(k) not in apart)
+    changed = (f", evaluated with {_typed(*item)}" for item in run.evaluated_with.items())
+    return name + "".join(changed)
+
+
+def _one_run_per_seed(label: str, runs: Sequence[Run], notes: list[str]) -> tuple[Run, ...]:
+    """Returns the last run of each seed by seed, and notes those that are left out."""
+    by_seed = {run.config.seed: run for run in runs}
+    for run in runs:
+        taken = by_seed[run.config.seed]
+        if run is not taken:
+            notes.append(
+                f"{label}: seed {run.config.seed} was trained twice; "
+                f"{taken.path} is taken, {run.path} is left out"
+            )
+    return tuple(by_seed[seed] for seed in sorted(by_seed))
+
+
+def _trained_with(run: Run) -> dict[str, Any]:
+    """Returns the settings on which a training depends, but for the seed."""
+    return {k: v for k, v in run.settings.items() if _first_part(k) not in NOT_COMPARED}
+
+
+def _split(runs: Iterable[Run], key: Callable[[Run], Any]) -> list[list[Run]]:
+    """Returns lists of the runs with equal keys, in order of the first run of each."""
+    parts: dict[str, list[Run]] = {}
+    for run in runs:
+        parts.setdefault(json.dumps(key(run), sort_keys=True), []).append(run)
+    return list(parts.values())
+
+
+def _settings_apart(run: Run, others: Sequence[Run], counts: Callable[[str], bool]) -> str:
+    """Returns the settings that tell a run from others of the same name, in brackets.
+
+    Settings that are as in the run's recipe are left out; without any, the text is empty.
+
+    Args:
+        run: the run to name.
+        others: all runs of that name, itself included.
+        counts: whether a key may be part of the name.
+    """
+    keys = [key for key in _differing(others) if counts(key)]
+    recipe = _recipe(run.config) if keys else {}
+    apart = [
+        _typed(key, run.settings.get(key))
+        for key in keys
+        if key not in recipe or run.settings.get(key) != recipe[key]
+    ]
+    return f" ({', '.join(apart)})" if apart else ""
+
+
+def _typed(key: str, value: Any) -> str:
+    """Returns a setting as it is typed on the command line."""
+    words = {None: "null", True: "true", False: "false"}
+    return f"{key}={words[value] if value is None or isinstance(value, bool) else value}"
+
+
+def _recipe(config: RunConfig) -> dict[str, Any]:
+    """Returns the settings of a run's recipe by dotted key; none if it is not installed."""
+    try:
+        choices = [f"setup={config.setup}", f"fire={config.fire.name}"]
+        return flat(to_values(resolve(config.method, choices)))
+    except UserError:
+        return {}
+
+
+def _differing(runs: Sequence[Run]) -> list[str]:
+    """Returns the keys that do not have the same value in all runs."""
+    keys = dict.fromkeys(key for run in runs for key in run.settings)
+    return [key for key in keys if len({repr(run.settings.get(key)) for run in runs}) > 1]
+
+
+def _first_part(key: str) -> str:
+    return key.split(".")[0]
+
+
+def _check_same_fires(section: str, runs: Sequence[Run]) -> None:
+    """Checks that all runs of a section were evaluated on the same fires."""
+    first = runs[0]
+    fires = sorted(first.evaluation.results)
+    for run in runs:
+        if sorted(run.evaluation.results) != fires:
+            raise UserError(
+                f"{section}: {first.path} was evaluated on {', '.join(fires)}, "
+                f"{run.path} on {', '.join(sorted(run.evaluation.results))}; "
+                "evaluate them alike (emberlink eval RUN)"
+            )
+        for fire in fires:
+            if run.evaluation.held_out.get(fire) != first.evaluation.held_out.get(fire):
+                raise UserError(
+                    f"{section}: {first.path} and {run.path} were not evaluated on the same fires "
+                    f"of {fire} (held_out in eval.json); evaluate them alike (emberlink eval RUN)"
+                )

@@ -1,0 +1,117 @@
+"""The numbers of scripted policies, which have no training seeds."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from emberlink.policies.scripted.registry import SCRIPTED
+from emberlink.trainers.evaluation.results import LEARNED
+
+from .groups import Section
+
+TOLERANCE = 1e-5
+"""share by which a scripted policy's numbers on the same fires may differ between devices"""
+REWARD = "mean_reward"
+"""the measure that depends on a method's own reward"""
+
+
+@dataclass(frozen=True)
+class Scripted:
+    """A number of a scripted policy.
+
+    Attributes:
+        methods: the groups whose number it is; empty where it is the same for all.
+        value: the mean over episodes.
+    """
+
+    methods: list[str]
+    value: float
+
+
+def scripted(
+    section: Section, fire: str, measure: str, notes: list[str]
+) -> dict[str, list[Scripted]]:
+    """Returns each scripted policy's mean over episodes, one for each group where they differ.
+
+    Args:
+        section: the groups.
+        fire: the fire of the evaluation.
+        measure: one of `metrics.NAMES`.
+        notes: gets a note where numbers differ that should not.
+    """
+    policies = dict.fromkeys(p for run in section.runs for p in run.evaluation.results[fire])
+    found: dict[str, list[Scripted]] = {}
+    for policy in sorted(policies.keys() - {LEARNED}):
+        values = _values(section, fire, measure, policy)
+        everyone = [value for own in values.values() for value in own]
+        if len(everyone) < len(section.runs):
+            notes.append(
+                f"{section.label}: {policy} was played for {len(everyone)} of the runs only"
+            )
+        may_differ = measure == REWARD or _hears_messages(section, policy)
+        for own in values.values() if may_differ else [everyone]:
+            if own and not _same(own):
+                notes.append(
+                    f"{section.label}: {policy} does not have the same {measure} on {fire} in all "
+                    f"runs ({min(own):.6g} to {max(own):.6g}): they were not evaluated on the same "
+                    "fires and starts, or with another version"
+                )
+        found[policy] = _by_methods({label: own[0] for label, own in values.items() if own})
+    return found
+
+
+def different_rewards(section: Section, fire: str) -> str:
+    """Returns why the groups' rewards cannot be compared, or an empty text if they can.
+
+    They cannot if the reward's settings differ, or if a scripted policy, which acts the same
+    whatever the reward is, earns differently with them.
+    """
+    rewards = [
+        {k: v for k, v in group.runs[0].settings.items() if k.startswith("env.reward.")}
+        for group in section.groups
+    ]
+    for key in rewards[0]:
+        if any(reward.get(key) != rewards[0][key] for reward in rewards):
+            return f"the methods' rewards differ in {key}"
+    policies = set.intersection(*(set(run.evaluation.results[fire]) for run in section.runs))
+    for policy in sorted(policies - {LEARNED}):
+        if not _hears_messages(section, policy):
+            values = _values(section, fire, REWARD, policy)
+            if not _same([own[0] for own in values.values()]):
+                return f"the methods' rewards differ: {policy} earns differently with them"
+    return ""
+
+
+def _values(section: Section, fire: str, measure: str, policy: str) -> dict[str, list[float]]:
+    """Returns a policy's mean over episodes in each run that has it, by group."""
+    return {
+        group.label: [
+            run.mean(fire, policy, measure)
+            for run in group.runs
+            if policy in run.evaluation.results[fire]
+        ]
+        for group in section.groups
+    }
+
+
+def _hears_messages(section: Section, policy: str) -> bool:
+    """Returns whether a policy acts on messages that are not the same for all groups."""
+    if policy not in SCRIPTED or SCRIPTED[policy].recipe is None:
+        return False
+    settings = [run.evaluation.communication.get(policy) for run in section.runs]
+    return any(one != settings[0] for one in settings)
+
+
+def _by_methods(values: Mapping[str, float]) -> list[Scripted]:
+    """Returns the numbers of several groups, equal ones once."""
+    different: list[Scripted] = []
+    for method, value in values.items():
+        same = next((one for one in different if _same([value, one.value])), None)
+        if same is None:
+            different.append(Scripted([method], value))
+        else:
+            same.methods.append(method)
+    return different if len(different) > 1 else [Scripted([], one.value) for one in different]
+
+
+def _same(values: Sequence[float]) -> bool:
+    return max(values) - min(values) <= TOLERANCE * max(1.0, *map(abs, values))

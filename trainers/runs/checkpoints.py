@@ -1,0 +1,175 @@
+"""Finds, writes and removes the checkpoints of a run folder."""
+
+import re
+from collections.abc import Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from torch import Tensor
+
+from emberlink.envs.utils import atomic_io
+from emberlink.envs.utils.errors import UserError
+from emberlink.trainers.config.compose import to_values
+from emberlink.trainers.config.schema import RunConfig
+
+from . import checkpoint_file
+
+_NUMBERED = re.compile(r"(state|step)_\d{9,18}\.safetensors")
+_PARTIAL = ("*.safetensors.[0-9]*.part", ".tmp*")  # safetensors' own names begin with .tmp
+
+
+class Checkpoints:
+    """The checkpoints of a run: networks (`step_N`), resumable states (`state_N`) and `best`.
+
+    Files with other names, such as a user's copy `step_mine.safetensors`, are not the run's.
+
+    Args:
+        path: the run folder.
+    """
+
+    def __init__(self, path: Path | str):
+        self.path = Path(path)
+
+    @property
+    def checkpoints(self) -> Path:
+        """The folder of the checkpoints."""
+        return self.path / "checkpoints"
+
+    def own_checkpoints(self) -> Path:
+        """Creates the folder of the checkpoints if it is missing, and returns it.
+
+        Raises:
+            UserError: it is a link or not a folder, or cannot be created.
+        """
+        try:
+            return atomic_io.inner_folder(self.path, "checkpoints")
+        except OSError as error:
+            raise UserError(f"{self.checkpoints}: cannot be written: {error.strerror}") from None
+
+    def save(self, weights: Mapping[str, Tensor], config: RunConfig, step: int) -> Path:
+        """Writes the networks after a step, and returns the file.
+
+        Raises:
+            UserError: it cannot be written.
+        """
+        path = self.own_checkpoints() / f"step_{step:09d}.safetensors"
+        checkpoint_file.write(path, weights, _network_header(config, step))
+        return path
+
+    def save_best(self, weights: Mapping[str, Tensor], config: RunConfig, step: int) -> None:
+        """Writes networks to best.safetensors, in place of the earlier ones.
+
+        Raises:
+            UserError: it cannot be written.
+        """
+        path = self.own_checkpoints() / "best.safetensors"
+        checkpoint_file.write(path, weights, _network_header(config, step))
+
+    def state(self, step: int) -> Path:
+        """Returns the path of the state after a step."""
+        return self.own_checkpoints() / f"state_{step:09d}.safetensors"
+
+    def states(self) -> list[Path]:
+        """Returns the states that a run can be resumed from, oldest first."""
+        return self._numbered("state")
+
+    def networks(self) -> list[Path]:
+        """Returns the checkpoints' networks, oldest first."""
+        return self._numbered("step")
+
+    def checkpoint(self) -> Path:
+        """Returns the newest checkpoint's networks.
+
+        Raises:
+            UserError: there is no checkpoint.
+        """
+        networks = self.networks()
+        if not networks:
+            raise UserError(f"{self.path}: holds no checkpoint (checkpoints/*.safetensors)")
+        return networks[-1]
+
+    def rotate(self, keep: int, states: int) -> None:
+        """Removes all but the newest `keep` networks and `states` states."""
+        self.own_checkpoints()
+        for path in self.networks()[:-keep] + self.states()[:-states]:
+            atomic_io.remove(path)
+
+    def checkpoints_after(self, step: int) -> list[Path]:
+        """Returns the networks and states of later steps."""
+        return [path for path in self.networks() + self.states() if step_of(path) > step]
+
+    def partial_checkpoints(self) -> list[Path]:
+        """Returns the checkpoints that a killed process did not complete."""
+        folder = self.own_checkpoints()
+        return [path for pattern in _PARTIAL for path in folder.glob(pattern)]
+
+    def _numbered(self, name: str) -> list[Path]:
+        paths = self.checkpoints.glob(f"{name}_*.safetensors")
+        return sorted((path for path in paths if _is_numbered(path)), key=step_of)
+
+
+def step_of(checkpoint: Path) -> int:
+    """Returns the step in a checkpoint's name; -1 if there is none."""
+    with suppress(ValueError):
+        return int(checkpoint.stem.rpartition("_")[2])
+    return -1
+
+
+def load_weights(
+    path: Path, expected: Mapping[str, Tensor], config: RunConfig | None = None
+) -> dict[str, Tensor]:
+    """Reads the weights of a checkpoint.
+
+    Args:
+        path: a safetensors file.
+        expected: tensors with the names, shapes and types that the checkpoint must hold.
+        config: its method and number of UAVs must be the checkpoint's; not checked if None.
+
+    Returns:
+        The weights with the names of `expected`.
+
+    Raises:
+        UserError: the file cannot be read or is damaged, a tensor is missing or of another shape
+            or type, or a number is NaN or infinite.
+    """
+    header, weights = checkpoint_file.read(path)
+    if header is not None and config is not None:
+        _check_header(path, header, config)
+    for name, tensor in expected.items():
+        if name not in weights:
+            raise UserError(f"{path}: holds no {name}")
+        weight = weights[name]
+        if weight.shape != tensor.shape or weight.dtype != tensor.dtype:
+            raise UserError(
+                f"{path}: {name} has shape {list(weight.shape)}, {weight.dtype}; this "
+                f"configuration needs {list(tensor.shape)}, {tensor.dtype}"
+            )
+    chosen = {name: weights[name] for name in expected}
+    checkpoint_file.check_finite(path, chosen)
+    return chosen
+
+
+def _check_header(path: Path, header: Mapping[str, Any], config: RunConfig) -> None:
+    expected = _network_header(config, 0)
+    for name in ("method", "uavs"):
+        if header.get(name, expected[name]) != expected[name]:
+            raise UserError(
+                f"{path}: a checkpoint of {name}={header[name]}; "
+                f"this configuration has {name}={expected[name]}"
+            )
+
+
+def _network_header(config: RunConfig, step: int) -> dict[str, Any]:
+    return {
+        "kind": "networks",
+        "step": step,
+        "method": config.method,
+        "uavs": config.env.num_uavs,
+        "seed": config.seed,
+        "config": to_values(config),
+    }
+
+
+def _is_numbered(path: Path) -> bool:
+    return _NUMBERED.fullmatch(path.name) is not None and path.is_file()
