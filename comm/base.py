@@ -9,12 +9,11 @@ from torch import Tensor
 from torchrl.data import Binary, Composite
 from torchrl.envs import Transform
 
+from emberlink.comm._radio import Radio, RadioConfig
 from emberlink.envs import keys
 from emberlink.envs.config import WildfireConfig
 from emberlink.envs.utils.buffers import Buffers
 from emberlink.envs.utils.errors import UserError
-
-from ._radio import Radio, RadioConfig
 
 
 class CommModule(Buffers, TensorDictModuleBase):

@@ -9,17 +9,16 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import Bounded, Composite, Unbounded
 
+from emberlink.comm._agreement import choose_leader, known_discoverers
+from emberlink.comm._heading import HeadingConfig, circling, heading_reward
+from emberlink.comm._radio import RadioConfig, pairwise_distance
+from emberlink.comm.base import CommModule
 from emberlink.envs import keys
 from emberlink.envs.config import WildfireConfig
 from emberlink.envs.utils import counter_rng
 from emberlink.envs.utils.counter_rng import Use
 from emberlink.envs.world import motion
 from emberlink.envs.world.reward import left_box
-
-from ._agreement import choose_leader, known_discoverers
-from ._heading import HeadingConfig, circling, heading_reward
-from ._radio import RadioConfig, pairwise_distance
-from .base import CommModule
 
 
 @dataclass(frozen=True, kw_only=True, config=ConfigDict(extra="forbid", strict=True))

@@ -6,7 +6,7 @@ from pydantic import ConfigDict
 from pydantic.dataclasses import dataclass
 from tensordict import TensorDictBase
 
-from .base import CommModule
+from emberlink.comm.base import CommModule
 
 
 @dataclass(frozen=True, kw_only=True, config=ConfigDict(extra="forbid", strict=True))

@@ -9,11 +9,10 @@ from pydantic.dataclasses import dataclass
 from tensordict import TensorDictBase
 from torchrl.data import Composite, Unbounded
 
+from emberlink.comm._radio import Radio, RadioConfig
+from emberlink.comm.base import CommModule
 from emberlink.envs import keys
 from emberlink.envs.config import WildfireConfig
-
-from ._radio import Radio, RadioConfig
-from .base import CommModule
 
 
 @dataclass(frozen=True, kw_only=True, config=ConfigDict(extra="forbid", strict=True))

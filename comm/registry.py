@@ -3,11 +3,10 @@
 from collections.abc import Mapping
 from typing import Any
 
+from emberlink.comm.base import CommModule
 from emberlink.envs.config import WildfireConfig
 from emberlink.envs.utils.plugins import Registry
 from emberlink.envs.utils.validation import from_plain
-
-from .base import CommModule
 
 _REGISTRY = Registry(CommModule, "emberlink.comm", "comm.name")
 known, find = _REGISTRY.known, _REGISTRY.find

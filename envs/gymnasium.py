@@ -11,9 +11,8 @@ import numpy as np
 from gymnasium.spaces import Box
 from numpy.typing import NDArray
 
+from emberlink.envs.pettingzoo import WildfireParallelEnv, parallel_env
 from emberlink.envs.utils.errors import UserError
-
-from .pettingzoo import WildfireParallelEnv, parallel_env
 
 ID = "emberlink/WildfireTeam-v0"
 

@@ -8,7 +8,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from . import keys
+from emberlink.envs import keys
 
 NAMES = (
     "mean_reward",

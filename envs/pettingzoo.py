@@ -12,12 +12,11 @@ from pettingzoo.utils.conversions import parallel_to_aec
 from tensordict import TensorDictBase
 from torchrl.envs import EnvBase, TransformedEnv, step_mdp
 
+from emberlink.envs import keys
+from emberlink.envs.config import WildfireConfig
 from emberlink.envs.rendering.window import Window
 from emberlink.envs.utils.errors import UserError
-
-from . import keys
-from .config import WildfireConfig
-from .wildfire import WildfireEnv, default_config
+from emberlink.envs.wildfire import WildfireEnv, default_config
 
 Array = NDArray[np.float32]
 Observation = Array | dict[str, NDArray[Any]]

@@ -3,7 +3,7 @@
 import torch
 from torchrl.data import Binary, Bounded, Composite, TensorSpec, Unbounded
 
-from . import keys
+from emberlink.envs import keys
 
 DONE_NAMES = ("done", "terminated", "truncated")
 

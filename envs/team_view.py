@@ -3,12 +3,11 @@
 import torch
 from torch import Tensor
 
+from emberlink.envs import keys
+from emberlink.envs.config import WildfireConfig
 from emberlink.envs.rendering import frame
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.world.coverage_map import CoverageMap
-
-from . import keys
-from .config import WildfireConfig
 
 
 class TeamView:

@@ -9,6 +9,10 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
+from emberlink.envs import keys, specs
+from emberlink.envs.config import WildfireConfig
+from emberlink.envs.scenarios import ScenarioConfig, load_fires
+from emberlink.envs.team_view import TeamView
 from emberlink.envs.utils import counter_rng
 from emberlink.envs.utils.buffers import Buffers
 from emberlink.envs.utils.counter_rng import Use
@@ -18,11 +22,6 @@ from emberlink.envs.world import motion
 from emberlink.envs.world.coverage_map import CoverageMap, Sighting
 from emberlink.envs.world.reward import view_reward
 from emberlink.envs.world.sensor import Sensor
-
-from . import keys, specs
-from .config import WildfireConfig
-from .scenarios import ScenarioConfig, load_fires
-from .team_view import TeamView
 
 
 class WildfireEnv(TeamView, Buffers, EnvBase):

@@ -1,7 +1,7 @@
 """Generated fires: scenarios, their seeds, and the level set by which a front spreads."""
 
-from .cache import fire_bank
-from .generator import (
+from emberlink.envs.fire.cache import fire_bank
+from emberlink.envs.fire.generator import (
     FireConfig,
     Split,
     fire_seeds,

@@ -13,9 +13,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from emberlink.envs.fire.generator import FireConfig, Split, fire_seeds, make_fires
 from emberlink.envs.utils.atomic_io import read_sealed, write_sealed
-
-from .generator import FireConfig, Split, fire_seeds, make_fires
 
 GENERATOR_VERSION = 1  # raise it whenever the same config and seed give another fire
 _MAX_HEADER = 10_000  # bytes of NumPy's format before the numbers

@@ -18,14 +18,13 @@ from torch import Tensor
 
 from emberlink.configs import known
 from emberlink.envs.config import BASE_SIDE, check_grid
+from emberlink.envs.fire.advection import current, max_time_step, tide_speed
+from emberlink.envs.fire.ellipse import MAX_LENGTH_TO_BREADTH
+from emberlink.envs.fire.level_set import arrival_times, disc
 from emberlink.envs.utils.config_files import read
 from emberlink.envs.utils.counter_rng import Use, fold_in, uniform
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import Name, describe
-
-from .advection import current, max_time_step, tide_speed
-from .ellipse import MAX_LENGTH_TO_BREADTH
-from .level_set import arrival_times, disc
 
 TEST_FROM = 1_000_000
 VALIDATION_FROM = 2_000_000

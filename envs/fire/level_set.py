@@ -22,9 +22,8 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from emberlink.envs.fire.ellipse import ellipse_rates
 from emberlink.envs.utils.errors import UserError
-
-from .ellipse import ellipse_rates
 
 Varying = Tensor | Callable[[float], Tensor]
 """A value per fire, [fires] (a drift: [fires, 2]), or a function from the time in steps to one."""

@@ -1,5 +1,7 @@
 """Fires from files: reads rasters, perimeters, the paper's text and banks onto a grid."""
 
+from emberlink.envs.fire_files.banks import write_bank
+from emberlink.envs.fire_files.config import FileFireConfig
 from emberlink.envs.fire_files.reader import (
     FireSets,
     fire_sets,
@@ -7,9 +9,6 @@ from emberlink.envs.fire_files.reader import (
     save_copy,
     with_checksum,
 )
-
-from .banks import write_bank
-from .config import FileFireConfig
 
 __all__ = [
     "FileFireConfig",

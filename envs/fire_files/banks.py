@@ -11,13 +11,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from emberlink.envs.config import SIDES
+from emberlink.envs.fire_files.projection import first_line
+from emberlink.envs.fire_files.raster_source import RasterSource, check_spreads
+from emberlink.envs.fire_files.rasters import clean, open_raster
+from emberlink.envs.fire_files.times import Clock
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.publish import new_file, published
-
-from .projection import first_line
-from .raster_source import RasterSource, check_spreads
-from .rasters import clean, open_raster
-from .times import Clock
 
 SUFFIXES = (".npy", ".tif", ".tiff")
 MAX_CELLS = 300_000_000

@@ -6,10 +6,9 @@ from typing import Annotated, Any, Literal
 from pydantic import BeforeValidator, ConfigDict, Field, model_validator
 from pydantic.dataclasses import dataclass
 
+from emberlink.envs.fire_files.times import Units
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import Name
-
-from .times import Units
 
 _Number = Annotated[float, Field(allow_inf_nan=False)]
 _Time = _Number | Annotated[str, Field(min_length=1, max_length=40)]

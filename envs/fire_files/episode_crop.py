@@ -7,11 +7,10 @@ import numpy as np
 from scipy import ndimage
 
 from emberlink.envs.config import BASE_SIDE
+from emberlink.envs.fire_files.config import FileFireConfig
+from emberlink.envs.fire_files.raster_source import Source, Window
+from emberlink.envs.fire_files.times import SECONDS, Clock, Units, in_utc, parse_time
 from emberlink.envs.utils.errors import UserError
-
-from .config import FileFireConfig
-from .raster_source import Source, Window
-from .times import SECONDS, Clock, Units, in_utc, parse_time
 
 
 def on_grid(

@@ -4,10 +4,9 @@ from pathlib import Path
 
 import numpy as np
 
+from emberlink.envs.fire_files.raster_source import RasterSource, check_spreads
+from emberlink.envs.fire_files.times import Clock, Units
 from emberlink.envs.utils.errors import UserError
-
-from .raster_source import RasterSource, check_spreads
-from .times import Clock, Units
 
 SIDE = 30
 """Cells along a side of the paper's map."""

@@ -5,9 +5,8 @@ from typing import Any
 
 import numpy as np
 
+from emberlink.envs.fire_files.projection import library
 from emberlink.envs.utils.errors import UserError
-
-from .projection import library
 
 _GAP = 0.01  # of a line's length: a gap that small between its ends is closed
 _POINT = 1e-3  # of an area's width: a fire drawn in to a point keeps that much

@@ -7,9 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from emberlink.envs.fire_files.times import Clock, Units, in_utc, parse_time
 from emberlink.envs.utils.errors import UserError
-
-from .times import Clock, Units, in_utc, parse_time
 
 ELAPSED: dict[str, Units] = {
     "elapsed_mi": "minutes",

@@ -7,14 +7,19 @@ from typing import Any
 import numpy as np
 from scipy.ndimage import distance_transform_edt
 
+from emberlink.envs.fire_files.config import FileFireConfig
+from emberlink.envs.fire_files.perimeter_areas import enclosed, ignition, make_valid, polygons
+from emberlink.envs.fire_files.perimeter_times import perimeter_times
+from emberlink.envs.fire_files.projection import (
+    Bounds,
+    check_projection,
+    first_line,
+    library,
+    projections,
+)
+from emberlink.envs.fire_files.raster_source import Window
+from emberlink.envs.fire_files.times import Clock
 from emberlink.envs.utils.errors import UserError
-
-from .config import FileFireConfig
-from .perimeter_areas import enclosed, ignition, make_valid, polygons
-from .perimeter_times import perimeter_times
-from .projection import Bounds, check_projection, first_line, library, projections
-from .raster_source import Window
-from .times import Clock
 
 MAX_TIMES = 500
 _SHRUNK = 0.75  # a perimeter inside the burnt area must have that share of it

@@ -11,9 +11,8 @@ from typing import Any
 
 import numpy as np
 
+from emberlink.envs.fire_files.formats import beside
 from emberlink.envs.utils.errors import UserError
-
-from .formats import beside
 
 Bounds = tuple[float, float, float, float]
 """Least x, least y, greatest x, greatest y."""

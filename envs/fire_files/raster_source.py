@@ -6,10 +6,9 @@ from typing import Protocol
 import numpy as np
 from scipy.ndimage import minimum_filter
 
+from emberlink.envs.fire_files.projection import Bounds
+from emberlink.envs.fire_files.times import Clock
 from emberlink.envs.utils.errors import UserError
-
-from .projection import Bounds
-from .times import Clock
 
 SAMPLES = 180
 """Sample points along the grid's shorter side; a cell of the grid keeps the earliest of its own.

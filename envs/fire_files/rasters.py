@@ -10,12 +10,11 @@ from typing import Any, TextIO
 
 import numpy as np
 
+from emberlink.envs.fire_files.formats import beside
+from emberlink.envs.fire_files.projection import check_projection, first_line, library, projections
+from emberlink.envs.fire_files.raster_source import RasterSource, check_spreads
+from emberlink.envs.fire_files.times import Clock, Units
 from emberlink.envs.utils.errors import UserError
-
-from .formats import beside
-from .projection import check_projection, first_line, library, projections
-from .raster_source import RasterSource, check_spreads
-from .times import Clock, Units
 
 MAX_CELLS = 50_000_000
 """Cells of a raster, which is read as a whole."""

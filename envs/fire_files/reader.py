@@ -12,19 +12,18 @@ import torch
 from torch import Tensor
 
 from emberlink.envs.config import check_grid
+from emberlink.envs.fire_files import formats
+from emberlink.envs.fire_files.banks import MAX_CELLS, bank_horizon, is_bank, read_bands, read_npy
+from emberlink.envs.fire_files.config import FileFireConfig
+from emberlink.envs.fire_files.episode_crop import on_grid
+from emberlink.envs.fire_files.front_points import read_front_points
+from emberlink.envs.fire_files.perimeters import read_perimeters
+from emberlink.envs.fire_files.projection import quiet
+from emberlink.envs.fire_files.raster_source import Source
+from emberlink.envs.fire_files.rasters import read_ascii, read_geotiff
 from emberlink.envs.utils.atomic_io import read_sealed, write_sealed
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import printable
-
-from . import formats
-from .banks import MAX_CELLS, bank_horizon, is_bank, read_bands, read_npy
-from .config import FileFireConfig
-from .episode_crop import on_grid
-from .front_points import read_front_points
-from .perimeters import read_perimeters
-from .projection import quiet
-from .raster_source import Source
-from .rasters import read_ascii, read_geotiff
 
 READER_VERSION = 4  # raise it whenever the same file gives another grid
 COPY_FILE = "fires.npz"

@@ -4,11 +4,11 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from .frame import Chart, write_gif
-    from .marks import FrameData
-    from .panels import Episode, Screen
-    from .video import write_mp4
-    from .window import Window
+    from emberlink.envs.rendering.frame import Chart, write_gif
+    from emberlink.envs.rendering.marks import FrameData
+    from emberlink.envs.rendering.panels import Episode, Screen
+    from emberlink.envs.rendering.video import write_mp4
+    from emberlink.envs.rendering.window import Window
 
 __all__ = ["Chart", "Episode", "FrameData", "Screen", "Window", "write_gif", "write_mp4"]
 

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import ImageDraw
 
-from .frame import NO_FIRE, UAV, Chart
+from emberlink.envs.rendering.frame import NO_FIRE, UAV, Chart
 
 LINK = (0, 200, 255)
 LINK_WIDTHS = {NO_FIRE: 4, LINK: 2}

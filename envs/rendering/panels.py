@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from . import marks
-from .frame import FIELD_OF_VIEW, FIRE, NO_FIRE, Chart
-from .marks import ROLE_COLOURS, ROLES, TARGET, FrameData
+from emberlink.envs.rendering import marks
+from emberlink.envs.rendering.frame import FIELD_OF_VIEW, FIRE, NO_FIRE, Chart
+from emberlink.envs.rendering.marks import ROLE_COLOURS, ROLES, TARGET, FrameData
 
 SEEN_FIRE = (140, 140, 140)
 """of seen fire, where it is shown in another colour (paper, figure 2)"""

@@ -1,5 +1,5 @@
 """Small tools without knowledge of fires: errors, validation, random numbers, files, buffers."""
 
-from .errors import UserError
+from emberlink.envs.utils.errors import UserError
 
 __all__ = ["UserError"]

@@ -9,9 +9,8 @@ from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
 from emberlink.configs import folders, known
-
-from .errors import UserError
-from .validation import unknown
+from emberlink.envs.utils.errors import UserError
+from emberlink.envs.utils.validation import unknown
 
 
 def find(group: str, name: str, within: Sequence[Path] | None = None) -> Path:

@@ -12,7 +12,7 @@ from enum import IntEnum, unique
 import torch
 from torch import Tensor
 
-from .errors import UserError
+from emberlink.envs.utils.errors import UserError
 
 _GOLDEN = -0x61C8864680B583EB  # 0x9E3779B97F4A7C15 as a signed 64-bit integer
 _MIX_A = -0x40A7B892E31B1A47  # 0xBF58476D1CE4E5B9

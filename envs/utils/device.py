@@ -2,8 +2,8 @@
 
 import torch
 
-from .errors import UserError
-from .validation import shown
+from emberlink.envs.utils.errors import UserError
+from emberlink.envs.utils.validation import shown
 
 
 def check_device(name: str) -> str:

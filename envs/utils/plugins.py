@@ -7,7 +7,7 @@ from importlib.metadata import EntryPoint, entry_points
 from pkgutil import iter_modules
 from typing import Any, Generic, TypeVar
 
-from .errors import UserError
+from emberlink.envs.utils.errors import UserError
 
 T = TypeVar("T")
 

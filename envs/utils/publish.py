@@ -6,9 +6,9 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-from .atomic_io import sync, temporary
-from .errors import UserError
-from .validation import shown
+from emberlink.envs.utils.atomic_io import sync, temporary
+from emberlink.envs.utils.errors import UserError
+from emberlink.envs.utils.validation import shown
 
 _NO_LINKS = {errno.EPERM, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS, errno.EMLINK}
 

@@ -9,7 +9,7 @@ from typing import Annotated, Any, TypeVar
 import numpy as np
 from pydantic import Field, TypeAdapter, ValidationError
 
-from .errors import UserError
+from emberlink.envs.utils.errors import UserError
 
 T = TypeVar("T")
 

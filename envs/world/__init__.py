@@ -1,7 +1,7 @@
 """The physics of one step: motion, field of view, coverage and reward, as tensor operations."""
 
-from .coverage_map import CoverageMap, Sighting
-from .reward import left_box, view_reward
-from .sensor import Sensor, view_radius
+from emberlink.envs.world.coverage_map import CoverageMap, Sighting
+from emberlink.envs.world.reward import left_box, view_reward
+from emberlink.envs.world.sensor import Sensor, view_radius
 
 __all__ = ["CoverageMap", "Sensor", "Sighting", "left_box", "view_radius", "view_reward"]

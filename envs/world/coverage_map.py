@@ -6,9 +6,8 @@ import torch
 from torch import Tensor
 
 from emberlink.envs.utils.buffers import Buffers
-
-from .burning import BurningCounts
-from .sensor import Sensor
+from emberlink.envs.world.burning import BurningCounts
+from emberlink.envs.world.sensor import Sensor
 
 _NEVER = torch.iinfo(torch.int32).max
 

@@ -1,6 +1,11 @@
 """The networks of the UAVs: encoders of observations, actors and critics."""
 
-from .actor_critic import STATE_ACTION_VALUE, make_actor, make_critic, team_of
-from .layers import Generators
+from emberlink.policies.networks.actor_critic import (
+    STATE_ACTION_VALUE,
+    make_actor,
+    make_critic,
+    team_of,
+)
+from emberlink.policies.networks.layers import Generators
 
 __all__ = ["STATE_ACTION_VALUE", "Generators", "make_actor", "make_critic", "team_of"]

@@ -10,10 +10,9 @@ from torchrl.data import Composite
 from torchrl.modules import ValueOperator
 
 from emberlink.envs import keys
-
-from .grouping import Grouping
-from .layers import Generators
-from .stacked import StackedActor, StackedCritic
+from emberlink.policies.networks.grouping import Grouping
+from emberlink.policies.networks.layers import Generators
+from emberlink.policies.networks.stacked import StackedActor, StackedCritic
 
 STATE_ACTION_VALUE = (keys.AGENTS, "state_action_value")
 """float32 [..., uavs, 1]: the critics' output"""

@@ -6,7 +6,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from .layers import Generators, StackedConv2d
+from emberlink.policies.networks.layers import Generators, StackedConv2d
 
 CHANNELS = 16
 """channels of the convolutions"""

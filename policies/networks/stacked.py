@@ -7,10 +7,16 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from .encoders import ObservationEncoder
-from .feature_cache import FeatureCache
-from .grouping import Grouping
-from .layers import Generators, Layer, StackedLayerNorm, StackedLinear, team_generators
+from emberlink.policies.networks.encoders import ObservationEncoder
+from emberlink.policies.networks.feature_cache import FeatureCache
+from emberlink.policies.networks.grouping import Grouping
+from emberlink.policies.networks.layers import (
+    Generators,
+    Layer,
+    StackedLayerNorm,
+    StackedLinear,
+    team_generators,
+)
 
 MAX_BATCHED = 2**17
 """numbers of one group between two layers, half a megabyte, up to which a CPU computes all groups

@@ -1,6 +1,6 @@
 """Policies that learn nothing, to which learned ones are compared."""
 
-from .base import Scripted
-from .registry import SCRIPTED
+from emberlink.policies.scripted.base import Scripted
+from emberlink.policies.scripted.registry import SCRIPTED
 
 __all__ = ["SCRIPTED", "Scripted"]

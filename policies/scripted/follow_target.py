@@ -6,8 +6,7 @@ from tensordict import TensorDictBase
 
 from emberlink.envs import keys
 from emberlink.envs.wildfire import WildfireEnv
-
-from .base import Scripted
+from emberlink.policies.scripted.base import Scripted
 
 
 class FollowTarget(Scripted):

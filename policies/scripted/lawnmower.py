@@ -10,8 +10,7 @@ from torch import Tensor
 from emberlink.envs import keys
 from emberlink.envs.wildfire import WildfireEnv
 from emberlink.envs.world import motion
-
-from .base import Scripted
+from emberlink.policies.scripted.base import Scripted
 
 _REACHED = 1e-3  # cells; what float32 leaves of a flight that ends at a stop
 _SLACK = 0.01  # cells; more than a UAV that is nearly at its stop can fail to see at the edge

@@ -8,8 +8,7 @@ from torch import Tensor
 
 from emberlink.envs import keys
 from emberlink.envs.wildfire import WildfireEnv
-
-from .base import Scripted
+from emberlink.policies.scripted.base import Scripted
 
 _STEP_OF_WAITING = 1000.0  # cells; longer than any map, so that cells which burn come first
 

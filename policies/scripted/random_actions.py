@@ -5,8 +5,7 @@ from tensordict import TensorDictBase
 from emberlink.envs import keys
 from emberlink.envs.utils import counter_rng
 from emberlink.envs.utils.counter_rng import Use
-
-from .base import Scripted
+from emberlink.policies.scripted.base import Scripted
 
 
 class RandomActions(Scripted):

@@ -7,8 +7,7 @@ from emberlink.envs import keys
 from emberlink.envs.utils.counter_rng import Use
 from emberlink.envs.wildfire import WildfireEnv
 from emberlink.envs.world import motion
-
-from .base import Scripted
+from emberlink.policies.scripted.base import Scripted
 
 
 class RandomWaypoints(Scripted):

@@ -3,8 +3,7 @@
 from collections.abc import Iterator, Mapping
 
 from emberlink.envs.utils.plugins import Registry
-
-from .base import Scripted
+from emberlink.policies.scripted.base import Scripted
 
 _REGISTRY = Registry(Scripted, "emberlink.policies.scripted", "policy", group="emberlink.scripted")
 _ORDER = (

@@ -4,8 +4,7 @@ import torch
 from tensordict import TensorDictBase
 
 from emberlink.envs import keys
-
-from .base import Scripted
+from emberlink.policies.scripted.base import Scripted
 
 
 class Stationary(Scripted):

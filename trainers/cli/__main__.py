@@ -1,5 +1,5 @@
 """Runs the command line: `python -m emberlink.trainers.cli`."""
 
-from .main import main
+from emberlink.trainers.cli.main import main
 
 raise SystemExit(main())

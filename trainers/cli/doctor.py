@@ -3,7 +3,7 @@
 import argparse
 from typing import TYPE_CHECKING, Any
 
-from .parser import command
+from emberlink.trainers.cli.parser import command
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -23,6 +23,6 @@ def add_doctor(commands: Any) -> None:
 
 
 def _doctor(options: argparse.Namespace, console: "Console") -> int:
-    from .self_test import doctor
+    from emberlink.trainers.cli.self_test import doctor
 
     return doctor(console)

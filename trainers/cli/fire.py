@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from .parser import command, positive
+from emberlink.trainers.cli.parser import command, positive
 
 if TYPE_CHECKING:
     from rich.console import Console

@@ -3,7 +3,7 @@
 import argparse
 from typing import TYPE_CHECKING, Any
 
-from .parser import command
+from emberlink.trainers.cli.parser import command
 
 if TYPE_CHECKING:
     from rich.console import Console

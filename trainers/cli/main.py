@@ -7,16 +7,15 @@ import sys
 from collections.abc import Sequence
 from contextlib import suppress
 
+from emberlink.trainers.cli.compare import add_compare
 from emberlink.trainers.cli.doctor import add_doctor
-
-from .compare import add_compare
-from .eval import add_eval
-from .fire import add_fire
-from .list import add_list
-from .parser import Parser
-from .render_arguments import add_render
-from .sweep import add_sweep
-from .train import add_train
+from emberlink.trainers.cli.eval import add_eval
+from emberlink.trainers.cli.fire import add_fire
+from emberlink.trainers.cli.list import add_list
+from emberlink.trainers.cli.parser import Parser
+from emberlink.trainers.cli.render_arguments import add_render
+from emberlink.trainers.cli.sweep import add_sweep
+from emberlink.trainers.cli.train import add_train
 
 INTERRUPTED = 130
 """exit status after Ctrl-C"""

@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from .parser import between, command, positive
+from emberlink.trainers.cli.parser import between, command, positive
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -62,7 +62,7 @@ _step, _fps, _size = between(0, 1_000_000), between(1, 50), between(100, 2000)
 
 
 def _render(options: argparse.Namespace, console: "Console") -> int:
-    from .render import Choices, render
+    from emberlink.trainers.cli.render import Choices, render
 
     choices = Choices(
         fire=options.fire,

@@ -3,7 +3,7 @@
 import argparse
 from typing import TYPE_CHECKING, Any
 
-from .parser import command, positive
+from emberlink.trainers.cli.parser import command, positive
 
 if TYPE_CHECKING:
     from rich.console import Console

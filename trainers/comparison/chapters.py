@@ -4,14 +4,13 @@ import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+from emberlink.trainers.comparison import plots
+from emberlink.trainers.comparison.page import Chapter, Picture
+from emberlink.trainers.comparison.rankings import Numbers
+from emberlink.trainers.comparison.runs import newest_checkpoint
 from emberlink.trainers.evaluation import evaluate
 from emberlink.trainers.evaluation.actor import load_actor
 from emberlink.trainers.evaluation.plots import timelapse
-
-from . import plots
-from .page import Chapter, Picture
-from .rankings import Numbers
-from .runs import newest_checkpoint
 
 FRAMES = 5
 """frames of a timelapse"""

@@ -7,11 +7,10 @@ from functools import partial
 import numpy as np
 
 from emberlink.envs import metrics
+from emberlink.trainers.comparison import bootstrap
+from emberlink.trainers.comparison.bootstrap import Interval
+from emberlink.trainers.comparison.groups import Group, Section
 from emberlink.trainers.evaluation.results import LEARNED
-
-from . import bootstrap
-from .bootstrap import Interval
-from .groups import Group, Section
 
 
 @dataclass(frozen=True)

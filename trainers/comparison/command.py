@@ -7,10 +7,10 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from .bootstrap import FEW
-from .page import FLAG, counts, decision, lines, ratio
-from .rankings import Numbers, Ranking
-from .report import compare_runs, free_folder, write_report
+from emberlink.trainers.comparison.bootstrap import FEW
+from emberlink.trainers.comparison.page import FLAG, counts, decision, lines, ratio
+from emberlink.trainers.comparison.rankings import Numbers, Ranking
+from emberlink.trainers.comparison.report import compare_runs, free_folder, write_report
 
 
 def compare(paths: Sequence[Path], console: Console, output: Path | None = None) -> int:

@@ -6,10 +6,9 @@ from dataclasses import dataclass
 from typing import Any
 
 from emberlink.envs.utils.errors import UserError
+from emberlink.trainers.comparison.runs import Run
 from emberlink.trainers.config.compose import flat, resolve, to_values
 from emberlink.trainers.config.schema import NOT_LEARNT_WITH, RunConfig
-
-from .runs import Run
 
 NOT_COMPARED = ("seed", "seeds", "output", "evaluation", *NOT_LEARNT_WITH)
 """first parts of the keys in which the runs of a group may differ: none changes the training"""

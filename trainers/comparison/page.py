@@ -9,11 +9,11 @@ from pathlib import Path
 
 from jinja2 import Environment, StrictUndefined
 
-from . import bootstrap
-from .claims import Verdict
-from .rankings import Numbers, Ranking, Row
-from .record import settings
-from .runs import LeftOut
+from emberlink.trainers.comparison import bootstrap
+from emberlink.trainers.comparison.claims import Verdict
+from emberlink.trainers.comparison.rankings import Numbers, Ranking, Row
+from emberlink.trainers.comparison.record import settings
+from emberlink.trainers.comparison.runs import LeftOut
 
 NONE = "-"
 FLAG = "*"

@@ -9,9 +9,8 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator, StrMethodFormatter
 
+from emberlink.trainers.comparison.rankings import Curve, Numbers, Ranking
 from emberlink.trainers.evaluation.results import CURVES
-
-from .rankings import Curve, Numbers, Ranking
 
 FIGURES = {
     5: (("mean_reward",), "Averaged rewards collected by all UAVs at each episode."),

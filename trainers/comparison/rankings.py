@@ -6,14 +6,13 @@ from itertools import zip_longest
 import numpy as np
 
 from emberlink.envs import metrics
+from emberlink.trainers.comparison import bootstrap
+from emberlink.trainers.comparison.bootstrap import Interval
+from emberlink.trainers.comparison.claims import Verdict, verdicts
+from emberlink.trainers.comparison.groups import Group, Section
+from emberlink.trainers.comparison.scripted import REWARD, Scripted, different_rewards, scripted
 from emberlink.trainers.evaluation.evaluate import HELD_OUT_SCENARIO
 from emberlink.trainers.evaluation.results import CURVES, LEARNED
-
-from . import bootstrap
-from .bootstrap import Interval
-from .claims import Verdict, verdicts
-from .groups import Group, Section
-from .scripted import REWARD, Scripted, different_rewards, scripted
 
 MEASURES = (*(name for name in metrics.NAMES if name != REWARD), REWARD)
 """coverage first, and last the measure that depends on a method's own reward"""

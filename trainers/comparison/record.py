@@ -7,9 +7,9 @@ from dataclasses import asdict
 from importlib.metadata import version
 from typing import Any
 
-from . import bootstrap
-from .rankings import Numbers
-from .runs import LeftOut
+from emberlink.trainers.comparison import bootstrap
+from emberlink.trainers.comparison.rankings import Numbers
+from emberlink.trainers.comparison.runs import LeftOut
 
 
 def settings() -> dict[str, Any]:

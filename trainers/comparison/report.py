@@ -9,13 +9,12 @@ from pathlib import Path
 from typing import Any
 
 from emberlink.envs.utils.errors import UserError
-
-from . import chapters
-from .groups import gather
-from .page import Report, html
-from .rankings import Numbers, numbers
-from .record import to_json, to_values
-from .runs import LeftOut, read_all
+from emberlink.trainers.comparison import chapters
+from emberlink.trainers.comparison.groups import gather
+from emberlink.trainers.comparison.page import Report, html
+from emberlink.trainers.comparison.rankings import Numbers, numbers
+from emberlink.trainers.comparison.record import to_json, to_values
+from emberlink.trainers.comparison.runs import LeftOut, read_all
 
 
 @dataclass(frozen=True)

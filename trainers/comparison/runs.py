@@ -8,14 +8,13 @@ from pathlib import Path
 from typing import Any
 
 from emberlink.envs.utils.errors import UserError
+from emberlink.trainers.comparison.evaluation_file import Evaluation, read_curves, read_evaluation
 from emberlink.trainers.config.compose import flat, to_values
 from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.evaluation.results import LEARNED
 from emberlink.trainers.runs import pretrained
 from emberlink.trainers.runs.run_folder import RunFolder
 from emberlink.trainers.runs.seal import check_trained_with
-
-from .evaluation_file import Evaluation, read_curves, read_evaluation
 
 LeftOut = tuple[str, str]
 """a folder or file that is no part of the comparison, and the reason"""

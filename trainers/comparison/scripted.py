@@ -4,9 +4,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from emberlink.policies.scripted.registry import SCRIPTED
+from emberlink.trainers.comparison.groups import Section
 from emberlink.trainers.evaluation.results import LEARNED
-
-from .groups import Section
 
 TOLERANCE = 1e-5
 """share by which a scripted policy's numbers on the same fires may differ between devices"""

@@ -24,9 +24,8 @@ from emberlink.envs.utils.config_files import find, read
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import from_plain, plain, shown, unknown
 from emberlink.policies.scripted.registry import SCRIPTED
+from emberlink.trainers.config.overrides import all_keys, flat, full_key, parse, put
 from emberlink.trainers.config.schema import RunConfig
-
-from .overrides import all_keys, flat, full_key, parse, put
 
 GROUPS = ("setup", "fire", "learner")
 """groups of which a user chooses a file by `GROUP=NAME`, beside the method"""

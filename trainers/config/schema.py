@@ -13,10 +13,9 @@ from emberlink.envs.scenarios import Scenario
 from emberlink.envs.utils.device import check_device as check_device
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import Name
+from emberlink.trainers.config import choice
 from emberlink.trainers.learners import registry as learners
 from emberlink.trainers.learners.base import LearnerConfig
-
-from . import choice
 
 _STRICT = ConfigDict(extra="forbid", strict=True)
 

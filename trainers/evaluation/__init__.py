@@ -1,8 +1,7 @@
 """Evaluates frozen policies beside scripted ones: numbers, figures, eval.json."""
 
+from emberlink.trainers.evaluation.actor import load_actor
 from emberlink.trainers.evaluation.report import evaluate_run
-
-from .actor import load_actor
-from .results import Results
+from emberlink.trainers.evaluation.results import Results
 
 __all__ = ["Results", "evaluate_run", "load_actor"]

@@ -26,9 +26,8 @@ from emberlink.envs.fire.cache import cache_folder
 from emberlink.envs.utils.atomic_io import read_sealed, write_sealed
 from emberlink.policies.scripted.registry import SCRIPTED
 from emberlink.trainers.config.schema import RunConfig
+from emberlink.trainers.evaluation.results import Measured
 from emberlink.trainers.runs.safe_read import MAX_JSON, parse_json
-
-from .results import Measured
 
 _SOURCES = (emberlink.envs.wildfire, emberlink.comm.base, emberlink.policies)
 _IMPORTED = time.time_ns()

@@ -9,15 +9,14 @@ from rich.console import Console
 from emberlink.envs.utils.errors import UserError
 from emberlink.trainers.config.compose import override
 from emberlink.trainers.config.schema import RunConfig, check_device
+from emberlink.trainers.evaluation.actor import load_actor
+from emberlink.trainers.evaluation.evaluate import Policy
 from emberlink.trainers.evaluation.report import evaluate_run
+from emberlink.trainers.evaluation.results import Results
+from emberlink.trainers.evaluation.tables import print_results
 from emberlink.trainers.runs.pretrained import open_run
 from emberlink.trainers.runs.run_folder import RunFolder
 from emberlink.trainers.runs.seal import check_trained_with
-
-from .actor import load_actor
-from .evaluate import Policy
-from .results import Results
-from .tables import print_results
 
 _CHANGEABLE = ("comm.", "env.")
 """beginnings of the keys that an evaluation may be given in place of the run's"""

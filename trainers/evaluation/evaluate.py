@@ -20,9 +20,8 @@ from emberlink.policies.scripted.registry import SCRIPTED
 from emberlink.trainers.build import build_env
 from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.config.schema import RunConfig
-
-from .baseline_cache import ScriptedResults
-from .results import LEARNED, Measured, Results, means
+from emberlink.trainers.evaluation.baseline_cache import ScriptedResults
+from emberlink.trainers.evaluation.results import LEARNED, Measured, Results, means
 
 HELD_OUT_SCENARIO = "huygens"
 START_SEED = 20_250_923

@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from .results import CURVES, LEARNED, Results
+from emberlink.trainers.evaluation.results import CURVES, LEARNED, Results
 
 
 def training_curves(path: Path, lines: Sequence[Mapping[str, Any]], title: str) -> None:

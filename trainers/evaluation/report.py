@@ -12,11 +12,10 @@ from emberlink.envs.scenarios import fires_of
 from emberlink.envs.utils.errors import UserError
 from emberlink.policies.scripted.registry import SCRIPTED
 from emberlink.trainers.config.schema import RunConfig
+from emberlink.trainers.evaluation import evaluate, plots
+from emberlink.trainers.evaluation.results import LEARNED, Results
 from emberlink.trainers.runs.run_folder import RunFolder
 from emberlink.trainers.terminal import OutputError
-
-from . import evaluate, plots
-from .results import LEARNED, Results
 
 _PACKAGES = ("emberlink", "torch", "torchrl", "tensordict", "numpy")
 

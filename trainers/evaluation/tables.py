@@ -9,9 +9,8 @@ from rich.text import Text
 
 from emberlink.envs import metrics
 from emberlink.trainers.config.schema import RunConfig
+from emberlink.trainers.evaluation.results import LEARNED, Results, means
 from emberlink.trainers.terminal import print_table
-
-from .results import LEARNED, Results, means
 
 
 def print_results(

@@ -19,8 +19,7 @@ from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.publish import free_name
 from emberlink.trainers.config.compose import to_values
 from emberlink.trainers.config.schema import RunConfig
-
-from .select import from_file, generated, read
+from emberlink.trainers.fires.select import from_file, generated, read
 
 _AT_A_TIME = 16  # fires between two movements of the progress bar
 

@@ -14,7 +14,7 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
-from .stats import Arrival, TeamCapability, burnt_out
+from emberlink.trainers.fires.stats import Arrival, TeamCapability, burnt_out
 
 NEVER, BURNT_OUT = "0.9", "0.45"
 _COLOURS = "viridis"

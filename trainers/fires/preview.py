@@ -11,10 +11,9 @@ from rich.console import Console
 from rich.table import Table
 
 from emberlink.envs.utils.publish import free_name, new_file, published
-
-from .plot import arrival_figure
-from .select import SelectedFire, find_fire
-from .stats import Growth, TeamCapability, comparisons, growth, short
+from emberlink.trainers.fires.plot import arrival_figure
+from emberlink.trainers.fires.select import SelectedFire, find_fire
+from emberlink.trainers.fires.stats import Growth, TeamCapability, comparisons, growth, short
 
 
 def preview(

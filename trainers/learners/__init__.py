@@ -1,6 +1,6 @@
 """Learners: how the UAVs' networks are trained from the transitions that are collected."""
 
-from .base import Learner, LearnerConfig, LearnerContext, Losses
-from .registry import build, find, known
+from emberlink.trainers.learners.base import Learner, LearnerConfig, LearnerContext, Losses
+from emberlink.trainers.learners.registry import build, find, known
 
 __all__ = ["Learner", "LearnerConfig", "LearnerContext", "Losses", "build", "find", "known"]

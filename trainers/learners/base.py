@@ -15,8 +15,7 @@ from torchrl.data import Composite
 
 from emberlink.envs.utils.validation import Name
 from emberlink.policies.networks import Generators, make_actor
-
-from .nan_guard import NonFiniteGuard
+from emberlink.trainers.learners.nan_guard import NonFiniteGuard
 
 STRICT = ConfigDict(extra="forbid", strict=True)
 

@@ -8,9 +8,8 @@ from tensordict import TensorDictBase
 from torchrl.objectives import DDPGLoss
 
 from emberlink.policies.networks import make_critic
-
-from .base import STRICT, LearnerContext, Losses
-from .off_policy import OffPolicyConfig, OffPolicyLearner
+from emberlink.trainers.learners.base import STRICT, LearnerContext, Losses
+from emberlink.trainers.learners.off_policy import OffPolicyConfig, OffPolicyLearner
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)

@@ -17,9 +17,7 @@ from emberlink.envs import keys
 from emberlink.envs.utils.errors import UserError
 from emberlink.policies.exploration import ExplorationConfig, OrnsteinUhlenbeck
 from emberlink.policies.networks import STATE_ACTION_VALUE
-from emberlink.trainers.rollout.cuda_graphs import graphed
-
-from .base import (
+from emberlink.trainers.learners.base import (
     STRICT,
     Count,
     Learner,
@@ -30,8 +28,15 @@ from .base import (
     Positive,
     generators,
 )
-from .replay_buffer import DONE, TERMINATED, ReplayMemory
-from .tensors import copy_into, group, load_optimizer, optimizer_tensors, prefixed
+from emberlink.trainers.learners.replay_buffer import DONE, TERMINATED, ReplayMemory
+from emberlink.trainers.learners.tensors import (
+    copy_into,
+    group,
+    load_optimizer,
+    optimizer_tensors,
+    prefixed,
+)
+from emberlink.trainers.rollout.cuda_graphs import graphed
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)

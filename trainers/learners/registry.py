@@ -1,8 +1,7 @@
 """Finds learners by name: the files of this folder and entry points of other packages."""
 
 from emberlink.envs.utils.plugins import Registry
-
-from .base import Learner, LearnerConfig, LearnerContext
+from emberlink.trainers.learners.base import Learner, LearnerConfig, LearnerContext
 
 _REGISTRY = Registry(
     Learner,

@@ -14,9 +14,8 @@ from torchrl.data.replay_buffers.storages import TensorStorage
 from emberlink.envs import keys
 from emberlink.envs.utils import counter_rng
 from emberlink.envs.utils.counter_rng import Use
-
-from .base import LearnerContext
-from .tensors import flatten, group, prefixed, unflatten
+from emberlink.trainers.learners.base import LearnerContext
+from emberlink.trainers.learners.tensors import flatten, group, prefixed, unflatten
 
 DONE = (keys.AGENTS, "done")
 TERMINATED = (keys.AGENTS, "terminated")

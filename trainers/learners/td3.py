@@ -14,9 +14,8 @@ from emberlink.envs import keys
 from emberlink.envs.utils import counter_rng
 from emberlink.envs.utils.counter_rng import Use
 from emberlink.policies.networks import make_critic
-
-from .base import STRICT, Count, LearnerContext, Losses, NotNegative
-from .off_policy import OffPolicyConfig, OffPolicyLearner
+from emberlink.trainers.learners.base import STRICT, Count, LearnerContext, Losses, NotNegative
+from emberlink.trainers.learners.off_policy import OffPolicyConfig, OffPolicyLearner
 
 _TARGET_NOISE = (keys.AGENTS, "target_noise")
 """float32 [batch, uavs, 3]: added to the target's actions; part of the next observation's level"""

@@ -1,7 +1,7 @@
 """Collects transitions: steps the environments with the exploring policy."""
 
-from .allocator import keep_freed_memory
-from .collector import make_collector
-from .cuda_graphs import graphed
+from emberlink.trainers.rollout.allocator import keep_freed_memory
+from emberlink.trainers.rollout.collector import make_collector
+from emberlink.trainers.rollout.cuda_graphs import graphed
 
 __all__ = ["graphed", "keep_freed_memory", "make_collector"]

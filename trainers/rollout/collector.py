@@ -10,8 +10,7 @@ from torchrl.collectors import Collector
 from torchrl.envs import EnvBase, ExplorationType, set_exploration_type, step_mdp
 
 from emberlink.envs import keys
-
-from .cuda_graphs import graphed
+from emberlink.trainers.rollout.cuda_graphs import graphed
 
 
 def make_collector(

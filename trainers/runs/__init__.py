@@ -3,9 +3,9 @@
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from .lock import Lock
-    from .pretrained import open_run
-    from .run_folder import RunFolder
+    from emberlink.trainers.runs.lock import Lock
+    from emberlink.trainers.runs.pretrained import open_run
+    from emberlink.trainers.runs.run_folder import RunFolder
 
 __all__ = ["Lock", "RunFolder", "open_run"]
 

@@ -12,8 +12,7 @@ from emberlink.envs.utils import atomic_io
 from emberlink.envs.utils.errors import UserError
 from emberlink.trainers.config.compose import to_values
 from emberlink.trainers.config.schema import RunConfig
-
-from . import checkpoint_file
+from emberlink.trainers.runs import checkpoint_file
 
 _NUMBERED = re.compile(r"(state|step)_\d{9,18}\.safetensors")
 _PARTIAL = ("*.safetensors.[0-9]*.part", ".tmp*")  # safetensors' own names begin with .tmp

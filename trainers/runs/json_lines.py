@@ -8,8 +8,7 @@ from typing import Any
 
 from emberlink.envs.utils import atomic_io
 from emberlink.envs.utils.errors import UserError
-
-from .safe_read import MAX_JSON, parse_json, read_text
+from emberlink.trainers.runs.safe_read import MAX_JSON, parse_json, read_text
 
 
 class JsonLines:

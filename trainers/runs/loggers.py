@@ -20,8 +20,7 @@ from emberlink.envs.utils.atomic_io import inner_folder, remove_links
 from emberlink.envs.utils.errors import UserError
 from emberlink.trainers.config.compose import to_values
 from emberlink.trainers.config.schema import RunConfig
-
-from .run_folder import RunFolder
+from emberlink.trainers.runs.run_folder import RunFolder
 
 PATIENCE = 60.0
 """seconds that the end of a training waits for its tracker"""

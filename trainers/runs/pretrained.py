@@ -19,10 +19,9 @@ from emberlink.envs.fire_files.reader import COPY_FILE
 from emberlink.envs.utils.errors import UserError
 from emberlink.trainers.config.compose import to_values
 from emberlink.trainers.learners.base import ACTOR
+from emberlink.trainers.runs import checkpoint_file
+from emberlink.trainers.runs.run_folder import RunFolder
 from emberlink.trainers.runs.seal import check_trained_with
-
-from . import checkpoint_file
-from .run_folder import RunFolder
 
 PREFIX = "pretrained:"
 USUAL_SETUP = "tuned"

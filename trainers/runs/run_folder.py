@@ -17,11 +17,10 @@ from emberlink.envs.utils import atomic_io
 from emberlink.envs.utils.errors import UserError
 from emberlink.trainers.config.compose import flat, from_values, to_values
 from emberlink.trainers.config.schema import RunConfig, comm_settings
-
-from . import compact_json
-from .checkpoints import Checkpoints
-from .json_lines import JsonLines
-from .safe_read import MAX_JSON, parse_json, read_text, read_yaml
+from emberlink.trainers.runs import compact_json
+from emberlink.trainers.runs.checkpoints import Checkpoints
+from emberlink.trainers.runs.json_lines import JsonLines
+from emberlink.trainers.runs.safe_read import MAX_JSON, parse_json, read_text, read_yaml
 
 _PARTIAL = ("config.yaml", "metrics.csv", "*.json", "*.jsonl", "fires.npz")
 _PARTIAL_FIGURES = ("*.png.[0-9]*.part", "*.gif.[0-9]*.part")

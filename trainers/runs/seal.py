@@ -12,8 +12,7 @@ from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import shown
 from emberlink.trainers.config.compose import flat, from_values, to_values
 from emberlink.trainers.config.schema import NOT_LEARNT_WITH, RunConfig
-
-from . import checkpoint_file
+from emberlink.trainers.runs import checkpoint_file
 
 MAY_CHANGE = ("episodes", *NOT_LEARNT_WITH)
 """keys that may be changed when a run is resumed, besides those of `evaluation`"""

@@ -8,10 +8,9 @@ from contextlib import suppress
 from pathlib import Path
 
 from emberlink.trainers.config.schema import RunConfig
-
-from . import loggers
-from .loggers import Tracker
-from .run_folder import RunFolder
+from emberlink.trainers.runs import loggers
+from emberlink.trainers.runs.loggers import Tracker
+from emberlink.trainers.runs.run_folder import RunFolder
 
 _Job = Callable[[int, Tracker], None]
 """called with the number of a run and its tracker"""

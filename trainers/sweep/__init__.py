@@ -4,8 +4,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from emberlink.trainers.sweep.command import sweep
-
-    from .jobs import Job, jobs_of
+    from emberlink.trainers.sweep.jobs import Job, jobs_of
 
 __all__ = ["Job", "jobs_of", "sweep"]
 
@@ -17,7 +16,7 @@ def __getattr__(name: str) -> Any:
 
         return sweep
     if name in __all__:
-        from . import jobs
+        from emberlink.trainers.sweep import jobs
 
         return getattr(jobs, name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -8,8 +8,7 @@ from pathlib import Path
 
 from emberlink.envs.utils.atomic_io import inner_folder
 from emberlink.envs.utils.errors import UserError
-
-from .jobs import Identity
+from emberlink.trainers.sweep.jobs import Identity
 
 FOLDER = ("logs", "claims")
 """where the lock files are, in the output folder"""

@@ -8,13 +8,12 @@ from rich.table import Table
 
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import shown
-
-from . import executors
-from .jobs import Job, jobs_of
-from .plan import plan
-from .progress import SweepProgress
-from .run_index import RunIndex
-from .scheduler import Scheduler
+from emberlink.trainers.sweep import executors
+from emberlink.trainers.sweep.jobs import Job, jobs_of
+from emberlink.trainers.sweep.plan import plan
+from emberlink.trainers.sweep.progress import SweepProgress
+from emberlink.trainers.sweep.run_index import RunIndex
+from emberlink.trainers.sweep.scheduler import Scheduler
 
 _EXECUTOR = "executor"
 

@@ -4,8 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from emberlink.trainers.config.schema import RunConfig
-
-from .jobs import FoundRun, Identity, Job, identity, is_finished, job_for
+from emberlink.trainers.sweep.jobs import FoundRun, Identity, Job, identity, is_finished, job_for
 
 
 def plan(jobs: Sequence[Job], runs: Mapping[Identity, FoundRun]) -> list[Job]:

@@ -5,7 +5,7 @@ from typing import Any
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
-from .jobs import Job
+from emberlink.trainers.sweep.jobs import Job
 
 
 class SweepProgress(Progress):

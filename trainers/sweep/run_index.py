@@ -3,8 +3,7 @@
 from pathlib import Path
 
 from emberlink.trainers.runs.run_folder import RunFolder
-
-from .jobs import FoundRun, Identity, identity
+from emberlink.trainers.sweep.jobs import FoundRun, Identity, identity
 
 
 class RunIndex:

@@ -1,8 +1,8 @@
 """Prints to terminals, pipes and files: text, tables and the progress of a training."""
 
-from .console import OutputError, SafeConsole
-from .progress import TrainingProgress
-from .table import print_table
+from emberlink.trainers.terminal.console import OutputError, SafeConsole
+from emberlink.trainers.terminal.progress import TrainingProgress
+from emberlink.trainers.terminal.table import print_table
 
 __all__ = [
     "OutputError",

@@ -9,7 +9,7 @@ from rich.console import Console, ConsoleOptions, RenderableType
 from rich.segment import Segment
 from rich.table import Table
 
-from .table import print_table
+from emberlink.trainers.terminal.table import print_table
 
 _CONTROL_CODES = (
     *(code for code in range(0x20) if chr(code) not in "\t\n"),

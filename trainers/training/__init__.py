@@ -5,10 +5,10 @@ collector), `episode` (measures of the episode at hand), `folders` (run folders)
 loop), `checkpoints`, `non_finite` and `rollback` (NaN and Inf), `resume`.
 """
 
-from .non_finite import NonFiniteError, NonFiniteReport, replay
-from .resume import resume
-from .setup import TrainingSetup
-from .trainer import Progress, Trainer
+from emberlink.trainers.training.non_finite import NonFiniteError, NonFiniteReport, replay
+from emberlink.trainers.training.resume import resume
+from emberlink.trainers.training.setup import TrainingSetup
+from emberlink.trainers.training.trainer import Progress, Trainer
 
 __all__ = [
     "NonFiniteError",

@@ -8,10 +8,9 @@ from torch import Tensor
 
 from emberlink.envs.utils.errors import UserError
 from emberlink.trainers.runs import checkpoint_file
-
-from .non_finite import first_non_finite
-from .rollback import Rollbacks
-from .setup import TrainingSetup
+from emberlink.trainers.training.non_finite import first_non_finite
+from emberlink.trainers.training.rollback import Rollbacks
+from emberlink.trainers.training.setup import TrainingSetup
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -18,9 +18,8 @@ from emberlink.trainers.runs.signals import Interrupted, Interruption
 from emberlink.trainers.runs.tracking import Trackers
 from emberlink.trainers.terminal import OutputError, TrainingProgress
 from emberlink.trainers.training.non_finite import NonFiniteError
+from emberlink.trainers.training.resume import resume
 from emberlink.trainers.training.trainer import Progress, Trainer
-
-from .resume import resume
 
 
 def train(method: str | None, overrides: Sequence[str], console: Console) -> int:

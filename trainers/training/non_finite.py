@@ -16,8 +16,7 @@ from emberlink.trainers.learners.nan_guard import ROLLOUT
 from emberlink.trainers.learners.tensors import flatten, group, prefixed, unflatten
 from emberlink.trainers.runs import checkpoint_file
 from emberlink.trainers.runs.run_folder import RunFolder
-
-from .setup import TrainingSetup
+from emberlink.trainers.training.setup import TrainingSetup
 
 _PACKAGES = ("emberlink", "torch", "torchrl", "tensordict")
 _TENSORS = "tensors.safetensors"

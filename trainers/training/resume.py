@@ -11,10 +11,9 @@ from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.runs.checkpoints import step_of
 from emberlink.trainers.runs.run_folder import RunFolder
 from emberlink.trainers.runs.seal import MAY_CHANGE, check_same, differences
+from emberlink.trainers.training import checkpoints
+from emberlink.trainers.training.folders import RunFolders, Sizes, check_seeds, empty, find_runs
 from emberlink.trainers.training.trainer import Trainer
-
-from . import checkpoints
-from .folders import RunFolders, Sizes, check_seeds, empty, find_runs
 
 
 def resume(path: Path, method: str | None = None, overrides: Sequence[str] = ()) -> Trainer:

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from .non_finite import NonFiniteError
+from emberlink.trainers.training.non_finite import NonFiniteError
 
 FACTOR = 0.5
 """by which the learning rates are multiplied at each rollback"""

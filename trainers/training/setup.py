@@ -17,8 +17,7 @@ from emberlink.trainers.learners.nan_guard import NonFiniteGuard
 from emberlink.trainers.learners.tensors import copy_into, flatten, group, prefixed, unflatten
 from emberlink.trainers.rollout.allocator import keep_freed_memory
 from emberlink.trainers.rollout.collector import make_collector
-
-from .episode import EpisodeRecord
+from emberlink.trainers.training.episode import EpisodeRecord
 
 
 class TrainingSetup:

@@ -13,11 +13,10 @@ from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.evaluation import evaluate
 from emberlink.trainers.runs.run_folder import RunFolder
 from emberlink.trainers.runs.tracking import Trackers
-
-from . import checkpoints, non_finite, rollback
-from .folders import RunFolders, empty
-from .rollback import Rollbacks
-from .setup import TrainingSetup
+from emberlink.trainers.training import checkpoints, non_finite, rollback
+from emberlink.trainers.training.folders import RunFolders, empty
+from emberlink.trainers.training.rollback import Rollbacks
+from emberlink.trainers.training.setup import TrainingSetup
 
 
 @dataclass

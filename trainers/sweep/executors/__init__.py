@@ -1,6 +1,6 @@
 """Runs the processes of a sweep: an executor is one file here and one in configs/executor."""
 
-from .base import Executor, Task
-from .registry import known, make
+from emberlink.trainers.sweep.executors.base import Executor, Task
+from emberlink.trainers.sweep.executors.registry import known, make
 
 __all__ = ["Executor", "Task", "known", "make"]

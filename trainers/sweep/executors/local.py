@@ -8,7 +8,7 @@ from typing import Annotated
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
-from .base import Executor, Task
+from emberlink.trainers.sweep.executors.base import Executor, Task
 
 _PROGRAM = "emberlink.trainers.sweep.executors._process"
 

@@ -6,8 +6,7 @@ from emberlink.envs.utils.config_files import read
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.plugins import Registry
 from emberlink.envs.utils.validation import from_plain
-
-from .base import Executor
+from emberlink.trainers.sweep.executors.base import Executor
 
 _REGISTRY = Registry(
     Executor, "emberlink.trainers.sweep.executors", "executor", group="emberlink.executors"
