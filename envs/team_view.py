@@ -1,5 +1,7 @@
 """What can be read of a `WildfireEnv` without changing it."""
 
+from typing import Any
+
 import torch
 from torch import Tensor
 
@@ -14,8 +16,8 @@ class TeamView:
     """Sizes, names, maps and pictures of the environments; a base class of `WildfireEnv`."""
 
     config: WildfireConfig
-    batch_size: torch.Size
-    device: torch.device
+    batch_size: Any  # of EnvBase
+    device: Any
     _fire_name: str | None
     _map: CoverageMap
     _time: Tensor

@@ -198,7 +198,8 @@ class WildfireEnv(TeamView, Buffers, EnvBase):
         )
         self._position.copy_(position)
         sighting = self._map.look(self._position, self._time.float())
-        reward = view_reward(*sighting.counts.unbind(-1), hit_boundary, config.reward)
+        new, old, none = sighting.counts.unbind(-1)
+        reward = view_reward(new, old, none, hit_boundary, config.reward)
         self._seen.add_(sighting.counts[..., 0].sum(-1).long())
         return self._snapshot(position, sighting, hit_boundary, reward)
 
