@@ -165,7 +165,7 @@ def test_a_checkpoint_that_is_none(run, capsys):
         refused(["eval", str(run)], capsys, checkpoint.name, "not a readable checkpoint")
     weights = {"else": torch.zeros(3)}
     save_file(weights, checkpoint)
-    refused(["eval", str(run)], capsys, checkpoint.name, "holds no actor_network_params")
+    refused(["eval", str(run)], capsys, checkpoint.name, "does not hold the configuration")
     other = run / "nothing.safetensors"
     refused(["eval", str(run), "--checkpoint", str(other)], capsys, other.name)
 

@@ -300,7 +300,7 @@ def flat(values: dict, prefix: str = "") -> Iterator[str]:
 
 
 def test_every_key_of_every_group_is_fuzzed():
-    fuzzed = set(KEYS).union(*COMM_KEYS.values()) | {"comm.name"}
+    fuzzed = set(KEYS).union(*COMM_KEYS.values()) | {"comm.name", "learner.name"}
     found: set[str] = set()
     for method in known("method"):
         for setup in known("setup"):
