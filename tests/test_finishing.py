@@ -2,6 +2,7 @@
 
 import errno
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -148,7 +149,7 @@ def test_the_folder_of_seeds_side_by_side_by_any_path(tmp_path, capsys, monkeypa
     [
         ("env={}", "'env={}': give its keys one by one, as env.KEY=VALUE"),
         ("learner={gamma: 0.5}", "give its keys one by one, as learner.KEY=VALUE"),
-        ("fire.name=paper", "'fire.name=paper': a scenario is chosen with fire=NAME"),
+        ("fire.name=paper", "fire.name=paper: is chosen with fire=NAME"),
         ("env.reward.exit=-1e13", "env.reward.exit=-10000000000000.0"),
         ("learner.actor_lr=1e31", "learner.actor_lr=1e+31"),
         ("comm.jitter=1e13", "comm.jitter"),
@@ -283,8 +284,9 @@ def test_a_world_that_lacks_a_key_is_not_completed(key, tmp_path, capsys):
     assert trained(capsys, *arguments)[0] == 0
     run = run_of(tmp_path / "runs")
     file = run.path / "config.yaml"
-    lines = [one for one in file.read_text().splitlines() if not one.lstrip().startswith(f"{key}:")]
-    file.write_text("\n".join(lines) + "\n")
+    text, count = re.subn(rf"^ *{key}: .*\n|\b{key}: [^,}}\n]*, ", "", file.read_text(), flags=re.M)
+    assert count == 1
+    file.write_text(text)
     assert main.main(["eval", str(run.path)]) == 2
     error = capsys.readouterr().err
     assert f"{file}: key " in error

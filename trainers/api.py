@@ -58,7 +58,8 @@ class TrainedPolicy(TensorDictSequential):
     """
 
     def __init__(self, actor: TensorDictModule, config: RunConfig, checkpoint: Path):
-        super().__init__(actor)
+        modules: Any = [actor]
+        super().__init__(*modules)
         self.config = config
         self.checkpoint = checkpoint
 
@@ -180,7 +181,7 @@ def load(
     Raises:
         UserError: there is no such run, a file in it is damaged, or a setting does not fit.
     """
-    folder = RunFolder(pretrained.find_one(str(run)) if pretrained.is_name(str(run)) else run)
+    folder = RunFolder(pretrained.find_one(str(run)) if pretrained.is_name(str(run)) else Path(run))
     trained = folder.config(**({} if device is None else {"device": device}))
     file = folder.checkpoint() if checkpoint is None else Path(checkpoint)
     check_trained_with(file, trained)

@@ -150,8 +150,8 @@ class StackedCritic(_Network):
         def compute(observations: Sequence[Tensor]) -> list[Tensor]:
             return apply_layers(_features, self._hidden_layers(), self._encode(observations, batch))
 
-        weight: Any = self.first.weight
-        features = self._cache.get(observations, weight, compute)
+        first: Any = self.first
+        features = self._cache.get(observations, first.weight, compute)
         actions = self._parts(self.grouping.split(action, batch))
         values = apply_layers(_value, [self.action, self.value], actions, features)
         return self._join(values, batch)

@@ -129,8 +129,8 @@ def _ranking(section: Section, fire: str, measure: str, notes: list[str]) -> Ran
         probability = ends = None
         if other is not None and not _same_trainings(group, other):
             pair = (own, values[other.label]) if higher else (values[other.label], own)
-            arrays = map(np.asarray, pair)
-            probability = float(bootstrap.probability_of_improvement(*arrays))
+            better, worse = map(np.asarray, pair)
+            probability = float(bootstrap.probability_of_improvement(better, worse))
             ends = bootstrap.interval(bootstrap.probability_of_improvement, *pair)
         rows.append(
             Row(
