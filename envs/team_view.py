@@ -1,9 +1,8 @@
 """What can be read of a `WildfireEnv` without changing it."""
 
-from typing import Any
-
 import torch
 from torch import Tensor
+from torchrl.envs import EnvBase
 
 from emberlink.envs import keys
 from emberlink.envs.config import WildfireConfig
@@ -12,12 +11,10 @@ from emberlink.envs.utils.errors import UserError
 from emberlink.envs.world.coverage_map import CoverageMap
 
 
-class TeamView:
+class TeamView(EnvBase):
     """Sizes, names, maps and pictures of the environments; a base class of `WildfireEnv`."""
 
     config: WildfireConfig
-    batch_size: Any  # of EnvBase
-    device: Any
     _fire_name: str | None
     _map: CoverageMap
     _time: Tensor

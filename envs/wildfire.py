@@ -7,7 +7,6 @@ from typing import Any
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.envs import EnvBase
 
 from emberlink.envs import keys, specs
 from emberlink.envs.config import WildfireConfig
@@ -24,7 +23,7 @@ from emberlink.envs.world.reward import view_reward
 from emberlink.envs.world.sensor import Sensor
 
 
-class WildfireEnv(TeamView, Buffers, EnvBase):
+class WildfireEnv(Buffers, TeamView):
     """A team of UAVs over a spreading fire, batched over environments.
 
     Args:
@@ -200,7 +199,7 @@ class WildfireEnv(TeamView, Buffers, EnvBase):
         sighting = self._map.look(self._position, self._time.float())
         new, old, none = sighting.counts.unbind(-1)
         reward = view_reward(new, old, none, hit_boundary, config.reward)
-        self._seen.add_(sighting.counts[..., 0].sum(-1).long())
+        self._seen.add_(new.sum(-1).long())
         return self._snapshot(position, sighting, hit_boundary, reward)
 
     def _step_proc_data(self, next_tensordict_out: TensorDictBase) -> TensorDictBase:

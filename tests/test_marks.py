@@ -10,6 +10,8 @@ from emberlink.envs.rendering import marks, panels
 from emberlink.envs.rendering.frame import UAV
 from emberlink.envs.rendering.marks import LINK, ROLE_COLOURS, ROLES, FrameData
 from emberlink.envs.rendering.panels import Episode, Screen
+from emberlink.policies.scripted.follow_target import FollowTarget
+from emberlink.trainers import make_env
 from emberlink.trainers.evaluation import record_episode
 
 WHERE = [(2, 2, 1), (12, 2, 1), (22, 12, 1)]
@@ -204,3 +206,13 @@ def test_links_roles_and_targets_are_drawn_where_the_tensordict_holds_them():
         record_episode.frame_data(tensordict(9, **told), nothing, hears=False),
     ):
         assert silent.links is silent.roles is silent.target is None
+
+
+@pytest.mark.parametrize(("loss", "drawn"), [(0.0, True), (1.0, False)])
+def test_links_are_the_messages_that_were_received(loss, drawn):
+    fire = torch.zeros(12, 12)
+    env = make_env("consensus", fire=fire, horizon=4, seed=0, **{"comm.loss": loss})
+    policy = FollowTarget(env.base_env)
+    frames = record_episode.record_episode(env, policy, env.transform.module, steps=range(5))
+    assert len(frames) == 5
+    assert all(frame.links.any() == drawn for frame in frames)
