@@ -9,6 +9,7 @@ from torchrl.collectors import Collector
 
 from emberlink.trainers.build import build_env
 from emberlink.trainers.config.compose import resolve
+from emberlink.trainers.rollout.collector import LockstepCollector
 from emberlink.trainers.rollout.cuda_graphs import graphed
 from emberlink.trainers.training.setup import TrainingSetup
 
@@ -17,6 +18,12 @@ SMALL = [
     *("learner.hidden=[8,8]", "fire=huygens"),
     *("learner.exploration.sigma=0.4", "learner.exploration.dt=1"),
 ]
+
+
+@pytest.fixture(autouse=True)
+def lockstep(monkeypatch):
+    """Trains with the collector for GPUs."""
+    monkeypatch.setattr("emberlink.trainers.training.setup.make_collector", LockstepCollector)
 
 
 def torchrls(setup: TrainingSetup) -> Collector:

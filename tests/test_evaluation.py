@@ -8,6 +8,7 @@ import os
 import subprocess
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
@@ -15,6 +16,7 @@ import torch
 from emberlink.envs import metrics
 from emberlink.envs.fire.cache import cache_folder
 from emberlink.envs.fire.generator import fire_seeds, load_scenario, make_fires
+from emberlink.envs.utils.atomic_io import read_sealed, write_sealed
 from emberlink.policies.scripted.registry import SCRIPTED
 from emberlink.trainers.build import build_actor, build_env
 from emberlink.trainers.cli import main
@@ -159,13 +161,19 @@ def lawnmower(config, fires: int = 2):
     )
 
 
+def stored(file: Path) -> dict:
+    content = read_sealed(file, 1_000_000)
+    assert content is not None
+    return json.loads(content)
+
+
 def test_a_scripted_policy_is_played_once(cache, played):
     first = lawnmower(small())
     assert len(played) == 1
     assert lawnmower(small("consensus", "seed=3", "episodes=7", "learner.batch_size=9")) == first
     assert len(played) == 1
     (file,) = cache.glob("scripted-*")
-    assert json.loads(file.read_text()) == first
+    assert stored(file) == first
 
 
 @pytest.mark.parametrize(
@@ -207,10 +215,10 @@ def test_a_damaged_file_is_replaced(content, cache, played):
         content = json.dumps({**first, "coverage": [math.nan, 1.0]})
     elif content == "one episode less":
         content = json.dumps({name: numbers[:1] for name, numbers in first.items()})
-    file.write_text(content)
+    write_sealed(file, content.encode())  # damaged before its checksum was taken
     assert lawnmower(small()) == first
     assert len(played) == 2
-    assert json.loads(file.read_text()) == first
+    assert stored(file) == first
     assert not list(cache.glob("*.tmp"))
 
 

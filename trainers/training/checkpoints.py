@@ -73,6 +73,7 @@ def restore(
     if name := first_non_finite(tensors):
         raise UserError(f"{path}: {name} holds NaN or infinite numbers")
     try:
+        _check_margins(setup, tensors)
         setup.load_state_dict(tensors, run.step)
         rollbacks = Rollbacks(**run.rollbacks)
     except (ValueError, KeyError, RuntimeError, TypeError, IndexError) as error:
@@ -80,3 +81,12 @@ def restore(
         raise UserError(f"{path}: does not fit this training: {reason}") from None
     setup.learner.scale_lr(rollbacks.lr_scale)
     return rollbacks
+
+
+def _check_margins(setup: TrainingSetup, tensors: dict[str, Tensor]) -> None:
+    """Checks that arrival times are NaN in the margin around the grid, and only there."""
+    for name, fresh in setup.env.base_env.state_dict().items():
+        if "arrival_time" in name and not fresh.isnan().equal(
+            tensors[f"environments/{name}"].isnan()
+        ):
+            raise UserError(f"environments/{name} holds NaN within the grid")
