@@ -88,7 +88,8 @@ def test_what_every_command_needs_starts_without_torch(module):
 
 
 EFFECTS = """
-import random, threading, numpy, rich.style, torch, torchrl.envs, torchrl.collectors, torchrl.objectives
+import random, threading, numpy, rich.style, torch
+import torchrl.envs, torchrl.collectors, torchrl.objectives
 import torchrl.record.loggers
 state = torch.get_rng_state(), random.getstate(), torch.get_num_threads()
 threads, default = threading.active_count(), torch.get_default_dtype()
