@@ -408,7 +408,7 @@ def test_a_config_is_frozen_complete_and_closed():
     high=st.floats(1e-6, 1),
     ratio=st.floats(1, 8),
     radius=st.floats(0.05, 30),
-    fuel_patches=st.integers(0, 32),
+    patches=st.integers(0, 32),
     seed=st.integers(0, 2**40),
 )
 def test_every_valid_config_gives_a_fire(low, high, ratio, radius, patches, seed):
