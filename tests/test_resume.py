@@ -202,7 +202,7 @@ def test_more_episodes_are_those_of_a_run_that_had_them_from_the_start(whole, tm
         (["setup=tuned"], "setup=tuned: the run has setup=paper"),
         (["fire=huygens"], "fire=huygens: the run has fire=paper"),
         (["episodes=1"], "episodes=1: the run has done 1.5"),
-        (["keap=3"], "'keap' is not known; did you mean keep?"),
+        (["keep_checkpoint=3"], "'keep_checkpoint' is not known; did you mean keep_checkpoints?"),
         (["keep_checkpoints=0"], "keep_checkpoints=0"),
     ],
 )

@@ -135,9 +135,6 @@ class LockstepCollector:
         self._td.update_(carried)
         self.step = step
 
-    def shutdown(self) -> None:
-        """Does nothing; TorchRL's collector closes its environments here."""
-
     def _collect(self) -> TensorDictBase:
         with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
             stepped = self._advance()

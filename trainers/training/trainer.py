@@ -122,7 +122,6 @@ class Trainer:
                     note = self.roll_back(error)
                 report(self._progress(note=note))
         finally:
-            self.setup.collector.shutdown()
             if not hold:
                 self.close()
 
