@@ -84,7 +84,7 @@ def test_a_configuration_keeps_its_learner(learner):
     [
         ({"hidden": [8, 8]}, "learner.name is missing; known: ddpg, td3"),
         ({"name": "sac"}, "learner.name='sac' is not known; known: ddpg, td3"),
-        ({"policy_delay": 3}, "key 'learner.policy_delay' is not known"),
+        ({"policy_delay": 3}, "learner.policy_delay is not a setting of ddpg"),
         ({"gamma": 2.0}, "learner.gamma=2.0: should be less than 1"),
     ],
 )

@@ -10,7 +10,6 @@ import pytest
 import torch
 from PIL import Image
 from rich.console import Console
-from safetensors.torch import save_file
 
 from emberlink.configs import known
 from emberlink.envs.rendering import marks, video
@@ -37,7 +36,7 @@ def make_run(folder, method="consensus", *overrides):
     }
     run = RunFolder.create(config)
     run.write_config(config)
-    save_file(weights, run.path / "checkpoints" / "step_000000012.safetensors")
+    run.save(weights, config, 12)
     return run.path
 
 
