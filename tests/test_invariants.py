@@ -39,7 +39,7 @@ def random_settings(rng: np.random.Generator) -> dict:
         "altitude": altitude.tolist(),
         "view_angle": angle,
         "displacement": float(rng.choice([1e-3, 0.1, 1.0, 5.5, 256.0])),
-        "observation": str(rng.choice(["raw", "box"])),
+        "observation_scale": str(rng.choice(["raw", "box"])),
     }
     values["env"]["reward"] = {
         "exit_axes": str(rng.choice(["xyz", "xy"])),

@@ -114,22 +114,22 @@ def test_all_methods_side_by_side_have_the_same_fire_and_the_same_starts(tmp_pat
     assert len(episodes) == len(methods) + len(SCRIPTED)
     first, *others = episodes
     for other in others:
-        assert np.array_equal(other.moments[0].position, first.moments[0].position)
-        for one, two in zip(first.moments, other.moments, strict=True):
+        assert np.array_equal(other.frames[0].position, first.frames[0].position)
+        for one, two in zip(first.frames, other.frames, strict=True):
             assert one.step == two.step
             assert np.array_equal(one.fire_map > 0, two.fire_map > 0)
     assert any(
-        not np.array_equal(other.moments[-1].position, first.moments[-1].position)
+        not np.array_equal(other.frames[-1].position, first.frames[-1].position)
         for other in others
     )
     for method, episode in zip(methods, episodes, strict=False):
         assert episode.title == f"{method}, setup tuned, seed 0"
-        now = episode.moments[-1]
+        now = episode.frames[-1]
         assert (now.links is not None) == (method in ("consensus", "positional"))
         assert (now.roles is not None) == (now.target is not None) == (method == "consensus")
     for name, episode in zip(SCRIPTED, episodes[len(methods) :], strict=True):
         listens = SCRIPTED[name].recipe is not None
-        assert {v is not None for v in (episode.moments[-1].links, episode.moments[-1].roles)} == {
+        assert {v is not None for v in (episode.frames[-1].links, episode.frames[-1].roles)} == {
             listens
         }
 
@@ -144,7 +144,7 @@ def test_an_episode_is_the_evaluations(tmp_path, monkeypatch):
     for index in range(3):
         choices = render.Choices(fire=str(index))
         (episode,) = panels_of([run.path], choices, monkeypatch)
-        assert episode.moments[-1].coverage == pytest.approx(covered[index], rel=1e-6)
+        assert episode.frames[-1].coverage == pytest.approx(covered[index], rel=1e-6)
 
 
 @pytest.mark.parametrize("horizon", [1, 2, 12])
