@@ -70,7 +70,7 @@ def random_fire(rng: np.random.Generator, config, generator: torch.Generator):
     kind = rng.integers(6)
     shape = [*([ENVS] if rng.integers(2) else []), *config.env.grid]
     if kind == 0:
-        return config.fire.__class__(**{**vars(config.fire), "bank": 2})
+        return config.fire.__class__(**{**vars(config.fire), "num_train_fires": 2})
     if kind == 1:
         return torch.full(shape, math.inf)
     if kind == 2:
