@@ -119,8 +119,7 @@ def test_all_methods_side_by_side_have_the_same_fire_and_the_same_starts(tmp_pat
             assert one.step == two.step
             assert np.array_equal(one.fire_map > 0, two.fire_map > 0)
     assert any(
-        not np.array_equal(other.frames[-1].position, first.frames[-1].position)
-        for other in others
+        not np.array_equal(other.frames[-1].position, first.frames[-1].position) for other in others
     )
     for method, episode in zip(methods, episodes, strict=False):
         assert episode.title == f"{method}, setup tuned, seed 0"
