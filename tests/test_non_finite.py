@@ -332,8 +332,12 @@ def test_the_command_says_it_in_one_line(tmp_path, monkeypatch, capsys):
 def test_a_dump_that_cannot_be_written_hides_nothing(tmp_path, monkeypatch):
     Poison(monkeypatch, "reward")
 
-    def full(*_):
-        raise UserError("no space left")
+    write = checkpoint_file.write
+
+    def full(path, *rest):
+        if path.parent.name.startswith("divergence"):
+            raise UserError("no space left")
+        write(path, *rest)
 
     monkeypatch.setattr(non_finite.checkpoint_file, "write", full)
     error = diverged(begun("consensus", tmp_path))
@@ -404,7 +408,8 @@ def test_a_rollback_goes_on_and_resumes_as_if_it_had_not_stopped(seeds, tmp_path
     assert progress_of(resumed) == (0.5, 1, 20)
     until(resumed, 37)
     again = resume(resumed.run.path)
-    assert progress_of(again) == (0.25, 2, 37)
+    # The checkpoint of step 30 is beyond the step that failed: the count starts again.
+    assert progress_of(again) == (0.25, 0, 37)
     assert_same(trainer, until(again, None))
 
 

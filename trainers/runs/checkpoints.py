@@ -10,9 +10,9 @@ from torch import Tensor
 
 from emberlink.envs.utils import atomic_io
 from emberlink.envs.utils.errors import UserError
-from emberlink.trainers.config.compose import to_values
 from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.runs import checkpoint_file
+from emberlink.trainers.runs.seal import to_header
 
 _NUMBERED = re.compile(r"(state|step)_\d{9,18}\.safetensors")
 _PARTIAL = ("*.safetensors.[0-9]*.part", ".tmp*")  # safetensors' own names begin with .tmp
@@ -166,7 +166,7 @@ def _network_header(config: RunConfig, step: int) -> dict[str, Any]:
         "method": config.method,
         "uavs": config.env.num_uavs,
         "seed": config.seed,
-        "config": to_values(config),
+        "config": to_header(config),
     }
 
 

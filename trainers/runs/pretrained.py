@@ -17,11 +17,10 @@ from pathlib import Path
 
 from emberlink.envs.fire_files.reader import COPY_FILE
 from emberlink.envs.utils.errors import UserError
-from emberlink.trainers.config.compose import to_values
 from emberlink.trainers.learners.base import ACTOR
 from emberlink.trainers.runs import checkpoint_file
 from emberlink.trainers.runs.run_folder import RunFolder
-from emberlink.trainers.runs.seal import check_trained_with
+from emberlink.trainers.runs.seal import check_trained_with, to_header
 
 PREFIX = "pretrained:"
 USUAL_SETUP = "tuned"
@@ -119,7 +118,7 @@ def pack(run: RunFolder, into: Path) -> Path:
     header, weights = checkpoint_file.read(newest)
     actors = {name: value for name, value in weights.items() if name.startswith(ACTOR)}
     about = {k: v for k, v in (header or {}).items() if k not in ("sha256", "format")}
-    about["config"] = to_values(config)
+    about["config"] = to_header(config)
     (target / "checkpoints").mkdir(parents=True)
     checkpoint_file.write(target / "checkpoints" / newest.name, actors, about)
     RunFolder(target).write_config(config)

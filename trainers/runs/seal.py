@@ -54,7 +54,8 @@ def check_same(path: Path, sealed: Mapping[str, Any], config: RunConfig) -> None
     """
     free = {key: getattr(config, key) for key in _FREE}
     try:
-        trained = from_values({**sealed, "device": config.device})
+        here = {"device": config.device, "output": config.output}
+        trained = from_values({**sealed, **here})
     except (ValueError, TypeError) as error:
         raise UserError(f"{path}: its configuration cannot be read: {error}") from None
     for key, (before, now) in differences(replace(trained, **free), config).items():
@@ -65,6 +66,15 @@ def check_same(path: Path, sealed: Mapping[str, Any], config: RunConfig) -> None
             f"{path}: made with {key}={shown(str(before))}; the run has {key}={shown(str(now))}: "
             f"put {shown(str(before))} back into config.yaml{hint}"
         )
+
+
+def to_header(config: RunConfig) -> dict[str, Any]:
+    """Returns the configuration as a checkpoint's header holds it.
+
+    The folder of the runs is left out: copies of a training in two folders have the same bytes,
+    and networks that are handed on do not name a folder of their author.
+    """
+    return {key: value for key, value in to_values(config).items() if key != "output"}
 
 
 def differences(one: RunConfig, other: RunConfig) -> dict[str, tuple[Any, Any]]:

@@ -8,10 +8,10 @@ from typing import Any
 
 from torch import Tensor
 
-from emberlink.trainers.config.compose import to_values
 from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.evaluation import evaluate
 from emberlink.trainers.runs.run_folder import RunFolder
+from emberlink.trainers.runs.seal import to_header
 from emberlink.trainers.runs.tracking import Trackers
 from emberlink.trainers.training import checkpoints, non_finite, rollback
 from emberlink.trainers.training.folders import RunFolders, empty
@@ -218,7 +218,7 @@ class Trainer:
         self.rollbacks = self.rollbacks.passed(setup.step)
         state = checkpoints.RunState(
             step=setup.step,
-            config=to_values(self.config),
+            config=to_header(self.config),
             folders=folders.names,
             sizes=folders.sizes(),
             best=self.best,
