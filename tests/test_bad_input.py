@@ -76,6 +76,8 @@ SETUPS = "known: paper, released, tuned"
         ),
         (["consensus", "comm.name=no_comm"], ["comm.", "not a setting of no_comm; known: none"]),
         (["consensus", "learner.hidden=[10000000,8]"], ["learner.hidden.0=10000000", "8192"]),
+        (["consensus", "learner.hidden=[]"], ["learner.hidden=[]", "at least 1 item"]),
+        (["consensus", "learner.hidden=[8,8,8,8,8,8,8,8,8]"], ["learner.hidden=", "at most 8"]),
         (["consensus", "num_envs=100000000"], ["num_envs=100000000", "65536"]),
         (["consensus", "device=cuda:99"], ["device=cuda:99 is not there", "known: cpu"]),
         (["consensus", "device=tpu"], ["device=tpu is not there", "known: cpu"]),

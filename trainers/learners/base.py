@@ -37,8 +37,8 @@ class LearnerConfig:
 
     name: Name
     """the learner: a file in trainers/learners, or an entry point of `emberlink.learners`"""
-    hidden: Annotated[tuple[Units, Units], Strict(False)]
-    """units of the two hidden layers"""
+    hidden: Annotated[tuple[Units, ...], Field(min_length=1, max_length=8), Strict(False)]
+    """units of the hidden layers, 1 to 8 layers"""
     share_parameters: bool = False
     """one set of weights for all UAVs of a seed instead of one per UAV"""
 
