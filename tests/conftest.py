@@ -8,9 +8,10 @@ from tiny_run import train_tiny
 
 
 @pytest.fixture(autouse=True, scope="session")
-def _own_cache(tmp_path_factory):
-    """Banks of fires are cached in a folder of the tests' own, also by what they start."""
+def _environment(tmp_path_factory):
+    """Gives the tests, and the programs that they start, a cache of their own and no terminal."""
     with pytest.MonkeyPatch.context() as patch:
+        patch.delenv("COLUMNS", raising=False)
         patch.setenv("EMBERLINK_CACHE", str(tmp_path_factory.mktemp("cache")))
         yield
 
