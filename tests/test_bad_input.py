@@ -167,7 +167,7 @@ def test_a_checkpoint_that_is_none(run, capsys):
         refused(["eval", str(run)], capsys, checkpoint.name, "not a readable checkpoint")
     weights = {"else": torch.zeros(3)}
     save_file(weights, checkpoint)
-    refused(["eval", str(run)], capsys, checkpoint.name, "does not hold the configuration")
+    refused(["eval", str(run)], capsys, checkpoint.name, "not a readable checkpoint")
     other = run / "nothing.safetensors"
     refused(["eval", str(run), "--checkpoint", str(other)], capsys, other.name)
 

@@ -133,7 +133,7 @@ def load_weights(
             or type, or a number is NaN or infinite.
     """
     header, weights = checkpoint_file.read(path)
-    if header is not None and config is not None:
+    if config is not None:
         _check_header(path, header, config)
     for name, tensor in expected.items():
         if name not in weights:

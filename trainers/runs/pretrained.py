@@ -117,7 +117,7 @@ def pack(run: RunFolder, into: Path) -> Path:
     check_trained_with(newest, trained)
     header, weights = checkpoint_file.read(newest)
     actors = {name: value for name, value in weights.items() if name.startswith(ACTOR)}
-    about = {k: v for k, v in (header or {}).items() if k not in ("sha256", "format")}
+    about = {k: v for k, v in header.items() if k not in ("sha256", "format")}
     about["config"] = to_header(config)
     (target / "checkpoints").mkdir(parents=True)
     checkpoint_file.write(target / "checkpoints" / newest.name, actors, about)

@@ -33,11 +33,8 @@ def check_trained_with(path: Path, config: RunConfig) -> None:
             first key that differs, and both values.
     """
     header = checkpoint_file.read_header(path)
-    if header is None or "config" not in header:
-        raise UserError(
-            f"{path}: does not hold the configuration that it was trained with; it was written by "
-            "another program"
-        )
+    if "config" not in header:
+        raise UserError(f"{path}: does not hold the configuration that it was trained with")
     check_same(path, header["config"], config)
 
 
