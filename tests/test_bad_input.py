@@ -90,7 +90,7 @@ SETUPS = "known: paper, released, tuned"
         (["consensus", "seed=1,2"], ["'seed=1,2'", "one value", "seeds=[1,2]"]),
         (["consensus", "seeds=0,1"], ["'seeds=0,1'", "one value", "seeds=[0,1]"]),
         (["consensus", "env.grid=30,20"], ["one value", "env.grid=[30,20]"]),
-        (["consensus", "fire.kind=file"], ["fire.kind", "chosen with fire=NAME"]),
+        (["consensus", "fire.kind=file"], ["fire.kind", "choose it with fire=NAME"]),
         (["consensus", "comm={range: 3}"], ["give its keys one by one", "comm.KEY=VALUE"]),
         (["consensus", "env.horizon=${nope}"], ["nope", "env.horizon"]),
     ],

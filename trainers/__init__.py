@@ -1,4 +1,4 @@
-"""Configurations, training, evaluation, comparison and the command line; what Python offers."""
+"""Configuration, training, evaluation and comparison of policies; the Python API of emberlink."""
 
 from typing import TYPE_CHECKING
 

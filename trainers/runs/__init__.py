@@ -1,4 +1,4 @@
-"""Run folders on disk: configuration, metrics, checkpoints, lock, trackers and trained policies."""
+"""Manages run folders: configuration, metrics, checkpoints, lock, trackers, trained policies."""
 
 from typing import TYPE_CHECKING
 
