@@ -144,9 +144,10 @@ def test_a_tensor_of_another_shape_is_refused(stopped):
     assert reason.startswith("does not fit this training: tensor actor_network_params.module.first")
 
 
-@pytest.mark.parametrize(
-    "key", [*["folders", "sizes", "best", "seconds", "step", "rollbacks", "versions"]]
-)
+STATE_KEYS = ["folders", "sizes", "best", "seconds", "step", "rollbacks", "versions"]
+
+
+@pytest.mark.parametrize("key", STATE_KEYS)
 def test_a_header_that_lacks_a_key_is_refused(key, stopped):
     reason = refused(stopped, lambda header, _: header.pop(key))
     assert reason == f"a checkpoint of another version: it has no '{key}'"
