@@ -6,6 +6,8 @@ from pathlib import Path
 import pytest
 from tiny_run import train_tiny
 
+from emberlink.trainers.evaluation import plots, report
+
 
 @pytest.fixture(autouse=True, scope="session")
 def _environment(tmp_path_factory):
@@ -14,6 +16,18 @@ def _environment(tmp_path_factory):
         patch.delenv("COLUMNS", raising=False)
         patch.setenv("EMBERLINK_CACHE", str(tmp_path_factory.mktemp("cache")))
         yield
+
+
+@pytest.fixture
+def quick_figures(monkeypatch) -> None:
+    """Leaves the pictures of an evaluation empty, which draws them in half of its time."""
+
+    def empty(path: Path, *_) -> None:
+        path.write_bytes(b"")
+
+    for name in ("coverage_bars", "training_curves", "timelapse"):
+        monkeypatch.setattr(plots, name, empty)
+    monkeypatch.setattr(report, "write_gif", empty)
 
 
 @pytest.fixture(scope="session")

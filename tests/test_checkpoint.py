@@ -21,6 +21,8 @@ from emberlink.trainers.runs import checkpoint_file
 from emberlink.trainers.runs.run_folder import RunFolder
 from emberlink.trainers.training.resume import resume
 
+pytestmark = pytest.mark.usefixtures("quick_figures")
+
 
 @settings(max_examples=30, deadline=None)
 @given(

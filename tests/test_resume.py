@@ -20,6 +20,8 @@ from emberlink.trainers.runs.run_folder import RunFolder
 from emberlink.trainers.training.resume import resume
 from emberlink.trainers.training.trainer import Progress, Trainer
 
+pytestmark = pytest.mark.usefixtures("quick_figures")
+
 HORIZON, EPISODES = 20, 4
 SMALL = [
     *(f"env.horizon={HORIZON}", f"episodes={EPISODES}", "env.num_uavs=2", "num_envs=2"),
