@@ -21,8 +21,6 @@ from emberlink.trainers.runs import checkpoint_file
 from emberlink.trainers.runs.run_folder import RunFolder
 from emberlink.trainers.training.resume import resume
 
-pytestmark = pytest.mark.usefixtures("quick_figures")
-
 
 @settings(max_examples=30, deadline=None)
 @given(
@@ -58,6 +56,7 @@ def test_every_byte_is_sealed(tmp_path):
             checkpoint_file.read(path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS)
 def test_nothing_damaged_or_of_something_else_is_accepted(method, tmp_path):
     files = readable(tmp_path, method)
@@ -111,6 +110,7 @@ def refused(path: Path, change: Callable[[dict, dict[str, torch.Tensor]], object
     return text.partition("; the one before it")[0].removeprefix(f"{path}: ")
 
 
+@pytest.mark.slow
 def test_nan_is_refused_wherever_it_is(stopped):
     _, content = checkpoint_file.read(stopped)
     floating = [name for name, value in content.items() if value.is_floating_point()]

@@ -35,9 +35,6 @@ def contents(folder: Path) -> dict[str, bytes]:
     return {str(path): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
-pytestmark = pytest.mark.usefixtures("quick_figures")
-
-
 @pytest.fixture(scope="module")
 def independent(tmp_path_factory) -> Path:
     output = tmp_path_factory.mktemp("runs")
@@ -188,6 +185,7 @@ def test_the_folder_stays_locked_until_the_evaluation_is_written(tmp_path, capsy
     assert not list((tmp_path / "runs").glob("*/lock"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("call", range(1, 5))
 def test_a_kill_while_the_folders_of_seeds_are_made(call, tmp_path, capsys):
     """Either nothing is there that could be taken for a run, or it goes on with all its seeds."""

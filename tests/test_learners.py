@@ -17,8 +17,6 @@ from emberlink.trainers.learners.td3 import TD3
 from emberlink.trainers.training.setup import TrainingSetup
 from emberlink.trainers.training.trainer import Trainer
 
-pytestmark = pytest.mark.usefixtures("quick_figures")
-
 SMALL = [
     *("env.horizon=15", "env.num_uavs=3", "num_envs=2", "episodes=2", "learner.batch_size=8"),
     *("learner.hidden=[8,8]", "evaluation.interval=0", "evaluation.episodes=1"),
@@ -37,6 +35,7 @@ def test_the_files_are_the_learners():
         registry.find("sac")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("learner", LEARNERS)
 @pytest.mark.parametrize("method", METHODS)
 def test_a_short_run_learns_and_evaluates(method, learner, tmp_path, capsys):

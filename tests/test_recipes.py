@@ -13,8 +13,6 @@ from emberlink.trainers.evaluation.actor import load_actor
 from emberlink.trainers.runs.run_folder import RunFolder
 from emberlink.trainers.training.trainer import Trainer
 
-pytestmark = pytest.mark.usefixtures("quick_figures")
-
 METHODS = ["independent", "shared_memory", "positional", "consensus"]
 SETUPS = ["paper", "released", "tuned"]
 EPISODES, HORIZON, ENVS, BATCH = 3, 70, 2, 32
@@ -39,7 +37,9 @@ def trained(config) -> Trainer:
     return trainer
 
 
-@pytest.mark.parametrize("setup", SETUPS)
+@pytest.mark.parametrize(
+    "setup", ["paper", *(pytest.param(s, marks=pytest.mark.slow) for s in SETUPS[1:])]
+)
 @pytest.mark.parametrize("method", METHODS)
 def test_a_recipe_trains(method, setup, tmp_path):
     config = short(method, tmp_path, setup=setup)

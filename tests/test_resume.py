@@ -20,8 +20,6 @@ from emberlink.trainers.runs.run_folder import RunFolder
 from emberlink.trainers.training.resume import resume
 from emberlink.trainers.training.trainer import Progress, Trainer
 
-pytestmark = pytest.mark.usefixtures("quick_figures")
-
 HORIZON, EPISODES = 20, 4
 SMALL = [
     *(f"env.horizon={HORIZON}", f"episodes={EPISODES}", "env.num_uavs=2", "num_envs=2"),
@@ -113,6 +111,7 @@ def whole(tmp_path_factory):
     return of
 
 
+@pytest.mark.slow
 # Before the first update, within an episode, at its end, behind it, before the last step; at 33 of
 # 80 the memory has just come round.
 @pytest.mark.parametrize("learner", ["ddpg", "td3"])

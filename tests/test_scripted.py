@@ -21,8 +21,6 @@ from emberlink.trainers.build import build_env
 from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.evaluation.evaluate import play, scripted_config
 
-pytestmark = pytest.mark.usefixtures("quick_figures")
-
 NEVER = math.inf
 THREE = math.degrees(math.atan(1.2 / 4))  # the view angle: from 4 three cells by three are seen
 
@@ -275,6 +273,7 @@ def test_a_policy_begins_anew_with_every_episode(name):
         moment = step_mdp(env.step(moment), keep_other=True)
 
 
+@pytest.mark.slow
 def test_what_each_policy_covers():
     """Within wide bounds; docs/evaluation.md has the numbers."""
     config = resolve("consensus", ["setup=tuned"])
