@@ -24,6 +24,8 @@ from emberlink.trainers.cli import main
 from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.fires import plot
 
+pytestmark = pytest.mark.drawn
+
 HUYGENS = load_scenario("huygens")
 
 
