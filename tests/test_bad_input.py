@@ -14,6 +14,8 @@ from tiny_run import PROGRAM, TINY
 from emberlink.trainers.cli import main
 from emberlink.trainers.runs.run_folder import RunFolder
 
+pytestmark = pytest.mark.usefixtures("quick_figures")
+
 
 def refused(arguments: list[str], capsys, *words: str) -> str:
     """The one line with which a command ends at status 2; it holds all the words."""

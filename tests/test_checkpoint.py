@@ -21,6 +21,8 @@ from emberlink.trainers.runs import checkpoint_file
 from emberlink.trainers.runs.run_folder import RunFolder
 from emberlink.trainers.training.resume import resume
 
+pytestmark = pytest.mark.usefixtures("quick_figures")
+
 
 @settings(max_examples=30, deadline=None)
 @given(
@@ -144,7 +146,10 @@ def test_a_tensor_of_another_shape_is_refused(stopped):
     assert reason.startswith("does not fit this training: tensor actor_network_params.module.first")
 
 
-@pytest.mark.parametrize("key", ["folders", "sizes", "best", "seconds", "step", "rollbacks"])
+STATE_KEYS = ["folders", "sizes", "best", "seconds", "step", "rollbacks", "versions"]
+
+
+@pytest.mark.parametrize("key", STATE_KEYS)
 def test_a_header_that_lacks_a_key_is_refused(key, stopped):
     reason = refused(stopped, lambda header, _: header.pop(key))
     assert reason == f"a checkpoint of another version: it has no '{key}'"

@@ -9,6 +9,8 @@ from emberlink.envs import keys
 from emberlink.envs.config import WildfireConfig
 from emberlink.envs.wildfire import WildfireEnv
 
+pytestmark = pytest.mark.usefixtures("quick_figures")
+
 
 @pytest.mark.parametrize("method", METHODS)
 def test_a_seed_repeats_its_run_byte_for_byte(method, tmp_path):

@@ -13,6 +13,8 @@ from emberlink.policies.networks.encoders import ObservationEncoder, WindowEncod
 from emberlink.policies.networks.grouping import Grouping
 from emberlink.policies.networks.stacked import StackedActor, StackedCritic
 
+pytestmark = pytest.mark.usefixtures("quick_figures")
+
 UAVS, ACTIONS, WINDOW, HIDDEN = 3, 3, 5, (10, 8)
 
 

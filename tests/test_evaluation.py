@@ -25,6 +25,8 @@ from emberlink.trainers.evaluation import baseline_cache, evaluate, tables
 from emberlink.trainers.runs.run_folder import RunFolder
 from emberlink.trainers.terminal import SafeConsole
 
+pytestmark = pytest.mark.usefixtures("quick_figures")
+
 SMALL = ["env.horizon=12", "env.num_uavs=2", "learner.hidden=[8,8]", "env.grid=[12,10]"]
 
 

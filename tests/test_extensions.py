@@ -22,6 +22,8 @@ from emberlink.envs.utils.errors import UserError
 from emberlink.trainers.cli import main
 from emberlink.trainers.config.compose import resolve
 
+pytestmark = pytest.mark.usefixtures("quick_figures")
+
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch) -> Path:

@@ -25,6 +25,8 @@ from emberlink.trainers.cli import main
 from emberlink.trainers.config.compose import from_values, override, resolve, to_values
 from emberlink.trainers.runs.run_folder import RunFolder
 
+pytestmark = pytest.mark.usefixtures("quick_figures")
+
 GRID, HORIZON = (12, 10), 15
 SMALL = [*TINY, "env.grid=[12,10]"]
 

@@ -26,6 +26,8 @@ from emberlink.trainers.cli import main
 from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.runs.run_folder import RunFolder
 
+pytestmark = pytest.mark.usefixtures("quick_figures")
+
 
 class Bomb:
     """Leaves a mark where it is unpickled."""

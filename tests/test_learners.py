@@ -17,6 +17,8 @@ from emberlink.trainers.learners.td3 import TD3
 from emberlink.trainers.training.setup import TrainingSetup
 from emberlink.trainers.training.trainer import Trainer
 
+pytestmark = pytest.mark.usefixtures("quick_figures")
+
 SMALL = [
     *("env.horizon=15", "env.num_uavs=3", "num_envs=2", "episodes=2", "learner.batch_size=8"),
     *("learner.hidden=[8,8]", "evaluation.interval=0", "evaluation.episodes=1"),

@@ -29,6 +29,8 @@ from emberlink.trainers.training.non_finite import NonFiniteError, NonFiniteRepo
 from emberlink.trainers.training.resume import resume
 from emberlink.trainers.training.trainer import Trainer
 
+pytestmark = pytest.mark.usefixtures("quick_figures")
+
 HORIZON, UAVS, ENVS, BATCH = 20, 3, 2, 16
 STEP, UAV, ENV = 33, 1, 1
 SMALL = [

@@ -14,6 +14,8 @@ from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.training.resume import resume
 from emberlink.trainers.training.trainer import Trainer
 
+pytestmark = pytest.mark.usefixtures("quick_figures")
+
 STILL = """
 from emberlink.policies.scripted.base import Scripted
 from emberlink.policies.scripted.stationary import Stationary

@@ -17,6 +17,8 @@ from emberlink.envs.utils.errors import UserError
 from emberlink.policies.scripted.registry import SCRIPTED
 from emberlink.trainers.runs.run_folder import RunFolder
 
+pytestmark = pytest.mark.usefixtures("quick_figures")
+
 ROOT = Path(__file__).parents[1]
 SHORT = {
     "episodes": 2,

@@ -13,6 +13,8 @@ from emberlink.trainers.evaluation.actor import load_actor
 from emberlink.trainers.runs.run_folder import RunFolder
 from emberlink.trainers.training.trainer import Trainer
 
+pytestmark = pytest.mark.usefixtures("quick_figures")
+
 METHODS = ["independent", "shared_memory", "positional", "consensus"]
 SETUPS = ["paper", "released", "tuned"]
 EPISODES, HORIZON, ENVS, BATCH = 3, 70, 2, 32

@@ -21,6 +21,8 @@ from emberlink.trainers.build import build_env
 from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.evaluation.evaluate import play, scripted_config
 
+pytestmark = pytest.mark.usefixtures("quick_figures")
+
 NEVER = math.inf
 THREE = math.degrees(math.atan(1.2 / 4))  # the view angle: from 4 three cells by three are seen
 

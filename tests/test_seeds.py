@@ -18,6 +18,8 @@ from emberlink.trainers.config.compose import from_values, resolve, to_values
 from emberlink.trainers.evaluation import report
 from emberlink.trainers.training.setup import TrainingSetup
 
+pytestmark = pytest.mark.usefixtures("quick_figures")
+
 SEEDS = [3, 11]
 
 

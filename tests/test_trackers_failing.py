@@ -20,6 +20,8 @@ from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.runs import loggers
 from emberlink.trainers.training.trainer import Progress, Trainer
 
+pytestmark = pytest.mark.usefixtures("quick_figures")
+
 EPISODES = 4
 SHORT = [
     *(f"episodes={EPISODES}", "env.horizon=8", "env.num_uavs=2", "fire=paper"),
