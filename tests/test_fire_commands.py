@@ -16,13 +16,12 @@ from PIL import Image
 
 from emberlink.envs.fire.cache import GENERATOR_VERSION
 from emberlink.envs.fire.generator import fire_seeds, load_scenario, make_fires
-from emberlink.envs.fire_files import banks
-from emberlink.envs.fire_files.banks import write_bank
 from emberlink.envs.scenarios import fires_of
 from emberlink.envs.utils.publish import published
 from emberlink.trainers.cli import main
 from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.fires import plot
+from emberlink.trainers.fires.bank_writer import SUFFIXES, write_bank
 
 HUYGENS = load_scenario("huygens")
 
@@ -472,7 +471,7 @@ def test_where_there_are_no_links_a_file_is_published_all_the_same(tmp_path, mon
 def test_what_is_no_time_is_not_written(wrong, tmp_path):
     fires = torch.zeros(1, 8, 8)
     fires[0, 2, 3] = wrong
-    for suffix in banks.SUFFIXES:
+    for suffix in SUFFIXES:
         with pytest.raises(AssertionError, match="arrival times are 0 or more"):
             write_bank(tmp_path / f"a{suffix}", fires)
     assert list(tmp_path.iterdir()) == []

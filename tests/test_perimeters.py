@@ -327,14 +327,6 @@ def test_an_end_before_the_first_perimeter(tmp_path):
     assert torch.isfinite(early).any()
 
 
-def test_farsites_month_day_and_hour(tmp_path):
-    frame = squares(200, 300, 400, column="Month", values=[12.0, 12.0, 1.0])
-    frame["Day"], frame["Hour"] = [31.0, 31.0, 1.0], [2200.0, 2300.0, 0.0]
-    frame.to_file(tmp_path / "fire.shp")
-    squares(200, 300, 400, column="Elapsed_Mi", values=[0, 60, 120]).to_file(tmp_path / "e.shp")
-    assert torch.equal(read(tmp_path / "fire.shp"), read(tmp_path / "e.shp"))
-
-
 @pytest.mark.parametrize(
     ("column", "keys"),
     [
@@ -421,11 +413,3 @@ def test_dates_as_numbers(tmp_path, keys):
     )
     with pytest.raises(ValueError, match=r"feature 2 has date='?20200832'?, which is not a date"):
         read(tmp_path / "wrong.gpkg", **keys)
-
-
-def test_a_month_in_words_is_named(tmp_path):
-    frame = squares(200, 300, 400, column="Month", values=["4", "April", "4"])
-    frame["Day"], frame["Hour"] = [1, 1, 1], [1200, 1300, 1400]
-    frame.to_file(tmp_path / "fire.gpkg")
-    with pytest.raises(ValueError, match="feature 1 has Month=April, Day=1, Hour=1300; "):
-        read(tmp_path / "fire.gpkg")

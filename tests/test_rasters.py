@@ -15,9 +15,8 @@ from rasterio.transform import from_origin
 
 from emberlink.envs.fire_files import rasters
 from emberlink.envs.fire_files.config import FileFireConfig
-from emberlink.envs.fire_files.raster_source import RasterSource, Window
+from emberlink.envs.fire_files.raster_source import Clock, RasterSource, Window
 from emberlink.envs.fire_files.reader import read_fires
-from emberlink.envs.fire_files.times import Clock
 
 INF = math.inf
 PLAIN = {"units": "minutes", "ring_width": None, "margin": None}

@@ -1,4 +1,4 @@
-"""The configuration of fires that are read from files."""
+"""Configuration of fires that are read from files."""
 
 import dataclasses
 from typing import Annotated, Any, Literal
@@ -6,10 +6,10 @@ from typing import Annotated, Any, Literal
 from pydantic import BeforeValidator, ConfigDict, Field, model_validator
 from pydantic.dataclasses import dataclass
 
-from emberlink.envs.fire_files.times import Units
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import Name
 
+Units = Literal["steps", "seconds", "minutes", "hours", "days"]
 _Number = Annotated[float, Field(allow_inf_nan=False)]
 _Time = _Number | Annotated[str, Field(min_length=1, max_length=40)]
 _Digest = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]

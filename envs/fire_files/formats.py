@@ -3,6 +3,7 @@
 import hashlib
 import json
 import os
+import re
 import sqlite3
 import struct
 from collections.abc import Callable
@@ -16,7 +17,6 @@ MAX_BYTES = 300_000_000
 """Of a text file."""
 _BESIDE = {".shp": (".shx", ".dbf", ".prj", ".cpg"), ".asc": (".prj",)}
 _BESIDE |= {".tif": (".tfw",), ".tiff": (".tfw",)}
-_BOM = b"\xef\xbb\xbf"
 
 
 @dataclass(frozen=True)
@@ -25,27 +25,10 @@ class Format:
 
     name: str
     suffixes: tuple[str, ...]
-    matches: Callable[[bytes], bool]
-    """Tells whether the first bytes of a file are those of the format."""
+    head: re.Pattern[bytes]
+    """Matches the first bytes of a file of the format."""
     check: Callable[[Path], None] = lambda _: None
     """Raises a UserError for damage that the library that reads it would not notice."""
-
-
-def _is_tiff(head: bytes) -> bool:
-    return head[:4] in (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
-
-
-def _is_ascii(head: bytes) -> bool:
-    return head.removeprefix(_BOM).lstrip()[:5].lower() in (b"ncols", b"nrows")
-
-
-def _is_json(head: bytes) -> bool:
-    return head.removeprefix(_BOM).lstrip()[:1] == b"{"
-
-
-def _is_points(head: bytes) -> bool:
-    line = head.split(b"\n", 1)[0].strip()
-    return not line.strip(b"0123456789+-.eE, \t\r\n") and (not line or line.count(b",") >= 2)
 
 
 def _check_length(path: Path) -> None:
@@ -105,15 +88,25 @@ def _check_shapefile(path: Path) -> None:
         raise UserError(f"{name} has {records} records, the .shx {features}: damaged")
 
 
-NUMPY = Format("NumPy bank", (".npy",), lambda head: head[:6] == b"\x93NUMPY")
-GEOTIFF = Format("GeoTIFF", (".tif", ".tiff"), _is_tiff)
-ASCII = Format("ESRI ASCII", (".asc", ".agr", ".grd"), _is_ascii, _check_length)
-SHAPEFILE = Format("shapefile", (".shp",), lambda h: h[:4] == b"\0\0\x27\x0a", _check_shapefile)
-GEOJSON = Format("GeoJSON", (".geojson", ".json"), _is_json, _check_json)
-GEOPACKAGE = Format(
-    "GeoPackage", (".gpkg",), lambda h: h[:16] == b"SQLite format 3\0", _check_sqlite
+_TEXT = rb"(?:\xef\xbb\xbf)?\s*"  # after a byte order mark
+_NUMBERS = rb"[-+.\deE \t\r]*,"
+NUMPY = Format("NumPy bank", (".npy",), re.compile(rb"\x93NUMPY"))
+GEOTIFF = Format("GeoTIFF", (".tif", ".tiff"), re.compile(rb"II[*+]\0|MM\0[*+]"))
+ASCII = Format(
+    "ESRI ASCII",
+    (".asc", ".agr", ".grd"),
+    re.compile(_TEXT + rb"(?i:ncols|nrows)"),
+    _check_length,
 )
-POINTS = Format("the paper's text", (".txt", ".csv"), _is_points, _check_length)
+SHAPEFILE = Format("shapefile", (".shp",), re.compile(rb"\0\0\x27\x0a"), _check_shapefile)
+GEOJSON = Format("GeoJSON", (".geojson", ".json"), re.compile(_TEXT + rb"\{"), _check_json)
+GEOPACKAGE = Format("GeoPackage", (".gpkg",), re.compile(rb"SQLite format 3\0"), _check_sqlite)
+POINTS = Format(
+    "the paper's text",
+    (".txt", ".csv"),
+    re.compile(rb"\s*?(?:\n|\Z)|(?:" + _NUMBERS + rb"){2,}[-+.\deE \t\r]*(?:\n|\Z)"),
+    _check_length,
+)
 FORMATS = (NUMPY, GEOTIFF, ASCII, SHAPEFILE, GEOJSON, GEOPACKAGE, POINTS)
 
 
@@ -137,7 +130,7 @@ def find_format(path: Path) -> Format:
     # A file that ends in .txt may be anything.
     candidates = FORMATS if not named or POINTS in named else named
     for candidate in candidates:
-        if candidate.matches(head):
+        if candidate.head.match(head):
             candidate.check(path)
             return candidate
     start = head[:16].decode("latin-1").encode("unicode_escape").decode()

@@ -27,7 +27,7 @@ def enclosed(geometries: Sequence[Any], features: Sequence[int]) -> Any:
     Raises:
         UserError: a feature encloses nothing, or a line is not closed.
     """
-    shapely = library("shapely", "perimeters")
+    shapely = library("shapely")
     areas: list[Any] = []
     lines: list[tuple[Any, int]] = []
     for geometry, feature in zip(geometries, features, strict=True):
@@ -50,7 +50,7 @@ def enclosed(geometries: Sequence[Any], features: Sequence[int]) -> Any:
 
 def make_valid(area: Any) -> Any:
     """Returns an area that does not cross itself, with the same shells."""
-    shapely = library("shapely", "perimeters")
+    shapely = library("shapely")
     if area.is_valid:
         return area
     return shapely.make_valid(area, method="structure", keep_collapsed=False)
@@ -70,7 +70,7 @@ def ignition(area: Any, moved: np.ndarray) -> Any:
         area: a shapely polygon or several.
         moved: float64 [4], how far least x, least y, greatest x and greatest y have moved since.
     """
-    shapely = library("shapely", "perimeters")
+    shapely = library("shapely")
     earlier: list[Any] = []
     for part in polygons(area):
         now = np.array(part.bounds)
@@ -100,7 +100,7 @@ def _parts(geometry: Any) -> list[Any]:
 
 def _within_lines(lines: Sequence[tuple[Any, int]]) -> Any:
     """Returns what closed lines enclose; those within an odd number of others are islands."""
-    shapely = library("shapely", "perimeters")
+    shapely = library("shapely")
     rings: dict[bytes, Any] = {}
     for line in _parts(shapely.line_merge(shapely.MultiLineString([line for line, _ in lines]))):
         ends = np.asarray(line.coords)[[0, -1]]

@@ -17,8 +17,7 @@ from emberlink.envs.fire_files.projection import (
     library,
     projections,
 )
-from emberlink.envs.fire_files.raster_source import Window
-from emberlink.envs.fire_files.times import Clock
+from emberlink.envs.fire_files.raster_source import Clock, Window
 from emberlink.envs.utils.errors import UserError
 
 MAX_TIMES = 500
@@ -33,21 +32,21 @@ def read_perimeters(path: Path, config: FileFireConfig) -> "PerimeterSource":
         UserError: the file, a feature or a column is wrong.
     """
     frame = _read_table(path, config.layer)
-    times = perimeter_times(frame, config.time_field, config.units)
-    distinct = np.unique(times.values)
+    times, clock = perimeter_times(frame, config.time_field, config.units)
+    distinct = np.unique(times)
     if len(distinct) > MAX_TIMES:
         raise UserError(f"{len(distinct)} times; at most {MAX_TIMES} are read")
     areas: list[Any] = []
     for time in distinct:
-        features = np.flatnonzero(times.values == time).tolist()
+        features = np.flatnonzero(times == time).tolist()
         areas.append(enclosed(frame.geometry.iloc[features].tolist(), features))
-    return PerimeterSource(_project(path, frame, areas, config.crs), distinct, times.clock)
+    return PerimeterSource(_project(path, frame, areas, config.crs), distinct, clock)
 
 
 def _read_table(path: Path, layer: str | None) -> Any:
     """Reads the features, each of which has a geometry."""
-    pyogrio = library("pyogrio", "perimeters")
-    library("geopandas", "perimeters")
+    pyogrio = library("pyogrio")
+    library("geopandas")
     # As text: of dates in GeoJSON, GDAL loses some zones where not all are the same.
     options = {"DATE_AS_STRING": "YES"} if _is_json(path) else {}
     try:
@@ -98,7 +97,7 @@ def _project(path: Path, frame: Any, areas: Sequence[Any], crs: str | None) -> l
     chosen = projections(source_crs, crs, (x0, y0, x1, y1), None)
     if chosen is None:
         return list(areas)
-    geopandas = library("geopandas", "perimeters")
+    geopandas = library("geopandas")
     projected = geopandas.GeoSeries(areas, crs=chosen[0]).to_crs(chosen[1])
     if not np.isfinite(projected.total_bounds).all():
         raise UserError(
@@ -179,7 +178,7 @@ class PerimeterSource:
 
 def _check_growth(areas: Sequence[Any], times: np.ndarray, clock: Clock) -> None:
     """Checks that areas do not shrink: then times go backwards, or are of another fire."""
-    shapely = library("shapely", "perimeters")
+    shapely = library("shapely")
     burnt, united, largest = areas[0], 1, areas[0].area
     for k in range(1, len(areas)):
         area = areas[k]
@@ -217,9 +216,9 @@ def _rasterize(area: Any, window: Window) -> np.ndarray:
 
     A polygon that covers no centre covers the cell of a point in it, so that none is lost.
     """
-    features = library("rasterio.features", "perimeters")
-    shapely = library("shapely", "perimeters")
-    affine = library("rasterio.transform", "perimeters").from_origin(
+    features = library("rasterio.features")
+    shapely = library("shapely")
+    affine = library("rasterio.transform").from_origin(
         window.x, window.y + window.grid[1] * window.side, window.side, window.side
     )
     about = {"out_shape": window.grid[::-1], "transform": affine, "dtype": "uint8"}

@@ -24,17 +24,17 @@ _MAX_DEGREES = 20.0  # across; a UTM zone is no plane for more
 _MAX_METRES = 1e9  # no projection of the Earth has such coordinates
 
 
-def library(name: str, what: str) -> Any:
+def library(name: str, what: str = "reading this file") -> Any:
     """Imports a module of the extra `geo`.
 
     Raises:
-        UserError: it is not installed; `what` says for what it is needed.
+        UserError: the module is not installed; `what` needs it.
     """
     try:
         return importlib.import_module(name)
     except ImportError:
         raise UserError(
-            f"reading {what} needs the extra geo: pip install '.[geo]' in Emberlink's folder "
+            f"{what} needs the extra geo: pip install '.[geo]' in Emberlink's folder "
             f"({name} is missing)"
         ) from None
 

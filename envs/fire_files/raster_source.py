@@ -1,19 +1,39 @@
 """Arrival times on a raster, and how they are sampled on the cells of a grid."""
 
 from dataclasses import dataclass, replace
+from datetime import datetime, timedelta
 from typing import Protocol
 
 import numpy as np
 from scipy.ndimage import minimum_filter
 
+from emberlink.envs.fire_files.config import Units
 from emberlink.envs.fire_files.projection import Bounds
-from emberlink.envs.fire_files.times import Clock
 from emberlink.envs.utils.errors import UserError
 
+SECONDS = {"seconds": 1.0, "minutes": 60.0, "hours": 3600.0, "days": 86400.0}
 SAMPLES = 180
 """Sample points along the grid's shorter side; a cell of the grid keeps the earliest of its own.
 Rasters and perimeters are sampled at the same points."""
 _EDGE = 1e-6  # cells: a centre on an edge belongs to the same side whatever is rounded
+
+
+@dataclass(frozen=True)
+class Clock:
+    """The unit of a source's times, and the calendar time of 0 where it is known."""
+
+    unit: Units
+    origin: datetime | None = None
+
+    def format(self, time: float) -> str:
+        """Returns a time as text for a message."""
+        if self.origin is not None:
+            try:
+                date = self.origin + timedelta(seconds=time * SECONDS[self.unit])
+                return date.isoformat(timespec="minutes")
+            except OverflowError:  # not a year of four digits
+                pass
+        return f"{time:g} {self.unit}"
 
 
 @dataclass(frozen=True)

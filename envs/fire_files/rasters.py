@@ -1,6 +1,7 @@
-"""Rasters of arrival times: ESRI ASCII, as FARSITE, FlamMap and ELMFIRE write it, and GeoTIFF."""
+"""Reads rasters of arrival times: ESRI ASCII (FARSITE, FlamMap, ELMFIRE) and GeoTIFF."""
 
 import logging
+import logging.handlers
 import math
 import re
 from collections.abc import Iterator
@@ -10,10 +11,10 @@ from typing import Any, TextIO
 
 import numpy as np
 
+from emberlink.envs.fire_files.config import Units
 from emberlink.envs.fire_files.formats import beside
 from emberlink.envs.fire_files.projection import check_projection, first_line, library, projections
-from emberlink.envs.fire_files.raster_source import RasterSource, check_spreads
-from emberlink.envs.fire_files.times import Clock, Units
+from emberlink.envs.fire_files.raster_source import Clock, RasterSource, check_spreads
 from emberlink.envs.utils.errors import UserError
 
 MAX_CELLS = 50_000_000
@@ -21,9 +22,13 @@ MAX_CELLS = 50_000_000
 MAX_TIME = 1e12
 """A larger number is not a time."""
 _NEVER = (-9999.0, -1.0)  # NODATA of FARSITE and FlamMap, and of ELMFIRE
-_VOID = 1e30  # a number beyond it is NODATA that nobody declared, such as -3.4e38
-_KEYS = ("ncols", "nrows", "xllcorner", "xllcenter", "yllcorner", "yllcenter")
-_KEYS += ("cellsize", "dx", "dy", "nodata_value")
+_VOID = 1e30  # a number beyond it is NODATA although not declared, such as -3.4e38
+_COUNT, _SIZE, _PLACE = "a whole number above 0", "a size above 0", "a coordinate"
+_KEYS = {"ncols": _COUNT, "nrows": _COUNT, "cellsize": _SIZE, "dx": _SIZE, "dy": _SIZE}
+_KEYS |= dict.fromkeys(("xllcorner", "xllcenter", "yllcorner", "yllcenter"), _PLACE)
+_KEYS |= {"nodata_value": "a number"}
+_NEEDED = (("ncols",), ("nrows",), ("cellsize", "dx"), ("cellsize", "dy"))
+_NEEDED += (("xllcorner", "xllcenter"), ("yllcorner", "yllcenter"))
 _DAMAGE = re.compile(r"IO error|tag ignored|TIFFVSetField|(Null|Incorrect) count|_tiff\w+Proc:")
 Affine = tuple[float, float, float, float, float, float]
 """(a, b, c, d, e, f): the outer corners of cells are at x = a column + b row + c and
@@ -86,8 +91,8 @@ def open_raster(path: Path) -> Iterator[Any]:
     Raises:
         UserError: the file is damaged, also where GDAL would go on with a part of it lost.
     """
-    rasterio = library("rasterio", "GeoTIFF")
-    log = _DamageLog()
+    rasterio = library("rasterio")
+    log = logging.handlers.BufferingHandler(capacity=1_000_000)
     logger = logging.getLogger("rasterio._env")
     level, propagate = logger.level, logger.propagate
     logger.setLevel(logging.WARNING)
@@ -102,21 +107,10 @@ def open_raster(path: Path) -> Iterator[Any]:
         logger.removeHandler(log)
         logger.setLevel(level)
         logger.propagate = propagate
-    if log.messages:
-        raise UserError(f"damaged: {log.messages[0][:200]}; expected a whole raster")
-
-
-class _DamageLog(logging.Handler):
-    """Collects what GDAL logs of damage."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.messages: list[str] = []
-
-    def emit(self, record: logging.LogRecord) -> None:
+    for record in log.buffer:
         message = record.getMessage()
         if record.levelno >= logging.ERROR or _DAMAGE.search(message):
-            self.messages.append(message)
+            raise UserError(f"damaged: {message[:200]}; expected a whole raster")
 
 
 def clean(times: np.ndarray, never: np.ndarray | None = None) -> np.ndarray:
@@ -171,7 +165,11 @@ def _check_band(dataset: Any) -> None:
 
 
 def _read_header(file: TextIO) -> tuple[dict[str, float], int]:
-    """Reads the keys of ESRI ASCII; the file then stands at the first row. Returns their lines."""
+    """Reads the header of ESRI ASCII up to the first row.
+
+    Returns:
+        The values, and the number of lines.
+    """
     header: dict[str, float] = {}
     while True:
         start = file.tell()
@@ -185,30 +183,27 @@ def _read_header(file: TextIO) -> tuple[dict[str, float], int]:
             raise UserError(
                 f"line {line}: {key[:30]!r} is not a key of ESRI ASCII; expected {', '.join(_KEYS)}"
             )
-        try:
-            header[key] = float(words[1]) if key not in header and len(words) == 2 else math.nan
-        except ValueError:
-            header[key] = math.nan
-        if math.isnan(header[key]) and (key != "nodata_value" or words[1:] != ["nan"]):
-            raise UserError(f"line {line}: expected {key} once, with one number")
-    _check_header(header)
+        if key in header or len(words) != 2 or not _is_valid(key, words[1]):
+            text = " ".join(words)[:60]
+            raise UserError(f"line {line}: {text!r}; expected {key} once, with {_KEYS[key]}")
+        header[key] = float(words[1])
+    for keys in _NEEDED:
+        if sum(key in header for key in keys) != 1:
+            raise UserError(f"expected one {' or '.join(keys)} in the header of ESRI ASCII")
     return header, len(header)
 
 
-def _check_header(header: dict[str, float]) -> None:
-    for needed in (("ncols",), ("nrows",), ("cellsize", "dx"), ("cellsize", "dy")):
-        if not any(key in header for key in needed):
-            raise UserError(f"the header has no {needed[0]}; expected ESRI ASCII")
-    for pair in _KEYS[2:4], _KEYS[4:6]:
-        if sum(key in header for key in pair) != 1:
-            raise UserError(f"the header must have one of {' and '.join(pair)}")
-    for key, value in header.items():
-        if key[0] == "n" and key != "nodata_value" and not (1 <= value < 1e12 and value % 1 == 0):
-            raise UserError(f"{key}={value:g}; expected a whole number above 0")
-        if key in ("cellsize", "dx", "dy") and not 0 < value < math.inf:
-            raise UserError(f"{key}={value:g}; expected a size above 0")
-        if key[0] in "xy" and not math.isfinite(value):
-            raise UserError(f"{key}={value:g}; expected a coordinate")
+def _is_valid(key: str, text: str) -> bool:
+    """Tells whether the value of a key of ESRI ASCII is one."""
+    try:
+        value = float(text)
+    except ValueError:
+        return False
+    if _KEYS[key] is _COUNT:
+        return 1 <= value < 1e12 and value % 1 == 0
+    if _KEYS[key] is _SIZE:
+        return 0 < value < math.inf
+    return math.isfinite(value) if _KEYS[key] is _PLACE else True
 
 
 def _prj(path: Path) -> Any:
@@ -258,8 +253,8 @@ def _warp(
 
     Times are interpolated between burnt cells; a point in a cell that never burns stays inf.
     """
-    rasterio = library("rasterio", "a projection")
-    vrt = library("rasterio.vrt", "a projection").WarpedVRT
+    rasterio = library("rasterio")
+    vrt = library("rasterio.vrt").WarpedVRT
     source, target = chosen or ("EPSG:3857", "EPSG:3857")  # any plane: only turned
     about = {
         "height": times.shape[0],

@@ -13,10 +13,15 @@ from torch import Tensor
 
 from emberlink.envs.config import check_grid
 from emberlink.envs.fire_files import formats
-from emberlink.envs.fire_files.banks import MAX_CELLS, bank_horizon, is_bank, read_bands, read_npy
 from emberlink.envs.fire_files.config import FileFireConfig
 from emberlink.envs.fire_files.episode_crop import on_grid
-from emberlink.envs.fire_files.front_points import read_front_points
+from emberlink.envs.fire_files.grid_maps import (
+    MAX_CELLS,
+    map_of_grid,
+    read_front_points,
+    read_geotiff_bank,
+    read_numpy_bank,
+)
 from emberlink.envs.fire_files.perimeters import read_perimeters
 from emberlink.envs.fire_files.projection import quiet
 from emberlink.envs.fire_files.raster_source import Source
@@ -66,25 +71,25 @@ def _read(
 ) -> list[np.ndarray]:
     """Returns the fires in a file, [X, Y] each."""
     kind = formats.find_format(path)
+    bank = None
     if kind is formats.NUMPY:
-        bank = read_npy(path)
-    elif kind is formats.GEOTIFF and is_bank(path):
-        bank = read_bands(path)
-    else:
+        bank = read_numpy_bank(path)
+    elif kind is formats.GEOTIFF:
+        bank = read_geotiff_bank(path)
+    if bank is None:
         return [on_grid(_read_one(path, kind, config), config, grid, horizon)]
-    _check_horizon(path, config, horizon)
+    _check_horizon(bank.horizon, config, horizon)
     fires: list[np.ndarray] = []
-    for source in bank:
+    for times in bank.fires:
         try:
-            fires.append(on_grid(source, config, grid, horizon))
+            fires.append(on_grid(map_of_grid(times), config, grid, horizon))
         except UserError as error:
             raise UserError(f"fire {len(fires)}: {error}") from None
     return fires
 
 
-def _check_horizon(path: Path, config: FileFireConfig, horizon: int) -> None:
+def _check_horizon(written: int | None, config: FileFireConfig, horizon: int) -> None:
     """Checks that a bank whose times stay steps was written for this horizon."""
-    written = bank_horizon(path)
     in_steps = config.start is config.end is config.minutes_per_step is None
     if in_steps and written not in (None, horizon):
         raise UserError(
