@@ -5,7 +5,7 @@ from datetime import datetime, timedelta
 from typing import Protocol
 
 import numpy as np
-from scipy.ndimage import minimum_filter
+from scipy.ndimage import map_coordinates, minimum_filter
 
 from emberlink.envs.fire_files.config import Units
 from emberlink.envs.fire_files.projection import Bounds
@@ -235,17 +235,11 @@ class RasterSource:
 
     def _interpolate(self, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
         """Interpolates among burnt cells, bilinear, [X, Y]; inf in a cell that never burns."""
-        height, width = self.times.shape
         inside = self._at(np.rint(rows).astype(np.int64), np.rint(columns).astype(np.int64))
-        total, weights = np.zeros(inside.shape), np.zeros(inside.shape)
-        row, column = np.floor(rows).astype(np.int64), np.floor(columns).astype(np.int64)
-        for r in (row, row + 1):
-            for c in (column, column + 1):
-                times = self.times[np.ix_(np.clip(r, 0, height - 1), np.clip(c, 0, width - 1))].T
-                weight = (1 - np.abs(columns - c))[:, None] * (1 - np.abs(rows - r))[None, :]
-                weight = np.where(np.isfinite(times), weight, 0)
-                total += weight * np.where(np.isfinite(times), times, 0)
-                weights += weight
+        burns = np.isfinite(self.times)
+        at = np.meshgrid(rows, columns)
+        weights = map_coordinates(burns.astype(np.float64), at, order=1, mode="nearest")
+        total = map_coordinates(np.where(burns, self.times, 0), at, order=1, mode="nearest")
         times = np.maximum(total / np.where(weights > 0, weights, 1), self.first)
         return np.where(np.isinf(inside) | (weights == 0), inside, times)
 
