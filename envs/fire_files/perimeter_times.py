@@ -26,7 +26,7 @@ ELAPSED: dict[str, Units] = {
 CALENDAR = (
     *("poly_polygondatetime", "polygondatetime", "perimeterdatetime", "perdatetime", "perdattime"),
     *("gdb_from_date", "datetime", "date_time", "timestamp", "acq_datetime", "acq_date"),
-    *("date_", "date", "time", "t"),
+    *("date_", "date", "time", "t", "begin"),
 )
 """Columns of the time at which a perimeter was mapped, in lower case."""
 EDITED = ("poly_datecurrent", "datecurrent")
@@ -45,7 +45,7 @@ def perimeter_times(frame: Any, wanted: str | None, unit: Units | None) -> tuple
     """Reads the time of each feature.
 
     Args:
-        frame: a table with a column per attribute.
+        frame: a table with a column per attribute; the index names the features in messages.
         wanted: `fire.time_field`; None takes the only column with a known name.
         unit: `fire.units`.
 
@@ -61,8 +61,8 @@ def perimeter_times(frame: Any, wanted: str | None, unit: Units | None) -> tuple
         if wanted.lower() not in names:
             raise UserError(f"no column {wanted!r} (fire.time_field); there are {known}")
         return _of_column(frame[names[wanted.lower()]], unit)
-    edited = _present(names, EDITED)
-    columns = _present(names, tuple(ELAPSED)) or _present(names, CALENDAR) or edited
+    edited = known_columns(names, EDITED)
+    columns = known_columns(names, tuple(ELAPSED)) or known_columns(names, CALENDAR) or edited
     if "time_" in names and columns == [names.get("date_")]:
         return _geomac(frame, columns[0], names["time_"])
     if len(columns) > 1:
@@ -122,8 +122,13 @@ def in_utc(time: datetime) -> datetime:
         raise UserError(f"{time.isoformat()} is before year 1 or after year 9999") from None
 
 
-def _present(names: dict[str, str], known: Sequence[str]) -> list[str]:
-    """Returns the columns with a known name, also as a .dbf cuts it."""
+def known_columns(names: dict[str, str], known: Sequence[str]) -> list[str]:
+    """Returns the columns with a known name, also as a .dbf cuts it.
+
+    Args:
+        names: the columns, by their names in lower case.
+        known: in lower case.
+    """
     short = {name[:_DBF_LENGTH] for name in known if len(name) > _DBF_LENGTH}
     return [names[name] for name in names if name in known or name in short]
 
@@ -133,13 +138,14 @@ def _of_column(column: Any, unit: Units | None) -> tuple[np.ndarray, Clock]:
     name = str(column.name)
     empty = np.flatnonzero(column.isna().to_numpy())
     if len(empty):
-        raise UserError(f"feature {empty[0]} has no time in {name}; expected one in each")
+        raise UserError(f"{column.index[empty[0]]} has no time in {name}; expected one in each")
     values = column.tolist()
     numbers = [number for value in values if (number := _number(value)) is not None]
-    dates = len(numbers) < len(values) or all(map(_is_date, numbers))
-    if name.lower() in ELAPSED or not dates:
-        return _elapsed(values, name, unit)
-    return _calendar([_date(value, i, name) for i, value in enumerate(values)], name)
+    elapsed = len(numbers) == len(values) and not all(map(_is_date, numbers))
+    if elapsed or name.lower() in ELAPSED:
+        return _elapsed(column, unit)
+    dates = [_date(value, feature, name) for feature, value in column.items()]
+    return _calendar(dates, name, column.index)
 
 
 def _number(value: Any) -> float | None:
@@ -155,7 +161,7 @@ def _is_date(number: float) -> bool:
     return number >= _MIN_MS or (len(digits) == 8 and digits[:2] in _CENTURIES)
 
 
-def _date(value: Any, feature: int, name: str) -> datetime:
+def _date(value: Any, feature: str, name: str) -> datetime:
     """Reads a date as text, as a number in digits, or as milliseconds since 1970."""
     text, number = str(value), _number(value)
     try:
@@ -166,19 +172,18 @@ def _date(value: Any, feature: int, name: str) -> datetime:
         return parse_time(text)
     except (UserError, ValueError, OverflowError, OSError):
         raise UserError(
-            f"feature {feature} has {name}={str(value)[:40]!r}, which is not a date; expected such "
-            "as 2020-08-19T13:00"
+            f"{feature} has {name}={str(value)[:40]!r}, which is not a date; expected such as "
+            "2020-08-19T13:00"
         ) from None
 
 
-def _elapsed(values: Sequence[Any], name: str, unit: Units | None) -> tuple[np.ndarray, Clock]:
+def _elapsed(column: Any, unit: Units | None) -> tuple[np.ndarray, Clock]:
+    name = str(column.name)
     numbers: list[float] = []
-    for feature, value in enumerate(values):
+    for feature, value in column.items():
         number = _number(value)
         if number is None or not 0 <= number <= _MAX_TIME:
-            raise UserError(
-                f"feature {feature} has {name}={str(value)[:40]}; expected a time of 0 or more"
-            )
+            raise UserError(f"{feature} has {name}={str(value)[:40]}; expected a time of 0 or more")
         numbers.append(number)
     known = ELAPSED.get(name.lower())
     if known and unit and unit != known:
@@ -192,13 +197,15 @@ def _elapsed(values: Sequence[Any], name: str, unit: Units | None) -> tuple[np.n
     return np.array(numbers), Clock(unit)
 
 
-def _calendar(dates: Sequence[datetime], name: str) -> tuple[np.ndarray, Clock]:
+def _calendar(
+    dates: Sequence[datetime], name: str, features: Sequence[str]
+) -> tuple[np.ndarray, Clock]:
     """Returns minutes since the first date."""
     aware = [date.tzinfo is not None for date in dates]
     if any(aware) and not all(aware):
         raise UserError(
-            f"{name}: feature {aware.index(True)} has a time zone and feature "
-            f"{aware.index(False)} has none; expected all or none"
+            f"{name}: {features[aware.index(True)]} has a time zone and "
+            f"{features[aware.index(False)]} has none; expected all or none"
         )
     try:
         dates = [in_utc(date) for date in dates]
@@ -212,16 +219,17 @@ def _calendar(dates: Sequence[datetime], name: str) -> tuple[np.ndarray, Clock]:
 def _geomac(frame: Any, date_name: str, time_name: str) -> tuple[np.ndarray, Clock]:
     """Joins GeoMAC's columns: a date, and the time of day as 2300, 155 or 23:00."""
     dates: list[datetime] = []
-    for feature, (date, time) in enumerate(zip(frame[date_name], frame[time_name], strict=True)):
+    rows = zip(frame.index, frame[date_name], frame[time_name], strict=True)
+    for feature, date, time in rows:
         try:
             day = parse_time(str(date)).replace(hour=0, minute=0, second=0)
             dates.append(day + _time_of_day(str(time)))
         except UserError:
             raise UserError(
-                f"feature {feature} has {date_name}={str(date)[:40]}, {time_name}={str(time)[:40]};"
-                " expected a date and a time such as 2300"
+                f"{feature} has {date_name}={str(date)[:40]}, {time_name}={str(time)[:40]}; "
+                "expected a date and a time such as 2300"
             ) from None
-    return _calendar(dates, f"{date_name}, {time_name}")
+    return _calendar(dates, f"{date_name}, {time_name}", frame.index)
 
 
 def _time_of_day(text: str) -> timedelta:

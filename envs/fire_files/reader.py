@@ -70,6 +70,8 @@ def _read(
     path: Path, config: FileFireConfig, grid: tuple[int, int], horizon: int
 ) -> list[np.ndarray]:
     """Returns the fires in a file, [X, Y] each."""
+    if path.is_dir():
+        return [on_grid(read_perimeters(path, config), config, grid, horizon)]
     kind = formats.find_format(path)
     bank = None
     if kind is formats.NUMPY:
