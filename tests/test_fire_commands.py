@@ -52,9 +52,10 @@ def refused(capsys, *arguments) -> str:
 
 
 def numbers(lines: list[str]) -> dict[str, float]:
-    """The rows of the table, without the colons that only sentences have."""
+    """Returns the rows of the table."""
     found = {}
-    for line in lines[1:-5]:
+    first = 2 if lines[1].startswith("read: ") else 1
+    for line in lines[first:-5]:
         name, _, rest = line.partition("  ")
         found[name] = float(rest.split()[0])
     return found
@@ -260,6 +261,17 @@ def test_another_horizon_than_the_banks_is_refused(suffix, capsys, tmp_path):
     ran(capsys, "import", file, "env.horizon=300", "fire.end=1000", "--output", stretched)
     fires = make_fires(HUYGENS, fire_seeds("train", 1), (30, 30), 1000)
     assert np.allclose(np.load(stretched), fires.numpy() * 0.3)
+
+
+def test_preview_says_what_was_read(capsys, tmp_path):
+    source = ascii_raster(tmp_path / "fire.asc", disc())
+    lines = ran(capsys, "preview", source, "fire.units=minutes")
+    cells = np.isfinite(disc()).sum()
+    assert lines[1] == (
+        f"read: {cells} cells burn from 0 minutes to 247.386 minutes, beginning at 1 place"
+    )
+    ran(capsys, "make", "huygens", "--count", 2, "--output", "two.npy")
+    assert ran(capsys, "preview", "two.npy:1")[1] == "read: a bank of 2 fires, in steps"
 
 
 def test_import_of_several_files_is_each_of_them(capsys, tmp_path):

@@ -3,6 +3,7 @@
 import math
 import subprocess
 import sys
+import warnings
 
 import numpy as np
 import pytest
@@ -12,10 +13,11 @@ from fire_files import CORNER, UTM, Ellipses, raster_of, write_asc, write_tif
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from rasterio.transform import from_origin
+from scipy.ndimage import gaussian_filter
 
 from emberlink.envs.fire_files import rasters
-from emberlink.envs.fire_files.config import FileFireConfig
-from emberlink.envs.fire_files.raster_source import Clock, RasterSource, Window
+from emberlink.envs.fire_files.config import Clock, FileFireConfig
+from emberlink.envs.fire_files.raster_source import RasterSource, Window
 from emberlink.envs.fire_files.reader import read_fires
 
 INF = math.inf
@@ -398,3 +400,26 @@ def test_no_arrival_is_lost(rows, columns, side, x, y, seed):
                 assert got[i, j] <= expected[i, j]
             if expected[i, j] == times.min():
                 assert got[i, j] == times.min()
+
+
+def test_a_raster_of_something_else_is_warned_of(tmp_path):
+    """Elevation has many minima, a fire few, also where several fires merge or hours are whole."""
+    hills = np.random.default_rng(0).random((60, 60))
+    hills = 900 + 100 * gaussian_filter(hills, 2)
+    path = write_tif(tmp_path / "hills.tif", hills.astype("float32"))
+    with rasterio.open(path, "r+") as dataset:
+        dataset.set_band_description(1, "Elevation")
+    with pytest.warns(UserWarning, match="'Elevation': 3600 cells burn .* are these arrival times"):
+        read(path, (30, 30))
+    merging = Ellipses(origins=((1200.0, 1300.0), (1900.0, 1500.0)), breadth=1.5)
+    times = raster_of(merging, 300.0)
+    hours = np.where(times < 0, times, np.floor(times / 60))
+    for values, units in ((times, "minutes"), (hours, "hours")):
+        assert source_of(values).beginnings == 2
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            read(write_asc(tmp_path / "fire.asc", values), (30, 30), units=units)
+
+
+def source_of(times):
+    return RasterSource(np.where(times < 0, INF, times), (0, 0), (1, 1), Clock("minutes"))

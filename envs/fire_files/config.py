@@ -1,6 +1,7 @@
-"""Configuration of fires that are read from files."""
+"""Configuration of fires that are read from files, and their units of time."""
 
 import dataclasses
+from datetime import datetime, timedelta
 from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, ConfigDict, Field, model_validator
@@ -10,6 +11,7 @@ from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import Name
 
 Units = Literal["steps", "seconds", "minutes", "hours", "days"]
+SECONDS = {"seconds": 1.0, "minutes": 60.0, "hours": 3600.0, "days": 86400.0}
 _Number = Annotated[float, Field(allow_inf_nan=False)]
 _Time = _Number | Annotated[str, Field(min_length=1, max_length=40)]
 _Digest = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
@@ -20,6 +22,24 @@ def _required(value: Any) -> Any:
     if value is None:
         raise UserError("a file is needed, such as fire.path=ArrivalTime.asc")
     return value
+
+
+@dataclasses.dataclass(frozen=True)
+class Clock:
+    """The unit of a source's times, and the calendar time of 0 where it is known."""
+
+    unit: Units
+    origin: datetime | None = None
+
+    def format(self, time: float) -> str:
+        """Returns a time as text for a message."""
+        if self.origin is not None:
+            try:
+                date = self.origin + timedelta(seconds=time * SECONDS[self.unit])
+                return date.isoformat(timespec="minutes")
+            except OverflowError:  # not a year of four digits
+                pass
+        return f"{time:g} {self.unit}"
 
 
 @dataclass(

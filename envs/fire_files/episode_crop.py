@@ -7,9 +7,9 @@ import numpy as np
 from scipy import ndimage
 
 from emberlink.envs.config import BASE_SIDE
-from emberlink.envs.fire_files.config import FileFireConfig, Units
+from emberlink.envs.fire_files.config import SECONDS, Clock, FileFireConfig, Units
 from emberlink.envs.fire_files.perimeter_times import in_utc, parse_time
-from emberlink.envs.fire_files.raster_source import SECONDS, Clock, Source, Window
+from emberlink.envs.fire_files.raster_source import Source, Window
 from emberlink.envs.utils.errors import UserError
 
 

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 
 from emberlink.envs.config import SIDES
-from emberlink.envs.fire_files.config import Units
+from emberlink.envs.fire_files.config import Clock, Units
 from emberlink.envs.fire_files.projection import first_line
-from emberlink.envs.fire_files.raster_source import Clock, RasterSource, check_spreads
+from emberlink.envs.fire_files.raster_source import RasterSource, check_spreads
 from emberlink.envs.fire_files.rasters import clean, open_raster
 from emberlink.envs.utils.errors import UserError
 

@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from emberlink.envs.fire_files.config import Units
-from emberlink.envs.fire_files.raster_source import Clock
+from emberlink.envs.fire_files.config import Clock, Units
 from emberlink.envs.utils.errors import UserError
 
 ELAPSED: dict[str, Units] = {

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from scipy.ndimage import distance_transform_edt
 
-from emberlink.envs.fire_files.config import FileFireConfig
+from emberlink.envs.fire_files.config import Clock, FileFireConfig
 from emberlink.envs.fire_files.formats import (
     GEOJSON,
     KML,
@@ -25,7 +25,7 @@ from emberlink.envs.fire_files.projection import (
     library,
     projections,
 )
-from emberlink.envs.fire_files.raster_source import Clock, Window
+from emberlink.envs.fire_files.raster_source import Window
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import unknown
 
@@ -192,6 +192,7 @@ class PerimeterSource:
     """
 
     whole = False
+    beginnings = 1
 
     def __init__(self, areas: Sequence[Any], times: np.ndarray, clock: Clock):
         if len(times) < 2:
@@ -199,6 +200,8 @@ class PerimeterSource:
                 f"one perimeter, of {clock.format(times[0])}; expected two times or more"
             )
         self.clock, self.first, self.last = clock, float(times[0]), float(times[-1])
+        span = f"{clock.format(self.first)} to {clock.format(self.last)}"
+        self.summary = f"perimeters of {len(times)} times, from {span}"
         _check_growth(areas, times, clock)
         if clock.origin is None and times[0] > 0:
             areas, times = [area_at_zero(areas, times), *areas], np.concatenate([[0.0], times])

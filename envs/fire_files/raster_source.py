@@ -1,39 +1,20 @@
 """Arrival times on a raster, and how they are sampled on the cells of a grid."""
 
 from dataclasses import dataclass, replace
-from datetime import datetime, timedelta
-from typing import Protocol
+from functools import cached_property
+from typing import Any, Protocol
 
 import numpy as np
-from scipy.ndimage import map_coordinates, minimum_filter
+from scipy.ndimage import label, map_coordinates, minimum_filter
 
-from emberlink.envs.fire_files.config import Units
+from emberlink.envs.fire_files.config import Clock
 from emberlink.envs.fire_files.projection import Bounds
 from emberlink.envs.utils.errors import UserError
 
-SECONDS = {"seconds": 1.0, "minutes": 60.0, "hours": 3600.0, "days": 86400.0}
 SAMPLES = 180
 """Sample points along the grid's shorter side; a cell of the grid keeps the earliest of its own.
 Rasters and perimeters are sampled at the same points."""
 _EDGE = 1e-6  # cells: a centre on an edge belongs to the same side whatever is rounded
-
-
-@dataclass(frozen=True)
-class Clock:
-    """The unit of a source's times, and the calendar time of 0 where it is known."""
-
-    unit: Units
-    origin: datetime | None = None
-
-    def format(self, time: float) -> str:
-        """Returns a time as text for a message."""
-        if self.origin is not None:
-            try:
-                date = self.origin + timedelta(seconds=time * SECONDS[self.unit])
-                return date.isoformat(timespec="minutes")
-            except OverflowError:  # not a year of four digits
-                pass
-        return f"{time:g} {self.unit}"
 
 
 @dataclass(frozen=True)
@@ -99,6 +80,10 @@ class Source(Protocol):
     """latest arrival in the file"""
     extent: Bounds
     """of everything that the file covers"""
+    summary: str
+    """what was read, for the user"""
+    beginnings: int
+    """number of places that burn before all around them, as far as is known"""
     whole: bool
     """whether the file is a map of the whole grid, which is neither cropped nor burnt out"""
 
@@ -120,6 +105,7 @@ class RasterSource:
         cell: width and height of a cell.
         clock: of the times.
         whole: as of `Source`.
+        name: what the file calls the values, for messages.
     """
 
     def __init__(
@@ -129,15 +115,37 @@ class RasterSource:
         cell: tuple[float, float],
         clock: Clock,
         whole: bool = False,
+        name: str = "",
     ):
         rows, columns = times.shape
         x, y = corner
         self.extent: Bounds = x, y - rows * cell[1], x + columns * cell[0], y
         self.times, self.clock, self.whole = times.astype(np.float64), clock, whole
-        self._corner, self._cell = corner, cell
+        self._corner, self._cell, self._name = corner, cell, name
         burning = times[np.isfinite(times)]
         self.first, self.last = float(burning.min()), float(burning.max())
         self.began = 0.0 if self._from_zero() else self.first
+
+    @property
+    def summary(self) -> str:
+        """What was read, for the user."""
+        first, last = self.clock.format(self.first), self.clock.format(self.last)
+        places = "1 place" if self.beginnings == 1 else f"{self.beginnings} places"
+        cells = np.isfinite(self.times).sum()
+        name = f"{self._name!r}: " if self._name else ""
+        return f"{name}{cells} cells burn from {first} to {last}, beginning at {places}"
+
+    @cached_property
+    def beginnings(self) -> int:
+        """Number of places that burn before all around them, on 2000 x 2000 cells at most."""
+        row, column = np.unravel_index(self.times.argmin(), self.times.shape)
+        times = self.times[max(row - 1000, 0) : row + 1000, max(column - 1000, 0) : column + 1000]
+        burns, earliest = np.isfinite(times), times == minimum_filter(times, 3)
+        # A place of several cells that burn at once may have an earlier cell beside one of them.
+        later = minimum_filter(np.where(burns & ~earliest, times, np.inf), 3) == times
+        places: Any = label(burns & earliest, np.ones((3, 3)))
+        spread_to = np.unique(places[0][burns & earliest & later])
+        return int(places[1] - len(spread_to))
 
     def burnt(self, until: float) -> Bounds:
         """Returns the bounds of the area burnt by a time: to the front, else to cells' edges.

@@ -11,10 +11,10 @@ from typing import Any, TextIO
 
 import numpy as np
 
-from emberlink.envs.fire_files.config import Units
+from emberlink.envs.fire_files.config import Clock, Units
 from emberlink.envs.fire_files.formats import beside
 from emberlink.envs.fire_files.projection import check_projection, first_line, library, projections
-from emberlink.envs.fire_files.raster_source import Clock, RasterSource, check_spreads
+from emberlink.envs.fire_files.raster_source import RasterSource, check_spreads
 from emberlink.envs.utils.errors import UserError
 
 MAX_CELLS = 50_000_000
@@ -48,7 +48,8 @@ def read_geotiff(path: Path, unit: Units | None, crs: str | None) -> RasterSourc
         times = clean(dataset.read(1), never) * dataset.scales[0] + dataset.offsets[0]
         tagged: Units | None = "steps" if dataset.tags().get("units") == "steps" else None
         affine, source_crs = dataset.transform[:6], dataset.crs
-    return _on_plane(times, affine, source_crs, unit or tagged, crs)
+        name = (dataset.descriptions[0] or "")[:60]
+    return _on_plane(times, affine, source_crs, unit or tagged, crs, name)
 
 
 def read_ascii(path: Path, unit: Units | None, crs: str | None) -> RasterSource:
@@ -219,7 +220,12 @@ def _prj(path: Path) -> Any:
 
 
 def _on_plane(
-    times: np.ndarray, affine: Affine, source_crs: Any, unit: Units | None, crs: str | None
+    times: np.ndarray,
+    affine: Affine,
+    source_crs: Any,
+    unit: Units | None,
+    crs: str | None,
+    name: str = "",
 ) -> RasterSource:
     """Places cleaned times on a plane, north up.
 
@@ -243,7 +249,7 @@ def _on_plane(
     if chosen or b or d or a < 0 or e > 0:
         times, affine = _warp(times, (a, b, c, d, e, f), chosen)
         a, b, c, d, e, f = affine
-    return RasterSource(times, (c, f), (a, -e), Clock(unit))
+    return RasterSource(times, (c, f), (a, -e), Clock(unit), name=name)
 
 
 def _warp(

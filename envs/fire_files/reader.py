@@ -4,6 +4,7 @@ import dataclasses
 import hashlib
 import io
 import json
+import warnings
 from pathlib import Path
 from typing import NamedTuple
 
@@ -31,6 +32,8 @@ from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import printable
 
 READER_VERSION = 4  # raise it whenever the same file gives another grid
+MAX_BEGINNINGS = 10
+"""Places at which a raster's fire may begin without a warning."""
 COPY_FILE = "fires.npz"
 """The file of a run folder that holds the run's own copy of its grids."""
 _MAX_COPY = 12 * MAX_CELLS + 1_000_000  # bytes of it, unpacked: float32 of the cells of every set
@@ -49,37 +52,50 @@ def read_fires(config: FileFireConfig, grid: tuple[int, int], horizon: int) -> T
         float32 [fires, X, Y], steps: 0 burns from the start, inf never burns.
 
     Raises:
-        UserError: one line that names the file and what is wrong with it.
+        UserError: one line that names the file and the mistake in it.
+    """
+    return read_with_summary(config, grid, horizon)[0]
+
+
+def read_with_summary(
+    config: FileFireConfig, grid: tuple[int, int], horizon: int
+) -> tuple[Tensor, str]:
+    """Returns what `read_fires` does, and a line that says what was read.
+
+    Warns if a raster's fire begins at many places, as elevation taken for arrival times would.
     """
     check_grid(grid)
     path = Path(config.path).expanduser()
+    name = printable(str(path))
     try:
         with quiet():
-            fires = _read(path, config, grid, horizon)
+            fires, summary, many = _read(path, config, grid, horizon)
     except UserError as error:
-        raise UserError(f"{printable(str(path))}: {printable(str(error))}") from None
+        raise UserError(f"{name}: {printable(str(error))}") from None
     except OSError as error:
-        reason = error.strerror or error
-        raise UserError(f"{printable(str(path))}: cannot be read: {reason}") from None
+        raise UserError(f"{name}: cannot be read: {error.strerror or error}") from None
     except MemoryError:
-        raise UserError(f"{printable(str(path))}: not enough memory to read it") from None
-    return torch.from_numpy(np.stack(fires))
+        raise UserError(f"{name}: not enough memory to read it") from None
+    summary = printable(summary)
+    if many:
+        warnings.warn(f"{name}: {summary}: are these arrival times?", stacklevel=3)
+    return torch.from_numpy(np.stack(fires)), summary
 
 
 def _read(
     path: Path, config: FileFireConfig, grid: tuple[int, int], horizon: int
-) -> list[np.ndarray]:
-    """Returns the fires in a file, [X, Y] each."""
-    if path.is_dir():
-        return [on_grid(read_perimeters(path, config), config, grid, horizon)]
-    kind = formats.find_format(path)
+) -> tuple[list[np.ndarray], str, bool]:
+    """Returns the fires in a file, [X, Y] each, a summary, and whether it looks doubtful."""
+    kind = None if path.is_dir() else formats.find_format(path)
     bank = None
     if kind is formats.NUMPY:
         bank = read_numpy_bank(path)
     elif kind is formats.GEOTIFF:
         bank = read_geotiff_bank(path)
     if bank is None:
-        return [on_grid(_read_one(path, kind, config), config, grid, horizon)]
+        source = _read_one(path, kind, config)
+        fire = on_grid(source, config, grid, horizon)
+        return [fire], source.summary, source.beginnings > MAX_BEGINNINGS
     _check_horizon(bank.horizon, config, horizon)
     fires: list[np.ndarray] = []
     for times in bank.fires:
@@ -87,7 +103,7 @@ def _read(
             fires.append(on_grid(map_of_grid(times), config, grid, horizon))
         except UserError as error:
             raise UserError(f"fire {len(fires)}: {error}") from None
-    return fires
+    return fires, f"a bank of {len(fires)} fires, in steps", False
 
 
 def _check_horizon(written: int | None, config: FileFireConfig, horizon: int) -> None:
@@ -100,7 +116,7 @@ def _check_horizon(written: int | None, config: FileFireConfig, horizon: int) ->
         )
 
 
-def _read_one(path: Path, kind: formats.Format, config: FileFireConfig) -> Source:
+def _read_one(path: Path, kind: formats.Format | None, config: FileFireConfig) -> Source:
     """Returns the fire of a file that holds one."""
     if kind is formats.GEOTIFF:
         return read_geotiff(path, config.units, config.crs)

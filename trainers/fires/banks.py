@@ -107,7 +107,7 @@ def import_files(arguments: Sequence[str], console: Console, output: Path) -> in
     check_bank(output, len(paths), configs[0].env.grid)
     fires, names = [], []
     for path, config in zip(paths, configs, strict=True):
-        fires.append(read(config))
+        fires.append(read(config)[0])
         names += list(_names(path, len(fires[-1])))
     facts = _facts(configs[0])
     del facts["fire"]["path"], facts["fire"]["sha256"]  # of the first file alone

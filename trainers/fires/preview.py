@@ -54,6 +54,8 @@ def _print(console: Console, fire: SelectedFire, numbers: Growth, team: TeamCapa
         soft_wrap=True,
         highlight=False,
     )
+    if fire.summary:
+        console.print(f"read: {fire.summary}", soft_wrap=True, highlight=False)
     table = Table(box=box.SIMPLE_HEAD, padding=0, show_edge=False, show_header=False)
     table.add_column()
     table.add_column(justify="right", no_wrap=True)

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from emberlink.envs.fire.generator import scenarios
 from emberlink.envs.fire_files.config import FileFireConfig
-from emberlink.envs.fire_files.reader import read_fires
+from emberlink.envs.fire_files.reader import read_with_summary
 from emberlink.envs.scenarios import fires_of
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import shown, unknown
@@ -35,6 +35,8 @@ class SelectedFire:
     config: RunConfig
     arrival: Tensor
     """float32 [X, Y], steps"""
+    summary: str = ""
+    """what was read from a file"""
 
 
 def find_fire(text: str, overrides: Sequence[str]) -> SelectedFire:
@@ -63,7 +65,7 @@ def find_fire(text: str, overrides: Sequence[str]) -> SelectedFire:
         raise UserError(f"{shown(text)}: there is no such file; as a scenario {known}")
     path = Path(name)
     config = from_file(path, overrides)
-    fires = read(config)
+    fires, summary = read(config)
     if not index.isdecimal() or int(index) >= len(fires):
         raise UserError(f"{shown(text)}: there is no fire {index!r}; known: 0 to {len(fires) - 1}")
     several, shortened = len(fires) > 1, shown(path.name)
@@ -72,6 +74,7 @@ def find_fire(text: str, overrides: Sequence[str]) -> SelectedFire:
         stem=f"fire_{path.stem}_{index}" if several else f"fire_{path.stem}",
         config=config,
         arrival=fires[int(index)],
+        summary=summary,
     )
 
 
@@ -120,11 +123,11 @@ def _resolve(texts: Sequence[str], overrides: Sequence[str], path: str | None = 
     return config
 
 
-def read(config: RunConfig) -> Tensor:
-    """Returns the fires of a file, float32 [fires, X, Y], steps.
+def read(config: RunConfig) -> tuple[Tensor, str]:
+    """Returns the fires of a file, float32 [fires, X, Y], steps, and what was read.
 
     Raises:
         UserError: one line that names the file and what is wrong with it.
     """
     assert isinstance(config.fire, FileFireConfig)
-    return read_fires(config.fire, config.env.grid, config.env.horizon)
+    return read_with_summary(config.fire, config.env.grid, config.env.horizon)
