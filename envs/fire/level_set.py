@@ -13,8 +13,8 @@ Space is discretised by upwind differences limited by superbee (Roe 1986, Annu. 
 18), time by Heun's method at a Courant number of 0.4.
 
 Conventions: cell (i, j) has its centre at x = i, y = j; lengths are in cells, times in steps,
-rates in cells per step; an azimuth is in radians, counter-clockwise from the +x axis, and points
-TOWARDS where the head runs (not where a wind comes from).
+rates in cells per step. An azimuth is in radians, counter-clockwise from the +x axis, and is the
+direction in which the head moves (not the direction from which a wind comes).
 """
 
 import math

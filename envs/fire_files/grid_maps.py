@@ -19,7 +19,7 @@ from emberlink.envs.fire_files.rasters import clean, open_raster
 from emberlink.envs.utils.errors import UserError
 
 MAX_CELLS = 300_000_000
-"""Cells of all fires of a bank: 1.2 GB."""
+"""Maximum number of cells of all fires of a bank: 1.2 GB."""
 _MAX_FACTS = 50_000_000  # bytes of the .json beside an .npy
 _SIDE = 30  # cells along a side of the paper's map
 _SKIPPED = 6000  # lines of the paper's text before step 0
@@ -34,7 +34,7 @@ class Bank:
     fires: Sequence[np.ndarray]
     """[rows, columns] each, rows from north to south, as in the file"""
     horizon: int | None
-    """steps for which the bank was written, if it says so"""
+    """number of steps for which the bank was written; None if unknown"""
 
 
 def read_numpy_bank(path: Path) -> Bank:
@@ -44,9 +44,9 @@ def read_numpy_bank(path: Path) -> Bank:
         UserError: the file holds another array.
     """
     try:
-        # Mapped, so that a header that promises more than there is costs no memory.
+        # Memory-mapped, so that a wrong header allocates nothing.
         array = np.load(path, mmap_mode="r", allow_pickle=False)
-    except Exception as error:  # of many types, if the header is damaged
+    except Exception as error:  # a damaged header raises many types
         raise UserError(f"{first_line(error)}; expected an array in NumPy's format") from None
     if not isinstance(array, np.ndarray) or array.dtype.kind not in "iuf":
         kind = getattr(array, "dtype", type(array).__name__)

@@ -47,7 +47,7 @@ def enclosed(geometries: Sequence[Any], features: Sequence[str]) -> Any:
 
 
 def make_valid(area: Any) -> Any:
-    """Returns an area that does not cross itself, with the same shells."""
+    """Returns an area without self-intersections, with the same shells."""
     shapely = library("shapely")
     if area.is_valid:
         return area
@@ -55,7 +55,7 @@ def make_valid(area: Any) -> Any:
 
 
 def polygons(area: Any) -> list[Any]:
-    """Returns the polygons that an area consists of."""
+    """Returns the polygons of an area."""
     return [part for part in _parts(area) if part.geom_type == "Polygon"]
 
 
@@ -92,7 +92,7 @@ def _shrunk(part: Any, moved: np.ndarray) -> Any:
 
 
 def _parts(geometry: Any) -> list[Any]:
-    """Returns the simple geometries in one, however they are nested."""
+    """Returns the simple geometries of a collection, which may be nested."""
     parts: list[Any] = []
     rest = [geometry]
     while rest:
@@ -105,7 +105,7 @@ def _parts(geometry: Any) -> list[Any]:
 
 
 def _within_lines(lines: Sequence[tuple[Any, str]]) -> Any:
-    """Returns what closed lines enclose; those within an odd number of others are islands."""
+    """Returns the area inside closed lines. A line within an odd number of others is an island."""
     shapely = library("shapely")
     rings: dict[bytes, Any] = {}
     for line in _parts(shapely.line_merge(shapely.MultiLineString([line for line, _ in lines]))):

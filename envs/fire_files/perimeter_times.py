@@ -1,4 +1,4 @@
-"""Times of perimeters: calendar times as text, and the columns of a table that hold times."""
+"""Reads the times of perimeters: calendar times as text, and columns of a table."""
 
 from collections.abc import Sequence
 from datetime import UTC, datetime, timedelta
@@ -29,8 +29,8 @@ CALENDAR = (
 )
 """Columns of the time at which a perimeter was mapped, in lower case."""
 EDITED = ("poly_datecurrent", "datecurrent")
-"""Columns of the time at which a record was changed, read where a perimeter has no other time."""
-_DBF_LENGTH = 10  # letters of a column's name that a .dbf keeps
+"""Columns of the time at which a record was changed, for perimeters without another time."""
+_DBF_LENGTH = 10  # maximum length of a column's name in a .dbf
 _MIN_MS = 1e11  # a number from here on is a date: milliseconds since 1970, or digits
 _CENTURIES = ("19", "20")  # the first digits of a year
 _MAX_TIME = 1e12
@@ -80,7 +80,7 @@ def perimeter_times(frame: Any, wanted: str | None, unit: Units | None) -> tuple
 
 
 def parse_time(text: str) -> datetime:
-    """Reads a calendar time; one without a zone stays so.
+    """Reads a calendar time. The result has a zone only if the text has one.
 
     Known forms are ISO 8601 (also with slashes), digits such as 20200819, 202008191300 and
     20200819130000, RFC 2822 (`Fri, 13 Feb 2026 14:30:58 GMT`), and month first with slashes as in
@@ -110,7 +110,7 @@ def parse_time(text: str) -> datetime:
 
 
 def in_utc(time: datetime) -> datetime:
-    """Returns the time in UTC; one without a zone is taken for UTC.
+    """Returns the time in UTC. A time without a zone is taken as UTC.
 
     Raises:
         UserError: the time is before year 1 or after year 9999.
@@ -122,7 +122,7 @@ def in_utc(time: datetime) -> datetime:
 
 
 def known_columns(names: dict[str, str], known: Sequence[str]) -> list[str]:
-    """Returns the columns with a known name, also as a .dbf cuts it.
+    """Returns the columns with a known name, also in the short form of a .dbf.
 
     Args:
         names: the columns, by their names in lower case.

@@ -31,8 +31,8 @@ from emberlink.envs.utils.validation import unknown
 
 MAX_TIMES = 500
 _INCIDENTS = ("poly_incidentname", "attr_incidentname", "incidentname", "incident", "fire_name")
-_SHRUNK = 0.75  # a perimeter inside the burnt area must have that share of it
-_INSIDE = 0.99  # share of a perimeter that lies inside the burnt area
+_SHRUNK = 0.75  # minimum share of the burnt area that a perimeter inside it has
+_INSIDE = 0.99  # share of a perimeter inside the burnt area, from which it counts as inside
 
 
 def read_perimeters(path: Path, config: FileFireConfig) -> "PerimeterSource":
@@ -94,7 +94,7 @@ def _read_table(path: Path, layer: str | None) -> Any:
     library("geopandas")
     suffix = path.suffix.lower()
     is_json, is_kml = suffix in GEOJSON.suffixes, suffix in (*KML.suffixes, *KMZ.suffixes)
-    # As text: of dates in GeoJSON, GDAL loses some zones where not all are the same.
+    # Dates in GeoJSON as text, because GDAL loses zones that differ.
     options = {"DATE_AS_STRING": "YES"} if is_json else {}
     try:
         layers = _choose_layers(pyogrio.list_layers(path.absolute()), layer, several=is_kml)
@@ -108,11 +108,11 @@ def _read_table(path: Path, layer: str | None) -> Any:
         ).reset_index(drop=True)
     except UserError:
         raise
-    except Exception as error:  # of many types: of GDAL, of text, of geometries
+    except Exception as error:  # GDAL, text and geometries raise many types
         if isinstance(error, pyogrio.errors.CRSError):
             check_projection(path, None)
         raise UserError(f"{first_line(error)}; expected perimeters") from None
-    if is_kml:  # hot spots lie beside the perimeters, and every table has all columns of KML
+    if is_kml:  # without hot spots, and without the columns of KML that are empty
         frame = frame[frame.geom_type != "Point"].dropna(axis="columns", how="all")
     if not hasattr(frame, "geometry") or len(frame) == 0:
         raise UserError("no feature with a geometry; expected perimeters")
@@ -122,12 +122,12 @@ def _read_table(path: Path, layer: str | None) -> Any:
     if not is_json:
         check_projection(path, frame.crs)
     elif frame.crs is not None and frame.crs.is_geographic and abs(frame.total_bounds).max() > 360:
-        return frame.set_crs(None, allow_override=True)  # GDAL takes any GeoJSON for degrees
+        return frame.set_crs(None, allow_override=True)  # GDAL assumes degrees
     return frame
 
 
 def _choose_layers(layers: Sequence[Any], wanted: str | None, *, several: bool) -> list[str]:
-    """Returns the layer that is named, else the only one with geometries, or all of several."""
+    """Returns the layer `wanted`, or the only layer with geometries, or all if `several`."""
     names = [str(name) for name, kind in layers if kind is not None]
     if wanted in names:
         return [str(wanted)]
@@ -142,7 +142,7 @@ def _choose_layers(layers: Sequence[Any], wanted: str | None, *, several: bool) 
 
 
 def _choose_incident(frame: Any, wanted: str | None) -> Any:
-    """Returns the features of the incident that is named, else of the only one."""
+    """Returns the features of the incident `wanted`, or of the only incident."""
     columns = known_columns({str(name).lower(): str(name) for name in frame.columns}, _INCIDENTS)
     if wanted == "*" or not (columns or wanted):
         return frame
@@ -180,15 +180,15 @@ def _project(frame: Any, areas: Sequence[Any], crs: str | None) -> list[Any]:
 
 
 class PerimeterSource:
-    """A fire whose burnt area is known at some times; the front is interpolated in between.
+    """A fire whose burnt area is known at some times. The front is interpolated between them.
 
     Args:
-        areas: of shapely, on a plane, one for each time.
+        areas: shapely polygons on a plane, one for each time.
         times: float64, ascending.
-        clock: of the times.
+        clock: unit of the times.
 
     Raises:
-        UserError: there are not two times, or the areas shrink.
+        UserError: there are fewer than two times, or the areas shrink.
     """
 
     whole = False
@@ -219,7 +219,7 @@ class PerimeterSource:
     def on(self, window: Window, until: float) -> np.ndarray:
         """Returns the earliest arrival in each cell of a grid, float64 [X, Y]."""
         count = int(min(np.searchsorted(self._times, until), len(self._times) - 1)) + 1
-        # The distance to the last front is needed, so all of it must lie in the window.
+        # The window must contain all of the last front, to which distances are computed.
         x0, y0, x1, y1 = self._boxes[count - 1]
         right = window.x + window.grid[0] * window.side
         upper = window.y + window.grid[1] * window.side
@@ -234,7 +234,7 @@ class PerimeterSource:
     def _interpolate(self, window: Window, count: int) -> np.ndarray:
         """Returns the arrival times of the first perimeters at the centres of a window's cells.
 
-        Times between two fronts are interpolated by the distances to the two.
+        Times between two fronts are interpolated by the distances to both.
         """
         before = _rasterize(self._areas[0], window)
         times = np.where(before, self._times[0], np.inf)
@@ -252,7 +252,7 @@ class PerimeterSource:
 
 
 def _check_growth(areas: Sequence[Any], times: np.ndarray, clock: Clock) -> None:
-    """Checks that areas do not shrink: then times go backwards, or are of another fire."""
+    """Checks that areas do not shrink, as they do if times go backwards or fires are mixed."""
     shapely = library("shapely")
     burnt, united, largest = areas[0], 1, areas[0].area
     for k in range(1, len(areas)):
@@ -271,15 +271,15 @@ def _check_growth(areas: Sequence[Any], times: np.ndarray, clock: Clock) -> None
 
 
 def _depth(area: np.ndarray) -> np.ndarray:
-    """Returns how far each cell's centre is from the edge of the area that it lies in, cells."""
+    """Returns the distance from each cell's centre to the edge of the area, in cells."""
     distance: Any = distance_transform_edt(area)
     return distance - 0.5
 
 
 def _rasterize(area: Any, window: Window) -> np.ndarray:
-    """Returns whether each cell's centre lies in an area, bool [X, Y].
+    """Returns the mask of cells whose centre lies in an area, bool [X, Y].
 
-    A polygon that covers no centre covers the cell of a point in it, so that none is lost.
+    A polygon that covers no centre gets the cell of a point inside it, so that it is not lost.
     """
     features = library("rasterio.features")
     shapely = library("shapely")

@@ -20,7 +20,7 @@ from emberlink.envs.utils.errors import UserError
 MAX_CELLS = 50_000_000
 """Cells of a raster, which is read as a whole."""
 MAX_TIME = 1e12
-"""A larger number is not a time."""
+"""Maximum time; a larger number is not a time."""
 _NEVER = (-9999.0, -1.0)  # NODATA of FARSITE and FlamMap, and of ELMFIRE
 _VOID = 1e30  # a number beyond it is NODATA although not declared, such as -3.4e38
 _COUNT, _SIZE, _PLACE = "a whole number above 0", "a size above 0", "a coordinate"
@@ -36,10 +36,10 @@ y = d column + e row + f."""
 
 
 def read_geotiff(path: Path, unit: Units | None, crs: str | None) -> RasterSource:
-    """Reads arrival times from a GeoTIFF of one band; its tag `units` may stand for `unit`.
+    """Reads arrival times from a GeoTIFF with one band. The tag units=steps replaces `unit`.
 
     Raises:
-        UserError: the file is damaged, not a raster of times, or without a place on the Earth.
+        UserError: the file is damaged, is not a raster of times, or has no geotransform.
     """
     with open_raster(path) as dataset:
         _check_band(dataset)
@@ -53,9 +53,9 @@ def read_geotiff(path: Path, unit: Units | None, crs: str | None) -> RasterSourc
 
 
 def read_ascii(path: Path, unit: Units | None, crs: str | None) -> RasterSource:
-    """Reads arrival times from ESRI ASCII; a .prj beside it is its projection.
+    """Reads arrival times from ESRI ASCII, with the projection in a .prj beside the file.
 
-    GDAL would read a word as 0 and wrap rows of another length, so NumPy reads the numbers.
+    NumPy reads the numbers, because GDAL reads a word as 0 and wraps rows of another length.
 
     Raises:
         UserError: a line of the header or a number is wrong.
@@ -90,7 +90,7 @@ def open_raster(path: Path) -> Iterator[Any]:
     """Opens a GeoTIFF with rasterio.
 
     Raises:
-        UserError: the file is damaged, also where GDAL would go on with a part of it lost.
+        UserError: the file is damaged, also if GDAL only logs the damage.
     """
     rasterio = library("rasterio")
     log = logging.handlers.BufferingHandler(capacity=1_000_000)
@@ -118,9 +118,9 @@ def clean(times: np.ndarray, never: np.ndarray | None = None) -> np.ndarray:
     """Returns arrival times in which cells that never burn are inf, float32 or float64.
 
     Args:
-        times: as in a file, any real type.
-        never: where the file declares NODATA. If it declares none, the greatest number of an
-            integer type is NODATA, and the least of one with a sign.
+        times: values of a file, any real type.
+        never: mask of the NODATA that the file declares. Without one, the maximum of an integer
+            type is NODATA, and the minimum of a signed one.
 
     Raises:
         UserError: a number is not a time.
@@ -227,10 +227,10 @@ def _on_plane(
     crs: str | None,
     name: str = "",
 ) -> RasterSource:
-    """Places cleaned times on a plane, north up.
+    """Returns cleaned times on a plane, north up.
 
     Raises:
-        UserError: no fire spreads, there is no unit, or the raster has no place on the Earth.
+        UserError: no fire spreads, there is no unit, or the coordinates are not valid.
     """
     check_spreads(times)
     a, b, c, d, e, f = (float(value) for value in affine)
@@ -255,13 +255,13 @@ def _on_plane(
 def _warp(
     times: np.ndarray, affine: Affine, chosen: tuple[Any, Any] | None
 ) -> tuple[np.ndarray, Affine]:
-    """Projects times and turns the raster north up, on cells of half the size.
+    """Projects times and rotates the raster north up, on cells of half the size.
 
-    Times are interpolated between burnt cells; a point in a cell that never burns stays inf.
+    Times are interpolated between burnt cells. A point in a cell that never burns stays inf.
     """
     rasterio = library("rasterio")
     vrt = library("rasterio.vrt").WarpedVRT
-    source, target = chosen or ("EPSG:3857", "EPSG:3857")  # any plane: only turned
+    source, target = chosen or ("EPSG:3857", "EPSG:3857")  # any plane: only rotated
     about = {
         "height": times.shape[0],
         "width": times.shape[1],

@@ -1,4 +1,4 @@
-"""Reads the fires of a file onto a grid, in three sets, or from a run's own copy of them."""
+"""Reads the fires of a file onto a grid, in three sets, and keeps a run's copy of them."""
 
 import dataclasses
 import hashlib
@@ -31,12 +31,12 @@ from emberlink.envs.utils.atomic_io import read_sealed, write_sealed
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import printable
 
-READER_VERSION = 4  # raise it whenever the same file gives another grid
+READER_VERSION = 4  # increase it if the same file gives another grid
 MAX_BEGINNINGS = 10
 """Places at which a raster's fire may begin without a warning."""
 COPY_FILE = "fires.npz"
-"""The file of a run folder that holds the run's own copy of its grids."""
-_MAX_COPY = 12 * MAX_CELLS + 1_000_000  # bytes of it, unpacked: float32 of the cells of every set
+"""Name of the file in a run folder that holds the run's copy of its fires."""
+_MAX_COPY = 12 * MAX_CELLS + 1_000_000  # bytes when unpacked: float32 of the cells of all sets
 _EVERY, _VALIDATION, _TEST = 5, 3, 4  # remainders of the numbers of validation and test fires
 
 
@@ -60,9 +60,9 @@ def read_fires(config: FileFireConfig, grid: tuple[int, int], horizon: int) -> T
 def read_with_summary(
     config: FileFireConfig, grid: tuple[int, int], horizon: int
 ) -> tuple[Tensor, str]:
-    """Returns what `read_fires` does, and a line that says what was read.
+    """Returns the fires as `read_fires` does, and a line that describes the file.
 
-    Warns if a raster's fire begins at many places, as elevation taken for arrival times would.
+    Warns if the fire of a raster begins at many places: the raster may hold elevation, for example.
     """
     check_grid(grid)
     path = Path(config.path).expanduser()
@@ -117,7 +117,7 @@ def _check_horizon(written: int | None, config: FileFireConfig, horizon: int) ->
 
 
 def _read_one(path: Path, kind: formats.Format | None, config: FileFireConfig) -> Source:
-    """Returns the fire of a file that holds one."""
+    """Returns the fire of a file with one fire."""
     if kind is formats.GEOTIFF:
         return read_geotiff(path, config.units, config.crs)
     if kind is formats.ASCII:
@@ -136,10 +136,10 @@ class FireSets(NamedTuple):
 
 
 def fire_sets(config: FileFireConfig, grid: tuple[int, int], horizon: int) -> FireSets:
-    """Returns the fires from the run's own copy, if it is of this grid and horizon, else the files.
+    """Returns the fires from the run's copy if it has this grid and horizon, else from the files.
 
     Raises:
-        UserError: one line that names the file and what is wrong with it.
+        UserError: one line that names the file and the mistake in it.
     """
     saved = _read_copy(config, grid, horizon)
     if saved is not None:
@@ -158,12 +158,12 @@ def _divide(count: int, *, test_file: bool) -> tuple[list[int], list[int], list[
     """Divides the fires of a file into training, validation and test fires.
 
     Of five or more fires every fifth is a test fire and every fifth a validation fire. Of fewer
-    the last is the test fire and the last but one the validation fire. If too few fires are left
-    for a set, it shares the last one: the only fire of a file is in all three sets.
+    the last is the test fire and the last but one the validation fire. A set without a fire shares
+    the last one, so the only fire of a file is in all three sets.
 
     Args:
         count: number of fires in the file.
-        test_file: the test fires are those of another file, so none of this one.
+        test_file: whether another file holds the test fires.
     """
     fires = list(range(count))
     many = count >= _EVERY
@@ -177,7 +177,7 @@ def _divide(count: int, *, test_file: bool) -> tuple[list[int], list[int], list[
 
 
 def with_checksum(config: FileFireConfig) -> FileFireConfig:
-    """Returns the scenario with the checksums of its files.
+    """Computes the checksums of the files and returns the scenario with them.
 
     Raises:
         UserError: a file is missing, or has another checksum than the scenario.
@@ -202,10 +202,10 @@ def _checksum(file: str, expected: str | None) -> str:
 
 
 def save_copy(config: FileFireConfig, folder: Path, grid: tuple[int, int], horizon: int) -> None:
-    """Writes the run's own copy of its grids; afterwards the run does not need the files.
+    """Writes the run's copy of its fires. Afterwards the run does not need the files.
 
     Raises:
-        UserError: it cannot be written.
+        UserError: the copy cannot be written.
     """
     fires = fire_sets(config, grid, horizon)
     try:
@@ -219,7 +219,7 @@ def save_copy(config: FileFireConfig, folder: Path, grid: tuple[int, int], horiz
 
 
 def _key(config: FileFireConfig, grid: tuple[int, int], horizon: int) -> str:
-    """Returns a hash of everything that the grids depend on."""
+    """Returns a hash of all values on which the fires depend."""
     values = dataclasses.asdict(config)
     del values["saved_copy"]
     parts = [READER_VERSION, values, *grid, horizon]
@@ -227,7 +227,7 @@ def _key(config: FileFireConfig, grid: tuple[int, int], horizon: int) -> str:
 
 
 def _read_copy(config: FileFireConfig, grid: tuple[int, int], horizon: int) -> FireSets | None:
-    """Returns the run's own copy, None if there is none or it is damaged or of another grid."""
+    """Returns the run's copy; None if there is none, it is damaged, or it has another grid."""
     if config.saved_copy is None or config.sha256 is None:
         return None
     content = read_sealed(Path(config.saved_copy), _MAX_COPY)
@@ -240,7 +240,7 @@ def _read_copy(config: FileFireConfig, grid: tuple[int, int], horizon: int) -> F
             if str(arrays["key"]) != _key(config, grid, horizon):
                 return None
             fires = [arrays[name] for name in FireSets._fields]
-    except Exception:  # of many types, if the file is damaged
+    except Exception:  # damage raises many types
         return None
     for values in fires:
         fits = values.ndim == 3 and values.shape[1:] == tuple(grid) and len(values) > 0

@@ -1,4 +1,4 @@
-"""`emberlink fire make` and `emberlink fire import`: write fires to a file."""
+"""Runs `emberlink fire make` and `emberlink fire import`, which write fires to a file."""
 
 import os
 import re
@@ -92,13 +92,13 @@ def import_files(arguments: Sequence[str], console: Console, output: Path) -> in
 
     Args:
         arguments: paths, and `key=value` of setup, env. and fire.
-        console: prints what was read and, last, the path of the file.
+        console: prints the number of fires and, last, the path of the file.
         output: a new .npy, .tif or .tiff file.
 
     Raises:
         UserError: a file cannot be read or written.
     """
-    # A file of that name comes before a key.
+    # An existing file takes precedence over a key.
     overrides = [text for text in arguments if "=" in text and not os.path.exists(text)]
     paths = [Path(text) for text in arguments if text not in overrides]
     if not paths:
@@ -110,7 +110,7 @@ def import_files(arguments: Sequence[str], console: Console, output: Path) -> in
         fires.append(read(config)[0])
         names += list(_names(path, len(fires[-1])))
     facts = _facts(configs[0])
-    del facts["fire"]["path"], facts["fire"]["sha256"]  # of the first file alone
+    del facts["fire"]["path"], facts["fire"]["sha256"]  # they hold for the first file only
     digests = [to_values(config)["fire"]["sha256"] for config in configs]
     facts["sources"] = [
         {"file": path.name, "sha256": digest} for path, digest in zip(paths, digests, strict=True)
@@ -125,7 +125,7 @@ def _names(path: Path, count: int) -> Iterator[str]:
 
 
 def _facts(config: RunConfig) -> dict[str, Any]:
-    """Returns the settings that the fires depend on."""
+    """Returns the settings on which the fires depend."""
     return {
         "horizon": config.env.horizon,
         "grid": list(config.env.grid),

@@ -1,4 +1,4 @@
-"""Finds the fire that a command names: a scenario's test fire, or one of a file."""
+"""Finds the fire that a command names: a test fire of a scenario, or a fire of a file."""
 
 import os
 from collections.abc import Sequence
@@ -18,10 +18,10 @@ from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.config.schema import RunConfig
 
 MAX_TEST_FIRES = 65_536
-"""test fires of a scenario, as many as an evaluation can have"""
+"""maximum number of test fires, as in an evaluation"""
 FILE = "file"
-"""the scenario of fires that are read, not made"""
-_METHOD = "independent"  # any: a fire depends on no method
+"""name of the scenario of fires that are read from a file"""
+_METHOD = "independent"  # any method; fires do not depend on it
 _KEYS = ("env.", "fire.")
 
 
@@ -31,19 +31,19 @@ class SelectedFire:
 
     title: str
     stem: str
-    """Begins the names of files about it."""
+    """beginning of the names of files about the fire"""
     config: RunConfig
     arrival: Tensor
     """float32 [X, Y], steps"""
     summary: str = ""
-    """what was read from a file"""
+    """description of the file; empty for a scenario"""
 
 
 def find_fire(text: str, overrides: Sequence[str]) -> SelectedFire:
     """Returns the fire that NAME, NAME:INDEX, FILE or FILE:INDEX names.
 
     Args:
-        text: the name of a scenario or a path; a scenario comes first.
+        text: the name of a scenario or a path. A scenario takes precedence.
         overrides: `key=value` of setup, env. and fire.
 
     Raises:
@@ -90,7 +90,7 @@ def generated(scenario: str, overrides: Sequence[str]) -> RunConfig:
     """Returns the configuration with which a scenario's fires are made.
 
     Raises:
-        UserError: there is no such scenario, its fires are read, or a key or value is wrong.
+        UserError: there is no such scenario, it reads a file, or a key or value is wrong.
     """
     if scenario not in scenarios():
         raise UserError(f"fire {unknown(scenario, scenarios())}")
@@ -105,7 +105,7 @@ def from_file(path: Path, overrides: Sequence[str]) -> RunConfig:
     """
     if any(text.partition("=")[0] == "fire.path" for text in overrides):
         raise UserError("fire.path: the file is given without a key here")
-    # The name is set past the parser of overrides, to which some characters mean something.
+    # The path bypasses the parser of overrides, in which some characters have a meaning.
     return _resolve([f"fire={FILE}", "fire.path=_", *overrides], overrides, path=str(path))
 
 
@@ -124,10 +124,10 @@ def _resolve(texts: Sequence[str], overrides: Sequence[str], path: str | None = 
 
 
 def read(config: RunConfig) -> tuple[Tensor, str]:
-    """Returns the fires of a file, float32 [fires, X, Y], steps, and what was read.
+    """Returns the fires of a file, float32 [fires, X, Y], steps, and a description of the file.
 
     Raises:
-        UserError: one line that names the file and what is wrong with it.
+        UserError: one line that names the file and the mistake in it.
     """
     assert isinstance(config.fire, FileFireConfig)
     return read_with_summary(config.fire, config.env.grid, config.env.horizon)
