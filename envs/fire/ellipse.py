@@ -1,8 +1,8 @@
 """Computes the rates of the elliptical wavelet that spreads from every point of a front.
 
 The half length of a wavelet grows at the rate `a` and its half breadth at `b`. Its centre moves at
-`c` along the axis. Rates are in cells per step. Angles are in radians, counter-clockwise from +x, and
-give the direction in which the head moves.
+`c` along the axis. Rates are in cells per step. Angles are in radians, counter-clockwise from +x,
+and give the direction in which the head moves.
 """
 
 import torch

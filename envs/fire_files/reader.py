@@ -95,7 +95,8 @@ def _read(
     if bank is None:
         source = _read_one(path, kind, config)
         fire = on_grid(source, config, grid, horizon)
-        return [fire], source.summary, source.beginnings > MAX_BEGINNINGS
+        doubtful = not source.whole and source.beginnings > MAX_BEGINNINGS
+        return [fire], source.summary, doubtful
     _check_horizon(bank.horizon, config, horizon)
     fires: list[np.ndarray] = []
     for times in bank.fires:
