@@ -1,18 +1,35 @@
 """What all tests share."""
 
+import io
 import shutil
 from pathlib import Path
 
 import pytest
+from matplotlib.figure import Figure
+from PIL import Image
 from tiny_run import train_tiny
 
 
 @pytest.fixture(autouse=True, scope="session")
-def _own_cache(tmp_path_factory):
-    """Banks of fires are cached in a folder of the tests' own, also by what they start."""
+def _environment(tmp_path_factory):
+    """Gives the tests, and the programs that they start, a cache of their own and no terminal."""
     with pytest.MonkeyPatch.context() as patch:
+        patch.delenv("COLUMNS", raising=False)
         patch.setenv("EMBERLINK_CACHE", str(tmp_path_factory.mktemp("cache")))
         yield
+
+
+@pytest.fixture(autouse=True)
+def _blank_figures(request, monkeypatch) -> None:
+    """Saves a blank picture for each figure, except in tests marked `drawn`, which look at it.
+
+    Drawing takes half of the time of a short training.
+    """
+    if request.node.get_closest_marker("drawn"):
+        return
+    blank = io.BytesIO()
+    Image.new("RGB", (8, 8)).save(blank, "png")
+    monkeypatch.setattr(Figure, "savefig", lambda _, path, **__: path.write_bytes(blank.getvalue()))
 
 
 @pytest.fixture(scope="session")

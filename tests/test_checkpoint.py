@@ -56,6 +56,7 @@ def test_every_byte_is_sealed(tmp_path):
             checkpoint_file.read(path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS)
 def test_nothing_damaged_or_of_something_else_is_accepted(method, tmp_path):
     files = readable(tmp_path, method)
@@ -109,6 +110,7 @@ def refused(path: Path, change: Callable[[dict, dict[str, torch.Tensor]], object
     return text.partition("; the one before it")[0].removeprefix(f"{path}: ")
 
 
+@pytest.mark.slow
 def test_nan_is_refused_wherever_it_is(stopped):
     _, content = checkpoint_file.read(stopped)
     floating = [name for name, value in content.items() if value.is_floating_point()]
@@ -144,7 +146,10 @@ def test_a_tensor_of_another_shape_is_refused(stopped):
     assert reason.startswith("does not fit this training: tensor actor_network_params.module.first")
 
 
-@pytest.mark.parametrize("key", ["folders", "sizes", "best", "seconds", "step", "rollbacks"])
+STATE_KEYS = ["folders", "sizes", "best", "seconds", "step", "rollbacks", "versions"]
+
+
+@pytest.mark.parametrize("key", STATE_KEYS)
 def test_a_header_that_lacks_a_key_is_refused(key, stopped):
     reason = refused(stopped, lambda header, _: header.pop(key))
     assert reason == f"a checkpoint of another version: it has no '{key}'"

@@ -146,6 +146,7 @@ def test_fuel_slows_the_front():
     assert (many - few)[:, -1].double().mean() > 5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("grid", "fires", "tolerance"),
     [

@@ -126,6 +126,7 @@ def test_a_run_tells_what_it_was_trained_on(trained):
             assert np.array_equal(kept[split], expected.numpy())
 
 
+@pytest.mark.slow
 def test_a_run_is_evaluated_rendered_and_resumed_without_its_file(run, trained, tmp_path, capfd):
     gone = trained / "fire.asc"
     gone.rename(trained / "elsewhere.asc")

@@ -8,6 +8,7 @@ from weakref import WeakKeyDictionary
 
 import pytest
 import torch
+from damage import sealed_again
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from test_recipes import METHODS
 
@@ -110,6 +111,7 @@ def whole(tmp_path_factory):
     return of
 
 
+@pytest.mark.slow
 # Before the first update, within an episode, at its end, behind it, before the last step; at 33 of
 # 80 the memory has just come round.
 @pytest.mark.parametrize("learner", ["ddpg", "td3"])
@@ -243,6 +245,24 @@ def test_the_command_goes_on_and_says_when_nothing_is_left(paused, whole, capsys
     assert main.main(["train", f"resume={paused}"]) == 0
     assert "is finished" in capsys.readouterr().out
     assert contents(paused) == before
+
+
+def test_another_version_of_a_package_is_said(paused, capsys):
+    state = RunFolder(paused).states()[-1]
+    sealed_again(state, lambda header, _: header["versions"].update(torch="1.0", vmas="1.4"))
+    assert main.main(["train", f"resume={paused}", "evaluation.episodes=2"]) == 0
+    out = " ".join(capsys.readouterr().out.split())
+    expected = f"made with torch 1.0 (now {torch.__version__}), vmas 1.4 (now not installed): the"
+    assert expected in out
+
+
+def test_networks_of_a_save_that_was_killed_before_the_rotation_are_removed(tmp_path):
+    more = ["checkpoint_steps=9", "keep_checkpoints=2"]
+    run = until(begun("independent", tmp_path, *more), None).run
+    kept = run.networks()
+    shutil.copy(kept[0], kept[0].with_name("step_000000054.safetensors"))
+    resume(run.path).close()
+    assert run.networks() == kept
 
 
 def test_folders_that_cannot_be_resumed(paused, tmp_path, capsys):

@@ -8,6 +8,7 @@ from emberlink.comm.consensus import ConsensusConfig
 from emberlink.configs import known
 from emberlink.envs.config import RewardConfig, WildfireConfig
 from emberlink.envs.fire.generator import scenarios
+from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import from_plain
 from emberlink.trainers.config.compose import flat, resolve, to_values
 from emberlink.trainers.config.schema import build_comm
@@ -130,6 +131,20 @@ def test_each_setup_chooses_its_fire_and_the_user_may_choose_another(setup, fire
     assert resolve("consensus", [f"setup={setup}"]).fire.name == fire
     for other in scenarios():
         assert resolve("consensus", [f"setup={setup}", f"fire={other}"]).fire.name == other
+
+
+@pytest.mark.parametrize("value", ["Läufe", "日本", "meine Läufe (2)", "größer/ßß"])
+def test_letters_that_hydra_lacks_need_no_quotes(value):
+    assert resolve("consensus", [f"output={value}"]).output == value
+
+
+@pytest.mark.parametrize("text", ["output=a{ä", "output=ä,b", "output=[ä"])
+def test_special_characters_ask_for_quotes(text):
+    with pytest.raises(UserError, match="quotes: 'key="):
+        resolve("consensus", [text])
+    key, value = text.split("=")
+    quoted = resolve("consensus", [f'{key}="{value}"'])
+    assert quoted.output == value
 
 
 def test_tuned_keeps_the_physics_of_released():

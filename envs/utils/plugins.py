@@ -3,10 +3,11 @@
 import importlib
 from collections.abc import Collection
 from dataclasses import dataclass
-from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import EntryPoint
 from pkgutil import iter_modules
 from typing import Any, Generic, TypeVar
 
+from emberlink.configs import entry_points
 from emberlink.envs.utils.errors import UserError
 
 T = TypeVar("T")
@@ -18,7 +19,7 @@ def registered(group: str) -> dict[str, EntryPoint]:
     Args:
         group: such as "emberlink.comm".
     """
-    return {point.name: point for point in entry_points(group=group)}
+    return {point.name: point for point in entry_points.read(group)}
 
 
 @dataclass(frozen=True)

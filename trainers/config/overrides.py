@@ -1,5 +1,6 @@
 """Reads `key=value` texts and puts values into nested mappings by their dotted key."""
 
+import re
 from collections.abc import Iterator, Mapping
 from functools import reduce
 from operator import getitem
@@ -11,9 +12,15 @@ from hydra.errors import HydraException
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import shown, unknown
 
+# Hydra's grammar lacks letters such as ä, and parentheses.
+_SPECIAL = r"\[\]{}\"'`=,$\\\x00-\x1f"
+_PLAIN_TEXT = re.compile(rf"(?P<key>[A-Za-z_][\w.]*)=(?P<value>[^\s{_SPECIAL}][^{_SPECIAL}]*)")
+
 
 def parse(text: str) -> tuple[str, Any]:
     """Returns the key and the value of a `key=value`, read as Hydra reads it.
+
+    Text that Hydra's grammar refuses for a character alone, as in `output=Läufe`, is a string.
 
     Raises:
         UserError: the text is of another form, or gives several values or a mapping.
@@ -21,7 +28,10 @@ def parse(text: str) -> tuple[str, Any]:
     try:
         parsed = OverridesParser.create().parse_override(text)
     except (HydraException, ValueError, RecursionError):
-        raise UserError(f"{shown(text)!r} is not of the form key=value") from None
+        if plain_text := _PLAIN_TEXT.fullmatch(text):
+            return plain_text["key"], plain_text["value"]
+        hint = "; put special characters into quotes: 'key=\"value\"'" if "=" in text else ""
+        raise UserError(f"{shown(text)!r} is not of the form key=value{hint}") from None
     key, value = parsed.get_key_element(), parsed.value()
     if parsed.is_sweep_override():
         several = f"{'seeds' if key == 'seed' else key}=[{text.partition('=')[2]}]"

@@ -33,6 +33,8 @@ class RunState:
     """see `Rollbacks`"""
     tensors: int
     """how many tensors the checkpoint holds"""
+    versions: dict[str, str]
+    """of the packages that it was made with"""
 
 
 def write(path: Path, run: RunState, tensors: dict[str, Tensor]) -> None:

@@ -89,6 +89,13 @@ def _announce(trainer: Trainer, console: Console) -> None:
     if setup.step:
         rate = "" if scale == 1 else f", learning rates x {scale:g}"
         console.print(f"resumed at step {setup.step} of {setup.total_steps}{rate}")
+    if trainer.changed_versions:
+        console.print(
+            f"note: the checkpoint was made with {trainer.changed_versions}: the numbers may not "
+            "be those of a run that was never stopped",
+            style="yellow",
+            soft_wrap=True,
+        )
     for run in trainer.runs:
         text = f"{config.method}, setup {config.setup}, fire {config.fire.name} -> {run.path}"
         console.print(text, soft_wrap=True)

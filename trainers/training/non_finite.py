@@ -3,7 +3,6 @@
 import platform
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from importlib.metadata import version
 from pathlib import Path
 
 import torch
@@ -16,9 +15,9 @@ from emberlink.trainers.learners.nan_guard import ROLLOUT
 from emberlink.trainers.learners.tensors import flatten, group, prefixed, unflatten
 from emberlink.trainers.runs import checkpoint_file
 from emberlink.trainers.runs.run_folder import RunFolder
+from emberlink.trainers.runs.versions import versions
 from emberlink.trainers.training.setup import TrainingSetup
 
-_PACKAGES = ("emberlink", "torch", "torchrl", "tensordict")
 _TENSORS = "tensors.safetensors"
 
 
@@ -173,8 +172,7 @@ def _write(setup: TrainingSetup, run: RunFolder, report: NonFiniteReport) -> Pat
     about = {
         "report": asdict(report),
         "message": str(report),
-        "versions": {name: version(name) for name in _PACKAGES}
-        | {"python": platform.python_version(), "platform": platform.platform()},
+        "versions": versions() | {"platform": platform.platform()},
         "device": str(setup.config.device),
     }
     RunFolder(folder).write("report.json", about)

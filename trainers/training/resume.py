@@ -55,6 +55,9 @@ def resume(path: Path, method: str | None = None, overrides: Sequence[str] = ())
         if trainer.setup.step:
             trainer.saved = trainer.setup.step
             trainer.save_networks()
+            # A run that was killed between a save and the rotation has a file too many.
+            for run in runs:
+                run.rotate(config.keep_checkpoints, states=2)
     except BaseException:
         folders.close()
         raise

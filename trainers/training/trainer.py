@@ -13,6 +13,7 @@ from emberlink.trainers.evaluation import evaluate
 from emberlink.trainers.runs.run_folder import RunFolder
 from emberlink.trainers.runs.seal import to_header
 from emberlink.trainers.runs.tracking import Trackers
+from emberlink.trainers.runs.versions import changed, versions
 from emberlink.trainers.training import checkpoints, non_finite, rollback
 from emberlink.trainers.training.folders import RunFolders, empty
 from emberlink.trainers.training.rollback import Rollbacks
@@ -52,6 +53,8 @@ class Trainer:
         """highest coverage of each seed, with which best.safetensors was written"""
         self.saved: int | None = None
         """the step of the newest checkpoint"""
+        self.changed_versions = ""
+        """packages whose version is not that of the checkpoint that was resumed"""
         self.folders: RunFolders | None = None
         self._began = time.monotonic()
         self._stopping = self._untracked = False
@@ -225,6 +228,7 @@ class Trainer:
             seconds=round(self.elapsed(), 3),
             rollbacks=asdict(self.rollbacks),
             tensors=len(tensors),
+            versions=versions(),
         )
         checkpoints.write(self.run.state(setup.step), state, tensors)
         self.save_networks()
@@ -245,6 +249,7 @@ class Trainer:
         """
         self.rollbacks = checkpoints.restore(path, self.setup, state, tensors)
         self.best, self.seconds = list(state.best), state.seconds
+        self.changed_versions = changed(state.versions)
 
     def roll_back(self, error: non_finite.NonFiniteError) -> str:
         """Returns to the newest checkpoint, or to the beginning, with smaller learning rates.
