@@ -422,5 +422,13 @@ def test_a_raster_of_something_else_is_warned_of(tmp_path):
             read(write_asc(tmp_path / "fire.asc", values), (30, 30), units=units)
 
 
+def test_a_front_of_many_points_is_not_warned_of(tmp_path):
+    places = [f"{12 + 3 * (k % 8)},{12 + 3 * (k // 8)},1," for k in range(40)]
+    (tmp_path / "fire.txt").write_text("\n".join(["1,1,1,"] * 6000 + places))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        read(tmp_path / "fire.txt", (30, 30), units="steps")
+
+
 def source_of(times):
     return RasterSource(np.where(times < 0, INF, times), (0, 0), (1, 1), Clock("minutes"))
