@@ -31,7 +31,7 @@ _PLUS = ((0, 0), (1, 0), (-1, 0), (0, 1), (0, -1))
 class Bank:
     """Fires on a grid, in steps."""
 
-    fires: Sequence[np.ndarray]
+    fires: Sequence[np.ndarray] | np.ndarray
     """[rows, columns] each, rows from north to south, as in the file"""
     horizon: int | None
     """number of steps for which the bank was written; None if unknown"""

@@ -1,7 +1,6 @@
 """Samples arrival times on a raster at the cells of a grid."""
 
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Any, Protocol
 
 import numpy as np
@@ -80,12 +79,18 @@ class Source(Protocol):
     """latest arrival in the file"""
     extent: Bounds
     """bounds of the whole file"""
-    summary: str
-    """description of the content, for the user"""
-    beginnings: int
-    """number of places that burn before all cells around them"""
     whole: bool
     """True for a map of the whole grid, which is neither cropped nor burnt out"""
+
+    @property
+    def summary(self) -> str:
+        """Description of the content, for the user."""
+        ...
+
+    @property
+    def beginnings(self) -> int:
+        """Number of places that burn before all cells around them."""
+        ...
 
     def burnt(self, until: float) -> Bounds:
         """Returns the bounds of the area burnt by a time."""
@@ -130,12 +135,13 @@ class RasterSource:
     def summary(self) -> str:
         """Description of the content, for the user."""
         first, last = self.clock.format(self.first), self.clock.format(self.last)
-        places = "1 place" if self.beginnings == 1 else f"{self.beginnings} places"
+        count = self.beginnings
+        places = "1 place" if count == 1 else f"{count} places"
         cells = np.isfinite(self.times).sum()
         name = f"{self._name!r}: " if self._name else ""
         return f"{name}{cells} cells burn from {first} to {last}, beginning at {places}"
 
-    @cached_property
+    @property
     def beginnings(self) -> int:
         """Number of places that burn before all cells around them, in 2000 x 2000 cells at most."""
         row, column = np.unravel_index(self.times.argmin(), self.times.shape)
