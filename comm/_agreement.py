@@ -1,25 +1,25 @@
-"""The agreement of a network of UAVs on whom to follow (paper, algorithm 3)."""
+"""Max-consensus of a network of UAVs on the discoverer to follow (paper, algorithm 3)."""
 
 import torch
 from torch import Tensor
 
 
 def known_discoverers(hears: Tensor, discovers: Tensor, *, agree: bool = True) -> Tensor:
-    """Returns the discoverers that each UAV knows of after the exchange, bool [..., n, n].
+    """Returns the discoverers that each UAV knows after the exchange, bool [..., n, n].
 
-    A non-discoverer hears the discoverers among its neighbours. Non-discoverers that are connected
-    through non-discoverers then know of all discoverers that any of them hears.
+    A non-discoverer hears the discoverers among its neighbours. Non-discoverers in the same
+    connected sub-network of non-discoverers then share the discoverers that any of them hears.
 
     Args:
         hears: bool [..., n, n], whether a UAV (row) hears another one (column).
-        discovers: bool [..., n].
-        agree: whether non-discoverers tell each other.
+        discovers: bool [..., n], whether a UAV is a discoverer.
+        agree: whether non-discoverers share the discoverers that they hear.
     """
     uavs = discovers.shape[-1]
     known = hears & discovers.unsqueeze(-2)
     if not agree:
         return known
-    # Neighbours exchange once per round; k squarings of the matrix reach all within 2**k hops.
+    # Each squaring doubles the number of hops; a path has at most n - 1 hops.
     others = ~discovers
     identity = torch.eye(uavs, dtype=torch.bool, device=hears.device)
     within = ((hears & others.unsqueeze(-1) & others.unsqueeze(-2)) | identity).float()
@@ -29,15 +29,18 @@ def known_discoverers(hears: Tensor, discovers: Tensor, *, agree: bool = True) -
 
 
 def choose_leader(known: Tensor, cost: Tensor, discovers: Tensor) -> Tensor:
-    """Returns whom each UAV follows, int64 [..., n]: itself if a discoverer, -1 if nobody.
+    """Returns the index of the discoverer that each UAV follows, int64 [..., n].
+
+    A discoverer follows itself. The index is -1 for a UAV that knows no discoverer.
 
     Args:
         known: bool [..., n, n], the discoverers that a UAV (row) knows of.
-        cost: [..., n or 1, n]; the lowest is chosen, among equals the lower index.
-        discovers: bool [..., n].
+        cost: [..., n or 1, n], of following a UAV (column). Each UAV chooses the discoverer of
+            lowest cost, and of equal costs the lower index.
+        discovers: bool [..., n], whether a UAV is a discoverer.
     """
     uavs = discovers.shape[-1]
-    # Positions in the sorted order differ, so that the minimum is the same on every device.
+    # Ranks have no ties, so the minimum is the same on every device.
     order = torch.sort(cost, dim=-1, stable=True).indices.argsort(-1)
     best, leader = order.masked_fill(~known, uavs).min(-1)
     leader = torch.where(best < uavs, leader, -1)

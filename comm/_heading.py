@@ -1,4 +1,4 @@
-"""Reward terms for flying towards the target."""
+"""Computes the reward terms for flying towards the target (paper, section IV.F)."""
 
 from typing import Literal
 
@@ -12,22 +12,23 @@ from emberlink.envs.config import Number
 
 @dataclass(frozen=True, kw_only=True, config=ConfigDict(extra="forbid", strict=True))
 class HeadingConfig:
-    """The bonus for flying towards the target (paper, section IV.F); defaults: the paper's."""
+    """The settings of the bonus for flying towards the target; the defaults are the paper's."""
 
     form: Literal["folded_linear", "folded_exponential", "linear", "approach"] = "folded_linear"
-    """one of `HEADING_FORMS`"""
+    """the formula, a key of `HEADING_FORMS`"""
     weight: Number = 1.0
-    """factor on the term"""
+    """factor of the term"""
     circle: Number = 0.0
-    """where not 0, factor on `circling`, which replaces the term over old fire alone"""
+    """factor of `circling`, which replaces the term of a UAV that sees old fire only; 0 for none"""
 
 
 def _degrees(vector: Tensor) -> Tensor:
+    """Returns the angles of vectors [..., 2 or 3] in the x-y plane, [...], in (-180, 180]."""
     return torch.rad2deg(torch.atan2(vector[..., 1], vector[..., 0]))
 
 
 def _folded_difference(target: Tensor, moved: Tensor) -> Tensor:
-    """| |A_target| - |A_moved| | as printed: it takes left and right for the same."""
+    """Returns | |A_target| - |A_moved| |, degrees; as in the paper, it ignores the signs."""
     return (_degrees(target).abs() - _degrees(moved).abs()).abs()
 
 
@@ -40,13 +41,13 @@ def _folded_exponential(target: Tensor, moved: Tensor) -> Tensor:
 
 
 def _linear(target: Tensor, moved: Tensor) -> Tensor:
-    """(90 - D) / 90 with D the true angle between the two; 0 where the UAV stood still."""
+    """Returns (90 - D) / 90 for an angle D between the vectors; 0 for a UAV that did not move."""
     difference = (_degrees(target) - _degrees(moved) + 180).remainder(360) - 180
     return torch.where((moved[..., :2] == 0).all(-1), 0.0, (90 - difference.abs()) / 90)
 
 
 def _approach(target: Tensor, moved: Tensor) -> Tensor:
-    """Cells by which the UAV came nearer to its target, altitude included."""
+    """Returns the cells by which the 3-D distance to the target has decreased."""
     return torch.linalg.vector_norm(target, dim=-1) - torch.linalg.vector_norm(
         target - moved, dim=-1
     )
@@ -58,17 +59,19 @@ HEADING_FORMS = {
     "linear": _linear,
     "approach": _approach,
 }
+"""the formula of each form, of the vector to the target and the vector of the move, [..., 3]"""
 
 
 def heading_reward(before: Tensor, after: Tensor, target: Tensor, config: HeadingConfig) -> Tensor:
-    """The heading term, float32 [...].
+    """Computes the heading term, float32 [...].
+
+    Angles are measured in the x-y plane, in degrees, from the position before the move. They are
+    computed in float64: a move of 0.1 cells is a difference of nearly equal float32 numbers.
 
     Args:
         before, after: float32 [..., 3], positions before and after the move, cells.
-        target: float32 [..., 3], where the UAV was told to go before the move, cells.
-
-    Angles are taken in the x-y plane, in degrees, from the position before the move; computed in
-    float64 because 0.1 cells of movement leave few digits.
+        target: float32 [..., 3], the target that the UAV had before the move, cells.
+        config: form and weight.
     """
     before = before.double()
     term = HEADING_FORMS[config.form](target.double() - before, after.double() - before)
@@ -76,12 +79,15 @@ def heading_reward(before: Tensor, after: Tensor, target: Tensor, config: Headin
 
 
 def circling(before: Tensor, after: Tensor, target: Tensor) -> Tensor:
-    """Cells flown around the target with the target to the left, float32 [...].
+    """Computes the cells flown around the target counterclockwise, float32 [...].
 
-    The move's component across the way to the target, times 2 d / (1 + d^2) at a distance of d:
-    full at 1 cell, less where the target is underneath the UAV or about to be lost from view.
-    Arguments as `heading_reward`.
+    The term is the component of the move perpendicular to the vector to the target, times
+    2 d / (1 + d^2), where d is the horizontal distance to the target in cells. This factor is 1 at
+    a distance of 1 and smaller both nearer to the target and further away.
+
+    Args:
+        before, after, target: as of `heading_reward`.
     """
-    way, moved = (end[..., :2].double() - before[..., :2].double() for end in (target, after))
-    arm = 2 * way / (1 + way.square().sum(-1, keepdim=True))
+    offset, moved = (end[..., :2].double() - before[..., :2].double() for end in (target, after))
+    arm = 2 * offset / (1 + offset.square().sum(-1, keepdim=True))
     return (moved[..., 0] * arm[..., 1] - moved[..., 1] * arm[..., 0]).float()

@@ -1,4 +1,4 @@
-"""The radio: which UAV hears which other one in a step."""
+"""Models the radio: computes which UAVs hear each other in a step."""
 
 from typing import Annotated
 
@@ -16,7 +16,7 @@ from emberlink.envs.world import motion
 
 @dataclass(frozen=True, kw_only=True, config=ConfigDict(extra="forbid", strict=True))
 class RadioConfig:
-    """The settings of a radio. The settings of a method with a radio inherit from it."""
+    """The settings of a radio; the configuration of a method with a radio inherits them."""
 
     range: Annotated[float, Field(ge=0)] = 10.0
     """UAVs at a distance below this hear each other, cells; .inf for no limit"""
@@ -25,10 +25,10 @@ class RadioConfig:
 
 
 class Radio:
-    """Decides who hears whom in a step.
+    """Computes the communication links of a step.
 
-    `Communication` writes the result under `keys.HEARS`, once per step. Communication modules,
-    pictures and tests read it there.
+    `Communication` writes them under `keys.HEARS` once per step, where communication modules and
+    pictures read them.
 
     Args:
         config: range and loss.
@@ -38,7 +38,7 @@ class Radio:
         self.config = config
 
     def links(self, tensordict: TensorDictBase) -> Tensor:
-        """Returns who hears whom, bool [..., n, n]: row i holds the UAVs that UAV i hears.
+        """Returns the links, bool [..., n, n]: row i marks the UAVs that UAV i hears.
 
         The lost messages are a function of the episode's random key and the step.
 
@@ -57,12 +57,12 @@ class Radio:
 
 
 def pairwise_distance(position: Tensor) -> Tensor:
-    """Returns the distances between UAVs, float64 [..., n, n], cells; of positions [..., n, 3]."""
+    """Returns the distances between UAVs at positions [..., n, 3], float64 [..., n, n], cells."""
     return motion.distance(position.unsqueeze(-2), position.unsqueeze(-3))
 
 
 def neighbours(position: Tensor, limit: float) -> Tensor:
-    """Returns which other UAVs are at a distance below `limit`, bool [..., n, n].
+    """Returns whether each other UAV is nearer than `limit`, bool [..., n, n].
 
     Args:
         position: float32 [..., n, 3], cells.

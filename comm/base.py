@@ -1,4 +1,4 @@
-"""The base class of communication modules, and the transform that adds one to an environment."""
+"""Defines communication modules and the transform that adds one to an environment."""
 
 from typing import Any, ClassVar
 
@@ -26,8 +26,8 @@ class CommModule(Buffers, TensorDictModuleBase):
     `forward` and `reset` write in place (`self.map.copy_(...)`). Buffers are saved with a
     checkpoint and must hold finite numbers. Constants are registered with `persistent=False`.
 
-    Where `config` inherits from `RadioConfig`, or where a subclass sets `radio`, the links of each
-    step stand under `keys.HEARS` before `shaping` and `forward` are called.
+    If `config` inherits from `RadioConfig`, or a subclass sets `radio`, the links of each step are
+    written under `keys.HEARS` before `shaping` and `forward` are called.
 
     Args:
         world: the environment's constants.
@@ -43,11 +43,11 @@ class CommModule(Buffers, TensorDictModuleBase):
         self.world, self.config, self.num_envs = world, config, num_envs
         self.radio = Radio(config) if isinstance(config, RadioConfig) else None
         default: list[Any] = [keys.OBSERVATION]
-        self.in_keys = getattr(self, "_in_keys", default)  # those of the class, if it has some
+        self.in_keys = getattr(self, "_in_keys", default)  # a subclass may define class attributes
         self.out_keys = getattr(self, "_out_keys", default)
 
     def specs(self, observation: Composite) -> Composite:
-        """Returns the environment's observation spec with everything that `forward` writes."""
+        """Returns the environment's observation spec, with the entries that `forward` writes."""
         return observation
 
     def reset(self, tensordict: TensorDictBase, mask: Tensor) -> None:
@@ -64,12 +64,12 @@ class CommModule(Buffers, TensorDictModuleBase):
         raise NotImplementedError
 
     def shaping(self, tensordict: TensorDictBase) -> Tensor | None:
-        """Returns the term that is added to the reward of a step, float32 [num_envs, n], if any.
+        """Returns a term to add to the reward of a step, float32 [num_envs, n], or None.
 
-        It is called before `forward`; the state is that of the time step before.
+        It is called before `forward`, when the state is still that of the previous time step.
 
         Args:
-            tensordict: the time step after the move, not yet rewritten.
+            tensordict: the time step after the move, before `forward`.
         """
         return None
 
@@ -77,12 +77,15 @@ class CommModule(Buffers, TensorDictModuleBase):
 class Communication(Transform):
     """Adds a communication module to an environment.
 
-    It is a transform and not part of the policy, so that the next observation of a transition is
-    rewritten exactly as the first one is. It reads nothing from the time step before: the memory
-    is in the module.
+    It is a transform and not part of the policy, so that both observations of a transition are
+    rewritten. It reads nothing from the previous time step: all state is in the module.
 
     Args:
-        module: the communication module, made for as many environments.
+        module: the communication module, built for the same number of environments.
+
+    Raises:
+        ValueError: a persistent buffer of the module does not have `num_envs` as its first
+            dimension.
     """
 
     def __init__(self, module: CommModule):
@@ -112,26 +115,30 @@ class Communication(Transform):
         state = self.module.state_dict()
         before = {name: buffer.clone() for name, buffer in state.items()}
         result = self._communicate(tensordict_reset)
-        # For the other environments the time step is no new one: their state stays.
+        # The other environments are within an episode; their state must not change.
         for name, buffer in state.items():
             began = mask.view(-1, *[1] * (buffer.ndim - 1))
             buffer.copy_(torch.where(began, buffer, before[name]))
         return result
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        self._listen(next_tensordict)
         bonus = self.module.shaping(next_tensordict)
         if bonus is not None:
             reward = next_tensordict.get(keys.REWARD) + bonus.unsqueeze(-1)
             next_tensordict.set(keys.REWARD, reward)
-        return self._communicate(next_tensordict)
+        return self.module(next_tensordict)
 
     def _communicate(self, tensordict: TensorDictBase) -> TensorDictBase:
-        if self.module.radio is not None:
-            tensordict.set(keys.HEARS, self.module.radio.links(tensordict))
+        self._listen(tensordict)
         return self.module(tensordict)
 
+    def _listen(self, tensordict: TensorDictBase) -> None:
+        if self.module.radio is not None:
+            tensordict.set(keys.HEARS, self.module.radio.links(tensordict))
+
     def _check_keys(self, tensordict: TensorDictBase) -> None:
-        """Checks that the environment, with the transforms before this one, gives every input."""
+        """Checks that the environment and the transforms before this one write every input key."""
         for key in self.module.in_keys:
             if key != keys.HEARS and tensordict.get(key, None) is None:
                 raise UserError(

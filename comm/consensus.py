@@ -1,4 +1,4 @@
-"""A network that agrees whom to follow: method 4 of the paper (section IV.F, algorithm 3)."""
+"""Consensus communication: method 4 of the paper (section IV.F, algorithm 3)."""
 
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -26,47 +26,47 @@ class ConsensusConfig(RadioConfig):
     """The settings of method 4; the defaults are the paper's text."""
 
     discoverer: Literal["new_fire", "any_fire"] = "new_fire"
-    """what a discoverer sees: new fire, or new or old fire"""
+    """condition for being a discoverer: seeing new fire, or any fire"""
     jitter: Annotated[float, Field(ge=0, le=1e12)] = 0.0
     """standard deviation of the noise on x and y of a target closer than 1, cells"""
     target: Literal["absolute", "relative"] = "absolute"
     """whether the UAV observes the target's coordinates or the vector to it"""
     agree: bool = True
-    """whether sub-networks agree; if not, a UAV only knows the discoverers that it hears itself"""
+    """whether sub-networks reach consensus; if not, a UAV knows only discoverers that it hears"""
     follow: Literal["best", "nearest"] = "best"
-    """the discoverer that a UAV follows, of those it knows: that of highest rank or the nearest"""
+    """the known discoverer that a UAV follows: the one of highest rank, or the nearest"""
     wander: bool = True
-    """whether UAVs with nobody to follow get random targets; if not, they have no target"""
+    """whether wanderers get random targets; if not, a wanderer's target is its own position"""
     heading: HeadingConfig = HeadingConfig()
     """the bonus for flying towards the target"""
 
 
 class Consensus(CommModule):
-    """Gives every UAV a target: the observation is the UAV's own vector and x, y, z of the target.
+    """Gives every UAV a target and appends its x, y, z to the UAV's observation.
 
-    State: the waypoint of each UAV, the track record of its current streak as a discoverer, and
-    what the bonus needs of the time step before.
+    A discoverer's target is the mean of the fire in its view. A seeker's is the position of the
+    discoverer that it follows. A wanderer, which has no discoverer to follow, gets a random point.
     """
 
     config_type: ClassVar[type] = ConsensusConfig
     low: Tensor
     high: Tensor
     waypoint: Tensor
-    """float32 [num_envs, n, 3]: the random point that the UAV flies to as a wanderer, cells"""
+    """float32 [num_envs, n, 3]: random targets of wanderers, cells"""
     streak: Tensor
     """int64 [num_envs, n]: consecutive steps as a discoverer"""
     fire_score: Tensor
-    """int64 [num_envs, n]: new fire points over the streak"""
+    """int64 [num_envs, n]: new fire cells counted over the streak"""
     altitude_sum: Tensor
     """float64 [num_envs, n]: sum of the altitudes over the streak; Avg_Alt times the streak"""
     position: Tensor
-    """float32 [num_envs, n, 3]: position at the time step before, cells"""
+    """float32 [num_envs, n, 3]: positions at the previous time step, cells"""
     target: Tensor
-    """float32 [num_envs, n, 3]: target at the time step before, cells"""
+    """float32 [num_envs, n, 3]: targets at the previous time step, cells"""
     leaderless: Tensor
-    """bool [num_envs, n]: whether the UAV was a wanderer at the time step before"""
+    """bool [num_envs, n]: whether a UAV was a wanderer at the previous time step"""
     old_fire_only: Tensor
-    """bool [num_envs, n]: whether it was a discoverer that saw no new fire"""
+    """bool [num_envs, n]: whether a UAV was then a discoverer that saw no new fire"""
 
     def __init__(self, world: WildfireConfig, config: ConsensusConfig, num_envs: int = 1):
         super().__init__(world, config, num_envs)
@@ -123,7 +123,7 @@ class Consensus(CommModule):
         return tensordict.set(keys.OBSERVATION, torch.cat((vector, self._scaled(shown)), -1))
 
     def shaping(self, tensordict: TensorDictBase) -> Tensor:
-        """Returns the heading term, 0 where the UAV left the box."""
+        """Returns the heading term, float32 [num_envs, n]; 0 for a UAV that left the box."""
         heading = self.config.heading
         flight = self.position, tensordict.get(keys.POSITION), self.target
         term = heading_reward(*flight, heading)
@@ -137,7 +137,7 @@ class Consensus(CommModule):
     def _keep_for_shaping(
         self, tensordict: TensorDictBase, target: Tensor, follows: Tensor
     ) -> None:
-        """Keeps what the bonus of the next step needs of this time step."""
+        """Stores the positions, targets and roles that the bonus of the next step depends on."""
         self.position.copy_(tensordict.get(keys.POSITION))
         self.target.copy_(target)
         if not self.config.wander:
@@ -147,7 +147,7 @@ class Consensus(CommModule):
             self.old_fire_only.copy_(self._discovers(tensordict) & no_new_fire)
 
     def _discovers(self, tensordict: TensorDictBase) -> Tensor:
-        """Returns which UAVs are discoverers, bool [num_envs, n]."""
+        """Returns whether each UAV is a discoverer, bool [num_envs, n]."""
         fire = tensordict.get(keys.NEW_FIRE)
         if self.config.discoverer == "any_fire":
             fire = fire + tensordict.get(keys.OLD_FIRE)
@@ -160,7 +160,7 @@ class Consensus(CommModule):
         self.streak.add_(1).mul_(discovers)
         self.fire_score.add_(discovered).mul_(discovers)
         self.altitude_sum.add_(altitude).mul_(discovers)
-        # Avg_Alt * Streak of the paper's equation is the sum of the altitudes of the streak.
+        # Avg_Alt * Streak in the paper's rank is the sum of the altitudes over the streak.
         record = self.fire_score / self.altitude_sum.clamp(min=1e-9)
         return record * (discovered / altitude)
 
@@ -181,7 +181,7 @@ class Consensus(CommModule):
         return self._jittered(tensordict, target) if self.config.jitter else target
 
     def _redraw_key(self, tensordict: TensorDictBase) -> Tensor:
-        """Returns the random key of new waypoints, at step 0 another one than in `reset`."""
+        """Returns the random key of new waypoints; at step 0 it differs from that of `reset`."""
         step = tensordict.get(keys.STEP)
         use = Use.WAYPOINT + (step == 0) * (Use.FIRST_WAYPOINT_REDRAW - Use.WAYPOINT)
         return counter_rng.step_key(tensordict.get(keys.RNG_KEY), step, use)
@@ -199,7 +199,7 @@ class Consensus(CommModule):
         return counter_rng.step_key(tensordict.get(keys.RNG_KEY), tensordict.get(keys.STEP), use)
 
     def _scaled(self, shown: Tensor) -> Tensor:
-        """Returns targets or vectors to them in the scale of the observation."""
+        """Returns targets, or vectors to targets, in the scale of the observation."""
         if self.world.observation_scale == "raw":
             return shown
         if self.config.target == "relative":

@@ -15,7 +15,7 @@ class NoCommConfig:
 
 
 class NoComm(CommModule):
-    """Leaves every UAV with its own 6 numbers (paper, section IV.C)."""
+    """Leaves the observations unchanged: 6 numbers per UAV (paper, section IV.C)."""
 
     config_type: ClassVar[type] = NoCommConfig
 

@@ -1,4 +1,4 @@
-"""Everyone hears everyone: method 3 of the paper (section IV.E, algorithm 2)."""
+"""Full communication: method 3 of the paper (section IV.E, algorithm 2)."""
 
 import math
 from typing import ClassVar
@@ -21,10 +21,9 @@ class PositionalConfig:
 
 
 class Positional(CommModule):
-    """Gives every UAV the concatenation of all UAVs' vectors, UAV 0 first: 6 n numbers.
+    """Concatenates the vectors of all UAVs, UAV 0 first, for every UAV: 6 n numbers.
 
-    The order is the same for all UAVs, as in algorithm 2. Only the weights of a UAV's networks
-    distinguish its own numbers from those of the others.
+    All UAVs observe the same numbers in the same order, as in algorithm 2.
     """
 
     config_type: ClassVar[type] = PositionalConfig
@@ -40,6 +39,6 @@ class Positional(CommModule):
         return observation
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        own = tensordict.get(keys.OBSERVATION)
-        everyone = own.flatten(-2).unsqueeze(-2)
-        return tensordict.set(keys.OBSERVATION, everyone.repeat_interleave(own.shape[-2], -2))
+        vectors = tensordict.get(keys.OBSERVATION)
+        joined = vectors.flatten(-2).unsqueeze(-2)
+        return tensordict.set(keys.OBSERVATION, joined.repeat_interleave(vectors.shape[-2], -2))

@@ -1,4 +1,4 @@
-"""Finds communication modules: the files beside this one, and those of other packages."""
+"""Finds communication modules by name: files of this folder, and entry points of other packages."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -15,16 +15,16 @@ known, find = _REGISTRY.known, _REGISTRY.find
 def build(
     name: str, world: WildfireConfig, settings: Mapping[str, Any], num_envs: int = 1
 ) -> CommModule:
-    """Returns a communication module with its settings.
+    """Returns a new communication module.
 
     Args:
-        name: of the communication method.
+        name: name of the communication method.
         world: the environment's constants.
-        settings: what stands under `comm` but the name.
-        num_envs: environments that run side by side.
+        settings: the keys under `comm`, without `name`.
+        num_envs: number of environments.
 
     Raises:
-        UserError: an unknown name or setting, or a value out of range.
+        UserError: the name or a setting is not known, or a value is out of range.
     """
     module = find(name)
     return module(world, from_plain(module.config_type, settings, "comm"), num_envs)

@@ -1,7 +1,8 @@
 """The wildfire environment, for TorchRL and for PettingZoo."""
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from emberlink.envs.utils.lazy import lazy
 
 if TYPE_CHECKING:
     from emberlink.envs.config import RewardConfig, WildfireConfig
@@ -19,18 +20,14 @@ __all__ = [
     "parallel_env",
 ]
 
-_FILES = {
-    "FileFireConfig": "fire_files.reader",
-    "FireConfig": "fire.generator",
-    "RewardConfig": "config",
-    "WildfireConfig": "config",
-    "WildfireEnv": "wildfire",
-    "parallel_env": "pettingzoo",
-}
-
-
-def __getattr__(name: str) -> Any:
-    # Imported when asked for: `emberlink.envs.utils` is used where torch is not needed.
-    if name in _FILES:
-        return getattr(import_module(f"{__name__}.{_FILES[name]}"), name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+__getattr__ = lazy(
+    __name__,
+    {
+        "FileFireConfig": "fire_files.config",
+        "FireConfig": "fire.generator",
+        "RewardConfig": "config",
+        "WildfireConfig": "config",
+        "WildfireEnv": "wildfire",
+        "parallel_env": "pettingzoo",
+    },
+)

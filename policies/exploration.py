@@ -1,4 +1,4 @@
-"""Exploration: Ornstein-Uhlenbeck noise on the actions."""
+"""Adds Ornstein-Uhlenbeck noise to the actions for exploration."""
 
 import math
 from typing import Annotated, Any
@@ -15,7 +15,7 @@ from emberlink.envs.utils import counter_rng
 from emberlink.envs.utils.counter_rng import Use
 
 NOISE = (keys.AGENTS, "noise")
-"""float32 [..., 3]: the noise process, carried from step to step"""
+"""float32 [..., 3]: the state of the noise process, carried from step to step"""
 
 
 @dataclass(frozen=True, kw_only=True, config=ConfigDict(extra="forbid", strict=True))
@@ -23,21 +23,20 @@ class ExplorationConfig:
     """Ornstein-Uhlenbeck noise: x += theta * (0 - x) * dt + sigma * sqrt(dt) * N(0, 1)."""
 
     theta: Annotated[float, Field(ge=0, le=1e30)]
-    """pull towards 0"""
+    """rate of return to 0"""
     sigma: Annotated[float, Field(ge=0, le=1e30)]
-    """strength of the noise"""
+    """standard deviation per square root of time"""
     dt: Annotated[float, Field(gt=0, le=1e30)]
-    """length of a step"""
+    """time per step"""
 
 
 class OrnsteinUhlenbeck(TensorDictModuleBase):
     """Adds Ornstein-Uhlenbeck noise to the actions and clips them to [-1, 1].
 
-    The process starts from 0 with each episode and is not annealed (the paper anneals nothing).
-    Random numbers come from each environment's own stream, so the noise of an environment depends
-    neither on the number of environments nor on the device. (TorchRL's module draws from the global
-    generator.) Where exploration is off (`torchrl.envs.set_exploration_type`), actions are
-    unchanged.
+    The process starts from 0 in each episode and is not annealed, as in the paper. Random numbers
+    come from each environment's random key, so the noise of an environment does not depend on the
+    number of environments or on the device. (TorchRL's module draws from the global generator.) If
+    exploration is off (`torchrl.envs.set_exploration_type`), the actions are unchanged.
 
     Args:
         config: constants of the process.

@@ -76,10 +76,12 @@ SETUPS = "known: paper, released, tuned"
         ),
         (["consensus", "comm.name=no_comm"], ["comm.", "not a setting of no_comm; known: none"]),
         (["consensus", "learner.hidden=[10000000,8]"], ["learner.hidden.0=10000000", "8192"]),
+        (["consensus", "learner.hidden=[]"], ["learner.hidden=[]", "at least 1 item"]),
+        (["consensus", "learner.hidden=[8,8,8,8,8,8,8,8,8]"], ["learner.hidden=", "at most 8"]),
         (["consensus", "num_envs=100000000"], ["num_envs=100000000", "65536"]),
-        (["consensus", "device=cuda:99"], ["device=cuda:99 is not there", "known: cpu"]),
-        (["consensus", "device=tpu"], ["device=tpu is not there", "known: cpu"]),
-        (["consensus", "device=cpu:3"], ["device=cpu:3 is not there", "known: cpu"]),
+        (["consensus", "device=cuda:99"], ["device=cuda:99 is not available", "known: cpu"]),
+        (["consensus", "device=tpu"], ["device=tpu is not available", "known: cpu"]),
+        (["consensus", "device=cpu:3"], ["device=cpu:3 is not available", "known: cpu"]),
         (["consensus", "episodes"], ["'episodes'", "key=value"]),
         (["consensus", "a=b=c"], ["'a=b=c'", "key=value"]),
         (["consensus", "=3"], ["key ''"]),
@@ -88,7 +90,7 @@ SETUPS = "known: paper, released, tuned"
         (["consensus", "seed=1,2"], ["'seed=1,2'", "one value", "seeds=[1,2]"]),
         (["consensus", "seeds=0,1"], ["'seeds=0,1'", "one value", "seeds=[0,1]"]),
         (["consensus", "env.grid=30,20"], ["one value", "env.grid=[30,20]"]),
-        (["consensus", "fire.kind=file"], ["fire.kind", "chosen with fire=NAME"]),
+        (["consensus", "fire.kind=file"], ["fire.kind", "choose it with fire=NAME"]),
         (["consensus", "comm={range: 3}"], ["give its keys one by one", "comm.KEY=VALUE"]),
         (["consensus", "env.horizon=${nope}"], ["nope", "env.horizon"]),
     ],
@@ -165,7 +167,7 @@ def test_a_checkpoint_that_is_none(run, capsys):
         refused(["eval", str(run)], capsys, checkpoint.name, "not a readable checkpoint")
     weights = {"else": torch.zeros(3)}
     save_file(weights, checkpoint)
-    refused(["eval", str(run)], capsys, checkpoint.name, "does not hold the configuration")
+    refused(["eval", str(run)], capsys, checkpoint.name, "not a readable checkpoint")
     other = run / "nothing.safetensors"
     refused(["eval", str(run), "--checkpoint", str(other)], capsys, other.name)
 

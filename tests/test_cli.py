@@ -91,7 +91,6 @@ def test_eval_plays_the_checkpoint_it_is_given(run, capsys):
     newest = (run / "eval.json").read_bytes()
     trained = json.loads(newest)["results"]["huygens"]
     header, weights = checkpoint_file.read(RunFolder(run).checkpoint())
-    assert header is not None
     about = {key: value for key, value in header.items() if key not in ("sha256", "format")}
     name = next(n for n in weights if n.startswith("actor_network_params") and "action.bias" in n)
     changed = {**weights, name: weights[name] + 9}

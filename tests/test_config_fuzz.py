@@ -126,8 +126,10 @@ def fitting(key: str, schema: dict) -> st.SearchStrategy:
     if "prefixItems" in schema:
         parts = [fitting(key, entered(one, SCHEMA)) for one in schema["prefixItems"]]
         pair = st.tuples(*parts)
-        return pair.map(list) if key in ("env.grid", "learner.hidden") else pair.map(sorted)
-    return st.lists(fitting(key, schema["items"]), unique=True, max_size=3)
+        return pair.map(list) if key == "env.grid" else pair.map(sorted)
+    least, most = schema.get("minItems", 0), min(schema.get("maxItems", 3), 3)
+    items = fitting(key, entered(schema["items"], SCHEMA))
+    return st.lists(items, unique=key == "seeds", min_size=least, max_size=most)
 
 
 def wrong(schema: dict) -> list:
@@ -150,7 +152,10 @@ def wrong(schema: dict) -> list:
         right = [1] * len(parts)
         other += ["ab", 3, True, math.nan, [[1], [1]], [None] * len(parts), ["x"] * len(parts)]
         other += [[*right[:-1], one] for one in (True, "1", math.nan, {}, 10**400, -(10**9))]
-        return [*other, [], right[:-1], [*right, 1]] if "prefixItems" in schema else other
+        if "prefixItems" in schema:
+            return [*other, [], right[:-1], [*right, 1]]
+        other += [[]] if "minItems" in schema else []
+        return [*other, [1] * (schema["maxItems"] + 1)] if "maxItems" in schema else other
     if kind == "boolean":
         return [*other, 0, 1, "true", [True]]
     assert kind == "string", schema

@@ -155,7 +155,7 @@ def test_the_folder_of_seeds_side_by_side_by_any_path(tmp_path, capsys, monkeypa
     [
         ("env={}", "'env={}': give its keys one by one, as env.KEY=VALUE"),
         ("learner={gamma: 0.5}", "give its keys one by one, as learner.KEY=VALUE"),
-        ("fire.name=paper", "fire.name=paper: is chosen with fire=NAME"),
+        ("fire.name=paper", "fire.name=paper: choose it with fire=NAME"),
         ("env.reward.exit=-1e13", "env.reward.exit=-10000000000000.0"),
         ("learner.actor_lr=1e31", "learner.actor_lr=1e+31"),
         ("comm.jitter=1e13", "comm.jitter"),

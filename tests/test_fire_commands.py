@@ -23,6 +23,8 @@ from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.fires import plot
 from emberlink.trainers.fires.bank_writer import SUFFIXES, write_bank
 
+pytestmark = pytest.mark.drawn
+
 HUYGENS = load_scenario("huygens")
 
 

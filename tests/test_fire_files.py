@@ -90,7 +90,7 @@ def test_keys_come_in_any_order_and_setup_keeps_its_own(source):
         ("fire.start=nan", "fire.start"),
         ("fire.minutes_per_step=-1", "fire.minutes_per_step"),
         ("fire.num_train_fires=3", "fire.num_train_fires"),
-        ("fire.kind=spread", "chosen with fire=NAME"),
+        ("fire.kind=spread", "choose it with fire=NAME"),
         ("fire.sha256=abc", "fire.sha256"),
         ("fire.saved_copy=abc", "fire.saved_copy"),
     ):

@@ -112,7 +112,7 @@ def test_observations_are_float32_whatever_the_default_is():
 
 def test_a_device_that_is_not_there_and_unknown_options_are_named():
     if not torch.cuda.is_available():
-        with pytest.raises(ValueError, match="device=cuda is not there; known: cpu"):
+        with pytest.raises(ValueError, match="device=cuda is not available; known: cpu"):
             WildfireEnv(device="cuda")
     with pytest.raises(ValueError, match="device=abacus"):
         WildfireEnv(device="abacus")

@@ -1,4 +1,4 @@
-"""What every learner must do, with every method, observation and sharing of weights."""
+"""Tests of every learner with every method, observation and sharing of weights."""
 
 import json
 from importlib.metadata import EntryPoint
@@ -28,6 +28,15 @@ def made(learner: str, *more: str, method: str = "consensus") -> TrainingSetup:
     return TrainingSetup(resolve(method, [f"learner={learner}", *SMALL, *more]))
 
 
+@pytest.mark.parametrize("learner", LEARNERS)
+@pytest.mark.parametrize("hidden", [[8], [8, 6, 4]])
+def test_networks_may_have_one_hidden_layer_or_several(learner, hidden):
+    setup = made(learner, f"learner.hidden={hidden}")
+    setup.dry_run(steps=10)
+    assert setup.learner.updates > 0
+    assert not setup.guard.poll(wait=True)
+
+
 def test_the_files_are_the_learners():
     assert registry.known() == LEARNERS
     assert [registry.find(name) for name in LEARNERS] == [DDPG, TD3]
@@ -54,7 +63,6 @@ def test_a_short_run_learns_and_evaluates(method, learner, tmp_path, capsys):
 @pytest.mark.parametrize("learner", LEARNERS)
 @pytest.mark.parametrize("more", [[], ["env.observation=window"], ["seeds=[1,2]"]])
 def test_all_uavs_of_a_seed_share_their_weights(learner, more, tmp_path):
-    """Trained, stopped and resumed; the weights move, and each seed has its own."""
     settings = [f"learner={learner}", *SMALL, "learner.share_parameters=true", *more]
     config = resolve("consensus", [*settings, f"output={tmp_path}"])
     trainer = Trainer(config)

@@ -121,7 +121,7 @@ def test_other_names_are_errors_of_one_line(name, said, shipped, capsys):
 def test_only_finished_runs_are_packed_and_nothing_is_overwritten(packed, tmp_path, capsys):
     root, (run, *_) = packed
     assert pretrained.main([str(run), "--into", str(root)]) == 2
-    assert "is there already" in capsys.readouterr().err
+    assert "exists already" in capsys.readouterr().err
     copy = tmp_path / "copy"
     shutil.copytree(run, copy)
     (copy / "eval.json").unlink()

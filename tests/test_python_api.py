@@ -177,7 +177,7 @@ def test_compare_writes_the_report_of_the_command(trained, tmp_path):
         (lambda run: trainers.train("consensus", setup="papr"), "did you mean paper"),
         (lambda run: trainers.train("consensus", fire="papr"), "did you mean paper"),
         (lambda run: trainers.train("consensus", horizn=3), "'horizn' is not known"),
-        (lambda run: trainers.train("consensus", seeds=[1, 1]), "each seed at most once"),
+        (lambda run: trainers.train("consensus", seeds=[1, 1]), "a seed is repeated"),
         (lambda run: trainers.train("consensus", device="cuda:99"), "device=cuda:99"),
         (lambda run: trainers.evaluate("nowhere"), "there is no such run folder"),
         (lambda run: trainers.evaluate(run, episodes=0), "episodes=0"),

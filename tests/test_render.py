@@ -145,7 +145,7 @@ def test_a_colour_that_comes_later_is_kept():
     frames = [np.full((4, 6, 3), shade, np.uint8) for shade in range(0, 250, 5)]
     frames[7][0, 0] = (1, 2, 250)
     images = [Image.fromarray(original).quantize(256) for original in frames]
-    shared = frame._one_palette(images)
+    shared = frame._share_palette(images)
     assert len({bytes(image.getpalette()) for image in shared}) == 1
     for image, original in zip(shared, frames, strict=True):
         assert np.array_equal(np.asarray(image.convert("RGB")), original)

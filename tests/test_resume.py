@@ -91,7 +91,6 @@ def assert_same(one: Trainer, other: Trainer) -> None:
 def networks_of(path: Path) -> tuple[dict, dict[str, bytes]]:
     """What a file of networks holds, but for its configuration."""
     header, tensors = checkpoint_file.read(path)
-    assert header is not None
     for key in ("config", "sha256"):  # of which `output` and `checkpoint_steps` differ
         header.pop(key)
     return header, {name: value.numpy().tobytes() for name, value in tensors.items()}
@@ -306,7 +305,6 @@ def test_old_checkpoints_go_and_the_best_stays(tmp_path):
     assert [path.stem[-3:] for path in run.networks()] == ["063", "072", "080"]
     assert [path.stem[-3:] for path in run.states()] == ["072", "080"]
     header = checkpoint_file.read_header(run.checkpoints / "best.safetensors")
-    assert header is not None
     held_out = [line["huygens/coverage"] + line["paper/coverage"] for line in run.lines()]
     assert header["step"] == HORIZON * (1 + held_out.index(max(held_out)))
 

@@ -14,7 +14,7 @@ from emberlink.envs import WildfireConfig, WildfireEnv, keys, metrics
 from emberlink.envs.world.sensor import view_radius
 from emberlink.policies.scripted.base import Scripted
 from emberlink.policies.scripted.follow_target import FollowTarget
-from emberlink.policies.scripted.lawnmower import Lawnmower, stops
+from emberlink.policies.scripted.lawnmower import Lawnmower, search_path
 from emberlink.policies.scripted.oracle import Oracle
 from emberlink.policies.scripted.registry import SCRIPTED
 from emberlink.trainers.build import build_env
@@ -52,7 +52,7 @@ def flown(env, policy, steps: int, position) -> list:
 def test_the_lawnmower_of_one_uav_by_hand():
     # Three cells are seen. 8 x 9 cells: strips of x 0-1, 2-4, 5-7, each in y 0-2, 3-5, 6-8.
     path = [[0.5, 1], [0.5, 4], [0.5, 7], [3, 7], [3, 4], [3, 1], [6, 1], [6, 4], [6, 7]]
-    assert stops((8, 9), 1.2).tolist() == path
+    assert search_path((8, 9), 1.2).tolist() == path
     env = WildfireEnv(1, world((8, 9), displacement=3.0, view_angle=THREE), torch.zeros(8, 9))
     places = flown(env, Lawnmower(env), 20, [[3.5, 4.0, 4.0]])
     path = [[*ground, 4] for ground in path]
@@ -64,8 +64,8 @@ def test_the_lawnmower_gives_every_uav_its_strips():
     # The paper's world: 5 cells are seen, six strips of 30 for six UAVs.
     env = WildfireEnv(1, WildfireConfig(), torch.zeros(30, 30))
     mower = Lawnmower(env)
-    assert sorted({x for x, _ in mower.stops.tolist()}) == [2, 7, 12, 17, 22, 27]
-    assert sorted({y for _, y in mower.stops.tolist()}) == [2, 7, 12, 17, 22, 27]
+    assert sorted({x for x, _ in mower.path.tolist()}) == [2, 7, 12, 17, 22, 27]
+    assert sorted({y for _, y in mower.path.tolist()}) == [2, 7, 12, 17, 22, 27]
     places = flown(env, mower, 140, [[x, 14.0, 1.0] for x in (2.0, 7.0, 12.0, 17.0, 22.0, 27.0)])
     for uav, x in enumerate((2, 7, 12, 17, 22, 27)):
         own = [place[uav] for place in places[20:]]
@@ -77,7 +77,7 @@ def test_the_lawnmower_gives_every_uav_its_strips():
 def test_more_uavs_than_stops_and_fewer_than_strips():
     env = WildfireEnv(1, world((8, 8), uavs=5, view_angle=60.0), torch.zeros(8, 8))
     mower = Lawnmower(env)  # a view 13 wide: one stop for all
-    assert mower.stops.tolist() == [[3.5, 3.5]]
+    assert mower.path.tolist() == [[3.5, 3.5]]
     assert flown(env, mower, 12, [[0.0, 0.0, 2.0]] * 5)[-1] == [[3.5, 3.5, 4]] * 5
     env = WildfireEnv(1, world((30, 30), uavs=4), torch.zeros(30, 30))
     mower = Lawnmower(env)  # 36 stops, nine each
@@ -104,7 +104,7 @@ def test_the_lawnmower_sees_every_cell(grid, uavs, angle, ceiling, displacement)
     )
     env = WildfireEnv(1, config, torch.zeros(grid))  # all burns: what is seen is counted
     mower = Lawnmower(env)
-    flight = len(mower.stops) * (2 + math.ceil(max(grid) / displacement)) // uavs
+    flight = len(mower.path) * (2 + math.ceil(max(grid) / displacement)) // uavs
     moment = env.reset()
     for _ in range(3 * max(grid) + 2 * flight):
         moment = step_mdp(env.step(mower(moment)), keep_other=True)

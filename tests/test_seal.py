@@ -145,8 +145,11 @@ def test_another_world_is_said_on_the_command_line(run, capsys):
     assert (run / "eval_env.view_angle=31.0.json").is_file()
 
 
-def test_networks_without_a_configuration_are_refused(run, capsys):
+def test_networks_without_a_header_are_refused(run, capsys):
     path = RunFolder(run).checkpoint()
     save_file(load_file(path), path)
     assert main.main(["eval", str(run)]) == 2
-    assert "does not hold the configuration that it was trained with" in capsys.readouterr().err
+    assert (
+        "not a readable checkpoint: damaged, or of another program (no header of emberlink)"
+        in capsys.readouterr().err
+    )

@@ -156,8 +156,8 @@ def test_every_seed_gets_a_run_folder_that_evaluates(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
-        (["seeds=[1,2]", "seed=3"], "seed=3 and seeds=[1, 2]: give one of them"),
-        (["seeds=[1,1]"], "seeds=[1, 1]: each seed at most once"),
+        (["seeds=[1,2]", "seed=3"], "seed=3 and seeds=[1, 2]: give only one of them"),
+        (["seeds=[1,1]"], "seeds=[1, 1]: a seed is repeated"),
         (["seeds=[1,-2]"], "seeds.1=-2"),
         (["seeds=3"], "seeds=3"),
         (["seeds=[a]"], "seeds.0=a"),

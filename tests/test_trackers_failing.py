@@ -46,7 +46,7 @@ def train(logger: str, folder: Path, watch: Callable[[Progress], None] = lambda 
 def only(messages: list[str], *words: str) -> None:
     (message,) = messages
     assert message.count("\n") == 0
-    for word in (*words, "training goes on", "metrics.jsonl"):
+    for word in (*words, "training continues", "metrics.jsonl"):
         assert word in message
 
 

@@ -1,7 +1,8 @@
-"""Configurations, training, evaluation, comparison and the command line; what Python offers."""
+"""Configuration, training, evaluation and comparison of policies; the Python API of emberlink."""
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from emberlink.envs.utils.lazy import lazy
 
 if TYPE_CHECKING:
     from emberlink.trainers.api import Run, TrainedPolicy, compare, evaluate, load, train
@@ -23,22 +24,18 @@ __all__ = [
     "train",
 ]
 
-_FILES = {
-    "Run": "api",
-    "RunConfig": "config.schema",
-    "TrainedPolicy": "api",
-    "Trainer": "training.trainer",
-    "compare": "api",
-    "evaluate": "api",
-    "load": "api",
-    "make_env": "build",
-    "resolve": "config.compose",
-    "train": "api",
-}
-
-
-def __getattr__(name: str) -> Any:
-    # Imported when asked for, so that `emberlink --help` need not wait for torch.
-    if name in _FILES:
-        return getattr(import_module(f"{__name__}.{_FILES[name]}"), name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+__getattr__ = lazy(
+    __name__,
+    {
+        "Run": "api",
+        "RunConfig": "config.schema",
+        "TrainedPolicy": "api",
+        "Trainer": "training.trainer",
+        "compare": "api",
+        "evaluate": "api",
+        "load": "api",
+        "make_env": "build",
+        "resolve": "config.compose",
+        "train": "api",
+    },
+)

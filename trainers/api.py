@@ -1,4 +1,4 @@
-"""Trains, evaluates, loads and compares from Python. Nothing is printed."""
+"""The Python API: trains, evaluates, loads and compares policies without printing."""
 
 import logging
 import os
@@ -29,8 +29,8 @@ from emberlink.trainers.runs.seal import check_trained_with
 from emberlink.trainers.training.trainer import Progress, Trainer
 
 Reference = str | os.PathLike[str]
-"""a run folder, or a trained policy that comes with emberlink: `pretrained:METHOD`,
-`pretrained:SETUP/METHOD` or `pretrained:SETUP/METHOD/SEED`"""
+"""a run folder, or a trained policy of emberlink: `pretrained:METHOD`, `pretrained:SETUP/METHOD` or
+`pretrained:SETUP/METHOD/SEED`"""
 
 
 @dataclass(frozen=True)
@@ -42,19 +42,19 @@ class Run:
     config: RunConfig
     """all settings"""
     results: Results
-    """fire -> policy ("learned", or a scripted one) -> measure -> a number per episode; empty if
+    """fire -> policy ("learned", or a scripted one) -> measure -> one number per episode; empty if
     the run was not evaluated"""
 
 
 class TrainedPolicy(TensorDictSequential):
-    """The frozen policy of a run: reads the agents' observations, writes ("agents", "action").
+    """The frozen policy of a run, which maps observations to ("agents", "action").
 
-    Its environment is `make_env(policy.config)`.
+    `make_env(policy.config)` returns its environment.
 
     Args:
         actor: the networks.
-        config: of the run.
-        checkpoint: the file that the networks were read from.
+        config: configuration of the run.
+        checkpoint: file of the networks.
     """
 
     def __init__(self, actor: TensorDictModule, config: RunConfig, checkpoint: Path):
@@ -96,25 +96,26 @@ def train(
     evaluate_after: bool = True,
     **settings: Any,
 ) -> Run | list[Run]:
-    """Trains a method, evaluates its frozen policy, and leaves a run folder as the command does.
+    """Trains a method, evaluates its frozen policy, and writes a run folder.
 
     Args:
-        method: independent, shared_memory, positional, consensus, or one of yours.
-        setup: paper, released, tuned, or one of yours.
-        fire: a scenario; the setup's if None.
-        seeds: seeds to train side by side, a run folder each, in place of `seed=`.
+        method: independent, shared_memory, positional, consensus, or a method of your own.
+        setup: paper, released, tuned, or a setup of your own.
+        fire: name of a scenario; that of the setup if None.
+        seeds: seeds to train in parallel, with a run folder for each, in place of `seed=`.
         progress: called after each step of the environments; an exception in it ends the training.
-        evaluate_after: evaluates at the end, which leaves eval.json, figures and an animation.
-        settings: any other setting, by the last part of its key (`episodes=5`, `horizon=50`) or by
-            all of it (`**{"learner.gamma": 0.9}`); `output="runs"` holds the run folders.
+        evaluate_after: whether to evaluate at the end, which writes eval.json, figures and a GIF.
+        settings: other settings, by the last part of their key (`episodes=5`, `horizon=50`) or the
+            whole key (`**{"learner.gamma": 0.9}`); `output="runs"` is the folder of run folders.
 
     Returns:
-        The run; with `seeds`, the run of each seed in their order.
+        The run, or with `seeds` a list of runs in the order of the seeds.
 
     Raises:
-        UserError: an unknown name or setting, a value out of range, or a file that cannot be
+        UserError: a name or setting is not known, a value is out of range, or a file cannot be
             written.
-        NonFiniteError: a number was not finite, and `on_nan` is not rollback or did not help.
+        NonFiniteError: a number became NaN or infinite, and `on_nan` is "stop" or the rollbacks
+            failed.
     """
     chosen = [f"setup={setup}", *([] if fire is None else [f"fire={fire}"])]
     several = {} if seeds is None else {"seeds": list(seeds)}
@@ -139,19 +140,20 @@ def evaluate(
     progress: Callable[[str, str], None] | None = None,
     **settings: Any,
 ) -> Results:
-    """Evaluates the frozen policy of a run on test fires; no file is written.
+    """Evaluates the frozen policy of a run on test fires without writing files.
 
     Args:
         run: a run folder, or `pretrained:METHOD`.
-        episodes: one on each of as many fires; the run's `evaluation.episodes` if None.
-        scripted: whether the scripted policies are evaluated too.
-        checkpoint: a file of networks; the newest of the run if None.
-        device: where the episodes are played; the run's if None.
-        progress: called with the fire and the policy before each is played.
-        settings: of `env` or `comm`, in place of the run's, as for `train`; networks must fit.
+        episodes: number of episodes, each on another fire; if None, the run's
+            `evaluation.episodes`.
+        scripted: whether to evaluate the scripted policies, too.
+        checkpoint: file of networks; the newest of the run if None.
+        device: device of the episodes; that of the run if None.
+        progress: called with the names of the fire and the policy before each evaluation.
+        settings: settings of `env` or `comm` to change, as for `train`; the networks must fit.
 
     Returns:
-        fire -> policy ("learned", or a scripted one) -> measure -> a number per episode.
+        fire -> policy ("learned", or a scripted one) -> measure -> one number per episode.
 
     Raises:
         UserError: there is no such run, a file in it is damaged, or a setting does not fit.
@@ -174,9 +176,9 @@ def load(
 
     Args:
         run: a run folder, or `pretrained:METHOD`.
-        checkpoint: a file of networks; the newest of the run if None.
-        device: where the networks live; the run's if None.
-        settings: of `env` or `comm`, in place of the run's, as for `train`; networks must fit.
+        checkpoint: file of networks; the newest of the run if None.
+        device: device of the networks; that of the run if None.
+        settings: settings of `env` or `comm` to change, as for `train`; the networks must fit.
 
     Raises:
         UserError: there is no such run, a file in it is damaged, or a setting does not fit.
@@ -192,19 +194,19 @@ def load(
 
 
 def compare(paths: Sequence[Reference], output: Reference | None = None) -> Comparison:
-    """Compares finished runs by setup and method, as the command does.
+    """Compares finished runs by setup and method.
 
     Args:
-        paths: run folders, folders that hold some, or `pretrained:SETUP`.
+        paths: run folders, folders of run folders, or `pretrained:SETUP`.
         output: a new or empty folder for compare.html, compare.json and the figures; if None, no
             file is written.
 
     Returns:
-        Interquartile means, intervals, rankings and the paper's claims, setup by setup.
+        Interquartile means, intervals, rankings and the paper's claims for each setup.
 
     Raises:
-        UserError: there is nothing to compare, the runs cannot be compared, a file is damaged, or
-            `output` holds something.
+        UserError: there are no runs, the runs cannot be compared, a file is damaged, or `output` is
+            not empty.
     """
     folder = None if output is None else free_folder(Path(output))
     comparison = compare_runs([Path(path) for path in paths])
@@ -212,7 +214,7 @@ def compare(paths: Sequence[Reference], output: Reference | None = None) -> Comp
 
 
 def _finished(trainer: Trainer, team: int, evaluate_after: bool) -> Run:
-    """Evaluates a seed of a finished training and returns its run."""
+    """Evaluates one seed of a finished training if asked to, and returns its run."""
     run, config, results = trainer.runs[team], trainer.configs[team], {}
     if evaluate_after:
         results = evaluate_run(
@@ -228,7 +230,7 @@ def _finished(trainer: Trainer, team: int, evaluate_after: bool) -> Run:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Keeps torchrl from printing notes, unless the user has chosen a level of them."""
+    """Silences torchrl's messages below warnings, unless the user has set their level."""
     logger = logging.getLogger("torchrl")
     before = logger.level
     if "RL_LOGGING_LEVEL" not in os.environ:

@@ -30,27 +30,27 @@ def make_env(
     device: torch.device | str = "cpu",
     **settings: Any,
 ) -> TransformedEnv:
-    """Returns the environment of a method, communication included.
+    """Returns the environment of a method with its communication.
 
     Args:
-        method: independent, shared_memory, positional, consensus, or one of yours; or the
+        method: independent, shared_memory, positional, consensus, or a method of your own; or the
             configuration of a run, such as `load("pretrained:consensus").config`.
-        setup: paper (if None), released, tuned, or one of yours; not with a configuration.
-        num_envs: environments side by side.
-        fire: as for `WildfireEnv`; the scenario of the setup or of the run if None.
-        seed: of everything random in the environment; a fresh one if None.
-        device: where all tensors live.
-        settings: any other setting, by the last part of its key (`horizon=50`, `num_uavs=3`) or by
-            all of it (`**{"env.reward.exit": -10.0}`).
+        setup: paper (if None), released, tuned, or a setup of your own; not with a configuration.
+        num_envs: number of environments, the batch size.
+        fire: see `WildfireEnv`; the scenario of the setup or of the run if None.
+        seed: seed of all random numbers of the environment; a random one if None.
+        device: device of all tensors.
+        settings: other settings, by the last part of their key (`horizon=50`, `num_uavs=3`) or the
+            whole key (`**{"env.reward.exit": -10.0}`).
 
     Raises:
-        UserError: an unknown method, setup or setting, or a value out of range.
+        UserError: a method, setup or setting is not known, or a value is out of range.
     """
     check_device(str(device))
     if isinstance(fire, Tensor) and fire.ndim in (2, 3):
         settings.setdefault("grid", list(fire.shape[-2:]))
     if "seeds" in settings:
-        raise UserError(f"seeds={settings['seeds']}: of a training; an environment takes seed=")
+        raise UserError(f"seeds={settings['seeds']}: only for training; an environment takes seed=")
     if isinstance(method, str):
         config = resolve(method, [f"setup={setup or 'paper'}"], **settings)
     elif isinstance(method, RunConfig) and setup is None:
@@ -69,7 +69,7 @@ def build_env(
     seed: int | Sequence[int] | None,
     device: torch.device | str,
 ) -> TransformedEnv:
-    """Returns the wildfire and the communication of a configuration; see `WildfireEnv`."""
+    """Returns the environment and communication of a configuration; see `WildfireEnv`."""
     world = WildfireEnv(num_envs, config.env, fire, seed, device)
     return TransformedEnv(world, Communication(build_comm(config, num_envs).to(world.device)))
 
@@ -77,19 +77,19 @@ def build_env(
 def build_actor(
     config: RunConfig, env: TransformedEnv, generator: Generators = None
 ) -> TensorDictModule:
-    """Returns new actors of the configuration's learner for an environment."""
+    """Returns new actors of a configuration's learner for an environment."""
     learner = registry.find(config.learner.name)
     specs = env.observation_spec, env.full_action_spec
     return learner.make_actor(config.learner, *specs, generator)
 
 
 def build_learner(config: RunConfig, env: TransformedEnv, guard: NonFiniteGuard) -> Learner:
-    """Returns the learner of a configuration, for all its seeds.
+    """Returns a new learner of a configuration, for all its seeds.
 
     Args:
-        config: of the run.
-        env: the environments of all seeds, side by side.
-        guard: told of all that the learner computes.
+        config: configuration of the run.
+        env: the environments of all seeds in one batch.
+        guard: checks losses and gradients for NaN and Inf.
     """
     context = LearnerContext(
         observation_spec=env.observation_spec,

@@ -1,7 +1,8 @@
 """Pictures, animations and videos of episodes."""
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from emberlink.envs.utils.lazy import lazy
 
 if TYPE_CHECKING:
     from emberlink.envs.rendering.frame import Chart, write_gif
@@ -12,19 +13,15 @@ if TYPE_CHECKING:
 
 __all__ = ["Chart", "Episode", "FrameData", "Screen", "Window", "write_gif", "write_mp4"]
 
-_FILES = {
-    "Chart": "frame",
-    "Episode": "panels",
-    "FrameData": "marks",
-    "Screen": "panels",
-    "Window": "window",
-    "write_gif": "frame",
-    "write_mp4": "video",
-}
-
-
-def __getattr__(name: str) -> Any:
-    # Imported when asked for: an environment needs none of them but `frame`.
-    if name in _FILES:
-        return getattr(import_module(f"{__name__}.{_FILES[name]}"), name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+__getattr__ = lazy(
+    __name__,
+    {
+        "Chart": "frame",
+        "Episode": "panels",
+        "FrameData": "marks",
+        "Screen": "panels",
+        "Window": "window",
+        "write_gif": "frame",
+        "write_mp4": "video",
+    },
+)

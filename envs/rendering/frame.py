@@ -1,4 +1,4 @@
-"""Pictures of an episode in the paper's colours (section IV.A), and animations of them."""
+"""Draws frames of an episode in the paper's colours (section IV.A) and writes animations."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -14,11 +14,11 @@ FIRE = (255, 255, 255)
 FIELD_OF_VIEW = (255, 255, 0)
 UAV = (0, 0, 255)
 MAX_COLOURS = 256
-"""of a GIF"""
+"""colours in the palette of a GIF"""
 
 
 class Chart:
-    """A picture of the map to draw on: no fire black, fire white, fields of view yellow.
+    """Draws a map: no fire black, fire white, fields of view yellow.
 
     Args:
         fire_map: [X, Y], 0 no fire, 1 seen fire, 2 unseen fire.
@@ -59,12 +59,12 @@ class Chart:
         return (x + 0.5) * self.scale, (self._rows - 0.5 - y) * self.scale
 
     def square(self, x: float, y: float, half: float) -> tuple[float, float, float, float]:
-        """Returns the box of pixels `half` cells around a point, at least one pixel."""
+        """Returns the box, in pixels, of the square of 2 * half cells around a point."""
         (across, down), reach = self.point(x, y), max(half * self.scale, 0.5)
         return across - reach, down - reach, across + reach - 1, down + reach - 1
 
     def uav(self, x: float, y: float) -> None:
-        """Draws a UAV: a blue disc."""
+        """Draws a UAV as a blue disc."""
         self.draw.ellipse(self.square(x, y, max(0.45, 4 / self.scale)), fill=UAV)
 
 
@@ -75,10 +75,10 @@ def frame(
     view_angle: float,
     size: int = 360,
 ) -> NDArray[np.uint8]:
-    """Draws one picture: no fire black, fire white, field of view yellow, UAV blue.
+    """Returns one frame: no fire black, fire white, fields of view yellow, UAVs blue.
 
     Args:
-        fire_map: [X, Y], 0 where nothing burns.
+        fire_map: [X, Y], 0 no fire, 1 seen fire, 2 unseen fire.
         position: [n, 3], cells.
         view_angle: half the opening angle of the cameras, degrees.
         size: approximate pixels of the longer side of the grid.
@@ -94,11 +94,15 @@ def frame(
 
 
 def write_gif(path: Path, frames: Iterable[NDArray[np.uint8]], *, fps: int = 20) -> None:
-    """Writes frames, uint8 [height, width, 3] each, as an animation that repeats."""
+    """Writes frames, uint8 [height, width, 3] each, as a GIF that repeats.
+
+    Raises:
+        ValueError: there is no frame.
+    """
     images = [Image.fromarray(picture).quantize(MAX_COLOURS) for picture in frames]
     if not images:
         raise ValueError(f"{path}: an animation needs at least one frame")
-    images = _one_palette(images)
+    images = _share_palette(images)
     duration = round(1000 / fps)
     images[0].save(
         path,
@@ -111,10 +115,10 @@ def write_gif(path: Path, frames: Iterable[NDArray[np.uint8]], *, fps: int = 20)
     )
 
 
-def _one_palette(images: list[Image.Image]) -> list[Image.Image]:
-    """Gives all pictures one palette, if their colours fit into one.
+def _share_palette(images: list[Image.Image]) -> list[Image.Image]:
+    """Converts images to a common palette if all their colours fit into it.
 
-    Pixels that do not change between pictures then take almost no space in the file.
+    Pixels that do not change between frames then take almost no space in the file.
     """
     colours: dict[bytes, int] = {}
     tables: list[list[int]] = []
@@ -122,7 +126,7 @@ def _one_palette(images: list[Image.Image]) -> list[Image.Image]:
         palette = bytes(image.getpalette() or ())
         entries = (palette[i : i + 3] for i in range(0, len(palette), 3))
         tables.append([colours.setdefault(entry, len(colours)) for entry in entries])
-    # One entry is left for pixels that do not change.
+    # One entry must be free for pixels that do not change.
     if len(colours) >= MAX_COLOURS:
         return images
     shared = []

@@ -1,4 +1,4 @@
-"""Marks over the map: links between UAVs, their roles and their targets."""
+"""Draws marks on a map: the UAVs, their roles, targets and communication links."""
 
 from dataclasses import dataclass
 from itertools import pairwise
@@ -11,15 +11,15 @@ from emberlink.envs.rendering.frame import NO_FIRE, UAV, Chart
 
 LINK = (0, 200, 255)
 LINK_WIDTHS = {NO_FIRE: 4, LINK: 2}
-"""pixels by colour; the dark edge is drawn first"""
+"""width in pixels of each line of a link; the dark edge is drawn first"""
 TARGET = (255, 140, 0)
 ROLES = ("discoverer", "seeker", "wanderer")
 """the roles of UAVs in a consensus network (paper, section IV.F)"""
 ROLE_COLOURS = ((230, 0, 60), (0, 150, 60), (215, 215, 215))
 MANY = 16
-"""Above this number of UAVs links are thin, and no lines lead to the targets."""
+"""number of UAVs above which links are thin and lines to targets are left out"""
 
-# Corners of a UAV's mark by role, in half widths to the right and downwards.
+# Corners of the shape of each role: offsets to the right and downwards, in half widths.
 _DIAMOND = ((0, -1.3), (1.3, 0), (0, 1.3), (-1.3, 0))
 _TRIANGLE = ((0, -1.4), (1.35, 1), (-1.35, 1))
 _SQUARE = ((-1, -1), (1, -1), (1, 1), (-1, 1))
@@ -33,7 +33,7 @@ class FrameData:
     step: int
     """steps since the episode began"""
     seen: int
-    """burning cells that any UAV has seen"""
+    """burning cells that a UAV has seen"""
     burning: int
     """cells that burn"""
     fire_map: NDArray[np.uint8]
@@ -41,11 +41,11 @@ class FrameData:
     position: NDArray[np.float32]
     """[n, 3], cells"""
     links: NDArray[np.bool_] | None = None
-    """[n, n], the UAVs (columns) whose messages a UAV (row) received; None without communication"""
+    """[n, n], whether a UAV (row) hears another one (column); None without communication"""
     roles: NDArray[np.int64] | None = None
     """[n], indices into `ROLES`; None without roles"""
     target: NDArray[np.float32] | None = None
-    """[n, 3], the point that each UAV is told to fly to, cells; None without targets"""
+    """[n, 3], the target of each UAV, cells; None without targets"""
 
     @property
     def coverage(self) -> float:
@@ -54,12 +54,12 @@ class FrameData:
 
 
 def draw_marks(chart: Chart, data: FrameData) -> None:
-    """Draws links, lines to targets, and UAVs over the map."""
+    """Draws links, lines to targets, and UAVs on a map."""
     places = [chart.point(x, y) for x, y, _ in data.position.tolist()]
     half = mark_size(chart.scale)
     if data.links is not None:
         pairs = np.argwhere(np.triu(data.links | data.links.T, 1)).tolist()
-        # The edges of very many links would black out the map.
+        # The dark edges of many links would hide the map.
         widths = LINK_WIDTHS if len(places) <= MANY else {LINK: 1}
         for colour, width in widths.items():
             for i, j in pairs:
@@ -105,7 +105,7 @@ def cross(
     half: float,
     colour: tuple[int, int, int],
 ) -> None:
-    """Draws a cross with dark edges, at a target."""
+    """Draws a target as a cross with dark edges."""
     x, y = place
     for width, fill in ((4, NO_FIRE), (2, colour)):
         for turn in (1, -1):
@@ -116,7 +116,7 @@ def cross(
 def uav(
     draw: ImageDraw.ImageDraw, place: tuple[float, float], half: float, role: int | None
 ) -> None:
-    """Draws a UAV: a blue disc, inside a shape in the colour of its role if it has one."""
+    """Draws a UAV as a blue disc, within a shape in the colour of its role if it has one."""
     x, y = place
     if role is not None:
         corners = [(x + half * right, y + half * down) for right, down in _SHAPES[role]]

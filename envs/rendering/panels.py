@@ -1,4 +1,4 @@
-"""Episodes side by side: a panel with a title for each, and a legend."""
+"""Draws episodes side by side: a panel with a title for each, and a legend."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -14,23 +14,23 @@ from emberlink.envs.rendering.frame import FIELD_OF_VIEW, FIRE, NO_FIRE, Chart
 from emberlink.envs.rendering.marks import ROLE_COLOURS, ROLES, TARGET, FrameData
 
 SEEN_FIRE = (140, 140, 140)
-"""of seen fire, where it is shown in another colour (paper, figure 2)"""
+"""colour of seen fire if it differs from that of unseen fire (paper, figure 2)"""
 PAPER = (40, 40, 44)
 INK = (240, 240, 240)
 GAP = 10
 LINE = 20
 HEADER = 2 * LINE + 4
 NARROWEST = 250
-"""pixels; a panel's title needs as many"""
+"""minimum width of a panel in pixels, for its title"""
 _TEXT = 15
-_SAMPLE = 30  # width of the sample before a word of the legend
+_SAMPLE = 30  # width of the sample before the text of a legend entry
 
 Sample = Callable[[ImageDraw.ImageDraw, float, float], None]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Episode:
-    """The content of one panel."""
+    """An episode in one panel."""
 
     title: str
     view_angle: float
@@ -42,7 +42,7 @@ class Screen:
     """Draws the same frame of several episodes into one picture.
 
     Args:
-        episodes: on grids of the same size, with the same number of frames.
+        episodes: episodes with the same grid size and number of frames.
         size: approximate pixels of a map's longer side.
         grey_seen: whether seen fire is grey.
     """
@@ -74,7 +74,7 @@ class Screen:
             self._write(draw, x, y, self._cut(episode.title, panel[0] - GAP))
 
     def map_corner(self, panel: int) -> tuple[int, int]:
-        """Returns the left and upper pixel of a panel's map."""
+        """Returns the upper left pixel of a panel's map, (x, y)."""
         x, y = self._corners[panel]
         return x, y + HEADER
 
@@ -102,7 +102,7 @@ class Screen:
         draw.text((x, y + LINE / 2), text, fill=INK, font=self._font, anchor="lm")
 
     def _cut(self, text: str, width: float) -> str:
-        """Returns the text, cut at its end to fit a width."""
+        """Returns the text, shortened at its end to fit a width in pixels."""
         if self._font.getlength(text) <= width:
             return text
         while text and self._font.getlength(text + "…") > width:
@@ -110,7 +110,7 @@ class Screen:
         return text + "…"
 
     def _wrap(self, words: Sequence[str]) -> tuple[list[tuple[float, float]], int]:
-        """Returns the place of each word of the legend, and the height of all."""
+        """Returns the position of each legend entry, and the height of the legend."""
         places: list[tuple[float, float]] = []
         x, y = GAP, 0
         for word in words:
@@ -122,7 +122,7 @@ class Screen:
         return places, y + LINE
 
     def _legend(self) -> Sequence[tuple[str, Sample]]:
-        """Returns a word and a sample for each mark that occurs."""
+        """Returns the text and a sample of each legend entry, for the marks that occur."""
 
         def occurs(name: str) -> list[bool]:
             return [getattr(e.frames[0], name) is not None for e in self._episodes]
@@ -146,14 +146,17 @@ class Screen:
 
 
 def scale_of(grid: Sequence[int], size: int) -> int:
-    """Returns pixels per cell: `size` for the longer side, up to twice that for a narrow map."""
+    """Returns pixels per cell, so that the longer side has about `size` pixels.
+
+    A narrow map is drawn up to twice as large.
+    """
     longer, shorter = max(grid), min(grid)
     wide = min(2 * size // longer, math.ceil(size / 4 / shorter))
     return max(2, size // longer, wide)
 
 
 def _columns(count: int, width: int, height: int) -> int:
-    """Returns the number of columns with which the panels fit into the smallest square."""
+    """Returns the number of columns for which the panels fit into the smallest square."""
 
     def side(columns: int) -> int:
         return max(columns * width, math.ceil(count / columns) * height)

@@ -1,4 +1,4 @@
-"""Writes videos that browsers play, with ffmpeg."""
+"""Writes MP4 videos with ffmpeg."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -15,9 +15,9 @@ _COLOURS = (
     "setparams=color_primaries=bt709:color_trc=bt709:colorspace=bt709:range=tv"
 )
 
-# H.264 in 4:2:0, which every browser plays. A constant rate factor of 18 keeps flat colours clean,
-# and the tune for drawings keeps edges sharp. The colour matrix is stated, so that players do not
-# guess it. With the index at the front a video starts before it is loaded as a whole.
+# H.264 with 4:2:0 chroma, which all browsers support. A constant rate factor of 18 and the tune
+# for animations preserve flat colours and sharp edges. The colour matrix is stored, so that players
+# do not guess it. With "faststart" a video can start before it is loaded completely.
 _OPTIONS = [
     *("-crf", "18", "-preset", "medium", "-tune", "animation"),
     *("-vf", _COLOURS),
@@ -31,8 +31,9 @@ def write_mp4(path: Path, frames: Iterable[NDArray[np.uint8]], *, fps: int = 20)
     Raises:
         UserError: ffmpeg failed, or did not write all frames.
         OSError: the file cannot be written.
+        ValueError: there is no frame.
     """
-    path.touch()  # its error names the path, that of ffmpeg does not
+    path.touch()  # raises an error that names the path; ffmpeg's does not
     written, writer = 0, None
     try:
         for picture in frames:
@@ -42,18 +43,18 @@ def write_mp4(path: Path, frames: Iterable[NDArray[np.uint8]], *, fps: int = 20)
             written += 1
         if writer is not None:
             writer.close()
-        whole = written > 0 and imageio_ffmpeg.count_frames_and_secs(path)[0] == written
+        complete = written > 0 and imageio_ffmpeg.count_frames_and_secs(path)[0] == written
     except (OSError, RuntimeError) as error:
         reason = str(error).strip().splitlines()[0]
         raise UserError(f"{path.name}: ffmpeg failed: {reason}") from None
     if written == 0:
         raise ValueError(f"{path}: a video needs at least one frame")
-    if not whole:
+    if not complete:
         raise UserError(f"{path.name}: ffmpeg failed: not all {written} frames were written")
 
 
 def _start(path: Path, picture: NDArray[np.uint8], fps: int):
-    """Starts ffmpeg for frames of the size of a picture."""
+    """Starts ffmpeg for frames of the size of `picture`."""
     height, width = picture.shape[:2]
     writer = imageio_ffmpeg.write_frames(
         path,

@@ -1,4 +1,4 @@
-"""A window that shows pictures, by matplotlib."""
+"""Shows frames in a matplotlib window."""
 
 from typing import Any
 
@@ -7,21 +7,21 @@ from numpy.typing import NDArray
 
 
 class Window:
-    """Shows pictures in a window; it stays invisible where matplotlib has no screen.
+    """Shows frames in a window; nothing is shown if matplotlib has no display.
 
     Args:
         title: of the window.
     """
 
     def __init__(self, title: str):
-        from matplotlib import pyplot  # takes a second to import, and only a window needs it
+        from matplotlib import pyplot  # imported here, since it takes a second
 
         self._pyplot = pyplot
         self._figure = pyplot.figure(num=title)
         self._image: Any = None
 
     def show(self, picture: NDArray[np.uint8]) -> None:
-        """Shows a picture, uint8 [height, width, 3], in place of the last one."""
+        """Shows a frame, uint8 [height, width, 3], in place of the previous one."""
         if self._image is None:
             axes = self._figure.add_axes((0, 0, 1, 1), frame_on=False, xticks=[], yticks=[])
             self._image = axes.imshow(picture)

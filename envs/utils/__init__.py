@@ -1,4 +1,4 @@
-"""Small tools without knowledge of fires: errors, validation, random numbers, files, buffers."""
+"""General utilities: errors, validation, random numbers, files, plugins and buffers."""
 
 from emberlink.envs.utils.errors import UserError
 

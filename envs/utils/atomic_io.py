@@ -1,4 +1,4 @@
-"""Reads and writes the files of run folders and caches, which another person may have prepared.
+"""Reads and writes files of run folders and caches safely, even if others prepared the folder.
 
 Nothing is written, truncated or deleted through a link, and only regular files are read.
 """
@@ -13,10 +13,10 @@ from pathlib import Path
 from typing import BinaryIO
 
 PART = ".part"
-"""suffix of files that are not complete yet"""
+"""suffix of incomplete files"""
 _LINK = "it is a link, and nothing is written through links"
 _DIGEST = 64
-"""characters of a SHA-256"""
+"""hexadecimal digits of a SHA-256"""
 _NOT_REGULAR = "it is not a regular file"
 _READ = os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC
 _CREATE = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
@@ -24,15 +24,15 @@ _CHANGE = os.O_RDWR | os.O_APPEND | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_NOCTTY 
 
 
 def open_regular(path: Path, max_bytes: int, *, follow: bool = True) -> BinaryIO:
-    """Opens a regular file for reading, without waiting for a pipe or a device.
+    """Opens a regular file for reading, without blocking on a pipe or a device.
 
     Args:
-        path: of the file.
-        max_bytes: largest size that is accepted.
-        follow: accept a link to such a file.
+        path: path of the file.
+        max_bytes: maximum size.
+        follow: whether a link to a regular file is accepted.
 
     Raises:
-        OSError: the file cannot be opened, is not regular, is larger, or is a link.
+        OSError: the file cannot be opened, is not regular, is too large, or is a link.
     """
     handle = _open(path, _READ if follow else _READ | os.O_NOFOLLOW)
     try:
@@ -46,7 +46,7 @@ def open_regular(path: Path, max_bytes: int, *, follow: bool = True) -> BinaryIO
 
 
 def read_bytes(path: Path, max_bytes: int, *, follow: bool = True) -> bytes:
-    """Returns the content of a regular file; see `open_regular`."""
+    """Returns the content of a regular file; arguments and errors are those of `open_regular`."""
     with open_regular(path, max_bytes, follow=follow) as file:
         content = file.read(max_bytes + 1)
     if len(content) > max_bytes:
@@ -55,11 +55,11 @@ def read_bytes(path: Path, max_bytes: int, *, follow: bool = True) -> bytes:
 
 
 def inner_folder(root: Path, *names: str) -> Path:
-    """Creates a folder below another one if it is missing, and returns its path.
+    """Creates a folder within another one if it is missing, and returns its path.
 
     Args:
-        root: chosen by the user; it may be a link.
-        names: of the folders below `root`, outermost first; none of them may be a link.
+        root: the outer folder; it may be a link.
+        names: names of the folders within `root`, outermost first; none may be a link.
 
     Raises:
         OSError: one of `names` is a link or not a folder, or cannot be created.
@@ -79,12 +79,12 @@ def inner_folder(root: Path, *names: str) -> Path:
 
 @contextmanager
 def temporary(path: Path) -> Iterator[Path]:
-    """Yields a new empty file beside `path`; at the end it is removed if it is still there.
+    """Yields a new empty file in the folder of `path`, and removes it at the end if it exists.
 
     Raises:
         OSError: the file cannot be created.
     """
-    # The process number keeps an evaluation and a training in one folder apart.
+    # The process number distinguishes processes that write to the same folder.
     partial = path.with_name(f"{path.name}.{os.getpid()}{PART}")
     remove(partial)
     os.close(os.open(partial, _CREATE, 0o666))
@@ -102,7 +102,7 @@ def replaced(path: Path) -> Iterator[Path]:
     A link, a pipe or a device at `path` is replaced; the target of a link is not changed.
 
     Raises:
-        OSError: the file cannot be written; `path` is as before.
+        OSError: the file cannot be written; `path` is unchanged.
     """
     with temporary(path) as partial:
         yield partial
@@ -112,7 +112,7 @@ def replaced(path: Path) -> Iterator[Path]:
 
 
 def write_bytes(path: Path, content: bytes) -> None:
-    """Writes a file completely or not at all, in place of an earlier one; see `replaced`."""
+    """Writes a file completely, or leaves the earlier one; see `replaced`."""
     with replaced(path) as partial:
         partial.write_bytes(content)
 
@@ -123,7 +123,7 @@ def write_sealed(path: Path, content: bytes | memoryview) -> None:
     NumPy's readers ignore bytes after the end of an array or an archive.
 
     Raises:
-        OSError: the file cannot be written; `path` is as before.
+        OSError: the file cannot be written; `path` is unchanged.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     with replaced(path) as partial, partial.open("wb") as file:
@@ -132,14 +132,14 @@ def write_sealed(path: Path, content: bytes | memoryview) -> None:
 
 
 def read_sealed(path: Path, max_bytes: int) -> bytes | None:
-    """Returns the content of a file of `write_sealed`.
+    """Returns the content of a file that `write_sealed` wrote.
 
     Args:
-        path: of the file.
-        max_bytes: largest content that is accepted.
+        path: path of the file.
+        max_bytes: maximum size of the content.
 
     Returns:
-        None if there is no such file or any of its bits has changed.
+        The content; None if there is no such file or its SHA-256 is wrong.
     """
     try:
         whole = read_bytes(path, max_bytes + _DIGEST)
@@ -151,10 +151,10 @@ def read_sealed(path: Path, max_bytes: int) -> bytes | None:
 
 @contextmanager
 def open_in_place(path: Path, *, create: bool = False) -> Iterator[int]:
-    """Yields a descriptor of a regular file to append to or to truncate.
+    """Yields a descriptor of a regular file, for appending or truncating.
 
-    A file with a second name (a hard link) is replaced by a copy first, so that the content under
-    the other name does not change.
+    A file with a second name (a hard link) is first replaced by a copy, so that the other file does
+    not change.
 
     Raises:
         OSError: the file is a link, is not regular, or cannot be opened.
@@ -220,19 +220,19 @@ def check_regular(handle: int, path: Path) -> None:
 
 
 def _open(path: Path, flags: int) -> int:
-    """Returns a new descriptor; the messages of its errors name links, pipes and sockets."""
+    """Opens a file and returns its descriptor; error messages name links, pipes and sockets."""
     try:
         return os.open(path, flags, 0o666)
     except OSError as error:
         if error.errno == errno.ELOOP and path.is_symlink() and flags & os.O_NOFOLLOW:
             raise OSError(errno.ELOOP, _LINK, str(path)) from None
-        if error.errno == errno.ENXIO:  # a pipe that nobody reads, or a socket
+        if error.errno == errno.ENXIO:  # a pipe without a reader, or a socket
             raise OSError(errno.EINVAL, _NOT_REGULAR, str(path)) from None
         raise
 
 
 def _separate(handle: int, path: Path) -> None:
-    """Replaces a name of the open file by a copy of its content."""
+    """Replaces `path`, a name of the open file, by a copy of its content."""
     with replaced(path) as partial, partial.open("wb") as copy:
         offset = 0
         while block := os.pread(handle, 1 << 20, offset):

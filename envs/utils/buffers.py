@@ -1,4 +1,4 @@
-"""Modules whose tensors are quick to look up."""
+"""Defines modules with fast attribute access to buffers."""
 
 from typing import Any
 
@@ -6,11 +6,11 @@ from torch import Tensor, nn
 
 
 class Buffers(nn.Module):
-    """A module that has its buffers and submodules as plain attributes as well.
+    """A module whose buffers and submodules are plain attributes as well.
 
-    `nn.Module` finds them only after everything else has been tried: a tenth of a step of one
-    environment. Buffers are to be written in place, and moved with `to`. Those that change with the
-    steps are an environment's state, which a checkpoint holds; constants are `persistent=False`.
+    `nn.Module` looks them up last, which takes a tenth of the time of a step of one environment.
+    Buffers must be written in place, and moved with `to`. Persistent buffers are the state of an
+    environment, which checkpoints hold. Constants are registered with `persistent=False`.
     """
 
     def register_buffer(self, name: str, tensor: Tensor | None, persistent: bool = True) -> None:

@@ -1,4 +1,4 @@
-"""Reads one YAML file of a configuration group."""
+"""Finds and reads YAML files of configuration groups."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -14,31 +14,35 @@ from emberlink.envs.utils.validation import unknown
 
 
 def find(group: str, name: str, within: Sequence[Path] | None = None) -> Path:
-    """Returns the file of a choice.
+    """Returns the path of a configuration file.
 
     Args:
-        group: such as "method", "setup", "setup_method" or "fire".
-        name: the file's name without `.yaml`.
-        within: the folders to look in; those of `emberlink.configs.folders` if None.
+        group: name of the group, such as "method", "setup", "setup_method" or "fire".
+        name: name of the file without `.yaml`.
+        within: the folders to search; those of `emberlink.configs.folders` if None.
 
     Raises:
-        UserError: there is no such file, or there are several; the message lists them.
+        UserError: there is no such file, or several folders have one.
     """
     searched = folders() if within is None else within
     if name not in (names := known(group, searched)):
         raise UserError(f"{group} {unknown(name, names)}")
     files = [folder / group / f"{name}.yaml" for folder in searched]
-    found = [file for file in files if file.is_file()]
-    if len(found) != 1:
-        raise UserError(f"{group} {name!r} is in several folders: {', '.join(map(str, found))}")
-    return found[0]
+    existing = [file for file in files if file.is_file()]
+    if len(existing) != 1:
+        raise UserError(f"{group} {name!r} is in several folders: {', '.join(map(str, existing))}")
+    return existing[0]
 
 
 def read(group: str, name: str) -> dict[str, Any]:
-    """Returns the content of a choice's file.
+    """Returns the content of a configuration file.
+
+    Args:
+        group: name of the group.
+        name: name of the file without `.yaml`.
 
     Raises:
-        UserError: see `find`; or the file is not YAML with keys and values.
+        UserError: there is no such file, or it does not hold keys and values.
     """
     file = find(group, name)
     try:

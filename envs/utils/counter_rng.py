@@ -1,9 +1,9 @@
-"""Random numbers as a pure function of a key, a counter and a position.
+"""Generates random numbers as a pure function of a key and a counter.
 
-A `torch.Generator` is one sequence for a whole batch, so the draws of one environment would depend
-on the number of environments and on the device. Here every draw is a hash of a key: the same on
-every device and for any batch, without a state to carry or to save. Keys are int64 tensors; a key
-is derived from another with `fold_in`.
+A `torch.Generator` produces one sequence for a whole batch, so the random numbers of an environment
+would depend on the number of environments and on the device. Here, random numbers are hashes of a
+key. They are the same on every device and for any batch size, and there is no state to save. Keys
+are int64 tensors; `fold_in` derives a key from another.
 """
 
 from collections.abc import Sequence
@@ -21,16 +21,16 @@ _MIX_B = -0x6B2FB644ECCEEE15  # 0x94D049BB133111EB
 
 @unique
 class Use(IntEnum):
-    """The purposes that random numbers are drawn for; each has a number of its own.
+    """The purposes of random numbers, each with a unique number.
 
-    Numbers from 500 to 999 are left to other packages, as the `use` of `step_key`.
+    Numbers from 500 to 999 are reserved for the `use` of `step_key` in other packages.
     """
 
-    # of an episode's key, with `fold_in`
+    # for `fold_in` with an episode's key
     START_POSITION = 0
     EPISODE_FIRE = 1
     STEPS = 2
-    # of a step, with `step_key`
+    # for `step_key`
     WAYPOINT = 100
     TARGET_JITTER = 101
     MESSAGE_LOSS = 102
@@ -38,14 +38,14 @@ class Use(IntEnum):
     SCRIPTED_WAYPOINT = 200
     SCRIPTED_ACTION = 201
     EXPLORATION_NOISE = 300
-    # of a seed, with `fold_in`, beside its environments' indices
+    # for `fold_in` with a seed; distinct from the indices of environments
     FIRE_PARAMETER = 0xF12E
     REPLAY_SAMPLE = 2**40
     TARGET_NOISE = 2**40 + 1
 
 
 def _shift(x: Tensor, bits: int) -> Tensor:
-    """Shifts right logically; torch's `>>` on int64 copies the sign."""
+    """Shifts right logically; torch's `>>` on int64 is arithmetic."""
     return (x >> bits) & ((1 << (64 - bits)) - 1)
 
 
@@ -57,7 +57,7 @@ def _mix(x: Tensor) -> Tensor:
 
 
 def _signed(value: int) -> int:
-    """Wraps a Python integer to a signed 64-bit one, as tensors wrap by themselves."""
+    """Wraps a Python integer to signed 64 bits, as int64 tensors do."""
     return (value + 2**63) % 2**64 - 2**63
 
 
@@ -69,7 +69,7 @@ def fold_in(key: Tensor, counter: Tensor | int) -> Tensor:
         counter: int64 or an integer, broadcast against `key`.
 
     Returns:
-        int64 of the broadcast shape; different counters give unrelated keys.
+        int64 of the broadcast shape; different counters give statistically independent keys.
     """
     offset = (counter + 1) * _GOLDEN
     if isinstance(offset, int):
@@ -78,18 +78,18 @@ def fold_in(key: Tensor, counter: Tensor | int) -> Tensor:
 
 
 def step_key(key: Tensor, step: Tensor, use: int | Tensor) -> Tensor:
-    """Returns the key for one purpose at one step of an episode.
+    """Returns the key for a purpose at a step of an episode.
 
     Args:
-        key: of the episode's steps (`keys.RNG_KEY`), int64 [...].
+        key: int64 [...], `keys.RNG_KEY` of the episode.
         step: int64 [...].
-        use: a `Use` below 1000; purposes with the same number would draw the same numbers.
+        use: a `Use` below 1000; the same `use` gives the same random numbers.
     """
     return fold_in(key, step * 1000 + use)
 
 
 def seed_keys(seed: int, count: int, device: torch.device | str | None = None) -> Tensor:
-    """Returns one key per environment: int64 [count], of which key i depends on (seed, i) alone."""
+    """Returns one key per environment, int64 [count]; key i depends only on the seed and i."""
     root = torch.full((count,), seed, dtype=torch.int64, device=device)
     return fold_in(root, torch.arange(count, device=device))
 
@@ -98,28 +98,28 @@ def check_seeds(seed: int | Sequence[int], num_envs: int) -> list[int]:
     """Returns one or several seeds as a list.
 
     Raises:
-        UserError: a negative seed, or a number of environments that the seeds cannot share evenly.
+        UserError: a seed is negative, or `num_envs` is not a multiple of the number of seeds.
     """
     seeds = list(seed) if isinstance(seed, Sequence) else [int(seed)]
     if min(seeds, default=-1) < 0:
-        raise UserError(f"seed={seed}: a number that is not negative is needed")
+        raise UserError(f"seed={seed}: expected a number of at least 0")
     if num_envs % len(seeds):
-        raise UserError(f"num_envs={num_envs} is no multiple of the {len(seeds)} seeds")
+        raise UserError(f"num_envs={num_envs} is not a multiple of the {len(seeds)} seeds")
     return seeds
 
 
 def _bits(key: Tensor, count: int) -> Tensor:
-    """Returns `count` times 64 random bits per key, int64 [..., count]."""
+    """Returns 64 random bits `count` times per key, int64 [..., count]."""
     return fold_in(key.unsqueeze(-1), torch.arange(count, device=key.device))
 
 
 def integers(key: Tensor, count: int, limit: int | Tensor) -> Tensor:
-    """Returns whole numbers from 0 to limit - 1, all equally likely to within limit / 2³².
+    """Returns integers uniform in [0, limit), with a relative bias of at most limit / 2³².
 
     Args:
         key: int64 [...].
         count: numbers per key.
-        limit: at most 2³¹.
+        limit: upper limit, at most 2³¹.
 
     Returns:
         int64 [..., count].
@@ -128,7 +128,7 @@ def integers(key: Tensor, count: int, limit: int | Tensor) -> Tensor:
 
 
 def uniform(key: Tensor, count: int) -> Tensor:
-    """Returns uniform numbers from (0, 1), both ends excluded.
+    """Returns numbers uniform in (0, 1), excluding both ends.
 
     Args:
         key: int64 [...].
@@ -141,5 +141,5 @@ def uniform(key: Tensor, count: int) -> Tensor:
 
 
 def normal(key: Tensor, count: int) -> Tensor:
-    """Returns standard normal numbers, float32 [..., count], by inversion of `uniform`."""
+    """Returns standard normal numbers, float32 [..., count], by inverse transform of `uniform`."""
     return torch.special.ndtri(uniform(key, count))

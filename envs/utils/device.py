@@ -7,19 +7,19 @@ from emberlink.envs.utils.validation import shown
 
 
 def check_device(name: str) -> str:
-    """Returns the name of a device that this machine has.
+    """Checks that a device is available and returns its name.
 
     Raises:
-        UserError: the machine does not have it; the message lists the devices that it has.
+        UserError: it is not available; the message lists the available devices.
     """
     present = ["cpu", *(f"cuda:{i}" for i in range(torch.cuda.device_count()))]
     try:
         device = torch.device(name)
     except RuntimeError:
         device = None
-    there = device is not None and (
+    available = device is not None and (
         str(device) == "cpu" or (device.type == "cuda" and (device.index or 0) < len(present) - 1)
     )
-    if not there:
-        raise UserError(f"device={shown(name)} is not there; known: {', '.join(present)}")
+    if not available:
+        raise UserError(f"device={shown(name)} is not available; known: {', '.join(present)}")
     return name

@@ -1,9 +1,9 @@
-"""The error for mistakes of a user."""
+"""Defines the error for mistakes of the user."""
 
 
 class UserError(ValueError):
-    """Reports a wrong input: a value, a key, a file or a folder that the user chose.
+    """Reports wrong input: a value, a key, a file or a folder that the user chose.
 
-    The commands print its message in one line, without a traceback. Any other exception is a
-    mistake in the program and keeps its traceback.
+    The command line prints its message in one line. Any other exception is a defect of the program
+    and keeps its traceback.
     """

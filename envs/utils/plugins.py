@@ -1,4 +1,4 @@
-"""Finds classes by name: in the files of a package, and in what other packages register."""
+"""Finds classes by name: in the files of a package, and among entry points of other packages."""
 
 import importlib
 from collections.abc import Collection
@@ -14,24 +14,21 @@ T = TypeVar("T")
 
 
 def registered(group: str) -> dict[str, EntryPoint]:
-    """Returns the entry points of a group by name.
-
-    Args:
-        group: such as "emberlink.comm".
-    """
+    """Returns the entry points of a group, such as "emberlink.comm", by name."""
     return {point.name: point for point in entry_points.read(group)}
 
 
 @dataclass(frozen=True)
 class Registry(Generic[T]):
-    """The subclasses of a class: one in each file of a package, and entry points.
+    """Finds the subclasses of a class: one in each file of a package, and entry points.
 
     Attributes:
         base: the class.
-        package: whose files define them, a file's name being the class's.
-        key: of the name in a configuration, for messages.
-        other_files: of the package, without those that begin with an underscore.
-        group: of the entry points, which name a class; the package's name if empty.
+        package: the package. The name of a file is the name of the subclass in it.
+        key: configuration key of the name, for messages.
+        other_files: files of the package without a subclass, besides those with a leading
+            underscore.
+        group: group of the entry points; the package's name if empty.
     """
 
     base: type[T]
@@ -48,8 +45,8 @@ class Registry(Generic[T]):
         """Returns the class of a name.
 
         Raises:
-            UserError: the name is not known, or several classes have it; or the package of an
-                entry point cannot be imported or does not hold such a class.
+            UserError: the name is not known or not unique, or the entry point cannot be imported or
+                is not such a class.
         """
         points, files = self._points(), self._files()
         if name in points and name in files:
@@ -72,10 +69,11 @@ class Registry(Generic[T]):
 
     def _class_in(self, name: str) -> type[T]:
         file = importlib.import_module(f"{self.package}.{name}")
-        own = [
-            item for item in vars(file).values() if getattr(item, "__module__", "") == file.__name__
+        classes = [
+            item
+            for item in vars(file).values()
+            if getattr(item, "__module__", "") == file.__name__ and self._fits(item)
         ]
-        classes = [item for item in own if self._fits(item)]
         if len(classes) != 1:
             kind = self.base.__name__
             raise UserError(f"{file.__file__}: has {len(classes)} subclasses of {kind}; expected 1")
@@ -85,13 +83,13 @@ class Registry(Generic[T]):
         package = point.dist.name if point.dist else point.module
         where = f"package {package}: entry point {point.name!r} of {point.group}, {point.value}"
         try:
-            found = point.load()
-        except Exception as error:  # whatever the code of another package does at its import
+            item = point.load()
+        except Exception as error:  # code of another package may raise anything
             message = " ".join(f"{type(error).__name__}: {error}".split())
             raise UserError(f"{where}: cannot be imported: {message}") from error
-        if not self._fits(found):
+        if not self._fits(item):
             raise UserError(f"{where}: not a subclass of {self.base.__name__}")
-        return found
+        return item
 
     def _fits(self, item: Any) -> bool:
         return isinstance(item, type) and issubclass(item, self.base)

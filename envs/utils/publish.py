@@ -1,4 +1,4 @@
-"""Writes files that the user names or that get a new name; no existing file is replaced."""
+"""Writes new files without replacing existing ones."""
 
 import errno
 import os
@@ -18,11 +18,11 @@ def published(path: Path) -> Iterator[Path]:
     """Yields a new empty file, which is renamed to `path` when the block ends without an error.
 
     Args:
-        path: a name that is not taken yet.
+        path: path of the new file.
 
     Raises:
-        UserError: the name is taken, or the file cannot be written, such as to a full disk. No
-            part of it is left.
+        UserError: the path exists, or the file cannot be written, such as to a full disk. No
+            partial file is left.
     """
     try:
         with temporary(path) as partial:
@@ -42,20 +42,20 @@ def _take(partial: Path, path: Path) -> None:
     except OSError as error:
         if error.errno not in _NO_LINKS:
             raise
-        # Memory cards and some network drives have no links; an empty file reserves the name.
+        # Some file systems have no hard links; an empty file reserves the name.
         path.open("x").close()
         partial.replace(path)
 
 
 def new_file(output: Path, suffixes: Sequence[str]) -> Path:
-    """Checks the path of an output that the user named, and returns it.
+    """Checks that a file can be created at a path that the user gave, and returns the path.
 
     Args:
-        output: as the user gave it.
-        suffixes: accepted endings of its name.
+        output: the path.
+        suffixes: accepted suffixes.
 
     Raises:
-        UserError: the path exists, ends otherwise, or is in a folder that does not exist.
+        UserError: the path exists, has another suffix, or is in a folder that does not exist.
     """
     if os.path.isdir(output):
         raise UserError(f"{output} is a folder; a file ends in {', '.join(suffixes)}")
@@ -71,12 +71,12 @@ def new_file(output: Path, suffixes: Sequence[str]) -> Path:
 
 
 def free_name(folder: Path, stem: str, suffixes: Sequence[str]) -> Path:
-    """Returns the first of `stem`, `stem_2`, ... in a folder that no file has yet.
+    """Returns the first of the paths `stem`, `stem_2`, ... that no file has yet, without a suffix.
 
     Args:
-        folder: where the files are to be written.
-        stem: of the name; the returned path has no suffix.
-        suffixes: of all files that are to have this name.
+        folder: folder of the files.
+        stem: first name to try.
+        suffixes: suffixes of the files that will have this name.
 
     Raises:
         UserError: 9999 names are taken.

@@ -1,4 +1,4 @@
-"""Checks of configurations and plain values, and the messages about them."""
+"""Validates configurations and plain values, and describes errors in one line."""
 
 import difflib
 import json
@@ -15,26 +15,26 @@ T = TypeVar("T")
 
 
 TAG = "kind:"
-"""begins the tags of pydantic's unions, which are no part of a key"""
+"""prefix of the tags of pydantic's unions, which are not part of a key"""
 
 Name = Annotated[str, Field(pattern=r"^\w[\w.+-]*$", max_length=100)]
-"""text that can be part of the names of files and measures"""
+"""text that can be part of file names and measures"""
 
 
 def from_plain(config_type: type[T], values: Mapping[str, Any], key: str = "") -> T:
-    """Returns a configuration from plain values as YAML has them.
+    """Returns a configuration from plain values, such as those of a YAML file.
 
-    No key may be unknown, and no value is converted to another type.
+    Unknown keys are errors, and no value is converted to another type.
 
     Args:
         config_type: a pydantic dataclass.
         values: mappings, lists and tuples of text, numbers, bool and None.
-        key: of the values within a larger configuration, for messages.
+        key: key of the values in the whole configuration, for messages.
 
     Raises:
-        UserError: one line that names the first key that is wrong, its value and what is wrong.
+        UserError: a key or a value is wrong; the message names the first one and the reason.
     """
-    # Through JSON, whose lists and mappings strict validation takes for tuples and dataclasses.
+    # From JSON, strict validation accepts lists as tuples and mappings as dataclasses.
     text = json.dumps(plain(values, key))
     try:
         return TypeAdapter(config_type).validate_json(text)
@@ -43,15 +43,15 @@ def from_plain(config_type: type[T], values: Mapping[str, Any], key: str = "") -
 
 
 def plain(value: Any, key: str = "", deepest: int = 16) -> Any:
-    """Returns the value as JSON can hold it; ranges and NumPy's arrays become lists.
+    """Returns a value with types that JSON has; ranges and NumPy arrays become lists.
 
     Args:
         value: mappings, lists and tuples of text, numbers, bool and None.
-        key: of the value, for messages.
-        deepest: levels that it may have.
+        key: key of the value, for messages.
+        deepest: maximum number of nested levels.
 
     Raises:
-        UserError: it holds something else; one line that names the key.
+        UserError: the value holds another type or too many levels; the message names the key.
     """
     if isinstance(value, np.generic | np.ndarray):
         value = value.tolist()
@@ -79,26 +79,26 @@ def plain(value: Any, key: str = "", deepest: int = 16) -> Any:
 
 
 def shown(value: Any) -> str:
-    """Returns a value for a message: cut if it is long, escaped where it cannot be printed."""
+    """Returns a value as text for a message, shortened if it is long, with escaped characters."""
     text = value if isinstance(value, str) else reprlib.repr(value)
     return printable(text if len(text) <= 100 else f"{text[:60]}...{text[-20:]}")
 
 
 def printable(text: str) -> str:
-    """Returns the text on one line, with characters that cannot be printed escaped."""
+    """Returns the text on one line, with escapes for characters that cannot be printed."""
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 
 def describe(error: ValidationError, prefix: str = "") -> str:
-    """Returns one line about the first error: the key, the value and the expected.
+    """Describes the first error of a validation in one line: key, value and reason.
 
     Args:
-        error: of a validation by pydantic.
-        prefix: the key of what was validated.
+        error: pydantic's error.
+        prefix: key of the validated values, for the message.
     """
     errors = error.errors()
-    # A key that is mistyped is also a key that is missing.
-    mistyped = [found for found in errors if found["type"] == "unexpected_keyword_argument"]
+    # A mistyped key is reported as missing, too.
+    mistyped = [entry for entry in errors if entry["type"] == "unexpected_keyword_argument"]
     first = (mistyped or errors)[0]
     parts = [str(part) for part in first["loc"] if not str(part).startswith(TAG)]
     key = ".".join([prefix, *parts] if prefix else parts)
@@ -115,12 +115,13 @@ def describe(error: ValidationError, prefix: str = "") -> str:
 
 
 def unknown(value: str, known: Iterable[str], *, listed: bool = True) -> str:
-    """Returns the part of a message that says that a name is not known, and the nearest one.
+    """Returns a message that a name is not known, with the most similar known name.
 
     Args:
         value: the name.
-        known: names that would do; of dotted keys the last part is compared too.
-        listed: appends all known names; else only where none is near, and dotted ones left out.
+        known: all known names; the last part of a dotted key is compared too.
+        listed: whether to append all known names. If not, names without dots are appended only if
+            no name is similar.
     """
     names = list(known)
     last_parts = {name.rsplit(".", 1)[-1]: name for name in names}

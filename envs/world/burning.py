@@ -1,21 +1,21 @@
-"""The number of burning cells of many fires at any step."""
+"""Counts the burning cells of many fires at any step."""
 
 import torch
 from torch import Tensor
 
 from emberlink.envs.utils.buffers import Buffers
 
-_CHUNK = 2**22  # cells that are sorted at a time
+_CHUNK = 2**22  # cells sorted at a time
 
 
 class BurningCounts(Buffers):
     """Counts the burning cells of a fire at a step by binary search.
 
-    The table holds one entry for each fire and step at which any cell ignites, so its size is at
-    most the number of cells, however long an episode is.
+    The table has one entry for each fire and step at which a cell ignites, so its size is at most
+    the number of cells and does not depend on the horizon.
 
     Args:
-        fires: arrival times in steps, float32 [fires, X, Y], inf where a cell never burns.
+        fires: arrival times in steps, float32 [fires, X, Y]; inf for cells that never burn.
         horizon: steps of an episode.
     """
 
@@ -37,11 +37,11 @@ class BurningCounts(Buffers):
         self.register_buffer("_total", total, persistent=False)
 
     def _entry(self, fire: Tensor, step: Tensor) -> Tensor:
-        """Returns numbers that order by fire first and by step second."""
+        """Returns integers that sort by fire first and by step second."""
         return fire * (self._horizon + 2) + step
 
     def at(self, fire: Tensor, step: Tensor) -> Tensor:
-        """Returns the number of cells of a fire that burn at a step.
+        """Returns the number of cells of a fire that burn at a step, int64 [...].
 
         Args:
             fire: int64 [...], indices of fires.

@@ -1,4 +1,4 @@
-"""The fires of all environments, and the UAV and step at which each cell was first seen."""
+"""Stores the fires of all environments and when and by which UAV each cell was first seen."""
 
 from typing import NamedTuple
 
@@ -18,22 +18,22 @@ class Sighting(NamedTuple):
     counts: Tensor
     """float64 [..., 3]: number of cells"""
     centres: Tensor
-    """float32 [..., 3, 2]: their mean (i, j), 0 without any"""
+    """float32 [..., 3, 2]: mean (i, j) of the cells; 0 if there are none"""
     classes: Tensor
-    """bool [..., 3, W * W]: the cells of the UAV's window that belong to the class"""
+    """bool [..., 3, W * W]: mask of the cells in the UAV's window"""
 
 
 class CoverageMap(Buffers):
-    """The fire of every environment and the cells of it that its UAVs have seen.
+    """Stores the fire of every environment and the cells that its UAVs have seen.
 
-    At each step UAV 0 looks first: a burning cell is new to the lowest UAV that sees it at the
-    first step at which any UAV does, and old to all others and at all later steps. A sighting is
-    stored as one number, step * uavs + UAV; the minimum over sightings gives this order without a
-    loop over UAVs.
+    The UAVs count the cells in their view one after another, UAV 0 first. So a burning cell is new
+    fire for one UAV at one step only, and old fire for the other UAVs and at later steps. A
+    sighting is stored as the number step * uavs + uav; the minimum over all sightings of a cell
+    gives the first one without a loop over UAVs.
 
     Args:
         sensor: the UAVs' camera.
-        fires: arrival times in steps, float32 [fires, X, Y], inf where a cell never burns.
+        fires: arrival times in steps, float32 [fires, X, Y]; inf for cells that never burn.
         horizon: steps of an episode.
         envs: number of environments.
         uavs: UAVs per environment.
@@ -52,7 +52,7 @@ class CoverageMap(Buffers):
         super().__init__()
         self._sensor, self._uavs = sensor, uavs
         self._burning = BurningCounts(fires, horizon)
-        # Padding is NaN, so that comparisons with it are false: it neither burns nor does not burn.
+        # Padding is NaN: all comparisons with it are false, so it belongs to no class.
         self.register_buffer("_fires", sensor.pad(fires, torch.nan), persistent=False)
         self.register_buffer(
             "_start", torch.arange(envs).unsqueeze(-1) * sensor.area, persistent=False
@@ -78,7 +78,7 @@ class CoverageMap(Buffers):
 
     @property
     def seen(self) -> Tensor:
-        """The burning cells that any UAV has seen, bool [envs, X, Y]."""
+        """Whether each cell burned when a UAV saw it, bool [envs, X, Y]."""
         return self._sensor.crop(self._first_seen < _NEVER)
 
     def start_episodes(self, mask: Tensor, fire: Tensor) -> None:
@@ -94,20 +94,20 @@ class CoverageMap(Buffers):
         self._stamp.copy_(torch.where(mask[:, None, None], self._uav, self._stamp))
 
     def count_burning(self, step: Tensor) -> Tensor:
-        """Returns the number of cells that burn at a step, int64 [envs] both."""
+        """Returns the number of cells that burn at steps, int64 [envs]; int64 [envs]."""
         return self._burning.at(self._fire_index, step)
 
     def look(self, position: Tensor, step: Tensor) -> Sighting:
-        """Classifies the cells in view of all UAVs, and marks the burning ones as seen.
+        """Classifies the cells in view of all UAVs and marks the burning ones as seen.
 
-        It must be called once per step.
+        It must be called exactly once per step.
 
         Args:
             position: float64 [envs, uavs, 3], cells.
             step: float32 [envs], steps since the episode began.
 
         Returns:
-            What each UAV sees, batch size [envs, uavs].
+            The cells in view of each UAV, batch shape [envs, uavs].
         """
         centre, cells, in_view = self._sensor.look(position, self._start)
         stamp, first_seen, time = self._stamp, self._first_seen, step.view(-1, 1, 1)

@@ -1,7 +1,7 @@
-"""Motion of the UAVs: pure functions of tensors.
+"""Moves UAVs and draws waypoints: pure functions of tensors.
 
-`move` works in float64 inside, so that a scalar program that reads the same float32 positions
-finds the same exits.
+`move` computes in float64, so that a scalar reference implementation with the same float32
+positions gives the same result.
 """
 
 from collections.abc import Sequence
@@ -13,10 +13,10 @@ from emberlink.envs.utils import counter_rng
 
 
 def corners(low: Sequence[float], high: Sequence[float]) -> tuple[Tensor, Tensor]:
-    """Returns two corners of the box, float64 [3] each, rounded to values that float32 has.
+    """Returns two corners of the box, float64 [3] each, rounded to float32.
 
-    Positions are stored as float32: a UAV at an altitude of 3.3 must not be outside of a box that
-    begins at 3.3.
+    Positions are float32: without rounding, a UAV at an altitude of 3.3 could be outside a box with
+    a corner at 3.3.
     """
     both = torch.tensor([low, high], dtype=torch.float32).double()
     return both[0], both[1]
@@ -28,11 +28,10 @@ def move(
     """Moves all UAVs at once and clips their positions to the box.
 
     Args:
-        position: [..., 3], cells; numbers that float32 has exactly.
-        action: float32 [..., 3]; components outside [-1, 1] are clipped to it, and NaN counts
-            as 0.
+        position: [..., 3], cells; exactly representable in float32.
+        action: float32 [..., 3]; components are clipped to [-1, 1], and NaN counts as 0.
         displacement: cells per unit of action.
-        low, high: float64 [3], the corners of the box, cells; numbers that float32 has exactly.
+        low, high: float64 [3], the corners of the box, from `corners`.
 
     Returns:
         The new positions, float32 [..., 3], and the axes along which the move would have left
@@ -45,20 +44,20 @@ def move(
 
 
 def random_points(key: Tensor, count: int, low: Tensor, high: Tensor) -> Tensor:
-    """Draws uniform points of the box, float32 [..., count, 3], one set for each key of [...]."""
+    """Draws uniform points in the box, float32 [..., count, 3], given keys int64 [...]."""
     unit = counter_rng.uniform(key, count * 3).unflatten(-1, (count, 3))
     points = low.float() + unit * (high - low).float()
-    return torch.minimum(points, high.float())  # rounding may exceed the box
+    return torch.minimum(points, high.float())  # rounding may exceed the upper corner
 
 
 def next_waypoint(
     waypoint: Tensor, position: Tensor, key: Tensor, low: Tensor, high: Tensor
 ) -> Tensor:
-    """Returns the waypoint, or another random point of the box if the UAV is closer than 1 to it.
+    """Returns the waypoints, with a new random one for each UAV closer than 1 cell to its own.
 
     Args:
         waypoint, position: float32 [..., n, 3], cells.
-        key: int64 [...], used for nothing else at this step.
+        key: int64 [...], a random key for this purpose alone.
         low, high: [3], the corners of the box, cells.
     """
     reached = (distance(position, waypoint) < 1).unsqueeze(-1)

@@ -1,4 +1,4 @@
-"""The rewards: pure functions of what is in view and of the move."""
+"""Computes rewards from the cells in view and the move: pure functions of tensors."""
 
 from typing import Literal
 
@@ -11,7 +11,7 @@ def left_box(hit_boundary: Tensor, axes: Literal["xyz", "xy"]) -> Tensor:
     """Returns whether the last move would have left the box on the tested axes, bool [...].
 
     Args:
-        hit_boundary: bool [..., 3], per axis.
+        hit_boundary: bool [..., 3], per axis, from `motion.move`.
         axes: the axes that are tested.
     """
     return hit_boundary[..., : len(axes)].any(-1)
@@ -23,9 +23,9 @@ def view_reward(
     """Returns the reward for the cells in view, or the penalty for leaving the box.
 
     Args:
-        new, old, none: whole numbers [...], cells in view of each class.
+        new, old, none: [...], number of cells of new fire, old fire and no fire in view.
         hit_boundary: bool [..., 3], the axes along which the move would have left the box.
-        config: the worth of each class, and the penalty.
+        config: reward per cell of each class, and the penalty.
 
     Returns:
         float32 [...].

@@ -1,4 +1,4 @@
-"""The UAVs' cameras: the cells in view, their number and their mean per class."""
+"""Models the cameras of UAVs: computes the cells in view, and their number and mean per class."""
 
 import math
 
@@ -9,21 +9,26 @@ from emberlink.envs.utils.buffers import Buffers
 
 
 def view_radius(altitude: float, view_angle: float) -> float:
-    """Returns half the side of the square in view from `altitude` cells, in cells."""
+    """Returns half the side of the square in view, in cells.
+
+    Args:
+        altitude: cells.
+        view_angle: half the opening angle, degrees.
+    """
     return altitude * math.tan(math.radians(view_angle))
 
 
 class Sensor(Buffers):
-    """A camera that looks down: |i - x| <= z tan(angle) and |j - y| <= z tan(angle).
+    """A downward camera that sees cells (i, j) with |i - x| and |j - y| <= z tan(view_angle).
 
-    Every UAV has a window of W x W cells, centred at the cell nearest to it, that contains its
-    field of view at any altitude. Maps are stored flat and padded by half a window, so that a
-    window never exceeds its map; the cost of a look grows with the window and not with the map.
+    Each UAV has a window of W x W cells, centred at the cell nearest to it, that contains the field
+    of view at any altitude. Maps are stored flat and padded by half a window, so that windows lie
+    within them. The cost of a step depends on the size of the window, not on that of the map.
 
     Args:
         grid: cells along x and y.
         view_angle: half the opening angle, degrees.
-        ceiling: the highest altitude, cells; it fixes the size of the window.
+        ceiling: the maximum altitude, cells; it determines the size of the window.
     """
 
     _offsets: Tensor
@@ -44,7 +49,7 @@ class Sensor(Buffers):
         self.register_buffer(
             "_window", ((i + reach) * self._padded[1] + j + reach).flatten(), persistent=False
         )
-        # In float64, so that the sums of a window of any size are whole numbers.
+        # In float64, so that sums over a window of any size are exact.
         weights = torch.stack((i, j, torch.ones_like(i)), -1).flatten(0, 1)
         self.register_buffer("_weights", weights.double(), persistent=False)
 
@@ -64,17 +69,16 @@ class Sensor(Buffers):
         return flat.unflatten(-1, self._padded)[..., self._inner[0], self._inner[1]]
 
     def look(self, position: Tensor, start: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Returns the window of every UAV, and which of its cells are in view.
+        """Returns the window of each UAV and whether its cells are in view.
 
         Args:
-            position: float64 [..., n, 3] within the grid, cells. In float64, so that a scalar
-                program that reads the same float32 positions finds the same cells.
-            start: int64 that broadcasts against [..., n]: where each UAV's map begins.
+            position: float64 [..., n, 3], within the grid, cells.
+            start: int64, broadcast against [..., n]: index of the first cell of each UAV's map.
 
         Returns:
             centre: float64 [..., n, 2], the (i, j) of the cell nearest to the UAV.
-            cells: int64 [..., n, W * W], the places of the window's cells in the flat maps.
-            in_view: bool [..., n, W * W], true for cells of the padding too.
+            cells: int64 [..., n, W * W], the indices of the window's cells in the flat maps.
+            in_view: bool [..., n, W * W]; cells of the padding can be in view.
         """
         ground = position[..., :2]
         centre = ground.round()
@@ -87,14 +91,14 @@ class Sensor(Buffers):
         return centre, corner.unsqueeze(-1) + self._window, in_view
 
     def count_classes(self, classes: Tensor, centre: Tensor) -> tuple[Tensor, Tensor]:
-        """Counts the cells of each class and computes their mean.
+        """Computes the number of cells of each class and their mean.
 
         Args:
-            classes: bool [..., k, W * W], the cells of a window that belong to each of k classes.
+            classes: bool [..., k, W * W], masks of the cells of k classes.
             centre: float64 [..., 2], from `look`.
 
         Returns:
-            Counts, float64 [..., k], and mean (i, j), float32 [..., k, 2], 0 without any cell.
+            Number, float64 [..., k], and mean (i, j), float32 [..., k, 2]; 0 without any cell.
         """
         sums = classes.double() @ self._weights
         offset, count = sums.split((2, 1), -1)

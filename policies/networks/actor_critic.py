@@ -4,7 +4,6 @@ import copy
 from collections.abc import Sequence
 from typing import Any
 
-import torch
 from tensordict.nn import TensorDictModule
 from torchrl.data import Composite
 from torchrl.modules import ValueOperator
@@ -26,25 +25,22 @@ def make_actor(
     share_parameters: bool = False,
     generator: Generators = None,
 ) -> TensorDictModule:
-    """Returns the UAVs' actors: the tensors of the observation -> ("agents", "action").
+    """Returns the actors of all UAVs, which map the observation to ("agents", "action").
 
     Args:
         observation_spec, action_spec: of the environment, batch size [num_envs].
-        hidden: units of the hidden layers.
+        hidden: units of the hidden layers, 1 to 8 layers.
         share_parameters: whether all UAVs of a team use the same weights.
-        generator: of the initial weights. Several generators make as many teams, which share no
-            weights; see `Grouping`.
+        generator: of the initial weights. Several generators create the same number of teams,
+            which share no weights; see `Grouping`.
+
+    Raises:
+        ValueError: the number of layers or the shape of an observation is not supported.
     """
-    observations: list[Any] = keys.observation_keys(observation_spec)
-    sizes = _sizes(observation_spec, action_spec)
-    network = StackedActor(
-        *sizes,
-        hidden,
-        share_parameters=share_parameters,
-        device=observation_spec.device,
-        generator=generator,
-    )
-    return TensorDictModule(network, in_keys=observations, out_keys=[keys.ACTION])
+    specs = observation_spec, action_spec
+    network = _build(StackedActor, *specs, hidden, share_parameters, generator)
+    in_keys: list[Any] = keys.observation_keys(observation_spec)
+    return TensorDictModule(network, in_keys=in_keys, out_keys=[keys.ACTION])
 
 
 def make_critic(
@@ -55,32 +51,40 @@ def make_critic(
     share_parameters: bool = False,
     generator: Generators = None,
 ) -> ValueOperator:
-    """Returns the UAVs' critics: observation and action -> `STATE_ACTION_VALUE`.
+    """Returns the critics of all UAVs, which map observation and action to `STATE_ACTION_VALUE`.
 
-    Arguments as `make_actor`.
+    Arguments and errors are those of `make_actor`.
     """
-    observations: list[Any] = keys.observation_keys(observation_spec)
-    sizes = _sizes(observation_spec, action_spec)
-    network = StackedCritic(
-        *sizes,
-        hidden,
-        share_parameters=share_parameters,
-        device=observation_spec.device,
-        generator=generator,
-    )
-    in_keys = [*observations, keys.ACTION]
+    specs = observation_spec, action_spec
+    network = _build(StackedCritic, *specs, hidden, share_parameters, generator)
+    in_keys: list[Any] = [*keys.observation_keys(observation_spec), keys.ACTION]
     return ValueOperator(network, in_keys=in_keys, out_keys=[STATE_ACTION_VALUE])
 
 
-def _sizes(observation: Composite, action: Composite) -> tuple[int, list[torch.Size], int]:
-    """Returns the UAVs, the shapes of their observation's tensors, and the size of an action."""
+def _build(
+    network: type[StackedActor] | type[StackedCritic],
+    observation: Composite,
+    action: Composite,
+    hidden: Sequence[int],
+    share_parameters: bool,
+    generator: Generators,
+) -> StackedActor | StackedCritic:
+    """Returns a new network with the sizes of an environment's specs."""
     *batch, actions = action[keys.ACTION].shape
     shapes = [observation[key].shape[len(batch) :] for key in keys.observation_keys(observation)]
-    return batch[-1], shapes, actions
+    return network(
+        batch[-1],
+        shapes,
+        actions,
+        hidden,
+        share_parameters=share_parameters,
+        device=observation.device,
+        generator=generator,
+    )
 
 
 def team_of(network: TensorDictModule, team: int, teams: int) -> TensorDictModule:
-    """Returns one team's networks out of several; they share memory, so that they learn with it."""
+    """Returns the networks of one of several teams; their weights share memory with `network`."""
     if teams == 1:
         return network
     single = copy.deepcopy(network)

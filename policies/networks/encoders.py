@@ -1,4 +1,4 @@
-"""Encoders: they turn the tensors of an observation into one vector of features."""
+"""Encodes the tensors of an observation as one vector of features."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -11,14 +11,14 @@ from emberlink.policies.networks.layers import Generators, StackedConv2d
 CHANNELS = 16
 """channels of the convolutions"""
 MAX_SIDE = 15
-"""cells along a side above which a window is averaged down before the convolutions"""
+"""cells along a side of a window; a larger window is average-pooled before the convolutions"""
 
 
 class VectorEncoder(nn.Module):
-    """Takes the numbers of a vector as they are.
+    """Returns a vector unchanged.
 
     Args:
-        groups: groups of weights; a vector needs none.
+        groups: not used.
         shape: [features].
     """
 
@@ -27,7 +27,7 @@ class VectorEncoder(nn.Module):
         (self.features,) = shape
 
     def forward(self, x: Tensor) -> Tensor:
-        """float32 [groups, rows, features] -> the same."""
+        """Maps float32 [groups, rows, features] to itself."""
         return x
 
 
@@ -35,7 +35,7 @@ class WindowEncoder(nn.Module):
     """Applies two 3 x 3 convolutions, the second with stride 2, each followed by a ReLU.
 
     Args:
-        groups: groups of weights.
+        groups: number of groups of weights.
         shape: [channels, W, W] of the window.
         device: of the weights.
         generator: of the initial weights.
@@ -59,7 +59,7 @@ class WindowEncoder(nn.Module):
         self.features = CHANNELS * ((pooled + 1) // 2) ** 2
 
     def forward(self, x: Tensor) -> Tensor:
-        """bool or float [groups, rows, channels, W, W] -> float32 [groups, rows, features]."""
+        """Maps bool or float [groups, rows, channels, W, W] to float32 [groups, rows, features]."""
         groups = len(x)
         x = x.transpose(0, 1).flatten(1, 2).to(self.first.weight.dtype)
         if self.pool > 1:
@@ -69,20 +69,20 @@ class WindowEncoder(nn.Module):
 
 
 ENCODERS = {1: VectorEncoder, 3: WindowEncoder}
-"""the encoder of a tensor by its number of dimensions per UAV"""
+"""the encoder for each number of dimensions of a tensor, per UAV"""
 
 
 class ObservationEncoder(nn.Module):
     """Encodes each tensor of an observation and concatenates the features.
 
     Args:
-        groups: groups of weights.
-        shapes: per UAV, of each tensor: [features] or [channels, W, W].
+        groups: number of groups of weights.
+        shapes: shape of each tensor, per UAV: [features] or [channels, W, W].
         device: of the weights.
         generator: of the initial weights.
 
     Raises:
-        ValueError: there is no encoder for a tensor of such a shape.
+        ValueError: there is no encoder for the shape of a tensor.
     """
 
     def __init__(
@@ -104,6 +104,6 @@ class ObservationEncoder(nn.Module):
         self.features: int = sum(part.features for part in self.parts)  # pyright: ignore[reportArgumentType, reportCallIssue]
 
     def forward(self, tensors: Sequence[Tensor]) -> Tensor:
-        """[groups, rows, *shape] of each tensor -> float32 [groups, rows, features]."""
+        """Maps tensors [groups, rows, *shape] to float32 [groups, rows, features]."""
         features = [part(x) for part, x in zip(self.parts, tensors, strict=True)]
         return features[0] if len(features) == 1 else torch.cat(features, -1)

@@ -1,4 +1,4 @@
-"""A cache that lets two losses use the same features of an observation."""
+"""Caches the features of an observation for two losses."""
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -7,11 +7,11 @@ from torch import Tensor
 
 
 class FeatureCache:
-    """Keeps the features of observations while it is active.
+    """Caches the features of observations while it is active.
 
-    The losses of DDPG evaluate a critic twice at each observation of a batch: with the action that
-    was taken, and with the actor's action. The features do not depend on the action. Nothing may
-    write to observations or weights while the cache is active.
+    The losses of DDPG evaluate a critic twice at each observation of a batch: with the action of
+    the transition and with the actor's action. The features do not depend on the action. While the
+    cache is active, observations and weights must not be written to.
     """
 
     def __init__(self) -> None:
@@ -19,7 +19,7 @@ class FeatureCache:
 
     @contextmanager
     def active(self) -> Iterator[None]:
-        """Keeps features within a `with` block, and forgets them at its end."""
+        """Activates the cache for a `with` block and empties it at the end."""
         self._entries = {}
         try:
             yield
@@ -34,22 +34,22 @@ class FeatureCache:
     ) -> list[Tensor]:
         """Returns the features of an observation.
 
-        Kept features are returned detached, and only where the weights need no gradient: the
+        Cached features are returned detached, and only if the weights need no gradient: the
         actor's loss does not train the critic.
 
         Args:
             observations: the tensors of the observation.
-            weight: a weight of the network, by which networks and their targets differ.
-            compute: computes the features.
+            weight: a weight of the network; it distinguishes a network from its target network.
+            compute: computes the features if they are not cached.
         """
         if self._entries is None:
             return compute(observations)
-        # By their memory: the losses hand over new tensor objects for the same numbers.
+        # Keyed by memory address: the losses pass new tensor objects that share memory.
         key = tuple((tensor.data_ptr(), tensor.shape) for tensor in (*observations, weight))
         if key in self._entries and not weight.requires_grad:
             _, features = self._entries[key]
             return [part.detach() for part in features]
         features = compute(observations)
-        # With the observation, so that its memory is not used for another tensor meanwhile.
+        # Holding the observations prevents their memory from being reused by other tensors.
         self._entries[key] = observations, features
         return features

@@ -1,4 +1,4 @@
-"""The arrangement of observations by the weights that read them."""
+"""Arranges inputs by the group of weights that they are multiplied with."""
 
 import math
 
@@ -7,17 +7,17 @@ from torch import Tensor
 
 
 class Grouping:
-    """Arranges the UAVs' tensors by groups: the inputs of one group are read by the same weights.
+    """Arranges tensors of UAVs by group; the inputs of a group use the same weights.
 
     With weights per UAV, a group is a UAV; with shared weights, it is a team. Several teams that
-    train side by side, one per seed, share no weights; the groups of team 0 come first.
+    are trained in parallel, one per seed, share no weights. The groups of team 0 come first.
 
-    Tensors have the UAVs of all teams, [..., teams * uavs, *features], or, while transitions are
-    collected, those of one team, [teams * envs, uavs, *features] with the environments of team 0
-    first.
+    In a batch of the replay buffer, the UAVs of all teams are in one dimension,
+    [..., teams * uavs, *features]. While transitions are collected, the teams are in the dimension
+    of the environments, [teams * envs, uavs, *features], those of team 0 first.
 
     Args:
-        uavs: UAVs of a team.
+        uavs: number of UAVs in a team.
         teams: number of teams.
         shared: whether the UAVs of a team share their weights.
     """
@@ -31,10 +31,10 @@ class Grouping:
         return self.teams if self.shared else self.teams * self.uavs
 
     def split(self, x: Tensor, batch: torch.Size) -> Tensor:
-        """[*batch, *features] -> [groups, rows, *features].
+        """Maps [*batch, *features] to [groups, rows, *features].
 
         Args:
-            x: the UAVs' tensors.
+            x: a tensor of UAVs.
             batch: [..., uavs] or [..., teams * uavs].
         """
         features = x.shape[len(batch) :]
@@ -47,7 +47,7 @@ class Grouping:
         return x.flatten(1, 2) if self.shared else x.transpose(1, 2).flatten(0, 1)
 
     def join(self, x: Tensor, batch: torch.Size) -> Tensor:
-        """[groups, rows, features] -> [*batch, features]; the reverse of `split`."""
+        """Reverses `split`: maps [groups, rows, features] to [*batch, features]."""
         if self.shared:
             x = x.unflatten(1, (-1, self.uavs))
         else:

@@ -1,7 +1,7 @@
-"""Layers with separate weights per group of inputs, computed as one batched operation.
+"""Layers with separate weights for each group of inputs, computed as one batched operation.
 
-The first dimension of every weight is the group. A group is a UAV, or a team whose UAVs share their
-weights (see `grouping`).
+The first dimension of every weight is the group: a UAV, or a team whose UAVs share their weights
+(see `grouping`).
 """
 
 import math
@@ -12,11 +12,11 @@ from torch import Tensor, nn
 
 Layer = Callable[[Tensor], Tensor]
 Generators = torch.Generator | Sequence[torch.Generator] | None
-"""of the initial weights: one generator, or one per team; see `team_generators`"""
+"""generators of the initial weights: one, or one per team; None for the global generator"""
 
 
 def team_generators(generator: Generators) -> Sequence[torch.Generator | None]:
-    """Returns the generator of each team."""
+    """Returns the generator of each team; a single generator is one team."""
     return generator if isinstance(generator, Sequence) else [generator]
 
 
@@ -27,10 +27,10 @@ def initial_weights(
     device: torch.device | str | None = None,
     generator: Generators = None,
 ) -> nn.Parameter:
-    """Returns weights uniform in [-bound, bound], [groups, *shape].
+    """Draws weights [groups, *shape] uniformly from [-bound, bound].
 
-    They are drawn on the CPU, so that a seed gives the same weights on every device. Each team's
-    generator draws the weights of the team's groups.
+    Weights are drawn on the CPU, so a seed gives the same weights on every device. The generator of
+    a team draws the weights of its groups.
     """
     generators = team_generators(generator)
     teams = [
@@ -41,13 +41,13 @@ def initial_weights(
 
 
 class StackedLinear(nn.Module):
-    """A linear map per group.
+    """Applies a linear map per group.
 
     Args:
         groups: number of groups.
-        inputs, outputs: features of the input and of the output.
-        bound: weights and biases start uniform in [-bound, bound]; 1 / sqrt(inputs) if None, as
-            in the DDPG paper (Lillicrap et al. 2016, section 7).
+        inputs, outputs: number of features of the input and of the output.
+        bound: weights and biases are initialised uniformly in [-bound, bound]; if None, 1 /
+            sqrt(inputs), as in the DDPG paper (Lillicrap et al. 2016, section 7).
         device: of the weights.
         generator: of the initial weights.
     """
@@ -69,17 +69,17 @@ class StackedLinear(nn.Module):
         self.bias = initial_weights(groups, 1, outputs, **start)
 
     def forward(self, x: Tensor) -> Tensor:
-        """[groups, rows, inputs] -> [groups, rows, outputs]."""
+        """Maps [groups, rows, inputs] to [groups, rows, outputs]."""
         return torch.baddbmm(self.bias, x, self.weight)
 
     def per_group(self) -> list[Layer]:
-        """Returns the layer of each group, [rows, inputs] -> [rows, outputs]."""
+        """Returns the layer of each group, which maps [rows, inputs] to [rows, outputs]."""
         groups = zip(self.weight.unbind(0), self.bias.squeeze(1).unbind(0), strict=True)
         return [lambda x, w=weight, b=bias: torch.addmm(b, x, w) for weight, bias in groups]
 
 
 class StackedLayerNorm(nn.Module):
-    """Layer normalisation (Ba et al. 2016) with a scale and a shift per group."""
+    """Applies layer normalisation (Ba et al. 2016) with a scale and a shift per group."""
 
     def __init__(self, groups: int, features: int, *, device: torch.device | str | None = None):
         super().__init__()
@@ -87,12 +87,12 @@ class StackedLayerNorm(nn.Module):
         self.bias = nn.Parameter(torch.zeros(groups, 1, features, device=device))
 
     def forward(self, x: Tensor) -> Tensor:
-        """[groups, rows, features] -> the same."""
+        """Maps [groups, rows, features] to the same shape."""
         normal = nn.functional.layer_norm(x, x.shape[-1:])
         return torch.addcmul(self.bias, normal, self.weight)
 
     def per_group(self) -> list[Layer]:
-        """Returns the layer of each group, [rows, features] -> the same."""
+        """Returns the layer of each group, which maps [rows, features] to the same shape."""
         norm = nn.functional.layer_norm
         weights, biases = self.weight.squeeze(1).unbind(0), self.bias.squeeze(1).unbind(0)
         groups = zip(weights, biases, strict=True)
@@ -100,14 +100,14 @@ class StackedLayerNorm(nn.Module):
 
 
 class StackedConv2d(nn.Module):
-    """A 3 x 3 convolution per group, with a margin of one cell.
+    """Applies a 3 x 3 convolution per group, with a zero padding of one cell.
 
     Args:
         groups: number of groups.
-        inputs, outputs: channels of the input and of the output.
-        stride: of the output's cells.
+        inputs, outputs: number of channels of the input and of the output.
+        stride: stride along both sides.
         device: of the weights.
-        generator: of the initial weights, which start as `StackedLinear`'s.
+        generator: of the initial weights; their bound is 1 / sqrt(9 * inputs).
     """
 
     def __init__(
@@ -127,7 +127,7 @@ class StackedConv2d(nn.Module):
         self.bias = initial_weights(groups, outputs, **start)
 
     def forward(self, x: Tensor) -> Tensor:
-        """[rows, groups * inputs, H, W] -> [rows, groups * outputs, H / stride, W / stride]."""
+        """Maps [rows, groups * inputs, H, W] to [rows, groups * outputs, H/stride, W/stride]."""
         return nn.functional.conv2d(
             x,
             self.weight.flatten(0, 1),

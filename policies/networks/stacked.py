@@ -1,4 +1,4 @@
-"""The paper's networks, with weights per UAV or per team, as batched products (section III.C)."""
+"""The actor and critic of the paper (section III.C), with weights per UAV or per team."""
 
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
@@ -19,32 +19,38 @@ from emberlink.policies.networks.layers import (
 )
 
 MAX_BATCHED = 2**17
-"""numbers of one group between two layers, half a megabyte, up to which a CPU computes all groups
-at once; larger ones would not stay in its cache from one layer to the next"""
+"""Maximum size of a group's activations for which a CPU computes all groups in one batched product.
+Larger activations (over 0.5 MB) would not stay in its cache from one layer to the next."""
 LAYER_NAMES = ("first", "second", "third", "fourth", "fifth", "sixth", "seventh", "eighth")
 """names of the hidden layers"""
 FINAL_BOUND = 3e-3
-"""of the initial weights of the last layer (Lillicrap et al. 2016, section 7)"""
+"""bound of the initial weights of the last layer (Lillicrap et al. 2016, section 7)"""
 
 
 class _Network(nn.Module):
-    """The layers that actors and critics have in common: encoder and hidden layers.
+    """The common part of actors and critics: an encoder and hidden layers.
 
     Args:
-        uavs: UAVs of a team.
-        observations: the shape of each tensor of an observation, per UAV: [features] or
+        uavs: number of UAVs in a team.
+        observations: shape of each tensor of an observation, per UAV: [features] or
             [channels, W, W].
-        hidden: units of the hidden layers, at most eight; LayerNorm after each, ReLU in between.
+        actions: number of components of an action.
+        hidden: units of the hidden layers, 1 to 8 layers. Each is followed by a LayerNorm.
         share_parameters: whether the UAVs of a team share their weights.
         device: of the weights.
-        generator: of the initial weights; several make as many teams.
+        generator: of the initial weights; several generators create the same number of teams.
+
+    Raises:
+        ValueError: there are no hidden layers or more than 8, or an observation has an unsupported
+            shape.
     """
 
     def __init__(
         self,
         uavs: int,
         observations: Sequence[Sequence[int]],
-        hidden: Sequence[int],
+        actions: int,
+        hidden: Sequence[int] = (400, 300),
         *,
         share_parameters: bool = False,
         device: torch.device | str | None = None,
@@ -64,9 +70,14 @@ class _Network(nn.Module):
             self.add_module(name, StackedLinear(groups, inputs, units, **start))
             self.add_module(f"{name}_norm", StackedLayerNorm(groups, units, device=device))
             inputs = units
+        self._add_output(actions, inputs, **start)
+
+    def _add_output(self, actions: int, inputs: int, **start: Any) -> None:
+        """Adds the layers after the hidden ones, which have `inputs` units at the end."""
+        raise NotImplementedError
 
     def _hidden_layers(self) -> list[Any]:
-        """Returns linear map and norm of each hidden layer in turn."""
+        """Returns the linear map and the LayerNorm of each hidden layer, in order."""
         return [getattr(self, name + kind) for name in self.names for kind in ("", "_norm")]
 
     def _encode(self, observations: Sequence[Tensor], batch: torch.Size) -> list[Tensor]:
@@ -74,76 +85,52 @@ class _Network(nn.Module):
         return self._parts(self.encoder(tensors))
 
     def _parts(self, x: Tensor) -> list[Tensor]:
-        """Takes an input apart for `apply_layers`, [groups, rows, features].
+        """Splits an input [groups, rows, features] for `apply_layers`.
 
         Returns:
-            The input itself in a list, or the [rows, features] of each group.
+            The whole input as one part, or a part [rows, features] for each group.
         """
         at_once = x.is_cuda or x.shape[1] * self.widest < MAX_BATCHED
         return [x] if at_once else list(x.unbind(0))
 
     def _join(self, parts: list[Tensor], batch: torch.Size) -> Tensor:
-        """Puts the result of `apply_layers` together: [*batch, features]."""
+        """Joins the parts of a result of `apply_layers`: [*batch, features]."""
         x = parts[0] if parts[0].ndim == 3 else torch.stack(parts)
         return self.grouping.join(x, batch)
 
 
 class StackedActor(_Network):
-    """Observation -> hidden layers -> action; ReLU after each hidden layer, tanh at the end.
+    """Maps observations to actions in [-1, 1].
 
-    Args:
-        uavs, observations: see `_Network`.
-        actions: numbers in an action.
-        hidden, share_parameters: see `_Network`.
-        start: `device` and `generator` of `_Network`.
+    A ReLU follows each hidden layer, and a tanh the last layer. Arguments are those of `_Network`.
     """
 
-    def __init__(
-        self,
-        uavs: int,
-        observations: Sequence[Sequence[int]],
-        actions: int,
-        hidden: Sequence[int] = (400, 300),
-        *,
-        share_parameters: bool = False,
-        **start: Any,
-    ):
-        super().__init__(uavs, observations, hidden, share_parameters=share_parameters, **start)
-        groups, last = self.grouping.groups, hidden[-1]
-        self.action = StackedLinear(groups, last, actions, bound=FINAL_BOUND, **start)
+    def _add_output(self, actions: int, inputs: int, **start: Any) -> None:
+        groups = self.grouping.groups
+        self.action = StackedLinear(groups, inputs, actions, bound=FINAL_BOUND, **start)
 
     def forward(self, *observations: Tensor) -> Tensor:
-        """The tensors of an observation, [*batch, uavs, ...] -> [*batch, uavs, actions]."""
+        """Maps the tensors of an observation, [*batch, uavs, ...], to [*batch, uavs, actions]."""
         batch = observations[0].shape[: -self._dims]
         layers = [*self._hidden_layers(), self.action]
         return self._join(apply_layers(_action, layers, self._encode(observations, batch)), batch)
 
 
 class StackedCritic(_Network):
-    """Observation and action -> value.
+    """Maps observations and actions to values.
 
-    The action enters late: a linear map of it is added to the normalised last hidden layer before
-    its ReLU. Arguments as `StackedActor`.
+    A linear map of the action is added to the normalised last hidden layer before its ReLU.
+    Arguments are those of `_Network`.
     """
 
-    def __init__(
-        self,
-        uavs: int,
-        observations: Sequence[Sequence[int]],
-        actions: int,
-        hidden: Sequence[int] = (400, 300),
-        *,
-        share_parameters: bool = False,
-        **start: Any,
-    ):
-        super().__init__(uavs, observations, hidden, share_parameters=share_parameters, **start)
-        groups, last = self.grouping.groups, hidden[-1]
-        self.action = StackedLinear(groups, actions, last, **start)
-        self.value = StackedLinear(groups, last, 1, bound=FINAL_BOUND, **start)
+    def _add_output(self, actions: int, inputs: int, **start: Any) -> None:
+        groups = self.grouping.groups
+        self.action = StackedLinear(groups, actions, inputs, **start)
+        self.value = StackedLinear(groups, inputs, 1, bound=FINAL_BOUND, **start)
         self._cache = FeatureCache()
 
     def forward(self, *inputs: Tensor) -> Tensor:
-        """The tensors of an observation, and the action, -> float32 [*batch, uavs, 1]."""
+        """Maps the tensors of an observation and then the action to float32 [*batch, uavs, 1]."""
         *observations, action = inputs
         batch = action.shape[:-1]
 
@@ -157,19 +144,19 @@ class StackedCritic(_Network):
         return self._join(values, batch)
 
     def sharing(self) -> AbstractContextManager[None]:
-        """Computes what does not depend on the action once per observation, see `FeatureCache`."""
+        """Computes features once per observation within a `with` block, see `FeatureCache`."""
         return self._cache.active()
 
 
 def apply_layers(
     function: Callable[..., Tensor], layers: Sequence[Any], *inputs: list[Tensor]
 ) -> list[Tensor]:
-    """Applies a function to the layers and the parts of its inputs.
+    """Applies a function to all groups at once, or to one group after another.
 
     Args:
-        function: of a list of layers and one part of each input.
+        function: function of a list of layers and one part of each input.
         layers: stacked layers.
-        inputs: each in as many parts: one with all groups, or one per group.
+        inputs: the parts of each input: one part with all groups, or one part per group.
     """
     if inputs[0][0].ndim == 3:
         return [function(layers, *(parts[0] for parts in inputs))]
@@ -177,11 +164,11 @@ def apply_layers(
     return [function(*group) for group in zip(by_group, *inputs, strict=True)]
 
 
-# ReLU and tanh overwrite the output of the layer before: no gradient needs it.
+# ReLU and tanh are computed in place: no gradient needs the output of the layer before.
 
 
 def _features(layers: Sequence[Layer], x: Tensor) -> Tensor:
-    """The last hidden layer before its ReLU; layers: linear map and norm in turn."""
+    """Returns the last hidden layer before its ReLU, given a linear map and a norm per layer."""
     *before, last, last_norm = layers
     for linear, norm in zip(before[::2], before[1::2], strict=True):
         x = norm(linear(x)).relu_()

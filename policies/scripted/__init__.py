@@ -1,4 +1,4 @@
-"""Policies that learn nothing, to which learned ones are compared."""
+"""Scripted policies: baselines that learned policies are compared with."""
 
 from emberlink.policies.scripted.base import Scripted
 from emberlink.policies.scripted.registry import SCRIPTED

@@ -1,4 +1,4 @@
-"""What a scripted policy is: a policy that learns nothing."""
+"""Defines the base class of scripted policies."""
 
 from typing import Any, ClassVar
 
@@ -12,21 +12,22 @@ from emberlink.envs.wildfire import WildfireEnv
 from emberlink.envs.world import motion
 from emberlink.envs.world.sensor import view_radius
 
-_NOT_QUITE = 1 - 2**-22  # rounding must not carry a UAV across the edge that it flies to
+_BELOW_ONE = 1 - 2**-22  # so that rounding does not carry a UAV across the edge of the box
 
 
 class Scripted(TensorDictModuleBase):
-    """Reads and writes TensorDicts as a learned actor does; no gradients, no weights.
+    """Maps observations to actions without learning.
 
-    What it must remember from step to step it writes into the TensorDict, which is carried on.
+    It reads and writes TensorDicts as a learned actor does and has no weights. State that lasts
+    for several steps is written to the TensorDict, which the caller carries to the next step.
 
     Args:
-        env: the environment that it is played in. Its constants are read and, by a policy that
-            says so, what no UAV could know.
+        env: the environment that it acts in. The policy reads its constants. `Oracle` also reads
+            its fires.
     """
 
     recipe: ClassVar[str | None] = None
-    """the method whose communication it needs; None where any will do"""
+    """the method whose communication the policy needs; None if it needs none"""
 
     low: torch.Tensor
     high: torch.Tensor
@@ -39,7 +40,7 @@ class Scripted(TensorDictModuleBase):
         self.in_keys, self.out_keys = reads, writes
         low, high = motion.corners(self.world.low, self.world.high)
         self.radius = view_radius(high[2].item(), self.world.view_angle)
-        """half the side of the square that is seen from full altitude, cells"""
+        """half the side of the square in view from the maximum altitude, cells"""
         self.register_buffer("low", low)
         self.register_buffer("high", high)
         self.to(env.device)
@@ -50,26 +51,33 @@ class Scripted(TensorDictModuleBase):
 
     @staticmethod
     def step_key(tensordict: TensorDictBase, use: int) -> torch.Tensor:
-        """Returns the key of the random numbers of this step for one use, int64 [num_envs]."""
+        """Returns the random key of a step for a `counter_rng.Use`, int64 [num_envs]."""
         return counter_rng.step_key(tensordict.get(keys.RNG_KEY), tensordict.get(keys.STEP), use)
 
     def fly(self, tensordict: TensorDictBase, target: torch.Tensor) -> TensorDictBase:
-        """Writes the action that flies straight at a target at full speed and stops there.
+        """Writes the action that flies straight to a target at full speed and stops there.
 
         Args:
-            tensordict: the moment.
-            target: [num_envs, n, 3], cells.
+            tensordict: the current time step.
+            target: float [num_envs, n, 3], cells.
+
+        Returns:
+            The same TensorDict.
         """
         step = (target - tensordict.get(keys.POSITION)) / self.world.displacement
         action = (step / step.abs().amax(-1, keepdim=True).clamp(min=1)).float()
-        return tensordict.set(keys.ACTION, action * _NOT_QUITE)
+        return tensordict.set(keys.ACTION, action * _BELOW_ONE)
 
-    def remembered(
-        self, tensordict: TensorDictBase, key: str, initial: torch.Tensor
-    ) -> torch.Tensor:
-        """What was carried under `key`, or `initial` in an episode's first step."""
-        before = tensordict.get(key, None)
-        if before is None:
+    def carried(self, tensordict: TensorDictBase, key: str, initial: torch.Tensor) -> torch.Tensor:
+        """Returns the tensor under `key`, or `initial` at the first step of an episode.
+
+        Args:
+            tensordict: the current time step.
+            key: where the previous step wrote the tensor.
+            initial: [num_envs, ...].
+        """
+        previous = tensordict.get(key, None)
+        if previous is None:
             return initial
         begins = tensordict.get(keys.STEP) == 0
-        return torch.where(begins.view(-1, *[1] * (initial.ndim - 1)), initial, before)
+        return torch.where(begins.view(-1, *[1] * (initial.ndim - 1)), initial, previous)

@@ -1,4 +1,4 @@
-"""What method 4 could do if learning were perfect at what its bonus asks for."""
+"""A scripted policy that follows the targets of method 4."""
 
 from typing import ClassVar
 
@@ -10,7 +10,11 @@ from emberlink.policies.scripted.base import Scripted
 
 
 class FollowTarget(Scripted):
-    """Flies straight at the target that the network agrees on, altitude included."""
+    """Flies straight to the target that the consensus module gives, altitude included.
+
+    It is the policy that earns the most heading bonus, and so shows the best that method 4 could
+    learn from the bonus alone.
+    """
 
     recipe: ClassVar[str | None] = "consensus"
 

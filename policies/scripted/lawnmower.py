@@ -1,4 +1,4 @@
-"""A scripted search of the whole map, strip by strip."""
+"""A scripted policy that searches the whole map in strips."""
 
 import math
 from itertools import pairwise
@@ -12,63 +12,67 @@ from emberlink.envs.wildfire import WildfireEnv
 from emberlink.envs.world import motion
 from emberlink.policies.scripted.base import Scripted
 
-_REACHED = 1e-3  # cells; what float32 leaves of a flight that ends at a stop
-_SLACK = 0.01  # cells; more than a UAV that is nearly at its stop can fail to see at the edge
+_REACHED = 1e-3  # cells; distance to a waypoint that counts as 0, above the float32 rounding error
+_SLACK = 0.01  # cells; margin of the view, above the distance by which a waypoint may be missed
 
 
 class Lawnmower(Scripted):
-    """Flies strips as wide as the view at full altitude, back and forth, forever.
+    """Flies back and forth over strips of the map that are as wide as the view.
 
-    The strips are cut into stops from which they are seen without a gap, however long a step is.
-    Strip by strip, every other one backwards, the stops make one path, of which the UAVs get equal
-    parts: with as many UAVs as strips one strip each. Each flies to the first stop of its part,
-    along it to the last and back. Where UAVs outnumber the stops, some fly the same part.
+    All UAVs fly at the maximum altitude. The map is divided into strips, and each strip into
+    waypoints from which all of it is seen, however long a step is. The waypoints of all strips form
+    one path, in boustrophedon order, and each UAV gets an equal part of it. A UAV flies to the
+    first waypoint of its part, along the part to the last, and back. If there are more UAVs than
+    waypoints, some share a part.
 
-    Which flight from stop to stop a UAV is on is carried in the TensorDict, under
-    "_lawnmower_flight".
+    The number of flights between waypoints that a UAV has completed is carried in the TensorDict
+    under "_lawnmower_flight".
     """
 
     FLIGHT = "_lawnmower_flight"
-    stops: Tensor
+    path: Tensor
+    """float32 [waypoints, 2], cells"""
     first: Tensor
+    """int64 [n]: the first waypoint of each UAV's part"""
     period: Tensor
+    """int64 [n]: flights from the first waypoint to the last and back"""
 
     def __init__(self, env: WildfireEnv):
         super().__init__(env)
         self.out_keys.append(self.FLIGHT)
-        path = stops(self.world.grid, self.radius)
-        places, uavs = len(path), self.world.num_uavs
-        first = torch.arange(uavs) * places // uavs
-        last = (torch.arange(1, uavs + 1) * places // uavs - 1).maximum(first)
-        self.register_buffer("stops", path.to(env.device))
+        path = search_path(self.world.grid, self.radius)
+        length, uavs = len(path), self.world.num_uavs
+        first = torch.arange(uavs) * length // uavs
+        last = (torch.arange(1, uavs + 1) * length // uavs - 1).maximum(first)
+        self.register_buffer("path", path.to(env.device))
         self.register_buffer("first", first.to(env.device))
         self.register_buffer("period", (2 * (last - first)).clamp(min=1).to(env.device))
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         position = tensordict.get(keys.POSITION)
-        nothing = torch.zeros_like(tensordict.get(keys.NEW_FIRE))
-        flight = self.remembered(tensordict, self.FLIGHT, nothing)
-        flight = flight + (motion.distance(position, self._ends(flight)) < _REACHED)
+        zero = torch.zeros_like(tensordict.get(keys.NEW_FIRE))
+        flight = self.carried(tensordict, self.FLIGHT, zero)
+        flight = flight + (motion.distance(position, self._waypoint(flight)) < _REACHED)
         tensordict.set(self.FLIGHT, flight)
-        return self.fly(tensordict, self._ends(flight))
+        return self.fly(tensordict, self._waypoint(flight))
 
-    def _ends(self, flight: Tensor) -> Tensor:
-        """Where a flight ends, float32 [num_envs, n, 3], cells."""
+    def _waypoint(self, flight: Tensor) -> Tensor:
+        """Returns the waypoint at the end of each UAV's flight, float32 [num_envs, n, 3], cells."""
         phase = flight % self.period
-        ground = self.stops[self.first + torch.minimum(phase, self.period - phase)]
+        ground = self.path[self.first + torch.minimum(phase, self.period - phase)]
         ceiling = self.high[2:].float().expand_as(ground[..., :1])
         return torch.cat((ground, ceiling), -1)
 
 
-def stops(grid: tuple[int, int], radius: float) -> Tensor:
-    """The path of stops from which every cell is seen, float32 [stops, 2], cells.
+def search_path(grid: tuple[int, int], radius: float) -> Tensor:
+    """Returns a path of waypoints from which every cell is seen, float32 [waypoints, 2], cells.
 
     Args:
         grid: cells along x and y.
-        radius: half the side of the square that is seen from a stop, cells.
+        radius: half the side of the square in view, cells.
     """
-    most = max(1, math.floor(2 * (radius - _SLACK)) + 1)
-    across, along = _middles(grid[0], most), _middles(grid[1], most)
+    width = max(1, math.floor(2 * (radius - _SLACK)) + 1)
+    across, along = _centres(grid[0], width), _centres(grid[1], width)
     strips = [
         [(x, y) for y in (along if strip % 2 == 0 else along[::-1])]
         for strip, x in enumerate(across)
@@ -76,8 +80,8 @@ def stops(grid: tuple[int, int], radius: float) -> Tensor:
     return torch.tensor(strips).flatten(0, 1)
 
 
-def _middles(side: int, most: int) -> list[float]:
-    """The middles of nearly equal pieces of `side` cells, `most` each at most."""
-    pieces = math.ceil(side / most)
+def _centres(side: int, width: int) -> list[float]:
+    """Divides `side` cells into equal pieces of at most `width` cells and returns their centres."""
+    pieces = math.ceil(side / width)
     edges = [piece * side // pieces for piece in range(pieces + 1)]
     return [(low + high - 1) / 2 for low, high in pairwise(edges)]

@@ -1,4 +1,4 @@
-"""What a team could cover that knew the fire."""
+"""A scripted policy that knows the fire: an upper baseline of coverage."""
 
 import math
 
@@ -10,22 +10,21 @@ from emberlink.envs import keys
 from emberlink.envs.wildfire import WildfireEnv
 from emberlink.policies.scripted.base import Scripted
 
-_STEP_OF_WAITING = 1000.0  # cells; longer than any map, so that cells which burn come first
+_STEP_COST = 1000.0  # cells; above any distance on a map, so that burning cells come first
 
 
 class Oracle(Scripted):
-    """Knows what burns, what will and what has been seen, and flies to the nearest uncovered cells.
+    """Flies to the nearest uncovered cells, given the whole fire and the cells seen so far.
 
-    At every step each UAV is given a cell that nobody has seen. How far a cell is from a UAV is
-    how far it is along the longer axis, as a flight takes, and 1000 cells more for each step until
-    it burns: cells that burn come first, then those that burn soonest. The UAV that is nearest to
-    any cell chooses first. UAVs spread out because what is in view, at full altitude, of a cell
-    that has been chosen is no longer to be had for those that choose later. Among equals the
-    lower index goes first, of UAVs and of cells. Who finds nothing left stays where it is. All
-    fly at full altitude.
+    At every step each UAV is assigned a cell that no UAV has seen. The cost of a cell is its
+    Chebyshev distance from the UAV plus 1000 cells for each step until it burns. So burning cells
+    come first, then the cells that burn soonest. The UAV with the lowest cost chooses first and
+    reserves all cells in view from its cell at the maximum altitude, so that UAVs spread out. Ties
+    go to the lower index of UAVs and of cells. A UAV without a cell stays at its position. All UAVs
+    fly at the maximum altitude.
 
     Args:
-        env: the environment that it is played in, whose fire it reads as the episode goes on.
+        env: the environment that it acts in; its fire is read at every step.
     """
 
     columns: Tensor
@@ -33,7 +32,7 @@ class Oracle(Scripted):
 
     def __init__(self, env: WildfireEnv):
         super().__init__(env)
-        self._env = (env,)  # in a tuple: as an attribute it would be a module of this one
+        self._env = (env,)  # in a tuple, so that it is not registered as a submodule
         self.register_buffer("columns", torch.arange(self.world.grid[0]).double().to(env.device))
         self.register_buffer("rows", torch.arange(self.world.grid[1]).double().to(env.device))
 
@@ -41,36 +40,39 @@ class Oracle(Scripted):
         position = tensordict.get(keys.POSITION)
         ground = position[..., :2].double()
         delay = self._delay(tensordict.get(keys.STEP))
-        uavs = range(ground.shape[1])
-        nearest = torch.stack([self._nearest(delay, ground[:, uav])[0] for uav in uavs], -1)
+        nearest = torch.stack([self._nearest(delay, xy)[0] for xy in ground.unbind(1)], -1)
         target = ground.clone()
         for turn in torch.sort(nearest, dim=-1, stable=True).indices.unsqueeze(-1).unbind(1):
-            who = turn.unsqueeze(-1).expand(-1, 1, 2)
-            own = ground.gather(1, who).squeeze(1)
-            distance, cell = self._nearest(delay, own)
-            cell = torch.where(distance.isfinite().unsqueeze(-1), cell, own)
-            target.scatter_(1, who, cell.unsqueeze(1))
-            self._withdraw(delay, cell)
+            uav = turn.unsqueeze(-1).expand(-1, 1, 2)
+            xy = ground.gather(1, uav).squeeze(1)
+            cost, cell = self._nearest(delay, xy)
+            cell = torch.where(cost.isfinite().unsqueeze(-1), cell, xy)
+            target.scatter_(1, uav, cell.unsqueeze(1))
+            self._reserve(delay, cell)
         ceiling = self.high[2:].expand_as(target[..., :1])
         return self.fly(tensordict, torch.cat((target, ceiling), -1))
 
     def _delay(self, step: Tensor) -> Tensor:
-        """What the wait for each cell counts, float64 [num_envs, X, Y], cells; inf if not to do."""
+        """Returns the cost of the wait for each cell, float64 [num_envs, X, Y], cells.
+
+        It is infinite for cells that have been seen or never burn.
+        """
         (env,) = self._env
         arrival = env.arrival_time.double()
         wait = (arrival - step.view(-1, 1, 1)).clamp_(min=0)
         done = (env.fire_map == 1) | (arrival > self.world.horizon)
-        return (wait * _STEP_OF_WAITING).masked_fill_(done, math.inf)
+        return (wait * _STEP_COST).masked_fill_(done, math.inf)
 
     def _nearest(self, delay: Tensor, ground: Tensor) -> tuple[Tensor, Tensor]:
-        """The nearest cell of one UAV of every environment.
+        """Returns the cell of lowest cost for one UAV of every environment.
 
         Args:
-            delay: float64 [num_envs, X, Y].
-            ground: float64 [num_envs, 2], where it is.
+            delay: float64 [num_envs, X, Y], from `_delay`.
+            ground: float64 [num_envs, 2], the UAV's position, cells.
 
         Returns:
-            How far it is, float64 [num_envs], inf where there is none, and where, [num_envs, 2].
+            The cost, float64 [num_envs], inf if there is no cell, and the cell, float64
+            [num_envs, 2].
         """
         along_x = (ground[:, :1] - self.columns).abs().unsqueeze(-1)
         along_y = (ground[:, 1:] - self.rows).abs().unsqueeze(-2)
@@ -78,8 +80,8 @@ class Oracle(Scripted):
         side = len(self.rows)
         return distance, torch.stack((index // side, index % side), -1).double()
 
-    def _withdraw(self, delay: Tensor, cell: Tensor) -> None:
-        """Takes what is in view of a cell of every environment, [num_envs, 2], out of `delay`."""
+    def _reserve(self, delay: Tensor, cell: Tensor) -> None:
+        """Sets `delay` to infinity for all cells in view from a cell, float64 [num_envs, 2]."""
         near_x = (cell[:, :1] - self.columns).abs() <= self.radius
         near_y = (cell[:, 1:] - self.rows).abs() <= self.radius
         delay.masked_fill_(near_x.unsqueeze(-1) & near_y.unsqueeze(-2), math.inf)

@@ -11,9 +11,10 @@ from emberlink.policies.scripted.base import Scripted
 
 
 class RandomWaypoints(Scripted):
-    """Flies to random points of the box at full altitude, to the next once closer than 1.
+    """Flies to random waypoints at the maximum altitude.
 
-    The waypoints are carried in the TensorDict, under "_scripted_waypoint".
+    A UAV that is closer than 1 cell to its waypoint gets a new one. The waypoints are carried in
+    the TensorDict under "_scripted_waypoint".
     """
 
     WAYPOINT = "_scripted_waypoint"
@@ -26,8 +27,8 @@ class RandomWaypoints(Scripted):
         position = tensordict.get(keys.POSITION)
         key = self.step_key(tensordict, Use.SCRIPTED_WAYPOINT)
         low = torch.cat((self.low[:2], self.high[2:]))
-        # At the first step the waypoint is where the UAV is, so that it draws one.
-        old = self.remembered(tensordict, self.WAYPOINT, position)
+        # At the first step the waypoint is the UAV's position, so a new one is drawn.
+        old = self.carried(tensordict, self.WAYPOINT, position)
         waypoint = motion.next_waypoint(old, position, key, low, self.high)
         tensordict.set(self.WAYPOINT, waypoint)
         return self.fly(tensordict, waypoint)

@@ -1,4 +1,4 @@
-"""Finds scripted policies: the files beside this one, and those of other packages."""
+"""Finds scripted policies by name: files of this folder, and entry points of other packages."""
 
 from collections.abc import Iterator, Mapping
 
@@ -29,4 +29,4 @@ class _Policies(Mapping[str, type[Scripted]]):
 
 
 SCRIPTED: Mapping[str, type[Scripted]] = _Policies()
-"""The policies that every evaluation reports, by name and in this order."""
+"""the policies of every evaluation, by name and in this order"""

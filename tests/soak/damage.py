@@ -43,7 +43,6 @@ def lengthened(path: Path, draw: random.Random) -> None:
 def sealed_again(path: Path, change: Callable[[dict, dict[str, torch.Tensor]], None]) -> None:
     """As a program that knows the format would have written it."""
     header, content = checkpoint_file.read(path)
-    assert header is not None
     change(header, content)
     version, rest = header.pop("format"), {k: v for k, v in header.items() if k != "sha256"}
     before, checkpoint_file.FORMAT = checkpoint_file.FORMAT, version
@@ -106,7 +105,6 @@ def without_a_tensor(path: Path, draw: random.Random) -> None:
 
 
 def without_a_seal(path: Path, draw: random.Random) -> None:
-    """Only for a state: networks from before there were seals are read."""
     save_file(load_file(path), path)
 
 
@@ -121,7 +119,7 @@ def not_a_checkpoint(path: Path, draw: random.Random) -> None:
 
 KINDS = (
     *(truncated, bit_flipped, zeroed, lengthened, of_another_method, of_another_team),
-    *(of_another_version, with_nan, without_a_tensor, not_a_checkpoint),
+    *(of_another_version, with_nan, without_a_tensor, without_a_seal, not_a_checkpoint),
 )
 
 

@@ -54,7 +54,7 @@ def signal_trial(number: int, folder: Path, draw: random.Random) -> list[str]:
     if f"resume with: emberlink train resume={path}" not in text or "Traceback" in text:
         wrong.append(text)
     newest, run = RunFolder(path).states()[-1], RunFolder(path)
-    header = checkpoint_file.read(newest)[0] or {}
+    header = checkpoint_file.read_header(newest)
     lines = (path / "metrics.jsonl").read_bytes() if (path / "metrics.jsonl").exists() else b""
     if header["sizes"][0]["metrics.jsonl"] != len(lines):
         wrong.append("metrics.jsonl and the checkpoint are of different moments")

@@ -1,7 +1,7 @@
-"""Settings of a choice by name: `{"name": NAME, ...}`, checked by the class of that name.
+"""Validates settings of the form `{"name": NAME, ...}` with the configuration type of a class.
 
-`comm` and `learner` are such choices: each file in comm and in trainers/learners defines a
-class with settings of its own.
+`comm` and `learner` have this form: each file in comm/ and in trainers/learners/ defines a class
+with its own settings.
 """
 
 from collections.abc import Mapping
@@ -13,14 +13,14 @@ from emberlink.envs.utils.validation import from_plain, shown
 
 
 class Registry(Protocol):
-    """Knows classes by name. Each has a `config_type`, a pydantic dataclass of its settings."""
+    """Finds classes by name. Each has a `config_type`, the pydantic dataclass of its settings."""
 
     def known(self) -> list[str]:
         """Returns the names in alphabetical order."""
         ...
 
     def find(self, name: str) -> Any:
-        """Returns the class of a name, or raises a UserError that lists the names."""
+        """Returns the class of a name; raises a UserError if the name is not known."""
         ...
 
 
@@ -28,9 +28,9 @@ def settings(key: str, values: Any, registry: Registry) -> Any:
     """Returns the settings as an instance of the named class's `config_type`.
 
     Args:
-        key: of the settings in the configuration, for messages.
-        values: the name and the settings, plain values; or such an instance.
-        registry: finds the class.
+        key: key of the settings in the configuration, for messages.
+        values: name and settings as plain values, or an instance of a `config_type`.
+        registry: finds the class of the name.
 
     Raises:
         UserError: the name or a setting is missing or not known, or a value does not fit.

@@ -1,4 +1,4 @@
-"""Composes a run's configuration from YAML files and the settings that a user gives."""
+"""Composes a run's configuration from YAML files and the user's settings."""
 
 import threading
 from collections.abc import Iterator, Mapping, Sequence
@@ -28,7 +28,7 @@ from emberlink.trainers.config.overrides import all_keys, flat, full_key, parse,
 from emberlink.trainers.config.schema import RunConfig
 
 GROUPS = ("setup", "fire", "learner")
-"""groups of which a user chooses a file by `GROUP=NAME`, beside the method"""
+"""groups whose file is chosen by `GROUP=NAME`, besides the method"""
 _HYDRA = threading.RLock()
 
 
@@ -36,13 +36,13 @@ def resolve(method: str, overrides: Sequence[str] = (), **settings: Any) -> RunC
     """Returns the configuration of a method.
 
     Args:
-        method: a file in configs/method, without `.yaml`.
-        overrides: `key=value`, as on the command line.
-        settings: other keys and their values; the last part of a key suffices where no other key
-            ends in it: `horizon=50` for `env.horizon`.
+        method: name of a file in configs/method.
+        overrides: texts `key=value`, as on the command line.
+        settings: other keys and their values. The last part of a key suffices if it is unique, such
+            as `horizon=50` for `env.horizon`.
 
     Raises:
-        UserError: one line that names the method, key or value that is wrong, and what is known.
+        UserError: the method, a key or a value is wrong; the message names it and what is known.
     """
     given = [parse(text) for text in overrides]
     chosen = {"setup": "paper"} | {key: str(value) for key, value in given if key in GROUPS}
@@ -51,7 +51,7 @@ def resolve(method: str, overrides: Sequence[str] = (), **settings: Any) -> RunC
     for key, value in given:
         if key in (*(f"{group}.name" for group in GROUPS), "fire.kind"):
             group = key.partition(".")[0]
-            raise UserError(f"{key}={shown(value)}: is chosen with {group}=NAME")
+            raise UserError(f"{key}={shown(value)}: choose it with {group}=NAME")
         if key not in known:
             raise UserError(_not_known(key, known, method))
         if key not in GROUPS:
@@ -65,11 +65,12 @@ def resolve(method: str, overrides: Sequence[str] = (), **settings: Any) -> RunC
 
 
 def override(config: RunConfig, overrides: Sequence[str] = (), **settings: Any) -> RunConfig:
-    """Returns a run's configuration with some values changed; no YAML file is read.
+    """Returns a run's configuration with some values changed, without reading YAML files.
 
     Args:
-        config: of a run.
-        overrides: `key=value`, as on the command line; `setup` and `fire` must be the run's.
+        config: configuration of the run.
+        overrides: texts `key=value`, as on the command line; `setup`, `fire` and `learner` cannot
+            change.
         settings: as for `resolve`.
 
     Raises:
@@ -89,7 +90,7 @@ def override(config: RunConfig, overrides: Sequence[str] = (), **settings: Any) 
             put(values, key, value)
     _put_settings(values, settings)
     changed = from_values({**values, "baseline_comm": baseline_comm})
-    # Equal fires are the run's own, which know where the run keeps its copy of their file.
+    # The run's own fire also holds the path of the run's copy of a fire file.
     return replace(changed, fire=config.fire) if changed.fire == config.fire else changed
 
 
@@ -97,29 +98,29 @@ def from_values(values: Mapping[str, Any]) -> RunConfig:
     """Returns a configuration from plain values, such as those of a run folder's config.yaml.
 
     Raises:
-        UserError: one line that names the first key that is wrong, its value and what is wrong.
+        UserError: a key or a value is wrong; the message names the first one and the reason.
     """
     return from_plain(RunConfig, values)
 
 
 def to_values(config: RunConfig) -> dict[str, Any]:
-    """Returns the configuration as plain values, for YAML and trackers."""
+    """Returns a configuration as plain values, for YAML and trackers."""
     return _lists(TypeAdapter(RunConfig).dump_python(config))
 
 
 def _lists(value: Any) -> Any:
-    """Returns the value with lists for tuples. Infinite numbers stay, as they would not in JSON."""
+    """Returns a value with lists in place of tuples; unlike JSON, it keeps infinite numbers."""
     if isinstance(value, Mapping):
         return {key: _lists(item) for key, item in value.items()}
     return [_lists(item) for item in value] if isinstance(value, list | tuple) else value
 
 
 def _composed(method: str, chosen: Mapping[str, str]) -> dict[str, Any]:
-    """Returns what Hydra composes of the chosen files, with every `${...}` as it is.
+    """Returns the values that Hydra composes from the chosen files, without resolving `${...}`.
 
     Args:
-        method: a file in configs/method.
-        chosen: files of `GROUPS`, of which `setup` is one.
+        method: name of a file in configs/method.
+        chosen: group -> name of the chosen file, for the setup and other `GROUPS`.
 
     Raises:
         UserError: a file is not known or not a configuration.
@@ -134,7 +135,7 @@ def _composed(method: str, chosen: Mapping[str, str]) -> dict[str, Any]:
     stamps = tuple((file, file.stat().st_mtime_ns) for file in files)
     values = deepcopy(_compose(tuple(chosen.items()), tuple(folders), stamps))
     for group in ("method", "setup"):
-        if group in values:  # then Hydra did not put its content at the top
+        if group in values:  # without the header, Hydra puts the content under the group
             file = find(group, chosen[group])
             raise UserError(f"{file} must begin with '# @package _global_'")
     return values
@@ -144,8 +145,8 @@ def _composed(method: str, chosen: Mapping[str, str]) -> dict[str, Any]:
 def _compose(
     chosen: tuple[tuple[str, str], ...], folders: tuple[Path, ...], stamps: tuple
 ) -> dict[str, Any]:
-    """Calls Hydra, once for the same choices and the same times of change of all files."""
-    # Emberlink's own folder is the last, and Hydra searches it anyway.
+    """Calls Hydra; results are cached by the choices and the modification times of all files."""
+    # The last folder is emberlink's own, which Hydra searches anyway.
     paths = ["'file://" + str(folder).replace("'", "\\'") + "'" for folder in folders[:-1]]
     overrides = [f"{group}={name}" for group, name in chosen]
     try:
@@ -159,7 +160,7 @@ def _compose(
 
 @contextmanager
 def _own_hydra() -> Iterator[None]:
-    """Initialises Hydra for one composition; afterwards a Hydra of the caller's is as before."""
+    """Initialises Hydra for one composition, then restores the caller's state of Hydra."""
     with _HYDRA:
         callers, version = GlobalHydra.instance().hydra, VersionBase.instance().getbase()
         GlobalHydra.instance().clear()
@@ -172,7 +173,7 @@ def _own_hydra() -> Iterator[None]:
 
 
 def _interpolated(values: dict[str, Any]) -> dict[str, Any]:
-    """Returns the values with every `${key}` replaced by the value that it refers to."""
+    """Returns the values with each `${key}` replaced by the value of the key."""
     try:
         whole: Any = OmegaConf.to_container(
             OmegaConf.create(values), resolve=True, throw_on_missing=True
@@ -183,15 +184,15 @@ def _interpolated(values: dict[str, Any]) -> dict[str, Any]:
 
 
 def _put_settings(values: dict[str, Any], settings: Mapping[str, Any]) -> None:
-    """Sets what a Python caller gave by keyword."""
+    """Sets the values of keyword arguments."""
     for key, value in settings.items():
         if key in ("method", *GROUPS):
-            raise UserError(f"{key}={shown(value)}: not a setting but a choice of several")
+            raise UserError(f"{key}={shown(value)}: names a file, so it is not a setting")
         put(values, full_key(values, key), plain(value, key))
 
 
 def _baseline_comm(setup: str) -> dict[str, Any]:
-    """Returns the `comm` of each method that a scripted policy is played with."""
+    """Returns method -> `comm` for the methods whose communication scripted policies use."""
     methods = {policy.recipe for policy in SCRIPTED.values() if policy.recipe}
     return {
         method: _interpolated(_composed(method, {"setup": setup}))["comm"]
@@ -200,20 +201,20 @@ def _baseline_comm(setup: str) -> dict[str, Any]:
 
 
 def _choose_seed(values: dict[str, Any], seed_is_given: bool) -> None:
-    """Sets `seed` to the first of `seeds`, if there are any.
+    """Sets `seed` to the first of `seeds`, if `seeds` is not empty.
 
     Raises:
-        UserError: both were given.
+        UserError: the user gave both.
     """
     seeds = values["seeds"]
     if seeds and seed_is_given:
-        raise UserError(f"seed={values['seed']} and seeds={seeds}: give one of them")
+        raise UserError(f"seed={values['seed']} and seeds={seeds}: give only one of them")
     if seeds and isinstance(seeds, list):
         values["seed"] = seeds[0]
 
 
 def _not_known(key: str, known: Sequence[str], method: str) -> str:
-    """Returns a message about a key that a method does not have, and the methods that have it."""
+    """Returns a message that a method does not have a key, with the methods that have it."""
     others = [name for name in configs.known("method") if key in all_keys(read("method", name))]
     if others:
         return f"key {key!r} is a setting of method {', '.join(others)}, not of {method}"

@@ -1,4 +1,4 @@
-"""Reads `key=value` texts and puts values into nested mappings by their dotted key."""
+"""Parses `key=value` and sets values of nested mappings by their dotted key."""
 
 import re
 from collections.abc import Iterator, Mapping
@@ -45,13 +45,13 @@ def parse(text: str) -> tuple[str, Any]:
 
 
 def put(values: dict[str, Any], key: str, value: Any) -> None:
-    """Sets the value of a dotted key that is there.
+    """Sets the value of an existing dotted key.
 
-    A mapping changes those keys that it holds. It replaces all of a named choice, such as `comm`,
-    if it has another name.
+    A mapping changes only the keys that it holds. If it has another `name`, as in `comm`, it
+    replaces the whole mapping.
 
     Raises:
-        UserError: the value is a mapping with a key that is not known.
+        UserError: the mapping has a key that is not known.
     """
     *path, last = key.split(".")
     parent = reduce(getitem, path, values)
@@ -67,24 +67,24 @@ def put(values: dict[str, Any], key: str, value: Any) -> None:
 
 
 def full_key(values: Mapping[str, Any], key: str) -> str:
-    """Returns the dotted key that equals `key` or, if only one does, ends in it.
+    """Returns the dotted key that equals `key`, or else the only one that ends with it.
 
     Raises:
-        UserError: there is no such key, or there are several.
+        UserError: there is no such key, or several.
     """
     names = list(all_keys(values))
     if key in names:
         return key
-    found = [name for name in names if name.endswith(f".{key}")]
-    if len(found) > 1:
-        raise UserError(f"key {key!r} is one of {', '.join(found)}: say which")
-    if not found:
+    matching = [name for name in names if name.endswith(f".{key}")]
+    if len(matching) > 1:
+        raise UserError(f"key {key!r} is ambiguous: {', '.join(matching)}")
+    if not matching:
         raise UserError(f"key {unknown(key, names)}")
-    return found[0]
+    return matching[0]
 
 
 def all_keys(values: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
-    """Yields the dotted keys of nested mappings, those of the mappings included."""
+    """Yields the dotted keys of nested mappings, including those of inner mappings."""
     for key, value in values.items():
         yield prefix + key
         if isinstance(value, Mapping):

@@ -1,4 +1,4 @@
-"""The schema of a run's configuration."""
+"""Defines the schema of a run's configuration."""
 
 from dataclasses import asdict
 from typing import Annotated, Any, Literal
@@ -24,7 +24,7 @@ NOT_LEARNT_WITH = (
     *("device", "logger", "on_nan"),
     *("checkpoint_interval", "checkpoint_steps", "keep_checkpoints"),
 )
-"""keys that do not change what is learnt: runs that differ only in them are the same run"""
+"""keys that do not affect learning: configurations that differ only in them are of the same run"""
 
 Count = Annotated[int, Field(ge=1, le=1_000_000_000)]
 CountOrZero = Annotated[int, Field(ge=0)]
@@ -34,19 +34,19 @@ LearnerChoice = Annotated[
     SerializeAsAny[LearnerConfig],
     PlainValidator(lambda values: choice.settings("learner", values, learners)),
 ]
-"""the settings of the learner that `learner.name` names"""
+"""settings of the learner `learner.name`"""
 
 
 @dataclass(frozen=True, kw_only=True, config=_STRICT)
 class EvaluationConfig:
-    """Evaluations of the frozen policies, on fires that are not trained on."""
+    """The settings of evaluations of frozen policies on held-out fires."""
 
     episodes: Many
-    """episodes of the evaluation after training, each on a test fire of its own"""
+    """episodes of the evaluation after training, each on another test fire"""
     interval: CountOrZero
     """episodes between evaluations during training; 0 for none"""
     interval_episodes: Many
-    """episodes of an evaluation during training, each on a validation fire of its own"""
+    """episodes of an evaluation during training, each on another validation fire"""
 
 
 @dataclass(frozen=True, kw_only=True, config=_STRICT)
@@ -54,46 +54,46 @@ class RunConfig:
     """All settings of a run."""
 
     method: Name
-    """the method: a file in configs/method"""
+    """name of the method, a file in configs/method"""
     setup: Name
-    """the constants: a file in configs/setup"""
+    """name of the setup, a file in configs/setup"""
     replay: Literal["per_agent", "shared"]
-    """a replay buffer for each UAV, or one for all"""
+    """whether each UAV has its own replay buffer, or all share one"""
     comm: dict[str, Any]
-    """the communication module: `name` and its settings"""
+    """name and settings of the communication module"""
     baseline_comm: dict[str, dict[str, Any]] = Field(default_factory=dict)
-    """the `comm` of the methods that scripted policies are played with, in this setup; by method"""
+    """method -> `comm` of the methods whose communication scripted policies use, in this setup"""
     env: WildfireConfig
-    """the environment"""
+    """settings of the environment"""
     fire: Scenario
-    """the fires to train on"""
+    """training fires"""
     learner: LearnerChoice
-    """the learning algorithm"""
+    """settings of the learning algorithm"""
     evaluation: EvaluationConfig
-    """the evaluations"""
+    """settings of the evaluations"""
     episodes: Count
     """training episodes of each environment"""
     num_envs: Many
-    """environments that are stepped together, for each seed"""
+    """environments per seed, stepped in one batch"""
     seeds: Annotated[tuple[Seed, ...], Strict(False)] = ()
-    """seeds to train side by side, with a run folder for each; if empty, only `seed` is trained"""
+    """seeds to train in parallel, each with its own run folder; if empty, only `seed` is trained"""
     seed: Seed
-    """seed of everything random in the run; with `seeds`, the one of this run folder"""
+    """seed of all random numbers; with `seeds`, the seed of this run folder"""
     device: str
     """device of the environment, the replay buffer and the networks"""
     logger: Literal["wandb", "tensorboard", "csv", "none"]
-    """the tracker, in addition to metrics.jsonl"""
+    """experiment tracker, in addition to metrics.jsonl"""
     output: Annotated[str, Field(min_length=1)]
-    """the folder in which run folders are made"""
+    """folder in which run folders are created"""
     checkpoint_interval: Count
     """episodes between checkpoints"""
     checkpoint_steps: CountOrZero = 0
     """steps between additional checkpoints; 0 for none"""
     keep_checkpoints: Count = 5
-    """checkpoints whose networks are kept; the two newest can be resumed from"""
+    """checkpoints whose networks are kept; training can be resumed from the two newest"""
     on_nan: Literal["stop", "rollback"] = "stop"
-    """reaction to a number that is not finite: stop, or return to the last checkpoint and continue
-    with smaller learning rates"""
+    """reaction to NaN or Inf: stop, or return to the last checkpoint and continue with smaller
+    learning rates"""
 
     @field_validator("device")
     @classmethod
@@ -104,7 +104,7 @@ class RunConfig:
     @classmethod
     def _check_seeds(cls, value: tuple[int, ...]) -> tuple[int, ...]:
         if len(set(value)) < len(value):
-            raise UserError(f"seeds={list(value)}: each seed at most once")
+            raise UserError(f"seeds={list(value)}: a seed is repeated")
         return value
 
     @field_validator("comm")
@@ -122,7 +122,7 @@ class RunConfig:
 
 
 def build_comm(config: RunConfig, num_envs: int) -> CommModule:
-    """Returns a new communication module of a configuration."""
+    """Returns a new communication module for `num_envs` environments."""
     settings = {key: value for key, value in config.comm.items() if key != "name"}
     return registry.build(config.comm["name"], config.env, settings, num_envs)
 

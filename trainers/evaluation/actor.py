@@ -13,10 +13,10 @@ from emberlink.trainers.runs.checkpoints import load_weights
 
 
 def load_actor(config: RunConfig, checkpoint: Path) -> TensorDictModule:
-    """Returns the frozen policy of a checkpoint, which writes ("agents", "action").
+    """Returns the frozen policy of a checkpoint, which maps observations to ("agents", "action").
 
     Raises:
-        UserError: the checkpoint cannot be read or is of another shape.
+        UserError: the checkpoint cannot be read or does not fit the configuration.
     """
     env = build_env(
         config,

@@ -1,6 +1,6 @@
-"""Keeps the results of scripted policies in files, so that each is computed once.
+"""Caches the results of scripted policies in files.
 
-They depend on the constants of a run only, so runs with the same constants share a file.
+They do not depend on training, so all runs with the same environment share them.
 """
 
 import hashlib
@@ -34,18 +34,18 @@ _IMPORTED = time.time_ns()
 
 
 class ScriptedResults:
-    """The file of one policy's results on the fires of one evaluation.
+    """Reads and writes the file of one policy's results on the fires of one evaluation.
 
-    Its name is a hash of everything that the numbers depend on: environment, communication,
-    fires, start seeds, the version of torch, the kind of device, and the source files, those of a
-    policy or a communication module from another package included. If a source file has changed
-    since it was imported, nothing is read and nothing is written.
+    The name of the file is a hash of everything that the results depend on: environment,
+    communication, fires, start seeds, the version of torch, the type of the device, and the source
+    files, including those of policies and communication modules of other packages. If a source file
+    has changed since it was imported, the cache is not used.
 
     Args:
         policy: name of the policy.
-        config: configuration of the environment that it is played in.
-        arrival: arrival times of the fires, float32 [count, X, Y].
-        protocol: other values that the numbers depend on, as plain values.
+        config: configuration of the environment.
+        arrival: arrival times of the fires in steps, float32 [count, X, Y].
+        protocol: other plain values that the results depend on.
     """
 
     def __init__(
@@ -67,7 +67,7 @@ class ScriptedResults:
         self.file = cache_folder() / f"scripted-{key}.json" if source else None
 
     def read(self) -> Measured | None:
-        """Returns the results, or None if there is no such file or it is damaged."""
+        """Returns the results, or None if the file does not exist or is damaged."""
         if self.file is None:
             return None
         content = read_sealed(self.file, MAX_JSON)
@@ -80,7 +80,7 @@ class ScriptedResults:
         return stored if _whole(stored, self._episodes) else None
 
     def write(self, measured: Measured) -> None:
-        """Writes the file; warns if the folder cannot be written to."""
+        """Writes the results, or warns if the folder is not writable."""
         if self.file is None:
             return
         try:
@@ -94,17 +94,17 @@ def sources(*used: type) -> list[Path]:
     """Returns the source files that the results depend on.
 
     Args:
-        used: classes of the policy and the communication, which may be of other packages.
+        used: classes of the policy and the communication module.
     """
     folders = [Path(str(module.__file__)).parent for module in _SOURCES]
     files = [file for folder in folders for file in sorted(folder.rglob("*.py"))]
     here = Path(__file__)
     files += [here.with_name("evaluate.py"), here.parents[1] / "build.py"]
-    return list(dict.fromkeys([*files, *(Path(inspect.getfile(one)) for one in used)]))
+    return list(dict.fromkeys([*files, *(Path(inspect.getfile(cls)) for cls in used)]))
 
 
 def source_digest(*used: type) -> str | None:
-    """Returns a hash of `sources`, or None if one has changed since it was imported."""
+    """Returns a hash of `sources`, or None if a file has changed since it was imported."""
     files = sources(*used)
     if max(file.stat().st_mtime_ns for file in files) > _IMPORTED:
         return None
@@ -116,7 +116,7 @@ def source_digest(*used: type) -> str | None:
 
 
 def _whole(stored: Any, episodes: int) -> bool:
-    """Returns whether these are all measures of so many episodes."""
+    """Returns whether a stored value has all measures of the given number of episodes."""
     return (
         isinstance(stored, dict)
         and list(stored) == list(metrics.NAMES)

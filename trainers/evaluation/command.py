@@ -1,4 +1,4 @@
-"""The command `emberlink eval`: evaluates a run folder and prints the table."""
+"""Runs `emberlink eval`: evaluates a run folder and prints a table."""
 
 import re
 from collections.abc import Sequence
@@ -19,7 +19,7 @@ from emberlink.trainers.runs.run_folder import RunFolder
 from emberlink.trainers.runs.seal import check_trained_with
 
 _CHANGEABLE = ("comm.", "env.")
-"""beginnings of the keys that an evaluation may be given in place of the run's"""
+"""prefixes of the keys that can be changed in an evaluation"""
 
 
 def evaluate_folder(
@@ -34,15 +34,15 @@ def evaluate_folder(
     """Evaluates the frozen policy of a run, prints the table and returns 0.
 
     Args:
-        name: a run folder, or a trained policy that comes with emberlink.
-        console: where the table is printed.
-        overrides: `key=value` of the environment or the communication, in place of the run's.
-        checkpoint: a checkpoint; the newest if None.
-        fires: number of episodes; the run's if None.
-        device: a device; the run's if None.
+        name: a run folder, or `pretrained:METHOD`.
+        console: prints the table.
+        overrides: texts `key=value` that change the environment or the communication.
+        checkpoint: file of networks; the newest of the run if None.
+        fires: number of test fires, one episode each; that of the run if None.
+        device: device of the evaluation; that of the run if None.
 
     Raises:
-        UserError: one line for whatever cannot be read, played or written.
+        UserError: a file cannot be read or written, or an argument does not fit.
     """
     run = open_run(name)
     if device is not None:
@@ -56,7 +56,7 @@ def evaluate_folder(
             raise UserError(f"{text!r}: one run is evaluated at a time; compare takes several runs")
         if not text.startswith(_CHANGEABLE):
             raise UserError(
-                f"{text!r}: an evaluation can be given keys of {' and '.join(_CHANGEABLE)} only"
+                f"{text!r}: an evaluation can change keys of {' and '.join(_CHANGEABLE)} only"
             )
         config = override(config, [text])
         label += "_" + re.sub(r"[^\w.=+-]", "-", text)
@@ -72,13 +72,13 @@ def evaluate_and_print(
     label: str = "",
     fires: int | None = None,
 ) -> list[Results]:
-    """Evaluates the frozen policies of several seeds and prints one table, then the folders.
+    """Evaluates the frozen policies of several seeds and prints one table and the run folders.
 
     Args:
         seeds: run folder, configuration, frozen policy and checkpoint of each seed.
-        console: where the table is printed.
-        label: ends the names of the files.
-        fires: number of episodes; the run's if None.
+        console: prints the table.
+        label: suffix of the file names.
+        fires: number of test fires, one episode each; that of the runs if None.
 
     Returns:
         The results of each seed.

@@ -1,4 +1,4 @@
-"""Plays frozen policies without noise: on test fires, and on validation fires during training."""
+"""Evaluates frozen policies on test fires and, during training, on validation fires."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -24,12 +24,13 @@ from emberlink.trainers.evaluation.baseline_cache import ScriptedResults
 from emberlink.trainers.evaluation.results import LEARNED, Measured, Results, means
 
 HELD_OUT_SCENARIO = "huygens"
+"""the scenario of every evaluation"""
 START_SEED = 20_250_923
-"""seed of everything random in test episode 0, start positions included; episode i adds i"""
+"""seed of test episode 0, including start positions; episode i has this seed plus i"""
 VALIDATION_START_SEED = 20_350_923
-"""the same of validation episode 0; no episode of one set has a seed of the other"""
+"""seed of validation episode 0; no validation episode shares a seed with a test episode"""
 BLOCK = 50
-"""environments stepped together in tests, also where fewer are wanted"""
+"""environments in a batch of an evaluation, even if fewer episodes are needed"""
 
 Policy = Callable[[TensorDictBase], TensorDictBase]
 
@@ -39,15 +40,15 @@ def play(
     policy: Policy,
     at_step: Callable[[int], None] | None = None,
 ) -> dict[str, Tensor]:
-    """Plays one episode in every environment, without noise.
+    """Plays one episode in each environment without exploration noise.
 
     Args:
-        env: an environment with communication.
+        env: environments with communication.
         policy: writes ("agents", "action").
-        at_step: called with each step, 0 ... horizon, once the environments are there.
+        at_step: called with the step when the environments have reached it, from 0 to the horizon.
 
     Returns:
-        Every measure of `metrics.NAMES`, float32 [num_envs].
+        The measures of `metrics.NAMES`, float32 [num_envs] each.
     """
     world: Any = env.base_env
     horizon: int = world.config.horizon
@@ -67,12 +68,12 @@ def play(
 
 
 def shown_scenario(trained: ScenarioConfig) -> str:
-    """Returns the name of the scenario to draw: the file that was trained on, else `huygens`."""
+    """Returns the name of the scenario to draw: the fire file of the training, else `huygens`."""
     return trained.name if isinstance(trained, FileFireConfig) else HELD_OUT_SCENARIO
 
 
 def evaluation_scenarios(config: RunConfig) -> dict[str, ScenarioConfig]:
-    """Returns the scenarios of an evaluation by name: `huygens`, and the one trained on."""
+    """Returns the scenarios of an evaluation by name: `huygens` and that of the training."""
     scenarios: dict[str, ScenarioConfig] = {HELD_OUT_SCENARIO: load_scenario(HELD_OUT_SCENARIO)}
     if config.fire not in scenarios.values():
         changed = config.fire.name in scenarios
@@ -83,9 +84,13 @@ def evaluation_scenarios(config: RunConfig) -> dict[str, ScenarioConfig]:
 def evaluation_fires(config: RunConfig, count: int) -> dict[str, Tensor]:
     """Returns the test fires of an evaluation by scenario.
 
+    Args:
+        config: configuration of the run.
+        count: number of fires per scenario.
+
     Returns:
-        Arrival times, float32 [count, X, Y] each. A scenario that always is the same fire is
-        repeated; the start positions differ.
+        Arrival times in steps, float32 [count, X, Y] each. A scenario with a single fire repeats
+        it; the start positions differ.
     """
     grid, horizon = config.env.grid, config.env.horizon
     return {
@@ -95,7 +100,7 @@ def evaluation_fires(config: RunConfig, count: int) -> dict[str, Tensor]:
 
 
 def shown_fire(config: RunConfig) -> tuple[str, Tensor]:
-    """Returns the fire to draw: the name of its scenario, and arrival times, float32 [X, Y]."""
+    """Returns the fire to draw: the name of its scenario and its arrival times, float32 [X, Y]."""
     name = shown_scenario(config.fire)
     fires = fires_of(evaluation_scenarios(config)[name])
     return name, fires.test_fire(0, config.env.grid, config.env.horizon)[0]
@@ -109,18 +114,21 @@ def evaluate(
     scripted: bool = True,
     report: Callable[[str, str], None] | None = None,
 ) -> Results:
-    """Plays a frozen policy, and the scripted ones, on test fires from the same start positions.
+    """Evaluates a frozen policy and the scripted ones on test fires with the same start positions.
 
-    Episode i does not depend on the number of fires: its random numbers come from the seed
-    `START_SEED` + i, and `BLOCK` environments are always stepped together, since the last bit of a
-    matrix product depends on the number of rows.
+    Episode i does not depend on the number of fires. Its random numbers come from the seed
+    `START_SEED` + i, and batches always have `BLOCK` environments, since the last bit of a matrix
+    product depends on the number of rows.
 
     Args:
-        config: of the run; its environment is used.
+        config: configuration of the run.
         actor: the frozen policy.
         fires: number of test fires, one episode each.
-        scripted: whether the scripted policies are played too.
-        report: called with the fire and the policy before each is played.
+        scripted: whether to evaluate the scripted policies, too.
+        report: called with the names of the fire and the policy before each evaluation.
+
+    Returns:
+        fire -> policy -> measure -> one number per episode.
     """
     results: Results = {}
     for fire, arrival in evaluation_fires(config, fires).items():
@@ -137,20 +145,20 @@ def evaluate(
 
 
 def validate(config: RunConfig, actor: Policy) -> dict[str, float]:
-    """Plays a frozen policy on validation fires, to choose among the checkpoints of a training.
+    """Evaluates a frozen policy on validation fires, for selecting the best checkpoint.
 
-    Neither the fires nor the start positions are those of a test. As many environments are stepped
-    together as there are episodes, up to `BLOCK`.
+    Fires and start positions differ from those of tests. A batch has one environment per episode,
+    at most `BLOCK`.
 
     Args:
-        config: of the run; `evaluation.interval_episodes` is the number of episodes.
+        config: configuration of the run; `evaluation.interval_episodes` episodes are played.
         actor: the frozen policy.
 
     Returns:
         "fire/measure" -> mean.
     """
     count = config.evaluation.interval_episodes
-    found: dict[str, float] = {}
+    result: dict[str, float] = {}
     for name, scenario in evaluation_scenarios(config).items():
         arrival = fires_of(scenario).validation(count, config.env.grid, config.env.horizon)
         measured = play_blocks(
@@ -160,8 +168,8 @@ def validate(config: RunConfig, actor: Policy) -> dict[str, float]:
             start_seed=VALIDATION_START_SEED,
             block=min(count, BLOCK),
         )
-        found |= {f"{name}/{measure}": value for measure, value in means(measured).items()}
-    return found
+        result |= {f"{name}/{measure}": value for measure, value in means(measured).items()}
+    return result
 
 
 def play_scripted(
@@ -171,13 +179,13 @@ def play_scripted(
     *,
     report: Callable[[str], None] = lambda _: None,
 ) -> Measured:
-    """Returns the measures of a scripted policy, read from the cache if it was played before.
+    """Returns the measures of a scripted policy, from the cache if they are in it.
 
     Args:
-        config: of the run.
-        name: one of `SCRIPTED`.
-        arrival: float32 [fires, X, Y].
-        report: called with the name before it is played.
+        config: configuration of the run.
+        name: a name in `SCRIPTED`.
+        arrival: arrival times in steps, float32 [fires, X, Y].
+        report: called with the name if the policy is evaluated.
     """
     world = scripted_config(config, name)
     protocol = {"start_seed": START_SEED, "block": BLOCK}
@@ -191,10 +199,10 @@ def play_scripted(
 
 
 def scripted_config(config: RunConfig, name: str) -> RunConfig:
-    """Returns the configuration of the environment that a scripted policy is played in.
+    """Returns the configuration of the environment of a scripted policy.
 
-    It is the run's, unless the policy needs the communication of another method: then it has the
-    communication of that method in the run's setup.
+    It is that of the run. If the policy needs the communication of another method, its settings in
+    the run's setup replace those of the run.
     """
     recipe = SCRIPTED[name].recipe
     if recipe is None:
@@ -211,18 +219,17 @@ def play_blocks(
     start_seed: int = START_SEED,
     block: int = BLOCK,
 ) -> Measured:
-    """Plays one episode on each fire, some environments at a time.
+    """Plays one episode on each fire, in batches.
 
     Args:
-        config: of the environment.
-        policy: makes the policy for an environment.
-        arrival: arrival times, float32 [fires, X, Y].
-        start_seed: seed of episode 0; episode i adds i.
-        block: environments stepped together. The last block is filled up with episodes that do
-            not count.
+        config: configuration of the environment.
+        policy: returns the policy for an environment.
+        arrival: arrival times in steps, float32 [fires, X, Y].
+        start_seed: seed of episode 0; episode i has this seed plus i.
+        block: environments per batch. The last batch is padded with episodes that are not counted.
 
     Returns:
-        Every measure of `metrics.NAMES`, a number per fire.
+        The measures of `metrics.NAMES`, one number per fire.
     """
     count = len(arrival)
     measured: Measured = {name: [] for name in metrics.NAMES}
@@ -244,7 +251,7 @@ def play_blocks(
 def film(
     config: RunConfig, policy: Policy, *, fire: Tensor | ScenarioConfig, frames: int = 100
 ) -> tuple[list[np.ndarray], list[int]]:
-    """Returns pictures of one test episode in one environment, and their steps."""
+    """Returns frames of test episode 0 on a fire, uint8 [height, width, 3], and their steps."""
     env = build_env(config, num_envs=1, fire=fire, seed=START_SEED, device=config.device)
     world: Any = env.base_env
     horizon = config.env.horizon

@@ -1,4 +1,4 @@
-"""Draws the figures of a run."""
+"""Draws the figures of a run: training curves, coverage, timelapse."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -16,8 +16,8 @@ def training_curves(path: Path, lines: Sequence[Mapping[str, Any]], title: str) 
 
     Args:
         path: a .png file.
-        lines: lines of metrics.jsonl: measures of the policy with noise, and "fire/measure" of the
-            policy without noise on validation fires.
+        lines: lines of metrics.jsonl. Keys are measures of the exploring policy, and "fire/measure"
+            for the frozen policy on validation fires.
         title: title of the figure.
     """
     figure = Figure(figsize=(11, 6), layout="constrained")
@@ -72,7 +72,14 @@ def coverage_bars(path: Path, results: Results) -> None:
 def timelapse(
     path: Path, pictures: Sequence[np.ndarray], steps: Sequence[int], title: str = ""
 ) -> None:
-    """Draws a row of frames of one episode, as the paper's figure 3."""
+    """Draws a row of up to five frames of one episode, as in the paper's figure 3.
+
+    Args:
+        path: a .png file.
+        pictures: frames, uint8 [height, width, 3].
+        steps: step of each frame.
+        title: title of the figure; none if empty.
+    """
     chosen = np.linspace(0, len(pictures) - 1, min(5, len(pictures))).round().astype(int)
     figure = Figure(figsize=(2.4 * len(chosen), 2.7), layout="constrained")
     for axes, index in zip(figure.subplots(1, len(chosen), squeeze=False)[0], chosen, strict=True):

@@ -1,4 +1,4 @@
-"""Plays one episode and keeps the data of its pictures."""
+"""Records the data for drawing an episode."""
 
 from collections.abc import Collection
 from typing import Any
@@ -23,14 +23,14 @@ def record_episode(
     steps: Collection[int],
     member: int = 0,
 ) -> list[FrameData]:
-    """Plays one episode without exploration, as `evaluate.play` does.
+    """Returns the frames of one episode without exploration noise.
 
     Args:
-        env: a recipe's environment.
+        env: environments with communication.
         policy: writes ("agents", "action").
-        comm: the environment's communication.
-        steps: the steps to keep, from 0 to the horizon.
-        member: the index of the environment to keep.
+        comm: communication module of the environment.
+        steps: steps to record, from 0 to the horizon.
+        member: index of the environment to record.
     """
     world: Any = env.base_env
     hears = any(key in comm.out_keys for key in policy.in_keys)
@@ -47,14 +47,14 @@ def record_episode(
 
 
 def frame_data(td: TensorDictBase, fire_map: Tensor, *, hears: bool) -> FrameData:
-    """Returns the data of a picture of one environment.
+    """Returns the data for drawing one environment at one step.
 
-    It has links, roles and targets where the communication writes them.
+    Links, roles and targets are included if the communication module writes them.
 
     Args:
-        td: of a reset or a step, batch size [].
+        td: output of a reset or a step, batch size [].
         fire_map: uint8 [X, Y], see `WildfireEnv.fire_map`.
-        hears: whether the policy reads anything that the communication writes.
+        hears: whether the policy reads an output of the communication module.
     """
     links = td.get(keys.HEARS, None) if hears else None
     follows = td.get(keys.FOLLOWS, None) if hears else None
@@ -72,11 +72,11 @@ def frame_data(td: TensorDictBase, fire_map: Tensor, *, hears: bool) -> FrameDat
 
 
 def roles(follows: Tensor) -> Tensor:
-    """Returns the role of each UAV, its index in `marks.ROLES`, int64 [..., n].
+    """Returns the role of each UAV as an index in `marks.ROLES`, int64 [..., n].
 
     Args:
-        follows: int64 [..., n]: the discoverer that it follows, itself for a discoverer, -1 for
-            nobody.
+        follows: int64 [..., n], the UAV that each UAV follows: itself for a discoverer, -1 for
+            none.
     """
     discoverer, seeker, wanderer = range(len(ROLES))
     itself = torch.arange(follows.shape[-1], device=follows.device)

@@ -1,4 +1,4 @@
-"""Evaluates the frozen policy of a run and writes eval.json, figures and an animation."""
+"""Evaluates the frozen policy of a run and writes eval.json, figures and a GIF."""
 
 from collections.abc import Callable
 from dataclasses import asdict
@@ -27,23 +27,26 @@ def evaluate_run(
     report: Callable[[str], None],
     label: str = "",
 ) -> Results:
-    """Evaluates a frozen policy and writes eval.json, the figures and one animation.
+    """Evaluates a frozen policy and writes eval.json, the figures and a GIF.
 
     Args:
-        run: where everything is written.
-        config: of the run.
+        run: folder of the files.
+        config: configuration of the run.
         actor: the frozen policy.
-        checkpoint: where it is from.
+        checkpoint: file of the policy.
         fires: number of test fires, one episode each.
-        report: called with a line about each thing that is done.
-        label: ends the names of the files.
+        report: called with a line of text before each part of the work.
+        label: suffix of the file names.
+
+    Raises:
+        UserError: a file cannot be written.
     """
 
     def say(fire: str, policy: str) -> None:
         report(f"{policy} on {fires} fires of {fire}")
 
     try:
-        run.figures()  # refused before the episodes are played, not after
+        run.figures()  # an unusable folder is an error before the episodes, not after
         results = evaluate.evaluate(config, actor, fires=fires, report=say)
         _draw(run, config, actor, results, report, label)
     except OutputError:
@@ -82,7 +85,13 @@ def _draw(
 
 
 def record(config: RunConfig, results: Results, **about: Any) -> dict[str, Any]:
-    """Returns the content of eval.json: all measures of all episodes, and what was played."""
+    """Returns the content of eval.json: the measures of all episodes and the settings.
+
+    Args:
+        config: configuration of the run.
+        results: of `evaluate.evaluate`.
+        about: other entries.
+    """
     configs = evaluate.evaluation_scenarios(config)
     count = len(next(iter(results.values()))[LEARNED]["coverage"])
     return {

@@ -1,4 +1,4 @@
-"""The form of the results of an evaluation."""
+"""Defines the structure of the results of an evaluation."""
 
 from collections.abc import Mapping
 
@@ -20,6 +20,7 @@ Measured = dict[str, list[float]]
 
 
 LEARNED = "learned"
+"""name of the learned policy in results"""
 
 
 Results = dict[str, dict[str, Measured]]
@@ -32,7 +33,7 @@ def means(measured: Mapping[str, list[float]]) -> dict[str, float]:
 
 
 def learned_means(results: Results) -> dict[str, float]:
-    """Returns the means of the learned policy: "test/fire/measure" -> mean."""
+    """Returns "test/fire/measure" -> mean over episodes of the learned policy."""
     return {
         f"test/{fire}/{name}": value
         for fire, by_policy in results.items()

@@ -1,4 +1,4 @@
-"""The table of an evaluation."""
+"""Prints the table of an evaluation."""
 
 from collections.abc import Mapping, Sequence
 
@@ -18,13 +18,13 @@ def print_results(
 ) -> None:
     """Prints means over episodes: a table per fire, a row per policy, a column per measure.
 
-    With several seeds there is a row per seed, and one each for the mean over the seeds and the
-    standard deviation between them. The scripted policies' rows are those of the first seed.
+    With several seeds, there is a row for their mean, one for each seed, and one for the standard
+    deviation between seeds. The results of scripted policies are those of the first seed.
 
     Args:
-        console: where the table is printed.
-        results: of each seed.
-        configs: of each seed.
+        console: prints the tables.
+        results: results of each seed.
+        configs: configuration of each seed.
     """
     method, setup = configs[0].method, configs[0].setup
     for fire, by_policy in results[0].items():
@@ -32,9 +32,9 @@ def print_results(
         table = Table(title=Text(f"test fires: {fire} ({episodes} episodes, mean; setup {setup})"))
         table.add_column()
         for name in metrics.NAMES:
-            # One word below the other, so that all measures fit 80 columns.
+            # One word per line, so that the table fits 80 columns.
             table.add_column(name.replace("_", "\n"), justify="right")
-        learned = [means(one[fire][LEARNED]) for one in results]
+        learned = [means(of_seed[fire][LEARNED]) for of_seed in results]
         if len(results) == 1:
             _add_row(table, method, learned[0], "bold")
         else:
@@ -49,19 +49,21 @@ def _add_seeds(
     table: Table, method: str, learned: Sequence[Mapping[str, float]], seeds: Sequence[int]
 ) -> None:
     """Adds the mean over the seeds, a row per seed, and the standard deviation."""
-    values = {name: [one[name] for one in learned] for name in metrics.NAMES}
+    values = {name: [of_seed[name] for of_seed in learned] for name in metrics.NAMES}
     _add_row(table, method, {name: float(np.mean(of)) for name, of in values.items()}, "bold")
-    for seed, one in zip(seeds, learned, strict=True):
-        _add_row(table, f"  seed {seed}", one)
+    for seed, of_seed in zip(seeds, learned, strict=True):
+        _add_row(table, f"  seed {seed}", of_seed)
     deviation = {name: float(np.std(of, ddof=1)) for name, of in values.items()}
     _add_row(table, "  std. dev.", deviation)
 
 
 def _add_row(table: Table, name: str, measured: Mapping[str, float], style: str = "") -> None:
-    table.add_row(name, *(_number(one, measured[one]) for one in metrics.NAMES), style=style)
+    table.add_row(
+        name, *(_number(measure, measured[measure]) for measure in metrics.NAMES), style=style
+    )
 
 
 def _number(measure: str, value: float) -> str:
-    """Returns one decimal; of a mean reward, which may be small, as many as make four digits."""
+    """Formats a value with one decimal place, but a mean reward with at least four digits."""
     digits = max(1, 4 - len(str(int(abs(value))))) if measure == "mean_reward" else 1
     return f"{value:.{digits}f}"

@@ -1,4 +1,4 @@
-"""Learners: how the UAVs' networks are trained from the transitions that are collected."""
+"""Learning algorithms: they train the networks of all UAVs from collected transitions."""
 
 from emberlink.trainers.learners.base import Learner, LearnerConfig, LearnerContext, Losses
 from emberlink.trainers.learners.registry import build, find, known

@@ -1,4 +1,4 @@
-"""Defines what a learner is: its configuration, what it is built for, and what a training calls."""
+"""Defines the base class of learners, its configuration and its context."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
@@ -25,69 +25,69 @@ Count = Annotated[int, Field(ge=1, le=1_000_000_000)]
 Units = Annotated[int, Field(ge=1, le=8192)]
 
 Losses = dict[str, Tensor]
-"""the losses of one update by name, one number per UAV of all seeds, detached"""
+"""losses of an update by name, detached, one number per UAV of all seeds"""
 
 ACTOR = "actor_network_params.module."
-"""begins the names of the actors' weights in `Learner.weights`"""
+"""prefix of the names of the actors' weights in `Learner.weights`"""
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class LearnerConfig:
-    """The settings that every learner has; a learner's own config inherits them."""
+    """The settings of all learners; the configuration of a learner inherits from it."""
 
     name: Name
-    """the learner: a file in trainers/learners, or an entry point of `emberlink.learners`"""
-    hidden: Annotated[tuple[Units, Units], Strict(False)]
-    """units of the two hidden layers"""
+    """name of a file in trainers/learners, or of an entry point of `emberlink.learners`"""
+    hidden: Annotated[tuple[Units, ...], Field(min_length=1, max_length=8), Strict(False)]
+    """units of the hidden layers, 1 to 8 layers"""
     share_parameters: bool = False
-    """one set of weights for all UAVs of a seed instead of one per UAV"""
+    """whether all UAVs of a seed use the same weights; if not, each UAV has its own"""
 
 
 @plain_dataclass(frozen=True, kw_only=True)
 class LearnerContext:
-    """What a learner is built for."""
+    """The environment and the run that a learner is built for."""
 
     observation_spec: Composite
-    """of the environments, batch size [seeds * num_envs]"""
+    """observation spec of the environments, batch size [seeds * num_envs]"""
     action_spec: Composite
-    """likewise"""
+    """action spec of the environments, batch size [seeds * num_envs]"""
     num_uavs: int
-    """UAVs of a seed's team"""
+    """UAVs per environment"""
     num_envs: int
-    """environments of a seed; those of the first seed come first"""
+    """environments per seed; those of the first seed come first"""
     seeds: tuple[int, ...]
-    """the seeds that train side by side; they share no parameters and no transitions"""
+    """seeds that are trained in parallel; they share no weights and no transitions"""
     shared_replay: bool
     """whether UAVs of a team learn from each other's transitions"""
     total_steps: int
-    """steps of all environments in the whole run"""
+    """steps of the batch of environments in the whole run"""
     guard: NonFiniteGuard
-    """to be told each update's batch, losses and gradients"""
+    """checks the batch, losses and gradients of each update"""
     device: str
-    """where networks and transitions live"""
+    """device of networks and transitions"""
 
 
 class Learner(ABC):
-    """Trains the networks of all UAVs, of one seed or of several side by side.
+    """Trains the networks of all UAVs, for one seed or several in parallel.
 
-    A subclass in a file of its own, `trainers/learners/<name>.py`, is a new learner; its defaults
-    are in `configs/learner/<name>.yaml`. It owns the networks, how they are updated, the
-    transitions it learns from, the exploration policy, its named losses and its state.
+    A subclass in its own file, `trainers/learners/<name>.py`, is a new learner; its defaults are in
+    `configs/learner/<name>.yaml`. It owns the networks, their updates, the transitions that it
+    learns from, and the exploration policy.
 
     Args:
         config: an instance of `config_type`.
-        context: what it is built for.
+        context: environment and run.
     """
 
     config_type: ClassVar[type[LearnerConfig]]
     actor: TensorDictModule
-    """the actors of all UAVs, without noise"""
+    """the actors of all UAVs, without exploration noise"""
     explorer: TensorDictModuleBase
     """the policy that collects transitions"""
     rollout_steps: int = 1
-    """steps of all environments that `learn` is given at once; divides the horizon"""
+    """steps of the batch of environments per call of `learn`; must divide the horizon"""
     learning_starts: int = 0
-    """steps of all environments before the first update"""
+    """steps of the batch of environments before the first update"""
     updates: int = 0
     """updates made so far"""
 
@@ -102,7 +102,7 @@ class Learner(ABC):
         action_spec: Composite,
         generator: Generators = None,
     ) -> TensorDictModule:
-        """Returns new actors; several generators make those of as many seeds."""
+        """Returns new actors for as many seeds as there are generators."""
         return make_actor(
             observation_spec,
             action_spec,
@@ -116,41 +116,41 @@ class Learner(ABC):
         """Learns from a rollout, batch size [seeds * num_envs, rollout_steps].
 
         Returns:
-            The losses of each update that was made; none if there was none.
+            The losses of each update; an empty list if there was no update.
         """
 
     @abstractmethod
     def update(self, batch: TensorDictBase) -> Losses:
-        """Makes one update from a batch as the guard has recorded it."""
+        """Performs one update with a batch that the guard recorded."""
 
     @abstractmethod
     def scale_lr(self, scale: float) -> None:
-        """Sets all learning rates to the configuration's times a factor."""
+        """Sets all learning rates to those of the configuration times a factor."""
 
     @abstractmethod
     def weights(self, team: int = 0) -> dict[str, Tensor]:
         """Returns the weights of one seed's networks by name, detached.
 
-        Those of the actors are called `ACTOR` and then as in `make_actor`'s network.
+        The names of the actors' weights are `ACTOR` and the name in the network of `make_actor`.
         """
 
     @abstractmethod
     def state_dict(self, *, transitions: bool = True) -> dict[str, Tensor]:
-        """Returns everything that learning changes, by name.
+        """Returns the state that learning changes, by name.
 
         Args:
-            transitions: whether those that it learns from are included.
+            transitions: whether to include the replay buffer's transitions.
         """
 
     @abstractmethod
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
-        """Restores what `state_dict` gave, with or without transitions.
+        """Restores the state of `state_dict`, with or without transitions.
 
         Raises:
-            ValueError: the state is not one of this configuration.
+            ValueError: the state does not fit this configuration.
         """
 
 
 def generators(seeds: tuple[int, ...]) -> list[torch.Generator]:
-    """Returns the generators of the initial weights, one per seed."""
+    """Returns a generator of initial weights for each seed."""
     return [torch.Generator().manual_seed(seed) for seed in seeds]

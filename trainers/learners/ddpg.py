@@ -1,4 +1,4 @@
-"""DDPG for all UAVs at once (Lillicrap et al. 2016; paper, section III.C)."""
+"""DDPG for all UAVs (Lillicrap et al. 2016; paper, section III.C)."""
 
 from typing import Any
 
@@ -14,11 +14,11 @@ from emberlink.trainers.learners.off_policy import OffPolicyConfig, OffPolicyLea
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class DDPGConfig(OffPolicyConfig):
-    """DDPG for every UAV (paper, section III.C)."""
+    """The settings of DDPG."""
 
 
 class DDPG(OffPolicyLearner):
-    """Updates every UAV's actor, critic and their targets from its own batch."""
+    """Updates the actor, the critic and their target networks of each UAV from its own batch."""
 
     config_type = DDPGConfig
     critic_name = "value"

@@ -1,7 +1,7 @@
-"""Detects the first NaN or Inf in training without waiting for the device.
+"""Detects the first NaN or Inf in training without synchronising with the device.
 
-All checks are tensor operations on the device, so a recorded CUDA graph contains them. Once
-something was found, the learner changes nothing any more, however late the host reads the flag.
+All checks are tensor operations, so CUDA graphs can contain them. After a detection, the learner
+changes no weights, even if the host reads the flag much later.
 """
 
 from collections.abc import Mapping, Sequence
@@ -12,44 +12,44 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 NOTHING, ROLLOUT, UPDATE = range(3)
-"""where the first number that is not finite was found"""
+"""place of the first NaN or Inf"""
 
 
 class NonFiniteGuard:
-    """Flags rollouts, losses and gradients that are not finite, and keeps the first of them.
+    """Flags non-finite rollouts, losses and gradients, and keeps the first of them.
 
-    A tensor counts as finite where the sum of its squares is, because Adam squares gradients.
+    A tensor counts as finite if the sum of its squares is finite, because Adam squares gradients.
 
     Args:
-        device: of the training.
+        device: device of the training.
     """
 
     def __init__(self, device: torch.device | str):
         self.bad = torch.zeros((), device=device)
-        """1 once something was found, else 0; Adam skips a step where its `found_inf` is 1"""
+        """1 after a detection, else 0; Adam skips a step if its `found_inf` is 1"""
         self._counts = torch.zeros(3, dtype=torch.int64, device=device)
         self._place, self._steps, self._updates = self._counts.unbind()
         self.rollout: TensorDictBase | None = None
-        """the first bad rollout; the newest while there is none"""
+        """the first non-finite rollout; before a detection, the newest rollout"""
         self.batch: TensorDictBase | None = None
-        """the batch of the first bad update; of the newest while there is none"""
+        """the batch of the first non-finite update; before a detection, of the newest update"""
         self.losses: dict[str, Tensor] = {}
-        """the losses of that update, [uavs] each"""
+        """losses of that update, [uavs] each"""
         self.gradients: dict[str, Tensor] = {}
-        """the norms of its gradients, one per row of the parameter"""
+        """norms of its gradients, one per row of the parameter"""
         self._arriving: tuple[Any, Tensor] | None = None
 
     def start(self, steps: int, updates: int) -> None:
-        """Sets how many steps and updates are done, from which those found are counted."""
+        """Sets the number of steps and updates done so far."""
         self._steps.fill_(steps)
         self._updates.fill_(updates)
 
     def share(self, value: float) -> Tensor:
-        """Returns the value, float64 []; 0 once something was found."""
+        """Returns the value, float64 []; 0 after a detection."""
         return (1 - self.bad).double() * value
 
     def record_rollout(self, rollout: TensorDictBase, steps: int) -> None:
-        """Checks a rollout of so many steps and keeps it."""
+        """Checks and keeps a rollout of the given number of steps."""
         self.rollout = self._keep(self.rollout, rollout)
         values = [value for value in rollout.values(True, True) if value.is_floating_point()]
         self._flag(torch.stack([torch.linalg.vector_norm(value) for value in values]), ROLLOUT)
@@ -62,11 +62,11 @@ class NonFiniteGuard:
     def check_gradients(
         self, losses: Mapping[str, Tensor], gradients: Mapping[str, Tensor]
     ) -> None:
-        """Checks an update's losses and gradients and counts the update.
+        """Checks the losses and gradients of an update and counts the update.
 
         Args:
-            losses: by name, [uavs] each, detached.
-            gradients: by parameter, [rows, ...] each, where a row is a UAV's or a network's.
+            losses: detached losses by name, [uavs] each.
+            gradients: gradients by parameter, [rows, ...] each; a row belongs to a UAV or a team.
         """
         norms = dict(zip(gradients, row_norms(list(gradients.values())), strict=True))
         for kept, new in ((self.losses, losses), (self.gradients, norms)):
@@ -79,10 +79,10 @@ class NonFiniteGuard:
         self._updates.add_(self.bad == 0)
 
     def poll(self, *, wait: bool = False) -> bool:
-        """Returns whether something was found.
+        """Returns whether a NaN or Inf was detected.
 
         Args:
-            wait: whether to wait for a GPU; else the answer may be some steps old.
+            wait: whether to wait for a GPU; if not, the result may be some steps old.
         """
         if wait or not self.bad.is_cuda:
             return bool(self.bad)
@@ -95,7 +95,7 @@ class NonFiniteGuard:
         return bool(arrived)
 
     def found(self) -> tuple[int, int, int]:
-        """Returns where it was found, and the steps and updates that were finite before it."""
+        """Returns the place of the detection, and the steps and updates that were finite before."""
         place, steps, updates = self._counts.tolist()
         return place, steps, updates
 
@@ -108,7 +108,7 @@ class NonFiniteGuard:
         return event, arriving
 
     def _keep(self, place: TensorDictBase | None, value: TensorDictBase) -> TensorDictBase:
-        """Writes a TensorDict in place, unless something was found before."""
+        """Copies a TensorDict into the kept one, unless there was a detection before."""
         if place is None or place.shape != value.shape:
             return value.clone()
         for key, tensor in place.items(True, True):
@@ -122,8 +122,8 @@ class NonFiniteGuard:
 
 
 def row_norms(tensors: Sequence[Tensor]) -> list[Tensor]:
-    """Returns the Euclidean norm of each row of each tensor [rows, ...]: [rows] each."""
-    if tensors and tensors[0].is_cuda:  # few launches for all; a CPU is faster one by one
+    """Returns the Euclidean norms of the rows of tensors [rows, ...], [rows] each."""
+    if tensors and tensors[0].is_cuda:  # few kernel launches; on a CPU, a loop is faster
         rows = [row for tensor in tensors for row in tensor.detach().unbind(0)]
         norms = torch.stack(torch._foreach_norm(rows))  # pyright: ignore[reportPrivateImportUsage]
         return list(norms.split([len(tensor) for tensor in tensors]))

@@ -1,4 +1,4 @@
-"""The common part of learners with a replay buffer and target networks (DDPG, TD3)."""
+"""Defines the base class of learners with a replay buffer and target networks (DDPG, TD3)."""
 
 from abc import abstractmethod
 from collections.abc import Mapping
@@ -46,35 +46,36 @@ class OffPolicyConfig(LearnerConfig):
     gamma: Annotated[float, Field(ge=0, lt=1)]
     """discount per step"""
     actor_lr: Positive
-    """Adam's learning rate of the actors"""
+    """learning rate of the actors' Adam"""
     critic_lr: Positive
-    """Adam's learning rate of the critics"""
+    """learning rate of the critics' Adam"""
     critic_weight_decay: NotNegative
     """L2 penalty in the critics' Adam"""
     tau: Annotated[float, Field(gt=0, le=0.5)]
-    """share of the networks in their targets per update of the targets"""
+    """soft update of the target networks: target += tau * (network - target)"""
     updates_per_step: Count
-    """updates of every UAV's networks per step of all environments side by side"""
+    """updates of every UAV's networks per step of the batch of environments"""
     batch_size: Annotated[int, Field(ge=1, le=1_000_000)]
-    """transitions per UAV and update"""
+    """transitions per update and UAV"""
     buffer_size: Count
-    """transitions that a replay memory holds"""
+    """capacity of a replay buffer, in transitions of a UAV"""
     exploration: ExplorationConfig
+    """exploration noise"""
 
     @model_validator(mode="after")
     def _a_batch_fits(self) -> "OffPolicyConfig":
         if self.batch_size > self.buffer_size:
             raise UserError(
-                f"batch_size={self.batch_size} is more than buffer_size={self.buffer_size} holds"
+                f"batch_size={self.batch_size} is larger than buffer_size={self.buffer_size}"
             )
         return self
 
 
 class OffPolicyLearner(Learner):
-    """Updates actors and critics from replayed transitions; a subclass gives the losses."""
+    """Updates actors and critics from replayed transitions; subclasses define the losses."""
 
     critic_name: ClassVar[str]
-    """what TorchRL's loss calls the critic: "value" or "qvalue\""""
+    """name of the critic in TorchRL's loss: "value" or "qvalue\""""
 
     def __init__(self, config: OffPolicyConfig, context: LearnerContext):
         self.config, self.teams = config, len(context.seeds)
@@ -87,7 +88,7 @@ class OffPolicyLearner(Learner):
             terminated=TERMINATED,
         )
         self.loss.make_value_estimator(gamma=config.gamma)
-        # Tells the loss that its targets are moved; `_move_targets` does it.
+        # Registers an updater with the loss; `_move_targets` performs the updates.
         SoftUpdate(self.loss, tau=config.tau)
         parts: list[Any] = [self.actor, OrnsteinUhlenbeck(config.exploration)]
         self.explorer = TensorDictSequential(*parts)
@@ -104,22 +105,22 @@ class OffPolicyLearner(Learner):
 
     @abstractmethod
     def make_loss(self, context: LearnerContext, generators: list[torch.Generator]) -> LossModule:
-        """Sets `actor` and returns TorchRL's loss for it and new critics, reduction "none"."""
+        """Sets `actor` and returns TorchRL's loss of it and new critics, with reduction "none"."""
 
     @abstractmethod
     def losses(self, batch: TensorDictBase, *, actor: bool = True) -> Losses:
-        """Computes the losses, one per UAV, with gradients.
+        """Computes the losses with gradients, one number per UAV.
 
-        The mean is over a UAV's batch alone: averaged over UAVs as well, every gradient would
-        shrink with the size of the team.
+        Losses are averaged over the batch of each UAV and not over UAVs; otherwise gradients would
+        shrink with the number of UAVs.
 
         Args:
             batch: batch size [batch].
-            actor: whether the actors are updated too.
+            actor: whether to compute the actors' losses, too.
         """
 
     def moves_actor(self, update: int) -> bool:
-        """Returns whether an update, counted from 1, moves the actors and the targets too."""
+        """Returns whether an update, counted from 1, changes actors and target networks, too."""
         return True
 
     def sample(self) -> TensorDictBase:
@@ -127,12 +128,12 @@ class OffPolicyLearner(Learner):
         return self.replay.sample()
 
     def gradients(self) -> dict[str, Tensor]:
-        """Returns the gradients that are there by parameter, [uavs, ...] each."""
+        """Returns the gradients by parameter, [uavs, ...] each, of parameters that have one."""
         named = self.parameters.items()
         return {name: value.grad for name, value in named if value.grad is not None}
 
     def learn(self, rollout: TensorDictBase) -> list[Losses]:
-        """Stores a rollout and makes the updates of its step, once there is a full batch."""
+        """Stores a rollout, and performs updates if there is a full batch."""
         self.replay.extend(rollout)
         if not self.replay.ready:
             return []
@@ -144,7 +145,7 @@ class OffPolicyLearner(Learner):
         return losses
 
     def update(self, batch: TensorDictBase) -> Losses:
-        """Makes one step of the optimizers and of the targets."""
+        """Performs one step of the optimizers and of the target networks."""
         self.updates += 1
         return self._update(batch, self.moves_actor(self.updates))
 
@@ -152,7 +153,7 @@ class OffPolicyLearner(Learner):
         return self._update(self.sample(), actor)
 
     def _update(self, batch: TensorDictBase, actor: bool) -> Losses:
-        """Changes nothing once the guard has found something."""
+        """Performs an update; after a detection of the guard, no weight changes."""
         self.guard.record_batch(batch)
         losses = self.losses(batch, actor=actor)
         torch.stack([*losses.values()]).sum().backward()
@@ -165,7 +166,7 @@ class OffPolicyLearner(Learner):
         return losses
 
     def _move_targets(self) -> None:
-        """Moves the target networks the share `tau` of the way to the networks."""
+        """Performs the soft update of the target networks."""
         for name in ("actor", self.critic_name):
             networks, targets = (
                 [
@@ -178,7 +179,7 @@ class OffPolicyLearner(Learner):
             torch._foreach_lerp_(targets, networks, [share] * len(targets))  # pyright: ignore[reportPrivateImportUsage]
 
     def _trained(self, network: str, name: str = "") -> dict[str, Tensor]:
-        """Returns a network's parameters in the order of the layers, "actor.first.weight" first."""
+        """Returns a network's parameters by name, such as "actor.first.weight", layer by layer."""
         tree = getattr(self.loss, f"{network}_network_params")
         items = tree.items(include_nested=True, leaves_only=True)
         return {
@@ -192,7 +193,7 @@ class OffPolicyLearner(Learner):
             [value for name, value in self.parameters.items() if name.startswith(network)]
             for network in ("actor.", "critic.")
         )
-        # Capturable: Adam's count of steps is on the device too, where a CUDA graph can add to it.
+        # Capturable: Adam's step counter is on the device, where a CUDA graph can increment it.
         adam = partial(torch.optim.Adam, fused=True, capturable=actor[0].is_cuda)
         self.optimizer = group_optimizers(
             adam(actor, lr=config.actor_lr),
@@ -206,7 +207,7 @@ class OffPolicyLearner(Learner):
             entry["lr"] = scale * rate
 
     def networks(self) -> dict[str, Tensor]:
-        """Returns the weights of all seeds' networks and targets by name, as they lie in memory."""
+        """Returns the weights of all seeds' networks and target networks by name, not copied."""
         return {name: v for name, v in self.loss.state_dict().items() if "_params." in name}
 
     def weights(self, team: int = 0) -> dict[str, Tensor]:

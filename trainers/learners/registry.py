@@ -1,4 +1,4 @@
-"""Finds learners by name: the files of this folder and entry points of other packages."""
+"""Finds learners by name: files of this folder, and entry points of other packages."""
 
 from emberlink.envs.utils.plugins import Registry
 from emberlink.trainers.learners.base import Learner, LearnerConfig, LearnerContext
@@ -14,5 +14,5 @@ known, find = _REGISTRY.known, _REGISTRY.find
 
 
 def build(config: LearnerConfig, context: LearnerContext) -> Learner:
-    """Returns a new learner."""
+    """Returns a new learner of a configuration."""
     return find(config.name)(config, context)

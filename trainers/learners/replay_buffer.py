@@ -1,4 +1,4 @@
-"""The replay memory of a team: one per UAV, or one for all (paper, sections IV.C and IV.D)."""
+"""Stores transitions in a replay buffer per UAV or per team (paper, sections IV.C and IV.D)."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -24,15 +24,16 @@ _ROWS, _COLUMNS = range(2)
 
 
 class ReplayMemory:
-    """Stores the transitions of all UAVs and draws a batch for each of them.
+    """Stores the transitions of all UAVs and samples a batch for each UAV.
 
-    Rows are transitions of all UAVs at one step of one environment of each seed. Everything that
-    the networks read is stored, of any shape.
+    A row holds the transitions of all UAVs at one step of one environment, for every seed. All
+    tensors of the observation are stored.
 
     Args:
-        context: of the learner.
-        batch_size: transitions per UAV and sample.
-        buffer_size: UAV transitions that a memory holds; a shared one holds them of all together.
+        context: context of the learner.
+        batch_size: transitions per UAV in a sample.
+        buffer_size: capacity in transitions of a UAV. A shared buffer has this capacity for all
+            UAVs together.
     """
 
     def __init__(self, context: LearnerContext, *, batch_size: int, buffer_size: int):
@@ -40,15 +41,15 @@ class ReplayMemory:
         self.teams, self.device = len(context.seeds), context.device
         self._keys = keys.observation_keys(context.observation_spec)
         size = -(-buffer_size // uavs) if shared else buffer_size
-        # No more is allocated than a run can fill.
+        # The run cannot fill more rows.
         self.capacity = min(size, context.total_steps * context.num_envs)
         self.needed = -(-batch_size // uavs) if shared else batch_size
-        """rows at which the memory first holds a full batch"""
+        """rows that hold a full batch"""
         never = context.total_steps + 1
         fits = self.needed <= self.capacity
         self.learning_starts = -(-self.needed // context.num_envs) if fits else never
         self.written = 0
-        """rows written so far, those that were overwritten included"""
+        """rows written so far, including overwritten ones"""
         self._sampler = TeamSampler(
             uavs,
             shared=shared,
@@ -57,8 +58,8 @@ class ReplayMemory:
             device=context.device,
         )
         self._buffer = ReplayBuffer(
-            # Compilable: without it, TorchRL waits for the device to tell where it last wrote.
-            storage=_ClaimedStorage(self.capacity, device=context.device, compilable=True),
+            # Compilable: otherwise TorchRL synchronises with the device to read the write position.
+            storage=_PreallocatedStorage(self.capacity, device=context.device, compilable=True),
             writer=RoundRobinWriter(compilable=True),
             sampler=self._sampler,
             batch_size=batch_size,
@@ -70,12 +71,12 @@ class ReplayMemory:
 
     @property
     def ready(self) -> bool:
-        """Whether there is a full batch to draw."""
+        """Whether the buffer holds a full batch."""
         return len(self) >= self.needed
 
     @property
     def draws(self) -> Tensor:
-        """How many batches have been drawn, int64 [] on the device."""
+        """Number of samples so far, int64 [] on the device."""
         return self._sampler.draws
 
     def extend(self, rollout: TensorDictBase) -> None:
@@ -83,16 +84,16 @@ class ReplayMemory:
         self.extend_rows(to_rows(rollout, self.teams, self._keys))
 
     def extend_rows(self, rows: TensorDictBase) -> None:
-        """Stores rows as `to_rows` gives them."""
+        """Stores rows of `to_rows`."""
         self._buffer.extend(rows)
         self.written += len(rows)
 
     def sample(self) -> TensorDict:
-        """Draws a batch for each UAV: batch size [batch], "agents" and "next" as collected."""
+        """Samples a batch for each UAV: batch size [batch], with the keys of a rollout."""
         return self._buffer.sample()
 
     def state_dict(self, *, transitions: bool = True) -> dict[str, Tensor]:
-        """Returns the counters and the rows that are filled; the rows are not copied."""
+        """Returns the counters and the filled rows, which are not copied."""
         state = {"draws": self.draws.clone(), "written": torch.tensor(self.written)}
         if not (transitions and len(self)):
             return state
@@ -100,7 +101,7 @@ class ReplayMemory:
         return state | prefixed(rows=flatten(rows))
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
-        """Restores what `state_dict` gave, into a memory that is empty and no smaller."""
+        """Restores the state of `state_dict` into an empty buffer of at least the same capacity."""
         self.draws.copy_(state["draws"])
         rows = group(state, "rows")
         if not rows:
@@ -110,22 +111,22 @@ class ReplayMemory:
         self.written = int(state["written"])
         behind = self.written % self.capacity
         if self.written > self.capacity and behind:
-            # The next row goes behind the newest: up to there, the same is written once more.
+            # Writing the first rows again moves the write position behind the newest row.
             self._buffer.extend(content[:behind])
 
 
 class TeamSampler(RandomSampler):
-    """Draws a batch for each UAV, uniformly, from a storage of shape [rows, teams * uavs].
+    """Samples a batch for each UAV, uniformly, from a storage of shape [rows, teams * uavs].
 
-    A draw is a function of the seed and of the number of earlier draws: it is the same on every
-    device, and for one seed alone as for one of several.
+    A sample is a function of the seed and the number of earlier samples. It is the same on every
+    device and does not depend on other seeds that are trained in parallel.
 
     Args:
-        uavs: UAVs of a team.
-        shared: whether a UAV draws from the transitions of its team or only from its own.
+        uavs: UAVs per team.
+        shared: whether a UAV samples from the transitions of its team, or only from its own.
         rows: capacity of the storage.
-        seeds: one per team.
-        device: of the storage, where indices are made.
+        seeds: seed of each team.
+        device: device of the storage and the indices.
     """
 
     def __init__(
@@ -139,7 +140,7 @@ class TeamSampler(RandomSampler):
     ):
         super().__init__()
         self.uavs, self.shared, self.rows = uavs, shared, rows
-        # On the device, so that a recorded graph reads their present values.
+        # On the device, so that CUDA graphs read their current values.
         self.draws = torch.zeros((), dtype=torch.int64, device=device)
         self.filled = torch.zeros((), dtype=torch.int64, device=device)
         self._keys = counter_rng.fold_in(torch.tensor(seeds, device=device), Use.REPLAY_SAMPLE)
@@ -147,11 +148,14 @@ class TeamSampler(RandomSampler):
         self._own = torch.arange(uavs, device=device)
 
     def extend(self, index: Tensor) -> None:
-        """Counts the rows that the buffer has just written."""
+        """Counts the rows that the buffer has written."""
         self.filled.add_(len(index)).clamp_(max=self.rows)
 
     def sample(self, storage: TensorStorage, batch_size: int) -> tuple[tuple[Tensor, Tensor], dict]:
-        """Returns rows and columns, int64 [batch_size, teams * uavs] each; column k is UAV k's."""
+        """Returns rows and columns, int64 [batch_size, teams * uavs] each.
+
+        Entry [:, k] is the batch of UAV k.
+        """
         if len(storage) == 0:
             raise RuntimeError("cannot sample from an empty replay memory")
         key = counter_rng.fold_in(self._keys, self.draws)
@@ -171,39 +175,39 @@ class TeamSampler(RandomSampler):
         return (rows, columns), {}
 
 
-class _ClaimedStorage(LazyTensorStorage):
-    """Claims all of its memory with the first transition, so that too little fails at once."""
+class _PreallocatedStorage(LazyTensorStorage):
+    """Allocates all memory with the first transition, so that a lack of memory is seen at once."""
 
     def _init(self, data: TensorDictBase) -> None:
         super()._init(data)
         self._storage.zero_()
 
     def get(self, index: tuple[Tensor, Tensor]) -> TensorDictBase:
-        """Returns the rows that `TeamSampler` drew.
+        """Returns the rows that `TeamSampler` sampled.
 
-        TorchRL first cuts off the rows not yet written; a recorded graph would then always read
-        from as many rows as there were when it was recorded.
+        TorchRL's method first slices the storage to the filled rows. A CUDA graph would record the
+        size of that slice.
         """
         return self._storage[index]
 
 
 def to_rows(rollout: TensorDictBase, teams: int, observations: Sequence[Any]) -> TensorDict:
-    """Returns the transitions of a rollout as rows of a replay memory.
+    """Returns the transitions of a rollout as rows of a replay buffer.
 
     Args:
         rollout: batch size [teams * environments] or [teams * environments, steps].
-        teams: how many seeds train side by side.
-        observations: keys of the observation's tensors.
+        teams: number of seeds that are trained in parallel.
+        observations: keys of the observation.
 
     Returns:
-        Batch size [environments * steps, teams * uavs]. Only `terminated` stops the bootstrap, and
-        an episode never terminates: the value beyond the horizon is bootstrapped.
+        Batch size [environments * steps, teams * uavs]. Episodes are truncated and never
+        terminated, so values beyond the horizon are bootstrapped.
     """
     dims = rollout.ndim
     rows, uavs = math.prod(rollout.shape) // teams, rollout.get(keys.ACTION).shape[dims]
 
     def arrange(value: Tensor) -> Tensor:
-        """[*batch, uavs, ...] -> [rows, teams * uavs, ...]."""
+        """Maps [*batch, uavs, ...] to [rows, teams * uavs, ...]."""
         rest = value.shape[dims + 1 :]
         value = value.reshape(teams, rows, uavs, *rest)
         return value.transpose(0, 1).reshape(rows, teams * uavs, *rest)
@@ -229,7 +233,7 @@ def to_rows(rollout: TensorDictBase, teams: int, observations: Sequence[Any]) ->
 
 
 def _to_batch(sample: TensorDictBase) -> TensorDict:
-    """Arranges a sample [batch, uavs] as the losses read it, batch size [batch]."""
+    """Arranges a sample [batch, uavs] with the keys of a rollout, batch size [batch]."""
     return TensorDict(
         {
             keys.AGENTS: sample.exclude("next"),

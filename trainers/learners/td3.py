@@ -1,4 +1,4 @@
-"""TD3 for all UAVs at once (Fujimoto, van Hoof and Meger 2018, ICML)."""
+"""TD3 for all UAVs (Fujimoto, van Hoof and Meger 2018, ICML)."""
 
 from typing import Annotated, Any
 
@@ -18,24 +18,24 @@ from emberlink.trainers.learners.base import STRICT, Count, LearnerContext, Loss
 from emberlink.trainers.learners.off_policy import OffPolicyConfig, OffPolicyLearner
 
 _TARGET_NOISE = (keys.AGENTS, "target_noise")
-"""float32 [batch, uavs, 3]: added to the target's actions; part of the next observation's level"""
+"""float32 [batch, uavs, 3], under "next": noise on the target actors' actions"""
 _CRITICS = 2
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class TD3Config(OffPolicyConfig):
-    """TD3 for every UAV."""
+    """The settings of TD3."""
 
     policy_delay: Count
-    """updates of the critics per update of the actors and of all targets"""
+    """updates of the critics per update of the actors and the target networks"""
     target_noise: NotNegative
-    """standard deviation of the noise on the target's actions"""
+    """standard deviation of the noise on the target actors' actions"""
     target_noise_clip: Annotated[float, Field(ge=0, le=2)]
-    """largest absolute value of that noise; actions are in [-1, 1]"""
+    """maximum absolute value of that noise; actions are in [-1, 1]"""
 
 
 class TD3(OffPolicyLearner):
-    """Updates every UAV's actor and two critics, with smoothed targets and delayed actors."""
+    """Updates the actor and two critics of each UAV, with target smoothing and delayed actors."""
 
     config_type = TD3Config
     critic_name = "qvalue"
@@ -62,9 +62,9 @@ class TD3(OffPolicyLearner):
         bounds: Any = (-1.0, 1.0)
         loss = TD3Loss(
             actor,
-            critics,  # two, initialised apart; TorchRL would draw the second's weights itself
+            critics,  # a list, so that TorchRL does not draw weights itself
             bounds=bounds,
-            policy_noise=0.0,  # ours is in the batch, from a stream of its own
+            policy_noise=0.0,  # `sample` draws the noise
             noise_clip=0.0,
             loss_function="l2",
             reduction="none",
@@ -77,7 +77,7 @@ class TD3(OffPolicyLearner):
         return update % self.config.policy_delay == 0
 
     def sample(self) -> TensorDictBase:
-        """Draws a batch and the noise on the target's actions."""
+        """Draws a batch and the noise on the target actors' actions."""
         batch, config = self.replay.sample(), self.config
         action = batch.get(keys.ACTION)
         size, _, features = action.shape
@@ -98,7 +98,7 @@ class TD3(OffPolicyLearner):
         return losses
 
     def gradients(self) -> dict[str, Tensor]:
-        """Returns the gradients by parameter, those of the two critics apart."""
+        """Returns the gradients by parameter, with separate entries for the two critics."""
         gradients: dict[str, Tensor] = {}
         for name, value in super().gradients().items():
             network, _, rest = name.partition(".")
@@ -109,17 +109,17 @@ class TD3(OffPolicyLearner):
         return gradients
 
     def weights(self, team: int = 0) -> dict[str, Tensor]:
-        """Returns one seed's weights; the first dimension of the critics is the two critics."""
+        """Returns one seed's weights; the first dimension of a critic's weight is the critic."""
         weights: dict[str, Tensor] = {}
         for name, value in self.networks().items():
             dim = int("qvalue" in name)
-            own = value.detach().unflatten(dim, (self.teams, -1)).select(dim, team)
-            weights[name.replace("params.actor.module.", "params.module.")] = own
+            weight = value.detach().unflatten(dim, (self.teams, -1)).select(dim, team)
+            weights[name.replace("params.actor.module.", "params.module.")] = weight
         return weights
 
 
 class _SmoothedActor(TensorDictModuleBase):
-    """The actors; where a batch carries noise for the target's actions, it is added and clipped."""
+    """Adds the noise in a batch, if there is any, to the actors' actions and clips them."""
 
     def __init__(self, actor: TensorDictModule):
         super().__init__()

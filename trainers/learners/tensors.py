@@ -1,4 +1,4 @@
-"""State as tensors by name: flattens TensorDicts and optimizers, and restores them."""
+"""Converts TensorDicts and optimizers to tensors by name, and back."""
 
 from collections.abc import Mapping
 
@@ -10,7 +10,7 @@ from emberlink.envs import keys
 
 
 def flatten(tree: TensorDictBase) -> dict[str, Tensor]:
-    """Returns the leaves of a TensorDict by name, nested keys joined by dots."""
+    """Returns the leaves of a TensorDict by name; nested keys are joined by dots."""
     return {
         key if isinstance(key, str) else ".".join(key): value
         for key, value in tree.items(include_nested=True, leaves_only=True)
@@ -18,12 +18,12 @@ def flatten(tree: TensorDictBase) -> dict[str, Tensor]:
 
 
 def unflatten(tensors: Mapping[str, Tensor], dims: int, device: torch.device | str) -> TensorDict:
-    """Returns the TensorDict that `flatten` took apart.
+    """Reverses `flatten`.
 
     Args:
-        tensors: at least one leaf.
-        dims: number of its batch dimensions; those under "agents" have the UAVs in addition.
-        device: where its tensors are put.
+        tensors: leaves by name, at least one.
+        dims: number of batch dimensions; entries under "agents" have one more, for the UAVs.
+        device: device of the result.
     """
     batch = next(iter(tensors.values())).shape[:dims]
     tree = TensorDict({}, batch_size=batch, device=device)
@@ -54,10 +54,10 @@ def group(tensors: Mapping[str, Tensor], name: str) -> dict[str, Tensor]:
 
 
 def copy_into(places: Mapping[str, Tensor], tensors: Mapping[str, Tensor]) -> None:
-    """Copies tensors by name into those that are there, on their device.
+    """Copies tensors into existing ones of the same names, on their device.
 
     Raises:
-        ValueError: a tensor is missing, unknown, or of another shape or type.
+        ValueError: a tensor is missing, not known, or of another shape or type.
     """
     check_like(places, tensors)
     with torch.no_grad():
@@ -66,10 +66,10 @@ def copy_into(places: Mapping[str, Tensor], tensors: Mapping[str, Tensor]) -> No
 
 
 def check_like(places: Mapping[str, Tensor], tensors: Mapping[str, Tensor]) -> None:
-    """Checks that tensors have the names, shapes and types of others.
+    """Checks that tensors have the names, shapes and types of existing ones.
 
     Raises:
-        ValueError: they do not; the message names the first tensor that differs.
+        ValueError: a tensor differs; the message names the first one.
     """
     for name in [*places, *tensors]:
         if name not in tensors or name not in places:
@@ -83,18 +83,18 @@ def check_like(places: Mapping[str, Tensor], tensors: Mapping[str, Tensor]) -> N
 
 
 def optimizer_tensors(optimizer: torch.optim.Optimizer) -> dict[str, Tensor]:
-    """Returns an optimizer's state, "parameter.key" -> tensor."""
+    """Returns the state of an optimizer, "parameter index.key" -> tensor."""
     state = optimizer.state_dict()["state"]
     return {f"{index}.{key}": value for index, of in state.items() for key, value in of.items()}
 
 
 def load_optimizer(optimizer: torch.optim.Optimizer, tensors: Mapping[str, Tensor]) -> None:
-    """Restores an optimizer's state from what `optimizer_tensors` gave; its groups stay.
+    """Restores the state of `optimizer_tensors`; the parameter groups do not change.
 
     Raises:
-        ValueError: a tensor is neither a number nor of its parameter's shape.
+        ValueError: a tensor is neither a scalar nor of its parameter's shape.
     """
-    parameters = [one for entry in optimizer.param_groups for one in entry["params"]]
+    parameters = [value for entry in optimizer.param_groups for value in entry["params"]]
     state: dict[int, dict[str, Tensor]] = {}
     for name, value in tensors.items():
         index, _, key = name.partition(".")

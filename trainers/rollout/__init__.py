@@ -1,4 +1,4 @@
-"""Collects transitions: steps the environments with the exploring policy."""
+"""Collects transitions by stepping the environments with the exploring policy."""
 
 from emberlink.trainers.rollout.allocator import keep_freed_memory
 from emberlink.trainers.rollout.collector import make_collector

@@ -1,4 +1,4 @@
-"""Settings of the C library's memory allocator."""
+"""Configures the C library's memory allocator."""
 
 import ctypes
 
@@ -7,13 +7,13 @@ _KEPT = 2**30
 
 
 def keep_freed_memory() -> bool:
-    """Lets the process keep freed blocks of up to a gigabyte instead of returning them.
+    """Makes the process keep freed blocks of up to 1 GiB instead of returning them to the system.
 
-    An update frees and allocates blocks of some megabytes dozens of times. Returned to the system,
-    each is handed out again page by page, filled with zeros. The setting is process-wide.
+    An update frees and allocates blocks of some megabytes dozens of times. The system zeroes each
+    returned page before it can be used again. The setting is process-wide.
 
     Returns:
-        Whether it was applied; only glibc's allocator has this setting.
+        Whether the setting was applied; only glibc supports it.
     """
     try:
         mallopt = ctypes.CDLL(None).mallopt

@@ -1,4 +1,4 @@
-"""Collects transitions of all environments: TorchRL's collector, and one for GPUs."""
+"""Collects transitions with TorchRL's collector, or on a GPU without synchronisation."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -24,11 +24,11 @@ def make_collector(
     """Returns a collector of rollouts, batch size [environments, rollout_steps].
 
     Args:
-        env: environments side by side, with their communication.
-        policy: the actors with exploration noise.
+        env: batch of environments with communication.
+        policy: actors with exploration noise.
         horizon: steps of an episode.
-        total_steps: steps of all environments, in the whole run.
-        rollout_steps: steps in a yielded rollout; divides the horizon.
+        total_steps: steps of the batch of environments in the whole run.
+        rollout_steps: steps of a rollout; must divide the horizon.
     """
     if torch.device(env.device or "cpu").type == "cuda":
         return LockstepCollector(
@@ -38,10 +38,10 @@ def make_collector(
 
 
 class ResumableCollector(Collector):
-    """TorchRL's collector, whose input of the next step can be read and replaced.
+    """TorchRL's collector with access to the TensorDict of the next step.
 
-    TorchRL leaves that TensorDict out of the collector's state; resuming bit for bit needs it.
-    Arguments as `make_collector`.
+    Exact resuming needs this TensorDict, which TorchRL does not include in the collector's state.
+    Arguments are those of `make_collector`.
     """
 
     def __init__(
@@ -62,11 +62,11 @@ class ResumableCollector(Collector):
 
     @property
     def carried(self) -> TensorDictBase:
-        """The input of the next step but its action: observations, communication and noise."""
+        """The input of the next step without the action: observations, communication, noise."""
         return self._carrier.exclude(keys.ACTION)
 
     def restore(self, carried: TensorDictBase, step: int) -> None:
-        """Continues from a TensorDict that `carried` gave, after so many steps of the run."""
+        """Continues from an earlier value of `carried`, at a step of the run."""
         self._carrier = carried
         self._frames = step * carried.numel()
 
@@ -74,7 +74,7 @@ class ResumableCollector(Collector):
 def _add_policy_state(
     tensordict: TensorDictBase, env: EnvBase, policy: TensorDictModuleBase
 ) -> None:
-    """Adds zeros for what the policy carries from step to step, such as its noise."""
+    """Adds zeros for the tensors that the policy carries from step to step, such as its noise."""
     with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
         acted = policy(tensordict.copy())
     for key in set(policy.out_keys) - set(env.action_keys):
@@ -82,18 +82,11 @@ def _add_policy_state(
 
 
 class LockstepCollector:
-    """Yields rollouts as TorchRL's Collector does, but never waits for the device.
+    """Yields rollouts as TorchRL's Collector does, but never synchronises with the device.
 
-    All environments begin together and every episode lasts for the horizon, so the ends of episodes
-    are known without reading a tensor. The TensorDict that the next step begins with can be read
-    and replaced, which resuming bit for bit needs. A yielded rollout is valid until the next one.
-
-    Args:
-        env: environments side by side, with their communication.
-        policy: the actors with exploration noise.
-        horizon: steps of an episode.
-        total_steps: steps of all environments, in the whole run.
-        rollout_steps: steps in a yielded rollout; divides the horizon.
+    All environments are reset together and all episodes last for the horizon, so the ends of
+    episodes are known without reading a tensor. A rollout is valid until the next one is yielded.
+    Arguments are those of `make_collector`.
     """
 
     def __init__(
@@ -124,13 +117,13 @@ class LockstepCollector:
 
     @property
     def carried(self) -> TensorDictBase:
-        """The input of the next step but its action: observations, communication and noise."""
+        """The input of the next step without the action: observations, communication, noise."""
         return self._td.exclude(keys.ACTION)
 
     def restore(self, carried: TensorDictBase, step: int) -> None:
-        """Continues from a TensorDict that `carried` gave, after so many steps of the run.
+        """Continues from an earlier value of `carried`, at a step of the run.
 
-        The tensors are written in place, because a recorded CUDA graph reads them where they are.
+        Tensors are written in place, because a CUDA graph reads them at their address.
         """
         self._td.update_(carried)
         self.step = step

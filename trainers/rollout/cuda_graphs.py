@@ -1,7 +1,6 @@
-"""CUDA graphs: launches a function's kernels on a GPU as one.
+"""Launches all kernels of a function on a GPU at once, as a CUDA graph.
 
-A step of the environments is a few hundred small kernels, and launching them takes longer than
-running them.
+A step of the environments is a few hundred small kernels, which take longer to launch than to run.
 """
 
 from collections.abc import Callable
@@ -12,17 +11,17 @@ import torch
 T = TypeVar("T")
 
 _WARM_UP = 3
-"""calls before a graph is recorded, in which libraries allocate their workspaces"""
+"""calls before recording, in which libraries allocate their workspaces"""
 
 
 class CudaGraph(Generic[T]):
-    """Records a function without arguments at its fourth call and replays it from then on.
+    """Records a function without arguments at its fourth call and replays it afterwards.
 
-    The function must read and write tensors that stay at their address, and must not wait for the
-    device. (tensordict's CudaGraphModule waits for the device at each call.)
+    The function must read and write tensors at fixed addresses, and must not synchronise with the
+    device. (tensordict's CudaGraphModule synchronises at each call.)
 
     Args:
-        function: its result is overwritten by the next call.
+        function: the function; each call overwrites the result of the previous one.
         device: the GPU.
     """
 
@@ -48,7 +47,7 @@ class CudaGraph(Generic[T]):
         return result
 
     def _warm_up(self) -> T:
-        """Calls the function on a side stream, as torch requires before a recording."""
+        """Calls the function on a side stream, as torch requires before recording."""
         stream = torch.cuda.Stream()
         stream.wait_stream(torch.cuda.current_stream())
         with torch.cuda.stream(stream):
@@ -58,6 +57,6 @@ class CudaGraph(Generic[T]):
 
 
 def graphed(function: Callable[[], T], device: torch.device | str) -> Callable[[], T]:
-    """Returns the function as a CUDA graph, or itself where the device is no GPU."""
+    """Returns the function as a CUDA graph, or the function itself if the device is not a GPU."""
     device = torch.device(device)
     return CudaGraph(function, device) if device.type == "cuda" else function

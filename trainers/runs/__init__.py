@@ -1,6 +1,8 @@
-"""Run folders on disk: configuration, metrics, checkpoints, lock, trackers and trained policies."""
+"""Manages run folders: configuration, metrics, checkpoints, lock, trackers, trained policies."""
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from emberlink.envs.utils.lazy import lazy
 
 if TYPE_CHECKING:
     from emberlink.trainers.runs.lock import Lock
@@ -9,12 +11,4 @@ if TYPE_CHECKING:
 
 __all__ = ["Lock", "RunFolder", "open_run"]
 
-
-def __getattr__(name: str) -> Any:
-    """Imports a public name when it is first used; the command line starts without torch."""
-    from importlib import import_module
-
-    modules = {"Lock": "lock", "RunFolder": "run_folder", "open_run": "pretrained"}
-    if name not in modules:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f".{modules[name]}", __name__), name)
+__getattr__ = lazy(__name__, {"Lock": "lock", "RunFolder": "run_folder", "open_run": "pretrained"})

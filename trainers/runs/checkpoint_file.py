@@ -1,4 +1,4 @@
-"""Checkpoint files: safetensors with a seal over every byte, written whole or not at all."""
+"""Reads and writes checkpoint files: safetensors with a JSON header and a SHA-256 of every byte."""
 
 import hashlib
 import json
@@ -16,33 +16,37 @@ from emberlink.envs.utils.atomic_io import open_regular, replaced
 from emberlink.envs.utils.errors import UserError
 
 FORMAT = 1
-"""of the files; a reader accepts its own alone, and files from before there was a number"""
+"""version of the file format; files of another version are refused"""
 
 _KEY = "emberlink"
 _BLANK = "0" * 64
+"""stands for the digest while it is computed"""
 _SEAL = re.compile(rb'sha256\\": \\"([0-9a-f]{64})\\"')
-_LONGEST_HEADER = 100_000_000
-_LONGEST = 2**35
-"""bytes of a file; the largest state that was measured has 333 MB"""
+_MAX_HEADER = 100_000_000
+"""bytes"""
+_MAX_FILE = 2**35
+"""bytes; the largest checkpoint measured has 333 MB"""
 
 
 def write(path: Path, tensors: Mapping[str, Tensor], header: Mapping[str, Any]) -> None:
-    """Writes a checkpoint beside its place, flushes it to the disk and renames it.
+    """Writes a checkpoint completely, or leaves the earlier file.
+
+    The file is written under another name, flushed to the disk and renamed.
 
     Args:
-        path: of the file; what is there of that name is replaced.
-        tensors: by name, on any device.
-        header: what else is to be known, as JSON.
+        path: path of the file; an existing file is replaced.
+        tensors: tensors by name, on any device.
+        header: other content, as plain values.
 
     Raises:
-        ValueError: it cannot be written, such as to a full disk; nothing is left of it then.
+        UserError: the file cannot be written, such as to a full disk.
     """
     content = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
     text = json.dumps({"sha256": _BLANK, "format": FORMAT, **header})
     try:
         with replaced(path) as partial:
             save_file(content, partial, metadata={_KEY: text})
-            partial.chmod(path.parent.stat().st_mode & 0o666)  # safetensors lets nobody else read
+            partial.chmod(path.parent.stat().st_mode & 0o666)  # safetensors makes it private
             with partial.open("r+b") as file:
                 digest, place = _digest(file)
                 file.seek(place)
@@ -51,45 +55,36 @@ def write(path: Path, tensors: Mapping[str, Tensor], header: Mapping[str, Any]) 
         raise UserError(f"{path}: cannot be written: {_reason(error)}") from None
 
 
-def read(path: Path) -> tuple[dict[str, Any] | None, dict[str, Tensor]]:
-    """A checkpoint's header and tensors, after its seal has been checked.
-
-    Returns:
-        The header, None for a file from before there were any, and the tensors on the CPU.
+def read(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    """Returns a checkpoint's header and its tensors, on the CPU, after checking its SHA-256.
 
     Raises:
-        ValueError: it cannot be read, has been damaged, or is of another format.
+        UserError: the file cannot be read, is damaged, or is not of this format.
     """
+    header = read_header(path)
     try:
-        header = read_header(path)
-        if header is not None:
-            with open_regular(path, _LONGEST) as file:
-                digest, _ = _digest(file)
-            if digest.decode() != header.get("sha256"):
-                raise UserError(
-                    f"{path}: not a readable checkpoint: damaged, its bytes are not those that "
-                    "were written"
-                )
+        with open_regular(path, _MAX_FILE) as file:
+            digest, _ = _digest(file)
+        if not digest or digest.decode() != header.get("sha256"):
+            raise UserError(f"{path}: not a readable checkpoint: damaged, its SHA-256 is wrong")
         return header, load_file(path)
     except (OSError, SafetensorError) as error:
         raise UserError(f"{path}: not a readable checkpoint: {_reason(error)}") from None
 
 
-def read_header(path: Path) -> dict[str, Any] | None:
-    """A checkpoint's header, its seal not checked; None for a file from before there were any.
+def read_header(path: Path) -> dict[str, Any]:
+    """Returns a checkpoint's header without checking the SHA-256.
 
     Raises:
-        ValueError: there is no such file, it is no checkpoint, or it is of another format.
+        UserError: there is no such file, it is not a checkpoint, or it is not of this format.
     """
     try:
-        with open_regular(path, _LONGEST) as file:
-            whole = json.loads(_head(file))
-        if not isinstance(whole, dict):
-            raise UserError("its header holds no names")
-        if "__metadata__" not in whole:
-            return None
-        header = json.loads(whole["__metadata__"][_KEY])
-        found = header["format"]
+        with open_regular(path, _MAX_FILE) as file:
+            head = json.loads(_head(file))
+        if not isinstance(head, dict) or "__metadata__" not in head:
+            raise UserError("no header of emberlink")
+        header = json.loads(head["__metadata__"][_KEY])
+        version = header["format"]
     except OSError as error:
         raise UserError(f"{path}: not a readable checkpoint: {_reason(error)}") from None
     except (KeyError, TypeError, ValueError, RecursionError) as error:
@@ -97,16 +92,16 @@ def read_header(path: Path) -> dict[str, Any] | None:
         raise UserError(
             f"{path}: not a readable checkpoint: damaged, or of another program ({reason})"
         ) from None
-    if found != FORMAT:
-        raise UserError(f"{path}: a checkpoint of format {found}; this version reads {FORMAT}")
+    if version != FORMAT:
+        raise UserError(f"{path}: a checkpoint of format {version}; this version reads {FORMAT}")
     return header
 
 
 def check_finite(path: Path, tensors: Mapping[str, Tensor]) -> None:
-    """Looks for what no network and no memory may hold.
+    """Checks that all tensors are finite.
 
     Raises:
-        ValueError: a number is NaN or infinite; the message names the tensor.
+        UserError: a number is NaN or infinite; the message names the tensor.
     """
     for name, value in tensors.items():
         if value.is_floating_point() and not torch.isfinite(value).all():
@@ -114,15 +109,18 @@ def check_finite(path: Path, tensors: Mapping[str, Tensor]) -> None:
 
 
 def _head(file: BinaryIO) -> bytes:
-    """The JSON that a safetensors file begins with, after its length."""
+    """Returns the JSON at the beginning of a safetensors file, after its length."""
     length = int.from_bytes(file.read(8), "little")
-    if length > _LONGEST_HEADER:
-        raise UserError("its header has no end")
+    if length > _MAX_HEADER:
+        raise UserError(f"its header has {length} bytes")
     return file.read(length)
 
 
 def _digest(file: BinaryIO) -> tuple[bytes, int]:
-    """The SHA-256 of a file in which the seal is blank, and where in it the seal stands."""
+    """Returns the SHA-256 of a file and the offset at which its header holds it.
+
+    It is computed with zeros in its place, and empty if the header has no place for it.
+    """
     file.seek(0)
     head = _head(file)
     found = _SEAL.search(head)
@@ -136,6 +134,6 @@ def _digest(file: BinaryIO) -> tuple[bytes, int]:
 
 
 def _reason(error: Exception) -> str:
-    """What went wrong in a few words, on one line."""
+    """Returns the message of an error on one line."""
     text = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
     return " ".join(text.split()).removeprefix("Error while serializing: I/O error: ")

@@ -15,13 +15,13 @@ from emberlink.trainers.runs import checkpoint_file
 from emberlink.trainers.runs.seal import to_header
 
 _NUMBERED = re.compile(r"(state|step)_\d{9,18}\.safetensors")
-_PARTIAL = ("*.safetensors.[0-9]*.part", ".tmp*")  # safetensors' own names begin with .tmp
+_PARTIAL = ("*.safetensors.[0-9]*.part", ".tmp*")  # safetensors writes to .tmp*
 
 
 class Checkpoints:
-    """The checkpoints of a run: networks (`step_N`), resumable states (`state_N`) and `best`.
+    """The checkpoints of a run: networks (`step_N`), training states (`state_N`) and `best`.
 
-    Files with other names, such as a user's copy `step_mine.safetensors`, are not the run's.
+    Files with other names, such as `step_mine.safetensors`, are ignored.
 
     Args:
         path: the run folder.
@@ -47,7 +47,7 @@ class Checkpoints:
             raise UserError(f"{self.checkpoints}: cannot be written: {error.strerror}") from None
 
     def save(self, weights: Mapping[str, Tensor], config: RunConfig, step: int) -> Path:
-        """Writes the networks after a step, and returns the file.
+        """Writes the networks of a step and returns the path.
 
         Raises:
             UserError: it cannot be written.
@@ -57,7 +57,7 @@ class Checkpoints:
         return path
 
     def save_best(self, weights: Mapping[str, Tensor], config: RunConfig, step: int) -> None:
-        """Writes networks to best.safetensors, in place of the earlier ones.
+        """Writes networks to best.safetensors.
 
         Raises:
             UserError: it cannot be written.
@@ -66,19 +66,19 @@ class Checkpoints:
         checkpoint_file.write(path, weights, _network_header(config, step))
 
     def state(self, step: int) -> Path:
-        """Returns the path of the state after a step."""
+        """Returns the path of the training state of a step."""
         return self.own_checkpoints() / f"state_{step:09d}.safetensors"
 
     def states(self) -> list[Path]:
-        """Returns the states that a run can be resumed from, oldest first."""
+        """Returns the paths of the training states, oldest first."""
         return self._numbered("state")
 
     def networks(self) -> list[Path]:
-        """Returns the checkpoints' networks, oldest first."""
+        """Returns the paths of the networks, oldest first."""
         return self._numbered("step")
 
     def checkpoint(self) -> Path:
-        """Returns the newest checkpoint's networks.
+        """Returns the path of the newest networks.
 
         Raises:
             UserError: there is no checkpoint.
@@ -95,11 +95,11 @@ class Checkpoints:
             atomic_io.remove(path)
 
     def checkpoints_after(self, step: int) -> list[Path]:
-        """Returns the networks and states of later steps."""
+        """Returns the paths of the networks and training states after a step."""
         return [path for path in self.networks() + self.states() if step_of(path) > step]
 
     def partial_checkpoints(self) -> list[Path]:
-        """Returns the checkpoints that a killed process did not complete."""
+        """Returns the paths of incomplete checkpoints, which a killed process left."""
         folder = self.own_checkpoints()
         return [path for pattern in _PARTIAL for path in folder.glob(pattern)]
 
@@ -109,7 +109,7 @@ class Checkpoints:
 
 
 def step_of(checkpoint: Path) -> int:
-    """Returns the step in a checkpoint's name; -1 if there is none."""
+    """Returns the step in the name of a checkpoint, or -1 if there is none."""
     with suppress(ValueError):
         return int(checkpoint.stem.rpartition("_")[2])
     return -1
@@ -121,19 +121,19 @@ def load_weights(
     """Reads the weights of a checkpoint.
 
     Args:
-        path: a safetensors file.
-        expected: tensors with the names, shapes and types that the checkpoint must hold.
-        config: its method and number of UAVs must be the checkpoint's; not checked if None.
+        path: a checkpoint file.
+        expected: tensors with the expected names, shapes and types.
+        config: configuration with the expected method and number of UAVs; not checked if None.
 
     Returns:
         The weights with the names of `expected`.
 
     Raises:
-        UserError: the file cannot be read or is damaged, a tensor is missing or of another shape
-            or type, or a number is NaN or infinite.
+        UserError: the file cannot be read or is damaged, a tensor is missing, of another shape or
+            type, or not finite.
     """
     header, weights = checkpoint_file.read(path)
-    if header is not None and config is not None:
+    if config is not None:
         _check_header(path, header, config)
     for name, tensor in expected.items():
         if name not in weights:

@@ -1,22 +1,21 @@
-"""JSON with one line for each list of numbers."""
+"""Writes JSON with one line per list of numbers."""
 
 import json
 from typing import Any
 
 _WIDTH = 240
-"""characters up to which a mapping stands on one line"""
+"""maximum number of characters of a mapping on one line"""
 
 
 def dumps(value: Any, indent: str = "") -> str:
-    """Returns a value as JSON that is read line by line as easily as by a program.
+    """Returns a value as compact, readable JSON.
 
-    A list of numbers or texts stands on one line however long it is, such as a measure with one
-    number per episode. A mapping stands on one line if that has at most 240 characters; otherwise
-    each of its keys begins a line.
+    A list of numbers or texts is on one line, however long. A mapping is on one line if that has at
+    most 240 characters; otherwise each of its keys begins a line.
 
     Args:
-        value: mappings, lists, texts, numbers, True, False and None.
-        indent: the white space at the beginning of the line on which the value begins.
+        value: mappings, lists, texts, numbers, bool and None.
+        indent: indentation of the line on which the value begins.
     """
     if isinstance(value, dict):
         line = json.dumps(value)

@@ -1,4 +1,4 @@
-"""Reads, extends and truncates the .jsonl files of a run folder."""
+"""Reads, appends to and truncates the .jsonl files of a run folder."""
 
 import json
 import os
@@ -24,7 +24,7 @@ class JsonLines:
     def lines(self, file: str = "metrics.jsonl") -> list[dict[str, Any]]:
         """Returns the lines of a file; an empty list if there is no such file.
 
-        A last line without a line break is left out: a killed process did not complete it.
+        An incomplete last line, which a killed process left, is ignored.
 
         Raises:
             UserError: a line is not of the form {"episode": 1, NAME: NUMBER, ...}.
@@ -44,7 +44,7 @@ class JsonLines:
         return values
 
     def append(self, file: str, line: Mapping[str, Any]) -> None:
-        """Writes a line at the end of a file, completely or not at all.
+        """Appends a line to a file, completely or not at all.
 
         Raises:
             UserError: it cannot be written, such as to a full disk.
@@ -64,7 +64,7 @@ class JsonLines:
             raise UserError(f"{path}: cannot be written: {error.strerror}") from None
 
     def size(self, file: str) -> int:
-        """Flushes a file to the disk and returns its bytes; 0 if there is no such file.
+        """Flushes a file to the disk and returns its size in bytes; 0 if there is no such file.
 
         Raises:
             UserError: it cannot be read.
@@ -80,15 +80,16 @@ class JsonLines:
             raise UserError(f"{path}: cannot be read: {error.strerror or error}") from None
 
     def check_lines(self, file: str, size: int, lines: int) -> None:
-        """Checks that the beginning of a file has the size and the lines of a checkpoint's time.
+        """Checks that the first bytes of a file are those that it had at a checkpoint.
 
         Args:
-            file: its name; a link is refused, because a resumed run appends to the file.
-            size: bytes that the file had.
-            lines: that these bytes hold.
+            file: name of the file; a link is refused, because a resumed run appends to the file.
+            size: size of the file at the checkpoint, bytes.
+            lines: number of lines at the checkpoint.
 
         Raises:
-            UserError: the file is a link, is not regular, is shorter, or has other lines.
+            UserError: the file is a link, is not regular, is shorter, or has another number of
+                lines.
         """
         path = self.path / file
         try:
@@ -100,12 +101,12 @@ class JsonLines:
         complete = not kept or kept.endswith(b"\n")
         if len(kept) < size or not complete or kept.count(b"\n") != lines:
             raise UserError(
-                f"{path}: the checkpoint was made when it had {lines} lines in {size} bytes; its "
-                f"first {len(kept)} bytes are not those"
+                f"{path}: had {lines} lines in {size} bytes at the checkpoint; its first "
+                f"{len(kept)} bytes differ"
             )
 
     def cut(self, file: str, size: int) -> None:
-        """Truncates a file to `size` bytes if it has more.
+        """Truncates a file to `size` bytes if it is larger.
 
         Raises:
             UserError: it is a link, is not regular, or cannot be written.

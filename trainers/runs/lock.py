@@ -1,4 +1,4 @@
-"""Locks a run folder, so that one process at a time trains in it."""
+"""Locks a run folder, so that only one process trains in it."""
 
 import errno
 import os
@@ -17,13 +17,13 @@ _MAX_HOLDER = 1000
 
 
 class Lock:
-    """An exclusive lock on the file `lock` of a run folder, held until `release`.
+    """Holds an exclusive lock on the file `lock` of a run folder until `release`.
 
-    The operating system releases the lock when the process ends, also by SIGKILL. The file holds
-    the process number and the machine of the holder for the error message.
+    The operating system releases the lock when the process ends, also after SIGKILL. The file holds
+    the process number and the host name, for error messages.
 
     Args:
-        folder: of the run.
+        folder: the run folder.
 
     Raises:
         UserError: another process holds the lock, `lock` is a link or not a regular file, or the
@@ -32,7 +32,7 @@ class Lock:
 
     def __init__(self, folder: Path):
         self.path = folder / "lock"
-        # Nothing but the operating system's own lock: a file alone would outlive its process.
+        # No fallback to a lock without the operating system: its file would outlive the process.
         self._lock = FileLock(
             self.path,
             timeout=0,
@@ -41,7 +41,7 @@ class Lock:
             on_acquired=self._write_holder,
         )
         try:
-            folder.stat()  # FileLock would create a missing folder
+            folder.stat()  # an error if it is missing: FileLock would create it
             self._lock.acquire()
         except Timeout:
             raise UserError(f"{folder}: {self._holder()} is training here") from None
@@ -49,14 +49,18 @@ class Lock:
             raise UserError(f"{self.path}: cannot be locked: {_reason(error)}") from None
 
     def release(self) -> None:
-        """Removes the file and releases the lock; does nothing the second time."""
+        """Removes the file and releases the lock; further calls do nothing."""
         if self._lock.is_locked:
-            with suppress(OSError):  # the folder may be read-only by now; the file stays then
+            with suppress(OSError):  # the folder may have become read-only
                 self.path.unlink(missing_ok=True)
             self._lock.release()
 
     def _write_holder(self, handle: int) -> None:
-        """Writes this process into the locked file, which must have no second name."""
+        """Writes the process number and host name to the locked file.
+
+        Raises:
+            OSError: it is not a regular file, or is a hard link.
+        """
         check_regular(handle, self.path)
         if os.fstat(handle).st_nlink > 1:
             raise OSError(errno.EMLINK, "it is a hard link", str(self.path))

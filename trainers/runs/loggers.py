@@ -1,4 +1,4 @@
-"""The trackers that a training may report to beside metrics.jsonl: wandb, TensorBoard, CSV."""
+"""Defines experiment trackers: wandb, TensorBoard and CSV."""
 
 import csv
 import io
@@ -23,46 +23,46 @@ from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.runs.run_folder import RunFolder
 
 PATIENCE = 60.0
-"""seconds that the end of a training waits for its tracker"""
+"""maximum seconds that a finished training waits for its tracker"""
 _CONNECTING = 20.0
-"""seconds that wandb may take to reach its server, where WANDB_MODE=online"""
+"""maximum seconds for wandb to connect to its server, if WANDB_MODE=online"""
 _BETWEEN_TABLES = 10.0
-"""seconds between two versions of metrics.csv"""
+"""minimum seconds between two writes of metrics.csv"""
 WANDB_TEARDOWN = "emberlink-wandb-teardown"
-"""name of a thread that may outlive a wandb tracker that failed"""
+"""name of the thread that shuts down a failed wandb"""
 
 
 class Tracker(Protocol):
-    """Receives the numbers of one run."""
+    """Logs the metrics of one run."""
 
     def log(self, line: Mapping[str, float], episode: int) -> None:
         """Logs an episode's line of metrics.jsonl."""
         ...
 
     def log_evaluation(self, numbers: Mapping[str, float], figures: Sequence[Path]) -> None:
-        """Logs the final evaluation: its means by name, and PNG files."""
+        """Logs the final evaluation: means by name, and PNG files."""
         ...
 
     def finish(self) -> None:
-        """Writes what is left; the tracker is not used afterwards."""
+        """Flushes and closes the tracker."""
         ...
 
 
 class Wandb:
-    """Logs to wandb: grouped by setup and fire, tagged by method and seed.
+    """Logs to wandb, grouped by setup and fire, with tags for method and seed.
 
-    Offline, unless WANDB_MODE says otherwise. A resumed run keeps its id.
+    It is offline unless WANDB_MODE is set. A resumed run keeps its id.
 
     Args:
-        config: of the run.
-        run: where wandb writes.
-        episode: number of episodes that were logged before.
+        config: configuration of the run.
+        run: run folder that wandb writes to.
+        episode: number of episodes logged before.
     """
 
     def __init__(self, config: RunConfig, run: RunFolder, episode: int):
-        # The id is the last part of the name of the folder that wandb made.
+        # The name of a folder that wandb created ends with the id of the run.
         folder = inner_folder(run.path, "wandb")
-        remove_links(folder)  # wandb makes its own again
+        remove_links(folder)  # wandb creates its own links again
         before = sorted(folder.glob("*run-*-*"))
         import wandb
 
@@ -74,37 +74,37 @@ class Wandb:
             id=before[-1].name.rpartition("-")[2] if before else None,
             save_dir=str(run.path.absolute()),
             offline=offline,
-            log_env_packages=False,  # it would stand in the configuration as "env"
+            log_env_packages=False,  # it would overwrite "env" in the configuration
             settings=wandb.Settings(
                 silent=offline,
                 console="off",
                 init_timeout=_CONNECTING,
                 finish_timeout=PATIENCE / 2,
             ),
-            reinit="create_new",  # seeds that train side by side are runs of their own
+            reinit="create_new",  # each of several parallel seeds is a run
             group=f"{config.setup}-{config.fire.name}",
             tags=[config.method, f"seed-{config.seed}"],
         )
         self._logger.log_hparams(to_values(config))
 
     def log(self, line: Mapping[str, float], episode: int) -> None:
-        """See `Tracker`; the step of wandb's history is the episode."""
+        """Logs an episode's line of metrics.jsonl, with the episode as wandb's step."""
         self._logger.log_metrics(dict(line), step=episode, override_global_step=True)
 
     def log_evaluation(self, numbers: Mapping[str, float], figures: Sequence[Path]) -> None:
-        """See `Tracker`; the step is the one after the last episode."""
+        """Logs the final evaluation at the step after the last episode."""
         import wandb
 
         images = {f"figures/{path.stem}": wandb.Image(str(path)) for path in figures}
         self._logger.experiment.log({**numbers, **images}, step=self._episodes + 1)
 
     def finish(self) -> None:
-        """See `Tracker`."""
+        """Flushes and closes the tracker."""
         self._logger.experiment.finish()
 
 
 class Tensorboard:
-    """Logs to TensorBoard; the arguments are those of `Wandb`."""
+    """Logs to TensorBoard; arguments are those of `Wandb`."""
 
     def __init__(self, config: RunConfig, run: RunFolder, episode: int):
         self._episodes = config.episodes
@@ -116,20 +116,20 @@ class Tensorboard:
             self._purge(episode + 1)
 
     def _purge(self, step: int) -> None:
-        """Tells TensorBoard to forget what an earlier process logged from a step on."""
+        """Makes TensorBoard discard the events that an earlier process logged from a step on."""
         from tensorboard.compat.proto import event_pb2
 
-        made: Any = event_pb2  # its classes are made when it is imported
-        start = made.Event(session_log=made.SessionLog(status=made.SessionLog.START))
+        proto: Any = event_pb2  # its classes are generated when it is imported
+        start = proto.Event(session_log=proto.SessionLog(status=proto.SessionLog.START))
         self._logger.experiment.file_writer.add_event(start, step)
 
     def log(self, line: Mapping[str, float], episode: int) -> None:
-        """See `Tracker`; the step is the episode."""
+        """Logs an episode's line of metrics.jsonl, with the episode as the step."""
         for name, value in line.items():
             self._logger.log_scalar(name, float(value), step=episode)
 
     def log_evaluation(self, numbers: Mapping[str, float], figures: Sequence[Path]) -> None:
-        """See `Tracker`; the step is the last episode."""
+        """Logs the final evaluation at the step of the last episode."""
         self.log(numbers, self._episodes)
         for path in figures:
             pixels = np.asarray(Image.open(path).convert("RGB"))
@@ -138,14 +138,14 @@ class Tensorboard:
             )
 
     def finish(self) -> None:
-        """See `Tracker`."""
+        """Flushes and closes the tracker."""
         self._logger.experiment.close()
 
 
 class Csv:
-    """Writes metrics.csv, with a header; the arguments are those of `Wandb`.
+    """Writes metrics.csv with a header; arguments are those of `Wandb`.
 
-    The file is made of metrics.jsonl, so that it is right after a run was resumed, too.
+    The file is converted from metrics.jsonl, so that it is correct in a resumed run.
     """
 
     def __init__(self, config: RunConfig, run: RunFolder, episode: int):
@@ -153,15 +153,15 @@ class Csv:
         self._write(episode)
 
     def log(self, line: Mapping[str, float], episode: int) -> None:
-        """See `Tracker`; the file is written again after some seconds."""
+        """Writes the file again if the last write was some seconds ago."""
         if time.monotonic() >= self._next:
             self._write(episode)
 
     def log_evaluation(self, numbers: Mapping[str, float], figures: Sequence[Path]) -> None:
-        """Does nothing: eval.json and figures/ are beside the file."""
+        """Does nothing: the run folder holds eval.json and the figures."""
 
     def finish(self) -> None:
-        """See `Tracker`."""
+        """Writes all lines."""
         self._write(None)
 
     def _write(self, episodes: int | None) -> None:
@@ -180,14 +180,14 @@ TRACKERS: dict[str, type[Wandb] | type[Tensorboard] | type[Csv]] = {
     "tensorboard": Tensorboard,
     "csv": Csv,
 }
-"""the trackers by the value of the key `logger`"""
+"""value of the key `logger` -> tracker"""
 
 
 def check_installed(config: RunConfig) -> None:
     """Checks that the package of a configuration's tracker is installed.
 
     Raises:
-        UserError: it is not; the message says how to install it.
+        UserError: it is not installed; the message says how to install it.
     """
     name = config.logger
     if name in ("wandb", "tensorboard") and find_spec(name) is None:
@@ -196,17 +196,17 @@ def check_installed(config: RunConfig) -> None:
 
 
 def release_wandb() -> None:
-    """Undoes wandb's hook at the end of the program, which would wait for a process that is gone.
+    """Shuts wandb down, so that its exit hook does not wait for a service that has ended.
 
-    The call itself may wait, so a thread makes it.
+    The shutdown may block, so it runs in a thread.
     """
 
     def teardown() -> None:
         with suppress(BaseException):
             sys.modules["wandb"].teardown()
 
-    ending = threading.Thread(target=teardown, name=WANDB_TEARDOWN, daemon=True)
-    ending.start()
-    ending.join(2.0)
-    # By this variable, a later run of this process would look for the one that is gone.
+    thread = threading.Thread(target=teardown, name=WANDB_TEARDOWN, daemon=True)
+    thread.start()
+    thread.join(2.0)
+    # With this variable, a later run of this process would connect to the service that has ended.
     os.environ.pop("WANDB_SERVICE", None)

@@ -1,7 +1,7 @@
-"""Opens the trained policies of the package, named `pretrained:consensus` on the command line.
+"""Opens the trained policies of the package, such as `pretrained:consensus`.
 
-Each is a reduced run folder, policies/pretrained/SETUP/METHOD/sSEED: config.yaml, metrics.jsonl,
-eval.json, and a checkpoint with the actors alone. Finished runs are packed with
+Each is a reduced run folder, policies/pretrained/SETUP/METHOD/sSEED, with config.yaml,
+metrics.jsonl, eval.json, and a checkpoint of the actors. Finished runs are packed with
 
     python -m emberlink.trainers.runs.pretrained RUN... --into policies/pretrained
 """
@@ -27,18 +27,19 @@ USUAL_SETUP = "tuned"
 
 
 def is_name(text: str) -> bool:
-    """Returns whether a text names a trained policy of the package rather than a folder."""
+    """Returns whether a text names a trained policy of the package and not a folder."""
     return text.startswith(PREFIX)
 
 
 def open_run(text: str, output: Path | str = "runs") -> RunFolder:
     """Returns the run that an argument of the command line names.
 
+    A trained policy of the package is copied to a run folder in `output`, unless there is a copy.
+
     Args:
         text: a run folder, or `pretrained:METHOD`, `pretrained:SETUP/METHOD` or
-            `pretrained:SETUP/METHOD/SEED`. A trained policy is copied to a folder in `output`,
-            where its figures are written; an existing copy is used.
-        output: the folder of run folders.
+            `pretrained:SETUP/METHOD/SEED`.
+        output: folder of run folders.
 
     Raises:
         UserError: there is no such policy, or several; the message lists the known ones.
@@ -51,18 +52,18 @@ def open_run(text: str, output: Path | str = "runs") -> RunFolder:
         try:
             _copy(source, target)
         except OSError as error:
-            raise UserError(f"{target}: cannot be made: {error.strerror or error}") from None
+            raise UserError(f"{target}: cannot be created: {error.strerror or error}") from None
     return RunFolder(target)
 
 
 def find(text: str) -> list[Path]:
-    """Returns the folders of the trained policies that a name covers, lowest seed first.
+    """Returns the folders of the trained policies that match a name, lowest seed first.
 
     Args:
-        text: as for `open_run`; `pretrained:SETUP` covers all policies of a setup.
+        text: see `open_run`; `pretrained:SETUP` matches all policies of a setup.
 
     Raises:
-        UserError: there is none.
+        UserError: there is no such policy.
     """
     folders = sorted((file.parent for file in _shipped().glob("*/*/*/config.yaml")), key=_order)
     name = text.removeprefix(PREFIX).strip("/")
@@ -73,32 +74,32 @@ def find(text: str) -> list[Path]:
     usual = [path for path in folders if path.parts[-3:-1] == (USUAL_SETUP, name)]
     if not matching and not usual:
         known = ", ".join(sorted({"/".join(path.parts[-3:-1]) for path in folders})) or "none"
-        raise UserError(f"{text}: no such trained policy; there are {known}")
+        raise UserError(f"{text}: no such trained policy; known: {known}")
     return matching or usual
 
 
 def find_one(text: str) -> Path:
-    """Returns the folder of the trained policy that a name means, of the lowest seed.
+    """Returns the folder of the trained policy with a name and, among several, the lowest seed.
 
     Args:
-        text: as for `open_run`.
+        text: see `open_run`.
 
     Raises:
-        UserError: there is none, or there are several methods or setups.
+        UserError: there is no such policy, or the name matches several methods or setups.
     """
     policies = find(text)
     recipes = sorted({"/".join(folder.parts[-3:-1]) for folder in policies})
     if len(recipes) > 1:
-        raise UserError(f"{text}: one is needed, and there are {', '.join(recipes)}")
+        raise UserError(f"{text} is ambiguous: {', '.join(recipes)}")
     return policies[0]
 
 
 def pack(run: RunFolder, into: Path) -> Path:
-    """Copies a finished run to the trained policies, without the files of its training.
+    """Copies a finished run to the trained policies, without training states and critics.
 
     Args:
-        run: trained and evaluated.
-        into: the folder of trained policies.
+        run: a trained and evaluated run.
+        into: folder of the trained policies.
 
     Returns:
         The new folder.
@@ -112,12 +113,12 @@ def pack(run: RunFolder, into: Path) -> Path:
         raise UserError(f"{run.path}: not finished, or not evaluated")
     target = into / config.setup / config.method / f"s{config.seed}"
     if target.exists():
-        raise UserError(f"{target}: is there already")
+        raise UserError(f"{target}: exists already")
     newest = run.checkpoint()
     check_trained_with(newest, trained)
     header, weights = checkpoint_file.read(newest)
     actors = {name: value for name, value in weights.items() if name.startswith(ACTOR)}
-    about = {k: v for k, v in (header or {}).items() if k not in ("sha256", "format")}
+    about = {k: v for k, v in header.items() if k not in ("sha256", "format")}
     about["config"] = to_header(config)
     (target / "checkpoints").mkdir(parents=True)
     checkpoint_file.write(target / "checkpoints" / newest.name, actors, about)
@@ -141,13 +142,13 @@ def _copy(source: Path, target: Path) -> None:
     """Copies a folder completely or not at all."""
     target.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=target.parent, prefix=".pretrained") as partial:
-        # Modes are not copied: an installed package may be read-only.
+        # Without file modes, since an installed package may be read-only.
         shutil.copytree(source, Path(partial) / "run", copy_function=shutil.copyfile)
         (Path(partial) / "run").rename(target)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Packs the runs that are named on the command line; returns the exit status."""
+    """Packs the runs named on the command line and returns the exit status."""
     parser = argparse.ArgumentParser(prog="python -m emberlink.trainers.runs.pretrained")
     parser.add_argument("runs", metavar="RUN", nargs="+", type=Path)
     parser.add_argument("--into", type=Path, required=True, help="policies/pretrained")

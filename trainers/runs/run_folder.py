@@ -1,4 +1,4 @@
-"""A run on disk: config.yaml, metrics.jsonl, checkpoints, evaluation, figures."""
+"""Reads and writes run folders: config.yaml, metrics.jsonl, checkpoints, evaluation, figures."""
 
 import errno
 import shutil
@@ -36,7 +36,7 @@ class RunFolder(JsonLines, Checkpoints):
 
     @classmethod
     def create(cls, config: RunConfig) -> "RunFolder":
-        """Creates a folder under `config.output`; `write_config` comes next.
+        """Creates a new run folder in `config.output`, without config.yaml.
 
         Raises:
             UserError: the folder cannot be created.
@@ -52,7 +52,7 @@ class RunFolder(JsonLines, Checkpoints):
         return cls(path)
 
     def write_config(self, config: RunConfig) -> None:
-        """Writes the resolved configuration completely, or leaves the earlier one.
+        """Writes config.yaml completely, or leaves the earlier one.
 
         Raises:
             UserError: it cannot be written.
@@ -62,18 +62,18 @@ class RunFolder(JsonLines, Checkpoints):
         self.write_text("config.yaml", text)
 
     def has_config(self) -> bool:
-        """Returns whether config.yaml exists; a new folder gets it last."""
+        """Returns whether config.yaml exists; it is the last file of a new folder to be written."""
         return (self.path / "config.yaml").exists()
 
     def config(self, **changes: Any) -> RunConfig:
         """Reads the run's configuration.
 
         Args:
-            changes: values in place of those in the file, such as `device="cpu"`.
+            changes: keys and values to change, such as `device="cpu"`.
 
         Raises:
-            UserError: the folder or its config.yaml is missing, or the file lacks a key or holds a
-                wrong value.
+            UserError: the folder or its config.yaml does not exist, or a key or value in it is
+                missing or wrong.
         """
         file = self.path / "config.yaml"
         if not self.path.is_dir():
@@ -121,7 +121,7 @@ class RunFolder(JsonLines, Checkpoints):
 
     @contextmanager
     def figure(self, file: str) -> Iterator[Path]:
-        """Yields a path to draw to, which is renamed to figures/FILE at the end.
+        """Yields a path for a figure, which is renamed to figures/FILE at the end.
 
         Raises:
             OSError: it cannot be written, or the folder is a link.
@@ -130,7 +130,7 @@ class RunFolder(JsonLines, Checkpoints):
             yield partial
 
     def evaluated(self) -> bool:
-        """Returns whether eval.json exists and is of the newest checkpoint."""
+        """Returns whether eval.json is an evaluation of the newest checkpoint."""
         try:
             evaluation = parse_json(read_text(self.path / "eval.json", MAX_JSON))
             return evaluation["checkpoint"] == self.checkpoint().name
@@ -138,7 +138,7 @@ class RunFolder(JsonLines, Checkpoints):
             return False
 
     def take_away_after(self, step: int) -> None:
-        """Removes the checkpoints of later steps and all files that are not complete.
+        """Removes the checkpoints after a step and all incomplete files.
 
         Raises:
             UserError: a file cannot be removed.
@@ -147,19 +147,19 @@ class RunFolder(JsonLines, Checkpoints):
         try:
             partial += [self.figures().glob(pattern) for pattern in _PARTIAL_FIGURES]
             for path in chain(self.checkpoints_after(step), self.partial_checkpoints(), *partial):
-                if path.is_file() or path.is_symlink():  # a folder of such a name is the user's
+                if path.is_file() or path.is_symlink():  # a folder with such a name is not ours
                     atomic_io.remove(path)
             for path in self.path.glob(_PARTIAL_DUMPS):
                 if path.is_dir() and not path.is_symlink():
                     shutil.rmtree(path)
         except OSError as error:
-            raise UserError(f"{error.filename}: cannot be taken away: {error.strerror}") from None
+            raise UserError(f"{error.filename}: cannot be removed: {error.strerror}") from None
 
 
 def _check_complete(values: Mapping[str, Any], config: RunConfig) -> None:
-    """Checks that no setting of the environment, fire or communication is left to a default.
+    """Checks that all settings of the environment, fire and communication are in the file.
 
-    Defaults may change, and a setup has its own.
+    A missing setting would get a default, which may not be the value of the run.
 
     Raises:
         UserError: a key is missing.
@@ -172,7 +172,7 @@ def _check_complete(values: Mapping[str, Any], config: RunConfig) -> None:
 
 
 def _new_folder(path: Path) -> Path:
-    """Creates `path`, or `path_2`, ... if it exists, and returns the new folder."""
+    """Creates `path`, or `path_2` and so on if it exists, and returns the new folder."""
     path.parent.mkdir(parents=True, exist_ok=True)
     for attempt in range(1, 1000):
         candidate = path if attempt == 1 else path.with_name(f"{path.name}_{attempt}")

@@ -1,4 +1,4 @@
-"""Reads YAML and JSON of unknown origin: plain values of bounded size, or an error."""
+"""Reads YAML and JSON from untrusted files: only plain values of limited size."""
 
 import json
 from collections.abc import Hashable
@@ -11,23 +11,23 @@ from emberlink.envs.utils.atomic_io import read_bytes
 from emberlink.envs.utils.errors import UserError
 
 MAX_YAML = 100_000
-"""bytes of a config.yaml; usual ones have 2,000"""
+"""maximum bytes of a config.yaml; a typical one has 2,000"""
 MAX_JSON = 500_000_000
-"""bytes of eval.json and metrics.jsonl; five times the largest evaluation that can be set"""
+"""maximum bytes of eval.json and metrics.jsonl; the largest evaluation has a fifth of it"""
 _MAX_DIGITS = 20
-"""digits"""
+"""digits of an integer"""
 
 
 def read_text(path: Path, max_bytes: int) -> str:
     """Returns the text of a regular file or of the target of a link.
 
     Args:
-        path: of the file.
-        max_bytes: largest size that is accepted.
+        path: path of the file.
+        max_bytes: maximum size.
 
     Raises:
         FileNotFoundError: there is no such file.
-        UserError: it is not a regular file, is larger, or is not UTF-8.
+        UserError: it is not a regular file, is too large, or is not UTF-8.
     """
     try:
         return read_bytes(path, max_bytes).decode()
@@ -40,7 +40,7 @@ def read_text(path: Path, max_bytes: int) -> str:
 
 
 def read_yaml(path: Path) -> Any:
-    """Returns the mappings, lists, text, numbers and dates of a YAML file.
+    """Returns the content of a YAML file: mappings, lists, text, numbers and dates.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -63,18 +63,18 @@ def parse_json(text: str) -> Any:
     try:
         return json.loads(text, object_pairs_hook=_once, parse_int=_integer)
     except RecursionError:
-        raise UserError("lists or mappings within each other, too many levels") from None
+        raise UserError("too many levels of lists or mappings") from None
 
 
 class _PlainLoader(yaml.SafeLoader):
-    """Refuses tags, which convert values, and aliases, which make a short file very large."""
+    """Refuses tags, which convert values, and aliases, which can expand a file to any size."""
 
     def compose_node(self, parent: Any, index: Any) -> Any:
         if self.check_event(yaml.AliasEvent):
-            raise UserError("aliases (*name) are not read here")
+            raise UserError("aliases (*name) are not allowed")
         event: Any = self.peek_event()
         if event.tag is not None or event.anchor is not None:
-            raise UserError("tags (!!name) and anchors (&name) are not read here")
+            raise UserError("tags (!!name) and anchors (&name) are not allowed")
         return super().compose_node(parent, index)
 
     def construct_mapping(self, node: Any, deep: bool = False) -> dict[Hashable, Any]:
@@ -82,7 +82,7 @@ class _PlainLoader(yaml.SafeLoader):
         for key, _ in node.value:
             name = self.construct_object(key, deep=True)
             if name in names:
-                raise UserError(f"key {str(name)[:100]!r} stands twice")
+                raise UserError(f"key {str(name)[:100]!r} is repeated")
             names.add(name)
         return super().construct_mapping(node, deep=deep)
 
@@ -90,7 +90,7 @@ class _PlainLoader(yaml.SafeLoader):
 def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     mapping = dict(pairs)
     if len(mapping) < len(pairs):
-        raise UserError("a key stands twice")
+        raise UserError("a key is repeated")
     return mapping
 
 

@@ -1,6 +1,6 @@
 """Compares config.yaml with the configuration in the header of a checkpoint.
 
-The header is covered by the checkpoint's checksum.
+The SHA-256 of the checkpoint covers its header, but not config.yaml.
 """
 
 from collections.abc import Mapping
@@ -20,24 +20,21 @@ _FREE = (*MAY_CHANGE, "output", "evaluation")
 
 
 def check_trained_with(path: Path, config: RunConfig) -> None:
-    """Checks that a checkpoint's networks were trained with the configuration of their run folder.
+    """Checks that a checkpoint was trained with the configuration of its run folder.
 
-    Keys that do not change the training, such as `device`, may differ.
+    Keys that do not affect training, such as `device`, may differ.
 
     Args:
-        path: of the checkpoint.
-        config: read from config.yaml.
+        path: path of the checkpoint.
+        config: configuration from config.yaml.
 
     Raises:
-        UserError: the checkpoint holds no configuration or a different one. The message names the
-            first key that differs, and both values.
+        UserError: the checkpoint holds no configuration or another one; the message names the first
+            key that differs and both values.
     """
     header = checkpoint_file.read_header(path)
-    if header is None or "config" not in header:
-        raise UserError(
-            f"{path}: does not hold the configuration that it was trained with; it was written by "
-            "another program"
-        )
+    if "config" not in header:
+        raise UserError(f"{path}: does not hold the configuration that it was trained with")
     check_same(path, header["config"], config)
 
 
@@ -45,9 +42,9 @@ def check_same(path: Path, sealed: Mapping[str, Any], config: RunConfig) -> None
     """Checks that the configuration in a checkpoint's header is that of the run.
 
     Args:
-        path: of the checkpoint, for the message.
-        sealed: the configuration in its header, as plain values.
-        config: of the run.
+        path: path of the checkpoint, for the message.
+        sealed: configuration in its header, as plain values.
+        config: configuration of the run.
 
     Raises:
         UserError: they differ; see `check_trained_with`.
@@ -69,10 +66,9 @@ def check_same(path: Path, sealed: Mapping[str, Any], config: RunConfig) -> None
 
 
 def to_header(config: RunConfig) -> dict[str, Any]:
-    """Returns the configuration as a checkpoint's header holds it.
+    """Returns the configuration for the header of a checkpoint.
 
-    The folder of the runs is left out: copies of a training in two folders have the same bytes,
-    and networks that are handed on do not name a folder of their author.
+    It does not contain `output`, so that a checkpoint does not depend on the path of its folder.
     """
     return {key: value for key, value in to_values(config).items() if key != "output"}
 

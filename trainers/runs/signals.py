@@ -1,4 +1,4 @@
-"""Lets a training finish its step before Ctrl-C, SIGTERM or SIGHUP ends it."""
+"""Handles SIGINT, SIGTERM and SIGHUP, so that a training can finish its step and save."""
 
 import signal
 from collections.abc import Callable
@@ -8,14 +8,14 @@ _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 class Interrupted(KeyboardInterrupt):
-    """Is raised by a signal that does not wait for the end of the step."""
+    """Reports a signal that ends the program at once."""
 
 
 class Interruption:
     """Calls `stop` at the first SIGINT, SIGTERM or SIGHUP and raises `Interrupted` at the second.
 
     Args:
-        stop: requests an end between two steps.
+        stop: called at the first signal; requests the end of the training after a step.
     """
 
     def __init__(self, stop: Callable[[], None]):
@@ -24,7 +24,7 @@ class Interruption:
         self.received: int | None = None
         """number of the first signal; None before it"""
         self.at_once = False
-        """raise `Interrupted` at the first signal too"""
+        """whether the first signal raises `Interrupted`, too"""
 
     def __enter__(self) -> "Interruption":
         signals = [*_SIGNALS]

@@ -1,4 +1,4 @@
-"""Runs trackers in a thread of their own, so that none can hold up or end a training."""
+"""Runs experiment trackers in a thread, so that they cannot delay or end a training."""
 
 import queue
 import threading
@@ -13,20 +13,19 @@ from emberlink.trainers.runs.loggers import Tracker
 from emberlink.trainers.runs.run_folder import RunFolder
 
 _Job = Callable[[int, Tracker], None]
-"""called with the number of a run and its tracker"""
+"""called with the index of a run and its tracker"""
 
 
 class Trackers:
-    """Hands the numbers of several runs to their trackers.
+    """Passes the metrics of several runs to their trackers.
 
-    A tracker may wait for a network, or for a process that is gone, so all of them work in a
-    thread. If one fails, one warning says so and no tracker is told anything more; metrics.jsonl
-    holds everything in any case.
+    All trackers run in one thread, since they may block on a network or a process. If one fails,
+    there is a warning, and all trackers are stopped. metrics.jsonl does not depend on trackers.
 
     Args:
-        configs: of the runs; all name the same tracker.
-        runs: where each one's tracker writes.
-        episode: number of episodes that were logged before, for a resumed run.
+        configs: configurations of the runs, with the same `logger`.
+        runs: the run folders.
+        episode: number of episodes logged before, for a resumed run.
     """
 
     def __init__(
@@ -38,24 +37,24 @@ class Trackers:
         self._failure: str | None = None
         self._thread: threading.Thread | None = None
         self.given_up = False
-        """whether a tracker has failed, and a warning has said so"""
+        """whether a tracker has failed"""
         if self._name in loggers.TRACKERS:
             self._thread = threading.Thread(target=self._work, daemon=True)
             self._thread.start()
 
     def log(self, lines: Sequence[Mapping[str, float]], episode: int) -> None:
-        """Logs an episode's line of metrics.jsonl of every run."""
+        """Logs an episode's line of metrics.jsonl for each run."""
         copies = [dict(line) for line in lines]
         self._put(lambda place, tracker: tracker.log(copies[place], episode))
 
     def log_evaluation(
         self, numbers: Sequence[Mapping[str, float]], figures: Sequence[Sequence[Path]]
     ) -> None:
-        """Logs the final evaluation of every run: means by name, and PNG files."""
+        """Logs the final evaluation of each run: means by name, and PNG files."""
         self._put(lambda place, tracker: tracker.log_evaluation(numbers[place], figures[place]))
 
     def close(self) -> None:
-        """Writes what is left, if that takes no longer than `PATIENCE` seconds."""
+        """Closes the trackers; waits at most `PATIENCE` seconds."""
         if self._thread is None:
             return
         self._jobs.put(None)
@@ -83,7 +82,7 @@ class Trackers:
                     job(place, tracker)
             while trackers:
                 trackers.pop().finish()
-        except BaseException as error:  # no error of a tracker is one of the training
+        except BaseException as error:  # an error of a tracker must not end the training
             self._failure = " ".join(f"{type(error).__name__}: {error}".split())
             for tracker in trackers:
                 with suppress(BaseException):
@@ -96,6 +95,6 @@ class Trackers:
         shown = reason if len(reason) <= 200 else reason[:200] + " ..."
         warnings.warn(
             f"logger={self._name} has stopped ({shown}); "
-            "the training goes on, metrics.jsonl holds everything",
+            "the training continues, metrics.jsonl is complete",
             stacklevel=4,
         )

@@ -53,7 +53,7 @@ def read(path: Path) -> tuple[RunState, dict[str, Tensor]]:
         UserError: it cannot be read, is damaged, or is no checkpoint of a training.
     """
     header, tensors = checkpoint_file.read(path)
-    if header is None or header.get("kind") != "state":
+    if header.get("kind") != "state":
         raise UserError(f"{path}: holds networks alone; nothing can be resumed from it")
     try:
         run = RunState(**{field.name: header[field.name] for field in fields(RunState)})

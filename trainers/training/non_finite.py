@@ -197,13 +197,12 @@ def replay(dump: Path | str, device: str = "cpu") -> NonFiniteReport | None:
     setup = TrainingSetup(RunFolder(folder).config(device=device))
     header, content = checkpoint_file.read(folder / _TENSORS)
     try:
-        assert header is not None
         setup.learner.load_state_dict(group(content, "learner"))
         setup.learner.updates = header["updates"]
         setup.guard.start(header["steps"], header["updates"])
         rollout = header["place"] == ROLLOUT
         bad = unflatten(group(content, "bad"), 2 if rollout else 1, device)
-    except (AssertionError, KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError) as error:
         raise UserError(f"{folder}: not a dump of a divergence: {error}") from None
     if rollout:
         setup.guard.record_rollout(bad, bad.shape[1])
