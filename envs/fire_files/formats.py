@@ -43,7 +43,7 @@ def _check_length(path: Path) -> None:
 
 def _check_size(size: int) -> None:
     if size > MAX_BYTES:
-        raise UserError(f"{size} bytes; a text file may have {MAX_BYTES}")
+        raise UserError(f"{size} bytes; a text file has at most {MAX_BYTES}")
 
 
 def _check_json(path: Path) -> None:
@@ -54,7 +54,7 @@ def _check_json(path: Path) -> None:
     except RecursionError:
         raise UserError("too many levels; expected GeoJSON") from None
     except UnicodeDecodeError as error:
-        raise UserError(f"no text at byte {error.start}; expected GeoJSON in UTF-8") from None
+        raise UserError(f"byte {error.start} is not UTF-8; expected GeoJSON in UTF-8") from None
     except ValueError as error:
         raise UserError(f"{error}; expected GeoJSON") from None
     if content.get("type") not in ("FeatureCollection", "Feature"):
@@ -76,7 +76,7 @@ def _parse_kml(content: bytes) -> None:
             raise UserError(f"the first element is {tag[:40]!r}; expected KML")
 
     def refuse(*_: Any) -> None:
-        raise UserError("it has a document type; expected KML without one")
+        raise UserError("a document type declaration; expected KML without one")
 
     parser.StartElementHandler, parser.StartDoctypeDeclHandler = check_root, refuse
     try:

@@ -70,9 +70,7 @@ def perimeter_times(frame: Any, wanted: str | None, unit: Units | None) -> tuple
             f"as fire.time_field={columns[0]}"
         )
     if not columns:
-        raise UserError(
-            f"which column holds the times is not known; expected fire.time_field, one of {known}"
-        )
+        raise UserError(f"no column of times is known; expected fire.time_field, one of {known}")
     column = frame[columns[0]]
     for other in edited:
         column = column.where(column.notna(), frame[other])

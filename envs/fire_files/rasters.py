@@ -155,13 +155,13 @@ def _check_band(dataset: Any) -> None:
         raise UserError(f"values of type {kind} without NODATA, as of a picture; expected times")
     if dataset.width * dataset.height > MAX_CELLS:
         raise UserError(
-            f"{dataset.width} x {dataset.height} cells; at most {MAX_CELLS} are read: expected a "
-            "part of it, as gdalwarp -te cuts out"
+            f"{dataset.width} x {dataset.height} cells; at most {MAX_CELLS} are read; expected a "
+            "part, such as gdalwarp -te cuts out"
         )
     if dataset.transform.is_identity:
         raise UserError(
-            "no geotransform: it does not say where its cells are, or has lost it; expected one, "
-            "as gdal_translate -a_ullr gives it"
+            "no geotransform, so that the place of the cells is not known; expected one, such as "
+            "gdal_translate -a_ullr writes"
         )
 
 
@@ -239,7 +239,7 @@ def _on_plane(
         raise UserError(f"cells of {a:g} x {e:g}; expected a size above 0")
     if unit is None:
         raise UserError(
-            "a raster does not say the unit of its times: expected fire.units=minutes (FARSITE, "
+            "the unit of the raster's times is not known; expected fire.units=minutes (FARSITE, "
             "FlamMap), seconds (ELMFIRE), hours, days or steps"
         )
     rows, columns = times.shape

@@ -196,8 +196,8 @@ def _checksum(file: str, expected: str | None) -> str:
         raise UserError(f"{printable(str(path))}: {error}") from None
     if expected not in (None, digest):
         raise UserError(
-            f"{printable(str(path))}: has changed: its content has sha256 {digest[:12]}..., that "
-            f"of the run {str(expected)[:12]}..."
+            f"{printable(str(path))}: has changed: its SHA-256 is {digest[:12]}..., in the run "
+            f"{str(expected)[:12]}..."
         )
     return digest
 

@@ -102,7 +102,7 @@ def import_files(arguments: Sequence[str], console: Console, output: Path) -> in
     overrides = [text for text in arguments if "=" in text and not os.path.exists(text)]
     paths = [Path(text) for text in arguments if text not in overrides]
     if not paths:
-        raise UserError("which file? FILE, such as ArrivalTime.asc, is missing")
+        raise UserError("FILE is missing; expected a file, such as ArrivalTime.asc")
     configs = [from_file(path, overrides) for path in paths]
     check_bank(output, len(paths), configs[0].env.grid)
     fires, names = [], []
