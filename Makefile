@@ -16,16 +16,19 @@ UNFINISHED := $(VENV)/emberlink-unfinished
 PIP := $(BIN)/python -m pip install -q --disable-pip-version-check -c constraints.txt
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test soak bench guard lint typecheck install clean
+.PHONY: help demo test test-slow soak bench guard lint typecheck install clean
 
 help:  ## list the targets
-	@sed -n 's/^\([a-z]*\):.*## /  make \1\t/p' $(MAKEFILE_LIST) | expand -t 20
+	@sed -n 's/^\([a-z-]*\):.*## /  make \1\t/p' $(MAKEFILE_LIST) | expand -t 20
 
 demo: $(INSTALLED)  ## train consensus for a few minutes and evaluate it, with figures and a GIF
 	@OMP_NUM_THREADS=$(THREADS) $(BIN)/emberlink train consensus setup=tuned $(DEMO)
 
-test: $(INSTALLED)  ## run the tests
-	@OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n $(WORKERS) --dist loadgroup
+test: $(INSTALLED)  ## run the tests, without the slow ones (about 5 minutes)
+	@OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n $(WORKERS) --dist loadgroup -m "not slow"
+
+test-slow: $(INSTALLED)  ## run the slow tests (about 5 minutes)
+	@OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n $(WORKERS) --dist loadgroup -m slow
 
 soak: $(INSTALLED)  ## kill, interrupt and damage trainings repeatedly (about half an hour)
 	@OMP_NUM_THREADS=1 $(BIN)/python tests/soak/soak.py $(SOAK)

@@ -122,16 +122,20 @@ class Communication(Transform):
         return result
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        self._listen(next_tensordict)
         bonus = self.module.shaping(next_tensordict)
         if bonus is not None:
             reward = next_tensordict.get(keys.REWARD) + bonus.unsqueeze(-1)
             next_tensordict.set(keys.REWARD, reward)
-        return self._communicate(next_tensordict)
+        return self.module(next_tensordict)
 
     def _communicate(self, tensordict: TensorDictBase) -> TensorDictBase:
+        self._listen(tensordict)
+        return self.module(tensordict)
+
+    def _listen(self, tensordict: TensorDictBase) -> None:
         if self.module.radio is not None:
             tensordict.set(keys.HEARS, self.module.radio.links(tensordict))
-        return self.module(tensordict)
 
     def _check_keys(self, tensordict: TensorDictBase) -> None:
         """Checks that the environment and the transforms before this one write every input key."""

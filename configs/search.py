@@ -6,9 +6,10 @@ A group is a folder such as `method` or `fire`. Each file in it is a choice of t
 import os
 import warnings
 from collections.abc import Sequence
-from importlib.metadata import entry_points
 from importlib.util import find_spec
 from pathlib import Path
+
+from emberlink.configs import entry_points
 
 VARIABLE = "EMBERLINK_CONFIGS"
 """environment variable with folders of groups, separated as in PATH"""
@@ -23,7 +24,7 @@ def folders() -> list[Path]:
     exist, there is a warning.
     """
     listed = [Path(text) for text in os.environ.get(VARIABLE, "").split(os.pathsep) if text]
-    plugins = [path for point in entry_points(group=ENTRY_POINTS) for path in _package(point.value)]
+    plugins = [path for point in entry_points.read(ENTRY_POINTS) for path in _package(point.value)]
     every = [path.resolve() for path in (*listed, *plugins, Path(__file__).parent)]
     return [path for path in dict.fromkeys(every) if path.is_dir()]
 

@@ -1,9 +1,12 @@
 """What all tests share."""
 
+import io
 import shutil
 from pathlib import Path
 
 import pytest
+from matplotlib.figure import Figure
+from PIL import Image
 from tiny_run import train_tiny
 
 
@@ -14,6 +17,19 @@ def _environment(tmp_path_factory):
         patch.delenv("COLUMNS", raising=False)
         patch.setenv("EMBERLINK_CACHE", str(tmp_path_factory.mktemp("cache")))
         yield
+
+
+@pytest.fixture(autouse=True)
+def _blank_figures(request, monkeypatch) -> None:
+    """Saves a blank picture for each figure, except in tests marked `drawn`, which look at it.
+
+    Drawing takes half of the time of a short training.
+    """
+    if request.node.get_closest_marker("drawn"):
+        return
+    blank = io.BytesIO()
+    Image.new("RGB", (8, 8)).save(blank, "png")
+    monkeypatch.setattr(Figure, "savefig", lambda _, path, **__: path.write_bytes(blank.getvalue()))
 
 
 @pytest.fixture(scope="session")

@@ -1,4 +1,4 @@
-"""Fires whose arrival is known at every point, written as the files that people have."""
+"""Writes fires with known arrival times in the file formats of other programs."""
 
 import math
 from collections.abc import Sequence
@@ -18,25 +18,25 @@ UTM = "EPSG:32611"
 
 @dataclass(frozen=True)
 class Ellipses:
-    """Elliptical fires from points, metres and minutes: the front at t is that at 1, t times."""
+    """Elliptical fires from points, metres and minutes. The front grows in proportion to time."""
 
     origins: Sequence[tuple[float, float]] = ((1500.0, 1300.0),)
     head: float = 4.0
-    """metres per minute"""
+    """rate of spread of the head, metres per minute"""
     breadth: float = 2.0
     """length-to-breadth ratio"""
     azimuth: float = 40.0
-    """degrees counter-clockwise from +x"""
+    """direction of the head, degrees counter-clockwise from +x"""
 
     @property
     def axes(self) -> tuple[float, float, float]:
-        """Half length, half breadth and shift of the ellipse after a minute."""
+        """Half length, half breadth and shift of the ellipse after a minute, metres."""
         e = math.sqrt(self.breadth**2 - 1) / self.breadth
         back = self.head * (1 - e) / (1 + e)
         return (self.head + back) / 2, (self.head + back) / 2 / self.breadth, (self.head - back) / 2
 
     def arrival(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """Minutes, of ((along - c t) / a)² + (across / b)² = t²."""
+        """Solves ((along - c t) / a)² + (across / b)² = t² for t, minutes."""
         a, b, c = self.axes
         turn = math.radians(self.azimuth)
         times = []
@@ -49,7 +49,7 @@ class Ellipses:
         return np.min(times, axis=0)
 
     def perimeter(self, time: float, points: int = 90) -> shapely.Geometry:
-        """The area burnt by a time."""
+        """Returns the area burnt by a time."""
         a, b, c = self.axes
         angle = np.linspace(0, 2 * np.pi, points, endpoint=False)
         along, across = (c + a * np.cos(angle)) * time, b * np.sin(angle) * time
@@ -61,14 +61,14 @@ class Ellipses:
 
 
 def raster_of(fire: Ellipses, until: float, cells: int = 100, cell: float = CELL) -> np.ndarray:
-    """Arrival at the centres of cells, rows from north to south; -9999 after `until`."""
+    """Returns arrival times at the centres of cells, north up; -9999 after `until`."""
     at = (np.arange(cells) + 0.5) * cell
     times = fire.arrival(at[None, :], at[::-1, None])
     return np.where(times <= until, times, -9999.0)
 
 
 def write_asc(path: Path, times: np.ndarray, cell: float = CELL, **header: object) -> Path:
-    """ESRI ASCII as FARSITE writes it."""
+    """Writes ESRI ASCII as FARSITE does."""
     keys = {
         "NCOLS": times.shape[1],
         "NROWS": times.shape[0],
@@ -85,7 +85,7 @@ def write_asc(path: Path, times: np.ndarray, cell: float = CELL, **header: objec
 
 
 def write_tif(path: Path, times: np.ndarray, cell: float = CELL, **about: object) -> Path:
-    """A GeoTIFF of one band, or of a band for each of [bands, rows, columns]."""
+    """Writes a GeoTIFF of [rows, columns] or [bands, rows, columns]."""
     bands = np.atleast_3d(times.T).T if times.ndim == 2 else times
     tags = about.pop("tags", {})
     north = CORNER[1] + cell * bands.shape[1]
@@ -109,10 +109,10 @@ def write_tif(path: Path, times: np.ndarray, cell: float = CELL, **about: object
 def frame_of(
     fire: Ellipses, times: Sequence[float], kind: str = "polygon", column: str = "Elapsed_Mi"
 ) -> geopandas.GeoDataFrame:
-    """Perimeters at some times, elapsed minutes, in the coordinates of the rasters."""
+    """Returns perimeters at some elapsed minutes, in the coordinates of the rasters."""
     shapes = [shapely.transform(fire.perimeter(time), lambda at: at + CORNER) for time in times]
     return geopandas.GeoDataFrame(
-        {column: np.array(times, float)}, geometry=[KINDS[kind](one) for one in shapes], crs=UTM
+        {column: np.array(times, float)}, geometry=[KINDS[kind](shape) for shape in shapes], crs=UTM
     )
 
 
@@ -130,20 +130,20 @@ KINDS = {
     "multiline": lambda shape: _in_parts(shape.boundary),
     "collection": _with_z,
 }
-"""how a perimeter is written"""
+"""conversion of a perimeter to a kind of geometry"""
 
 
 def _in_parts(line: shapely.Geometry) -> shapely.Geometry:
     parts = []
-    for one in getattr(line, "geoms", [line]):
-        at = list(one.coords)
+    for part in getattr(line, "geoms", [line]):
+        at = list(part.coords)
         third = len(at) // 3
         parts += [at[: third + 1], at[third : 2 * third + 1][::-1], at[2 * third :]]
     return shapely.MultiLineString(parts)
 
 
 def points_text(fire: Ellipses, lines: int, skipped: int = 6000, points: int = 90) -> str:
-    """The paper's text: a line per iteration, the same front until `skipped`."""
+    """Returns the paper's text: a line per iteration, the same front until line `skipped`."""
     rows = []
     for line in range(lines):
         time = 60 + max(line - skipped, 0)

@@ -56,6 +56,7 @@ def test_every_byte_is_sealed(tmp_path):
             checkpoint_file.read(path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS)
 def test_damaged_and_foreign_checkpoints_are_refused(method, tmp_path):
     files = readable(tmp_path, method)
@@ -109,6 +110,7 @@ def refused(path: Path, change: Callable[[dict, dict[str, torch.Tensor]], object
     return text.partition("; the one before it")[0].removeprefix(f"{path}: ")
 
 
+@pytest.mark.slow
 def test_nan_is_refused_wherever_it_is(stopped):
     _, content = checkpoint_file.read(stopped)
     floating = [name for name, value in content.items() if value.is_floating_point()]

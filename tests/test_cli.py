@@ -44,6 +44,7 @@ def test_help_says_what_a_command_does_with_an_example(command, capsys):
     assert f"\n    {command}" in capsys.readouterr().out
 
 
+@pytest.mark.drawn
 def test_train_leaves_the_files_and_prints_the_table(tmp_path, capsys):
     output = tmp_path / "some where" / "deep"
     assert main.main(["train", "independent", *TINY, f"output={output}"]) == 0

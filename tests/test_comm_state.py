@@ -15,6 +15,7 @@ from torchrl.envs import (
 from visited_map import VisitedMap, VisitedMapConfig
 
 from emberlink.comm._heading import HeadingConfig
+from emberlink.comm._radio import neighbours
 from emberlink.comm.base import CommModule, Communication
 from emberlink.comm.consensus import Consensus, ConsensusConfig
 from emberlink.comm.positional import Positional, PositionalConfig
@@ -44,6 +45,28 @@ STATES = {"consensus": ["streak", "waypoint", "fire_score", "altitude_sum"], "ma
 
 def action(step: int) -> torch.Tensor:
     return torch.rand(ENVS, UAVS, 3, generator=torch.Generator().manual_seed(step)) * 2 - 1
+
+
+class Heard(VisitedMap):
+    """Rewards a UAV for each UAV that it hears."""
+
+    def shaping(self, tensordict):
+        return tensordict[keys.HEARS].sum(-1).float()
+
+
+def test_the_links_of_a_step_are_there_before_the_reward_is_shaped():
+    env = TransformedEnv(bare(), Communication(Heard(WORLD, VisitedMapConfig(range=6.0), ENVS)))
+    plain = bare()
+    moments = [one.reset() for one in (env, plain)]
+    for step in range(5):
+        moments = [
+            one.step(moment.set(keys.ACTION, action(step)))["next"]
+            for one, moment in zip((env, plain), moments, strict=True)
+        ]
+        shaped, reward = (moment[keys.REWARD][..., 0] for moment in moments)
+        links = neighbours(moments[0][keys.POSITION], 6.0)
+        assert links.any()
+        assert shaped.equal(reward + links.sum(-1))
 
 
 def bare() -> WildfireEnv:

@@ -253,6 +253,7 @@ def test_spread_within_a_run_is_in_no_interval(tmp_path):
     assert calm.interval == wild.interval == (20, 40)
 
 
+@pytest.mark.drawn
 def test_the_order_of_runs_does_not_matter(runs, tmp_path):
     folders = find([runs])
     whole = []
@@ -378,6 +379,7 @@ def test_rewards_that_differ_are_not_ranked(tmp_path, capsys):
     )
 
 
+@pytest.mark.drawn
 def test_an_evaluation_without_the_fire_trained_on(tmp_path):
     run = write_run(tmp_path, "consensus", overrides=("fire=paper",), scenarios=("elsewhere",))
     assert main.main(["compare", str(run), "--output", str(tmp_path / "out")]) == 0
@@ -407,6 +409,7 @@ def in_another_world(run, name, coverage, **about):
     (run / name).write_text(json.dumps(content))
 
 
+@pytest.mark.drawn
 def test_evaluations_in_other_worlds_are_no_trainings(tmp_path, capsys):
     """They have rows in the tables, and no claims, curves and colours."""
     for seed in (0, 1):
@@ -743,6 +746,7 @@ def test_nothing_is_overwritten(runs, tmp_path, monkeypatch, capsys):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["compare", "compare_2", "taken"]
 
 
+@pytest.mark.drawn
 def test_a_real_run_has_a_timelapse(finished, tmp_path):
     assert main.main(["compare", str(finished.parent), "--output", str(tmp_path / "out")]) == 0
     (timelapse,) = (tmp_path / "out").glob("*timelapse*.png")

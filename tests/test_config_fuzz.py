@@ -29,7 +29,7 @@ from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.learners.ddpg import DDPGConfig
 from emberlink.trainers.training.setup import TrainingSetup
 
-EXAMPLES = 5000 if SOAK else 500
+EXAMPLES = 5000 if SOAK else 200
 FUZZ = settings(
     max_examples=EXAMPLES // 2,  # half of them right, half of them wrong
     deadline=None,
@@ -201,12 +201,14 @@ def stepped(values: dict) -> None:
         assert moment[key].isfinite().all(), key
 
 
+@pytest.mark.slow
 @FUZZ
 @given(valid_values())
 def test_what_fits_is_built_and_stepped(values):
     stepped(values)
 
 
+@pytest.mark.slow
 @settings(FUZZ, max_examples=max(15, EXAMPLES // 50))
 @given(valid_values())
 def test_what_fits_collects_and_learns(values):

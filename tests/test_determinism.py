@@ -10,6 +10,7 @@ from emberlink.envs.config import WildfireConfig
 from emberlink.envs.wildfire import WildfireEnv
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS)
 def test_a_seed_repeats_its_run_byte_for_byte(method, tmp_path):
     def lines(folder: str, seed: int) -> bytes:

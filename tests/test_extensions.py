@@ -80,10 +80,10 @@ def test_a_users_file_with_a_mistake(text, message, folder):
 
 def entry_point(monkeypatch, group: str, name: str, value: str) -> None:
     point = metadata.EntryPoint(name, value, group)
-    for module in ("emberlink.envs.utils.plugins", "emberlink.configs.search"):
-        monkeypatch.setattr(
-            f"{module}.entry_points", lambda *, group: [point] if point.group == group else []
-        )
+    monkeypatch.setattr(
+        "emberlink.configs.entry_points.read",
+        lambda group: (point,) if point.group == group else (),
+    )
 
 
 def test_an_entry_point_that_does_not_fit_names_itself(monkeypatch):

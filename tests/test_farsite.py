@@ -11,6 +11,8 @@ from exact_front import exact_arrival
 
 from emberlink.envs.fire.ellipse import ellipse_rates
 
+pytestmark = pytest.mark.drawn
+
 SIDE, RADIUS, HEAD, RATIO, END = 45, 4.0, 0.035, 1.5, 420.0
 HEADER = "ncols {0}\nnrows {1}\nxllcorner 0\nyllcorner 0\ncellsize 30\nNODATA_value -9999\n"
 WINDS = ("3mph300deg", "3mph45deg7hr", "clockwise1hr", "counterClockwise3hr")

@@ -35,11 +35,17 @@ def contents(folder: Path) -> dict[str, bytes]:
     return {str(path): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
+@pytest.fixture(scope="module")
+def independent(tmp_path_factory) -> Path:
+    output = tmp_path_factory.mktemp("runs")
+    assert main.main(["train", "independent", *TINY, f"output={output}"]) == 0
+    return run_of(output).path
+
+
 @pytest.fixture
-def run(tmp_path, capsys) -> RunFolder:
-    """A finished run."""
-    assert trained(capsys, "independent", *TINY, f"output={tmp_path / 'runs'}")[0] == 0
-    return run_of(tmp_path / "runs")
+def run(independent, tmp_path) -> RunFolder:
+    """A copy of a finished run."""
+    return RunFolder(shutil.copytree(independent, tmp_path / "runs" / independent.name))
 
 
 def test_a_disk_that_fills_up_in_the_evaluation(tmp_path, capsys, monkeypatch):
@@ -179,6 +185,7 @@ def test_the_folder_stays_locked_until_the_evaluation_is_written(tmp_path, capsy
     assert not list((tmp_path / "runs").glob("*/lock"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("call", range(1, 5))
 def test_a_kill_while_the_folders_of_seeds_are_made(call, tmp_path, capsys):
     """Either nothing is there that could be taken for a run, or it goes on with all its seeds."""

@@ -1,4 +1,4 @@
-"""Scenarios, seeds, generated fires and the bank on disk."""
+"""Tests scenarios, seeds, generated fires and the cached bank."""
 
 import dataclasses
 import math
@@ -36,7 +36,7 @@ RANGES = [
 
 
 def settings_of(**changes: Any) -> dict[str, Any]:
-    """The values of `huygens`, some of them changed."""
+    """Returns the values of `huygens` with changes."""
     return {**dataclasses.asdict(load_scenario("huygens")), **changes}
 
 
@@ -71,7 +71,7 @@ def test_paper_is_the_measured_fire(paper: torch.Tensor):
     assert (int(count[0]), int(count[-1])) == (77, 141)
     assert (count.diff() >= 0).all()
     burning = paper[0].isfinite().nonzero()
-    assert burning[:, 1].max() < 18  # the lower half and what grows out of it
+    assert burning[:, 1].max() < 18  # the lower half and its growth
     x, y = torch.meshgrid(torch.arange(30.0), torch.arange(30.0), indexing="ij")
     away = torch.hypot(x - 0.36 * 29, y - 0.29 * 29)
     assert int((away <= 5.75).sum()) == 107
@@ -79,7 +79,7 @@ def test_paper_is_the_measured_fire(paper: torch.Tensor):
     assert paper[0][away < 3].isinf().all()
     start, end = ((paper[0] <= t).nonzero().float() for t in (0, HORIZON))
     grown = end.amax(0) - start.amax(0), start.amin(0) - end.amin(0)
-    assert [g.tolist() for g in grown] == [[4, 1], [0, 1]]  # towards +x, not against the wind
+    assert [g.tolist() for g in grown] == [[4, 1], [0, 1]]  # towards +x and not upwind
 
 
 def test_paper_is_one_fire(paper: torch.Tensor):
@@ -97,8 +97,8 @@ def test_huygens_counts(test_fires: torch.Tensor):
     assert end.double().std() > 10
     assert len(test_fires.flatten(1).unique(dim=0)) == 200
     edge = torch.cat([test_fires[:, [0, -1]].flatten(1), test_fires[:, :, [0, -1]].flatten(1)], 1)
-    assert (edge > 0).all()  # every fire starts inside the box,
-    assert 0.15 < edge.isfinite().any(1).double().mean() < 0.3  # and some heads leave it
+    assert (edge > 0).all()  # every fire starts inside the box
+    assert 0.15 < edge.isfinite().any(1).double().mean() < 0.3  # some heads leave the box
 
 
 def test_a_fire_depends_on_its_seed_alone(test_fires: torch.Tensor):
@@ -146,6 +146,7 @@ def test_fuel_slows_the_front():
     assert (many - few)[:, -1].double().mean() > 5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("grid", "fires", "tolerance"),
     [
@@ -153,12 +154,12 @@ def test_fuel_slows_the_front():
         ((45, 30), 60, 0.015),
         ((128, 128), 12, 0.012),
         ((15, 15), 60, 0.03),
-        ((8, 20), 60, 0.08),  # a ring of some five cells: the sampling of its edge shows
+        ((8, 20), 60, 0.08),  # a ring of about five cells, with coarse edges
         ((8, 8), 60, 0.11),
     ],
 )
 def test_a_scenario_scales_with_the_shorter_side(grid, fires: int, tolerance: float):
-    """Areas scale with the square of min(X, Y)/30, at the start and at the end."""
+    """Checks that areas scale with the square of min(X, Y)/30 at the start and at the end."""
     config = FireConfig(**settings_of(centre_x=(0.45, 0.55), centre_y=(0.45, 0.55)))
     seeds = fire_seeds("train", fires)
     base = burning_cells(make_fires(config, seeds, GRID, HORIZON), HORIZON)
@@ -429,7 +430,7 @@ def test_every_valid_config_gives_a_fire(low, high, ratio, radius, patches, seed
 
 
 def test_a_patch_as_small_as_a_number_can_be_is_no_nan():
-    """At the centre of a cell its distance and its radius, squared, are both 0."""
+    """The squared radius underflows to 0, and so does the squared distance at a cell's centre."""
     config = dataclasses.replace(
         load_scenario("paper"),
         patch_radius=(1e-30, 1e-30),

@@ -1,4 +1,4 @@
-"""`emberlink fire` from the outside: pictures, numbers, banks, and what it refuses."""
+"""Tests `emberlink fire`: pictures, numbers, banks and errors."""
 
 import json
 import os
@@ -16,13 +16,14 @@ from PIL import Image
 
 from emberlink.envs.fire.cache import GENERATOR_VERSION
 from emberlink.envs.fire.generator import fire_seeds, load_scenario, make_fires
-from emberlink.envs.fire_files import banks
-from emberlink.envs.fire_files.banks import write_bank
 from emberlink.envs.scenarios import fires_of
 from emberlink.envs.utils.publish import published
 from emberlink.trainers.cli import main
 from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.fires import plot
+from emberlink.trainers.fires.bank_writer import SUFFIXES, write_bank
+
+pytestmark = pytest.mark.drawn
 
 HUYGENS = load_scenario("huygens")
 
@@ -33,7 +34,7 @@ def _in_a_folder_of_its_own(tmp_path, monkeypatch):
 
 
 def ran(capsys, *arguments) -> list[str]:
-    """The lines that a command prints; it ends well and says nothing else."""
+    """Runs a command without an error and returns the lines that it prints."""
     capsys.readouterr()
     assert main.main(["fire", *map(str, arguments)]) == 0
     out, err = capsys.readouterr()
@@ -42,7 +43,7 @@ def ran(capsys, *arguments) -> list[str]:
 
 
 def refused(capsys, *arguments) -> str:
-    """The one line with which a command ends at status 2."""
+    """Runs a command that ends at status 2 and returns its message."""
     capsys.readouterr()
     assert main.main(["fire", *map(str, arguments)]) == 2
     out, err = capsys.readouterr()
@@ -53,16 +54,17 @@ def refused(capsys, *arguments) -> str:
 
 
 def numbers(lines: list[str]) -> dict[str, float]:
-    """The rows of the table, without the colons that only sentences have."""
-    found = {}
-    for line in lines[1:-5]:
+    """Returns the rows of the table."""
+    rows = {}
+    first = 2 if lines[1].startswith("read: ") else 1
+    for line in lines[first:-5]:
         name, _, rest = line.partition("  ")
-        found[name] = float(rest.split()[0])
-    return found
+        rows[name] = float(rest.split()[0])
+    return rows
 
 
 def area(path, colour: tuple[float, ...] | str) -> int:
-    """Pixels of a colour, or of a grey."""
+    """Returns the number of pixels of a colour or a grey."""
     wanted = [255 * float(colour)] * 3 if isinstance(colour, str) else colour
     with Image.open(path) as picture:
         pixels = np.asarray(picture.convert("RGB"), dtype=float)
@@ -70,7 +72,7 @@ def area(path, colour: tuple[float, ...] | str) -> int:
 
 
 def ascii_raster(path: Path, times: np.ndarray, *, cell: float = 30.0) -> Path:
-    """Writes arrival times [X, Y], inf for never, as others' programs do: north up."""
+    """Writes arrival times [X, Y], inf for never, north up as other programs do."""
     rows = np.where(np.isinf(times), -9999, times).T[::-1]
     transform = rasterio.Affine(cell, 0, 0, 0, -cell, cell * len(rows))
     height, width = rows.shape
@@ -85,7 +87,7 @@ def ascii_raster(path: Path, times: np.ndarray, *, cell: float = 30.0) -> Path:
 
 
 def disc(side: int = 40, speed: float = 0.05, at: tuple[int, int] = (15, 22)) -> np.ndarray:
-    """A fire that spreads evenly from a point, [X, Y], minutes."""
+    """Returns a fire that spreads evenly from a point, [X, Y], minutes."""
     x, y = np.meshgrid(np.arange(side), np.arange(side), indexing="ij")
     times = np.hypot(x - at[0], y - at[1]) / speed
     return np.where(times <= 250, times, np.inf)
@@ -96,15 +98,15 @@ def test_preview_prints_the_numbers_of_the_test_fire(capsys):
     burning = burning_cells(fire[None], 400)[0]
     lines = ran(capsys, "preview", "huygens:3", "env.grid=[40,30]", "env.horizon=400")
     assert lines[0] == "huygens, test fire 3: 40 x 30 cells, 400 steps, setup paper"
-    found = numbers(lines)
-    assert found["burning at the start"] == burning[0]
-    assert found["burning at the end"] == burning[-1]
-    assert found["growth, mean"] == pytest.approx(float(burning[-1] - burning[0]) / 400, rel=0.01)
+    rows = numbers(lines)
+    assert rows["burning at the start"] == burning[0]
+    assert rows["burning at the end"] == burning[-1]
+    assert rows["growth, mean"] == pytest.approx(float(burning[-1] - burning[0]) / 400, rel=0.01)
     most = max(int(burning[t + 20] - burning[t]) for t in range(381)) / 20
-    assert found["growth, maximum"] == pytest.approx(most, rel=0.01)
-    assert found["a UAV flies"] == 1
-    assert found["a UAV sees"] == pytest.approx(8 / 3**0.5, rel=0.01)  # 2 x 4 x tan 30 degrees
-    assert found["the team uncovers"] == pytest.approx(6 * 8 / 3**0.5, rel=0.01)
+    assert rows["growth, maximum"] == pytest.approx(most, rel=0.01)
+    assert rows["a UAV flies"] == 1
+    assert rows["a UAV sees"] == pytest.approx(8 / 3**0.5, rel=0.01)  # 2 x 4 x tan 30 degrees
+    assert rows["the team uncovers"] == pytest.approx(6 * 8 / 3**0.5, rel=0.01)
     assert lines[-4] == "UAVs can keep up: yes"
     assert all(len(line) <= 80 for line in lines[:9])
     assert lines[-1] == "fire_huygens_3.png"
@@ -116,10 +118,10 @@ def test_preview_draws_what_it_says(capsys, tmp_path):
         assert picture.format == "PNG"
         assert max(picture.size) == 900
     cell = area(name, plot.BURNT_OUT) / 30  # cells that are burnt out (docs/fire.md)
-    never = 900 - 30 - 141  # all but those and what burns; the square and lines cover some
+    never = 900 - 30 - 141  # without these and the burning cells; the square and lines cover a part
     assert 0.9 * never < area(name, plot.NEVER) / cell < never
     assert cell < area(name, (255, 255, 0)) < 3 * cell
-    # Nothing is burnt out before a fire that starts from a point.
+    # A fire that starts from a point has no burnt-out cells.
     source = ascii_raster(tmp_path / "point.asc", disc())
     (*_, name) = ran(capsys, "preview", source, "fire.units=minutes", "fire.ring_width=null")
     assert name == "fire_point.png"
@@ -158,7 +160,7 @@ def test_names_that_mean_something_elsewhere_are_shown_as_they_are(capsys, tmp_p
     longer = odd.rename(tmp_path / f"{'long' * 50}.asc")
     (*_, name) = ran(capsys, "preview", longer, keys[0], "env.grid=[8,64]")
     assert len(name) < 120
-    with Image.open(name) as picture:  # nothing runs over its sides
+    with Image.open(name) as picture:  # nothing is cut off at the sides
         assert (np.asarray(picture.convert("L"))[:, [0, -1]] == 255).all()
 
 
@@ -263,14 +265,25 @@ def test_another_horizon_than_the_banks_is_refused(suffix, capsys, tmp_path):
     assert np.allclose(np.load(stretched), fires.numpy() * 0.3)
 
 
+def test_preview_says_what_was_read(capsys, tmp_path):
+    source = ascii_raster(tmp_path / "fire.asc", disc())
+    lines = ran(capsys, "preview", source, "fire.units=minutes")
+    cells = np.isfinite(disc()).sum()
+    assert lines[1] == (
+        f"read: {cells} cells burn from 0 minutes to 247.386 minutes, beginning at 1 place"
+    )
+    ran(capsys, "make", "huygens", "--count", 2, "--output", "two.npy")
+    assert ran(capsys, "preview", "two.npy:1")[1] == "read: a bank of 2 fires, in steps"
+
+
 def test_import_of_several_files_is_each_of_them(capsys, tmp_path):
-    one = ascii_raster(tmp_path / "one.asc", disc())
-    two = ascii_raster(tmp_path / "a=b.asc", disc(30, 0.03, (12, 12)))
+    first = ascii_raster(tmp_path / "one.asc", disc())
+    second = ascii_raster(tmp_path / "a=b.asc", disc(30, 0.03, (12, 12)))
     keys = ("fire.units=minutes", "env.grid=[25,20]", "env.horizon=200")
-    assert ran(capsys, "import", one, *keys, two, "--output", "both.tif") == [
+    assert ran(capsys, "import", first, *keys, second, "--output", "both.tif") == [
         *("2 fires of 25 x 20 cells, 200 steps", "both.tif")
     ]
-    for name, file in (("first.npy", one), ("second.npy", two)):
+    for name, file in (("first.npy", first), ("second.npy", second)):
         ran(capsys, "import", file, *keys, "--output", name)
     with rasterio.open("both.tif") as raster:
         both, tags, names = raster.read(), raster.tags(), raster.descriptions
@@ -416,7 +429,7 @@ def test_without_the_extra_one_line_says_which(capsys, tmp_path, monkeypatch):
 
 @contextmanager
 def files_of_at_most(size: int):
-    """As a disk that is full after so many bytes."""
+    """Limits the size of files, as a full disk does."""
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
     try:
@@ -472,7 +485,7 @@ def test_where_there_are_no_links_a_file_is_published_all_the_same(tmp_path, mon
 def test_what_is_no_time_is_not_written(wrong, tmp_path):
     fires = torch.zeros(1, 8, 8)
     fires[0, 2, 3] = wrong
-    for suffix in banks.SUFFIXES:
+    for suffix in SUFFIXES:
         with pytest.raises(AssertionError, match="arrival times are 0 or more"):
             write_bank(tmp_path / f"a{suffix}", fires)
     assert list(tmp_path.iterdir()) == []

@@ -1,4 +1,4 @@
-"""`fire=file` from the command line to the evaluation, and what a run keeps of its files."""
+"""Tests `fire=file` from the command line to the evaluation, and the run's copy of its fires."""
 
 import json
 import shutil
@@ -31,14 +31,14 @@ SMALL = [*TINY, "env.grid=[12,10]"]
 
 @pytest.fixture(scope="module")
 def source(tmp_path_factory) -> Path:
-    """A raster of a fire."""
+    """Returns a raster of a fire."""
     times = raster_of(Ellipses(), 300.0, cells=40, cell=75.0)
     return write_asc(tmp_path_factory.mktemp("source") / "fire.asc", times, 75.0)
 
 
 @pytest.fixture(scope="module")
 def trained(source, tmp_path_factory) -> Path:
-    """A run on a copy of it: the folder of both."""
+    """Trains on a copy of the raster and returns the folder of both."""
     folder = tmp_path_factory.mktemp("trained")
     shutil.copy(source, folder / "fire.asc")
     keys = ["fire=file", f"fire.path={folder}/fire.asc", "fire.units=minutes"]
@@ -48,21 +48,21 @@ def trained(source, tmp_path_factory) -> Path:
 
 @pytest.fixture
 def run(trained, tmp_path) -> Path:
-    """A copy of the run; its file is where it was."""
+    """Returns a copy of the run."""
     return Path(shutil.copytree(next((trained / "runs").iterdir()), tmp_path / "run"))
 
 
 def fails(arguments, capfd) -> str:
-    """The one line of standard error with which a command ends."""
+    """Returns the only line of standard error of a command that fails."""
     capfd.readouterr()
-    assert main.main([str(one) for one in arguments]) == 2
+    assert main.main([str(argument) for argument in arguments]) == 2
     lines = capfd.readouterr().err.strip().splitlines()
     assert len(lines) == 1, lines
     return lines[0]
 
 
 def bank_of(count, horizon=HORIZON):
-    """Some fires of the generator."""
+    """Returns fires of the generator."""
     return make_fires(load_scenario("huygens"), torch.arange(count), GRID, horizon)
 
 
@@ -126,6 +126,7 @@ def test_a_run_tells_what_it_was_trained_on(trained):
             assert np.array_equal(kept[split], expected.numpy())
 
 
+@pytest.mark.slow
 def test_a_run_is_evaluated_rendered_and_resumed_without_its_file(run, trained, tmp_path, capfd):
     gone = trained / "fire.asc"
     gone.rename(trained / "elsewhere.asc")
@@ -139,7 +140,7 @@ def test_a_run_is_evaluated_rendered_and_resumed_without_its_file(run, trained, 
         assert picture.stat().st_size > 1000
         assert main.main(["train", f"resume={run}", "episodes=3"]) == 0
         assert len(RunFolder(run).lines()) == 3
-        # On another grid the file itself is needed.
+        # Another grid needs the file.
         line = fails(["eval", run, "env.horizon=9"], capfd)
         assert line.endswith("fire.asc: there is no such file")
         (run / COPY_FILE).write_bytes((run / COPY_FILE).read_bytes()[:300])
@@ -212,24 +213,24 @@ def test_old_runs_load_as_they_were():
 def test_the_fires_of_a_file_are_divided_into_three_sets(count, train, validation, test, tmp_path):
     fires = bank_of(count)
     np.save(tmp_path / "bank.npy", fires.numpy())
-    found = fires_of(FileFireConfig(path=str(tmp_path / "bank.npy")))
-    assert torch.equal(found.train(GRID, HORIZON), fires[train])
-    assert torch.equal(found.validation(7, GRID, HORIZON), fires[(validation * 7)[:7]])
+    scenario = fires_of(FileFireConfig(path=str(tmp_path / "bank.npy")))
+    assert torch.equal(scenario.train(GRID, HORIZON), fires[train])
+    assert torch.equal(scenario.validation(7, GRID, HORIZON), fires[(validation * 7)[:7]])
     repeated = (test * 7)[:7]
-    assert torch.equal(found.test(7, GRID, HORIZON), fires[repeated])
-    assert torch.equal(found.test_fire(3, GRID, HORIZON), fires[repeated[3:4]])
+    assert torch.equal(scenario.test(7, GRID, HORIZON), fires[repeated])
+    assert torch.equal(scenario.test_fire(3, GRID, HORIZON), fires[repeated[3:4]])
 
 
 def test_a_second_file_holds_the_test_fires(tmp_path, source):
     fires = bank_of(7)
     np.save(tmp_path / "bank.npy", fires.numpy())
     config = FileFireConfig(path=str(tmp_path / "bank.npy"), units="minutes", test=str(source))
-    found = fires_of(config)
-    assert torch.equal(found.train(GRID, HORIZON), fires[[0, 1, 2, 4, 5, 6]])
-    assert torch.equal(found.validation(1, GRID, HORIZON), fires[[3]])
+    scenario = fires_of(config)
+    assert torch.equal(scenario.train(GRID, HORIZON), fires[[0, 1, 2, 4, 5, 6]])
+    assert torch.equal(scenario.validation(1, GRID, HORIZON), fires[[3]])
     other = read_fires(FileFireConfig(path=str(source), units="minutes"), GRID, HORIZON)
-    assert torch.equal(found.test(2, GRID, HORIZON), other.expand(2, -1, -1))
-    pinned = found.with_checksum()
+    assert torch.equal(scenario.test(2, GRID, HORIZON), other.expand(2, -1, -1))
+    pinned = scenario.with_checksum()
     assert pinned.sha256 != pinned.test_sha256
     with pytest.raises(ValueError, match=r"nothing\.asc: there is no such file"):
         fires_of(FileFireConfig(path=str(source), test="nothing.asc")).with_checksum()

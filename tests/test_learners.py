@@ -44,6 +44,7 @@ def test_the_files_are_the_learners():
         registry.find("sac")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("learner", LEARNERS)
 @pytest.mark.parametrize("method", METHODS)
 def test_a_short_run_learns_and_evaluates(method, learner, tmp_path, capsys):

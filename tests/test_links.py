@@ -27,7 +27,7 @@ from emberlink.envs.utils.publish import published
 from emberlink.trainers.cli import main
 from emberlink.trainers.runs.lock import Lock
 from emberlink.trainers.runs.run_folder import RunFolder
-from emberlink.trainers.runs.tracking import Trackers
+from emberlink.trainers.tracking.trackers import Trackers
 from emberlink.trainers.training import rollback
 
 

@@ -1,4 +1,4 @@
-"""No damaged file of a fire ends otherwise than in one line, or in the grid of the whole file."""
+"""Checks that a damaged file gives a message of one line, or the grid of the whole file."""
 
 import re
 import signal
@@ -15,17 +15,17 @@ from emberlink.envs.fire_files.reader import read_fires
 
 GRID, HORIZON = (12, 10), 50
 LONGEST = 5.0
-"""seconds for a file"""
+"""maximum time to read a file, seconds"""
 
 
 def read(path, **keys):
-    """Its grids on few cells."""
+    """Returns the fires of a file on few cells."""
     return read_fires(FileFireConfig(path=str(path), **keys), GRID, HORIZON)
 
 
 @pytest.fixture(scope="module")
 def alarm():
-    """Ends what hangs."""
+    """Interrupts a reader that hangs."""
 
     def stop(*_):
         raise TimeoutError(f"no end after {3 * LONGEST} seconds")
@@ -37,11 +37,11 @@ def alarm():
 
 
 def outcome(case) -> str:
-    """What is wrong with how the file was read; nothing if all is well."""
+    """Returns the mistake of the reader, or an empty text."""
     signal.setitimer(signal.ITIMER_REAL, 3 * LONGEST)
     began = time.perf_counter()
     try:
-        found = read(case.path, **case.keys)
+        fires = read(case.path, **case.keys)
     except ValueError as error:
         message = str(error)
         shown = case.path.name if len(case.path.name) < 60 else case.path.name[-15:]
@@ -55,14 +55,14 @@ def outcome(case) -> str:
         return f"{type(error).__name__}: {error}"
     else:
         if case.whole is None:
-            return f"was read: {torch.isfinite(found).sum()} cells burn"
+            return f"was read: {torch.isfinite(fires).sum()} cells burn"
         kind = "asc" if case.whole.suffix == ".asc" else case.whole.suffix[1:]
         whole = read(case.whole, **keys_of(kind))
-        burnt = [torch.isfinite(one).sum().item() for one in (found, whole)]
+        burnt = [torch.isfinite(bank).sum().item() for bank in (fires, whole)]
         if kind == "txt":
-            if ((found != whole) & torch.isfinite(found)).any():
+            if ((fires != whole) & torch.isfinite(fires)).any():
                 return "has other times than the whole file"
-        elif not torch.equal(found, whole):
+        elif not torch.equal(fires, whole):
             return f"was read, and differently: {burnt[0]} cells burn, of the whole file {burnt[1]}"
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0)

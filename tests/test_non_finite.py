@@ -208,6 +208,7 @@ CASES = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("method", "learner", "place"), CASES)
 def test_it_stops_at_once_and_names_the_number(
     method, learner, place, clean, tmp_path, monkeypatch
@@ -370,6 +371,7 @@ def progress_of(trainer: Trainer) -> tuple[float, int, int]:
 ROLLBACK = ["on_nan=rollback", "setup=paper"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seeds", [[], ["seeds=[0,4]"]])
 def test_a_rollback_goes_on_and_resumes_as_if_it_had_not_stopped(seeds, tmp_path, monkeypatch):
     diverging_above(monkeypatch, 0.3)

@@ -188,6 +188,7 @@ def test_console_script_starts(installed: Path, elsewhere):
     assert list(cwd.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_console_script_trains(installed: Path, elsewhere):
     cwd, env = elsewhere
     tiny = ("env.horizon=20", "env.num_uavs=2", "learner.batch_size=8", "learner.hidden=[8,8]")
@@ -199,6 +200,7 @@ def test_console_script_trains(installed: Path, elsewhere):
     assert list((folder / "figures").glob("*.gif"))
 
 
+@pytest.mark.slow
 def test_a_package_of_a_users_own_adds_a_method_a_setup_and_a_fire(installed: Path, elsewhere):
     cwd, env = elsewhere
     python = installed / "python"

@@ -1,4 +1,4 @@
-"""Perimeters over time: of every kind, in every format, and against the raster of the same fire."""
+"""Tests perimeters of every kind in every format, and against the raster of the same fire."""
 
 import datetime
 
@@ -24,15 +24,15 @@ FIRES = {
 
 
 def read(path, grid=GRID, horizon=HORIZON, **keys):
-    """The one fire of a file, [X, Y]; nothing of it burnt out."""
+    """Returns the fire of a file, [X, Y], without burnt-out cells."""
     config = FileFireConfig(path=str(path), **{"ring_width": None, **keys})
     (fire,) = read_fires(config, grid, horizon)
     return fire
 
 
-def overlaps(one, two, steps=(0, 250, 500, 750, 1000)):
-    """Intersection over union of the burnt area at some steps."""
-    pairs = [(one <= step, two <= step) for step in steps]
+def overlaps(first, second, steps=(0, 250, 500, 750, 1000)):
+    """Returns the intersection over union of the burnt areas at some steps."""
+    pairs = [(first <= step, second <= step) for step in steps]
     return [((a & b).sum() / (a | b).sum()).item() for a, b in pairs]
 
 
@@ -42,11 +42,11 @@ def test_a_fire_is_the_same_from_its_raster_and_from_its_perimeters(tmp_path, na
     fire, span = FIRES[name], {"start": 180.0, "end": 360.0}
     raster = write_asc(tmp_path / "fire.asc", raster_of(fire, 360.0, 150, 20.0), 20.0)
     frame_of(fire, (120.0, *range(180, 390, 30)), "line").to_file(tmp_path / "fire.shp")
-    one = read(raster, grid, units="minutes", **span)
-    two = read(tmp_path / "fire.shp", grid, **span)
-    assert min(overlaps(one, two)) > 0.9, overlaps(one, two)
-    later = torch.isfinite(one) & torch.isfinite(two) & (one > 0) & (two > 0)
-    assert (one - two)[later].abs().mean() < 0.06 * HORIZON
+    cells = read(raster, grid, units="minutes", **span)
+    fronts = read(tmp_path / "fire.shp", grid, **span)
+    assert min(overlaps(cells, fronts)) > 0.9, overlaps(cells, fronts)
+    later = torch.isfinite(cells) & torch.isfinite(fronts) & (cells > 0) & (fronts > 0)
+    assert (cells - fronts)[later].abs().mean() < 0.06 * HORIZON
 
 
 @pytest.mark.parametrize("name", FIRES)
@@ -55,13 +55,13 @@ def test_by_default_both_begin_when_the_fire_began(tmp_path, name, grid):
     fire = FIRES[name]
     raster = write_asc(tmp_path / "fire.asc", raster_of(fire, 300.0, 150, 20.0), 20.0)
     frame_of(fire, HOURS, "line").to_file(tmp_path / "fire.shp")
-    one, two = read(raster, grid, units="minutes"), read(tmp_path / "fire.shp", grid)
-    found = overlaps(one, two, (300, 475, 650, 825, 1000))
-    assert min(found) > 0.9, found
+    cells, fronts = read(raster, grid, units="minutes"), read(tmp_path / "fire.shp", grid)
+    shares = overlaps(cells, fronts, (300, 475, 650, 825, 1000))
+    assert min(shares) > 0.9, shares
 
 
 def test_before_the_first_perimeter_by_hand(tmp_path):
-    """Edges that move 50 m an hour: at 0 a square of 200 m, where the first one has 300 m."""
+    """Edges move 50 m an hour, so that a square of 300 m after an hour is one of 200 m at 0."""
     squares(300, 400, column="Elapsed_Mi", values=[60, 120]).to_file(tmp_path / "fire.shp")
     fire = read(tmp_path / "fire.shp", (40, 40), 120, margin=0.0)  # cells of 10 m
     assert (fire[10:30, 10:30] == 0).all()
@@ -69,7 +69,7 @@ def test_before_the_first_perimeter_by_hand(tmp_path):
     assert (fire <= 60).sum() == pytest.approx(30 * 30, abs=4 * 30)
     assert (fire[5:9, 20] > 0).all()
     assert (fire[5:9, 20] < 60).all()
-    # Three hours before the first perimeter it was a point; six hours before it still is one.
+    # The fire was a point three hours before the first perimeter, and stays one earlier.
     for first, width in ((180, 30), (360, 30)):
         squares(300, 400, column="Elapsed_Mi", values=[first, first + 60]).to_file(
             tmp_path / "late.shp"
@@ -87,8 +87,8 @@ def test_before_the_first_perimeter_by_hand(tmp_path):
 
 
 def test_before_the_first_perimeter_each_part_is_drawn_in(tmp_path):
-    """Edges of the whole that move 50 m: two squares of 200 m began as two of 100 m; what stays
-    where it is, as the lower edge, did so before."""
+    """The left, right and upper edges move 50 m, so that two squares of 200 m began as squares
+    of 100 m. The lower edge does not move."""
     shapes = [
         shapely.MultiPolygon([shapely.box(0, 0, 200, 200), shapely.box(400, 0, 600, 200)]),
         shapely.box(-50, 0, 650, 250),
@@ -103,7 +103,7 @@ def test_before_the_first_perimeter_each_part_is_drawn_in(tmp_path):
 
 
 def test_a_small_polygon_beside_a_large_one_is_not_lost(tmp_path):
-    """A spot fire of 4 m, cells of 62 m that are looked at in parts of 10 m."""
+    """A spot fire of 4 m lies between samples 10 m apart."""
     spot = [shapely.box(2000, 0, 2000 + side, side) for side in (4, 8)]
     large = [shapely.box(0, 0, side, side) for side in (1000, 1200)]
     shapes = [shapely.MultiPolygon(pair) for pair in zip(large, spot, strict=True)]
@@ -125,7 +125,7 @@ def test_a_small_polygon_beside_a_large_one_is_not_lost(tmp_path):
         (kind, suffix)
         for kind in KINDS
         for suffix in ("shp", "geojson", "gpkg")
-        if (kind, suffix) != ("collection", "shp")  # which has none
+        if (kind, suffix) != ("collection", "shp")  # a shapefile has no collections
     ],
 )
 def test_each_kind_of_geometry_in_each_format(tmp_path, kind, suffix):
@@ -139,7 +139,7 @@ def test_each_kind_of_geometry_in_each_format(tmp_path, kind, suffix):
 
 
 def squares(*sides, column, values, kind=None):
-    """Concentric squares, metres from the corner of the other files; one for each side."""
+    """Returns concentric squares with the given sides in metres."""
     boxes = [shapely.box(*(np.array([-s, -s, s, s]) / 2)) for s in sides]
     shapes = [shapely.transform(box, lambda at: at + CORNER) for box in boxes]
     return geopandas.GeoDataFrame({column: values}, geometry=shapes, crs=UTM)
@@ -147,20 +147,20 @@ def squares(*sides, column, values, kind=None):
 
 def test_between_two_squares_by_hand(tmp_path):
     squares(100, 500, column="Elapsed_Mi", values=[0, 400]).to_file(tmp_path / "fire.shp")
-    # 25 cells of 20 m, of which the middle 5 x 5 burn at 0 and the outermost last.
+    # Of 25 x 25 cells of 20 m, the middle 5 x 5 burn at 0 and the outermost last.
     fire = read(tmp_path / "fire.shp", (25, 25), 400, margin=0.0)
     assert (fire[10:15, 10:15] == 0).all()
     assert torch.isfinite(fire).all()
     row = fire[12, 15:]
     assert (row.diff() > 0).all()
-    # Ten cells from front to front, of which each starts where the one before ends.
+    # There are ten cells between the fronts.
     assert row.tolist() == pytest.approx([k * 40 for k in range(10)], abs=20)
     assert torch.allclose(fire, fire.flip(0), atol=1e-3)
     assert torch.allclose(fire, fire.T, atol=1e-3)
 
 
 def test_what_burnt_once_stays_burnt(tmp_path):
-    """Observed perimeters do not contain each other: shifted squares, of which the union counts."""
+    """Observed perimeters may not contain each other. Their union counts."""
     frame = squares(200, 300, 310, column="Elapsed_Mi", values=[0, 60, 120])
     frame.loc[1, "geometry"] = shapely.affinity.translate(frame.geometry[1], 80, 0)
     frame.to_file(tmp_path / "fire.shp")
@@ -173,7 +173,7 @@ def test_what_burnt_once_stays_burnt(tmp_path):
 
 
 def test_growth_alone_accumulates(tmp_path):
-    """Some maps hold, for each time, what burnt since the last."""
+    """Some maps hold the growth since the previous time."""
     whole = squares(200, 300, 400, column="Elapsed_Mi", values=[0, 60, 120])
     grown = whole.copy()
     grown.loc[1, "geometry"] = whole.geometry[1].difference(whole.geometry[0])
@@ -198,12 +198,12 @@ def test_an_island_is_a_line_within_a_line(tmp_path):
 
 
 def test_what_burns_within_an_island(tmp_path):
-    """Four closed lines within each other: burnt, island, burnt, and the next time's around all."""
+    """Closed lines within each other are burnt, island and burnt; the next time encloses all."""
     frame = squares(400, 240, 100, 420, column="Elapsed_Mi", values=[0, 0, 0, 60])
     frame.geometry = frame.boundary
     frame.to_file(tmp_path / "fire.shp")
     fire = read(tmp_path / "fire.shp", (42, 42), margin=0.0)  # cells of 10 m
-    assert fire[21, 21] == 0  # the middle
+    assert fire[21, 21] == 0  # the centre
     assert fire[5, 21] == 0  # between 120 and 200 m from it
     assert (fire[11:14, 21] > 0).all()  # between 50 and 120 m
 
@@ -217,7 +217,7 @@ def test_areas_that_cross_themselves(tmp_path):
         frame.to_file(tmp_path / f"{name}.gpkg")
         fire = read(tmp_path / f"{name}.gpkg")
         assert (fire[[9, 9, 20, 20], [12, 17, 12, 17]] == 0).all()  # the two lobes
-        assert (fire[[14, 15, 14, 15], [9, 9, 20, 20]] > 0).all()  # and what is between them
+        assert (fire[[14, 15, 14, 15], [9, 9, 20, 20]] > 0).all()  # and between them
         cell = 500 / 24
         near = shapely.make_valid(bow).buffer(cell / 2)  # a cell counts if a part of it burns
         assert (fire <= 0).sum() == pytest.approx(near.area / cell**2, rel=0.15)
@@ -264,7 +264,7 @@ def test_calendar_times(tmp_path, name, suffix):
 
 
 def test_when_a_perimeter_was_mapped_counts_not_when_its_record_was_changed(tmp_path):
-    """The columns of NIFC's and GeoMAC's layers, as they are and as a .dbf cuts them."""
+    """Tests the columns of NIFC and GeoMAC, also in the short form of a .dbf."""
     squares(200, 300, 400, column="Elapsed_Mi", values=[0, 60, 120]).to_file(tmp_path / "e.shp")
     elapsed, changed = read(tmp_path / "e.shp"), [DATED[0], DATED[2], DATED[2]]
     columns = {
@@ -292,7 +292,7 @@ def test_when_a_perimeter_was_mapped_counts_not_when_its_record_was_changed(tmp_
     "times", [["2200", "2300", "0000"], [2200, 2300, 0], ["22:00", "23:00", "0:00"]]
 )
 def test_geomacs_date_and_time(tmp_path, times):
-    """Two columns; without the clock time all three would be of two dates."""
+    """Without the time of day, three perimeters would have two dates."""
     squares(200, 300, 400, column="Elapsed_Mi", values=[0, 60, 120]).to_file(tmp_path / "e.shp")
     dates = pandas.to_datetime(["2020-08-19", "2020-08-19", "2020-08-20"])
     for values in (dates.date, dates.strftime("%m/%d/%Y")):
@@ -320,19 +320,11 @@ def test_columns_that_may_both_hold_the_times_are_named(tmp_path):
 
 
 def test_an_end_before_the_first_perimeter(tmp_path):
-    """The fire began at 0, so its first half hour is a span of time as well."""
+    """The fire began at 0, so that its first half hour is a valid span."""
     squares(300, 400, 500, column="Elapsed_Mi", values=[60, 120, 180]).to_file(tmp_path / "f.shp")
     early = read(tmp_path / "f.shp", end=30.0)
     assert torch.equal(early, read(tmp_path / "f.shp", start=0.0, end=30.0))
     assert torch.isfinite(early).any()
-
-
-def test_farsites_month_day_and_hour(tmp_path):
-    frame = squares(200, 300, 400, column="Month", values=[12.0, 12.0, 1.0])
-    frame["Day"], frame["Hour"] = [31.0, 31.0, 1.0], [2200.0, 2300.0, 0.0]
-    frame.to_file(tmp_path / "fire.shp")
-    squares(200, 300, 400, column="Elapsed_Mi", values=[0, 60, 120]).to_file(tmp_path / "e.shp")
-    assert torch.equal(read(tmp_path / "fire.shp"), read(tmp_path / "e.shp"))
 
 
 @pytest.mark.parametrize(
@@ -397,7 +389,7 @@ def test_a_line_left_beside_a_polygon_is_left_out(tmp_path):
     frame = frame_of(FIRES["slow and round"], HOURS)
     frame.to_file(tmp_path / "plain.gpkg")
     left = shapely.LineString([CORNER, (CORNER[0] + 900, CORNER[1] + 900)])
-    frame.geometry = [shapely.GeometryCollection([one, left]) for one in frame.geometry]
+    frame.geometry = [shapely.GeometryCollection([shape, left]) for shape in frame.geometry]
     frame.to_file(tmp_path / "fire.gpkg")
     assert torch.equal(read(tmp_path / "fire.gpkg"), read(tmp_path / "plain.gpkg"))
 
@@ -421,11 +413,3 @@ def test_dates_as_numbers(tmp_path, keys):
     )
     with pytest.raises(ValueError, match=r"feature 2 has date='?20200832'?, which is not a date"):
         read(tmp_path / "wrong.gpkg", **keys)
-
-
-def test_a_month_in_words_is_named(tmp_path):
-    frame = squares(200, 300, 400, column="Month", values=["4", "April", "4"])
-    frame["Day"], frame["Hour"] = [1, 1, 1], [1200, 1300, 1400]
-    frame.to_file(tmp_path / "fire.gpkg")
-    with pytest.raises(ValueError, match="feature 1 has Month=April, Day=1, Hour=1300; "):
-        read(tmp_path / "fire.gpkg")

@@ -1,8 +1,9 @@
-"""Rasters of arrival times on grids, against numbers by hand and a loop over cells."""
+"""Tests rasters of arrival times on grids, against numbers by hand and a loop over cells."""
 
 import math
 import subprocess
 import sys
+import warnings
 
 import numpy as np
 import pytest
@@ -12,25 +13,25 @@ from fire_files import CORNER, UTM, Ellipses, raster_of, write_asc, write_tif
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from rasterio.transform import from_origin
+from scipy.ndimage import gaussian_filter
 
 from emberlink.envs.fire_files import rasters
-from emberlink.envs.fire_files.config import FileFireConfig
+from emberlink.envs.fire_files.config import Clock, FileFireConfig
 from emberlink.envs.fire_files.raster_source import RasterSource, Window
 from emberlink.envs.fire_files.reader import read_fires
-from emberlink.envs.fire_files.times import Clock
 
 INF = math.inf
 PLAIN = {"units": "minutes", "ring_width": None, "margin": None}
 
 
 def read(path, grid=(8, 8), horizon=10, **keys):
-    """The one fire of a file, [X, Y]."""
+    """Returns the fire of a file, [X, Y]."""
     (fire,) = read_fires(FileFireConfig(path=str(path), **{**PLAIN, **keys}), grid, horizon)
     return fire
 
 
 def corner(times, rows, columns):
-    """Rows and columns of a raster of 8 x 8 that never burns elsewhere."""
+    """Returns a raster of 8 x 8 that burns in the upper left corner only."""
     whole = np.full((8, 8), -9999.0)
     whole[:rows, :columns] = times
     return whole
@@ -51,7 +52,7 @@ def test_of_the_cells_in_a_coarse_one_the_earliest_counts(tmp_path):
     times = np.full((16, 24), -9999.0)
     times[:2, :3] = [[9, 8, 4], [7, -9999, 6]]
     times[15, 23] = 14
-    # Cells of 3: [24, 16] on 8 x 8 leave a free cell and a third below and above.
+    # A cell of the grid is 3 x 3 cells of the raster. 1 1/3 cells stay free below and above.
     fire = read(write_asc(tmp_path / "fire.asc", times), horizon=10)
     # The raster's rows 0 and 1 are the northern two of 16; the grid's rows of 3 begin 4 lower.
     assert fire[0, 6] == 0  # the earliest of all six, 4 minutes, is step 0
@@ -63,10 +64,10 @@ def test_between_the_cells_of_a_coarser_raster_times_are_interpolated(tmp_path):
     times = np.full((4, 4), -9999.0)
     times[0, :3] = [0, 4, 8]
     fire = read(write_asc(tmp_path / "fire.asc", times), horizon=8)
-    # A cell of the raster is 2 x 2 of the grid's, each looked at 22 x 22 times: of the cell whose
-    # left edge is k half cells of the raster from its outer edge, first at k / 2 + 1 / 88. Times
-    # are 4 a cell, from the centre of the first cell on and to that of the last.
-    first = [4 * (k / 2 + 1 / 88 - 1 / 2) for k in range(1, 5)]  # the first of all is step 0
+    # A cell of the raster is 2 x 2 cells of the grid, each with 22 x 22 samples. The first sample
+    # of the cell k lies k / 2 + 1 / 88 cells of the raster from the outer edge. Times rise by 4
+    # per cell of the raster, from the centre of the first to the centre of the last.
+    first = [4 * (k / 2 + 1 / 88 - 1 / 2) for k in range(1, 5)]  # the earliest is step 0
     assert fire[:6, 7].tolist() == pytest.approx([0, 0, *first[1:], 8], abs=1e-5)
     assert torch.equal(fire[2:6, 6], fire[2:6, 7])
     assert torch.isfinite(fire).sum() == 12
@@ -87,8 +88,10 @@ def test_what_never_burns(tmp_path, never):
     times = np.where(corner([[1, 2], [3, 4]], 2, 2) < 0, never, corner([[1, 2], [3, 4]], 2, 2))
     asc = write_asc(tmp_path / "fire.asc", times, NODATA_VALUE=None)
     tif = write_tif(tmp_path / "fire.tif", times, nodata=None)
-    own = write_tif(tmp_path / "own.tif", np.where(times == never, 777, times), nodata=777)
-    for path in (asc, tif) if np.isnan(never) else (asc, tif, own):
+    declared = write_tif(
+        tmp_path / "declared.tif", np.where(times == never, 777, times), nodata=777
+    )
+    for path in (asc, tif) if np.isnan(never) else (asc, tif, declared):
         assert torch.isfinite(read(path)).sum() == 4
 
 
@@ -123,7 +126,7 @@ def test_bytes_with_nodata_scale_and_offset(tmp_path):
     ("keys", "expected"),
     [
         ({}, [0, 5, 10, 20]),
-        ({"start": 10.0}, [0, 0, 0, 20]),  # 10 and later of 20: what burns by then burns at 0
+        ({"start": 10.0}, [0, 0, 0, 20]),  # cells that burn by then burn at 0
         ({"start": 5.0}, [0, 0, 20 / 3, 20]),
         ({"end": 10.0}, [0, 10, 20, INF]),
         ({"start": 5.0, "end": 10.0}, [0, 0, 20, INF]),
@@ -147,14 +150,14 @@ def test_a_crop_leaves_the_margin_on_all_sides(tmp_path):
     times = np.full((60, 50), -9999.0)
     times[20:44, 10:22] = np.arange(24)[:, None] + 1.0
     path = write_asc(tmp_path / "fire.asc", times)
-    # A row a minute: the front of 24.5 minutes is where the row of 24 ends. 24 cells over 80 % of
-    # 30: a cell of the raster is one of the grid's. 12 columns are centred.
+    # A row burns each minute. The front at 24.5 minutes is the edge of row 24. 24 rows fill 80 %
+    # of 30, so that the cells of raster and grid have the same size. 12 columns are centred.
     fire = read(path, (30, 30), horizon=100, margin=0.1, end=24.5)
     assert torch.isfinite(fire[9:21, 3:27]).all()
     assert torch.isfinite(fire).sum() == 12 * 24
     assert fire[9, 26] == 0
     assert fire[9, 3].item() == pytest.approx(100 * 24 / 24.5)
-    # The front of 12 minutes is at the centre of the twelfth row: 11.5 rows of 12 fill 22 x 23.
+    # The front at 12 minutes is the centre of row 12, so that 11.5 rows of 12 columns are burnt.
     burnt = torch.isfinite(read(path, (30, 30), horizon=100, margin=0.1, end=12.0))
     assert burnt.any(1).nonzero()[:, 0].tolist() == list(range(3, 27))
     assert burnt.any(0).nonzero()[:, 0].tolist() == list(range(3, 27))
@@ -169,7 +172,7 @@ def test_the_inside_of_the_front_is_burnt_out(tmp_path):
     ring = read(path, (30, 30), **keys, ring_width=3.0)
     burnt_out = torch.isinf(ring) & torch.isfinite(solid)
     assert torch.equal(ring[~burnt_out], solid[~burnt_out])
-    # Deeper than 3 cells within a disc of 8: a disc of about 5.
+    # Cells deeper than 3 in a disc of radius 8 are a disc of radius 5.
     inner, outer = torch.as_tensor(far < 4.4), torch.as_tensor(far < 5.6)
     assert (burnt_out >= inner).all()
     assert (burnt_out <= outer).all()
@@ -203,13 +206,13 @@ def test_degrees_are_projected_to_metres(tmp_path):
     assert torch.equal(read(plain, (30, 30), margin=0.1, crs="EPSG:4326"), fire)
     i, j = np.nonzero(torch.isfinite(fire).numpy())
     assert np.ptp(i) == pytest.approx(np.ptp(j), abs=1)
-    # A disc of 24 cells, without holes, and the cells on its edge.
+    # The fire is a disc 24 cells across without holes, with the cells on its edge.
     assert len(i) == pytest.approx(math.pi * (24 + 1) ** 2 / 4, rel=0.03)
     assert read(path, (30, 30), margin=0.1, crs="EPSG:3857").isfinite().any()
 
 
 def test_a_raster_turned_by_its_transform(tmp_path):
-    """The same fire, once on cells along x and y and once on cells turned by 30 degrees."""
+    """Compares a fire on cells along x and y with the fire on cells rotated by 30 degrees."""
     fire, n, cell = Ellipses(origins=((0.0, 0.0),)), 120, 25.0
     turned = rasterio.Affine.translation(*CORNER) @ rasterio.Affine.rotation(30)
     turned = turned @ rasterio.Affine.scale(cell, -cell) @ rasterio.Affine.translation(-60, -60)
@@ -220,20 +223,20 @@ def test_a_raster_turned_by_its_transform(tmp_path):
     at = (np.arange(n) - 59.5) * cell
     straight = fire.arrival(at[None, :], at[::-1, None])
     other = write_tif(tmp_path / "straight.tif", np.where(straight < 250, straight, -9999), cell)
-    one, two = (read(p, (30, 30), margin=0.1, end=250.0) for p in (path, other))
+    rotated, upright = (read(p, (30, 30), margin=0.1, end=250.0) for p in (path, other))
     for step in (4, 6, 8, 10):
-        assert iou(one <= step, two <= step) > 0.88
-    assert iou(one <= 10, two <= 10) > 0.93
+        assert iou(rotated <= step, upright <= step) > 0.88
+    assert iou(rotated <= 10, upright <= 10) > 0.93
 
 
-def iou(one, two):
-    return ((one & two).sum() / (one | two).sum()).item()
+def iou(a, b):
+    return ((a & b).sum() / (a | b).sum()).item()
 
 
 @pytest.mark.parametrize("first", [0.0, 3.0, 10.0, 10.5, 700.0])
 def test_a_fire_begins_at_0_where_its_first_cell_allows_it(tmp_path, first):
-    """A cell each ten minutes, the first at `first`: an ignition at its edge was at 0 at most
-    ten minutes before."""
+    """Burns a cell every ten minutes, so that an ignition at the edge of the first cell was at
+    most ten minutes earlier."""
     path = write_asc(tmp_path / "fire.asc", corner([[first + t for t in (0, 10, 20, 30)]], 1, 4))
     began = 0.0 if first <= 10 else first
     fire = read(path, horizon=100)[:4, 7]
@@ -318,16 +321,15 @@ def test_a_small_fire_in_a_large_raster_is_read_finely(tmp_path):
     fire = raster_of(Ellipses(), 300.0).astype("float32")
     large = np.full((2200, 6300), -9999.0, "float32")
     large[901:1001, 4003:4103] = fire
-    one = read(write_tif(tmp_path / "one.tif", fire), (30, 30), margin=0.1)
+    small = read(write_tif(tmp_path / "small.tif", fire), (30, 30), margin=0.1)
     path = write_tif(tmp_path / "large.tif", large, compress="deflate")
-    two = read(path, (30, 30), margin=0.1)
-    assert torch.allclose(one, two, atol=1e-2)
-    with pytest.raises(ValueError, match="no fire spreads"):  # on all that the file covers
+    assert torch.allclose(read(path, (30, 30), margin=0.1), small, atol=1e-2)
+    with pytest.raises(ValueError, match="no fire spreads"):  # margin=None takes the whole file
         read(path, (60, 20))
 
 
 def test_a_large_raster_takes_bounded_memory(tmp_path):
-    """6000 x 8000 cells in less than 1.2 GB, also where they are compressed."""
+    """Checks that 6000 x 8000 cells need less than 1.2 GB, also if the file is compressed."""
     path, height, width = tmp_path / "large.tif", 6000, 8000
     about = {"driver": "GTiff", "count": 1, "dtype": "float32", "nodata": -9999.0, "crs": UTM}
     about |= {"sparse_ok": True, "tiled": True, "transform": from_origin(*CORNER, 30, 30)}
@@ -357,15 +359,15 @@ def test_a_large_raster_takes_bounded_memory(tmp_path):
 
 
 def by_loops(times, window):
-    """The earliest of the cells whose centre lies in each cell of the grid; None where none."""
-    found = {}
+    """Returns the earliest centre in each cell of the grid that contains one."""
+    earliest = {}
     rows = len(times)
     for r, row in enumerate(times):
         for c, time in enumerate(row):
             i = math.floor((c + 0.5 - window.x) / window.side + 1e-6)
             j = math.floor((rows - r - 0.5 - window.y) / window.side + 1e-6)
-            found[i, j] = min(time, found.get((i, j), INF))
-    return found
+            earliest[i, j] = min(time, earliest.get((i, j), INF))
+    return earliest
 
 
 @settings(max_examples=60, deadline=None)
@@ -399,3 +401,34 @@ def test_no_arrival_is_lost(rows, columns, side, x, y, seed):
                 assert got[i, j] <= expected[i, j]
             if expected[i, j] == times.min():
                 assert got[i, j] == times.min()
+
+
+def test_a_raster_of_something_else_is_warned_of(tmp_path):
+    """Checks that elevation is noticed, but not fires that merge or times in whole hours."""
+    hills = np.random.default_rng(0).random((60, 60))
+    hills = 900 + 100 * gaussian_filter(hills, 2)
+    path = write_tif(tmp_path / "hills.tif", hills.astype("float32"))
+    with rasterio.open(path, "r+") as dataset:
+        dataset.set_band_description(1, "Elevation")
+    with pytest.warns(UserWarning, match="'Elevation': 3600 cells burn .* are these arrival times"):
+        read(path, (30, 30))
+    merging = Ellipses(origins=((1200.0, 1300.0), (1900.0, 1500.0)), breadth=1.5)
+    times = raster_of(merging, 300.0)
+    hours = np.where(times < 0, times, np.floor(times / 60))
+    for values, units in ((times, "minutes"), (hours, "hours")):
+        assert source_of(values).beginnings == 2
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            read(write_asc(tmp_path / "fire.asc", values), (30, 30), units=units)
+
+
+def test_a_front_of_many_points_is_not_warned_of(tmp_path):
+    places = [f"{12 + 3 * (k % 8)},{12 + 3 * (k // 8)},1," for k in range(40)]
+    (tmp_path / "fire.txt").write_text("\n".join(["1,1,1,"] * 6000 + places))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        read(tmp_path / "fire.txt", (30, 30), units="steps")
+
+
+def source_of(times):
+    return RasterSource(np.where(times < 0, INF, times), (0, 0), (1, 1), Clock("minutes"))

@@ -37,7 +37,9 @@ def trained(config) -> Trainer:
     return trainer
 
 
-@pytest.mark.parametrize("setup", SETUPS)
+@pytest.mark.parametrize(
+    "setup", ["paper", *(pytest.param(s, marks=pytest.mark.slow) for s in SETUPS[1:])]
+)
 @pytest.mark.parametrize("method", METHODS)
 def test_a_recipe_trains(method, setup, tmp_path):
     config = short(method, tmp_path, setup=setup)

@@ -110,6 +110,7 @@ def whole(tmp_path_factory):
     return of
 
 
+@pytest.mark.slow
 # Before the first update, within an episode, at its end, behind it, before the last step; at 33 of
 # 80 the memory has just come round.
 @pytest.mark.parametrize("learner", ["ddpg", "td3"])

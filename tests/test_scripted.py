@@ -273,6 +273,7 @@ def test_a_policy_begins_anew_with_every_episode(name):
         moment = step_mdp(env.step(moment), keep_other=True)
 
 
+@pytest.mark.slow
 def test_what_each_policy_covers():
     """Within wide bounds; docs/evaluation.md has the numbers."""
     config = resolve("consensus", ["setup=tuned"])

@@ -21,10 +21,8 @@ from emberlink.trainers.training.setup import TrainingSetup
 SEEDS = [3, 11]
 
 
-@pytest.mark.parametrize(
-    ("method", "setup"),
-    [*zip(METHODS, ["released", "paper"] * 2, strict=True), ("consensus", "paper")],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("method", "setup"), zip(METHODS, ["released", "paper"] * 2, strict=True))
 def test_a_seed_of_a_stack_learns_what_it_learns_alone(method, setup, tmp_path):
     """Some two hundred updates; both work in float32, in another order."""
     settings = [
@@ -45,6 +43,7 @@ def test_a_seed_of_a_stack_learns_what_it_learns_alone(method, setup, tmp_path):
             assert line == pytest.approx(single, rel=1e-3, abs=1e-3)
 
 
+@pytest.mark.slow
 def test_a_stack_of_networks_learns_as_each_does_to_the_last_digits(tmp_path):
     """300 updates in float64 at tuned's learning rates, from transitions that were recorded once.
 

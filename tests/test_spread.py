@@ -1,4 +1,4 @@
-"""The level set against closed forms and against the exact front from its support function."""
+"""Tests the level set against closed forms and the exact front from its support function."""
 
 import math
 
@@ -14,10 +14,10 @@ STRAIGHT, TURNING = 0.0, math.pi
 
 
 def exact_arrival(n: int, ratio: float, azimuth, horizon: float = HORIZON) -> Tensor:
-    """Arrival in a domain of 30 x 30 with n nodes a side; float64 [n, n].
+    """Returns the exact arrival in a domain of 30 x 30 with n nodes a side, float64 [n, n].
 
     The front's support function is h(n, t) = h0(n) + integral of F(n, s); a point is reached when
-    the last of the half planes x·n <= h(n, t) has come to it.
+    the last of the half planes x·n <= h(n, t) contains it.
     """
     times = torch.linspace(0, horizon, 401, dtype=torch.float64)
     scale, middle = (n - 1) / SIDE, (n - 1) / 2
@@ -46,7 +46,7 @@ def computed_arrival(n: int, ratio: float, azimuth, refine: int = 1, **more) -> 
 
 
 def compare(n: int, ratio: float, turn: float) -> tuple[float, float, float]:
-    """Ratio of areas, intersection over union, mean error of arrival as a part of the horizon."""
+    """Returns the ratio of areas, the intersection over union, and the mean error of arrival."""
 
     def azimuth(time: Tensor) -> Tensor:
         return 0.3 + turn * time / HORIZON
@@ -58,7 +58,7 @@ def compare(n: int, ratio: float, turn: float) -> tuple[float, float, float]:
 
 
 def grow(grid=(24, 24), centre=(11.0, 11.0), radius=3.0, head=0.006, ratio=2.5, azimuth=0.4, **k):
-    """One fire with plain numbers; float32 [X, Y]."""
+    """Returns one fire from plain numbers, float32 [X, Y]."""
     start = disc(torch.tensor([centre]), torch.tensor([radius]))
     k = {"horizon": 1000, **k}
     args = (torch.tensor([v]) for v in (head, ratio, azimuth))
@@ -84,7 +84,7 @@ def test_ellipse_rates_by_hand():
 
 @pytest.mark.parametrize("ratio", [1.0, 1.5, 4.0])
 def test_front_speed_supports_the_wavelet(ratio: float):
-    """F(n) is the farthest reach along n of the ellipse R (1 - e) / (1 - e cos ψ)."""
+    """Compares F(n) with the maximum along n of the ellipse R (1 - e) / (1 - e cos ψ)."""
     eccentricity = math.sqrt(ratio**2 - 1) / ratio
     psi = torch.linspace(0, 2 * math.pi, 28801, dtype=torch.float64)
     radius = (1 - eccentricity) / (1 - eccentricity * torch.cos(psi))
@@ -114,7 +114,7 @@ def test_agrees_with_the_exact_front_and_converges(ratio: float, turn: float, ov
 
 @pytest.mark.parametrize("ratio", [1.0, 2.0, 4.0])
 def test_area_grows_as_the_offset_of_a_disc(ratio: float):
-    """π r² + r · perimeter · t + π a b t²: the mixed area of a disc and the wavelet."""
+    """Compares the area with π r² + r · perimeter · t + π a b t², of a disc and the wavelet."""
     arrival = computed_arrival(121, ratio, torch.zeros_like)
     a, b, _ = (float(v) for v in ellipse_rates(HEAD, ratio))
     angle = torch.linspace(0, 2 * math.pi, 3601)
@@ -164,7 +164,7 @@ def test_the_head_runs_towards_the_azimuth():
 
 
 def test_arrival_never_decreases_outwards():
-    """Along rays, and over patchy fuel: every cell is reached by way of an earlier neighbour."""
+    """Checks rays, and with patchy fuel that every cell has an earlier neighbour."""
     even, field = grow(), torch.rand(1, 24, 24, generator=torch.Generator().manual_seed(3))
     for dx, dy in ((1, 0), (1, 1), (0, 1), (-1, 1), (-1, 0), (-1, -1), (0, -1), (1, -1)):
         ray = torch.stack([even[11 + k * dx, 11 + k * dy] for k in range(11)])
@@ -181,11 +181,11 @@ def test_arrival_never_decreases_outwards():
 
 
 def wall(kind: str) -> tuple[Tensor, Tensor]:
-    """Barrier cells and the cells behind them, bool [24, 24]."""
+    """Returns the barrier cells and the cells behind them, bool [24, 24]."""
     x, y = torch.meshgrid(torch.arange(24), torch.arange(24), indexing="ij")
     if kind == "straight":
         return x == 16, x > 16
-    if kind == "diagonal":  # touches at corners only
+    if kind == "diagonal":  # cells touch at corners only
         return x + y == 29, x + y > 29
     ring = torch.maximum((x - 11).abs(), (y - 11).abs())
     return ring == 5, ring > 5
@@ -204,7 +204,7 @@ def test_a_barrier_one_cell_wide_never_burns_and_does_not_leak(kind: str, refine
 
 
 def test_the_front_goes_around_a_barrier():
-    """The shortest way from the core to behind the wall passes the wall's two upper corners."""
+    """Compares with the shortest path, which passes the two upper corners of the wall."""
     barrier, _ = wall("straight")
     barrier[:, 15:] = False
     options = {"head": 0.02, "ratio": 1.0}
@@ -215,7 +215,7 @@ def test_the_front_goes_around_a_barrier():
         assert 1 < float(got[x, y]) * 0.02 / path < 1.08
     free = grow(**options)
     assert free[17, 11] < 160
-    # In front of the wall nothing changes.
+    # The arrival in front of the wall does not change.
     early = (slice(12, 15), slice(8, 14))
     coarse = grow(rate_field=(~barrier).float()[None], **options)
     torch.testing.assert_close(coarse[early], free[early], rtol=0, atol=0.3)
@@ -237,7 +237,7 @@ def test_rates_in_space_and_time():
     ramp = lambda time: torch.tensor([0.012 * time / 1000])  # noqa: E731
     more = torch.tensor([2.5]), torch.tensor([0.4])
     got = arrival_times(start, (24, 24), ramp, *more, horizon=1000, max_rate=0.012)[0]
-    steady = grow(head=0.006)  # the same path, run at another pace: t² / 1000
+    steady = grow(head=0.006)  # the same path at another speed: t² / 1000
     want = (steady * 1000).sqrt()
     finite = got.isfinite() & want.isfinite()
     assert finite.sum() > 60
@@ -251,7 +251,7 @@ def test_the_edge_of_the_grid_does_not_disturb():
         inner = grow(centre=(19.0, 5.0), rate_field=whole[:, 8:32, 8:32], **more)
         outer = grow((40, 40), (27.0, 13.0), rate_field=whole, **more)[8:32, 8:32]
         assert inner[23].isfinite().any()
-        # Fuel beyond the edge is that of the edge: there the patchy fire differs by right.
+        # Fuel outside the grid equals that at the edge, so that fires with patches differ there.
         cut = (slice(0, 24 - inside), slice(inside, 24))
         worst = 0.1 if inside else 4.0
         torch.testing.assert_close(inner[cut], outer[cut], rtol=0, atol=worst)
@@ -266,9 +266,9 @@ def test_batch_and_horizon_do_not_matter():
     assert batch.shape == (3, 20, 24)
     assert batch.dtype == torch.float32
     for k in range(3):
-        one = slice(k, k + 1)
-        start = disc(centres[one], radii[one])
-        alone = arrival_times(start, (20, 24), heads[one], ratios[one], winds[one], **common)
+        fire = slice(k, k + 1)
+        start = disc(centres[fire], radii[fire])
+        alone = arrival_times(start, (20, 24), heads[fire], ratios[fire], winds[fire], **common)
         assert torch.equal(alone[0], batch[k])
     half = arrival_times(
         disc(centres, radii), (20, 24), heads, ratios, winds, horizon=500, max_rate=0.006

@@ -377,6 +377,7 @@ def test_every_executor_has_a_file_and_its_keys():
     assert (executor.slots(9), executor.slots(2)) == (3, 2)
 
 
+@pytest.mark.slow
 def test_a_stopped_sweep_goes_on_and_ends_where_an_unbroken_one_does(tmp_path):
     program = "from emberlink.trainers.cli.main import main; raise SystemExit(main())"
     broken, whole = tmp_path / "broken", tmp_path / "whole"

@@ -17,7 +17,7 @@ from tiny_run import PROGRAM
 
 from emberlink.trainers.cli import main
 from emberlink.trainers.config.compose import resolve
-from emberlink.trainers.runs import loggers
+from emberlink.trainers.tracking import loggers
 from emberlink.trainers.training.trainer import Progress, Trainer
 
 EPISODES = 4

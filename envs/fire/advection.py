@@ -1,4 +1,4 @@
-"""The velocity of the medium that carries a front along: a steady drift and a tide."""
+"""Computes the velocity of the medium that carries a front: a steady drift and a tide."""
 
 import math
 from collections.abc import Callable, Mapping

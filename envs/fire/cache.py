@@ -16,7 +16,7 @@ from torch import Tensor
 from emberlink.envs.fire.generator import FireConfig, Split, fire_seeds, make_fires
 from emberlink.envs.utils.atomic_io import read_sealed, write_sealed
 
-GENERATOR_VERSION = 1  # raise it whenever the same config and seed give another fire
+GENERATOR_VERSION = 1  # increase it if the same config and seed give another fire
 _MAX_HEADER = 10_000  # bytes of NumPy's format before the numbers
 
 
@@ -35,7 +35,7 @@ def bank_key(
     horizon: int,
     start: int = 0,
 ) -> str:
-    """Returns a hash of everything that a bank of fires depends on."""
+    """Returns a hash of all values on which a bank of fires depends."""
     parts = [GENERATOR_VERSION, dataclasses.asdict(config), split, count, *grid, horizon, start]
     return hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:32]
 
@@ -56,8 +56,8 @@ def fire_bank(
         config, grid, horizon: as in `make_fires`.
         split, count, start: as in `fire_seeds`.
         cache_dir: folder of the file, `cache_folder()` by default. The file begins with the
-            SHA-256 of the rest, and a damaged one is replaced. A folder that cannot be written to
-            costs a warning and the time to compute.
+            SHA-256 of its content. A damaged file is replaced. If the folder cannot be written
+            to, a warning is issued and the fires are computed each time.
 
     Returns:
         float32 [count, X, Y] on the CPU, so that every device trains on the same fires.
@@ -74,13 +74,13 @@ def fire_bank(
 
 
 def _read(file: Path, shape: tuple[int, ...]) -> Tensor | None:
-    """Returns the bank in a file, None if there is none or a byte of it has changed."""
+    """Returns the bank in a file; None if there is no file or its content has changed."""
     content = read_sealed(file, 4 * math.prod(shape) + _MAX_HEADER)
     if content is None:
         return None
     try:
         array = np.load(io.BytesIO(content), allow_pickle=False)
-    except Exception:  # of many types, if the header is damaged although sealed
+    except Exception:  # a damaged header raises many types
         return None
     if array.dtype != np.float32 or array.shape != shape or not (array >= 0).all():
         return None
@@ -88,7 +88,7 @@ def _read(file: Path, shape: tuple[int, ...]) -> Tensor | None:
 
 
 def _write(file: Path, fires: Tensor) -> None:
-    """Writes a bank whole; a folder that cannot be written to costs a warning."""
+    """Writes a bank atomically. Warns if the folder cannot be written to."""
     content = io.BytesIO()
     np.save(content, fires.numpy(), allow_pickle=False)
     try:

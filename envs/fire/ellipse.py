@@ -1,8 +1,8 @@
-"""Rates and shape of the elliptical wavelet that spreads from every point of a front.
+"""Computes the rates of the elliptical wavelet that spreads from every point of a front.
 
-A wavelet grows at the rate `a` along its axis and at `b` across, in half lengths, while its centre
-moves at `c` along the axis: (a, b, c), cells per step. Angles are in radians, counter-clockwise
-from +x, and point towards where the head runs.
+The half length of a wavelet grows at the rate `a` and its half breadth at `b`. Its centre moves at
+`c` along the axis. Rates are in cells per step. Angles are in radians, counter-clockwise from +x,
+and give the direction in which the head moves.
 """
 
 import torch
@@ -32,12 +32,12 @@ def length_to_breadth(wind: float | Tensor) -> Tensor:
 def ellipse_rates(
     head_ros: float | Tensor, length_to_breadth: float | Tensor, two_sided: bool = False
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Returns the rates of the ellipse of a point source, which lies in a focus of it.
+    """Returns the rates of the ellipse of a point source, which lies in one of its foci.
 
     Args:
         head_ros: rate of the head, cells per step.
         length_to_breadth: at least 1, broadcast against `head_ros`.
-        two_sided: the source lies in the centre instead: the back runs as fast as the head.
+        two_sided: whether the source lies in the centre, so that the back is as fast as the head.
 
     Returns:
         (a, b, c): growth of the half length, of the half breadth, and speed of the centre.

@@ -1,8 +1,8 @@
-"""Generates fires: a scenario is a set of ranges, from which a seed draws one fire.
+"""Generates fires. A scenario is a set of ranges, from which a seed draws one fire.
 
 A fire is an arrival time per cell, in steps; a cell burns once `step >= arrival_time`. It starts as
 a ring, the edge of a disc whose inside is burnt out and never counts as fire, and spreads by the
-level set of `level_set`. Other waves, such as oil on water, are scenarios too.
+level set of `level_set`. Other waves, such as oil on water, are scenarios as well.
 Lengths of a scenario are in cells of a grid whose shorter side has 30 cells (`BASE_SIDE`). On
 another grid lengths and rates are scaled by min(X, Y)/30.
 """
@@ -31,7 +31,7 @@ VALIDATION_FROM = 2_000_000
 Split = Literal["train", "validation", "test"]
 
 _MIN_NODES = 60  # along the shorter side: twice the resolution of 30 cells
-_MAX_NODES = 200_000  # computed at a time, so that the work stays in the processor's cache
+_MAX_NODES = 200_000  # computed together, so that the data fits in the processor's cache
 _MIN_RADIUS = 1e-6  # of a patch, cells, so that its square does not underflow
 
 
@@ -73,7 +73,7 @@ class FireConfig:
     length_to_breadth: Annotated[tuple[_Ratio, _Ratio], _Pair, _Ordered]
     """Length-to-breadth ratio of the elliptical wavelet, 1 without wind."""
     azimuth: Annotated[tuple[_Degrees, _Degrees], _Pair, _Ordered]
-    """Direction towards which the head runs at step 0, degrees counter-clockwise from +x."""
+    """Direction in which the head moves at step 0, degrees counter-clockwise from +x."""
     wind_shift: Annotated[tuple[_Turn, _Turn], _Pair, _Ordered]
     """Steady turning of that direction, degrees per 1000 steps, counter-clockwise."""
     centre_x: Annotated[tuple[_Fraction, _Fraction], _Pair, _Ordered]
@@ -87,9 +87,9 @@ class FireConfig:
     fuel_patches: Annotated[tuple[_Count, _Count], _Pair, _Ordered]
     """Number of patches of slow fuel."""
     patch_bearing: Annotated[tuple[_Degrees, _Degrees], _Pair, _Ordered]
-    """Where a patch lies as seen from the disc's centre, degrees from the initial azimuth."""
+    """Direction of a patch from the disc's centre, degrees from the initial azimuth."""
     patch_distance: Annotated[tuple[_Signed, _Signed], _Pair, _Ordered]
-    """How far a patch's centre lies outside the initial disc, cells, negative inside."""
+    """Distance of a patch's centre from the initial disc, cells, negative inside."""
     patch_radius: Annotated[tuple[_Length, _Length], _Pair, _Ordered]
     """Distance from a patch's centre at which its effect has fallen to 1/e, cells."""
     patch_rate: Annotated[tuple[_Fraction, _Fraction], _Pair, _Ordered]
@@ -97,15 +97,15 @@ class FireConfig:
     drift_rate: Annotated[tuple[_Drift, _Drift], _Pair, _Ordered] = (0.0, 0.0)
     """Steady drift of the medium towards the azimuth, cells per step."""
     tide_reach: Annotated[tuple[_Reach, _Reach], _Pair, _Ordered] = (0.0, 0.0)
-    """How far the medium swings to and fro along one axis, from turn to turn, cells."""
+    """Distance that the tide moves the medium between two turns, cells."""
     tide_period: Annotated[tuple[_Period, _Period], _Pair, _Ordered] = (1000.0, 1000.0)
-    """Steps from flood to flood."""
+    """Period of the tide, steps."""
     tide_phase: Annotated[tuple[_Degrees, _Degrees], _Pair, _Ordered] = (0.0, 0.0)
-    """Where in its period the tide is at step 0, degrees; at 0 it runs strongest."""
+    """Phase of the tide at step 0, degrees; the speed is greatest at 0."""
     tide_bearing: Annotated[tuple[_Degrees, _Degrees], _Pair, _Ordered] = (0.0, 0.0)
-    """Axis of the tide, degrees counter-clockwise from +x: whereto it runs at phase 0."""
+    """Direction of the tide at phase 0, degrees counter-clockwise from +x."""
     two_sided: bool = False
-    """Whether the back of the wavelet runs as fast as its head."""
+    """Whether the back of the wavelet is as fast as its head."""
 
 
 _FIXED = {"name", "num_train_fires", "two_sided"}
@@ -142,7 +142,7 @@ def fire_seeds(split: Split, count: int, start: int = 0) -> Tensor:
     Args:
         split: "train", "validation" or "test".
         count: number of seeds.
-        start: the first training seed. Validation and test fires are the same for everyone.
+        start: the first training seed. Validation and test seeds always start at 0.
 
     Raises:
         UserError: the split is not known, or the seeds would not lie in its interval.
@@ -166,13 +166,13 @@ def make_fires(
     horizon: int,
     device: torch.device | str | None = None,
 ) -> Tensor:
-    """Returns the arrival times of one fire per seed; each depends on its own seed alone.
+    """Returns the arrival times of one fire per seed. A fire depends on its seed alone.
 
     Args:
         config: the scenario.
         seeds: int64 [fires].
         grid: (X, Y), each 8 to 256 cells.
-        horizon: steps; later arrivals are inf. A longer horizon continues the same fires.
+        horizon: steps. Later arrivals are inf. A longer horizon continues the same fires.
         device: where to compute.
 
     Returns:

@@ -1,23 +1,25 @@
-"""Fronts that spread by Huygens' principle: a batched level set on tensors [fires, X, Y].
+"""Computes fronts that spread by Huygens' principle: a batched level set, [fires, X, Y].
 
-Every point of a front sends out an elliptical wavelet; the envelope of the wavelets is the next
-front (Huygens; for wildfire Richards 1990, Int. J. Numer. Methods Eng. 30, and Finney 1998,
-FARSITE, RMRS-RP-4). The same front is the zero contour of φ with
+Every point of a front emits an elliptical wavelet. The envelope of the wavelets is the next front
+(Huygens; for wildfire Richards 1990, Int. J. Numer. Methods Eng. 30, and Finney 1998, FARSITE,
+RMRS-RP-4). The same front is the zero contour of φ with
 
     φ_t + m · (u·∇φ + c (w·∇φ) + sqrt(a² (w·∇φ)² + b² (w⊥·∇φ)²)) = 0
 
 where w is the unit vector of the direction of maximum spread, (a, b, c) the rates at which the
-wavelet's half length, half breadth and centre grow, u the drift of the medium (none for fire, the
-current for oil on water), and m ≥ 0 a multiplier in space (fuel; 0 is a barrier). Any wave
-with an elliptical wavelet is described by it, not fire alone.
+wavelet's half length and half breadth grow and its centre moves, u the drift of the medium (none
+for fire, the current for oil on water), and m ≥ 0 a multiplier in space (fuel; 0 is a barrier).
+Space is discretised by upwind differences limited by superbee (Roe 1986, Annu. Rev. Fluid Mech.
+18), time by Heun's method at a Courant number of 0.4.
 
 Conventions: cell (i, j) has its centre at x = i, y = j; lengths are in cells, times in steps,
-rates in cells per step; an azimuth is in radians, counter-clockwise from the +x axis, and points
-TOWARDS where the head runs (not where a wind comes from).
+rates in cells per step. An azimuth is in radians, counter-clockwise from the +x axis, and is the
+direction in which the head moves (not the direction from which a wind comes).
 """
 
 import math
 from collections.abc import Callable
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -65,34 +67,22 @@ def arrival_times(
 ) -> Tensor:
     """Computes when a front that starts at `distance` = 0 arrives at the centre of each cell.
 
-    Heun's method (RK2) in time at a Courant number of 0.4; upwind differences in space, limited
-    by superbee (Roe 1986, Annu. Rev. Fluid Mech. 18). The size of a time step follows from
-    `max_rate` and `refine` alone, so a fire does not depend on the horizon, and with `max_rate`
-    given not on the other fires of the batch either.
-
     Args:
-        distance: the initial front; use `disc` or a function of your own.
-        grid: (X, Y), cells.
-        head_ros, length_to_breadth, azimuth: [fires], or a function of time returning it.
-        horizon: steps.
-        two_sided: as in `ellipse_rates`.
-        drift: velocity of the medium, cells per step, [fires, 2] or a function of time: it carries
-            the front along, away from some of the cells it has reached; the first arrival counts.
-        margin: cells around the grid that are computed too, so that what a drift carries out of
-            the grid can come back.
+        distance: the initial front, such as `disc`.
+        grid, horizon: (X, Y) in cells, and steps.
+        head_ros, length_to_breadth, azimuth, two_sided: the wavelet, as in `ellipse_rates`.
+        drift: velocity of the medium, cells per step. The first arrival at a cell counts.
+        margin: cells around the grid that are computed too; a drift can carry the front back.
         refine: nodes per cell and axis.
-        rate_field: multiplier of all rates at the cells, [fires, X, Y] or [1, X, Y], not
-            negative; linear in between. A cell with 0 never burns and lets nothing through.
+        rate_field: multiplier of all rates, [fires, X, Y] or [1, X, Y], linear in between. A cell
+            with 0 never burns and lets nothing through.
         max_rate: upper bound of (head rate + speed of the drift) · multiplier, cells per step;
             needed if `head_ros` or `drift` is a function.
-        max_step: upper bound of a time step, steps; needed if a function of time varies faster
-            than the front crosses a node.
-        device: where to compute.
-        dtype: float32, or float64 for studies of accuracy.
+        max_step: upper bound of a time step, for functions that vary faster than the front moves.
+        device, dtype: of the computation; float64 is for studies of accuracy.
 
     Returns:
-        [fires, X, Y] of `dtype`, in steps: 0 where the front has been at the start, inf where it
-        does not arrive within the horizon.
+        [fires, X, Y], steps: 0 where the front is at the start, inf where it does not arrive.
     """
     if refine < 1 or horizon <= 0 or min(grid) < 1:
         raise UserError(f"expected refine, horizon, grid > 0; got {refine}, {horizon}, {grid}")
@@ -101,25 +91,56 @@ def arrival_times(
     phi = distance(x[None, :, None], y[None, None, :])
     rates = None if rate_field is None else _refined(rate_field.to(phi), grid, x, y)
     step = COURANT / refine / max(_rate_bound(head_ros, drift, rates, max_rate), 1e-12)
-    step = min(step, max_step)
-    cells = (slice(None), *(slice(pad * refine, -pad * refine, refine) for _ in grid))
+    wave = _Wave(head_ros, length_to_breadth, azimuth, two_sided, drift, rates, refine)
+    return _march(phi, wave, pad * refine, horizon, min(step, max_step))
 
-    def speed(field: Tensor, time: float) -> Tensor:
+
+class _Wave(NamedTuple):
+    """The rates of a front on the fine nodes."""
+
+    head_ros: Varying
+    length_to_breadth: Varying
+    azimuth: Varying
+    two_sided: bool
+    drift: Varying | None
+    rates: Tensor | None
+    """multiplier of the rates at the nodes"""
+    refine: int
+    """nodes per cell and axis"""
+
+    def decay(self, phi: Tensor, time: float) -> Tensor:
+        """Returns −φ_t at a time."""
+
         def now(value: Varying) -> Tensor:
             return (value(time) if callable(value) else value).to(phi)
 
-        wavelet = ellipse_rates(now(head_ros), now(length_to_breadth), two_sided)
-        current = None if drift is None else now(drift)
-        decay = _hamiltonian(field * refine, wavelet, now(azimuth), current)
-        return decay if rates is None else decay * rates
+        wavelet = ellipse_rates(now(self.head_ros), now(self.length_to_breadth), self.two_sided)
+        drift = None if self.drift is None else now(self.drift)
+        decay = _hamiltonian(phi * self.refine, wavelet, now(self.azimuth), drift)
+        return decay if self.rates is None else decay * self.rates
 
+
+def _march(phi: Tensor, wave: _Wave, border: int, horizon: float, step: float) -> Tensor:
+    """Advances a level set by Heun's method (RK2) and returns the arrival times at the cells.
+
+    The step follows from the maximum rate and the resolution. A fire therefore does not depend on
+    the horizon, nor, if `max_rate` is given, on the other fires of the batch.
+
+    Args:
+        phi: the level set at time 0 at the nodes, [fires, NX, NY].
+        wave: the rates.
+        border: nodes outside the grid on each side.
+        horizon, step: total time and time step, steps.
+    """
+    inner = slice(border, -border, wave.refine)
+    cells = (slice(None), inner, inner)
     blocked = torch.zeros_like(phi[cells], dtype=torch.bool)
-    if rates is not None:
-        blocked = blocked | (rates[cells] <= 0)
+    if wave.rates is not None:
+        blocked = blocked | (wave.rates[cells] <= 0)
     arrival = torch.where((phi[cells] <= 0) & ~blocked, 0.0, math.inf).to(phi)
     for k in range(math.ceil(min(horizon / step, 1e9))):
-        first = speed(phi, k * step)
-        second = speed(phi - step * first, (k + 1) * step)
+        first = wave.decay(phi, k * step)
+        second = wave.decay(phi - step * first, (k + 1) * step)
         new = phi - step / 2 * (first + second)
         old, now = phi[cells], new[cells]
         crossed = (old > 0) & (now <= 0) & arrival.isinf()

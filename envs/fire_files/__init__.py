@@ -1,6 +1,5 @@
 """Fires from files: reads rasters, perimeters, the paper's text and banks onto a grid."""
 
-from emberlink.envs.fire_files.banks import write_bank
 from emberlink.envs.fire_files.config import FileFireConfig
 from emberlink.envs.fire_files.reader import (
     FireSets,
@@ -17,5 +16,4 @@ __all__ = [
     "read_fires",
     "save_copy",
     "with_checksum",
-    "write_bank",
 ]

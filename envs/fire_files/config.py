@@ -1,15 +1,17 @@
-"""The configuration of fires that are read from files."""
+"""Configuration of fires that are read from files, and their units of time."""
 
 import dataclasses
+from datetime import datetime, timedelta
 from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, ConfigDict, Field, model_validator
 from pydantic.dataclasses import dataclass
 
-from emberlink.envs.fire_files.times import Units
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import Name
 
+Units = Literal["steps", "seconds", "minutes", "hours", "days"]
+SECONDS = {"seconds": 1.0, "minutes": 60.0, "hours": 3600.0, "days": 86400.0}
 _Number = Annotated[float, Field(allow_inf_nan=False)]
 _Time = _Number | Annotated[str, Field(min_length=1, max_length=40)]
 _Digest = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
@@ -20,6 +22,24 @@ def _required(value: Any) -> Any:
     if value is None:
         raise UserError("a file is needed, such as fire.path=ArrivalTime.asc")
     return value
+
+
+@dataclasses.dataclass(frozen=True)
+class Clock:
+    """The unit of a source's times, and the calendar time of 0 where it is known."""
+
+    unit: Units
+    origin: datetime | None = None
+
+    def format(self, time: float) -> str:
+        """Returns a time as text for a message."""
+        if self.origin is not None:
+            try:
+                date = self.origin + timedelta(seconds=time * SECONDS[self.unit])
+                return date.isoformat(timespec="minutes")
+            except OverflowError:  # not a year of four digits
+                pass
+        return f"{time:g} {self.unit}"
 
 
 @dataclass(
@@ -35,17 +55,17 @@ class FileFireConfig:
     name: Name = "file"
     """Name of the scenario, that of its file in configs/fire."""
     path: Annotated[_Text, BeforeValidator(_required)]
-    """The file; a relative path is relative to the working directory."""
+    """The file, or a folder of one fire's perimeters; relative to the working directory."""
     test: _Text | None = None
     """A second file, of the test fires; without one every fifth fire of the file is a test fire."""
     units: Units | None = None
-    """Of the numbers in the file, and of `start` and `end`."""
+    """Unit of the numbers in the file, and of `start` and `end`."""
     start: _Time | None = None
     """Time of step 0, in `units`, or ISO text for calendar times; when the fire began if None."""
     end: _Time | None = None
     """Time of the last step, as `start`; the last arrival if None."""
     minutes_per_step: Annotated[float, Field(gt=0, le=1e9)] | None = None
-    """In place of `end`: minutes of the fire per step of the episode."""
+    """Minutes of the fire per step of the episode, in place of `end`."""
     margin: Annotated[float, Field(ge=0, le=0.45)] | None = 0.1
     """Part of the grid left free on each side of the burnt area; None takes the file's extent."""
     ring_width: Annotated[float, Field(gt=0, le=30)] | None = 3.0
@@ -55,15 +75,17 @@ class FileFireConfig:
     time_field: _Text | None = None
     """Column of the perimeters' times; None takes the only column with a known name."""
     layer: _Text | None = None
-    """Layer of a GeoPackage that has several."""
+    """Layer of a GeoPackage that has several; of KML all are read if None."""
+    incident: _Text | None = None
+    """Incident whose perimeters are read, where a file has several; "*" reads all as one fire."""
     sha256: _Digest | None = None
-    """Of the file's content; a run writes it down when it begins and checks it afterwards."""
+    """SHA-256 of the file's content; a run records it when it begins and checks it afterwards."""
     test_sha256: _Digest | None = None
-    """Of the content of `test`, likewise."""
+    """SHA-256 of the content of `test`, likewise."""
     saved_copy: Annotated[str | None, Field(exclude=True)] = dataclasses.field(
         default=None, compare=False
     )
-    """A run's own copy of the grids, set where a run folder is opened and never written."""
+    """A run's own copy of the grids; set when a run folder is opened, and never written."""
 
     @model_validator(mode="after")
     def _one_end(self) -> "FileFireConfig":

@@ -1,4 +1,4 @@
-"""The part of a fire, in time and space, that an episode shows."""
+"""Crops a fire in time and space to an episode."""
 
 import math
 from typing import Any
@@ -7,9 +7,9 @@ import numpy as np
 from scipy import ndimage
 
 from emberlink.envs.config import BASE_SIDE
-from emberlink.envs.fire_files.config import FileFireConfig
+from emberlink.envs.fire_files.config import SECONDS, Clock, FileFireConfig, Units
+from emberlink.envs.fire_files.perimeter_times import in_utc, parse_time
 from emberlink.envs.fire_files.raster_source import Source, Window
-from emberlink.envs.fire_files.times import SECONDS, Clock, Units, in_utc, parse_time
 from emberlink.envs.utils.errors import UserError
 
 
@@ -20,7 +20,7 @@ def on_grid(
 
     Args:
         source: the fire.
-        config: its span of time, margin and ring.
+        config: the span of time, the margin and the ring.
         grid: (X, Y).
         horizon: steps.
 
@@ -28,7 +28,7 @@ def on_grid(
         float32 [X, Y], steps; 0 burns from the start, inf never burns.
 
     Raises:
-        UserError: the chosen span of time or place shows no fire that spreads.
+        UserError: no fire spreads in the chosen span of time.
     """
     no_span = config.start is config.end is config.minutes_per_step is None
     in_steps = no_span and source.clock.unit == "steps"
@@ -38,7 +38,7 @@ def on_grid(
     times = source.on(Window.around(bounds, grid, margin or 0), end)
     times[times > end] = np.inf
     if config.start is None and not in_steps and not (times <= start).any():
-        times[times == times.min()] = start  # the first cell burns from the beginning
+        times[times == times.min()] = start  # the first cell burns from step 0
     if config.ring_width is not None and not (source.whole and in_steps):
         times[_burnt_out(times, start, config.ring_width * min(grid) / BASE_SIDE)] = np.inf
     steps = (np.maximum(times, start) - start) / (end - start) * horizon
@@ -109,14 +109,15 @@ def _calendar(text: str, key: str, clock: Clock) -> float:
 
 
 def _burnt_out(times: np.ndarray, start: float, width: float) -> np.ndarray:
-    """Returns which cells lie deeper inside the area burnt at the start than the ring, [X, Y].
+    """Returns the mask of burnt cells that are deeper inside than the width of the ring, [X, Y].
 
-    A hole in it that never burns, such as a lake or a core burnt out before, has no front.
+    Depth is measured from the front at the start. A hole that never burns, such as a lake, has no
+    front.
     """
     burnt = times <= start
     if not burnt.any() or math.isinf(width):
         return np.zeros_like(burnt)
-    around = np.pad(burnt, 1)  # what lies beyond the grid has not burnt
+    around = np.pad(burnt, 1)  # cells outside the grid have not burnt
     labelled: Any = ndimage.label(~around)
     holes = labelled[0]
     later = np.pad(np.isfinite(times) & ~burnt, 1)

@@ -1,22 +1,28 @@
-"""The format of a file: by its name and its first bytes; both must agree."""
+"""Finds the format of a file by its name and its first bytes, which must agree."""
 
 import hashlib
 import json
 import os
+import re
 import sqlite3
 import struct
+import zipfile
+import zlib
 from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
+from xml.parsers import expat
 
 from emberlink.envs.utils.errors import UserError
 
 MAX_BYTES = 300_000_000
-"""Of a text file."""
+"""Bytes of a text file."""
+MAX_FILES = 500
+"""Files of perimeters in a folder."""
 _BESIDE = {".shp": (".shx", ".dbf", ".prj", ".cpg"), ".asc": (".prj",)}
 _BESIDE |= {".tif": (".tfw",), ".tiff": (".tfw",)}
-_BOM = b"\xef\xbb\xbf"
 
 
 @dataclass(frozen=True)
@@ -25,52 +31,76 @@ class Format:
 
     name: str
     suffixes: tuple[str, ...]
-    matches: Callable[[bytes], bool]
-    """Tells whether the first bytes of a file are those of the format."""
+    head: re.Pattern[bytes]
+    """Matches the first bytes of a file of the format."""
     check: Callable[[Path], None] = lambda _: None
-    """Raises a UserError for damage that the library that reads it would not notice."""
-
-
-def _is_tiff(head: bytes) -> bool:
-    return head[:4] in (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
-
-
-def _is_ascii(head: bytes) -> bool:
-    return head.removeprefix(_BOM).lstrip()[:5].lower() in (b"ncols", b"nrows")
-
-
-def _is_json(head: bytes) -> bool:
-    return head.removeprefix(_BOM).lstrip()[:1] == b"{"
-
-
-def _is_points(head: bytes) -> bool:
-    line = head.split(b"\n", 1)[0].strip()
-    return not line.strip(b"0123456789+-.eE, \t\r\n") and (not line or line.count(b",") >= 2)
+    """Raises a UserError for damage that the library that reads the file would not report."""
 
 
 def _check_length(path: Path) -> None:
-    size = path.stat().st_size
+    _check_size(path.stat().st_size)
+
+
+def _check_size(size: int) -> None:
     if size > MAX_BYTES:
-        raise UserError(f"{size} bytes; a text file may have {MAX_BYTES}")
+        raise UserError(f"{size} bytes; a text file has at most {MAX_BYTES}")
 
 
 def _check_json(path: Path) -> None:
-    """Parses it all, because GDAL returns the features before a damage."""
+    """Parses the whole file, because GDAL returns the features before a damage."""
     _check_length(path)
     try:
         content = json.loads(path.read_bytes().decode("utf-8-sig"))
     except RecursionError:
         raise UserError("too many levels; expected GeoJSON") from None
     except UnicodeDecodeError as error:
-        raise UserError(f"no text at byte {error.start}; expected GeoJSON in UTF-8") from None
+        raise UserError(f"byte {error.start} is not UTF-8; expected GeoJSON in UTF-8") from None
     except ValueError as error:
         raise UserError(f"{error}; expected GeoJSON") from None
     if content.get("type") not in ("FeatureCollection", "Feature"):
         raise UserError(f"type {str(content.get('type'))[:40]!r}; expected a FeatureCollection")
 
 
+def _check_kml(path: Path) -> None:
+    _check_length(path)
+    _parse_kml(path.read_bytes())
+
+
+def _parse_kml(content: bytes) -> None:
+    """Parses all of it, because GDAL returns the features before a damage."""
+    parser = expat.ParserCreate()
+
+    def check_root(tag: str, _: Any) -> None:
+        parser.StartElementHandler = None
+        if tag.rpartition(":")[2] != "kml":
+            raise UserError(f"the first element is {tag[:40]!r}; expected KML")
+
+    def refuse(*_: Any) -> None:
+        raise UserError("a document type declaration; expected KML without one")
+
+    parser.StartElementHandler, parser.StartDoctypeDeclHandler = check_root, refuse
+    try:
+        parser.Parse(content, True)
+    except expat.ExpatError as error:
+        raise UserError(f"{error}; expected KML") from None
+
+
+def _check_kmz(path: Path) -> None:
+    """Checks each .kml in an archive."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            parts = [part for part in archive.infolist() if part.filename.endswith(".kml")]
+            if not parts:
+                raise UserError("the archive holds no .kml; expected KMZ")
+            _check_size(sum(part.file_size for part in parts))
+            for part in parts:
+                _parse_kml(archive.read(part))
+    except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError) as error:
+        raise UserError(f"{error}; expected KMZ") from None
+
+
 def _check_sqlite(path: Path) -> None:
-    """Checks all pages, because GDAL reads what is left of a file that was cut off."""
+    """Checks all pages, because GDAL reads the rest of a file that was cut off."""
     try:
         uri = f"{path.absolute().as_uri()}?mode=ro&immutable=1"
         with closing(sqlite3.connect(uri, uri=True)) as database:
@@ -82,7 +112,7 @@ def _check_sqlite(path: Path) -> None:
 
 
 def _check_shapefile(path: Path) -> None:
-    """Checks that the three files are there, whole, and of as many features."""
+    """Checks that the three files exist, are whole, and have the same number of features."""
     heads: dict[str, tuple[str, bytes, int]] = {}
     for suffix in (".shp", ".shx", ".dbf"):
         part = beside(path, suffix)
@@ -105,23 +135,36 @@ def _check_shapefile(path: Path) -> None:
         raise UserError(f"{name} has {records} records, the .shx {features}: damaged")
 
 
-NUMPY = Format("NumPy bank", (".npy",), lambda head: head[:6] == b"\x93NUMPY")
-GEOTIFF = Format("GeoTIFF", (".tif", ".tiff"), _is_tiff)
-ASCII = Format("ESRI ASCII", (".asc", ".agr", ".grd"), _is_ascii, _check_length)
-SHAPEFILE = Format("shapefile", (".shp",), lambda h: h[:4] == b"\0\0\x27\x0a", _check_shapefile)
-GEOJSON = Format("GeoJSON", (".geojson", ".json"), _is_json, _check_json)
-GEOPACKAGE = Format(
-    "GeoPackage", (".gpkg",), lambda h: h[:16] == b"SQLite format 3\0", _check_sqlite
+_TEXT = rb"(?:\xef\xbb\xbf)?\s*"  # after a byte order mark
+_NUMBERS = rb"[-+.\deE \t\r]*,"
+NUMPY = Format("NumPy bank", (".npy",), re.compile(rb"\x93NUMPY"))
+GEOTIFF = Format("GeoTIFF", (".tif", ".tiff"), re.compile(rb"II[*+]\0|MM\0[*+]"))
+ASCII = Format(
+    "ESRI ASCII",
+    (".asc", ".agr", ".grd"),
+    re.compile(_TEXT + rb"(?i:ncols|nrows)"),
+    _check_length,
 )
-POINTS = Format("the paper's text", (".txt", ".csv"), _is_points, _check_length)
-FORMATS = (NUMPY, GEOTIFF, ASCII, SHAPEFILE, GEOJSON, GEOPACKAGE, POINTS)
+SHAPEFILE = Format("shapefile", (".shp",), re.compile(rb"\0\0\x27\x0a"), _check_shapefile)
+GEOJSON = Format("GeoJSON", (".geojson", ".json"), re.compile(_TEXT + rb"\{"), _check_json)
+GEOPACKAGE = Format("GeoPackage", (".gpkg",), re.compile(rb"SQLite format 3\0"), _check_sqlite)
+KML = Format("KML", (".kml",), re.compile(_TEXT + rb"<"), _check_kml)
+KMZ = Format("KMZ", (".kmz",), re.compile(rb"PK\x03\x04"), _check_kmz)
+POINTS = Format(
+    "the paper's text",
+    (".txt", ".csv"),
+    re.compile(rb"\s*?(?:\n|\Z)|(?:" + _NUMBERS + rb"){2,}[-+.\deE \t\r]*(?:\n|\Z)"),
+    _check_length,
+)
+PERIMETERS = (SHAPEFILE, GEOJSON, GEOPACKAGE, KML, KMZ)
+FORMATS = (NUMPY, GEOTIFF, ASCII, *PERIMETERS, POINTS)
 
 
 def find_format(path: Path) -> Format:
-    """Returns the format of a file, whole as far as can be seen without its library.
+    """Returns the format of a file and checks that the file is whole.
 
     Raises:
-        UserError: there is no such file, or its format is not known.
+        UserError: there is no such file, its format is not known, or it is damaged.
     """
     _check_regular(path)
     head, suffix = _head(path, 4096), path.suffix.lower()
@@ -131,19 +174,62 @@ def find_format(path: Path) -> Format:
         raise UserError(
             f"a part of a shapefile; expected the .shp: {path.with_suffix('.shp').name}"
         )
-    if suffix in (".zip", ".kmz", ".gz") or head[:4] == b"PK\3\4":
+    if suffix != ".kmz" and (suffix in (".zip", ".gz") or head[:4] == b"PK\3\4"):
         raise UserError("an archive; expected the files in it")
+    _refuse_convertible(path, head)
     named = [known for known in FORMATS if suffix in known.suffixes]
-    # A file that ends in .txt may be anything.
+    # A file that ends in .txt may be of any format.
     candidates = FORMATS if not named or POINTS in named else named
     for candidate in candidates:
-        if candidate.matches(head):
+        if candidate.head.match(head):
             candidate.check(path)
             return candidate
     start = head[:16].decode("latin-1").encode("unicode_escape").decode()
     known = ", ".join(format.name for format in FORMATS)
     expected = f"{named[0].name}, as its name says" if named else known
     raise UserError(f"begins with {start!r}; expected {expected}")
+
+
+def perimeter_files(folder: Path) -> list[Path]:
+    """Returns the perimeters in a folder, sorted by name.
+
+    Raises:
+        UserError: there are none, or too many.
+    """
+    suffixes = [suffix for known in PERIMETERS for suffix in known.suffixes]
+    paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in suffixes)
+    if not 0 < len(paths) <= MAX_FILES:
+        number = f"{len(paths)} files of" if paths else "without"
+        raise UserError(
+            f"a folder {number} perimeters ({', '.join(suffixes)}); expected a file, or a folder "
+            f"of up to {MAX_FILES} files of perimeters of one fire"
+        )
+    return paths
+
+
+def _refuse_convertible(path: Path, head: bytes) -> None:
+    """Raises a UserError that says how to convert a format that is not read."""
+    if head[:3] == b"CDF" or head[:4] == b"\x89HDF":
+        raise UserError(
+            "NetCDF, as of WRF-SFIRE; expected a GeoTIFF: gdal_translate -b LAST -a_ullr 0 HEIGHT "
+            f"WIDTH 0 NETCDF:{path.name}:TIGN_G fire.tif (number of the last time; metres), read "
+            "with fire.units=seconds and fire.end, the seconds of that time"
+        )
+    if head[:19] == b"latitude,longitude,":
+        raise UserError(
+            "points, as of FIRMS; expected perimeters: ogr2ogr -a_srs EPSG:4326 -oo "
+            "X_POSSIBLE_NAMES=longitude -oo Y_POSSIBLE_NAMES=latitude -dialect sqlite -sql "
+            "\"SELECT acq_date || 'T' || substr('000' || acq_time, -4, 2) || ':' || "
+            "substr('000' || acq_time, -2) AS datetime, ST_Buffer(geometry, 0.002) AS geometry "
+            f'FROM [{path.stem}]" fire.gpkg {path.name}'
+        )
+    if path.name.startswith("ForestGrid") and path.suffix == ".csv":
+        raise UserError(
+            'a grid of Cell2Fire; expected an array of all: python -c "import glob, numpy as n; '
+            "names = sorted(glob.glob('ForestGrid*.csv'), key=lambda f: (len(f), f)); burnt = "
+            "n.array([n.loadtxt(f, delimiter=',') for f in names]) > 0; n.save('fire.npy', "
+            'n.where(burnt.any(0), burnt.argmax(0), n.inf)[::-1].T)"'
+        )
 
 
 def beside(path: Path, suffix: str) -> Path | None:
@@ -153,13 +239,17 @@ def beside(path: Path, suffix: str) -> Path | None:
 
 
 def digest(path: Path) -> str:
-    """Returns the sha256 of a file and of the files beside it that are read with it.
+    """Returns the SHA-256 of a file and the files beside it, or of a folder's perimeters.
 
     Raises:
-        UserError: the file is missing or cannot be read.
+        UserError: a file is missing or cannot be read.
     """
-    _check_regular(path)
     content = hashlib.sha256()
+    if path.is_dir():
+        for part in perimeter_files(path):
+            content.update(f"{part.name}:{digest(part)}:".encode())
+        return content.hexdigest()
+    _check_regular(path)
     try:
         for suffix in ("", *_BESIDE.get(path.suffix.lower(), ())):
             part = beside(path, suffix) if suffix else path
@@ -179,7 +269,7 @@ def _head(path: Path, count: int) -> bytes:
 
 
 def _check_regular(path: Path) -> None:
-    """Checks that a path is a regular file: a pipe would never end."""
+    """Checks that a path is a regular file. A pipe, for example, would block for ever."""
     try:
         path.stat()
     except FileNotFoundError:

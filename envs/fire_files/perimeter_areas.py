@@ -1,4 +1,4 @@
-"""The area that perimeters enclose: polygons, closed lines, collections of them."""
+"""Computes the area that perimeters enclose: polygons, closed lines, collections of them."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -8,85 +8,91 @@ import numpy as np
 from emberlink.envs.fire_files.projection import library
 from emberlink.envs.utils.errors import UserError
 
-_GAP = 0.01  # of a line's length: a gap that small between its ends is closed
-_POINT = 1e-3  # of an area's width: a fire drawn in to a point keeps that much
 MAX_RINGS = 20_000
 """Closed lines of one time."""
+_GAP = 0.01  # of a line's length: a smaller gap between its ends is closed
+_POINT = 1e-3  # of an area's width: the size of a fire that is a point
 
 
-def enclosed(geometries: Sequence[Any], features: Sequence[int]) -> Any:
+def enclosed(geometries: Sequence[Any], features: Sequence[str]) -> Any:
     """Returns the area inside perimeters of one time, a shapely polygon or several.
 
     A closed line within another is an unburnt island. Points, and open lines beside a polygon of
     the same feature, are left out.
 
     Args:
-        geometries: of shapely.
-        features: number of the feature of each, for messages.
+        geometries: shapely geometries.
+        features: names of the features, for messages.
 
     Raises:
         UserError: a feature encloses nothing, or a line is not closed.
     """
-    shapely = library("shapely", "perimeters")
+    shapely = library("shapely")
     areas: list[Any] = []
-    lines: list[tuple[Any, int]] = []
+    lines: list[tuple[Any, str]] = []
     for geometry, feature in zip(geometries, features, strict=True):
         parts = _parts(shapely.force_2d(geometry))
         shapes = [part for part in parts if part.geom_type == "Polygon"]
         strokes = [part for part in parts if part.geom_type in ("LineString", "LinearRing")]
         if not shapes and not strokes:
-            raise UserError(
-                f"feature {feature} is of {geometry.geom_type}; expected polygons or lines"
-            )
+            raise UserError(f"{feature} is of {geometry.geom_type}; expected polygons or lines")
         areas += [make_valid(shape) for shape in shapes]
         lines += [(line, feature) for line in strokes if not shapes or line.is_closed]
     if lines:
         areas.append(_within_lines(lines))
     area = shapely.union_all(areas)
     if not area.area > 0:
-        raise UserError(f"feature {features[0]} encloses no area; expected a perimeter")
+        raise UserError(f"{features[0]} encloses no area; expected a perimeter")
     return area
 
 
 def make_valid(area: Any) -> Any:
-    """Returns an area that does not cross itself, with the same shells."""
-    shapely = library("shapely", "perimeters")
+    """Returns an area without self-intersections, with the same shells."""
+    shapely = library("shapely")
     if area.is_valid:
         return area
     return shapely.make_valid(area, method="structure", keep_collapsed=False)
 
 
 def polygons(area: Any) -> list[Any]:
-    """Returns the polygons that an area consists of."""
+    """Returns the polygons of an area."""
     return [part for part in _parts(area) if part.geom_type == "Polygon"]
 
 
-def ignition(area: Any, moved: np.ndarray) -> Any:
-    """Returns the area at an earlier time, from the speeds of the edges of the whole fire.
+def area_at_zero(areas: Sequence[Any], times: np.ndarray) -> Any:
+    """Returns the area that burnt at time 0, before the first perimeter.
 
-    The box around each polygon is drawn in by `moved`, to a point at most.
+    The four edges of the whole fire move at the speeds that they have from the first perimeter to
+    the second. The box around each polygon shrinks with them, to a point at most.
 
     Args:
-        area: a shapely polygon or several.
-        moved: float64 [4], how far least x, least y, greatest x and greatest y have moved since.
+        areas: shapely polygons, one for each time.
+        times: float64, ascending, above 0.
     """
-    shapely = library("shapely", "perimeters")
-    earlier: list[Any] = []
-    for part in polygons(area):
-        now = np.array(part.bounds)
-        size, then = now[2:] - now[:2], now - moved
-        scale = np.maximum((then[2:] - then[:2]) / size, _POINT)
-        shift = np.clip((then[:2] + then[2:]) / 2, now[:2], now[2:]) - scale * (now[:2] + size / 2)
-        small = shapely.transform(part, lambda at, scale=scale, shift=shift: at * scale + shift)
-        small = small.intersection(part)
-        if not small.area > 0:
-            small = part.representative_point().buffer(_POINT * size.min())
-        earlier.append(small)
-    return shapely.union_all(earlier)
+    first, second = (np.array(area.bounds) for area in areas[:2])
+    grown = np.concatenate([np.minimum(second - first, 0)[:2], np.maximum(second - first, 0)[2:]])
+    speed = grown / (times[1] - times[0])
+    width, spread = ((at[2:] - at[:2]).sum() for at in (first, speed))
+    back = min(times[0], width / spread) if spread > 0 else 0.0  # then it is a point
+    parts = [_shrunk(part, speed * back) for part in polygons(areas[0])]
+    return library("shapely").union_all(parts)
+
+
+def _shrunk(part: Any, moved: np.ndarray) -> Any:
+    """Returns a polygon whose box is smaller by `moved`, the distance of each edge, [4]."""
+    shapely = library("shapely")
+    now = np.array(part.bounds)
+    size, then = now[2:] - now[:2], now - moved
+    scale = np.maximum((then[2:] - then[:2]) / size, _POINT)
+    shift = np.clip((then[:2] + then[2:]) / 2, now[:2], now[2:]) - scale * (now[:2] + size / 2)
+    small = shapely.transform(part, lambda at: at * scale + shift).intersection(part)
+    if not small.area > 0:
+        small = part.representative_point().buffer(_POINT * size.min())
+    return small
 
 
 def _parts(geometry: Any) -> list[Any]:
-    """Returns the simple geometries in one, however they are nested."""
+    """Returns the simple geometries of a collection, which may be nested."""
     parts: list[Any] = []
     rest = [geometry]
     while rest:
@@ -98,19 +104,19 @@ def _parts(geometry: Any) -> list[Any]:
     return parts
 
 
-def _within_lines(lines: Sequence[tuple[Any, int]]) -> Any:
-    """Returns what closed lines enclose; those within an odd number of others are islands."""
-    shapely = library("shapely", "perimeters")
+def _within_lines(lines: Sequence[tuple[Any, str]]) -> Any:
+    """Returns the area inside closed lines. A line within an odd number of others is an island."""
+    shapely = library("shapely")
     rings: dict[bytes, Any] = {}
     for line in _parts(shapely.line_merge(shapely.MultiLineString([line for line, _ in lines]))):
         ends = np.asarray(line.coords)[[0, -1]]
         gap = float(np.hypot(*(ends[1] - ends[0])))
         if len(line.coords) < 3 or gap > _GAP * line.length:
             end = line.coords[0]
-            feature = next(number for part, number in lines if end in list(part.coords))
+            feature = next(name for part, name in lines if end in list(part.coords))
             raise UserError(
-                f"feature {feature}: a line of {len(line.coords)} points is not closed, {gap:g} of "
-                f"its length of {line.length:g} is missing; expected closed lines"
+                f"{feature}: a line of {len(line.coords)} points is not closed, {gap:g} of its "
+                f"length of {line.length:g} is missing; expected closed lines"
             )
         area = make_valid(shapely.Polygon(line.coords))
         rings.setdefault(shapely.normalize(area).wkb, area)

@@ -1,13 +1,13 @@
-"""Times of perimeters, from the columns of their table."""
+"""Reads the times of perimeters: calendar times as text, and columns of a table."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
+from email.utils import parsedate_to_datetime
 from typing import Any
 
 import numpy as np
 
-from emberlink.envs.fire_files.times import Clock, Units, in_utc, parse_time
+from emberlink.envs.fire_files.config import Clock, Units
 from emberlink.envs.utils.errors import UserError
 
 ELAPSED: dict[str, Units] = {
@@ -21,87 +21,128 @@ ELAPSED: dict[str, Units] = {
     "hours": "hours",
     "days": "days",
 }
-"""Columns of elapsed time, in lower case; the name says the unit."""
+"""Columns of elapsed time, in lower case, and the unit of each."""
 CALENDAR = (
     *("poly_polygondatetime", "polygondatetime", "perimeterdatetime", "perdatetime", "perdattime"),
     *("gdb_from_date", "datetime", "date_time", "timestamp", "acq_datetime", "acq_date"),
-    *("date_", "date", "time", "t"),
+    *("date_", "date", "time", "t", "begin"),
 )
 """Columns of the time at which a perimeter was mapped, in lower case."""
 EDITED = ("poly_datecurrent", "datecurrent")
-"""Columns of the time at which a record was changed, used where a perimeter has no other time."""
-_DBF_LENGTH = 10  # letters of a column's name that a .dbf keeps
-_FIRST_MS, _LAST_MS = 1e11, 2.5e14  # numbers in between are milliseconds since 1970
+"""Columns of the time at which a record was changed, for perimeters without another time."""
+_DBF_LENGTH = 10  # maximum length of a column's name in a .dbf
+_MIN_MS = 1e11  # a number from here on is a date: milliseconds since 1970, or digits
+_CENTURIES = ("19", "20")  # the first digits of a year
 _MAX_TIME = 1e12
+_MAX_LENGTH = 40
+_DIGITS = {8: "%Y%m%d", 12: "%Y%m%d%H%M", 14: "%Y%m%d%H%M%S"}
+_AMERICAN = ("%m-%d-%Y", "%m-%d-%Y %H:%M", "%m-%d-%Y %H:%M:%S")
+_AMERICAN += ("%m-%d-%Y %I:%M %p", "%m-%d-%Y %I:%M:%S %p")
 
 
-@dataclass(frozen=True)
-class Times:
-    """The time of each feature of a file."""
-
-    values: np.ndarray
-    """float64 [features]"""
-    clock: Clock
-
-
-def perimeter_times(frame: Any, wanted: str | None, unit: Units | None) -> Times:
+def perimeter_times(frame: Any, wanted: str | None, unit: Units | None) -> tuple[np.ndarray, Clock]:
     """Reads the time of each feature.
 
     Args:
-        frame: a table with a column per attribute.
+        frame: a table with a column per attribute; the index names the features in messages.
         wanted: `fire.time_field`; None takes the only column with a known name.
         unit: `fire.units`.
+
+    Returns:
+        The times, float64 [features], and their clock.
 
     Raises:
         UserError: no column, several columns, or a value that is not a time.
     """
     names = {str(name).lower(): str(name) for name in frame.columns if name != frame.geometry.name}
+    known = ", ".join(list(names.values())[:30]) or "none"
     if wanted is not None:
         if wanted.lower() not in names:
-            raise UserError(f"no column {wanted!r} (fire.time_field); there are {_list(names)}")
-        return _of_column(frame, names[wanted.lower()], unit)
-    found = _present(names, tuple(ELAPSED))
-    if not found and {"month", "day", "hour"} <= set(names):
-        return _farsite(frame, names)
-    found = found or _present(names, CALENDAR)
-    edited = _present(names, EDITED)
-    if {"date_", "time_"} <= set(names) and found == [names["date_"]]:
-        return _geomac(frame, names["date_"], names["time_"])
-    if len(found) > 1:
+            raise UserError(f"no column {wanted!r} (fire.time_field); there are {known}")
+        return _of_column(frame[names[wanted.lower()]], unit)
+    edited = known_columns(names, EDITED)
+    columns = known_columns(names, tuple(ELAPSED)) or known_columns(names, CALENDAR) or edited
+    if "time_" in names and columns == [names.get("date_")]:
+        return _geomac(frame, columns[0], names["time_"])
+    if len(columns) > 1:
         raise UserError(
-            f"the columns {', '.join(found)} may hold the times; expected fire.time_field, such as "
-            f"fire.time_field={found[0]}"
+            f"the columns {', '.join(columns)} may hold the times; expected fire.time_field, such "
+            f"as fire.time_field={columns[0]}"
         )
-    if not found and not edited:
-        raise UserError(
-            "which column holds the times is not known; expected fire.time_field, one of "
-            f"{_list(names)}"
-        )
-    return _of_column(frame, (found or edited)[0], unit, instead=edited if found else [])
+    if not columns:
+        raise UserError(f"no column of times is known; expected fire.time_field, one of {known}")
+    column = frame[columns[0]]
+    for other in edited:
+        column = column.where(column.notna(), frame[other])
+    return _of_column(column, unit)
 
 
-def _present(names: dict[str, str], known: Sequence[str]) -> list[str]:
-    """Returns the columns with a known name, also as a .dbf cuts it."""
+def parse_time(text: str) -> datetime:
+    """Reads a calendar time. The result has a zone only if the text has one.
+
+    Known forms are ISO 8601 (also with slashes), digits such as 20200819, 202008191300 and
+    20200819130000, RFC 2822 (`Fri, 13 Feb 2026 14:30:58 GMT`), and month first with slashes as in
+    the USA (`8/19/2015 1:55:00 AM`).
+
+    Raises:
+        UserError: the text has another form.
+    """
+    text = text.strip()
+    if len(text) > _MAX_LENGTH:
+        raise UserError(f"{text[:_MAX_LENGTH]!r} is not a calendar time")
+    text = text.replace("/", "-")
+    forms = _AMERICAN
+    if text.isdecimal() and len(text) in _DIGITS:
+        forms = (_DIGITS[len(text)],)
+    else:
+        try:
+            return parsedate_to_datetime(text) if "," in text else datetime.fromisoformat(text)
+        except (TypeError, ValueError):
+            pass
+    for form in forms:
+        try:
+            return datetime.strptime(text, form)
+        except ValueError:
+            continue
+    raise UserError(f"{text!r} is not a calendar time")
+
+
+def in_utc(time: datetime) -> datetime:
+    """Returns the time in UTC. A time without a zone is taken as UTC.
+
+    Raises:
+        UserError: the time is before year 1 or after year 9999.
+    """
+    try:
+        return time.astimezone(UTC) if time.tzinfo else time.replace(tzinfo=UTC)
+    except OverflowError:
+        raise UserError(f"{time.isoformat()} is before year 1 or after year 9999") from None
+
+
+def known_columns(names: dict[str, str], known: Sequence[str]) -> list[str]:
+    """Returns the columns with a known name, also in the short form of a .dbf.
+
+    Args:
+        names: the columns, by their names in lower case.
+        known: in lower case.
+    """
     short = {name[:_DBF_LENGTH] for name in known if len(name) > _DBF_LENGTH}
     return [names[name] for name in names if name in known or name in short]
 
 
-def _list(names: dict[str, str]) -> str:
-    return ", ".join(list(names.values())[:30]) or "none"
-
-
-def _of_column(frame: Any, name: str, unit: Units | None, instead: Sequence[str] = ()) -> Times:
-    column = frame[name]
-    for other in instead:
-        if other != name:
-            column = column.where(column.notna(), frame[other])
+def _of_column(column: Any, unit: Units | None) -> tuple[np.ndarray, Clock]:
+    """Reads a column of elapsed times or of dates."""
+    name = str(column.name)
     empty = np.flatnonzero(column.isna().to_numpy())
     if len(empty):
-        raise UserError(f"feature {empty[0]} has no time in {name}; expected one in each")
+        raise UserError(f"{column.index[empty[0]]} has no time in {name}; expected one in each")
     values = column.tolist()
-    if name.lower() in ELAPSED or _are_elapsed(values):
-        return _elapsed(values, name, unit)
-    return _calendar([_date(value, i, name) for i, value in enumerate(values)], name)
+    numbers = [number for value in values if (number := _number(value)) is not None]
+    elapsed = len(numbers) == len(values) and not all(map(_is_date, numbers))
+    if elapsed or name.lower() in ELAPSED:
+        return _elapsed(column, unit)
+    dates = [_date(value, feature, name) for feature, value in column.items()]
+    return _calendar(dates, name, column.index)
 
 
 def _number(value: Any) -> float | None:
@@ -111,67 +152,57 @@ def _number(value: Any) -> float | None:
         return None
 
 
-def _are_elapsed(values: Sequence[Any]) -> bool:
-    """Tells whether all values are numbers that are not dates."""
-    numbers = [_number(value) for value in values]
-    if any(number is None for number in numbers):
-        return False
-    return not all(_is_date(number) for number in numbers if number is not None)
-
-
 def _is_date(number: float) -> bool:
     """Tells whether a number is a date in digits, or milliseconds since 1970."""
-    if not np.isfinite(number) or number != np.floor(number):
-        return False
     digits = f"{number:.0f}"
-    plausible = "1900" <= digits[:4] <= "2100" and "01" <= digits[4:6] <= "12"
-    return (len(digits) in (8, 12, 14) and plausible) or _FIRST_MS < number < _LAST_MS
+    return number >= _MIN_MS or (len(digits) == 8 and digits[:2] in _CENTURIES)
 
 
-def _date(value: Any, feature: int, name: str) -> datetime:
-    number = _number(value)
-    if number is not None and _is_date(number):
-        digits = f"{number:.0f}"
-        plausible = "1900" <= digits[:4] <= "2100" and len(digits) in (8, 12, 14)
-        if not plausible:
-            return datetime.fromtimestamp(number / 1000, UTC)
-        value = digits
+def _date(value: Any, feature: str, name: str) -> datetime:
+    """Reads a date as text, as a number in digits, or as milliseconds since 1970."""
+    text, number = str(value), _number(value)
     try:
-        return parse_time(str(value))
-    except UserError:
+        if number is not None and _is_date(number):
+            text = f"{number:.0f}"
+            if len(text) not in _DIGITS or text[:2] not in _CENTURIES:
+                return datetime.fromtimestamp(number / 1000, UTC)
+        return parse_time(text)
+    except (UserError, ValueError, OverflowError, OSError):
         raise UserError(
-            f"feature {feature} has {name}={str(value)[:40]!r}, which is not a date; expected such "
-            "as 2020-08-19T13:00"
+            f"{feature} has {name}={str(value)[:40]!r}, which is not a date; expected such as "
+            "2020-08-19T13:00"
         ) from None
 
 
-def _elapsed(values: Sequence[Any], name: str, unit: Units | None) -> Times:
+def _elapsed(column: Any, unit: Units | None) -> tuple[np.ndarray, Clock]:
+    name = str(column.name)
     numbers: list[float] = []
-    for feature, value in enumerate(values):
+    for feature, value in column.items():
         number = _number(value)
         if number is None or not 0 <= number <= _MAX_TIME:
-            raise UserError(
-                f"feature {feature} has {name}={str(value)[:40]}; expected a time of 0 or more"
-            )
+            raise UserError(f"{feature} has {name}={str(value)[:40]}; expected a time of 0 or more")
         numbers.append(number)
     known = ELAPSED.get(name.lower())
     if known and unit and unit != known:
         raise UserError(f"{name} is in {known}; expected fire.units={known}, not {unit}")
-    if not (known or unit):
+    unit = known or unit
+    if unit is None:
         raise UserError(
             f"the unit of {name} is not known; expected fire.units=minutes, seconds, hours, days "
             "or steps"
         )
-    return Times(np.array(numbers), Clock(known or unit or "minutes"))
+    return np.array(numbers), Clock(unit)
 
 
-def _calendar(dates: Sequence[datetime], name: str) -> Times:
+def _calendar(
+    dates: Sequence[datetime], name: str, features: Sequence[str]
+) -> tuple[np.ndarray, Clock]:
     """Returns minutes since the first date."""
     aware = [date.tzinfo is not None for date in dates]
     if any(aware) and not all(aware):
         raise UserError(
-            f"{name}: feature {aware.index(True)} has a time zone and feature "
-            f"{aware.index(False)} has none; expected all or none"
+            f"{name}: {features[aware.index(True)]} has a time zone and "
+            f"{features[aware.index(False)]} has none; expected all or none"
         )
     try:
         dates = [in_utc(date) for date in dates]
@@ -179,48 +210,27 @@ def _calendar(dates: Sequence[datetime], name: str) -> Times:
         raise UserError(f"{name}: {error}") from None
     first = min(dates)
     values = [(date - first) / timedelta(minutes=1) for date in dates]
-    return Times(np.array(values), Clock("minutes", first))
+    return np.array(values), Clock("minutes", first)
 
 
-def _geomac(frame: Any, date_name: str, time_name: str) -> Times:
+def _geomac(frame: Any, date_name: str, time_name: str) -> tuple[np.ndarray, Clock]:
     """Joins GeoMAC's columns: a date, and the time of day as 2300, 155 or 23:00."""
     dates: list[datetime] = []
-    for feature, (date, time) in enumerate(zip(frame[date_name], frame[time_name], strict=True)):
-        digits = str(time).strip().removesuffix(".0").replace(":", "").zfill(4)
-        text = f"{date_name}={str(date)[:40]}, {time_name}={str(time)[:40]}"
+    rows = zip(frame.index, frame[date_name], frame[time_name], strict=True)
+    for feature, date, time in rows:
         try:
-            day = parse_time(str(date))
-            dates.append(day.replace(hour=0, minute=0, second=0) + _time_of_day(digits[:4]))
+            day = parse_time(str(date)).replace(hour=0, minute=0, second=0)
+            dates.append(day + _time_of_day(str(time)))
         except UserError:
             raise UserError(
-                f"feature {feature} has {text}; expected a date and a time such as 2300"
+                f"{feature} has {date_name}={str(date)[:40]}, {time_name}={str(time)[:40]}; "
+                "expected a date and a time such as 2300"
             ) from None
-    return _calendar(dates, f"{date_name}, {time_name}")
+    return _calendar(dates, f"{date_name}, {time_name}", frame.index)
 
 
-def _time_of_day(digits: str) -> timedelta:
-    """Reads a time of day such as 1300."""
-    if not digits.isdecimal() or int(digits[:-2] or 0) > 24 or int(digits[-2:]) > 59:
-        raise UserError(f"{digits!r} is not a time of day")
-    return timedelta(hours=int(digits[:-2] or 0), minutes=int(digits[-2:]))
-
-
-def _farsite(frame: Any, names: dict[str, str]) -> Times:
-    """Reads FARSITE's columns Month, Day and Hour (1300 is 13:00), which hold no year."""
-    keys = ("month", "day", "hour")
-    rows = [[_number(value) for value in frame[names[key]]] for key in keys]
-    months = [month for month in rows[0] if month is not None]
-    # A fire from December to January changes the year; no fire lasts for half a year.
-    over = any(month >= 11 for month in months) and any(month <= 2 for month in months)
-    dates: list[datetime] = []
-    for feature, (month, day, hour) in enumerate(zip(*rows, strict=True)):
-        try:
-            year = 2005 if over and int(month or 0) <= 6 else 2004
-            time = _time_of_day(f"{hour:04.0f}")
-            dates.append(datetime(year, int(month or 0), int(day or 0)) + time)
-        except (TypeError, ValueError, OverflowError):
-            at = (f"{names[key]}={str(frame[names[key]].iloc[feature])[:40]}" for key in keys)
-            raise UserError(
-                f"feature {feature} has {', '.join(at)}; expected a date and a time such as 1300"
-            ) from None
-    return _calendar(dates, "Month, Day, Hour")
+def _time_of_day(text: str) -> timedelta:
+    digits = text.strip().removesuffix(".0").replace(":", "").zfill(4)[:4]
+    if not digits.isdecimal() or int(digits[:2]) > 24 or int(digits[2:]) > 59:
+        raise UserError(f"{text!r} is not a time of day")
+    return timedelta(hours=int(digits[:2]), minutes=int(digits[2:]))

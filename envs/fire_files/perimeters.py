@@ -1,4 +1,4 @@
-"""Perimeters over time: shapefile, GeoJSON, GeoPackage."""
+"""Reads perimeters over time: shapefile, GeoJSON, GeoPackage, KML."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -7,9 +7,17 @@ from typing import Any
 import numpy as np
 from scipy.ndimage import distance_transform_edt
 
-from emberlink.envs.fire_files.config import FileFireConfig
-from emberlink.envs.fire_files.perimeter_areas import enclosed, ignition, make_valid, polygons
-from emberlink.envs.fire_files.perimeter_times import perimeter_times
+from emberlink.envs.fire_files.config import Clock, FileFireConfig
+from emberlink.envs.fire_files.formats import (
+    GEOJSON,
+    KML,
+    KMZ,
+    PERIMETERS,
+    find_format,
+    perimeter_files,
+)
+from emberlink.envs.fire_files.perimeter_areas import area_at_zero, enclosed, make_valid, polygons
+from emberlink.envs.fire_files.perimeter_times import known_columns, perimeter_times
 from emberlink.envs.fire_files.projection import (
     Bounds,
     check_projection,
@@ -18,88 +26,151 @@ from emberlink.envs.fire_files.projection import (
     projections,
 )
 from emberlink.envs.fire_files.raster_source import Window
-from emberlink.envs.fire_files.times import Clock
 from emberlink.envs.utils.errors import UserError
+from emberlink.envs.utils.validation import unknown
 
 MAX_TIMES = 500
-_SHRUNK = 0.75  # a perimeter inside the burnt area must have that share of it
-_INSIDE = 0.99  # share of a perimeter that lies inside the burnt area
+_INCIDENTS = ("poly_incidentname", "attr_incidentname", "incidentname", "incident", "fire_name")
+_SHRUNK = 0.75  # minimum share of the burnt area that a perimeter inside it has
+_INSIDE = 0.99  # share of a perimeter inside the burnt area, from which it counts as inside
 
 
 def read_perimeters(path: Path, config: FileFireConfig) -> "PerimeterSource":
     """Reads perimeters with the time of each, as a fire.
 
+    Args:
+        path: a file, or a folder of files of one fire, such as GeoMAC's file per date.
+        config: the scenario.
+
     Raises:
-        UserError: the file, a feature or a column is wrong.
+        UserError: a file, a feature or a column is wrong.
     """
-    frame = _read_table(path, config.layer)
-    times = perimeter_times(frame, config.time_field, config.units)
-    distinct = np.unique(times.values)
+    frame = _choose_incident(_read_tables(path, config.layer), config.incident)
+    times, clock = perimeter_times(frame, config.time_field, config.units)
+    distinct = np.unique(times)
     if len(distinct) > MAX_TIMES:
         raise UserError(f"{len(distinct)} times; at most {MAX_TIMES} are read")
     areas: list[Any] = []
     for time in distinct:
-        features = np.flatnonzero(times.values == time).tolist()
-        areas.append(enclosed(frame.geometry.iloc[features].tolist(), features))
-    return PerimeterSource(_project(path, frame, areas, config.crs), distinct, times.clock)
+        part = frame[times == time]
+        areas.append(enclosed(part.geometry.tolist(), part.index.tolist()))
+    return PerimeterSource(_project(frame, areas, config.crs), distinct, clock)
+
+
+def _read_tables(path: Path, layer: str | None) -> Any:
+    """Reads the features of a file, or of all files in a folder.
+
+    The index of the table names the features in messages.
+    """
+    if not path.is_dir():
+        return _read_table(path, layer).rename(index="feature {}".format)
+    names, frames = [], []
+    for part in perimeter_files(path):
+        try:
+            if find_format(part) not in PERIMETERS:
+                raise UserError("expected perimeters")
+            frame = _read_table(part, layer).rename(columns=str.lower)
+        except UserError as error:
+            raise UserError(f"{part.name}: {error}") from None
+        names.append(part.name)
+        frames.append(frame.rename(index=f"{part.name}: feature {{}}".format))
+    for name, frame in zip(names, frames, strict=True):
+        if (frame.crs is None) != (frames[0].crs is None):
+            without, other = (name, names[0]) if frame.crs is None else (names[0], name)
+            raise UserError(f"{without}: no projection, which {other} has; expected one in each")
+    return _join(frames)
+
+
+def _join(frames: Sequence[Any]) -> Any:
+    """Joins tables, in the projection of the first."""
+    crs = frames[0].crs
+    same = [frame if frame.crs == crs else frame.to_crs(crs) for frame in frames]
+    return library("pandas").concat(same)
 
 
 def _read_table(path: Path, layer: str | None) -> Any:
-    """Reads the features, each of which has a geometry."""
-    pyogrio = library("pyogrio", "perimeters")
-    library("geopandas", "perimeters")
-    # As text: of dates in GeoJSON, GDAL loses some zones where not all are the same.
-    options = {"DATE_AS_STRING": "YES"} if _is_json(path) else {}
+    """Reads the features of a file, each of which has a geometry."""
+    pyogrio = library("pyogrio")
+    library("geopandas")
+    suffix = path.suffix.lower()
+    is_json, is_kml = suffix in GEOJSON.suffixes, suffix in (*KML.suffixes, *KMZ.suffixes)
+    # Dates in GeoJSON as text, because GDAL loses zones that differ.
+    options = {"DATE_AS_STRING": "YES"} if is_json else {}
     try:
-        layer = _choose_layer(pyogrio.list_layers(path.absolute()), layer)
-        frame = pyogrio.read_dataframe(
-            path.absolute(), layer=layer, datetime_as_string=True, **options
-        )
+        layers = _choose_layers(pyogrio.list_layers(path.absolute()), layer, several=is_kml)
+        frame = _join(
+            [
+                pyogrio.read_dataframe(
+                    path.absolute(), layer=name, datetime_as_string=True, **options
+                )
+                for name in layers
+            ]
+        ).reset_index(drop=True)
     except UserError:
         raise
-    except Exception as error:  # of many types: of GDAL, of text, of geometries
+    except Exception as error:  # GDAL, text and geometries raise many types
         if isinstance(error, pyogrio.errors.CRSError):
             check_projection(path, None)
         raise UserError(f"{first_line(error)}; expected perimeters") from None
+    if is_kml:  # without hot spots, and without the columns of KML that are empty
+        frame = frame[frame.geom_type != "Point"].dropna(axis="columns", how="all")
     if not hasattr(frame, "geometry") or len(frame) == 0:
         raise UserError("no feature with a geometry; expected perimeters")
-    missing = np.flatnonzero((frame.geometry.isna() | frame.geometry.is_empty).to_numpy())
+    missing = frame.index[frame.geometry.isna() | frame.geometry.is_empty]
     if len(missing):
         raise UserError(f"feature {missing[0]} has no geometry; expected a perimeter in each")
-    if not _is_json(path):
+    if not is_json:
         check_projection(path, frame.crs)
+    elif frame.crs is not None and frame.crs.is_geographic and abs(frame.total_bounds).max() > 360:
+        return frame.set_crs(None, allow_override=True)  # GDAL assumes degrees
     return frame
 
 
-def _is_json(path: Path) -> bool:
-    return path.suffix.lower() in (".geojson", ".json")
-
-
-def _choose_layer(layers: Sequence[Any], wanted: str | None) -> str:
-    """Returns the layer that is named, or the only one with geometries."""
+def _choose_layers(layers: Sequence[Any], wanted: str | None, *, several: bool) -> list[str]:
+    """Returns the layer `wanted`, or the only layer with geometries, or all if `several`."""
     names = [str(name) for name, kind in layers if kind is not None]
-    if wanted is None and len(names) == 1:
-        return names[0]
     if wanted in names:
-        return str(wanted)
+        return [str(wanted)]
     known = ", ".join(names[:30]) or "none"
+    if wanted is not None:
+        raise UserError(f"no layer {wanted!r} (fire.layer); there are {known}")
+    if not names:
+        raise UserError("no feature with a geometry; expected perimeters")
+    if len(names) > 1 and not several:
+        raise UserError(f"{len(names)} layers of perimeters; expected fire.layer, one of {known}")
+    return names
+
+
+def _choose_incident(frame: Any, wanted: str | None) -> Any:
+    """Returns the features of the incident `wanted`, or of the only incident."""
+    columns = known_columns({str(name).lower(): str(name) for name in frame.columns}, _INCIDENTS)
+    if wanted == "*" or not (columns or wanted):
+        return frame
+    if not columns:
+        raise UserError(f"fire.incident={wanted}: no column of incidents, such as {_INCIDENTS[0]}")
+    named = frame[columns[0]].dropna().astype(str).str.strip()
+    names = {name.casefold(): name for name in named[::-1]}
+    if wanted is None and len(names) < 2:
+        return frame
     if wanted is None:
-        raise UserError(f"{len(names)} layers; expected fire.layer, one of {known}")
-    raise UserError(f"no layer {wanted!r} (fire.layer); there are {known}")
+        known = sorted(names.values())
+        raise UserError(
+            f"perimeters of {len(known)} incidents: {', '.join(known[:30])}; expected "
+            f"fire.incident, such as fire.incident={known[0]}, or * for all as one fire"
+        )
+    if wanted.casefold() not in names:
+        raise UserError(f"fire.incident={unknown(wanted, sorted(names.values()))}")
+    chosen = named.str.casefold() == wanted.casefold()
+    return frame.loc[chosen.index[chosen]]
 
 
-def _project(path: Path, frame: Any, areas: Sequence[Any], crs: str | None) -> list[Any]:
+def _project(frame: Any, areas: Sequence[Any], crs: str | None) -> list[Any]:
     """Projects areas onto a plane."""
     x0, y0, x1, y1 = (float(value) for value in frame.total_bounds)
-    source_crs = frame.crs
-    in_degrees = source_crs is not None and source_crs.is_geographic
-    if _is_json(path) and in_degrees and max(map(abs, (x0, y0, x1, y1))) > 360:
-        source_crs = None  # GDAL takes GeoJSON without a projection for degrees
-    chosen = projections(source_crs, crs, (x0, y0, x1, y1), None)
+    chosen = projections(frame.crs, crs, (x0, y0, x1, y1), None)
     if chosen is None:
         return list(areas)
-    geopandas = library("geopandas", "perimeters")
-    projected = geopandas.GeoSeries(areas, crs=chosen[0]).to_crs(chosen[1])
+    projected = library("geopandas").GeoSeries(areas, crs=chosen[0]).to_crs(chosen[1])
     if not np.isfinite(projected.total_bounds).all():
         raise UserError(
             f"coordinates from {x0, y0} to {x1, y1} cannot be projected from {chosen[0].name} to "
@@ -109,18 +180,19 @@ def _project(path: Path, frame: Any, areas: Sequence[Any], crs: str | None) -> l
 
 
 class PerimeterSource:
-    """A fire whose burnt area is known at some times; the front is interpolated in between.
+    """A fire whose burnt area is known at some times. The front is interpolated between them.
 
     Args:
-        areas: of shapely, on a plane, one for each time.
+        areas: shapely polygons on a plane, one for each time.
         times: float64, ascending.
-        clock: of the times.
+        clock: unit of the times.
 
     Raises:
-        UserError: there are not two times, or the areas shrink.
+        UserError: there are fewer than two times, or the areas shrink.
     """
 
     whole = False
+    beginnings = 1
 
     def __init__(self, areas: Sequence[Any], times: np.ndarray, clock: Clock):
         if len(times) < 2:
@@ -128,9 +200,11 @@ class PerimeterSource:
                 f"one perimeter, of {clock.format(times[0])}; expected two times or more"
             )
         self.clock, self.first, self.last = clock, float(times[0]), float(times[-1])
+        span = f"{clock.format(self.first)} to {clock.format(self.last)}"
+        self.summary = f"perimeters of {len(times)} times, from {span}"
         _check_growth(areas, times, clock)
         if clock.origin is None and times[0] > 0:
-            areas, times = [_at_zero(areas, times), *areas], np.concatenate([[0.0], times])
+            areas, times = [area_at_zero(areas, times), *areas], np.concatenate([[0.0], times])
         self._areas, self._times, self.began = areas, times, float(times[0])
         boxes = np.array([area.bounds for area in areas])
         low, high = np.minimum.accumulate(boxes[:, :2]), np.maximum.accumulate(boxes[:, 2:])
@@ -145,7 +219,7 @@ class PerimeterSource:
     def on(self, window: Window, until: float) -> np.ndarray:
         """Returns the earliest arrival in each cell of a grid, float64 [X, Y]."""
         count = int(min(np.searchsorted(self._times, until), len(self._times) - 1)) + 1
-        # The distance to the last front is needed, so all of it must lie in the window.
+        # The window must contain all of the last front, to which distances are computed.
         x0, y0, x1, y1 = self._boxes[count - 1]
         right = window.x + window.grid[0] * window.side
         upper = window.y + window.grid[1] * window.side
@@ -160,7 +234,7 @@ class PerimeterSource:
     def _interpolate(self, window: Window, count: int) -> np.ndarray:
         """Returns the arrival times of the first perimeters at the centres of a window's cells.
 
-        Times between two fronts are interpolated by the distances to the two.
+        Times between two fronts are interpolated by the distances to both.
         """
         before = _rasterize(self._areas[0], window)
         times = np.where(before, self._times[0], np.inf)
@@ -178,8 +252,8 @@ class PerimeterSource:
 
 
 def _check_growth(areas: Sequence[Any], times: np.ndarray, clock: Clock) -> None:
-    """Checks that areas do not shrink: then times go backwards, or are of another fire."""
-    shapely = library("shapely", "perimeters")
+    """Checks that areas do not shrink, as they do if times go backwards or fires are mixed."""
+    shapely = library("shapely")
     burnt, united, largest = areas[0], 1, areas[0].area
     for k in range(1, len(areas)):
         area = areas[k]
@@ -196,30 +270,20 @@ def _check_growth(areas: Sequence[Any], times: np.ndarray, clock: Clock) -> None
             )
 
 
-def _at_zero(areas: Sequence[Any], times: np.ndarray) -> Any:
-    """Returns the area that burnt at time 0, from the speed between the first two perimeters."""
-    first, second = (np.array(area.bounds) for area in areas[:2])
-    grown = np.concatenate([np.minimum(second - first, 0)[:2], np.maximum(second - first, 0)[2:]])
-    speed = grown / (times[1] - times[0])
-    width, spread = ((at[2:] - at[:2]).sum() for at in (first, speed))
-    back = min(times[0], width / spread) if spread > 0 else 0.0  # then it is a point
-    return ignition(areas[0], speed * back)
-
-
 def _depth(area: np.ndarray) -> np.ndarray:
-    """Returns how far each cell's centre is from the edge of the area that it lies in, cells."""
+    """Returns the distance from each cell's centre to the edge of the area, in cells."""
     distance: Any = distance_transform_edt(area)
     return distance - 0.5
 
 
 def _rasterize(area: Any, window: Window) -> np.ndarray:
-    """Returns whether each cell's centre lies in an area, bool [X, Y].
+    """Returns the mask of cells whose centre lies in an area, bool [X, Y].
 
-    A polygon that covers no centre covers the cell of a point in it, so that none is lost.
+    A polygon that covers no centre gets the cell of a point inside it, so that it is not lost.
     """
-    features = library("rasterio.features", "perimeters")
-    shapely = library("shapely", "perimeters")
-    affine = library("rasterio.transform", "perimeters").from_origin(
+    features = library("rasterio.features")
+    shapely = library("shapely")
+    affine = library("rasterio.transform").from_origin(
         window.x, window.y + window.grid[1] * window.side, window.side, window.side
     )
     about = {"out_shape": window.grid[::-1], "transform": affine, "dtype": "uint8"}

@@ -1,4 +1,4 @@
-"""The optional libraries of the extra `geo`, and the plane onto which coordinates are projected."""
+"""Imports the libraries of the extra `geo`, and chooses projections onto a plane."""
 
 import importlib
 import logging
@@ -15,7 +15,7 @@ from emberlink.envs.fire_files.formats import beside
 from emberlink.envs.utils.errors import UserError
 
 Bounds = tuple[float, float, float, float]
-"""Least x, least y, greatest x, greatest y."""
+"""Minimum x, minimum y, maximum x, maximum y."""
 
 _LOGGERS = ("rasterio", "pyogrio", "fiona", "shapely", "pyproj")
 _DEGREE_CELL = 0.1  # a cell as large as this is 11 km wide if its side is in degrees
@@ -24,24 +24,24 @@ _MAX_DEGREES = 20.0  # across; a UTM zone is no plane for more
 _MAX_METRES = 1e9  # no projection of the Earth has such coordinates
 
 
-def library(name: str, what: str) -> Any:
+def library(name: str, what: str = "reading this file") -> Any:
     """Imports a module of the extra `geo`.
 
     Raises:
-        UserError: it is not installed; `what` says for what it is needed.
+        UserError: the module is not installed; `what` needs it.
     """
     try:
         return importlib.import_module(name)
     except ImportError:
         raise UserError(
-            f"reading {what} needs the extra geo: pip install '.[geo]' in Emberlink's folder "
+            f"{what} needs the extra geo: pip install '.[geo]' in Emberlink's folder "
             f"({name} is missing)"
         ) from None
 
 
 @contextmanager
 def quiet() -> Iterator[None]:
-    """Silences the libraries' warnings and logs; what matters of them becomes an error."""
+    """Silences the warnings and logs of the libraries. Damage is reported as an error instead."""
     loggers = [logging.getLogger(name) for name in _LOGGERS]
     levels = [logger.level for logger in loggers]
     try:
@@ -69,14 +69,14 @@ def projections(
     """Chooses how coordinates of a file are projected onto a plane.
 
     Args:
-        crs: the file's own projection, None if it carries none.
-        wanted: `fire.crs`: the projection of a file that carries none, else the one to project to.
-        bounds: of the file's coordinates.
+        crs: the projection of the file; None if it has none.
+        wanted: `fire.crs`: the projection of a file without one, otherwise the target.
+        bounds: bounds of the coordinates.
         cell: side of a raster's cells in these coordinates; None for perimeters.
 
     Returns:
-        The projections from and to which the coordinates are taken, pyproj.CRS; None if they are
-        on a plane already. Degrees go to the UTM zone of the middle.
+        The source and the target projection, pyproj.CRS; None if the coordinates are on a plane
+        already. Degrees are projected to the UTM zone of the middle.
 
     Raises:
         UserError: degrees without a projection, an unknown projection, or coordinates outside it.
@@ -106,10 +106,10 @@ def projections(
 
 
 def check_projection(path: Path, crs: Any) -> None:
-    """Checks that a .prj beside a file, if there is one, was understood.
+    """Checks that the projection in a .prj beside a file was read.
 
     Raises:
-        UserError: the file has a .prj, and `crs`, which was read from it, is None.
+        UserError: the file has a .prj, and `crs` is None.
     """
     prj = beside(path, ".prj")
     if crs is None and prj is not None and prj.stat().st_size:
@@ -143,7 +143,7 @@ def _refuse_degrees(bounds: Bounds, cell: float | None) -> None:
 
 
 def _utm(bounds: Bounds) -> Any:
-    """Returns the UTM zone of the middle."""
+    """Returns the UTM zone of the middle of `bounds`."""
     width, height = bounds[2] - bounds[0], bounds[3] - bounds[1]
     x, y = (bounds[0] + bounds[2]) / 2, (bounds[1] + bounds[3]) / 2
     if max(width, height) > _MAX_DEGREES or abs(y) > 84:

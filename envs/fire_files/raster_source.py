@@ -1,19 +1,19 @@
-"""Arrival times on a raster, and how they are sampled on the cells of a grid."""
+"""Samples arrival times on a raster at the cells of a grid."""
 
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
-from scipy.ndimage import minimum_filter
+from scipy.ndimage import label, map_coordinates, minimum_filter
 
+from emberlink.envs.fire_files.config import Clock
 from emberlink.envs.fire_files.projection import Bounds
-from emberlink.envs.fire_files.times import Clock
 from emberlink.envs.utils.errors import UserError
 
 SAMPLES = 180
-"""Sample points along the grid's shorter side; a cell of the grid keeps the earliest of its own.
+"""Sample points along the grid's shorter side. A cell of the grid gets the earliest of its samples.
 Rasters and perimeters are sampled at the same points."""
-_EDGE = 1e-6  # cells: a centre on an edge belongs to the same side whatever is rounded
+_EDGE = 1e-6  # cells: tolerance, so that rounding does not move a centre across an edge
 
 
 @dataclass(frozen=True)
@@ -21,16 +21,16 @@ class Window:
     """A part of the plane that a grid covers with square cells."""
 
     x: float
-    """of the left edge"""
+    """coordinate of the left edge"""
     y: float
-    """of the lower edge"""
+    """coordinate of the lower edge"""
     side: float
-    """of a cell"""
+    """side of a cell"""
     grid: tuple[int, int]
 
     @classmethod
     def around(cls, bounds: Bounds, grid: tuple[int, int], margin: float) -> "Window":
-        """Returns the smallest window that leaves a part of the grid free around `bounds`."""
+        """Returns the smallest window with a margin, a part of the grid, around `bounds`."""
         width, height = bounds[2] - bounds[0], bounds[3] - bounds[1]
         side = max(width / grid[0], height / grid[1]) / (1 - 2 * margin)
         x, y = (bounds[0] + bounds[2]) / 2, (bounds[1] + bounds[3]) / 2
@@ -42,7 +42,7 @@ class Window:
         return max(1, round(SAMPLES / min(self.grid)))
 
     def samples(self, border: tuple[int, int] = (0, 0)) -> "Window":
-        """Returns the window of the sample points: cuts x cuts in a cell, and a border of them."""
+        """Returns the window of the sample points: cuts x cuts per cell, and a border of them."""
         side = self.side / self.cuts
         grid = (
             self.grid[0] * self.cuts + 2 * border[0],
@@ -62,32 +62,42 @@ class Window:
         return samples.reshape(columns, self.cuts, rows, self.cuts).min((1, 3))
 
     def cells(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the indices of the cells that points lie in; they may be outside the grid."""
+        """Returns the indices of the cells in which points lie; they may lie outside the grid."""
         i, j = (x - self.x) / self.side, (y - self.y) / self.side
         return np.floor(i + _EDGE).astype(np.int64), np.floor(j + _EDGE).astype(np.int64)
 
 
 class Source(Protocol):
-    """A fire as a file has it, on a plane."""
+    """A fire read from a file, on a plane."""
 
     clock: Clock
     began: float
-    """time at which the fire began, as far as is known"""
+    """time at which the fire began, as far as it is known"""
     first: float
     """earliest arrival in the file"""
     last: float
     """latest arrival in the file"""
     extent: Bounds
-    """of everything that the file covers"""
+    """bounds of the whole file"""
     whole: bool
-    """whether the file is a map of the whole grid, which is neither cropped nor burnt out"""
+    """True for a map of the whole grid, which is neither cropped nor burnt out"""
+
+    @property
+    def summary(self) -> str:
+        """Description of the content, for the user."""
+        ...
+
+    @property
+    def beginnings(self) -> int:
+        """Number of places that burn before all cells around them."""
+        ...
 
     def burnt(self, until: float) -> Bounds:
         """Returns the bounds of the area burnt by a time."""
         ...
 
     def on(self, window: Window, until: float) -> np.ndarray:
-        """Returns arrival times, float64 [X, Y], inf for never; exact up to `until`."""
+        """Returns arrival times, float64 [X, Y], inf for never. Times after `until` may be late."""
         ...
 
 
@@ -98,8 +108,9 @@ class RasterSource:
         times: float [rows, columns], inf for never.
         corner: x and y of the upper left corner of the raster.
         cell: width and height of a cell.
-        clock: of the times.
-        whole: as of `Source`.
+        clock: unit of the times.
+        whole: as in `Source`.
+        name: name of the values in the file, for messages.
     """
 
     def __init__(
@@ -109,21 +120,44 @@ class RasterSource:
         cell: tuple[float, float],
         clock: Clock,
         whole: bool = False,
+        name: str = "",
     ):
         rows, columns = times.shape
         x, y = corner
         self.extent: Bounds = x, y - rows * cell[1], x + columns * cell[0], y
         self.times, self.clock, self.whole = times.astype(np.float64), clock, whole
-        self._corner, self._cell = corner, cell
+        self._corner, self._cell, self._name = corner, cell, name
         burning = times[np.isfinite(times)]
         self.first, self.last = float(burning.min()), float(burning.max())
         self.began = 0.0 if self._from_zero() else self.first
 
+    @property
+    def summary(self) -> str:
+        """Description of the content, for the user."""
+        first, last = self.clock.format(self.first), self.clock.format(self.last)
+        count = self.beginnings
+        places = "1 place" if count == 1 else f"{count} places"
+        cells = np.isfinite(self.times).sum()
+        name = f"{self._name!r}: " if self._name else ""
+        return f"{name}{cells} cells burn from {first} to {last}, beginning at {places}"
+
+    @property
+    def beginnings(self) -> int:
+        """Number of places that burn before all cells around them, in 2000 x 2000 cells at most."""
+        row, column = np.unravel_index(self.times.argmin(), self.times.shape)
+        times = self.times[max(row - 1000, 0) : row + 1000, max(column - 1000, 0) : column + 1000]
+        burns, earliest = np.isfinite(times), times == minimum_filter(times, 3)
+        # Of cells that burn at the same time, one may have an earlier neighbour: no beginning.
+        later = minimum_filter(np.where(burns & ~earliest, times, np.inf), 3) == times
+        places: Any = label(burns & earliest, np.ones((3, 3)))
+        reached = np.unique(places[0][burns & earliest & later])
+        return int(places[1] - len(reached))
+
     def burnt(self, until: float) -> Bounds:
-        """Returns the bounds of the area burnt by a time: to the front, else to cells' edges.
+        """Returns the bounds of the area burnt by a time: to the front, or to the edges of cells.
 
         Raises:
-            UserError: a single cell has burnt.
+            UserError: only one cell has burnt.
         """
         times = self.times
         if (times <= until).sum() < 2:
@@ -140,10 +174,10 @@ class RasterSource:
     def on(self, window: Window, until: float) -> np.ndarray:
         """Returns the earliest arrival in each cell of a grid.
 
-        That is the earliest of the sample points in the cell, interpolated between the burnt cells
-        around them, and of the raster's own centres in the cell. On a grid finer than the raster
-        only those centres count that burn before all around them. A map of the whole grid, and a
-        raster whose cells are the grid's, are not interpolated.
+        The candidates are the sample points in the cell, interpolated between the burnt cells
+        around them, and the centres of the raster's cells. On a grid finer than the raster, a
+        centre counts only if it burns before all cells around it. A map of the whole grid, and a
+        raster with the same cells as the grid, are not interpolated.
         """
         fine = window.side < (1 - _EDGE) * min(self._cell)
         if self.whole or self._is_aligned(window):
@@ -155,9 +189,9 @@ class RasterSource:
         return np.minimum(samples, self._earliest(times, window))
 
     def _from_zero(self) -> bool:
-        """Tells whether the fire began at time 0, before the first centre of a cell burnt.
+        """Tells whether the fire began at time 0, before the centre of the first cell burnt.
 
-        That is so if the first cell burns no later than the front takes to cross a cell there.
+        This is assumed if the first cell burns no later than the front takes to cross a cell.
         """
         if self.whole or self.clock.unit == "steps" or self.clock.origin is not None:
             return False
@@ -172,19 +206,19 @@ class RasterSource:
         return x + (columns + 0.5) * width, y - (rows + 0.5) * height
 
     def _indices(self, window: Window) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the rows [Y] and columns [X], with fractions, of a window's centres."""
+        """Returns the fractional rows [Y] and columns [X] of the centres of a window's cells."""
         (left, top), (width, height) = self._corner, self._cell
         x, y = window.centres()
         return (top - y) / height - 0.5, (x - left) / width - 0.5
 
     def _is_aligned(self, window: Window) -> bool:
-        """Tells whether the grid's cells are cells of the raster."""
+        """Tells whether the cells of the grid are cells of the raster."""
         apart = [np.abs(at - np.rint(at)).max() for at in self._indices(window)]
         same = all(abs(window.side / side - 1) < _EDGE for side in self._cell)
         return same and max(apart) < 1e-3
 
     def _nearest(self, window: Window, fine: bool) -> np.ndarray:
-        """Returns the earliest of the centres in each cell, else that of the nearest cell."""
+        """Returns the earliest of the centres in each cell, or the time of the nearest centre."""
         near = self._at(*(np.rint(at).astype(np.int64) for at in self._indices(window)))
         if fine:
             return near
@@ -214,18 +248,12 @@ class RasterSource:
         return times
 
     def _interpolate(self, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
-        """Interpolates among burnt cells, bilinear, [X, Y]; inf in a cell that never burns."""
-        height, width = self.times.shape
+        """Interpolates bilinearly between burnt cells, [X, Y]; inf in a cell that never burns."""
         inside = self._at(np.rint(rows).astype(np.int64), np.rint(columns).astype(np.int64))
-        total, weights = np.zeros(inside.shape), np.zeros(inside.shape)
-        row, column = np.floor(rows).astype(np.int64), np.floor(columns).astype(np.int64)
-        for r in (row, row + 1):
-            for c in (column, column + 1):
-                times = self.times[np.ix_(np.clip(r, 0, height - 1), np.clip(c, 0, width - 1))].T
-                weight = (1 - np.abs(columns - c))[:, None] * (1 - np.abs(rows - r))[None, :]
-                weight = np.where(np.isfinite(times), weight, 0)
-                total += weight * np.where(np.isfinite(times), times, 0)
-                weights += weight
+        burns = np.isfinite(self.times)
+        at = np.meshgrid(rows, columns)
+        weights = map_coordinates(burns.astype(np.float64), at, order=1, mode="nearest")
+        total = map_coordinates(np.where(burns, self.times, 0), at, order=1, mode="nearest")
         times = np.maximum(total / np.where(weights > 0, weights, 1), self.first)
         return np.where(np.isinf(inside) | (weights == 0), inside, times)
 
@@ -235,11 +263,11 @@ def check_spreads(times: np.ndarray, *, may_stand: bool = False) -> None:
 
     Args:
         times: with inf for never.
-        may_stand: whether a part of the map may burn at once and nothing after it, as a fire does
-            that was made for a few steps.
+        may_stand: whether all cells that burn may burn at once, as in a fire that was generated
+            for a few steps.
 
     Raises:
-        UserError: no cell burns, only one does, or all at once.
+        UserError: no cell burns, only one burns, or all burn at once.
     """
     burning = times[np.isfinite(times)]
     if len(burning) == 0:
@@ -254,11 +282,11 @@ def check_spreads(times: np.ndarray, *, may_stand: bool = False) -> None:
 
 
 def _front(times: np.ndarray, until: float) -> float:
-    """Returns where the burnt area begins along the lines of cells, in cells from their start.
+    """Returns the position of the front along the lines of cells, in cells from their start.
 
-    Between two cells that burn at some time the front is interpolated. Beyond the first cell of a
-    line it moves on at its last speed, if that does not take it to the next cell; else the burnt
-    area ends with the cell.
+    The front is interpolated between two cells that burn. Beyond the first cell of a line it
+    continues at its last speed, unless it would reach the next cell; then the burnt area ends at
+    the edge of the cell.
     """
     times = times[(times <= until).any(1)]
     lines, last = np.arange(len(times)), times.shape[1] - 1

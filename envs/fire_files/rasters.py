@@ -1,6 +1,7 @@
-"""Rasters of arrival times: ESRI ASCII, as FARSITE, FlamMap and ELMFIRE write it, and GeoTIFF."""
+"""Reads rasters of arrival times: ESRI ASCII (FARSITE, FlamMap, ELMFIRE) and GeoTIFF."""
 
 import logging
+import logging.handlers
 import math
 import re
 from collections.abc import Iterator
@@ -10,20 +11,24 @@ from typing import Any, TextIO
 
 import numpy as np
 
+from emberlink.envs.fire_files.config import Clock, Units
 from emberlink.envs.fire_files.formats import beside
 from emberlink.envs.fire_files.projection import check_projection, first_line, library, projections
 from emberlink.envs.fire_files.raster_source import RasterSource, check_spreads
-from emberlink.envs.fire_files.times import Clock, Units
 from emberlink.envs.utils.errors import UserError
 
 MAX_CELLS = 50_000_000
 """Cells of a raster, which is read as a whole."""
 MAX_TIME = 1e12
-"""A larger number is not a time."""
+"""Maximum time; a larger number is not a time."""
 _NEVER = (-9999.0, -1.0)  # NODATA of FARSITE and FlamMap, and of ELMFIRE
-_VOID = 1e30  # a number beyond it is NODATA that nobody declared, such as -3.4e38
-_KEYS = ("ncols", "nrows", "xllcorner", "xllcenter", "yllcorner", "yllcenter")
-_KEYS += ("cellsize", "dx", "dy", "nodata_value")
+_VOID = 1e30  # a number beyond it is NODATA although not declared, such as -3.4e38
+_COUNT, _SIZE, _PLACE = "a whole number above 0", "a size above 0", "a coordinate"
+_KEYS = {"ncols": _COUNT, "nrows": _COUNT, "cellsize": _SIZE, "dx": _SIZE, "dy": _SIZE}
+_KEYS |= dict.fromkeys(("xllcorner", "xllcenter", "yllcorner", "yllcenter"), _PLACE)
+_KEYS |= {"nodata_value": "a number"}
+_NEEDED = (("ncols",), ("nrows",), ("cellsize", "dx"), ("cellsize", "dy"))
+_NEEDED += (("xllcorner", "xllcenter"), ("yllcorner", "yllcenter"))
 _DAMAGE = re.compile(r"IO error|tag ignored|TIFFVSetField|(Null|Incorrect) count|_tiff\w+Proc:")
 Affine = tuple[float, float, float, float, float, float]
 """(a, b, c, d, e, f): the outer corners of cells are at x = a column + b row + c and
@@ -31,10 +36,10 @@ y = d column + e row + f."""
 
 
 def read_geotiff(path: Path, unit: Units | None, crs: str | None) -> RasterSource:
-    """Reads arrival times from a GeoTIFF of one band; its tag `units` may stand for `unit`.
+    """Reads arrival times from a GeoTIFF with one band. The tag units=steps replaces `unit`.
 
     Raises:
-        UserError: the file is damaged, not a raster of times, or without a place on the Earth.
+        UserError: the file is damaged, is not a raster of times, or has no geotransform.
     """
     with open_raster(path) as dataset:
         _check_band(dataset)
@@ -43,13 +48,14 @@ def read_geotiff(path: Path, unit: Units | None, crs: str | None) -> RasterSourc
         times = clean(dataset.read(1), never) * dataset.scales[0] + dataset.offsets[0]
         tagged: Units | None = "steps" if dataset.tags().get("units") == "steps" else None
         affine, source_crs = dataset.transform[:6], dataset.crs
-    return _on_plane(times, affine, source_crs, unit or tagged, crs)
+        name = (dataset.descriptions[0] or "")[:60]
+    return _on_plane(times, affine, source_crs, unit or tagged, crs, name)
 
 
 def read_ascii(path: Path, unit: Units | None, crs: str | None) -> RasterSource:
-    """Reads arrival times from ESRI ASCII; a .prj beside it is its projection.
+    """Reads arrival times from ESRI ASCII, with the projection in a .prj beside the file.
 
-    GDAL would read a word as 0 and wrap rows of another length, so NumPy reads the numbers.
+    NumPy reads the numbers, because GDAL reads a word as 0 and wraps rows of another length.
 
     Raises:
         UserError: a line of the header or a number is wrong.
@@ -84,10 +90,10 @@ def open_raster(path: Path) -> Iterator[Any]:
     """Opens a GeoTIFF with rasterio.
 
     Raises:
-        UserError: the file is damaged, also where GDAL would go on with a part of it lost.
+        UserError: the file is damaged, also if GDAL only logs the damage.
     """
-    rasterio = library("rasterio", "GeoTIFF")
-    log = _DamageLog()
+    rasterio = library("rasterio")
+    log = logging.handlers.BufferingHandler(capacity=1_000_000)
     logger = logging.getLogger("rasterio._env")
     level, propagate = logger.level, logger.propagate
     logger.setLevel(logging.WARNING)
@@ -102,30 +108,19 @@ def open_raster(path: Path) -> Iterator[Any]:
         logger.removeHandler(log)
         logger.setLevel(level)
         logger.propagate = propagate
-    if log.messages:
-        raise UserError(f"damaged: {log.messages[0][:200]}; expected a whole raster")
-
-
-class _DamageLog(logging.Handler):
-    """Collects what GDAL logs of damage."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.messages: list[str] = []
-
-    def emit(self, record: logging.LogRecord) -> None:
+    for record in log.buffer:
         message = record.getMessage()
         if record.levelno >= logging.ERROR or _DAMAGE.search(message):
-            self.messages.append(message)
+            raise UserError(f"damaged: {message[:200]}; expected a whole raster")
 
 
 def clean(times: np.ndarray, never: np.ndarray | None = None) -> np.ndarray:
     """Returns arrival times in which cells that never burn are inf, float32 or float64.
 
     Args:
-        times: as in a file, any real type.
-        never: where the file declares NODATA. If it declares none, the greatest number of an
-            integer type is NODATA, and the least of one with a sign.
+        times: values of a file, any real type.
+        never: mask of the NODATA that the file declares. Without one, the maximum of an integer
+            type is NODATA, and the minimum of a signed one.
 
     Raises:
         UserError: a number is not a time.
@@ -160,18 +155,22 @@ def _check_band(dataset: Any) -> None:
         raise UserError(f"values of type {kind} without NODATA, as of a picture; expected times")
     if dataset.width * dataset.height > MAX_CELLS:
         raise UserError(
-            f"{dataset.width} x {dataset.height} cells; at most {MAX_CELLS} are read: expected a "
-            "part of it, as gdalwarp -te cuts out"
+            f"{dataset.width} x {dataset.height} cells; at most {MAX_CELLS} are read; expected a "
+            "part, such as gdalwarp -te cuts out"
         )
     if dataset.transform.is_identity:
         raise UserError(
-            "no geotransform: it does not say where its cells are, or has lost it; expected one, "
-            "as gdal_translate -a_ullr gives it"
+            "no geotransform, so that the place of the cells is not known; expected one, such as "
+            "gdal_translate -a_ullr writes"
         )
 
 
 def _read_header(file: TextIO) -> tuple[dict[str, float], int]:
-    """Reads the keys of ESRI ASCII; the file then stands at the first row. Returns their lines."""
+    """Reads the header of ESRI ASCII up to the first row.
+
+    Returns:
+        The values, and the number of lines.
+    """
     header: dict[str, float] = {}
     while True:
         start = file.tell()
@@ -185,30 +184,27 @@ def _read_header(file: TextIO) -> tuple[dict[str, float], int]:
             raise UserError(
                 f"line {line}: {key[:30]!r} is not a key of ESRI ASCII; expected {', '.join(_KEYS)}"
             )
-        try:
-            header[key] = float(words[1]) if key not in header and len(words) == 2 else math.nan
-        except ValueError:
-            header[key] = math.nan
-        if math.isnan(header[key]) and (key != "nodata_value" or words[1:] != ["nan"]):
-            raise UserError(f"line {line}: expected {key} once, with one number")
-    _check_header(header)
+        if key in header or len(words) != 2 or not _is_valid(key, words[1]):
+            text = " ".join(words)[:60]
+            raise UserError(f"line {line}: {text!r}; expected {key} once, with {_KEYS[key]}")
+        header[key] = float(words[1])
+    for keys in _NEEDED:
+        if sum(key in header for key in keys) != 1:
+            raise UserError(f"expected one {' or '.join(keys)} in the header of ESRI ASCII")
     return header, len(header)
 
 
-def _check_header(header: dict[str, float]) -> None:
-    for needed in (("ncols",), ("nrows",), ("cellsize", "dx"), ("cellsize", "dy")):
-        if not any(key in header for key in needed):
-            raise UserError(f"the header has no {needed[0]}; expected ESRI ASCII")
-    for pair in _KEYS[2:4], _KEYS[4:6]:
-        if sum(key in header for key in pair) != 1:
-            raise UserError(f"the header must have one of {' and '.join(pair)}")
-    for key, value in header.items():
-        if key[0] == "n" and key != "nodata_value" and not (1 <= value < 1e12 and value % 1 == 0):
-            raise UserError(f"{key}={value:g}; expected a whole number above 0")
-        if key in ("cellsize", "dx", "dy") and not 0 < value < math.inf:
-            raise UserError(f"{key}={value:g}; expected a size above 0")
-        if key[0] in "xy" and not math.isfinite(value):
-            raise UserError(f"{key}={value:g}; expected a coordinate")
+def _is_valid(key: str, text: str) -> bool:
+    """Tells whether the value of a key of ESRI ASCII is one."""
+    try:
+        value = float(text)
+    except ValueError:
+        return False
+    if _KEYS[key] is _COUNT:
+        return 1 <= value < 1e12 and value % 1 == 0
+    if _KEYS[key] is _SIZE:
+        return 0 < value < math.inf
+    return math.isfinite(value) if _KEYS[key] is _PLACE else True
 
 
 def _prj(path: Path) -> Any:
@@ -224,12 +220,17 @@ def _prj(path: Path) -> Any:
 
 
 def _on_plane(
-    times: np.ndarray, affine: Affine, source_crs: Any, unit: Units | None, crs: str | None
+    times: np.ndarray,
+    affine: Affine,
+    source_crs: Any,
+    unit: Units | None,
+    crs: str | None,
+    name: str = "",
 ) -> RasterSource:
-    """Places cleaned times on a plane, north up.
+    """Returns cleaned times on a plane, north up.
 
     Raises:
-        UserError: no fire spreads, there is no unit, or the raster has no place on the Earth.
+        UserError: no fire spreads, there is no unit, or the coordinates are not valid.
     """
     check_spreads(times)
     a, b, c, d, e, f = (float(value) for value in affine)
@@ -238,7 +239,7 @@ def _on_plane(
         raise UserError(f"cells of {a:g} x {e:g}; expected a size above 0")
     if unit is None:
         raise UserError(
-            "a raster does not say the unit of its times: expected fire.units=minutes (FARSITE, "
+            "the unit of the raster's times is not known; expected fire.units=minutes (FARSITE, "
             "FlamMap), seconds (ELMFIRE), hours, days or steps"
         )
     rows, columns = times.shape
@@ -248,19 +249,19 @@ def _on_plane(
     if chosen or b or d or a < 0 or e > 0:
         times, affine = _warp(times, (a, b, c, d, e, f), chosen)
         a, b, c, d, e, f = affine
-    return RasterSource(times, (c, f), (a, -e), Clock(unit))
+    return RasterSource(times, (c, f), (a, -e), Clock(unit), name=name)
 
 
 def _warp(
     times: np.ndarray, affine: Affine, chosen: tuple[Any, Any] | None
 ) -> tuple[np.ndarray, Affine]:
-    """Projects times and turns the raster north up, on cells of half the size.
+    """Projects times and rotates the raster north up, on cells of half the size.
 
-    Times are interpolated between burnt cells; a point in a cell that never burns stays inf.
+    Times are interpolated between burnt cells. A point in a cell that never burns stays inf.
     """
-    rasterio = library("rasterio", "a projection")
-    vrt = library("rasterio.vrt", "a projection").WarpedVRT
-    source, target = chosen or ("EPSG:3857", "EPSG:3857")  # any plane: only turned
+    rasterio = library("rasterio")
+    vrt = library("rasterio.vrt").WarpedVRT
+    source, target = chosen or ("EPSG:3857", "EPSG:3857")  # any plane: only rotated
     about = {
         "height": times.shape[0],
         "width": times.shape[1],

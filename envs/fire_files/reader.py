@@ -1,9 +1,10 @@
-"""Reads the fires of a file onto a grid, in three sets, or from a run's own copy of them."""
+"""Reads the fires of a file onto a grid, in three sets, and keeps a run's copy of them."""
 
 import dataclasses
 import hashlib
 import io
 import json
+import warnings
 from pathlib import Path
 from typing import NamedTuple
 
@@ -13,10 +14,15 @@ from torch import Tensor
 
 from emberlink.envs.config import check_grid
 from emberlink.envs.fire_files import formats
-from emberlink.envs.fire_files.banks import MAX_CELLS, bank_horizon, is_bank, read_bands, read_npy
 from emberlink.envs.fire_files.config import FileFireConfig
 from emberlink.envs.fire_files.episode_crop import on_grid
-from emberlink.envs.fire_files.front_points import read_front_points
+from emberlink.envs.fire_files.grid_maps import (
+    MAX_CELLS,
+    map_of_grid,
+    read_front_points,
+    read_geotiff_bank,
+    read_numpy_bank,
+)
 from emberlink.envs.fire_files.perimeters import read_perimeters
 from emberlink.envs.fire_files.projection import quiet
 from emberlink.envs.fire_files.raster_source import Source
@@ -25,10 +31,12 @@ from emberlink.envs.utils.atomic_io import read_sealed, write_sealed
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import printable
 
-READER_VERSION = 4  # raise it whenever the same file gives another grid
+READER_VERSION = 4  # increase it if the same file gives another grid
+MAX_BEGINNINGS = 10
+"""Places at which a raster's fire may begin without a warning."""
 COPY_FILE = "fires.npz"
-"""The file of a run folder that holds the run's own copy of its grids."""
-_MAX_COPY = 12 * MAX_CELLS + 1_000_000  # bytes of it, unpacked: float32 of the cells of every set
+"""Name of the file in a run folder that holds the run's copy of its fires."""
+_MAX_COPY = 12 * MAX_CELLS + 1_000_000  # bytes when unpacked: float32 of the cells of all sets
 _EVERY, _VALIDATION, _TEST = 5, 3, 4  # remainders of the numbers of validation and test fires
 
 
@@ -44,47 +52,63 @@ def read_fires(config: FileFireConfig, grid: tuple[int, int], horizon: int) -> T
         float32 [fires, X, Y], steps: 0 burns from the start, inf never burns.
 
     Raises:
-        UserError: one line that names the file and what is wrong with it.
+        UserError: one line that names the file and the mistake in it.
+    """
+    return read_with_summary(config, grid, horizon)[0]
+
+
+def read_with_summary(
+    config: FileFireConfig, grid: tuple[int, int], horizon: int
+) -> tuple[Tensor, str]:
+    """Returns the fires as `read_fires` does, and a line that describes the file.
+
+    Warns if the fire of a raster begins at many places: the raster may hold elevation, for example.
     """
     check_grid(grid)
     path = Path(config.path).expanduser()
+    name = printable(str(path))
     try:
         with quiet():
-            fires = _read(path, config, grid, horizon)
+            fires, summary, many = _read(path, config, grid, horizon)
     except UserError as error:
-        raise UserError(f"{printable(str(path))}: {printable(str(error))}") from None
+        raise UserError(f"{name}: {printable(str(error))}") from None
     except OSError as error:
-        reason = error.strerror or error
-        raise UserError(f"{printable(str(path))}: cannot be read: {reason}") from None
+        raise UserError(f"{name}: cannot be read: {error.strerror or error}") from None
     except MemoryError:
-        raise UserError(f"{printable(str(path))}: not enough memory to read it") from None
-    return torch.from_numpy(np.stack(fires))
+        raise UserError(f"{name}: not enough memory to read it") from None
+    summary = printable(summary)
+    if many:
+        warnings.warn(f"{name}: {summary}: are these arrival times?", stacklevel=3)
+    return torch.from_numpy(np.stack(fires)), summary
 
 
 def _read(
     path: Path, config: FileFireConfig, grid: tuple[int, int], horizon: int
-) -> list[np.ndarray]:
-    """Returns the fires in a file, [X, Y] each."""
-    kind = formats.find_format(path)
+) -> tuple[list[np.ndarray], str, bool]:
+    """Returns the fires in a file, [X, Y] each, a summary, and whether it looks doubtful."""
+    kind = None if path.is_dir() else formats.find_format(path)
+    bank = None
     if kind is formats.NUMPY:
-        bank = read_npy(path)
-    elif kind is formats.GEOTIFF and is_bank(path):
-        bank = read_bands(path)
-    else:
-        return [on_grid(_read_one(path, kind, config), config, grid, horizon)]
-    _check_horizon(path, config, horizon)
+        bank = read_numpy_bank(path)
+    elif kind is formats.GEOTIFF:
+        bank = read_geotiff_bank(path)
+    if bank is None:
+        source = _read_one(path, kind, config)
+        fire = on_grid(source, config, grid, horizon)
+        doubtful = not source.whole and source.beginnings > MAX_BEGINNINGS
+        return [fire], source.summary, doubtful
+    _check_horizon(bank.horizon, config, horizon)
     fires: list[np.ndarray] = []
-    for source in bank:
+    for times in bank.fires:
         try:
-            fires.append(on_grid(source, config, grid, horizon))
+            fires.append(on_grid(map_of_grid(times), config, grid, horizon))
         except UserError as error:
             raise UserError(f"fire {len(fires)}: {error}") from None
-    return fires
+    return fires, f"a bank of {len(fires)} fires, in steps", False
 
 
-def _check_horizon(path: Path, config: FileFireConfig, horizon: int) -> None:
+def _check_horizon(written: int | None, config: FileFireConfig, horizon: int) -> None:
     """Checks that a bank whose times stay steps was written for this horizon."""
-    written = bank_horizon(path)
     in_steps = config.start is config.end is config.minutes_per_step is None
     if in_steps and written not in (None, horizon):
         raise UserError(
@@ -93,8 +117,8 @@ def _check_horizon(path: Path, config: FileFireConfig, horizon: int) -> None:
         )
 
 
-def _read_one(path: Path, kind: formats.Format, config: FileFireConfig) -> Source:
-    """Returns the fire of a file that holds one."""
+def _read_one(path: Path, kind: formats.Format | None, config: FileFireConfig) -> Source:
+    """Returns the fire of a file with one fire."""
     if kind is formats.GEOTIFF:
         return read_geotiff(path, config.units, config.crs)
     if kind is formats.ASCII:
@@ -113,10 +137,10 @@ class FireSets(NamedTuple):
 
 
 def fire_sets(config: FileFireConfig, grid: tuple[int, int], horizon: int) -> FireSets:
-    """Returns the fires from the run's own copy, if it is of this grid and horizon, else the files.
+    """Returns the fires from the run's copy if it has this grid and horizon, else from the files.
 
     Raises:
-        UserError: one line that names the file and what is wrong with it.
+        UserError: one line that names the file and the mistake in it.
     """
     saved = _read_copy(config, grid, horizon)
     if saved is not None:
@@ -135,12 +159,12 @@ def _divide(count: int, *, test_file: bool) -> tuple[list[int], list[int], list[
     """Divides the fires of a file into training, validation and test fires.
 
     Of five or more fires every fifth is a test fire and every fifth a validation fire. Of fewer
-    the last is the test fire and the last but one the validation fire. If too few fires are left
-    for a set, it shares the last one: the only fire of a file is in all three sets.
+    the last is the test fire and the last but one the validation fire. A set without a fire shares
+    the last one, so the only fire of a file is in all three sets.
 
     Args:
         count: number of fires in the file.
-        test_file: the test fires are those of another file, so none of this one.
+        test_file: whether another file holds the test fires.
     """
     fires = list(range(count))
     many = count >= _EVERY
@@ -154,7 +178,7 @@ def _divide(count: int, *, test_file: bool) -> tuple[list[int], list[int], list[
 
 
 def with_checksum(config: FileFireConfig) -> FileFireConfig:
-    """Returns the scenario with the checksums of its files.
+    """Computes the checksums of the files and returns the scenario with them.
 
     Raises:
         UserError: a file is missing, or has another checksum than the scenario.
@@ -172,17 +196,17 @@ def _checksum(file: str, expected: str | None) -> str:
         raise UserError(f"{printable(str(path))}: {error}") from None
     if expected not in (None, digest):
         raise UserError(
-            f"{printable(str(path))}: has changed: its content has sha256 {digest[:12]}..., that "
-            f"of the run {str(expected)[:12]}..."
+            f"{printable(str(path))}: has changed: its SHA-256 is {digest[:12]}..., in the run "
+            f"{str(expected)[:12]}..."
         )
     return digest
 
 
 def save_copy(config: FileFireConfig, folder: Path, grid: tuple[int, int], horizon: int) -> None:
-    """Writes the run's own copy of its grids; afterwards the run does not need the files.
+    """Writes the run's copy of its fires. Afterwards the run does not need the files.
 
     Raises:
-        UserError: it cannot be written.
+        UserError: the copy cannot be written.
     """
     fires = fire_sets(config, grid, horizon)
     try:
@@ -196,7 +220,7 @@ def save_copy(config: FileFireConfig, folder: Path, grid: tuple[int, int], horiz
 
 
 def _key(config: FileFireConfig, grid: tuple[int, int], horizon: int) -> str:
-    """Returns a hash of everything that the grids depend on."""
+    """Returns a hash of all values on which the fires depend."""
     values = dataclasses.asdict(config)
     del values["saved_copy"]
     parts = [READER_VERSION, values, *grid, horizon]
@@ -204,7 +228,7 @@ def _key(config: FileFireConfig, grid: tuple[int, int], horizon: int) -> str:
 
 
 def _read_copy(config: FileFireConfig, grid: tuple[int, int], horizon: int) -> FireSets | None:
-    """Returns the run's own copy, None if there is none or it is damaged or of another grid."""
+    """Returns the run's copy; None if there is none, it is damaged, or it has another grid."""
     if config.saved_copy is None or config.sha256 is None:
         return None
     content = read_sealed(Path(config.saved_copy), _MAX_COPY)
@@ -217,7 +241,7 @@ def _read_copy(config: FileFireConfig, grid: tuple[int, int], horizon: int) -> F
             if str(arrays["key"]) != _key(config, grid, horizon):
                 return None
             fires = [arrays[name] for name in FireSets._fields]
-    except Exception:  # of many types, if the file is damaged
+    except Exception:  # damage raises many types
         return None
     for values in fires:
         fits = values.ndim == 3 and values.shape[1:] == tuple(grid) and len(values) > 0

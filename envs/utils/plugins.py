@@ -3,10 +3,11 @@
 import importlib
 from collections.abc import Collection
 from dataclasses import dataclass
-from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import EntryPoint
 from pkgutil import iter_modules
 from typing import Any, Generic, TypeVar
 
+from emberlink.configs import entry_points
 from emberlink.envs.utils.errors import UserError
 
 T = TypeVar("T")
@@ -14,7 +15,7 @@ T = TypeVar("T")
 
 def registered(group: str) -> dict[str, EntryPoint]:
     """Returns the entry points of a group, such as "emberlink.comm", by name."""
-    return {point.name: point for point in entry_points(group=group)}
+    return {point.name: point for point in entry_points.read(group)}
 
 
 @dataclass(frozen=True)

@@ -1,9 +1,7 @@
 """Evaluates the frozen policy of a run and writes eval.json, figures and a GIF."""
 
-import platform
 from collections.abc import Callable
 from dataclasses import asdict
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +13,8 @@ from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.evaluation import evaluate, plots
 from emberlink.trainers.evaluation.results import LEARNED, Results
 from emberlink.trainers.runs.run_folder import RunFolder
+from emberlink.trainers.runs.versions import versions
 from emberlink.trainers.terminal import OutputError
-
-_PACKAGES = ("emberlink", "torch", "torchrl", "tensordict", "numpy")
 
 
 def evaluate_run(
@@ -111,9 +108,6 @@ def record(config: RunConfig, results: Results, **about: Any) -> dict[str, Any]:
             **{name: evaluate.scripted_config(config, name).comm for name in SCRIPTED},
         },
         "device": config.device,
-        "versions": {
-            "python": platform.python_version(),
-            **{name: version(name) for name in _PACKAGES},
-        },
+        "versions": versions(),
         "results": results,
     }

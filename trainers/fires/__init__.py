@@ -1,1 +1,1 @@
-"""Fires on the command line: draws them, writes them to files, reads them from files."""
+"""Commands on fires: draws a fire, writes fires to a file, joins files of fires."""

@@ -1,4 +1,4 @@
-"""`emberlink fire make` and `emberlink fire import`: write fires to a file."""
+"""Runs `emberlink fire make` and `emberlink fire import`, which write fires to a file."""
 
 import os
 import re
@@ -12,16 +12,17 @@ from rich.console import Console
 from rich.progress import track
 from torch import Tensor
 
+from emberlink.envs.config import WildfireConfig
 from emberlink.envs.fire.cache import GENERATOR_VERSION
 from emberlink.envs.fire.generator import FireConfig, Split, fire_seeds, make_fires
-from emberlink.envs.fire_files.banks import check_bank, write_bank
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.publish import free_name
 from emberlink.trainers.config.compose import to_values
 from emberlink.trainers.config.schema import RunConfig
+from emberlink.trainers.fires.bank_writer import check_bank, write_bank
 from emberlink.trainers.fires.select import from_file, generated, read
 
-_AT_A_TIME = 16  # fires between two movements of the progress bar
+_AT_A_TIME = 16  # fires between two updates of the progress bar
 
 
 def make(
@@ -39,7 +40,7 @@ def make(
         scenario: a file in configs/fire.
         overrides: `key=value` of setup, env. and fire.
         console: prints the progress and, last, the path of the file.
-        count: fires; as many as a training or an evaluation uses if None.
+        count: number of fires; as many as a training or an evaluation uses if None.
         split: "train", "validation" or "test".
         output: a new .npy, .tif or .tiff file; the next free name if None.
 
@@ -47,26 +48,11 @@ def make(
         UserError: a name is not known, or the file cannot be written.
     """
     config = generated(scenario, overrides)
-    fire, world = config.fire, config.env
-    assert isinstance(fire, FireConfig)
-    evaluation = config.evaluation
-    usual = {
-        "train": fire.num_train_fires,
-        "validation": evaluation.interval_episodes,
-        "test": evaluation.episodes,
-    }
-    count = count or usual[split]
+    assert isinstance(config.fire, FireConfig)
+    count = count or _usual_count(config, config.fire)[split]
     path = output or _free(f"{scenario}_{split}_{count}")
-    check_bank(path, count, world.grid)
+    check_bank(path, count, config.env.grid)
     seeds = fire_seeds(split, count)
-    parts = track(
-        seeds.split(_AT_A_TIME),
-        "making fires",
-        console=console,
-        transient=True,
-        disable=not console.is_terminal,
-    )
-    made = [make_fires(fire, part, world.grid, world.horizon) for part in parts]
     facts = {
         "scenario": scenario,
         "split": split,
@@ -75,8 +61,30 @@ def make(
         "generator_version": GENERATOR_VERSION,
     }
     names = [f"{scenario} {split} {seed}" for seed in seeds.tolist()]
-    _write(path, torch.cat(made), facts, names, console)
+    _write(path, _make(config.fire, seeds, config.env, console), facts, names, console)
     return 0
+
+
+def _usual_count(config: RunConfig, fire: FireConfig) -> dict[Split, int]:
+    """Returns the number of fires that a training or an evaluation uses."""
+    evaluation = config.evaluation
+    return {
+        "train": fire.num_train_fires,
+        "validation": evaluation.interval_episodes,
+        "test": evaluation.episodes,
+    }
+
+
+def _make(fire: FireConfig, seeds: Tensor, world: WildfireConfig, console: Console) -> Tensor:
+    """Makes the fires of seeds and prints the progress."""
+    parts = track(
+        seeds.split(_AT_A_TIME),
+        "making fires",
+        console=console,
+        transient=True,
+        disable=not console.is_terminal,
+    )
+    return torch.cat([make_fires(fire, part, world.grid, world.horizon) for part in parts])
 
 
 def import_files(arguments: Sequence[str], console: Console, output: Path) -> int:
@@ -84,25 +92,25 @@ def import_files(arguments: Sequence[str], console: Console, output: Path) -> in
 
     Args:
         arguments: paths, and `key=value` of setup, env. and fire.
-        console: prints what was read and, last, the path of the file.
+        console: prints the number of fires and, last, the path of the file.
         output: a new .npy, .tif or .tiff file.
 
     Raises:
         UserError: a file cannot be read or written.
     """
-    # A file of that name comes before a key.
+    # An existing file takes precedence over a key.
     overrides = [text for text in arguments if "=" in text and not os.path.exists(text)]
     paths = [Path(text) for text in arguments if text not in overrides]
     if not paths:
-        raise UserError("which file? FILE, such as ArrivalTime.asc, is missing")
+        raise UserError("FILE is missing; expected a file, such as ArrivalTime.asc")
     configs = [from_file(path, overrides) for path in paths]
     check_bank(output, len(paths), configs[0].env.grid)
     fires, names = [], []
     for path, config in zip(paths, configs, strict=True):
-        fires.append(read(config))
+        fires.append(read(config)[0])
         names += list(_names(path, len(fires[-1])))
     facts = _facts(configs[0])
-    del facts["fire"]["path"], facts["fire"]["sha256"]  # of the first file alone
+    del facts["fire"]["path"], facts["fire"]["sha256"]  # they hold for the first file only
     digests = [to_values(config)["fire"]["sha256"] for config in configs]
     facts["sources"] = [
         {"file": path.name, "sha256": digest} for path, digest in zip(paths, digests, strict=True)
@@ -117,7 +125,7 @@ def _names(path: Path, count: int) -> Iterator[str]:
 
 
 def _facts(config: RunConfig) -> dict[str, Any]:
-    """Returns the settings that the fires depend on."""
+    """Returns the settings on which the fires depend."""
     return {
         "horizon": config.env.horizon,
         "grid": list(config.env.grid),

@@ -1,4 +1,4 @@
-"""The picture of a fire's arrival times."""
+"""Draws the arrival times of a fire."""
 
 import math
 from itertools import product
@@ -34,8 +34,8 @@ def arrival_figure(
         path: a .png file.
         arrival: [X, Y], steps; inf never burns.
         horizon: steps of the episode.
-        team: of which one UAV's view at full altitude is drawn.
-        title: above the map.
+        team: the team; the view of one UAV at full altitude is drawn.
+        title: title above the map.
     """
     across, up = arrival.shape
     scale = _SIDE / max(across, up)
@@ -63,7 +63,7 @@ def arrival_figure(
 
 
 def _legend(figure: Figure, core: bool, width: float, side: int, columns: int) -> None:
-    """Adds the meaning of the greys and the square below the map."""
+    """Adds a legend of the greys and the square below the map."""
     view = f"view of one UAV, {width:.3g} cells wide"
     view += " (more than the map)" if width > side else ""
     samples = [
@@ -91,10 +91,10 @@ def _contours(axes: Axes, arrival: Arrival, horizon: int) -> None:
 
 
 def _continued(arrival: Arrival, horizon: int) -> NDArray[np.float64]:
-    """Returns arrival times without gaps, at which contours would end.
+    """Fills the gaps in arrival times, because contours end at gaps.
 
-    Cells around the fire arrive after the horizon, the later the farther away; cells that are
-    burnt out arrive at step 0.
+    Cells around the fire get times after the horizon that grow with the distance. Cells that are
+    burnt out get 0.
     """
     reached = arrival <= horizon
     times = np.where(reached, arrival, 0.0)
@@ -106,7 +106,7 @@ def _continued(arrival: Arrival, horizon: int) -> NDArray[np.float64]:
 
 
 def _view(axes: Axes, arrival: Arrival, width: float) -> None:
-    """Draws a UAV's view in the corner of the map where the fewest cells burn."""
+    """Draws the view of a UAV in the corner of the map with the fewest burning cells."""
     free = 0.5  # between the square and the edge of the map
     corners = []
     for right, upper in product((True, False), repeat=2):
@@ -123,5 +123,5 @@ def _view(axes: Axes, arrival: Arrival, width: float) -> None:
 
 
 def _outline(width: float) -> list[AbstractPathEffect]:
-    """Returns a dark edge, which makes a light line visible on any colour."""
+    """Returns a dark outline, so that a light line is visible on any colour."""
     return [withStroke(linewidth=width, foreground="black")]

@@ -1,4 +1,4 @@
-"""`emberlink fire preview`: draws a fire and tells whether UAVs can keep up with it."""
+"""Runs `emberlink fire preview`: draws a fire and tells whether UAVs can keep up with it."""
 
 import os
 import re
@@ -39,7 +39,7 @@ def preview(
         name = free_name(output or Path(), stem, [".png"])
         path = name.with_name(f"{name.name}.png")
     with published(path) as partial, warnings.catch_warnings():
-        warnings.filterwarnings("ignore", "Glyph")  # a file's name may be in any script
+        warnings.filterwarnings("ignore", "Glyph")  # the font may lack letters of the file's name
         arrival_figure(partial, arrival, world.horizon, team, fire.title)
     _print(console, fire, numbers, team)
     console.print(str(path), soft_wrap=True, highlight=False)
@@ -54,6 +54,8 @@ def _print(console: Console, fire: SelectedFire, numbers: Growth, team: TeamCapa
         soft_wrap=True,
         highlight=False,
     )
+    if fire.summary:
+        console.print(f"read: {fire.summary}", soft_wrap=True, highlight=False)
     table = Table(box=box.SIMPLE_HEAD, padding=0, show_edge=False, show_header=False)
     table.add_column()
     table.add_column(justify="right", no_wrap=True)
@@ -69,7 +71,7 @@ def _print(console: Console, fire: SelectedFire, numbers: Growth, team: TeamCapa
 
 
 def _rows(fire: Growth, team: TeamCapability) -> Iterator[tuple[str, str, str]]:
-    """Yields what is measured, the number, and its unit and meaning."""
+    """Yields the name, the number, and the unit of each measure."""
     until = fire.since + fire.window
     yield "burning at the start", str(fire.start), "cells"
     yield "burning at the end", str(fire.end), "cells"

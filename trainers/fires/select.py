@@ -1,4 +1,4 @@
-"""Finds the fire that a command names: a scenario's test fire, or one of a file."""
+"""Finds the fire that a command names: a test fire of a scenario, or a fire of a file."""
 
 import os
 from collections.abc import Sequence
@@ -10,7 +10,7 @@ from torch import Tensor
 
 from emberlink.envs.fire.generator import scenarios
 from emberlink.envs.fire_files.config import FileFireConfig
-from emberlink.envs.fire_files.reader import read_fires
+from emberlink.envs.fire_files.reader import read_with_summary
 from emberlink.envs.scenarios import fires_of
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import shown, unknown
@@ -18,10 +18,10 @@ from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.config.schema import RunConfig
 
 MAX_TEST_FIRES = 65_536
-"""test fires of a scenario, as many as an evaluation can have"""
+"""maximum number of test fires, as in an evaluation"""
 FILE = "file"
-"""the scenario of fires that are read, not made"""
-_METHOD = "independent"  # any: a fire depends on no method
+"""name of the scenario of fires that are read from a file"""
+_METHOD = "independent"  # any method; fires do not depend on it
 _KEYS = ("env.", "fire.")
 
 
@@ -31,17 +31,19 @@ class SelectedFire:
 
     title: str
     stem: str
-    """Begins the names of files about it."""
+    """beginning of the names of files about the fire"""
     config: RunConfig
     arrival: Tensor
     """float32 [X, Y], steps"""
+    summary: str = ""
+    """description of the file; empty for a scenario"""
 
 
 def find_fire(text: str, overrides: Sequence[str]) -> SelectedFire:
     """Returns the fire that NAME, NAME:INDEX, FILE or FILE:INDEX names.
 
     Args:
-        text: the name of a scenario or a path; a scenario comes first.
+        text: the name of a scenario or a path. A scenario takes precedence.
         overrides: `key=value` of setup, env. and fire.
 
     Raises:
@@ -63,7 +65,7 @@ def find_fire(text: str, overrides: Sequence[str]) -> SelectedFire:
         raise UserError(f"{shown(text)}: there is no such file; as a scenario {known}")
     path = Path(name)
     config = from_file(path, overrides)
-    fires = read(config)
+    fires, summary = read(config)
     if not index.isdecimal() or int(index) >= len(fires):
         raise UserError(f"{shown(text)}: there is no fire {index!r}; known: 0 to {len(fires) - 1}")
     several, shortened = len(fires) > 1, shown(path.name)
@@ -72,6 +74,7 @@ def find_fire(text: str, overrides: Sequence[str]) -> SelectedFire:
         stem=f"fire_{path.stem}_{index}" if several else f"fire_{path.stem}",
         config=config,
         arrival=fires[int(index)],
+        summary=summary,
     )
 
 
@@ -87,7 +90,7 @@ def generated(scenario: str, overrides: Sequence[str]) -> RunConfig:
     """Returns the configuration with which a scenario's fires are made.
 
     Raises:
-        UserError: there is no such scenario, its fires are read, or a key or value is wrong.
+        UserError: there is no such scenario, it reads a file, or a key or value is wrong.
     """
     if scenario not in scenarios():
         raise UserError(f"fire {unknown(scenario, scenarios())}")
@@ -102,7 +105,7 @@ def from_file(path: Path, overrides: Sequence[str]) -> RunConfig:
     """
     if any(text.partition("=")[0] == "fire.path" for text in overrides):
         raise UserError("fire.path: the file is given without a key here")
-    # The name is set past the parser of overrides, to which some characters mean something.
+    # The path bypasses the parser of overrides, in which some characters have a meaning.
     return _resolve([f"fire={FILE}", "fire.path=_", *overrides], overrides, path=str(path))
 
 
@@ -120,11 +123,11 @@ def _resolve(texts: Sequence[str], overrides: Sequence[str], path: str | None = 
     return config
 
 
-def read(config: RunConfig) -> Tensor:
-    """Returns the fires of a file, float32 [fires, X, Y], steps.
+def read(config: RunConfig) -> tuple[Tensor, str]:
+    """Returns the fires of a file, float32 [fires, X, Y], steps, and a description of the file.
 
     Raises:
-        UserError: one line that names the file and what is wrong with it.
+        UserError: one line that names the file and the mistake in it.
     """
     assert isinstance(config.fire, FileFireConfig)
-    return read_fires(config.fire, config.env.grid, config.env.horizon)
+    return read_with_summary(config.fire, config.env.grid, config.env.horizon)

@@ -1,4 +1,4 @@
-"""The growth of a fire, and whether a team of UAVs can keep up with it."""
+"""Measures the growth of a fire, and compares it with the capability of a team of UAVs."""
 
 import dataclasses
 import math
@@ -27,7 +27,7 @@ class Growth:
     window: int
     """steps over which `maximum` is taken"""
     maximum: float
-    """new cells per step, in the window with the most"""
+    """new cells per step, in the window of fastest growth"""
     since: int
     """step at which that window begins"""
 
@@ -56,11 +56,11 @@ def growth(arrival: Arrival, horizon: int) -> Growth:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class TeamCapability:
-    """Upper bounds of what a team of UAVs can see."""
+    """Upper bounds of the view of a team of UAVs."""
 
     num_uavs: int
     flight: float
-    """cells that a UAV flies in a step, along an axis"""
+    """maximum displacement of a UAV in a step along an axis, cells"""
     width: float
     """side of the square that a UAV sees from full altitude, cells"""
 
@@ -72,7 +72,7 @@ class TeamCapability:
 
     @property
     def uncovered(self) -> float:
-        """Cells that come into view in a step, if no UAV looks where another did."""
+        """Cells that come into view in a step, if no two UAVs see the same cells."""
         return self.num_uavs * self.width * self.flight
 
     @property
@@ -82,7 +82,7 @@ class TeamCapability:
 
 
 def comparisons(fire: Growth, team: TeamCapability, horizon: int) -> list[tuple[bool, str]]:
-    """Compares the fire with the team: whether the team's bound is enough, and the numbers."""
+    """Returns whether each bound of the team suffices for the fire, and a text with numbers."""
     steps = math.ceil(max(0.0, fire.end - team.seen) / team.uncovered)
     ratio = f": {short(team.uncovered / fire.maximum)} times as many" if fire.maximum > 0 else ""
     return [
@@ -100,14 +100,14 @@ def comparisons(fire: Growth, team: TeamCapability, horizon: int) -> list[tuple[
 
 
 def short(value: float) -> str:
-    """Returns three digits, or all of a whole number that has more."""
+    """Returns a number with three digits, or all digits of a larger whole number."""
     return f"{value:.0f}" if value >= 100 else f"{value:.3g}"
 
 
 def burnt_out(arrival: Arrival) -> NDArray[np.bool_]:
-    """Returns the cells inside the first fire that never burn: burnt before step 0, [X, Y].
+    """Returns the mask of cells that burnt before step 0, [X, Y].
 
-    Most cells around them burn at step 0, and they do not touch the edge of the map.
+    These never burn, most cells around them burn at step 0, and they do not touch the map's edge.
     """
     parts, count = label(np.isinf(arrival))  # pyright: ignore[reportGeneralTypeIssues]
     inside = np.zeros(arrival.shape, bool)

@@ -1,4 +1,4 @@
-"""Manages run folders: configuration, metrics, checkpoints, lock, trackers, trained policies."""
+"""Manages run folders: configuration, metrics, checkpoints, lock, trained policies."""
 
 from typing import TYPE_CHECKING
 

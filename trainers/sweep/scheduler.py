@@ -8,13 +8,13 @@ from typing import Any
 from emberlink.envs.utils.atomic_io import inner_folder
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.publish import free_name
-from emberlink.trainers.runs.signals import Interruption
 from emberlink.trainers.sweep.claims import Claim, claim
 from emberlink.trainers.sweep.executors import Executor, Task
 from emberlink.trainers.sweep.jobs import Job
 from emberlink.trainers.sweep.plan import plan
 from emberlink.trainers.sweep.progress import SweepProgress
 from emberlink.trainers.sweep.run_index import RunIndex
+from emberlink.trainers.terminal.signals import Interruption
 
 _INTERVAL = 0.5
 """seconds between polls of processes and run folders"""

@@ -12,11 +12,11 @@ from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.evaluation.command import evaluate_and_print
 from emberlink.trainers.evaluation.results import learned_means
-from emberlink.trainers.runs import loggers
 from emberlink.trainers.runs.run_folder import RunFolder
-from emberlink.trainers.runs.signals import Interrupted, Interruption
-from emberlink.trainers.runs.tracking import Trackers
 from emberlink.trainers.terminal import OutputError, TrainingProgress
+from emberlink.trainers.terminal.signals import Interrupted, Interruption
+from emberlink.trainers.tracking import loggers
+from emberlink.trainers.tracking.trackers import Trackers
 from emberlink.trainers.training.non_finite import NonFiniteError
 from emberlink.trainers.training.resume import resume
 from emberlink.trainers.training.trainer import Progress, Trainer

@@ -12,8 +12,8 @@ from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.evaluation import evaluate
 from emberlink.trainers.runs.run_folder import RunFolder
 from emberlink.trainers.runs.seal import to_header
-from emberlink.trainers.runs.tracking import Trackers
 from emberlink.trainers.runs.versions import changed, versions
+from emberlink.trainers.tracking.trackers import Trackers
 from emberlink.trainers.training import checkpoints, non_finite, rollback
 from emberlink.trainers.training.folders import RunFolders, empty
 from emberlink.trainers.training.rollback import Rollbacks

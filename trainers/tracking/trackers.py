@@ -8,9 +8,9 @@ from contextlib import suppress
 from pathlib import Path
 
 from emberlink.trainers.config.schema import RunConfig
-from emberlink.trainers.runs import loggers
-from emberlink.trainers.runs.loggers import Tracker
 from emberlink.trainers.runs.run_folder import RunFolder
+from emberlink.trainers.tracking import loggers
+from emberlink.trainers.tracking.loggers import Tracker
 
 _Job = Callable[[int, Tracker], None]
 """called with the index of a run and its tracker"""

@@ -1,0 +1,243 @@
+"""Perimeters as agencies hand them out: KML and KMZ, a file per date, and several incidents."""
+
+import zipfile
+
+import geopandas
+import numpy as np
+import pytest
+import scipy.io
+import shapely
+import torch
+from fire_files import UTM, Ellipses, frame_of
+
+from emberlink.envs.fire_files.config import FileFireConfig
+from emberlink.envs.fire_files.reader import read_fires, with_checksum
+from emberlink.envs.utils.errors import UserError
+
+HOURS = (60.0, 120.0, 180.0)
+DATES = [f"2020-08-19T{hour}:00:00Z" for hour in (22, 23)] + ["2020-08-19T17:00:00-07:00"]
+
+
+def read(path, **keys):
+    """Returns the one fire of a file, [X, Y]."""
+    (fire,) = read_fires(FileFireConfig(path=str(path), **keys), (30, 30), 1000)
+    return fire
+
+
+def refused(path, **keys):
+    """Returns the message with which a file is refused."""
+    with pytest.raises(UserError) as error:
+        read(path, **keys)
+    message = str(error.value)
+    assert message.startswith(str(path))
+    assert "\n" not in message
+    assert len(message) < 600
+    return message
+
+
+@pytest.fixture
+def frame():
+    """Perimeters with dates, in degrees."""
+    frame = frame_of(Ellipses(), HOURS).to_crs("EPSG:4326")
+    return frame.drop(columns="Elapsed_Mi").assign(date=DATES)
+
+
+def kml_of(frame, time="<TimeStamp><when>{}</when></TimeStamp>"):
+    """Returns KML with a folder per perimeter, each with a hot spot beside the polygon."""
+    folders = []
+    for date, shape in zip(frame["date"], frame.geometry, strict=True):
+        ring = " ".join(f"{x!r},{y!r},0" for x, y in np.asarray(shape.exterior.coords).tolist())
+        x, y = shape.centroid.coords[0]
+        folders.append(
+            f"<Folder><name>Heat {date}</name><Placemark><name>{date}</name>{time.format(date)}"
+            "<Polygon><outerBoundaryIs><LinearRing><coordinates>"
+            f"{ring}</coordinates></LinearRing></outerBoundaryIs></Polygon></Placemark>"
+            f"<Placemark><name>hot</name><Point><coordinates>{x},{y}</coordinates></Point>"
+            "</Placemark></Folder>"
+        )
+    return (
+        '<?xml version="1.0" encoding="UTF-8"?><kml xmlns="http://www.opengis.net/kml/2.2">'
+        f"<Document>{''.join(folders)}</Document></kml>"
+    )
+
+
+def write_kmz(path, text, name="doc.kml"):
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr(name, text)
+
+
+TIMES = {
+    "TimeStamp": ("<TimeStamp><when>{}</when></TimeStamp>", {}),
+    "TimeSpan": ("<TimeSpan><begin>{}</begin></TimeSpan>", {}),
+    "Name": ("", {"time_field": "Name"}),
+}
+
+
+@pytest.mark.parametrize("name", TIMES)
+def test_kml_and_kmz_are_read_as_geojson_is(tmp_path, frame, name):
+    time, keys = TIMES[name]
+    frame.to_file(tmp_path / "fire.geojson", COORDINATE_PRECISION=15)
+    expected = read(tmp_path / "fire.geojson")
+    (tmp_path / "fire.kml").write_text(kml_of(frame, time))
+    write_kmz(tmp_path / "fire.kmz", kml_of(frame, time))
+    for suffix in ("kml", "kmz"):
+        got = read(tmp_path / f"fire.{suffix}", **keys)
+        assert torch.equal(got.isfinite(), expected.isfinite())
+        assert torch.allclose(got, expected, atol=1e-2)
+
+
+def test_kml_without_times_names_the_columns(tmp_path, frame):
+    (tmp_path / "fire.kml").write_text(kml_of(frame, ""))
+    assert "expected fire.time_field, one of Name" in refused(tmp_path / "fire.kml")
+
+
+def test_a_layer_of_kml_is_chosen(tmp_path, frame):
+    path = tmp_path / "fire.kml"
+    path.write_text(kml_of(frame))
+    assert "one perimeter" in refused(path, layer=f"Heat {DATES[0]}")
+    assert "no layer 'Cold'" in refused(path, layer="Cold")
+
+
+def test_damaged_kml_and_kmz_are_refused(tmp_path, frame):
+    text = kml_of(frame)
+    path = tmp_path / "fire.kml"
+    for content, words in (
+        (text[: len(text) // 2], "expected KML"),
+        (text.replace("<Folder>", "<Older>", 1), "expected KML"),
+        ("<?xml version='1.0'?><gpx></gpx>", "expected KML"),
+        (f"<!DOCTYPE a [<!ENTITY b 'c'>]>{text[38:]}", "expected KML"),
+        (kml_of(frame.iloc[:0]), "expected perimeters"),
+    ):
+        path.write_text(content)
+        assert words in refused(path)
+    kmz = tmp_path / "fire.kmz"
+    write_kmz(kmz, text)
+    whole = kmz.read_bytes()
+    for length in (len(whole) // 2, len(whole) - 9):
+        kmz.write_bytes(whole[:length])
+        assert "expected KMZ" in refused(kmz)
+    kmz.write_bytes(whole[:200] + bytes(8) + whole[208:])
+    assert "expected KMZ" in refused(kmz)
+    write_kmz(kmz, text, "fire.txt")
+    assert "no .kml" in refused(kmz)
+    write_kmz(kmz, text[: len(text) // 2])
+    assert "expected KML" in refused(kmz)
+    write_kmz(kmz, " " * 400_000_000)
+    assert "400000000 bytes" in refused(kmz)
+
+
+@pytest.mark.parametrize("suffix", ["shp", "geojson", "gpkg"])
+def test_a_file_per_date_is_one_fire(tmp_path, frame, suffix):
+    """GeoMAC has a shapefile per flight, whose columns changed between upper and lower case."""
+    frame.to_file(tmp_path / f"all.{suffix}")
+    folder = tmp_path / "fire"
+    folder.mkdir()
+    (folder / "readme.txt").write_text("Perimeters of a fire")
+    for number in (2, 0, 1):
+        name = "DATE_" if number else "date_"
+        part = frame.iloc[[number]].rename(columns={"date": name})
+        part.to_file(folder / f"flight_{number}.{suffix}")
+    expected = read(tmp_path / f"all.{suffix}")
+    assert torch.equal(read(folder), expected)
+
+
+def test_the_files_of_a_folder_may_have_different_projections(tmp_path, frame):
+    frame.to_file(tmp_path / "all.gpkg")
+    folder = tmp_path / "fire"
+    folder.mkdir()
+    frame.iloc[:1].to_file(folder / "a.gpkg")
+    frame.iloc[1:].to_crs(UTM).to_file(folder / "b.geojson")
+    assert torch.allclose(read(folder), read(tmp_path / "all.gpkg"), atol=1)
+    frame.iloc[1:].to_crs(UTM).set_crs(None, allow_override=True).to_file(folder / "b.geojson")
+    assert "b.geojson: no projection, which a.gpkg has" in refused(folder)
+
+
+def test_an_error_in_a_folder_names_the_file(tmp_path, frame):
+    folder = tmp_path / "fire"
+    folder.mkdir()
+    assert "a folder without perimeters" in refused(folder)
+    frame.iloc[:2].to_file(folder / "a.gpkg")
+    frame.iloc[2:].assign(date="soon").to_file(folder / "b.gpkg")
+    assert "b.gpkg: feature 0 has date='soon'" in refused(folder)
+    line = shapely.LineString([(-117, 36), (-116.9, 36.1)])
+    geopandas.GeoDataFrame({"date": DATES[2:]}, geometry=[line], crs=4326).to_file(
+        folder / "b.gpkg"
+    )
+    assert "b.gpkg: feature 0: a line of 2 points is not closed" in refused(folder)
+    (folder / "c.gpkg").write_bytes(b"nothing")
+    assert "c.gpkg: begins with 'nothing'" in refused(folder)
+
+
+def test_the_checksum_of_a_folder_is_that_of_its_perimeters(tmp_path, frame):
+    folder = tmp_path / "fire"
+    folder.mkdir()
+    frame.iloc[:2].to_file(folder / "a.shp")
+    frame.iloc[2:].to_file(folder / "b.geojson")
+    config = with_checksum(FileFireConfig(path=str(folder)))
+    (folder / "readme.txt").write_text("Perimeters of a fire")
+    assert with_checksum(config) == config
+    (folder / "a.dbf").write_bytes((folder / "a.dbf").read_bytes().replace(b"2020", b"2021"))
+    with pytest.raises(UserError, match="has changed"):
+        with_checksum(config)
+
+
+@pytest.mark.parametrize(
+    ("suffix", "column"), [("gpkg", "attr_IncidentName"), ("shp", "FIRE_NAME")]
+)
+def test_one_of_several_incidents_is_chosen(tmp_path, frame, suffix, column):
+    frame.to_file(tmp_path / f"one.{suffix}")
+    other = frame.translate(0.02, 0.01)
+    both = geopandas.GeoDataFrame(
+        {"date": DATES * 2, column: ["August", "AUGUST ", "August", "Creek", "Creek", None]},
+        geometry=[*frame.geometry, *other],
+        crs=4326,
+    )
+    path = tmp_path / f"both.{suffix}"
+    both.to_file(path)
+    message = refused(path)
+    assert "2 incidents: August, Creek; expected fire.incident, such as fire.incident=August" in (
+        message
+    )
+    assert torch.equal(read(path, incident="august"), read(tmp_path / f"one.{suffix}"))
+    assert read(path, incident="Creek").isfinite().any()
+    both.drop(columns=column).to_file(tmp_path / f"all.{suffix}")
+    assert torch.equal(read(path, incident="*"), read(tmp_path / f"all.{suffix}"))
+    assert "fire.incident='Crek' is not known; did you mean Creek?" in refused(
+        path, incident="Crek"
+    )
+    assert "no column of incidents" in refused(tmp_path / f"one.{suffix}", incident="Creek")
+
+
+def test_other_formats_are_named_with_a_command_that_converts_them(tmp_path):
+    wrf = tmp_path / "wrfout_d01.nc"
+    with scipy.io.netcdf_file(wrf, "w") as file:
+        file.createDimension("x", 3)
+        file.createVariable("TIGN_G", "f4", ("x",))[:] = 0
+    message = refused(wrf)
+    assert "NetCDF" in message
+    assert "gdal_translate" in message
+    assert "TIGN_G" in message
+    wrf.rename(tmp_path / "wrfout_d01_2020-08-19_22:00:00")
+    assert "gdal_translate" in refused(tmp_path / "wrfout_d01_2020-08-19_22:00:00")
+    firms = tmp_path / "fire_nrt_J1V-C2_1.csv"
+    firms.write_text("latitude,longitude,bright_ti4,scan,track,acq_date,acq_time\n36,-117,330,1,1,")
+    message = refused(firms)
+    assert "FIRMS" in message
+    assert "ogr2ogr" in message
+    grid = tmp_path / "ForestGrid07.csv"
+    grid.write_text("0,0,0,0\n0,1,0,0\n")
+    message = refused(grid)
+    assert "Cell2Fire" in message
+    assert "ForestGrid*.csv" in message
+
+
+def test_the_command_for_cell2fire_writes_a_bank(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    times = np.full((9, 8), np.inf)
+    times[1, 2:6] = [0, 1, 3, 4]  # rows from north to south
+    for hour in range(6):
+        np.savetxt(f"ForestGrid{hour:02}.csv", times <= hour, fmt="%d", delimiter=",")
+    message = refused(tmp_path / "ForestGrid00.csv")
+    exec(message.split('python -c "')[1].split('"')[0], {})
+    (fire,) = read_fires(FileFireConfig(path="fire.npy"), (8, 9), 6)
+    assert torch.equal(fire, torch.from_numpy(times[::-1].T.astype(np.float32)))
