@@ -1,4 +1,4 @@
-"""What all tests share."""
+"""Fixtures for all tests."""
 
 import io
 import shutil
@@ -12,7 +12,7 @@ from tiny_run import train_tiny
 
 @pytest.fixture(autouse=True, scope="session")
 def _environment(tmp_path_factory):
-    """Gives the tests, and the programs that they start, a cache of their own and no terminal."""
+    """Gives the tests and their subprocesses a temporary cache and no terminal."""
     with pytest.MonkeyPatch.context() as patch:
         patch.delenv("COLUMNS", raising=False)
         patch.setenv("EMBERLINK_CACHE", str(tmp_path_factory.mktemp("cache")))
@@ -34,11 +34,11 @@ def _blank_figures(request, monkeypatch) -> None:
 
 @pytest.fixture(scope="session")
 def finished(tmp_path_factory) -> Path:
-    """A run folder that `emberlink train` left."""
+    """Trains a short run and returns its folder."""
     return train_tiny(tmp_path_factory.mktemp("runs"))
 
 
 @pytest.fixture
 def run(finished, tmp_path) -> Path:
-    """A copy of it, to be damaged."""
+    """Returns a copy of the finished run that a test may damage."""
     return Path(shutil.copytree(finished, tmp_path / "run"))

@@ -1,8 +1,8 @@
-"""The exact front of a disc that grows by an elliptical wavelet and drifts: its support function.
+"""Computes the exact front of a drifting disc that grows by an elliptical wavelet.
 
-The grown disc is convex, so it is the intersection of half planes: relative to the drifting centre,
+The grown disc is convex, so it is an intersection of half planes. Relative to the drifting centre,
 x·n <= h(n, t) = radius + integral of F(n, s) ds for every normal n, where F is the wavelet's own
-support function. A point is reached at the first t at which all of them hold.
+support function. A point is reached at the first t at which all inequalities hold.
 """
 
 import math
@@ -13,13 +13,13 @@ STEPS, NORMALS = 320, 180
 
 
 def support(normal, a, b, c, azimuth):
-    """How fast a straight front with this normal moves: the farthest reach of the wavelet."""
+    """Returns the speed of a straight front along its normal: the wavelet's support function."""
     along = np.cos(normal - azimuth)
     return c * along + np.sqrt((a * along) ** 2 + (b * np.sin(normal - azimuth)) ** 2)
 
 
 def running(values, times):
-    """The integral of sampled values from the first time to each of the times."""
+    """Integrates sampled values from the first time to each of the times."""
     steps = (values[1:] + values[:-1]) / 2 * np.diff(times)[:, None]
     return np.concatenate([np.zeros_like(values[:1]), np.cumsum(steps, 0)])
 
@@ -27,7 +27,7 @@ def running(values, times):
 def exact_arrival(
     grid: tuple[int, int], centre, radius: float, rates, azimuth, velocity, horizon: float
 ) -> np.ndarray:
-    """Arrival at the centres of the cells, [X, Y], steps.
+    """Returns the arrival times at the centres of the cells, [X, Y], steps.
 
     Args:
         rates: (a, b, c) of the wavelet.
@@ -45,7 +45,7 @@ def exact_arrival(
     for k, time in enumerate(times):
         outside = (along - (moved[k] @ unit + reach[k]).astype(np.float32)).max(-1)
         new = (outside <= 0) & np.isinf(arrival)
-        # Cells inside at the start have no time before; the others were reached in between.
+        # Cells inside the initial disc have no earlier sample. The others were reached in between.
         part = before[new] / (before[new] - outside[new]) if k else 0.0
         arrival[new] = time if k == 0 else times[k - 1] + part * (time - times[k - 1])
         before = outside

@@ -18,7 +18,7 @@ UTM = "EPSG:32611"
 
 @dataclass(frozen=True)
 class Ellipses:
-    """Elliptical fires from points, metres and minutes. The front grows in proportion to time."""
+    """Models elliptical fires from points. The front grows linearly in time; metres and minutes."""
 
     origins: Sequence[tuple[float, float]] = ((1500.0, 1300.0),)
     head: float = 4.0
@@ -30,7 +30,7 @@ class Ellipses:
 
     @property
     def axes(self) -> tuple[float, float, float]:
-        """Half length, half breadth and shift of the ellipse after a minute, metres."""
+        """Returns half length, half breadth and shift of the ellipse after one minute, metres."""
         e = math.sqrt(self.breadth**2 - 1) / self.breadth
         back = self.head * (1 - e) / (1 + e)
         return (self.head + back) / 2, (self.head + back) / 2 / self.breadth, (self.head - back) / 2

@@ -1,4 +1,4 @@
-"""Makes damaged files of fires, and files of a wrong kind, from whole files."""
+"""Generates damaged fire files and files of a wrong format from valid files."""
 
 import json
 import os
@@ -31,7 +31,7 @@ MINUTES = {"units": "minutes"}
 
 @dataclass(frozen=True)
 class Case:
-    """A file, its keys, and the expected error."""
+    """Holds a file, its keys and the expected error."""
 
     name: str
     path: Path
@@ -43,7 +43,7 @@ class Case:
 
 
 def wholes(folder: Path) -> dict[str, Path]:
-    """Writes a whole file of each kind."""
+    """Writes a valid file of each format."""
     folder.mkdir()
     times = raster_of(FIRE, 300.0, cells=40, cell=75.0)
     frame = frame_of(FIRE, TIMES)
@@ -71,7 +71,7 @@ def wholes(folder: Path) -> dict[str, Path]:
 
 
 def keys_of(kind: str) -> dict[str, Any]:
-    """Returns the keys with which a whole file is read."""
+    """Returns the keys with which a valid file is read."""
     return MINUTES if kind in ("asc", "tif", "deflated") else {}
 
 
@@ -113,7 +113,7 @@ def _no_files(folder: Path, good: dict[str, Path]) -> Iterator[Case]:
 
 
 def _cut(folder: Path, good: dict[str, Path]) -> Iterator[Case]:
-    """Yields files that are cut off at parts of their length, and near both ends."""
+    """Yields files that are cut off at fractions of their length and near both ends."""
     for kind, source in good.items():
         content = source.read_bytes()
         size = len(content)
@@ -123,7 +123,7 @@ def _cut(folder: Path, good: dict[str, Path]) -> Iterator[Case]:
             path.write_bytes(content[:length])
             # A cut near the end of a text may remove nothing, or only the last digits.
             harmless = kind in ("asc", "txt", "geojson") and length >= size - 9
-            text = kind == "txt"  # it may end after any line
+            text = kind == "txt"  # may end after any line
             yield Case(
                 f"{kind} cut to {length} of {size}",
                 path,
@@ -154,7 +154,7 @@ def _tagged(folder: Path, good: dict[str, Path]) -> Iterator[Case]:
             path = folder / f"spoilt_{tag}_{number}.tif"
             where = at + offset
             path.write_bytes(content[:where] + spoilt + content[where + len(spoilt) :])
-            # The second tag holds the place on the Earth, which changes no grid.
+            # The second tag holds the geographic position, which does not change the grid.
             same = whole if tag == 33922 else None
             yield Case(f"tif with tag {tag} spoilt, {number}", path, "", MINUTES, same)
     without = write_tif(folder / "no_place.tif", raster_of(FIRE, 300.0), transform=None)
@@ -200,7 +200,7 @@ def _garbage(folder: Path, good: dict[str, Path]) -> Iterator[Case]:
 
 
 def _other_kinds(folder: Path, good: dict[str, Path]) -> Iterator[Case]:
-    """Yields each kind under the name of another."""
+    """Yields each format under the file name of another format."""
     folder.mkdir()
     for kind, source in good.items():
         for other in (".asc", ".tif", ".geojson", ".npy"):
@@ -255,7 +255,7 @@ def _headers(folder: Path, good: dict[str, Path]) -> Iterator[Case]:
 
 
 def _values(folder: Path, good: dict[str, Path]) -> Iterator[Case]:
-    """Yields numbers that are not times, or not those of a fire that spreads."""
+    """Yields numbers that are no times, or no times of a spreading fire."""
     folder.mkdir()
     times = raster_of(FIRE, 300.0, cells=40, cell=75.0)
     single = np.full_like(times, -9999.0)
@@ -292,7 +292,7 @@ def _values(folder: Path, good: dict[str, Path]) -> Iterator[Case]:
 
 
 def _rasters(folder: Path, good: dict[str, Path]) -> Iterator[Case]:
-    """Yields GeoTIFFs without arrival times or without a valid place."""
+    """Yields GeoTIFFs without arrival times or without a valid georeference."""
     folder.mkdir()
     times = raster_of(FIRE, 300.0, cells=40, cell=75.0).astype("float32")
     affine = rasterio.Affine
@@ -479,7 +479,7 @@ def _shapes(folder: Path, good: dict[str, Path]) -> Iterator[Case]:
 
 
 def _shapefiles(folder: Path, good: dict[str, Path]) -> Iterator[Case]:
-    """Yields shapefiles whose parts are missing, cut off, or of another file."""
+    """Yields shapefiles with parts that are missing, cut off, or taken from another file."""
     for suffix in (".shx", ".dbf"):
         path = _beside(folder / f"without{suffix}", good["shp"])
         path.with_suffix(suffix).unlink()
@@ -577,7 +577,7 @@ def _texts(folder: Path, good: dict[str, Path]) -> Iterator[Case]:
 
 
 def _choices(folder: Path, good: dict[str, Path]) -> Iterator[Case]:
-    """Yields whole files with keys that do not fit them."""
+    """Yields valid files with keys that do not fit them."""
     for keys, cause in (
         ({"start": 400.0}, "no fire spreads"),
         ({"end": 0.0}, "after the start"),

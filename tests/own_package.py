@@ -1,4 +1,4 @@
-"""The package of a user's own that docs/extensions.md prints, with a setup and a fire more."""
+"""Writes the extension package of docs/extensions.md with an additional setup and fire."""
 
 import re
 from pathlib import Path
@@ -17,7 +17,7 @@ env:
 
 
 def write(folder: Path, files: dict[str, str]) -> Path:
-    """Writes files by their name within a folder."""
+    """Writes files into a folder; `files` maps relative names to contents."""
     for name, text in files.items():
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_text(text)
@@ -25,7 +25,7 @@ def write(folder: Path, files: dict[str, str]) -> Path:
 
 
 def yaml_files() -> dict[str, str]:
-    """The method `headcount`, the setup `small`, its fire, and its change of that method."""
+    """Returns the method `headcount`, the setup `small`, its fire and its change of that method."""
     fire = find("fire", "paper").read_text().replace("name: paper", "name: faint")
     return {
         "method/headcount.yaml": METHOD,
@@ -36,7 +36,7 @@ def yaml_files() -> dict[str, str]:
 
 
 def write_package(folder: Path) -> Path:
-    """Writes the sources of a package that holds all of these."""
+    """Writes the sources of a package that contains these files."""
     files = {f"headcount/configs/{name}": text for name, text in yaml_files().items()}
     files |= {"pyproject.toml": PROJECT, "headcount/module.py": MODULE}
     files |= {"headcount/__init__.py": "", "headcount/configs/__init__.py": ""}

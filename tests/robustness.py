@@ -1,4 +1,4 @@
-"""How long the tests of robustness run: EMBERLINK_SOAK=1 makes them long."""
+"""Sets the duration of the robustness tests: EMBERLINK_SOAK=1 selects the long version."""
 
 import os
 

@@ -1,4 +1,4 @@
-"""Method 4 for one network of UAVs in plain Python: loops, dictionaries, explicit rounds."""
+"""Implements method 4 for one team in plain Python, with loops and explicit rounds."""
 
 import math
 from collections.abc import Container, Sequence
@@ -7,13 +7,13 @@ Point = tuple[float, float, float]
 
 
 class ScalarConsensus:
-    """Remembers, per UAV, what a discoverer has done since it became one.
+    """Computes the consensus of one team and keeps each discoverer's track record.
 
     Args:
-        reach: UAVs nearer than this hear each other, cells.
-        any_fire: whether old fire makes a discoverer too.
-        agree: whether UAVs tell each other what they hear.
-        nearest: whether they follow the nearest discoverer in place of the best.
+        reach: range of communication, cells; UAVs nearer than this hear each other.
+        any_fire: whether a UAV over old fire is a discoverer too.
+        agree: whether UAVs forward the messages that they receive.
+        nearest: whether they follow the nearest discoverer instead of the best.
     """
 
     def __init__(
@@ -30,10 +30,10 @@ class ScalarConsensus:
         old: Sequence[int],
         lost: Container[tuple[int, int]] = (),
     ) -> list[int]:
-        """Whom each UAV follows after this moment: itself if a discoverer, -1 if nobody.
+        """Returns the UAV that each UAV follows: itself if it is a discoverer, -1 if none.
 
         Args:
-            position, new, old: of each UAV.
+            position, new, old: position and cells of new and old fire in view of each UAV.
             lost: the pairs (i, j) of which i does not hear j.
         """
         uavs = range(len(position))
@@ -61,7 +61,7 @@ class ScalarConsensus:
             knows = told
 
         def worse(i: int, j: int) -> tuple[float, int]:
-            """Of two, the one for which this is lower is followed."""
+            """Returns the sort key of a discoverer; the lowest is followed."""
             return (math.dist(position[i], position[j]) if self.nearest else -self.rank(j)), j
 
         return [
@@ -70,32 +70,32 @@ class ScalarConsensus:
         ]
 
     def streak(self, uav: int) -> int:
-        """Consecutive steps as a discoverer."""
+        """Returns the number of consecutive steps as a discoverer."""
         return len(self.history.get(uav, []))
 
     def fire_score(self, uav: int) -> int:
-        """Fire points discovered over the streak."""
+        """Returns the fire points discovered over the streak."""
         return sum(points for points, _ in self.history.get(uav, []))
 
     def average_altitude(self, uav: int) -> float:
-        """Mean altitude over the streak."""
+        """Returns the mean altitude over the streak."""
         altitudes = [altitude for _, altitude in self.history[uav]]
         return sum(altitudes) / len(altitudes)
 
     def rank(self, uav: int) -> float:
-        """Equation of the rank of a discoverer."""
+        """Returns the rank of a discoverer."""
         points, altitude = self.history[uav][-1]
         record = self.fire_score(uav) / (self.average_altitude(uav) * self.streak(uav))
         return record * (points / altitude)
 
 
 def bearing(start: Point, end: Point) -> float:
-    """Direction in the x-y plane, degrees in (-180, 180]."""
+    """Returns the direction in the x-y plane, degrees in (-180, 180]."""
     return math.degrees(math.atan2(end[1] - start[1], end[0] - start[0]))
 
 
 def heading_term(form: str, before: Point, after: Point, target: Point) -> float:
-    """The bonus for one UAV's move, by the name of its form."""
+    """Returns the bonus for one UAV's move, by the name of its form."""
     aimed, moved = bearing(before, target), bearing(before, after)
     folded = abs(abs(aimed) - abs(moved))
     if form == "folded_linear":

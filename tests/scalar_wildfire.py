@@ -1,4 +1,4 @@
-"""The wildfire environment once more, one number at a time, to compare the batched one with."""
+"""Re-implements the wildfire environment with scalars, as a reference for the batched one."""
 
 import math
 
@@ -8,7 +8,7 @@ NO_FIRE, OLD_FIRE, NEW_FIRE = 0, 1, 2
 
 
 class ScalarWildfire:
-    """One environment. Python floats throughout; positions are rounded to float32 when stored.
+    """Simulates one environment with Python floats; stored positions are rounded to float32.
 
     Args:
         arrival: times of arrival in steps, a list of X lists of Y numbers.
@@ -41,7 +41,7 @@ class ScalarWildfire:
                     self.fire[i][j] = NEW_FIRE
 
     def step(self, actions):
-        """Moves every UAV; per UAV the counts (new, old, none), exits per axis, and reward."""
+        """Moves every UAV; returns counts (new, old, none), exits per axis and reward per UAV."""
         self.time += 1
         self.spread()
         exits = [self.move(n, action) for n, action in enumerate(actions)]

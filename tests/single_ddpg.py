@@ -1,4 +1,4 @@
-"""One UAV's DDPG in plain torch modules: what each UAV of a stack must equal."""
+"""Implements DDPG for one UAV in plain torch modules, as a reference for the stacked learner."""
 
 import copy
 from collections.abc import Iterator
@@ -43,8 +43,8 @@ class SingleCritic(nn.Module):
 def matched(
     stack: StackedActor | StackedCritic, single: nn.Module, uav: int
 ) -> Iterator[tuple[str, Tensor, Tensor]]:
-    """Name, the UAV's slice of the stack, and the single network's parameter of that shape."""
-    assert not list(stack.encoder.parameters())  # of a vector
+    """Yields name, the UAV's slice of the stack, and the single network's parameter."""
+    assert not list(stack.encoder.parameters())  # a vector
     for name, layer in stack.named_children():
         if name == "encoder":
             continue
@@ -58,14 +58,14 @@ def matched(
 
 @torch.no_grad()
 def copy_uav(stack: StackedActor | StackedCritic, single: nn.Module, uav: int) -> nn.Module:
-    """The single network with one UAV's weights."""
+    """Copies one UAV's weights into the single network and returns it."""
     for _, theirs, own in matched(stack, single, uav):
         own.copy_(theirs)
     return single
 
 
 class SingleDDPG:
-    """Lillicrap et al. 2016, algorithm 1, from the sampled batch on."""
+    """Implements algorithm 1 of Lillicrap et al. 2016 after the sampling of the batch."""
 
     def __init__(
         self,

@@ -1,4 +1,4 @@
-"""Run folders with made-up numbers."""
+"""Writes run folders with synthetic numbers."""
 
 import json
 from functools import cache
@@ -32,11 +32,11 @@ def write_run(
     scripted: tuple[str, ...] = ("random_actions", "random_waypoints"),
     scenarios: tuple[str, ...] = ("huygens",),
 ) -> Path:
-    """A finished, evaluated run without checkpoints.
+    """Writes a finished, evaluated run without checkpoints and returns its folder.
 
     Args:
-        learned: the learned policy's numbers, measure -> a number, or one per held-out fire;
-            random where left out.
+        learned: the learned policy's numbers: measure -> a number, or a list with one number per
+            held-out fire. Missing measures are random.
     """
     config = {**_values(method, (f"episodes={episodes}", *overrides)), "seed": seed}
     run = folder / (name or f"{method}_{config['setup']}_s{seed}")
@@ -77,10 +77,10 @@ def write_run(
 
 
 def read_evaluation(run: Path) -> dict[str, Any]:
-    """What eval.json holds."""
+    """Returns the contents of eval.json."""
     return json.loads((run / "eval.json").read_text())
 
 
 def write_evaluation(run: Path, content: Any) -> None:
-    """Another eval.json."""
+    """Writes eval.json."""
     (run / "eval.json").write_text(json.dumps(content))

@@ -1,4 +1,4 @@
-"""What the commands refuse: one line, exit status 2, and nothing left behind."""
+"""Tests that invalid input gives a one-line error, exit status 2, and no files."""
 
 import shutil
 import subprocess
@@ -16,7 +16,7 @@ from emberlink.trainers.runs.run_folder import RunFolder
 
 
 def refused(arguments: list[str], capsys, *words: str) -> str:
-    """The one line with which a command ends at status 2; it holds all the words."""
+    """Returns the one-line error of a command that exits with status 2 and checks its words."""
     capsys.readouterr()
     assert main.main(arguments) == 2
     out, err = capsys.readouterr()
@@ -99,7 +99,7 @@ SETUPS = "known: paper, released, tuned"
 def test_bad_input_is_one_line_and_leaves_nothing(arguments, words, tmp_path, capsys):
     output = tmp_path / "runs"
     method, *wrong = arguments
-    # Short, in case it is taken after all.
+    # Short, in case the input is accepted.
     refused(["train", method, *TINY, *wrong, f"output={output}"], capsys, *words)
     assert not output.exists()
 
@@ -118,7 +118,7 @@ def contents(folder: Path) -> dict[str, bytes]:
     return {str(f): f.read_bytes() for f in sorted(folder.rglob("*")) if f.is_file()}
 
 
-def test_a_run_folder_that_is_none(tmp_path, capsys):
+def test_invalid_run_folder(tmp_path, capsys):
     nowhere, empty = tmp_path / "nowhere", tmp_path / "empty"
     empty.mkdir()
     refused(["eval", str(nowhere)], capsys, str(nowhere), "no such run folder")
@@ -137,7 +137,7 @@ def test_a_run_folder_that_is_none(tmp_path, capsys):
         ({"comm": {"name": "positional"}}, ["config.yaml", "comm."]),
     ],
 )
-def test_a_run_whose_configuration_does_not_fit(run, change, words, capsys):
+def test_run_with_a_configuration_that_does_not_fit(run, change, words, capsys):
     file = run / "config.yaml"
     values = yaml.safe_load(file.read_text())
     for key, inner in change.items():
@@ -149,7 +149,7 @@ def test_a_run_whose_configuration_does_not_fit(run, change, words, capsys):
 
 
 @pytest.mark.parametrize("text", ["", "- 1\n- 2\n", "a: [", "\x00\x01"])
-def test_a_configuration_that_is_none(run, text, capsys):
+def test_invalid_configuration_file(run, text, capsys):
     (run / "config.yaml").write_text(text)
     refused(["eval", str(run)], capsys, "config.yaml")
 
@@ -159,7 +159,7 @@ def test_a_run_without_a_checkpoint(run, capsys):
     refused(["eval", str(run)], capsys, str(run), "holds no checkpoint")
 
 
-def test_a_checkpoint_that_is_none(run, capsys):
+def test_invalid_checkpoint_file(run, capsys):
     checkpoint = RunFolder(run).checkpoint()
     whole = checkpoint.read_bytes()
     for content in (b"", b"not a checkpoint", whole[: len(whole) // 2]):
@@ -172,11 +172,11 @@ def test_a_checkpoint_that_is_none(run, capsys):
     refused(["eval", str(run), "--checkpoint", str(other)], capsys, other.name)
 
 
-def test_eval_on_a_device_that_is_not_there(run, capsys):
+def test_eval_on_a_missing_device(run, capsys):
     refused(["eval", str(run), "--device", "cuda:99"], capsys, "cuda:99", "known: cpu")
 
 
-def test_a_real_process_prints_one_line_and_ends_with_2(tmp_path):
+def test_subprocess_prints_one_line_and_exits_with_2(tmp_path):
     done = subprocess.run(
         [sys.executable, "-c", PROGRAM, "train", "consensus", "env.horizn=3"],
         capture_output=True,
@@ -197,7 +197,7 @@ def test_too_little_memory_is_one_line(capsys, monkeypatch):
     refused(["train", "consensus", *TINY], capsys, "not enough memory", "99 bytes")
 
 
-def test_a_line_that_was_not_finished_is_no_line(run):
+def test_an_unfinished_line_is_ignored(run):
     lines = RunFolder(run).lines()
     with (run / "metrics.jsonl").open("a") as out:
         out.write('{"epi')
@@ -207,7 +207,7 @@ def test_a_line_that_was_not_finished_is_no_line(run):
         RunFolder(run).lines()
 
 
-def test_a_batch_that_is_never_reached_is_said(tmp_path, capsys):
+def test_a_batch_that_is_never_filled_gives_a_warning(tmp_path, capsys):
     assert (
         main.main(["train", "consensus", *TINY, "learner.batch_size=500", f"output={tmp_path}"])
         == 0

@@ -1,4 +1,4 @@
-"""What the benchmarks count, and when the guard fails."""
+"""Tests the counts of the benchmarks and the failure condition of the guard."""
 
 from contextlib import nullcontext
 from typing import Any
@@ -15,7 +15,7 @@ from emberlink.trainers.training.setup import TrainingSetup
 
 
 class Flops(TorchDispatchMode):
-    """Adds up what torch's own formulas say of every operation."""
+    """Sums the floating-point operations by torch's formulas."""
 
     total = 0
 
@@ -36,7 +36,7 @@ class Flops(TorchDispatchMode):
     ],
 )
 @pytest.mark.parametrize("shared", [False, True])
-def test_flops_of_an_update_are_what_torch_counts(method, features, hidden, batch, shared):
+def test_flops_of_an_update_equal_torchs_count(method, features, hidden, batch, shared):
     settings = ["env.horizon=200", "episodes=1", "env.num_uavs=4"]
     sizes = [f"learner.hidden={list(hidden)}", f"learner.batch_size={batch}"]
     setup = TrainingSetup(resolve(method, [*settings, *sizes]))
@@ -50,7 +50,7 @@ def test_flops_of_an_update_are_what_torch_counts(method, features, hidden, batc
     assert counter.total == workloads.update_flops(4, features, 3, hidden, batch, shared=shared)
 
 
-def test_works_take_turns():
+def test_workloads_alternate():
     done = []
     seconds = workloads.in_turns(3, lambda: done.append("a"), lambda: done.append("b"))
     assert done == ["a", "b"] * 4
@@ -64,7 +64,7 @@ def test_works_take_turns():
         ([2.0], True, 1),
         ([1.0], True, 1),
         ([2.8], True, 1),  # 0.71 of the speed
-        ([2.9, 2.0], True, 2),  # 0.69, and then not
+        ([2.9, 2.0], True, 2),  # 0.69 at first, then above the limit
         ([2.9, 5.0, 2.9], False, 3),
     ],
 )
@@ -75,7 +75,7 @@ def test_the_guard_fails_at_a_loss_of_30_percent(taken, kept, calls, capsys):
     assert ("has lost more than 30%" in capsys.readouterr().out) is not kept
 
 
-def test_the_guard_has_a_record_of_every_work():
+def test_the_guard_has_a_record_of_every_workload():
     recorded = guard.json.loads(guard.BASELINE.read_text())
     assert recorded.keys() == guard.works().keys()
     assert all(ratio > 0 for ratio in recorded.values())
@@ -92,6 +92,6 @@ def test_time_to_90_percent(tmp_path, capsys):
     )
     figure = tmp_path / "figure.png"
     time_to_result.draw(figure, [f"now={file}"])
-    # The last three make 80; 90 % of that is 72, which the third has.
+    # The mean of the last three is 80. 90 % of it is 72, which the third reaches.
     assert capsys.readouterr().out == "| now | 3 | 80.0 | 30 | 1500 | 50 | 20.0 |\n"
     assert figure.stat().st_size > 5000

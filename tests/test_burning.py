@@ -1,4 +1,4 @@
-"""The counts of burning cells, against counting them."""
+"""Compares `burning_cells` with a direct count."""
 
 import math
 

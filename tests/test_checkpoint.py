@@ -1,4 +1,4 @@
-"""Checkpoint files: written whole or not at all, and nothing damaged is read."""
+"""Tests that checkpoints are written atomically and damaged checkpoints are refused."""
 
 import errno
 import json
@@ -28,7 +28,7 @@ from emberlink.trainers.training.resume import resume
     st.dictionaries(st.text("abc./_", min_size=1), st.integers(0, 4), max_size=4),
     st.dictionaries(st.text(min_size=1), st.floats(allow_nan=False) | st.text()),
 )
-def test_what_is_written_is_read(tmp_path_factory, sizes, header):
+def test_write_and_read_round_trip(tmp_path_factory, sizes, header):
     path = tmp_path_factory.mktemp("checkpoint") / "one.safetensors"
     content = {name: torch.randn(size) for name, size in sizes.items()}
     own = {key: value for key, value in header.items() if key not in ("sha256", "format")}
@@ -40,7 +40,7 @@ def test_what_is_written_is_read(tmp_path_factory, sizes, header):
     assert [one.name for one in path.parent.iterdir()] == [path.name]
 
 
-def test_every_byte_is_sealed(tmp_path):
+def test_a_change_of_any_byte_is_detected(tmp_path):
     path = tmp_path / "one.safetensors"
     checkpoint_file.write(path, {"a": torch.arange(5.0)}, {"kind": "networks", "step": 3})
     sound = path.read_bytes()
@@ -65,7 +65,7 @@ def test_damaged_and_foreign_checkpoints_are_refused(method, tmp_path):
     assert wrong == []
 
 
-def test_a_state_without_a_seal_is_refused_and_the_one_before_it_is_named(tmp_path, capsys):
+def test_a_state_without_a_seal_is_refused_and_the_previous_state_is_named(tmp_path, capsys):
     (path, _), _ = readable(tmp_path, "consensus")
     run = RunFolder(path.parent.parent)
     assert len(run.states()) == 2
@@ -92,13 +92,13 @@ def _stopped(tmp_path_factory) -> Path:
 
 @pytest.fixture
 def stopped(_stopped, tmp_path) -> Path:
-    """The newest state of a copy of a run: after 33 steps of 2 environments, 12 in an episode."""
+    """Returns the newest state of a copied run: step 33 of 2 environments, 12 steps an episode."""
     run = RunFolder(shutil.copytree(_stopped, tmp_path / "run"))
     return run.states()[-1]
 
 
 def refused(path: Path, change: Callable[[dict, dict[str, torch.Tensor]], object]) -> str:
-    """Why a state is refused after a change of its header and tensors, and a new seal."""
+    """Changes header and tensors of a state, seals it again and returns the error on reading."""
     sound = path.read_bytes()
     sealed_again(path, change)
     with pytest.raises(ValueError, match=r"^.*/state_\d+\.safetensors: ") as error:
@@ -111,7 +111,7 @@ def refused(path: Path, change: Callable[[dict, dict[str, torch.Tensor]], object
 
 
 @pytest.mark.slow
-def test_nan_is_refused_wherever_it_is(stopped):
+def test_nan_in_any_tensor_is_refused(stopped):
     _, content = checkpoint_file.read(stopped)
     floating = [name for name, value in content.items() if value.is_floating_point()]
     assert {name.partition("/")[0] for name in floating} == {
@@ -131,7 +131,7 @@ def test_nan_is_refused_wherever_it_is(stopped):
 
 
 @pytest.mark.parametrize("group", ["learner/networks", "learner/replay", "environments", "episode"])
-def test_a_state_with_a_tensor_more_or_less_is_refused(group, stopped):
+def test_a_state_with_an_extra_or_missing_tensor_is_refused(group, stopped):
     _, content = checkpoint_file.read(stopped)
     name = next(name for name in content if name.startswith(group))
     reason = refused(stopped, lambda _, content: content.pop(name))
@@ -167,8 +167,8 @@ def test_a_state_of_another_configuration_is_refused(key, stopped):
     assert refused(stopped, change).startswith(f"made with {key}=")
 
 
-def test_only_an_earlier_state_is_the_one_before(stopped):
-    """Not one of the same step under another name, nor a later one."""
+def test_the_previous_state_is_an_earlier_one(stopped):
+    """States of the same step under another name and later states are not named."""
     run = RunFolder(stopped.parent.parent)
     first, last = run.states()
     copy = Path(shutil.copy(last, last.with_name("state_x.safetensors")))
@@ -196,7 +196,7 @@ def test_networks_alone_cannot_be_resumed(run, capsys):
 
 
 @pytest.mark.parametrize("part", ["save_file", "fsync", "replace"])
-def test_a_save_that_fails_leaves_what_was_there(part, tmp_path, monkeypatch):
+def test_a_failed_save_keeps_the_existing_file(part, tmp_path, monkeypatch):
     path = tmp_path / "one.safetensors"
     checkpoint_file.write(path, {"a": torch.ones(3)}, {})
     before = path.read_bytes()
@@ -214,8 +214,8 @@ def test_a_save_that_fails_leaves_what_was_there(part, tmp_path, monkeypatch):
     assert [one.name for one in tmp_path.iterdir()] == [path.name]
 
 
-def test_what_is_written_is_flushed_before_it_gets_its_name(tmp_path, monkeypatch):
-    """The file, then the rename, then the folder's names."""
+def test_a_file_is_flushed_before_it_is_renamed(tmp_path, monkeypatch):
+    """The order is: flush of the file, rename, flush of the folder."""
     done, fsync, replace = [], os.fsync, Path.replace
 
     def flushing(handle: int) -> None:
@@ -233,7 +233,7 @@ def test_what_is_written_is_flushed_before_it_gets_its_name(tmp_path, monkeypatc
     assert done == [f"{path}.{os.getpid()}.part", "rename", str(path.parent)]
 
 
-def test_a_line_is_written_whole_or_not_at_all(tmp_path, monkeypatch):
+def test_a_line_is_written_completely_or_not_at_all(tmp_path, monkeypatch):
     run, write = RunFolder(tmp_path), os.write
     run.append("metrics.jsonl", {"episode": 1})
     calls = iter([4, None])

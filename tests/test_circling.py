@@ -1,4 +1,4 @@
-"""The bonus for flying around known fire, by hand."""
+"""Tests the bonus for circling known fire against hand-computed numbers."""
 
 import pytest
 import torch
@@ -12,9 +12,9 @@ from emberlink.envs import keys
 @pytest.mark.parametrize(
     ("target", "move", "bonus"),
     [
-        # Northwards with the target to the west, which is left: all of the move counts at 1 cell,
+        # Flying north, a target at 1 cell to the west (left): the whole move counts,
         ([-1.0, 0.0], [0.0, 0.1], 0.1),
-        ([1.0, 0.0], [0.0, 0.1], -0.1),  # and counts against the UAV where it is to the right.
+        ([1.0, 0.0], [0.0, 0.1], -0.1),  # to the right: it counts negatively
         ([-2.0, 0.0], [0.0, 0.1], 0.08),  # 2 d / (1 + d²) = 4/5
         ([-0.5, 0.0], [0.0, 0.1], 0.08),  # 1 / 1.25
         ([0.0, 0.0], [0.0, 0.1], 0.0),
@@ -30,10 +30,10 @@ def test_circling_by_hand(target, move, bonus):
     assert circling(here, there, way).item() == pytest.approx(bonus, abs=1e-6)
 
 
-def test_only_a_discoverer_over_old_fire_alone_circles():
+def test_circling_is_for_discoverers_with_old_fire_only():
     heading = HeadingConfig(form="approach", weight=2.0, circle=5.0)
     config = ConsensusConfig(discoverer="any_fire", heading=heading, range=5.0)
-    # UAV 0 sees old fire alone, UAV 1 both, UAV 2 hears UAV 1, UAV 3 nobody.
+    # UAV 0 sees old fire only, UAV 1 old and new fire, UAV 2 hears UAV 1, UAV 3 hears no UAV.
     places = [[10.0, 10.0, 2.0], [30.0, 10.0, 2.0], [33.0, 10.0, 2.0], [50.0, 50.0, 2.0]]
     before = moment(
         places,

@@ -1,4 +1,4 @@
-"""The commands from the outside: what they print and leave."""
+"""Tests the output and the files of the commands."""
 
 import json
 import os
@@ -20,7 +20,7 @@ from emberlink.trainers.runs.run_folder import RunFolder
 
 
 @pytest.mark.parametrize("arguments", [["trane"], ["train"], ["eval"], ["eval", "x", "--fires=0"]])
-def test_usage_errors_end_with_what_is_wrong(arguments, capsys):
+def test_usage_errors_name_the_cause(arguments, capsys):
     with pytest.raises(SystemExit) as ended:
         main.main(arguments)
     assert ended.value.code == 2
@@ -32,20 +32,20 @@ def test_usage_errors_end_with_what_is_wrong(arguments, capsys):
 
 
 @pytest.mark.parametrize("command", ["train", "eval", "doctor"])
-def test_help_says_what_a_command_does_with_an_example(command, capsys):
+def test_help_has_a_description_and_an_example(command, capsys):
     with pytest.raises(SystemExit) as ended:
         main.main([command, "--help"])
     assert ended.value.code == 0
     text = capsys.readouterr().out
     assert f"example:\n  emberlink {command}" in text
-    assert len(text.split("\n\n")[1]) > 60  # the paragraph that says what it does
+    assert len(text.split("\n\n")[1]) > 60  # the paragraph of the description
     with pytest.raises(SystemExit):
         main.main(["--help"])
     assert f"\n    {command}" in capsys.readouterr().out
 
 
 @pytest.mark.drawn
-def test_train_leaves_the_files_and_prints_the_table(tmp_path, capsys):
+def test_train_writes_its_files_and_prints_the_table(tmp_path, capsys):
     output = tmp_path / "some where" / "deep"
     assert main.main(["train", "independent", *TINY, f"output={output}"]) == 0
     out, _ = capsys.readouterr()
@@ -60,7 +60,7 @@ def test_train_leaves_the_files_and_prints_the_table(tmp_path, capsys):
 
 
 def check_evaluation(folder: Path, out: str, *, episodes: int = 2) -> None:
-    """The table and the path are printed, and the evaluation's files are there."""
+    """Checks that table and path are printed and the files of the evaluation exist."""
     assert out.rstrip().splitlines()[-1] == str(folder)
     words = set(out.split())
     assert {word for name in metrics.NAMES for word in name.split("_")} <= words
@@ -87,7 +87,7 @@ def test_eval_repeats_the_evaluation_of_train(run, capsys):
     check_evaluation(run, capsys.readouterr().out, episodes=1)
 
 
-def test_eval_plays_the_checkpoint_it_is_given(run, capsys):
+def test_eval_uses_the_given_checkpoint(run, capsys):
     newest = (run / "eval.json").read_bytes()
     trained = json.loads(newest)["results"]["huygens"]
     header, weights = checkpoint_file.read(RunFolder(run).checkpoint())
@@ -102,7 +102,7 @@ def test_eval_plays_the_checkpoint_it_is_given(run, capsys):
     again = again["results"]["huygens"]
     assert again["random_waypoints"] == trained["random_waypoints"]
     assert min(again["learned"]["boundary_exits"]) > max(trained["learned"]["boundary_exits"])
-    # The evaluation of the newest is still there.
+    # The evaluation of the newest checkpoint still exists.
     assert (run / "eval.json").read_bytes() == newest
     for figure in ("coverage_other.png", "timelapse_huygens_other.png"):
         assert (run / "figures" / figure).exists()
@@ -116,7 +116,7 @@ def wait_for(condition, process, seconds: float = 120) -> None:
         time.sleep(0.05)
 
 
-def test_ctrl_c_leaves_a_run_that_can_be_evaluated(tmp_path, capsys):
+def test_an_interrupted_run_can_be_evaluated(tmp_path, capsys):
     endless = [*TINY, "episodes=100000", f"output={tmp_path}"]
     process = subprocess.Popen(
         [sys.executable, "-c", PROGRAM, "train", "consensus", *endless],

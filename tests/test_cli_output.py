@@ -1,4 +1,4 @@
-"""Outputs that cannot take what is printed, signals, and mistakes of the program itself."""
+"""Tests closed and full outputs, encodings, signals and internal errors."""
 
 import os
 import signal
@@ -23,13 +23,13 @@ def started(arguments: list[str], stdout: object) -> subprocess.Popen:
         stderr=subprocess.PIPE,
         text=True,
         env={**os.environ, "OMP_NUM_THREADS": "1"},
-        # A program that nohup has started, such as these tests, has SIGHUP ignored.
+        # Under nohup SIGHUP is ignored, and subprocesses inherit that.
         preexec_fn=lambda: signal.signal(signal.SIGHUP, signal.SIG_DFL),
     )
 
 
 def check_saved(output: Path) -> None:
-    """The training can be resumed: it was saved, and nothing holds the folder."""
+    """Checks that a training was saved and its folder is unlocked, so that it can be resumed."""
     (folder,) = output.iterdir()
     run = RunFolder(folder)
     assert run.states()
@@ -38,12 +38,12 @@ def check_saved(output: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_reader_that_ends_ends_the_training_with_a_checkpoint(tmp_path):
+def test_a_closed_pipe_ends_the_training_with_a_checkpoint(tmp_path):
     process = started(["train", "independent", *ENDLESS, f"output={tmp_path}"], subprocess.PIPE)
     try:
         assert process.stdout is not None
         process.stdout.readline()
-        process.stdout.close()  # as `| head -1` does
+        process.stdout.close()  # like `| head -1`
         _, error = process.communicate(timeout=400)
     finally:
         process.kill()
@@ -54,7 +54,7 @@ def test_a_reader_that_ends_ends_the_training_with_a_checkpoint(tmp_path):
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs Linux's /dev/full")
-def test_a_full_output_is_named_and_frees_the_folder(tmp_path):
+def test_a_full_output_is_an_error_and_unlocks_the_folder(tmp_path):
     with open("/dev/full", "w") as full:
         process = started(["train", "independent", *TINY, f"output={tmp_path}"], full)
         _, error = process.communicate(timeout=400)
@@ -81,7 +81,7 @@ def test_a_lost_terminal_ends_the_training_with_a_checkpoint(tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("encoding", ["ascii", "cp1252"])
-def test_no_encoding_makes_a_command_fail(encoding, run, tmp_path):
+def test_commands_succeed_with_every_encoding(encoding, run, tmp_path):
     commands = (
         ["compare", str(run), "--output", str(tmp_path / "report")],
         ["list"],
@@ -103,7 +103,7 @@ def test_no_encoding_makes_a_command_fail(encoding, run, tmp_path):
     assert (tmp_path / "report" / "compare.html").exists()
 
 
-def test_a_mistake_of_the_program_keeps_its_traceback(monkeypatch):
+def test_an_internal_error_keeps_its_traceback(monkeypatch):
     def fail(*_):
         raise ValueError("zip() argument 2 is longer than argument 1")
 
@@ -112,7 +112,7 @@ def test_a_mistake_of_the_program_keeps_its_traceback(monkeypatch):
         main.main(["train", "independent"])
 
 
-def test_without_a_command_there_is_help(capsys):
+def test_help_is_printed_without_a_command(capsys):
     assert main.main([]) == 0
     assert capsys.readouterr().out.startswith("usage: emberlink")
 
@@ -134,7 +134,7 @@ def test_the_version(capsys):
         (["eval", "RUN", "--chekpoint", "x"], ["--chekpoint", "did you mean --checkpoint?"]),
     ],
 )
-def test_usage_errors_say_what_was_meant(arguments, words, capsys):
+def test_usage_errors_suggest_a_correction(arguments, words, capsys):
     with pytest.raises(SystemExit) as ended:
         main.main(arguments)
     assert ended.value.code == 2
@@ -144,7 +144,7 @@ def test_usage_errors_say_what_was_meant(arguments, words, capsys):
         assert word in error
 
 
-def test_one_run_is_evaluated_at_a_time(run, capsys):
+def test_eval_takes_a_single_run(run, capsys):
     assert main.main(["eval", str(run), str(run)]) == 2
     assert "one run is evaluated at a time; compare takes several" in capsys.readouterr().err
 
@@ -157,7 +157,7 @@ def test_one_run_is_evaluated_at_a_time(run, capsys):
         ("policies", ["stationary", "oracle"]),
     ],
 )
-def test_names_are_listed_one_a_line(kind, names, capsys):
+def test_names_are_listed_on_separate_lines(kind, names, capsys):
     assert main.main(["list", kind]) == 0
     assert set(names) <= set(capsys.readouterr().out.splitlines())
 
@@ -169,7 +169,7 @@ def test_an_unknown_kind_is_one_line(capsys):
     )
 
 
-def test_windows_is_told_in_one_line(monkeypatch, capsys):
+def test_windows_gives_a_one_line_error(monkeypatch, capsys):
     monkeypatch.setattr(sys, "platform", "win32")
     assert main.main(["doctor"]) == 2
     assert capsys.readouterr().err == "emberlink: runs on Linux and macOS; on Windows, use WSL\n"

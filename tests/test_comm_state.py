@@ -1,4 +1,4 @@
-"""The state of communication modules: frame skips, resets, checkpoints, further transforms."""
+"""Tests the state of communication modules: frame skips, resets, checkpoints, transforms."""
 
 import pytest
 import torch
@@ -54,7 +54,7 @@ class Heard(VisitedMap):
         return tensordict[keys.HEARS].sum(-1).float()
 
 
-def test_the_links_of_a_step_are_there_before_the_reward_is_shaped():
+def test_links_are_computed_before_the_reward_is_shaped():
     env = TransformedEnv(bare(), Communication(Heard(WORLD, VisitedMapConfig(range=6.0), ENVS)))
     plain = bare()
     moments = [one.reset() for one in (env, plain)]
@@ -78,7 +78,7 @@ def communicating(name: str) -> TransformedEnv:
 
 
 def state(env) -> dict[str, torch.Tensor]:
-    """The state of the communication of an environment, however deep it stands."""
+    """Returns the communication state of an environment, at any depth of transforms."""
     every = [part for part in env.transform.modules() if isinstance(part, CommModule)]
     (module,) = every or [
         part for part in env.base_env.transform.modules() if isinstance(part, CommModule)
@@ -87,7 +87,7 @@ def state(env) -> dict[str, torch.Tensor]:
 
 
 def fly(env, steps: range, td=None):
-    """The last time step and the rewards; only the action is handed to the environment."""
+    """Returns the last time step and the rewards; the environment receives the action only."""
     td, rewards = env.reset() if td is None else td, []
     for step in steps:
         stepped = env.step(TensorDict({keys.ACTION: action(step)}, [ENVS]))
@@ -98,7 +98,7 @@ def fly(env, steps: range, td=None):
 
 @pytest.mark.parametrize("name", MODULES)
 @pytest.mark.parametrize("nested", [False, True])
-def test_a_frame_skip_is_as_many_steps(name, nested):
+def test_a_frame_skip_equals_single_steps(name, nested):
     skip = 4
     if nested:
         skipping = TransformedEnv(communicating(name), FrameSkipTransform(skip), auto_unwrap=False)
@@ -153,7 +153,7 @@ def test_a_restored_state_continues_bit_for_bit(name):
     world = {key: value.clone() for key, value in first.base_env.state_dict().items()}
     saved = {key: value.clone() for key, value in first.transform.state_dict().items()}
     assert len(saved) == len(state(first))
-    fly(second, range(20, 23))  # somewhere else
+    fly(second, range(20, 23))  # changes the state
     for place, content in ((second.base_env, world), (second.transform, saved)):
         place.load_state_dict(content)
     one, rewards = fly(first, range(6, 11), first)
@@ -164,7 +164,7 @@ def test_a_restored_state_continues_bit_for_bit(name):
 
 
 @pytest.mark.parametrize("name", MODULES)
-def test_further_transforms_may_drop_what_communication_wrote(name):
+def test_further_transforms_may_drop_keys_of_the_communication(name):
     transforms = Compose(
         Communication(MODULES[name]()),
         RewardSum(in_keys=[keys.REWARD], out_keys=["sum"]),
@@ -186,7 +186,7 @@ def test_further_transforms_may_drop_what_communication_wrote(name):
 
 
 @pytest.mark.parametrize("name", MODULES)
-def test_a_missing_input_is_named(name):
+def test_a_missing_input_gives_a_named_error(name):
     dropping = Compose(ExcludeTransform(keys.POSITION), Communication(MODULES[name]()))
     env = TransformedEnv(bare(), dropping)
     with pytest.raises(ValueError, match=r"key \('agents', 'position'\) is missing: .* reads it"):
@@ -210,7 +210,7 @@ def test_state_has_a_row_per_environment_and_is_written_in_place():
 
 
 @pytest.mark.parametrize(("limit", "loss"), [(6.0, 0.0), (6.0, 0.4), (float("inf"), 1.0)])
-def test_who_hears_whom_is_written_once_for_all(limit, loss):
+def test_links_are_written_once(limit, loss):
     module = VisitedMap(WORLD, VisitedMapConfig(range=limit, loss=loss), ENVS)
     env = TransformedEnv(bare(), Communication(module))
     rollout = env.rollout(10)["next"]
@@ -225,7 +225,7 @@ def test_who_hears_whom_is_written_once_for_all(limit, loss):
         assert 0.3 < 1 - hears.sum() / near.sum() < 0.5
 
 
-def test_everyone_hears_everyone_in_positional():
+def test_positional_links_all_uavs():
     env = TransformedEnv(bare(), Communication(Positional(WORLD, PositionalConfig(), ENVS)))
     hears = env.reset()[keys.HEARS]
     assert hears.equal((~torch.eye(UAVS, dtype=torch.bool)).expand(ENVS, -1, -1))

@@ -1,4 +1,4 @@
-"""What the communication modules write, on an environment and off it, and how they are found."""
+"""Tests the outputs and the discovery of the communication modules."""
 
 from pathlib import Path
 
@@ -19,7 +19,7 @@ UAVS, ENVS, HORIZON = 5, 3, 8
 
 
 def ablaze() -> torch.Tensor:
-    """Cells that catch fire one after another: nearly everyone finds new fire all the time."""
+    """Returns cells that ignite one after another, so that most UAVs find new fire each step."""
     return 16 * torch.rand(12, 10, generator=torch.Generator().manual_seed(0))
 
 
@@ -28,8 +28,8 @@ def recipe(method: str, **more):
     return make_env(method, fire=ablaze(), seed=4, **more)
 
 
-def own_numbers(moment) -> torch.Tensor:
-    """A UAV's 6 numbers from everything else that the environment wrote."""
+def features_of_uav(moment) -> torch.Tensor:
+    """Computes a UAV's 6 numbers from the other entries of the environment."""
     new, old = moment[keys.NEW_FIRE] > 0, moment[keys.OLD_FIRE] > 0
     step = moment[keys.STEP].unsqueeze(-1).expand_as(new)
     flags = torch.stack((new, old, step), -1).float()
@@ -37,7 +37,7 @@ def own_numbers(moment) -> torch.Tensor:
 
 
 def expected(method: str, moment) -> torch.Tensor:
-    own = own_numbers(moment)
+    own = features_of_uav(moment)
     if method == "consensus":
         return torch.cat((own, moment[keys.TARGET]), -1)
     if method == "positional":
@@ -47,7 +47,7 @@ def expected(method: str, moment) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_first_and_next_observations_are_rewritten_alike(method):
+def test_root_and_next_observations_are_rewritten_alike(method):
     env = recipe(method)
     rollout = env.rollout(2 * HORIZON, break_when_any_done=False)
     assert rollout[keys.OBSERVATION].shape == (ENVS, 2 * HORIZON, UAVS, OBSERVED[method])
@@ -55,7 +55,7 @@ def test_first_and_next_observations_are_rewritten_alike(method):
     following = rollout["next"]
     assert following[keys.OBSERVATION].equal(expected(method, following))
     assert env.observation_spec[keys.OBSERVATION].shape == (ENVS, UAVS, OBSERVED[method])
-    # The step that begins where another ended sees the very same; a new episode does not.
+    # Root equals the previous next, except at the start of an episode.
     same = rollout[:, 1:][keys.OBSERVATION] == following[:, :-1][keys.OBSERVATION]
     ended = torch.arange(1, 2 * HORIZON) == HORIZON
     assert same[:, ~ended].all()
@@ -63,7 +63,7 @@ def test_first_and_next_observations_are_rewritten_alike(method):
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_communication_leaves_the_world_as_it_is(method):
+def test_communication_does_not_change_the_world(method):
     env = recipe(method)
     plain = WildfireEnv(ENVS, env.base_env.config, ablaze(), seed=4)
     one, other = env.reset(), plain.reset()
@@ -80,7 +80,7 @@ def test_communication_leaves_the_world_as_it_is(method):
         one, other = step_mdp(one, keep_other=True), step_mdp(other, keep_other=True)
 
 
-def test_known_modules_are_the_files_on_disk():
+def test_registered_modules_are_the_files_on_disk():
     files = {file.stem for file in (ROOT / "comm").glob("[!_]*.py")} - {"base", "registry"}
     assert registry.known() == sorted(files) == ["consensus", "no_comm", "positional"]
     for name in registry.known():
@@ -97,7 +97,7 @@ def test_every_recipe_names_a_module():
 
 
 @pytest.mark.parametrize("name", ["consensu", "", "base", "../no_comm"])
-def test_an_unknown_module_is_an_error_that_lists_the_known(name):
+def test_an_unknown_module_gives_an_error_with_the_known_names(name):
     with pytest.raises(ValueError, match=r"known: consensus, no_comm, positional$") as error:
         registry.find(name)
     assert repr(name) in str(error.value)

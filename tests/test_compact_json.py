@@ -1,4 +1,4 @@
-"""JSON with one line for each list of numbers."""
+"""Tests JSON with one line for each list of numbers."""
 
 import json
 
@@ -16,11 +16,11 @@ values = st.recursive(
 
 @settings(deadline=None)
 @given(values)
-def test_it_is_the_same_json(value):
+def test_compact_json_parses_to_the_same_value(value):
     assert json.loads(dumps(value)) == value
 
 
-def test_a_measure_is_one_line():
+def test_a_measure_takes_one_line():
     text = dumps(
         {"results": {"huygens": {"learned": {"coverage": [1.5] * 100, "exits": [2] * 100}}}}
     )
@@ -28,7 +28,7 @@ def test_a_measure_is_one_line():
     assert dumps({"a": [1, {"b": 2}]}) == '{"a": [1, {"b": 2}]}'
 
 
-def test_shipped_evaluations_are_few_lines_and_as_they_would_be_written():
+def test_shipped_evaluations_are_compact():
     for folder in find("pretrained:tuned"):
         text = (folder / "eval.json").read_text()
         assert text == dumps(json.loads(text)) + "\n"

@@ -1,4 +1,4 @@
-"""`emberlink compare`: which runs are counted, and how; its numbers; its page."""
+"""Tests `emberlink compare`: its grouping of runs, its numbers and its page."""
 
 import html.parser
 import json
@@ -29,14 +29,14 @@ METHODS = ("consensus", "independent", "positional", "shared_memory")
 
 
 def gathered(*paths):
-    """Sections and notes of run folders."""
+    """Returns the sections and notes of run folders."""
     runs = [read(path) for path in find(paths)]
     assert all(isinstance(run, Run) for run in runs), runs
     return gather(runs)
 
 
 def only(*paths):
-    """The numbers of the one section."""
+    """Returns the numbers of the only section."""
     (section,), _ = gathered(*paths)
     return numbers(section)
 
@@ -47,7 +47,7 @@ def ranking(one, measure, fire="huygens"):
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory):
-    """Two methods with three and two seeds."""
+    """Writes runs of two methods with three and two seeds."""
     folder = tmp_path_factory.mktemp("runs")
     for seed, coverage in enumerate((50, 70, 60)):
         write_run(folder, "consensus", seed, learned={"coverage": [coverage - 5, coverage + 5] * 2})
@@ -61,7 +61,7 @@ def test_numbers_by_hand(runs):
     first, second = ranking(one, "coverage").rows
     assert (first.method, first.seeds, first.values) == ("consensus", [0, 1, 2], [50, 70, 60])
     assert (first.iqm, first.interval) == (60, (50, 70))
-    # 50 beats 40; 70 beats both; 60 beats 40: 4 of 6 pairs.
+    # 50 is above 40, 70 above both, 60 above 40: 4 of 6 pairs.
     assert (first.next, first.probability_of_improvement) == ("independent", pytest.approx(4 / 6))
     assert (second.iqm, second.interval, second.next) == (52.5, (40, 65), None)
     assert (second.probability_of_improvement, second.probability_interval) == (None, None)
@@ -71,7 +71,7 @@ def test_numbers_by_hand(runs):
     assert (claim.best_other, claim.verdict, claim.fewest_seeds) == ("independent", "undecided", 2)
 
 
-def test_less_is_better_where_it_is(tmp_path):
+def test_measures_where_lower_is_better(tmp_path):
     for seed in range(3):
         write_run(tmp_path, "consensus", seed, learned={"tracking_first": 10 + seed})
         write_run(tmp_path, "positional", seed, learned={"tracking_first": 30 + seed})
@@ -92,7 +92,7 @@ def test_every_measure_has_a_direction():
 
 
 def test_verdicts(tmp_path):
-    """Ratios 2, 1 and about 1.3, with seeds that hardly differ or differ much."""
+    """The ratios are 2, 1 and about 1.3, with little or much spread between seeds."""
     cases = {"holds": (60, 30, 0), "does not hold": (30, 30, 0), "undecided": (39, 30, 10)}
     for verdict, (own, other, spread) in cases.items():
         for seed in range(5):
@@ -103,7 +103,7 @@ def test_verdicts(tmp_path):
         assert [v.verdict for v in got] == [verdict]
 
 
-def test_the_best_of_the_other_methods_is_the_one_compared_with(tmp_path):
+def test_a_method_is_compared_with_the_best_other(tmp_path):
     for method, exits in (("consensus", 2), ("independent", 9), ("positional", 5)):
         for seed in range(2):
             write_run(tmp_path, method, seed, learned={"boundary_exits": exits})
@@ -112,7 +112,7 @@ def test_the_best_of_the_other_methods_is_the_one_compared_with(tmp_path):
     assert claim.interval == pytest.approx((2.5, 2.5))
 
 
-def test_a_ratio_to_nothing_is_infinite(tmp_path, capsys):
+def test_a_ratio_to_zero_is_infinite(tmp_path, capsys):
     for method, exits in (("consensus", 0), ("independent", 9)):
         for seed in range(2):
             write_run(tmp_path, method, seed, learned={"boundary_exits": exits})
@@ -123,7 +123,7 @@ def test_a_ratio_to_nothing_is_infinite(tmp_path, capsys):
     assert claims["boundary_exits"]["interval"] == ["inf", "inf"]
 
 
-def test_with_one_seed_there_is_no_interval(tmp_path, capsys):
+def test_one_seed_has_no_interval(tmp_path, capsys):
     for method in ("consensus", "independent"):
         write_run(tmp_path, method, 0)
     one = only(tmp_path)
@@ -145,7 +145,7 @@ def test_two_seeds_are_flagged(runs, tmp_path, capsys):
     assert "too few for an interval" in (tmp_path / "out/compare.html").read_text()
 
 
-def test_a_group_of_one_seed_hides_no_other_of_few(tmp_path, capsys):
+def test_groups_of_one_and_of_few_seeds_are_both_flagged(tmp_path, capsys):
     for seed, method in enumerate(["consensus", "independent", "independent"]):
         write_run(tmp_path, method, seed)
     assert main.main(["compare", str(tmp_path), "--output", str(tmp_path / "out")]) == 0
@@ -158,8 +158,8 @@ def test_a_group_of_one_seed_hides_no_other_of_few(tmp_path, capsys):
     assert page.count('<td class="n">1*</td>') == 8
 
 
-def test_where_scripted_policies_are_drawn(tmp_path, monkeypatch):
-    """A line in the rows whose number it is, and in no other, whatever the rows' names."""
+def test_scripted_policies_are_drawn_in_their_rows(tmp_path, monkeypatch):
+    """A line is drawn only in the rows that have its value, independent of the rows' names."""
     assert list(plots._stretches([0, 1, 3, 5, 6])) == [(0, 1), (3, 3), (5, 6)]
     drawn = []
     plot = Axes.plot
@@ -196,7 +196,7 @@ def test_where_scripted_policies_are_drawn(tmp_path, monkeypatch):
     assert sorted(lines)[:3] == [(20.0, 0.5, 1.5), (40.0, -0.5, 0.5), (40.0, 1.5, 2.5)]
 
 
-def test_an_output_that_cannot_be(runs, tmp_path, capsys):
+def test_invalid_output_folder(runs, tmp_path, capsys):
     (tmp_path / "file").write_text("mine")
     (tmp_path / "link").symlink_to("nowhere")
     for output in ("file", "file/sub", "link", "x" * 300):
@@ -209,7 +209,7 @@ def test_an_output_that_cannot_be(runs, tmp_path, capsys):
 
 
 def summary(one):
-    """Everything that statistics say of a section, as plain numbers."""
+    """Returns all statistics of a section as plain numbers."""
     rows = [row for rank in one.fires["huygens"] for row in rank.rows]
     return [
         *((r.method, r.iqm, r.interval) for r in rows),
@@ -229,7 +229,7 @@ def plain(value):
 
 
 def test_episodes_are_not_independent_runs(runs, tmp_path):
-    """Each episode ten times over changes no interval: the number of episodes is in none."""
+    """Repeating each episode ten times does not change the intervals."""
     copy = shutil.copytree(runs, tmp_path / "copy")
     for run in find([copy]):
         content = read_evaluation(run)
@@ -239,12 +239,12 @@ def test_episodes_are_not_independent_runs(runs, tmp_path):
                 measured |= {name: values * 10 for name, values in measured.items()}
         write_evaluation(run, content)
     assert plain(summary(only(copy))) == approximately(summary(only(runs)))
-    # A tenth seed more does: so the comparison above can fail.
+    # An additional seed does change them, so the comparison above can fail.
     write_run(copy, "consensus", 9, fires=40)
     assert plain(summary(only(copy))) != approximately(summary(only(runs)))
 
 
-def test_spread_within_a_run_is_in_no_interval(tmp_path):
+def test_intervals_ignore_the_spread_within_a_run(tmp_path):
     for seed, mean in enumerate((20, 30, 40)):
         write_run(tmp_path / "calm", "consensus", seed, learned={"coverage": mean})
         wild = [mean - 20, mean + 20, mean - 15, mean + 15]
@@ -254,7 +254,7 @@ def test_spread_within_a_run_is_in_no_interval(tmp_path):
 
 
 @pytest.mark.drawn
-def test_the_order_of_runs_does_not_matter(runs, tmp_path):
+def test_results_do_not_depend_on_the_order_of_runs(runs, tmp_path):
     folders = find([runs])
     whole = []
     for place, order in enumerate([folders, folders[::-1], [*folders[2:], *folders[:2]]]):
@@ -294,7 +294,7 @@ def test_any_number_of_methods_and_seeds(tmp_path_factory, counts, start):
     assert len(one.verdicts) == (4 if len(counts) > 1 else 0)
 
 
-def test_setups_fires_and_configurations_are_kept_apart(tmp_path):
+def test_setups_fires_and_configurations_have_separate_sections(tmp_path):
     write_run(tmp_path, "consensus", 0)
     write_run(tmp_path, "consensus", 1, overrides=("learner.batch_size=64",))
     write_run(tmp_path, "consensus", 2, overrides=("learner.batch_size=64", "device=cpu"))
@@ -320,8 +320,8 @@ def fewer_fires(content):
         measured |= {name: values[:2] for name, values in measured.items()}
 
 
-def test_runs_that_were_evaluated_otherwise_are_in_sections_of_their_own(tmp_path, capsys):
-    """Such as those of a smoke test, in the same folder."""
+def test_runs_with_other_evaluations_have_separate_sections(tmp_path, capsys):
+    """An example is a smoke test in the same folder."""
     for seed in range(2):
         write_run(tmp_path, "consensus", seed)
     write_run(tmp_path, "consensus", 0, name="short", overrides=("env.horizon=50",))
@@ -349,8 +349,8 @@ def test_numbers_without_printing(runs, tmp_path, capsys, monkeypatch):
         compare([tmp_path / "missing"])
 
 
-def test_rewards_that_differ_are_not_ranked(tmp_path, capsys):
-    """By their settings, or by what a scripted policy earns with them."""
+def test_different_rewards_are_not_ranked(tmp_path, capsys):
+    """Rewards differ by their settings or by the reward of a scripted policy."""
     for seed in range(2):
         write_run(tmp_path / "settings", "consensus", seed)
         write_run(tmp_path / "settings", "independent", seed)
@@ -373,7 +373,7 @@ def test_rewards_that_differ_are_not_ranked(tmp_path, capsys):
         assert because in " ".join(page(out).text.split())
         said = " ".join(capsys.readouterr().out.split())
         assert "mean_reward is not ranked: the methods' rewards differ" in said
-    # Runs of one method have one reward.
+    # Runs of one method share a reward.
     assert (
         ranking(only(tmp_path / "earned" / "positional_tuned_s0"), "mean_reward").not_ranked == ""
     )
@@ -386,7 +386,7 @@ def test_an_evaluation_without_the_fire_trained_on(tmp_path):
     assert (tmp_path / "out" / "1_tuned_frozen_1_elsewhere.png").stat().st_size > 10_000
 
 
-def test_groups_are_named_as_one_types_their_settings(tmp_path):
+def test_groups_are_named_by_their_settings(tmp_path):
     for seed, setting in enumerate(("comm.agree=false", "comm.range=inf", "comm.follow=nearest")):
         write_run(tmp_path, "consensus", seed, overrides=(setting,))
     write_run(tmp_path, "consensus", 9)
@@ -399,8 +399,8 @@ def test_groups_are_named_as_one_types_their_settings(tmp_path):
     ]
 
 
-def in_another_world(run, name, coverage, **about):
-    """An evaluation of a run with messages lost, beside its own."""
+def write_extra_evaluation(run, name, coverage, **about):
+    """Writes an additional evaluation of a run, with lost messages."""
     content = read_evaluation(run)
     config = RunFolder(run).config()
     comm = {"learned": {**config.comm, "loss": 0.5}}
@@ -410,17 +410,17 @@ def in_another_world(run, name, coverage, **about):
 
 
 @pytest.mark.drawn
-def test_evaluations_in_other_worlds_are_no_trainings(tmp_path, capsys):
-    """They have rows in the tables, and no claims, curves and colours."""
+def test_extra_evaluations_are_not_counted_as_runs(tmp_path, capsys):
+    """They have rows in the tables, but no rankings, curves or colours."""
     for seed in (0, 1):
         run = write_run(tmp_path, "consensus", seed, learned={"coverage": 80 + seed})
         write_run(tmp_path, "independent", seed, learned={"coverage": 30 + seed})
-        in_another_world(run, "eval_comm.loss=0.5.json", 60 + seed)
+        write_extra_evaluation(run, "eval_comm.loss=0.5.json", 60 + seed)
     for name, about in {
         "eval_step_7.json": {"checkpoint": "step_7.safetensors"},
         "eval_fires.json": {"fires": 4, "start_seed": 2},
     }.items():
-        in_another_world(run, name, 10, **about)
+        write_extra_evaluation(run, name, 10, **about)
     shutil.copy(run / "eval.json", run / "eval_the_same.json")
     assert main.main(["compare", str(tmp_path), "--output", str(tmp_path / "out")]) == 0
     said = " ".join(capsys.readouterr().out.split())
@@ -433,7 +433,7 @@ def test_evaluations_in_other_worlds_are_no_trainings(tmp_path, capsys):
         ("consensus, evaluated with comm.loss=0.5", 60.5),
         ("independent", 30.5),
     ]
-    # The same trainings twice are no two samples.
+    # Two evaluations of the same runs are not independent samples.
     assert [r["probability_of_improvement"] for r in coverage["rows"]] == [None, 1.0, None]
     assert [r["evaluated_with"] for r in one["runs"]] == [{}] * 2 + [{"comm.loss": 0.5}] * 2 + [
         {}
@@ -443,8 +443,8 @@ def test_evaluations_in_other_worlds_are_no_trainings(tmp_path, capsys):
     assert (tmp_path / "out" / "1_tuned_frozen_1_huygens.png").stat().st_size > 10_000
 
 
-def test_who_hears_something_else_may_fly_otherwise(tmp_path):
-    """Scripted follow_target follows the messages: no note, and a number for each group."""
+def test_scripted_policies_may_depend_on_the_messages(tmp_path):
+    """Scripted follow_target depends on the messages, so each group has its own value."""
     for seed, (loss, coverage) in enumerate([(0.0, 40.0), (0.5, 20.0)]):
         run = write_run(
             tmp_path,
@@ -467,7 +467,7 @@ def test_who_hears_something_else_may_fly_otherwise(tmp_path):
     assert not [note for note in one.notes if "follow_target" in note]
 
 
-def test_what_does_not_change_the_training_is_said_and_does_not_part_runs(tmp_path):
+def test_settings_without_effect_on_training_are_noted_and_do_not_split_groups(tmp_path):
     write_run(tmp_path, "consensus", 0)
     write_run(tmp_path, "consensus", 1, overrides=("logger=csv", "output=elsewhere"))
     (section,), notes = gathered(tmp_path)
@@ -475,7 +475,7 @@ def test_what_does_not_change_the_training_is_said_and_does_not_part_runs(tmp_pa
     assert notes == ["setup tuned, trained on huygens, consensus: one group, though logger differ"]
 
 
-def test_a_seed_counts_once(tmp_path):
+def test_a_seed_is_counted_once(tmp_path):
     old = write_run(tmp_path, "consensus", 0, name="2026-01-01", learned={"coverage": 1})
     new = write_run(tmp_path, "consensus", 0, name="2026-01-02", learned={"coverage": 2})
     write_run(tmp_path, "consensus", 1, learned={"coverage": 3})
@@ -487,7 +487,7 @@ def test_a_seed_counts_once(tmp_path):
         assert f"{new} is used, {old} is left out" in note
 
 
-def test_scripted_policies_have_rows_of_their_own(tmp_path):
+def test_scripted_policies_have_separate_rows(tmp_path):
     for seed in range(2):
         write_run(tmp_path, "consensus", seed)
         write_run(tmp_path, "positional", seed)
@@ -498,7 +498,7 @@ def test_scripted_policies_have_rows_of_their_own(tmp_path):
     assert [row.method for row in rank.rows].count("random_actions") == 0
     assert rank.scripted["random_actions"] == [Scripted([], pytest.approx(expected))]
     assert one.notes == []
-    # A method's own reward gives it a score of its own, in all its runs alike.
+    # The score depends on the method's reward and is the same in all runs of the method.
     for seed in range(2):
         run = tmp_path / f"positional_tuned_s{seed}"
         content = read_evaluation(run)
@@ -510,7 +510,7 @@ def test_scripted_policies_have_rows_of_their_own(tmp_path):
     assert consensus.methods == ["consensus"]
     assert consensus.value != 7
     assert one.notes == []
-    # But coverage is the same on the same fires.
+    # Coverage is the same on the same fires.
     content["results"]["huygens"]["random_actions"]["coverage"] = [7.0] * 4
     write_evaluation(run, content)
     (note,) = only(tmp_path).notes
@@ -531,7 +531,7 @@ def test_curves_are_over_seeds(runs):
 
 
 class Tags(html.parser.HTMLParser):
-    """Whether every tag is closed, and what is loaded from where."""
+    """Collects unclosed tags and loaded resources of an HTML page."""
 
     VOID = frozenset({"meta", "img", "br", "link"})
 
@@ -560,7 +560,7 @@ def page(folder) -> Tags:
     return tags
 
 
-def test_the_page_holds_everything_and_loads_nothing(runs, tmp_path):
+def test_the_page_is_self_contained(runs, tmp_path):
     out = tmp_path / "out"
     assert main.main(["compare", str(runs), "--output", str(out)]) == 0
     tags = page(out)
@@ -581,8 +581,8 @@ def test_the_page_holds_everything_and_loads_nothing(runs, tmp_path):
     assert content["settings"]["resamples"] == 10_000
 
 
-def test_words_of_a_table_are_not_broken_on_a_phone():
-    """A table scrolls in a box of its own; only paths may be broken anywhere."""
+def test_words_of_a_table_are_not_broken_on_narrow_screens():
+    """A table scrolls in its own box; only paths may be broken anywhere."""
     source = files("emberlink.trainers.comparison").joinpath("page.html").read_text("utf-8")
     style = source.split("<style>")[1].split("</style>")[0]
     rules = dict(re.findall(r"([^{}\n]+) \{([^{}]*)\}", style))
@@ -595,8 +595,8 @@ def test_words_of_a_table_are_not_broken_on_a_phone():
 HOSTILE = '<script>alert("1")</script>[red]$x_{/../'
 
 
-def test_names_from_files_are_text(tmp_path, capsys):
-    """Not markup of the page, the console or a figure's formulas."""
+def test_names_from_files_are_escaped(tmp_path, capsys):
+    """They are no markup of the page, of the console or of formulas in a figure."""
     run = write_run(tmp_path / "runs", name="a<b>&'\"")
     content = read_evaluation(run)
     results = content["results"]
@@ -611,7 +611,7 @@ def test_names_from_files_are_text(tmp_path, capsys):
     assert all(file.parent == tmp_path / "out" for file in (tmp_path / "out").rglob("*"))
 
 
-def test_unfinished_runs_are_named_and_left_out(tmp_path, capsys):
+def test_unfinished_runs_are_noted_and_left_out(tmp_path, capsys):
     runs = tmp_path / "runs"
     good = write_run(runs, "consensus", 0)
     stopped = write_run(runs, "consensus", 1)
@@ -702,7 +702,7 @@ SPOILT = {
 
 
 @pytest.mark.parametrize("case", SPOILT)
-def test_what_is_wrong_is_said_in_a_line_and_nothing_is_left(case, tmp_path, capsys):
+def test_errors_are_one_line_and_leave_no_files(case, tmp_path, capsys):
     change, said = SPOILT[case]
     write_run(tmp_path / "runs", "consensus", 0)
     change(write_run(tmp_path / "runs", "independent", 1))
@@ -715,7 +715,7 @@ def test_what_is_wrong_is_said_in_a_line_and_nothing_is_left(case, tmp_path, cap
     assert [path.name for path in tmp_path.iterdir()] == ["runs"]
 
 
-def test_no_runs(tmp_path, capsys):
+def test_without_runs(tmp_path, capsys):
     for path, said in (
         (tmp_path, "neither a run folder nor a folder that holds runs"),
         (tmp_path / "missing", "there is no such run folder"),
@@ -751,12 +751,12 @@ def test_a_real_run_has_a_timelapse(finished, tmp_path):
     assert main.main(["compare", str(finished.parent), "--output", str(tmp_path / "out")]) == 0
     (timelapse,) = (tmp_path / "out").glob("*timelapse*.png")
     tags = page(tmp_path / "out")
-    assert len(tags.loaded) == 5 + 2 + 1  # figures 5 to 9, one for each fire, the timelapse
+    assert len(tags.loaded) == 5 + 2 + 1  # figures 5 to 9: one for each fire, and the timelapse
     assert "frozen policy of step_000000030.safetensors" in tags.text
     assert timelapse.stat().st_size > 1000
 
 
-def test_help_says_what_compare_does_with_an_example(capsys):
+def test_help_of_compare_has_a_description_and_an_example(capsys):
     with pytest.raises(SystemExit) as ended:
         main.main(["compare", "--help"])
     assert ended.value.code == 0

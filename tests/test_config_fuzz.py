@@ -1,6 +1,6 @@
-"""Every key of the configuration: what fits is built and stepped, all else is one line naming it.
+"""Fuzzes every key of the configuration: valid values run, others give a one-line error.
 
-The keys, their types and bounds are read from the schema, so that a new key is fuzzed as well.
+Keys, types and bounds are read from the schema, so that a new key is fuzzed as well.
 """
 
 import copy
@@ -31,13 +31,13 @@ from emberlink.trainers.training.setup import TrainingSetup
 
 EXAMPLES = 5000 if SOAK else 200
 FUZZ = settings(
-    max_examples=EXAMPLES // 2,  # half of them right, half of them wrong
+    max_examples=EXAMPLES // 2,  # half of them valid, half invalid
     deadline=None,
     derandomize=not SOAK,
     suppress_health_check=list(HealthCheck),
     database=None,
 )
-# The largest values that are tried where larger ones would only take long.
+# Upper limits of the tried values, where larger values would only take longer.
 CAPS = {
     "env.grid": 17,
     "env.num_uavs": 4,
@@ -59,13 +59,13 @@ COMM = {
 
 
 def entered(schema: dict, root: dict) -> dict:
-    """The schema that a reference stands for; of a scenario that of the generator's."""
+    """Resolves a reference to its schema; for a scenario that of the generator."""
     schema = schema.get("oneOf", [schema])[0]
     return root["$defs"][schema["$ref"].rsplit("/", 1)[-1]] if "$ref" in schema else schema
 
 
 def leaves(schema: dict, root: dict, prefix: str = "") -> Iterator[tuple[str, dict]]:
-    """Every key that holds a value, with its schema; not those of `comm` and `learner`."""
+    """Yields every leaf key with its schema, except those of `comm` and `learner`."""
     for name, below in schema["properties"].items():
         below = entered(below, root)
         if "properties" in below:
@@ -90,8 +90,8 @@ def bounds(schema: dict) -> tuple[float, float]:
     )
 
 
-def fitting(key: str, schema: dict) -> st.SearchStrategy:
-    """Values that fit a key."""
+def values_of(key: str, schema: dict) -> st.SearchStrategy:
+    """Returns valid values of a key."""
     low, high = bounds(schema)
     cap = CAPS.get(key, math.inf)
     kind = schema.get("type")
@@ -100,7 +100,7 @@ def fitting(key: str, schema: dict) -> st.SearchStrategy:
     if "enum" in schema or "const" in schema:
         return st.sampled_from(schema.get("enum", [schema.get("const")]))
     if "anyOf" in schema:
-        return st.one_of([fitting(key, one) for one in schema["anyOf"]])
+        return st.one_of([values_of(key, one) for one in schema["anyOf"]])
     if kind == "null":
         return st.none()
     if kind == "boolean":
@@ -124,22 +124,24 @@ def fitting(key: str, schema: dict) -> st.SearchStrategy:
         )
     assert kind == "array", (key, schema)
     if "prefixItems" in schema:
-        parts = [fitting(key, entered(one, SCHEMA)) for one in schema["prefixItems"]]
+        parts = [values_of(key, entered(one, SCHEMA)) for one in schema["prefixItems"]]
         pair = st.tuples(*parts)
         return pair.map(list) if key == "env.grid" else pair.map(sorted)
     least, most = schema.get("minItems", 0), min(schema.get("maxItems", 3), 3)
-    items = fitting(key, entered(schema["items"], SCHEMA))
+    items = values_of(key, entered(schema["items"], SCHEMA))
     return st.lists(items, unique=key == "seeds", min_size=least, max_size=most)
 
 
-def wrong(schema: dict) -> list:
-    """Values that do not fit: other types, beyond the bounds, of another length."""
+def invalid_values(schema: dict) -> list:
+    """Returns invalid values: other types, out of bounds, of another length."""
     low, high = bounds(schema)
     kind = schema.get("type")
     other: list = [None, {}, {"a": {"b": 1}}, b"x", {1, 2}, object(), "\ud800", "a\nb", 10**5000]
     if "anyOf" in schema:
-        kinds = [set(map(repr, wrong(one))) for one in schema["anyOf"]]
-        return [one for one in wrong(schema["anyOf"][0]) if all(repr(one) in k for k in kinds)]
+        kinds = [set(map(repr, invalid_values(one))) for one in schema["anyOf"]]
+        return [
+            one for one in invalid_values(schema["anyOf"][0]) if all(repr(one) in k for k in kinds)
+        ]
     if kind in ("integer", "number"):
         other += [True, False, "1", "", "1e400", [1], [], math.nan, "∞", 1j]
         other += [low - max(1, abs(low)), -(10**400)] if math.isfinite(low) else []
@@ -179,11 +181,11 @@ def put(values: dict, key: str, value) -> dict:
 
 @st.composite
 def valid_values(draw) -> dict:
-    """A recipe with every one of its keys drawn anew."""
+    """Returns a recipe with a random valid value for every key."""
     method = draw(st.sampled_from(known("method")))
     values = copy.deepcopy(recipe(method, draw(st.sampled_from(known("setup")))))
     for key, schema in {**KEYS, **COMM_KEYS[values["comm"]["name"]]}.items():
-        values = put(values, key, draw(fitting(key, schema)))
+        values = put(values, key, draw(values_of(key, schema)))
     learner = values["learner"]
     learner["buffer_size"] = max(learner["buffer_size"], learner["batch_size"])
     return values
@@ -191,7 +193,7 @@ def valid_values(draw) -> dict:
 
 def stepped(values: dict) -> None:
     config = from_values(values)
-    assert to_values(config) == values  # nothing was coerced, and nothing left out
+    assert to_values(config) == values  # no value was coerced or left out
     env = build_env(config, num_envs=config.num_envs, fire=config.fire, seed=1, device="cpu")
     moment = env.reset()
     for _ in range(2):
@@ -204,14 +206,14 @@ def stepped(values: dict) -> None:
 @pytest.mark.slow
 @FUZZ
 @given(valid_values())
-def test_what_fits_is_built_and_stepped(values):
+def test_valid_values_are_built_and_stepped(values):
     stepped(values)
 
 
 @pytest.mark.slow
 @settings(FUZZ, max_examples=max(15, EXAMPLES // 50))
 @given(valid_values())
-def test_what_fits_collects_and_learns(values):
+def test_valid_values_collect_and_learn(values):
     values["seeds"] = values["seeds"][:2]
     for name in ("episodes", "num_envs"):
         values[name] = 2
@@ -231,7 +233,7 @@ def refused(key: str, build) -> str:
 
 
 def every_key() -> list[tuple[str, str, dict]]:
-    """A method that has the key, the key, its schema."""
+    """Yields a method that has the key, the key and its schema."""
     of_comm = {recipe(method, "paper")["comm"]["name"]: method for method in known("method")}
     found = [("consensus", key, schema) for key, schema in KEYS.items()]
     for name, several in COMM_KEYS.items():
@@ -240,9 +242,9 @@ def every_key() -> list[tuple[str, str, dict]]:
 
 
 @pytest.mark.parametrize(("method", "key", "schema"), every_key(), ids=lambda one: str(one)[:40])
-def test_what_does_not_fit_is_one_line_that_names_the_key(method, key, schema):
+def test_an_invalid_value_gives_one_line_that_names_the_key(method, key, schema):
     values = recipe(method, "tuned")
-    for value in wrong(schema):
+    for value in invalid_values(schema):
         refused(key, lambda value=value: from_values(put(values, key, value)))
     *path, last = key.split(".")
     for other in (last + "s", last[:-1] + "é", last.upper(), f" {last}", "_target_", "", "a\nb"):
@@ -258,13 +260,13 @@ def test_what_does_not_fit_is_one_line_that_names_the_key(method, key, schema):
 
 @FUZZ
 @given(st.data())
-def test_several_wrong_values_are_one_line_that_names_one_of_them(data):
+def test_several_invalid_values_give_one_line_that_names_a_key(data):
     method = data.draw(st.sampled_from(known("method")))
     values = recipe(method, data.draw(st.sampled_from(known("setup"))))
     there = {**KEYS, **COMM_KEYS[values["comm"]["name"]]}
     chosen = data.draw(st.lists(st.sampled_from(sorted(there)), min_size=1, max_size=3))
     for key in chosen:
-        values = put(values, key, data.draw(st.sampled_from(wrong(there[key]))))
+        values = put(values, key, data.draw(st.sampled_from(invalid_values(there[key]))))
     text = refused("", lambda: from_values(values))
     assert any(key in text for key in chosen), (chosen, text)
 
@@ -284,11 +286,11 @@ TEXTS = (
 
 
 @pytest.mark.parametrize("text", TEXTS)
-def test_the_command_line_refuses_what_does_not_fit(text, tmp_path, capsys):
+def test_the_command_line_refuses_invalid_values(text, tmp_path, capsys):
     rng = np.random.default_rng(len(text))
     numbers = [k for k, s in KEYS.items() if s.get("type") in ("integer", "number", "array")]
     for key in rng.permutation(numbers)[: 400 if SOAK else 4]:
-        if (key, text) == ("seeds", "[1,2,3,4]"):  # fits
+        if (key, text) == ("seeds", "[1,2,3,4]"):  # valid
             continue
         arguments = ["train", "consensus", f"{key}={text}", f"output={tmp_path / 'x'}"]
         assert main.main(arguments) == 2
@@ -315,7 +317,7 @@ def test_every_key_of_every_group_is_fuzzed():
                 config = resolve(method, [f"setup={setup}", f"fire={fire}"])
                 found |= {key for key in flat(to_values(config)) if "baseline_comm" not in key}
     assert found == fuzzed
-    assert set(CAPS) | set(FIXED) <= fuzzed  # none of these is a key that went
+    assert set(CAPS) | set(FIXED) <= fuzzed  # every listed key still exists
 
 
 @pytest.mark.parametrize(
@@ -338,10 +340,10 @@ def test_numpys_numbers_are_numbers(given, plain):
 
 
 @pytest.mark.parametrize("name", ["setup", "method_", "setups"])
-def test_a_choice_is_not_taken_for_a_setting(name):
+def test_a_choice_is_not_a_setting(name):
     refused(name, lambda: resolve("consensus", **{name: "tuned"}))
 
 
-def test_seeds_from_python_that_are_none():
+def test_invalid_seeds_from_python():
     for seeds in ("12", {1: 2}, b"12", [torch.tensor(1)], [1.0], [True], [[1]], 3):
         refused("seeds", lambda seeds=seeds: resolve("consensus", seeds=seeds))
