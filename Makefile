@@ -1,10 +1,10 @@
-# Every target does its own set-up: a virtual environment in .venv with the versions of
-# constraints.txt, installed again only when pyproject.toml or constraints.txt change.
+# All targets use a virtual environment in .venv with the versions of constraints.txt. It is created
+# by the first target, and updated if pyproject.toml or constraints.txt change.
 PYTHON ?= python3
-# processes that run tests side by side, with one thread each
+# number of parallel test processes, with one thread each
 WORKERS ?= 2
-# threads of the demo: networks this small gain little from a second one, and with two the demo all
-# but stands still where something else wants a core
+# threads of the demo: its small networks gain little from a second thread, and two threads are very
+# slow if another process uses a core
 THREADS ?= 1
 # settings of the demo; `make demo DEMO="episodes=10 seed=1"` chooses others
 DEMO ?= episodes=7 evaluation.episodes=32
@@ -21,7 +21,7 @@ PIP := $(BIN)/python -m pip install -q --disable-pip-version-check -c constraint
 help:  ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## /  make \1\t/p' $(MAKEFILE_LIST) | expand -t 20
 
-demo: $(INSTALLED)  ## train consensus for a few minutes, evaluate it, leave figures and a GIF
+demo: $(INSTALLED)  ## train consensus for a few minutes and evaluate it, with figures and a GIF
 	@OMP_NUM_THREADS=$(THREADS) $(BIN)/emberlink train consensus setup=tuned $(DEMO)
 
 test: $(INSTALLED)  ## run the tests, without the slow ones (about 5 minutes)
@@ -30,12 +30,12 @@ test: $(INSTALLED)  ## run the tests, without the slow ones (about 5 minutes)
 test-slow: $(INSTALLED)  ## run the slow tests (about 5 minutes)
 	@OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n $(WORKERS) --dist loadgroup -m slow
 
-soak: $(INSTALLED)  ## kill, interrupt and damage trainings over and over (about half an hour)
+soak: $(INSTALLED)  ## kill, interrupt and damage trainings repeatedly (about half an hour)
 	@OMP_NUM_THREADS=1 $(BIN)/python tests/soak/soak.py $(SOAK)
 	@OMP_NUM_THREADS=1 EMBERLINK_SOAK=1 $(BIN)/python -m pytest -q -n $(WORKERS) \
 		tests/test_invariants.py tests/test_config_fuzz.py
 
-bench: $(INSTALLED)  ## run the benchmarks (about half an hour; BENCH="-k update" runs some)
+bench: $(INSTALLED)  ## run the benchmarks (about half an hour; BENCH="-k update" selects some)
 	@$(BIN)/python -m pytest tests/benchmarks -q -p no:xdist -o python_files='bench_*.py' $(BENCH)
 
 guard: $(INSTALLED)  ## check that nothing has become slower (a few seconds)
@@ -49,12 +49,12 @@ lint: $(INSTALLED)  ## check style, layout and the direction of imports
 typecheck: $(INSTALLED)  ## check the types
 	@$(BIN)/basedpyright --pythonpath $(BIN)/python
 
-install: $(INSTALLED)  ## only set up .venv
+install: $(INSTALLED)  ## only create .venv
 
-# The marker tells an interrupted installation from a complete one: what it left is thrown away.
+# The marker file identifies an interrupted installation, which is then removed.
 $(INSTALLED): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null || \
-		{ echo "emberlink needs Python 3.11 or later as '$(PYTHON)'; or name one: make PYTHON=python3.12" >&2; exit 1; }
+		{ echo "emberlink needs Python 3.11 or later as '$(PYTHON)'; choose one with: make PYTHON=python3.12" >&2; exit 1; }
 	@if [ -e $(UNFINISHED) ]; then rm -rf $(VENV); fi
 	@mkdir -p $(VENV) && touch $(UNFINISHED)
 	@echo "setting up $(VENV) (once; a few minutes)" >&2
@@ -63,6 +63,6 @@ $(INSTALLED): pyproject.toml constraints.txt
 	@$(PIP) --no-build-isolation -e '.[dev]'
 	@mv $(UNFINISHED) $(INSTALLED) && touch $(INSTALLED)
 
-clean:  ## remove .venv and what tools leave behind; runs/ stays
+clean:  ## remove .venv and generated files, but not runs/
 	@rm -rf $(VENV) build dist *.egg-info .pytest_cache .ruff_cache .hypothesis
 	@find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -1,4 +1,4 @@
-"""The YAML files of configurations, and the search for those of other packages and folders."""
+"""Configuration files in YAML, and the search for those of other packages and folders."""
 
 from emberlink.configs.search import ENTRY_POINTS, VARIABLE, folders, known
 

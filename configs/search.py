@@ -1,6 +1,6 @@
-"""Finds the YAML files of configuration groups, installed with emberlink or added by a user.
+"""Finds the YAML files of configuration groups of emberlink, other packages and the user.
 
-A group is a folder such as `method` or `fire`; each file in it is one choice of the group.
+A group is a folder such as `method` or `fire`. Each file in it is a choice of the group.
 """
 
 import os
@@ -12,16 +12,16 @@ from pathlib import Path
 from emberlink.configs import entry_points
 
 VARIABLE = "EMBERLINK_CONFIGS"
-"""the environment variable that lists folders of groups, separated as in PATH"""
+"""environment variable with folders of groups, separated as in PATH"""
 ENTRY_POINTS = "emberlink.configs"
-"""the entry points of other packages; each names a package whose folder holds groups"""
+"""group of entry points; each names a package whose folder holds groups"""
 
 
 def folders() -> list[Path]:
-    """Returns the folders that hold groups: of the environment, of other packages, emberlink's.
+    """Returns the folders of groups: those in `VARIABLE`, of other packages, and of emberlink.
 
-    Folders that do not exist are left out, as in PATH. An entry point that names no package is left
-    out with a warning.
+    Folders that do not exist are ignored, as in PATH. For an entry point whose package does not
+    exist, there is a warning.
     """
     listed = [Path(text) for text in os.environ.get(VARIABLE, "").split(os.pathsep) if text]
     plugins = [path for point in entry_points.read(ENTRY_POINTS) for path in _package(point.value)]
@@ -30,11 +30,11 @@ def folders() -> list[Path]:
 
 
 def known(group: str, within: Sequence[Path] | None = None) -> list[str]:
-    """Returns the choices of a group, in alphabetical order.
+    """Returns the choices of a group in alphabetical order.
 
     Args:
-        group: such as "method", "setup", "setup_method" or "fire".
-        within: the folders to look in; `folders()` if None.
+        group: name of the group, such as "method", "setup", "setup_method" or "fire".
+        within: folders to search; `folders()` if None.
     """
     searched = folders() if within is None else within
     files = (file for folder in searched for file in (folder / group).glob("*.yaml"))

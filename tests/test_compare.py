@@ -311,7 +311,7 @@ def test_setups_fires_and_configurations_are_kept_apart(tmp_path):
         ("setup tuned, trained on paper", [("consensus", [0])]),
     ]
     assert [s.trained_on for s in sections] == ["", "huygens", "paper"]
-    assert any("not all methods have the same learner.batch_size" in note for note in notes)
+    assert any("the methods differ in learner.batch_size" in note for note in notes)
 
 
 def fewer_fires(content):
@@ -472,9 +472,7 @@ def test_what_does_not_change_the_training_is_said_and_does_not_part_runs(tmp_pa
     write_run(tmp_path, "consensus", 1, overrides=("logger=csv", "output=elsewhere"))
     (section,), notes = gathered(tmp_path)
     assert [g.seeds for g in section.groups] == [[0, 1]]
-    assert notes == [
-        "setup tuned, trained on huygens, consensus: taken together though logger differ"
-    ]
+    assert notes == ["setup tuned, trained on huygens, consensus: one group, though logger differ"]
 
 
 def test_a_seed_counts_once(tmp_path):
@@ -486,7 +484,7 @@ def test_a_seed_counts_once(tmp_path):
         (row,) = ranking(numbers(section), "coverage").rows
         assert (row.seeds, row.values) == ([0, 1], [2, 3])
         (note,) = notes
-        assert f"{new} is taken, {old} is left out" in note
+        assert f"{new} is used, {old} is left out" in note
 
 
 def test_scripted_policies_have_rows_of_their_own(tmp_path):
@@ -667,7 +665,7 @@ SPOILT = {
     "no fire": (lambda run: spoil(run, lambda c: c["results"].clear()), ("no fire",)),
     "no learned": (
         lambda run: spoil(run, lambda c: c["results"]["huygens"].pop("learned")),
-        ("holds no policy 'learned'",),
+        ("has no policy 'learned'",),
     ),
     "another's": (lambda run: spoil(run, lambda c: c.update(seed=5)), ("seed=5", "says 1")),
     "held-out": (
@@ -694,7 +692,7 @@ SPOILT = {
         lambda run: (run / "metrics.jsonl").write_text(
             2 * (run / "metrics.jsonl").read_text().splitlines(keepends=True)[0]
         ),
-        ("metrics.jsonl: line 2 is not that of episode 2",),
+        ("metrics.jsonl: line 2 is not of episode 2",),
     ),
     "a curve": (
         lambda run: (run / "metrics.jsonl").write_text('{"episode": 1, "mean_reward": null}\n'),
@@ -739,7 +737,7 @@ def test_nothing_is_overwritten(runs, tmp_path, monkeypatch, capsys):
     (taken / "mine").write_text("x")
     for path in (taken, taken / "mine"):
         assert main.main(["compare", str(runs), "--output", str(path)]) == 2
-        assert "is there and not an empty folder" in capsys.readouterr().err
+        assert "exists and is not an empty folder" in capsys.readouterr().err
     assert [file.name for file in taken.iterdir()] == ["mine"]
     monkeypatch.chdir(tmp_path)
     for name in ("compare", "compare_2"):

@@ -104,7 +104,7 @@ def test_they_can_be_compared(shipped, tmp_path):
     ("name", "said"),
     [
         ("pretrained:consensos", "tuned/consensus, tuned/independent"),
-        ("pretrained:tuned", "one is needed"),
+        ("pretrained:tuned", "is ambiguous"),
         ("pretrained:tuned/consensus/4", "no such trained policy"),
         ("pretrained:", "no such trained policy"),
         ("pretrained:../../tuned", "no such trained policy"),

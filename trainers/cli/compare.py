@@ -1,4 +1,4 @@
-"""The command `emberlink compare`."""
+"""Defines the arguments of `emberlink compare`."""
 
 import argparse
 from pathlib import Path
@@ -11,14 +11,14 @@ if TYPE_CHECKING:
 
 
 def add_compare(commands: Any) -> None:
-    """Adds the command."""
+    """Adds the command to the parser."""
     comparison = command(
         commands,
         "compare",
         _compare,
         "compare runs: methods, setups, several seeds",
         "Gathers finished runs by setup and method and prints interquartile means with 95 % "
-        "bootstrap intervals over training seeds, and the paper's claims; leaves a new folder "
+        "bootstrap intervals over training seeds, and the paper's claims; writes a new folder "
         "with compare.html (tables, the paper's figures 5 to 9, timelapses), compare.json and "
         "the PNGs.",
         "emberlink compare runs/ --output comparison",
@@ -28,7 +28,7 @@ def add_compare(commands: Any) -> None:
         metavar="RUN",
         nargs="+",
         type=Path,
-        help="run folders, or folders that hold some",
+        help="run folders, or folders of run folders",
     )
     comparison.add_argument(
         "--output", metavar="FOLDER", type=Path, help="a new folder (default: compare)"

@@ -1,4 +1,4 @@
-"""The command `emberlink doctor`."""
+"""Defines the arguments of `emberlink doctor`."""
 
 import argparse
 from typing import TYPE_CHECKING, Any
@@ -10,7 +10,7 @@ if TYPE_CHECKING:
 
 
 def add_doctor(commands: Any) -> None:
-    """Adds the command."""
+    """Adds the command to the parser."""
     command(
         commands,
         "doctor",

@@ -1,4 +1,4 @@
-"""The command `emberlink eval`."""
+"""Defines the arguments of `emberlink eval`."""
 
 import argparse
 from pathlib import Path
@@ -11,15 +11,15 @@ if TYPE_CHECKING:
 
 
 def add_eval(commands: Any) -> None:
-    """Adds the command."""
+    """Adds the command to the parser."""
     evaluation = command(
         commands,
         "eval",
         _eval,
         "evaluate the frozen policies of a run",
         "Loads the newest checkpoint of a run, plays the frozen policies and the scripted ones on "
-        "the same test fires, prints the table, and leaves eval.json, figures and a GIF in the "
-        "run folder.",
+        "the same test fires, prints a table, and writes eval.json, figures and a GIF to the run "
+        "folder.",
         "emberlink eval runs/2026-01-31_12-00-00_consensus_tuned_s0 --fires 64",
     )
     evaluation.add_argument(
@@ -30,8 +30,8 @@ def add_eval(commands: Any) -> None:
         metavar="key=value",
         nargs="*",
         default=[],
-        help="keys of comm. or env. in place of the run's, such as comm.loss=0.5; "
-        "the files are named after them",
+        help="keys of comm. or env. to change, such as comm.loss=0.5; "
+        "the names of the files contain them",
     )
     evaluation.add_argument(
         "--checkpoint", metavar="FILE", type=Path, help="a checkpoint (default: the newest)"

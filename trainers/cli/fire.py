@@ -1,4 +1,4 @@
-"""The command line of `emberlink fire`: preview, make, import."""
+"""Defines the arguments of `emberlink fire`: preview, make, import."""
 
 import argparse
 from pathlib import Path
@@ -13,14 +13,14 @@ _KEYS = "keys of setup, env. and fire., as for train, such as setup=tuned, 'env.
 
 
 def add_fire(commands: Any) -> None:
-    """Adds the group of commands."""
+    """Adds the group of commands to the parser."""
     group = command(
         commands,
         "fire",
         lambda options, console: _help(group),
-        "look at fires, write them to files, read them from files",
-        "Draws a fire and says whether UAVs can keep up with it, writes generated fires to a file "
-        "for use elsewhere, and turns files of fires into one.",
+        "preview fires, write them to files, import them",
+        "Draws a fire and tells whether UAVs can keep up with it, writes generated fires "
+        "to files, and imports fires from files.",
         "emberlink fire preview huygens:3",
     )
     actions = group.add_subparsers(dest="action", metavar="ACTION")
@@ -39,10 +39,10 @@ def _add_preview(actions: Any) -> None:
         actions,
         "preview",
         _preview,
-        "draw a fire and say whether UAVs can keep up",
-        "Draws a fire's times of arrival with contours and prints how many cells burn, how fast "
-        "that grows, and whether the setup's UAVs can keep up with it. The picture gets a name "
-        "that is free.",
+        "draw a fire and tell whether UAVs can keep up",
+        "Draws the arrival times of a fire with contours and prints the number of burning cells, "
+        "its growth, and whether the setup's UAVs can keep up with it. No existing file is "
+        "replaced.",
         "emberlink fire preview ArrivalTime.asc fire.units=minutes 'env.grid=[40,40]' setup=tuned",
     )
     preview.add_argument(
@@ -64,8 +64,8 @@ def _add_make(actions: Any) -> None:
         "make",
         _make,
         "write generated fires to a GeoTIFF or NumPy file",
-        "Makes fires of a scenario and writes their times of arrival, in steps, to a new file: a "
-        "GeoTIFF with a band per fire, or NumPy [fires, x, y] with a .json beside it.",
+        "Generates fires of a scenario and writes their arrival times, in steps, to a new file: a "
+        "GeoTIFF with a band per fire, or NumPy [fires, x, y] with a .json file.",
         "emberlink fire make huygens --count 64 --split test --output fires.tif 'env.grid=[60,60]'",
     )
     make.add_argument("scenario", metavar="SCENARIO", help="a file in configs/fire: huygens, ...")
@@ -74,7 +74,7 @@ def _add_make(actions: Any) -> None:
         "--count",
         metavar="N",
         type=positive,
-        help="fires; by default as many as a training or an evaluation uses",
+        help="number of fires (default: as many as a training or an evaluation uses)",
     )
     make.add_argument(
         "--split",
@@ -86,7 +86,7 @@ def _add_make(actions: Any) -> None:
         "--output",
         metavar="FILE",
         type=Path,
-        help="a new file that ends in .npy, .tif or .tiff; SCENARIO_SPLIT_N.npy if left out",
+        help="a new file that ends in .npy, .tif or .tiff (default: SCENARIO_SPLIT_N.npy)",
     )
     make.set_defaults(command="fire make")
 
@@ -96,7 +96,7 @@ def _add_import(actions: Any) -> None:
         actions,
         "import",
         _import,
-        "turn files of fires into one that trains quickly",
+        "convert files of fires to a bank of fires",
         "Reads rasters, perimeters, the paper's text or banks and writes the fires on the grid of "
         "the configuration, in steps, to a new file for fire=file fire.path=BANK.",
         "emberlink fire import ArrivalTime.asc fire.units=minutes --output fires.npy",
@@ -105,7 +105,7 @@ def _add_import(actions: Any) -> None:
         "arguments",
         metavar="FILE | key=value",
         nargs="+",
-        help="files, a fire or more each; " + _KEYS,
+        help="files with one fire or more; " + _KEYS,
     )
     imported.add_argument(
         "--output",
@@ -117,7 +117,7 @@ def _add_import(actions: Any) -> None:
     imported.set_defaults(command="fire import")
 
 
-# The commands import what they need when they run: `emberlink --help` need not wait for torch.
+# Commands import their code when they run, so that `emberlink --help` does not import torch.
 
 
 def _preview(options: argparse.Namespace, console: "Console") -> int:

@@ -1,4 +1,4 @@
-"""The command `emberlink list`."""
+"""Defines the arguments of `emberlink list`."""
 
 import argparse
 from typing import TYPE_CHECKING, Any
@@ -13,13 +13,13 @@ _KINDS = (*_GROUPS, "policies")
 
 
 def add_list(commands: Any) -> None:
-    """Adds the command."""
+    """Adds the command to the parser."""
     listing = command(
         commands,
         "list",
         _list,
         "list methods, setups, fires, learners, scripted policies",
-        "Prints the names that other commands take, one a line.",
+        "Prints the names that other commands accept, one per line.",
         "emberlink list methods",
     )
     listing.add_argument(

@@ -1,4 +1,4 @@
-"""Runs the command line: parses the arguments, runs a command, reports errors."""
+"""Parses the command line, runs a command, and reports errors."""
 
 import argparse
 import errno
@@ -20,13 +20,13 @@ from emberlink.trainers.cli.train import add_train
 INTERRUPTED = 130
 """exit status after Ctrl-C"""
 _BROKEN_PIPE = 141
-"""exit status after the reader of the output ended, as shells report it"""
+"""exit status of shells after a closed pipe"""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs one command and returns its exit status: 0, or 2 for a mistake of the user.
+    """Runs a command and returns its exit status, which is 2 for a mistake of the user.
 
-    Mistakes of the program itself, and only these, end in a traceback.
+    Only defects of the program end in a traceback.
     """
     if sys.platform == "win32":
         print("emberlink: runs on Linux and macOS; on Windows, use WSL", file=sys.stderr)
@@ -43,10 +43,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _run(options: argparse.Namespace) -> int:
-    # torchrl's messages of level INFO would break into the progress bar.
+    # torchrl's messages of level INFO would disturb the progress bar.
     os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")
     try:
-        # Imported here, since it takes a second, in which Ctrl-C must end in one line as well.
+        # Imported here, since Ctrl-C during the import must end in one line, too.
         from emberlink.trainers.terminal import SafeConsole
 
         return options.run(options, SafeConsole())
@@ -67,7 +67,7 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def _message(error: Exception) -> str | None:
-    """Returns what a user is told about an error; None if it is a mistake of the program."""
+    """Returns the message of a user's mistake; None for a defect of the program."""
     from emberlink.envs.utils.errors import UserError
 
     if isinstance(error, UserError):
@@ -86,7 +86,7 @@ def _report(options: argparse.Namespace, message: str, status: int = 2) -> int:
 
 
 def _flush() -> None:
-    """Flushes standard output; drops what cannot be written, so that Python ends quietly."""
+    """Flushes standard output, and discards it if that fails, so that Python does not report it."""
     try:
         sys.stdout.flush()
     except OSError:

@@ -1,4 +1,4 @@
-"""The parser of the command line, and what its commands share."""
+"""Defines the parser of the command line and functions shared by its commands."""
 
 import argparse
 import difflib
@@ -15,15 +15,15 @@ class _Help(argparse.HelpFormatter):
 
 
 class Parser(argparse.ArgumentParser):
-    """A parser whose errors are one line, without the usage before it.
+    """Parses arguments and prints errors on one line, without the usage.
 
-    Options of a command may stand before, among or behind its other arguments.
+    Options and other arguments of a command may be in any order.
     """
 
     _is_intermixed = False
 
     def parse_known_args(self, args=None, namespace=None):  # pyright: ignore
-        """Parses as argparse does; an option that a command does not know is an error."""
+        """Parses as argparse does; unknown options are errors."""
         if self._is_intermixed or self._subparsers is not None:
             return super().parse_known_args(args, namespace)
         self._is_intermixed = True  # parse_known_intermixed_args calls this method
@@ -43,7 +43,7 @@ class Parser(argparse.ArgumentParser):
         raise SystemExit(2)
 
     def _unknown_option(self, text: str, arguments: Sequence[str]) -> str:
-        """Returns a message with the option, or the key=value, that was probably meant."""
+        """Returns a message with the most similar option, or with key=value."""
         name, _, value = text.partition("=")
         options = [option for action in self._actions for option in action.option_strings]
         near = difflib.get_close_matches(name, options, n=1)
@@ -52,7 +52,7 @@ class Parser(argparse.ArgumentParser):
             return f"{message}; did you mean {near[0]}?"
         if self._takes_keys() and name.startswith("--"):
             after = arguments[arguments.index(text) + 1 :] if text in arguments else []
-            value = value or next((one for one in after[:1] if "=" not in one), "VALUE")
+            value = value or next((word for word in after[:1] if "=" not in word), "VALUE")
             key = name.removeprefix("--").replace("-", "_")
             return f"{message}; keys are given as {key}={value}"
         return message
@@ -73,13 +73,13 @@ def command(
     """Adds a command and returns its parser.
 
     Args:
-        commands: as `add_subparsers` returns it.
+        commands: result of `add_subparsers`.
         name: name of the command.
         run: called with the options and a console; returns the exit status.
-        summary: its line in the list of commands.
-        description: what it does, in a paragraph.
-        example: a command line.
-        usage: its usage; made of its arguments if None.
+        summary: text in the list of commands.
+        description: description of the command.
+        example: example of a command line.
+        usage: usage of the command; generated from its arguments if None.
     """
     parser = commands.add_parser(
         name,

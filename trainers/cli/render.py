@@ -1,4 +1,4 @@
-"""The command `emberlink render`: episodes of runs as GIF and MP4, side by side."""
+"""Runs `emberlink render`: draws episodes of runs side by side as GIF and MP4."""
 
 import dataclasses
 import os
@@ -36,9 +36,9 @@ from emberlink.trainers.runs.run_folder import RunFolder
 from emberlink.trainers.runs.seal import check_trained_with
 
 FIRES = 65_536
-"""held-out fires of a scenario: as many as an evaluation can have"""
+"""number of held-out fires of a scenario, the maximum of an evaluation"""
 SHARED = ("grid", "num_uavs", "horizon", "altitude")
-"""settings that fires and start positions depend on; panels must have them in common"""
+"""settings that must be equal for all panels; fires and start positions depend on them"""
 _ALONE, _BESIDE = (480, 800), (360, 600)  # minimum and maximum pixels of a map's longer side
 _CELL = 8  # pixels of a cell, within those limits
 
@@ -47,7 +47,7 @@ Write = Callable[[Path, Screen, int], None]
 
 @dataclasses.dataclass(frozen=True)
 class Panel:
-    """The policy and the title of one panel."""
+    """The title, configuration and policy of a panel."""
 
     title: str
     config: RunConfig
@@ -62,9 +62,9 @@ class Choices:
     fire: str | None = None
     """NAME, INDEX or NAME:INDEX of a held-out fire; see `find_fire`"""
     policies: Sequence[str] = ()
-    """names of scripted policies, shown beside the runs"""
+    """names of scripted policies to draw, too"""
     checkpoints: Sequence[Path] = ()
-    """one for each run; the newest of each if empty"""
+    """a checkpoint for each run; the newest of each run if empty"""
     output: Path | None = None
     """a file or a folder; the figures of the first run if None"""
     frames: int = 126
@@ -72,9 +72,9 @@ class Choices:
     size: int | None = None
     """pixels of a map's longer side"""
     step: int | None = None
-    """of a single picture; the last if None"""
+    """step of a single picture; the last if None"""
     seen: bool = False
-    """whether fire that was seen is grey"""
+    """whether seen fire is grey"""
 
 
 def render(runs: Sequence[str], console: Console, choices: Choices) -> int:
@@ -82,11 +82,14 @@ def render(runs: Sequence[str], console: Console, choices: Choices) -> int:
 
     Args:
         runs: run folders.
-        console: shows the progress and, last, the paths.
-        choices: the options.
+        console: prints the progress and the paths.
+        choices: options of the command.
+
+    Returns:
+        The exit status 0.
 
     Raises:
-        UserError: a run, a fire or an output that cannot be used.
+        UserError: a run, fire or output is wrong.
     """
     folders = [open_run(name) for name in runs]
     scenario, index = find_fire(choices.fire, folders[0].config(device="cpu").fire)
@@ -113,9 +116,9 @@ def find_fire(text: str | None, trained: ScenarioConfig) -> tuple[ScenarioConfig
     """Returns the scenario and the index of a held-out fire.
 
     Args:
-        text: NAME, INDEX or NAME:INDEX; the default name is that of `shown_scenario`, the default
-            index 0.
-        trained: the scenario that the run was trained on; its name is known too.
+        text: NAME, INDEX or NAME:INDEX. The default name is that of `shown_scenario`, and the
+            default index is 0.
+        trained: training scenario of the run, which is known, too.
 
     Raises:
         UserError: there is no such scenario or fire.
@@ -153,7 +156,7 @@ def _learned(folders: Sequence[RunFolder], checkpoints: Sequence[Path]) -> Itera
 
 
 def _scripted(folders: Sequence[RunFolder], names: Sequence[str]) -> Iterator[Panel]:
-    """Yields a panel for each scripted policy, in the world of the first run."""
+    """Yields a panel for each scripted policy, in the environment of the first run."""
     for name in names:
         if name not in SCRIPTED:
             raise UserError(f"policy {name!r} is not known; known: {', '.join(SCRIPTED)}")
@@ -165,11 +168,11 @@ def _check_comparable(panels: Sequence[Panel]) -> None:
     first, *others = panels
     for other in others:
         for name in SHARED:
-            one, two = (getattr(panel.config.env, name) for panel in (first, other))
-            if one != two:
+            expected, actual = (getattr(panel.config.env, name) for panel in (first, other))
+            if actual != expected:
                 raise UserError(
-                    f"{other.title} has env.{name}={_plain(two)}, {first.title} has "
-                    f"{_plain(one)}: side by side, {', '.join(SHARED)} must be the same"
+                    f"{other.title} has env.{name}={_plain(actual)}, {first.title} has "
+                    f"{_plain(expected)}: side by side, {', '.join(SHARED)} must be the same"
                 )
 
 
@@ -178,7 +181,7 @@ def _plain(value: Any) -> str:
 
 
 def _steps(choices: Choices, horizon: int, suffixes: Sequence[str]) -> list[int]:
-    """Returns the steps that are drawn."""
+    """Returns the steps to draw."""
     if suffixes != [".png"]:
         if choices.step is not None:
             raise UserError(f"step={choices.step}: only of a picture, --output FILE.png")
@@ -193,9 +196,9 @@ def _steps(choices: Choices, horizon: int, suffixes: Sequence[str]) -> list[int]
 def _play(
     panel: Panel, arrival: Tensor, index: int, steps: Sequence[int], console: Console
 ) -> Episode:
-    """Plays the evaluation's episode `index`: its fire, its start positions."""
+    """Plays episode `index` of the evaluation and returns its frames."""
     config = panel.config
-    # As many environments and the same place among them, so that it is the same to the last bit.
+    # The same batch size and index as in an evaluation, so that the episode is bit-identical.
     env = build_env(
         config,
         num_envs=BLOCK,

@@ -1,4 +1,4 @@
-"""The command `emberlink render`."""
+"""Defines the arguments of `emberlink render`."""
 
 import argparse
 from pathlib import Path
@@ -11,15 +11,15 @@ if TYPE_CHECKING:
 
 
 def add_render(commands: Any) -> None:
-    """Adds the command."""
+    """Adds the command to the parser."""
     rendering = command(
         commands,
         "render",
         _render,
         "an episode as GIF and MP4; several runs side by side",
         "Plays the frozen policies of one or more runs on the same held-out fire from the same "
-        "start positions, and draws fire, UAVs, their roles and the links of their network. Leaves "
-        "a GIF and an MP4 in the first run's figures, under names that are free.",
+        "start positions, and draws fire, UAVs, their roles and the links of their network. Writes "
+        "a GIF and an MP4 to the first run's figures. No existing file is replaced.",
         "emberlink render runs/2026-01-31_12-00-00_consensus_tuned_s0 --policy random_waypoints",
     )
     add = rendering.add_argument
@@ -29,7 +29,7 @@ def add_render(commands: Any) -> None:
         metavar="NAME",
         action="append",
         default=[],
-        help="a scripted policy beside the runs; may be given several times",
+        help="a scripted policy to draw, too; may be given several times",
     )
     add(
         "--fire",
@@ -43,7 +43,7 @@ def add_render(commands: Any) -> None:
         type=Path,
         action="append",
         default=[],
-        help="another than the newest; as many as there are runs",
+        help="a checkpoint in place of the newest; one for each run",
     )
     add(
         "--output",
@@ -51,11 +51,11 @@ def add_render(commands: Any) -> None:
         type=Path,
         help="a folder, or a new file that ends in .gif, .mp4 or .png (one picture)",
     )
-    add("--step", metavar="STEP", type=_step, help="of a .png; the last if left out")
-    add("--frames", type=positive, default=126, help="at most (default: 126)")
+    add("--step", metavar="STEP", type=_step, help="step of a .png (default: the last)")
+    add("--frames", type=positive, default=126, help="maximum number of frames (default: 126)")
     add("--fps", type=_fps, default=12, help="frames per second, 1 to 50 (default: 12)")
     add("--size", type=_size, help="pixels of a map's longer side, 100 to 2000")
-    add("--seen", action="store_true", help="draw fire that a UAV has seen grey")
+    add("--seen", action="store_true", help="draw seen fire in grey")
 
 
 _step, _fps, _size = between(0, 1_000_000), between(1, 50), between(100, 2000)

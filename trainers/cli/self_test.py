@@ -1,4 +1,4 @@
-"""Checks an installation: versions, devices, and a self-test."""
+"""Runs `emberlink doctor`: prints versions and devices, and runs a self-test."""
 
 import platform
 import time
@@ -20,7 +20,7 @@ _TINY = ("env.horizon=40", "env.num_uavs=3", "episodes=1", "num_envs=2", "learne
 
 
 def doctor(console: Console) -> int:
-    """Prints what is installed and tests it; returns 0 if every test passed, else 1."""
+    """Prints versions and devices, runs the self-test, and returns 0 if it passed, else 1."""
     console.print(f"python {platform.python_version()} on {platform.platform()}")
     console.print(", ".join(f"{name} {version(name)}" for name in _PACKAGES), soft_wrap=True)
     gpus = [torch.cuda.get_device_name(i) for i in range(torch.cuda.device_count())]
@@ -28,12 +28,12 @@ def doctor(console: Console) -> int:
         f"devices: cpu ({torch.get_num_threads()} threads), {', '.join(gpus) or 'no GPU'}"
     )
     console.print(f"fires from files: {_geo()}", soft_wrap=True)
-    checks = {"fire": _fire} | {method: _recipe(method) for method in known("method")}
+    checks = {"fire": _fire} | {method: _method(method) for method in known("method")}
     began, failures = time.monotonic(), 0
     for name, check in checks.items():
         try:
             console.print(f"  ok      {name}: {check()}")
-        except Exception as error:  # whatever is wrong, the other checks are made
+        except Exception as error:  # the other checks must run
             failures += 1
             text = f"  FAILED  {name}: {type(error).__name__}: {error}"
             console.print(text, style="red", soft_wrap=True)
@@ -56,7 +56,7 @@ def _fire() -> str:
     return f"{start} cells burn at the start, {end} at the end"
 
 
-def _recipe(method: str):
+def _method(method: str):
     def check() -> str:
         check_env_specs(make_env(method, num_envs=2, horizon=5, num_uavs=3))
         setup = TrainingSetup(resolve(method, _TINY))

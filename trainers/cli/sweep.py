@@ -1,4 +1,4 @@
-"""The command `emberlink sweep`."""
+"""Defines the arguments of `emberlink sweep`."""
 
 import argparse
 from typing import TYPE_CHECKING, Any
@@ -10,15 +10,15 @@ if TYPE_CHECKING:
 
 
 def add_sweep(commands: Any) -> None:
-    """Adds the command."""
+    """Adds the command to the parser."""
     sweep = command(
         commands,
         "sweep",
         _sweep,
         "train methods x seeds x setups",
-        "Trains and evaluates every combination, several runs at a time on the cores of the "
-        "machine. Finished runs in the output folder are skipped, and stopped ones are resumed: "
-        "the same command again does what is left.",
+        "Trains and evaluates every combination, several runs at a time. Finished runs in the "
+        "output folder are skipped, and stopped ones are resumed, so that the same command can be "
+        "repeated.",
         "emberlink sweep consensus positional setup=paper,tuned seed=0,1,2 output=runs",
         usage="emberlink sweep [--jobs N] [--dry-run] [METHOD ...] [key=value,value ...]",
     )
@@ -31,7 +31,7 @@ def add_sweep(commands: Any) -> None:
     sweep.add_argument(
         "--jobs", metavar="N", type=positive, help="runs at a time (default: one per core)"
     )
-    sweep.add_argument("--dry-run", action="store_true", help="only print what would be done")
+    sweep.add_argument("--dry-run", action="store_true", help="only print the state of each run")
 
 
 def _sweep(options: argparse.Namespace, console: "Console") -> int:

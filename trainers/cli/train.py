@@ -1,4 +1,4 @@
-"""The command `emberlink train`."""
+"""Defines the arguments of `emberlink train`."""
 
 import argparse
 from typing import TYPE_CHECKING, Any
@@ -10,13 +10,13 @@ if TYPE_CHECKING:
 
 
 def add_train(commands: Any) -> None:
-    """Adds the command."""
+    """Adds the command to the parser."""
     train = command(
         commands,
         "train",
         _train,
         "train one of the methods and evaluate it",
-        "Trains a method, evaluates the frozen policies on test fires, and leaves a run folder "
+        "Trains a method, evaluates the frozen policies on test fires, and writes a run folder "
         "with config.yaml, metrics.jsonl, checkpoints, eval.json, figures and a GIF.",
         "emberlink train consensus setup=tuned episodes=20 seed=1",
         usage="emberlink train METHOD [key=value ...]\n"
@@ -25,8 +25,8 @@ def add_train(commands: Any) -> None:
     train.add_argument(
         "method",
         metavar="METHOD",
-        help="a method: independent, shared_memory, positional, consensus, or one of yours "
-        "(emberlink list methods); or resume=RUN, to continue the training of a run folder",
+        help="a method: independent, shared_memory, positional, consensus, or your own "
+        "(see emberlink list methods); or resume=RUN, to resume the training of a run folder",
     )
     train.add_argument(
         "overrides",
@@ -39,7 +39,7 @@ def add_train(commands: Any) -> None:
 
 
 def _train(options: argparse.Namespace, console: "Console") -> int:
-    # Commands import what they need when they run, so that `--help` need not wait for torch.
+    # Commands import their code when they run, so that `--help` does not import torch.
     from emberlink.trainers.training.command import train
 
     return train(options.method, options.overrides, console)

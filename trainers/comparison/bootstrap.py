@@ -1,7 +1,8 @@
-"""Statistics over training seeds. A run is one number, however many episodes it was evaluated on.
+"""Computes statistics over training seeds; each run contributes one number.
 
-The recipe of Agarwal et al., "Deep Reinforcement Learning at the Edge of the Statistical
-Precipice" (2021), with SciPy: interquartile mean, percentile bootstrap, probability of improvement.
+The statistics are those of Agarwal et al., "Deep Reinforcement Learning at the Edge of the
+Statistical Precipice" (2021), with SciPy: interquartile mean, percentile bootstrap, and probability
+of improvement.
 """
 
 from collections.abc import Callable, Sequence
@@ -14,12 +15,13 @@ from scipy import stats
 LEVEL = 0.95
 """confidence level of an interval"""
 RESAMPLES = 10_000
-"""resamples of an interval"""
+"""number of resamples of an interval"""
 BOOTSTRAP_SEED = 20_210_830
-"""seed of the resamples; each interval starts with it, so that none depends on another"""
+"""seed of the resamples of every interval"""
 FEW = 5
-"""Intervals of fewer seeds are flagged. With 2, 3 or 4 seeds an interval reaches from the worst to
-the best, which contains the median of all possible seeds in 50 %, 75 % or 88 % of cases."""
+"""number of seeds below which intervals are flagged. With 2, 3 or 4 seeds, an interval extends from
+the worst to the best seed, which contains the population median with a probability of 50 %, 75 % or
+88 %."""
 
 Values = NDArray[np.float64]
 Interval = tuple[float, float]
@@ -28,8 +30,8 @@ Interval = tuple[float, float]
 def iqm(values: Values, axis: int = -1) -> Any:
     """Returns the interquartile mean: the mean without the lowest and the highest quarter.
 
-    A quarter is rounded down: 1 to 3 values give the mean of all, 4 that of the middle 2, 5 that of
-    the middle 3.
+    The size of a quarter is rounded down: 1 to 3 values give the mean of all, 4 the mean of the
+    middle 2, 5 the mean of the middle 3.
     """
     return stats.trim_mean(values, 0.25, axis=axis)
 
@@ -44,14 +46,14 @@ def probability_of_improvement(one: Values, other: Values, axis: int = -1) -> An
 
 
 def iqm_ratio_share(own: Values, *others: Values, higher: bool, axis: int = -1) -> Any:
-    """Returns r / (1 + r) for the ratio r of an IQM to the best IQM of others; better is above 0.5.
+    """Returns r / (1 + r) for the ratio r of an IQM to the best IQM of others; above 0.5 is better.
 
-    The share is finite where the ratio is not: it is 1 for a ratio to 0, and 0.5 for 0 to 0.
+    Unlike the ratio, the share is finite: it is 1 for a ratio to 0, and 0.5 for 0 to 0.
 
     Args:
-        own, others: numbers from 0 up, one per run.
-        higher: whether more is better; the ratio is inverted where less is better.
-        axis: along which the runs lie.
+        own, others: non-negative numbers, one per run.
+        higher: whether more is better; if not, the ratio is inverted.
+        axis: axis of the runs.
     """
     mine = iqm(own, axis)
     rest = np.stack([iqm(other, axis) for other in others])
@@ -71,11 +73,11 @@ def interval(statistic: Callable[..., Any], *samples: Sequence[float]) -> Interv
 
     Args:
         statistic: a function of arrays with the keyword `axis`.
-        samples: one number per run, for each method. Runs are drawn with replacement within their
-            method, as many as it has.
+        samples: one number per run, for each method. Each resample draws as many runs as a method
+            has, with replacement.
 
     Returns:
-        Lower and upper end; None if a method has one run.
+        Lower and upper end; None if a method has only one run.
     """
     if min(map(len, samples)) < 2:
         return None
@@ -84,7 +86,7 @@ def interval(statistic: Callable[..., Any], *samples: Sequence[float]) -> Interv
 
 
 def band(values: Values) -> tuple[Values, Values] | None:
-    """Returns the interval of the IQM per episode: values [seeds, episodes] -> [episodes] each."""
+    """Returns the ends of the interval of the IQM, [episodes] each, of values [seeds, episodes]."""
     return _bootstrap(iqm, [values], 0) if len(values) > 1 else None
 
 

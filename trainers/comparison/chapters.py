@@ -1,4 +1,4 @@
-"""Draws the pictures of a section of the report."""
+"""Draws the figures of a section of the report."""
 
 import re
 from collections.abc import Callable, Iterator
@@ -22,17 +22,17 @@ def draw(
     """Draws the figures and timelapses of a section.
 
     Args:
-        folder: of the report; the files are written there.
-        place: number of the section, with which the names of the files begin.
-        numbers: the section's numbers.
-        notes: gets a note for each method that has no timelapse.
-        say: called with a line before each picture.
+        folder: folder of the report.
+        place: number of the section; prefix of the file names.
+        numbers: numbers of the section.
+        notes: a note is appended for each method without a timelapse.
+        say: called with a line of text before each figure.
     """
-    stem = f"{place}_{_in_a_file_name(numbers.section.runs[0].config.setup)}"
+    stem = f"{place}_{_as_file_name(numbers.section.runs[0].config.setup)}"
     say(f"figures of {numbers.section.label}")
     frozen: list[Picture] = []
     for number, fire in enumerate(numbers.fires, 1):
-        path = folder / f"{stem}_frozen_{number}_{_in_a_file_name(fire)}.png"
+        path = folder / f"{stem}_frozen_{number}_{_as_file_name(fire)}.png"
         plots.frozen(path, numbers, fire)
         frozen.append(Picture(path, _frozen_caption(numbers, fire)))
     pictures: list[Picture] = []
@@ -44,7 +44,7 @@ def draw(
     return Chapter(numbers, frozen, pictures, films)
 
 
-def _in_a_file_name(name: str) -> str:
+def _as_file_name(name: str) -> str:
     return re.sub(r"[^A-Za-z0-9]+", "_", name)[:40]
 
 
@@ -59,11 +59,11 @@ def _frozen_caption(numbers: Numbers, fire: str) -> str:
     )
 
 
-def _caption(numbers: Numbers, number: int, what: str) -> str:
+def _caption(numbers: Numbers, number: int, content: str) -> str:
     section = numbers.section
     seeds = ", ".join(f"{group.label} {len(group.runs)}" for group in section.as_trained)
     text = (
-        f"The paper's figure {number}. {what} The exploring policy in each episode of training, "
+        f"The paper's figure {number}. {content} The exploring policy in each episode of training, "
         "mean over the environments side by side. Line: interquartile mean over seeds; band: 95 % "
         f"bootstrap interval over seeds, none with one seed (seeds: {seeds})."
     )
@@ -79,7 +79,7 @@ def _caption(numbers: Numbers, number: int, what: str) -> str:
 def _timelapses(
     folder: Path, stem: str, numbers: Numbers, notes: list[str], say: Callable[[str], None]
 ) -> Iterator[Picture]:
-    """Draws one episode of the first seed of each method as a row of frames."""
+    """Draws a timelapse of the first seed of each method and yields the figures."""
     for place, group in enumerate(numbers.section.as_trained, 1):
         run = group.runs[0]
         newest = newest_checkpoint(run.path)

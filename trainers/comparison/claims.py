@@ -1,4 +1,4 @@
-"""The claims of the paper, and whether the runs support them."""
+"""Tests the claims of the paper (sections V and VI) with intervals over seeds."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ from emberlink.trainers.evaluation.results import LEARNED
 
 @dataclass(frozen=True)
 class Claim:
-    """A method is better than the best other method by a factor."""
+    """The claim that a method is better than the best other method by a factor."""
 
     method: str
     measure: str
@@ -29,7 +29,7 @@ CLAIMS = (
     Claim("consensus", "tracking_last", 1.4, "1.4 times faster tracking, by the slowest UAV"),
     Claim("consensus", "boundary_exits", 2.0, "half the boundary exits"),
 )
-"""the paper, sections V and VI: method 4 against the next best"""
+"""claims of the paper about method 4, compared with the next best method"""
 
 
 @dataclass(frozen=True)
@@ -38,15 +38,15 @@ class Verdict:
 
     Attributes:
         fire: the fire of the evaluation.
-        method: label of the group that the claim is about.
-        claim: the claim in words.
-        measure: its measure.
+        method: label of the group.
+        claim: text of the claim.
+        measure: measure of the claim.
         factor: the factor claimed.
         best_other: label of the best other group.
-        ratio: ratio of the IQMs, above 1 where the method is better; infinite for a ratio to 0.
+        ratio: ratio of the IQMs, above 1 if the method is better; infinite for a ratio to 0.
         interval: of the ratio; None with one seed.
         verdict: "holds", "does not hold" or "undecided".
-        fewest_seeds: number of seeds of the group that has the fewest.
+        fewest_seeds: minimum number of seeds of a group.
     """
 
     fire: str
@@ -62,7 +62,7 @@ class Verdict:
 
 
 def verdicts(section: Section, fires: Sequence[str]) -> list[Verdict]:
-    """Returns the verdict of each claim on each fire, for each group that the claim is about."""
+    """Returns the verdict of each claim on each fire, for each group of the claim's method."""
     return [
         _verdict(group, others, fire, claim)
         for fire in fires
@@ -75,9 +75,7 @@ def verdicts(section: Section, fires: Sequence[str]) -> list[Verdict]:
 
 def _verdict(group: Group, others: Sequence[Group], fire: str, claim: Claim) -> Verdict:
     higher = claim.measure in metrics.HIGHER_IS_BETTER
-    samples = [
-        [run.mean(fire, LEARNED, claim.measure) for run in one.runs] for one in (group, *others)
-    ]
+    samples = [[run.mean(fire, LEARNED, claim.measure) for run in g.runs] for g in (group, *others)]
     share = partial(bootstrap.iqm_ratio_share, higher=higher)
     shares = bootstrap.interval(share, *samples)
     ratios = shares and (bootstrap.as_ratio(shares[0]), bootstrap.as_ratio(shares[1]))

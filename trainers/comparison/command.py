@@ -1,4 +1,4 @@
-"""`emberlink compare`: prints the tables of a comparison and leaves a folder with the report."""
+"""Runs `emberlink compare`: prints the tables of a comparison and writes the report."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -17,15 +17,15 @@ def compare(paths: Sequence[Path], console: Console, output: Path | None = None)
     """Compares runs, prints the tables and writes the report.
 
     Args:
-        paths: run folders, folders that hold some, or names such as `pretrained:tuned`.
-        console: shows the tables.
-        output: a new or empty folder; `compare`, or `compare_2`, ... if None.
+        paths: run folders, folders of run folders, or names such as `pretrained:tuned`.
+        console: prints the tables.
+        output: a new or empty folder; if None, `compare`, `compare_2` and so on.
 
     Returns:
-        0, the exit status.
+        The exit status 0.
 
     Raises:
-        UserError: as `compare_runs`; or the folder is not empty or cannot be written.
+        UserError: the runs cannot be compared, or the folder is not empty or not writable.
     """
     folder = free_folder(output)
     comparison = compare_runs(paths)
@@ -37,13 +37,13 @@ def compare(paths: Sequence[Path], console: Console, output: Path | None = None)
     for note in comparison.notes:
         console.print(Text(f"note: {note}", style="yellow"))
     for numbers in comparison.sections:
-        _print(console, numbers)
+        _print_section(console, numbers)
     console.print(Text(str(folder / "compare.html")), soft_wrap=True)
     return 0
 
 
-def _print(console: Console, numbers: Numbers) -> None:
-    """Prints a table for each fire, then the claims."""
+def _print_section(console: Console, numbers: Numbers) -> None:
+    """Prints a table of rankings for each fire, and a table of the paper's claims."""
     for fire, rankings in numbers.fires.items():
         trained = ", the fire trained on" if fire == numbers.section.trained_on else ""
         table = _rankings_table(rankings, f"{numbers.section.label}: on {fire}{trained}")
@@ -64,6 +64,7 @@ def _print(console: Console, numbers: Numbers) -> None:
 
 
 def _rankings_table(rankings: Sequence[Ranking], title: str) -> Table:
+    """Returns a table of rankings, with a section for each measure."""
     table = Table(title=Text(title), caption="↑ more is better, ↓ less is better")
     for column in ("policy", "seeds", "IQM", "95 % interval", "P(better than the next)"):
         table.add_column(column, justify="left" if column == "policy" else "right")

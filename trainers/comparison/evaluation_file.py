@@ -1,4 +1,4 @@
-"""Reads and checks the evaluation and the training curves of a run folder."""
+"""Reads and validates the evaluation and the training curves of a run folder."""
 
 from pathlib import Path
 from typing import Annotated, Any
@@ -15,7 +15,7 @@ from emberlink.trainers.runs.run_folder import RunFolder
 from emberlink.trainers.runs.safe_read import MAX_JSON, read_text
 
 MAX_VALUE = 1e12
-"""the largest absolute value of a measure"""
+"""maximum absolute value of a measure"""
 Measured = Annotated[float, Field(ge=-MAX_VALUE, le=MAX_VALUE, allow_inf_nan=False)]
 _MEASURE = TypeAdapter(Measured)
 
@@ -32,11 +32,11 @@ class Evaluation:
     checkpoint: str
     """file name of the checkpoint that was evaluated"""
     fires: Annotated[int, Field(ge=1)]
-    """episodes of every policy on every fire"""
+    """episodes per policy and fire"""
     results: dict[str, dict[str, dict[str, list[Measured]]]]
     """fire -> policy -> measure -> one number per episode"""
     held_out: dict[str, Any] = Field(default_factory=dict)
-    """fire -> how the held-out fires were made"""
+    """fire -> description of the held-out fires"""
     environment: dict[str, Any] = Field(default_factory=dict)
     """settings of the environment"""
     communication: dict[str, dict[str, Any]] = Field(default_factory=dict)
@@ -47,8 +47,8 @@ def read_evaluation(file: Path, config: RunConfig) -> Evaluation:
     """Returns the content of an eval.json.
 
     Args:
-        file: the file.
-        config: of the run that it belongs to.
+        file: path of the file.
+        config: configuration of its run.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -59,9 +59,9 @@ def read_evaluation(file: Path, config: RunConfig) -> Evaluation:
     except ValidationError as error:
         raise UserError(f"{file}: {' '.join(describe(error).split())[:300]}") from None
     for key in ("method", "setup", "seed"):
-        found, expected = getattr(evaluation, key), getattr(config, key)
-        if found != expected:
-            raise UserError(f"{file}: {key}={found}, but the run's config.yaml says {expected}")
+        actual, expected = getattr(evaluation, key), getattr(config, key)
+        if actual != expected:
+            raise UserError(f"{file}: {key}={actual}, but the run's config.yaml says {expected}")
     _check_results(file, evaluation)
     return evaluation
 
@@ -69,10 +69,10 @@ def read_evaluation(file: Path, config: RunConfig) -> Evaluation:
 def _check_results(file: Path, evaluation: Evaluation) -> None:
     """Checks that every policy has all measures of all episodes."""
     if not evaluation.results:
-        raise UserError(f"{file}: results holds no fire")
+        raise UserError(f"{file}: results has no fire")
     for fire, policies in evaluation.results.items():
         if LEARNED not in policies:
-            raise UserError(f"{file}: results.{fire} holds no policy {LEARNED!r}")
+            raise UserError(f"{file}: results.{fire} has no policy {LEARNED!r}")
         for policy, measured in policies.items():
             for name in metrics.NAMES:
                 if name not in measured:
@@ -88,7 +88,7 @@ def read_curves(folder: RunFolder) -> list[dict[str, Any]]:
     """Returns the lines of metrics.jsonl, one per episode of training.
 
     Raises:
-        UserError: an episode is missing or out of order, or a measure is no finite number.
+        UserError: an episode is missing or out of order, or a measure is not a finite number.
     """
     file = folder.path / "metrics.jsonl"
     try:
@@ -97,7 +97,7 @@ def read_curves(folder: RunFolder) -> list[dict[str, Any]]:
         raise UserError(f"{file}: cannot be read: {error}") from None
     for number, line in enumerate(lines, 1):
         if line.get("episode") != number:
-            raise UserError(f"{file}: line {number} is not that of episode {number}")
+            raise UserError(f"{file}: line {number} is not of episode {number}")
         for name in CURVES:
             value = line.get(name)
             try:

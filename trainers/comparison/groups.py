@@ -1,4 +1,4 @@
-"""Groups runs by setup, fire and method, and names the groups."""
+"""Groups runs by setup, fire and method, and labels the groups."""
 
 import json
 from collections.abc import Callable, Iterable, Sequence
@@ -11,20 +11,20 @@ from emberlink.trainers.config.compose import flat, resolve, to_values
 from emberlink.trainers.config.schema import NOT_LEARNT_WITH, RunConfig
 
 NOT_COMPARED = ("seed", "seeds", "output", "evaluation", *NOT_LEARNT_WITH)
-"""first parts of the keys in which the runs of a group may differ: none changes the training"""
+"""first parts of keys that may differ within a group, since they do not affect training"""
 NOT_NOTED = ("seed", "seeds", "output", "baseline_comm")
-"""those of them whose differences are not noted"""
+"""first parts of keys whose differences within a group are not reported in notes"""
 _OF_SECTION = ("env.horizon", "env.grid")
-"""settings of the environment that the runs of a section have in common, beside the fire's"""
+"""settings of the environment that are equal within a section, besides those of the fire"""
 
 
 @dataclass(frozen=True)
 class Group:
-    """Runs that differ in nothing but the seed.
+    """Runs that differ only in the seed.
 
     Attributes:
-        label: the method, and the settings that tell it from other groups of the method.
-        runs: by seed, each seed once.
+        label: the method, and settings that distinguish it from other groups of the method.
+        runs: one run per seed, sorted by seed.
     """
 
     label: str
@@ -32,12 +32,12 @@ class Group:
 
     @property
     def as_trained(self) -> bool:
-        """Whether the runs were evaluated with the settings of their training."""
+        """Whether the runs were evaluated with their training settings."""
         return not self.runs[0].evaluated_with
 
     @property
     def method(self) -> str:
-        """The recipe."""
+        """The method of the runs."""
         return self.runs[0].config.method
 
     @property
@@ -48,11 +48,11 @@ class Group:
 
 @dataclass(frozen=True)
 class Section:
-    """The groups of one setup that were trained on the same fire and evaluated alike.
+    """Groups with the same setup and training fire and comparable evaluations.
 
     Attributes:
-        label: the setup, the fire, and the settings that tell it from other sections of these.
-        groups: by label.
+        label: the setup, the fire, and settings that distinguish it from other sections of these.
+        groups: groups sorted by label.
     """
 
     label: str
@@ -60,7 +60,7 @@ class Section:
 
     @property
     def as_trained(self) -> list[Group]:
-        """The groups that were evaluated with the settings of their training."""
+        """The groups that were evaluated with their training settings."""
         return [group for group in self.groups if group.as_trained]
 
     @property
@@ -70,7 +70,7 @@ class Section:
 
     @property
     def trained_on(self) -> str:
-        """The name in the evaluation of the fire trained on; empty if it was not evaluated."""
+        """The name of the training fire in the evaluation; empty if it was not evaluated."""
         run = self.runs[0]
         name = run.config.fire.name
         fires = run.evaluation.results
@@ -78,13 +78,13 @@ class Section:
 
 
 def gather(runs: Sequence[Run]) -> tuple[list[Section], list[str]]:
-    """Groups runs by setup and fire trained on, and within these by method.
+    """Groups runs into sections by setup and training fire, and within sections by method.
 
-    Runs with another horizon, grid, number of held-out fires or start positions are in a section of
-    their own. Of several runs with the same seed in a group, the last by name is taken.
+    Runs with different horizons, grids, numbers of held-out fires or start positions are in
+    different sections. Of several runs of a group with the same seed, the last by name is used.
 
     Returns:
-        The sections by label, and notes about differences between runs.
+        The sections sorted by label, and notes about differences between runs.
 
     Raises:
         UserError: runs of a section were evaluated on different fires.
@@ -108,11 +108,11 @@ def _section_key(run: Run) -> list[Any]:
 
 
 def _section_name(run: Run, firsts: Sequence[Run]) -> str:
-    """Returns the name of a run's section.
+    """Returns the label of a run's section.
 
     Args:
         run: a run of the section.
-        firsts: a run of each section.
+        firsts: one run of each section.
     """
     setup, fire = run.config.setup, run.config.fire.name
     alike = [r for r in firsts if (r.config.setup, r.config.fire.name) == (setup, fire)]
@@ -126,7 +126,7 @@ def _section_name(run: Run, firsts: Sequence[Run]) -> str:
 
 
 def _groups(section: str, runs: Sequence[Run], notes: list[str]) -> list[Group]:
-    """Returns the groups of a section by label, and notes what is left out or differs."""
+    """Returns the groups of a section sorted by label, and appends notes about their runs."""
     parts = _split(runs, lambda run: [run.config.method, _trained_with(run), run.evaluated_with])
     names = [_group_name(part[0], [other[0] for other in parts]) for part in parts]
     groups = [
@@ -136,18 +136,16 @@ def _groups(section: str, runs: Sequence[Run], notes: list[str]) -> list[Group]:
     for group in groups:
         keys = [key for key in _differing(group.runs) if _first_part(key) not in NOT_NOTED]
         if keys:
-            notes.append(
-                f"{section}, {group.label}: taken together though {', '.join(keys)} differ"
-            )
+            notes.append(f"{section}, {group.label}: one group, though {', '.join(keys)} differ")
     for key in _differing([group.runs[0] for group in groups]):
         if _first_part(key) not in ("method", "replay", "comm", *NOT_COMPARED):
             values = ", ".join(f"{g.label} {g.runs[0].settings.get(key)}" for g in groups)
-            notes.append(f"{section}: not all methods have the same {key}: {values}")
+            notes.append(f"{section}: the methods differ in {key}: {values}")
     return groups
 
 
 def _group_name(run: Run, firsts: Sequence[Run]) -> str:
-    """Returns the name of a run's group, given a run of each group of the section."""
+    """Returns the label of a run's group, given one run of each group of the section."""
     alike = [other for other in firsts if other.config.method == run.config.method]
     apart = (*NOT_COMPARED, "method")
     name = run.config.method + _settings_apart(run, alike, lambda k: _first_part(k) not in apart)
@@ -156,25 +154,25 @@ def _group_name(run: Run, firsts: Sequence[Run]) -> str:
 
 
 def _one_run_per_seed(label: str, runs: Sequence[Run], notes: list[str]) -> tuple[Run, ...]:
-    """Returns the last run of each seed by seed, and notes those that are left out."""
+    """Returns the last run of each seed, sorted by seed, and appends notes about other runs."""
     by_seed = {run.config.seed: run for run in runs}
     for run in runs:
         taken = by_seed[run.config.seed]
         if run is not taken:
             notes.append(
                 f"{label}: seed {run.config.seed} was trained twice; "
-                f"{taken.path} is taken, {run.path} is left out"
+                f"{taken.path} is used, {run.path} is left out"
             )
     return tuple(by_seed[seed] for seed in sorted(by_seed))
 
 
 def _trained_with(run: Run) -> dict[str, Any]:
-    """Returns the settings on which a training depends, but for the seed."""
+    """Returns the settings that affect training, without the seed."""
     return {k: v for k, v in run.settings.items() if _first_part(k) not in NOT_COMPARED}
 
 
 def _split(runs: Iterable[Run], key: Callable[[Run], Any]) -> list[list[Run]]:
-    """Returns lists of the runs with equal keys, in order of the first run of each."""
+    """Splits runs into lists with equal keys, in order of the first run of each list."""
     parts: dict[str, list[Run]] = {}
     for run in runs:
         parts.setdefault(json.dumps(key(run), sort_keys=True), []).append(run)
@@ -182,33 +180,33 @@ def _split(runs: Iterable[Run], key: Callable[[Run], Any]) -> list[list[Run]]:
 
 
 def _settings_apart(run: Run, others: Sequence[Run], counts: Callable[[str], bool]) -> str:
-    """Returns the settings that tell a run from others of the same name, in brackets.
+    """Returns the settings that distinguish a run from others with the same name, in brackets.
 
-    Settings that are as in the run's recipe are left out; without any, the text is empty.
+    Settings with the default of the run's method and setup are left out. The text can be empty.
 
     Args:
-        run: the run to name.
-        others: all runs of that name, itself included.
-        counts: whether a key may be part of the name.
+        run: the run.
+        others: all runs with the same name, including `run`.
+        counts: whether a key may be part of the text.
     """
     keys = [key for key in _differing(others) if counts(key)]
-    recipe = _recipe(run.config) if keys else {}
+    defaults = _defaults(run.config) if keys else {}
     apart = [
         _typed(key, run.settings.get(key))
         for key in keys
-        if key not in recipe or run.settings.get(key) != recipe[key]
+        if key not in defaults or run.settings.get(key) != defaults[key]
     ]
     return f" ({', '.join(apart)})" if apart else ""
 
 
 def _typed(key: str, value: Any) -> str:
-    """Returns a setting as it is typed on the command line."""
+    """Returns a setting as on the command line."""
     words = {None: "null", True: "true", False: "false"}
     return f"{key}={words[value] if value is None or isinstance(value, bool) else value}"
 
 
-def _recipe(config: RunConfig) -> dict[str, Any]:
-    """Returns the settings of a run's recipe by dotted key; none if it is not installed."""
+def _defaults(config: RunConfig) -> dict[str, Any]:
+    """Returns the default settings of a run's method and setup; empty if it is not installed."""
     try:
         choices = [f"setup={config.setup}", f"fire={config.fire.name}"]
         return flat(to_values(resolve(config.method, choices)))
@@ -217,7 +215,7 @@ def _recipe(config: RunConfig) -> dict[str, Any]:
 
 
 def _differing(runs: Sequence[Run]) -> list[str]:
-    """Returns the keys that do not have the same value in all runs."""
+    """Returns the keys whose values differ between runs."""
     keys = dict.fromkeys(key for run in runs for key in run.settings)
     return [key for key in keys if len({repr(run.settings.get(key)) for run in runs}) > 1]
 
@@ -235,11 +233,11 @@ def _check_same_fires(section: str, runs: Sequence[Run]) -> None:
             raise UserError(
                 f"{section}: {first.path} was evaluated on {', '.join(fires)}, "
                 f"{run.path} on {', '.join(sorted(run.evaluation.results))}; "
-                "evaluate them alike (emberlink eval RUN)"
+                "evaluate them again (emberlink eval RUN)"
             )
         for fire in fires:
             if run.evaluation.held_out.get(fire) != first.evaluation.held_out.get(fire):
                 raise UserError(
                     f"{section}: {first.path} and {run.path} were not evaluated on the same fires "
-                    f"of {fire} (held_out in eval.json); evaluate them alike (emberlink eval RUN)"
+                    f"of {fire} (held_out in eval.json); evaluate them again (emberlink eval RUN)"
                 )

@@ -1,4 +1,4 @@
-"""A comparison as text: the rows of tables, and the HTML page."""
+"""Formats a comparison as rows of tables and as an HTML page."""
 
 import base64
 import math
@@ -17,14 +17,14 @@ from emberlink.trainers.comparison.runs import LeftOut
 
 NONE = "-"
 FLAG = "*"
-"""follows a number of seeds that is too small for an interval"""
+"""mark of a number of seeds that is too small for an interval"""
 DIGITS = {"mean_reward": 3, "boundary_exits": 2, "fire_losses": 2}
 """digits after the decimal point; 1 for other measures"""
 
 
 @dataclass(frozen=True)
 class Line:
-    """A row of a table, as text."""
+    """The cells of a table row, as text."""
 
     name: str
     seeds: str
@@ -44,7 +44,7 @@ class Picture:
 
     @property
     def uri(self) -> str:
-        """The picture as a data URI."""
+        """The file as a data URI."""
         return "data:image/png;base64," + base64.b64encode(self.path.read_bytes()).decode()
 
 
@@ -53,10 +53,10 @@ class Chapter:
     """The part of the page about one section.
 
     Attributes:
-        numbers: the section's numbers.
-        frozen: a figure of the frozen policies for each fire of the evaluation.
-        figures: the figures of the training.
-        timelapses: a row of frames for each method.
+        numbers: numbers of the section.
+        frozen: figure of the frozen policies for each fire of the evaluation.
+        figures: figures of the training.
+        timelapses: timelapse of each method.
     """
 
     numbers: Numbers
@@ -70,9 +70,9 @@ class Report:
     """The content of the page.
 
     Attributes:
-        command: the command line that made it.
-        chapters: one for each section.
-        left_out: folders and files that are no part of it, with the reason.
+        command: command line of the comparison.
+        chapters: one chapter per section.
+        left_out: folders and files that are not compared, with the reason.
         notes: differences between runs.
     """
 
@@ -110,24 +110,24 @@ def _probability(row: Row) -> str:
 
 
 def heading(ranking: Ranking) -> str:
-    """Returns the measure, and which direction is better or why nothing is ranked."""
+    """Returns the measure with its better direction, or the reason why it is not ranked."""
     if ranking.not_ranked:
         return f"{ranking.measure} (not ranked: {ranking.not_ranked})"
     return f"{ranking.measure} ({'more' if ranking.higher_is_better else 'less'} is better)"
 
 
 def ratio(verdict: Verdict) -> tuple[str, str]:
-    """Returns a claim's ratio and its interval."""
+    """Returns the ratio of a claim and its interval."""
     return _number(verdict.ratio, 2), _interval(verdict.interval, 2)
 
 
 def decision(verdict: Verdict) -> str:
-    """Returns a claim's verdict, with a flag where the seeds are few."""
+    """Returns the verdict of a claim, with a note if there are too few seeds."""
     return verdict.verdict + few(verdict.fewest_seeds)
 
 
 def few(seeds: int) -> str:
-    """Returns a flag for results of too few seeds, else an empty text."""
+    """Returns a note for results of too few seeds, else an empty text."""
     return "" if seeds >= bootstrap.FEW else f" (only {seeds} seed{'s' if seeds > 1 else ''})"
 
 
@@ -137,7 +137,7 @@ def counts(numbers: Numbers) -> list[int]:
 
 
 def html(report: Report) -> str:
-    """Returns the page, which loads no other file and no address."""
+    """Returns the page as HTML without external files."""
     source = files("emberlink.trainers.comparison").joinpath("page.html").read_text("utf-8")
     environment = Environment(
         autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True

@@ -1,4 +1,4 @@
-"""The paper's figures 5 to 9 for several methods and seeds."""
+"""Draws the paper's figures 5 to 9 and the results of frozen policies."""
 
 import textwrap
 from collections.abc import Iterator, Mapping, Sequence
@@ -22,30 +22,30 @@ FIGURES = {
     8: (("boundary_exits",), "Attempted moves out of the box, mean over UAVs."),
     9: (("fire_losses",), "Times a UAV fell out of the fire region, mean over UAVs."),
 }
-"""number in the paper -> the measure of each panel, and the caption"""
+"""number of the figure in the paper -> measure of each panel, and the caption"""
 COLOURS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#D55E00", "#56B4E9", "#8C6D00", "#000000")
-"""colours of methods, which colour-blind readers can tell apart (Okabe and Ito, 2008; with a dark
-yellow, which is visible on white)"""
+"""colours of methods, distinguishable with colour blindness (Okabe and Ito, 2008, with a darker
+yellow)"""
 DASHES = (
     *((0, (7, 3)), (0, (7, 2, 1, 2)), (0, (3, 2)), (0, (7, 2, 1, 2, 1, 2)), (0, (12, 4))),
     *((0, (3, 2, 1, 2)), (0, (12, 2, 3, 2)), (0, (1, 1))),
 )
 """line styles of scripted policies"""
 FROZEN = ("coverage", "tracking_first", "tracking_last", "boundary_exits")
-"""measures of the figure of frozen policies; its rows are ranked by the first"""
+"""measures of the figure of frozen policies; rows are sorted by the first"""
 LOGARITHMIC = {"tracking_first": 1.0, "boundary_exits": 0.1}
-"""measures of that figure with a logarithmic axis -> the number below which it is linear"""
+"""measure with a logarithmic axis in that figure -> value below which the axis is linear"""
 DOTTED = "tracking_last"
-"""the measure that is dotted, as in the paper's figure 7"""
+"""measure with dotted lines, as in the paper's figure 7"""
 
 
 def figure(path: Path, numbers: Numbers, measures: tuple[str, ...]) -> None:
-    """Draws one of the paper's figures: a line per method over training, a band over its seeds.
+    """Draws training curves: the IQM over seeds and its interval for each method.
 
     Args:
         path: a .png file.
-        numbers: the numbers of a section.
-        measures: a panel each.
+        numbers: numbers of a section.
+        measures: measure of each panel.
     """
     figure = Figure(figsize=(9.2, 3.8), layout="constrained")
     colours = _colours(numbers)
@@ -62,14 +62,14 @@ def figure(path: Path, numbers: Numbers, measures: tuple[str, ...]) -> None:
 
 
 def frozen(path: Path, numbers: Numbers, fire: str) -> None:
-    """Draws frozen policies on one evaluation fire: a row per method, a panel per measure.
+    """Draws the results of frozen policies on a fire: a row per group, a panel per measure.
 
     Args:
         path: a .png file.
-        numbers: the numbers of a section.
-        fire: one of `numbers.fires`.
+        numbers: numbers of a section.
+        fire: a key of `numbers.fires`.
     """
-    rankings = {one.measure: one for one in numbers.fires[fire]}
+    rankings = {ranking.measure: ranking for ranking in numbers.fires[fire]}
     order = [row.method for row in rankings[FROZEN[0]].rows][::-1]
     colours = _colours(numbers)
     policies = _policies(numbers)
@@ -96,7 +96,7 @@ def frozen(path: Path, numbers: Numbers, fire: str) -> None:
 def _frozen_rows(
     axes: Axes, ranking: Ranking, order: Sequence[str], colours: Mapping[str, str]
 ) -> None:
-    """Draws each group's seeds, IQM and interval in its row."""
+    """Draws the seeds, IQM and interval of each group in its row."""
     for row in ranking.rows:
         y, colour = order.index(row.method), colours.get(row.method, "0.45")
         axes.plot(row.values, [y] * len(row.values), "o", ms=3, color=colour, alpha=0.5)
@@ -111,13 +111,14 @@ def _frozen_scripted(
     order: Sequence[str],
     policies: Mapping[str, tuple[int, tuple[int, ...]]],
 ) -> None:
-    """Draws a line per scripted policy through the rows of the groups whose number it is."""
+    """Draws the result of each scripted policy as a line across the rows of its groups."""
     for policy, values in ranking.scripted.items():
-        for one in values:
-            rows = [order.index(name) for name in one.methods or order]
+        for result in values:
+            rows = [order.index(name) for name in result.methods or order]
             for low, high in _stretches(rows):
                 ends = [low - 0.5, high + 0.5]
-                axes.plot([one.value] * 2, ends, color="0.3", ls=policies[policy], lw=1.3, zorder=1)
+                style = {"color": "0.3", "ls": policies[policy], "lw": 1.3}
+                axes.plot([result.value] * 2, ends, **style, zorder=1)
 
 
 def _stretches(places: Sequence[int]) -> Iterator[tuple[int, int]]:
@@ -129,6 +130,7 @@ def _stretches(places: Sequence[int]) -> Iterator[tuple[int, int]]:
 
 
 def _colours(numbers: Numbers) -> dict[str, str]:
+    """Returns the colour of each group, by label."""
     groups = enumerate(numbers.section.as_trained)
     return {group.label: COLOURS[i % len(COLOURS)] for i, group in groups}
 
@@ -148,7 +150,7 @@ def _legend(
     legend = figure.legend(
         handles=handles, loc="outside right upper", frameon=False, handlelength=3
     )
-    for text in legend.get_texts():  # a name is no formula
+    for text in legend.get_texts():  # names are not formulas
         text.set_parse_math(False)
 
 
@@ -165,9 +167,9 @@ def _curves(
 
 
 def _policies(numbers: Numbers) -> dict[str, tuple[int, tuple[int, ...]]]:
-    """Returns the dashes of each scripted policy."""
-    rankings = [one for on_fire in numbers.fires.values() for one in on_fire]
-    names = sorted({policy for one in rankings for policy in one.scripted})
+    """Returns the line style of each scripted policy, by name."""
+    rankings = [ranking for on_fire in numbers.fires.values() for ranking in on_fire]
+    names = sorted({policy for ranking in rankings for policy in ranking.scripted})
     return {name: DASHES[i % len(DASHES)] for i, name in enumerate(names)}
 
 
@@ -178,11 +180,11 @@ def _scripted_lines(
     policies: Mapping[str, tuple[int, tuple[int, ...]]],
     colours: Mapping[str, str],
 ) -> None:
-    """Draws a line per scripted policy, in a method's colour where the number is that method's."""
-    for ranking in (one for one in numbers.on_trained if one.measure == measure):
-        for policy, each in ranking.scripted.items():
-            for one in each:
-                shown = [name for name in one.methods if name in colours]
-                if shown or not one.methods:
+    """Draws the result of each scripted policy, in the colour of a group if it is of one group."""
+    for ranking in (ranking for ranking in numbers.on_trained if ranking.measure == measure):
+        for policy, results in ranking.scripted.items():
+            for result in results:
+                shown = [name for name in result.methods if name in colours]
+                if shown or not result.methods:
                     colour = colours[shown[0]] if len(shown) == 1 else "0.3"
-                    axes.axhline(one.value, color=colour, ls=policies[policy], lw=1.3, zorder=1)
+                    axes.axhline(result.value, color=colour, ls=policies[policy], lw=1.3, zorder=1)

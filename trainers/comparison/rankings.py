@@ -1,4 +1,4 @@
-"""The numbers of a section: rankings by each measure, claims and training curves."""
+"""Computes the numbers of a section: rankings by measure, verdicts and training curves."""
 
 from dataclasses import dataclass, field
 from itertools import zip_longest
@@ -15,23 +15,24 @@ from emberlink.trainers.evaluation.evaluate import HELD_OUT_SCENARIO
 from emberlink.trainers.evaluation.results import CURVES, LEARNED
 
 MEASURES = (*(name for name in metrics.NAMES if name != REWARD), REWARD)
-"""coverage first, and last the measure that depends on a method's own reward"""
+"""all measures, with the reward last, since methods may have different rewards"""
 
 
 @dataclass(frozen=True)
 class Row:
-    """A group's number of one measure.
+    """The result of a group for one measure.
 
     Attributes:
         method: label of the group.
-        seeds: its training seeds.
-        values: a run's mean over its episodes, for each seed.
+        seeds: training seeds of the group.
+        values: mean over the episodes of the run of each seed.
         iqm: interquartile mean over seeds.
-        interval: of the IQM; None with one seed.
-        next: label of the group ranked next; None for the last, and where nothing is ranked.
+        interval: interval of the IQM; None with one seed.
+        next: label of the next group in the ranking; None for the last group, and if the measure is
+            not ranked.
         probability_of_improvement: probability that a run is better than a run of the next group;
-            None for the last, and where both are the same trainings evaluated differently.
-        probability_interval: of that; None with one seed.
+            None without a next group, and if both groups are evaluations of the same runs.
+        probability_interval: interval of this probability; None with one seed.
     """
 
     method: str
@@ -46,14 +47,14 @@ class Row:
 
 @dataclass(frozen=True)
 class Ranking:
-    """One measure on one fire.
+    """The ranking of groups by one measure on one fire.
 
     Attributes:
-        measure: one of `metrics.NAMES`.
+        measure: a name in `metrics.NAMES`.
         higher_is_better: whether more is better.
-        rows: best first; by label where nothing is ranked.
-        scripted: the numbers of each scripted policy.
-        not_ranked: the reason where the groups cannot be compared by the measure, else empty.
+        rows: rows of the groups, best first; sorted by label if the measure is not ranked.
+        scripted: results of each scripted policy.
+        not_ranked: reason why the measure is not ranked, else empty.
     """
 
     measure: str
@@ -69,7 +70,7 @@ class Curve:
 
     Attributes:
         iqm: interquartile mean over seeds.
-        low, high: its interval; None with one seed.
+        low, high: ends of its interval; None with one seed.
     """
 
     iqm: list[float]
@@ -82,11 +83,11 @@ class Numbers:
     """The numbers of a section.
 
     Attributes:
-        section: the groups.
-        fires: a ranking per measure, for each fire of the evaluation.
-        verdicts: the claims of the paper.
-        curves: measure -> group -> curve.
-        notes: differences that a reader should know of.
+        section: the section.
+        fires: fire of the evaluation -> ranking of each measure.
+        verdicts: verdicts of the paper's claims.
+        curves: measure -> label of the group -> curve.
+        notes: differences between runs.
     """
 
     section: Section
@@ -97,12 +98,12 @@ class Numbers:
 
     @property
     def on_trained(self) -> list[Ranking]:
-        """The rankings on the fire trained on; none if it was not evaluated."""
+        """The rankings on the training fire; empty if it was not evaluated."""
         return self.fires.get(self.section.trained_on, [])
 
 
 def numbers(section: Section) -> Numbers:
-    """Computes the rankings, claims and curves of a section."""
+    """Computes the rankings, verdicts and curves of a section."""
     fires = sorted(
         section.runs[0].evaluation.results, key=lambda name: (name != HELD_OUT_SCENARIO, name)
     )
@@ -118,7 +119,7 @@ def numbers(section: Section) -> Numbers:
 def _ranking(section: Section, fire: str, measure: str, notes: list[str]) -> Ranking:
     higher = measure in metrics.HIGHER_IS_BETTER
     values = {g.label: [run.mean(fire, LEARNED, measure) for run in g.runs] for g in section.groups}
-    means = {label: float(bootstrap.iqm(np.asarray(own))) for label, own in values.items()}
+    means = {label: float(bootstrap.iqm(np.asarray(v))) for label, v in values.items()}
     why = different_rewards(section, fire) if measure == REWARD else ""
     order = list(section.groups)
     if not why:
@@ -148,7 +149,7 @@ def _ranking(section: Section, fire: str, measure: str, notes: list[str]) -> Ran
 
 
 def _same_trainings(one: Group, other: Group) -> bool:
-    """Returns whether two groups are evaluations of the same runs, so not two samples."""
+    """Returns whether two groups are evaluations of the same runs."""
     return not {run.path for run in one.runs}.isdisjoint(run.path for run in other.runs)
 
 

@@ -1,4 +1,4 @@
-"""A comparison as plain values and as JSON."""
+"""Converts a comparison to plain values and JSON."""
 
 import json
 import math
@@ -43,7 +43,7 @@ def to_values(
 
 
 def to_json(values: Any) -> str:
-    """Returns values as JSON; an infinite number is the text "inf"."""
+    """Returns values as JSON, with the text "inf" for infinite numbers."""
     return json.dumps(_without_infinities(values), indent=1, allow_nan=False) + "\n"
 
 

@@ -1,4 +1,4 @@
-"""Compares runs and writes the report; prints nothing."""
+"""Compares runs and writes the report."""
 
 import os
 import shlex
@@ -19,13 +19,13 @@ from emberlink.trainers.comparison.runs import LeftOut, read_all
 
 @dataclass(frozen=True)
 class Comparison:
-    """The numbers of a comparison.
+    """The results of a comparison.
 
     Attributes:
-        paths: the folders that were compared, as given.
-        sections: rankings, claims and training curves for each setup and fire trained on.
-        notes: differences between runs that a reader should know of.
-        left_out: folders and files that are no part of it, with the reason.
+        paths: compared folders, as given.
+        sections: rankings, verdicts and training curves for each setup and training fire.
+        notes: differences between runs.
+        left_out: folders and files that are not compared, with the reason.
     """
 
     paths: tuple[Path, ...]
@@ -39,15 +39,15 @@ class Comparison:
         return shlex.join(["emberlink", "compare", *sorted(map(str, self.paths))])
 
     def to_values(self) -> dict[str, Any]:
-        """Returns everything as plain values: the content of compare.json."""
+        """Returns all results as plain values, the content of compare.json."""
         return to_values(self.command, self.sections, self.left_out, self.notes)
 
 
 def compare_runs(paths: Sequence[Path]) -> Comparison:
-    """Compares runs by setup, fire trained on and method.
+    """Compares runs by setup, training fire and method.
 
     Args:
-        paths: run folders, folders that hold some, or names such as `pretrained:tuned`.
+        paths: run folders, folders of run folders, or names such as `pretrained:tuned`.
 
     Raises:
         UserError: there is no finished run, runs of a section were evaluated on different fires,
@@ -64,10 +64,10 @@ def compare_runs(paths: Sequence[Path]) -> Comparison:
 
 
 def free_folder(output: Path | None) -> Path:
-    """Returns a folder for a report: `output`, else `compare`, `compare_2`, ...
+    """Returns a folder for a report: `output`, or the first free of `compare`, `compare_2`, ...
 
     Raises:
-        UserError: `output` is a file or not empty.
+        UserError: `output` is a file, a dangling link, or not empty.
     """
     if output is None:
         tried = (Path("compare" if i == 1 else f"compare_{i}") for i in range(1, 10_000))
@@ -78,9 +78,9 @@ def free_folder(output: Path | None) -> Path:
     except OSError as error:
         raise UserError(f"--output {output}: cannot be written: {error.strerror}") from None
     if dangling:
-        raise UserError(f"--output {output}: a link to what is not there; name a new folder")
+        raise UserError(f"--output {output}: a link to a missing folder; name a new folder")
     if taken:
-        raise UserError(f"--output {output}: is there and not an empty folder; name a new one")
+        raise UserError(f"--output {output}: exists and is not an empty folder; name a new one")
     return output
 
 
@@ -90,12 +90,12 @@ def write_report(
     """Writes compare.html, compare.json and the figures into a new or empty folder.
 
     Args:
-        comparison: of `compare_runs`.
-        folder: of `free_folder`; it gets its name when the report is complete.
-        say: called with a line before each picture.
+        comparison: result of `compare_runs`.
+        folder: result of `free_folder`; it is created when the report is complete.
+        say: called with a line of text before each figure.
 
     Returns:
-        The comparison, with a note for each method that has no timelapse.
+        The comparison, with a note for each method without a timelapse.
 
     Raises:
         UserError: the folder cannot be written.
@@ -107,8 +107,8 @@ def write_report(
             path = Path(partial) / "report"
             path.mkdir()
             drawn = [
-                chapters.draw(path, place, one, notes, say)
-                for place, one in enumerate(comparison.sections, 1)
+                chapters.draw(path, place, section, notes, say)
+                for place, section in enumerate(comparison.sections, 1)
             ]
             whole = replace(comparison, notes=tuple(notes))
             page = html(Report(whole.command, drawn, whole.left_out, notes))

@@ -17,7 +17,7 @@ from emberlink.trainers.runs.run_folder import RunFolder
 from emberlink.trainers.runs.seal import check_trained_with
 
 LeftOut = tuple[str, str]
-"""a folder or file that is no part of the comparison, and the reason"""
+"""a folder or file that is not compared, and the reason"""
 
 
 @dataclass(frozen=True)
@@ -26,10 +26,10 @@ class Run:
 
     Attributes:
         path: the run folder.
-        config: the configuration of the training.
-        lines: the lines of metrics.jsonl, one per episode of training.
-        evaluation: the content of eval.json, or of one eval_*.json.
-        evaluated_with: dotted key -> value of each setting in which the evaluation differs from the
+        config: configuration of the training.
+        lines: lines of metrics.jsonl, one per training episode.
+        evaluation: content of eval.json or of an eval_*.json.
+        evaluated_with: dotted key -> value of each setting of the evaluation that differs from the
             training, such as comm.loss; empty for eval.json.
     """
 
@@ -54,10 +54,10 @@ def read_all(paths: Iterable[Path | str]) -> tuple[list[Run], list[LeftOut]]:
     """Reads the runs of a comparison.
 
     Args:
-        paths: run folders, folders that hold some, or names such as `pretrained:tuned`.
+        paths: run folders, folders of run folders, or names such as `pretrained:tuned`.
 
     Returns:
-        The finished runs with each of their evaluations, and what is left out.
+        The finished runs, one entry per evaluation, and the folders and files left out.
 
     Raises:
         UserError: a path holds no run, or a file is damaged.
@@ -76,12 +76,12 @@ def read_all(paths: Iterable[Path | str]) -> tuple[list[Run], list[LeftOut]]:
 
 
 def find(paths: Iterable[Path | str]) -> list[Path]:
-    """Returns the run folders among `paths` and directly in them, each once, by name.
+    """Returns the run folders among `paths` and directly within them, sorted and unique.
 
     Raises:
-        UserError: a path is neither a run folder nor holds one.
+        UserError: a path is not a run folder and does not hold any.
     """
-    found: dict[Path, Path] = {}
+    unique: dict[Path, Path] = {}
     for name in paths:
         path = Path(name)
         if pretrained.is_name(str(name)):
@@ -95,16 +95,16 @@ def find(paths: Iterable[Path | str]) -> list[Path]:
         if not folders:
             raise UserError(f"{path}: neither a run folder nor a folder that holds runs")
         for folder in sorted(folders):
-            known = found.setdefault(folder.resolve(), folder)
-            found[folder.resolve()] = min(known, folder)
-    return sorted(found.values())
+            known = unique.setdefault(folder.resolve(), folder)
+            unique[folder.resolve()] = min(known, folder)
+    return sorted(unique.values())
 
 
 def read(path: Path) -> Run | str:
-    """Returns a run, or the reason why it is left out of a comparison.
+    """Returns a run, or the reason why it cannot be compared.
 
     Raises:
-        UserError: a file of it is damaged.
+        UserError: a file of the run is damaged.
     """
     folder = RunFolder(path)
     config = folder.config(device="cpu")
@@ -130,13 +130,13 @@ def evaluated_otherwise(run: Run) -> tuple[list[Run], list[LeftOut]]:
     """Reads the evaluations of a run with changed settings, one per eval_*.json.
 
     Returns:
-        The run with each of these evaluations, and the files that are left out since they are of
-        another checkpoint or of other fires than eval.json.
+        The run with each of these evaluations, and the files left out because their checkpoint or
+        fires differ from those of eval.json.
 
     Raises:
         UserError: a file is damaged.
     """
-    found: list[Run] = []
+    others: list[Run] = []
     left_out: list[LeftOut] = []
     for file in sorted(run.path.glob("eval_*.json")):
         evaluation = read_evaluation(file, run.config)
@@ -148,21 +148,21 @@ def evaluated_otherwise(run: Run) -> tuple[list[Run], list[LeftOut]]:
         ]
         why += [f"{key}={changed[key]}" for key in ("env.horizon", "env.grid") if key in changed]
         if changed and not why:
-            found.append(replace(run, evaluation=evaluation, evaluated_with=changed))
+            others.append(replace(run, evaluation=evaluation, evaluated_with=changed))
         elif changed:
             left_out.append((str(file), f"evaluated otherwise: {', '.join(why)}"))
-    return found, left_out
+    return others, left_out
 
 
 def _changed_settings(run: Run, evaluation: Evaluation) -> dict[str, Any]:
-    """Returns the settings of an evaluation that are not those of the training, by dotted key."""
+    """Returns the settings of an evaluation that differ from the training, by dotted key."""
     learned = evaluation.communication.get(LEARNED, {})
     settings = flat({"env": evaluation.environment, "comm": learned})
     return {key: value for key, value in settings.items() if run.settings.get(key) != value}
 
 
 def newest_checkpoint(path: Path) -> Path | None:
-    """Returns the newest checkpoint of a run folder, or None if it holds none."""
+    """Returns the newest checkpoint of a run folder, or None if there is none."""
     try:
         return RunFolder(path).checkpoint()
     except UserError:

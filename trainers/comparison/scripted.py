@@ -1,4 +1,4 @@
-"""The numbers of scripted policies, which have no training seeds."""
+"""Collects the results of scripted policies, which have no training seeds."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -8,18 +8,18 @@ from emberlink.trainers.comparison.groups import Section
 from emberlink.trainers.evaluation.results import LEARNED
 
 TOLERANCE = 1e-5
-"""share by which a scripted policy's numbers on the same fires may differ between devices"""
+"""relative difference that is possible between devices for a scripted policy on the same fires"""
 REWARD = "mean_reward"
 """the measure that depends on a method's own reward"""
 
 
 @dataclass(frozen=True)
 class Scripted:
-    """A number of a scripted policy.
+    """A result of a scripted policy.
 
     Attributes:
-        methods: the groups whose number it is; empty where it is the same for all.
-        value: the mean over episodes.
+        methods: labels of the groups with this result; empty if it is the same for all groups.
+        value: mean over episodes.
     """
 
     methods: list[str]
@@ -29,13 +29,13 @@ class Scripted:
 def scripted(
     section: Section, fire: str, measure: str, notes: list[str]
 ) -> dict[str, list[Scripted]]:
-    """Returns each scripted policy's mean over episodes, one for each group where they differ.
+    """Returns the mean over episodes of each scripted policy, with an entry per differing group.
 
     Args:
-        section: the groups.
-        fire: the fire of the evaluation.
-        measure: one of `metrics.NAMES`.
-        notes: gets a note where numbers differ that should not.
+        section: the section.
+        fire: fire of the evaluation.
+        measure: a name in `metrics.NAMES`.
+        notes: a note is appended for results that should be equal and differ.
     """
     policies = dict.fromkeys(p for run in section.runs for p in run.evaluation.results[fire])
     found: dict[str, list[Scripted]] = {}
@@ -59,10 +59,10 @@ def scripted(
 
 
 def different_rewards(section: Section, fire: str) -> str:
-    """Returns why the groups' rewards cannot be compared, or an empty text if they can.
+    """Returns the reason why the groups' rewards cannot be compared, or an empty text if they can.
 
-    They cannot if the reward's settings differ, or if a scripted policy, which acts the same
-    whatever the reward is, earns differently with them.
+    They cannot if the settings of the reward differ, or if a scripted policy, whose actions do not
+    depend on the reward, has different rewards.
     """
     rewards = [
         {k: v for k, v in group.runs[0].settings.items() if k.startswith("env.reward.")}
@@ -93,23 +93,23 @@ def _values(section: Section, fire: str, measure: str, policy: str) -> dict[str,
 
 
 def _hears_messages(section: Section, policy: str) -> bool:
-    """Returns whether a policy acts on messages that are not the same for all groups."""
+    """Returns whether a policy uses communication whose settings differ between runs."""
     if policy not in SCRIPTED or SCRIPTED[policy].recipe is None:
         return False
     settings = [run.evaluation.communication.get(policy) for run in section.runs]
-    return any(one != settings[0] for one in settings)
+    return any(other != settings[0] for other in settings)
 
 
 def _by_methods(values: Mapping[str, float]) -> list[Scripted]:
-    """Returns the numbers of several groups, equal ones once."""
+    """Merges equal results of several groups."""
     different: list[Scripted] = []
     for method, value in values.items():
-        same = next((one for one in different if _same([value, one.value])), None)
+        same = next((other for other in different if _same([value, other.value])), None)
         if same is None:
             different.append(Scripted([method], value))
         else:
             same.methods.append(method)
-    return different if len(different) > 1 else [Scripted([], one.value) for one in different]
+    return different if len(different) > 1 else [Scripted([], item.value) for item in different]
 
 
 def _same(values: Sequence[float]) -> bool:

@@ -1,4 +1,4 @@
-"""The right to train a run of a sweep, held by one sweep and its processes at a time."""
+"""Locks the runs of a sweep, so that only one sweep trains a run at a time."""
 
 import fcntl
 import hashlib
@@ -11,14 +11,14 @@ from emberlink.envs.utils.errors import UserError
 from emberlink.trainers.sweep.jobs import Identity
 
 FOLDER = ("logs", "claims")
-"""where the lock files are, in the output folder"""
+"""folder of the lock files, in the output folder"""
 
 
 class Claim:
-    """Locks on the runs of one job.
+    """Holds locks on the runs of one job.
 
-    The locks are `flock`s on files of the output folder. A process that inherits `handles` holds
-    them too: they are free once the sweep and that process have ended, however they ended.
+    The locks are `flock`s on files in the output folder. A process that inherits `handles` holds
+    them, too. They are released when the sweep and that process have ended, for whatever reason.
 
     Attributes:
         handles: file descriptors of the locked files.
@@ -28,21 +28,21 @@ class Claim:
         self.handles = handles
 
     def release(self) -> None:
-        """Closes the files. The lock files stay: removing them could free another's lock."""
+        """Closes the files. They are not removed, since another sweep may have locked them."""
         for handle in self.handles:
             os.close(handle)
         self.handles = []
 
 
 def claim(output: Path, identities: Iterable[Identity]) -> Claim | None:
-    """Locks runs, or returns None where another sweep has one of them.
+    """Locks runs, or returns None if another sweep has locked one of them.
 
     Args:
-        output: the folder of the run folders; it is made if it is not there.
-        identities: of the runs.
+        output: folder of the run folders; it is created if it does not exist.
+        identities: identities of the runs.
 
     Raises:
-        UserError: a lock file cannot be made.
+        UserError: a lock file cannot be created.
     """
     taken = Claim([])
     try:

@@ -1,4 +1,4 @@
-"""`emberlink sweep`: trains every combination, and resumes what was stopped."""
+"""Runs `emberlink sweep`: trains every combination, and resumes stopped runs."""
 
 from collections.abc import Sequence
 
@@ -26,14 +26,14 @@ def sweep(
     dry: bool = False,
     executor: executors.Executor | None = None,
 ) -> int:
-    """Trains and evaluates the runs that are not finished yet.
+    """Trains and evaluates the runs that are not finished.
 
     Args:
-        arguments: as in `jobs_of`, and the executor as `executor=NAME` and `executor.KEY=VALUE`.
+        arguments: see `jobs_of`; and `executor=NAME`, `executor.KEY=VALUE`.
         console: shows the progress and a table at the end.
-        at_a_time: number of runs side by side, in place of `executor.workers`.
-        dry: only prints the state of each run.
-        executor: runs the trainings, in place of the one that the arguments name.
+        at_a_time: number of runs in parallel; replaces `executor.workers`.
+        dry: whether to print the state of each run and do nothing else.
+        executor: runs the trainings; replaces the executor of the arguments.
 
     Returns:
         0; 1 if a run failed; 130 or 143 after a signal.
@@ -73,7 +73,7 @@ def _is_executor(text: str) -> bool:
 
 
 def _executor(arguments: Sequence[str], workers: int | None) -> executors.Executor:
-    """Returns the executor that `executor=NAME` and `executor.KEY=VALUE` name."""
+    """Returns the executor of the arguments `executor=NAME` and `executor.KEY=VALUE`."""
     name = "local"
     settings: dict[str, object] = {} if workers is None else {"workers": workers}
     for text in arguments:
@@ -89,6 +89,7 @@ def _executor(arguments: Sequence[str], workers: int | None) -> executors.Execut
 
 
 def _print_table(jobs: Sequence[Job], console: Console) -> None:
+    """Prints the state and the run folders of each job."""
     table = Table("run", "state")
     table.add_column("folder", overflow="fold")
     for job in jobs:

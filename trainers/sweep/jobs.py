@@ -1,4 +1,4 @@
-"""The jobs of a sweep: every combination of methods and values."""
+"""Defines the jobs of a sweep: every combination of methods and values."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -14,10 +14,10 @@ from emberlink.trainers.config.schema import NOT_LEARNT_WITH, RunConfig
 from emberlink.trainers.runs.run_folder import RunFolder
 
 _MAY_DIFFER = ("output", "seeds", *NOT_LEARNT_WITH)
-"""first parts of the keys in which two configurations of the same run may differ"""
+"""first parts of keys that may differ between configurations of the same run"""
 
 Identity = tuple[tuple[str, str], ...]
-"""keys and values that are equal for two configurations of the same run"""
+"""keys and values that identify a run"""
 
 
 @dataclass(frozen=True)
@@ -26,8 +26,8 @@ class FoundRun:
 
     Attributes:
         folder: the run folder.
-        stack: the seeds that are trained side by side with it, its own included; empty where it is
-            trained alone.
+        stack: seeds that are trained in parallel, including that of this run; empty if it is the
+            only one.
     """
 
     folder: RunFolder
@@ -36,10 +36,10 @@ class FoundRun:
 
 @dataclass(eq=False)
 class Job:
-    """A training process of a sweep: one run, or several seeds trained as one stack.
+    """A training process of a sweep: one run, or several seeds trained in parallel.
 
     Attributes:
-        method: the recipe.
+        method: the method.
         overrides: `key=value` arguments of a new training.
         configs: the configuration of each seed.
         found: the runs on disk, by seed.
@@ -67,7 +67,7 @@ class Job:
 
     @property
     def finished(self) -> bool:
-        """Whether every seed has been trained to its end and evaluated."""
+        """Whether every seed is fully trained and evaluated."""
         return all(
             config.seed in self.found and is_finished(self.found[config.seed].folder, config)
             for config in self.configs
@@ -75,12 +75,15 @@ class Job:
 
     @property
     def state(self) -> str:
-        """The state in a word or two: finished, unfinished or new."""
+        """The state: "finished", "unfinished" or "new"."""
         return "finished" if self.finished else "unfinished" if self.found else "new"
 
     @property
     def identities(self) -> set[Identity]:
-        """The runs that the process trains: a stack is resumed as a whole."""
+        """The identities of all runs that the process trains.
+
+        Seeds that are trained in parallel are resumed together.
+        """
         first = self.configs[0]
         seeds = {config.seed for config in self.configs}
         for run in self.found.values():
@@ -89,10 +92,10 @@ class Job:
 
     @property
     def arguments(self) -> list[str]:
-        """The arguments of `emberlink train`: of a new training, or of one to resume.
+        """The arguments of `emberlink train` for a new or resumed training.
 
-        A resumed training is given the device and those keys of the command line that it may be
-        given anew, such as `logger`.
+        The arguments of a resumed training contain the device and the given keys that may change,
+        such as `logger`.
         """
         first = self.configs[0]
         if first.seed not in self.found:
@@ -103,10 +106,10 @@ class Job:
         return [f"resume={self.found[first.seed].folder.path}", *given]
 
     def find_runs(self, runs: Mapping[Identity, FoundRun]) -> None:
-        """Looks up the run of each seed that is on disk.
+        """Sets `found` to the runs on disk.
 
         Args:
-            runs: the runs of the output folder.
+            runs: runs in the output folder.
         """
         for config in self.configs:
             run = runs.get(identity(config))
@@ -115,16 +118,16 @@ class Job:
 
 
 def jobs_of(arguments: Sequence[str]) -> list[Job]:
-    """Returns a job for every combination of the methods and of the values that keys are given.
+    """Returns a job for every combination of methods and values.
 
-    A run that occurs twice is kept once, also where it is a seed of two stacks.
+    A run that occurs in several combinations is in one job only.
 
     Args:
-        arguments: methods, all if there are none, and `key=value` or `key=value,value,...` in
-            Hydra's form for several values (`seed=0,1,2`, `seed=range(0,5)`).
+        arguments: names of methods (all methods if there are none), and `key=value` or, in Hydra's
+            syntax for several values, `seed=0,1,2` or `seed=range(0,5)`.
 
     Raises:
-        UserError: a combination is wrong; one line that names the key and the value.
+        UserError: a key or a value is wrong; the message names it.
     """
     methods = [text for text in arguments if "=" not in text] or list(known("method"))
     choices = [_values(text) for text in arguments if "=" in text]
@@ -133,15 +136,15 @@ def jobs_of(arguments: Sequence[str]) -> list[Job]:
     for method, overrides in product(methods, product(*choices)):
         config = resolve(method, overrides)
         wanted = [replace(config, seed=seed) for seed in config.seeds or (config.seed,)]
-        configs = [one for one in wanted if (one.output, identity(one)) not in taken]
-        taken |= {(one.output, identity(one)) for one in configs}
+        configs = [c for c in wanted if (c.output, identity(c)) not in taken]
+        taken |= {(c.output, identity(c)) for c in configs}
         if configs:
             jobs.append(job_for(configs, overrides))
     return jobs
 
 
 def identity(config: RunConfig) -> Identity:
-    """Returns the keys and values that two configurations of the same run have in common."""
+    """Returns the identity of a configuration's run."""
     values = flat(to_values(config))
     return tuple(
         sorted((k, str(v)) for k, v in values.items() if k.split(".")[0] not in _MAY_DIFFER)
@@ -149,11 +152,11 @@ def identity(config: RunConfig) -> Identity:
 
 
 def job_for(configs: list[RunConfig], overrides: Sequence[str]) -> Job:
-    """Returns the job that trains the seeds of `configs`.
+    """Returns a job that trains several configurations in parallel.
 
     Args:
-        configs: configurations that differ in their seed alone.
-        overrides: `key=value` arguments that make them, whatever seeds these name.
+        configs: configurations that differ only in their seed.
+        overrides: `key=value` arguments of the configurations; their seeds are replaced.
     """
     seeds = [config.seed for config in configs]
     if configs[0].seeds and list(configs[0].seeds) != seeds:
@@ -163,7 +166,7 @@ def job_for(configs: list[RunConfig], overrides: Sequence[str]) -> Job:
 
 
 def is_finished(folder: RunFolder, config: RunConfig) -> bool:
-    """Returns whether a run has all its episodes and an evaluation of its newest checkpoint."""
+    """Returns whether a run has all episodes and an evaluation of its newest checkpoint."""
     try:
         return len(folder.lines()) >= config.episodes and folder.evaluated()
     except (OSError, ValueError):  # resuming the run raises the error
@@ -176,7 +179,7 @@ def key_of(text: str) -> str:
 
 
 def _values(text: str) -> list[str]:
-    """Returns `key=1` and `key=2` for `key=1,2`, and any other text as it is."""
+    """Splits `key=1,2` into `key=1` and `key=2`; other texts are unchanged."""
     try:
         parsed = OverridesParser.create().parse_override(text)
         if parsed.is_sweep_override():

@@ -1,4 +1,4 @@
-"""Fits the jobs of a sweep to the runs that are on disk."""
+"""Adapts the jobs of a sweep to the runs on disk."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -8,14 +8,14 @@ from emberlink.trainers.sweep.jobs import FoundRun, Identity, Job, identity, is_
 
 
 def plan(jobs: Sequence[Job], runs: Mapping[Identity, FoundRun]) -> list[Job]:
-    """Returns jobs for the same runs, each of which is finished, to be resumed, or new as a whole.
+    """Returns jobs for the same runs; all runs of a job are finished, stopped or new.
 
-    A stack of seeds is split where some of its seeds are finished, stopped or missing. Seeds that
-    were trained side by side and stopped become one job, since they are resumed together.
+    A job with several seeds is split if its seeds differ in this respect. Stopped seeds that were
+    trained in parallel are one job, since they are resumed together.
 
     Args:
-        jobs: jobs with one seed or several.
-        runs: the runs of the output folder.
+        jobs: jobs of one seed or several.
+        runs: runs in the output folder.
     """
     planned: list[Job] = []
     stacks: dict[tuple, Job] = {}
@@ -36,7 +36,7 @@ def plan(jobs: Sequence[Job], runs: Mapping[Identity, FoundRun]) -> list[Job]:
 
 
 def _parts(job: Job) -> list[list[RunConfig]]:
-    """Returns the seeds of a job in groups: finished, of one training to resume, or new."""
+    """Returns the configurations of a job in groups: finished, stopped together, or new."""
     if len(job.configs) == 1:
         return [job.configs]
     groups: dict[str, list[RunConfig]] = {}
@@ -53,7 +53,7 @@ def _parts(job: Job) -> list[list[RunConfig]]:
 
 
 def _stack(job: Job) -> tuple | None:
-    """Returns what two jobs have in common that resume the same stack; None for any other job."""
+    """Returns a key that is equal for jobs that resume the same seeds; None for other jobs."""
     first = job.configs[0]
     run = job.found.get(first.seed)
     if run is None or len(run.stack) < 2 or job.finished:

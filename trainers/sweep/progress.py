@@ -1,4 +1,4 @@
-"""The progress display of a sweep."""
+"""Shows the progress of a sweep."""
 
 from typing import Any
 
@@ -9,10 +9,10 @@ from emberlink.trainers.sweep.jobs import Job
 
 
 class SweepProgress(Progress):
-    """A bar for all runs and one for each job that is running; a line for each job that ends.
+    """Shows a bar for all runs, a bar for each running job, and a line for each finished job.
 
     Args:
-        console: where it is shown.
+        console: shows the bars.
         total: number of runs in the sweep.
         done: number of runs that were finished before.
     """
@@ -30,18 +30,18 @@ class SweepProgress(Progress):
         self._bars: dict[Job, TaskID] = {}
 
     def begin(self, job: Job) -> None:
-        """Adds a bar for a job that was started."""
+        """Adds a bar for a started job."""
         self._bars[job] = self.add_task(
             job.name, total=job.configs[0].episodes, unit="episodes", coverage=""
         )
 
     def follow(self, job: Job) -> None:
-        """Shows the episodes in a job's metrics.jsonl, and the coverage of the last."""
+        """Updates the bar of a job from its metrics.jsonl: number of episodes and last coverage."""
         shown: dict[str, Any] = {}
         for run in list(job.found.values())[:1]:
             try:
                 lines = run.folder.lines()
-            except (OSError, ValueError):  # the file is being made, or cut when a run is resumed
+            except (OSError, ValueError):  # the file is being created or truncated
                 continue
             if lines:
                 shown = {"completed": len(lines), "coverage": f"{lines[-1]['coverage']:.1f} %"}
@@ -50,12 +50,12 @@ class SweepProgress(Progress):
         self.update(self._bars[job], **shown)
 
     def wait(self, job: Job) -> None:
-        """Leaves a line for a job that waits for another sweep."""
-        text = f"  {job.name}: is being trained by another sweep; waits for it"
+        """Prints a line for a job that waits for another sweep."""
+        text = f"  {job.name}: waits, another sweep is training it"
         self.console.print(text, highlight=False, soft_wrap=True)
 
     def end(self, job: Job, state: str) -> None:
-        """Replaces a job's bar by a line."""
+        """Removes a job's bar and prints a line."""
         if job in self._bars:
             self.remove_task(self._bars.pop(job))
         self.advance(self._all, len(job.configs))

@@ -1,4 +1,4 @@
-"""The run folders in an output folder, each read once."""
+"""Reads the run folders in an output folder."""
 
 from pathlib import Path
 
@@ -7,14 +7,14 @@ from emberlink.trainers.sweep.jobs import FoundRun, Identity, identity
 
 
 class RunIndex:
-    """Finds run folders by the identity of their configuration.
+    """Maps identities of configurations to run folders; each folder is read once.
 
     Args:
-        output: the folder that holds the run folders; it need not be there yet.
+        output: folder of the run folders; it may not exist yet.
 
     Attributes:
         runs: the newest run of each identity.
-        unreadable: why a folder with a config.yaml is not read, by path.
+        unreadable: path -> reason for each folder whose config.yaml cannot be read.
     """
 
     def __init__(self, output: Path):
@@ -25,11 +25,11 @@ class RunIndex:
 
     @property
     def size(self) -> int:
-        """The number of folders that were read, which grows with each new one."""
+        """The number of folders read so far."""
         return len(self._read)
 
     def update(self) -> None:
-        """Reads the configurations of the folders that are new."""
+        """Reads the configurations of new folders."""
         for file in sorted(self.output.glob("*/config.yaml")):
             if file.parent not in self._read:
                 self._read.add(file.parent)
@@ -37,7 +37,7 @@ class RunIndex:
 
     def _add(self, run: RunFolder) -> None:
         try:
-            # The run may be from a machine with another device.
+            # The device of the run may not exist on this machine.
             config = run.config(device="cpu")
         except ValueError as error:
             self.unreadable[run.path] = str(error)

@@ -17,16 +17,16 @@ from emberlink.trainers.sweep.run_index import RunIndex
 from emberlink.trainers.terminal.signals import Interruption
 
 _INTERVAL = 0.5
-"""seconds between two looks at the processes and the run folders"""
+"""seconds between polls of processes and run folders"""
 
 
 @dataclass
 class _Running:
-    """A job that was submitted.
+    """A submitted job.
 
     Attributes:
-        handle: what the executor returned.
-        claim: keeps other sweeps from training the same runs.
+        handle: the executor's handle.
+        claim: locks of the job's runs.
     """
 
     handle: Any
@@ -34,15 +34,15 @@ class _Running:
 
 
 class Scheduler:
-    """Submits jobs as slots become free, follows them, and cancels them when it is interrupted.
+    """Submits jobs when slots are free, shows their progress, and cancels them if interrupted.
 
-    A job whose runs another sweep has claimed waits until that sweep has ended or finished them.
+    If another sweep has locked the runs of a job, the job waits until they are free or finished.
 
     Args:
-        jobs: all jobs of the sweep; a job that is partly done is replaced by its parts.
-        index: the run folders of the output folder.
-        executor: where the jobs run.
-        progress: the display.
+        jobs: all jobs of the sweep, from `plan`.
+        index: run folders in the output folder.
+        executor: runs the jobs.
+        progress: shows the progress.
     """
 
     def __init__(
@@ -71,73 +71,73 @@ class Scheduler:
                     time.sleep(_INTERVAL)
                     self._look()
         finally:
-            self._stop()  # after a second signal: a training that is told twice does not wait
+            self._stop()  # after a second signal, the trainings end at once
             self._wait()
         if interruption.received:
             return interruption.status
         return int(any(job.failed for job in self.jobs))
 
     def _wait(self) -> None:
-        """Waits for the jobs that still run, and gives up what they claim."""
+        """Waits for running jobs and releases their locks."""
         for running in self._running.values():
             while self._executor.poll(running.handle) is None:
                 time.sleep(_INTERVAL / 10)
             running.claim.release()
 
     def _submit(self) -> None:
-        """Fills the free slots with jobs that no other sweep has claimed."""
+        """Submits jobs that no other sweep has locked until all slots are taken."""
         while not self._stopping and len(self._running) < self._slots:
             taken = self._claim_next()
             if taken is None:
                 return
-            job, own = taken
+            job, locks = taken
             if job.finished:
-                own.release()
+                locks.release()
                 self._progress.end(job, "finished by another sweep")
             else:
-                self._start(job, own)
+                self._start(job, locks)
 
     def _claim_next(self) -> tuple[Job, Claim] | None:
-        """Takes the first waiting job that no other sweep has claimed; None if there is none."""
+        """Locks and returns the first waiting job that is not locked; None if there is none."""
         for job in self._waiting:
-            own = claim(job.output, job.identities)
-            if own is None:
+            locks = claim(job.output, job.identities)
+            if locks is None:
                 if job not in self._blocked:
                     self._progress.wait(job)
                 self._blocked.add(job)
                 continue
-            # Another sweep may have trained some of it since the last look.
+            # Another sweep may have trained some of the runs since the last update.
             self._index.update()
             if self._index.size != self._planned_with:
-                own.release()
+                locks.release()
                 self._plan_again()
                 return self._claim_next()
             self._waiting.remove(job)
-            return job, own
+            return job, locks
         return None
 
     def _plan_again(self) -> None:
-        """Fits the waiting jobs to the runs that other sweeps have begun."""
+        """Adapts the waiting jobs to the runs of other sweeps."""
         self._planned_with = self._index.size
         others = [job for job in self.jobs if job not in self._waiting]
         self._waiting = plan(self._waiting, self._index.runs)
         self.jobs = [*others, *self._waiting]
 
-    def _start(self, job: Job, own: Claim) -> None:
+    def _start(self, job: Job, locks: Claim) -> None:
         seeds = "-".join(str(config.seed) for config in job.configs)
         stem = f"{job.configs[0].setup}_{job.method}_s{seeds}"
         try:
             logs = inner_folder(job.output, "logs")
             job.log = Path(f"{free_name(logs, stem, ['.txt'])}.txt")
-            handle = self._executor.submit(Task(job.arguments, job.log, own.handles))
+            handle = self._executor.submit(Task(job.arguments, job.log, locks.handles))
         except OSError as error:
-            own.release()
+            locks.release()
             raise UserError(f"output={job.output}: {error.strerror or error}") from None
-        self._running[job] = _Running(handle, own)
+        self._running[job] = _Running(handle, locks)
         self._progress.begin(job)
 
     def _look(self) -> None:
-        """Shows how far the jobs are, and removes those that have ended."""
+        """Updates the progress of running jobs and handles those that have ended."""
         if any(len(job.found) < len(job.configs) for job in self._running):
             self._index.update()
         for job, running in list(self._running.items()):

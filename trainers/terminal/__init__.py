@@ -1,4 +1,4 @@
-"""Prints to terminals, pipes and files: text, tables and the progress of a training."""
+"""Prints text, tables and the progress of trainings to terminals, pipes and files."""
 
 from emberlink.trainers.terminal.console import OutputError, SafeConsole
 from emberlink.trainers.terminal.progress import TrainingProgress

@@ -1,4 +1,4 @@
-"""A rich console for any standard output: any encoding, any width, any text."""
+"""Defines a rich console that supports any encoding, width and text."""
 
 import os
 import sys
@@ -14,7 +14,7 @@ from emberlink.trainers.terminal.table import print_table
 _CONTROL_CODES = (
     *(code for code in range(0x20) if chr(code) not in "\t\n"),
     *range(0x7F, 0xA0),
-    *range(0x202A, 0x202F),  # these and the next ones change the direction of text
+    *range(0x202A, 0x202F),  # these and the next change the direction of text
     *range(0x2066, 0x206A),
 )
 _NO_CONTROL = dict.fromkeys(_CONTROL_CODES, "?")
@@ -26,7 +26,7 @@ _PLAIN = {
 
 
 class OutputError(OSError):
-    """Reports that standard output cannot be written to: a closed pipe, a full disk."""
+    """Reports that standard output cannot be written, for example to a closed pipe or full disk."""
 
 
 class SafeConsole(Console):
@@ -52,11 +52,11 @@ class SafeConsole(Console):
 
     @property
     def line_width(self) -> int | None:
-        """Columns of a line; None in a pipe or a file, unless `COLUMNS` sets them."""
+        """The width of a line in columns; None for a pipe or a file without `COLUMNS`."""
         return self.width if self._is_limited else None
 
     def print(self, *objects: Any, **options: Any) -> None:
-        """Prints as rich does; a table as `print_table` does."""
+        """Prints as rich does, but tables with `print_table`."""
         if len(objects) == 1 and isinstance(objects[0], Table):
             print_table(self, objects[0])
         else:
@@ -65,14 +65,14 @@ class SafeConsole(Console):
     def render(
         self, renderable: RenderableType, options: ConsoleOptions | None = None
     ) -> Iterator[Segment]:
-        """Renders as rich does, without control characters of the text's own."""
+        """Renders as rich does, with control characters in the text replaced."""
         for segment in super().render(renderable, options):
             text, style, control = segment
             yield segment if control else Segment(text.translate(_NO_CONTROL), style)
 
 
 class _StandardOutput:
-    """`sys.stdout` as it is at each write; see `SafeConsole`."""
+    """Forwards to the current `sys.stdout` at each write; see `SafeConsole`."""
 
     def write(self, text: str) -> int:
         stream = _stdout()
@@ -92,7 +92,7 @@ class _StandardOutput:
 
 
 def _stdout() -> Any:
-    # While rich shows a progress bar, it puts an object of its own in the place of sys.stdout.
+    # While rich shows a progress bar, it replaces sys.stdout.
     return getattr(sys.stdout, "rich_proxied_file", sys.stdout)
 
 
@@ -101,7 +101,7 @@ def _output_error(error: OSError) -> OutputError:
 
 
 def _encodable(text: str, encoding: str) -> str:
-    """Replaces characters that the encoding lacks by similar ASCII, or by a question mark."""
+    """Replaces characters that cannot be encoded by similar ASCII or a question mark."""
 
     def fits(characters: str) -> bool:
         try:

@@ -1,4 +1,4 @@
-"""The progress of a training: a bar at a terminal, and lines that stay."""
+"""Shows the progress of a training: a line per episode and, on a terminal, a bar."""
 
 import time
 from collections import deque
@@ -10,28 +10,28 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 
 BETWEEN_LINES = 60.0
-"""seconds after which a line says how far an episode is, where there is no bar"""
+"""seconds between lines about the progress within an episode, without a bar"""
 FIRST_LINE = 10.0
-"""seconds after which the first of these lines comes"""
+"""seconds before the first of these lines"""
 _BETWEEN_REFRESHES = 0.2
-"""seconds between two drawings of the bar"""
+"""seconds between updates of the bar"""
 
 
 class TimeLeft:
-    """Estimates speed and remaining time of a training.
+    """Estimates the speed and the remaining time of a training.
 
-    Steps before the first update are much faster than those after it. So the remaining time
-    follows from the mean of all steps since the updates began, and is unknown before.
+    Steps before the first update are much faster than later ones. So the remaining time is
+    estimated from the mean of the steps since then.
 
     Args:
-        steps: of the whole training.
-        learns: whether there will be updates at all.
+        steps: number of steps of the whole training.
+        learns: whether there will be any updates.
     """
 
     ENOUGH = 3.0
-    """seconds with updates before there is an estimate"""
+    """seconds with updates before the first estimate"""
     WINDOW = 30.0
-    """seconds over which the speed is measured"""
+    """seconds over which the speed is averaged"""
 
     def __init__(self, steps: int, *, learns: bool = True):
         self._steps, self._learns = steps, learns
@@ -39,10 +39,10 @@ class TimeLeft:
         self._recent: deque[tuple[float, int]] = deque()
 
     def add(self, now: float, step: int, updates: int) -> None:
-        """Notes that a step ended.
+        """Records the end of a step.
 
         Args:
-            now: seconds.
+            now: time in seconds.
             step: number of the step.
             updates: number of updates so far.
         """
@@ -54,7 +54,7 @@ class TimeLeft:
 
     @property
     def speed(self) -> float | None:
-        """Recent steps per second."""
+        """Steps per second in the last `WINDOW` seconds; None before the second step."""
         if not self._recent:
             return None
         (before, first), (now, last) = self._recent[0], self._recent[-1]
@@ -62,7 +62,7 @@ class TimeLeft:
 
     @property
     def seconds(self) -> float | None:
-        """Remaining seconds; None while there are too few steps with updates."""
+        """Remaining seconds; None if there are too few steps with updates."""
         if self._start is None or not self._recent:
             return None
         (before, first), (now, last) = self._start, self._recent[-1]
@@ -72,18 +72,18 @@ class TimeLeft:
 
 
 class TrainingProgress:
-    """Shows how far a training is.
+    """Shows the progress of a training.
 
-    Prints a line for each episode, with its measures, and for each evaluation. A terminal also has
-    a bar; elsewhere a line a minute says how far a long episode is.
+    Prints a line with measures for each episode and each evaluation. A terminal also shows a bar.
+    Without a terminal, a line per minute shows the progress within a long episode.
 
     Args:
-        console: where all is printed.
-        steps: steps of the whole training.
-        episodes: episodes of the whole training.
-        step: steps that were made before.
-        learns: whether there will be updates at all.
-        clock: returns seconds.
+        console: prints the lines and shows the bar.
+        steps: number of steps of the whole training.
+        episodes: number of episodes of the whole training.
+        step: number of steps done before.
+        learns: whether there will be any updates.
+        clock: returns the time in seconds.
     """
 
     def __init__(
@@ -124,10 +124,10 @@ class TrainingProgress:
             self._bar.stop()
 
     def step(self, step: int, episode: int, updates: int) -> None:
-        """Shows that a step of all environments ended.
+        """Updates the progress at the end of a step.
 
         Args:
-            step: its number.
+            step: number of the step.
             episode: number of finished episodes.
             updates: number of updates so far.
         """
@@ -147,11 +147,11 @@ class TrainingProgress:
             )
 
     def episode(self, episode: int, lines: Sequence[Mapping[str, Any]]) -> None:
-        """Prints the measures of an episode, and of the evaluation after it.
+        """Prints the measures of an episode and of the evaluation after it, if any.
 
         Args:
-            episode: its number.
-            lines: the episode's line of metrics.jsonl of every seed; means are printed.
+            episode: number of the episode.
+            lines: the line of metrics.jsonl of each seed; their means are printed.
         """
         means = {name: sum(line[name] for line in lines) / len(lines) for name in lines[0]}
         self.note(
@@ -169,7 +169,7 @@ class TrainingProgress:
         self._next_line = self._clock() + BETWEEN_LINES
 
     def _pace(self, updates: float) -> str:
-        """Returns speed and remaining time in words."""
+        """Returns the speed and the remaining time as text."""
         speed, seconds = self._left.speed, self._left.seconds
         parts = [] if speed is None else [f"{speed:.{0 if speed >= 100 else 1}f} steps/s"]
         if seconds is not None:

@@ -1,4 +1,4 @@
-"""Tables that show every cell whole, at any width."""
+"""Prints tables without cutting cells, at any width."""
 
 import re
 from collections.abc import Iterator, Sequence
@@ -12,17 +12,16 @@ from rich.text import Text
 
 
 def print_table(console: Console, table: Table) -> None:
-    """Prints a table.
+    """Prints a table completely.
 
-    Where it is wider than the console, names of rows such as random_waypoints are put on two lines.
-    If that is not enough, it is printed in parts, one below the other: each has the first column
-    and as many of the others as fit. Nothing is cut or left out. Pipes and files have no width, so
-    that the table is in one part there.
+    If the table is too wide for the console, row names such as random_waypoints are wrapped. If it
+    still is, it is printed in parts, each with the first column and as many other columns as fit.
+    Pipes and files have no width, so the table has one part.
 
     Args:
-        console: a `SafeConsole`, or any other, whose width then counts.
-        table: the table. The first column names the rows; a row whose other cells are empty is a
-            heading. Boxes, paddings and widths are not used.
+        console: a `SafeConsole`, or another console.
+        table: the table. The first column holds the row names; a row whose other cells are empty is
+            a heading. Boxes, padding and column widths are ignored.
     """
     width = getattr(console, "line_width", console.width)
     columns = [_texts(table, place) for place in range(len(table.columns))]
@@ -46,7 +45,7 @@ def _plain(text: Any) -> str:
 
 
 def _rows(table: Table) -> Iterator[tuple[list[str], str]]:
-    """Yields the cells of each row, and its style; a row of one text is one cell."""
+    """Yields the cells and the style of each row; a heading has one cell."""
     columns = [list(column.cells) for column in table.columns]
     for row, *cells in zip(table.rows, *columns, strict=True):
         texts = [_plain(cell).replace("\n", ", ") for cell in cells]
@@ -55,25 +54,25 @@ def _rows(table: Table) -> Iterator[tuple[list[str], str]]:
 
 
 def _texts(table: Table, place: int) -> list[str]:
-    """Returns the lines of a column's header, and its cells."""
+    """Returns the header lines and the cells of a column."""
     cells = [cells[place] for cells, _ in _rows(table) if len(cells) == len(table.columns)]
     return [*_plain(table.columns[place].header).split("\n"), *cells]
 
 
 def _label_size(labels: Sequence[str], room: int) -> int:
-    """Returns the size of the first column: that of its labels, or `room` if they fit on lines."""
+    """Returns the width of the first column: that of its labels, or `room` if they wrap."""
     longest = max(map(cell_len, labels))
     words = max(cell_len(word) for label in labels for word in _words(label))
     return room if words <= room < longest else longest
 
 
 def _words(label: str) -> list[str]:
-    """Splits a name after each underscore; labels of several words are left whole."""
+    """Splits a name after each underscore; a label with spaces is not split."""
     return [label] if " " in label else re.findall(r"[^_]*_+|[^_]+", label) or [""]
 
 
 def _wrapped(label: str, size: int) -> list[str]:
-    """Splits a label into lines of a size."""
+    """Wraps a label to lines of a width."""
     lines = [""]
     for word in _words(label):
         if lines[-1] and cell_len(lines[-1] + word.rstrip()) > size:
@@ -83,7 +82,7 @@ def _wrapped(label: str, size: int) -> list[str]:
 
 
 def _parts(sizes: Sequence[int], width: int | None) -> list[list[int]]:
-    """Returns which columns are side by side: the first one, and others as long as they fit."""
+    """Returns the columns of each part: the first column and as many others as fit."""
     parts = [[0]]
     used = sizes[0]
     for place, size in enumerate(sizes[1:], 1):
@@ -96,12 +95,12 @@ def _parts(sizes: Sequence[int], width: int | None) -> list[list[int]]:
 
 
 def _lines(table: Table, sizes: Sequence[int], places: Sequence[int]) -> Iterator[tuple[str, str]]:
-    """Yields the lines of some columns, each with its style."""
+    """Yields the lines of a part of the table, each with its style."""
     aligned = [table.columns[place].justify == "right" for place in places]
     chosen = [sizes[place] for place in places]
     headers = [_plain(table.columns[place].header).split("\n") for place in places]
     if any(map(any, headers)):
-        # Headers of fewer lines stand at the bottom.
+        # Headers with fewer lines are aligned at the bottom.
         lines = zip_longest(*(reversed(header) for header in headers), fillvalue="")
         for line in reversed(list(lines)):
             yield _line(line, aligned, chosen), "bold"
@@ -117,7 +116,7 @@ def _lines(table: Table, sizes: Sequence[int], places: Sequence[int]) -> Iterato
 
 
 def _line(cells: Sequence[str], aligned: Sequence[bool], sizes: Sequence[int]) -> str:
-    """Joins cells, each filled up to its size, at the left where it is aligned to the right."""
+    """Joins cells, each padded to its width."""
     padded: list[str] = []
     for cell, right, size in zip(cells, aligned, sizes, strict=True):
         space = " " * (size - cell_len(cell))

@@ -1,8 +1,8 @@
-"""Trains policies: what is trained, the loop, checkpoints, checks for NaN, and resuming.
+"""Trains policies: set-up, training loop, checkpoints, checks for NaN and Inf, resuming.
 
-The files in the order of a run: `command` (emberlink train), `setup` (environments, learner,
-collector), `episode` (measures of the episode at hand), `folders` (run folders), `trainer` (the
-loop), `checkpoints`, `non_finite` and `rollback` (NaN and Inf), `resume`.
+The files in the order of a run are `command` (emberlink train), `setup` (environments, learner,
+collector), `episode` (measures of the current episode), `folders` (run folders), `trainer` (the
+loop), `checkpoints`, `non_finite` and `rollback` (NaN and Inf), and `resume`.
 """
 
 from emberlink.trainers.training.non_finite import NonFiniteError, NonFiniteReport, replay

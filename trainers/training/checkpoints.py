@@ -1,4 +1,4 @@
-"""Checkpoints of a training: everything that a resumed run needs, in one file."""
+"""Reads and writes training states, from which a run can be resumed exactly."""
 
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
@@ -15,30 +15,30 @@ from emberlink.trainers.training.setup import TrainingSetup
 
 @dataclass(frozen=True, kw_only=True)
 class RunState:
-    """The numbers of a run that go with the tensors of its setup."""
+    """The part of a training state that is not tensors."""
 
     step: int
-    """steps of all environments"""
+    """steps of the batch of environments so far"""
     config: dict[str, Any]
-    """of the run"""
+    """configuration of the run, as plain values"""
     folders: list[str]
     """names of the run folders, one per seed"""
     sizes: list[dict[str, int]]
-    """bytes of each folder's files of lines"""
+    """file -> size in bytes of the .jsonl files of each folder"""
     best: list[float | None]
-    """highest coverage of each seed so far, percent"""
+    """highest coverage of each seed so far, %"""
     seconds: float
-    """of training"""
+    """seconds of training so far"""
     rollbacks: dict[str, Any]
     """see `Rollbacks`"""
     tensors: int
-    """how many tensors the checkpoint holds"""
+    """number of tensors in the checkpoint"""
     versions: dict[str, str]
     """of the packages that it was made with"""
 
 
 def write(path: Path, run: RunState, tensors: dict[str, Tensor]) -> None:
-    """Writes a checkpoint whole or not at all.
+    """Writes a training state completely, or not at all.
 
     Raises:
         UserError: it cannot be written, such as to a full disk.
@@ -47,10 +47,10 @@ def write(path: Path, run: RunState, tensors: dict[str, Tensor]) -> None:
 
 
 def read(path: Path) -> tuple[RunState, dict[str, Tensor]]:
-    """Returns the numbers and tensors of a checkpoint.
+    """Returns the numbers and tensors of a training state.
 
     Raises:
-        UserError: it cannot be read, is damaged, or is no checkpoint of a training.
+        UserError: the file cannot be read, is damaged, or is not a training state.
     """
     header, tensors = checkpoint_file.read(path)
     if header.get("kind") != "state":
@@ -67,10 +67,10 @@ def read(path: Path) -> tuple[RunState, dict[str, Tensor]]:
 def restore(
     path: Path, setup: TrainingSetup, run: RunState, tensors: dict[str, Tensor]
 ) -> Rollbacks:
-    """Puts a new setup where a checkpoint was made and returns the rollbacks until then.
+    """Restores a new setup from a training state and returns the rollbacks of the state.
 
     Raises:
-        UserError: the tensors do not fit the setup, or hold NaN or Inf.
+        UserError: the tensors do not fit the setup, or are not finite.
     """
     if name := first_non_finite(tensors):
         raise UserError(f"{path}: {name} holds NaN or infinite numbers")
@@ -86,7 +86,7 @@ def restore(
 
 
 def _check_margins(setup: TrainingSetup, tensors: dict[str, Tensor]) -> None:
-    """Checks that arrival times are NaN in the margin around the grid, and only there."""
+    """Checks that arrival times are NaN in the padding around the grid, and only there."""
     for name, fresh in setup.env.base_env.state_dict().items():
         if "arrival_time" in name and not fresh.isnan().equal(
             tensors[f"environments/{name}"].isnan()

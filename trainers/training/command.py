@@ -1,4 +1,4 @@
-"""The command `emberlink train`: trains, shows the progress, evaluates."""
+"""Runs `emberlink train`: trains, shows the progress, evaluates."""
 
 from collections.abc import Sequence
 from contextlib import suppress
@@ -23,21 +23,21 @@ from emberlink.trainers.training.trainer import Progress, Trainer
 
 
 def train(method: str | None, overrides: Sequence[str], console: Console) -> int:
-    """Trains a method, or continues a run, then evaluates it.
+    """Trains a method or resumes a run, and evaluates it.
 
-    Ctrl-C, SIGTERM, SIGHUP and an output that cannot be written to end the training after the
-    step, with a checkpoint.
+    SIGINT, SIGTERM, SIGHUP and a failure of the output end the training after the current step with
+    a checkpoint.
 
     Args:
-        method: the method; or `resume=RUN`.
-        overrides: `key=value`.
-        console: where progress and results are printed.
+        method: name of the method, or `resume=RUN`.
+        overrides: texts `key=value`.
+        console: prints progress and results.
 
     Returns:
-        The exit status: 0, or 128 and the number of the signal that ended the training.
+        The exit status: 0, or 128 plus the number of the signal that ended the training.
 
     Raises:
-        UserError: one line for whatever cannot be trained, resumed or written.
+        UserError: an argument is wrong, the run cannot be resumed, or a file cannot be written.
     """
     trainer = _trainer(method, overrides)
     interruption = Interruption(trainer.stop)
@@ -45,7 +45,7 @@ def train(method: str | None, overrides: Sequence[str], console: Console) -> int
         _announce(trainer, console)
         with interruption:
             _train(trainer, console)
-            # The run folders stay locked for the evaluation.
+            # The run folders are locked during the evaluation, too.
             interruption.at_once = True
             if interruption.received:
                 raise Interrupted
@@ -64,26 +64,28 @@ def train(method: str | None, overrides: Sequence[str], console: Console) -> int
 
 
 def _trainer(method: str | None, overrides: Sequence[str]) -> Trainer:
-    """Returns a new training, or that of the run folder that `resume=` names."""
+    """Returns a new training, or the resumed training of `resume=RUN`."""
     if method is not None and "=" in method:
         method, overrides = None, [method, *overrides]
     folders = [text.partition("=")[2] for text in overrides if text.startswith("resume=")]
     if not folders:
         if method is None:
-            raise UserError(f"{overrides[0]!r} is no method; known: {', '.join(known('method'))}")
+            raise UserError(
+                f"{overrides[0]!r} is not a method; known: {', '.join(known('method'))}"
+            )
         config = resolve(method, overrides)
         loggers.check_installed(config)
         trainer = Trainer(config)
         trainer.start()
         return trainer
     if len(folders) > 1 or not folders[0]:
-        raise UserError("resume=RUN: one run folder is needed")
+        raise UserError("resume=RUN: expected one run folder")
     others = [text for text in overrides if not text.startswith("resume=")]
     return resume(Path(folders[0]), method, others)
 
 
 def _announce(trainer: Trainer, console: Console) -> None:
-    """Prints what will be trained and where."""
+    """Prints the method, the run folders, and notes about the training."""
     config = trainer.config
     setup, scale = trainer.setup, trainer.rollbacks.lr_scale
     if setup.step:
@@ -127,7 +129,7 @@ def _train(trainer: Trainer, console: Console) -> None:
     """Trains and shows the progress.
 
     Raises:
-        OutputError: the progress cannot be written. The training has been stopped and saved.
+        OutputError: the output cannot be written; the training has stopped and saved.
     """
     setup = trainer.setup
     if setup.step == setup.total_steps:
@@ -165,7 +167,7 @@ def _show(progress: TrainingProgress, state: Progress, trainer: Trainer) -> None
 
 
 def _evaluate(trainer: Trainer, console: Console) -> None:
-    """Evaluates the seeds that were not evaluated yet, and prints the results."""
+    """Evaluates the seeds without an evaluation, and prints and logs the results."""
     seeds = [
         (run, config, trainer.setup.team_actor(team), run.checkpoint())
         for team, (config, run) in enumerate(zip(trainer.configs, trainer.runs, strict=True))
@@ -189,6 +191,7 @@ def _figures(run: RunFolder) -> list[Path]:
 
 
 def _print_how_to_resume(trainer: Trainer, console: Console) -> None:
+    """Prints the commands that evaluate and resume a stopped run."""
     for run in trainer.runs:
         networks = run.networks()
         if networks:
@@ -201,14 +204,14 @@ def _print_how_to_resume(trainer: Trainer, console: Console) -> None:
 
 
 def _resume_hint(trainer: Trainer, error: Exception | None = None) -> str:
-    """Returns the newest checkpoint of a run that an error ended, and how to resume it."""
-    # Without this key, the run would end at the same step again.
+    """Returns text about the newest checkpoint and how to resume from it, after an error."""
     config: RunConfig = trainer.config
+    # Without a rollback, the run would end at the same step again.
     diverged = isinstance(error, NonFiniteError) and config.on_nan == "stop"
     command = f"emberlink train resume={trainer.run.path}" + (
         " on_nan=rollback" if diverged else ""
     )
     states = trainer.run.states()
     if not states:
-        return f"there is no checkpoint: {command} begins again, if there has been none"
+        return f"there is no checkpoint; begin again with: {command}"
     return f"the last good checkpoint is {states[-1]}, resume with: {command}"

@@ -1,4 +1,4 @@
-"""Measures and losses of the episode at hand."""
+"""Records the measures and losses of the current episode."""
 
 from collections.abc import Mapping
 from typing import Any, cast
@@ -13,18 +13,18 @@ from emberlink.trainers.learners.tensors import flatten, group, prefixed, unflat
 
 
 class EpisodeRecord:
-    """Collects what is measured of an episode, for all seeds that train side by side.
+    """Records the measures and losses of an episode for all seeds.
 
     Args:
-        teams: how many seeds.
+        teams: number of seeds that are trained in parallel.
     """
 
     def __init__(self, teams: int):
         self.teams = teams
         self.steps: list[TensorDictBase] = []
-        """what is measured of each rollout, batch size [environments, steps]"""
+        """measured tensors of each rollout, batch size [environments, steps]"""
         self.losses: dict[str, list[Tensor]] = {}
-        """of each update, [uavs of all seeds]"""
+        """losses of each update by name, [seeds * uavs]"""
 
     def add(self, rollout: TensorDictBase, losses: list[Losses]) -> None:
         """Adds a rollout and the losses of the updates that followed it."""
@@ -34,7 +34,7 @@ class EpisodeRecord:
                 self.losses.setdefault(name, []).append(value)
 
     def clear(self) -> None:
-        """Forgets everything: the next episode begins."""
+        """Removes all records, at the beginning of an episode."""
         self.steps, self.losses = [], {}
 
     def measures(self) -> list[dict[str, float]]:
@@ -50,10 +50,10 @@ class EpisodeRecord:
         ]
 
     def _mean_losses(self) -> dict[str, Tensor]:
-        """Returns the mean of each loss over updates and UAVs, [teams] each."""
+        """Returns the means of losses over updates and UAVs, [teams] each."""
         means: dict[str, Tensor] = {}
         for count in dict.fromkeys(len(values) for values in self.losses.values()):
-            # Losses of as many updates in one sum: its order decides the last digit.
+            # Losses with equal numbers of updates share one sum: its order affects the last digit.
             names = sorted(name for name, v in self.losses.items() if len(v) == count)
             stacked = torch.stack([torch.stack(self.losses[name]) for name in names], dim=1)
             of_uavs = stacked.mean(0).unflatten(1, (self.teams, -1))
@@ -61,13 +61,13 @@ class EpisodeRecord:
         return dict(sorted(means.items()))
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Returns everything that has been added, by name."""
+        """Returns all records by name."""
         steps: Any = torch.cat(cast(Any, self.steps), dim=1) if self.steps else None
         losses = {name: torch.stack(values) for name, values in self.losses.items()}
         return prefixed(steps=flatten(steps) if self.steps else {}, losses=losses)
 
     def load_state_dict(self, state: Mapping[str, Tensor], device: torch.device | str) -> None:
-        """Restores what `state_dict` gave."""
+        """Restores the records of `state_dict`."""
         steps = group(state, "steps")
         self.steps = [unflatten(steps, 2, device)] if steps else []
         self.losses = {

@@ -1,4 +1,4 @@
-"""The run folders of a training: one for each of the seeds that train side by side."""
+"""Manages the run folders of a training, one for each seed."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
@@ -13,20 +13,23 @@ from emberlink.trainers.runs.run_folder import RunFolder
 from emberlink.trainers.runs.safe_read import MAX_YAML, parse_json, read_text
 
 LINES = ("metrics.jsonl", "timing.jsonl")
-"""the files of a run folder that have a line for each episode"""
+"""files of a run folder with a line for each episode"""
 SEED_RUNS = "seed_runs.json"
-"""names the folders of the seeds that train side by side, in order"""
+"""file with the names of the run folders of all seeds, in order"""
 
 Sizes = Mapping[str, int]
-"""bytes of a run folder's files of lines"""
+"""file -> size in bytes of the files `LINES` of a run folder"""
 
 
 class RunFolders:
     """The run folders of all seeds, in order, with their configurations and locks.
 
     Args:
-        runs: the folders; this process locks them until `close`.
-        configs: of each.
+        runs: the run folders; they are locked until `close`.
+        configs: configuration of each run.
+
+    Raises:
+        UserError: a folder is locked by another process.
     """
 
     def __init__(self, runs: Sequence[RunFolder], configs: Sequence[RunConfig]):
@@ -41,11 +44,11 @@ class RunFolders:
 
     @classmethod
     def create(cls, configs: Sequence[RunConfig]) -> "RunFolders":
-        """Makes a folder for each seed; the configurations are written last, when all are there."""
+        """Creates a folder for each seed; the configurations are written last."""
         runs = [RunFolder.create(config) for config in configs]
         if len(runs) > 1:
             for run in runs:
-                run.write(SEED_RUNS, {"folders": [one.path.name for one in runs]})
+                run.write(SEED_RUNS, {"folders": [other.path.name for other in runs]})
         for run, config in zip(runs, configs, strict=True):
             run.write_config(config)
         grid, horizon = configs[0].env.grid, configs[0].env.horizon
@@ -61,25 +64,25 @@ class RunFolders:
         return [run.path.name for run in self.runs]
 
     def sizes(self) -> list[dict[str, int]]:
-        """Returns the bytes of each folder's files of lines, flushed to the disk."""
+        """Flushes the files `LINES` of each folder to the disk and returns their sizes."""
         return [{file: run.size(file) for file in LINES} for run in self.runs]
 
     def check_lines(self, sizes: Iterable[Sizes], episode: int) -> None:
-        """Checks that the files of lines begin as they were when a checkpoint was made."""
+        """Checks that the files `LINES` have the lines that they had at a checkpoint."""
         for run, size in zip(self.runs, sizes, strict=True):
             run.own_checkpoints()
             for file in LINES:
                 run.check_lines(file, size[file], episode)
 
     def cut_back(self, sizes: Iterable[Sizes], step: int) -> None:
-        """Removes what came after a checkpoint: lines, later checkpoints, half-written files."""
+        """Removes lines and checkpoints after a step, and incomplete files."""
         for run, size in zip(self.runs, sizes, strict=True):
             for file in LINES:
                 run.cut(file, size[file])
             run.take_away_after(step)
 
     def append(self, file: str, line: Mapping[str, Any]) -> None:
-        """Adds the same line to a file in each folder."""
+        """Appends a line to a file in each folder."""
         for run in self.runs:
             run.append(file, line)
 
@@ -91,15 +94,15 @@ class RunFolders:
 
 
 def empty(runs: Sequence[RunFolder]) -> list[dict[str, int]]:
-    """Returns the sizes of files of lines that hold none."""
+    """Returns sizes of 0 for the files `LINES` of each folder."""
     return [dict.fromkeys(LINES, 0) for _ in runs]
 
 
 def find_runs(folder: Path) -> list[RunFolder]:
-    """Returns the folders of all seeds that train with the one whose folder is given, in order.
+    """Returns the run folders of all seeds of a training, in order, given one of them.
 
     Raises:
-        UserError: one of them is missing, or the file that names them is not readable.
+        UserError: a folder is missing or a link, or the file that names them is not readable.
     """
     file = folder / SEED_RUNS
     try:
@@ -116,21 +119,21 @@ def find_runs(folder: Path) -> list[RunFolder]:
     except (OSError, ValueError, TypeError, KeyError):
         raise UserError(f"{file}: does not name the folders of the other seeds") from None
     for path in linked:
-        raise UserError(f"{path}: cannot be resumed: it is a link, named by {file}")
+        raise UserError(f"{path}: cannot be resumed: {file} names it, and it is a link")
     for path in missing:
-        raise UserError(f"{path}: is missing; its seed trains side by side with {folder}")
+        raise UserError(f"{path}: is missing; its seed is trained together with {folder}")
     return runs
 
 
 def check_seeds(runs: Sequence[RunFolder], config: RunConfig) -> None:
-    """Checks that each folder is of this training, as far as its configuration is written.
+    """Checks that the folders that have a configuration belong to the same training.
 
     Args:
-        runs: the folders.
-        config: the first folder's.
+        runs: the run folders.
+        config: configuration of the first folder.
 
     Raises:
-        UserError: one is not.
+        UserError: a folder belongs to another training.
     """
     seeds = config.seeds or (config.seed,)
     if len(runs) != len(seeds):

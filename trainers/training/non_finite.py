@@ -1,4 +1,4 @@
-"""Reports the first NaN or Inf in training, and leaves a dump that reproduces it."""
+"""Reports the first NaN or Inf in training and writes a dump that reproduces it."""
 
 import platform
 from collections.abc import Mapping
@@ -23,20 +23,20 @@ _TENSORS = "tensors.safetensors"
 
 @dataclass(frozen=True)
 class NonFiniteReport:
-    """The first number in training that is not finite, and where it was."""
+    """The first NaN or Inf in training and its place."""
 
     tensor: str
-    """such as "reward" or "gradient of critic.second.weight\""""
+    """name of the tensor, such as "reward" or "gradient of critic.second.weight\""""
     uav: int | None
-    """whose, counted from 0; None where it belongs to no single one"""
+    """index of the UAV; None if the number belongs to several"""
     seed: int | None
-    """of whose team; likewise"""
+    """seed of the team; None if the number belongs to several"""
     environment: int | None
-    """of that seed, counted from 0; None for a loss or a gradient"""
+    """index among the seed's environments; None for a loss or a gradient"""
     step: int
-    """of the environments, counted through the run from 1"""
+    """step of the run, counted from 1"""
     update: int | None
-    """counted through the run from 1; None for a number that was collected"""
+    """update of the run, counted from 1; None for a number in a rollout"""
     value: str
     """nan, inf, -inf, or a number whose square is too large"""
 
@@ -49,12 +49,12 @@ class NonFiniteReport:
 
 
 class NonFiniteError(UserError):
-    """A training cannot continue because a number is not finite.
+    """Reports that training cannot continue because a number is NaN or infinite.
 
     Args:
         message: one line.
-        report: which number.
-        dump: the folder that reproduces it; None where it could not be written.
+        report: the number and its place.
+        dump: folder that reproduces it; None if it was not written.
     """
 
     def __init__(self, message: str, report: NonFiniteReport, dump: Path | None):
@@ -63,7 +63,7 @@ class NonFiniteError(UserError):
 
 
 def report_of(setup: TrainingSetup) -> NonFiniteReport:
-    """Returns the number that a setup's guard has found."""
+    """Returns a report about the number that a setup's guard detected."""
     place, steps, updates = setup.guard.found()
     if place == ROLLOUT:
         return _in_rollout(setup, steps)
@@ -91,7 +91,10 @@ def report_of(setup: TrainingSetup) -> NonFiniteReport:
 
 
 def _in_rollout(setup: TrainingSetup, steps: int) -> NonFiniteReport:
-    """Finds the first number of a rollout in the order of cause and effect."""
+    """Returns a report about the first non-finite number of a rollout.
+
+    Tensors are searched in causal order: observation, action, position, reward.
+    """
     assert setup.guard.rollout is not None, "a rollout was recorded"
     tensors = {
         name.replace(f"{keys.AGENTS}.", ""): value
@@ -124,7 +127,7 @@ def _in_rollout(setup: TrainingSetup, steps: int) -> NonFiniteReport:
 
 
 def first_non_finite(state: Mapping[str, Tensor]) -> str | None:
-    """Returns the name of the first tensor of a setup's state that is not finite, if any."""
+    """Returns the name of the first tensor of a setup's state that is not finite, or None."""
     for name, value in state.items():
         fires = "arrival_time" in name  # infinite where nothing burns, NaN in the margin
         if not fires and value.is_floating_point() and not value.isfinite().all():
@@ -133,10 +136,10 @@ def first_non_finite(state: Mapping[str, Tensor]) -> str | None:
 
 
 def check_state(setup: TrainingSetup, state: Mapping[str, Tensor]) -> None:
-    """Checks that everything that is about to be saved is finite.
+    """Checks that a state is finite before it is saved.
 
     Raises:
-        NonFiniteError: a tensor is not; there is no dump of it.
+        NonFiniteError: a tensor is not finite; no dump is written.
     """
     if name := first_non_finite(state):
         value = state[name]
@@ -146,7 +149,7 @@ def check_state(setup: TrainingSetup, state: Mapping[str, Tensor]) -> None:
 
 
 def error_of(setup: TrainingSetup, run: RunFolder) -> NonFiniteError:
-    """Returns the error that ends a training, after its dump was written to a run folder."""
+    """Writes a dump to a run folder and returns the error that ends the training."""
     report = report_of(setup)
     try:
         dump = _write(setup, run, report)
@@ -156,7 +159,7 @@ def error_of(setup: TrainingSetup, run: RunFolder) -> NonFiniteError:
 
 
 def _write(setup: TrainingSetup, run: RunFolder, report: NonFiniteReport) -> Path:
-    """Writes the rollout or batch, the learner before the update, and the report."""
+    """Writes the rollout or batch, the learner's state before the update, and the report."""
     whole = free_name(run.path, f"divergence_step_{report.step}", ["", ".part"])
     folder = whole.with_name(whole.name + ".part")
     folder.mkdir()
@@ -184,14 +187,14 @@ def replay(dump: Path | str, device: str = "cpu") -> NonFiniteReport | None:
     """Repeats the update of a dump, or checks its rollout again.
 
     Args:
-        dump: a folder that a training has left.
-        device: where it is repeated.
+        dump: folder of the dump.
+        device: device of the repetition.
 
     Returns:
-        The number that is not finite; None where everything is finite this time.
+        A report about the first non-finite number; None if all numbers are finite this time.
 
     Raises:
-        UserError: the folder holds no dump.
+        UserError: the folder does not hold a dump.
     """
     folder = Path(dump)
     setup = TrainingSetup(RunFolder(folder).config(device=device))

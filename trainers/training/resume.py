@@ -1,4 +1,4 @@
-"""Continues a run that was stopped, as if it had not been."""
+"""Resumes a stopped run exactly where its newest checkpoint was made."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -17,23 +17,23 @@ from emberlink.trainers.training.trainer import Trainer
 
 
 def resume(path: Path, method: str | None = None, overrides: Sequence[str] = ()) -> Trainer:
-    """Returns the training of a run folder, where its newest checkpoint was made.
+    """Returns the training of a run folder, restored from its newest checkpoint.
 
-    Metrics of later steps are cut off, and later or half-written checkpoints are removed: the
-    training makes them again. A run that has no checkpoint yet begins again.
+    Metrics and checkpoints of later steps, and incomplete checkpoints, are removed. A run without a
+    checkpoint begins again.
 
     Args:
-        path: a run folder, of any of the seeds that train side by side; or one of its
-            `checkpoints/state_*.safetensors`, to go back further.
-        method: must be the run's, if given.
-        overrides: `key=value`, of keys that change nothing that was learnt.
+        path: run folder of any seed of the training, or one of its older
+            `checkpoints/state_*.safetensors`.
+        method: if given, must be the method of the run.
+        overrides: texts `key=value`, of keys that do not affect learning.
 
     Raises:
-        UserError: the run cannot be resumed. Nothing was changed.
+        UserError: the run cannot be resumed; no file has changed.
     """
     chosen = path if path.suffix == ".safetensors" else None
     runs = find_runs(path.absolute().parent.parent if chosen else path)
-    # The run's own device may not be there: it is replaced before it is checked.
+    # The device of the run may not exist here, so it is replaced before it is checked.
     devices = [text.partition("=")[2] for text in overrides if text.startswith("device=")]
     before = runs[0].config(**({"device": devices[-1]} if devices else {}))
     check_seeds(runs, before)
@@ -46,11 +46,11 @@ def resume(path: Path, method: str | None = None, overrides: Sequence[str] = ())
         trainer = Trainer(config)
         sizes = _restore(trainer, runs, chosen)
         folders.check_lines(sizes, trainer.setup.episode)
-        # From here on everything is known to fit.
+        # All checks have passed; files are changed from here on.
         folders.cut_back(sizes, trainer.setup.step)
-        for run, own in zip(runs, folders.configs, strict=True):
+        for run, run_config in zip(runs, folders.configs, strict=True):
             if overrides or not run.has_config():
-                run.write_config(own)
+                run.write_config(run_config)
         trainer.folders = folders
         if trainer.setup.step:
             trainer.saved = trainer.setup.step
@@ -65,7 +65,11 @@ def resume(path: Path, method: str | None = None, overrides: Sequence[str] = ())
 
 
 def _check_beginning(runs: Sequence[RunFolder], config: RunConfig) -> None:
-    """Checks that a run without a checkpoint never had one: then it has few lines."""
+    """Checks that a run without a checkpoint has too few lines to have had one.
+
+    Raises:
+        UserError: the run has more lines, or an evaluation.
+    """
     most = config.checkpoint_interval
     if config.checkpoint_steps:
         most = min(most, -(-config.checkpoint_steps // config.env.horizon))
@@ -80,7 +84,11 @@ def _check_beginning(runs: Sequence[RunFolder], config: RunConfig) -> None:
 
 
 def _changed(config: RunConfig, method: str | None, overrides: Sequence[str]) -> RunConfig:
-    """Returns the configuration with the overrides, which must be of keys that may change."""
+    """Returns the configuration with the overrides.
+
+    Raises:
+        UserError: an override changes a key that may not change.
+    """
     if method is not None and method != config.method:
         raise UserError(f"method {method!r}: the run is of method {config.method!r}")
     changed = override(config, overrides)
@@ -91,7 +99,7 @@ def _changed(config: RunConfig, method: str | None, overrides: Sequence[str]) ->
 
 
 def _restore(trainer: Trainer, runs: Sequence[RunFolder], chosen: Path | None) -> Sequence[Sizes]:
-    """Puts the training where the checkpoint was made; returns the sizes of files until then."""
+    """Restores the training from a checkpoint and returns the file sizes of the checkpoint."""
     states = runs[0].states()
     if chosen is None and not states:
         if runs[0].networks():
@@ -109,7 +117,7 @@ def _restore(trainer: Trainer, runs: Sequence[RunFolder], chosen: Path | None) -
             raise UserError(f"episodes={trainer.config.episodes}: the run has done {done:g}")
         trainer.restore(path, state, tensors)
     except UserError as error:
-        older = [one for one in states if 0 <= step_of(one) < step_of(path)]
+        older = [state for state in states if 0 <= step_of(state) < step_of(path)]
         hint = f"; the one before it: emberlink train resume={older[-1]}" if older else ""
         raise UserError(f"{error}{hint}") from None
     if len(runs) > 1 and state.folders != [run.path.name for run in runs]:

@@ -1,15 +1,15 @@
-"""How often and with what learning rates training returns to a checkpoint after a NaN or Inf."""
+"""Counts rollbacks to a checkpoint after a NaN or Inf, and reduces the learning rates."""
 
 from dataclasses import dataclass
 
 from emberlink.trainers.training.non_finite import NonFiniteError
 
 FACTOR = 0.5
-"""by which the learning rates are multiplied at each rollback"""
+"""factor of the learning rates at each rollback"""
 MAX_ROLLBACKS = 5
 """maximum rollbacks without progress"""
 FILE = "rollbacks.jsonl"
-"""has a line for each rollback; unlike metrics.jsonl, it is never cut"""
+"""file with a line for each rollback; unlike metrics.jsonl, it is never truncated"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -17,14 +17,14 @@ class Rollbacks:
     """The rollbacks of a run so far."""
 
     lr_scale: float = 1.0
-    """share of the configuration's learning rates that is left"""
+    """factor of the configuration's learning rates"""
     count: int = 0
     """rollbacks since training last passed `worst_step`"""
     worst_step: int = 0
-    """the latest step that failed"""
+    """latest step at which training failed"""
 
     def passed(self, step: int) -> "Rollbacks":
-        """Returns the rollbacks after a step was saved: beyond the worst one, counting restarts."""
+        """Returns the rollbacks after a step was saved; past `worst_step`, the count is 0 again."""
         if step <= self.worst_step:
             return self
         return Rollbacks(lr_scale=self.lr_scale, worst_step=self.worst_step)
@@ -33,7 +33,7 @@ class Rollbacks:
         """Returns the rollbacks with one more.
 
         Raises:
-            NonFiniteError: it would be one too many.
+            NonFiniteError: there are `MAX_ROLLBACKS` already.
         """
         if self.count == MAX_ROLLBACKS:
             raise NonFiniteError(

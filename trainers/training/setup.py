@@ -1,4 +1,4 @@
-"""What is trained: the environments, the learner and the collector of a configuration."""
+"""Sets up a training: the environments, the learner and the collector of a configuration."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -21,14 +21,17 @@ from emberlink.trainers.training.episode import EpisodeRecord
 
 
 class TrainingSetup:
-    """Everything that training changes, in memory: no file is read or written.
+    """Holds all objects that training changes, and accesses no files.
 
-    With several seeds their environments lie side by side and their networks are one stack; nothing
-    crosses from one seed to another. From then on the process keeps the memory that it frees (see
-    `allocator`).
+    The environments of several seeds are one batch, and their networks are stacked. Seeds do not
+    share transitions or weights. Creating a setup changes the memory allocator of the process, see
+    `keep_freed_memory`.
 
     Args:
-        config: of the run.
+        config: configuration of the run.
+
+    Raises:
+        UserError: the horizon is not a multiple of the learner's `rollout_steps`.
     """
 
     def __init__(self, config: RunConfig):
@@ -38,7 +41,7 @@ class TrainingSetup:
         self.teams = len(self.seeds)
         self.total_steps = config.episodes * self.horizon
         self.step = 0
-        """steps of all environments so far"""
+        """steps of the batch of environments so far"""
         self.env = build_env(
             config,
             num_envs=self.teams * config.num_envs,
@@ -67,7 +70,7 @@ class TrainingSetup:
 
     @property
     def episode(self) -> int:
-        """Episodes that are finished."""
+        """The number of finished episodes."""
         return self.step // self.horizon
 
     def learn(self, rollout: TensorDictBase) -> None:
@@ -78,7 +81,7 @@ class TrainingSetup:
         self.record.add(rollout, self.learner.learn(rollout))
 
     def dry_run(self, steps: int) -> None:
-        """Collects and learns for some steps; nothing is measured or written."""
+        """Collects and learns for some steps without writing files."""
         for rollout in islice(self.collector, -(-steps // self.learner.rollout_steps)):
             self.learn(rollout)
 
@@ -87,14 +90,14 @@ class TrainingSetup:
         return replace(self.config, seed=self.seeds[team])
 
     def team_actor(self, team: int) -> TensorDictModule:
-        """Returns the actors of one seed, without noise; they learn on with the others."""
+        """Returns the actors of one seed without noise; they share memory with the learner."""
         return team_of(self.learner.actor, team, self.teams)
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Returns everything that training has changed, "group/name" -> tensor, copied.
+        """Returns the state of the training, "group/name" -> tensor.
 
-        What is missing follows from the configuration: fires, initial weights, and all random
-        numbers, which are hashes of a seed and of counters that are included.
+        Tensors are copied, except the transitions. The state does not contain fires, which follow
+        from the configuration, or random states: random numbers are hashes of seeds and counters.
         """
         state = prefixed(
             learner=self.learner.state_dict(),
@@ -103,15 +106,15 @@ class TrainingSetup:
             carried=flatten(self.collector.carried),
             episode=self.record.state_dict(),
         )
-        # The transitions are by far the largest part; nothing changes them until they are written.
+        # The transitions are by far the largest part, and do not change before they are written.
         big = "learner/replay/"
         return {k: v if k.startswith(big) else v.detach().clone() for k, v in state.items()}
 
     def load_state_dict(self, state: Mapping[str, Tensor], step: int) -> None:
-        """Restores what `state_dict` gave after so many steps, into a setup that is new.
+        """Restores the state of `state_dict` at a step, in a new setup.
 
         Raises:
-            ValueError, KeyError, RuntimeError: the state is not one of this configuration.
+            ValueError, KeyError, RuntimeError: the state does not fit this configuration.
         """
         device = self.config.device
         self.learner.load_state_dict(group(state, "learner"))

@@ -1,4 +1,4 @@
-"""The training loop: collects, learns, measures, evaluates and saves."""
+"""Runs the training loop: collects, learns, measures, evaluates and saves."""
 
 import time
 from collections.abc import Callable
@@ -22,25 +22,29 @@ from emberlink.trainers.training.setup import TrainingSetup
 
 @dataclass
 class Progress:
-    """What a caller is told after each rollout."""
+    """The progress of a training after a rollout."""
 
     step: int
+    """steps of the batch of environments so far"""
     steps: int
+    """steps of the whole training"""
     episode: int
+    """finished episodes"""
     episodes: int
+    """episodes of the whole training"""
     lines: list[dict[str, Any]] = field(default_factory=list)
-    """the last finished episode's line of metrics.jsonl, of every seed"""
+    """line of metrics.jsonl of the last finished episode, for each seed"""
     note: str = ""
-    """a message for the user: that training returned to a checkpoint"""
+    """message for the user about a rollback, or empty"""
 
 
 class Trainer:
-    """Trains a configuration, or one run of each seed side by side, and writes the run folders.
+    """Trains all seeds of a configuration and writes their run folders.
 
-    The setup is built before a folder is made, so that an error leaves nothing behind.
+    The setup is built before a folder is created, so that an error leaves no files.
 
     Args:
-        config: everything that the run depends on.
+        config: configuration of the run.
     """
 
     def __init__(self, config: RunConfig):
@@ -48,11 +52,11 @@ class Trainer:
         self.setup = TrainingSetup(config)
         self.rollbacks = Rollbacks()
         self.seconds = 0.0
-        """of training before `train` was called"""
+        """seconds of training before `train` was called"""
         self.best: list[float | None] = [None] * self.setup.teams
-        """highest coverage of each seed, with which best.safetensors was written"""
+        """highest coverage of each seed, %; that of best.safetensors"""
         self.saved: int | None = None
-        """the step of the newest checkpoint"""
+        """step of the newest checkpoint"""
         self.changed_versions = ""
         """packages whose version is not that of the checkpoint that was resumed"""
         self.folders: RunFolders | None = None
@@ -61,7 +65,7 @@ class Trainer:
 
     @property
     def runs(self) -> list[RunFolder]:
-        """The run folders, one per seed; `start` makes them."""
+        """The run folders, one per seed; `start` creates them."""
         assert self.folders is not None, "start() comes first"
         return self.folders.runs
 
@@ -77,18 +81,18 @@ class Trainer:
         return self.runs[0]
 
     def start(self) -> RunFolder:
-        """Makes the run folders, one for each seed, and returns the first."""
+        """Creates the run folders, one per seed, and returns the first."""
         teams = range(self.setup.teams)
         self.folders = RunFolders.create([self.setup.seed_config(team) for team in teams])
         self.config = replace(self.config, fire=self.configs[0].fire)
         return self.run
 
     def stop(self) -> None:
-        """Ends the training after the present rollout; may be called from a signal handler."""
+        """Ends the training after the current rollout; may be called from a signal handler."""
         self._stopping = True
 
     def close(self) -> None:
-        """Releases the run folders; `train` does it unless told to hold them."""
+        """Unlocks the run folders."""
         if self.folders is not None:
             self.folders.close()
 
@@ -101,17 +105,18 @@ class Trainer:
     ) -> bool:
         """Trains to the end, or until `stop`, and saves.
 
-        If an exception ends it, nothing more is saved: a setup is consistent only between rollouts.
+        After an exception, nothing is saved: a setup is consistent only between rollouts.
 
         Args:
             report: called after each rollout.
-            hold: whether to keep the run folders locked, until `close`.
+            hold: whether the run folders stay locked until `close`.
 
         Returns:
             True at the end of the run, False after `stop`.
 
         Raises:
-            NonFiniteError: a number was not finite, and `on_nan` is not rollback or did not help.
+            NonFiniteError: a number is NaN or infinite, and `on_nan` is "stop" or the rollbacks
+                failed.
             UserError: a file cannot be written, such as to a full disk.
         """
         try:
@@ -129,8 +134,8 @@ class Trainer:
                 self.close()
 
     def _train(self, report: Callable[[Progress], None]) -> None:
-        """Trains to the end, until `stop`, or until a number is not finite."""
-        # A tracker that has failed is not tried again after a rollback.
+        """Trains to the end, or until `stop` or a NaN or Inf."""
+        # A failed tracker is not started again after a rollback.
         quiet = [replace(config, logger="none") for config in self.configs]
         configs = quiet if self._untracked else self.configs
         trackers = Trackers(configs, self.runs, episode=self.setup.episode)
@@ -170,12 +175,12 @@ class Trainer:
         return any(after // steps > before // steps for steps in intervals if steps)
 
     def _check_finite(self, *, wait: bool) -> None:
-        """Ends the training where a number is not finite, before anything of it is written."""
+        """Raises an error if the guard has detected a NaN or Inf."""
         if self.setup.guard.poll(wait=wait):
             raise non_finite.error_of(self.setup, self.run)
 
     def _finish_episode(self, trackers: Trackers) -> list[dict[str, Any]]:
-        """Measures an episode, evaluates if that is due, and writes the lines."""
+        """Measures an episode, evaluates if it is due, and writes and returns the lines."""
         setup, interval = self.setup, self.config.evaluation.interval
         counted = {"episode": setup.episode, "updates": setup.learner.updates}
         lines = [counted | measures for measures in setup.record.measures()]
@@ -192,10 +197,10 @@ class Trainer:
         return lines
 
     def _keep_best(self, team: int, line: dict[str, Any]) -> None:
-        """Writes the networks whose coverage is the highest so far.
+        """Writes the networks of a seed if their coverage is the highest so far.
 
-        The coverage is that on validation fires, or, without evaluations during training, the
-        episode's own.
+        The coverage is that on validation fires or, without evaluations during training, that of
+        the episode.
         """
         evaluated = [value for name, value in line.items() if name.endswith("/coverage")]
         if self.config.evaluation.interval and not evaluated:
@@ -208,10 +213,10 @@ class Trainer:
             self.runs[team].save_best(weights, self.configs[team], self.setup.step)
 
     def save(self) -> None:
-        """Writes a checkpoint: first the whole state, then each seed's networks.
+        """Writes a checkpoint: the training state, then the networks of each seed.
 
         Raises:
-            NonFiniteError: something in the state is not finite.
+            NonFiniteError: a tensor in the state is not finite.
             UserError: a file cannot be written; earlier checkpoints are unchanged.
         """
         setup, folders = self.setup, self.folders
@@ -237,12 +242,12 @@ class Trainer:
         self.saved = setup.step
 
     def save_networks(self) -> None:
-        """Writes the networks alone to a checkpoint of each run."""
+        """Writes the networks of each seed."""
         for team, (config, run) in enumerate(zip(self.configs, self.runs, strict=True)):
             run.save(self.setup.learner.weights(team), config, self.setup.step)
 
     def restore(self, path: Path, state: checkpoints.RunState, tensors: dict[str, Tensor]) -> None:
-        """Puts a new setup where a checkpoint was made.
+        """Restores a new setup from a training state.
 
         Raises:
             UserError: the checkpoint does not fit; the message begins with its path.
@@ -254,8 +259,8 @@ class Trainer:
     def roll_back(self, error: non_finite.NonFiniteError) -> str:
         """Returns to the newest checkpoint, or to the beginning, with smaller learning rates.
 
-        A checkpoint with these rates is made at once, so that a run that is stopped resumes with
-        them. The best networks stay.
+        A checkpoint with these rates is written at once, so that a resumed run has them, too. The
+        best networks are kept.
 
         Returns:
             A message for the user.

@@ -1,4 +1,4 @@
-"""Runs the processes of a sweep: an executor is one file here and one in configs/executor."""
+"""Executors: they run the trainings of a sweep. Each is a file here and in configs/executor."""
 
 from emberlink.trainers.sweep.executors.base import Executor, Task
 from emberlink.trainers.sweep.executors.registry import known, make

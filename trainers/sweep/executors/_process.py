@@ -1,9 +1,9 @@
-"""`emberlink train` in a child process that ends when its parent does.
+"""Runs `emberlink train` in a child process that ends with its parent.
 
     python -m emberlink.trainers.sweep.executors._process ARGUMENT...
 
-The standard input is a pipe from the parent, which writes nothing to it. The pipe ends when the
-parent has ended, however it ended; the training is then told to save and end.
+The standard input is a pipe from the parent, which writes nothing to it. When the parent ends, for
+whatever reason, the pipe is closed, and this process sends itself SIGTERM: the training saves.
 """
 
 import os
@@ -13,7 +13,7 @@ import sys
 import threading
 
 _COMMAND_LINE = "emberlink.trainers.cli"
-"""run as a program, not imported: the command line imports the sweep"""
+"""run by `runpy`, since importing it would be circular"""
 
 
 def _end_with_parent() -> None:

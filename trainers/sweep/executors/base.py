@@ -1,4 +1,4 @@
-"""The interface between a sweep and the place where its trainings run."""
+"""Defines the base class of executors, which run the trainings of a sweep."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -12,10 +12,10 @@ class Task:
     """A training to run.
 
     Attributes:
-        arguments: of `emberlink train`.
-        log: a new file for its output.
-        locks: file descriptors that its process keeps open as long as it runs, if it runs on this
-            machine; the sweep closes its own when the task has ended.
+        arguments: arguments of `emberlink train`.
+        log: a new file for the output.
+        locks: file descriptors that a process on this machine must inherit and keep open. The sweep
+            closes its own descriptors when the task has ended.
     """
 
     arguments: Sequence[str]
@@ -24,38 +24,38 @@ class Task:
 
 
 class Executor(ABC):
-    """Runs trainings somewhere, several at a time.
+    """Runs trainings, several at a time.
 
     Args:
-        config: of type `config_type`.
+        config: an instance of `config_type`.
     """
 
     config_type: ClassVar[type]
-    """a dataclass whose fields are the keys of configs/executor/NAME.yaml but `name`"""
+    """a dataclass; its fields are the keys of configs/executor/NAME.yaml without `name`"""
 
     @abstractmethod
     def __init__(self, config: Any): ...
 
     @abstractmethod
     def slots(self, tasks: int) -> int:
-        """Returns how many tasks to submit at a time.
+        """Returns the number of tasks to run at a time.
 
         Args:
-            tasks: how many there are in all.
+            tasks: number of all tasks.
         """
 
     @abstractmethod
     def submit(self, task: Task) -> Any:
-        """Starts a task and returns a handle on it, without waiting.
+        """Starts a task without waiting for it and returns a handle.
 
         Raises:
-            OSError: the task cannot be started, such as for a log that cannot be written.
+            OSError: the task cannot be started, for example because the log cannot be written.
         """
 
     @abstractmethod
     def poll(self, handle: Any) -> int | None:
-        """Returns the exit status of a task, or None while it waits or runs."""
+        """Returns the exit status of a task, or None if it has not ended."""
 
     @abstractmethod
     def cancel(self, handle: Any) -> None:
-        """Asks a task to save and end; a task that has ended is left alone. Does not wait."""
+        """Requests that a task saves and ends, without waiting; has no effect if it has ended."""

@@ -1,4 +1,4 @@
-"""Trainings as processes on this machine."""
+"""Runs trainings as processes on this machine."""
 
 import os
 import subprocess
@@ -15,16 +15,16 @@ _PROGRAM = "emberlink.trainers.sweep.executors._process"
 
 @dataclass(frozen=True, kw_only=True, config=ConfigDict(extra="forbid", strict=True))
 class LocalConfig:
-    """Processes on this machine."""
+    """The settings of local processes."""
 
     workers: Annotated[int, Field(ge=1)] | None = None
     """runs at a time; the number of cores if None"""
     threads: Annotated[int, Field(ge=1)] | None = None
-    """threads of each run; the cores divided by the runs at a time if None"""
+    """threads of each run; if None, the number of cores divided by the runs at a time"""
 
 
 class LocalExecutor(Executor):
-    """Runs each task as a child process, which saves and ends when this process is gone."""
+    """Runs each task as a child process, which saves and ends when this process ends."""
 
     config_type = LocalConfig
 
@@ -42,11 +42,11 @@ class LocalExecutor(Executor):
     def submit(self, task: Task) -> subprocess.Popen:
         settings = {"OMP_NUM_THREADS": str(self._threads), **os.environ, "COLUMNS": "120"}
         with task.log.open("x") as log:
-            # In a session of its own: Ctrl-C reaches the sweep alone, which cancels the tasks.
-            # -P: modules in the working folder are not imported.
+            # In a new session, so that Ctrl-C reaches only the sweep, which cancels the tasks.
+            # -P: modules of the working directory are not imported.
             return subprocess.Popen(
                 [sys.executable, "-P", "-m", _PROGRAM, *task.arguments],
-                stdin=subprocess.PIPE,  # ends when this process does
+                stdin=subprocess.PIPE,  # closed when this process ends
                 stdout=log,
                 stderr=subprocess.STDOUT,
                 env=settings,

@@ -1,4 +1,4 @@
-"""Finds executors: the files beside this one, each with a YAML file in configs/executor."""
+"""Finds executors by name: files of this folder, and entry points of other packages."""
 
 from typing import Any
 
@@ -15,14 +15,14 @@ known = _REGISTRY.known
 
 
 def make(name: str, settings: dict[str, Any]) -> Executor:
-    """Returns an executor.
+    """Returns a new executor.
 
     Args:
-        name: a file of this folder, or an entry point of `emberlink.executors`.
-        settings: values in place of those in configs/executor/NAME.yaml.
+        name: name of a file in this folder, or of an entry point of `emberlink.executors`.
+        settings: values that replace those of configs/executor/NAME.yaml.
 
     Raises:
-        UserError: the name or a key is not known, or a value does not fit.
+        UserError: the name or a key is not known, or a value is wrong.
     """
     executor = _REGISTRY.find(name)
     values = {key: value for key, value in read("executor", name).items() if key != "name"}
