@@ -10,7 +10,7 @@ import pytest
 import rasterio
 import torch
 from fire_files import CORNER, UTM, Ellipses, raster_of, write_asc, write_tif
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from rasterio.transform import from_origin
 from scipy.ndimage import gaussian_filter
@@ -379,6 +379,7 @@ def by_loops(times, window):
     st.floats(-3, 3),
     st.integers(0, 2**32 - 1),
 )
+@example(2, 2, 1.0, 0.0, -1.5, 2)  # centres on the edges of cells
 def test_no_arrival_is_lost(rows, columns, side, x, y, seed):
     random = np.random.default_rng(seed)
     times = random.uniform(0, 100, (rows, columns))

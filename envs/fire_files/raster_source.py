@@ -223,12 +223,8 @@ class RasterSource:
         if fine:
             return near
         earliest = self._earliest(self.times, window)
-        x, y = window.centres()
-        rows, columns = (np.rint(at).astype(np.int64) for at in self._indices(window))
-        at_x, at_y = self._centres(rows, columns)
-        i, j = window.cells(at_x, at_y)
-        missed = (i != np.arange(len(x)))[:, None] | (j != np.arange(len(y)))[None, :]
-        return np.where(np.isinf(earliest) & missed, near, earliest)
+        without_centre = np.isinf(self._earliest(np.zeros_like(self.times), window))
+        return np.where(without_centre, near, earliest)
 
     def _earliest(self, times: np.ndarray, window: Window) -> np.ndarray:
         """Returns the earliest arrival among the raster's centres in each cell of a grid."""

@@ -2,7 +2,7 @@
 
 import copy
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, cast
 
 from tensordict.nn import TensorDictModule
 from torchrl.data import Composite
@@ -78,7 +78,7 @@ def _build(
         actions,
         hidden,
         share_parameters=share_parameters,
-        device=observation.device,
+        device=cast(torch.device | None, observation.device),
         generator=generator,
     )
 
