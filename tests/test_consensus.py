@@ -1,4 +1,4 @@
-"""Consensus on networks made by hand."""
+"""Tests consensus on small networks with known results."""
 
 import math
 
@@ -21,7 +21,7 @@ def in_a_row(count: int, gap: float = 9.0) -> list[list[float]]:
 
 
 def told(position, new, *, config=None, world=WORLD, **more) -> TensorDict:
-    """A moment as an episode's first, rewritten by consensus."""
+    """Returns the first time step of an episode after consensus."""
     now = moment(position, new, **more)
     return communication(now, config, world)._reset(now, now)
 
@@ -40,28 +40,28 @@ def test_seekers_follow_the_discoverer_of_higher_rank(mirrored):
 
 
 @pytest.mark.parametrize("end", [0, 6])
-def test_a_rank_travels_along_a_chain_of_any_length(end):
+def test_a_rank_is_forwarded_along_a_chain_of_any_length(end):
     new = [0] * 7
     new[end] = 1
     assert follows(in_a_row(7), new) == [end] * 7
 
 
-def test_the_better_discoverer_wins_the_whole_chain():
+def test_the_whole_chain_follows_the_discoverer_of_higher_rank():
     assert follows(in_a_row(8), [1, 0, 0, 0, 0, 0, 0, 5]) == [0, *[7] * 7]
 
 
-def test_nothing_crosses_a_cut():
+def test_separate_networks_do_not_exchange_messages():
     left, right = in_a_row(3), [[x + 40, y, z] for x, y, z in in_a_row(3)]
     assert follows(left + right, [4, 0, 0, 0, 0, 0]) == [0, 0, 0, -1, -1, -1]
     assert follows(left + right, [4, 0, 0, 0, 0, 9]) == [0, 0, 0, 5, 5, 5]
 
 
-def test_a_discoverer_does_not_join_two_networks_of_others():
+def test_a_discoverer_does_not_forward_messages_between_networks():
     # 0 - 1 - [2] - 3 - [4]: 3 hears the better 4; 1 hears only 2, and 0 only 1.
     assert follows(in_a_row(5), [0, 0, 1, 0, 5]) == [2, 2, 2, 4, 4]
 
 
-def test_without_a_discoverer_all_wander():
+def test_all_uavs_wander_without_a_discoverer():
     now = moment(in_a_row(5), [0] * 5)
     talk = communication(now)
     rewritten = talk._reset(now, now)
@@ -69,18 +69,18 @@ def test_without_a_discoverer_all_wander():
     assert rewritten[keys.TARGET].equal(talk.module.waypoint)
 
 
-def test_everyone_may_discover():
+def test_all_uavs_may_be_discoverers():
     assert follows(in_a_row(4), [1, 2, 3, 4]) == [0, 1, 2, 3]
 
 
 def test_ties_go_to_the_lower_index():
     assert follows(in_a_row(3), [2, 0, 2]) == [0, 0, 2]
-    # Through a chain too, and whichever of the two is nearer.
+    # The same holds through a chain, and independent of the distances.
     assert follows(in_a_row(6), [0, 2, 0, 0, 0, 2]) == [1, 1, 1, 1, 1, 5]
 
 
 @pytest.mark.parametrize(("limit", "near"), [(10.0, False), (10.001, True), (math.inf, True)])
-def test_hearing_ends_below_the_range(limit, near):
+def test_the_range_is_exclusive(limit, near):
     position = torch.tensor([[0.0, 0.0, 1.0], [6.0, 8.0, 1.0]])
     assert neighbours(position, limit).tolist() == [[False, near], [near, False]]
 
@@ -91,7 +91,7 @@ def test_distance_is_taken_in_three_dimensions():
     assert neighbours(position, 9.95).sum() == 2
 
 
-def test_no_range_is_silence_and_infinite_range_is_one_network():
+def test_range_zero_and_infinite_range():
     position, new = in_a_row(4, gap=20), [0, 3, 0, 0]
     assert follows(position, new) == [-1, 1, -1, -1]
     assert follows(position, new, config=ConsensusConfig(range=math.inf)) == [1, 1, 1, 1]
@@ -99,7 +99,7 @@ def test_no_range_is_silence_and_infinite_range_is_one_network():
     assert follows(same, [0, 3, 0], config=ConsensusConfig(range=0.0)) == [-1, 1, -1]
 
 
-def test_the_choice_reads_the_ranks_of_discoverers_only():
+def test_only_ranks_of_discoverers_are_compared():
     everyone = ~torch.eye(3, dtype=torch.bool)
     discovers = torch.tensor([False, True, False])
     rank = torch.tensor([math.inf, -1.0, 99.0])
@@ -107,16 +107,16 @@ def test_the_choice_reads_the_ranks_of_discoverers_only():
     assert choose_leader(known, -rank.unsqueeze(-2), discovers).tolist() == [1, 1, 1]
 
 
-def test_without_agreement_only_neighbours_are_known():
-    # 0 - [1] - 2 - 3 - 4 - [5]: 3 hears neither of the two.
+def test_without_agreement_only_neighbours_are_heard():
+    # 0 - [1] - 2 - 3 - 4 - [5]: 3 hears neither discoverer.
     alone = ConsensusConfig(agree=False)
     assert follows(in_a_row(6), [0, 1, 0, 0, 0, 9], config=alone) == [1, 1, 1, -1, 5, 5]
     assert follows(in_a_row(6), [0, 1, 0, 0, 0, 9]) == [1, 1, 5, 5, 5, 5]
 
 
-def test_the_nearest_discoverer_in_place_of_the_best():
+def test_the_nearest_discoverer_instead_of_the_best():
     nearest = ConsensusConfig(follow="nearest")
-    # 2 to 4 learn of both from each other; 5 has found more, and 3 is as near to 1: lower index.
+    # 2 to 4 receive both ranks. 5 has the higher rank. 3 is equally near to 1 and 5: lower index.
     assert follows(in_a_row(6), [0, 1, 0, 0, 0, 9], config=nearest) == [1, 1, 1, 1, 5, 5]
 
 
@@ -133,13 +133,13 @@ def test_without_wandering_there_is_no_target_and_no_bonus():
     assert first[keys.TARGET][0, 0].tolist() == start[0]
     assert first[keys.OBSERVATION][0, 0, -3:].tolist() == [0.0, 0.0, 0.0]
     second = talk._step(first, moment(moved, [0, 0, 0], step=1))
-    # The first has no target; the third came from 5 to sqrt(18) of the second.
+    # UAV 0 has no target. UAV 2 moved from a distance of 5 to one of sqrt(18) to UAV 1.
     expected = torch.tensor([0.0, 0.0, 2 * (5 - 18**0.5)])
     torch.testing.assert_close(second[keys.REWARD].flatten(), expected)
 
 
 @pytest.mark.parametrize("loss", [0.0, 0.2, 0.5, 1.0])
-def test_messages_are_lost_as_often_as_they_are_said_to_be(loss):
+def test_the_share_of_lost_messages(loss):
     envs, uavs = 500, 6
     radio = Radio(RadioConfig(loss=loss, range=math.inf))
     position = torch.rand(envs, uavs, 3) * 20 + 1
@@ -155,12 +155,12 @@ def test_messages_are_lost_as_often_as_they_are_said_to_be(loss):
     assert share == pytest.approx(1 - loss, abs=0.01)  # 45,000 links, 4 standard deviations
     if 0 < loss < 1:
         both = (heard & heard.mT)[..., off].float().mean().item()
-        assert both == pytest.approx((1 - loss) ** 2, abs=0.015)  # each way for itself
+        assert both == pytest.approx((1 - loss) ** 2, abs=0.015)  # independent in both directions
         assert not heard[0].equal(heard[1])
 
 
 def walk(*moments: TensorDict) -> tuple[Consensus, TensorDict]:
-    """The module and the last of an episode's moments, each rewritten as on an environment."""
+    """Returns the module and the last time step after consensus on all steps of an episode."""
     talk = communication(moments[0])
     now = talk._reset(moments[0], moments[0])
     for following in moments[1:]:
@@ -168,7 +168,7 @@ def walk(*moments: TensorDict) -> tuple[Consensus, TensorDict]:
     return talk.module, now
 
 
-def test_streak_score_and_altitude_add_up_and_start_anew():
+def test_streak_score_and_altitude_accumulate_and_reset():
     def at(z: float, new: int) -> TensorDict:
         return moment([[5.0, 5.0, z]], [new])
 
@@ -188,7 +188,7 @@ def test_streak_score_and_altitude_add_up_and_start_anew():
 def test_rank_by_hand():
     # UAV 0: 6 then 2 points at altitudes 1 and 3: 8 / (2 * 2) * 2 / 3 = 1.3333
     # UAV 2: 0 then 4 points at altitude 3.5: 4 / (3.5 * 1) * 4 / 3.5 = 1.3061
-    # The latest step alone would put 2 first: 2 / 3 < 4 / 3.5.
+    # By the latest step alone 2 would rank first: 2 / 3 < 4 / 3.5.
     before = [[0.0, 0.0, 1.0], [9.0, 0.0, 2.0], [18.0, 0.0, 3.5]]
     after = [[0.0, 0.0, 3.0], [9.0, 0.0, 2.0], [18.0, 0.0, 3.5]]
     _, now = walk(moment(before, [6, 0, 0]), moment(after, [2, 0, 4]))
@@ -204,15 +204,15 @@ def test_targets_by_role():
     talk = communication(now)
     rewritten = talk._reset(now, now)
     target = rewritten[keys.TARGET][0]
-    assert target[0].tolist() == [3.25, 4.5, 2.5]  # the mean of the new fire, at its own z
-    assert target[1].tolist() == position[0]  # where the discoverer is, not where it goes
+    assert target[0].tolist() == [3.25, 4.5, 2.5]  # the centre of the new fire, at the UAV's own z
+    assert target[1].tolist() == position[0]  # the discoverer's position, not its target
     assert target[2].equal(talk.module.waypoint[0, 2])
     observed = rewritten[keys.OBSERVATION]
     assert observed.shape == (1, 3, 9)
     assert observed[..., 6:].equal(rewritten[keys.TARGET])
 
 
-def test_relative_targets_are_the_way_there():
+def test_relative_targets_are_displacements():
     config = ConsensusConfig(target="relative")
     position = [[3.0, 4.0, 2.5], [8.0, 4.0, 1.5]]
     centre = [[3.25, 4.5], [0.0, 0.0]]
@@ -226,7 +226,7 @@ def test_relative_targets_are_the_way_there():
 
 
 @pytest.mark.parametrize("target", ["absolute", "relative"])
-def test_a_box_without_height_leaves_no_nan(target):
+def test_a_box_without_height_gives_no_nan(target):
     world = WildfireConfig(grid=(21, 11), altitude=(2.0, 2.0), observation_scale="box")
     config = ConsensusConfig(target=target)
     rewritten = told([[3.0, 4.0, 2.0], [8.0, 4.0, 2.0]], [2, 0], config=config, world=world)
@@ -234,7 +234,7 @@ def test_a_box_without_height_leaves_no_nan(target):
 
 
 def test_a_waypoint_is_redrawn_only_by_a_wanderer_closer_than_one():
-    # 0 and 1 wander, 2 discovers, 3 seeks it; all but 1 are at their waypoint.
+    # 0 and 1 wander, 2 is a discoverer, 3 follows it. All but 1 are at their waypoint.
     position = [[5.0, 5.0, 2.0], [30.0, 5.0, 2.0], [50.0, 50.0, 2.0], [55.0, 50.0, 2.0]]
     waypoint = torch.tensor(
         [[[5.0, 5.9, 2.0], [30.0, 6.0, 2.0], [50.0, 50.5, 2.0], [55.0, 50.0, 2.5]]]
@@ -250,7 +250,7 @@ def test_a_waypoint_is_redrawn_only_by_a_wanderer_closer_than_one():
 
 
 def test_a_first_waypoint_closer_than_one_is_drawn_again():
-    # At each UAV's first waypoint, as the module draws it for an episode of this random stream.
+    # Each UAV starts at its first waypoint, drawn as the module draws it from this key.
     first = moment([[32.0, 32.0, 2.0]] * 6, [0] * 6)
     module = communication(first).module
     module.reset(first, torch.tensor([True]))
@@ -295,8 +295,8 @@ def test_any_fire_makes_a_discoverer_in_released():
     assert both[keys.TARGET][0, 0].tolist() == [3.0, 1.0, 2.0]
 
 
-def test_jitter_moves_x_and_y_of_near_targets_only():
-    # 0 discovers 0.5 cells away, 1 discovers 1 cell away, 2 seeks 0 from 3 cells away.
+def test_jitter_changes_x_and_y_of_near_targets_only():
+    # 0 sees fire 0.5 cells away, 1 sees fire 1 cell away, 2 follows 0 from 3 cells away.
     position = torch.tensor([[20.0, 20.0, 2.0], [40.0, 40.0, 3.0], [20.0, 23.0, 2.0]])
     more = {
         "position": position.expand(4000, 3, 3),
@@ -308,7 +308,7 @@ def test_jitter_moves_x_and_y_of_near_targets_only():
     assert noise[:, 1:].abs().max() == 0
     assert noise[..., 2].abs().max() == 0
     near = noise[:, 0, :2]
-    # 0.396 is the variance of N(0, 0.75) clipped to +-1, 0.182 the share of it that is clipped.
+    # N(0, 0.75) clipped to +-1 has the variance 0.396; a share of 0.182 is clipped.
     assert near.abs().max() <= 1 + 1e-5
     assert near.mean().abs() < 0.03
     assert near.var().item() == pytest.approx(0.396, abs=0.02)
@@ -327,7 +327,7 @@ def test_the_result_does_not_depend_on_the_order_of_uavs():
     )
     order = torch.randperm(9, generator=generator)
     centre = position[..., :2] + 0.5
-    waypoint = torch.full((200, 9, 3), 60.0)  # far from everyone: nobody draws another
+    waypoint = torch.full((200, 9, 3), 60.0)  # far from all UAVs: no UAV draws another one
 
     def run(order: Tensor) -> tuple[dict[str, Tensor], TensorDict]:
         now = moment(position[:, order], new[:, order], centre=centre[:, order], step=1)

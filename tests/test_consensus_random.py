@@ -1,4 +1,4 @@
-"""Consensus on random networks against plain Python."""
+"""Compares consensus on random networks with an implementation in plain Python."""
 
 import random
 
@@ -54,7 +54,7 @@ def test_random_networks_equal_plain_python(uavs):
     before: TensorDict | None = None
     followed = 0
     for step in range(steps):
-        sees = torch.where(draw() < 0.75, sees, draw() < 0.3)  # so that streaks last
+        sees = torch.where(draw() < 0.75, sees, draw() < 0.3)  # so that streaks are long
         new = ((draw() * 9 + 1).long() * sees).masked_fill(draw() < 0.1, 0)
         now = moment(
             position,
@@ -86,7 +86,7 @@ def test_random_networks_equal_plain_python(uavs):
 
 
 def compare(scalar: ScalarConsensus, now, before, config: ConsensusConfig) -> int:
-    """Asserts that a moment of one environment is as plain Python has it; counts the seekers."""
+    """Compares a time step of one environment with plain Python; returns the number of seekers."""
     position = [tuple(p) for p in now[keys.POSITION].tolist()]
     new, old = now[keys.NEW_FIRE].tolist(), now[keys.OLD_FIRE].tolist()
     follows = scalar.step(position, new, old, scalar.lost)
@@ -109,7 +109,7 @@ def compare(scalar: ScalarConsensus, now, before, config: ConsensusConfig) -> in
 
 
 def compare_streaks(scalar: ScalarConsensus, module: Consensus, env: int) -> None:
-    """Asserts that the track records of one environment are as plain Python has them."""
+    """Compares the track records of one environment with plain Python."""
     for i, streak in enumerate(module.streak[env].tolist()):
         assert streak == scalar.streak(i)
         assert module.fire_score[env, i] == scalar.fire_score(i)

@@ -1,4 +1,4 @@
-"""Random numbers from keys: distribution, independence, reproducibility."""
+"""Tests random numbers from keys: distribution, independence, reproducibility."""
 
 import math
 
@@ -11,7 +11,7 @@ from emberlink.envs.utils.counter_rng import Use
 COUNT = 20_000
 
 
-def test_uniform_looks_uniform():
+def test_uniform_distribution():
     draws = counter_rng.uniform(torch.tensor([1, -5, 2**60]), COUNT).double()
     assert ((draws > 0) & (draws < 1)).all()
     # Five standard errors of the mean, the variance and each of ten bins.
@@ -21,7 +21,7 @@ def test_uniform_looks_uniform():
     assert (bins - 0.1).abs().max() < 5 * math.sqrt(0.09 / COUNT)
 
 
-def test_normal_looks_normal():
+def test_normal_distribution():
     draws = counter_rng.normal(torch.tensor([3, 4]), COUNT).double()
     assert draws.isfinite().all()
     assert draws.mean(-1).abs().max() < 5 / math.sqrt(COUNT)
@@ -30,7 +30,7 @@ def test_normal_looks_normal():
 
 
 @pytest.mark.parametrize(("bits", "end"), [(0, 2.0**-24), (-1, 1 - 2.0**-24)])
-def test_the_ends_are_left_out(monkeypatch, bits, end):
+def test_uniform_excludes_0_and_1(monkeypatch, bits, end):
     monkeypatch.setattr(counter_rng, "fold_in", lambda key, count: torch.full_like(count, bits))
     assert counter_rng.uniform(torch.tensor(0), 1).item() == end
     assert counter_rng.normal(torch.tensor(0), 1).isfinite().all()
@@ -41,12 +41,12 @@ def correlation(one: torch.Tensor, other: torch.Tensor) -> float:
 
 
 @pytest.mark.parametrize("seed", [0, 1, 12345])
-def test_neighbours_are_unrelated(seed):
+def test_neighbouring_draws_are_uncorrelated(seed):
     limit = 5 / math.sqrt(COUNT)
     envs = counter_rng.uniform(counter_rng.seed_keys(seed, 3), COUNT)
     assert abs(correlation(envs[0], envs[1])) < limit
     assert abs(correlation(envs[0], envs[2])) < limit
-    # The same position over environments, over episodes, and over seeds.
+    # The same position in different environments, episodes and seeds.
     column = counter_rng.uniform(counter_rng.seed_keys(seed, COUNT), 2)
     assert abs(correlation(column[:, 0], column[:, 1])) < limit
     assert abs(correlation(column[1:, 0], column[:-1, 0])) < limit
@@ -55,10 +55,10 @@ def test_neighbours_are_unrelated(seed):
     assert abs(correlation(episodes[1:], episodes[:-1])) < limit
     others = counter_rng.uniform(counter_rng.seed_keys(seed + 1, 3), COUNT)
     assert abs(correlation(envs[0], others[0])) < limit
-    assert abs(correlation(envs[1], others[0])) < limit  # nor shifted by one
+    assert abs(correlation(envs[1], others[0])) < limit  # also if shifted by one
 
 
-def test_keys_never_collide():
+def test_keys_do_not_collide():
     every = [counter_rng.seed_keys(seed, 1000) for seed in range(20)]
     folds = [counter_rng.fold_in(every[0], counter) for counter in range(20)]
     twice = [counter_rng.fold_in(folds[0], counter) for counter in range(3)]
@@ -84,7 +84,7 @@ def test_a_draw_is_a_function_of_its_key():
     assert torch.equal(counter_rng.uniform(key.view(2, 2), 5).view(4, 5), first)
 
 
-def test_key_i_depends_on_the_seed_and_i_alone():
+def test_key_i_depends_on_the_seed_and_i_only():
     assert torch.equal(counter_rng.seed_keys(3, 100)[:7], counter_rng.seed_keys(3, 7))
     assert not torch.equal(counter_rng.seed_keys(4, 7), counter_rng.seed_keys(3, 7))
 
@@ -97,8 +97,8 @@ def test_counters_may_be_integers_or_tensors():
     assert folded.tolist() == [int(f) for f in each]
 
 
-def test_the_numbers_themselves():
-    """SplitMix64 in Python's unbounded integers."""
+def test_values_equal_splitmix64():
+    """The reference is SplitMix64 in Python's unbounded integers."""
 
     def mix(x: int) -> int:
         x = (x ^ x >> 30) * 0xBF58476D1CE4E5B9 % 2**64
@@ -129,7 +129,7 @@ def test_integers_are_uniform_below_their_limit(limit):
         assert abs(unit.std().item() - 12**-0.5) < 0.003
 
 
-def test_uses_have_the_numbers_that_results_were_made_with():
+def test_uses_keep_their_numbers():
     assert {use.name: use.value for use in Use} == {
         "START_POSITION": 0,
         "EPISODE_FIRE": 1,

@@ -1,4 +1,4 @@
-"""A seed is a run: the same again, whatever else runs; another one is another."""
+"""Tests that a seed determines a run, independent of other computations."""
 
 import pytest
 import torch
@@ -14,7 +14,7 @@ from emberlink.envs.wildfire import WildfireEnv
 @pytest.mark.parametrize("method", METHODS)
 def test_a_seed_repeats_its_run_byte_for_byte(method, tmp_path):
     def lines(folder: str, seed: int) -> bytes:
-        torch.manual_seed(len(folder))  # whatever was drawn before must not matter
+        torch.manual_seed(len(folder))  # earlier draws must not matter
         trainer = until(begun(method, tmp_path / folder, "episodes=2", f"seed={seed}"), None)
         assert trainer.setup.learner.updates > 0
         return (trainer.run.path / "metrics.jsonl").read_bytes()
@@ -26,8 +26,8 @@ def test_a_seed_repeats_its_run_byte_for_byte(method, tmp_path):
 
 
 @pytest.mark.parametrize("fire", ["paper", "huygens"])
-def test_an_environment_does_not_know_how_many_others_there_are(fire):
-    """Over two episodes, with the same actions."""
+def test_an_environment_does_not_depend_on_the_batch_size(fire):
+    """Compares two episodes with the same actions."""
     world = WildfireConfig(horizon=15)
     few, many = (WildfireEnv(count, world, fire=fire, seed=3) for count in (2, 5))
     generator = torch.Generator().manual_seed(0)

@@ -1,4 +1,4 @@
-"""What a GPU needs, checked without one: nothing waits, and one step is the same as TorchRL's."""
+"""Tests the requirements of GPUs on a CPU: no synchronisation, and TorchRL's transitions."""
 
 import pytest
 import torch
@@ -27,7 +27,7 @@ def lockstep(monkeypatch):
 
 
 def torchrls(setup: TrainingSetup) -> Collector:
-    """TorchRL's collector over an environment like the setup's."""
+    """Returns TorchRL's collector over an environment like that of the setup."""
     config, envs = setup.config, len(setup.collector.carried)
     env = build_env(config, num_envs=envs, fire=config.fire, seed=setup.seeds, device="cpu")
     return Collector(
@@ -43,7 +43,7 @@ def torchrls(setup: TrainingSetup) -> Collector:
 
 @pytest.mark.parametrize("seeds", ["seed=5", "seeds=[5,6]"])
 @pytest.mark.parametrize("method", METHODS)
-def test_our_collector_collects_what_torchrls_does(method, seeds):
+def test_our_collector_equals_torchrls(method, seeds):
     setup = TrainingSetup(resolve(method, [*SMALL, seeds, "learner.exploration.theta=0.2"]))
     torch.nn.init.normal_(setup.learner.actor.module.action.weight, std=0.3)
     pairs = zip(torchrls(setup), setup.collector, strict=True)
@@ -57,7 +57,7 @@ def test_our_collector_collects_what_torchrls_does(method, seeds):
 
 
 class Waiting(TorchDispatchMode):
-    """Notes every operation for whose result a GPU would have to be waited for."""
+    """Records the operations that would synchronise with a GPU."""
 
     NAMES = (
         *("_local_scalar_dense", "nonzero", "is_nonzero", "equal", "item", "masked_select"),
@@ -80,7 +80,7 @@ class Waiting(TorchDispatchMode):
 
 
 class Elsewhere(TorchFunctionMode):
-    """Notes every call that makes a tensor on the CPU, or moves one, whatever the device is."""
+    """Records the calls that create a tensor on the CPU or move a tensor."""
 
     MAKES = (
         *("arange", "zeros", "ones", "full", "empty", "tensor", "as_tensor", "eye", "rand"),
@@ -95,7 +95,7 @@ class Elsewhere(TorchFunctionMode):
     def __torch_function__(self, func, types, args=(), kwargs=None):
         kwargs = kwargs or {}
         name = getattr(func, "__name__", "")
-        # Without waiting: fused Adam asks for its flag on the device where it is.
+        # No synchronisation: fused Adam requests its flag on the same device.
         there = kwargs == {"non_blocking": True}
         moves = name == "to" and not (there or any(isinstance(arg, torch.dtype) for arg in args))
         if moves or name in self.MOVES or (name in self.MAKES and kwargs.get("device") is None):
@@ -111,7 +111,7 @@ class Elsewhere(TorchFunctionMode):
 )
 @pytest.mark.parametrize("method", METHODS)
 def test_no_step_leaves_the_device(method, setup, learner, watch, seeds):
-    """Environment, communication, noise, memory and update, within an episode."""
+    """A step has environment, communication, noise, replay buffer and update, within an episode."""
     settings = [f"setup={setup}", f"learner={learner}", *SMALL, seeds]
     training = TrainingSetup(resolve(method, settings))
     rollouts = iter(training.collector)
@@ -124,7 +124,7 @@ def test_no_step_leaves_the_device(method, setup, learner, watch, seeds):
     assert watched.found == []
 
 
-def test_what_is_made_elsewhere_is_noticed():
+def test_tensors_on_the_cpu_are_recorded():
     ones = torch.ones(3)
     with Elsewhere() as elsewhere:
         torch.zeros(3)
@@ -135,7 +135,7 @@ def test_what_is_made_elsewhere_is_noticed():
     assert elsewhere.found == ["zeros", "tolist", "to"]
 
 
-def test_waiting_is_noticed():
+def test_synchronisation_is_recorded():
     ones = torch.ones(3)
     with Waiting() as waiting:
         ones.sum().item()
@@ -144,5 +144,5 @@ def test_waiting_is_noticed():
     assert waiting.found == ["_local_scalar_dense", "index", "lift_fresh"]
 
 
-def test_on_a_cpu_a_function_is_left_as_it_is():
+def test_functions_are_not_captured_on_a_cpu():
     assert graphed(dict, "cpu") is dict

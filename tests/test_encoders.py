@@ -1,4 +1,4 @@
-"""Windows, shared weights and other numbers of layers, against plain torch modules."""
+"""Compares networks with windows, shared weights or other depths with plain torch modules."""
 
 import pytest
 import torch
@@ -42,7 +42,7 @@ def scrambled(module):
 
 
 class PlainActor(nn.Module):
-    """The actor of one group as plain torch modules."""
+    """Implements the actor of one group in plain torch modules."""
 
     def __init__(self, stack: StackedActor, group: int):
         super().__init__()
@@ -83,7 +83,7 @@ def test_window_and_vector_equal_a_plain_network(shared, hidden):
 
 
 @pytest.mark.parametrize("window", [False, True])
-def test_shared_weights_are_one_set_and_treat_uavs_alike(window):
+def test_shared_weights_are_the_same_for_all_uavs(window):
     observation, action = specs(4, window=window)
     for make in (make_actor, make_critic):
         generator = torch.Generator().manual_seed(1)
@@ -97,14 +97,14 @@ def test_shared_weights_are_one_set_and_treat_uavs_alike(window):
 
 
 @pytest.mark.parametrize("shared", [False, True])
-def test_teams_share_no_weights_and_read_their_own_environments(shared):
+def test_teams_have_separate_weights_and_environments(shared):
     teams, envs = 2, 3
     observation, action = specs(teams * envs, window=True)
     generators = [torch.Generator().manual_seed(seed) for seed in range(teams)]
     more = {"share_parameters": shared}
     both = make_actor(observation, action, HIDDEN, generator=generators, **more)
     collected = observed(teams * envs, UAVS)
-    # As a batch to learn from: the teams' UAVs beside each other.
+    # As a batch of the replay buffer: the UAVs of all teams in one dimension.
     batch = collected.apply(
         lambda x: x.unflatten(0, (teams, envs)).transpose(0, 1).flatten(1, 2), batch_size=[envs]
     )
@@ -124,7 +124,7 @@ def test_teams_share_no_weights_and_read_their_own_environments(shared):
 
 @pytest.mark.parametrize("shared", [False, True])
 @pytest.mark.parametrize("batch", [(4, 6), (8, 3)])
-def test_a_grouping_puts_together_what_it_took_apart(shared, batch):
+def test_grouping_round_trip(shared, batch):
     grouping = Grouping(3, 2, shared=shared)
     x = torch.randn(*batch, 5)
     split = grouping.split(x, torch.Size(batch))
@@ -135,13 +135,13 @@ def test_a_grouping_puts_together_what_it_took_apart(shared, batch):
 @pytest.mark.parametrize(
     ("side", "features"), [(1, 16), (5, 144), (15, 1024), (16, 256), (63, 784)]
 )
-def test_windows_of_any_size_have_few_features(side, features):
+def test_windows_of_any_size_have_a_bounded_number_of_features(side, features):
     encoder = WindowEncoder(2, (3, side, side))
     out = encoder(torch.rand(2, 4, 3, side, side) < 0.5)
     assert out.shape == (2, 4, features) == (2, 4, encoder.features)
 
 
-def test_what_no_network_can_be_made_for_is_an_error():
+def test_unsupported_observations_are_errors():
     with pytest.raises(ValueError, match=r"no encoder for an observation of shape \[2, 3\]"):
         ObservationEncoder(1, [(2, 3)])
     for hidden in ((), (8,) * 9):
@@ -172,7 +172,7 @@ def prepared(loss):
 @pytest.mark.parametrize("vmap", [False, True], ids=["one by one", "vmap"])
 @pytest.mark.parametrize("shared", [False, True])
 @pytest.mark.parametrize("window", [False, True])
-def test_td3_of_torchrl_learns_with_them(window, shared, vmap):
+def test_td3_of_torchrl_trains_these_networks(window, shared, vmap):
     observation, action = specs(1, window=window)
     actor = make_actor(observation, action, HIDDEN, share_parameters=shared)
     critics = [make_critic(observation, action, HIDDEN, share_parameters=shared) for _ in range(2)]

@@ -1,4 +1,4 @@
-"""The protocol: the same fires and starts for everyone, and the same numbers every time."""
+"""Tests the evaluation protocol: fires and starts are shared, and results are reproducible."""
 
 import importlib
 import itertools
@@ -33,7 +33,7 @@ def small(method: str = "consensus", *more: str):
 
 
 def untrained(config):
-    """An actor that answers large actions."""
+    """Returns an untrained actor with large actions."""
     env = build_env(config, num_envs=1, fire="paper", seed=0, device="cpu")
     actor = build_actor(config, env, torch.Generator().manual_seed(0))
     draw = torch.Generator().manual_seed(1)
@@ -44,7 +44,7 @@ def untrained(config):
 
 @pytest.fixture
 def cache(tmp_path, monkeypatch):
-    """An empty cache, of a program that was started just now."""
+    """Returns an empty cache folder and clears the caches in memory."""
     monkeypatch.setenv("EMBERLINK_CACHE", str(tmp_path / "cache"))
     monkeypatch.setattr(baseline_cache, "_IMPORTED", 2**62)
     return tmp_path / "cache"
@@ -52,18 +52,18 @@ def cache(tmp_path, monkeypatch):
 
 @pytest.fixture
 def played(monkeypatch):
-    """Notes how many blocks are really played."""
+    """Counts the batches of episodes that are simulated."""
     count, play = [], evaluate.play
     monkeypatch.setattr(evaluate, "play", lambda *args: (count.append(args), play(*args))[1])
     return count
 
 
-def test_every_evaluation_plays_a_hundred_fires():
+def test_evaluations_have_a_hundred_fires():
     assert resolve("consensus").evaluation.episodes == 100
 
 
 @pytest.mark.parametrize("method", ["consensus", "independent"])
-def test_an_episode_does_not_depend_on_those_beside_it(method, cache):
+def test_an_episode_does_not_depend_on_the_others(method, cache):
     config = small(method)
     actor = untrained(config)
     few, more, many = (evaluate.evaluate(config, actor, fires=n) for n in (1, 3, 53))
@@ -75,7 +75,7 @@ def test_an_episode_does_not_depend_on_those_beside_it(method, cache):
     assert len(set(many["huygens"]["learned"]["coverage_auc"])) > 25
 
 
-def test_all_policies_start_alike_on_the_same_fires(cache, monkeypatch):
+def test_all_policies_have_the_same_fires_and_starts(cache, monkeypatch):
     config = small("independent", "fire=paper")
     begun: dict = {}
 
@@ -97,12 +97,12 @@ def test_all_policies_start_alike_on_the_same_fires(cache, monkeypatch):
             starts, arrival = begun[panel * policies + place]
             assert starts == begun[0][0]
             assert arrival[:4] == fires
-    # Episode i is that of the seed START_SEED + i alone.
+    # Episode i depends only on the seed START_SEED + i.
     alone = build_env(config, num_envs=1, fire="paper", seed=evaluate.START_SEED + 2, device="cpu")
     assert alone.reset()["agents", "position"][0].tolist() == begun[0][0][2]
 
 
-def test_pursuit_is_played_with_the_consensus_of_the_setup():
+def test_follow_target_uses_the_consensus_of_the_setup():
     own = small("consensus", "comm.range=3")
     assert evaluate.scripted_config(own, "follow_target") == own
     for method in ("independent", "shared_memory", "positional"):
@@ -115,7 +115,7 @@ def test_pursuit_is_played_with_the_consensus_of_the_setup():
                 assert evaluate.scripted_config(config, name) is config
 
 
-def test_eval_json_is_the_same_to_the_byte(run, cache, played):
+def test_eval_json_is_reproducible_to_the_byte(run, cache, played):
     assert main.main(["eval", str(run), "--fires", "3"]) == 0
     first = (run / "eval.json").read_bytes()
     blocks = len(played)
@@ -129,7 +129,7 @@ def test_eval_json_is_the_same_to_the_byte(run, cache, played):
     assert len(played) == 2 * blocks + 3
 
 
-def test_eval_json_says_what_was_played(run, cache):
+def test_eval_json_describes_the_evaluation(run, cache):
     assert main.main(["eval", str(run), "--fires", "3"]) == 0
     content = json.loads((run / "eval.json").read_text())
     config = RunFolder(run).config()
@@ -152,7 +152,7 @@ def test_eval_json_says_what_was_played(run, cache):
                 assert all(math.isfinite(x) for x in numbers)
 
 
-# The cache of what scripted policies reach
+# The cache of results of scripted policies
 
 
 def lawnmower(config, fires: int = 2):
@@ -167,7 +167,7 @@ def stored(file: Path) -> dict:
     return json.loads(content)
 
 
-def test_a_scripted_policy_is_played_once(cache, played):
+def test_a_scripted_policy_is_evaluated_once(cache, played):
     first = lawnmower(small())
     assert len(played) == 1
     assert lawnmower(small("consensus", "seed=3", "episodes=7", "learner.batch_size=9")) == first
@@ -183,15 +183,13 @@ def test_a_scripted_policy_is_played_once(cache, played):
         *("comm.range=4", "comm.heading.weight=2"),
     ],
 )
-def test_what_the_numbers_depend_on_is_in_the_name(change, cache, played):
+def test_the_file_name_depends_on_the_settings(change, cache, played):
     lawnmower(small())
     lawnmower(small("consensus", change))
     assert len(played) == 2
 
 
-def test_other_fires_policies_protocols_and_sources_have_files_of_their_own(
-    cache, played, monkeypatch
-):
+def test_other_fires_policies_protocols_and_sources_have_separate_files(cache, played, monkeypatch):
     config = small()
     lawnmower(config)
     lawnmower(config, fires=3)
@@ -215,7 +213,7 @@ def test_a_damaged_file_is_replaced(content, cache, played):
         content = json.dumps({**first, "coverage": [math.nan, 1.0]})
     elif content == "one episode less":
         content = json.dumps({name: numbers[:1] for name, numbers in first.items()})
-    write_sealed(file, content.encode())  # damaged before its checksum was taken
+    write_sealed(file, content.encode())  # damaged, with a valid checksum
     assert lawnmower(small()) == first
     assert len(played) == 2
     assert stored(file) == first
@@ -238,14 +236,14 @@ for name, module in sys.modules.items():
 """
 
 
-def test_everything_that_is_played_is_in_the_name_of_the_file(cache):
+def test_the_file_name_depends_on_all_source_files(cache):
     done = subprocess.run(
         [sys.executable, "-c", LOADED], capture_output=True, text=True, check=True
     )
     assert done.stdout == ""
 
 
-def test_the_source_of_a_policy_from_elsewhere_is_in_the_name_of_the_file(tmp_path, monkeypatch):
+def test_the_file_name_depends_on_the_source_of_an_external_policy(tmp_path, monkeypatch):
     file = tmp_path / "elsewhere.py"
     file.write_text("class Mine:\n    pass\n")
     monkeypatch.syspath_prepend(tmp_path)
@@ -257,7 +255,7 @@ def test_the_source_of_a_policy_from_elsewhere_is_in_the_name_of_the_file(tmp_pa
     assert before != baseline_cache.source_digest(mine) is not None
 
 
-def test_changed_source_is_neither_read_nor_written(cache, played, monkeypatch):
+def test_source_that_changes_during_the_run_disables_the_cache(cache, played, monkeypatch):
     newest = max(f.stat().st_mtime_ns for f in baseline_cache.sources())
     lawnmower(small())
     monkeypatch.setattr(baseline_cache, "_IMPORTED", newest - 1)
@@ -269,7 +267,7 @@ def test_changed_source_is_neither_read_nor_written(cache, played, monkeypatch):
     assert len(list(cache.glob("scripted-*"))) == 1
 
 
-def test_a_cache_that_cannot_be_written_costs_a_warning(cache, monkeypatch):
+def test_a_cache_that_cannot_be_written_gives_a_warning(cache, monkeypatch):
     fires = evaluate.evaluation_fires(small(), 2)["huygens"]
 
     def fail(*_):
@@ -292,7 +290,7 @@ NUMBERS = ["-123.5", *["1000.0"] * 6, "499.5"]
 
 
 def printed(monkeypatch, capsys, columns: str | None, results, configs) -> str:
-    """The table as it is printed to a pipe of that many columns."""
+    """Returns the table as printed to a pipe of the given width."""
     monkeypatch.setenv("COLUMNS", columns or "")
     if columns is None:
         monkeypatch.delenv("COLUMNS")
@@ -301,7 +299,7 @@ def printed(monkeypatch, capsys, columns: str | None, results, configs) -> str:
 
 
 @pytest.mark.parametrize("columns", ["40", "64", "72", "80", "120", "0", None])
-def test_no_table_loses_a_number(columns, monkeypatch, capsys):
+def test_narrow_tables_keep_every_number(columns, monkeypatch, capsys):
     config = resolve("shared_memory", ["setup=released"])
     lines = printed(monkeypatch, capsys, columns, [RESULTS], [config]).splitlines()
     parts = sum(line.startswith("test fires") for line in lines)
@@ -309,7 +307,7 @@ def test_no_table_loses_a_number(columns, monkeypatch, capsys):
     if columns not in ("0", None):
         assert max(map(len, lines)) <= int(columns)
     for policy in ("shared_memory", *SCRIPTED):
-        # At 80 columns, a name may be on two lines.
+        # At 80 columns, a name may take two lines.
         heads = (f"{policy} ", f"{policy.partition('_')[0]}_ ")
         rows = [line.split() for line in lines if line.startswith(heads)]
         assert len(rows) in (parts, 2 * parts)  # two of the names begin with "random_"

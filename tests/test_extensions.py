@@ -1,6 +1,6 @@
-"""Methods, setups and fires of a user's own folder, and entry points that do not fit.
+"""Tests methods, setups and fires in a user's folder, and invalid entry points.
 
-`test_packaging.py` installs a package of a user's own.
+`test_packaging.py` tests an installed extension package.
 """
 
 import json
@@ -25,7 +25,7 @@ from emberlink.trainers.config.compose import resolve
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch) -> Path:
-    """A folder of YAML files that EMBERLINK_CONFIGS names after one that does not exist."""
+    """Returns a folder of YAML files that EMBERLINK_CONFIGS lists after a missing folder."""
     folder = write(tmp_path / "a user's folder", yaml_files())
     text = METHOD.replace("headcount", "no_comm").replace("  scale: 0.1\n", "")
     write(folder, {"method/alone.yaml": text})
@@ -51,7 +51,7 @@ def test_a_folder_adds_a_method_a_setup_and_a_fire(folder):
         resolve("headcount")
 
 
-def test_a_file_of_a_name_that_is_taken_is_an_error(folder):
+def test_a_duplicate_name_is_an_error(folder):
     write(folder, {"setup/paper.yaml": SETUP})
     with pytest.raises(UserError, match=r"setup 'paper' is in several folders: .*folder/setup"):
         resolve("consensus")
@@ -70,7 +70,7 @@ def test_a_file_of_a_name_that_is_taken_is_an_error(folder):
         ("# @package _global_\nreplay: shared\ncomm:\n  name: no_comm\n  x: 1\n", "comm.x is not"),
     ],
 )
-def test_a_users_file_with_a_mistake(text, message, folder):
+def test_an_invalid_file_of_a_user(text, message, folder):
     write(folder, {"method/mine.yaml": text})
     with pytest.raises(UserError, match=message) as error:
         resolve("mine")
@@ -86,7 +86,7 @@ def entry_point(monkeypatch, group: str, name: str, value: str) -> None:
     )
 
 
-def test_an_entry_point_that_does_not_fit_names_itself(monkeypatch):
+def test_an_invalid_entry_point_is_named_in_the_error(monkeypatch):
     for value, message in (
         ("nowhere:Module", "cannot be imported: ModuleNotFoundError: No module named 'nowhere'"),
         ("emberlink.comm.consensus:Nothing", "cannot be imported"),
@@ -106,7 +106,7 @@ def test_an_entry_point_that_does_not_fit_names_itself(monkeypatch):
             assert "consensus" in configs.known("method")
 
 
-def test_a_run_folder_suffices_where_its_yaml_files_are_gone(folder, tmp_path, monkeypatch):
+def test_a_run_folder_does_not_need_its_yaml_files(folder, tmp_path, monkeypatch):
     write(
         folder, {"setup_method/small_consensus.yaml": "# @package _global_\ncomm:\n  range: 4.0\n"}
     )

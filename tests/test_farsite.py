@@ -1,4 +1,4 @@
-"""The comparison with FARSITE, on fires whose fronts are known."""
+"""Tests the comparison with FARSITE on fires with known fronts."""
 
 import math
 from pathlib import Path
@@ -25,7 +25,7 @@ def write(path: Path, rows: np.ndarray) -> None:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Four runs of known rates, by the support function."""
+    """Writes four runs with known rates, computed by the support function."""
     path = tmp_path_factory.mktemp("runs")
     rates = [float(rate) for rate in ellipse_rates(HEAD, RATIO)]
     for name in WINDS:
@@ -84,13 +84,15 @@ def test_the_fit_recovers_known_rates(folder: Path):
     for run in runs.values():
         overlaps, area, error = farsite.compare(run, farsite.simulate(run, head_rate, ratio))
         assert overlaps[-1] > 0.97
-        assert min(overlaps) > 0.93  # a hundred cells at first, of which the edge is a third
+        assert (
+            min(overlaps) > 0.93
+        )  # the initial fire has a hundred cells, a third of them on its edge
         assert area == pytest.approx(1, abs=0.02)
         assert error < 0.02 * END
 
 
 def test_another_wind_does_not_fit(folder: Path):
-    """An overlap of 0.9 tells a right wind from a wrong one."""
+    """An overlap of 0.9 separates the correct wind from a wrong wind."""
     run = farsite.read_runs(folder)["3mph300deg"]
     wrong = run._replace(wind=farsite.wind_of("3mph120deg"))
     assert farsite.overlap(farsite.simulate(wrong, HEAD, RATIO), run, END) < 0.75
@@ -123,7 +125,7 @@ def test_a_run_with_other_weather_has_no_wind_in_its_name():
             farsite.wind_of(name)
 
 
-def test_mistakes_are_one_line(tmp_path: Path, folder: Path, capsys: pytest.CaptureFixture[str]):
+def test_errors_are_one_line(tmp_path: Path, folder: Path, capsys: pytest.CaptureFixture[str]):
     (tmp_path / "strange").mkdir()
     write(tmp_path / "strange" / "upwards_ArrivalTime.asc", np.array([[0.0, 1.0]]))
     (tmp_path / "broken").mkdir()

@@ -1,4 +1,4 @@
-"""The end of a run: it is finished with the evaluation of its newest checkpoint, and not before."""
+"""Tests that a run is finished once its newest checkpoint is evaluated."""
 
 import errno
 import os
@@ -20,7 +20,7 @@ from emberlink.trainers.training.trainer import Trainer
 
 
 def trained(capsys, *arguments: str | Path) -> tuple[int, str, str]:
-    """Status of `emberlink train`, what it printed, and its errors."""
+    """Returns the exit status, the output and the errors of `emberlink train`."""
     status = main.main(["train", *map(str, arguments)])
     printed = capsys.readouterr()
     return status, printed.out, printed.err
@@ -44,11 +44,11 @@ def independent(tmp_path_factory) -> Path:
 
 @pytest.fixture
 def run(independent, tmp_path) -> RunFolder:
-    """A copy of a finished run."""
+    """Returns a copy of a finished run."""
     return RunFolder(shutil.copytree(independent, tmp_path / "runs" / independent.name))
 
 
-def test_a_disk_that_fills_up_in_the_evaluation(tmp_path, capsys, monkeypatch):
+def test_a_full_disk_during_the_evaluation(tmp_path, capsys, monkeypatch):
     def full(*_, **__):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
@@ -67,7 +67,7 @@ def test_a_disk_that_fills_up_in_the_evaluation(tmp_path, capsys, monkeypatch):
     assert "is finished" in trained(capsys, f"resume={run.path}")[1]
 
 
-def test_ctrl_c_in_the_evaluation_of_the_second_seed(tmp_path, capsys, monkeypatch):
+def test_an_interrupt_during_the_evaluation_of_the_second_seed(tmp_path, capsys, monkeypatch):
     played, evaluate = [], command.evaluate_run
 
     def stop(run, *arguments, **options):
@@ -90,7 +90,7 @@ def test_ctrl_c_in_the_evaluation_of_the_second_seed(tmp_path, capsys, monkeypat
     assert (first.path / "eval.json").stat().st_mtime_ns == before
 
 
-def test_an_evaluation_of_an_earlier_checkpoint_is_not_the_end(run, capsys):
+def test_an_evaluation_of_an_earlier_checkpoint_does_not_finish_a_run(run, capsys):
     assert trained(capsys, f"resume={run.path}", "episodes=3")[0] == 0
     assert run.evaluated()
     assert run.checkpoint().name == "step_000000045.safetensors"
@@ -100,7 +100,7 @@ def test_an_evaluation_of_an_earlier_checkpoint_is_not_the_end(run, capsys):
     assert run.evaluated()
 
 
-def test_a_run_whose_checkpoints_are_gone_is_not_begun_again(run, capsys):
+def test_a_run_with_deleted_checkpoints_is_not_restarted(run, capsys):
     shutil.rmtree(run.checkpoints)
     before = contents(run.path)
     status, _, error = trained(capsys, f"resume={run.path}")
@@ -110,7 +110,7 @@ def test_a_run_whose_checkpoints_are_gone_is_not_begun_again(run, capsys):
     assert contents(run.path) == before
 
 
-def test_only_what_is_emberlinks_own_is_taken_away(run, capsys):
+def test_only_files_of_emberlink_are_removed(run, capsys):
     own = [
         run.path / "eval.json.17.part",
         run.path / "figures" / "coverage.png.17.part",
@@ -127,7 +127,7 @@ def test_only_what_is_emberlinks_own_is_taken_away(run, capsys):
     assert all(path.read_text() == "half" for path in others)
 
 
-def test_a_folder_in_the_place_of_the_metrics(run, capsys):
+def test_a_folder_named_like_the_metrics(run, capsys):
     (run.path / "metrics.jsonl").unlink()
     (run.path / "metrics.jsonl").mkdir()
     status, _, error = trained(capsys, f"resume={run.path}", "episodes=3")
@@ -138,7 +138,7 @@ def test_a_folder_in_the_place_of_the_metrics(run, capsys):
         run.append("metrics.jsonl", {"episode": 3})
 
 
-def test_the_folder_of_seeds_side_by_side_by_any_path(tmp_path, capsys, monkeypatch):
+def test_the_folder_of_parallel_seeds_by_any_path(tmp_path, capsys, monkeypatch):
     more = ["seeds=[0,1]", f"output={tmp_path / 'runs'}"]
     assert trained(capsys, "independent", *TINY, *more)[0] == 0
     first, second = sorted((tmp_path / "runs").iterdir())
@@ -161,7 +161,7 @@ def test_the_folder_of_seeds_side_by_side_by_any_path(tmp_path, capsys, monkeypa
         ("comm.jitter=1e13", "comm.jitter"),
     ],
 )
-def test_settings_that_would_do_something_else_than_they_say(text, said, tmp_path, capsys):
+def test_settings_that_cannot_be_changed_are_refused(text, said, tmp_path, capsys):
     status, _, error = trained(capsys, "consensus", *TINY, f"output={tmp_path}", text)
     assert status == 2
     assert error.count("\n") == 1
@@ -187,8 +187,8 @@ def test_the_folder_stays_locked_until_the_evaluation_is_written(tmp_path, capsy
 
 @pytest.mark.slow
 @pytest.mark.parametrize("call", range(1, 5))
-def test_a_kill_while_the_folders_of_seeds_are_made(call, tmp_path, capsys):
-    """Either nothing is there that could be taken for a run, or it goes on with all its seeds."""
+def test_a_kill_during_the_creation_of_the_folders_of_seeds(call, tmp_path, capsys):
+    """Either no folder looks like a run, or the run can be resumed with all its seeds."""
     runs = tmp_path / "runs"
     program = (
         "import os, sys\n"
@@ -219,7 +219,7 @@ def test_a_kill_while_the_folders_of_seeds_are_made(call, tmp_path, capsys):
     assert main.main(["sweep", "independent", *TINY, "seeds=[0,1]", f"output={runs}"]) == 0
 
 
-def test_copies_that_a_user_keeps_are_not_the_runs(run, capsys):
+def test_copies_of_a_user_are_not_part_of_the_run(run, capsys):
     newest, state = run.checkpoint(), run.states()[-1]
     for name in ("step_mine.safetensors", "step_1.safetensors", "state_backup.safetensors"):
         shutil.copy(state if "state" in name else newest, run.checkpoints / name)
@@ -241,7 +241,7 @@ def test_copies_that_a_user_keeps_are_not_the_runs(run, capsys):
         ('{"folders": 3}', "does not name the folders"),
     ],
 )
-def test_folders_of_seeds_that_are_none(content, said, run, capsys):
+def test_invalid_lists_of_seed_folders(content, said, run, capsys):
     (run.path / "seed_runs.json").write_text(content)
     status, _, error = trained(capsys, f"resume={run.path}")
     assert status == 2
@@ -265,7 +265,7 @@ def test_a_seed_of_another_training_is_refused(tmp_path, capsys):
         assert said in error
 
 
-def test_folders_with_the_names_of_half_written_files_stay(run, capsys):
+def test_folders_named_like_temporary_files_are_kept(run, capsys):
     for name in ("eval.json.17.part", "checkpoints/x.safetensors.17.part", "checkpoints/.tmpx"):
         (run.path / name).mkdir()
     (run.checkpoints / "step_999999999.safetensors").mkdir()
@@ -274,7 +274,7 @@ def test_folders_with_the_names_of_half_written_files_stay(run, capsys):
     assert (run.path / "divergence_step_3.part").read_text() == "mine"
 
 
-def test_a_range_without_a_limit_is_read_again(tmp_path, capsys):
+def test_an_infinite_range_round_trips(tmp_path, capsys):
     arguments = ["consensus", *TINY, "comm.range=inf", f"output={tmp_path / 'runs'}"]
     assert trained(capsys, *arguments)[0] == 0
     run = run_of(tmp_path / "runs")
@@ -285,8 +285,8 @@ def test_a_range_without_a_limit_is_read_again(tmp_path, capsys):
 
 
 @pytest.mark.parametrize("key", ["displacement", "num_uavs", "new_fire", "range"])
-def test_a_world_that_lacks_a_key_is_not_completed(key, tmp_path, capsys):
-    """The default may be another setup's: the run would be played in another world."""
+def test_a_configuration_that_lacks_a_key_is_refused(key, tmp_path, capsys):
+    """Its default may belong to another setup and change the evaluated world."""
     arguments = ["consensus", *TINY, "setup=tuned", f"output={tmp_path / 'runs'}"]
     assert trained(capsys, *arguments)[0] == 0
     run = run_of(tmp_path / "runs")
@@ -301,8 +301,8 @@ def test_a_world_that_lacks_a_key_is_not_completed(key, tmp_path, capsys):
     assert f".{key}' is missing" in error
 
 
-def test_metrics_are_on_the_disk_before_the_state_that_counts_them(tmp_path, monkeypatch):
-    """Else a loss of power could leave a state that knows of lines which are not there."""
+def test_metrics_are_flushed_before_the_state(tmp_path, monkeypatch):
+    """Otherwise a loss of power could leave a state that counts missing lines."""
     trainer = Trainer(resolve("independent", [*TINY, "episodes=1", f"output={tmp_path}"]))
     run = trainer.start()
     synced: list[str] = []

@@ -40,7 +40,7 @@ def settings_of(**changes: Any) -> dict[str, Any]:
     return {**dataclasses.asdict(load_scenario("huygens")), **changes}
 
 
-def test_every_file_is_a_scenario_of_its_name():
+def test_every_file_is_a_scenario_with_its_name():
     files = resources.files("emberlink.configs").joinpath("fire").iterdir()
     names = sorted(Path(str(file)).stem for file in files)
     generated = [name for name in names if name != "file"]
@@ -97,11 +97,11 @@ def test_huygens_counts(test_fires: torch.Tensor):
     assert end.double().std() > 10
     assert len(test_fires.flatten(1).unique(dim=0)) == 200
     edge = torch.cat([test_fires[:, [0, -1]].flatten(1), test_fires[:, :, [0, -1]].flatten(1)], 1)
-    assert (edge > 0).all()  # every fire starts inside the box
-    assert 0.15 < edge.isfinite().any(1).double().mean() < 0.3  # some heads leave the box
+    assert (edge > 0).all()  # every fire starts in the box
+    assert 0.15 < edge.isfinite().any(1).double().mean() < 0.3  # some fronts leave the box
 
 
-def test_a_fire_depends_on_its_seed_alone(test_fires: torch.Tensor):
+def test_a_fire_depends_on_its_seed_only(test_fires: torch.Tensor):
     config, seeds = load_scenario("huygens"), fire_seeds("test", 200)
     some = torch.tensor([150, 0, 7])
     state = torch.get_rng_state()
@@ -208,7 +208,7 @@ def test_grid_out_of_range(grid: tuple[int, int]):
         make_fires(load_scenario("paper"), fire_seeds("train", 1), grid, 10)
 
 
-def test_seeds_are_disjoint_by_construction():
+def test_seeds_of_splits_are_disjoint():
     assert fire_seeds("train", 3).tolist() == [0, 1, 2]
     assert fire_seeds("train", 2, 500).tolist() == [500, 501]
     assert fire_seeds("test", 2).tolist() == [TEST_FROM, TEST_FROM + 1]
@@ -341,7 +341,7 @@ def test_the_cache_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
     assert len(list((tmp_path / "own").iterdir())) == 1
 
 
-def test_the_key_changes_with_everything(monkeypatch: pytest.MonkeyPatch):
+def test_the_cache_key_depends_on_every_setting(monkeypatch: pytest.MonkeyPatch):
     base = settings_of()
     args = {"split": "train", "count": 2, "grid": (12, 10), "horizon": 50, "start": 0}
 
@@ -429,7 +429,7 @@ def test_every_valid_config_gives_a_fire(low, high, ratio, radius, patches, seed
     assert ((arrival <= 20) | arrival.isinf()).all()
 
 
-def test_a_patch_as_small_as_a_number_can_be_is_no_nan():
+def test_the_smallest_patch_gives_no_nan():
     """The squared radius underflows to 0, and so does the squared distance at a cell's centre."""
     config = dataclasses.replace(
         load_scenario("paper"),

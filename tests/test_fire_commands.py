@@ -64,7 +64,7 @@ def numbers(lines: list[str]) -> dict[str, float]:
 
 
 def area(path, colour: tuple[float, ...] | str) -> int:
-    """Returns the number of pixels of a colour or a grey."""
+    """Returns the number of pixels of a colour or a grey value."""
     wanted = [255 * float(colour)] * 3 if isinstance(colour, str) else colour
     with Image.open(path) as picture:
         pixels = np.asarray(picture.convert("RGB"), dtype=float)
@@ -112,7 +112,7 @@ def test_preview_prints_the_numbers_of_the_test_fire(capsys):
     assert lines[-1] == "fire_huygens_3.png"
 
 
-def test_preview_draws_what_it_says(capsys, tmp_path):
+def test_preview_draws_its_numbers(capsys, tmp_path):
     (*_, name) = ran(capsys, "preview", "paper")
     with Image.open(name) as picture:
         assert picture.format == "PNG"
@@ -136,7 +136,7 @@ def test_preview_of_other_maps(grid, view, capsys):
     assert Path(name).stat().st_size > 5000
 
 
-def test_preview_overwrites_nothing(capsys, tmp_path):
+def test_preview_does_not_overwrite(capsys, tmp_path):
     first = ran(capsys, "preview", "paper")[-1]
     before = Path(first).read_bytes()
     assert ran(capsys, "preview", "paper")[-1] == "fire_paper_0_2.png"
@@ -150,7 +150,7 @@ def test_preview_overwrites_nothing(capsys, tmp_path):
 
 
 @pytest.mark.filterwarnings("error::UserWarning")
-def test_names_that_mean_something_elsewhere_are_shown_as_they_are(capsys, tmp_path):
+def test_names_with_special_characters_are_shown_unchanged(capsys, tmp_path):
     keys = ("fire.units=minutes", "env.grid=[20,20]")
     odd = tmp_path / "a b=[1]$_{$ 火, it's ${env}$.asc"
     ascii_raster(tmp_path / "plain.asc", disc()).rename(odd)
@@ -160,7 +160,7 @@ def test_names_that_mean_something_elsewhere_are_shown_as_they_are(capsys, tmp_p
     longer = odd.rename(tmp_path / f"{'long' * 50}.asc")
     (*_, name) = ran(capsys, "preview", longer, keys[0], "env.grid=[8,64]")
     assert len(name) < 120
-    with Image.open(name) as picture:  # nothing is cut off at the sides
+    with Image.open(name) as picture:  # no cut-off at the sides
         assert (np.asarray(picture.convert("L"))[:, [0, -1]] == 255).all()
 
 
@@ -171,7 +171,7 @@ def test_names_that_mean_something_elsewhere_are_shown_as_they_are(capsys, tmp_p
         (["env.horizon=5", "env.num_uavs=1"], ["of 77 cells at the end 21.3"]),
     ],
 )
-def test_preview_says_why_uavs_cannot_keep_up(changes, failing, capsys):
+def test_preview_explains_why_uavs_cannot_keep_up(changes, failing, capsys):
     lines = ran(capsys, "preview", "paper", *changes)
     assert lines[-4] == "UAVs can keep up: no"
     bad = [line for line in lines[-3:-1] if line.startswith("  - ")]
@@ -222,7 +222,7 @@ def test_make_writes_the_scenarios_fires(suffix, capsys, tmp_path):
     assert about["emberlink_version"]
 
 
-def test_make_without_more_writes_what_is_trained_on(capsys, tmp_path):
+def test_make_writes_the_training_fires_by_default(capsys, tmp_path):
     assert ran(capsys, "make", "paper")[-1] == "paper_train_1.npy"
     assert ran(capsys, "make", "paper")[-1] == "paper_train_1_2.npy"
     assert ran(capsys, "make", "huygens", "env.horizon=9", "fire.num_train_fires=3")[-1] == (
@@ -236,7 +236,7 @@ def test_make_without_more_writes_what_is_trained_on(capsys, tmp_path):
 
 @pytest.mark.parametrize("suffix", [".npy", ".tif"])
 @pytest.mark.parametrize("count", [1, 7])
-def test_a_bank_comes_back_bit_for_bit(suffix, count, capsys, tmp_path):
+def test_a_bank_round_trips_bit_for_bit(suffix, count, capsys, tmp_path):
     file, again = tmp_path / f"bank{suffix}", tmp_path / "again.npy"
     ran(capsys, "make", "huygens", "--count", count, "env.grid=[24,40]", "--output", file)
     fires = make_fires(HUYGENS, fire_seeds("train", count), (24, 40), 1000)
@@ -265,7 +265,7 @@ def test_another_horizon_than_the_banks_is_refused(suffix, capsys, tmp_path):
     assert np.allclose(np.load(stretched), fires.numpy() * 0.3)
 
 
-def test_preview_says_what_was_read(capsys, tmp_path):
+def test_preview_describes_the_file(capsys, tmp_path):
     source = ascii_raster(tmp_path / "fire.asc", disc())
     lines = ran(capsys, "preview", source, "fire.units=minutes")
     cells = np.isfinite(disc()).sum()
@@ -276,7 +276,7 @@ def test_preview_says_what_was_read(capsys, tmp_path):
     assert ran(capsys, "preview", "two.npy:1")[1] == "read: a bank of 2 fires, in steps"
 
 
-def test_import_of_several_files_is_each_of_them(capsys, tmp_path):
+def test_import_of_several_files(capsys, tmp_path):
     first = ascii_raster(tmp_path / "one.asc", disc())
     second = ascii_raster(tmp_path / "a=b.asc", disc(30, 0.03, (12, 12)))
     keys = ("fire.units=minutes", "env.grid=[25,20]", "env.horizon=200")
@@ -301,7 +301,7 @@ def test_import_of_several_files_is_each_of_them(capsys, tmp_path):
     assert lines[-1] == "fire_both_1.png"
 
 
-def test_a_file_with_the_name_of_a_scenario_is_found_by_its_path(capsys, tmp_path):
+def test_a_file_named_like_a_scenario_is_read_by_its_path(capsys, tmp_path):
     ascii_raster(tmp_path / "huygens.asc", disc()).rename(tmp_path / "huygens")
     assert ran(capsys, "preview", "huygens")[0].startswith("huygens, test fire 0: ")
     assert ran(capsys, "preview", "./huygens", "fire.units=minutes")[0].startswith("huygens: 30")
@@ -363,7 +363,7 @@ KNOWN = "known: huygens, oil_slick, paper"
     ],
     ids=lambda value: " ".join(value)[:40] if value and value[0] in cli_actions() else "",
 )
-def test_mistakes_are_one_line_and_leave_nothing(arguments, words, capsys, tmp_path):
+def test_errors_are_one_line_and_leave_no_files(arguments, words, capsys, tmp_path):
     (tmp_path / "folder").mkdir()
     (tmp_path / "empty.tif").touch()
     (tmp_path / "there.png").write_text("mine")
@@ -414,7 +414,7 @@ def test_without_an_action_the_help_is_printed(capsys):
         assert f"example:\n  emberlink fire {action} " in capsys.readouterr().out
 
 
-def test_without_the_extra_one_line_says_which(capsys, tmp_path, monkeypatch):
+def test_without_the_extra_the_error_names_it(capsys, tmp_path, monkeypatch):
     ran(capsys, "make", "paper", "--output", "bank.tif")
     monkeypatch.setitem(sys.modules, "rasterio", None)
     for arguments in (
@@ -429,7 +429,7 @@ def test_without_the_extra_one_line_says_which(capsys, tmp_path, monkeypatch):
 
 @contextmanager
 def files_of_at_most(size: int):
-    """Limits the size of files, as a full disk does."""
+    """Limits the size of files, like a full disk."""
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
     try:
@@ -439,7 +439,7 @@ def files_of_at_most(size: int):
 
 
 @pytest.mark.parametrize("size", [0, 100, 2000])
-def test_a_full_disk_is_one_line_and_leaves_nothing(size, capsys, tmp_path):
+def test_a_full_disk_gives_one_line_and_leaves_no_files(size, capsys, tmp_path):
     for arguments in (
         ["make", "huygens", "--count", 30, "--output", "a.npy"],
         ["make", "huygens", "--count", 30, "--output", "a.tif"],
@@ -450,7 +450,7 @@ def test_a_full_disk_is_one_line_and_leaves_nothing(size, capsys, tmp_path):
         assert list(tmp_path.iterdir()) == []
 
 
-def test_a_name_that_is_taken_meanwhile_is_left_alone(tmp_path, monkeypatch):
+def test_a_file_created_meanwhile_is_kept(tmp_path, monkeypatch):
     fires = make_fires(HUYGENS, fire_seeds("train", 1), (30, 30), 300)
     link = os.link
 
@@ -466,7 +466,7 @@ def test_a_name_that_is_taken_meanwhile_is_left_alone(tmp_path, monkeypatch):
     assert [path.name for path in tmp_path.iterdir()] == ["bank.npy"]
 
 
-def test_where_there_are_no_links_a_file_is_published_all_the_same(tmp_path, monkeypatch):
+def test_files_are_published_without_support_for_links(tmp_path, monkeypatch):
     def none(source, target):
         raise PermissionError(1, "Operation not permitted")
 
@@ -482,7 +482,7 @@ def test_where_there_are_no_links_a_file_is_published_all_the_same(tmp_path, mon
 
 
 @pytest.mark.parametrize("wrong", [float("nan"), -1.0])
-def test_what_is_no_time_is_not_written(wrong, tmp_path):
+def test_invalid_times_are_not_written(wrong, tmp_path):
     fires = torch.zeros(1, 8, 8)
     fires[0, 2, 3] = wrong
     for suffix in SUFFIXES:

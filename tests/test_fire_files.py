@@ -53,7 +53,7 @@ def run(trained, tmp_path) -> Path:
 
 
 def fails(arguments, capfd) -> str:
-    """Returns the only line of standard error of a command that fails."""
+    """Returns the one-line error of a command that fails."""
     capfd.readouterr()
     assert main.main([str(argument) for argument in arguments]) == 2
     lines = capfd.readouterr().err.strip().splitlines()
@@ -68,7 +68,7 @@ def bank_of(count, horizon=HORIZON):
 
 @pytest.mark.parametrize("method", known("method"))
 @pytest.mark.parametrize("setup", known("setup"))
-def test_every_recipe_takes_a_file(source, method, setup):
+def test_every_recipe_accepts_a_file(source, method, setup):
     keys = ["fire=file", f"fire.path={source}", "fire.units=minutes", f"setup={setup}"]
     config = resolve(method, keys, grid=list(GRID), horizon=HORIZON)
     assert config.fire.name == "file"
@@ -79,7 +79,7 @@ def test_every_recipe_takes_a_file(source, method, setup):
     assert torch.equal(env.arrival_time, expected.expand(2, -1, -1))
 
 
-def test_keys_come_in_any_order_and_setup_keeps_its_own(source):
+def test_keys_in_any_order_override_the_setup(source):
     keys = [f"fire.path={source}", "fire.units=minutes", "fire.margin=0.2", "fire=file"]
     assert resolve("consensus", keys).fire.margin == 0.2
     for text, wrong in (
@@ -102,7 +102,7 @@ def test_keys_come_in_any_order_and_setup_keeps_its_own(source):
         resolve("consensus", [f"fire.path={source}"])
 
 
-def test_without_a_path_or_a_file_a_line_says_so(capfd, tmp_path, monkeypatch):
+def test_a_missing_path_or_file_gives_one_line(capfd, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert "fire.path=None: a file is needed" in fails(["train", "consensus", "fire=file"], capfd)
     for path in ("none.asc", "3mph120deg7hr.asc", "2020.tif", ".", "a folder/x.shp"):
@@ -111,7 +111,7 @@ def test_without_a_path_or_a_file_a_line_says_so(capfd, tmp_path, monkeypatch):
     assert not list(tmp_path.iterdir())
 
 
-def test_a_run_tells_what_it_was_trained_on(trained):
+def test_a_run_describes_its_fires(trained):
     (run,) = (trained / "runs").iterdir()
     fire = yaml.safe_load((run / "config.yaml").read_text())["fire"]
     assert fire["path"] == f"{trained}/fire.asc"
@@ -154,7 +154,7 @@ def test_a_run_is_evaluated_rendered_and_resumed_without_its_file(run, trained, 
     )
 
 
-def test_a_file_that_changed_is_named(run, trained, capfd):
+def test_a_changed_file_is_named(run, trained, capfd):
     file = trained / "fire.asc"
     before = file.read_text()
     file.write_text(before.replace("CELLSIZE 75.0", "CELLSIZE 74.0"))
@@ -167,7 +167,7 @@ def test_a_file_that_changed_is_named(run, trained, capfd):
     assert main.main(["train", f"resume={run}", "episodes=3"]) == 0
 
 
-def test_a_copy_of_another_configuration_is_not_taken(run, trained):
+def test_a_copy_of_another_configuration_is_not_used(run, trained):
     config = RunFolder(run).config()
     assert config.fire.saved_copy == str(run / COPY_FILE)
     (trained / "fire.asc").rename(trained / "away.asc")
@@ -190,7 +190,7 @@ def splits_of(*arguments):
     return lambda: fire_sets(*arguments)
 
 
-def test_old_runs_load_as_they_were():
+def test_old_runs_load_unchanged():
     values = to_values(resolve("consensus", ["setup=tuned"]))
     assert "kind" not in values["fire"]
     assert from_values(values) == resolve("consensus", ["setup=tuned"])
@@ -236,7 +236,7 @@ def test_a_second_file_holds_the_test_fires(tmp_path, source):
         fires_of(FileFireConfig(path=str(source), test="nothing.asc")).with_checksum()
 
 
-def test_a_bank_is_taken_as_it_is(tmp_path):
+def test_a_bank_is_read_unchanged(tmp_path):
     fires = bank_of(6, 900)
     np.save(tmp_path / "bank.npy", fires.numpy())
     np.save(tmp_path / "double.npy", fires.double().numpy())
@@ -262,7 +262,7 @@ def test_a_bank_is_taken_as_it_is(tmp_path):
     assert torch.allclose(stretched, fires * 2)
 
 
-def test_a_bank_on_another_grid_keeps_the_earliest(tmp_path):
+def test_a_bank_on_another_grid_keeps_the_earliest_arrival(tmp_path):
     fires = make_fires(load_scenario("huygens"), torch.arange(3), (24, 20), HORIZON)
     np.save(tmp_path / "bank.npy", fires.numpy())
     got = read_fires(FileFireConfig(path=str(tmp_path / "bank.npy")), GRID, HORIZON)
@@ -277,7 +277,7 @@ def test_the_name_of_a_scenario_needs_no_file():
 
 
 @pytest.mark.parametrize(("suffix", "module"), [("tif", "rasterio"), ("shp", "pyogrio")])
-def test_without_the_extra_the_message_says_so(tmp_path, monkeypatch, suffix, module):
+def test_without_the_extra_the_message_names_it(tmp_path, monkeypatch, suffix, module):
     frame_of(Ellipses(), (60.0, 120.0)).to_file(tmp_path / "fire.shp")
     write_tif(tmp_path / "fire.tif", raster_of(Ellipses(), 300.0))
     monkeypatch.setitem(sys.modules, module, None)
@@ -313,7 +313,7 @@ def test_numpy_and_text_need_no_extra(tmp_path, monkeypatch, source):
         }
     ),
 )
-def test_any_choice_gives_a_grid_or_a_line(source, grid, horizon, keys):
+def test_any_settings_give_a_grid_or_a_one_line_error(source, grid, horizon, keys):
     config = FileFireConfig(path=str(source), units="minutes", **keys)
     try:
         fire = read_fires(config, grid, horizon)
@@ -331,7 +331,7 @@ def test_any_choice_gives_a_grid_or_a_line(source, grid, horizon, keys):
     assert fire.isfinite().sum() >= 2
 
 
-def test_a_message_is_one_line_whatever_a_library_says(tmp_path, monkeypatch):
+def test_messages_of_libraries_are_one_line(tmp_path, monkeypatch):
     def damaged(path):
         raise UserError("*** in database main ***\nPage 1: \x1b[31mcorruption")
 

@@ -1,4 +1,4 @@
-"""What `emberlink fire preview` says of a fire, against numbers worked out by hand."""
+"""Tests the numbers of `emberlink fire preview` against hand-computed values."""
 
 import numpy as np
 import pytest
@@ -20,7 +20,7 @@ INF = np.inf
 
 
 def fire(rows: list[list[float]]) -> np.ndarray:
-    """Arrival times from rows as they are seen, the uppermost first."""
+    """Returns arrival times from rows, the uppermost first."""
     return np.array(rows[::-1], dtype=np.float32).T
 
 
@@ -33,7 +33,7 @@ def test_growth_by_hand():
     assert (found.maximum, found.since) == (0.6, 9)
 
 
-def test_a_fire_that_stands_still_does_not_grow():
+def test_a_static_fire_does_not_grow():
     arrival = fire([[INF, 0, 0], [INF, 0, 200], [INF, INF, INF]])
     found = growth(arrival, 100)
     assert (found.start, found.end, found.mean, found.maximum) == (3, 3, 0, 0)
@@ -49,7 +49,7 @@ def test_a_fire_that_stands_still_does_not_grow():
     ),
     st.integers(1, 120),
 )
-def test_of_any_map_the_numbers_are_finite_and_the_same_when_it_is_turned(arrival, horizon):
+def test_numbers_are_finite_and_independent_of_rotation(arrival, horizon):
     found = growth(arrival, horizon)
     assert 0 <= found.start <= found.end == int((arrival <= horizon).sum())
     assert found.mean <= found.maximum + 1e-9
@@ -59,7 +59,7 @@ def test_of_any_map_the_numbers_are_finite_and_the_same_when_it_is_turned(arriva
     assert not (burnt_out(arrival) & np.isfinite(arrival)).any()
 
 
-def test_what_is_burnt_out_lies_within_the_first_fire():
+def test_burnt_out_cells_lie_within_the_first_fire():
     ring = fire(
         [
             [9, 9, 9, 9, 9, 9],
@@ -94,7 +94,7 @@ def test_the_team_by_hand():
         ({"maximum": 60.0, "end": 900}, [True, True]),
     ],
 )
-def test_what_is_compared(changes, enough):
+def test_growth_is_compared_with_the_team(changes, enough):
     team = TeamCapability(num_uavs=3, flight=2.0, width=10.0)
     about = {"start": 5, "end": 400, "mean": 1.0, "window": 1, "maximum": 3.0, "since": 0}
     checks = comparisons(Growth(**{**about, **changes}), team, 10)
@@ -107,5 +107,5 @@ def test_what_is_compared(changes, enough):
 @pytest.mark.parametrize(
     ("value", "text"), [(0, "0"), (0.00512, "0.00512"), (99.96, "100"), (12345.6, "12346")]
 )
-def test_numbers_are_short(value, text):
+def test_numbers_are_printed_with_few_digits(value, text):
     assert short(value) == text

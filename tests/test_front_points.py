@@ -1,4 +1,4 @@
-"""The paper's text, against the rule of the paper cell by cell."""
+"""Compares front points in the paper's text format with the paper's rule, cell by cell."""
 
 import math
 
@@ -16,7 +16,7 @@ def read(path, grid=(30, 30), horizon=1000, **keys):
 
 
 def stamped(lines):
-    """The same, cell by cell: line 6000 is step 0."""
+    """Computes the same arrival times cell by cell; line 6000 is step 0."""
     arrival = [[math.inf] * 30 for _ in range(30)]
     for step, line in enumerate(lines[6000:]):
         numbers = [float(text) for text in line.split(",") if text]

@@ -1,4 +1,4 @@
-"""The bonus for flying towards the target, by hand."""
+"""Tests the bonus for flying towards the target against hand-computed numbers."""
 
 import math
 
@@ -35,7 +35,7 @@ def test_heading_forms_by_hand(aimed, moved, folded, angle):
         assert term.item() == pytest.approx(0.5 * value, abs=1e-3), form
 
 
-def test_standing_still_earns_nothing_by_the_true_angle():
+def test_no_heading_bonus_without_a_move():
     here = torch.tensor([5.0, 7.0, 3.0])
     up, target = torch.tensor([5.0, 7.0, 4.0]), torch.tensor([9.0, 7.0, 3.0])
     assert heading_reward(here, up, target, HeadingConfig(form="linear")) == 0
@@ -47,7 +47,7 @@ def test_the_heading_term_is_added_unless_the_uav_left_the_box(axes, exits):
     before = moment([[10.0 * i, 5.0, 2.0] for i in range(4)], [1] * 4, centre=[[60.0, 5.0]] * 4)
     talk = communication(before, world=world)
     before = talk._reset(before, before)
-    # All fly straight at the target they were told; the next target is elsewhere.
+    # All UAVs fly straight to their target. Their next target is elsewhere.
     after = moment(
         [[10.0 * i + 1, 5.0, 2.0] for i in range(4)],
         [1] * 4,

@@ -1,4 +1,4 @@
-"""Files that were made to do harm, in every place where one is read: refused, nothing executed."""
+"""Tests that malicious files are refused wherever a file is read, and that no code runs."""
 
 import contextlib
 import io
@@ -28,7 +28,7 @@ from emberlink.trainers.runs.run_folder import RunFolder
 
 
 class Bomb:
-    """Leaves a mark where it is unpickled."""
+    """Creates a file when it is unpickled."""
 
     def __init__(self, mark: Path):
         self.mark = mark
@@ -43,7 +43,7 @@ def mark(tmp_path) -> Path:
 
 
 def refused(arguments: list[str], capsys, mark: Path) -> str:
-    """The one line with which a command ends, quickly, with little memory and without a mark."""
+    """Returns the one-line error of a command and checks its time, its memory and the mark."""
     capsys.readouterr()
     before, began = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, time.monotonic()
     status = main.main(arguments)
@@ -185,7 +185,7 @@ def test_a_configuration(kind, run, mark, capsys):
     replaced: set[str] = set()
     with contextlib.suppress(yaml.YAMLError, RecursionError, ValueError):
         replaced = set(yaml.safe_load(hostile))
-    # As far as can be, in the midst of a configuration that is right.
+    # Within an otherwise valid configuration, where possible.
     whole = yaml.safe_load(file.read_text())
     if kind not in ("the same key twice", "billion laughs", "two documents"):
         rest = {name: value for name, value in whole.items() if name not in replaced}
@@ -200,7 +200,7 @@ def test_a_configuration(kind, run, mark, capsys):
 
 
 def re_keyed(text: str) -> str:
-    """The key that a text begins with, if it begins with one."""
+    """Returns the key at the start of a text, if there is one."""
     head = text.partition(":")[0]
     return head if head.isidentifier() else ""
 
@@ -222,7 +222,7 @@ def test_the_lines_of_a_run(kind, run, mark, capsys):
     assert "metrics.jsonl" in refused(["eval", str(run), "--fires", "1"], capsys, mark)
 
 
-def test_numbers_of_a_run_without_bounds(run, capsys):
+def test_huge_numbers_in_a_run(run, capsys):
     many = "9" * 5000
     (run / "metrics.jsonl").write_text(
         '{"episode": 1, "mean_reward": NaN, "coverage": 1e999}\n'
@@ -266,7 +266,7 @@ def header(text: str) -> bytes:
 
 
 @pytest.mark.parametrize("kind", BANKS)
-def test_a_cached_bank_of_fires_is_made_anew(kind, tmp_path, mark, monkeypatch):
+def test_a_cached_bank_of_fires_is_computed_again(kind, tmp_path, mark, monkeypatch):
     monkeypatch.chdir(tmp_path)
     config = load_scenario("paper")
     arguments = config, "train", 1, (9, 9), 5
@@ -330,8 +330,8 @@ def test_a_scenario_with_a_tag(tmp_path, mark, monkeypatch):
 
 @pytest.mark.parametrize("name", ["config.yaml", "checkpoint", "metrics.jsonl", "eval.json"])
 @pytest.mark.parametrize("kind", ["pipe", "endless", "folder"])
-def test_what_is_no_regular_file(name, kind, run, mark, capsys, tmp_path):
-    """A pipe that nobody writes to, a device without an end, and a folder."""
+def test_special_files(name, kind, run, mark, capsys, tmp_path):
+    """Tests a pipe without a writer, an endless device, and a folder."""
     file = RunFolder(run).checkpoint() if name == "checkpoint" else run / name
     file.unlink()
     if kind == "pipe":
@@ -346,7 +346,7 @@ def test_what_is_no_regular_file(name, kind, run, mark, capsys, tmp_path):
     refused(command, capsys, mark)
 
 
-def test_links_out_of_a_run_folder_are_not_written_through(run, tmp_path):
+def test_links_out_of_a_run_folder_are_not_followed(run, tmp_path):
     mine = tmp_path / "mine"
     mine.write_text("mine")
     for name in (f"eval.json.{os.getpid()}.part", f"config.yaml.{os.getpid()}.part"):
@@ -364,7 +364,7 @@ def test_a_run_folder_that_is_a_link(run, tmp_path):
     assert main.main(["eval", str(tmp_path / "loop")]) == 2
 
 
-def test_a_run_folder_whose_name_is_markup(run, tmp_path, capsys):
+def test_a_run_folder_named_like_markup(run, tmp_path, capsys):
     odd = tmp_path / "[red]a[" / "blue] :boom:"
     odd.parent.mkdir()
     run.rename(odd)
@@ -372,8 +372,8 @@ def test_a_run_folder_whose_name_is_markup(run, tmp_path, capsys):
     assert str(odd) in capsys.readouterr().out.replace("\n", "")
 
 
-def test_the_files_of_the_working_folder_are_not_run(tmp_path, mark):
-    """Neither modules nor settings of a folder in which somebody runs the program."""
+def test_files_of_the_working_folder_are_not_executed(tmp_path, mark):
+    """Modules and settings in the working folder are ignored."""
     bomb = f"import os\nos.mkdir({str(mark)!r})\n"
     for name in ("torch", "yaml", "hydra", "wandb", "comm", "configs", "sitecustomize"):
         (tmp_path / f"{name}.py").write_text(bomb)

@@ -1,4 +1,4 @@
-"""Imports run one way: envs <- comm <- trainers, envs <- policies <- trainers."""
+"""Tests that imports run one way: envs <- comm <- trainers, envs <- policies <- trainers."""
 
 import ast
 import subprocess
@@ -19,7 +19,7 @@ ALLOWED = {
 
 
 def imported(source: str, folder: str) -> set[str]:
-    """The folders of emberlink that a file of `folder` imports, wherever in the file."""
+    """Returns the folders of emberlink that a file of `folder` imports anywhere."""
     found = set()
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Import):
@@ -49,7 +49,7 @@ def test_a_folder_imports_only_what_it_may(folder):
     assert crossing == {}
 
 
-def test_the_reader_of_imports_sees_every_form():
+def test_every_form_of_import_is_detected():
     forms = {
         "import emberlink.comm.base": {"comm"},
         "from emberlink import trainers": {"trainers"},
@@ -81,7 +81,7 @@ print(*sorted(heavy & (set(sys.modules) - before)))
         "emberlink.envs.utils.errors",
     ],
 )
-def test_what_every_command_needs_starts_without_torch(module):
+def test_the_command_line_starts_without_torch(module):
     code = LOADED.format(module=module)
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.split() == []
@@ -102,7 +102,7 @@ assert (threads, default) == (threading.active_count(), torch.get_default_dtype(
 """
 
 
-def test_importing_does_no_work(tmp_path):
+def test_imports_have_no_side_effects(tmp_path):
     done = subprocess.run(
         [sys.executable, "-c", EFFECTS], cwd=tmp_path, capture_output=True, text=True, check=False
     )

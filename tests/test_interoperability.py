@@ -1,4 +1,4 @@
-"""The environment beside other programs: seeds of copies, names and sizes, options, Gymnasium."""
+"""Tests the environment with other programs: seeds, names, sizes, options, Gymnasium."""
 
 import copy
 import pickle
@@ -27,7 +27,7 @@ def starts(env) -> torch.Tensor:
     return env.reset()[keys.POSITION]
 
 
-def test_unseeded_environments_are_different_worlds():
+def test_unseeded_environments_differ():
     assert not starts(make()).equal(starts(make()))
     assert not starts(make_env("consensus")).equal(starts(make_env("consensus")))
     unused = make()
@@ -37,7 +37,7 @@ def test_unseeded_environments_are_different_worlds():
     assert not workers[0].equal(workers[1])
 
 
-def test_seeds_given_in_either_way_are_the_same_world():
+def test_both_ways_of_seeding_are_equivalent():
     made, set_later = make(seed=4), make()
     set_later.set_seed(4)
     assert starts(made).equal(starts(set_later))
@@ -46,7 +46,7 @@ def test_seeds_given_in_either_way_are_the_same_world():
     assert not starts(make(seed=4)).equal(starts(set_later))
 
 
-def test_a_state_that_is_loaded_keeps_its_seed():
+def test_a_loaded_state_keeps_its_seed():
     old, new = make(seed=4), make()
     old.reset()
     new.load_state_dict(old.state_dict())
@@ -86,17 +86,17 @@ def test_done_per_agent():
     assert ("agents", "done") not in make().reset().keys(True)
 
 
-def test_staggered_first_episodes_put_environments_out_of_phase():
+def test_staggered_first_episodes():
     env = make(4, staggered=True, seed=0)
     steps = env.rollout(30, break_when_any_done=False)["next"]
     ends = [(row.squeeze(-1).nonzero().flatten() + 1).tolist() for row in steps["truncated"]]
-    # 10 steps shared by 4: the first episodes have 3, 5, 8 and 10 steps, all later ones 10.
+    # 4 environments, 10 steps: the first episodes have 3, 5, 8 and 10 steps, all later ones 10.
     assert ends == [[3, 13, 23], [5, 15, 25], [8, 18, 28], [10, 20, 30]]
     assert steps[keys.STEP][0, :5].tolist() == [1, 2, 3, 1, 2]
     assert starts(make(4, staggered=True, seed=0)).equal(starts(make(4, seed=0)))
 
 
-def test_observations_are_float32_whatever_the_default_is():
+def test_observations_are_float32_for_any_default_dtype():
     torch.set_default_dtype(torch.float64)
     try:
         for scale in ("raw", "box"):
@@ -110,7 +110,7 @@ def test_observations_are_float32_whatever_the_default_is():
         torch.set_default_dtype(torch.float32)
 
 
-def test_a_device_that_is_not_there_and_unknown_options_are_named():
+def test_missing_devices_and_unknown_options_are_named():
     if not torch.cuda.is_available():
         with pytest.raises(ValueError, match="device=cuda is not available; known: cpu"):
             WildfireEnv(device="cuda")
@@ -120,7 +120,7 @@ def test_a_device_that_is_not_there_and_unknown_options_are_named():
         make().reset(positions=torch.ones(3, 3))
 
 
-def test_a_long_horizon_costs_little_memory():
+def test_a_long_horizon_needs_little_memory():
     fires = torch.rand(64, 12, 10) * 2e6
     env = WildfireEnv(64, WildfireConfig(grid=(12, 10), horizon=1_000_000), fires)
     assert sum(buffer.nbytes for buffer in env.buffers()) < 2**20

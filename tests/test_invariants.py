@@ -1,4 +1,4 @@
-"""What holds after every step, whatever is configured and whatever the UAVs do."""
+"""Tests invariants of every step for random configurations and actions."""
 
 import copy
 import functools
@@ -26,11 +26,11 @@ def recipe(method: str, setup: str) -> dict:
 
 
 def random_settings(rng: np.random.Generator) -> dict:
-    """A valid configuration: a recipe with everything that the environment reads at random."""
+    """Returns a recipe with random valid values for all settings of the environment."""
     method, setup = str(rng.choice(METHODS)), str(rng.choice(SETUPS))
     values = copy.deepcopy(recipe(method, setup))
     altitude = np.sort(rng.choice([0.01, 0.5, 1.0, 3.3, 7.0, 40.0], 2))
-    # Steep cameras high up see the whole map: the window stays small enough to be quick.
+    # Wide views from high altitude cover the whole map. This bounds the window, for speed.
     angle = float(rng.choice([0.01, 15.0, 30.0, 45.0, 80.0]))
     values["env"] |= {
         "grid": [int(side) for side in rng.choice([8, 9, 13, 24], 2)],
@@ -66,7 +66,7 @@ def random_settings(rng: np.random.Generator) -> dict:
 
 
 def random_fire(rng: np.random.Generator, config, generator: torch.Generator):
-    """Arrival times of every kind, one fire for all or for each; or the scenario."""
+    """Returns random arrival times, shared or per environment, or the name of the scenario."""
     kind = rng.integers(6)
     shape = [*([ENVS] if rng.integers(2) else []), *config.env.grid]
     if kind == 0:
@@ -83,7 +83,7 @@ def random_fire(rng: np.random.Generator, config, generator: torch.Generator):
 
 
 def random_actions(shape: torch.Size, generator: torch.Generator) -> torch.Tensor:
-    """Half of the numbers sane; the others NaN, infinite, huge, and just beyond."""
+    """Returns actions, half of them valid, the others NaN, infinite, huge or just out of bounds."""
     odd = torch.tensor([math.nan, math.inf, -math.inf, 3e38, -3e38, 1.0001, -1.0, 1e-45, -0.0])
     sane = torch.rand(shape, generator=generator) * 2 - 1
     picked = odd[torch.randint(len(odd), shape, generator=generator)]
@@ -91,7 +91,7 @@ def random_actions(shape: torch.Size, generator: torch.Generator) -> torch.Tenso
 
 
 def footprint(position: torch.Tensor, config) -> torch.Tensor:
-    """Cells of the grid within |i - x| <= z tan(angle), |j - y| <= z tan(angle): counted anew."""
+    """Returns the cells of the grid within |i - x| <= z tan(angle), |j - y| <= z tan(angle)."""
     here = position.double()
     half = here[..., 2:] * math.tan(math.radians(config.view_angle))
     near = [
@@ -102,9 +102,9 @@ def footprint(position: torch.Tensor, config) -> torch.Tensor:
 
 
 def check(moment, before, env, config, looked: torch.Tensor) -> None:
-    """All that must hold at a moment, and from the moment a step before to it, if given.
+    """Checks the invariants of a time step, and of the transition to it from `before`, if given.
 
-    After a reset nobody has looked yet: `looked`, bool [ENVS], is where someone has.
+    UAVs do not observe at a reset. `looked`, bool [ENVS], marks environments after a step.
     """
     world = env.base_env
     position = moment[keys.POSITION]
@@ -131,7 +131,7 @@ def check(moment, before, env, config, looked: torch.Tensor) -> None:
 
 
 def play(seed: int, steps: int) -> int:
-    """A random configuration for at least an episode and a half; the environment steps taken."""
+    """Runs a random configuration for 1.5 episodes or more; returns the number of steps."""
     rng, generator = np.random.default_rng(seed), torch.Generator().manual_seed(seed)
     config = from_values(random_settings(rng))
     fire = random_fire(rng, config, generator)
@@ -159,7 +159,7 @@ def play(seed: int, steps: int) -> int:
 
 
 def sweep(steps: int, first: int = 0) -> int:
-    """Plays one configuration after the other until so many environment steps are taken."""
+    """Runs random configurations until the given number of environment steps is reached."""
     taken, seed = 0, first
     while taken < steps:
         taken += play(seed, steps=20)
@@ -172,8 +172,8 @@ def test_the_invariants_hold(part):
     assert sweep(STEPS // 4, first=1_000_000 * part) >= STEPS // 4
 
 
-def test_every_kind_of_configuration_is_played():
-    """What the sweep draws covers every recipe, and each of the odd values."""
+def test_the_sweep_covers_every_kind_of_configuration():
+    """The configurations include every recipe and every special value."""
     drawn = [random_settings(np.random.default_rng(seed)) for seed in range(60)]
     assert {one["method"] for one in drawn} == set(METHODS)
     assert {one["setup"] for one in drawn} == set(SETUPS)

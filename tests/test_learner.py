@@ -1,4 +1,4 @@
-"""The stacked learner: nothing crosses UAVs, and each UAV learns by plain DDPG."""
+"""Tests that UAVs of the stacked learner are independent and equal to plain DDPG."""
 
 import copy
 
@@ -85,7 +85,7 @@ def of_uav(batch: TensorDict, uav: int) -> tuple[torch.Tensor, ...]:
 
 
 def networks(learner: DDPG) -> dict[str, torch.nn.Module]:
-    """Copies of the actors, the critics and their targets, with their present weights."""
+    """Returns copies of the actors, the critics and their targets with their current weights."""
     copies = {}
     for name in ("actor", "value"):
         module = getattr(learner.loss, f"{name}_network")
@@ -104,7 +104,7 @@ def single(learner: DDPG, uav: int) -> SingleDDPG:
 
 @pytest.mark.parametrize("which", ["actor", "critic"])
 @pytest.mark.parametrize("uav", range(UAVS))
-def test_no_gradient_crosses_uavs(which, uav):
+def test_gradients_of_uavs_are_independent(which, uav):
     learner = make_learner()
     learner.losses(make_batch(0))[which][uav].backward()
     trained = {"actor": "actor_network_params", "critic": "value_network_params"}
@@ -119,7 +119,7 @@ def test_no_gradient_crosses_uavs(which, uav):
             assert not gradient[others].any(), (network, name)
 
 
-def test_another_uavs_batch_changes_nothing():
+def test_the_batch_of_another_uav_has_no_effect():
     one, other = make_learner(), make_learner()
     batch = make_batch(0)
     changed = batch.clone()
@@ -170,7 +170,7 @@ def test_updates_move_the_networks_and_their_targets():
             for key, value in stack.state_dict().items()
         }
         assert min(moved.values()) > 0, (name, moved)
-    # After one update a target has gone the share tau of the way of its network.
+    # After one update a target has moved by tau of its network's change.
     for name in ("actor", "value"):
         for start, target, network in zip(
             before[name].parameters(),
@@ -184,7 +184,7 @@ def test_updates_move_the_networks_and_their_targets():
 @pytest.mark.parametrize("terminated", [False, True])
 def test_the_time_limit_is_bootstrapped(terminated):
     learner = make_learner()
-    for seed in range(5):  # targets that differ from the networks
+    for seed in range(5):  # so that targets differ from the networks
         learner.update(make_batch(seed))
     batch = make_batch(9, size=1, done=True, terminated=terminated)
     losses = learner.losses(batch)["critic"]

@@ -37,7 +37,7 @@ def test_networks_may_have_one_hidden_layer_or_several(learner, hidden):
     assert not setup.guard.poll(wait=True)
 
 
-def test_the_files_are_the_learners():
+def test_learners_are_the_files_on_disk():
     assert registry.known() == LEARNERS
     assert [registry.find(name) for name in LEARNERS] == [DDPG, TD3]
     with pytest.raises(UserError, match=r"'sac' is not known; known: ddpg, td3"):
@@ -132,7 +132,7 @@ def test_td3_delays_the_actors_and_all_targets():
     assert moved == [critics, critics, every, critics, critics, every, critics]
 
 
-def test_td3s_target_noise_is_clipped_and_of_each_seed():
+def test_td3s_target_noise_is_clipped_and_seeded():
     """The noise of a seed is the same in a stack and alone, whatever the global generator."""
     options = "learner.target_noise=0.4", "learner.target_noise_clip=0.5", "learner.batch_size=512"
     key = "next", "agents", "target_noise"
@@ -147,7 +147,7 @@ def test_td3s_target_noise_is_clipped_and_of_each_seed():
     assert stacked[:, 3:].equal(alone)
     assert stacked.abs().max() == 0.5
     inner = stacked[stacked.abs() < 0.5]
-    assert inner.std().item() == pytest.approx(0.27, abs=0.02)  # of N(0, 0.4) within 0.5
+    assert inner.std().item() == pytest.approx(0.27, abs=0.02)  # share of N(0, 0.4) within 0.5
     assert not stacked[:, :3].equal(alone)
 
 

@@ -1,4 +1,4 @@
-"""Nothing is written, truncated or deleted through a link, and no pipe or device is waited for.
+"""Tests that links are not followed for writing, and that pipes and devices do not block.
 
 The module that opens files is tested with every kind of link, pipe, socket and device. Each command
 is run once with a mixture of them at the names that it writes, and once under an audit hook: every
@@ -32,7 +32,7 @@ from emberlink.trainers.training import rollback
 
 
 class Outside:
-    """A folder that belongs to the user, and what was in it."""
+    """Holds a folder of the user and its initial contents."""
 
     def __init__(self, path: Path):
         self.path, self.file, self.folder = path, path / "thesis.txt", path / "data"
@@ -49,7 +49,7 @@ class Outside:
 
 @pytest.fixture
 def outside(tmp_path) -> Iterator[Outside]:
-    """Unchanged at the end of every test."""
+    """Yields a folder outside of the run folder and checks that the test did not change it."""
     made = Outside(tmp_path / "home")
     yield made
     assert made.now() == made.before
@@ -82,24 +82,24 @@ REMOVED = [*LINKS, "hard link"]
 
 
 def plant(path: Path, kind: str, outside: Outside) -> None:
-    """Puts something in the place of a file or folder."""
+    """Replaces a file or folder by a link, pipe, socket or device."""
     if path.is_dir() and not path.is_symlink():
         shutil.rmtree(path)
     path.unlink(missing_ok=True)
     try:
         KINDS[kind](path, outside)
-    except PermissionError:  # a root without the right to make devices
+    except PermissionError:  # root without the right to create devices
         os.mkfifo(path)
 
 
-def own(path: Path) -> bool:
-    """Whether a name is a regular file that has no other name."""
+def is_regular(path: Path) -> bool:
+    """Checks whether a path is a regular file with a single name."""
     about = path.lstat()
     return stat.S_ISREG(about.st_mode) and about.st_nlink == 1
 
 
-def ends(arguments: list[str | Path], capsys) -> tuple[int, str]:
-    """The status and the errors of a command, which ends soon, without a traceback."""
+def run_command(arguments: list[str | Path], capsys) -> tuple[int, str]:
+    """Returns status and errors of a command; checks for a timeout and for tracebacks."""
     capsys.readouterr()
     began = time.monotonic()
     status = main.main([str(one) for one in arguments])
@@ -110,11 +110,11 @@ def ends(arguments: list[str | Path], capsys) -> tuple[int, str]:
     return status, error
 
 
-# The one place that opens files
+# The module that opens files
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_file_is_replaced_and_not_written_through(kind, tmp_path, outside):
+def test_an_existing_link_is_replaced(kind, tmp_path, outside):
     path = tmp_path / "eval.json"
     plant(path, kind, outside)
     plant(
@@ -124,12 +124,12 @@ def test_a_file_is_replaced_and_not_written_through(kind, tmp_path, outside):
     )
     atomic_io.write_bytes(path, b"whole")
     assert path.read_bytes() == b"whole"
-    assert own(path)
+    assert is_regular(path)
     assert [one.name for one in tmp_path.iterdir() if one.name != "home"] == ["eval.json"]
 
 
 @pytest.mark.parametrize("kind", sorted(set(KINDS) - set(REMOVED)))
-def test_a_temporary_name_that_is_taken(kind, tmp_path, outside):
+def test_an_existing_temporary_file(kind, tmp_path, outside):
     plant(tmp_path / f"eval.json.{os.getpid()}.part", kind, outside)
     with pytest.raises(OSError, match="not a regular file"):
         atomic_io.write_bytes(tmp_path / "eval.json", b"whole")
@@ -137,7 +137,7 @@ def test_a_temporary_name_that_is_taken(kind, tmp_path, outside):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_new_file_takes_no_name_that_is_there(kind, tmp_path, outside):
+def test_a_new_file_does_not_replace_an_existing_one(kind, tmp_path, outside):
     path = tmp_path / "fires.npy"
     plant(path, kind, outside)
     with pytest.raises(ValueError, match="is there already"), published(path) as partial:
@@ -163,7 +163,7 @@ def test_a_file_is_not_changed_through_a_link(kind, create, tmp_path, outside):
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("names", [("figures",), ("a", "b")])
-def test_a_folder_on_the_way_is_no_link(kind, names, tmp_path, outside):
+def test_a_parent_folder_must_not_be_a_link(kind, names, tmp_path, outside):
     run = tmp_path / "run"
     run.joinpath(*names[:-1]).mkdir(parents=True)
     plant(run.joinpath(*names), kind, outside)
@@ -219,7 +219,7 @@ def test_a_lock(kind, tmp_path, outside):
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("file", ["timing.jsonl", "metrics.jsonl", rollback.FILE])
-def test_lines_of_a_run(kind, file, tmp_path, outside):
+def test_metrics_of_a_run(kind, file, tmp_path, outside):
     run = RunFolder(tmp_path)
     plant(run.path / file, kind, outside)
     if kind == "hard link":
@@ -240,7 +240,7 @@ def test_lines_of_a_run(kind, file, tmp_path, outside):
 
 @dataclasses.dataclass
 class Opened:
-    """A file that was opened to be written, or removed."""
+    """Describes a file that was opened for writing, or removed."""
 
     path: Path
     safe: bool
@@ -267,10 +267,10 @@ def _look(event: str, arguments: tuple) -> None:
 
 @contextmanager
 def watched() -> Iterator[list[Opened]]:
-    """Yields the list to which every file is added that is opened to be written."""
+    """Yields a list that collects every file that is opened for writing."""
     global OPENED
     if not _HOOKED:
-        sys.addaudithook(_look)  # it cannot be taken off again
+        sys.addaudithook(_look)  # an audit hook cannot be removed
         _HOOKED.append(True)
     OPENED = []
     try:
@@ -284,7 +284,7 @@ _HOOKED: list[bool] = []
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory) -> tuple[Path, list[Opened]]:
-    """A run of two episodes that nobody changes, whose tracker is csv, and what it opened."""
+    """Trains two episodes with the csv tracker; returns the run and the files that it opened."""
     output = tmp_path_factory.mktemp("links") / "runs"
     with watched() as opened:
         assert main.main(["train", "independent", *TINY, "logger=csv", f"output={output}"]) == 0
@@ -321,7 +321,7 @@ def test_every_file_is_opened_without_following_links(trained, run, tmp_path, mo
 
 
 def test_an_evaluation_replaces_what_was_planted(run, outside, tmp_path, capsys, monkeypatch):
-    """At the names of the figures and of eval.json, and at those of the caches."""
+    """The links are at the names of figures, eval.json and caches."""
     cache = shutil.copytree(os.environ["EMBERLINK_CACHE"], tmp_path / "cache")
     monkeypatch.setenv("EMBERLINK_CACHE", str(cache))
     contents = {file: file.read_bytes() for file in cache.iterdir()}
@@ -331,18 +331,18 @@ def test_an_evaluation_replaces_what_was_planted(run, outside, tmp_path, capsys,
     names = [*drawn, run / "eval.json", *contents]
     for path, kind in zip(names, itertools.cycle(SOME)):
         plant(path, kind, outside)
-    status, error = ends(["eval", run], capsys)
+    status, error = run_command(["eval", run], capsys)
     assert status == 0, error
-    used = [file for file in contents if own(file)]
+    used = [file for file in contents if is_regular(file)]
     assert {file.name.partition("-")[0] for file in used} == {"fire", "scripted"}
     assert all(file.read_bytes() == contents[file] for file in used)
-    assert all(own(path) for path in (*drawn, run / "eval.json"))
+    assert all(is_regular(path) for path in (*drawn, run / "eval.json"))
 
 
 @pytest.mark.parametrize("arguments", [["eval"], ["render", "--frames", "2"]])
 def test_the_folder_of_the_figures(arguments, run, outside, capsys):
     plant(run / "figures", "link to a folder", outside)
-    status, error = ends([arguments[0], run, *arguments[1:]], capsys)
+    status, error = run_command([arguments[0], run, *arguments[1:]], capsys)
     assert status == 2
     assert "it is a link" in error
 
@@ -357,15 +357,15 @@ def test_the_folder_of_the_figures(arguments, run, outside, capsys):
         ("checkpoints", "link to a folder"),
     ],
 )
-def test_a_resumed_run_that_is_refused(name, kind, begun, run, outside, capsys):
-    """With a checkpoint and without one; no file is changed."""
+def test_a_refused_resume_changes_no_file(name, kind, begun, run, outside, capsys):
+    """Tests a run with and without a checkpoint."""
     if begun:
         shutil.rmtree(run / "checkpoints")
         (run / "eval.json").unlink()
         (run / "metrics.jsonl").unlink()
     plant(run / name, kind, outside)
     before = {file: file.lstat().st_mtime_ns for file in run.rglob("*") if file.is_file()}
-    status, error = ends(["train", f"resume={run}", "episodes=3"], capsys)
+    status, error = run_command(["train", f"resume={run}", "episodes=3"], capsys)
     assert status == 2
     assert name.partition(".")[0] in error
     now = {file: file.lstat().st_mtime_ns for file in run.rglob("*") if file.is_file()}
@@ -374,7 +374,7 @@ def test_a_resumed_run_that_is_refused(name, kind, begun, run, outside, capsys):
 
 
 def test_a_resumed_run_replaces_what_was_planted(run, outside, capsys):
-    """Everything that a resumed run writes again or removes, at once."""
+    """The links are at all names that a resumed run writes or removes."""
     again = [path for path in (run / "figures").iterdir() if not path.is_symlink()]
     again += [run / "eval.json", run / "metrics.csv"]
     later = run / "checkpoints" / "step_000000045.safetensors"
@@ -384,14 +384,14 @@ def test_a_resumed_run_replaces_what_was_planted(run, outside, capsys):
     kinds = ["link to a file", "dangling link", "hard link"]
     for path, kind in zip((*again, later, *removed, best), itertools.cycle(kinds)):
         plant(path, kind, outside)
-    for name in IN_PLACE:  # links are refused, a second name is kept as it is
+    for name in IN_PLACE:  # links are refused, a second name of the file is kept unchanged
         shutil.copy(run / name, outside.path / name)
         (run / name).unlink()
         (run / name).hardlink_to(outside.path / name)
     outside.before = outside.now()
-    status, error = ends(["train", f"resume={run}", "episodes=3"], capsys)
+    status, error = run_command(["train", f"resume={run}", "episodes=3"], capsys)
     assert status == 0, error
-    assert all(own(path) for path in (*again, later, *(run / name for name in IN_PLACE)))
+    assert all(is_regular(path) for path in (*again, later, *(run / name for name in IN_PLACE)))
     assert not any(os.path.lexists(path) for path in removed)
 
 
@@ -410,18 +410,18 @@ def test_the_table_of_the_csv_tracker(kind, run, outside):
     plant(path, kind, outside)
     here = RunFolder(run)
     Trackers([here.config()], [here], episode=2).close()
-    assert own(path)
+    assert is_regular(path)
     assert len(path.read_text().splitlines()) == 1 + 2
 
 
-def test_a_seed_beside_that_is_a_link(run, outside, capsys):
-    """The folders of the other seeds are named by a file of the run folder, not by the user."""
+def test_a_link_as_the_folder_of_another_seed(run, outside, capsys):
+    """A file of the run folder, not the user, names the folders of the other seeds."""
     other = outside.path / "other"
     shutil.copytree(run, other)
     outside.before = outside.now()
     (run.parent / "other").symlink_to(other)
     (run / "seed_runs.json").write_text('{"folders": ["run", "other"]}')
-    status, error = ends(["train", f"resume={run}", "episodes=3"], capsys)
+    status, error = run_command(["train", f"resume={run}", "episodes=3"], capsys)
     assert status == 2
     assert "is a link" in error
 
@@ -430,7 +430,7 @@ def test_the_logs_of_a_sweep(tmp_path, outside, capsys):
     runs = tmp_path / "runs"
     runs.mkdir()
     plant(runs / "logs", "link to a folder", outside)
-    status, error = ends(["sweep", "independent", *TINY, f"output={runs}"], capsys)
+    status, error = run_command(["sweep", "independent", *TINY, f"output={runs}"], capsys)
     assert status == 2
     assert "it is a link" in error
 
@@ -445,8 +445,8 @@ def test_the_logs_of_a_sweep(tmp_path, outside, capsys):
         ("fire.png", ["fire", "preview", "paper:0", "--output"]),
     ],
 )
-def test_outputs_that_are_named(name, command, run, outside, tmp_path, capsys):
+def test_output_files_given_by_the_user(name, command, run, outside, tmp_path, capsys):
     plant(tmp_path / name, "dangling link", outside)
     output = tmp_path / name.replace(".json", ".npy")
     command = [str(run) if word == "RUN" else word for word in command]
-    assert ends([*command, output], capsys)[0] == 2
+    assert run_command([*command, output], capsys)[0] == 2
