@@ -1,4 +1,4 @@
-"""One training a run folder."""
+"""Tests that a run folder is locked by at most one training."""
 
 import errno
 import fcntl
@@ -28,7 +28,7 @@ time.sleep(60)
 
 @pytest.fixture
 def other(tmp_path):
-    """Another process that has locked a folder."""
+    """Starts another process that locks a folder."""
     process = subprocess.Popen(
         [sys.executable, "-c", HOLD, str(tmp_path)],
         stdout=subprocess.PIPE,
@@ -42,13 +42,13 @@ def other(tmp_path):
     process.wait()
 
 
-def test_the_second_refuses_and_names_the_first(other, tmp_path):
+def test_the_second_process_is_refused_and_names_the_first(other, tmp_path):
     with pytest.raises(ValueError, match=f"process {other.pid} on {socket.gethostname()}"):
         Lock(tmp_path)
     assert (tmp_path / "lock").exists()
 
 
-def test_the_lock_of_a_dead_process_is_taken_over(other, tmp_path):
+def test_the_lock_of_a_dead_process_is_released(other, tmp_path):
     other.send_signal(signal.SIGKILL)
     other.wait()
     assert (tmp_path / "lock").exists()
@@ -58,8 +58,8 @@ def test_the_lock_of_a_dead_process_is_taken_over(other, tmp_path):
     assert not (tmp_path / "lock").exists()
 
 
-def test_a_number_that_was_given_out_again_is_not_taken_for_the_dead_process(tmp_path):
-    """The file names a process that lives: this one; it has not locked anything."""
+def test_a_reused_process_id_does_not_hold_the_lock(tmp_path):
+    """The file names a running process, this one, which holds no lock."""
     (tmp_path / "lock").write_text(f"process {os.getpid()} on {socket.gethostname()}\n")
     lock = Lock(tmp_path)
     with pytest.raises(ValueError, match="is training here"):
@@ -69,8 +69,8 @@ def test_a_number_that_was_given_out_again_is_not_taken_for_the_dead_process(tmp
     Lock(tmp_path).release()
 
 
-def test_a_lock_file_that_was_taken_away_in_between_is_no_lock(tmp_path, monkeypatch):
-    """The holder releases between the other's open and flock, which then locks a removed file."""
+def test_a_lock_on_a_removed_file_is_not_held(tmp_path, monkeypatch):
+    """The holder releases the lock between open and flock of another process."""
     real, first = fcntl.flock, Lock(tmp_path)
 
     def flock(handle: int, how: int) -> None:

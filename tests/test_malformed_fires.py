@@ -1,4 +1,4 @@
-"""Checks that a damaged file gives a message of one line, or the grid of the whole file."""
+"""Tests that a damaged file gives a one-line error or the same grid as the valid file."""
 
 import re
 import signal
@@ -37,7 +37,7 @@ def alarm():
 
 
 def outcome(case) -> str:
-    """Returns the mistake of the reader, or an empty text."""
+    """Returns the reader's fault, or an empty string."""
     signal.setitimer(signal.ITIMER_REAL, 3 * LONGEST)
     began = time.perf_counter()
     try:
@@ -72,20 +72,20 @@ def outcome(case) -> str:
 
 def test_malformed_files(tmp_path, alarm, capfd):
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of the libraries that write them
+        warnings.simplefilter("ignore")  # of the libraries that write the files
         all_cases = list(cases(tmp_path))
     capfd.readouterr()
     with warnings.catch_warnings(record=True) as warned:
         warnings.simplefilter("always")
-        wrong = {case.name: problem for case in all_cases if (problem := outcome(case))}
-    assert not wrong, "\n".join(f"{name}: {problem}" for name, problem in wrong.items())
+        failures = {case.name: problem for case in all_cases if (problem := outcome(case))}
+    assert not failures, "\n".join(f"{name}: {problem}" for name, problem in failures.items())
     assert len(all_cases) >= 300
     assert len({case.name for case in all_cases}) == len(all_cases)
     assert not warned
     assert capfd.readouterr() == ("", "")
 
 
-def test_the_whole_files_are_read(tmp_path):
+def test_valid_files_are_read(tmp_path):
     for kind, path in wholes(tmp_path / "whole").items():
         fires = read(path, **keys_of(kind))
         assert fires.dtype == torch.float32

@@ -1,4 +1,4 @@
-"""Links, roles, targets, panels and legend, probed pixel by pixel."""
+"""Tests the pixels of links, roles, targets, panels and legend."""
 
 import numpy as np
 import pytest
@@ -34,14 +34,14 @@ def screen(*frames: FrameData, size: int = 360, **options) -> Screen:
 
 
 def drawn(*frames: FrameData, panel: int = 0, **options) -> np.ndarray:
-    """The map of one panel."""
+    """Draws one panel and returns its map."""
     made = screen(*frames, **options)
     (x, y), (width, height) = made.map_corner(panel), made.map_size
     return made.picture(0)[y : y + height, x : x + width]
 
 
 def around(image: np.ndarray, x: float, y: float, reach: int = 2) -> set[tuple[int, ...]]:
-    """The colours near a place given in cells of a 30 x 20 grid."""
+    """Returns the colours near a position in cells of a 30 x 20 grid."""
     scale = image.shape[1] // 30
     across, down = int((x + 0.5) * scale), int((19.5 - y) * scale)
     part = image[down - reach : down + reach + 1, across - reach : across + reach + 1]
@@ -59,7 +59,7 @@ def linked(*pairs: tuple[int, int], n: int = 3) -> np.ndarray:
     return links
 
 
-def test_a_link_is_drawn_between_those_who_hear_each_other_and_nowhere_else():
+def test_links_are_drawn_between_neighbours_only():
     image = drawn(moment(links=linked((0, 1))))
     assert LINK in around(image, 7, 2)
     assert LINK not in around(image, 17, 7)  # between UAV 1 and UAV 2
@@ -68,7 +68,7 @@ def test_a_link_is_drawn_between_those_who_hear_each_other_and_nowhere_else():
     assert LINK not in all_of(drawn(moment()))
 
 
-def test_a_uav_wears_the_colour_of_its_role_around_its_blue_disc():
+def test_a_uav_has_a_ring_in_the_colour_of_its_role():
     image = drawn(moment(roles=np.array([0, 1, 2])))
     for (x, y, _), colour in zip(WHERE, ROLE_COLOURS, strict=True):
         near = around(image, x, y, reach=6)
@@ -79,7 +79,7 @@ def test_a_uav_wears_the_colour_of_its_role_around_its_blue_disc():
     assert not set(ROLE_COLOURS) & plain
 
 
-def test_roles_differ_in_shape_too():
+def test_roles_differ_in_shape():
     shapes = set()
     for role in range(len(ROLES)):
         image = drawn(moment(roles=np.full(3, role)))
@@ -87,7 +87,7 @@ def test_roles_differ_in_shape_too():
     assert len(shapes) == 3
 
 
-def test_a_target_is_a_cross_with_a_way_to_it():
+def test_a_target_is_a_cross_with_a_line_to_it():
     target = np.array([(2, 12, 1), (12, 14, 1), (22, 2, 1)], np.float32)
     image = drawn(moment(roles=np.array([0, 1, 2]), target=target))
     for (x, y, _), colour in zip(target.tolist(), ROLE_COLOURS, strict=True):
@@ -106,7 +106,7 @@ def test_a_large_team_has_no_lines_to_its_targets():
     assert ROLE_COLOURS[0] not in around(image, 2, 9, reach=20)
 
 
-def test_a_uav_that_flies_higher_has_a_larger_square():
+def test_a_higher_uav_has_a_larger_square():
     low, high = (
         (drawn(moment(position=np.array([(9, 9, z)], np.float32))) == (255, 255, 0)).all(-1).sum()
         for z in (1, 4)
@@ -120,7 +120,7 @@ def test_each_panel_shows_its_own_episode():
     assert not {LINK, ROLE_COLOURS[0]} & all_of(drawn(left, right, panel=1))
 
 
-def test_the_legend_names_what_occurs_and_nothing_else():
+def test_the_legend_has_the_visible_marks_only():
     def words(*frames, **options):
         return [word for word, _ in screen(*frames, **options)._legend()]
 
@@ -132,7 +132,7 @@ def test_the_legend_names_what_occurs_and_nothing_else():
     assert words(moment(), grey_seen=True)[:2] == ["fire", "fire, seen"]
 
 
-def test_seen_fire_is_told_apart_only_where_asked():
+def test_seen_fire_has_a_colour_only_on_request():
     fire = np.zeros((30, 20), np.uint8)
     fire[25, 5], fire[27, 5] = 1, 2
     assert around(drawn(moment(fire_map=fire)), 25, 5) == {(255, 255, 255)}
@@ -141,7 +141,7 @@ def test_seen_fire_is_told_apart_only_where_asked():
     assert around(told, 27, 5) == {(255, 255, 255)}
 
 
-def test_step_and_coverage_are_written():
+def test_panels_show_step_and_coverage():
     first, second = screen(moment()).picture(0), screen(moment(seen=4)).picture(0)
     assert not np.array_equal(first[:50], second[:50])
     assert moment().coverage == 37.5
@@ -163,7 +163,7 @@ def test_panels_do_not_overlap_and_sides_are_even(grid, count):
     assert covered.sum() == count * made.map_size[0] * made.map_size[1]
 
 
-def test_four_square_maps_are_two_by_two():
+def test_four_square_maps_are_arranged_two_by_two():
     made = screen(*[moment(fire_map=np.zeros((30, 30), np.uint8))] * 4)
     corners = [made.map_corner(panel) for panel in range(4)]
     assert len({x for x, _ in corners}) == len({y for _, y in corners}) == 2
@@ -179,14 +179,14 @@ def tensordict(features: int, **agents) -> TensorDict:
     return TensorDict({keys.AGENTS: TensorDict(own, [3]), **counts}, [])
 
 
-def test_roles_follow_from_whom_a_uav_follows():
+def test_roles_are_derived_from_the_followed_uavs():
     follows = torch.tensor([0, 0, -1, 3, 1])
     assert [ROLES[role] for role in record_episode.roles(follows)] == [
         *("discoverer", "seeker", "wanderer", "discoverer", "seeker")
     ]
 
 
-def test_links_roles_and_targets_are_drawn_where_the_tensordict_holds_them():
+def test_links_roles_and_targets_are_drawn_from_the_tensordict():
     nothing = torch.zeros(30, 20, dtype=torch.uint8)
     hears = torch.from_numpy(linked((0, 1)))
     told = {
@@ -209,7 +209,7 @@ def test_links_roles_and_targets_are_drawn_where_the_tensordict_holds_them():
 
 
 @pytest.mark.parametrize(("loss", "drawn"), [(0.0, True), (1.0, False)])
-def test_links_are_the_messages_that_were_received(loss, drawn):
+def test_links_are_received_messages(loss, drawn):
     fire = torch.zeros(12, 12)
     env = make_env("consensus", fire=fire, horizon=4, seed=0, **{"comm.loss": loss})
     policy = FollowTarget(env.base_env)

@@ -1,4 +1,4 @@
-"""Whose transitions a UAV samples, how many a memory holds, and what is stored."""
+"""Tests the replay buffer: sampling per UAV, capacity and contents."""
 
 import pytest
 import torch
@@ -31,7 +31,7 @@ def memory(*, shared: bool, capacity: int = 4000, batch: int = 64, most: int = 1
 
 
 def labelled(first: int, count: int, uavs: int = UAVS) -> TensorDict:
-    """Rows in which every number of a transition tells its row and its UAV."""
+    """Returns transitions whose values encode their row and UAV."""
     row = torch.arange(first, first + count).unsqueeze(-1).expand(count, uavs)
     label = torch.stack((row, torch.arange(uavs).expand(count, uavs)), -1).float()
     flag = torch.zeros(count, uavs, 1, dtype=torch.bool)
@@ -47,11 +47,11 @@ def labelled(first: int, count: int, uavs: int = UAVS) -> TensorDict:
 
 
 def drawn(buffer, samples: int) -> torch.Tensor:
-    """(row, UAV) of the transitions in many samples, [draws, uavs, 2]."""
+    """Returns (row, UAV) of the transitions in many samples, [draws, uavs, 2]."""
     return torch.cat([buffer.sample()[keys.OBSERVATION] for _ in range(samples)]).long()
 
 
-def test_private_memory_samples_a_uavs_own_transitions():
+def test_private_memory_samples_transitions_of_the_same_uav():
     buffer = memory(shared=False)
     buffer.extend_rows(labelled(0, 50))
     sample = drawn(buffer, 40)
@@ -62,7 +62,7 @@ def test_private_memory_samples_a_uavs_own_transitions():
     assert counts.max() < 85
 
 
-def test_shared_memory_samples_everyones_about_equally():
+def test_shared_memory_samples_all_uavs_equally():
     buffer = memory(shared=True)
     buffer.extend_rows(labelled(0, 50))
     sample = drawn(buffer, 200)
@@ -75,7 +75,7 @@ def test_shared_memory_samples_everyones_about_equally():
 
 
 @pytest.mark.parametrize("shared", [False, True])
-def test_each_uav_has_its_own_draws(shared):
+def test_uavs_sample_independently(shared):
     buffer = memory(shared=shared)
     buffer.extend_rows(labelled(0, 1000))
     rows = drawn(buffer, 1)[..., 0]
@@ -85,7 +85,7 @@ def test_each_uav_has_its_own_draws(shared):
 
 
 @pytest.mark.parametrize("shared", [False, True])
-def test_a_sampled_transition_is_one_that_was_stored(shared):
+def test_samples_are_stored_transitions(shared):
     buffer = memory(shared=shared)
     buffer.extend_rows(labelled(0, 300))
     sample = buffer.sample()
@@ -101,7 +101,7 @@ def test_capacity_counts_uav_transitions():
     million = {"capacity": 1_000_000, "uavs": 6}
     assert memory(shared=True, **million).capacity == 166_667
     assert memory(shared=False, **million).capacity == 1_000_000
-    # Nothing is allocated that a run cannot fill.
+    # A buffer is not larger than the run can fill.
     assert memory(shared=False, most=300, **million).capacity == 300
 
 
@@ -121,7 +121,7 @@ def test_a_full_batch_is_counted_in_transitions(uavs, shared, rows):
     assert memory(shared=shared, batch=512, uavs=uavs).needed == rows
 
 
-def test_rows_are_what_the_environment_did():
+def test_rows_are_the_transitions_of_the_environment():
     env = make_env("consensus", num_envs=2, horizon=3, num_uavs=UAVS)
     rollout = env.rollout(3, break_when_any_done=False)
     rows = to_rows(rollout, 1, [keys.OBSERVATION])
@@ -133,14 +133,14 @@ def test_rows_are_what_the_environment_did():
         assert row["action"].equal(step[keys.ACTION])
         assert row["next", "observation"].equal(step["next", *keys.OBSERVATION])
         assert row["next", "reward"].equal(step["next", *keys.REWARD])
-        # The horizon ends the episode, and it is no terminal state.
+        # The horizon truncates the episode, without a terminal state.
         assert row["next", "done"].flatten().tolist() == [at % 3 == 2] * UAVS
         assert not row["next", "terminated"].any()
 
 
 @pytest.mark.parametrize("shared", [False, True])
-def test_a_million_transitions_take_little_more_than_their_numbers(shared):
-    """Both observations, action and reward; the rest is two flags."""
+def test_memory_of_a_million_transitions(shared):
+    """A transition has two observations, action, reward and two flags."""
     buffer = memory(shared=shared, capacity=1_000_000, uavs=6)
     row = to_rows(make_env("consensus", horizon=2).rollout(1), 1, [keys.OBSERVATION])
     buffer.extend_rows(row)
@@ -151,7 +151,7 @@ def test_a_million_transitions_take_little_more_than_their_numbers(shared):
 
 
 def test_several_tensors_of_any_shape_are_stored():
-    """A vector and a window of bits, for two seeds of two environments."""
+    """Stores a vector and a window of bits, for two seeds of two environments."""
     observation, window = (keys.AGENTS, "observation"), (keys.AGENTS, "window")
     agents = {
         "observation": torch.rand(4, 3, UAVS, 6),
@@ -177,7 +177,7 @@ def test_several_tensors_of_any_shape_are_stored():
 
 
 @pytest.mark.parametrize("written", [20, 40, 55])
-def test_a_restored_memory_goes_on_as_the_one_that_was_saved(written):
+def test_a_restored_memory_samples_like_the_saved_one(written):
     def filled(rows: int) -> ReplayMemory:
         buffer = memory(shared=False, capacity=40, batch=10)
         for first in range(rows):

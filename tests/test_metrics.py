@@ -1,4 +1,4 @@
-"""Measures of episodes written by hand."""
+"""Tests the measures on hand-written episodes."""
 
 import pytest
 import torch
@@ -28,15 +28,15 @@ def test_coverage_is_of_the_last_step():
         ([0, 1, 2, 4], [4, 4, 4, 4], 4),
         ([0, 1, 2, 3], [4, 4, 4, 4], 4),  # never: the horizon
         ([0, 4, 4, 4], [4, 4, 5, 6], 2),  # the fire has grown since
-        ([3, 4, 5, 6], [4, 5, 6, 7], 4),  # always one behind
-        ([0, 0, 0, 0], [0, 0, 0, 0], 1),  # nothing to see
+        ([3, 4, 5, 6], [4, 5, 6, 7], 4),  # always one step behind
+        ([0, 0, 0, 0], [0, 0, 0, 0], 1),  # no fire
     ],
 )
 def test_coverage_time(seen, burning, time):
     assert metrics.time_to_full_coverage(torch.tensor(seen), torch.tensor(burning)).item() == time
 
 
-def test_where_nothing_burns_all_is_covered():
+def test_coverage_without_fire_is_complete():
     nothing = torch.zeros(3, dtype=torch.int64)
     assert metrics.coverage(nothing, nothing).item() == 100
     assert metrics.coverage_auc(nothing, nothing).item() == 100
@@ -48,7 +48,7 @@ def test_tracking():
     assert metrics.tracking_last(on_fire).item() == 4
 
 
-def test_a_uav_that_never_finds_fire_counts_as_the_horizon():
+def test_a_uav_that_never_finds_fire_has_the_horizon():
     on_fire = torch.zeros(5, 3, dtype=torch.bool)
     assert metrics.tracking_first(on_fire).item() == 5
     on_fire[0, 1] = on_fire[2, 0] = YES
@@ -56,12 +56,12 @@ def test_a_uav_that_never_finds_fire_counts_as_the_horizon():
     assert metrics.tracking_last(on_fire).item() == 5
 
 
-def test_boundary_exits_count_every_attempt():
+def test_boundary_exits_include_every_attempt():
     left = torch.tensor([[YES, NO], [YES, NO], [NO, YES], [YES, NO]])
     assert metrics.boundary_exits(left).item() == (3 + 1) / 2
 
 
-def test_fire_exits_count_every_loss():
+def test_fire_losses_include_every_loss():
     track = {
         "twice": [YES, NO, YES, YES, NO, NO],
         "never on": [NO, NO, NO, NO, NO, NO],
@@ -97,7 +97,7 @@ def test_every_measure_takes_any_batch():
 
 
 def by_hand(steps) -> dict[str, float]:
-    """The measures of one episode [T], counted with loops."""
+    """Computes the measures of one episode [T] with loops."""
     horizon, uavs = steps[keys.NEW_FIRE].shape
     on = [
         [steps[keys.NEW_FIRE][t, n] + steps[keys.OLD_FIRE][t, n] > 0 for n in range(uavs)]
@@ -122,12 +122,12 @@ def by_hand(steps) -> dict[str, float]:
 
 
 @pytest.mark.parametrize("method", [None, "consensus"])
-def test_episode_metrics_equal_a_count_by_loops(method):
+def test_episode_metrics_equal_loops(method):
     torch.manual_seed(0)  # of the random actions
     settings = {"grid": (10, 10), "num_uavs": 4, "horizon": 60}
     fire = torch.full((2, 10, 10), torch.inf)
-    fire[0, 4:6, 4:6] = 0  # soon seen wholly
-    fire[1] = torch.rand(10, 10) * 90 - 30  # a third from the start, then one cell a step
+    fire[0, 4:6, 4:6] = 0  # soon seen completely
+    fire[1] = torch.rand(10, 10) * 90 - 30  # a third from the start, then one cell per step
     if method:
         env = make_env(method, num_envs=2, fire=fire, num_uavs=4, horizon=60)
     else:
@@ -143,7 +143,7 @@ def test_episode_metrics_equal_a_count_by_loops(method):
     assert measured["time_to_full_coverage"][1] == 60
 
 
-def test_step_keys_are_all_that_is_read():
+def test_only_step_keys_are_read():
     env = WildfireEnv(1, WildfireConfig(horizon=5))
     steps = env.rollout(5)["next"]
     few = metrics.episode_metrics(steps.select(*metrics.STEP_KEYS))

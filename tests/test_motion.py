@@ -1,4 +1,4 @@
-"""Motion, by hand."""
+"""Tests motion against hand-computed positions."""
 
 import math
 
@@ -71,7 +71,7 @@ def test_random_points_fill_the_box():
     assert torch.allclose(flat.double().std(0), spread, rtol=0.04)
 
 
-def test_next_waypoint_changes_only_those_that_are_reached():
+def test_only_reached_waypoints_change():
     position = torch.tensor([[[5.0, 5, 2], [5, 5, 2], [5, 5, 2]]])
     waypoint = torch.tensor([[[5.0, 5.99, 2], [5, 6, 2], [20, 1, 3]]])
     new = motion.next_waypoint(waypoint, position, torch.tensor([7]), LOW, HIGH)
@@ -79,7 +79,7 @@ def test_next_waypoint_changes_only_those_that_are_reached():
     assert torch.equal(new[0, 0], motion.random_points(torch.tensor([7]), 3, LOW, HIGH)[0, 0])
 
 
-def test_what_is_no_number_does_not_move_the_uav():
+def test_nan_actions_do_not_move_the_uav():
     position = torch.tensor([[5.0, 6.0, 2.0]])
     action = torch.tensor([[math.nan, math.inf, -math.inf]])
     low, high = torch.zeros(3).double(), torch.full((3,), 9.0).double()

@@ -1,4 +1,4 @@
-"""The stacked networks against one torch.nn network per UAV."""
+"""Compares the stacked networks with one torch.nn network per UAV."""
 
 import math
 
@@ -18,7 +18,7 @@ SINGLE = FEATURES, ACTIONS, HIDDEN
 
 
 def scrambled(network):
-    """Weights of ordinary size everywhere, scales and shifts of the norms included."""
+    """Sets all parameters to random values of ordinary size, those of the norms included."""
     generator = torch.Generator().manual_seed(1)
     with torch.no_grad():
         for parameter in network.parameters():
@@ -27,7 +27,7 @@ def scrambled(network):
 
 
 @pytest.mark.parametrize("batch", [(), (5,), (2, 7)])
-def test_each_actor_of_the_stack_equals_its_own_network(batch):
+def test_stacked_actors_equal_single_networks(batch):
     stack = scrambled(StackedActor(*SIZES))
     observation = torch.randn(*batch, UAVS, FEATURES)
     actions = stack(observation)
@@ -39,7 +39,7 @@ def test_each_actor_of_the_stack_equals_its_own_network(batch):
 
 
 @pytest.mark.parametrize("batch", [(), (5,), (2, 7)])
-def test_each_critic_of_the_stack_equals_its_own_network(batch):
+def test_stacked_critics_equal_single_networks(batch):
     stack = scrambled(StackedCritic(*SIZES))
     observation, action = torch.randn(*batch, UAVS, FEATURES), torch.randn(*batch, UAVS, ACTIONS)
     values = stack(observation, action)
@@ -102,8 +102,8 @@ def test_modules_read_and_write_the_keys_of_the_environment():
 
 
 @pytest.mark.parametrize("hidden", [(12, 20), (20, 12)])
-def test_networks_one_by_one_are_the_stack(hidden, monkeypatch):
-    """Values and gradients, with inputs of one team and of two."""
+def test_networks_one_by_one_equal_the_stack(hidden, monkeypatch):
+    """Compares values and gradients, with inputs of one team and of two."""
     generator = torch.Generator().manual_seed(3)
     actor = StackedActor(2, [(5,)], 3, hidden, generator=[generator, generator])
     critic = StackedCritic(2, [(5,)], 3, hidden, generator=[generator, generator])
@@ -127,7 +127,7 @@ def test_networks_one_by_one_are_the_stack(hidden, monkeypatch):
 
 
 def test_a_team_reads_its_own_environments():
-    """Rows 0 to 2 are team 0's, rows 3 to 5 team 1's; each as alone."""
+    """Rows 0 to 2 belong to team 0, rows 3 to 5 to team 1."""
     generators = [torch.Generator().manual_seed(seed) for seed in (1, 2)]
     both = StackedActor(2, [(5,)], 3, (8, 8), generator=generators)
     observation = torch.randn(6, 2, 5)
@@ -141,8 +141,8 @@ def test_a_team_reads_its_own_environments():
 
 
 @pytest.mark.parametrize("large", [1, 10**9], ids=["one by one", "stack"])
-def test_critics_share_what_the_action_has_no_part_in(large, monkeypatch):
-    """Values and gradients are those without; what another network or observation has is not."""
+def test_critics_reuse_features_of_the_observation(large, monkeypatch):
+    """Values and gradients do not change; features of others are not reused."""
     monkeypatch.setattr(stacked, "MAX_BATCHED", large)
     critic, other = scrambled(StackedCritic(*SIZES)), StackedCritic(*SIZES)
     observation, following = torch.randn(2, 5, UAVS, FEATURES)
@@ -180,4 +180,4 @@ def test_critics_share_what_the_action_has_no_part_in(large, monkeypatch):
     before = len(made)
     critic(observation, taken)
     critic(observation, taken)
-    assert len(made) - before == 2 * runs // 5  # outside nothing is kept
+    assert len(made) - before == 2 * runs // 5  # outside the context no features are kept

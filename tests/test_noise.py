@@ -1,4 +1,4 @@
-"""Exploration: Ornstein-Uhlenbeck noise that starts anew with the episode, and none without."""
+"""Tests exploration: Ornstein-Uhlenbeck noise is reset per episode and off in evaluation."""
 
 import math
 
@@ -22,7 +22,7 @@ UAVS, ENVS = 2, 4000
 
 
 class Still(torch.nn.Module):
-    """An actor that always answers 0, so that an action is its noise."""
+    """Always returns 0, so that the action equals the noise."""
 
     def forward(self, observation: torch.Tensor) -> torch.Tensor:
         return torch.zeros_like(observation[..., :3])
@@ -38,7 +38,7 @@ def explorer(*, theta: float, sigma: float, dt: float, envs: int = ENVS, network
 
 
 def play(policy, starts: list[torch.Tensor | bool], envs: int = ENVS) -> torch.Tensor:
-    """The actions of consecutive steps, [steps, envs, uavs, 3]; `starts` marks new episodes."""
+    """Returns actions of consecutive steps, [steps, envs, uavs, 3]; `starts` marks new episodes."""
     actions = []
     moment = TensorDict({keys.OBSERVATION: torch.ones(envs, UAVS, 6)}, batch_size=[envs])
     episode = step = torch.zeros(envs, dtype=torch.int64)
@@ -55,19 +55,19 @@ def play(policy, starts: list[torch.Tensor | bool], envs: int = ENVS) -> torch.T
 def test_the_noise_is_an_ornstein_uhlenbeck_process():
     theta, sigma, dt = 0.8, 0.2, 0.25
     x = play(explorer(theta=theta, sigma=sigma, dt=dt), [True, *[False] * 11])
-    assert x.abs().max() < 1  # nothing is clipped, so that the action is the noise
+    assert x.abs().max() < 1  # without clipping, so that the action equals the noise
     before, after = x[3:-1].flatten(), x[4:].flatten()
     slope = (before * (after - before)).mean() / before.square().mean()
     assert slope.item() == pytest.approx(-theta * dt, abs=0.01)
     rest = after - before - slope * before
     assert rest.std().item() == pytest.approx(sigma * math.sqrt(dt), rel=0.01)
     assert abs(rest.mean().item()) < 0.002
-    # Every UAV and every component has its own.
+    # UAVs and components are independent.
     flat = x[-1].reshape(ENVS, -1).T
     assert (torch.corrcoef(flat) - torch.eye(UAVS * 3)).abs().max() < 0.08
 
 
-def test_the_noise_starts_anew_where_an_episode_does():
+def test_the_noise_is_reset_at_the_start_of_an_episode():
     starts = torch.zeros(ENVS, 1, dtype=torch.bool)
     starts[: ENVS // 2] = True
     policy = explorer(theta=0.0, sigma=0.1, dt=1.0)
@@ -79,13 +79,13 @@ def test_the_noise_starts_anew_where_an_episode_does():
     torch.testing.assert_close(spread[0][9:], walk[:2], rtol=0.03, atol=0)
 
 
-def test_actions_stay_in_their_box():
+def test_actions_stay_in_bounds():
     x = play(explorer(theta=0.1, sigma=5.0, dt=1.0, envs=50), [True, *[False] * 20], envs=50)
     assert x.abs().max() == 1
     assert (x.abs() == 1).float().mean() > 0.5
 
 
-def test_training_resets_the_noise_with_each_episode(tmp_path):
+def test_training_resets_the_noise_each_episode(tmp_path):
     short = [
         "env.horizon=6",
         "env.num_uavs=4",
@@ -96,7 +96,7 @@ def test_training_resets_the_noise_with_each_episode(tmp_path):
     noise = [f"learner.exploration.{one}" for one in ("theta=0", "sigma=0.2", "dt=0.25")]
     config = resolve("independent", [*short, *noise, f"output={tmp_path}"])
     setup = TrainingSetup(config)
-    with torch.no_grad():  # an actor that answers 0
+    with torch.no_grad():  # an actor that returns 0
         setup.learner.actor.module.action.weight.zero_()
         setup.learner.actor.module.action.bias.zero_()
     spread = [collected[keys.ACTION].std().item() for collected in setup.collector]
@@ -110,7 +110,7 @@ def test_a_frozen_policy_is_deterministic():
         assert not play(policy, [True, False], envs=7).any()
 
 
-def test_an_evaluation_acts_exactly_as_the_actor_says():
+def test_an_evaluation_uses_the_actions_of_the_actor():
     env = make_env("consensus", num_envs=3, num_uavs=UAVS, horizon=12)
     actor = make_actor(env.observation_spec, env.full_action_spec, (8, 8))
     torch.nn.init.normal_(actor.module.action.weight, std=0.3)

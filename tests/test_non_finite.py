@@ -1,4 +1,4 @@
-"""A number that is not finite ends a training at once and is named, or training rolls back."""
+"""Tests that a non-finite value ends training with a report, or rolls training back."""
 
 import functools
 import json
@@ -51,17 +51,17 @@ def begun(method: str, output: Path, *more: str) -> Trainer:
 
 
 def update_at(step: int, method: str) -> int:
-    """The number of the update that a step is followed by."""
+    """Returns the index of the update that follows a step."""
     shared = resolved(method, tuple(SMALL)).replay == "shared"
     needed = math.ceil(BATCH / UAVS) if shared else BATCH
     return step - math.ceil(needed / ENVS) + 1
 
 
 class Poison:
-    """Makes one number of a training wrong at `STEP`, by patching the classes.
+    """Injects NaN into one value of a training at `STEP` by patching the classes.
 
     Attributes:
-        always: also in updates that have another number, such as the one of a replay.
+        always: whether updates with another index, such as that of a replay, are patched too.
     """
 
     def __init__(
@@ -96,7 +96,7 @@ class Poison:
         self.monkeypatch.setattr(WildfireEnv, "_step", poisoned)
 
     def gradient(self) -> None:
-        """0 is added to the critic's loss, whose derivative is NaN."""
+        """Adds a term of value 0 to the critic's loss, whose derivative is NaN."""
 
         def change(learner, losses) -> None:
             weight = learner.parameters["critic.second.weight"]
@@ -138,7 +138,7 @@ class Poison:
         self.monkeypatch.setattr(OffPolicyLearner, "_update", poisoned)
 
     def is_due(self, world, time) -> bool:
-        """Whether a moment is that of `STEP`: the second of its number, as episodes begin at 0."""
+        """Checks whether an environment is at `STEP`; its step counter restarts each episode."""
         self.moments[world, int(time[0])] += 1
         return int(time[0]) == STEP % HORIZON and self.moments[world, STEP % HORIZON] == 2
 
@@ -158,11 +158,11 @@ def expected(place: str, method: str = "consensus", learner: str = "ddpg", **mor
     if place in ("gradient", "loss"):
         whole["update"] = update_at(STEP, method)
     if place == "weight":
-        whole["step"] = STEP + 1  # where it first does something: the actor's next action
+        whole["step"] = STEP + 1  # the first consequence: the actor's next action
     if learner == "td3" and place == "gradient":
         whole["tensor"] = "gradient of critic_1.second.weight"
     if place == "observation" and method == "positional":
-        whole["uav"] = 0  # the first of those that hear it
+        whole["uav"] = 0  # the first UAV that hears it
     return whole
 
 
@@ -178,7 +178,7 @@ def check_report(report: NonFiniteReport, wanted: dict) -> None:
 
 @pytest.fixture(scope="module")
 def clean(tmp_path_factory):
-    """The state of an undisturbed run just before `STEP`."""
+    """Returns a function that gives the state of an undisturbed run just before `STEP`."""
     found = {}
 
     def of(method: str, learner: str = "ddpg") -> dict:
@@ -210,9 +210,7 @@ CASES = [
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("method", "learner", "place"), CASES)
-def test_it_stops_at_once_and_names_the_number(
-    method, learner, place, clean, tmp_path, monkeypatch
-):
+def test_training_stops_and_names_the_value(method, learner, place, clean, tmp_path, monkeypatch):
     before = clean(method, learner)
     poison = Poison(monkeypatch, place, method, learner=learner)
     trainer = begun(method, tmp_path, f"learner={learner}")
@@ -229,16 +227,16 @@ def test_it_stops_at_once_and_names_the_number(
     assert RunFolder(dump).config() == trainer.config
     written = json.loads((dump / "report.json").read_text())
     assert NonFiniteReport(**written["report"]) == report
-    # No update was made with it.
+    # No update has used the value.
     if place != "weight":
         check_weights(dump, before)
-    # It can be found again.
+    # The dump reproduces the value.
     poison.always = True
     assert replay(dump) == report
     poison.always = False
     if place == "gradient":
         assert replay(dump) is None
-    # What was there before is good.
+    # Earlier checkpoints are valid.
     assert [path.name for path in trainer.run.states()] == [
         "state_000000020.safetensors",
         "state_000000030.safetensors",
@@ -251,8 +249,8 @@ def test_it_stops_at_once_and_names_the_number(
 
 
 @pytest.mark.parametrize("place", ["observation", "reward", "gradient"])
-def test_of_several_seeds_the_right_one_is_named(place, tmp_path, monkeypatch):
-    """The second seed's first environment, its UAV 1."""
+def test_the_seed_of_the_value_is_named(place, tmp_path, monkeypatch):
+    """The value is in the second seed's first environment, UAV 1."""
     Poison(monkeypatch, place, env=ENVS, uav=UAVS + UAV)
     trainer = begun("consensus", tmp_path, "seeds=[5,9]")
     error = diverged(trainer)
@@ -265,8 +263,8 @@ def test_of_several_seeds_the_right_one_is_named(place, tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("place", ["observation", "gradient", "loss"])
-def test_a_late_poll_finds_the_same(place, clean, tmp_path, monkeypatch):
-    """As on a GPU, whose flags arrive some steps later: nothing is learnt meanwhile."""
+def test_a_late_poll_reports_the_same_value(place, clean, tmp_path, monkeypatch):
+    """On a GPU the flags arrive some steps later. No update happens in between."""
     late = 3
     Poison(monkeypatch, place)
     seen: list[bool] = []
@@ -283,8 +281,8 @@ def test_a_late_poll_finds_the_same(place, clean, tmp_path, monkeypatch):
     check_weights(error.dump, clean("consensus"))
 
 
-def test_no_checkpoint_is_made_of_it(tmp_path, monkeypatch):
-    """A checkpoint waits for the guard, however late it is polled."""
+def test_no_checkpoint_contains_the_value(tmp_path, monkeypatch):
+    """A checkpoint waits for the guard, even if it is polled late."""
     poll = NonFiniteGuard.poll
     monkeypatch.setattr(
         NonFiniteGuard, "poll", lambda guard, *, wait=False: wait and poll(guard, wait=True)
@@ -307,14 +305,14 @@ def test_a_state_that_is_not_finite_is_not_saved(tmp_path):
 
 
 def test_a_learning_rate_that_blows_up(tmp_path):
-    """Nothing is injected: weights whose squares are no numbers, after one update."""
+    """Without injection, the squares of the weights overflow after one update."""
     trainer = begun("independent", tmp_path, "learner.critic_lr=1e25")
     error = diverged(trainer)
     assert error.report.update == 2
     assert replay(error.dump) == error.report
 
 
-def test_the_command_says_it_in_one_line(tmp_path, monkeypatch, capsys):
+def test_the_command_prints_one_line(tmp_path, monkeypatch, capsys):
     Poison(monkeypatch, "reward")
     assert main.main(["train", "consensus", *SMALL, f"output={tmp_path}"]) == 2
     (run,) = tmp_path.iterdir()
@@ -330,7 +328,7 @@ def test_the_command_says_it_in_one_line(tmp_path, monkeypatch, capsys):
     assert RunFolder(run).config().on_nan == "rollback"
 
 
-def test_a_dump_that_cannot_be_written_hides_nothing(tmp_path, monkeypatch):
+def test_a_failed_dump_keeps_the_message(tmp_path, monkeypatch):
     Poison(monkeypatch, "reward")
 
     write = checkpoint_file.write
@@ -348,7 +346,7 @@ def test_a_dump_that_cannot_be_written_hides_nothing(tmp_path, monkeypatch):
 
 
 def diverging_above(monkeypatch, share: float) -> None:
-    """A gradient is NaN at every learner's 20th update while its rates are above a share."""
+    """Makes a gradient NaN at the 20th update while the learning rates are above a share."""
     original = DDPG.losses
 
     def poisoned(learner, batch, *, actor=True):
@@ -364,7 +362,7 @@ def diverging_above(monkeypatch, share: float) -> None:
 
 
 def progress_of(trainer: Trainer) -> tuple[float, int, int]:
-    """Share of the learning rates, rollbacks, steps."""
+    """Returns scale of the learning rates, number of rollbacks, and steps."""
     return trainer.rollbacks.lr_scale, trainer.rollbacks.count, trainer.setup.step
 
 
@@ -373,7 +371,7 @@ ROLLBACK = ["on_nan=rollback", "setup=paper"]
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seeds", [[], ["seeds=[0,4]"]])
-def test_a_rollback_goes_on_and_resumes_as_if_it_had_not_stopped(seeds, tmp_path, monkeypatch):
+def test_a_rollback_resumes_bit_for_bit(seeds, tmp_path, monkeypatch):
     diverging_above(monkeypatch, 0.3)
     trainer = begun("consensus", tmp_path / "a", *ROLLBACK, *seeds)
     copy = tmp_path / "b"
@@ -382,10 +380,10 @@ def test_a_rollback_goes_on_and_resumes_as_if_it_had_not_stopped(seeds, tmp_path
     def watch(progress) -> None:
         if progress.note:
             notes.append(progress.note)
-            if len(notes) == 1:  # what is there is what a kill would leave
+            if len(notes) == 1:  # the files equal those after a kill
                 shutil.copytree(trainer.run.path.parent, copy)
 
-    # As `until` keeps what the training is by its end.
+    # Like `until`, keeps the final state of the training.
     train = trainer.train
     monkeypatch.setattr(trainer, "train", lambda report: train(lambda p: (watch(p), report(p))))
     until(trainer, None)
@@ -405,18 +403,18 @@ def test_a_rollback_goes_on_and_resumes_as_if_it_had_not_stopped(seeds, tmp_path
         assert [line["episode"] for line in run.lines()] == [1, 2, 3]
         assert [line["episode"] for line in run.lines("timing.jsonl")] == [1, 2, 3]
     assert len(list(trainer.run.path.glob("divergence_step_*"))) == 2
-    # Killed after the first rollback, and stopped behind the second.
+    # Killed after the first rollback, and stopped after the second.
     resumed = resume(copy / trainer.run.path.name)
     assert progress_of(resumed) == (0.5, 1, 20)
     until(resumed, 37)
     again = resume(resumed.run.path)
-    # The checkpoint of step 30 is beyond the step that failed: the count starts again.
+    # The checkpoint of step 30 is after the failing step, so the count restarts.
     assert progress_of(again) == (0.25, 0, 37)
     assert_same(trainer, until(again, None))
 
 
-def test_a_rollback_that_does_not_help_is_given_up(tmp_path, monkeypatch, capsys):
-    """An environment's NaN, before there is a checkpoint."""
+def test_rollbacks_without_progress_end_the_training(tmp_path, monkeypatch, capsys):
+    """The environment gives NaN before the first checkpoint."""
     step = WildfireEnv._step
 
     def poisoned(world, tensordict):
@@ -442,7 +440,7 @@ def test_a_rollback_that_does_not_help_is_given_up(tmp_path, monkeypatch, capsys
     again = resume(folder)
     assert progress_of(again) == (1 / 32, 5, 0)
     assert "given up" in str(diverged(again))
-    # With the environment mended, it goes on with what is left of the rates.
+    # Once the environment is repaired, training resumes with the reduced learning rates.
     monkeypatch.undo()
     mended = resume(folder)
     assert mended.train()
@@ -450,12 +448,12 @@ def test_a_rollback_that_does_not_help_is_given_up(tmp_path, monkeypatch, capsys
 
 
 @pytest.mark.parametrize("wrong", ["nan", "off", "true"])
-def test_what_can_be_chosen(wrong, capsys):
+def test_settings_of_rollbacks(wrong, capsys):
     assert main.main(["train", "consensus", f"on_nan={wrong}"]) == 2
     assert "'stop' or 'rollback'" in capsys.readouterr().err
 
 
-def test_norms_are_each_uavs():
+def test_gradient_norms_are_per_uav():
     generator = torch.Generator().manual_seed(0)
     tensors = [torch.randn(3, 4, 5, generator=generator), torch.randn(3, 1, 7, generator=generator)]
     wanted = [[math.sqrt(sum(x * x for x in uav.flatten().tolist())) for uav in t] for t in tensors]

@@ -1,4 +1,4 @@
-"""Fronts in a medium that moves: the exact solution, the tide, and the scenario `oil_slick`."""
+"""Tests fronts in a moving medium: exact solution, tide, and the scenario `oil_slick`."""
 
 import dataclasses
 import math
@@ -42,7 +42,7 @@ PLAIN: dict[str, Any] = {
 
 
 def slick(two_sided: bool = True, **changes: Any) -> FireConfig:
-    """A scenario whose every seed draws the same slick."""
+    """Returns a scenario that gives the same slick for every seed."""
     points = {key: (value, value) for key, value in {**PLAIN, **changes}.items()}
     return dataclasses.replace(load_scenario("oil_slick"), **points, two_sided=two_sided)
 
@@ -52,7 +52,7 @@ def computed(config: FireConfig, grid: tuple[int, int] = GRID, horizon: int = HO
 
 
 def expected(config: FireConfig, grid: tuple[int, int] = GRID, horizon: int = HORIZON) -> Tensor:
-    """What `computed` should be, from the support function."""
+    """Returns the exact result of `computed`, from the support function."""
     value = {
         key: getattr(config, key)[0] * (math.pi / 180 if key in DEGREES else 1) for key in PLAIN
     }
@@ -82,7 +82,7 @@ CASES = {
     "tide alone": {"drift_rate": 0.0, "tide_reach": 6.0, "tide_period": 1000.0},
     "steady drift": {"tide_reach": 0.0, "drift_rate": 0.01, "length_to_breadth": 3.0},
     "fire on a moving ground": {"two_sided": False, "drift_rate": 0.008},
-    # Steps that follow from the rates alone would be a period each, and see no tide but a drift.
+    # Steps derived from the rates alone would equal a period and miss the tide.
     "a tide much faster than the front": {
         "tide_period": 100.0,
         "tide_reach": 0.0318,
@@ -94,7 +94,7 @@ CASES = {
 
 @pytest.mark.parametrize("case", CASES)
 def test_agrees_with_the_exact_solution(case: str):
-    """With sixty nodes a side, seen at 30 x 30 and at 60 x 60 cells."""
+    """The grid has sixty nodes a side, sampled at 30 x 30 and at 60 x 60 cells."""
     config = slick(**CASES[case])
     for grid, overlap in ((GRID, 0.975), ((60, 60), 0.988)):
         got, want = computed(config, grid), expected(config, grid)
@@ -105,7 +105,7 @@ def test_agrees_with_the_exact_solution(case: str):
 
 
 def test_a_steady_drift_as_a_tensor_and_its_step():
-    """The drift is ten times as fast as the front: the step must follow it."""
+    """The drift is ten times as fast as the front, so it limits the step."""
     start = disc(torch.tensor([[7.0, 10.0]]), torch.tensor([4.0]))
     rates = torch.tensor([0.001]), torch.tensor([1.0]), torch.tensor([0.0])
     got = arrival_times(start, (30, 21), *rates, horizon=900, drift=torch.tensor([[0.01, 0.0]]))
@@ -123,8 +123,8 @@ def test_a_drift_that_is_a_function_needs_a_bound():
         arrival_times(start, (15, 15), *rates, horizon=9, drift=lambda _: torch.zeros(1, 2))
 
 
-def test_no_drift_is_a_drift_of_zero():
-    """Bit for bit, with fuel and turning wind."""
+def test_no_drift_equals_a_drift_of_zero():
+    """Compares bit for bit, with fuel and turning wind."""
     start = disc(torch.tensor([[11.3, 10.0]]), torch.tensor([4.0]))
     rates = torch.tensor([0.006]), torch.tensor([2.5])
     field = torch.rand(1, 24, 24, generator=torch.Generator().manual_seed(2))
@@ -136,14 +136,14 @@ def test_no_drift_is_a_drift_of_zero():
     assert still.isfinite().sum() > 60
 
 
-def test_a_tide_of_no_strength_is_none():
+def test_a_tide_of_strength_zero_equals_no_tide():
     config, seeds = load_scenario("huygens"), fire_seeds("test", 5)
     other = {"tide_period": (300, 900), "tide_phase": (-9, 9), "tide_bearing": (0, 90)}
     same = make_fires(dataclasses.replace(config, **other), seeds, GRID, 300)
     assert torch.equal(same, make_fires(config, seeds, GRID, 300))
 
 
-# Cells that burn, and the sum of their arrivals, as computed before there was a drift.
+# Number of burning cells and sum of their arrival times, computed before drift was introduced.
 UNCHANGED = [
     ("paper", fire_seeds("train", 1), (30, 30), 1000, 141, 33533.2004),
     ("huygens", fire_seeds("test", 20), (30, 30), 1000, 3161, 840003.0796),
@@ -152,7 +152,7 @@ UNCHANGED = [
 
 
 @pytest.mark.parametrize(("name", "seeds", "grid", "horizon", "count", "total"), UNCHANGED)
-def test_the_wildfires_are_what_they_were(name, seeds, grid, horizon, count, total):
+def test_wildfires_do_not_change(name, seeds, grid, horizon, count, total):
     fires = make_fires(load_scenario(name), seeds, grid, horizon)
     burning = fires[fires.isfinite()].double()
     assert len(burning) == count
@@ -170,7 +170,7 @@ def test_two_sided_by_hand():
     assert [float(rate) for rate in ellipse_rates(0.5, 4.0, two_sided=True)] == [0.5, 0.125, 0.0]
 
 
-def test_two_sides_are_alike_and_one_side_is_not():
+def test_two_sided_is_symmetric():
     calm = {"drift_rate": 0.0, "tide_reach": 0.0, "wind_shift": 0.0, "centre_y": 0.5}
     both, one = (computed(slick(side, **calm), (31, 31)) for side in (True, False))
     torch.testing.assert_close(both.rot90(2), both, atol=0.05, rtol=0)
@@ -184,14 +184,14 @@ def test_mirror():
     torch.testing.assert_close(back.flip(1), there, atol=0.05, rtol=0)
 
 
-def test_half_a_period_later_the_tide_runs_the_other_way():
+def test_the_tide_reverses_after_half_a_period():
     there = computed(slick(tide_phase=-120.0))
     torch.testing.assert_close(computed(slick(tide_bearing=-65.0)), there, atol=0.01, rtol=0)
     assert not torch.allclose(there, computed(slick()))
 
 
 def swept(period: float) -> Tensor:
-    """A disc of radius 3 that hardly grows and swings along x, by 4 cells to either side."""
+    """Computes a disc of radius 3 that barely grows and moves along x by 4 cells to both sides."""
     tide = {"tide_reach": 8.0, "tide_period": period, "tide_phase": 0.0}
     still = {"head_ros": 1e-6, "length_to_breadth": 1.0, "drift_rate": 0.0, "tide_bearing": 0.0}
     middle = {"centre_x": 0.5, "centre_y": 0.5, "core_radius": 3.0}
@@ -199,8 +199,8 @@ def swept(period: float) -> Tensor:
 
 
 @pytest.mark.parametrize("period", [400.0, 1000.0])
-def test_what_a_tide_sweeps(period: float):
-    """From phase 0 the centre is at 4 sin(2π t / period): to the right first, then to the left."""
+def test_the_area_that_a_tide_sweeps(period: float):
+    """The centre is at 4 sin(2π t / period): it moves to the right first, then to the left."""
     arrival, scale = swept(period), 31 / 30
     reach, radius = 4 * scale, 3 * scale
     right, left = arrival[16:, 15], arrival[:15, 15].flip(0)
@@ -213,7 +213,7 @@ def test_what_a_tide_sweeps(period: float):
     torch.testing.assert_close(left[inside], second, atol=0.01 * period, rtol=0)
     assert right[far > 1.05].isinf().all()
     assert left[far > 1.05].isinf().all()
-    # Nothing is new after three quarters of the first period, and no cell is given back.
+    # No cell is added after three quarters of the first period, and none is removed.
     assert float(arrival[arrival.isfinite()].max()) < 0.78 * period
     x, y = torch.meshgrid(torch.arange(31.0) - 15, torch.arange(31.0) - 15, indexing="ij")
     away = torch.hypot((x.abs() - reach).clamp_min(0), y) - radius
@@ -221,8 +221,8 @@ def test_what_a_tide_sweeps(period: float):
     assert torch.equal(arrival.isfinite()[clear], (away < 0)[clear])
 
 
-def test_what_leaves_the_grid_comes_back():
-    """Out over the right edge, and back a little higher: as on a grid that has room for it."""
+def test_oil_that_leaves_the_grid_returns():
+    """A slick leaves over the right edge and returns a little higher, as on a larger grid."""
     start = lambda x: disc(torch.tensor([[x, 6.0]]), torch.tensor([2.5]))  # noqa: E731
     rates = torch.tensor([1e-4]), torch.tensor([1.0]), torch.tensor([0.0])
 
@@ -239,7 +239,7 @@ def test_what_leaves_the_grid_comes_back():
     assert (without.isfinite() != wide.isfinite()).sum() > 5
 
 
-def test_the_margin_is_how_far_a_tide_carries():
+def test_the_margin_is_the_reach_of_the_tide():
     assert generator._margin(load_scenario("huygens"), GRID) == 0
     tide = slick(tide_reach=6.37)
     assert generator._margin(tide, GRID) == 7
@@ -247,7 +247,7 @@ def test_the_margin_is_how_far_a_tide_carries():
 
 
 def lehr(minutes: float, knots: float) -> tuple[float, float]:
-    """Length and breadth, cells of 500 m, of 79,000 barrels (Lehr et al. 1984).
+    """Returns length and breadth of 79,000 barrels, in cells of 500 m (Lehr et al. 1984).
 
     The area in m² is 2270 (Δ V)^(2/3) t^(1/2) + 40 (Δ V)^(1/3) W^(4/3) t, with V in barrels, t in
     minutes, W in knots; its first part is that of a circle, whose diameter is the breadth.
@@ -274,7 +274,7 @@ def test_the_numbers_are_those_of_the_sources():
             rounded["drift_rate"].append(round(metres / 500, 4))
     for key, values in rounded.items():
         assert getattr(config, key) == (min(values), max(values)), key
-    # Between two turns u cos(2π t / T) carries u T / π.
+    # Between two turns of the tide, u cos(2π t / T) moves the oil by u T / π.
     metres = [speed * 2 * episode * 60 / math.pi for speed in (0.05, 0.15)]
     assert config.tide_reach == tuple(round(value / 500, 1) for value in metres)
     assert config.tide_period == (2000, 2000)
@@ -285,7 +285,7 @@ def test_fires() -> Tensor:
     return make_fires(load_scenario("oil_slick"), fire_seeds("test", 100), GRID, HORIZON)
 
 
-def test_slicks_are_a_task_of_the_size_of_the_fires(test_fires: Tensor):
+def test_slicks_are_of_the_size_of_the_fires(test_fires: Tensor):
     count = burning_cells(test_fires, HORIZON)
     assert ((count[:, 0] >= 55) & (count[:, 0] <= 90)).all()
     assert ((count[:, -1] >= 110) & (count[:, -1] <= 230)).all()
@@ -296,7 +296,7 @@ def test_slicks_are_a_task_of_the_size_of_the_fires(test_fires: Tensor):
 
 
 def test_all_of_the_disc_is_oil(test_fires: Tensor):
-    """A ring as wide as its radius leaves no hole."""
+    """A ring as wide as its radius has no hole."""
     x, y = torch.meshgrid(torch.arange(30.0), torch.arange(30.0), indexing="ij")
     for arrival in test_fires[:10]:
         oil = (arrival == 0).nonzero().float()
@@ -304,7 +304,7 @@ def test_all_of_the_disc_is_oil(test_fires: Tensor):
         assert (arrival[torch.hypot(x - cx, y - cy) < 3.5] == 0).all()
 
 
-def test_a_slick_depends_on_its_seed_alone(test_fires: Tensor):
+def test_a_slick_depends_on_its_seed_only(test_fires: Tensor):
     config, seeds = load_scenario("oil_slick"), fire_seeds("test", 100)
     assert torch.equal(make_fires(config, seeds[37:39], GRID, HORIZON), test_fires[37:39])
     short = make_fires(config, seeds[:3], GRID, 350)
@@ -320,6 +320,6 @@ def test_a_slick_depends_on_its_seed_alone(test_fires: Tensor):
         ({"two_sided": 1}, "two_sided"),
     ],
 )
-def test_values_that_do_not_fit(changes: dict, message: str):
+def test_invalid_values(changes: dict, message: str):
     with pytest.raises(ValidationError, match=message):
         dataclasses.replace(load_scenario("oil_slick"), **changes)

@@ -1,4 +1,4 @@
-"""The wheel, its metadata, and the console script that it brings, outside the checkout."""
+"""Tests the wheel, its metadata and its console script, outside the checkout."""
 
 import json
 import os
@@ -18,7 +18,7 @@ from tiny_run import TINY
 
 ROOT = Path(__file__).parents[1]
 FOLDERS = ("envs", "comm", "policies", "trainers", "configs")
-# Written in two parts, so that this file does not hold what it forbids.
+# Written in two parts, so that this file does not contain the forbidden text.
 REGISTRIES = ("pypi" + ".org", "pythonhosted" + ".org", "download.pytorch" + ".org", "npmjs" + ".")
 PRIVATE = re.compile(
     r"(?<![\w.])/(?:work|root|home|Users)/\w|" + "|".join(map(re.escape, REGISTRIES))
@@ -29,7 +29,7 @@ pytestmark = pytest.mark.xdist_group("wheel")
 
 
 def run(*command, cwd: Path, env: dict[str, str] | None = None, **options) -> str:
-    """What the command prints; the test fails, showing all, if it does."""
+    """Returns the output of a command; fails with the output if the command fails."""
     done = subprocess.run(
         list(map(str, command)),
         cwd=cwd,
@@ -37,7 +37,7 @@ def run(*command, cwd: Path, env: dict[str, str] | None = None, **options) -> st
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
-        timeout=600,  # of a busy machine
+        timeout=600,  # on a busy machine
         **options,
     )
     assert done.returncode == 0, f"{command}\n{done.stdout}"
@@ -45,7 +45,7 @@ def run(*command, cwd: Path, env: dict[str, str] | None = None, **options) -> st
 
 
 def copy_sources(target: Path) -> Path:
-    """The checkout's files without what earlier builds left: setuptools would pick that up."""
+    """Copies the checkout without old build outputs, which setuptools would include."""
     for path in tracked_files():
         if path.is_file() and not path.is_symlink():
             copy = target / path.relative_to(ROOT)
@@ -55,7 +55,7 @@ def copy_sources(target: Path) -> Path:
 
 
 def tracked_files() -> list[Path]:
-    """The files that git tracks or would; all that stand here where there is no git."""
+    """Returns the files that git does not ignore, or all files if there is no git."""
     try:
         listed = run(
             *("git", "ls-files", "--cached", "--others", "--exclude-standard", "-z"), cwd=ROOT
@@ -86,23 +86,23 @@ def metadata(wheel: Path):
 
 @pytest.fixture(scope="module")
 def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder of executables of an environment that holds the wheel and sees our libraries."""
+    """Returns the executables of an environment with the wheel and the installed libraries."""
     folder = tmp_path_factory.mktemp("installed")
     venv.create(folder, with_pip=False)
     base = {"base": str(folder), "platbase": str(folder)}
     library = Path(sysconfig.get_path("purelib", "venv", vars=base))
-    # A path file is no site folder: what is editable in ours is not found through it.
+    # Editable installs are not visible through a path file.
     (library / "libraries.pth").write_text(sysconfig.get_path("purelib") + "\n")
     programs = Path(sysconfig.get_path("scripts", "venv", vars=base))
     pip = (sys.executable, "-m", "pip", "--python", programs / "python", "install", "-q")
-    # --ignore-installed: the emberlink that is seen through the path file is not to be replaced.
+    # --ignore-installed: do not replace the emberlink that is visible through the path file.
     run(*pip, "--no-deps", "--no-index", "--ignore-installed", wheel, cwd=folder)
     return programs
 
 
 @pytest.fixture
 def elsewhere(tmp_path: Path) -> tuple[Path, dict[str, str]]:
-    """A working folder that is not the checkout, and an environment that does not lead there."""
+    """Returns a working folder and environment variables that do not refer to the checkout."""
     env = {
         k: v for k, v in os.environ.items() if not k.startswith(("PYTHON", "PYTEST", "EMBERLINK"))
     }
@@ -133,11 +133,11 @@ def test_wheel_holds_the_package_and_nothing_else(wheel: Path):
     assert {path.split("/")[1] for path in held if path.endswith(".yaml")} >= {
         *("base.yaml", "method", "setup", "fire", "setup_method")
     }
-    # Jupyter's own package is called comm: with this file, tools started here would import ours.
+    # Jupyter has a package called comm. With this file, tools started here would import ours.
     assert "comm/__init__.py" not in held
 
 
-def test_metadata(metadata):
+def test_metadata_of_the_wheel(metadata):
     assert metadata["Name"] == "emberlink"
     assert re.fullmatch(r"\d+\.\d+\.\d+", metadata["Version"])
     assert metadata["License-Expression"] == "MIT"
@@ -158,7 +158,7 @@ def test_licence_is_in_the_wheel(wheel: Path):
 def test_every_dependency_is_pinned(metadata):
     lines = (ROOT / "constraints.txt").read_text().splitlines()
     pins = [line for line in lines if line and not line.startswith("#")]
-    # No local version such as +cpu, no address.
+    # No local version such as +cpu, no URL.
     assert [pin for pin in pins if not re.fullmatch(r"[A-Za-z0-9._-]+==[A-Za-z0-9.]+", pin)] == []
     names = {_normal(pin.split("==")[0]) for pin in pins}
     assert len(names) == len(pins)
@@ -201,7 +201,7 @@ def test_console_script_trains(installed: Path, elsewhere):
 
 
 @pytest.mark.slow
-def test_a_package_of_a_users_own_adds_a_method_a_setup_and_a_fire(installed: Path, elsewhere):
+def test_an_extension_package_adds_a_method_a_setup_and_a_fire(installed: Path, elsewhere):
     cwd, env = elsewhere
     python = installed / "python"
     before = {file: file.stat().st_mtime_ns for file in installed.parent.rglob("emberlink/**/*.py")}

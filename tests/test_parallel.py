@@ -1,4 +1,4 @@
-"""The PettingZoo environment: its own tests, and equality with the TorchRL environment."""
+"""Tests the PettingZoo environment with PettingZoo's tests and against the TorchRL environment."""
 
 import copy
 
@@ -57,7 +57,7 @@ def test_pettingzoo_rendering(monkeypatch):
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_recipes_pass_too(method):
+def test_recipes_pass_the_api_test(method):
     parallel_api_test(parallel_env(recipe(method)), num_cycles=35)
     parallel_seed_test(lambda: parallel_env(recipe(method)), num_cycles=20)
 
@@ -156,7 +156,7 @@ def test_rendering(monkeypatch):
     window.close()
 
 
-def test_a_copy_with_an_open_window_goes_on_alone(monkeypatch):
+def test_a_copy_with_an_open_window_is_independent(monkeypatch):
     monkeypatch.setenv("MPLBACKEND", "agg")
     env = small(render_mode="human", seed=2)
     env.reset()
@@ -220,7 +220,7 @@ def test_windows_are_a_dictionary():
             assert np.array_equal(observations[agent]["observation"], vector)
 
 
-def test_what_was_handed_out_does_not_change_later():
+def test_returned_arrays_do_not_change_later():
     env = small()
     observations, infos = env.reset()
     kept = [observations["uav_0"].copy(), infos["uav_0"]["position"].copy()]

@@ -1,4 +1,4 @@
-"""Perimeters as agencies hand them out: KML and KMZ, a file per date, and several incidents."""
+"""Tests perimeters as published by agencies: KML, KMZ, a file per date, several incidents."""
 
 import zipfile
 
@@ -19,13 +19,13 @@ DATES = [f"2020-08-19T{hour}:00:00Z" for hour in (22, 23)] + ["2020-08-19T17:00:
 
 
 def read(path, **keys):
-    """Returns the one fire of a file, [X, Y]."""
+    """Returns the only fire of a file, [X, Y]."""
     (fire,) = read_fires(FileFireConfig(path=str(path), **keys), (30, 30), 1000)
     return fire
 
 
 def refused(path, **keys):
-    """Returns the message with which a file is refused."""
+    """Returns the error message for a file."""
     with pytest.raises(UserError) as error:
         read(path, **keys)
     message = str(error.value)
@@ -37,7 +37,7 @@ def refused(path, **keys):
 
 @pytest.fixture
 def frame():
-    """Perimeters with dates, in degrees."""
+    """Returns perimeters with dates, in degrees."""
     frame = frame_of(Ellipses(), HOURS).to_crs("EPSG:4326")
     return frame.drop(columns="Elapsed_Mi").assign(date=DATES)
 
@@ -74,7 +74,7 @@ TIMES = {
 
 
 @pytest.mark.parametrize("name", TIMES)
-def test_kml_and_kmz_are_read_as_geojson_is(tmp_path, frame, name):
+def test_kml_and_kmz_equal_geojson(tmp_path, frame, name):
     time, keys = TIMES[name]
     frame.to_file(tmp_path / "fire.geojson", COORDINATE_PRECISION=15)
     expected = read(tmp_path / "fire.geojson")
@@ -128,7 +128,7 @@ def test_damaged_kml_and_kmz_are_refused(tmp_path, frame):
 
 @pytest.mark.parametrize("suffix", ["shp", "geojson", "gpkg"])
 def test_a_file_per_date_is_one_fire(tmp_path, frame, suffix):
-    """GeoMAC has a shapefile per flight, whose columns changed between upper and lower case."""
+    """GeoMAC has a shapefile per flight, with columns in upper or lower case."""
     frame.to_file(tmp_path / f"all.{suffix}")
     folder = tmp_path / "fire"
     folder.mkdir()
@@ -184,7 +184,7 @@ def test_the_checksum_of_a_folder_is_that_of_its_perimeters(tmp_path, frame):
 @pytest.mark.parametrize(
     ("suffix", "column"), [("gpkg", "attr_IncidentName"), ("shp", "FIRE_NAME")]
 )
-def test_one_of_several_incidents_is_chosen(tmp_path, frame, suffix, column):
+def test_an_incident_is_chosen_among_several(tmp_path, frame, suffix, column):
     frame.to_file(tmp_path / f"one.{suffix}")
     other = frame.translate(0.02, 0.01)
     both = geopandas.GeoDataFrame(

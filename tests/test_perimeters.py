@@ -1,4 +1,4 @@
-"""Tests perimeters of every kind in every format, and against the raster of the same fire."""
+"""Tests perimeters in every format, and compares them with the raster of the same fire."""
 
 import datetime
 
@@ -86,7 +86,7 @@ def test_before_the_first_perimeter_by_hand(tmp_path):
     assert (dated == 0).sum() == pytest.approx(30 * 30, abs=4 * 30)
 
 
-def test_before_the_first_perimeter_each_part_is_drawn_in(tmp_path):
+def test_before_the_first_perimeter_each_part_shrinks(tmp_path):
     """The left, right and upper edges move 50 m, so that two squares of 200 m began as squares
     of 100 m. The lower edge does not move."""
     shapes = [
@@ -159,7 +159,7 @@ def test_between_two_squares_by_hand(tmp_path):
     assert torch.allclose(fire, fire.T, atol=1e-3)
 
 
-def test_what_burnt_once_stays_burnt(tmp_path):
+def test_burnt_area_stays_burnt(tmp_path):
     """Observed perimeters may not contain each other. Their union counts."""
     frame = squares(200, 300, 310, column="Elapsed_Mi", values=[0, 60, 120])
     frame.loc[1, "geometry"] = shapely.affinity.translate(frame.geometry[1], 80, 0)
@@ -197,7 +197,7 @@ def test_an_island_is_a_line_within_a_line(tmp_path):
     assert torch.isinf(lines[14:16, 14:16]).all()
 
 
-def test_what_burns_within_an_island(tmp_path):
+def test_fire_within_an_island(tmp_path):
     """Closed lines within each other are burnt, island and burnt; the next time encloses all."""
     frame = squares(400, 240, 100, 420, column="Elapsed_Mi", values=[0, 0, 0, 60])
     frame.geometry = frame.boundary
@@ -216,7 +216,7 @@ def test_areas_that_cross_themselves(tmp_path):
         frame = geopandas.GeoDataFrame({"Elapsed_Mi": [0, 60]}, geometry=shapes, crs=UTM)
         frame.to_file(tmp_path / f"{name}.gpkg")
         fire = read(tmp_path / f"{name}.gpkg")
-        assert (fire[[9, 9, 20, 20], [12, 17, 12, 17]] == 0).all()  # the two lobes
+        assert (fire[[9, 9, 20, 20], [12, 17, 12, 17]] == 0).all()  # in the two lobes
         assert (fire[[14, 15, 14, 15], [9, 9, 20, 20]] > 0).all()  # and between them
         cell = 500 / 24
         near = shapely.make_valid(bow).buffer(cell / 2)  # a cell counts if a part of it burns
@@ -263,7 +263,7 @@ def test_calendar_times(tmp_path, name, suffix):
     assert torch.equal(read(path, start="2020-08-19T23:00", minutes_per_step=0.06), half)
 
 
-def test_when_a_perimeter_was_mapped_counts_not_when_its_record_was_changed(tmp_path):
+def test_the_mapping_time_has_priority_over_the_edit_time(tmp_path):
     """Tests the columns of NIFC and GeoMAC, also in the short form of a .dbf."""
     squares(200, 300, 400, column="Elapsed_Mi", values=[0, 60, 120]).to_file(tmp_path / "e.shp")
     elapsed, changed = read(tmp_path / "e.shp"), [DATED[0], DATED[2], DATED[2]]
@@ -356,7 +356,7 @@ def test_degrees_are_projected(tmp_path):
         assert min(overlaps(got, expected)) > 0.97
 
 
-def test_geojson_on_a_plane_that_names_no_projection(tmp_path):
+def test_projected_geojson_without_a_projection(tmp_path):
     plain = frame_of(FIRES["two that merge"], HOURS)
     plain.to_file(tmp_path / "plain.gpkg")
     plain.set_crs(None, allow_override=True).to_file(tmp_path / "fire.geojson")
@@ -378,14 +378,14 @@ def test_the_order_of_features_does_not_matter(tmp_path):
     assert torch.equal(read(tmp_path / "other.shp"), read(tmp_path / "fire.shp"))
 
 
-def test_a_fire_that_begins_smaller_than_the_survey_sees(tmp_path):
+def test_a_fire_that_begins_smaller_than_a_sample(tmp_path):
     frame_of(Ellipses(azimuth=346, breadth=3.0), [1, 2, 3, 4, 60, 120, 300]).to_file(
         tmp_path / "fire.gpkg"
     )
     assert torch.isfinite(read(tmp_path / "fire.gpkg")).any()
 
 
-def test_a_line_left_beside_a_polygon_is_left_out(tmp_path):
+def test_a_line_beside_a_polygon_is_ignored(tmp_path):
     frame = frame_of(FIRES["slow and round"], HOURS)
     frame.to_file(tmp_path / "plain.gpkg")
     left = shapely.LineString([CORNER, (CORNER[0] + 900, CORNER[1] + 900)])

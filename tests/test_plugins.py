@@ -1,4 +1,4 @@
-"""Communication and scripted policies of other packages, and state that is saved with a run."""
+"""Tests communication and scripted policies of other packages, and their saved state."""
 
 import sys
 from pathlib import Path
@@ -35,7 +35,7 @@ still = still:Still
 
 @pytest.fixture
 def installed(tmp_path, monkeypatch):
-    """A package in a folder of its own on the path, with what pip writes beside it."""
+    """Writes a package and its pip metadata to a new folder on the path."""
     (tmp_path / "still.py").write_text(STILL + "\nSTILL = 3\n")
     (tmp_path / "broken_on_import.py").write_text("raise RuntimeError('no such\\nsensor')\n")
     about = tmp_path / "guests-1.0.dist-info"

@@ -1,4 +1,4 @@
-"""Trained policies that come with emberlink, in place of run folders."""
+"""Tests trained policies that are shipped with emberlink."""
 
 import json
 import shutil
@@ -21,7 +21,7 @@ DATA = Path(__file__).parent.parent / "docs" / "data"
 
 @pytest.fixture(scope="module")
 def packed(tmp_path_factory) -> tuple[Path, list[Path]]:
-    """Two seeds of one method and one of another, and the runs that they are from."""
+    """Packs two seeds of one method and one of another; returns them and their runs."""
     folder = tmp_path_factory.mktemp("packed")
     root, runs = folder / "shipped", []
     for method, seed in (("consensus", 3), ("consensus", 10), ("independent", 3)):
@@ -36,14 +36,14 @@ def packed(tmp_path_factory) -> tuple[Path, list[Path]]:
 
 @pytest.fixture
 def shipped(packed, tmp_path, monkeypatch) -> Path:
-    """They come with the package, and the working folder is an empty one."""
+    """Installs the packed policies as shipped ones and changes to an empty folder."""
     root, _ = packed
     monkeypatch.setattr(pretrained, "_shipped", lambda: root)
     monkeypatch.chdir(tmp_path)
     return root
 
 
-def test_what_is_packed_is_the_run_without_what_its_training_needs(packed):
+def test_packed_runs_omit_the_training_state(packed):
     root, runs = packed
     for run, place in zip(runs, ("consensus/s3", "consensus/s10", "independent/s3"), strict=True):
         mine = root / "tuned" / place
@@ -54,7 +54,7 @@ def test_what_is_packed_is_the_run_without_what_its_training_needs(packed):
         for file in ("metrics.jsonl", "eval.json"):
             assert (mine / file).read_bytes() == (run / file).read_bytes()
         values = yaml.safe_load((mine / "config.yaml").read_text())
-        assert values["output"] == "runs"  # and no path of a machine
+        assert values["output"] == "runs"  # no local paths
         assert str(run.parent) not in (mine / "config.yaml").read_text()
         config = RunFolder(run).config()
         one, other = (load_actor(config, RunFolder(path).checkpoint()) for path in (run, mine))
@@ -62,7 +62,7 @@ def test_what_is_packed_is_the_run_without_what_its_training_needs(packed):
             assert weight.equal(other.state_dict()[name])
 
 
-def test_a_name_stands_for_a_run_folder(shipped, tmp_path, capsys):
+def test_a_name_replaces_a_run_folder(shipped, tmp_path, capsys):
     assert main(["eval", "pretrained:consensus"]) == 0
     folder = tmp_path / "runs" / "pretrained_tuned_consensus_s3"
     assert [path.name for path in (tmp_path / "runs").iterdir()] == [folder.name]
@@ -77,14 +77,14 @@ def test_a_name_stands_for_a_run_folder(shipped, tmp_path, capsys):
     assert "pretrained_tuned_consensus_s10/figures/side_by_side" in printed.replace("\n", "")
 
 
-def test_a_copy_that_is_there_is_used_and_kept(shipped, tmp_path):
+def test_an_existing_copy_is_used_and_kept(shipped, tmp_path):
     run = pretrained.open_run("pretrained:consensus")
     (run.path / "note.txt").write_text("mine")
     assert pretrained.open_run("pretrained:tuned/consensus/3").path == run.path
     assert (tmp_path / run.path / "note.txt").read_text() == "mine"
 
 
-def test_names_of_several(shipped):
+def test_names_of_several_policies(shipped):
     def names(text: str) -> list[str]:
         return ["/".join(path.parts[-2:]) for path in pretrained.find(text)]
 
@@ -93,7 +93,7 @@ def test_names_of_several(shipped):
     assert names("pretrained:tuned/consensus/10") == ["consensus/s10"]
 
 
-def test_they_can_be_compared(shipped, tmp_path):
+def test_shipped_policies_can_be_compared(shipped, tmp_path):
     assert main(["compare", "pretrained:tuned", "--output", "all"]) == 0
     numbers = json.loads((tmp_path / "all" / "compare.json").read_text())
     assert len(numbers["setups"]) == 1
@@ -110,7 +110,7 @@ def test_they_can_be_compared(shipped, tmp_path):
         ("pretrained:../../tuned", "no such trained policy"),
     ],
 )
-def test_other_names_are_errors_of_one_line(name, said, shipped, capsys):
+def test_unknown_names_give_one_line_errors(name, said, shipped, capsys):
     for command in ("eval", "render"):
         assert main([command, name]) == 2
         error = capsys.readouterr().err
@@ -118,7 +118,7 @@ def test_other_names_are_errors_of_one_line(name, said, shipped, capsys):
         assert error.count("\n") == 1
 
 
-def test_only_finished_runs_are_packed_and_nothing_is_overwritten(packed, tmp_path, capsys):
+def test_only_finished_runs_are_packed_without_overwriting(packed, tmp_path, capsys):
     root, (run, *_) = packed
     assert pretrained.main([str(run), "--into", str(root)]) == 2
     assert "exists already" in capsys.readouterr().err
@@ -130,8 +130,8 @@ def test_only_finished_runs_are_packed_and_nothing_is_overwritten(packed, tmp_pa
     assert not (tmp_path / "new").exists()
 
 
-def test_every_configuration_that_is_shipped_names_all_keys():
-    """A key that is new, with a default, is written into these files, too."""
+def test_shipped_configurations_have_all_keys():
+    """A new key with a default must be added to these files, too."""
     files = [*pretrained._shipped().rglob("config.yaml"), *DATA.rglob("config.yaml")]
     assert len(files) > 50
     for file in files:
@@ -139,7 +139,7 @@ def test_every_configuration_that_is_shipped_names_all_keys():
         assert to_values(RunFolder(file.parent).config()) == values, file
 
 
-def test_every_policy_that_is_shipped_loads():
+def test_every_shipped_policy_loads():
     folders = sorted(file.parent for file in pretrained._shipped().glob("*/*/*/config.yaml"))
     assert folders
     for folder in folders:

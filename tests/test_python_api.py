@@ -1,4 +1,4 @@
-"""What Python offers: as the commands do, but nothing is printed and the process goes on."""
+"""Tests the Python API, which equals the commands but does not print or exit."""
 
 import json
 import re
@@ -32,14 +32,14 @@ SHORT = {
 
 @pytest.fixture(autouse=True)
 def _silent(capfd):
-    """Checks that a test prints nothing, neither does what it calls."""
+    """Checks that a test prints nothing, neither in Python nor in libraries."""
     yield
     assert capfd.readouterr().out == ""
 
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):
-    """A run that `train` leaves, called in a thread, and its progress."""
+    """Calls `train` in a thread; returns the run and its progress."""
     output, steps, runs = tmp_path_factory.mktemp("runs"), [], []
 
     def work():
@@ -61,14 +61,14 @@ def trained(tmp_path_factory):
     return runs[0]
 
 
-def test_every_public_name_is_there_and_documented():
+def test_public_names_exist_and_are_documented():
     for name in trainers.__all__:
         assert getattr(trainers, name).__doc__, name
     with pytest.raises(AttributeError, match="nothing"):
         trainers.nothing  # noqa: B018
 
 
-def test_train_leaves_the_folder_of_the_command(trained):
+def test_train_writes_the_same_folder_as_the_command(trained):
     assert trained.config.setup == "tuned"
     assert trained.config.fire.name == "paper"
     assert RunFolder(trained.path).config() == trained.config
@@ -81,12 +81,12 @@ def test_train_leaves_the_folder_of_the_command(trained):
         for measured in by_policy.values():
             assert list(measured) == list(metrics.NAMES)
             assert {len(values) for values in measured.values()} == {2}
-    # The folder is given up: the command could resume it.
+    # The folder is unlocked, so that the command can resume it.
     assert trainers.train is trainers.train
     assert not list(trained.path.glob("*.part"))
 
 
-def test_train_seeds_and_without_an_evaluation(tmp_path):
+def test_train_several_seeds_without_an_evaluation(tmp_path):
     runs = trainers.train(
         "independent", seeds=[3, 4], evaluate_after=False, output=str(tmp_path), **SHORT
     )
@@ -139,7 +139,7 @@ def test_load_gives_the_trained_policy_and_its_environment(trained):
     assert larger.rollout(1, policy)[keys.ACTION].shape == (1, 1, 2, 3)
 
 
-def test_load_a_policy_that_comes_with_emberlink(tmp_path, monkeypatch):
+def test_load_a_shipped_policy(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     policy = trainers.load("pretrained:consensus")
     assert (policy.config.method, policy.config.setup) == ("consensus", "tuned")
@@ -191,7 +191,7 @@ def test_compare_writes_the_report_of_the_command(trained, tmp_path):
         (lambda run: trainers.make_env("consensus", seeds=[1]), "an environment takes seed="),
     ],
 )
-def test_errors_are_those_of_the_commands(call, message, trained, tmp_path, monkeypatch):
+def test_errors_equal_those_of_the_commands(call, message, trained, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(UserError, match=message) as error:
         call(trained.path)
@@ -199,7 +199,7 @@ def test_errors_are_those_of_the_commands(call, message, trained, tmp_path, monk
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_program_that_has_initialised_hydra_keeps_it(tmp_path):
+def test_the_hydra_state_of_a_program_is_kept(tmp_path):
     (tmp_path / "mine.yaml").write_text("answer: 42\n")
     with hydra.initialize_config_dir(str(tmp_path), version_base="1.2"):
         mine = GlobalHydra.instance().hydra
@@ -225,11 +225,11 @@ def test_configurations_are_resolved_in_several_threads():
     assert found == {(m, s): trainers.resolve(m, [f"setup={s}"]) for m, s in pairs}
 
 
-def test_the_examples_of_the_page_run(tmp_path, monkeypatch):
+def test_the_examples_of_the_documentation_run(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     page = (ROOT / "docs" / "python.md").read_text()
     names = {}
     for block in re.findall(r"```python\n(.*?)```", page, re.DOTALL):
-        exec(block, names)  # the page's own text
+        exec(block, names)  # the page's text
     assert names["run"].path.is_dir()
     assert torch.is_tensor(names["reward"])
