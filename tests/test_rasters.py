@@ -1,4 +1,4 @@
-"""Tests rasters of arrival times on grids, against numbers by hand and a loop over cells."""
+"""Tests rasters of arrival times against hand-computed numbers and a loop over cells."""
 
 import math
 import subprocess
@@ -38,7 +38,7 @@ def corner(times, rows, columns):
 
 
 @pytest.mark.parametrize("write", [write_asc, write_tif])
-def test_a_raster_of_the_grids_own_size_is_taken_cell_by_cell(tmp_path, write):
+def test_a_raster_of_the_size_of_the_grid_is_read_cell_by_cell(tmp_path, write):
     times = corner([[0, 5, 10], [2, 4, -9999]], 2, 3)
     fire = read(write(tmp_path / f"fire.{write.__name__[6:]}", times))
     # North up: row 0 is at y = 7; 10 minutes are 10 steps.
@@ -48,7 +48,7 @@ def test_a_raster_of_the_grids_own_size_is_taken_cell_by_cell(tmp_path, write):
     assert torch.equal(fire, expected)
 
 
-def test_of_the_cells_in_a_coarse_one_the_earliest_counts(tmp_path):
+def test_the_earliest_cell_within_a_coarse_cell_counts(tmp_path):
     times = np.full((16, 24), -9999.0)
     times[:2, :3] = [[9, 8, 4], [7, -9999, 6]]
     times[15, 23] = 14
@@ -60,7 +60,7 @@ def test_of_the_cells_in_a_coarse_one_the_earliest_counts(tmp_path):
     assert torch.isfinite(fire).sum() == 2
 
 
-def test_between_the_cells_of_a_coarser_raster_times_are_interpolated(tmp_path):
+def test_times_of_a_coarser_raster_are_interpolated(tmp_path):
     times = np.full((4, 4), -9999.0)
     times[0, :3] = [0, 4, 8]
     fire = read(write_asc(tmp_path / "fire.asc", times), horizon=8)
@@ -84,7 +84,7 @@ def test_the_earliest_arrival_is_kept_where_the_grid_is_finer(tmp_path):
 
 
 @pytest.mark.parametrize("never", [-9999.0, -1.0, np.nan, np.inf, -3.4028234663852886e38])
-def test_what_never_burns(tmp_path, never):
+def test_cells_that_never_burn(tmp_path, never):
     times = np.where(corner([[1, 2], [3, 4]], 2, 2) < 0, never, corner([[1, 2], [3, 4]], 2, 2))
     asc = write_asc(tmp_path / "fire.asc", times, NODATA_VALUE=None)
     tif = write_tif(tmp_path / "fire.tif", times, nodata=None)
@@ -286,7 +286,7 @@ def test_ascii_dialects(tmp_path):
         assert torch.equal(read(path), plain)
 
 
-def test_a_projection_beside_an_asc(tmp_path):
+def test_a_projection_file_of_an_asc(tmp_path):
     times = corner([[0, 5, 10], [2, 4, 9]], 2, 3)
     path = write_asc(tmp_path / "fire.asc", times)
     plain = read(path)
@@ -299,7 +299,7 @@ def test_a_projection_beside_an_asc(tmp_path):
     assert torch.isfinite(read(degrees, margin=0.1)).any()
 
 
-def test_an_integers_greatest_number_is_no_time(tmp_path):
+def test_the_largest_integer_is_no_time(tmp_path):
     for kind in ("uint16", "uint32", "int32", "int16"):
         never = np.iinfo(kind).max
         times = corner([[0, 2], [4, 6]], 2, 2)
@@ -308,7 +308,7 @@ def test_an_integers_greatest_number_is_no_time(tmp_path):
         assert torch.isfinite(fire).sum() == 4
 
 
-def test_a_mask_says_what_never_burns(tmp_path):
+def test_a_mask_marks_cells_that_never_burn(tmp_path):
     times = np.full((8, 8), 3.0, "float32")
     times[:2, :2] = [[0, 2], [4, 6]]
     path = write_tif(tmp_path / "fire.tif", times, nodata=None)
@@ -317,7 +317,7 @@ def test_a_mask_says_what_never_burns(tmp_path):
     assert torch.isfinite(read(path, horizon=3)).sum() == 4
 
 
-def test_a_small_fire_in_a_large_raster_is_read_finely(tmp_path):
+def test_a_small_fire_in_a_large_raster_keeps_its_resolution(tmp_path):
     fire = raster_of(Ellipses(), 300.0).astype("float32")
     large = np.full((2200, 6300), -9999.0, "float32")
     large[901:1001, 4003:4103] = fire
@@ -328,7 +328,7 @@ def test_a_small_fire_in_a_large_raster_is_read_finely(tmp_path):
         read(path, (60, 20))
 
 
-def test_a_large_raster_takes_bounded_memory(tmp_path):
+def test_a_large_raster_needs_bounded_memory(tmp_path):
     """Checks that 6000 x 8000 cells need less than 1.2 GB, also if the file is compressed."""
     path, height, width = tmp_path / "large.tif", 6000, 8000
     about = {"driver": "GTiff", "count": 1, "dtype": "float32", "nodata": -9999.0, "crs": UTM}
@@ -404,7 +404,7 @@ def test_no_arrival_is_lost(rows, columns, side, x, y, seed):
                 assert got[i, j] == times.min()
 
 
-def test_a_raster_of_something_else_is_warned_of(tmp_path):
+def test_a_raster_without_arrival_times_gives_a_warning(tmp_path):
     """Checks that elevation is noticed, but not fires that merge or times in whole hours."""
     hills = np.random.default_rng(0).random((60, 60))
     hills = 900 + 100 * gaussian_filter(hills, 2)
@@ -423,7 +423,7 @@ def test_a_raster_of_something_else_is_warned_of(tmp_path):
             read(write_asc(tmp_path / "fire.asc", values), (30, 30), units=units)
 
 
-def test_a_front_of_many_points_is_not_warned_of(tmp_path):
+def test_a_front_of_many_points_gives_no_warning(tmp_path):
     places = [f"{12 + 3 * (k % 8)},{12 + 3 * (k // 8)},1," for k in range(40)]
     (tmp_path / "fire.txt").write_text("\n".join(["1,1,1,"] * 6000 + places))
     with warnings.catch_warnings():

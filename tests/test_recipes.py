@@ -1,4 +1,4 @@
-"""All four recipes under all three setups: a short training, its files, and its repetition."""
+"""Tests all four recipes under all three setups: a short training, its files, determinism."""
 
 import json
 import math
@@ -63,7 +63,7 @@ def test_a_recipe_trains(method, setup, tmp_path):
 
 
 def check_lines(run: RunFolder, config) -> None:
-    """One line an episode, all measures in it, and as many updates as there were full batches."""
+    """Checks that metrics.jsonl has one complete line per episode and the number of updates."""
     text = (run.path / "metrics.jsonl").read_text()
     lines = [json.loads(line) for line in text.splitlines()]
     assert len(lines) == EPISODES
@@ -80,7 +80,7 @@ def check_lines(run: RunFolder, config) -> None:
 
 
 def check_actor(run: RunFolder, config, trainer: Trainer) -> None:
-    """The checkpoint's actor acts as the trained one does."""
+    """Checks that the checkpoint's actor equals the trained actor."""
     checkpoint = run.checkpoint()
     assert checkpoint.name == f"step_{EPISODES * HORIZON:09d}.safetensors"
     loaded = load_actor(config, checkpoint)
@@ -94,7 +94,7 @@ def check_actor(run: RunFolder, config, trainer: Trainer) -> None:
 @pytest.mark.parametrize("method", ["independent", "consensus"])
 def test_a_seed_repeats_a_run_byte_for_byte(method, tmp_path):
     def run(name: str, seed: int) -> tuple[bytes, dict]:
-        torch.manual_seed(len(name))  # whatever went on before must not matter
+        torch.manual_seed(len(name))  # earlier draws must not matter
         config = short(method, tmp_path / name, "episodes=2", "env.horizon=40", seed=seed)
         trainer = trained(config)
         return (trainer.run.path / "metrics.jsonl").read_bytes(), trainer.setup.learner.weights()
@@ -106,7 +106,7 @@ def test_a_seed_repeats_a_run_byte_for_byte(method, tmp_path):
         assert weight.equal(same[name]), name
 
 
-def test_evaluations_and_checkpoints_come_at_their_intervals(tmp_path):
+def test_evaluations_and_checkpoints_follow_their_intervals(tmp_path):
     config = short(
         "consensus",
         tmp_path,
@@ -130,10 +130,10 @@ def test_several_updates_a_step(tmp_path):
     trainer = trained(config)
     assert trainer.setup.learner.updates == 3 * (
         20 - 2
-    )  # 32 of 12 transitions a step: from step 3 on
+    )  # a batch of 32 with 12 transitions a step: from step 3
 
 
-def test_two_runs_in_the_same_second_get_folders_of_their_own(tmp_path):
+def test_two_runs_in_the_same_second_have_separate_folders(tmp_path):
     config = short("independent", tmp_path)
     folders = {Trainer(config).start().path for _ in range(3)}
     assert len(folders) == 3

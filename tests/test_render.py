@@ -1,4 +1,4 @@
-"""Pictures: colours, orientation, size, animation, window."""
+"""Tests pictures: colours, orientation, size, animation, window."""
 
 import numpy as np
 import pytest
@@ -21,7 +21,7 @@ def picture(fire=(), positions=(), grid=(30, 20), **options) -> np.ndarray:
 
 
 def colour(image: np.ndarray, x: float, y: float, grid=(30, 20)) -> tuple[int, ...]:
-    """The colour at a place given in cells."""
+    """Returns the colour at a position in cells."""
     scale = image.shape[1] / grid[0]
     row, column = int((grid[1] - 0.5 - y) * scale), int((x + 0.5) * scale)
     return tuple(image[row, column].tolist())
@@ -39,7 +39,7 @@ def test_colours():
     assert colour(image, 10 + 2.2, 6) == YELLOW  # the view ends 2.309 away
 
 
-def test_only_the_four_colours():
+def test_pictures_have_four_colours_only():
     positions = [(10, 6, 4), (11, 7, 3), (0, 0, 1), (29, 19, 4)]
     image = picture(fire=[(i, 6) for i in range(30)], positions=positions)
     assert {tuple(c) for c in image.reshape(-1, 3).tolist()} == {BLACK, WHITE, YELLOW, BLUE}
@@ -52,7 +52,7 @@ def test_seen_and_unseen_fire_look_the_same():
     assert np.array_equal(*(frame.frame(m, nobody, view_angle=30.0) for m in (seen, unseen)))
 
 
-def test_x_grows_to_the_right_and_y_upwards():
+def test_x_points_to_the_right_and_y_upwards():
     image = picture(fire=[(29, 0)], positions=[(0, 19, 1)])
     height, width = image.shape[:2]
     assert tuple(image[height - 3, width - 3]) == WHITE
@@ -80,12 +80,12 @@ def test_size(grid, shape):
     assert image.dtype == np.uint8
 
 
-def test_a_uav_shows_on_the_largest_grid():
+def test_a_uav_is_visible_on_the_largest_grid():
     image = picture(grid=(256, 256), positions=[(100, 100, 1)])
     assert (image == BLUE).all(-1).sum() >= 30
 
 
-def test_the_view_is_as_wide_as_the_angle_says():
+def test_the_width_of_the_view_follows_from_the_angle():
     for angle in (15.0, 30.0, 60.0):
         image = picture(positions=[(15, 10, 3)], view_angle=angle)
         width = 2 * 3 * np.tan(np.radians(angle)) * 12
@@ -119,7 +119,7 @@ def test_animation(tmp_path):
             assert np.array_equal(np.asarray(film.convert("RGB")), expected)
 
 
-def test_an_animation_needs_a_frame(tmp_path):
+def test_an_animation_without_frames_is_an_error(tmp_path):
     with pytest.raises(ValueError, match=r"none\.gif"):
         frame.write_gif(tmp_path / "none.gif", [])
     assert not list(tmp_path.iterdir())
@@ -137,11 +137,11 @@ def test_window_shows_the_last_picture(monkeypatch):
 
 
 @pytest.mark.parametrize("altitude", [0.0, 1e-3, 0.1])
-def test_a_view_smaller_than_a_pixel_is_no_error(altitude):
+def test_a_view_smaller_than_a_pixel(altitude):
     assert colour(picture(positions=[(5, 5, altitude)]), 5, 5) == BLUE
 
 
-def test_a_colour_that_comes_later_is_kept():
+def test_an_animation_keeps_colours_of_later_frames():
     frames = [np.full((4, 6, 3), shade, np.uint8) for shade in range(0, 250, 5)]
     frames[7][0, 0] = (1, 2, 250)
     images = [Image.fromarray(original).quantize(256) for original in frames]

@@ -1,4 +1,4 @@
-"""`emberlink render` from the outside: its files, what they hold, and what it refuses."""
+"""Tests `emberlink render`: its files, their contents, and its errors."""
 
 import dataclasses
 import os
@@ -25,7 +25,7 @@ SHORT = ("setup=tuned", "learner.hidden=[8,8]", "env.horizon=12", "env.num_uavs=
 
 
 def make_run(folder, method="consensus", *overrides):
-    """A run folder with networks that have learnt nothing."""
+    """Writes a run folder with untrained networks."""
     config = resolve(method, [*SHORT, *overrides, f"output={folder}"])
     nowhere = torch.full(config.env.grid, torch.inf)
     env = build_env(config, num_envs=1, fire=nowhere, seed=0, device="cpu")
@@ -55,7 +55,7 @@ def gif_frames(path) -> list[np.ndarray]:
     return frames
 
 
-def test_a_run_alone_gives_a_gif_and_an_mp4_that_play(tmp_path, capsys):
+def test_a_run_gives_a_gif_and_an_mp4_that_play(tmp_path, capsys):
     run = make_run(tmp_path)
     *_, gif, mp4 = rendered(capsys, run, "--fps", "10")
     assert gif == str(run / "figures" / "episode_huygens_0.gif")
@@ -76,7 +76,7 @@ def test_a_run_alone_gives_a_gif_and_an_mp4_that_play(tmp_path, capsys):
     assert not list(run.rglob(".*"))
 
 
-def test_a_second_one_takes_another_name(tmp_path, capsys):
+def test_a_second_rendering_takes_another_name(tmp_path, capsys):
     run = make_run(tmp_path)
     first = rendered(capsys, run, "--frames", 2)[-2:]
     before = [Path(path).read_bytes() for path in first]
@@ -89,7 +89,7 @@ def test_a_second_one_takes_another_name(tmp_path, capsys):
 
 
 def panels_of(runs, choices, monkeypatch):
-    """The episodes that a command shows, without its files."""
+    """Returns the episodes that a command shows, without writing files."""
     caught = []
 
     class Caught(Exception):
@@ -106,7 +106,7 @@ def panels_of(runs, choices, monkeypatch):
     return caught
 
 
-def test_all_methods_side_by_side_have_the_same_fire_and_the_same_starts(tmp_path, monkeypatch):
+def test_panels_have_the_same_fire_and_the_same_starts(tmp_path, monkeypatch):
     methods = known("method")
     runs = [make_run(tmp_path, method) for method in methods]
     choices = render.Choices(fire="paper:3", policies=list(SCRIPTED))
@@ -133,7 +133,7 @@ def test_all_methods_side_by_side_have_the_same_fire_and_the_same_starts(tmp_pat
         }
 
 
-def test_an_episode_is_the_evaluations(tmp_path, monkeypatch):
+def test_an_episode_equals_that_of_the_evaluation(tmp_path, monkeypatch):
     run = RunFolder(make_run(tmp_path))
     config = run.config()
     actor = render.load_actor(config, run.checkpoint())
@@ -174,7 +174,7 @@ def refused(arguments, capsys, *words: str) -> None:
         assert word in err, err
 
 
-def test_what_is_refused(tmp_path, capsys):
+def test_errors_of_render(tmp_path, capsys):
     run = make_run(tmp_path)
     wide = make_run(tmp_path, "consensus", "env.grid=[40,30]")
     team = make_run(tmp_path, "independent", "env.num_uavs=4")
@@ -213,7 +213,7 @@ def test_numbers_out_of_range(option, capsys):
     assert capsys.readouterr().err.count("\n") == 1
 
 
-def test_a_failing_ffmpeg_is_one_line(tmp_path, capsys, monkeypatch):
+def test_a_failing_ffmpeg_gives_one_line(tmp_path, capsys, monkeypatch):
     run = make_run(tmp_path)
     for program in ("false", "true"):
         monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", program)
@@ -222,7 +222,7 @@ def test_a_failing_ffmpeg_is_one_line(tmp_path, capsys, monkeypatch):
     assert not list(tmp_path.glob(".*"))
 
 
-def test_a_name_taken_meanwhile_is_not_overwritten(tmp_path):
+def test_a_file_created_meanwhile_is_not_overwritten(tmp_path):
     path = tmp_path / "a.gif"
 
     def write():
@@ -236,19 +236,19 @@ def test_a_name_taken_meanwhile_is_not_overwritten(tmp_path):
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_a_video_needs_a_frame(tmp_path):
+def test_a_video_without_frames_is_an_error(tmp_path):
     with pytest.raises(ValueError, match="at least one frame"):
         video.write_mp4(tmp_path / "a.mp4", [])
 
 
-def test_nothing_that_is_shared_is_forgotten():
-    """Start positions and fires differ where one of these does, and nowhere else."""
+def test_settings_of_starts_and_fires_must_agree():
+    """Start positions and fires depend on exactly these settings."""
     base = resolve("independent", SHORT).env
     other = {"reward", "observation", "observation_scale", "displacement", "view_angle"}
     assert {field.name for field in dataclasses.fields(base)} == other | set(render.SHARED)
 
 
-def test_a_video_that_lacks_frames_is_no_video(tmp_path, monkeypatch):
+def test_an_incomplete_video_is_an_error(tmp_path, monkeypatch):
     frames = [np.zeros((16, 16, 3), np.uint8)] * 3
     video.write_mp4(tmp_path / "whole.mp4", frames)
     monkeypatch.setattr(imageio_ffmpeg, "count_frames_and_secs", lambda _: (2, 1.0))

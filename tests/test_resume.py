@@ -1,4 +1,4 @@
-"""A run that was stopped and resumed is, bit for bit, the run that was not."""
+"""Tests that a stopped and resumed run equals the uninterrupted run bit for bit."""
 
 import shutil
 from dataclasses import asdict
@@ -23,7 +23,7 @@ from emberlink.trainers.training.trainer import Progress, Trainer
 HORIZON, EPISODES = 20, 4
 SMALL = [
     *(f"env.horizon={HORIZON}", f"episodes={EPISODES}", "env.num_uavs=2", "num_envs=2"),
-    # A memory of 60 rows comes round after 30 of the 80 steps.
+    # A replay buffer of 60 rows is full after 30 of the 80 steps.
     *("learner.hidden=[8,8]", "learner.batch_size=16", "learner.buffer_size=60"),
     *("evaluation.interval=0", "evaluation.interval_episodes=1", "evaluation.episodes=1"),
 ]
@@ -41,7 +41,7 @@ def begun(method: str, output: Path, *more: str) -> Trainer:
 
 
 def until(trainer: Trainer, step: int | None) -> Trainer:
-    """Trains until a step, or to the end; what it is by then goes to `final`."""
+    """Trains until a step, or to the end; appends the final state to `final`."""
 
     def watch(progress: Progress) -> None:
         if progress.step == step:
@@ -57,7 +57,7 @@ final: WeakKeyDictionary[Trainer, dict[str, torch.Tensor]] = WeakKeyDictionary()
 
 
 def stopped_at(steps: list[int], method: str, output: Path, *more: str) -> Trainer:
-    """A run that was stopped at each of some steps, and resumed, and has come to its end."""
+    """Trains a run that is stopped and resumed at the given steps, to its end."""
     trainer = until(begun(method, output, *more), steps[0])
     for step in [*steps[1:], None]:
         trainer = until(resume(trainer.run.path), step)
@@ -71,12 +71,12 @@ def everything(trainer: Trainer) -> dict[str, torch.Tensor]:
 
 
 def assert_same(one: Trainer, other: Trainer) -> None:
-    """The same state to the last bit, and the same lines."""
+    """Checks that two runs have the same state, to the last bit, and the same metrics."""
     first, second = final[one], final[other]
     assert first.keys() == second.keys()
     for name, value in first.items():
         assert value.dtype == second[name].dtype
-        # As bytes: NaN is NaN, and 0 is not -0.
+        # Compared as bytes: NaN equals NaN, and 0 differs from -0.
         assert value.numpy().tobytes() == second[name].numpy().tobytes(), name
     for a, b in zip(one.runs, other.runs, strict=True):
         assert (a.path / "metrics.jsonl").read_bytes() == (b.path / "metrics.jsonl").read_bytes()
@@ -89,16 +89,16 @@ def assert_same(one: Trainer, other: Trainer) -> None:
 
 
 def networks_of(path: Path) -> tuple[dict, dict[str, bytes]]:
-    """What a file of networks holds, but for its configuration."""
+    """Returns the contents of a file of networks without its configuration."""
     header, tensors = checkpoint_file.read(path)
-    for key in ("config", "sha256"):  # of which `output` and `checkpoint_steps` differ
+    for key in ("config", "sha256"):  # `output` and `checkpoint_steps` differ
         header.pop(key)
     return header, {name: value.numpy().tobytes() for name, value in tensors.items()}
 
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
-    """The uninterrupted run of a method."""
+    """Returns a function that gives the uninterrupted run of a method."""
     runs: dict[tuple, Trainer] = {}
 
     def of(method: str, *more: str) -> Trainer:
@@ -111,14 +111,14 @@ def whole(tmp_path_factory):
 
 
 @pytest.mark.slow
-# Before the first update, within an episode, at its end, behind it, before the last step; at 33 of
-# 80 the memory has just come round.
+# Before the first update; within, at and after the end of an episode; before the last step. At
+# step 33 of 80 the replay buffer has just wrapped around.
 @pytest.mark.parametrize("learner", ["ddpg", "td3"])
 @pytest.mark.parametrize(
     ("method", "steps"),
     zip(METHODS, [[1, 33], [40], [41, 42, 79], [33, 40, 79]], strict=True),
 )
-def test_a_stopped_run_is_the_run_that_was_not(method, steps, learner, whole, tmp_path):
+def test_a_resumed_run_equals_the_uninterrupted_run(method, steps, learner, whole, tmp_path):
     more = [] if learner == "ddpg" else [f"learner={learner}"]
     assert_same(whole(method, *more), stopped_at(steps, method, tmp_path, *more))
 
@@ -131,8 +131,8 @@ def test_seeds_side_by_side_are_resumed_together(method, learner, whole, tmp_pat
     assert_same(whole(method, *more), one)
 
 
-def test_every_step_can_be_the_last_one(whole, tmp_path):
-    """One run that is stopped after each 5 steps, so within, at and behind every episode's end."""
+def test_a_run_can_be_stopped_at_any_step(whole, tmp_path):
+    """Stops a run every 5 steps, so within, at and after the end of every episode."""
     steps, evaluated = list(range(5, HORIZON * EPISODES, 5)), "evaluation.interval=2"
     assert_same(whole("consensus", evaluated), stopped_at(steps, "consensus", tmp_path, evaluated))
 
@@ -142,7 +142,7 @@ def test_several_updates_a_step_and_the_released_setup(whole, tmp_path):
     assert_same(whole("consensus", *more), stopped_at([9, 50], "consensus", tmp_path, *more))
 
 
-def test_whichever_seeds_folder_is_named(tmp_path):
+def test_the_folder_of_any_seed_can_be_resumed(tmp_path):
     trainer = until(begun("independent", tmp_path, "seeds=[4,5]"), 25)
     again = resume(trainer.runs[1].path)
     assert [run.path for run in again.runs] == [run.path.absolute() for run in trainer.runs]
@@ -158,7 +158,7 @@ def test_whichever_seeds_folder_is_named(tmp_path):
         resume(moved / trainer.run.path.name)
 
 
-def test_what_came_after_the_checkpoint_is_cut_off_and_made_again(whole, tmp_path):
+def test_metrics_after_the_checkpoint_are_truncated_and_repeated(whole, tmp_path):
     trainer = until(begun("positional", tmp_path, "checkpoint_steps=7"), 45)
     run = trainer.run
     (run.checkpoints / "state_000000045.safetensors").unlink()
@@ -174,7 +174,7 @@ def test_what_came_after_the_checkpoint_is_cut_off_and_made_again(whole, tmp_pat
     assert_same(whole("positional"), until(again, None))
 
 
-def test_a_run_without_a_checkpoint_begins_again(whole, tmp_path):
+def test_a_run_without_a_checkpoint_restarts(whole, tmp_path):
     trainer = until(begun("consensus", tmp_path), 30)
     for path in trainer.run.states() + trainer.run.networks():
         path.unlink()
@@ -183,8 +183,8 @@ def test_a_run_without_a_checkpoint_begins_again(whole, tmp_path):
     assert_same(whole("consensus"), until(again, None))
 
 
-def test_more_episodes_are_those_of_a_run_that_had_them_from_the_start(whole, tmp_path):
-    """Also of a memory that was full to the last row, and is larger now."""
+def test_additional_episodes_equal_those_of_a_longer_run(whole, tmp_path):
+    """Includes a replay buffer that was full and becomes larger."""
     roomy = "learner.buffer_size=100000"
     short = until(begun("shared_memory", tmp_path, roomy, "episodes=2"), None)
     assert len(replay(short)) == replay(short).capacity == 2 * 2 * HORIZON
@@ -207,7 +207,7 @@ def test_more_episodes_are_those_of_a_run_that_had_them_from_the_start(whole, tm
         (["keep_checkpoints=0"], "keep_checkpoints=0"),
     ],
 )
-def test_what_was_learnt_with_is_kept(overrides, message, paused, capsys):
+def test_settings_of_the_training_are_kept(overrides, message, paused, capsys):
     before = contents(paused)
     assert main.main(["train", f"resume={paused}", *overrides]) == 2
     error = capsys.readouterr().err
@@ -223,7 +223,7 @@ def _paused(tmp_path_factory) -> Path:
 
 @pytest.fixture
 def paused(_paused, tmp_path) -> Path:
-    """A copy of a run that was stopped at step 30."""
+    """Returns a copy of a run that was stopped at step 30."""
     return Path(shutil.copytree(_paused, tmp_path / "paused"))
 
 
@@ -231,7 +231,7 @@ def contents(folder: Path) -> dict[str, bytes]:
     return {str(path): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
-def test_the_command_goes_on_and_says_when_nothing_is_left(paused, whole, capsys):
+def test_the_command_resumes_and_reports_a_finished_run(paused, whole, capsys):
     quiet = ["evaluation.episodes=2", "checkpoint_interval=1", "keep_checkpoints=2", "setup=paper"]
     assert main.main(["train", "positional", f"resume={paused}"]) == 2
     assert "the run is of method 'consensus'" in capsys.readouterr().err
@@ -246,7 +246,7 @@ def test_the_command_goes_on_and_says_when_nothing_is_left(paused, whole, capsys
     assert contents(paused) == before
 
 
-def test_another_version_of_a_package_is_said(paused, capsys):
+def test_another_version_of_a_package_gives_a_warning(paused, capsys):
     state = RunFolder(paused).states()[-1]
     sealed_again(state, lambda header, _: header["versions"].update(torch="1.0", vmas="1.4"))
     assert main.main(["train", f"resume={paused}", "evaluation.episodes=2"]) == 0
@@ -255,7 +255,7 @@ def test_another_version_of_a_package_is_said(paused, capsys):
     assert expected in out
 
 
-def test_networks_of_a_save_that_was_killed_before_the_rotation_are_removed(tmp_path):
+def test_networks_of_an_incomplete_save_are_removed(tmp_path):
     more = ["checkpoint_steps=9", "keep_checkpoints=2"]
     run = until(begun("independent", tmp_path, *more), None).run
     kept = run.networks()
@@ -285,7 +285,7 @@ def test_folders_that_cannot_be_resumed(paused, tmp_path, capsys):
     refused(paused, "holds networks alone", "emberlink eval")
 
 
-def test_a_tracker_goes_on_where_the_checkpoint_was_made(tmp_path):
+def test_a_tracker_continues_from_the_checkpoint(tmp_path):
     def table(trainer: Trainer) -> str:
         return (trainer.run.path / "metrics.csv").read_text()
 
@@ -293,12 +293,12 @@ def test_a_tracker_goes_on_where_the_checkpoint_was_made(tmp_path):
     one = until(begun("independent", tmp_path / "a", *more), None)
     two = until(begun("independent", tmp_path / "b", *more, "checkpoint_interval=1"), 70)
     for path in [two.run.state(70), *two.run.networks()[-1:]]:
-        path.unlink()  # stands for a run that was killed: csv knows of later episodes
+        path.unlink()  # like a killed run: the csv table contains later episodes
     assert table(one) == table(until(resume(two.run.path), None))
     assert len(table(one).splitlines()) == 1 + EPISODES
 
 
-def test_old_checkpoints_go_and_the_best_stays(tmp_path):
+def test_old_checkpoints_are_removed_except_the_best(tmp_path):
     more = ["checkpoint_steps=9", "keep_checkpoints=3", "evaluation.interval=1"]
     trainer = until(begun("consensus", tmp_path, *more), None)
     run = trainer.run
@@ -309,8 +309,8 @@ def test_old_checkpoints_go_and_the_best_stays(tmp_path):
     assert header["step"] == HORIZON * (1 + held_out.index(max(held_out)))
 
 
-def test_tensorboard_forgets_what_comes_again(tmp_path):
-    """A run that was killed before its first checkpoint: all four episodes come twice."""
+def test_tensorboard_replaces_repeated_episodes(tmp_path):
+    """A run killed before its first checkpoint repeats all four episodes."""
     trainer = until(begun("independent", tmp_path, "logger=tensorboard"), 70)
     for path in trainer.run.states() + trainer.run.networks():
         path.unlink()

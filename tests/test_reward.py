@@ -1,4 +1,4 @@
-"""Rewards by hand."""
+"""Tests rewards against hand-computed numbers."""
 
 import math
 from itertools import pairwise
@@ -53,7 +53,7 @@ def test_left_box():
 
 
 def point(degrees: float, length: float = 1.0) -> list[float]:
-    """A point seen from (5, 5) in a direction, at some other altitude."""
+    """Returns a point in a direction from (5, 5), at another altitude."""
     angle = math.radians(degrees)
     return [5 + length * math.cos(angle), 5 + length * math.sin(angle), 2 + length]
 
@@ -70,7 +70,7 @@ def heading(form: str, target: float, moved: float, weight: float = 1.0) -> floa
         (0, 0, 0, 0),
         (0, 90, 90, 90),
         (30, 75, 45, 45),
-        (90, -90, 0, 180),  # folded: left and right count as the same
+        (90, -90, 0, 180),  # folded: left and right are equivalent
         (170, -170, 0, 20),
         (150, -60, 90, 150),
         (-135, 45, 90, 180),
@@ -86,13 +86,13 @@ def test_heading_forms(target, moved, folded, true):
     assert heading("linear", target, moved, 0.5) == pytest.approx((90 - true) / 180, abs=1e-5)
 
 
-def test_heading_numbers_worked_out_by_hand():
+def test_heading_by_hand():
     assert heading("folded_linear", 0, 90) == pytest.approx(9.0, abs=1e-4)
     assert heading("folded_exponential", 0, 10) == pytest.approx(10.77230, abs=1e-3)
     assert heading("linear", 10, -20) == pytest.approx(2 / 3, abs=1e-5)
 
 
-def test_approach_counts_the_cells_gained_in_space():
+def test_approach_is_the_decrease_of_the_distance():
     config = HeadingConfig(form="approach", weight=2.0)
     before = torch.tensor([[0.0, 0, 1], [0, 0, 1], [0, 0, 1], [3, 0, 1]])
     after = torch.tensor([[3.0, 0, 1], [0, 0, 2], [0, 0, 1], [0, 0, 1]])
@@ -100,7 +100,7 @@ def test_approach_counts_the_cells_gained_in_space():
     assert heading_reward(before, after, target, config).tolist() == [2, 2, 0, -2]
 
 
-def test_heading_of_a_uav_that_stood_still():
+def test_heading_without_a_move():
     here, target = torch.tensor([5.0, 5, 1]), torch.tensor([5.0, 9, 1])
     terms = {f: heading_reward(here, here, target, HeadingConfig(form=f)) for f in HEADING_FORMS}
     assert terms["linear"] == 0
@@ -109,7 +109,7 @@ def test_heading_of_a_uav_that_stood_still():
     assert heading_reward(here, up, target, HeadingConfig(form="linear")) == 0
 
 
-def test_heading_keeps_its_digits_for_small_moves():
+def test_heading_is_precise_for_small_moves():
     before = torch.tensor([25.0, 25.0, 1.0])
     step = torch.tensor([1e-3, 1e-3, 0.0])
     term = heading_reward(before, before + step, before + 4 * step, HeadingConfig(form="linear"))
@@ -117,7 +117,7 @@ def test_heading_keeps_its_digits_for_small_moves():
 
 
 @pytest.mark.parametrize("form", list(HEADING_FORMS))
-def test_a_straighter_way_is_never_worth_less(form):
+def test_heading_does_not_decrease_with_a_straighter_move(form):
     terms = [heading(form, 0, moved) for moved in range(0, 181, 15)]
     assert all(near > far for near, far in pairwise(terms))
 

@@ -1,4 +1,4 @@
-"""Scripted policies: what each does by hand, and what all of them keep to."""
+"""Tests scripted policies against hand-computed paths, and properties that they share."""
 
 import itertools
 import math
@@ -22,7 +22,7 @@ from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.evaluation.evaluate import play, scripted_config
 
 NEVER = math.inf
-THREE = math.degrees(math.atan(1.2 / 4))  # the view angle: from 4 three cells by three are seen
+THREE = math.degrees(math.atan(1.2 / 4))  # the view angle: 3 x 3 cells are in view from altitude 4
 
 
 def world(grid=(9, 9), uavs=1, **settings) -> WildfireConfig:
@@ -30,7 +30,7 @@ def world(grid=(9, 9), uavs=1, **settings) -> WildfireConfig:
 
 
 def episode(env, policy, steps: int, **reset):
-    """The moments on which a policy acts, with its actions."""
+    """Yields the time steps of an episode with the policy's actions."""
     moments, moment = [], env.reset(**reset)
     for _ in range(steps):
         moment = policy(moment)
@@ -40,7 +40,7 @@ def episode(env, policy, steps: int, **reset):
 
 
 def flown(env, policy, steps: int, position) -> list:
-    """Where the UAVs of the first environment were, rounded to 1e-3 cells."""
+    """Returns the positions of the UAVs in the first environment, rounded to 1e-3 cells."""
     start = torch.tensor(position, dtype=torch.float32)
     moments = episode(env, policy, steps, position=start)
     return [[[round(x, 3) for x in uav] for uav in m[keys.POSITION][0].tolist()] for m in moments]
@@ -49,8 +49,8 @@ def flown(env, policy, steps: int, position) -> list:
 # Lawnmower
 
 
-def test_the_lawnmower_of_one_uav_by_hand():
-    # Three cells are seen. 8 x 9 cells: strips of x 0-1, 2-4, 5-7, each in y 0-2, 3-5, 6-8.
+def test_lawnmower_with_one_uav_by_hand():
+    # The view is 3 cells wide. 8 x 9 cells: strips of x 0-1, 2-4, 5-7, each in y 0-2, 3-5, 6-8.
     path = [[0.5, 1], [0.5, 4], [0.5, 7], [3, 7], [3, 4], [3, 1], [6, 1], [6, 4], [6, 7]]
     assert search_path((8, 9), 1.2).tolist() == path
     env = WildfireEnv(1, world((8, 9), displacement=3.0, view_angle=THREE), torch.zeros(8, 9))
@@ -60,8 +60,8 @@ def test_the_lawnmower_of_one_uav_by_hand():
     assert [uavs[0] for uavs in places] == expected
 
 
-def test_the_lawnmower_gives_every_uav_its_strips():
-    # The paper's world: 5 cells are seen, six strips of 30 for six UAVs.
+def test_lawnmower_assigns_strips_to_uavs():
+    # The paper's world: the view is 5 cells wide, six strips of 30 for six UAVs.
     env = WildfireEnv(1, WildfireConfig(), torch.zeros(30, 30))
     mower = Lawnmower(env)
     assert sorted({x for x, _ in mower.path.tolist()}) == [2, 7, 12, 17, 22, 27]
@@ -93,7 +93,7 @@ def test_more_uavs_than_stops_and_fewer_than_strips():
     ceiling=st.floats(1, 6),
     displacement=st.floats(0.9, 40),
 )
-def test_the_lawnmower_sees_every_cell(grid, uavs, angle, ceiling, displacement):
+def test_lawnmower_covers_every_cell(grid, uavs, angle, ceiling, displacement):
     config = world(
         grid,
         uavs,
@@ -102,7 +102,9 @@ def test_the_lawnmower_sees_every_cell(grid, uavs, angle, ceiling, displacement)
         displacement=displacement,
         horizon=2500,
     )
-    env = WildfireEnv(1, config, torch.zeros(grid))  # all burns: what is seen is counted
+    env = WildfireEnv(
+        1, config, torch.zeros(grid)
+    )  # all cells burn, so that seen cells are counted
     mower = Lawnmower(env)
     flight = len(mower.path) * (2 + math.ceil(max(grid) / displacement)) // uavs
     moment = env.reset()
@@ -116,12 +118,12 @@ def test_the_lawnmower_sees_every_cell(grid, uavs, angle, ceiling, displacement)
 # FollowTarget
 
 
-def test_follow_target_flies_straight_at_the_target_by_hand():
+def test_follow_target_flies_straight_to_the_target_by_hand():
     env = WildfireEnv(1, world(uavs=3, displacement=0.5), torch.full((9, 9), NEVER))
     moment = env.reset(position=torch.tensor([[1.0, 1, 2], [5, 5, 4], [3, 3, 3]]))
     moment[keys.TARGET] = torch.tensor([[[5.0, 3, 1], [5, 5, 3.75], [3, 3, 3]]])
     action = FollowTarget(env)(moment)[keys.ACTION].mul(1e4).round() / 1e4
-    # By (4, 2, -1) cells: 8, 4, -2 units. By (0, 0, -0.25): half a unit, and there it stops.
+    # By (4, 2, -1) cells: 8, 4, -2 units. By (0, 0, -0.25): half a unit, then it stops.
     assert action.tolist() == [[[1, 0.5, -0.25], [0, 0, -0.5], [0, 0, 0]]]
 
 
@@ -129,7 +131,7 @@ def test_follow_target_flies_straight_at_the_target_by_hand():
 
 
 def scalar_oracle(position, arrival, seen, step, config) -> list[tuple[float, float]]:
-    """Where each UAV of one environment is sent: the rule with loops."""
+    """Returns the destination of each UAV of one environment, computed with loops."""
     radius = view_radius(config.altitude[1], config.view_angle)
     cells = list(itertools.product(range(config.grid[0]), range(config.grid[1])))
     left = {c for c in cells if arrival[c[0]][c[1]] <= config.horizon and not seen[c[0]][c[1]]}
@@ -152,26 +154,26 @@ def scalar_oracle(position, arrival, seen, step, config) -> list[tuple[float, fl
 
 
 def sent(env, oracle, moment):
-    """Where the oracle flies to, if a step is long enough to get anywhere: [num_envs, n, 2]."""
+    """Returns the oracle's destinations for steps of any length, [num_envs, n, 2]."""
     action = oracle(moment.clone())[keys.ACTION]
     return moment[keys.POSITION][..., :2] + action[..., :2] * env.config.displacement
 
 
 def test_the_oracle_by_hand():
-    # Three cells by three are seen from 4. (4, 4) burns, (0, 8) will at step 3, (8, 0) at step 2,
-    # (8, 1) at 2.5 and in view with it; (4, 0) only after the horizon.
+    # The view from 4 is 3 x 3 cells. (4, 4) burns, (0, 8) ignites at step 3, (8, 0) at step 2,
+    # (8, 1) at 2.5 and within the same view, (4, 0) after the horizon.
     arrival = torch.full((9, 9), NEVER)
     arrival[4, 4], arrival[0, 8], arrival[8, 0], arrival[8, 1], arrival[4, 0] = 0, 3, 2, 2.5, 50
     config = world(uavs=4, displacement=16.0, horizon=20, view_angle=THREE)
     env = WildfireEnv(1, config, arrival)
     start = torch.tensor([[0.0, 0, 4], [8, 8, 4], [5, 4, 4], [1, 1, 4]])
     moment = env.reset(position=start)
-    # UAV 2 is nearest to (4, 4), as 1; 1 and 3 are at 4 and 3. UAV 3 chooses second, then 0, 1.
+    # UAV 2 is nearest to (4, 4), at 1; UAVs 1 and 3 are at 4 and 3. Then UAVs 3, 0 and 1 choose.
     places = sent(env, Oracle(env), moment)
     assert places.mul(1e3).round().tolist() == [[[0, 8e3], [8e3, 8e3], [4e3, 4e3], [8e3, 0]]]
 
 
-def test_an_oracle_flies_at_full_altitude_and_nowhere_once_all_is_covered():
+def test_the_oracle_flies_at_full_altitude_and_stops_at_full_coverage():
     env = WildfireEnv(1, world(uavs=2, displacement=1.0), torch.full((9, 9), NEVER))
     moment = env.reset(position=torch.tensor([[2.0, 2, 1], [6, 6, 4]]))
     action = Oracle(env)(moment)[keys.ACTION]
@@ -185,11 +187,11 @@ def test_an_oracle_flies_at_full_altitude_and_nowhere_once_all_is_covered():
     uavs=st.integers(1, 7),
     angle=st.floats(5, 60),
 )
-def test_the_oracle_against_its_rule_with_loops(seed, grid, uavs, angle):
+def test_the_oracle_equals_loops(seed, grid, uavs, angle):
     draw = torch.Generator().manual_seed(seed)
     envs, horizon = 3, 8
     config = world(grid, uavs, view_angle=angle, displacement=32.0, horizon=horizon)
-    # Whole steps and a few values, so that there are ties; and cells that never burn.
+    # Few integer values give ties. Some cells never burn.
     arrival = torch.randint(-3, 14, (envs, *grid), generator=draw).float()
     arrival[torch.rand(arrival.shape, generator=draw) < 0.6] = NEVER
     env = WildfireEnv(envs, config, arrival, seed=seed)
@@ -204,19 +206,19 @@ def test_the_oracle_against_its_rule_with_loops(seed, grid, uavs, angle):
             for e, rest in enumerate(zip(seen, [step] * envs, [config] * envs, strict=True))
         ]
         assert (sent(env, oracle, moment) - torch.tensor(expected)).abs().max() < 1e-4
-        # Half of a step on, so that it stands between cells.
+        # Half a step further, so that positions lie between cells.
         moment = oracle(moment)
         moment[keys.ACTION] = moment[keys.ACTION] / 2
         moment = step_mdp(env.step(moment), keep_other=True)
 
 
-# All of them
+# All policies
 
 SHAPES = [((30, 30), 6, 0.1), ((8, 17), 1, 1.0), ((21, 9), 9, 30.0)]
 
 
 def build(method: str, name: str, shape, *, seeds, fire):
-    """An environment that a policy can be played in, and the policy."""
+    """Returns an environment for a policy, and the policy."""
     grid, uavs, displacement = shape
     changed = [f"env.grid=[{grid[0]},{grid[1]}]", f"env.num_uavs={uavs}", "env.horizon=25"]
     config = resolve(method, ["setup=tuned", *changed, f"env.displacement={displacement}"])
@@ -226,7 +228,7 @@ def build(method: str, name: str, shape, *, seeds, fire):
 
 
 def fires(shape, count: int):
-    """Random fires that grow: [count, X, Y]."""
+    """Returns random fires that grow, [count, X, Y]."""
     draw = torch.Generator().manual_seed(count)
     arrival = 60 * torch.rand(count, *shape[0], generator=draw) - 20
     return arrival.where(arrival < 30, NEVER)
@@ -245,9 +247,9 @@ def test_every_policy_in_every_recipe(name, method, shape):
         assert action.dtype == torch.float32
         assert action.isfinite().all()
         assert action.abs().max() <= 1
-        if name != "random_actions":  # who flies to a point of the box does not leave it
+        if name != "random_actions":  # policies that fly to points in the box do not leave it
             assert not moment[keys.HIT_BOUNDARY].any()
-    # The second environment alone is what it is between the others.
+    # The second environment alone equals the second of the batch.
     env, policy = build(method, name, shape, seeds=[6], fire=arrival[1:2])
     for alone, moment in zip(episode(env, policy, 25), moments, strict=True):
         assert alone[keys.ACTION][0].equal(moment[keys.ACTION][1])
@@ -255,7 +257,7 @@ def test_every_policy_in_every_recipe(name, method, shape):
 
 
 @pytest.mark.parametrize("name", SCRIPTED)
-def test_a_policy_begins_anew_with_every_episode(name):
+def test_a_policy_restarts_with_every_episode(name):
     env, policy = build("consensus", name, SHAPES[0], seeds=[3, 4], fire=fires(SHAPES[0], 2))
     assert isinstance(policy, Scripted)
     moments = episode(env, policy, 20)
@@ -263,7 +265,7 @@ def test_a_policy_begins_anew_with_every_episode(name):
     first = episode(env, policy, 20)
     env.set_seed(1)
     moment = env.reset()
-    # What an episode before has left in the TensorDict means nothing in the first step.
+    # Entries of the previous episode in the TensorDict have no effect on the first step.
     for key in moments[-1].keys():  # noqa: SIM118
         if key.startswith("_"):
             moment[key] = moments[-1][key]
@@ -274,8 +276,8 @@ def test_a_policy_begins_anew_with_every_episode(name):
 
 
 @pytest.mark.slow
-def test_what_each_policy_covers():
-    """Within wide bounds; docs/evaluation.md has the numbers."""
+def test_coverage_of_each_policy():
+    """The bounds are wide; docs/evaluation.md has the measured values."""
     config = resolve("consensus", ["setup=tuned"])
     bounds = {
         "stationary": (2, 12),

@@ -1,4 +1,4 @@
-"""What was changed on disk is noticed: cached files, and config.yaml beside its networks."""
+"""Tests that changes on disk are detected: cached files, and config.yaml of networks."""
 
 import re
 
@@ -30,13 +30,13 @@ FREE = re.compile(
 
 
 def flips(content: bytes):
-    """The content with each of its bits changed, one at a time."""
+    """Yields the content with each bit changed, one at a time."""
     for place in range(len(content)):
         for bit in range(8):
             yield content[:place] + bytes([content[place] ^ 1 << bit]) + content[place + 1 :]
 
 
-def test_every_bit_of_a_cached_file_is_sealed(tmp_path):
+def test_a_change_of_any_bit_of_a_cached_file_is_detected(tmp_path):
     path = tmp_path / "one"
     write_sealed(path, b"some content")
     whole = path.read_bytes()
@@ -46,7 +46,7 @@ def test_every_bit_of_a_cached_file_is_sealed(tmp_path):
         assert read_sealed(path, 100) is None
 
 
-def test_a_cached_bank_with_a_changed_bit_is_made_anew(tmp_path):
+def test_a_cached_bank_with_a_changed_bit_is_computed_again(tmp_path):
     arguments = load_scenario("paper"), "train", 1, (9, 9), 5
     right = fire_bank(*arguments, cache_dir=tmp_path)
     (file,) = tmp_path.iterdir()
@@ -87,7 +87,7 @@ def test_a_runs_copy_of_its_fires_with_a_changed_bit_is_not_read(tmp_path):
 
 
 def test_changed_digits_of_a_configuration(run):
-    """Every ninth one is wrong, differs from the networks' or changes nothing that was learnt."""
+    """A changed digit is invalid, differs from the networks' header, or has no effect on them."""
     folder, file = RunFolder(run), run / "config.yaml"
     text, checkpoint, refused, free = file.read_text(), RunFolder(run).checkpoint(), 0, 0
     check_trained_with(checkpoint, folder.config())
@@ -138,7 +138,7 @@ def test_a_changed_configuration_is_refused(command, old, new, said, run, tmp_pa
     assert {path: path.read_bytes() for path in run.rglob("*") if path.is_file()} == before
 
 
-def test_another_world_is_said_on_the_command_line(run, capsys):
+def test_changed_settings_are_printed_by_the_command(run, capsys):
     before = (run / "eval.json").read_bytes()
     assert main.main(["eval", str(run), "env.view_angle=31.0", "--fires", "1"]) == 0
     assert (run / "eval.json").read_bytes() == before

@@ -1,4 +1,4 @@
-"""Statistics over seeds against hand-computed numbers and independent re-implementations."""
+"""Tests statistics over seeds against hand-computed numbers and plain Python."""
 
 import itertools
 
@@ -22,7 +22,7 @@ several = st.lists(st.integers(0, 40).map(float), min_size=2, max_size=6)
 
 
 def plain_iqm(values) -> float:
-    """The interquartile mean, by hand."""
+    """Computes the interquartile mean in plain Python."""
     ordered = sorted(values)
     cut = len(ordered) // 4
     kept = ordered[cut : len(ordered) - cut]
@@ -30,13 +30,13 @@ def plain_iqm(values) -> float:
 
 
 def plain_improvement(one, other) -> float:
-    """The probability of improvement, pair by pair."""
+    """Computes the probability of improvement, pair by pair."""
     pairs = list(itertools.product(one, other))
     return sum(1.0 if a > b else 0.5 if a == b else 0.0 for a, b in pairs) / len(pairs)
 
 
 def plain_interval(statistic, *samples) -> tuple[float, float]:
-    """The percentile interval of every resample there is, each as likely as the others."""
+    """Computes the percentile interval over all possible resamples with equal weights."""
     drawn = [list(itertools.product(sample, repeat=len(sample))) for sample in samples]
     values = [statistic(*chosen) for chosen in itertools.product(*drawn)]
     return float(np.quantile(values, 0.025)), float(np.quantile(values, 0.975))
@@ -67,7 +67,7 @@ def test_probability_of_improvement_by_hand(one, other, expected):
 
 @settings(deadline=None)
 @given(numbers, numbers)
-def test_statistics_equal_plain_ones(one, other):
+def test_statistics_equal_plain_python(one, other):
     a, b = np.asarray(one), np.asarray(other)
     assert iqm(a) == pytest.approx(plain_iqm(one))
     assert probability_of_improvement(a, b) == pytest.approx(plain_improvement(one, other))
@@ -92,7 +92,7 @@ def test_ratio_to_the_best_other(own, others, higher, ratio):
     assert as_ratio(float(share)) == pytest.approx(ratio)
 
 
-def test_one_seed_gives_no_interval_and_two_their_range():
+def test_one_seed_has_no_interval_and_two_have_their_range():
     assert interval(iqm, [3.0]) is None
     assert interval(probability_of_improvement, [3.0, 4.0], [1.0]) is None
     assert interval(iqm, [3.0, 5.0]) == (3, 5)
@@ -101,28 +101,28 @@ def test_one_seed_gives_no_interval_and_two_their_range():
 
 
 @pytest.mark.parametrize("values", [[1, 2, 4, 8], [0.1, 0.7, 0.2, 0.9, 0.4]])
-def test_interval_is_that_of_all_resamples(values):
+def test_interval_equals_that_of_all_resamples(values):
     low, high = plain_interval(lambda chosen: plain_iqm(chosen), values)
     got = interval(iqm, values)
-    # 10,000 of them are drawn, so that the ends may fall on the neighbouring value.
+    # 10,000 resamples are drawn, so that an end may be the neighbouring value.
     assert got is not None
     assert got == pytest.approx((low, high), abs=0.06 * (max(values) - min(values)))
-    # Of 4 seeds the ends are the worst and the best, of 5 they are within.
+    # With 4 seeds the ends are the worst and the best seed, with 5 they lie between them.
     assert (got == (min(values), max(values))) == (len(values) < statistics.FEW)
 
 
-def test_interval_draws_within_each_method():
+def test_interval_resamples_within_each_method():
     one, other = [1.0, 4.0, 5.0], [2.0, 3.0, 6.0]
     expected = plain_interval(plain_improvement, one, other)
     assert interval(probability_of_improvement, one, other) == pytest.approx(expected, abs=1 / 9)
-    # Drawn from both together the ends would be 0 and 1.
+    # Resampling both together would give the ends 0 and 1.
     apart = interval(probability_of_improvement, [1.0, 2.0, 3.0], [7.0, 8.0, 9.0])
     assert apart == (0, 0)
 
 
 @settings(deadline=None, max_examples=25)
 @given(several, several)
-def test_intervals_hold_the_statistic_and_do_not_depend_on_what_was_drawn_before(one, other):
+def test_intervals_contain_the_statistic_and_ignore_earlier_draws(one, other):
     first = interval(iqm, one)
     interval(probability_of_improvement, one, other)
     assert interval(iqm, one) == first
@@ -133,7 +133,7 @@ def test_intervals_hold_the_statistic_and_do_not_depend_on_what_was_drawn_before
     assert 0 <= got[0] <= got[1] <= 1
 
 
-def test_band_is_the_interval_at_every_episode():
+def test_band_equals_the_interval_at_every_episode():
     values = np.random.default_rng(0).random((5, 3))
     ends = band(values)
     assert ends is not None
@@ -143,7 +143,7 @@ def test_band_is_the_interval_at_every_episode():
     assert band(values[:1]) is None
 
 
-def test_few_seeds_hold_the_median_as_seldom_as_is_said():
+def test_coverage_of_the_median_with_few_seeds():
     draws = np.random.default_rng(0).standard_normal((20_000, 4))
     for seeds, share in ((2, 0.5), (3, 0.75), (4, 0.875)):
         some = draws[:, :seeds]

@@ -1,4 +1,4 @@
-"""Several seeds as one stack: each learns what it learns alone."""
+"""Tests that a seed in a stack of seeds learns the same as alone."""
 
 import csv
 import json
@@ -23,8 +23,8 @@ SEEDS = [3, 11]
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("method", "setup"), zip(METHODS, ["released", "paper"] * 2, strict=True))
-def test_a_seed_of_a_stack_learns_what_it_learns_alone(method, setup, tmp_path):
-    """Some two hundred updates; both work in float32, in another order."""
+def test_a_seed_of_a_stack_learns_the_same_as_alone(method, setup, tmp_path):
+    """About two hundred updates in float32, with operations in a different order."""
     settings = [
         *(f"setup={setup}", "env.horizon=60", "episodes=4", "num_envs=2", "env.num_uavs=3"),
         *("learner.batch_size=24", "learner.hidden=[24,16]", "evaluation.interval=0"),
@@ -44,10 +44,10 @@ def test_a_seed_of_a_stack_learns_what_it_learns_alone(method, setup, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_stack_of_networks_learns_as_each_does_to_the_last_digits(tmp_path):
-    """300 updates in float64 at tuned's learning rates, from transitions that were recorded once.
+def test_a_stack_of_networks_equals_single_networks_in_float64(tmp_path):
+    """Compares 300 updates in float64 at tuned's learning rates, from recorded transitions.
 
-    In float32 these rates let Adam blow rounding errors up where a gradient all but vanishes.
+    In float32, at these rates, Adam amplifies rounding errors of nearly vanishing gradients.
     """
     settings = ["setup=tuned", "env.horizon=50", "learner.batch_size=16", "learner.hidden=[24,16]"]
 
@@ -89,8 +89,8 @@ def next_of(batch: TensorDict, uavs: slice) -> TensorDict:
     return TensorDict({"agents": agents}, batch_size=batch.batch_size)
 
 
-def test_seeds_of_a_stack_differ_in_all_that_is_random():
-    """Weights, start positions, fires, noise, and what is drawn from the memory."""
+def test_seeds_of_a_stack_differ_in_all_random_values():
+    """Compares weights, start positions, fires, noise and replay samples."""
     settings = ["fire=huygens", "env.horizon=30", "learner.batch_size=24", "learner.hidden=[8,8]"]
     setup = TrainingSetup(resolve("consensus", [*settings, f"seeds={SEEDS}"]))
     learner: Any = setup.learner
@@ -109,7 +109,7 @@ def test_seeds_of_a_stack_differ_in_all_that_is_random():
     assert columns[:, :6].max() < 6 <= columns[:, 6:].min()
 
 
-def test_environments_of_several_seeds_are_those_of_each():
+def test_environments_of_several_seeds_equal_those_of_single_seeds():
     together = WildfireEnv(6, fire="huygens", seed=[5, 9])
     singles = [WildfireEnv(3, fire="huygens", seed=seed) for seed in (5, 9)]
     moments = [env.reset() for env in singles]
@@ -122,12 +122,12 @@ def test_environments_of_several_seeds_are_those_of_each():
 
 
 @pytest.mark.parametrize("seeds", [[], [1, -1], [1, 2]])
-def test_seeds_that_cannot_share_the_environments_out(seeds):
+def test_environments_not_divisible_by_seeds(seeds):
     with pytest.raises(ValueError, match="seed"):
         WildfireEnv(3, seed=seeds)
 
 
-def test_every_seed_gets_a_run_folder_that_evaluates(tmp_path, capsys):
+def test_every_seed_has_a_run_folder_that_can_be_evaluated(tmp_path, capsys):
     small = [
         *("episodes=2", "env.horizon=15", "env.num_uavs=2", "learner.hidden=[8,8]"),
         *("learner.batch_size=8", "evaluation.episodes=2", "evaluation.interval=1"),
@@ -147,7 +147,7 @@ def test_every_seed_gets_a_run_folder_that_evaluates(tmp_path, capsys):
         result = json.loads((folder / "eval.json").read_text())
         assert result["seed"] == seed
         assert main.main(["eval", str(folder)]) == 0
-        # The checkpoint plays as the networks in the stack did.
+        # The checkpoint's policy equals that of the stack.
         assert json.loads((folder / "eval.json").read_text()) == result
         evaluated.append(result["results"]["paper"]["learned"])
     assert evaluated[0] != evaluated[1]
@@ -163,7 +163,7 @@ def test_every_seed_gets_a_run_folder_that_evaluates(tmp_path, capsys):
         (["seeds=[a]"], "seeds.0=a"),
     ],
 )
-def test_wrong_seeds(overrides, message, capsys, tmp_path):
+def test_invalid_seeds(overrides, message, capsys, tmp_path):
     assert main.main(["train", "consensus", *overrides, f"output={tmp_path}"]) == 2
     error = capsys.readouterr().err
     assert message in error
@@ -180,13 +180,13 @@ def test_seeds_from_python():
         make_env("consensus", seeds=[1, 2])
 
 
-def test_a_configuration_from_before_there_were_seeds():
+def test_a_configuration_without_the_key_seeds():
     values = to_values(resolve("consensus"))
     del values["seeds"]
     assert from_values(values) == resolve("consensus")
 
 
-def test_every_seed_has_a_tracker_of_its_own(tmp_path):
+def test_every_seed_has_a_separate_tracker(tmp_path):
     small = ["env.horizon=8", "episodes=2", "learner.batch_size=8", "learner.hidden=[4,4]"]
     more = [f"seeds={SEEDS}", "logger=csv", f"output={tmp_path}", "evaluation.interval=0"]
     for run in trained(resolve("independent", [*small, *more])).runs:

@@ -1,4 +1,4 @@
-"""Field of view, and what is counted in it, by hand."""
+"""Tests field of view and class counts against hand-computed numbers."""
 
 import pytest
 import torch
@@ -14,11 +14,11 @@ def test_view_radius(altitude, radius):
 
 def seen(position, grid=(30, 20), view_angle=30.0, ceiling=4.0) -> set[tuple[int, int]]:
     view = Sensor(grid, view_angle=view_angle, ceiling=ceiling)
-    names = torch.arange(grid[0] * grid[1]).view(grid)  # of the cells, -1 in the margin
+    names = torch.arange(grid[0] * grid[1]).view(grid)  # cell indices, -1 in the margin
     flat = view.pad(names, -1)
     assert flat.shape == (view.area,)
     assert view.crop(flat).equal(names)
-    # Behind another map, as an environment's is behind those of others.
+    # After another map, as in a batch of environments.
     where = torch.tensor([position], dtype=torch.float64)
     centre, cells, near = view.look(where, torch.tensor([view.area]))
     assert view.area <= cells.min() <= cells.max() < 2 * view.area
@@ -34,7 +34,7 @@ def seen(position, grid=(30, 20), view_angle=30.0, ceiling=4.0) -> set[tuple[int
     [
         ([5.0, 7, 1], [5], [7]),  # radius 0.577
         ([5.5, 7, 1], [5, 6], [7]),
-        ([5.4, 7.6, 1], [5], [8]),  # 6 is 0.6 away along x, 7 as far along y
+        ([5.4, 7.6, 1], [5], [8]),  # 6 is 0.6 away along x, 7 is 0.6 away along y
         ([5.0, 7, 4], [3, 4, 5, 6, 7], [5, 6, 7, 8, 9]),  # radius 2.309
         ([5.5, 7.3, 4], [4, 5, 6, 7], [5, 6, 7, 8, 9]),
         ([0.0, 0, 4], [0, 1, 2], [0, 1, 2]),
@@ -46,7 +46,7 @@ def test_view(position, columns, rows):
     assert seen(position) == {(i, j) for i in columns for j in rows}
 
 
-def test_view_wider_than_the_grid_holds_every_cell_once():
+def test_view_wider_than_the_grid_has_every_cell_once():
     assert len(seen([3.0, 4, 50], (8, 10), 60.0, 50.0)) == 80
 
 

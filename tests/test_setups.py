@@ -1,4 +1,4 @@
-"""The constants that a recipe really runs with, against the table they were agreed in."""
+"""Compares the constants of the recipes with the table of agreed values."""
 
 import dataclasses
 
@@ -47,7 +47,7 @@ TABLE = {
 }
 GAMMA = {(method, setup): 0.95 for method in METHODS for setup in (PAPER, RELEASED)}
 GAMMA["independent", RELEASED] = 0.92
-# What a method is: whose memory, and what is heard.
+# The methods: replay buffer and communication.
 SWITCHES = {
     "independent": ("per_agent", "no_comm"),
     "shared_memory": ("shared", "no_comm"),
@@ -102,7 +102,7 @@ OWN = {
 
 
 @pytest.mark.parametrize("setup", OWN)
-def test_methods_differ_in_two_switches_and_in_what_is_listed(setup):
+def test_methods_differ_only_in_listed_settings(setup):
     every = {method: resolve(method, [f"setup={setup}"]) for method in METHODS}
     common: dict[str, set[str]] = {}
     for method, config in every.items():
@@ -114,7 +114,7 @@ def test_methods_differ_in_two_switches_and_in_what_is_listed(setup):
             if key.split(".")[0] not in ("method", "replay", "comm"):
                 common.setdefault(key, set()).add(repr(values[key]))
     assert all(len(values) == 1 for values in common.values())
-    for own in OWN[setup].values():  # and what is listed is not what the others have
+    for own in OWN[setup].values():  # listed settings differ from those of the other methods
         for key, value in own.items():
             assert repr(value) not in common.get(key, set())
 
@@ -127,19 +127,19 @@ def test_paper_is_the_default():
 @pytest.mark.parametrize(
     ("setup", "fire"), [("paper", "paper"), ("released", "paper"), ("tuned", "huygens")]
 )
-def test_each_setup_chooses_its_fire_and_the_user_may_choose_another(setup, fire):
+def test_each_setup_has_a_fire_that_can_be_overridden(setup, fire):
     assert resolve("consensus", [f"setup={setup}"]).fire.name == fire
     for other in scenarios():
         assert resolve("consensus", [f"setup={setup}", f"fire={other}"]).fire.name == other
 
 
 @pytest.mark.parametrize("value", ["Läufe", "日本", "meine Läufe (2)", "größer/ßß"])
-def test_letters_that_hydra_lacks_need_no_quotes(value):
+def test_letters_outside_of_hydras_grammar_need_no_quotes(value):
     assert resolve("consensus", [f"output={value}"]).output == value
 
 
 @pytest.mark.parametrize("text", ["output=a{ä", "output=ä,b", "output=[ä"])
-def test_special_characters_ask_for_quotes(text):
+def test_special_characters_need_quotes(text):
     with pytest.raises(UserError, match="quotes: 'key="):
         resolve("consensus", [text])
     key, value = text.split("=")
@@ -147,13 +147,13 @@ def test_special_characters_ask_for_quotes(text):
     assert quoted.output == value
 
 
-def test_tuned_keeps_the_physics_of_released():
+def test_tuned_has_the_physics_of_released():
     ours, theirs = (resolve("consensus", [f"setup={s}"]).env for s in ("tuned", RELEASED))
     for key in ("grid", "num_uavs", "horizon", "altitude", "view_angle", "displacement"):
         assert getattr(ours, key) == getattr(theirs, key), key
 
 
-def test_defaults_in_code_are_setup_paper():
+def test_defaults_in_code_equal_setup_paper():
     config = resolve("consensus")
     assert WildfireConfig() == config.env
     assert RewardConfig() == config.env.reward
@@ -162,7 +162,7 @@ def test_defaults_in_code_are_setup_paper():
     assert ConsensusConfig() == from_plain(ConsensusConfig, settings)
 
 
-def test_the_setups_and_methods_are_those_of_the_table():
+def test_the_table_has_all_setups_and_methods():
     assert known("method") == sorted(METHODS)
     assert known("setup") == ["paper", "released", "tuned"]
     assert known("fire") == ["file", "huygens", "oil_slick", "paper"]

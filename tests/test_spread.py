@@ -244,7 +244,7 @@ def test_rates_in_space_and_time():
     torch.testing.assert_close(got[finite], want[finite], rtol=0.005, atol=3)
 
 
-def test_the_edge_of_the_grid_does_not_disturb():
+def test_the_edge_of_the_grid_has_no_effect():
     field = torch.rand(1, 40, 40, generator=torch.Generator().manual_seed(1))
     more = {"azimuth": -0.3, "max_rate": 0.006}
     for whole, inside in ((torch.ones(1, 40, 40), 0), (field, 3)):

@@ -1,4 +1,4 @@
-"""The batched environment against the scalar one, and what holds at every step."""
+"""Compares the batched environment with the scalar one and checks invariants of a step."""
 
 import math
 
@@ -29,7 +29,7 @@ CASES = [  # grid, UAVs, displacement, view angle, altitude, reward
 
 
 def random_fire(grid: tuple[int, int], generator: torch.Generator) -> torch.Tensor:
-    """A third burns from the start, a third at some time, whole or not, a third never."""
+    """Returns fires: a third of the cells burns at 0, a third later, a third never."""
     kind = torch.randint(3, (ENVS, *grid), generator=generator)
     time = torch.rand(ENVS, *grid, generator=generator) * STEPS
     time = torch.where(time > STEPS / 2, time.round(), time)
@@ -37,7 +37,7 @@ def random_fire(grid: tuple[int, int], generator: torch.Generator) -> torch.Tens
 
 
 def random_actions(uavs: int, generator: torch.Generator) -> torch.Tensor:
-    """[STEPS, ENVS, uavs, 3]: noise about a slowly turning wish, now and then beyond [-1, 1]."""
+    """Returns [STEPS, ENVS, uavs, 3]: noise around slowly turning values, partly beyond [-1, 1]."""
     wish = 2 * torch.rand(STEPS // 15 + 1, ENVS, uavs, 3, generator=generator) - 1
     noise = torch.randn(STEPS, ENVS, uavs, 3, generator=generator)
     return wish.repeat_interleave(15, 0)[:STEPS] + 0.5 * noise
@@ -94,7 +94,7 @@ def test_equals_the_scalar_environment(case):
     observation_scale=st.sampled_from(["raw", "box"]),
     seed=st.integers(0, 2**31 - 1),
 )
-def test_what_holds_at_every_step(seed, grid, uavs, **changes):
+def test_invariants_of_every_step(seed, grid, uavs, **changes):
     generator = torch.Generator().manual_seed(seed)
     fire = torch.rand(*grid, generator=generator) * 8 - 1
     config = WildfireConfig(grid=grid, num_uavs=uavs, horizon=6, **changes)
@@ -122,7 +122,7 @@ def test_what_holds_at_every_step(seed, grid, uavs, **changes):
 
 
 def cells_in_view(position: torch.Tensor, config: WildfireConfig) -> torch.Tensor:
-    """Columns times rows in view, int64 [..., n]."""
+    """Returns the number of cells in view, columns times rows, int64 [..., n]."""
     radius = position[..., 2:].double() * math.tan(math.radians(config.view_angle))
     sides = [
         ((torch.arange(side) - position[..., axis, None].double()).abs() <= radius).sum(-1)
@@ -140,7 +140,7 @@ def test_the_largest_world_runs():
     assert (steps["next"][keys.BURNING] > 77).all()
 
 
-def test_the_widest_view_sees_the_whole_grid():
+def test_the_widest_view_covers_the_whole_grid():
     config = WildfireConfig(grid=(8, 256), num_uavs=1, altitude=(256.0, 256.0), view_angle=80.0)
     env = WildfireEnv(1, config, torch.zeros(8, 256))
     moment = env.rollout(1)["next"]

@@ -1,4 +1,4 @@
-"""Trainings that are killed, interrupted, or run out of room: a few of what `make soak` does."""
+"""Tests killed and interrupted trainings and full disks, with a few trials of `make soak`."""
 
 import json
 import os
@@ -14,9 +14,9 @@ SOAK = Path(__file__).parent / "soak" / "soak.py"
 
 @pytest.fixture(scope="module")
 def table(tmp_path_factory) -> dict[str, list[str]]:
-    """What the program prints, by kind of trial.
+    """Returns the printed table, by kind of trial.
 
-    In a process of its own: it forks, and this one may have threads.
+    The program forks, so it runs in a separate process without threads.
     """
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     result = subprocess.run(
@@ -35,7 +35,7 @@ def table(tmp_path_factory) -> dict[str, list[str]]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", COUNTS)
-def test_every_one_goes_on(kind, table):
+def test_every_trial_succeeds(kind, table):
     _, done, failures, _ = table[kind]
     assert int(done) == COUNTS[kind]
     assert failures == "0", table["all"][0]

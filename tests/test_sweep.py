@@ -1,4 +1,4 @@
-"""emberlink sweep: every combination once, and the same command again does what is left."""
+"""Tests emberlink sweep: every combination is trained once, and repeating it resumes."""
 
 import multiprocessing
 import os
@@ -51,7 +51,7 @@ def test_every_combination_once():
     assert jobs[3].configs[0].setup == "tuned"
 
 
-def test_lists_and_ranges_are_hydras():
+def test_lists_and_ranges_follow_hydras_syntax():
     jobs = jobs_of(
         ["consensus", "learner.hidden=[8,8],[4,4]", "env.grid=[40,20]", "seed=range(1,3)"]
     )
@@ -64,7 +64,7 @@ def test_lists_and_ranges_are_hydras():
     assert {job.configs[0].env.grid for job in jobs} == {(40, 20)}
 
 
-def test_all_methods_where_none_is_named_and_stacks_of_seeds():
+def test_all_methods_by_default_and_stacks_of_seeds():
     jobs = jobs_of(["seeds=[3,4]"])
     assert names(jobs) == [
         f"{method}, paper, seed 3,4"
@@ -83,7 +83,7 @@ def test_all_methods_where_none_is_named_and_stacks_of_seeds():
         (["consensus", "--jobs", "0"], "--jobs"),
     ],
 )
-def test_mistakes_are_named_before_anything_is_trained(arguments, said, capsys, tmp_path):
+def test_errors_are_named_before_training(arguments, said, capsys, tmp_path):
     with pytest.raises(SystemExit) if "--jobs" in arguments else nullcontext():
         assert main(["sweep", *arguments, f"output={tmp_path}"]) == 2
     error = capsys.readouterr().err
@@ -96,14 +96,14 @@ CHECKPOINT = "step_000000040.safetensors"
 
 
 def begin(config) -> RunFolder:
-    """Makes the run folder of a training that has just started."""
+    """Creates the run folder of a training that has just started."""
     run = RunFolder.create(config)
     run.write_config(config)
     return run
 
 
 def finish(run: RunFolder, episodes: int = 15) -> None:
-    """Adds what a training and its evaluation leave."""
+    """Adds the files of a training and its evaluation."""
     for episode in range(len(run.lines()) + 1, episodes + 1):
         run.append("metrics.jsonl", {"episode": episode, "coverage": 50.0})
     (run.checkpoints / CHECKPOINT).touch()
@@ -117,7 +117,7 @@ def configs_of(arguments) -> list:
 
 
 class Instant(executors.Executor):
-    """Finishes each task at once: a second executor beside that of the processes."""
+    """Finishes each task immediately, as an alternative to the executor with processes."""
 
     def __init__(self, fails=lambda arguments: False):
         self.submitted: list[list[str]] = []
@@ -157,7 +157,7 @@ def swept(arguments, executor=None) -> list[list[str]]:
     return [[text for text in task if text not in SMALL] for task in executor.submitted]
 
 
-def test_what_is_finished_is_skipped_and_the_rest_made(tmp_path, capsys):
+def test_finished_runs_are_skipped(tmp_path, capsys):
     output = f"output={tmp_path}"
     assert swept(["independent", "episodes=1", output, "seed=0"]) == [
         ["independent", "episodes=1", output, "seed=0"]
@@ -170,7 +170,7 @@ def test_what_is_finished_is_skipped_and_the_rest_made(tmp_path, capsys):
     assert "2 runs, of which 1 are finished" in capsys.readouterr().out
 
 
-def test_one_run_that_fails_does_not_end_the_others(tmp_path, capsys):
+def test_a_failing_run_does_not_stop_the_others(tmp_path, capsys):
     executor = Instant(fails=lambda arguments: "seed=0" in arguments)
     arguments = [*SMALL, "independent", f"output={tmp_path}", "seed=0,1,2"]
     assert sweep(arguments, Console(width=300), executor=executor) == 1
@@ -202,8 +202,8 @@ def test_a_run_folder_is_read_once(tmp_path, monkeypatch):
     assert len(read) == 6
 
 
-def test_a_run_of_another_device_is_the_same_run(tmp_path):
-    """It is resumed on the device that is wanted now."""
+def test_the_device_is_not_part_of_the_identity_of_a_run(tmp_path):
+    """The run is resumed on the requested device."""
     output = f"output={tmp_path}"
     (config,) = configs_of(["independent", *SMALL, output])
     done, stopped = begin(config), begin(replace(config, seed=1))
@@ -214,7 +214,7 @@ def test_a_run_of_another_device_is_the_same_run(tmp_path):
     assert swept(["independent", output, "seed=0,1"]) == [[f"resume={stopped.path}", "device=cpu"]]
 
 
-def test_a_resumed_run_is_given_what_may_change(tmp_path):
+def test_a_resumed_run_gets_the_settings_that_may_change(tmp_path):
     output = f"output={tmp_path}"
     (config,) = configs_of(["independent", *SMALL, output])
     run = begin(config)
@@ -238,7 +238,7 @@ def test_a_run_without_metrics_is_not_finished(tmp_path):
     assert swept(["independent", output]) == [[f"resume={run.path}", "device=cpu"]]
 
 
-def test_a_seed_of_two_stacks_is_trained_once(tmp_path):
+def test_a_seed_in_two_stacks_is_trained_once(tmp_path):
     output = f"output={tmp_path}"
     assert swept(["independent", output, "seeds=[0,1],[1,2]"]) == [
         ["independent", output, "seeds=[0,1]"],
@@ -247,7 +247,7 @@ def test_a_seed_of_two_stacks_is_trained_once(tmp_path):
     assert [run.config().seed for run in runs_in(tmp_path)] == [0, 1, 2]
 
 
-def test_a_stack_knows_the_runs_that_were_trained_one_by_one(tmp_path):
+def test_a_stack_uses_runs_that_were_trained_separately(tmp_path):
     output = f"output={tmp_path}"
     swept(["independent", output, "seed=0,1"])
     assert swept(["independent", output, "seeds=[0,1,2,3]"]) == [
@@ -257,7 +257,7 @@ def test_a_stack_knows_the_runs_that_were_trained_one_by_one(tmp_path):
 
 
 def test_a_stack_is_resumed_as_a_whole(tmp_path):
-    """Also where its seeds are wanted one by one, some of them finished."""
+    """This includes seeds that are requested separately and partly finished."""
     output = f"output={tmp_path}"
     stack = [begin(one) for one in configs_of(["independent", *SMALL, output, "seeds=[0,1,2]"])]
     finish(stack[0])
@@ -268,7 +268,7 @@ def test_a_stack_is_resumed_as_a_whole(tmp_path):
 
 
 class Later(Instant):
-    """Takes a second for a task and leaves no run folder until then."""
+    """Takes a second for a task and creates its run folder at the end."""
 
     def submit(self, task):
         with (task.log.parent / "submitted").open("a") as file:
@@ -283,8 +283,8 @@ class Later(Instant):
         return 0
 
 
-def test_two_sweeps_at_once_train_everything_once(tmp_path):
-    """The second takes what the first has not begun, and waits for the rest."""
+def test_two_simultaneous_sweeps_train_every_run_once(tmp_path):
+    """The second takes jobs that the first has not started, and waits for the others."""
     arguments = [*SMALL, "independent", f"output={tmp_path}", "seed=range(0,4)"]
 
     def work():
@@ -310,8 +310,8 @@ os.read(0, 1)
 """
 
 
-def test_a_killed_sweep_takes_its_trainings_along(tmp_path):
-    """And a run stays claimed until the training has ended."""
+def test_a_killed_sweep_ends_its_trainings(tmp_path):
+    """A run stays claimed until its training has ended."""
     (job,) = jobs_of(["independent", *SMALL, "episodes=10000", f"output={tmp_path}"])
     own = claims.claim(tmp_path, job.identities)
     assert own is not None
@@ -335,12 +335,12 @@ def test_a_killed_sweep_takes_its_trainings_along(tmp_path):
         assert time.monotonic() < deadline
         time.sleep(0.05)
     again.release()
-    # A process that nobody waits for may stay in the table, but holds nothing.
+    # A zombie process may remain, but holds no lock.
     status = Path(f"/proc/{child}/stat")
     assert not status.exists() or status.read_text().split()[2] == "Z"
 
 
-def test_claims_are_for_a_run_and_not_for_a_job(tmp_path):
+def test_claims_are_per_run(tmp_path):
     one, other = (identity(c) for c in configs_of(["independent", *SMALL, "seeds=[0,1]"]))
     first = claims.claim(tmp_path, [one])
     assert first is not None
@@ -371,17 +371,17 @@ def test_executors_are_chosen_and_checked(argument, said, capsys, tmp_path, monk
     assert not any(tmp_path.iterdir())
 
 
-def test_every_executor_has_a_file_and_its_keys():
+def test_every_executor_has_a_file_and_settings():
     assert executors.known() == ["local"]
     executor = executors.make("local", {"workers": 3})
     assert (executor.slots(9), executor.slots(2)) == (3, 2)
 
 
 @pytest.mark.slow
-def test_a_stopped_sweep_goes_on_and_ends_where_an_unbroken_one_does(tmp_path):
+def test_a_resumed_sweep_equals_an_uninterrupted_one(tmp_path):
     program = "from emberlink.trainers.cli.main import main; raise SystemExit(main())"
     broken, whole = tmp_path / "broken", tmp_path / "whole"
-    # Long enough to be met in the middle of it.
+    # Long enough to be interrupted during the training.
     arguments = ["sweep", *SMALL, "consensus", "episodes=12", "checkpoint_steps=20", "seed=5"]
     process = subprocess.Popen(
         [sys.executable, "-c", program, *arguments, f"output={broken}"],

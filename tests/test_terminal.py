@@ -1,4 +1,4 @@
-"""What reaches a terminal, a pipe or a file: every character, every number, on time."""
+"""Tests output to terminals, pipes and files: encodings, complete tables, progress."""
 
 import io
 import os
@@ -20,7 +20,7 @@ from emberlink.trainers.terminal.progress import BETWEEN_LINES, FIRST_LINE, Time
 
 
 class Stream(io.TextIOWrapper):
-    """A standard output of some encoding."""
+    """A standard output with a given encoding."""
 
     def __init__(self, encoding: str):
         super().__init__(io.BytesIO(), encoding=encoding, newline="\n")
@@ -55,7 +55,7 @@ def test_escape_sequences_of_names_are_not_printed(capsys):
 
 
 @pytest.mark.parametrize(("columns", "width"), [("0", None), ("", None), ("33", 33), (None, None)])
-def test_the_width_of_a_pipe_is_that_of_columns(columns, width, monkeypatch, capsys):
+def test_columns_sets_the_width_of_a_pipe(columns, width, monkeypatch, capsys):
     monkeypatch.setenv("COLUMNS", columns or "")
     if columns is None:
         monkeypatch.delenv("COLUMNS")
@@ -87,7 +87,7 @@ def table(label: str) -> Table:
     return made
 
 
-def test_a_table_that_fits_is_in_one_part():
+def test_a_table_that_fits_has_one_part():
     console = Console(width=40, file=io.StringIO(), record=True)
     print_table(console, table("consensus"))
     assert (
@@ -108,7 +108,7 @@ def test_a_table_that_fits_is_in_one_part():
 
 
 @pytest.mark.parametrize("width", [12, 20, 40, 64, 72, 80, 120])
-def test_a_table_shows_every_cell_whole(width):
+def test_a_table_shows_every_cell_completely(width):
     label = "consensus (learner.batch_size=64)"
     console = Console(width=width, file=io.StringIO(), record=True)
     print_table(console, table(label))
@@ -117,7 +117,7 @@ def test_a_table_shows_every_cell_whole(width):
         assert cell in text
 
 
-def test_the_console_prints_every_table_so(monkeypatch, capsys):
+def test_the_console_splits_every_table(monkeypatch, capsys):
     monkeypatch.setenv("COLUMNS", "24")
     SafeConsole().print(table("a long name of a run"))
     text = capsys.readouterr().out
@@ -133,14 +133,14 @@ def times(seconds: list[tuple[float, int, int]], steps: int = 1000) -> TimeLeft:
     return left
 
 
-def test_the_time_left_follows_from_steps_with_updates_only():
+def test_the_remaining_time_is_estimated_from_steps_with_updates():
     quick = [(step * 0.01, step, 0) for step in range(101)]
     slow = [(1 + i * 1.0, 100 + i, i) for i in range(1, 11)]
     assert times(quick).seconds is None
     assert times(quick).speed == pytest.approx(100)
     left = times(quick + slow)
     assert left.seconds == pytest.approx(1000 - 110)
-    assert times(quick + slow[:2]).seconds is None  # too few
+    assert times(quick + slow[:2]).seconds is None  # too few steps
     later = times(quick + [(1 + i, 100 + i, i) for i in range(1, 101)])
     assert later.seconds == pytest.approx(800)
     assert later.speed == pytest.approx(1, rel=0.05)
@@ -156,7 +156,7 @@ class Clock:
 LINE = {"episode": 1, "updates": 90, "coverage": 45.06, "mean_reward": -1.234}
 
 
-def test_a_file_gets_lines_within_long_episodes_and_one_for_each(capsys):
+def test_a_file_gets_lines_during_and_after_episodes(capsys):
     clock = Clock()
     progress = TrainingProgress(SafeConsole(), steps=2000, episodes=2, clock=clock)
     with progress:
@@ -179,7 +179,7 @@ def test_a_file_gets_lines_within_long_episodes_and_one_for_each(capsys):
     assert max(map(len, printed)) <= 80
 
 
-def test_a_terminal_gets_a_bar_and_the_lines(monkeypatch):
+def test_a_terminal_shows_a_bar_and_the_lines(monkeypatch):
     stream = Stream("utf-8")
     monkeypatch.setattr(sys, "stdout", stream)
     monkeypatch.setattr(stream, "isatty", lambda: True, raising=False)

@@ -1,4 +1,4 @@
-"""A tracker that fails, in whichever way: the training goes on, and one warning says so."""
+"""Tests that training continues with one warning if a tracker fails in any way."""
 
 import os
 import signal
@@ -68,9 +68,9 @@ def _elsewhere(tmp_path, monkeypatch):
 
 
 def forget() -> None:
-    """wandb reads its settings once in a process: what a test has set is no other test's.
+    """Resets wandb, which reads its settings once per process.
 
-    Nor is the process that it works in, which it finds again by an environment variable.
+    It also removes the environment variable by which wandb finds its service process.
     """
     with suppress(Exception):
         wandb.teardown()
@@ -78,7 +78,7 @@ def forget() -> None:
 
 
 class Fragile:
-    """A tracker that fails, or waits for ever, at one moment."""
+    """A tracker that fails, or blocks forever, in a given method."""
 
     def __init__(self, moment: str, how: Callable[[], None]):
         self.moment, self.how, self.told = moment, how, []
@@ -111,7 +111,7 @@ def wait() -> None:
 
 @pytest.mark.parametrize("how", [fail, leave, wait])
 @pytest.mark.parametrize("moment", ["init", "log", "finish"])
-def test_it_fails_or_never_answers(moment, how, tmp_path, monkeypatch):
+def test_a_tracker_that_fails_or_blocks(moment, how, tmp_path, monkeypatch):
     made = []
 
     def make(*_):
@@ -120,14 +120,14 @@ def test_it_fails_or_never_answers(moment, how, tmp_path, monkeypatch):
 
     monkeypatch.setitem(loggers.TRACKERS, "csv", make)
     expected = {fail: "No space left", leave: "SystemExit", wait: "no answer within 1.5 s"}[how]
-    # A stack of two seeds: two trackers, and still one warning.
+    # A stack of two seeds has two trackers but gives one warning.
     only(train("csv", tmp_path, lambda _: None, "seeds=[3,4]"), "logger=csv", expected)
     if moment == "log":
-        assert {step for _, step in made[0].told} == {1}  # and nothing after it had failed
+        assert {step for _, step in made[0].told} == {1}  # and no calls after the failure
 
 
 @pytest.mark.parametrize("logger", ["wandb", "tensorboard"])
-def test_a_package_that_is_missing_is_said_before_training(logger, tmp_path, monkeypatch, capsys):
+def test_a_missing_package_is_an_error_before_training(logger, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(loggers, "find_spec", lambda name: None)
     arguments = ["train", "independent", *SHORT, f"logger={logger}", f"output={tmp_path}/runs"]
     assert main.main(arguments) == 2
@@ -140,7 +140,7 @@ def test_a_package_that_is_missing_is_said_before_training(logger, tmp_path, mon
 @pytest.mark.parametrize(
     ("logger", "name"), [("csv", "metrics.csv"), ("tensorboard", "tensorboard")]
 )
-def test_its_files_cannot_be_made(logger, name, tmp_path):
+def test_a_tracker_whose_files_cannot_be_created(logger, name, tmp_path):
     config = resolve("independent", [*SHORT, f"logger={logger}", f"output={tmp_path}"])
     trainer = Trainer(config)
     run = trainer.start()
@@ -155,7 +155,7 @@ def test_its_files_cannot_be_made(logger, name, tmp_path):
     assert logger == "csv" or (run.path / name).read_text() == "in the way"
 
 
-def test_wandb_has_no_such_mode(tmp_path, monkeypatch):
+def test_an_unknown_mode_of_wandb(tmp_path, monkeypatch):
     monkeypatch.setenv("WANDB_MODE", "nonsense")
     only(train("wandb", tmp_path), "logger=wandb", "mode")
 
@@ -167,7 +167,7 @@ def test_wandb_is_switched_off(tmp_path, monkeypatch):
 
 
 def test_wandb_cannot_reach_its_server(tmp_path, monkeypatch):
-    """Nobody listens at port 9 of this machine; the key is none."""
+    """No server listens at port 9 of the local machine, and the key is invalid."""
     monkeypatch.setenv("WANDB_MODE", "online")
     monkeypatch.setenv("WANDB_BASE_URL", "http://127.0.0.1:9")
     monkeypatch.setenv("WANDB_API_KEY", "0" * 40)
@@ -176,7 +176,7 @@ def test_wandb_cannot_reach_its_server(tmp_path, monkeypatch):
 
 
 def service() -> int:
-    """The process that wandb has started beside this one."""
+    """Returns the service process that wandb has started."""
     end = time.monotonic() + 20
     while time.monotonic() < end:
         for folder in Path("/proc").iterdir():
@@ -194,7 +194,7 @@ def service() -> int:
 
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="needs Linux's /proc")
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGSTOP])
-def test_wandbs_process_is_killed_or_stands_still(how, tmp_path):
+def test_the_process_of_wandb_is_killed_or_stopped(how, tmp_path):
     struck: list[int] = []
 
     def strike(moment: Progress) -> None:
@@ -211,8 +211,8 @@ def test_wandbs_process_is_killed_or_stands_still(how, tmp_path):
             os.kill(process, signal.SIGKILL)
 
 
-def test_a_program_whose_wandb_was_killed_ends_in_peace(tmp_path):
-    """What wandb would do at the end of the program is its own, and shown to nobody."""
+def test_a_program_exits_normally_if_wandb_was_killed(tmp_path):
+    """Errors of wandb at the end of the program are not printed."""
     program = (
         "import os, signal, time\n"
         "from test_trackers_failing import service\n"
@@ -243,6 +243,6 @@ def test_a_program_whose_wandb_was_killed_ends_in_peace(tmp_path):
     assert (folder / "eval.json").exists()
 
 
-def test_none_at_all(tmp_path):
+def test_without_a_tracker(tmp_path):
     assert train("none", tmp_path) == []
     assert main.main(["train", "independent", *SHORT, "logger=mlflow", f"output={tmp_path}/x"]) == 2

@@ -1,4 +1,4 @@
-"""What the trackers were told, read back from their own files."""
+"""Tests the records of the trackers by reading their files."""
 
 import csv
 import importlib
@@ -24,7 +24,7 @@ SHORT = [
 
 
 def tracked(logger: str, folder: Path):
-    """A trained run's folder, configuration, and the lines of its metrics.jsonl."""
+    """Returns a trained run's folder, configuration, and lines of metrics.jsonl."""
     config = resolve("consensus", [*SHORT, f"logger={logger}", f"output={folder / 'runs'}"])
     trainer = Trainer(config)
     run = trainer.start()
@@ -38,11 +38,11 @@ def tracked(logger: str, folder: Path):
 
 @pytest.fixture(autouse=True)
 def _elsewhere(tmp_path, monkeypatch):
-    """In an empty folder, with no network and with no settings of the user's."""
+    """Runs tests in an empty folder, without network and without settings of the user."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("WANDB_CACHE_DIR", str(tmp_path.parent / f"{tmp_path.name}-cache"))
     monkeypatch.setenv("WANDB_CONFIG_DIR", str(tmp_path.parent / f"{tmp_path.name}-config"))
-    # Set and taken away, so that what the run itself sets is taken away at the end as well.
+    # Set and deleted, so that values set by the run are removed at the end as well.
     for name in ("WANDB_MODE", "WANDB_API_KEY", "WANDB_PROJECT", "WANDB_SILENT"):
         monkeypatch.setenv(name, "")
         monkeypatch.delenv(name)
@@ -57,12 +57,12 @@ def _elsewhere(tmp_path, monkeypatch):
 
 
 def records(file: Path) -> Iterator[wandb_internal_pb2.Record]:
-    """The records of a .wandb file: LevelDB's log format after a header of 7 bytes."""
+    """Yields the records of a .wandb file: LevelDB's log format after a header of 7 bytes."""
     data, at, whole = file.read_bytes(), 7, b""
     assert data[:4] in (b":W&B", b"")
     while at + 7 <= len(data):
         left = 32768 - at % 32768
-        if left < 7:  # no room for a head: the rest of the block is padding
+        if left < 7:  # no space for a header: the rest of the block is padding
             at += left
             continue
         _, length, kind = struct.unpack("<IHB", data[at : at + 7])
@@ -70,7 +70,7 @@ def records(file: Path) -> Iterator[wandb_internal_pb2.Record]:
             return
         whole += data[at + 7 : at + 7 + length]
         at += 7 + length
-        if kind in (1, 4):  # whole, or the last part
+        if kind in (1, 4):  # complete, or the last part
             record = wandb_internal_pb2.Record()
             record.ParseFromString(whole)
             yield record
@@ -78,7 +78,7 @@ def records(file: Path) -> Iterator[wandb_internal_pb2.Record]:
 
 
 def finished(file: Path) -> list[wandb_internal_pb2.Record]:
-    """All records, once wandb's own process has written the last: `finish` may return before."""
+    """Returns all records once wandb's process has written the last one, maybe after `finish`."""
     end = time.monotonic() + 30
     while not any(record.HasField("exit") for record in records(file)):
         assert time.monotonic() < end, "the run's file was not finished"
@@ -91,7 +91,7 @@ def read_items(items) -> dict[str, object]:
 
 
 @pytest.mark.parametrize("mode", [None, "offline"])
-def test_wandb_holds_every_number_offline(mode, tmp_path, monkeypatch, capfd):
+def test_wandb_has_every_number_offline(mode, tmp_path, monkeypatch, capfd):
     if mode:
         monkeypatch.setenv("WANDB_MODE", mode)
     folder, config, lines = tracked("wandb", tmp_path)
@@ -113,7 +113,7 @@ def test_wandb_holds_every_number_offline(mode, tmp_path, monkeypatch, capfd):
     assert settings == list(json.loads(json.dumps(to_values(config))).items())
 
 
-def test_tensorboard_holds_every_number(tmp_path):
+def test_tensorboard_has_every_number(tmp_path):
     reader = importlib.import_module("tensorboard.backend.event_processing.event_accumulator")
     folder, _, lines = tracked("tensorboard", tmp_path)
     (file,) = folder.rglob("events.out.tfevents.*")
@@ -154,7 +154,7 @@ def test_the_final_evaluation_reaches_wandb(tmp_path, capsys):
     assert main.main(["train", "consensus", *SHORT, *FINAL, "logger=wandb"]) == 0
     (folder,) = (tmp_path / "runs").iterdir()
     files = sorted(folder.rglob("*.wandb"))
-    assert len({file.stem for file in files}) == 1  # of one run
+    assert len({file.stem for file in files}) == 1  # of a single run
     rows = [
         read_items(record.history.item)
         for file in files
@@ -184,7 +184,7 @@ def final_means(folder: Path) -> dict[str, float]:
     }
 
 
-def test_without_a_tracker_there_are_the_runs_own_files_only(tmp_path):
+def test_without_a_tracker_there_are_no_additional_files(tmp_path):
     folder, _, _ = tracked("none", tmp_path)
     files = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
     own = {"config.yaml", "metrics.jsonl", "timing.jsonl"}

@@ -1,4 +1,4 @@
-"""The environment: hand-made moments, resets, fires, seeds; its steps are in test_steps.py."""
+"""Tests the environment: single steps, resets, fires, seeds. test_steps.py tests episodes."""
 
 import dataclasses
 import math
@@ -26,7 +26,7 @@ def world(fire=EVERYWHERE, num_envs=1, seed=0, **changes) -> WildfireEnv:
 
 
 def act(env: WildfireEnv, *actions) -> TensorDict:
-    """One step of the only environment with an action per UAV, null ones if none is given."""
+    """Runs a step of a single environment with an action per UAV, zeros if none is given."""
     uavs = env.config.num_uavs
     action = torch.tensor([actions]) if actions else torch.zeros(1, uavs, 3)
     return env.step(TensorDict({keys.ACTION: action}, [1]))["next"]
@@ -37,7 +37,7 @@ def start(env: WildfireEnv, *positions) -> TensorDict:
 
 
 def counts(moment: TensorDict) -> list[tuple[int, int, int]]:
-    """New, old and no fire in view of each UAV."""
+    """Returns the counts of new, old and no fire in view of each UAV."""
     columns = (moment[key][0].tolist() for key in (keys.NEW_FIRE, keys.OLD_FIRE, keys.NO_FIRE))
     return list(zip(*columns, strict=True))
 
@@ -46,7 +46,7 @@ def rewards(moment: TensorDict) -> list[float]:
     return moment[keys.REWARD][0, :, 0].tolist()
 
 
-def test_of_two_uavs_over_the_same_cells_the_first_discovers():
+def test_the_first_of_two_uavs_over_the_same_cells_discovers():
     env = world(num_uavs=2)
     start(env, [3.0, 3, 2], [3, 3, 2])
     moment = act(env)  # 2 tan 30 = 1.15: cells 2, 3 and 4 along x and y
@@ -58,7 +58,7 @@ def test_of_two_uavs_over_the_same_cells_the_first_discovers():
     assert env.fire_map.eq(2).sum() == 144 - 9
 
 
-def test_of_three_uavs_each_cell_goes_to_the_lowest_index():
+def test_each_cell_goes_to_the_uav_of_lowest_index():
     env = world(num_uavs=3)
     start(env, [4.0, 3, 2], [3, 3, 2], [5, 4, 2])
     moment = act(env)
@@ -78,7 +78,7 @@ def test_fire_spreads_before_uavs_look():
     assert seen == [(0, 0, 9), (1, 0, 8), (1, 1, 7), (0, 2, 7)]
 
 
-def test_flags_are_of_the_moment_and_time_counts():
+def test_flags_are_per_step_and_time_counts():
     fire = NOWHERE.clone()
     fire[3, 3] = 2
     env = world(fire)
@@ -127,13 +127,13 @@ def test_leaving_the_box_costs_on_the_tested_axes(axis, direction, exit_axes):
     assert moment[keys.HIT_BOUNDARY][0, 0].tolist() == [a == axis for a in range(3)]
     tested = "xyz"[axis] in exit_axes
     assert (rewards(moment)[0] == -100) == tested
-    # Reaching the edge exactly is not leaving.
+    # A UAV exactly at the edge has not left the box.
     position[0][axis] -= direction
     start(env, *position)
     assert not act(env, push)[keys.HIT_BOUNDARY].any()
 
 
-def test_standing_at_an_edge_that_float32_rounds_is_not_leaving():
+def test_an_edge_that_float32_rounds_is_inside():
     env = world(altitude=(3.3, 4.1))
     for z, push in ((3.5, -1.0), (4.0, 1.0)):
         start(env, [5.0, 5, z])
@@ -154,7 +154,7 @@ def test_reset_starts_in_the_box_and_has_seen_nothing():
     position = moment[keys.POSITION]
     low, high = torch.tensor(env.config.low), torch.tensor(env.config.high)
     assert ((position >= low) & (position <= high)).all()
-    near = 0.02 * (high - low)  # 600 uniform points come this near to each side
+    near = 0.02 * (high - low)  # 600 uniform points are this near to each side
     assert (position.flatten(0, 1).amin(0) < low + near).all()
     assert (position.flatten(0, 1).amax(0) > high - near).all()
     for key in (
@@ -219,7 +219,7 @@ def test_fire_by_name_by_config_and_by_arrival_times():
 
 
 @pytest.mark.parametrize("layout", ["turned", "expanded", "sliced"])
-def test_arrival_times_may_lie_in_memory_as_they_like_and_are_copied(layout):
+def test_arrival_times_may_be_strided_and_are_copied(layout):
     plain = torch.rand(3, 9, 12)
     fire = {
         "turned": plain.mT.contiguous().mT,
@@ -233,7 +233,7 @@ def test_arrival_times_may_lie_in_memory_as_they_like_and_are_copied(layout):
     assert torch.equal(env.arrival_time, expected)
 
 
-def test_fires_of_a_bank_are_drawn_anew():
+def test_fires_of_a_bank_are_drawn_each_episode():
     scenario = dataclasses.replace(load_scenario("huygens"), num_train_fires=3)
     env = world(scenario, 64)
     fires = []
@@ -271,7 +271,7 @@ def test_other_bad_input_is_named():
             WildfireConfig(**bad)
 
 
-def test_an_environment_does_not_depend_on_how_many_run_beside_it():
+def test_an_environment_does_not_depend_on_the_batch_size():
     scenario = dataclasses.replace(load_scenario("huygens"), num_train_fires=5)
     one, five = world(scenario, 1, seed=3), world(scenario, 5, seed=3)
     action = torch.rand(5, 1, 3, generator=torch.Generator().manual_seed(0)) * 2 - 1

@@ -1,4 +1,4 @@
-"""The window that a UAV sees, against an independent scalar re-implementation."""
+"""Compares the window observation with an independent scalar re-implementation."""
 
 import math
 import random
@@ -16,7 +16,7 @@ CLASSES = ("new_fire", "old_fire", "no_fire")
 
 
 class ScalarWindow(ScalarWildfire):
-    """Keeps the class of each cell in view, by its offset from the cell nearest to the UAV."""
+    """Computes the class of each cell in view, by its offset from the cell nearest to the UAV."""
 
     def look(self, n):
         x, y, z = (float(c) for c in self.position[n])
@@ -33,7 +33,7 @@ class ScalarWindow(ScalarWildfire):
 
 
 def cells(window: torch.Tensor) -> dict[tuple[int, int], str]:
-    """The class of each cell that is marked, by its offset; bool [3, W, W] -> a dictionary."""
+    """Returns the classes of the marked cells by their offset, from bool [3, W, W]."""
     middle = window.shape[-1] // 2
     marked = window.nonzero().tolist()
     assert len({(i, j) for _, i, j in marked}) == len(marked), "a cell has one class"
@@ -47,7 +47,7 @@ def environment(fire, *, num_envs=1, **changes) -> WildfireEnv:
 
 @pytest.mark.parametrize("altitude", [(1.0, 4.0), (0.5, 0.5), (3.3, 9.7), (2.0, 40.0)])
 @pytest.mark.parametrize("grid", [(12, 9), (8, 16)])
-def test_windows_are_those_of_a_scalar_program(altitude, grid):
+def test_windows_equal_a_scalar_program(altitude, grid):
     draw = random.Random(repr((altitude, grid)))
     arrival = [
         [draw.choice([0, 2.5, 7, 15, math.inf]) for _ in range(grid[1])] for _ in range(grid[0])
@@ -78,7 +78,7 @@ def test_windows_are_those_of_a_scalar_program(altitude, grid):
             assert cells(following[keys.WINDOW][0, uav]) == scalar.views[uav]
 
 
-def test_uav_0_sees_new_fire_first_and_the_margin_is_empty():
+def test_uav_0_has_priority_for_new_fire_and_the_margin_is_empty():
     env = environment(torch.zeros(12, 12), num_uavs=2)  # 4 tan 30 = 2.3: a window of 5 x 5
     env.reset(position=torch.tensor([[0.0, 11, 4], [1, 11, 4]]))
     window = env.step(TensorDict({keys.ACTION: torch.zeros(1, 2, 3)}, [1]))["next"][keys.WINDOW][0]
@@ -110,14 +110,14 @@ def test_recipes_keep_the_window(method):
     assert keys.WINDOW in env.rollout(3)["next"].keys(True)
 
 
-def test_counts_are_the_sums_of_the_windows():
+def test_counts_equal_the_sums_of_the_windows():
     steps = environment(torch.rand(4, 16, 9) * 30, num_envs=4, num_uavs=3).rollout(40)["next"]
     sums = steps[keys.WINDOW].sum((-1, -2))
     counts = torch.stack([steps[k] for k in (keys.NEW_FIRE, keys.OLD_FIRE, keys.NO_FIRE)], -1)
     assert sums.equal(counts)
 
 
-def test_everything_else_is_as_without_the_window():
+def test_the_window_does_not_change_other_entries():
     fire = torch.rand(2, 12, 9) * 30
     action = torch.rand(20, 2, 3, 3) * 2 - 1
     window, vector = (

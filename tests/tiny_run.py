@@ -1,4 +1,4 @@
-"""A training that takes about a second."""
+"""Trains for about a second."""
 
 from pathlib import Path
 
@@ -15,7 +15,7 @@ TINY = [
 ]
 PROGRAM = (
     "import signal, sys\n"
-    # A program started in the background may have inherited that Ctrl-C is ignored.
+    # A background process may inherit that SIGINT is ignored.
     "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
     "from emberlink.trainers.cli.main import main\n"
     "sys.exit(main())"
@@ -23,7 +23,7 @@ PROGRAM = (
 
 
 def train_tiny(output: Path) -> Path:
-    """The run folder that `emberlink train` leaves in an empty folder."""
+    """Runs `emberlink train` in an empty folder and returns the run folder."""
     assert main.main(["train", "consensus", *TINY, f"output={output}"]) == 0
     (folder,) = output.iterdir()
     return folder

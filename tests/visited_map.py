@@ -1,4 +1,4 @@
-"""A communication method with a large state, for tests: the cells that a UAV knows as visited."""
+"""Defines a communication method with a large state for tests: a map of visited cells."""
 
 from typing import ClassVar
 
@@ -18,7 +18,7 @@ class VisitedMapConfig(RadioConfig):
 
 
 class VisitedMap(CommModule):
-    """Each UAV marks its cell, joins the maps of those it hears, and observes its map's size."""
+    """Marks the UAV's cell, merges the maps of its neighbours, and observes the size of its map."""
 
     config_type: ClassVar[type] = VisitedMapConfig
     in_keys: ClassVar = [keys.OBSERVATION, keys.POSITION, keys.HEARS]

@@ -1,4 +1,4 @@
-"""How fast the environment is: UAV-steps a second, beside VMAS in the same run."""
+"""Measures UAV-steps per second of the environment, and of VMAS in the same run."""
 
 import pytest
 from workloads import flying, in_turns, make, steps_for, vmas_flying

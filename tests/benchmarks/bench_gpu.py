@@ -1,4 +1,4 @@
-"""On a GPU: the same results as on a CPU, no waiting, and the time of the paper's full protocol."""
+"""Compares GPU and CPU results, checks for synchronisation, and times the paper's protocol."""
 
 import time
 
@@ -18,7 +18,7 @@ pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")
 @pytest.mark.parametrize("setup", ["paper", "released", "tuned"])
 @pytest.mark.parametrize("method", METHODS)
 def test_the_environment_is_the_same(method, setup):
-    """Every number of 200 steps with the same actions, over the end of an episode."""
+    """Compares 200 steps with the same actions, including the end of an episode."""
     envs = [
         make_env(method, setup, num_envs=3, horizon=150, seed=0, device=d) for d in ("cpu", "cuda")
     ]
@@ -37,7 +37,7 @@ def test_the_environment_is_the_same(method, setup):
 @pytest.mark.parametrize("seeds", ["seed=1", "seeds=[1,2]"])
 @pytest.mark.parametrize("method", METHODS)
 def test_a_recipe_learns_the_same(method, seeds, tmp_path):
-    """60 updates, most of them by a graph, against the CPU's."""
+    """Compares 60 updates, most of them by a CUDA graph, with the CPU's."""
     small = ["env.horizon=40", "episodes=2", "num_envs=2", "learner.batch_size=32"]
     weights = []
     for device in ("cpu", "cuda"):
@@ -53,7 +53,7 @@ def test_a_recipe_learns_the_same(method, seeds, tmp_path):
 
 
 def seconds_of(method: str, output, *overrides: str) -> float:
-    """Of the whole protocol, from the steady state of a run of 10 episodes."""
+    """Returns the duration of the whole protocol, extrapolated from a run of 10 episodes."""
     config = resolve(
         method,
         ["device=cuda", "episodes=10", "evaluation.interval=0", f"output={output}", *overrides],
@@ -82,7 +82,7 @@ def test_four_methods_five_seeds(tell, tmp_path):
 
 
 def test_nothing_waits_for_the_device():
-    """torch itself raises where a step would wait for the GPU."""
+    """torch raises an error if a step synchronises with the GPU."""
     setup = TrainingSetup(resolve("consensus", ["device=cuda", "episodes=1"]))
     starts = setup.learner.learning_starts
     try:

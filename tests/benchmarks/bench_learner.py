@@ -1,4 +1,4 @@
-"""How near the learner comes to what the machine can do, and what a training step spends on it."""
+"""Measures the learner's share of the machine's peak rate and of a training step."""
 
 import time
 from typing import Any
@@ -12,7 +12,7 @@ from emberlink.trainers.training.setup import TrainingSetup
 
 @pytest.mark.parametrize("method", METHODS)
 def test_update(benchmark, tell, method):
-    """Operations a second of an update with the paper's networks and batch: goal 65 %."""
+    """Measures the rate of operations in an update of the paper's size: goal 65 % of the peak."""
     setup = TrainingSetup(resolve(method, ["env.horizon=1000", "episodes=1"]))
     batch = batch_of(setup)
     uavs, features = batch["agents", "observation"].shape[-2:]
@@ -32,7 +32,7 @@ def test_update(benchmark, tell, method):
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("setup", ["paper", "tuned"])
 def test_share_of_what_is_not_the_update(tell, method, setup):
-    """Environment, communication, noise, buffer, sampling and logging: goal 15 % in `paper`."""
+    """The rest includes communication, noise, sampling and logging: goal 15 % in `paper`."""
     training = TrainingSetup(resolve(method, [f"setup={setup}", "env.horizon=1000"]))
     learner: Any = training.learner
     inside, update = 0.0, learner._update

@@ -1,4 +1,4 @@
-"""What a million transitions take, and whether a long run grows."""
+"""Measures the memory of a million transitions and its growth in a long run."""
 
 import ctypes
 import gc
@@ -20,22 +20,22 @@ MILLION = 1_000_000
 
 
 def resident() -> int:
-    """Bytes of this process that are in memory now."""
+    """Returns the resident memory of this process in bytes."""
     pages = int(Path("/proc/self/statm").read_text().split()[1])
     return pages * resource.getpagesize()
 
 
 @pytest.mark.parametrize("method", METHODS)
 def test_a_million_transitions(tell, method):
-    """Resident bytes against those of the numbers: both observations, action and reward."""
+    """Compares resident bytes with the bytes of both observations, action and reward."""
     env = make(method, 1)
     shared = resolve(method).replay == "shared"
     rows = to_rows(env.rollout(1), 1, keys.observation_keys(env.observation_spec))
     uavs, features = rows["observation"].shape[-2:]
-    # Private memories hold a million each; one that is shared holds a million in all.
+    # Private buffers have a million transitions each, a shared buffer a million in total.
     numbers = 4 * (2 * features + 3 + 1) * MILLION * (1 if shared else uavs)
     gc.collect()
-    ctypes.CDLL(None).malloc_trim(0)  # what earlier benchmarks freed is not to be used again
+    ctypes.CDLL(None).malloc_trim(0)  # do not reuse memory that earlier benchmarks freed
     before = resident()
     context = LearnerContext(
         observation_spec=env.observation_spec,
@@ -59,7 +59,7 @@ def test_a_million_transitions(tell, method):
 
 
 def test_a_long_run_does_not_grow(tell, tmp_path):
-    """100 episodes of 1000 steps of `consensus` with small networks, a memory of a million."""
+    """Trains 100 episodes of 1000 steps with small networks and a replay buffer of 10^6."""
     small = ["learner.hidden=[16,16]", "learner.batch_size=32", "evaluation.interval=0"]
     trainer = Trainer(resolve("consensus", ["episodes=101", *small, f"output={tmp_path}"]))
     trainer.start()

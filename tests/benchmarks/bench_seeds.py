@@ -1,4 +1,4 @@
-"""Several seeds as one stack, against one after another."""
+"""Compares the time of several seeds in a stack with that of sequential trainings."""
 
 import pytest
 import torch
@@ -11,7 +11,7 @@ STEPS = 20
 
 
 def learning(overrides: list[str]):
-    """Some steps of a training whose memory is filled, updates included."""
+    """Returns a function that runs training steps with a filled replay buffer."""
     setup = TrainingSetup(resolve("consensus", ["episodes=1000", *overrides]))
     collected = iter(setup.collector)
     while setup.step < setup.learner.learning_starts + 5:

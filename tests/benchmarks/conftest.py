@@ -1,4 +1,4 @@
-"""The ratios of a run, printed at its end."""
+"""Prints the ratios of a run at its end."""
 
 import pytest
 
@@ -7,7 +7,7 @@ _RATIOS = pytest.StashKey[list[str]]()
 
 @pytest.fixture
 def tell(request):
-    """Adds a line to what is printed at the end."""
+    """Adds a line to the summary at the end."""
     lines = request.config.stash.setdefault(_RATIOS, [])
     return lines.append
 

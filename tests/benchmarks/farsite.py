@@ -1,4 +1,4 @@
-"""The level set against runs of FARSITE: rates fitted on one run, used on the others.
+"""Compares the level set with runs of FARSITE. Rates fitted on one run apply to all.
 
     python tests/benchmarks/farsite.py FOLDER [--fit RUN] [--figure FILE.png]
 
@@ -6,8 +6,8 @@ FOLDER holds `RUN_ArrivalTime.asc`: ESRI ASCII grids of elapsed minutes, north u
 from the whole name RUN: in `3mph120deg7hr` it blows from 120° (0 is north, clockwise); in
 `clockwise1hr` and `counterClockwise3hr` it starts from 180° and turns by 60° in that sense every
 hour or three hours.
-What is fitted, head rate and length-to-breadth ratio, holds for one wind speed and one fuel.
-Prints a Markdown table. The start is FARSITE's: the cells that burn at time 0. Needs the extra
+The fitted head rate and length-to-breadth ratio apply to one wind speed and one fuel.
+Prints a Markdown table. The initial fire is FARSITE's: the cells that burn at 0. Needs the extra
 `geo`.
 """
 
@@ -33,7 +33,7 @@ PARTS = (0.25, 0.5, 0.75, 1.0)
 
 
 class Run(NamedTuple):
-    """One run of FARSITE."""
+    """Holds one run of FARSITE."""
 
     name: str
     arrival: Tensor
@@ -43,7 +43,7 @@ class Run(NamedTuple):
 
     @property
     def end(self) -> float:
-        """Minutes to the last arrival, in whole ones."""
+        """Returns the time of the last arrival, rounded to minutes."""
         return float(math.ceil(self.arrival[self.arrival.isfinite()].max()))
 
 
@@ -65,7 +65,7 @@ def wind_of(name: str) -> Callable[[float], Tensor]:
 
 
 def read_grid(path: Path) -> Tensor:
-    """The arrivals in an ESRI ASCII grid, as in `Run`."""
+    """Returns the arrival times of an ESRI ASCII grid, as in `Run`."""
     try:
         times = read_ascii(path, "minutes", None).times
     except ValueError as error:
@@ -74,7 +74,7 @@ def read_grid(path: Path) -> Tensor:
 
 
 def read_runs(folder: Path) -> dict[str, Run]:
-    """The runs in a folder, in alphabetical order."""
+    """Returns the runs in a folder, in alphabetical order."""
     files = sorted(folder.glob(f"*{SUFFIX}"))
     if not files:
         raise ValueError(f"{folder}: no *{SUFFIX} in it")
@@ -83,7 +83,7 @@ def read_runs(folder: Path) -> dict[str, Run]:
 
 
 def around(mask: Tensor) -> Distance:
-    """The signed distance to the outline of cells, bool [X, Y], each a unit square."""
+    """Returns the signed distance to the outline of unit cells, bool [X, Y]."""
     ring = torch.nn.functional.max_pool2d(mask[None].float(), 3, 1, 1)[0] > 0
 
     def to_squares(cells: Tensor, x: Tensor, y: Tensor) -> Tensor:
@@ -100,7 +100,7 @@ def around(mask: Tensor) -> Distance:
 
 
 def simulate(run: Run, head_rate: float, ratio: float) -> Tensor:
-    """Our arrivals from the start of a run and in its wind, minutes [X, Y]."""
+    """Computes arrival times from the initial fire and the wind of a run, minutes [X, Y]."""
     x, y = run.arrival.shape
     rates = torch.tensor([head_rate]), torch.tensor([ratio])
     start = around(run.arrival <= 0)
@@ -108,16 +108,16 @@ def simulate(run: Run, head_rate: float, ratio: float) -> Tensor:
 
 
 def misfit(got: Tensor, run: Run) -> float:
-    """Mean difference of arrival over all cells, minutes; what never burns burns at the end."""
+    """Returns the mean difference of arrival, minutes; unburnt cells have the end time."""
     return float((got.clamp_max(run.end) - run.arrival.clamp_max(run.end)).abs().mean())
 
 
 def fit(run: Run) -> tuple[float, float]:
-    """Head rate, cells per minute, and length-to-breadth ratio that come closest to a run."""
+    """Fits the head rate, cells per minute, and the length-to-breadth ratio to a run."""
 
     def rates(logs: np.ndarray) -> tuple[float, float]:
-        # The rate at which the radius of the same area grows, and the ratio's excess over 1: what
-        # is tried is always positive, and one hardly depends on the other.
+        # Parameters are the growth rate of the equivalent radius and the ratio's excess over 1,
+        # both as logarithms, since they are positive and nearly independent.
         growth, ratio = math.exp(logs[0]), min(1 + math.exp(logs[1]), MAX_LENGTH_TO_BREADTH)
         a, b, c = (float(rate) for rate in ellipse_rates(1.0, ratio))
         return growth * (a + c) / math.sqrt(a * b), ratio
@@ -130,15 +130,15 @@ def fit(run: Run) -> tuple[float, float]:
 
 
 def overlap(got: Tensor, run: Run, minutes: float) -> float:
-    """Intersection over union of the cells that have burnt by a time."""
+    """Returns the intersection over union of the cells burnt by a time."""
     ours, theirs = got <= minutes, run.arrival <= minutes
     return float((ours & theirs).sum() / (ours | theirs).sum())
 
 
 def compare(run: Run, got: Tensor) -> tuple[list[float], float, float]:
-    """Overlap at `PARTS` of the run, ratio of areas at its end, mean error of arrival in minutes.
+    """Returns overlaps at `PARTS` of the run, final ratio of areas, mean error of arrival in minutes.
 
-    The error is over the cells that burn in both and not from the start.
+    The error is taken over cells that burn in both, without the initial fire.
     """
     overlaps = [overlap(got, run, part * run.end) for part in PARTS]
     both = got.isfinite() & run.arrival.isfinite() & (run.arrival > 0)
@@ -147,7 +147,7 @@ def compare(run: Run, got: Tensor) -> tuple[list[float], float, float]:
 
 
 def draw(runs: list[tuple[Run, Tensor]], file: str) -> None:
-    """Both fronts of every run, hour by hour."""
+    """Draws both fronts of every run for each hour."""
     import matplotlib
 
     matplotlib.use("Agg")

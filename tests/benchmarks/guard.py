@@ -1,11 +1,11 @@
-"""Fails when the program has become slower, measured against a loop that is run beside it.
+"""Fails if the program has become slower, relative to a reference loop in the same process.
 
-    python tests/benchmarks/guard.py            # compare with guard.json; some seconds
-    python tests/benchmarks/guard.py --record   # after a change that is meant
+    python tests/benchmarks/guard.py            # compare with guard.json; takes some seconds
+    python tests/benchmarks/guard.py --record   # after an intended change
 
-A ratio says how many times a loop of plain torch calls fits into one unit of our work. The loop is
+A ratio is the time of a unit of our work over that of a loop of plain torch calls. The loop is
 of the same kind as the work (many small calls; gathers in large tensors; matrix products), so that
-a faster or a busy machine speeds up or slows down both.
+a faster or a busy machine affects both.
 """
 
 import json
@@ -26,14 +26,14 @@ ROUNDS, ATTEMPTS = 12, 3
 
 
 def small_calls() -> None:
-    """2000 calls on a few numbers each."""
+    """Runs 2000 calls on small tensors."""
     a, b = torch.ones(6, 3), torch.ones(6, 3)
     for _ in range(1000):
         b = (a + b).clamp_(-1, 1)
 
 
 def gathers() -> Callable[[], object]:
-    """Gathers from and minima into a large tensor."""
+    """Returns a function that gathers from a large tensor and scatters minima into it."""
     index = torch.randint(1_000_000, (150_000,), generator=torch.Generator().manual_seed(0))
     table, new = torch.zeros(1_000_000), torch.ones(150_000)
 
@@ -46,7 +46,7 @@ def gathers() -> Callable[[], object]:
 
 
 def works() -> dict[str, tuple[Callable[[], object], Callable[[], object]]]:
-    """Name -> (our work, the loop beside it)."""
+    """Returns name -> (our workload, reference loop)."""
     setup = TrainingSetup(resolve("consensus", ["episodes=1", "env.horizon=200"]))
     batch = batch_of(setup)
     return {
@@ -59,18 +59,18 @@ def works() -> dict[str, tuple[Callable[[], object], Callable[[], object]]]:
 
 
 def ratio(ours: Callable[[], object], beside: Callable[[], object]) -> float:
-    """Our time over the loop's: of each the shortest of several rounds, taken in turns."""
+    """Returns our time over the loop's, each the minimum of several alternating rounds."""
     mine, its = in_turns(ROUNDS, ours, beside, pick=min)
     return mine / its
 
 
 def check(name: str, before: float, measure: Callable[[], float]) -> bool:
-    """Whether a work has kept its speed; a slow one gets another chance, and another.
+    """Checks whether a workload has kept its speed; a slow result is measured again twice.
 
     Args:
-        name: of the work.
-        before: its recorded ratio.
-        measure: takes the ratio.
+        name: name of the workload.
+        before: recorded ratio.
+        measure: function that measures the ratio.
     """
     for _ in range(ATTEMPTS):
         now = measure()
@@ -83,7 +83,7 @@ def check(name: str, before: float, measure: Callable[[], float]) -> bool:
 
 
 def main() -> int:
-    torch.set_num_threads(1)  # the second core may be somebody else's
+    torch.set_num_threads(1)  # other processes may use the second core
     measures = {name: partial(ratio, *pair) for name, pair in works().items()}
     if "--record" in sys.argv:
         recorded = {name: round(measure(), 3) for name, measure in measures.items()}

@@ -1,4 +1,4 @@
-"""Where the time goes: torch's own profile of an update and of environment steps.
+"""Prints torch's profile of an update and of environment steps.
 
 python tests/benchmarks/profiles.py
 """
@@ -27,7 +27,7 @@ def kind_of(name: str) -> str:
 
 
 def show(title: str, work: Callable[[], object], units: int, calls: int = 10) -> None:
-    """Milliseconds a unit and operations a unit, by kind."""
+    """Prints milliseconds and operations per unit, by kind."""
     for _ in range(3):
         work()
     with profile() as recorded:

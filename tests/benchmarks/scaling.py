@@ -1,9 +1,9 @@
-"""How the environment's cost grows with grid, team and number of environments: table and figure.
+"""Measures the environment's speed by grid, team and number of environments.
 
     python tests/benchmarks/scaling.py [FIGURE.png]
 
-Along each axis the rest stays as in the paper: 30 x 30 cells, 6 UAVs; 256 environments where their
-number is not the axis. Prints a Markdown table of UAV-steps a second.
+On each axis the other values are those of the paper: 30 x 30 cells, 6 UAVs; 256 environments if
+their number is not the axis. Prints a Markdown table of UAV-steps per second.
 """
 
 import sys
@@ -19,7 +19,7 @@ METHODS = {"environment alone": None, "with consensus": "consensus"}
 
 
 def settings(axis: str, value: int) -> tuple[int, int, dict]:
-    """Environments, UAVs, and what else differs from the paper."""
+    """Returns environments, UAVs, and the settings that differ from the paper."""
     envs, uavs, more = 256, 6, {}
     if axis == "environments":
         envs = value
@@ -31,7 +31,7 @@ def settings(axis: str, value: int) -> tuple[int, int, dict]:
 
 
 def measure(axis: str) -> dict[str, list[float]]:
-    """UAV-steps a second of both, for every value on an axis, taken in turns."""
+    """Measures UAV-steps per second of both methods for every value on an axis, in turns."""
     rates: dict[str, list[float]] = {}
     for name, method in METHODS.items():
         works, sizes = [], []

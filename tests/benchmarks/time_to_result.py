@@ -1,12 +1,12 @@
-"""Coverage of the frozen policies against seconds of training.
+"""Measures the coverage of frozen policies against training time in seconds.
 
     python tests/benchmarks/time_to_result.py train FILE [key=value ...]
     python tests/benchmarks/time_to_result.py draw FIGURE.png LABEL=FILE [LABEL=FILE ...]
 
 `train` trains `consensus` in `tuned` with the given overrides, stops the clock every 500 steps,
 plays 32 held-out fires, and appends {"seed", "step", "seconds", "coverage"} to FILE. `draw` draws
-such files, a line a seed, and prints when each run had 90 % of its final coverage (the mean of its
-last three measurements).
+such files, a line per seed, and prints when each run reached 90 % of its final coverage (mean of
+the last three measurements).
 """
 
 import json
@@ -57,7 +57,7 @@ def train(file: Path, overrides: list[str]) -> None:
 
 
 def read(file: str) -> dict[int, list[dict]]:
-    """Seed -> its measurements, in order."""
+    """Returns seed -> measurements, in order."""
     runs: dict[int, list[dict]] = {}
     for line in Path(file).read_text().splitlines():
         measured = json.loads(line)

@@ -1,7 +1,7 @@
-"""What the benchmarks time, and how: works take turns, so that a busy machine hits them all.
+"""Defines the workloads of the benchmarks, which alternate so that other load affects all.
 
-Every rate is taken over whole calls of the public interface: an environment's step is TorchRL's
-`step_and_maybe_reset` with actions drawn anew.
+Rates are measured over calls of the public interface: an environment's step is TorchRL's
+`step_and_maybe_reset` with new random actions.
 """
 
 import time
@@ -26,7 +26,7 @@ MATRIX = 2048
 def in_turns(
     rounds: int, *works: Callable[[], object], pick: Callable[[list[float]], float] = median
 ) -> list[float]:
-    """Seconds of each, the median over rounds in which every one runs once; one is left out."""
+    """Returns the median seconds of each workload over alternating rounds, without the first."""
     taken: list[list[float]] = [[] for _ in works]
     for _ in range(rounds + 1):
         for work, seconds in zip(works, taken, strict=True):
@@ -37,7 +37,7 @@ def in_turns(
 
 
 def make(method: str | None, num_envs: int, **settings):
-    """A recipe's environment, or the bare one."""
+    """Returns a recipe's environment, or the bare one."""
     if method is None:
         config = resolve("independent", **settings).env
         return WildfireEnv(num_envs, config)
@@ -45,7 +45,7 @@ def make(method: str | None, num_envs: int, **settings):
 
 
 def flying(env, steps: int) -> Callable[[], object]:
-    """`steps` steps of an environment with random actions."""
+    """Returns a function that runs `steps` environment steps with random actions."""
     shape = env.full_action_spec[keys.ACTION].shape
     moment = env.reset()
 
@@ -59,12 +59,12 @@ def flying(env, steps: int) -> Callable[[], object]:
 
 
 def steps_for(num_envs: int, uavs: int = 6) -> int:
-    """Steps that take some tenths of a second."""
+    """Returns a number of steps that takes some tenths of a second."""
     return max(5, min(400, 1_200_000 // (num_envs * uavs)))
 
 
 def vmas_flying(scenario: str, num_envs: int, steps: int) -> tuple[Callable[[], object], int]:
-    """`steps` steps of a VMAS scenario with random actions, and its number of agents."""
+    """Returns a function that runs `steps` steps of a VMAS scenario, and its number of agents."""
     import vmas
 
     env = vmas.make_env(scenario, num_envs=num_envs, device="cpu", continuous_actions=True)
@@ -78,7 +78,7 @@ def vmas_flying(scenario: str, num_envs: int, steps: int) -> tuple[Callable[[], 
 
 
 def matrix_product(device: str = "cpu") -> Callable[[], object]:
-    """2048^3 multiply-adds in float32: what the machine reaches where nothing is in the way."""
+    """Returns a function with 2048^3 multiply-adds in float32, which shows the machine's peak rate."""
     one, other = (torch.randn(MATRIX, MATRIX, device=device) for _ in range(2))
     return lambda: one @ other
 
@@ -95,15 +95,15 @@ def update_flops(
     *,
     shared: bool = False,
 ) -> int:
-    """Floating-point operations of one DDPG update of `members` networks, from the layer sizes.
+    """Returns the floating-point operations of a DDPG update of `members` networks, by layer sizes.
 
-    Matrix products alone, a multiply-add as two. Forward: actor and critic in the actors' loss,
-    critic, target actor and target critic in the critics'. Backward, for each layer that learns the
-    product for its weights, and for each input that a gradient must pass the product for it.
+    Only matrix products count, a multiply-add as two. Forward: actor and critic in the actors' loss,
+    critic, target actor and target critic in the critics'. Backward: for each trained layer the
+    product for its weights, and for each input with a gradient the product for that input.
 
     Args:
-        shared: with the critics' trunk once for both losses, as our learner has it; else as often
-            as DDPG asks for it.
+        shared: whether the critics' trunk is computed once for both losses, as in our learner, or
+            as often as in DDPG.
     """
     first, second = hidden
     trunk = features * first + first * second
@@ -115,7 +115,7 @@ def update_flops(
         second * actions
         + first * second  # the actors' own layers but the first
         + second
-        + second * actions  # through the critic to the action, past its trunk
+        + second * actions  # through the critic to the action, without its trunk
         + second
         + first * second  # the critics' layers but the first and the action's
     )
@@ -123,7 +123,7 @@ def update_flops(
 
 
 def batch_of(setup: TrainingSetup) -> TensorDict:
-    """Returns a sample of a memory that holds some hundred steps."""
+    """Returns a sample of a replay buffer with a few hundred steps."""
     learner: Any = setup.learner
     setup.dry_run(learner.learning_starts + 20)
     return learner.sample()

@@ -1,4 +1,4 @@
-"""Trainings in processes that are forked from one that has imported everything, to be killed."""
+"""Runs trainings in processes that are forked after the imports, and kills them."""
 
 import os
 import random
@@ -25,11 +25,11 @@ METHODS = ("independent", "shared_memory", "positional", "consensus")
 
 
 class Child:
-    """A forked process that does something and says what it has done.
+    """A forked process that writes its progress to a log.
 
     Args:
-        work: is given a function that writes a line to the log; its result is the exit status.
-        folder: where `log` and what it prints, `out`, are written.
+        work: called with a function that writes a line to the log; returns the exit status.
+        folder: folder for the files `log` and `out`, the printed output.
     """
 
     def __init__(self, work: Callable[[Callable[[str], None]], int], folder: Path):
@@ -55,7 +55,7 @@ class Child:
         return self.log.read_text().splitlines() if self.log.exists() else []
 
     def wait_for(self, condition: Callable[[], bool], seconds: float = 120) -> bool:
-        """Whether it came to that before it ended."""
+        """Waits for a line in the log; returns whether it was written before the process ended."""
         end = time.monotonic() + seconds
         while time.monotonic() < end:
             if condition():
@@ -69,7 +69,7 @@ class Child:
         os.kill(self.pid, number)
 
     def end(self) -> int:
-        """The exit status; of a signal, its negative number."""
+        """Returns the exit status, or the negative number of the signal that ended the process."""
         return os.waitstatus_to_exitcode(os.waitpid(self.pid, 0)[1])
 
     def text(self) -> str:
@@ -77,15 +77,15 @@ class Child:
 
 
 def temporary(folder: Path) -> list[str]:
-    """Files that a save had begun to write."""
+    """Returns the temporary files of incomplete saves."""
     found = [*folder.rglob("*.part"), *folder.rglob(".tmp*")]
     return sorted(path.name for path in found)
 
 
 def watch_saves(say: Callable[[str], None], die_at: tuple[str, int] | None) -> None:
-    """Writes down every save, and kills this process at the n-th call of a part of one.
+    """Logs every save, and kills this process at the n-th call of a function of a save.
 
-    For a forked process: it changes modules.
+    It patches modules, so that it must run in a forked process.
     """
     calls = 0
 
@@ -117,7 +117,7 @@ def watch_saves(say: Callable[[str], None], die_at: tuple[str, int] | None) -> N
 
 
 def training(method: str, output: Path, die_at: tuple[str, int] | None = None):
-    """Begins a run, or resumes the one that is there, and trains to the end."""
+    """Starts a run, or resumes an existing one, and trains to the end."""
 
     def work(say: Callable[[str], None]) -> int:
         watch_saves(say, die_at)
@@ -140,16 +140,16 @@ PARTS = ("save_file", "_digest", "fsync", "replace", "sync", "unlink")
 def kill_until_finished(
     method: str, folder: Path, draw: random.Random, kills: int
 ) -> tuple[int, list[str]]:
-    """Kills a training at random moments until it has come to its end.
+    """Kills and resumes a training at random times until it has finished.
 
     Args:
-        method: of the training.
-        folder: an empty one.
-        draw: decides when.
-        kills: at most.
+        method: name of the method.
+        folder: an empty folder.
+        draw: random numbers for the times.
+        kills: maximum number of kills.
 
     Returns:
-        How often it was killed, and what was wrong, nothing if all is well.
+        The number of kills and the failures.
     """
     output, wrong, done, saved = folder / "runs", [], 0, 0
     begun = saved
@@ -174,7 +174,7 @@ def kill_until_finished(
             word, _, rest = line.partition(" ")
             if word == "at":
                 step, _, left = rest.partition(" ")
-                # The newest whole save, or the one that was killed between its end and its notice.
+                # The newest complete save, or the save whose log line was lost by the kill.
                 if int(step) not in (saved, begun):
                     wrong.append(f"resumed at {step}; saved {saved}, begun {begun}")
                 if left:
@@ -199,7 +199,7 @@ def kill_until_finished(
 
 
 def outcome(output: Path) -> dict[str, bytes]:
-    """What a finished run has learnt and written down, whole."""
+    """Returns the networks and the complete files of a finished run."""
     (folder,) = output.iterdir()
     networks = sorted((folder / "checkpoints").glob("step_*.safetensors"))[-1]
     files = [networks, folder / "checkpoints" / "best.safetensors", folder / "metrics.jsonl"]
@@ -207,14 +207,14 @@ def outcome(output: Path) -> dict[str, bytes]:
 
 
 def reference(method: str, folder: Path) -> dict[str, bytes]:
-    """The outcome of a run that nobody disturbs."""
+    """Returns the outcome of an uninterrupted run."""
     child = Child(training(method, folder / "runs"), folder)
     assert child.end() == 0, child.text()
     return outcome(folder / "runs")
 
 
 def kill_trials(folder: Path, kills: int, seed: int) -> tuple[int, list[str]]:
-    """So many kills, over as many runs of all methods as it takes; what was wrong."""
+    """Kills runs of all methods `kills` times in total; returns the number and the failures."""
     draw, done, wrong, number = random.Random(seed), 0, [], 0
     references: dict[str, dict[str, bytes]] = {}
     while done < kills:

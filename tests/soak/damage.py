@@ -1,4 +1,4 @@
-"""Checkpoints that are damaged, or of something else."""
+"""Generates damaged checkpoints and checkpoints of other configurations."""
 
 import json
 import random
@@ -17,7 +17,7 @@ def truncated(path: Path, draw: random.Random) -> None:
 
 
 def bit_flipped(path: Path, draw: random.Random) -> None:
-    """One bit, half the time in the header."""
+    """Flips one bit, in the header in half of the cases."""
     content = bytearray(path.read_bytes())
     header = 8 + int.from_bytes(content[:8], "little")
     place = draw.randrange(header if draw.random() < 0.5 else len(content))
@@ -26,7 +26,7 @@ def bit_flipped(path: Path, draw: random.Random) -> None:
 
 
 def zeroed(path: Path, draw: random.Random) -> None:
-    """A block of a disk that was never written."""
+    """Zeroes a block, like a block of a disk that was never written."""
     content = bytearray(path.read_bytes())
     begin = draw.randrange(len(content))
     end = min(begin + 4096, len(content))
@@ -41,7 +41,7 @@ def lengthened(path: Path, draw: random.Random) -> None:
 
 
 def sealed_again(path: Path, change: Callable[[dict, dict[str, torch.Tensor]], None]) -> None:
-    """As a program that knows the format would have written it."""
+    """Changes a checkpoint and updates its checksum."""
     header, content = checkpoint_file.read(path)
     change(header, content)
     version, rest = header.pop("format"), {k: v for k, v in header.items() if k != "sha256"}
@@ -82,14 +82,14 @@ def with_nan(path: Path, draw: random.Random) -> None:
             name
             for name, value in content.items()
             if value.is_floating_point()
-            # What is evaluated, of a file of networks.
+            # The evaluated tensors in a file of networks.
             and ("/" in name or name.startswith("actor_network_params"))
         ]
-        # Every group as often as another, however many tensors it has.
+        # All groups have the same probability, independent of their number of tensors.
         group = draw.choice(sorted({name.rpartition("/")[0] for name in names}))
         name = draw.choice(sorted(n for n in names if n.rpartition("/")[0] == group))
         values = content[name].view(-1)
-        # A fire holds infinity where it never burns, and NaN in its margin.
+        # A fire has infinity in cells that never burn, and NaN in its margin.
         places = values.isfinite().nonzero().flatten().tolist()
         values[draw.choice(places)] = draw.choice((float("nan"), float("inf")))
 
@@ -126,12 +126,12 @@ KINDS = (
 def damage_trials(
     files: list[tuple[Path, Callable[[Path], object]]], count: int, seed: int
 ) -> tuple[int, list[str]]:
-    """Damages each of some files in turn and has it read; what was accepted or not clear.
+    """Damages checkpoints in turn and reads them; returns accepted files and unclear errors.
 
     Args:
-        files: sound checkpoints, each with what reads it.
-        count: how many trials.
-        seed: of what is drawn.
+        files: valid checkpoints and their readers.
+        count: number of trials.
+        seed: seed of the random numbers.
     """
     draw, wrong = random.Random(seed), []
     for number in range(count):

@@ -1,4 +1,4 @@
-"""Trainings that a signal or a full disk ends."""
+"""Ends trainings by a signal or a full disk."""
 
 import random
 import resource
@@ -28,7 +28,7 @@ from emberlink.trainers.training.resume import resume
 
 
 def command(arguments: list[str], before: Callable[[], None] = lambda: None):
-    """`emberlink` with arguments, in a forked process."""
+    """Starts `emberlink` with arguments in a forked process."""
 
     def work(say: Callable[[str], None]) -> int:
         signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -40,7 +40,7 @@ def command(arguments: list[str], before: Callable[[], None] = lambda: None):
 
 
 def signal_trial(number: int, folder: Path, draw: random.Random) -> list[str]:
-    """Sends a signal at a random moment of a training; what was wrong."""
+    """Sends a signal at a random time of a training; returns the failures."""
     method, output = draw.choice(METHODS), folder / "runs"
     arguments = ["train", method, *SMALL, "episodes=100000", f"output={output}"]
     child, wrong = Child(command(arguments), folder), []
@@ -60,7 +60,7 @@ def signal_trial(number: int, folder: Path, draw: random.Random) -> list[str]:
         wrong.append("metrics.jsonl and the checkpoint are of different moments")
     if step_of(run.checkpoint()) != header["step"] or temporary(path) or (path / "lock").exists():
         wrong.append(f"left: {sorted(p.name for p in path.rglob('*'))}")
-    # With as few episodes as allow it, so that it ends.
+    # With the smallest possible number of episodes, so that it ends soon.
     done = -(-header["step"] // HORIZON)
 
     def go_on(say: Callable[[str], None]) -> int:
@@ -74,12 +74,12 @@ def signal_trial(number: int, folder: Path, draw: random.Random) -> list[str]:
 
 
 def full_disk_trial(folder: Path, draw: random.Random, *, mount: bool = False) -> list[str]:
-    """Lets a training run out of room; what was wrong.
+    """Trains on a disk that becomes full; returns the failures.
 
     Args:
-        folder: an empty one.
-        draw: decides how much room.
-        mount: whether by a file system of limited size (as root) or by a limit for every file.
+        folder: an empty folder.
+        draw: random numbers for the size of the disk.
+        mount: whether to mount a small file system (as root) or to limit the size of every file.
     """
     method = draw.choice(METHODS)
     undisturbed = folder.parent / f"undisturbed_{method}"

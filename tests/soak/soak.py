@@ -1,4 +1,4 @@
-"""Stops trainings in every way that is known, many times over, and prints a table.
+"""Stops trainings in all known ways, many times, and prints a table.
 
 python tests/soak/soak.py            # about half an hour
 python tests/soak/soak.py --small    # a tenth of it
@@ -30,7 +30,7 @@ Result = tuple[int, list[str]]
 
 
 def readable(folder: Path, method: str) -> list[tuple[Path, Callable[[Path], object]]]:
-    """A stopped run's state and networks, each with what reads it."""
+    """Returns the state and the networks of a stopped run and their readers."""
     trainer = Trainer(resolve(method, [*SMALL, "episodes=3", f"output={folder}"]))
     trainer.start()
     trainer.train(lambda progress: trainer.stop() if progress.step == 33 else None)
@@ -46,7 +46,7 @@ def readable(folder: Path, method: str) -> list[tuple[Path, Callable[[Path], obj
 
 
 def trials(folder: Path, counts: dict[str, int], seed: int) -> dict[str, tuple[Callable, int]]:
-    """Every kind of trial by name: what makes so many of them."""
+    """Returns, for each kind of trial, a function that runs a number of trials."""
     draw = random.Random(seed)
 
     def repeated(trial: Callable[[Path], list[str]]) -> Callable[[int], Result]:
@@ -57,7 +57,7 @@ def trials(folder: Path, counts: dict[str, int], seed: int) -> dict[str, tuple[C
         return many
 
     def damaged(count: int) -> Result:
-        # What is not the training's: read by the four methods in turn.
+        # The seed selects the method, so that consecutive seeds cover all four.
         files = readable(folder / "damage", METHODS[seed % 4 - 1])
         return damage_trials(files, count, seed)
 
@@ -77,7 +77,7 @@ def trials(folder: Path, counts: dict[str, int], seed: int) -> dict[str, tuple[C
 
 
 def run(folder: Path, counts: dict[str, int], seed: int = 0) -> dict[str, tuple[int, list[str]]]:
-    """Makes all trials: how many there were of each kind, and what was wrong."""
+    """Runs all trials; returns the number and the failures of each kind."""
     results = {}
     for name, (many, count) in trials(folder, counts, seed).items():
         began = time.monotonic()

@@ -1,4 +1,4 @@
-"""Run folders and caches that somebody else has changed: links, pipes, bits and digits."""
+"""Changes run folders and caches: links, pipes, bits and digits."""
 
 import json
 import os
@@ -26,7 +26,7 @@ FREE = ("evaluation.", "episodes", "output", "device", "logger", "on_nan", "chec
 
 
 def finished(folder: Path, method: str) -> Path:
-    """Returns a finished run of a method, trained once with a cache of its own."""
+    """Returns a finished run of a method, trained once with a separate cache."""
     os.environ["EMBERLINK_CACHE"] = str(folder / "cache")
     output = folder / f"sound_{method}"
     if not output.exists():
@@ -38,7 +38,7 @@ def finished(folder: Path, method: str) -> Path:
 
 
 def ended(arguments: list[str], folder: Path) -> tuple[int, str]:
-    """Returns the status of a command and what it printed; it must end within `LONGEST`."""
+    """Returns status and output of a command, which must end within `LONGEST`."""
     child = Child(command(arguments), folder)
     try:
         child.wait_for(lambda: False, LONGEST)
@@ -52,10 +52,10 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 
 def planted_trial(folder: Path, draw: random.Random, *, pipes: bool) -> list[str]:
-    """Puts links (or pipes and devices) at names of a run folder, and runs a command.
+    """Puts links, pipes or devices at names of a run folder, and runs a command.
 
     Returns:
-        What was wrong: a traceback, a command that waits, a change outside of the run folder.
+        The failures: a traceback, a blocked command, a change outside of the run folder.
     """
     run, home = folder / "run", folder / "home"
     shutil.copytree(finished(folder.parent, draw.choice(METHODS)), run)
@@ -104,7 +104,7 @@ def plant(path: Path, home: Path, draw: random.Random, *, pipes: bool) -> None:
 
 
 def cache_trial(folder: Path, draw: random.Random) -> list[str]:
-    """Changes a bit of a cached file; an evaluation must give the same numbers."""
+    """Changes a bit of a cached file; checks that an evaluation gives the same numbers."""
     run, cache = folder / "run", folder / "cache"
     shutil.copytree(finished(folder.parent, draw.choice(METHODS)), run)
     shutil.copytree(folder.parent / "cache", cache)
@@ -124,7 +124,7 @@ def cache_trial(folder: Path, draw: random.Random) -> list[str]:
 
 
 def config_trial(folder: Path, draw: random.Random) -> list[str]:
-    """Changes a digit of config.yaml; it must be refused or change none of the numbers."""
+    """Changes a digit of config.yaml; checks that it is refused or does not change the numbers."""
     run = folder / "run"
     shutil.copytree(finished(folder.parent, draw.choice(METHODS)), run)
     text = (run / "config.yaml").read_text()
