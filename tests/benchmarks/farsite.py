@@ -136,7 +136,7 @@ def overlap(got: Tensor, run: Run, minutes: float) -> float:
 
 
 def compare(run: Run, got: Tensor) -> tuple[list[float], float, float]:
-    """Returns overlaps at `PARTS` of the run, final ratio of areas, mean error of arrival in minutes.
+    """Returns overlaps at `PARTS` of the run, final ratio of areas, mean error of arrival, minutes.
 
     The error is taken over cells that burn in both, without the initial fire.
     """

@@ -78,7 +78,7 @@ def vmas_flying(scenario: str, num_envs: int, steps: int) -> tuple[Callable[[], 
 
 
 def matrix_product(device: str = "cpu") -> Callable[[], object]:
-    """Returns a function with 2048^3 multiply-adds in float32, which shows the machine's peak rate."""
+    """Returns a function with 2048^3 multiply-adds in float32, to measure the machine's peak."""
     one, other = (torch.randn(MATRIX, MATRIX, device=device) for _ in range(2))
     return lambda: one @ other
 
@@ -95,7 +95,7 @@ def update_flops(
     *,
     shared: bool = False,
 ) -> int:
-    """Returns the floating-point operations of a DDPG update of `members` networks, by layer sizes.
+    """Counts the floating-point operations of a DDPG update of `members` networks, by layer sizes.
 
     Only matrix products count, a multiply-add as two. Forward: actor and critic in the actors' loss,
     critic, target actor and target critic in the critics'. Backward: for each trained layer the
