@@ -127,6 +127,7 @@ def test_a_run_folder_that_is_none(tmp_path, capsys):
     assert list(empty.iterdir()) == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "words"),
     [
@@ -176,6 +177,7 @@ def test_eval_on_a_device_that_is_not_there(run, capsys):
     refused(["eval", str(run), "--device", "cuda:99"], capsys, "cuda:99", "known: cpu")
 
 
+@pytest.mark.slow
 def test_a_real_process_prints_one_line_and_ends_with_2(tmp_path):
     done = subprocess.run(
         [sys.executable, "-c", PROGRAM, "train", "consensus", "env.horizn=3"],

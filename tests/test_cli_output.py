@@ -53,6 +53,7 @@ def test_a_reader_that_ends_ends_the_training_with_a_checkpoint(tmp_path):
     check_saved(tmp_path)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs Linux's /dev/full")
 def test_a_full_output_is_named_and_frees_the_folder(tmp_path):
     with open("/dev/full", "w") as full:

@@ -253,6 +253,7 @@ def test_spread_within_a_run_is_in_no_interval(tmp_path):
     assert calm.interval == wild.interval == (20, 40)
 
 
+@pytest.mark.slow
 @pytest.mark.drawn
 def test_the_order_of_runs_does_not_matter(runs, tmp_path):
     folders = find([runs])
@@ -266,6 +267,7 @@ def test_the_order_of_runs_does_not_matter(runs, tmp_path):
     assert sum(name.endswith(".png") for name in whole[0]) == 6
 
 
+@pytest.mark.slow
 @settings(
     deadline=None, max_examples=6, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
@@ -349,6 +351,7 @@ def test_numbers_without_printing(runs, tmp_path, capsys, monkeypatch):
         compare([tmp_path / "missing"])
 
 
+@pytest.mark.slow
 def test_rewards_that_differ_are_not_ranked(tmp_path, capsys):
     """By their settings, or by what a scripted policy earns with them."""
     for seed in range(2):

@@ -238,6 +238,7 @@ for name, module in sys.modules.items():
 """
 
 
+@pytest.mark.slow
 def test_everything_that_is_played_is_in_the_name_of_the_file(cache):
     done = subprocess.run(
         [sys.executable, "-c", LOADED], capture_output=True, text=True, check=True

@@ -372,6 +372,7 @@ def test_a_run_folder_whose_name_is_markup(run, tmp_path, capsys):
     assert str(odd) in capsys.readouterr().out.replace("\n", "")
 
 
+@pytest.mark.slow
 def test_the_files_of_the_working_folder_are_not_run(tmp_path, mark):
     """Neither modules nor settings of a folder in which somebody runs the program."""
     bomb = f"import os\nos.mkdir({str(mark)!r})\n"

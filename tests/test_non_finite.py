@@ -264,6 +264,7 @@ def test_of_several_seeds_the_right_one_is_named(place, tmp_path, monkeypatch):
         assert replay(error.dump) == error.report
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("place", ["observation", "gradient", "loss"])
 def test_a_late_poll_finds_the_same(place, clean, tmp_path, monkeypatch):
     """As on a GPU, whose flags arrive some steps later: nothing is learnt meanwhile."""

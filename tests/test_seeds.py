@@ -22,7 +22,9 @@ SEEDS = [3, 11]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("method", "setup"), zip(METHODS, ["released", "paper"] * 2, strict=True))
+@pytest.mark.parametrize(
+    ("method", "setup"), [*zip(METHODS, ["released", "paper"] * 2, strict=True)]
+)
 def test_a_seed_of_a_stack_learns_what_it_learns_alone(method, setup, tmp_path):
     """Some two hundred updates; both work in float32, in another order."""
     settings = [

@@ -192,6 +192,7 @@ def service() -> int:
     raise AssertionError("wandb has started no process")
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="needs Linux's /proc")
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGSTOP])
 def test_wandbs_process_is_killed_or_stands_still(how, tmp_path):
@@ -211,6 +212,7 @@ def test_wandbs_process_is_killed_or_stands_still(how, tmp_path):
             os.kill(process, signal.SIGKILL)
 
 
+@pytest.mark.slow
 def test_a_program_whose_wandb_was_killed_ends_in_peace(tmp_path):
     """What wandb would do at the end of the program is its own, and shown to nobody."""
     program = (
