@@ -127,6 +127,7 @@ def test_invalid_run_folder(tmp_path, capsys):
     assert list(empty.iterdir()) == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "words"),
     [
@@ -176,6 +177,7 @@ def test_eval_on_a_missing_device(run, capsys):
     refused(["eval", str(run), "--device", "cuda:99"], capsys, "cuda:99", "known: cpu")
 
 
+@pytest.mark.slow
 def test_subprocess_prints_one_line_and_exits_with_2(tmp_path):
     done = subprocess.run(
         [sys.executable, "-c", PROGRAM, "train", "consensus", "env.horizn=3"],

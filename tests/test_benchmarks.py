@@ -27,6 +27,7 @@ class Flops(TorchDispatchMode):
         return out
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("method", "features", "hidden", "batch"),
     [
@@ -81,6 +82,7 @@ def test_the_guard_has_a_record_of_every_workload():
     assert all(ratio > 0 for ratio in recorded.values())
 
 
+@pytest.mark.drawn
 def test_time_to_90_percent(tmp_path, capsys):
     file = tmp_path / "runs.jsonl"
     lines = [(500, 10, 40), (1000, 20, 71), (1500, 30, 73), (2000, 40, 79), (2500, 50, 88)]

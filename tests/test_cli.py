@@ -116,6 +116,7 @@ def wait_for(condition, process, seconds: float = 120) -> None:
         time.sleep(0.05)
 
 
+@pytest.mark.slow
 def test_an_interrupted_run_can_be_evaluated(tmp_path, capsys):
     endless = [*TINY, "episodes=100000", f"output={tmp_path}"]
     process = subprocess.Popen(

@@ -53,6 +53,7 @@ def test_a_closed_pipe_ends_the_training_with_a_checkpoint(tmp_path):
     check_saved(tmp_path)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs Linux's /dev/full")
 def test_a_full_output_is_an_error_and_unlocks_the_folder(tmp_path):
     with open("/dev/full", "w") as full:

@@ -253,6 +253,7 @@ def test_intervals_ignore_the_spread_within_a_run(tmp_path):
     assert calm.interval == wild.interval == (20, 40)
 
 
+@pytest.mark.slow
 @pytest.mark.drawn
 def test_results_do_not_depend_on_the_order_of_runs(runs, tmp_path):
     folders = find([runs])
@@ -266,6 +267,7 @@ def test_results_do_not_depend_on_the_order_of_runs(runs, tmp_path):
     assert sum(name.endswith(".png") for name in whole[0]) == 6
 
 
+@pytest.mark.slow
 @settings(
     deadline=None, max_examples=6, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
@@ -349,6 +351,7 @@ def test_numbers_without_printing(runs, tmp_path, capsys, monkeypatch):
         compare([tmp_path / "missing"])
 
 
+@pytest.mark.slow
 def test_different_rewards_are_not_ranked(tmp_path, capsys):
     """Rewards differ by their settings or by the reward of a scripted policy."""
     for seed in range(2):

@@ -186,6 +186,7 @@ def test_td3_of_torchrl_trains_these_networks(window, shared, vmap):
             assert weight.grad.flatten(int(name == "qvalue") + 1).any(-1).all(), key
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shared", [False, True])
 def test_ddpg_of_torchrl_fits_a_reward_seen_in_the_window(shared):
     torch.manual_seed(0)

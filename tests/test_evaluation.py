@@ -52,7 +52,7 @@ def cache(tmp_path, monkeypatch):
 
 @pytest.fixture
 def played(monkeypatch):
-    """Counts the batches of episodes that are simulated."""
+    """Counts the episodes batches that are simulated."""
     count, play = [], evaluate.play
     monkeypatch.setattr(evaluate, "play", lambda *args: (count.append(args), play(*args))[1])
     return count
@@ -236,6 +236,7 @@ for name, module in sys.modules.items():
 """
 
 
+@pytest.mark.slow
 def test_the_file_name_depends_on_all_source_files(cache):
     done = subprocess.run(
         [sys.executable, "-c", LOADED], capture_output=True, text=True, check=True

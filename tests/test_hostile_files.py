@@ -372,6 +372,7 @@ def test_a_run_folder_named_like_markup(run, tmp_path, capsys):
     assert str(odd) in capsys.readouterr().out.replace("\n", "")
 
 
+@pytest.mark.slow
 def test_files_of_the_working_folder_are_not_executed(tmp_path, mark):
     """Modules and settings in the working folder are ignored."""
     bomb = f"import os\nos.mkdir({str(mark)!r})\n"

@@ -262,6 +262,7 @@ def test_the_seed_of_the_value_is_named(place, tmp_path, monkeypatch):
         assert replay(error.dump) == error.report
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("place", ["observation", "gradient", "loss"])
 def test_a_late_poll_reports_the_same_value(place, clean, tmp_path, monkeypatch):
     """On a GPU the flags arrive some steps later. No update happens in between."""

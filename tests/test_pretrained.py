@@ -43,6 +43,7 @@ def shipped(packed, tmp_path, monkeypatch) -> Path:
     return root
 
 
+@pytest.mark.slow
 def test_packed_runs_omit_the_training_state(packed):
     root, runs = packed
     for run, place in zip(runs, ("consensus/s3", "consensus/s10", "independent/s3"), strict=True):
@@ -77,6 +78,7 @@ def test_a_name_replaces_a_run_folder(shipped, tmp_path, capsys):
     assert "pretrained_tuned_consensus_s10/figures/side_by_side" in printed.replace("\n", "")
 
 
+@pytest.mark.slow
 def test_an_existing_copy_is_used_and_kept(shipped, tmp_path):
     run = pretrained.open_run("pretrained:consensus")
     (run.path / "note.txt").write_text("mine")

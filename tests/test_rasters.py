@@ -328,6 +328,7 @@ def test_a_small_fire_in_a_large_raster_keeps_its_resolution(tmp_path):
         read(path, (60, 20))
 
 
+@pytest.mark.slow
 def test_a_large_raster_needs_bounded_memory(tmp_path):
     """Checks that 6000 x 8000 cells need less than 1.2 GB, also if the file is compressed."""
     path, height, width = tmp_path / "large.tif", 6000, 8000

@@ -91,6 +91,7 @@ def check_actor(run: RunFolder, config, trainer: Trainer) -> None:
     assert rollout[keys.ACTION].abs().max() > 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["independent", "consensus"])
 def test_a_seed_repeats_a_run_byte_for_byte(method, tmp_path):
     def run(name: str, seed: int) -> tuple[bytes, dict]:

@@ -116,13 +116,14 @@ def whole(tmp_path_factory):
 @pytest.mark.parametrize("learner", ["ddpg", "td3"])
 @pytest.mark.parametrize(
     ("method", "steps"),
-    zip(METHODS, [[1, 33], [40], [41, 42, 79], [33, 40, 79]], strict=True),
+    [*zip(METHODS, [[1, 33], [40], [41, 42, 79], [33, 40, 79]], strict=True)],
 )
 def test_a_resumed_run_equals_the_uninterrupted_run(method, steps, learner, whole, tmp_path):
     more = [] if learner == "ddpg" else [f"learner={learner}"]
     assert_same(whole(method, *more), stopped_at(steps, method, tmp_path, *more))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("method", "learner"), [("consensus", "ddpg"), ("positional", "td3")])
 def test_seeds_side_by_side_are_resumed_together(method, learner, whole, tmp_path):
     more = "seeds=[0,1,2]", f"learner={learner}"
@@ -131,12 +132,14 @@ def test_seeds_side_by_side_are_resumed_together(method, learner, whole, tmp_pat
     assert_same(whole(method, *more), one)
 
 
+@pytest.mark.slow
 def test_a_run_can_be_stopped_at_any_step(whole, tmp_path):
     """Stops a run every 5 steps, so within, at and after the end of every episode."""
     steps, evaluated = list(range(5, HORIZON * EPISODES, 5)), "evaluation.interval=2"
     assert_same(whole("consensus", evaluated), stopped_at(steps, "consensus", tmp_path, evaluated))
 
 
+@pytest.mark.slow
 def test_several_updates_a_step_and_the_released_setup(whole, tmp_path):
     more = ["setup=released", "learner.updates_per_step=3"]
     assert_same(whole("consensus", *more), stopped_at([9, 50], "consensus", tmp_path, *more))

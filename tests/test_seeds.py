@@ -22,7 +22,9 @@ SEEDS = [3, 11]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("method", "setup"), zip(METHODS, ["released", "paper"] * 2, strict=True))
+@pytest.mark.parametrize(
+    ("method", "setup"), [*zip(METHODS, ["released", "paper"] * 2, strict=True)]
+)
 def test_a_seed_of_a_stack_learns_the_same_as_alone(method, setup, tmp_path):
     """About two hundred updates in float32, with operations in a different order."""
     settings = [

@@ -191,6 +191,7 @@ def wall(kind: str) -> tuple[Tensor, Tensor]:
     return ring == 5, ring > 5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["straight", "diagonal", "ring"])
 @pytest.mark.parametrize("refine", [1, 2, 3, 4])
 def test_a_barrier_one_cell_wide_never_burns_and_does_not_leak(kind: str, refine: int):

@@ -192,6 +192,7 @@ def service() -> int:
     raise AssertionError("wandb has started no process")
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="needs Linux's /proc")
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGSTOP])
 def test_the_process_of_wandb_is_killed_or_stopped(how, tmp_path):
@@ -211,6 +212,7 @@ def test_the_process_of_wandb_is_killed_or_stopped(how, tmp_path):
             os.kill(process, signal.SIGKILL)
 
 
+@pytest.mark.slow
 def test_a_program_exits_normally_if_wandb_was_killed(tmp_path):
     """Errors of wandb at the end of the program are not printed."""
     program = (

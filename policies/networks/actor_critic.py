@@ -2,7 +2,7 @@
 
 import copy
 from collections.abc import Sequence
-from typing import Any, cast
+from typing import Any
 
 from tensordict.nn import TensorDictModule
 from torchrl.data import Composite
@@ -71,6 +71,7 @@ def _build(
 ) -> StackedActor | StackedCritic:
     """Returns a new network with the sizes of an environment's specs."""
     *batch, actions = action[keys.ACTION].shape
+    device: Any = observation.device
     shapes = [observation[key].shape[len(batch) :] for key in keys.observation_keys(observation)]
     return network(
         batch[-1],
@@ -78,7 +79,7 @@ def _build(
         actions,
         hidden,
         share_parameters=share_parameters,
-        device=cast(torch.device | None, observation.device),
+        device=device,
         generator=generator,
     )
 
