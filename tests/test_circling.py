@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from moments import communication, moment
+from time_steps import communication, time_step
 
 from emberlink.comm._heading import HeadingConfig, circling
 from emberlink.comm.consensus import ConsensusConfig
@@ -35,7 +35,7 @@ def test_circling_is_for_discoverers_with_old_fire_only():
     config = ConsensusConfig(discoverer="any_fire", heading=heading, range=5.0)
     # UAV 0 sees old fire only, UAV 1 old and new fire, UAV 2 hears UAV 1, UAV 3 hears no UAV.
     places = [[10.0, 10.0, 2.0], [30.0, 10.0, 2.0], [33.0, 10.0, 2.0], [50.0, 50.0, 2.0]]
-    before = moment(
+    before = time_step(
         places,
         [0, 2, 0, 0],
         [3, 3, 0, 0],
@@ -45,7 +45,7 @@ def test_circling_is_for_discoverers_with_old_fire_only():
     talk = communication(before, config)
     before = talk._reset(before, before)
     assert before[keys.FOLLOWS].flatten().tolist() == [0, 1, 1, -1]
-    after = moment([[x, y + 0.5, z] for x, y, z in places], [0] * 4)
+    after = time_step([[x, y + 0.5, z] for x, y, z in places], [0] * 4)
     waypoint = before["agents", "target"][0, 3]
     start = torch.tensor(places[3])
     nearer = (waypoint - start).norm() - (waypoint - start - torch.tensor([0, 0.5, 0])).norm()

@@ -57,14 +57,14 @@ class Heard(VisitedMap):
 def test_links_are_computed_before_the_reward_is_shaped():
     env = TransformedEnv(bare(), Communication(Heard(WORLD, VisitedMapConfig(range=6.0), ENVS)))
     plain = bare()
-    moments = [one.reset() for one in (env, plain)]
+    tds = [one.reset() for one in (env, plain)]
     for step in range(5):
-        moments = [
-            one.step(moment.set(keys.ACTION, action(step)))["next"]
-            for one, moment in zip((env, plain), moments, strict=True)
+        tds = [
+            one.step(td.set(keys.ACTION, action(step)))["next"]
+            for one, td in zip((env, plain), tds, strict=True)
         ]
-        shaped, reward = (moment[keys.REWARD][..., 0] for moment in moments)
-        links = neighbours(moments[0][keys.POSITION], 6.0)
+        shaped, reward = (td[keys.REWARD][..., 0] for td in tds)
+        links = neighbours(tds[0][keys.POSITION], 6.0)
         assert links.any()
         assert shaped.equal(reward + links.sum(-1))
 

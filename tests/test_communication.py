@@ -28,18 +28,18 @@ def recipe(method: str, **more):
     return make_env(method, fire=ablaze(), seed=4, **more)
 
 
-def features_of_uav(moment) -> torch.Tensor:
+def features_of_uav(td) -> torch.Tensor:
     """Computes a UAV's 6 numbers from the other entries of the environment."""
-    new, old = moment[keys.NEW_FIRE] > 0, moment[keys.OLD_FIRE] > 0
-    step = moment[keys.STEP].unsqueeze(-1).expand_as(new)
+    new, old = td[keys.NEW_FIRE] > 0, td[keys.OLD_FIRE] > 0
+    step = td[keys.STEP].unsqueeze(-1).expand_as(new)
     flags = torch.stack((new, old, step), -1).float()
-    return torch.cat((moment[keys.POSITION], flags), -1)
+    return torch.cat((td[keys.POSITION], flags), -1)
 
 
-def expected(method: str, moment) -> torch.Tensor:
-    own = features_of_uav(moment)
+def expected(method: str, td) -> torch.Tensor:
+    own = features_of_uav(td)
     if method == "consensus":
-        return torch.cat((own, moment[keys.TARGET]), -1)
+        return torch.cat((own, td[keys.TARGET]), -1)
     if method == "positional":
         everyone = torch.cat([own[..., uav, :] for uav in range(UAVS)], -1)
         return torch.stack([everyone] * UAVS, -2)

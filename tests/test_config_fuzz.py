@@ -195,12 +195,12 @@ def stepped(values: dict) -> None:
     config = from_values(values)
     assert to_values(config) == values  # no value was coerced or left out
     env = build_env(config, num_envs=config.num_envs, fire=config.fire, seed=1, device="cpu")
-    moment = env.reset()
+    td = env.reset()
     for _ in range(2):
-        moment = env.rand_action(moment)
-        moment = env.step(moment)["next"]
+        td = env.rand_action(td)
+        td = env.step(td)["next"]
     for key in (keys.OBSERVATION, keys.REWARD, keys.POSITION):
-        assert moment[key].isfinite().all(), key
+        assert td[key].isfinite().all(), key
 
 
 @pytest.mark.slow

@@ -4,8 +4,8 @@ import math
 
 import pytest
 import torch
-from moments import WORLD, communication, moment
 from tensordict import TensorDict
+from time_steps import WORLD, communication, time_step
 from torch import Tensor
 
 from emberlink.comm._agreement import choose_leader, known_discoverers
@@ -22,7 +22,7 @@ def in_a_row(count: int, gap: float = 9.0) -> list[list[float]]:
 
 def told(position, new, *, config=None, world=WORLD, **more) -> TensorDict:
     """Returns the first time step of an episode after consensus."""
-    now = moment(position, new, **more)
+    now = time_step(position, new, **more)
     return communication(now, config, world)._reset(now, now)
 
 
@@ -62,7 +62,7 @@ def test_a_discoverer_does_not_forward_messages_between_networks():
 
 
 def test_all_uavs_wander_without_a_discoverer():
-    now = moment(in_a_row(5), [0] * 5)
+    now = time_step(in_a_row(5), [0] * 5)
     talk = communication(now)
     rewritten = talk._reset(now, now)
     assert rewritten[keys.FOLLOWS].tolist() == [[-1] * 5]
@@ -126,13 +126,13 @@ def test_without_wandering_there_is_no_target_and_no_bonus():
     )
     start = [[5.0, 5.0, 2.0], [30.0, 30.0, 2.0], [33.0, 34.0, 2.0]]
     moved = [[5.0, 6.0, 2.0], [30.0, 30.0, 2.0], [33.0, 33.0, 2.0]]
-    first = moment(start, [0, 4, 0], centre=[[0.0, 0.0], [30.0, 30.0], [0.0, 0.0]])
+    first = time_step(start, [0, 4, 0], centre=[[0.0, 0.0], [30.0, 30.0], [0.0, 0.0]])
     talk = communication(first, still)
     first = talk._reset(first, first)
     assert first[keys.FOLLOWS].tolist() == [[-1, 1, 1]]
     assert first[keys.TARGET][0, 0].tolist() == start[0]
     assert first[keys.OBSERVATION][0, 0, -3:].tolist() == [0.0, 0.0, 0.0]
-    second = talk._step(first, moment(moved, [0, 0, 0], step=1))
+    second = talk._step(first, time_step(moved, [0, 0, 0], step=1))
     # UAV 0 has no target. UAV 2 moved from a distance of 5 to one of sqrt(18) to UAV 1.
     expected = torch.tensor([0.0, 0.0, 2 * (5 - 18**0.5)])
     torch.testing.assert_close(second[keys.REWARD].flatten(), expected)
@@ -145,7 +145,7 @@ def test_the_share_of_lost_messages(loss):
     position = torch.rand(envs, uavs, 3) * 20 + 1
     heard = torch.stack(
         [
-            radio.links(moment(position, torch.zeros(envs, uavs).long(), step=step))
+            radio.links(time_step(position, torch.zeros(envs, uavs).long(), step=step))
             for step in range(3)
         ]
     )
@@ -159,21 +159,21 @@ def test_the_share_of_lost_messages(loss):
         assert not heard[0].equal(heard[1])
 
 
-def walk(*moments: TensorDict) -> tuple[Consensus, TensorDict]:
+def walk(*steps: TensorDict) -> tuple[Consensus, TensorDict]:
     """Returns the module and the last time step after consensus on all steps of an episode."""
-    talk = communication(moments[0])
-    now = talk._reset(moments[0], moments[0])
-    for following in moments[1:]:
+    talk = communication(steps[0])
+    now = talk._reset(steps[0], steps[0])
+    for following in steps[1:]:
         now = talk._step(now, following)
     return talk.module, now
 
 
 def test_streak_score_and_altitude_accumulate_and_reset():
     def at(z: float, new: int) -> TensorDict:
-        return moment([[5.0, 5.0, z]], [new])
+        return time_step([[5.0, 5.0, z]], [new])
 
-    def record(*moments: TensorDict) -> tuple[float, ...]:
-        module, _ = walk(*(now.clone() for now in moments))
+    def record(*steps: TensorDict) -> tuple[float, ...]:
+        module, _ = walk(*(now.clone() for now in steps))
         return module.streak.item(), module.fire_score.item(), module.altitude_sum.item()
 
     first, second, third = at(1.5, 3), at(2.0, 4), at(4.0, 1)
@@ -191,16 +191,16 @@ def test_rank_by_hand():
     # By the latest step alone 2 would rank first: 2 / 3 < 4 / 3.5.
     before = [[0.0, 0.0, 1.0], [9.0, 0.0, 2.0], [18.0, 0.0, 3.5]]
     after = [[0.0, 0.0, 3.0], [9.0, 0.0, 2.0], [18.0, 0.0, 3.5]]
-    _, now = walk(moment(before, [6, 0, 0]), moment(after, [2, 0, 4]))
+    _, now = walk(time_step(before, [6, 0, 0]), time_step(after, [2, 0, 4]))
     assert now[keys.FOLLOWS].tolist() == [[0, 0, 2]]
-    now = moment(after, [2, 0, 4])
+    now = time_step(after, [2, 0, 4])
     rank = communication(now).module._update_track_record(now, torch.tensor([True] * 3))
     torch.testing.assert_close(rank[0, [0, 2]], torch.tensor([4 / 9, 16 / 3.5**2]).double())
 
 
 def test_targets_by_role():
     position = [[3.0, 4.0, 2.5], [8.0, 4.0, 1.5], [40.0, 40.0, 3.0]]
-    now = moment(position, [2, 0, 0], centre=[[3.25, 4.5], [0, 0], [0, 0]])
+    now = time_step(position, [2, 0, 0], centre=[[3.25, 4.5], [0, 0], [0, 0]])
     talk = communication(now)
     rewritten = talk._reset(now, now)
     target = rewritten[keys.TARGET][0]
@@ -239,7 +239,7 @@ def test_a_waypoint_is_redrawn_only_by_a_wanderer_closer_than_one():
     waypoint = torch.tensor(
         [[[5.0, 5.9, 2.0], [30.0, 6.0, 2.0], [50.0, 50.5, 2.0], [55.0, 50.0, 2.5]]]
     )
-    now = moment(position, [0, 0, 1, 0], step=3)
+    now = time_step(position, [0, 0, 1, 0], step=3)
     talk = communication(now)
     talk.module.waypoint.copy_(waypoint)
     now = talk._step(now, now)
@@ -251,11 +251,11 @@ def test_a_waypoint_is_redrawn_only_by_a_wanderer_closer_than_one():
 
 def test_a_first_waypoint_closer_than_one_is_drawn_again():
     # Each UAV starts at its first waypoint, drawn as the module draws it from this key.
-    first = moment([[32.0, 32.0, 2.0]] * 6, [0] * 6)
+    first = time_step([[32.0, 32.0, 2.0]] * 6, [0] * 6)
     module = communication(first).module
     module.reset(first, torch.tensor([True]))
     points = module.waypoint.clone()
-    now = moment(points[0], [0] * 6)
+    now = time_step(points[0], [0] * 6)
     target = communication(now)._reset(now, now)[keys.TARGET]
     assert (torch.linalg.vector_norm(target - points, dim=-1) >= 1).all()
 
@@ -264,7 +264,7 @@ def test_waypoints_are_uniform_in_the_box_and_differ():
     here = torch.full((500, 4, 3), 2.0)
 
     def drawn(step: int) -> Tensor:
-        now = moment(here, [0] * 4, step=step)
+        now = time_step(here, [0] * 4, step=step)
         module = communication(now).module
         module.reset(now, torch.ones(500, dtype=torch.bool))
         return module.waypoint
@@ -330,7 +330,7 @@ def test_the_result_does_not_depend_on_the_order_of_uavs():
     waypoint = torch.full((200, 9, 3), 60.0)  # far from all UAVs: no UAV draws another one
 
     def run(order: Tensor) -> tuple[dict[str, Tensor], TensorDict]:
-        now = moment(position[:, order], new[:, order], centre=centre[:, order], step=1)
+        now = time_step(position[:, order], new[:, order], centre=centre[:, order], step=1)
         talk = communication(now)
         talk.module.waypoint.copy_(waypoint)
         return dict(talk.module.named_buffers()), talk._step(now, now)

@@ -4,9 +4,9 @@ import random
 
 import pytest
 import torch
-from moments import communication, moment
 from scalar_consensus import ScalarConsensus, heading_term
 from tensordict import TensorDict
+from time_steps import communication, time_step
 from torch import Tensor
 
 from emberlink.comm._heading import HeadingConfig
@@ -56,7 +56,7 @@ def test_random_networks_equal_plain_python(uavs):
     for step in range(steps):
         sees = torch.where(draw() < 0.75, sees, draw() < 0.3)  # so that streaks are long
         new = ((draw() * 9 + 1).long() * sees).masked_fill(draw() < 0.1, 0)
-        now = moment(
+        now = time_step(
             position,
             new,
             (draw() * 3).long() * sees,

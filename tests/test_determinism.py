@@ -32,14 +32,14 @@ def test_an_environment_does_not_depend_on_the_batch_size(fire):
     few, many = (WildfireEnv(count, world, fire=fire, seed=3) for count in (2, 5))
     generator = torch.Generator().manual_seed(0)
     for _ in range(2):
-        moments = [env.reset() for env in (few, many)]
+        tds = [env.reset() for env in (few, many)]
         for _ in range(15):
-            one, other = moments
+            one, other = tds
             for key in (keys.OBSERVATION, keys.POSITION, keys.RNG_KEY, keys.BURNING):
                 assert one[key].equal(other[key][:2]), key
             assert not other[keys.RNG_KEY][2:].unsqueeze(1).eq(one[keys.RNG_KEY]).any()
             action = torch.rand(5, *one[keys.POSITION].shape[1:], generator=generator) * 2 - 1
-            moments = [
-                env.step(moment.set(keys.ACTION, action[: len(moment)]))["next"]
-                for env, moment in zip((few, many), moments, strict=True)
+            tds = [
+                env.step(td.set(keys.ACTION, action[: len(td)]))["next"]
+                for env, td in zip((few, many), tds, strict=True)
             ]

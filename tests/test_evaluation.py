@@ -52,7 +52,7 @@ def cache(tmp_path, monkeypatch):
 
 @pytest.fixture
 def played(monkeypatch):
-    """Counts the episodes batches that are simulated."""
+    """Counts the batches of episodes that are simulated."""
     count, play = [], evaluate.play
     monkeypatch.setattr(evaluate, "play", lambda *args: (count.append(args), play(*args))[1])
     return count
@@ -80,9 +80,9 @@ def test_all_policies_have_the_same_fires_and_starts(cache, monkeypatch):
     begun: dict = {}
 
     def play(env, policy):
-        moment = env.reset()
+        td = env.reset()
         world = env.base_env
-        seen = moment["agents", "position"].tolist(), world.arrival_time.tolist()
+        seen = td["agents", "position"].tolist(), world.arrival_time.tolist()
         begun.setdefault(len(begun), seen)
         return {name: torch.zeros(evaluate.BLOCK) for name in metrics.NAMES}
 

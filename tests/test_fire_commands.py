@@ -144,7 +144,7 @@ def test_preview_does_not_overwrite(capsys, tmp_path):
         tmp_path / "fire_paper_0_3.png"
     )
     assert ran(capsys, "preview", "--output", "own.png", "paper")[-1] == "own.png"
-    assert "own.png is there already" in refused(capsys, "preview", "paper", "--output", "own.png")
+    assert "own.png exists already" in refused(capsys, "preview", "paper", "--output", "own.png")
     assert Path(first).read_bytes() == before
     assert len(list(tmp_path.iterdir())) == 4
 
@@ -336,7 +336,7 @@ KNOWN = "known: huygens, oil_slick, paper"
         (["preview", "paper", "setup=zzz"], ["setup 'zzz'", "known: paper, released, tuned"]),
         (["preview", "paper", "env.grid=[4,30]"], ["env.grid.0=4"]),
         (["preview", "paper", "again"], ["'again'", "key=value"]),
-        (["preview", "paper", "--output", "there.png"], ["there.png is there already"]),
+        (["preview", "paper", "--output", "there.png"], ["there.png exists already"]),
         (["preview", "paper", "--output", "a.jpg"], ["a.jpg", "must end in .png"]),
         (["preview", "paper", "--output", "no/a.png"], ["no: there is no such folder"]),
         (["make", "zzz"], ["'zzz'", KNOWN]),
@@ -347,8 +347,8 @@ KNOWN = "known: huygens, oil_slick, paper"
         (["make", "paper", "--count", "300000"], ["300000 fires", "1073741824"]),
         (["make", "paper", "--count", "9" * 30], ["at most"]),
         (["make", "paper", "--count", "1000001", "env.grid=[8,8]"], ["1000001"]),
-        (["make", "paper", "--output", "bank.npy"], ["bank.npy is there already"]),
-        (["make", "paper", "--output", "beside.npy"], ["beside.json is there already"]),
+        (["make", "paper", "--output", "bank.npy"], ["bank.npy exists already"]),
+        (["make", "paper", "--output", "beside.npy"], ["beside.json exists already"]),
         (["make", "paper", "--output", "folder"], ["folder", "is a folder", ".npy, .tif, .tiff"]),
         (["make", "paper", "--output", "a.zip"], ["a.zip", ".npy or .tif or .tiff"]),
         (["make", "paper", "--output", "no/a.npy"], ["no: there is no such folder"]),
@@ -358,7 +358,7 @@ KNOWN = "known: huygens, oil_slick, paper"
         (["import", "env.grid=[9,9]", "--output", "a.npy"], ["FILE", "is missing"]),
         (["import", "bank.npy", "fire.path=x", "--output", "a.npy"], ["fire.path"]),
         (["import", "bank.npy", "fire.unit=steps", "--output", "a.npy"], ["fire.units?"]),
-        (["import", "bank.npy", "--output", "bank.npy"], ["bank.npy is there already"]),
+        (["import", "bank.npy", "--output", "bank.npy"], ["bank.npy exists already"]),
         (["import", "bank.npy", "--output", "a.asc"], ["a.asc", "must end in"]),
     ],
     ids=lambda value: " ".join(value)[:40] if value and value[0] in cli_actions() else "",
@@ -460,7 +460,7 @@ def test_a_file_created_meanwhile_is_kept(tmp_path, monkeypatch):
         link(source, target)
 
     monkeypatch.setattr(os, "link", overtaken)
-    with pytest.raises(ValueError, match=r"bank.npy is there already"):
+    with pytest.raises(ValueError, match=r"bank.npy exists already"):
         write_bank(tmp_path / "bank.npy", fires)
     assert (tmp_path / "bank.npy").read_text() == "theirs"
     assert [path.name for path in tmp_path.iterdir()] == ["bank.npy"]

@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from moments import communication, moment
+from time_steps import communication, time_step
 from torch import Tensor
 
 from emberlink.comm._heading import HeadingConfig, heading_reward
@@ -44,11 +44,11 @@ def test_no_heading_bonus_without_a_move():
 @pytest.mark.parametrize(("axes", "exits"), [("xyz", [18, 0, 0, 0]), ("xy", [18, 0, 0, 18])])
 def test_the_heading_term_is_added_unless_the_uav_left_the_box(axes, exits):
     world = WildfireConfig(grid=(64, 64), reward=RewardConfig(exit_axes=axes))
-    before = moment([[10.0 * i, 5.0, 2.0] for i in range(4)], [1] * 4, centre=[[60.0, 5.0]] * 4)
+    before = time_step([[10.0 * i, 5.0, 2.0] for i in range(4)], [1] * 4, centre=[[60.0, 5.0]] * 4)
     talk = communication(before, world=world)
     before = talk._reset(before, before)
     # All UAVs fly straight to their target. Their next target is elsewhere.
-    after = moment(
+    after = time_step(
         [[10.0 * i + 1, 5.0, 2.0] for i in range(4)],
         [1] * 4,
         centre=[[0.0, 60.0]] * 4,

@@ -101,31 +101,31 @@ def footprint(position: torch.Tensor, config) -> torch.Tensor:
     return near[0] * near[1]
 
 
-def check(moment, before, env, config, looked: torch.Tensor) -> None:
+def check(td, before, env, config, looked: torch.Tensor) -> None:
     """Checks the invariants of a time step, and of the transition to it from `before`, if given.
 
     UAVs do not observe at a reset. `looked`, bool [ENVS], marks environments after a step.
     """
     world = env.base_env
-    position = moment[keys.POSITION]
+    position = td[keys.POSITION]
     low, high = (torch.tensor(corner, dtype=torch.float32) for corner in (config.low, config.high))
     assert ((low <= position) & (position <= high)).all()
-    new, old, none = (moment[key] for key in (keys.NEW_FIRE, keys.OLD_FIRE, keys.NO_FIRE))
+    new, old, none = (td[key] for key in (keys.NEW_FIRE, keys.OLD_FIRE, keys.NO_FIRE))
     assert (new >= 0).all()
     assert (old >= 0).all()
     assert (none >= 0).all()
     total = footprint(position, config) * looked[:, None]
     assert torch.equal(new + old + none, total)
-    burning = world.arrival_time <= moment[keys.STEP][:, None, None]
+    burning = world.arrival_time <= td[keys.STEP][:, None, None]
     seen = world._map.seen
     assert not (seen & ~burning).any()
-    assert torch.equal(moment[keys.SEEN], seen.sum((1, 2)))
-    assert torch.equal(moment[keys.BURNING], burning.sum((1, 2)))
+    assert torch.equal(td[keys.SEEN], seen.sum((1, 2)))
+    assert torch.equal(td[keys.BURNING], burning.sum((1, 2)))
     if before is not None:
-        assert (moment[keys.BURNING] >= before[keys.BURNING]).all()
-        assert torch.equal(moment[keys.SEEN] - before[keys.SEEN], new.sum(1))
-        assert torch.equal(moment[keys.STEP], before[keys.STEP] + 1)
-    for key, value in moment.items(include_nested=True, leaves_only=True):
+        assert (td[keys.BURNING] >= before[keys.BURNING]).all()
+        assert torch.equal(td[keys.SEEN] - before[keys.SEEN], new.sum(1))
+        assert torch.equal(td[keys.STEP], before[keys.STEP] + 1)
+    for key, value in td.items(include_nested=True, leaves_only=True):
         if value.is_floating_point():
             assert value.isfinite().all(), key
 
@@ -136,25 +136,25 @@ def play(seed: int, steps: int) -> int:
     config = from_values(random_settings(rng))
     fire = random_fire(rng, config, generator)
     env = build_env(config, num_envs=ENVS, fire=fire, seed=seed, device="cpu")
-    moment, before, taken = env.reset(), None, 0
+    td, before, taken = env.reset(), None, 0
     everywhere = torch.ones(ENVS, dtype=torch.bool)
-    check(moment, None, env, config.env, looked=~everywhere)
+    check(td, None, env, config.env, looked=~everywhere)
     for _ in range(steps):
         shape = torch.Size((ENVS, config.env.num_uavs, 3))
-        moment[keys.ACTION] = random_actions(shape, generator)
-        before = moment
-        after = env.step(moment)["next"]
+        td[keys.ACTION] = random_actions(shape, generator)
+        before = td
+        after = env.step(td)["next"]
         taken += ENVS
         check(after, before, env, config.env, looked=everywhere)
         assert torch.equal(after["done"].squeeze(-1), after[keys.STEP] >= config.env.horizon)
         again = after["done"].squeeze(-1) | (torch.rand(ENVS, generator=generator) < 0.05)
-        moment = after.exclude(keys.REWARD).clone()
+        td = after.exclude(keys.REWARD).clone()
         if again.any():
-            moment["_reset"] = again.unsqueeze(-1)
-            moment = env.reset(moment)
-            check(moment, None, env, config.env, looked=~again)
+            td["_reset"] = again.unsqueeze(-1)
+            td = env.reset(td)
+            check(td, None, env, config.env, looked=~again)
             same = ~again
-            assert torch.equal(moment[keys.OBSERVATION][same], after[keys.OBSERVATION][same])
+            assert torch.equal(td[keys.OBSERVATION][same], after[keys.OBSERVATION][same])
     return taken
 
 

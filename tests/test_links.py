@@ -140,7 +140,7 @@ def test_an_existing_temporary_file(kind, tmp_path, outside):
 def test_a_new_file_does_not_replace_an_existing_one(kind, tmp_path, outside):
     path = tmp_path / "fires.npy"
     plant(path, kind, outside)
-    with pytest.raises(ValueError, match="is there already"), published(path) as partial:
+    with pytest.raises(ValueError, match="exists already"), published(path) as partial:
         partial.write_bytes(b"whole")
     assert len(list(tmp_path.iterdir())) == 2
 

@@ -17,7 +17,7 @@ from emberlink.trainers.evaluation import record_episode
 WHERE = [(2, 2, 1), (12, 2, 1), (22, 12, 1)]
 
 
-def moment(**changes) -> FrameData:
+def frame(**changes) -> FrameData:
     values = {
         "step": 4,
         "seen": 3,
@@ -60,21 +60,21 @@ def linked(*pairs: tuple[int, int], n: int = 3) -> np.ndarray:
 
 
 def test_links_are_drawn_between_neighbours_only():
-    image = drawn(moment(links=linked((0, 1))))
+    image = drawn(frame(links=linked((0, 1))))
     assert LINK in around(image, 7, 2)
     assert LINK not in around(image, 17, 7)  # between UAV 1 and UAV 2
     assert LINK not in around(image, 12, 7)  # between UAV 0 and UAV 2
-    assert LINK in around(drawn(moment(links=linked((1, 2)))), 17, 7)
-    assert LINK not in all_of(drawn(moment()))
+    assert LINK in around(drawn(frame(links=linked((1, 2)))), 17, 7)
+    assert LINK not in all_of(drawn(frame()))
 
 
 def test_a_uav_has_a_ring_in_the_colour_of_its_role():
-    image = drawn(moment(roles=np.array([0, 1, 2])))
+    image = drawn(frame(roles=np.array([0, 1, 2])))
     for (x, y, _), colour in zip(WHERE, ROLE_COLOURS, strict=True):
         near = around(image, x, y, reach=6)
         assert {UAV, colour} <= near
         assert not (set(ROLE_COLOURS) - {colour}) & near
-    plain = all_of(drawn(moment()))
+    plain = all_of(drawn(frame()))
     assert UAV in plain
     assert not set(ROLE_COLOURS) & plain
 
@@ -82,18 +82,18 @@ def test_a_uav_has_a_ring_in_the_colour_of_its_role():
 def test_roles_differ_in_shape():
     shapes = set()
     for role in range(len(ROLES)):
-        image = drawn(moment(roles=np.full(3, role)))
+        image = drawn(frame(roles=np.full(3, role)))
         shapes.add((image == ROLE_COLOURS[role]).all(-1).tobytes())
     assert len(shapes) == 3
 
 
 def test_a_target_is_a_cross_with_a_line_to_it():
     target = np.array([(2, 12, 1), (12, 14, 1), (22, 2, 1)], np.float32)
-    image = drawn(moment(roles=np.array([0, 1, 2]), target=target))
+    image = drawn(frame(roles=np.array([0, 1, 2]), target=target))
     for (x, y, _), colour in zip(target.tolist(), ROLE_COLOURS, strict=True):
         assert colour in around(image, x, y)
     assert ROLE_COLOURS[1] in around(image, 12, 8, reach=5)
-    assert marks.TARGET in around(drawn(moment(target=target)), 2, 12)
+    assert marks.TARGET in around(drawn(frame(target=target)), 2, 12)
 
 
 def test_a_large_team_has_no_lines_to_its_targets():
@@ -101,21 +101,21 @@ def test_a_large_team_has_no_lines_to_its_targets():
     position = np.tile(np.array([[2, 2, 1]], np.float32), (n, 1))
     target = np.tile(np.array([[2, 16, 1]], np.float32), (n, 1))
     options = {"position": position, "roles": np.zeros(n, int), "target": target}
-    image = drawn(moment(**options))
+    image = drawn(frame(**options))
     assert ROLE_COLOURS[0] in around(image, 2, 16)
     assert ROLE_COLOURS[0] not in around(image, 2, 9, reach=20)
 
 
 def test_a_higher_uav_has_a_larger_square():
     low, high = (
-        (drawn(moment(position=np.array([(9, 9, z)], np.float32))) == (255, 255, 0)).all(-1).sum()
+        (drawn(frame(position=np.array([(9, 9, z)], np.float32))) == (255, 255, 0)).all(-1).sum()
         for z in (1, 4)
     )
     assert high > 8 * low
 
 
 def test_each_panel_shows_its_own_episode():
-    left, right = moment(roles=np.zeros(3, int), links=linked((0, 1))), moment()
+    left, right = frame(roles=np.zeros(3, int), links=linked((0, 1))), frame()
     assert {LINK, ROLE_COLOURS[0]} <= all_of(drawn(left, right, panel=0))
     assert not {LINK, ROLE_COLOURS[0]} & all_of(drawn(left, right, panel=1))
 
@@ -124,34 +124,34 @@ def test_the_legend_has_the_visible_marks_only():
     def words(*frames, **options):
         return [word for word, _ in screen(*frames, **options)._legend()]
 
-    whole = moment(roles=np.zeros(3, int), links=linked(), target=np.zeros((3, 3)))
+    whole = frame(roles=np.zeros(3, int), links=linked(), target=np.zeros((3, 3)))
     ends = [*ROLES, "hear each other", "target"]
-    assert words(moment()) == ["fire", "field of view", "UAV"]
+    assert words(frame()) == ["fire", "field of view", "UAV"]
     assert words(whole) == ["fire", "field of view", *ends]
-    assert words(moment(), whole) == ["fire", "field of view", "UAV", *ends]
-    assert words(moment(), grey_seen=True)[:2] == ["fire", "fire, seen"]
+    assert words(frame(), whole) == ["fire", "field of view", "UAV", *ends]
+    assert words(frame(), grey_seen=True)[:2] == ["fire", "fire, seen"]
 
 
 def test_seen_fire_has_a_colour_only_on_request():
     fire = np.zeros((30, 20), np.uint8)
     fire[25, 5], fire[27, 5] = 1, 2
-    assert around(drawn(moment(fire_map=fire)), 25, 5) == {(255, 255, 255)}
-    told = drawn(moment(fire_map=fire), grey_seen=True)
+    assert around(drawn(frame(fire_map=fire)), 25, 5) == {(255, 255, 255)}
+    told = drawn(frame(fire_map=fire), grey_seen=True)
     assert around(told, 25, 5) == {panels.SEEN_FIRE}
     assert around(told, 27, 5) == {(255, 255, 255)}
 
 
 def test_panels_show_step_and_coverage():
-    first, second = screen(moment()).picture(0), screen(moment(seen=4)).picture(0)
+    first, second = screen(frame()).picture(0), screen(frame(seen=4)).picture(0)
     assert not np.array_equal(first[:50], second[:50])
-    assert moment().coverage == 37.5
-    assert moment(seen=0, burning=0).coverage == 100
+    assert frame().coverage == 37.5
+    assert frame(seen=0, burning=0).coverage == 100
 
 
 @pytest.mark.parametrize("grid", [(8, 8), (30, 30), (60, 40), (8, 256), (256, 8), (256, 256)])
 @pytest.mark.parametrize("count", [1, 2, 3, 4, 7])
 def test_panels_do_not_overlap_and_sides_are_even(grid, count):
-    one = moment(fire_map=np.zeros(grid, np.uint8), position=np.zeros((1, 3), np.float32))
+    one = frame(fire_map=np.zeros(grid, np.uint8), position=np.zeros((1, 3), np.float32))
     made = screen(*[one] * count, size=250)
     height, width, _ = made.picture(0).shape
     assert height % 2 == width % 2 == 0
@@ -164,7 +164,7 @@ def test_panels_do_not_overlap_and_sides_are_even(grid, count):
 
 
 def test_four_square_maps_are_arranged_two_by_two():
-    made = screen(*[moment(fire_map=np.zeros((30, 30), np.uint8))] * 4)
+    made = screen(*[frame(fire_map=np.zeros((30, 30), np.uint8))] * 4)
     corners = [made.map_corner(panel) for panel in range(4)]
     assert len({x for x, _ in corners}) == len({y for _, y in corners}) == 2
 

@@ -92,11 +92,11 @@ def test_modules_read_and_write_the_keys_of_the_environment():
         make_actor(observation, action, HIDDEN),
         make_critic(observation, action, HIDDEN),
     )
-    moment = TensorDict({keys.OBSERVATION: torch.randn(5, 4, 6)}, batch_size=[5])
-    critic(actor(moment))
-    assert moment[keys.ACTION].shape == (5, 4, 3)
-    assert moment[keys.ACTION].abs().max() < 1
-    assert moment[STATE_ACTION_VALUE].shape == (5, 4, 1)
+    td = TensorDict({keys.OBSERVATION: torch.randn(5, 4, 6)}, batch_size=[5])
+    critic(actor(td))
+    assert td[keys.ACTION].shape == (5, 4, 3)
+    assert td[keys.ACTION].abs().max() < 1
+    assert td[STATE_ACTION_VALUE].shape == (5, 4, 1)
     assert actor.module.first.weight.shape == (4, 6, HIDDEN[0])
     assert actor.module.second.weight.shape == (4, *HIDDEN)
 

@@ -40,15 +40,15 @@ def explorer(*, theta: float, sigma: float, dt: float, envs: int = ENVS, network
 def play(policy, starts: list[torch.Tensor | bool], envs: int = ENVS) -> torch.Tensor:
     """Returns actions of consecutive steps, [steps, envs, uavs, 3]; `starts` marks new episodes."""
     actions = []
-    moment = TensorDict({keys.OBSERVATION: torch.ones(envs, UAVS, 6)}, batch_size=[envs])
+    td = TensorDict({keys.OBSERVATION: torch.ones(envs, UAVS, 6)}, batch_size=[envs])
     episode = step = torch.zeros(envs, dtype=torch.int64)
     for start in starts:
         fresh = torch.as_tensor(start).flatten().expand(envs)
         episode, step = episode + fresh, torch.where(fresh, 0, step + 1)
-        moment[keys.RNG_KEY] = counter_rng.fold_in(counter_rng.seed_keys(0, envs), episode)
-        moment[keys.STEP] = step
-        moment = policy(moment)
-        actions.append(moment[keys.ACTION].clone())
+        td[keys.RNG_KEY] = counter_rng.fold_in(counter_rng.seed_keys(0, envs), episode)
+        td[keys.STEP] = step
+        td = policy(td)
+        actions.append(td[keys.ACTION].clone())
     return torch.stack(actions)
 
 
@@ -116,9 +116,9 @@ def test_an_evaluation_uses_the_actions_of_the_actor():
     torch.nn.init.normal_(actor.module.action.weight, std=0.3)
     watched = []
 
-    def policy(moment):
-        watched.append((moment[keys.OBSERVATION].clone(), actor(moment)[keys.ACTION].clone()))
-        return moment
+    def policy(td):
+        watched.append((td[keys.OBSERVATION].clone(), actor(td)[keys.ACTION].clone()))
+        return td
 
     measured = []
     for seed in (1, 2):

@@ -70,7 +70,7 @@ class Poison:
         self.monkeypatch, self.update = monkeypatch, update_at(STEP, method)
         self.env, self.uav, self.learner = env, uav, LEARNERS[learner]
         self.critic = "critic" if learner == "ddpg" else "qvalue"
-        self.always, self.moments, self.updates = False, Counter(), Counter()
+        self.always, self.visits, self.updates = False, Counter(), Counter()
         getattr(self, place)()
 
     def observation(self) -> None:
@@ -139,8 +139,8 @@ class Poison:
 
     def is_due(self, world, time) -> bool:
         """Checks whether an environment is at `STEP`; its step counter restarts each episode."""
-        self.moments[world, int(time[0])] += 1
-        return int(time[0]) == STEP % HORIZON and self.moments[world, STEP % HORIZON] == 2
+        self.visits[world, int(time[0])] += 1
+        return int(time[0]) == STEP % HORIZON and self.visits[world, STEP % HORIZON] == 2
 
 
 EXPECTED = {

@@ -62,13 +62,13 @@ def test_recipes_pass_the_api_test(method):
     parallel_seed_test(lambda: parallel_env(recipe(method)), num_cycles=20)
 
 
-def compare(moment: TensorDict, observations, infos, agents) -> None:
+def compare(td: TensorDict, observations, infos, agents) -> None:
     for i, agent in enumerate(agents):
         assert observations[agent].dtype == np.float32
-        assert np.array_equal(observations[agent], moment[keys.OBSERVATION][0, i].numpy())
+        assert np.array_equal(observations[agent], td[keys.OBSERVATION][0, i].numpy())
         for key in ("position", "new_fire", "old_fire", "no_fire", "hit_boundary"):
-            assert np.array_equal(infos[agent][key], moment[keys.AGENTS, key][0, i].numpy())
-        assert infos[agent]["seen"] == moment[keys.SEEN].item()
+            assert np.array_equal(infos[agent][key], td[keys.AGENTS, key][0, i].numpy())
+        assert infos[agent]["seen"] == td[keys.SEEN].item()
 
 
 @pytest.mark.parametrize("setup", ["paper", "released", "tuned"])
@@ -82,14 +82,14 @@ def test_same_transitions_as_torchrl(method, setup):
     generator = np.random.default_rng(0)
     torch_env.set_seed(11)
     for episode in range(2):
-        moment = torch_env.reset()
+        td = torch_env.reset()
         observations, infos = env.reset(seed=None if episode else 11)
-        compare(moment, observations, infos, env.possible_agents)
+        compare(td, observations, infos, env.possible_agents)
         for step in range(1, 31):
             action = generator.uniform(-1.2, 1.2, (3, 3)).astype(np.float32)
-            moment.set(keys.ACTION, torch.from_numpy(action)[None])
-            following = torch_env.step(moment)
-            moment = step_mdp(following, keep_other=True)
+            td.set(keys.ACTION, torch.from_numpy(action)[None])
+            following = torch_env.step(td)
+            td = step_mdp(following, keep_other=True)
             after = following["next"]
             result = env.step(dict(zip(env.agents, action, strict=True)))
             observations, rewards, terminated, truncated, infos = result

@@ -190,7 +190,7 @@ def test_errors_of_render(tmp_path, capsys):
         ([run, "--policy", "zzz"], ["policy 'zzz'", "random_waypoints"]),
         ([run, wide], ["env.grid=[40, 30]", "[30, 30]"]),
         ([run, team], ["env.num_uavs=4", "has 3"]),
-        ([run, "--output", there], ["there.gif is there already"]),
+        ([run, "--output", there], ["there.gif exists already"]),
         ([run, "--output", tmp_path / "no" / "a.gif"], [str(tmp_path / "no"), "no such folder"]),
         ([run, "--output", tmp_path / "no"], ["no such folder", ".gif, .mp4, .png"]),
         ([run, "--step", "3"], ["step=3", ".png"]),

@@ -31,19 +31,19 @@ def world(grid=(9, 9), uavs=1, **settings) -> WildfireConfig:
 
 def episode(env, policy, steps: int, **reset):
     """Yields the time steps of an episode with the policy's actions."""
-    moments, moment = [], env.reset(**reset)
+    tds, td = [], env.reset(**reset)
     for _ in range(steps):
-        moment = policy(moment)
-        moments.append(moment.clone())
-        moment = step_mdp(env.step(moment), keep_other=True)
-    return moments
+        td = policy(td)
+        tds.append(td.clone())
+        td = step_mdp(env.step(td), keep_other=True)
+    return tds
 
 
 def flown(env, policy, steps: int, position) -> list:
     """Returns the positions of the UAVs in the first environment, rounded to 1e-3 cells."""
     start = torch.tensor(position, dtype=torch.float32)
-    moments = episode(env, policy, steps, position=start)
-    return [[[round(x, 3) for x in uav] for uav in m[keys.POSITION][0].tolist()] for m in moments]
+    tds = episode(env, policy, steps, position=start)
+    return [[[round(x, 3) for x in uav] for uav in m[keys.POSITION][0].tolist()] for m in tds]
 
 
 # Lawnmower
@@ -107,12 +107,12 @@ def test_lawnmower_covers_every_cell(grid, uavs, angle, ceiling, displacement):
     )  # all cells burn, so that seen cells are counted
     mower = Lawnmower(env)
     flight = len(mower.path) * (2 + math.ceil(max(grid) / displacement)) // uavs
-    moment = env.reset()
+    td = env.reset()
     for _ in range(3 * max(grid) + 2 * flight):
-        moment = step_mdp(env.step(mower(moment)), keep_other=True)
-        if moment[keys.SEEN].item() == grid[0] * grid[1]:
+        td = step_mdp(env.step(mower(td)), keep_other=True)
+        if td[keys.SEEN].item() == grid[0] * grid[1]:
             return
-    pytest.fail(f"{moment[keys.SEEN].item()} of {grid[0] * grid[1]} cells were seen")
+    pytest.fail(f"{td[keys.SEEN].item()} of {grid[0] * grid[1]} cells were seen")
 
 
 # FollowTarget
@@ -120,9 +120,9 @@ def test_lawnmower_covers_every_cell(grid, uavs, angle, ceiling, displacement):
 
 def test_follow_target_flies_straight_to_the_target_by_hand():
     env = WildfireEnv(1, world(uavs=3, displacement=0.5), torch.full((9, 9), NEVER))
-    moment = env.reset(position=torch.tensor([[1.0, 1, 2], [5, 5, 4], [3, 3, 3]]))
-    moment[keys.TARGET] = torch.tensor([[[5.0, 3, 1], [5, 5, 3.75], [3, 3, 3]]])
-    action = FollowTarget(env)(moment)[keys.ACTION].mul(1e4).round() / 1e4
+    td = env.reset(position=torch.tensor([[1.0, 1, 2], [5, 5, 4], [3, 3, 3]]))
+    td[keys.TARGET] = torch.tensor([[[5.0, 3, 1], [5, 5, 3.75], [3, 3, 3]]])
+    action = FollowTarget(env)(td)[keys.ACTION].mul(1e4).round() / 1e4
     # By (4, 2, -1) cells: 8, 4, -2 units. By (0, 0, -0.25): half a unit, then it stops.
     assert action.tolist() == [[[1, 0.5, -0.25], [0, 0, -0.5], [0, 0, 0]]]
 
@@ -153,10 +153,10 @@ def scalar_oracle(position, arrival, seen, step, config) -> list[tuple[float, fl
     return [sent[uav] for uav in uavs]
 
 
-def sent(env, oracle, moment):
+def sent(env, oracle, td):
     """Returns the oracle's destinations for steps of any length, [num_envs, n, 2]."""
-    action = oracle(moment.clone())[keys.ACTION]
-    return moment[keys.POSITION][..., :2] + action[..., :2] * env.config.displacement
+    action = oracle(td.clone())[keys.ACTION]
+    return td[keys.POSITION][..., :2] + action[..., :2] * env.config.displacement
 
 
 def test_the_oracle_by_hand():
@@ -167,16 +167,16 @@ def test_the_oracle_by_hand():
     config = world(uavs=4, displacement=16.0, horizon=20, view_angle=THREE)
     env = WildfireEnv(1, config, arrival)
     start = torch.tensor([[0.0, 0, 4], [8, 8, 4], [5, 4, 4], [1, 1, 4]])
-    moment = env.reset(position=start)
+    td = env.reset(position=start)
     # UAV 2 is nearest to (4, 4), at 1; UAVs 1 and 3 are at 4 and 3. Then UAVs 3, 0 and 1 choose.
-    places = sent(env, Oracle(env), moment)
+    places = sent(env, Oracle(env), td)
     assert places.mul(1e3).round().tolist() == [[[0, 8e3], [8e3, 8e3], [4e3, 4e3], [8e3, 0]]]
 
 
 def test_the_oracle_flies_at_full_altitude_and_stops_at_full_coverage():
     env = WildfireEnv(1, world(uavs=2, displacement=1.0), torch.full((9, 9), NEVER))
-    moment = env.reset(position=torch.tensor([[2.0, 2, 1], [6, 6, 4]]))
-    action = Oracle(env)(moment)[keys.ACTION]
+    td = env.reset(position=torch.tensor([[2.0, 2, 1], [6, 6, 4]]))
+    action = Oracle(env)(td)[keys.ACTION]
     assert action.mul(1e4).round().tolist() == [[[0, 0, 1e4], [0, 0, 0]]]
 
 
@@ -198,18 +198,18 @@ def test_the_oracle_equals_loops(seed, grid, uavs, angle):
     oracle = Oracle(env)
     position = torch.rand(envs, uavs, 3, generator=draw) * torch.tensor([*grid, 0.0])
     position = position.floor() + torch.tensor([0.0, 0.0, 4.0])
-    moment = env.reset(position=position)
+    td = env.reset(position=position)
     for step in range(4):
         seen = (env.fire_map == 1).tolist()
         expected = [
-            scalar_oracle(moment[keys.POSITION][e].tolist(), env.arrival_time[e].tolist(), *rest)
+            scalar_oracle(td[keys.POSITION][e].tolist(), env.arrival_time[e].tolist(), *rest)
             for e, rest in enumerate(zip(seen, [step] * envs, [config] * envs, strict=True))
         ]
-        assert (sent(env, oracle, moment) - torch.tensor(expected)).abs().max() < 1e-4
+        assert (sent(env, oracle, td) - torch.tensor(expected)).abs().max() < 1e-4
         # Half a step further, so that positions lie between cells.
-        moment = oracle(moment)
-        moment[keys.ACTION] = moment[keys.ACTION] / 2
-        moment = step_mdp(env.step(moment), keep_other=True)
+        td = oracle(td)
+        td[keys.ACTION] = td[keys.ACTION] / 2
+        td = step_mdp(env.step(td), keep_other=True)
 
 
 # All policies
@@ -240,39 +240,39 @@ def fires(shape, count: int):
 def test_every_policy_in_every_recipe(name, method, shape):
     arrival = fires(shape, 3)
     env, policy = build(method, name, shape, seeds=[5, 6, 7], fire=arrival)
-    moments = episode(env, policy, 25)
-    for moment in moments:
-        action = moment[keys.ACTION]
+    tds = episode(env, policy, 25)
+    for td in tds:
+        action = td[keys.ACTION]
         assert action.shape == (3, shape[1], 3)
         assert action.dtype == torch.float32
         assert action.isfinite().all()
         assert action.abs().max() <= 1
         if name != "random_actions":  # policies that fly to points in the box do not leave it
-            assert not moment[keys.HIT_BOUNDARY].any()
+            assert not td[keys.HIT_BOUNDARY].any()
     # The second environment alone equals the second of the batch.
     env, policy = build(method, name, shape, seeds=[6], fire=arrival[1:2])
-    for alone, moment in zip(episode(env, policy, 25), moments, strict=True):
-        assert alone[keys.ACTION][0].equal(moment[keys.ACTION][1])
-        assert alone[keys.POSITION][0].equal(moment[keys.POSITION][1])
+    for alone, td in zip(episode(env, policy, 25), tds, strict=True):
+        assert alone[keys.ACTION][0].equal(td[keys.ACTION][1])
+        assert alone[keys.POSITION][0].equal(td[keys.POSITION][1])
 
 
 @pytest.mark.parametrize("name", SCRIPTED)
 def test_a_policy_restarts_with_every_episode(name):
     env, policy = build("consensus", name, SHAPES[0], seeds=[3, 4], fire=fires(SHAPES[0], 2))
     assert isinstance(policy, Scripted)
-    moments = episode(env, policy, 20)
+    tds = episode(env, policy, 20)
     env.set_seed(1)
     first = episode(env, policy, 20)
     env.set_seed(1)
-    moment = env.reset()
+    td = env.reset()
     # Entries of the previous episode in the TensorDict have no effect on the first step.
-    for key in moments[-1].keys():  # noqa: SIM118
+    for key in tds[-1].keys():  # noqa: SIM118
         if key.startswith("_"):
-            moment[key] = moments[-1][key]
+            td[key] = tds[-1][key]
     for expected in first:
-        moment = policy(moment)
-        assert moment[keys.ACTION].equal(expected[keys.ACTION])
-        moment = step_mdp(env.step(moment), keep_other=True)
+        td = policy(td)
+        assert td[keys.ACTION].equal(expected[keys.ACTION])
+        td = step_mdp(env.step(td), keep_other=True)
 
 
 @pytest.mark.slow

@@ -134,7 +134,7 @@ def test_a_changed_configuration_is_refused(command, old, new, said, run, tmp_pa
     assert error.count("\n") == 1
     key, value = said.split("=")
     assert f"made with {said}; the run has {key}={new.split(': ')[1]}: put {value} back" in error
-    assert ("to evaluate in another world: emberlink eval RUN" in error) == (key[0] != "l")
+    assert ("to evaluate with another value: emberlink eval RUN" in error) == (key[0] != "l")
     assert {path: path.read_bytes() for path in run.rglob("*") if path.is_file()} == before
 
 

@@ -114,12 +114,12 @@ def test_seeds_of_a_stack_differ_in_all_random_values():
 def test_environments_of_several_seeds_equal_those_of_single_seeds():
     together = WildfireEnv(6, fire="huygens", seed=[5, 9])
     singles = [WildfireEnv(3, fire="huygens", seed=seed) for seed in (5, 9)]
-    moments = [env.reset() for env in singles]
+    tds = [env.reset() for env in singles]
     whole = together.reset()
-    for team, moment in enumerate(moments):
+    for team, td in enumerate(tds):
         own = slice(3 * team, 3 * team + 3)
-        assert whole[own][keys.POSITION].equal(moment[keys.POSITION])
-        assert whole[own][keys.RNG_KEY].equal(moment[keys.RNG_KEY])
+        assert whole[own][keys.POSITION].equal(td[keys.POSITION])
+        assert whole[own][keys.RNG_KEY].equal(td[keys.RNG_KEY])
         assert together.arrival_time[own].equal(singles[team].arrival_time)
 
 

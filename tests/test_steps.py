@@ -66,19 +66,19 @@ def test_equals_the_scalar_environment(case):
     ]
     left = 0
     for step in range(STEPS):
-        moment = env.step(TensorDict({keys.ACTION: actions[step]}, [ENVS]))["next"]
+        td = env.step(TensorDict({keys.ACTION: actions[step]}, [ENVS]))["next"]
         maps, acted = env.fire_map.numpy(), actions[step].tolist()
-        classes = torch.stack([moment[k] for k in (keys.NEW_FIRE, keys.OLD_FIRE, keys.NO_FIRE)], -1)
+        classes = torch.stack([td[k] for k in (keys.NEW_FIRE, keys.OLD_FIRE, keys.NO_FIRE)], -1)
         for e, scalar in enumerate(scalars):
             counts, exits, rewards = scalar.step(acted[e])
             left += sum(map(any, exits))
-            assert np.array_equal(moment[keys.POSITION][e].numpy(), scalar.position)
+            assert np.array_equal(td[keys.POSITION][e].numpy(), scalar.position)
             assert np.array_equal(maps[e], scalar.fire)
             assert classes[e].tolist() == [list(c) for c in counts]
-            assert moment[keys.HIT_BOUNDARY][e].tolist() == exits
-            assert moment[keys.REWARD][e, :, 0].tolist() == pytest.approx(rewards, abs=1e-5, rel=0)
-            assert moment[keys.SEEN][e].item() == scalar.seen()
-            assert moment[keys.BURNING][e].item() == scalar.burning()
+            assert td[keys.HIT_BOUNDARY][e].tolist() == exits
+            assert td[keys.REWARD][e, :, 0].tolist() == pytest.approx(rewards, abs=1e-5, rel=0)
+            assert td[keys.SEEN][e].item() == scalar.seen()
+            assert td[keys.BURNING][e].item() == scalar.burning()
     assert left > 100, "the actions were to push out of the box"
 
 
@@ -104,20 +104,20 @@ def test_invariants_of_every_step(seed, grid, uavs, **changes):
     before = env.fire_map
     for _ in range(4):
         action = torch.randn(2, uavs, 3, generator=generator)
-        moment = env.step(TensorDict({keys.ACTION: action}, [2]))["next"]
+        td = env.step(TensorDict({keys.ACTION: action}, [2]))["next"]
         after = env.fire_map
         assert (after[before > 0] > 0).all(), "a burning cell went out"
         assert (after[before == 1] == 1).all(), "a seen cell was forgotten"
-        assert ((after > 0) == (fire <= moment[keys.STEP][:, None, None])).all()
-        assert (moment[keys.SEEN] == (after == 1).sum((1, 2))).all()
-        assert (moment[keys.BURNING] == (after > 0).sum((1, 2))).all()
-        new = moment[keys.NEW_FIRE]
+        assert ((after > 0) == (fire <= td[keys.STEP][:, None, None])).all()
+        assert (td[keys.SEEN] == (after == 1).sum((1, 2))).all()
+        assert (td[keys.BURNING] == (after > 0).sum((1, 2))).all()
+        new = td[keys.NEW_FIRE]
         assert (new.sum(-1) == ((after == 1) & (before != 1)).sum((1, 2))).all()
-        position = moment[keys.POSITION]
+        position = td[keys.POSITION]
         assert ((position >= low) & (position <= high)).all()
-        total = new + moment[keys.OLD_FIRE] + moment[keys.NO_FIRE]
+        total = new + td[keys.OLD_FIRE] + td[keys.NO_FIRE]
         assert torch.equal(total, cells_in_view(position, config))
-        assert all(value.isfinite().all() for value in moment.values(True, True))
+        assert all(value.isfinite().all() for value in td.values(True, True))
         before = after
 
 
@@ -143,6 +143,6 @@ def test_the_largest_world_runs():
 def test_the_widest_view_covers_the_whole_grid():
     config = WildfireConfig(grid=(8, 256), num_uavs=1, altitude=(256.0, 256.0), view_angle=80.0)
     env = WildfireEnv(1, config, torch.zeros(8, 256))
-    moment = env.rollout(1)["next"]
-    assert moment[keys.NEW_FIRE].item() == 8 * 256
-    assert moment[keys.SEEN].item() == moment[keys.BURNING].item() == 8 * 256
+    td = env.rollout(1)["next"]
+    assert td[keys.NEW_FIRE].item() == 8 * 256
+    assert td[keys.SEEN].item() == td[keys.BURNING].item() == 8 * 256

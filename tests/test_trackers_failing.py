@@ -80,12 +80,12 @@ def forget() -> None:
 class Fragile:
     """A tracker that fails, or blocks forever, in a given method."""
 
-    def __init__(self, moment: str, how: Callable[[], None]):
-        self.moment, self.how, self.told = moment, how, []
+    def __init__(self, stage: str, how: Callable[[], None]):
+        self.stage, self.how, self.told = stage, how, []
         self.meet("init")
 
-    def meet(self, moment: str) -> None:
-        if moment == self.moment:
+    def meet(self, stage: str) -> None:
+        if stage == self.stage:
             self.how()
 
     def log(self, line: dict[str, float], episode: int) -> None:
@@ -110,19 +110,19 @@ def wait() -> None:
 
 
 @pytest.mark.parametrize("how", [fail, leave, wait])
-@pytest.mark.parametrize("moment", ["init", "log", "finish"])
-def test_a_tracker_that_fails_or_blocks(moment, how, tmp_path, monkeypatch):
+@pytest.mark.parametrize("stage", ["init", "log", "finish"])
+def test_a_tracker_that_fails_or_blocks(stage, how, tmp_path, monkeypatch):
     made = []
 
     def make(*_):
-        made.append(Fragile(moment, how))
+        made.append(Fragile(stage, how))
         return made[-1]
 
     monkeypatch.setitem(loggers.TRACKERS, "csv", make)
     expected = {fail: "No space left", leave: "SystemExit", wait: "no answer within 1.5 s"}[how]
     # A stack of two seeds has two trackers but gives one warning.
     only(train("csv", tmp_path, lambda _: None, "seeds=[3,4]"), "logger=csv", expected)
-    if moment == "log":
+    if stage == "log":
         assert {step for _, step in made[0].told} == {1}  # and no calls after the failure
 
 
@@ -198,8 +198,8 @@ def service() -> int:
 def test_the_process_of_wandb_is_killed_or_stopped(how, tmp_path):
     struck: list[int] = []
 
-    def strike(moment: Progress) -> None:
-        if moment.step == 10:
+    def strike(progress: Progress) -> None:
+        if progress.step == 10:
             time.sleep(1)  # it may still be starting
             struck.append(service())
             os.kill(struck[0], how)

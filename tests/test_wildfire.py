@@ -36,22 +36,22 @@ def start(env: WildfireEnv, *positions) -> TensorDict:
     return env.reset(position=torch.tensor(positions))
 
 
-def counts(moment: TensorDict) -> list[tuple[int, int, int]]:
+def counts(td: TensorDict) -> list[tuple[int, int, int]]:
     """Returns the counts of new, old and no fire in view of each UAV."""
-    columns = (moment[key][0].tolist() for key in (keys.NEW_FIRE, keys.OLD_FIRE, keys.NO_FIRE))
+    columns = (td[key][0].tolist() for key in (keys.NEW_FIRE, keys.OLD_FIRE, keys.NO_FIRE))
     return list(zip(*columns, strict=True))
 
 
-def rewards(moment: TensorDict) -> list[float]:
-    return moment[keys.REWARD][0, :, 0].tolist()
+def rewards(td: TensorDict) -> list[float]:
+    return td[keys.REWARD][0, :, 0].tolist()
 
 
 def test_the_first_of_two_uavs_over_the_same_cells_discovers():
     env = world(num_uavs=2)
     start(env, [3.0, 3, 2], [3, 3, 2])
-    moment = act(env)  # 2 tan 30 = 1.15: cells 2, 3 and 4 along x and y
-    assert counts(moment) == [(9, 0, 0), (0, 9, 0)]
-    assert rewards(moment) == [9, -36]
+    td = act(env)  # 2 tan 30 = 1.15: cells 2, 3 and 4 along x and y
+    assert counts(td) == [(9, 0, 0), (0, 9, 0)]
+    assert rewards(td) == [9, -36]
     assert counts(act(env)) == [(0, 9, 0), (0, 9, 0)]
     assert env.fire_map[0, 2:5, 2:5].eq(1).all()
     assert env.fire_map.eq(1).sum() == 9
@@ -61,12 +61,12 @@ def test_the_first_of_two_uavs_over_the_same_cells_discovers():
 def test_each_cell_goes_to_the_uav_of_lowest_index():
     env = world(num_uavs=3)
     start(env, [4.0, 3, 2], [3, 3, 2], [5, 4, 2])
-    moment = act(env)
+    td = act(env)
     # UAV 1 adds column 2; UAV 2 sees columns 4 to 6, rows 3 to 5, of which UAV 0 saw 2 x 2.
-    assert counts(moment) == [(9, 0, 0), (3, 6, 0), (5, 4, 0)]
-    assert rewards(moment) == [9, 3 - 24, 5 - 16]
-    assert moment[keys.SEEN].item() == 17
-    assert moment[keys.BURNING].item() == 144
+    assert counts(td) == [(9, 0, 0), (3, 6, 0), (5, 4, 0)]
+    assert rewards(td) == [9, 3 - 24, 5 - 16]
+    assert td[keys.SEEN].item() == 17
+    assert td[keys.BURNING].item() == 144
 
 
 def test_fire_spreads_before_uavs_look():
@@ -83,15 +83,15 @@ def test_flags_are_per_step_and_time_counts():
     fire[3, 3] = 2
     env = world(fire)
     first = start(env, [3.0, 3, 2])
-    moments = [first, *(act(env) for _ in range(3))]
-    flags = [moment[keys.OBSERVATION][0, 0].tolist() for moment in moments]
+    tds = [first, *(act(env) for _ in range(3))]
+    flags = [td[keys.OBSERVATION][0, 0].tolist() for td in tds]
     assert flags == [[3, 3, 2, 0, 0, 0], [3, 3, 2, 0, 0, 1], [3, 3, 2, 1, 0, 2], [3, 3, 2, 0, 1, 3]]
 
 
 def test_box_observation_is_scaled():
     env = world(grid=(12, 12), observation_scale="box")
-    moment = start(env, [0.0, 5.5, 4])
-    assert moment[keys.OBSERVATION][0, 0].tolist() == [-1, 0, 1, 0, 0, 0]
+    td = start(env, [0.0, 5.5, 4])
+    assert td[keys.OBSERVATION][0, 0].tolist() == [-1, 0, 1, 0, 0, 0]
     assert act(env)[keys.OBSERVATION][0, 0].tolist() == pytest.approx([-1, 0, 1, 1, 0, 1 / 20])
 
 
@@ -122,11 +122,11 @@ def test_leaving_the_box_costs_on_the_tested_axes(axis, direction, exit_axes):
     start(env, *position)
     push = [0.0, 0, 0]
     push[axis] = direction
-    moment = act(env, push)
-    assert moment[keys.POSITION][0].tolist() == position
-    assert moment[keys.HIT_BOUNDARY][0, 0].tolist() == [a == axis for a in range(3)]
+    td = act(env, push)
+    assert td[keys.POSITION][0].tolist() == position
+    assert td[keys.HIT_BOUNDARY][0, 0].tolist() == [a == axis for a in range(3)]
     tested = "xyz"[axis] in exit_axes
-    assert (rewards(moment)[0] == -100) == tested
+    assert (rewards(td)[0] == -100) == tested
     # A UAV exactly at the edge has not left the box.
     position[0][axis] -= direction
     start(env, *position)
@@ -150,8 +150,8 @@ def test_actions_are_clipped():
 def test_reset_starts_in_the_box_and_has_seen_nothing():
     env = world(num_envs=200, num_uavs=3, altitude=(2.0, 3.0))
     env.rollout(5)
-    moment = env.reset()
-    position = moment[keys.POSITION]
+    td = env.reset()
+    position = td[keys.POSITION]
     low, high = torch.tensor(env.config.low), torch.tensor(env.config.high)
     assert ((position >= low) & (position <= high)).all()
     near = 0.02 * (high - low)  # 600 uniform points are this near to each side
@@ -165,8 +165,8 @@ def test_reset_starts_in_the_box_and_has_seen_nothing():
         keys.STEP,
         keys.HIT_BOUNDARY,
     ):
-        assert not moment[key].any(), key
-    assert not moment[keys.OBSERVATION][..., 3:].any()
+        assert not td[key].any(), key
+    assert not td[keys.OBSERVATION][..., 3:].any()
     assert env.fire_map.eq(2).all()
 
 
@@ -175,12 +175,12 @@ def test_partial_reset_leaves_the_others_alone(method):
     fire = torch.linspace(0, 20, 144).view(12, 12)
     env = make_env(method, num_envs=3, fire=fire, horizon=20) if method else world(fire, 3)
     core = env.base_env if method else env
-    moment = env.reset()
+    td = env.reset()
     for _ in range(5):
-        moment = step_mdp(env.step(env.rand_action(moment)), keep_other=True)
-    before, burning = moment.clone(), core.fire_map
+        td = step_mdp(env.step(env.rand_action(td)), keep_other=True)
+    before, burning = td.clone(), core.fire_map
     mask = torch.tensor([[False], [True], [False]])
-    after = env.reset(moment.set("_reset", mask))
+    after = env.reset(td.set("_reset", mask))
     for key in before.keys(True, True):
         if key in after.keys(True, True):
             assert (after[key][0::2] == before[key][0::2]).all(), key

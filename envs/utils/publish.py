@@ -30,7 +30,7 @@ def published(path: Path) -> Iterator[Path]:
             sync(partial)
             _take(partial, path)
     except FileExistsError:
-        raise UserError(f"{path} is there already; nothing is overwritten") from None
+        raise UserError(f"{path} exists already; nothing is overwritten") from None
     except OSError as error:
         raise UserError(f"{shown(str(path))}: {error.strerror or error}") from None
 
@@ -64,7 +64,7 @@ def new_file(output: Path, suffixes: Sequence[str]) -> Path:
             f"{shown(str(output))}: the file's name must end in {' or '.join(suffixes)}"
         )
     if os.path.lexists(output):
-        raise UserError(f"{output} is there already; nothing is overwritten")
+        raise UserError(f"{output} exists already; nothing is overwritten")
     if not os.path.isdir(output.parent):
         raise UserError(f"{shown(str(output.parent))}: there is no such folder")
     return output
@@ -85,4 +85,4 @@ def free_name(folder: Path, stem: str, suffixes: Sequence[str]) -> Path:
         name = folder / (stem if attempt == 1 else f"{stem}_{attempt}")
         if not any(os.path.lexists(f"{name}{suffix}") for suffix in suffixes):
             return name
-    raise UserError(f"{folder}: {stem} and 9999 more are there already")
+    raise UserError(f"{folder}: {stem} and 9999 more exist already")

@@ -22,13 +22,13 @@ def test_the_environment_is_the_same(method, setup):
     envs = [
         make_env(method, setup, num_envs=3, horizon=150, seed=0, device=d) for d in ("cpu", "cuda")
     ]
-    moments = [env.reset() for env in envs]
+    tds = [env.reset() for env in envs]
     for step in range(200):
         action = 2 * torch.rand(3, 6, 3, generator=torch.Generator().manual_seed(step)) - 1
         following = []
         for at, env in enumerate(envs):
-            moments[at].set(keys.ACTION, action.to(env.device))
-            done, moments[at] = env.step_and_maybe_reset(moments[at])
+            tds[at].set(keys.ACTION, action.to(env.device))
+            done, tds[at] = env.step_and_maybe_reset(tds[at])
             following.append(done["next"].cpu())
         for name, value in following[0].items(include_nested=True, leaves_only=True):
             torch.testing.assert_close(following[1][name], value, rtol=1e-4, atol=1e-4)

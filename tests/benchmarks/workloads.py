@@ -47,13 +47,13 @@ def make(method: str | None, num_envs: int, **settings):
 def flying(env, steps: int) -> Callable[[], object]:
     """Returns a function that runs `steps` environment steps with random actions."""
     shape = env.full_action_spec[keys.ACTION].shape
-    moment = env.reset()
+    td = env.reset()
 
     def fly() -> None:
-        nonlocal moment
+        nonlocal td
         for _ in range(steps):
-            moment.set(keys.ACTION, torch.rand(shape, device=env.device).mul_(2).sub_(1))
-            _, moment = env.step_and_maybe_reset(moment)
+            td.set(keys.ACTION, torch.rand(shape, device=env.device).mul_(2).sub_(1))
+            _, td = env.step_and_maybe_reset(td)
 
     return fly
 
@@ -97,9 +97,10 @@ def update_flops(
 ) -> int:
     """Counts the floating-point operations of a DDPG update of `members` networks, by layer sizes.
 
-    Only matrix products count, a multiply-add as two. Forward: actor and critic in the actors' loss,
-    critic, target actor and target critic in the critics'. Backward: for each trained layer the
-    product for its weights, and for each input with a gradient the product for that input.
+    Only matrix products are counted. A multiply-add is two operations. Forward: actor and critic in
+    the actors' loss, critic, target actor and target critic in the critics'. Backward: for each
+    trained layer the product for its weights, and for each input with a gradient the product for
+    that input.
 
     Args:
         shared: whether the critics' trunk is computed once for both losses, as in our learner, or

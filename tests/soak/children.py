@@ -154,10 +154,10 @@ def kill_until_finished(
     output, wrong, done, saved = folder / "runs", [], 0, 0
     begun = saved
     while True:
-        kind = draw.choice(("moment", "save", "part")) if done < kills else "none"
+        kind = draw.choice(("time", "save", "part")) if done < kills else "none"
         part = draw.choice(PARTS), draw.randint(1, 12)
         child = Child(training(method, output, part if kind == "part" else None), folder)
-        if kind == "moment":
+        if kind == "time":
             child.wait_for(lambda c=child: bool(c.lines()))
             time.sleep(draw.uniform(0, 0.3))
         elif kind == "save":
@@ -166,7 +166,7 @@ def kill_until_finished(
                 lambda c=child, n=last: sum(x.startswith("saving") for x in c.lines()) >= n
             )
             time.sleep(draw.uniform(0, 0.015))
-        if kind in ("moment", "save"):
+        if kind in ("time", "save"):
             child.send(signal.SIGKILL)
         status = child.end()
         lines = child.lines()

@@ -57,7 +57,7 @@ def signal_trial(number: int, folder: Path, draw: random.Random) -> list[str]:
     header = checkpoint_file.read_header(newest)
     lines = (path / "metrics.jsonl").read_bytes() if (path / "metrics.jsonl").exists() else b""
     if header["sizes"][0]["metrics.jsonl"] != len(lines):
-        wrong.append("metrics.jsonl and the checkpoint are of different moments")
+        wrong.append("metrics.jsonl and the checkpoint are of different steps")
     if step_of(run.checkpoint()) != header["step"] or temporary(path) or (path / "lock").exists():
         wrong.append(f"left: {sorted(p.name for p in path.rglob('*'))}")
     # With the smallest possible number of episodes, so that it ends soon.

@@ -240,7 +240,7 @@ def _free_paths(output: Path | None, run: RunFolder, stem: str) -> list[Path]:
                 f"{output}: there is no such folder, and a file ends in {', '.join(_WRITERS)}"
             )
         if os.path.lexists(output):
-            raise UserError(f"{output} is there already; nothing is overwritten")
+            raise UserError(f"{output} exists already; nothing is overwritten")
         if not output.parent.is_dir():
             raise UserError(f"{output.parent}: there is no such folder")
         return [output]

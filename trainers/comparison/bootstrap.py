@@ -36,31 +36,31 @@ def iqm(values: Values, axis: int = -1) -> Any:
     return stats.trim_mean(values, 0.25, axis=axis)
 
 
-def probability_of_improvement(one: Values, other: Values, axis: int = -1) -> Any:
-    """Returns the probability that a value of `one` is above a value of `other`; a tie counts half.
+def probability_of_improvement(first: Values, second: Values, axis: int = -1) -> Any:
+    """Returns the probability that a value of `first` is above one of `second`; ties count half.
 
     This is the Mann-Whitney statistic divided by the number of pairs, as in rliable.
     """
-    pairs = one.shape[axis] * other.shape[axis]
-    return stats.mannwhitneyu(one, other, axis=axis, method="asymptotic").statistic / pairs
+    pairs = first.shape[axis] * second.shape[axis]
+    return stats.mannwhitneyu(first, second, axis=axis, method="asymptotic").statistic / pairs
 
 
-def iqm_ratio_share(own: Values, *others: Values, higher: bool, axis: int = -1) -> Any:
+def iqm_ratio_share(sample: Values, *others: Values, higher: bool, axis: int = -1) -> Any:
     """Returns r / (1 + r) for the ratio r of an IQM to the best IQM of others; above 0.5 is better.
 
     Unlike the ratio, the share is finite: it is 1 for a ratio to 0, and 0.5 for 0 to 0.
 
     Args:
-        own, others: non-negative numbers, one per run.
+        sample, others: non-negative numbers, one per run.
         higher: whether more is better; if not, the ratio is inverted.
         axis: axis of the runs.
     """
-    mine = iqm(own, axis)
+    value = iqm(sample, axis)
     rest = np.stack([iqm(other, axis) for other in others])
     best = rest.max(0) if higher else rest.min(0)
-    total = mine + best
+    total = value + best
     with np.errstate(invalid="ignore", divide="ignore"):
-        return np.where(total == 0, 0.5, (mine if higher else best) / total)
+        return np.where(total == 0, 0.5, (value if higher else best) / total)
 
 
 def as_ratio(share: float) -> float:

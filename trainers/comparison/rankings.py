@@ -126,10 +126,10 @@ def _ranking(section: Section, fire: str, measure: str, notes: list[str]) -> Ran
         order.sort(key=lambda g: -means[g.label] if higher else means[g.label])
     rows: list[Row] = []
     for group, other in zip_longest(order, [] if why else order[1:]):
-        own = values[group.label]
+        sample = values[group.label]
         probability = ends = None
         if other is not None and not _same_trainings(group, other):
-            pair = (own, values[other.label]) if higher else (values[other.label], own)
+            pair = (sample, values[other.label]) if higher else (values[other.label], sample)
             better, worse = map(np.asarray, pair)
             probability = float(bootstrap.probability_of_improvement(better, worse))
             ends = bootstrap.interval(bootstrap.probability_of_improvement, *pair)
@@ -137,9 +137,9 @@ def _ranking(section: Section, fire: str, measure: str, notes: list[str]) -> Ran
             Row(
                 method=group.label,
                 seeds=group.seeds,
-                values=own,
+                values=sample,
                 iqm=means[group.label],
-                interval=bootstrap.interval(bootstrap.iqm, own),
+                interval=bootstrap.interval(bootstrap.iqm, sample),
                 next=other and other.label,
                 probability_of_improvement=probability,
                 probability_interval=ends,
@@ -148,9 +148,9 @@ def _ranking(section: Section, fire: str, measure: str, notes: list[str]) -> Ran
     return Ranking(measure, higher, rows, scripted(section, fire, measure, notes), why)
 
 
-def _same_trainings(one: Group, other: Group) -> bool:
+def _same_trainings(first: Group, second: Group) -> bool:
     """Returns whether two groups are evaluations of the same runs."""
-    return not {run.path for run in one.runs}.isdisjoint(run.path for run in other.runs)
+    return not {run.path for run in first.runs}.isdisjoint(run.path for run in second.runs)
 
 
 def _curve(group: Group, measure: str) -> Curve:

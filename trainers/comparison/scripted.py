@@ -38,24 +38,24 @@ def scripted(
         notes: a note is appended for results that should be equal and differ.
     """
     policies = dict.fromkeys(p for run in section.runs for p in run.evaluation.results[fire])
-    found: dict[str, list[Scripted]] = {}
+    results: dict[str, list[Scripted]] = {}
     for policy in sorted(policies.keys() - {LEARNED}):
         values = _values(section, fire, measure, policy)
-        everyone = [value for own in values.values() for value in own]
-        if len(everyone) < len(section.runs):
+        all_values = [value for group in values.values() for value in group]
+        if len(all_values) < len(section.runs):
             notes.append(
-                f"{section.label}: {policy} was played for {len(everyone)} of the runs only"
+                f"{section.label}: {policy} was played for {len(all_values)} of the runs only"
             )
         may_differ = measure == REWARD or _hears_messages(section, policy)
-        for own in values.values() if may_differ else [everyone]:
-            if own and not _same(own):
+        for group in values.values() if may_differ else [all_values]:
+            if group and not _same(group):
                 notes.append(
                     f"{section.label}: {policy} does not have the same {measure} on {fire} in all "
-                    f"runs ({min(own):.6g} to {max(own):.6g}): they were not evaluated on the same "
-                    "fires and starts, or with another version"
+                    f"runs ({min(group):.6g} to {max(group):.6g}): they were not evaluated on the "
+                    "same fires and starts, or with another version"
                 )
-        found[policy] = _by_methods({label: own[0] for label, own in values.items() if own})
-    return found
+        results[policy] = _by_methods({label: group[0] for label, group in values.items() if group})
+    return results
 
 
 def different_rewards(section: Section, fire: str) -> str:
@@ -75,7 +75,7 @@ def different_rewards(section: Section, fire: str) -> str:
     for policy in sorted(policies - {LEARNED}):
         if not _hears_messages(section, policy):
             values = _values(section, fire, REWARD, policy)
-            if not _same([own[0] for own in values.values()]):
+            if not _same([group[0] for group in values.values()]):
                 return f"the methods' rewards differ: {policy} earns differently with them"
     return ""
 

@@ -181,4 +181,4 @@ def _new_folder(path: Path) -> Path:
         except FileExistsError:
             continue
         return candidate
-    raise FileExistsError(errno.EEXIST, f"{path} and 998 more are there already")
+    raise FileExistsError(errno.EEXIST, f"{path} and 998 more exist already")

@@ -58,7 +58,7 @@ def check_same(path: Path, sealed: Mapping[str, Any], config: RunConfig) -> None
     for key, (before, now) in differences(replace(trained, **free), config).items():
         hint = ""
         if key.startswith(("env.", "comm.")):
-            hint = f"; to evaluate in another world: emberlink eval RUN {key}=VALUE"
+            hint = f"; to evaluate with another value: emberlink eval RUN {key}=VALUE"
         raise UserError(
             f"{path}: made with {key}={shown(str(before))}; the run has {key}={shown(str(now))}: "
             f"put {shown(str(before))} back into config.yaml{hint}"

@@ -1,4 +1,4 @@
-"""Time steps of an environment made by hand, and the consensus on them."""
+"""Builds time steps of an environment by hand, and the consensus for them."""
 
 from dataclasses import replace
 
@@ -13,10 +13,10 @@ from emberlink.envs.config import WildfireConfig
 WORLD = WildfireConfig(grid=(64, 64))
 
 
-def moment(
+def time_step(
     position, new, old=None, *, centre=None, old_centre=None, hit_boundary=None, step=0, seed=1
 ):
-    """What the environment writes; lists per UAV, or per environment and UAV."""
+    """Returns a time step of the environment from lists per UAV, or per environment and UAV."""
     position = torch.as_tensor(position, dtype=torch.float32)
     position = position.unsqueeze(0) if position.ndim == 2 else position
     envs, uavs = position.shape[:2]
