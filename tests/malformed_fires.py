@@ -214,7 +214,7 @@ def _headers(folder: Path, good: dict[str, Path]) -> Iterator[Case]:
     """Yields wrong headers of ESRI ASCII."""
     folder.mkdir()
     lines = good["asc"].read_text().splitlines()
-    wrong: dict[str, tuple[Callable[[list[str]], list[str]], str]] = {
+    invalid: dict[str, tuple[Callable[[list[str]], list[str]], str]] = {
         "too few columns": (lambda a: ["NCOLS 39", *a[1:]], "40 numbers.*ncols=39"),
         "columns and rows swapped": (lambda a: ["NCOLS 20", "NROWS 80", *a[2:]], "nrows=80"),
         "too few rows": (lambda a: [a[0], "NROWS 39", *a[2:]], "40 rows.*nrows=39"),
@@ -242,7 +242,7 @@ def _headers(folder: Path, good: dict[str, Path]) -> Iterator[Case]:
         "all in one row": (lambda a: [*a[:6], " ".join(a[6:])], "1600"),
         "rows wrapped": (lambda a: [*a[:6], *" ".join(a[6:]).replace(" ", "\n").split()], "1600"),
     }
-    for name, (spoil, cause) in wrong.items():
+    for name, (spoil, cause) in invalid.items():
         path = folder / f"{name.replace(' ', '_')}.asc"
         path.write_text("\n".join([*spoil(lines), ""]))
         yield Case(f"asc: {name}", path, cause, MINUTES)
@@ -260,7 +260,7 @@ def _values(folder: Path, good: dict[str, Path]) -> Iterator[Case]:
     times = raster_of(FIRE, 300.0, cells=40, cell=75.0)
     single = np.full_like(times, -9999.0)
     single[20, 20] = 5.0
-    wrong = {
+    invalid = {
         "NODATA everywhere": (np.full_like(times, -9999.0), "no cell burns"),
         "-1 everywhere": (np.full_like(times, -1.0), "no cell burns"),
         "NaN everywhere": (np.full_like(times, np.nan), "no cell burns"),
@@ -273,7 +273,7 @@ def _values(folder: Path, good: dict[str, Path]) -> Iterator[Case]:
         "a time of 1e20": (np.where(single == 5, 1e20, times), "not an arrival time"),
         "another NODATA": (np.where(times < 0, -32768.0, times), "-32768"),
     }
-    for name, (values, cause) in wrong.items():
+    for name, (values, cause) in invalid.items():
         stem = str(folder / name.replace(" ", "_"))
         yield Case(f"asc: {name}", write_asc(Path(f"{stem}.asc"), values, 75.0), cause, MINUTES)
         yield Case(f"tif: {name}", write_tif(Path(f"{stem}.tif"), values, 75.0), cause, MINUTES)
@@ -296,7 +296,7 @@ def _rasters(folder: Path, good: dict[str, Path]) -> Iterator[Case]:
     folder.mkdir()
     times = raster_of(FIRE, 300.0, cells=40, cell=75.0).astype("float32")
     affine = rasterio.Affine
-    wrong: dict[str, tuple[np.ndarray, dict[str, Any], str]] = {
+    invalid: dict[str, tuple[np.ndarray, dict[str, Any], str]] = {
         "three bands": (np.stack([times] * 3), {}, "3 bands"),
         "complex": (times.astype("complex64"), {"nodata": None}, "complex"),
         "a picture": (np.full((40, 40), 7, "uint8"), {"nodata": None}, "picture"),
@@ -315,7 +315,7 @@ def _rasters(folder: Path, good: dict[str, Path]) -> Iterator[Case]:
             "zone",
         ),
     }
-    for name, (values, about, cause) in wrong.items():
+    for name, (values, about, cause) in invalid.items():
         path = write_tif(folder / f"{name.replace(' ', '_')}.tif", values, 75.0, **about)
         yield Case(f"tif: {name}", path, cause, {} if name == "unknown units" else MINUTES)
     huge = folder / "huge.tif"
@@ -348,7 +348,7 @@ def _banks(folder: Path, good: dict[str, Path]) -> Iterator[Case]:
     """Yields NumPy files without fires."""
     folder.mkdir()
     fires = np.load(good["npy"])
-    wrong: dict[str, tuple[np.ndarray, str]] = {
+    invalid: dict[str, tuple[np.ndarray, str]] = {
         "no fires": (fires[:0], "shape"),
         "one number": (np.array(3.0), "shape"),
         "a row": (fires[0, 0], "shape"),
@@ -361,7 +361,7 @@ def _banks(folder: Path, good: dict[str, Path]) -> Iterator[Case]:
         "dates": (np.zeros((2, 9, 9), "datetime64[s]"), "datetime"),
         "records": (np.zeros((2, 9, 9), [("a", "f4")]), "type"),
     }
-    for name, (array, cause) in wrong.items():
+    for name, (array, cause) in invalid.items():
         path = folder / f"{name.replace(' ', '_')}.npy"
         np.save(path, array)
         yield Case(f"npy: {name}", path, cause)
@@ -393,7 +393,7 @@ def _tables(folder: Path, good: dict[str, Path]) -> Iterator[Case]:
     dated = ["2020-08-19T12:00", "2020-08-19T13:00", "2020-08-19T14:00", "soon", "2020-08-20"]
     zones = ["2020-08-19T12:00Z", "2020-08-19T13:00", *dated[2:3] * 3]
     date = {"date": [f"2020-08-19T{hour}:00" for hour in range(12, 17)]}
-    wrong: dict[str, tuple[dict[str, Any], str, dict[str, Any]]] = {
+    invalid: dict[str, tuple[dict[str, Any], str, dict[str, Any]]] = {
         "no column": ({}, "fire.time_field", {}),
         "no known column": ({"size": list(TIMES)}, "fire.time_field", {}),
         "another column": ({"size": list(TIMES)}, "no column 'when'", {"time_field": "when"}),
@@ -430,7 +430,7 @@ def _tables(folder: Path, good: dict[str, Path]) -> Iterator[Case]:
         "before the fire": (date, "no fire spreads", {"end": "2020-08-19T11:00"}),
         "a date for minutes": ({"Elapsed_Mi": list(TIMES)}, "minutes", {"start": "2020-08-19"}),
     }
-    for number, (name, (columns, cause, keys)) in enumerate(wrong.items()):
+    for number, (name, (columns, cause, keys)) in enumerate(invalid.items()):
         table = geopandas.GeoDataFrame(columns, geometry=frame.geometry, crs=UTM)
         path = folder / f"{name.replace(' ', '_')}.{('shp', 'geojson', 'gpkg')[number % 3]}"
         yield Case(f"table: {name}", _write(table, path), cause, keys)
@@ -445,7 +445,7 @@ def _shapes(folder: Path, good: dict[str, Path]) -> Iterator[Case]:
     opened = shapely.LineString(list(line.coords)[: len(line.coords) // 2])
     flat = shapely.LineString([(5e5, 4e6), (5.1e5, 4e6), (5e5, 4e6)])
     far = shapely.transform(shape, lambda at: at * 1e200)
-    wrong: dict[str, tuple[list[Any], str]] = {
+    invalid: dict[str, tuple[list[Any], str]] = {
         "points": ([point] * 5, "Point"),
         "an open line": ([*(g.boundary for g in frame.geometry[:4]), opened], "not closed"),
         "all open": ([opened] * 5, "not closed"),
@@ -456,7 +456,7 @@ def _shapes(folder: Path, good: dict[str, Path]) -> Iterator[Case]:
         "the same": ([shape] * 5, "no fire spreads"),
         "beyond the Earth": ([*frame.geometry[:4], far], "Earth|geometr|expected"),
     }
-    for name, (shapes, cause) in wrong.items():
+    for name, (shapes, cause) in invalid.items():
         table = geopandas.GeoDataFrame({"Elapsed_Mi": list(TIMES)}, geometry=shapes, crs=UTM)
         for suffix in ("shp", "geojson", "gpkg"):
             path = folder / f"{name.replace(' ', '_')}.{suffix}"
@@ -523,7 +523,7 @@ def _json(folder: Path, good: dict[str, Path]) -> Iterator[Case]:
     text = good["geojson"].read_text()
     whole = json.loads(text)
     nested = '{"type": "FeatureCollection", "features": ' + "[" * 1_000_000
-    wrong = {
+    invalid = {
         "a million levels": nested,
         "objects a million deep": '{"a":' * 1_000_000,
         "no features": json.dumps({**whole, "features": []}),
@@ -541,7 +541,7 @@ def _json(folder: Path, good: dict[str, Path]) -> Iterator[Case]:
         "rings of one number": json.dumps(_with_ring(whole, [[5e5]] * 4)),
         "rings of nothing": json.dumps(_with_ring(whole, [])),
     }
-    for name, content in wrong.items():
+    for name, content in invalid.items():
         path = folder / f"{name.replace(' ', '_')}.geojson"
         path.write_text(content, encoding="latin-1" if name == "UTF-16" else "utf-8")
         yield Case(f"geojson: {name}", path, "expected|begins with")
@@ -557,7 +557,7 @@ def _texts(folder: Path, good: dict[str, Path]) -> Iterator[Case]:
     """Yields wrong versions of the paper's text."""
     folder.mkdir()
     lines = good["txt"].read_text().splitlines()
-    wrong = {
+    invalid = {
         "too short": (lines[:5999], "5999 lines"),
         "only what is skipped": (lines[:6000], "6000 lines"),
         "two numbers": ([*lines[:6010], "1.0,2.0", *lines[6011:]], "line 6011.*2 numbers"),
@@ -570,7 +570,7 @@ def _texts(folder: Path, good: dict[str, Path]) -> Iterator[Case]:
         "no points": (["1,1,1,", *[""] * 6009], "no point|no fire"),
         "a front that stands": ([lines[0]] * 6010, "once|spreads"),
     }
-    for name, (content, cause) in wrong.items():
+    for name, (content, cause) in invalid.items():
         path = folder / f"{name.replace(' ', '_')}.txt"
         path.write_text("\n".join([*content, ""]))
         yield Case(f"txt: {name}", path, cause)

@@ -49,18 +49,18 @@ def matched(
         if name == "encoder":
             continue
         assert isinstance(layer, StackedLinear | StackedLayerNorm)
-        own = single.get_submodule(name)
+        module = single.get_submodule(name)
         weight = layer.weight[uav]
         weight = weight.T if isinstance(layer, StackedLinear) else weight[0]
-        yield f"{name}.weight", weight, own.get_parameter("weight")
-        yield f"{name}.bias", layer.bias[uav, 0], own.get_parameter("bias")
+        yield f"{name}.weight", weight, module.get_parameter("weight")
+        yield f"{name}.bias", layer.bias[uav, 0], module.get_parameter("bias")
 
 
 @torch.no_grad()
 def copy_uav(stack: StackedActor | StackedCritic, single: nn.Module, uav: int) -> nn.Module:
     """Copies one UAV's weights into the single network and returns it."""
-    for _, theirs, own in matched(stack, single, uav):
-        own.copy_(theirs)
+    for _, source, parameter in matched(stack, single, uav):
+        parameter.copy_(source)
     return single
 
 

@@ -42,9 +42,12 @@ def write_run(
     run = folder / (name or f"{method}_{config['setup']}_s{seed}")
     run.mkdir(parents=True)
     (run / "config.yaml").write_text(yaml.safe_dump(config, sort_keys=False))
-    own = np.random.default_rng([seed, *method.encode()])
+    generator = np.random.default_rng([seed, *method.encode()])
     lines = [
-        {"episode": e, **{m: float(v) for m, v in zip(metrics.NAMES, own.random(8), strict=True)}}
+        {
+            "episode": e,
+            **{m: float(v) for m, v in zip(metrics.NAMES, generator.random(8), strict=True)},
+        }
         for e in range(1, episodes + 1)
     ]
     (run / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
@@ -55,7 +58,7 @@ def write_run(
             m: np.broadcast_to(v, fires).astype(float).tolist() for m, v in (learned or {}).items()
         }
         results[scenario] = {
-            "learned": {m: (60 * own.random(fires)).tolist() for m in metrics.NAMES} | given
+            "learned": {m: (60 * generator.random(fires)).tolist() for m in metrics.NAMES} | given
         }
         for policy in scripted:
             results[scenario][policy] = {

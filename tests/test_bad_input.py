@@ -98,9 +98,9 @@ SETUPS = "known: paper, released, tuned"
 )
 def test_bad_input_is_one_line_and_leaves_nothing(arguments, words, tmp_path, capsys):
     output = tmp_path / "runs"
-    method, *wrong = arguments
+    method, *overrides = arguments
     # Short, in case the input is accepted.
-    refused(["train", method, *TINY, *wrong, f"output={output}"], capsys, *words)
+    refused(["train", method, *TINY, *overrides, f"output={output}"], capsys, *words)
     assert not output.exists()
 
 

@@ -31,13 +31,13 @@ from emberlink.trainers.training.resume import resume
 def test_write_and_read_round_trip(tmp_path_factory, sizes, header):
     path = tmp_path_factory.mktemp("checkpoint") / "one.safetensors"
     content = {name: torch.randn(size) for name, size in sizes.items()}
-    own = {key: value for key, value in header.items() if key not in ("sha256", "format")}
-    checkpoint_file.write(path, content, own)
-    found, tensors = checkpoint_file.read(path)
-    assert {k: v for k, v in found.items() if k not in ("sha256", "format")} == own
+    expected = {key: value for key, value in header.items() if key not in ("sha256", "format")}
+    checkpoint_file.write(path, content, expected)
+    header_read, tensors = checkpoint_file.read(path)
+    assert {k: v for k, v in header_read.items() if k not in ("sha256", "format")} == expected
     assert tensors.keys() == content.keys()
     assert all(tensors[name].equal(value) for name, value in content.items())
-    assert [one.name for one in path.parent.iterdir()] == [path.name]
+    assert [file.name for file in path.parent.iterdir()] == [path.name]
 
 
 def test_a_change_of_any_byte_is_detected(tmp_path):
@@ -60,9 +60,9 @@ def test_a_change_of_any_byte_is_detected(tmp_path):
 @pytest.mark.parametrize("method", METHODS)
 def test_damaged_and_foreign_checkpoints_are_refused(method, tmp_path):
     files = readable(tmp_path, method)
-    done, wrong = damage_trials(files, 28, METHODS.index(method))
+    done, failures = damage_trials(files, 28, METHODS.index(method))
     assert done == 28
-    assert wrong == []
+    assert failures == []
 
 
 def test_a_state_without_a_seal_is_refused_and_the_previous_state_is_named(tmp_path, capsys):
@@ -70,12 +70,12 @@ def test_a_state_without_a_seal_is_refused_and_the_previous_state_is_named(tmp_p
     run = RunFolder(path.parent.parent)
     assert len(run.states()) == 2
     without_a_seal(path, None)  # pyright: ignore[reportArgumentType]
-    before = {one: one.read_bytes() for one in run.path.rglob("*") if one.is_file()}
+    before = {file: file.read_bytes() for file in run.path.rglob("*") if file.is_file()}
     assert main.main(["train", f"resume={run.path}"]) == 2
     error = capsys.readouterr().err
     assert error.count("\n") == 1
     assert f"the one before it: emberlink train resume={run.states()[0]}" in error
-    assert before == {one: one.read_bytes() for one in run.path.rglob("*") if one.is_file()}
+    assert before == {file: file.read_bytes() for file in run.path.rglob("*") if file.is_file()}
     trainer = resume(run.states()[0])
     assert trainer.setup.step == 30
     assert not path.exists()
@@ -211,7 +211,7 @@ def test_a_failed_save_keeps_the_existing_file(part, tmp_path, monkeypatch):
         checkpoint_file.write(path, {"a": torch.zeros(3)}, {})
     monkeypatch.undo()
     assert path.read_bytes() == before
-    assert [one.name for one in tmp_path.iterdir()] == [path.name]
+    assert [file.name for file in tmp_path.iterdir()] == [path.name]
 
 
 def test_a_file_is_flushed_before_it_is_renamed(tmp_path, monkeypatch):

@@ -57,11 +57,11 @@ class Heard(VisitedMap):
 def test_links_are_computed_before_the_reward_is_shaped():
     env = TransformedEnv(bare(), Communication(Heard(WORLD, VisitedMapConfig(range=6.0), ENVS)))
     plain = bare()
-    tds = [one.reset() for one in (env, plain)]
+    tds = [environment.reset() for environment in (env, plain)]
     for step in range(5):
         tds = [
-            one.step(td.set(keys.ACTION, action(step)))["next"]
-            for one, td in zip((env, plain), tds, strict=True)
+            environment.step(td.set(keys.ACTION, action(step)))["next"]
+            for environment, td in zip((env, plain), tds, strict=True)
         ]
         shaped, reward = (td[keys.REWARD][..., 0] for td in tds)
         links = neighbours(tds[0][keys.POSITION], 6.0)
@@ -156,10 +156,10 @@ def test_a_restored_state_continues_bit_for_bit(name):
     fly(second, range(20, 23))  # changes the state
     for place, content in ((second.base_env, world), (second.transform, saved)):
         place.load_state_dict(content)
-    one, rewards = fly(first, range(6, 11), first)
+    restored, rewards = fly(first, range(6, 11), first)
     other, again = fly(second, range(6, 11), second)
     for key in (keys.OBSERVATION, keys.HEARS):
-        assert one[key].equal(other[key])
+        assert restored[key].equal(other[key])
     assert torch.stack(rewards).equal(torch.stack(again))
 
 
@@ -180,9 +180,9 @@ def test_further_transforms_may_drop_keys_of_the_communication(name):
             step_mdp(env.step(td.set(keys.ACTION, actions[:, step])))
             for env, td in zip((changed, plain), tds, strict=True)
         ]
-    one, other = tds
-    assert keys.POSITION not in one
-    assert one[keys.OBSERVATION].equal(other[keys.OBSERVATION])
+    first, second = tds
+    assert keys.POSITION not in first
+    assert first[keys.OBSERVATION].equal(second[keys.OBSERVATION])
 
 
 @pytest.mark.parametrize("name", MODULES)

@@ -37,13 +37,13 @@ def features_of_uav(td) -> torch.Tensor:
 
 
 def expected(method: str, td) -> torch.Tensor:
-    own = features_of_uav(td)
+    features = features_of_uav(td)
     if method == "consensus":
-        return torch.cat((own, td[keys.TARGET]), -1)
+        return torch.cat((features, td[keys.TARGET]), -1)
     if method == "positional":
-        everyone = torch.cat([own[..., uav, :] for uav in range(UAVS)], -1)
+        everyone = torch.cat([features[..., uav, :] for uav in range(UAVS)], -1)
         return torch.stack([everyone] * UAVS, -2)
-    return own
+    return features
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -66,18 +66,18 @@ def test_root_and_next_observations_are_rewritten_alike(method):
 def test_communication_does_not_change_the_world(method):
     env = recipe(method)
     plain = WildfireEnv(ENVS, env.base_env.config, ablaze(), seed=4)
-    one, other = env.reset(), plain.reset()
+    rewritten, bare = env.reset(), plain.reset()
     for step in range(HORIZON):
         action = torch.rand(ENVS, UAVS, 3, generator=torch.Generator().manual_seed(step)) * 2 - 1
-        one, other = (
-            env.step(one.set(keys.ACTION, action)),
-            plain.step(other.set(keys.ACTION, action)),
+        rewritten, bare = (
+            env.step(rewritten.set(keys.ACTION, action)),
+            plain.step(bare.set(keys.ACTION, action)),
         )
         for key in (keys.POSITION, keys.NEW_FIRE, keys.SEEN, keys.HIT_BOUNDARY):
-            assert one["next"].get(key).equal(other["next"].get(key)), key
-        bonus = (one["next", *keys.REWARD] - other["next", *keys.REWARD]).abs().max()
+            assert rewritten["next"].get(key).equal(bare["next"].get(key)), key
+        bonus = (rewritten["next", *keys.REWARD] - bare["next", *keys.REWARD]).abs().max()
         assert (bonus > 0) == (method == "consensus")
-        one, other = step_mdp(one, keep_other=True), step_mdp(other, keep_other=True)
+        rewritten, bare = step_mdp(rewritten, keep_other=True), step_mdp(bare, keep_other=True)
 
 
 def test_registered_modules_are_the_files_on_disk():

@@ -41,8 +41,8 @@ def only(*paths):
     return numbers(section)
 
 
-def ranking(one, measure, fire="huygens"):
-    return next(r for r in one.fires[fire] if r.measure == measure)
+def ranking(section, measure, fire="huygens"):
+    return next(r for r in section.fires[fire] if r.measure == measure)
 
 
 @pytest.fixture(scope="module")
@@ -57,15 +57,15 @@ def runs(tmp_path_factory):
 
 
 def test_numbers_by_hand(runs):
-    one = only(runs)
-    first, second = ranking(one, "coverage").rows
+    section = only(runs)
+    first, second = ranking(section, "coverage").rows
     assert (first.method, first.seeds, first.values) == ("consensus", [0, 1, 2], [50, 70, 60])
     assert (first.iqm, first.interval) == (60, (50, 70))
     # 50 is above 40, 70 above both, 60 above 40: 4 of 6 pairs.
     assert (first.next, first.probability_of_improvement) == ("independent", pytest.approx(4 / 6))
     assert (second.iqm, second.interval, second.next) == (52.5, (40, 65), None)
     assert (second.probability_of_improvement, second.probability_interval) == (None, None)
-    (claim,) = (v for v in one.verdicts if v.measure == "coverage")
+    (claim,) = (v for v in section.verdicts if v.measure == "coverage")
     assert claim.ratio == pytest.approx(60 / 52.5)
     assert claim.interval == pytest.approx((50 / 65, 70 / 40), abs=0.1)
     assert (claim.best_other, claim.verdict, claim.fewest_seeds) == ("independent", "undecided", 2)
@@ -75,11 +75,11 @@ def test_measures_where_lower_is_better(tmp_path):
     for seed in range(3):
         write_run(tmp_path, "consensus", seed, learned={"tracking_first": 10 + seed})
         write_run(tmp_path, "positional", seed, learned={"tracking_first": 30 + seed})
-    one = only(tmp_path)
-    first, last = ranking(one, "tracking_first").rows
+    section = only(tmp_path)
+    first, last = ranking(section, "tracking_first").rows
     assert (first.method, first.probability_of_improvement) == ("consensus", 1)
     assert last.method == "positional"
-    (claim,) = (v for v in one.verdicts if v.measure == "tracking_first")
+    (claim,) = (v for v in section.verdicts if v.measure == "tracking_first")
     assert claim.ratio == pytest.approx(31 / 11)
     assert claim.verdict == "holds"
 
@@ -94,10 +94,10 @@ def test_every_measure_has_a_direction():
 def test_verdicts(tmp_path):
     """The ratios are 2, 1 and about 1.3, with little or much spread between seeds."""
     cases = {"holds": (60, 30, 0), "does not hold": (30, 30, 0), "undecided": (39, 30, 10)}
-    for verdict, (own, other, spread) in cases.items():
+    for verdict, (coverage, other, spread) in cases.items():
         for seed in range(5):
             shift = spread * (seed - 2) / 2
-            write_run(tmp_path / verdict, "consensus", seed, learned={"coverage": own + shift})
+            write_run(tmp_path / verdict, "consensus", seed, learned={"coverage": coverage + shift})
             write_run(tmp_path / verdict, "positional", seed, learned={"coverage": other - shift})
         got = [v for v in only(tmp_path / verdict).verdicts if v.measure == "coverage"]
         assert [v.verdict for v in got] == [verdict]
@@ -119,21 +119,21 @@ def test_a_ratio_to_zero_is_infinite(tmp_path, capsys):
     assert main.main(["compare", str(tmp_path), "--output", str(tmp_path / "out")]) == 0
     assert "∞" in capsys.readouterr().out
     content = json.loads((tmp_path / "out" / "compare.json").read_text())
-    claims = {one["measure"]: one for one in content["setups"][0]["claims"]}
+    claims = {claim["measure"]: claim for claim in content["setups"][0]["claims"]}
     assert claims["boundary_exits"]["interval"] == ["inf", "inf"]
 
 
 def test_one_seed_has_no_interval(tmp_path, capsys):
     for method in ("consensus", "independent"):
         write_run(tmp_path, method, 0)
-    one = only(tmp_path)
-    for rank in one.fires["huygens"]:
+    section = only(tmp_path)
+    for rank in section.fires["huygens"]:
         assert [row.interval for row in rank.rows] == [None, None]
         assert rank.rows[0].probability_interval is None
         if not rank.not_ranked:
             assert rank.rows[0].probability_of_improvement in (0, 0.5, 1)
-    assert {v.verdict for v in one.verdicts} == {"undecided"}
-    assert all(c.low is None for by in one.curves.values() for c in by.values())
+    assert {v.verdict for v in section.verdicts} == {"undecided"}
+    assert all(c.low is None for by in section.curves.values() for c in by.values())
     assert main.main(["compare", str(tmp_path), "--output", str(tmp_path / "out")]) == 0
     assert " 1* " in capsys.readouterr().out
     assert "With one seed there is no interval" in (tmp_path / "out/compare.html").read_text()
@@ -169,8 +169,8 @@ def test_scripted_policies_are_drawn_in_their_rows(tmp_path, monkeypatch):
         return plot(self, *args, **about)
 
     monkeypatch.setattr(Axes, "plot", watched)
-    own = ("comm.agree=false", "comm.wander=false")
-    for seed, keys in enumerate([(), own, ("comm.loss=0.5",)]):
+    changed = ("comm.agree=false", "comm.wander=false")
+    for seed, keys in enumerate([(), changed, ("comm.loss=0.5",)]):
         coverage = {"coverage": 90.0 - 10 * seed}
         run = write_run(
             tmp_path,
@@ -184,9 +184,9 @@ def test_scripted_policies_are_drawn_in_their_rows(tmp_path, monkeypatch):
         content["communication"] = {"follow_target": {"name": str(seed % 2)}}
         content["results"]["huygens"]["follow_target"]["coverage"] = [40.0 - 20 * (seed % 2)] * 4
         write_evaluation(run, content)
-    one = only(tmp_path)
-    assert [row.method for row in ranking(one, "coverage").rows][1].count(", ") == 1
-    plots.frozen(tmp_path / "figure.png", one, "huygens")
+    section = only(tmp_path)
+    assert [row.method for row in ranking(section, "coverage").rows][1].count(", ") == 1
+    plots.frozen(tmp_path / "figure.png", section, "huygens")
     lines = [
         (args[0][0], *args[1])
         for args, about in drawn
@@ -208,13 +208,13 @@ def test_invalid_output_folder(runs, tmp_path, capsys):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "link"]
 
 
-def summary(one):
+def summary(section):
     """Returns all statistics of a section as plain numbers."""
-    rows = [row for rank in one.fires["huygens"] for row in rank.rows]
+    rows = [row for rank in section.fires["huygens"] for row in rank.rows]
     return [
         *((r.method, r.iqm, r.interval) for r in rows),
         *((r.probability_of_improvement, r.probability_interval) for r in rows),
-        *((v.ratio, v.interval, v.verdict) for v in one.verdicts),
+        *((v.ratio, v.interval, v.verdict) for v in section.verdicts),
     ]
 
 
@@ -277,8 +277,8 @@ def test_any_number_of_methods_and_seeds(tmp_path_factory, counts, start):
     for method, count in zip(METHODS, counts, strict=False):
         for seed in range(count):
             write_run(folder, method, start + seed)
-    one = only(folder)
-    for rank in one.fires["huygens"]:
+    section = only(folder)
+    for rank in section.fires["huygens"]:
         rows = rank.rows
         assert {r.method: len(r.values) for r in rows} == dict(zip(METHODS, counts, strict=False))
         assert bool(rank.not_ranked) == (rank.measure == "mean_reward" and len(counts) > 1)
@@ -293,7 +293,7 @@ def test_any_number_of_methods_and_seeds(tmp_path_factory, counts, start):
             if row.interval:
                 low, high = row.interval
                 assert min(row.values) - 1e-9 <= low <= high <= max(row.values) + 1e-9
-    assert len(one.verdicts) == (4 if len(counts) > 1 else 0)
+    assert len(section.verdicts) == (4 if len(counts) > 1 else 0)
 
 
 def test_setups_fires_and_configurations_have_separate_sections(tmp_path):
@@ -330,7 +330,9 @@ def test_runs_with_other_evaluations_have_separate_sections(tmp_path, capsys):
     spoil(write_run(tmp_path, "consensus", 0, name="few"), fewer_fires)
     spoil(write_run(tmp_path, "consensus", 0, name="starts"), lambda c: c.update(start_seed=2))
     assert main.main(["compare", str(tmp_path), "--output", str(tmp_path / "out")]) == 0
-    sections = {one.section.label: one.section.runs for one in compare([tmp_path]).sections}
+    sections = {
+        numbers.section.label: numbers.section.runs for numbers in compare([tmp_path]).sections
+    }
     usual = "setup tuned, trained on huygens (env.horizon="
     assert {label: [run.path.name for run in runs] for label, runs in sections.items()} == {
         f"{usual}40), 2 held-out fires, start_seed 1": ["few"],
@@ -429,8 +431,8 @@ def test_extra_evaluations_are_not_counted_as_runs(tmp_path, capsys):
     said = " ".join(capsys.readouterr().out.split())
     assert "eval_step_7.json is left out: evaluated otherwise: checkpoint is step_7" in said
     assert "eval_fires.json is left out: evaluated otherwise: start_seed is 2" in said
-    (one,) = json.loads((tmp_path / "out" / "compare.json").read_text())["setups"]
-    (coverage,) = [r for r in one["fires"]["huygens"] if r["measure"] == "coverage"]
+    (section,) = json.loads((tmp_path / "out" / "compare.json").read_text())["setups"]
+    (coverage,) = [r for r in section["fires"]["huygens"] if r["measure"] == "coverage"]
     assert [(r["method"], r["iqm"]) for r in coverage["rows"]] == [
         ("consensus", 80.5),
         ("consensus, evaluated with comm.loss=0.5", 60.5),
@@ -438,11 +440,11 @@ def test_extra_evaluations_are_not_counted_as_runs(tmp_path, capsys):
     ]
     # Two evaluations of the same runs are not independent samples.
     assert [r["probability_of_improvement"] for r in coverage["rows"]] == [None, 1.0, None]
-    assert [r["evaluated_with"] for r in one["runs"]] == [{}] * 2 + [{"comm.loss": 0.5}] * 2 + [
+    assert [r["evaluated_with"] for r in section["runs"]] == [{}] * 2 + [{"comm.loss": 0.5}] * 2 + [
         {}
     ] * 2
-    assert {claim["method"] for claim in one["claims"]} == {"consensus"}
-    assert one["curves"]["coverage"].keys() == {"consensus", "independent"}
+    assert {claim["method"] for claim in section["claims"]} == {"consensus"}
+    assert section["curves"]["coverage"].keys() == {"consensus", "independent"}
     assert (tmp_path / "out" / "1_tuned_frozen_1_huygens.png").stat().st_size > 10_000
 
 
@@ -460,14 +462,14 @@ def test_scripted_policies_may_depend_on_the_messages(tmp_path):
         content["communication"] = {"follow_target": {"name": "consensus", "loss": loss}}
         content["results"]["huygens"]["follow_target"]["coverage"] = [coverage] * 4
         write_evaluation(run, content)
-    one = only(tmp_path)
-    assert ranking(one, "coverage").scripted == {
+    section = only(tmp_path)
+    assert ranking(section, "coverage").scripted == {
         "follow_target": [
             Scripted(["consensus"], 40.0),
             Scripted(["consensus (comm.loss=0.5)"], 20.0),
         ]
     }
-    assert not [note for note in one.notes if "follow_target" in note]
+    assert not [note for note in section.notes if "follow_target" in note]
 
 
 def test_settings_without_effect_on_training_are_noted_and_do_not_split_groups(tmp_path):
@@ -496,23 +498,23 @@ def test_scripted_policies_have_separate_rows(tmp_path):
         write_run(tmp_path, "positional", seed)
     content = read_evaluation(tmp_path / "positional_tuned_s0")
     expected = np.mean(content["results"]["huygens"]["random_actions"]["coverage"])
-    one = only(tmp_path)
-    rank = ranking(one, "coverage")
+    section = only(tmp_path)
+    rank = ranking(section, "coverage")
     assert [row.method for row in rank.rows].count("random_actions") == 0
     assert rank.scripted["random_actions"] == [Scripted([], pytest.approx(expected))]
-    assert one.notes == []
+    assert section.notes == []
     # The score depends on the method's reward and is the same in all runs of the method.
     for seed in range(2):
         run = tmp_path / f"positional_tuned_s{seed}"
         content = read_evaluation(run)
         content["results"]["huygens"]["random_actions"]["mean_reward"] = [7.0] * 4
         write_evaluation(run, content)
-    one = only(tmp_path)
-    consensus, positional = ranking(one, "mean_reward").scripted["random_actions"]
+    section = only(tmp_path)
+    consensus, positional = ranking(section, "mean_reward").scripted["random_actions"]
     assert positional == Scripted(["positional"], 7.0)
     assert consensus.methods == ["consensus"]
     assert consensus.value != 7
-    assert one.notes == []
+    assert section.notes == []
     # Coverage is the same on the same fires.
     content["results"]["huygens"]["random_actions"]["coverage"] = [7.0] * 4
     write_evaluation(run, content)
@@ -521,13 +523,13 @@ def test_scripted_policies_have_separate_rows(tmp_path):
 
 
 def test_curves_are_over_seeds(runs):
-    one = only(runs)
+    section = only(runs)
     lines = [
         [json.loads(line)["coverage"] for line in (run / "metrics.jsonl").read_text().splitlines()]
         for run in find([runs])
         if run.name.startswith("consensus")
     ]
-    curve = one.curves["coverage"]["consensus"]
+    curve = section.curves["coverage"]["consensus"]
     assert curve.iqm == pytest.approx(np.mean(lines, axis=0))
     assert curve.low == pytest.approx(np.min(lines, axis=0))
     assert curve.high == pytest.approx(np.max(lines, axis=0))
@@ -629,7 +631,7 @@ def test_unfinished_runs_are_noted_and_left_out(tmp_path, capsys):
     assert main.main(["compare", str(runs), str(good), "--output", str(tmp_path / "out")]) == 0
     said = " ".join(capsys.readouterr().out.replace("\n", " ").split())
     content = json.loads((tmp_path / "out" / "compare.json").read_text())
-    assert {one["run"]: one["why"][:22] for one in content["left_out"]} == {
+    assert {entry["run"]: entry["why"][:22] for entry in content["left_out"]} == {
         str(stopped): "unfinished: 1 of 3 epi",
         str(bare): "not evaluated: there i",
         str(older): "eval.json is of step_0",

@@ -78,8 +78,10 @@ LEARNER = TypeAdapter(DDPGConfig).json_schema()
 LEARNER["properties"].pop("name")
 KEYS = dict(leaves(SCHEMA, SCHEMA)) | dict(leaves(LEARNER, LEARNER, "learner."))
 COMM_KEYS = {
-    name: {f"comm.{key}": below for key, below in leaves({"properties": {}, **one}, one)}
-    for name, one in COMM.items()
+    name: {
+        f"comm.{key}": below for key, below in leaves({"properties": {}, **below_root}, below_root)
+    }
+    for name, below_root in COMM.items()
 }
 
 
@@ -100,7 +102,7 @@ def values_of(key: str, schema: dict) -> st.SearchStrategy:
     if "enum" in schema or "const" in schema:
         return st.sampled_from(schema.get("enum", [schema.get("const")]))
     if "anyOf" in schema:
-        return st.one_of([values_of(key, one) for one in schema["anyOf"]])
+        return st.one_of([values_of(key, option) for option in schema["anyOf"]])
     if kind == "null":
         return st.none()
     if kind == "boolean":
@@ -124,7 +126,7 @@ def values_of(key: str, schema: dict) -> st.SearchStrategy:
         )
     assert kind == "array", (key, schema)
     if "prefixItems" in schema:
-        parts = [values_of(key, entered(one, SCHEMA)) for one in schema["prefixItems"]]
+        parts = [values_of(key, entered(option, SCHEMA)) for option in schema["prefixItems"]]
         pair = st.tuples(*parts)
         return pair.map(list) if key == "env.grid" else pair.map(sorted)
     least, most = schema.get("minItems", 0), min(schema.get("maxItems", 3), 3)
@@ -138,9 +140,11 @@ def invalid_values(schema: dict) -> list:
     kind = schema.get("type")
     other: list = [None, {}, {"a": {"b": 1}}, b"x", {1, 2}, object(), "\ud800", "a\nb", 10**5000]
     if "anyOf" in schema:
-        kinds = [set(map(repr, invalid_values(one))) for one in schema["anyOf"]]
+        kinds = [set(map(repr, invalid_values(value))) for value in schema["anyOf"]]
         return [
-            one for one in invalid_values(schema["anyOf"][0]) if all(repr(one) in k for k in kinds)
+            value
+            for value in invalid_values(schema["anyOf"][0])
+            if all(repr(value) in k for k in kinds)
         ]
     if kind in ("integer", "number"):
         other += [True, False, "1", "", "1e400", [1], [], math.nan, "∞", 1j]
@@ -153,7 +157,9 @@ def invalid_values(schema: dict) -> list:
         parts = schema.get("prefixItems", [schema.get("items")])
         right = [1] * len(parts)
         other += ["ab", 3, True, math.nan, [[1], [1]], [None] * len(parts), ["x"] * len(parts)]
-        other += [[*right[:-1], one] for one in (True, "1", math.nan, {}, 10**400, -(10**9))]
+        other += [
+            [*right[:-1], element] for element in (True, "1", math.nan, {}, 10**400, -(10**9))
+        ]
         if "prefixItems" in schema:
             return [*other, [], right[:-1], [*right, 1]]
         other += [[]] if "minItems" in schema else []
@@ -235,13 +241,15 @@ def refused(key: str, build) -> str:
 def every_key() -> list[tuple[str, str, dict]]:
     """Yields a method that has the key, the key and its schema."""
     of_comm = {recipe(method, "paper")["comm"]["name"]: method for method in known("method")}
-    found = [("consensus", key, schema) for key, schema in KEYS.items()]
+    rows = [("consensus", key, schema) for key, schema in KEYS.items()]
     for name, several in COMM_KEYS.items():
-        found += [(of_comm[name], key, schema) for key, schema in several.items()]
-    return found
+        rows += [(of_comm[name], key, schema) for key, schema in several.items()]
+    return rows
 
 
-@pytest.mark.parametrize(("method", "key", "schema"), every_key(), ids=lambda one: str(one)[:40])
+@pytest.mark.parametrize(
+    ("method", "key", "schema"), every_key(), ids=lambda value: str(value)[:40]
+)
 def test_an_invalid_value_gives_one_line_that_names_the_key(method, key, schema):
     values = recipe(method, "tuned")
     for value in invalid_values(schema):
@@ -310,13 +318,13 @@ def flat(values: dict, prefix: str = "") -> Iterator[str]:
 
 def test_every_key_of_every_group_is_fuzzed():
     fuzzed = set(KEYS).union(*COMM_KEYS.values()) | {"comm.name", "learner.name"}
-    found: set[str] = set()
+    present: set[str] = set()
     for method in known("method"):
         for setup in known("setup"):
             for fire in scenarios():
                 config = resolve(method, [f"setup={setup}", f"fire={fire}"])
-                found |= {key for key in flat(to_values(config)) if "baseline_comm" not in key}
-    assert found == fuzzed
+                present |= {key for key in flat(to_values(config)) if "baseline_comm" not in key}
+    assert present == fuzzed
     assert set(CAPS) | set(FIXED) <= fuzzed  # every listed key still exists
 
 

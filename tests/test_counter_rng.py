@@ -36,8 +36,8 @@ def test_uniform_excludes_0_and_1(monkeypatch, bits, end):
     assert counter_rng.normal(torch.tensor(0), 1).isfinite().all()
 
 
-def correlation(one: torch.Tensor, other: torch.Tensor) -> float:
-    return torch.corrcoef(torch.stack((one.flatten(), other.flatten())).double())[0, 1].item()
+def correlation(a: torch.Tensor, b: torch.Tensor) -> float:
+    return torch.corrcoef(torch.stack((a.flatten(), b.flatten())).double())[0, 1].item()
 
 
 @pytest.mark.parametrize("seed", [0, 1, 12345])
@@ -68,9 +68,9 @@ def test_keys_do_not_collide():
 
 def test_order_of_counters_matters():
     key = torch.tensor([7])
-    one = counter_rng.fold_in(counter_rng.fold_in(key, 1), 2)
-    other = counter_rng.fold_in(counter_rng.fold_in(key, 2), 1)
-    assert one != other
+    first = counter_rng.fold_in(counter_rng.fold_in(key, 1), 2)
+    second = counter_rng.fold_in(counter_rng.fold_in(key, 2), 1)
+    assert first != second
 
 
 def test_a_draw_is_a_function_of_its_key():
@@ -93,8 +93,8 @@ def test_counters_may_be_integers_or_tensors():
     key = torch.tensor([1, 2, 3])
     counters = torch.tensor([0, 5, -1])
     folded = counter_rng.fold_in(key, counters)
-    each = [counter_rng.fold_in(key[i], int(c)) for i, c in enumerate(counters)]
-    assert folded.tolist() == [int(f) for f in each]
+    single = [counter_rng.fold_in(key[i], int(c)) for i, c in enumerate(counters)]
+    assert folded.tolist() == [int(f) for f in single]
 
 
 def test_values_equal_splitmix64():

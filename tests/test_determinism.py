@@ -34,11 +34,11 @@ def test_an_environment_does_not_depend_on_the_batch_size(fire):
     for _ in range(2):
         tds = [env.reset() for env in (few, many)]
         for _ in range(15):
-            one, other = tds
+            small, large = tds
             for key in (keys.OBSERVATION, keys.POSITION, keys.RNG_KEY, keys.BURNING):
-                assert one[key].equal(other[key][:2]), key
-            assert not other[keys.RNG_KEY][2:].unsqueeze(1).eq(one[keys.RNG_KEY]).any()
-            action = torch.rand(5, *one[keys.POSITION].shape[1:], generator=generator) * 2 - 1
+                assert small[key].equal(large[key][:2]), key
+            assert not large[keys.RNG_KEY][2:].unsqueeze(1).eq(small[keys.RNG_KEY]).any()
+            action = torch.rand(5, *small[keys.POSITION].shape[1:], generator=generator) * 2 - 1
             tds = [
                 env.step(td.set(keys.ACTION, action[: len(td)]))["next"]
                 for env, td in zip((few, many), tds, strict=True)

@@ -111,8 +111,8 @@ def test_teams_have_separate_weights_and_environments(shared):
     actions, learnt = both(collected.clone())[keys.ACTION], both(batch)[keys.ACTION]
     for team in range(teams):
         rows, columns = (slice(team * of, team * of + of) for of in (envs, UAVS))
-        one = torch.Generator().manual_seed(team)
-        alone = make_actor(*specs(envs, window=True), HIDDEN, generator=one, **more)
+        generator = torch.Generator().manual_seed(team)
+        alone = make_actor(*specs(envs, window=True), HIDDEN, generator=generator, **more)
         expected = alone(collected[rows].clone())[keys.ACTION]
         torch.testing.assert_close(actions[rows], expected)
         torch.testing.assert_close(learnt[:, columns], expected)

@@ -103,8 +103,8 @@ def test_all_policies_have_the_same_fires_and_starts(cache, monkeypatch):
 
 
 def test_follow_target_uses_the_consensus_of_the_setup():
-    own = small("consensus", "comm.range=3")
-    assert evaluate.scripted_config(own, "follow_target") == own
+    base = small("consensus", "comm.range=3")
+    assert evaluate.scripted_config(base, "follow_target") == base
     for method in ("independent", "shared_memory", "positional"):
         for setup in ("paper", "released", "tuned"):
             config = resolve(method, [f"setup={setup}", "env.num_uavs=4"])

@@ -94,8 +94,8 @@ def test_the_fit_recovers_known_rates(folder: Path):
 def test_another_wind_does_not_fit(folder: Path):
     """An overlap of 0.9 separates the correct wind from a wrong wind."""
     run = farsite.read_runs(folder)["3mph300deg"]
-    wrong = run._replace(wind=farsite.wind_of("3mph120deg"))
-    assert farsite.overlap(farsite.simulate(wrong, HEAD, RATIO), run, END) < 0.75
+    other = run._replace(wind=farsite.wind_of("3mph120deg"))
+    assert farsite.overlap(farsite.simulate(other, HEAD, RATIO), run, END) < 0.75
 
 
 def test_overlap_by_hand():

@@ -111,19 +111,19 @@ def test_a_run_with_deleted_checkpoints_is_not_restarted(run, capsys):
 
 
 def test_only_files_of_emberlink_are_removed(run, capsys):
-    own = [
+    removed = [
         run.path / "eval.json.17.part",
         run.path / "figures" / "coverage.png.17.part",
         run.checkpoints / "step_000000099.safetensors.17.part",
     ]
     others = [run.path / "thesis.part", run.path / "figures" / "mine.png.part"]
-    for path in (*own, *others):
+    for path in (*removed, *others):
         path.write_text("half")
     bundle = run.path / "divergence_step_7.part"
     bundle.mkdir()
     (bundle / "weights.safetensors").write_bytes(b"half")
     assert trained(capsys, f"resume={run.path}", "episodes=3")[0] == 0
-    assert not any(path.exists() for path in (*own, bundle))
+    assert not any(path.exists() for path in (*removed, bundle))
     assert all(path.read_text() == "half" for path in others)
 
 

@@ -82,7 +82,7 @@ def test_every_recipe_accepts_a_file(source, method, setup):
 def test_keys_in_any_order_override_the_setup(source):
     keys = [f"fire.path={source}", "fire.units=minutes", "fire.margin=0.2", "fire=file"]
     assert resolve("consensus", keys).fire.margin == 0.2
-    for text, wrong in (
+    for text, message in (
         ("fire.pth=a", "fire.path"),
         ("fire.units=weeks", "fire.units"),
         ("fire.margin=0.5", "fire.margin"),
@@ -94,7 +94,7 @@ def test_keys_in_any_order_override_the_setup(source):
         ("fire.sha256=abc", "fire.sha256"),
         ("fire.saved_copy=abc", "fire.saved_copy"),
     ):
-        with pytest.raises(ValueError, match=wrong):
+        with pytest.raises(ValueError, match=message):
             resolve("consensus", [*keys, text])
     with pytest.raises(ValueError, match="end and minutes_per_step"):
         resolve("consensus", [*keys, "fire.end=5", "fire.minutes_per_step=1"])

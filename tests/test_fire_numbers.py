@@ -26,17 +26,17 @@ def fire(rows: list[list[float]]) -> np.ndarray:
 
 def test_growth_by_hand():
     arrival = fire([[INF, 0, 0, 10], [INF, 1.5, 90, 11], [INF, 61, 14, 101]])
-    found = growth(arrival, 100)
-    assert (found.start, found.end, found.window) == (2, 8, 5)
-    assert found.mean == 0.06
+    result = growth(arrival, 100)
+    assert (result.start, result.end, result.window) == (2, 8, 5)
+    assert result.mean == 0.06
     # 10, 11 and 14 burn at 14 and none of them at 9.
-    assert (found.maximum, found.since) == (0.6, 9)
+    assert (result.maximum, result.since) == (0.6, 9)
 
 
 def test_a_static_fire_does_not_grow():
     arrival = fire([[INF, 0, 0], [INF, 0, 200], [INF, INF, INF]])
-    found = growth(arrival, 100)
-    assert (found.start, found.end, found.mean, found.maximum) == (3, 3, 0, 0)
+    result = growth(arrival, 100)
+    assert (result.start, result.end, result.mean, result.maximum) == (3, 3, 0, 0)
     assert growth(np.full((8, 8), INF, np.float32), 100).maximum == 0
 
 
@@ -50,12 +50,12 @@ def test_a_static_fire_does_not_grow():
     st.integers(1, 120),
 )
 def test_numbers_are_finite_and_independent_of_rotation(arrival, horizon):
-    found = growth(arrival, horizon)
-    assert 0 <= found.start <= found.end == int((arrival <= horizon).sum())
-    assert found.mean <= found.maximum + 1e-9
+    result = growth(arrival, horizon)
+    assert 0 <= result.start <= result.end == int((arrival <= horizon).sum())
+    assert result.mean <= result.maximum + 1e-9
     for turned in (arrival[::-1], arrival.T, arrival[:, ::-1].T):
         other = growth(turned, horizon)
-        assert (other.start, other.end, other.maximum) == (found.start, found.end, found.maximum)
+        assert (other.start, other.end, other.maximum) == (result.start, result.end, result.maximum)
     assert not (burnt_out(arrival) & np.isfinite(arrival)).any()
 
 

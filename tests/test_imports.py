@@ -20,7 +20,7 @@ ALLOWED = {
 
 def imported(source: str, folder: str) -> set[str]:
     """Returns the folders of emberlink that a file of `folder` imports anywhere."""
-    found = set()
+    folders = set()
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Import):
             names = [alias.name for alias in node.names]
@@ -33,8 +33,8 @@ def imported(source: str, folder: str) -> set[str]:
             names = [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
         else:
             continue
-        found |= {name.split(".")[1] for name in names if name.startswith("emberlink.")}
-    return found & set(FOLDERS)
+        folders |= {name.split(".")[1] for name in names if name.startswith("emberlink.")}
+    return folders & set(FOLDERS)
 
 
 @pytest.mark.parametrize("folder", FOLDERS)

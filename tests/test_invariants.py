@@ -176,9 +176,9 @@ def test_the_invariants_hold(part):
 def test_the_sweep_covers_every_kind_of_configuration():
     """The configurations include every recipe and every special value."""
     drawn = [random_settings(np.random.default_rng(seed)) for seed in range(60)]
-    assert {one["method"] for one in drawn} == set(METHODS)
-    assert {one["setup"] for one in drawn} == set(SETUPS)
-    assert {tuple(one["env"]["grid"]) for one in drawn} >= {(8, 24), (24, 8)}
+    assert {config["method"] for config in drawn} == set(METHODS)
+    assert {config["setup"] for config in drawn} == set(SETUPS)
+    assert {tuple(config["env"]["grid"]) for config in drawn} >= {(8, 24), (24, 8)}
     odd = random_actions(torch.Size((4000,)), torch.Generator().manual_seed(0))
     assert odd.isnan().any()
     assert odd.isinf().any()

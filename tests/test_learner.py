@@ -120,14 +120,14 @@ def test_gradients_of_uavs_are_independent(which, uav):
 
 
 def test_the_batch_of_another_uav_has_no_effect():
-    one, other = make_learner(), make_learner()
+    plain, other = make_learner(), make_learner()
     batch = make_batch(0)
     changed = batch.clone()
     changed[keys.OBSERVATION][:, 1:] += 1
     changed["next", *keys.REWARD][:, 1:] -= 3
-    one.update(batch)
+    plain.update(batch)
     other.update(changed)
-    for name, stack in networks(one).items():
+    for name, stack in networks(plain).items():
         mine, theirs = (
             torch.cat([weight.flatten(1) for weight in network.parameters()], -1)
             for network in (stack, networks(other)[name])
@@ -145,8 +145,8 @@ def test_each_uav_of_the_stack_equals_a_single_ddpg():
         losses = learner.update(batch)
         for uav, ddpg in enumerate(singles):
             expected = ddpg.update(*of_uav(batch, uav))
-            found = losses["actor"][uav].item(), losses["critic"][uav].item()
-            assert found == pytest.approx(expected, rel=1e-4, abs=1e-5)
+            computed = losses["actor"][uav].item(), losses["critic"][uav].item()
+            assert computed == pytest.approx(expected, rel=1e-4, abs=1e-5)
     hand = {
         "actor": "actor",
         "value": "critic",

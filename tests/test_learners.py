@@ -174,6 +174,6 @@ def test_td3s_target_is_the_lower_of_two_critics_at_the_smoothed_action():
                     values.append(critic(*given))
         target = following["reward"] + 0.5 * torch.minimum(values[0], values[1])
         wanted = sum((value - target).square() for value in values[2:])
-    found = learner.losses(batch)["critic"].detach()
+    computed = learner.losses(batch)["critic"].detach()
     assert rows == 8
-    torch.testing.assert_close(found, wanted.mean(0)[:, 0], rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(computed, wanted.mean(0)[:, 0], rtol=1e-4, atol=1e-4)

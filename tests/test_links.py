@@ -43,8 +43,8 @@ class Outside:
         self.before = self.now()
 
     def now(self) -> dict[str, bytes | None]:
-        found = self.path.rglob("*")
-        return {str(p): p.read_bytes() if p.is_file() else None for p in found}
+        paths = self.path.rglob("*")
+        return {str(p): p.read_bytes() if p.is_file() else None for p in paths}
 
 
 @pytest.fixture
@@ -102,7 +102,7 @@ def run_command(arguments: list[str | Path], capsys) -> tuple[int, str]:
     """Returns status and errors of a command; checks for a timeout and for tracebacks."""
     capsys.readouterr()
     began = time.monotonic()
-    status = main.main([str(one) for one in arguments])
+    status = main.main([str(argument) for argument in arguments])
     error = capsys.readouterr().err
     assert time.monotonic() - began < 300
     assert "Traceback" not in error
@@ -125,7 +125,7 @@ def test_an_existing_link_is_replaced(kind, tmp_path, outside):
     atomic_io.write_bytes(path, b"whole")
     assert path.read_bytes() == b"whole"
     assert is_regular(path)
-    assert [one.name for one in tmp_path.iterdir() if one.name != "home"] == ["eval.json"]
+    assert [file.name for file in tmp_path.iterdir() if file.name != "home"] == ["eval.json"]
 
 
 @pytest.mark.parametrize("kind", sorted(set(KINDS) - set(REMOVED)))
@@ -312,12 +312,12 @@ def test_every_file_is_opened_without_following_links(trained, run, tmp_path, mo
     assert len(mine) > 30
     assert len(cached) > 5
     part = re.compile(rf".*\.{os.getpid()}\.part|\.tmp.*")
-    wrong = [
+    followed = [
         file.path
         for file in (*mine, *cached)
         if not file.safe and not part.fullmatch(file.path.name)
     ]
-    assert not wrong
+    assert not followed
 
 
 def test_an_evaluation_replaces_what_was_planted(run, outside, tmp_path, capsys, monkeypatch):

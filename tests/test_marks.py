@@ -29,7 +29,7 @@ def frame(**changes) -> FrameData:
 
 
 def screen(*frames: FrameData, size: int = 360, **options) -> Screen:
-    shown = [Episode(title="one", view_angle=30.0, frames=[each]) for each in frames]
+    shown = [Episode(title="one", view_angle=30.0, frames=[frame_data]) for frame_data in frames]
     return Screen(shown, size=size, **options)
 
 
@@ -151,8 +151,8 @@ def test_panels_show_step_and_coverage():
 @pytest.mark.parametrize("grid", [(8, 8), (30, 30), (60, 40), (8, 256), (256, 8), (256, 256)])
 @pytest.mark.parametrize("count", [1, 2, 3, 4, 7])
 def test_panels_do_not_overlap_and_sides_are_even(grid, count):
-    one = frame(fire_map=np.zeros(grid, np.uint8), position=np.zeros((1, 3), np.float32))
-    made = screen(*[one] * count, size=250)
+    empty = frame(fire_map=np.zeros(grid, np.uint8), position=np.zeros((1, 3), np.float32))
+    made = screen(*[empty] * count, size=250)
     height, width, _ = made.picture(0).shape
     assert height % 2 == width % 2 == 0
     covered = np.zeros((height, width), int)
@@ -170,13 +170,13 @@ def test_four_square_maps_are_arranged_two_by_two():
 
 
 def tensordict(features: int, **agents) -> TensorDict:
-    own = {
+    entries = {
         "observation": torch.zeros(3, features),
         "position": torch.tensor(WHERE, dtype=torch.float32),
         **agents,
     }
     counts = {name: torch.tensor(5) for name in (keys.STEP, keys.SEEN, keys.BURNING)}
-    return TensorDict({keys.AGENTS: TensorDict(own, [3]), **counts}, [])
+    return TensorDict({keys.AGENTS: TensorDict(entries, [3]), **counts}, [])
 
 
 def test_roles_are_derived_from_the_followed_uavs():

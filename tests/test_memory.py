@@ -69,9 +69,9 @@ def test_shared_memory_samples_all_uavs_equally():
     for reader in range(UAVS):
         whose = sample[:, reader, 1].bincount(minlength=UAVS) / len(sample)
         torch.testing.assert_close(whose, torch.full((UAVS,), 1 / UAVS), atol=0.02, rtol=0)
-        each = (sample[:, reader, 0] * UAVS + sample[:, reader, 1]).bincount(minlength=50 * UAVS)
-        assert each.min() > 30  # 64 expected
-        assert each.max() < 105
+        counts = (sample[:, reader, 0] * UAVS + sample[:, reader, 1]).bincount(minlength=50 * UAVS)
+        assert counts.min() > 30  # 64 expected
+        assert counts.max() < 105
 
 
 @pytest.mark.parametrize("shared", [False, True])
@@ -184,11 +184,11 @@ def test_a_restored_memory_samples_like_the_saved_one(written):
             buffer.extend_rows(labelled(first, 1))
         return buffer
 
-    one, other = filled(written), memory(shared=False, capacity=40, batch=10)
-    one.sample()
-    other.load_state_dict({name: value.clone() for name, value in one.state_dict().items()})
-    for buffer in (one, other):
+    saved, restored = filled(written), memory(shared=False, capacity=40, batch=10)
+    saved.sample()
+    restored.load_state_dict({name: value.clone() for name, value in saved.state_dict().items()})
+    for buffer in (saved, restored):
         for first in range(written, written + 15):
             buffer.extend_rows(labelled(first, 1))
-    assert (one.sample() == other.sample()).all()
-    assert len(one) == len(other)
+    assert (saved.sample() == restored.sample()).all()
+    assert len(saved) == len(restored)

@@ -103,7 +103,7 @@ def by_hand(steps) -> dict[str, float]:
         [steps[keys.NEW_FIRE][t, n] + steps[keys.OLD_FIRE][t, n] > 0 for n in range(uavs)]
         for t in range(horizon)
     ]
-    found = [next((t + 1 for t in range(horizon) if on[t][n]), horizon) for n in range(uavs)]
+    first_steps = [next((t + 1 for t in range(horizon) if on[t][n]), horizon) for n in range(uavs)]
     share = [
         100 * int(s) / int(b) for s, b in zip(steps[keys.SEEN], steps[keys.BURNING], strict=True)
     ]
@@ -114,8 +114,8 @@ def by_hand(steps) -> dict[str, float]:
         "coverage": share[-1],
         "coverage_auc": sum(share) / horizon,
         "time_to_full_coverage": next((t + 1 for t, s in enumerate(share) if s == 100), horizon),
-        "tracking_first": min(found),
-        "tracking_last": max(found),
+        "tracking_first": min(first_steps),
+        "tracking_last": max(first_steps),
         "boundary_exits": left / uavs,
         "fire_losses": lost / uavs,
     }

@@ -79,11 +79,11 @@ def test_uavs_start_from_different_weights_and_a_seed_repeats_them():
         actor = StackedActor(*SIZES, generator=torch.Generator().manual_seed(seed))
         return [weight for name, weight in actor.named_parameters() if "norm" not in name]
 
-    for one, same, other in zip(drawn(3), drawn(3), drawn(4), strict=True):
-        assert one.equal(same)
-        assert not one.equal(other)
+    for first, same, other in zip(drawn(3), drawn(3), drawn(4), strict=True):
+        assert first.equal(same)
+        assert not first.equal(other)
         for uav in range(1, UAVS):
-            assert not one[0].equal(one[uav])
+            assert not first[0].equal(first[uav])
 
 
 def test_modules_read_and_write_the_keys_of_the_environment():
@@ -122,8 +122,8 @@ def test_networks_one_by_one_equal_the_stack(hidden, monkeypatch):
         return [action, value, *torch.autograd.grad(value.square().sum(), weights)]
 
     for uavs in (4, 2):
-        for one, other in zip(evaluate(10**9, uavs), evaluate(1, uavs), strict=True):
-            torch.testing.assert_close(one, other)
+        for single, whole in zip(evaluate(10**9, uavs), evaluate(1, uavs), strict=True):
+            torch.testing.assert_close(single, whole)
 
 
 def test_a_team_reads_its_own_environments():
@@ -136,8 +136,8 @@ def test_a_team_reads_its_own_environments():
         alone = StackedActor(
             2, [(5,)], 3, (8, 8), generator=torch.Generator().manual_seed(team + 1)
         )
-        own = slice(3 * team, 3 * team + 3)
-        torch.testing.assert_close(actions[own], alone(observation[own]))
+        rows = slice(3 * team, 3 * team + 3)
+        torch.testing.assert_close(actions[rows], alone(observation[rows]))
 
 
 @pytest.mark.parametrize("large", [1, 10**9], ids=["one by one", "stack"])
@@ -171,12 +171,12 @@ def test_critics_reuse_features_of_the_observation(large, monkeypatch):
     with critic.sharing():
         together = values()
     assert len(made) - runs == runs * 4 // 5  # four of five
-    for one, same in zip(apart, together, strict=True):
-        assert one.equal(same)
-        if one.requires_grad:
-            for mine, theirs in zip(gradients(one), gradients(same), strict=True):
-                assert (mine is None) == (theirs is None)
-                torch.testing.assert_close(mine, theirs) if mine is not None else None
+    for single, same in zip(apart, together, strict=True):
+        assert single.equal(same)
+        if single.requires_grad:
+            for expected, got in zip(gradients(single), gradients(same), strict=True):
+                assert (expected is None) == (got is None)
+                torch.testing.assert_close(expected, got) if expected is not None else None
     before = len(made)
     critic(observation, taken)
     critic(observation, taken)

@@ -93,7 +93,7 @@ def test_training_resets_the_noise_each_episode(tmp_path):
         "num_envs=300",
         "learner.hidden=[4,4]",
     ]
-    noise = [f"learner.exploration.{one}" for one in ("theta=0", "sigma=0.2", "dt=0.25")]
+    noise = [f"learner.exploration.{setting}" for setting in ("theta=0", "sigma=0.2", "dt=0.25")]
     config = resolve("independent", [*short, *noise, f"output={tmp_path}"])
     setup = TrainingSetup(config)
     with torch.no_grad():  # an actor that returns 0

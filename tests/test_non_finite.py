@@ -77,10 +77,10 @@ class Poison:
         observe = WildfireEnv._observe
 
         def poisoned(world, position, counts, time):
-            found = observe(world, position, counts, time)
+            observation = observe(world, position, counts, time)
             if self.is_due(world, time):
-                found[self.env, self.uav % UAVS, 4] = math.nan
-            return found
+                observation[self.env, self.uav % UAVS, 4] = math.nan
+            return observation
 
         self.monkeypatch.setattr(WildfireEnv, "_observe", poisoned)
 
@@ -179,15 +179,15 @@ def check_report(report: NonFiniteReport, wanted: dict) -> None:
 @pytest.fixture(scope="module")
 def clean(tmp_path_factory):
     """Returns a function that gives the state of an undisturbed run just before `STEP`."""
-    found = {}
+    states = {}
 
     def of(method: str, learner: str = "ddpg") -> dict:
-        if (method, learner) not in found:
+        if (method, learner) not in states:
             more = "checkpoint_steps=1", f"learner={learner}"
             trainer = begun(method, tmp_path_factory.mktemp("clean"), *more)
             until(trainer, STEP - 1)
-            found[method, learner] = checkpoint_file.read(trainer.run.states()[-1])[1]
-        return found[method, learner]
+            states[method, learner] = checkpoint_file.read(trainer.run.states()[-1])[1]
+        return states[method, learner]
 
     return of
 
@@ -397,7 +397,7 @@ def test_a_rollback_resumes_bit_for_bit(seeds, tmp_path, monkeypatch):
     assert "rollback 2 of 5: on from step 20 with learning rates x 0.25" in notes[1]
     for run in trainer.runs:
         lines = (run.path / "rollbacks.jsonl").read_text().splitlines()
-        assert [(json.loads(one)["to"], json.loads(one)["lr_scale"]) for one in lines] == [
+        assert [(json.loads(text)["to"], json.loads(text)["lr_scale"]) for text in lines] == [
             (20, 0.5),
             (20, 0.25),
         ]

@@ -172,9 +172,9 @@ def test_two_sided_by_hand():
 
 def test_two_sided_is_symmetric():
     calm = {"drift_rate": 0.0, "tide_reach": 0.0, "wind_shift": 0.0, "centre_y": 0.5}
-    both, one = (computed(slick(side, **calm), (31, 31)) for side in (True, False))
+    both, one_sided = (computed(slick(side, **calm), (31, 31)) for side in (True, False))
     torch.testing.assert_close(both.rot90(2), both, atol=0.05, rtol=0)
-    assert (one.rot90(2).isfinite() != one.isfinite()).sum() > 10
+    assert (one_sided.rot90(2).isfinite() != one_sided.isfinite()).sum() > 10
 
 
 def test_mirror():

@@ -62,8 +62,8 @@ def tracked_files() -> list[Path]:
         )
     except (AssertionError, FileNotFoundError):
         skip = {".venv", ".git", "runs", "build", "dist"}
-        found = (p for p in ROOT.rglob("*") if not skip & set(p.relative_to(ROOT).parts))
-        return sorted(p for p in found if "__pycache__" not in p.parts)
+        files = (p for p in ROOT.rglob("*") if not skip & set(p.relative_to(ROOT).parts))
+        return sorted(p for p in files if "__pycache__" not in p.parts)
     return sorted(ROOT / name for name in listed.split("\0") if name)
 
 
@@ -73,8 +73,8 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     source = copy_sources(folder / "source")
     build = (sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", folder, source)
     run(*build, cwd=folder)
-    (found,) = folder.glob("emberlink-*.whl")
-    return found
+    (file,) = folder.glob("emberlink-*.whl")
+    return file
 
 
 @pytest.fixture(scope="module")
@@ -228,7 +228,7 @@ def test_typing_links_show_the_package():
 
 
 def test_no_file_names_a_machine_or_a_registry():
-    found = {}
+    hits_by_file = {}
     for path in tracked_files():
         if not path.is_file() or path.is_symlink():
             continue
@@ -237,5 +237,5 @@ def test_no_file_names_a_machine_or_a_registry():
         except UnicodeDecodeError:
             continue
         if hits:
-            found[str(path.relative_to(ROOT))] = hits
-    assert found == {}
+            hits_by_file[str(path.relative_to(ROOT))] = hits
+    assert hits_by_file == {}

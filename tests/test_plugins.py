@@ -98,5 +98,5 @@ def test_consensus_on_windows_trains_and_resumes(shared, tmp_path):
     weights = list(trainer.setup.learner.actor.parameters())
     assert {len(weight) for weight in weights} == {1 if shared else 2}
     assert weights[0].shape[1:] == (16, 3, 3, 3)
-    assert not any(one.equal(other) for one, other in zip(before, weights, strict=True))
+    assert not any(first.equal(other) for first, other in zip(before, weights, strict=True))
     assert_same(trainer, stopped_at([27], "consensus", tmp_path, *more))

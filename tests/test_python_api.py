@@ -150,8 +150,8 @@ def test_load_a_shipped_policy(tmp_path, monkeypatch):
 
 def test_compare_gives_the_numbers(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    found = trainers.compare(["pretrained:tuned"])
-    (section,) = found.sections
+    comparison = trainers.compare(["pretrained:tuned"])
+    (section,) = comparison.sections
     assert list(section.fires) == ["huygens"]
     coverage = next(r for r in section.fires["huygens"] if r.measure == "coverage")
     assert coverage.rows[0].method == "consensus"
@@ -161,10 +161,10 @@ def test_compare_gives_the_numbers(tmp_path, monkeypatch):
 
 
 def test_compare_writes_the_report_of_the_command(trained, tmp_path):
-    found = trainers.compare([trained.path], output=tmp_path / "report")
+    comparison = trainers.compare([trained.path], output=tmp_path / "report")
     assert (tmp_path / "report" / "compare.html").exists()
     assert json.loads((tmp_path / "report" / "compare.json").read_text())["notes"] == list(
-        found.notes
+        comparison.notes
     )
     with pytest.raises(UserError, match="not an empty folder"):
         trainers.compare([trained.path], output=tmp_path / "report")
@@ -211,10 +211,10 @@ def test_the_hydra_state_of_a_program_is_kept(tmp_path):
 
 
 def test_configurations_are_resolved_in_several_threads():
-    found = {}
+    resolved = {}
 
     def work(method, setup):
-        found[method, setup] = trainers.resolve(method, [f"setup={setup}"])
+        resolved[method, setup] = trainers.resolve(method, [f"setup={setup}"])
 
     pairs = [(m, s) for m in ("independent", "consensus") for s in ("paper", "released", "tuned")]
     threads = [threading.Thread(target=work, args=pair) for pair in pairs]
@@ -222,7 +222,7 @@ def test_configurations_are_resolved_in_several_threads():
         thread.start()
     for thread in threads:
         thread.join()
-    assert found == {(m, s): trainers.resolve(m, [f"setup={s}"]) for m, s in pairs}
+    assert resolved == {(m, s): trainers.resolve(m, [f"setup={s}"]) for m, s in pairs}
 
 
 @pytest.mark.slow

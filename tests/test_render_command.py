@@ -115,9 +115,9 @@ def test_panels_have_the_same_fire_and_the_same_starts(tmp_path, monkeypatch):
     first, *others = episodes
     for other in others:
         assert np.array_equal(other.frames[0].position, first.frames[0].position)
-        for one, two in zip(first.frames, other.frames, strict=True):
-            assert one.step == two.step
-            assert np.array_equal(one.fire_map > 0, two.fire_map > 0)
+        for frame, other_frame in zip(first.frames, other.frames, strict=True):
+            assert frame.step == other_frame.step
+            assert np.array_equal(frame.fire_map > 0, other_frame.fire_map > 0)
     assert any(
         not np.array_equal(other.frames[-1].position, first.frames[-1].position) for other in others
     )

@@ -70,15 +70,15 @@ def everything(trainer: Trainer) -> dict[str, torch.Tensor]:
     return rollbacks | {name: value.clone() for name, value in state}
 
 
-def assert_same(one: Trainer, other: Trainer) -> None:
+def assert_same(run: Trainer, other: Trainer) -> None:
     """Checks that two runs have the same state, to the last bit, and the same metrics."""
-    first, second = final[one], final[other]
+    first, second = final[run], final[other]
     assert first.keys() == second.keys()
     for name, value in first.items():
         assert value.dtype == second[name].dtype
         # Compared as bytes: NaN equals NaN, and 0 differs from -0.
         assert value.numpy().tobytes() == second[name].numpy().tobytes(), name
-    for a, b in zip(one.runs, other.runs, strict=True):
+    for a, b in zip(run.runs, other.runs, strict=True):
         assert (a.path / "metrics.jsonl").read_bytes() == (b.path / "metrics.jsonl").read_bytes()
         assert [line["episode"] for line in b.lines("timing.jsonl")] == [
             line["episode"] for line in a.lines("timing.jsonl")
@@ -127,9 +127,9 @@ def test_a_resumed_run_equals_the_uninterrupted_run(method, steps, learner, whol
 @pytest.mark.parametrize(("method", "learner"), [("consensus", "ddpg"), ("positional", "td3")])
 def test_seeds_side_by_side_are_resumed_together(method, learner, whole, tmp_path):
     more = "seeds=[0,1,2]", f"learner={learner}"
-    one = stopped_at([27, 60], method, tmp_path, *more)
-    assert len(one.runs) == 3
-    assert_same(whole(method, *more), one)
+    stopped = stopped_at([27, 60], method, tmp_path, *more)
+    assert len(stopped.runs) == 3
+    assert_same(whole(method, *more), stopped)
 
 
 @pytest.mark.slow
@@ -293,12 +293,12 @@ def test_a_tracker_continues_from_the_checkpoint(tmp_path):
         return (trainer.run.path / "metrics.csv").read_text()
 
     more = ["logger=csv", "evaluation.interval=0"]
-    one = until(begun("independent", tmp_path / "a", *more), None)
+    whole_run = until(begun("independent", tmp_path / "a", *more), None)
     two = until(begun("independent", tmp_path / "b", *more, "checkpoint_interval=1"), 70)
     for path in [two.run.state(70), *two.run.networks()[-1:]]:
         path.unlink()  # like a killed run: the csv table contains later episodes
-    assert table(one) == table(until(resume(two.run.path), None))
-    assert len(table(one).splitlines()) == 1 + EPISODES
+    assert table(whole_run) == table(until(resume(two.run.path), None))
+    assert len(table(whole_run).splitlines()) == 1 + EPISODES
 
 
 def test_old_checkpoints_are_removed_except_the_best(tmp_path):

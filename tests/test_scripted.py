@@ -68,9 +68,9 @@ def test_lawnmower_assigns_strips_to_uavs():
     assert sorted({y for _, y in mower.path.tolist()}) == [2, 7, 12, 17, 22, 27]
     places = flown(env, mower, 140, [[x, 14.0, 1.0] for x in (2.0, 7.0, 12.0, 17.0, 22.0, 27.0)])
     for uav, x in enumerate((2, 7, 12, 17, 22, 27)):
-        own = [place[uav] for place in places[20:]]
-        assert {(place[0], place[2]) for place in own} == {(x, 4)}
-        turns = [place[1] for place in own if place[1] in (2, 27)]
+        path = [place[uav] for place in places[20:]]
+        assert {(place[0], place[2]) for place in path} == {(x, 4)}
+        turns = [place[1] for place in path if place[1] in (2, 27)]
         assert turns in ([2, 27, 2, 27, 2], [27, 2, 27, 2, 27])
 
 

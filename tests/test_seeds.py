@@ -77,9 +77,9 @@ def test_a_stack_of_networks_equals_single_networks_in_float64(tmp_path):
             )
     for team, single in enumerate(singles):
         for name, weight in single.weights().items():
-            found = together.weights(team)[name]
+            learned = together.weights(team)[name]
             assert weight.dtype == torch.float64
-            torch.testing.assert_close(found, weight, rtol=1e-6, atol=1e-9)
+            torch.testing.assert_close(learned, weight, rtol=1e-6, atol=1e-9)
 
 
 def widened(value: torch.Tensor) -> torch.Tensor:
@@ -117,10 +117,10 @@ def test_environments_of_several_seeds_equal_those_of_single_seeds():
     tds = [env.reset() for env in singles]
     whole = together.reset()
     for team, td in enumerate(tds):
-        own = slice(3 * team, 3 * team + 3)
-        assert whole[own][keys.POSITION].equal(td[keys.POSITION])
-        assert whole[own][keys.RNG_KEY].equal(td[keys.RNG_KEY])
-        assert together.arrival_time[own].equal(singles[team].arrival_time)
+        rows = slice(3 * team, 3 * team + 3)
+        assert whole[rows][keys.POSITION].equal(td[keys.POSITION])
+        assert whole[rows][keys.RNG_KEY].equal(td[keys.RNG_KEY])
+        assert together.arrival_time[rows].equal(singles[team].arrival_time)
 
 
 @pytest.mark.parametrize("seeds", [[], [1, -1], [1, 2]])

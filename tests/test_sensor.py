@@ -22,11 +22,11 @@ def seen(position, grid=(30, 20), view_angle=30.0, ceiling=4.0) -> set[tuple[int
     where = torch.tensor([position], dtype=torch.float64)
     centre, cells, near = view.look(where, torch.tensor([view.area]))
     assert view.area <= cells.min() <= cells.max() < 2 * view.area
-    found = flat[cells - view.area][near]
+    in_view = flat[cells - view.area][near]
     assert centre.tolist() == [[round(position[0]), round(position[1])]]
-    found = found[found >= 0]
-    assert len(found.unique()) == len(found)
-    return {divmod(name, grid[1]) for name in found.tolist()}
+    in_view = in_view[in_view >= 0]
+    assert len(in_view.unique()) == len(in_view)
+    return {divmod(name, grid[1]) for name in in_view.tolist()}
 
 
 @pytest.mark.parametrize(

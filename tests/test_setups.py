@@ -107,15 +107,15 @@ def test_methods_differ_only_in_listed_settings(setup):
     common: dict[str, set[str]] = {}
     for method, config in every.items():
         assert (config.replay, config.comm["name"]) == SWITCHES[method]
-        own = OWN[setup].get(method, {})
+        listed = OWN[setup].get(method, {})
         values = flat(to_values(config))
-        assert {key: values[key] for key in own} == own
-        for key in values.keys() - own.keys():
+        assert {key: values[key] for key in listed} == listed
+        for key in values.keys() - listed.keys():
             if key.split(".")[0] not in ("method", "replay", "comm"):
                 common.setdefault(key, set()).add(repr(values[key]))
     assert all(len(values) == 1 for values in common.values())
-    for own in OWN[setup].values():  # listed settings differ from those of the other methods
-        for key, value in own.items():
+    for listed in OWN[setup].values():  # listed settings differ from those of the other methods
+        for key, value in listed.items():
             assert repr(value) not in common.get(key, set())
 
 

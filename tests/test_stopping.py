@@ -27,10 +27,10 @@ def table(tmp_path_factory) -> dict[str, list[str]]:
     )
     assert "Traceback" not in result.stdout, result.stdout
     rows = [line.strip("| ").split(" | ") for line in result.stdout.splitlines()]
-    found = {row[0]: row for row in rows if len(row) == 4}
-    assert found.keys() >= COUNTS.keys(), result.stdout + result.stderr
-    found["all"] = [result.stdout]
-    return found
+    results = {row[0]: row for row in rows if len(row) == 4}
+    assert results.keys() >= COUNTS.keys(), result.stdout + result.stderr
+    results["all"] = [result.stdout]
+    return results
 
 
 @pytest.mark.slow

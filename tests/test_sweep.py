@@ -259,7 +259,9 @@ def test_a_stack_uses_runs_that_were_trained_separately(tmp_path):
 def test_a_stack_is_resumed_as_a_whole(tmp_path):
     """This includes seeds that are requested separately and partly finished."""
     output = f"output={tmp_path}"
-    stack = [begin(one) for one in configs_of(["independent", *SMALL, output, "seeds=[0,1,2]"])]
+    stack = [
+        begin(config) for config in configs_of(["independent", *SMALL, output, "seeds=[0,1,2]"])
+    ]
     finish(stack[0])
     assert swept(["independent", output, "seed=range(0,4)"]) == [
         [f"resume={stack[1].path}", "device=cpu"],
@@ -313,19 +315,19 @@ os.read(0, 1)
 def test_a_killed_sweep_ends_its_trainings(tmp_path):
     """A run stays claimed until its training has ended."""
     (job,) = jobs_of(["independent", *SMALL, "episodes=10000", f"output={tmp_path}"])
-    own = claims.claim(tmp_path, job.identities)
-    assert own is not None
+    claim = claims.claim(tmp_path, job.identities)
+    assert claim is not None
     arguments = [tmp_path / "log.txt", *job.arguments]
     parent = subprocess.Popen(
         [sys.executable, "-c", PARENT, *arguments],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
-        pass_fds=own.handles,
-        env={**os.environ, "LOCK": str(own.handles[0])},
+        pass_fds=claim.handles,
+        env={**os.environ, "LOCK": str(claim.handles[0])},
     )
     assert parent.stdout is not None
     child = int(parent.stdout.readline())
-    own.release()
+    claim.release()
     assert claims.claim(tmp_path, job.identities) is None
     os.kill(child, 0)
     parent.kill()
@@ -341,15 +343,17 @@ def test_a_killed_sweep_ends_its_trainings(tmp_path):
 
 
 def test_claims_are_per_run(tmp_path):
-    one, other = (identity(c) for c in configs_of(["independent", *SMALL, "seeds=[0,1]"]))
-    first = claims.claim(tmp_path, [one])
+    first_seed, second_seed = (
+        identity(c) for c in configs_of(["independent", *SMALL, "seeds=[0,1]"])
+    )
+    first = claims.claim(tmp_path, [first_seed])
     assert first is not None
-    assert claims.claim(tmp_path, [other, one]) is None
-    free = claims.claim(tmp_path, [other])
+    assert claims.claim(tmp_path, [second_seed, first_seed]) is None
+    free = claims.claim(tmp_path, [second_seed])
     assert free is not None
     first.release()
     free.release()
-    both = claims.claim(tmp_path, [other, one])
+    both = claims.claim(tmp_path, [second_seed, first_seed])
     assert both is not None
     both.release()
 

@@ -40,7 +40,7 @@ def train(logger: str, folder: Path, watch: Callable[[Progress], None] = lambda 
     for run in trainer.runs:
         assert [line["episode"] for line in run.lines()] == list(range(1, EPISODES + 1))
         assert run.checkpoint().name == f"step_{EPISODES * 8:09d}.safetensors"
-    return [str(one.message) for one in caught if "logger=" in str(one.message)]
+    return [str(warning.message) for warning in caught if "logger=" in str(warning.message)]
 
 
 def only(messages: list[str], *words: str) -> None:
@@ -150,7 +150,7 @@ def test_a_tracker_whose_files_cannot_be_created(logger, name, tmp_path):
         (run.path / name).write_text("in the way")
     with pytest.warns(UserWarning, match=f"logger={logger} has stopped") as caught:
         assert trainer.train()
-    assert len([one for one in caught if "logger=" in str(one.message)]) == 1
+    assert len([warning for warning in caught if "logger=" in str(warning.message)]) == 1
     assert len(run.lines()) == EPISODES
     assert logger == "csv" or (run.path / name).read_text() == "in the way"
 

@@ -98,17 +98,17 @@ def test_wandb_has_every_number_offline(mode, tmp_path, monkeypatch, capfd):
     printed = capfd.readouterr()
     assert "wandb" not in printed.out + printed.err
     (file,) = folder.rglob("*.wandb")
-    found = finished(file)
-    history = [read_items(r.history.item) for r in found if r.HasField("history")]
+    records_found = finished(file)
+    history = [read_items(r.history.item) for r in records_found if r.HasField("history")]
     assert [row["_step"] for row in history] == [1, 2, 3, 4]
     for row, line in zip(history, lines, strict=True):
         assert {k: v for k, v in row.items() if not k.startswith("_")} == line
-    (run,) = (record.run for record in found if record.HasField("run"))
+    (run,) = (record.run for record in records_found if record.HasField("run"))
     assert run.project == "emberlink"
     assert run.run_group == "tuned-huygens"
     assert sorted(run.tags) == ["consensus", "seed-3"]
     assert run.display_name == folder.name
-    updates = [u for r in found if r.HasField("config") for u in r.config.update]
+    updates = [u for r in records_found if r.HasField("config") for u in r.config.update]
     settings = [(u.key, json.loads(u.value_json)) for u in updates if u.key != "_wandb"]
     assert settings == list(json.loads(json.dumps(to_values(config))).items())
 
@@ -170,9 +170,9 @@ FINAL = ["evaluation.episodes=2", "output=runs"]
 
 
 def figures(folder: Path) -> list[Path]:
-    found = sorted((folder / "figures").glob("*.png"))
-    assert len(found) >= 3
-    return found
+    figures_found = sorted((folder / "figures").glob("*.png"))
+    assert len(figures_found) >= 3
+    return figures_found
 
 
 def final_means(folder: Path) -> dict[str, float]:
@@ -187,9 +187,9 @@ def final_means(folder: Path) -> dict[str, float]:
 def test_without_a_tracker_there_are_no_additional_files(tmp_path):
     folder, _, _ = tracked("none", tmp_path)
     files = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
-    own = {"config.yaml", "metrics.jsonl", "timing.jsonl"}
+    expected = {"config.yaml", "metrics.jsonl", "timing.jsonl"}
     saved = ("best", "state_000000048", "step_000000048")
-    assert files == own | {f"checkpoints/{name}.safetensors" for name in saved}
+    assert files == expected | {f"checkpoints/{name}.safetensors" for name in saved}
 
 
 def test_the_tracker_does_not_change_the_run(tmp_path):

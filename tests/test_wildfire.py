@@ -207,14 +207,14 @@ def test_an_episode_is_truncated_at_the_horizon_and_never_terminated():
 def test_fire_by_name_by_config_and_by_arrival_times():
     scenario = load_scenario("paper")
     arrival = make_fires(scenario, torch.tensor([0]), (12, 12), 20)
-    each = torch.stack([NOWHERE, EVERYWHERE, arrival[0]])
+    arrivals = torch.stack([NOWHERE, EVERYWHERE, arrival[0]])
     for fire in ("paper", scenario, arrival[0], arrival.expand(3, -1, -1)):
         env = world(fire, 3)
         assert torch.equal(env.arrival_time, arrival.expand(3, -1, -1))
-    env = world(each, 3)
+    env = world(arrivals, 3)
     for _ in range(2):
         env.reset()
-        assert torch.equal(env.arrival_time, each)
+        assert torch.equal(env.arrival_time, arrivals)
     assert WildfireEnv(1, None, torch.zeros(9, 17)).config.grid == (9, 17)
 
 
@@ -273,17 +273,17 @@ def test_other_bad_input_is_named():
 
 def test_an_environment_does_not_depend_on_the_batch_size():
     scenario = dataclasses.replace(load_scenario("huygens"), num_train_fires=5)
-    one, five = world(scenario, 1, seed=3), world(scenario, 5, seed=3)
+    single, five = world(scenario, 1, seed=3), world(scenario, 5, seed=3)
     action = torch.rand(5, 1, 3, generator=torch.Generator().manual_seed(0)) * 2 - 1
     for _ in range(3):
-        alone, among = one.reset(), five.reset()
+        alone, among = single.reset(), five.reset()
         assert (alone == among[:1]).all()
-        assert torch.equal(one.arrival_time, five.arrival_time[:1])
+        assert torch.equal(single.arrival_time, five.arrival_time[:1])
         for _ in range(4):
-            alone = one.step(TensorDict({keys.ACTION: action[:1]}, [1]))["next"]
+            alone = single.step(TensorDict({keys.ACTION: action[:1]}, [1]))["next"]
             among = five.step(TensorDict({keys.ACTION: action}, [5]))["next"]
             assert (alone == among[:1]).all()
-            assert torch.equal(one.fire_map, five.fire_map[:1])
+            assert torch.equal(single.fire_map, five.fire_map[:1])
 
 
 def test_seeds_reproduce_and_differ():

@@ -42,9 +42,9 @@ class VisitedMap(CommModule):
         self.map.flatten(2).scatter_(2, index, 1.0)
         heard = tensordict[keys.HEARS][..., None, None] * self.map.unsqueeze(1)
         self.map.copy_(torch.maximum(self.map, heard.amax(2)))
-        own = tensordict[keys.OBSERVATION]
+        before = tensordict[keys.OBSERVATION]
         size = self.map.sum((-1, -2)).unsqueeze(-1)
-        return tensordict.set(keys.OBSERVATION, torch.cat((own, size), -1))
+        return tensordict.set(keys.OBSERVATION, torch.cat((before, size), -1))
 
     def shaping(self, tensordict):
         return 0.01 * self.map.sum((-1, -2))

@@ -32,9 +32,11 @@ def test_five_seeds(tell, setup, device):
     if device == "cuda" and not torch.cuda.is_available():
         pytest.skip("no GPU")
     common = [f"setup={setup}", f"device={device}"]
-    one, five = in_turns(5, learning([*common, "seed=0"]), learning([*common, "seeds=[0,1,2,3,4]"]))
+    single, five = in_turns(
+        5, learning([*common, "seed=0"]), learning([*common, "seeds=[0,1,2,3,4]"])
+    )
     goal = "at most 5" if device == "cpu" else "nearly 1"
     tell(
         f"5 seeds, {setup}, {device}: {1000 * five / STEPS:.1f} ms a step, one alone "
-        f"{1000 * one / STEPS:.1f} ms: {five / one:.2f} x (goal: {goal})"
+        f"{1000 * single / STEPS:.1f} ms: {five / single:.2f} x (goal: {goal})"
     )

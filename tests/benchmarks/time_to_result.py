@@ -74,15 +74,15 @@ def draw(figure: Path, named: list[str]) -> None:
     canvas, panel = plt.subplots(figsize=(7, 3.6), layout="constrained")
     for number, (label, file) in enumerate(name.split("=") for name in named):
         for seed, run in read(file).items():
-            seconds, coverage = ([one[key] for one in run] for key in ("seconds", "coverage"))
+            seconds, coverage = ([line[key] for line in run] for key in ("seconds", "coverage"))
             first = {} if seed else {"label": label}
             panel.plot(seconds, coverage, color=f"C{number}", alpha=0.8, **first)
             final = sum(coverage[-3:]) / 3
-            reached = next(one for one in run if one["coverage"] >= 0.9 * final)
-            each = 1000 * seconds[-1] / run[-1]["step"]
+            reached = next(line for line in run if line["coverage"] >= 0.9 * final)
+            per_step = 1000 * seconds[-1] / run[-1]["step"]
             print(
                 f"| {label} | {seed} | {final:.1f} | {reached['seconds']:.0f} | "
-                f"{reached['step']} | {seconds[-1]:.0f} | {each:.1f} |"
+                f"{reached['step']} | {seconds[-1]:.0f} | {per_step:.1f} |"
             )
     panel.set(xlabel="seconds of training", ylabel="coverage, %", ylim=(0, 100))
     panel.grid(alpha=0.3)

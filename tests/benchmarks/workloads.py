@@ -79,8 +79,8 @@ def vmas_flying(scenario: str, num_envs: int, steps: int) -> tuple[Callable[[], 
 
 def matrix_product(device: str = "cpu") -> Callable[[], object]:
     """Returns a function with 2048^3 multiply-adds in float32, to measure the machine's peak."""
-    one, other = (torch.randn(MATRIX, MATRIX, device=device) for _ in range(2))
-    return lambda: one @ other
+    a, b = (torch.randn(MATRIX, MATRIX, device=device) for _ in range(2))
+    return lambda: a @ b
 
 
 MATRIX_FLOPS = 2 * MATRIX**3

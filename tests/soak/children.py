@@ -78,8 +78,8 @@ class Child:
 
 def temporary(folder: Path) -> list[str]:
     """Returns the temporary files of incomplete saves."""
-    found = [*folder.rglob("*.part"), *folder.rglob(".tmp*")]
-    return sorted(path.name for path in found)
+    files = [*folder.rglob("*.part"), *folder.rglob(".tmp*")]
+    return sorted(path.name for path in files)
 
 
 def watch_saves(say: Callable[[str], None], die_at: tuple[str, int] | None) -> None:
@@ -151,7 +151,7 @@ def kill_until_finished(
     Returns:
         The number of kills and the failures.
     """
-    output, wrong, done, saved = folder / "runs", [], 0, 0
+    output, failures, done, saved = folder / "runs", [], 0, 0
     begun = saved
     while True:
         kind = draw.choice(("time", "save", "part")) if done < kills else "none"
@@ -176,9 +176,9 @@ def kill_until_finished(
                 step, _, left = rest.partition(" ")
                 # The newest complete save, or the save whose log line was lost by the kill.
                 if int(step) not in (saved, begun):
-                    wrong.append(f"resumed at {step}; saved {saved}, begun {begun}")
+                    failures.append(f"resumed at {step}; saved {saved}, begun {begun}")
                 if left:
-                    wrong.append(f"left after the resume: {left}")
+                    failures.append(f"left after the resume: {left}")
                 saved = int(step)
             elif word == "saving":
                 begun = int(rest)
@@ -189,13 +189,13 @@ def kill_until_finished(
                 try:
                     checkpoint_file.read(path)
                 except ValueError as error:
-                    wrong.append(str(error))
+                    failures.append(str(error))
         if status == -signal.SIGKILL:
             done += 1
         elif status == 0:
-            return done, wrong
+            return done, failures
         else:
-            return done, [*wrong, f"status {status}: {child.text()}"]
+            return done, [*failures, f"status {status}: {child.text()}"]
 
 
 def outcome(output: Path) -> dict[str, bytes]:
@@ -215,17 +215,17 @@ def reference(method: str, folder: Path) -> dict[str, bytes]:
 
 def kill_trials(folder: Path, kills: int, seed: int) -> tuple[int, list[str]]:
     """Kills runs of all methods `kills` times in total; returns the number and the failures."""
-    draw, done, wrong, number = random.Random(seed), 0, [], 0
+    draw, done, failures, number = random.Random(seed), 0, [], 0
     references: dict[str, dict[str, bytes]] = {}
     while done < kills:
         method = METHODS[number % len(METHODS)]
         if method not in references:
             references[method] = reference(method, folder / f"reference_{method}")
         here = folder / f"kill_{number}"
-        killed, found = kill_until_finished(method, here, draw, min(kills - done, 8))
-        if not found and outcome(here / "runs") != references[method]:
-            found = [f"{method}: another outcome than of the run that nobody killed"]
-        wrong += found
+        killed, new = kill_until_finished(method, here, draw, min(kills - done, 8))
+        if not new and outcome(here / "runs") != references[method]:
+            new = [f"{method}: the outcome differs from that of the uninterrupted run"]
+        failures += new
         done, number = done + killed, number + 1
         shutil.rmtree(here)
-    return done, wrong
+    return done, failures

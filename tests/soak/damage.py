@@ -133,7 +133,7 @@ def damage_trials(
         count: number of trials.
         seed: seed of the random numbers.
     """
-    draw, wrong = random.Random(seed), []
+    draw, failures = random.Random(seed), []
     for number in range(count):
         path, reader = files[number % len(files)]
         kind, sound = KINDS[number // len(files) % len(KINDS)], path.read_bytes()
@@ -143,9 +143,9 @@ def damage_trials(
         except ValueError as error:
             text = str(error).replace(str(path.parent.parent), "")
             if str(path) not in str(error) or "\n" in text or len(text) > 300:
-                wrong.append(f"{kind.__name__}: {error}")
+                failures.append(f"{kind.__name__}: {error}")
         else:
-            wrong.append(f"{kind.__name__} was accepted")
+            failures.append(f"{kind.__name__} was accepted")
         finally:
             path.write_bytes(sound)
-    return count, wrong
+    return count, failures

@@ -43,23 +43,23 @@ def signal_trial(number: int, folder: Path, draw: random.Random) -> list[str]:
     """Sends a signal at a random time of a training; returns the failures."""
     method, output = draw.choice(METHODS), folder / "runs"
     arguments = ["train", method, *SMALL, "episodes=100000", f"output={output}"]
-    child, wrong = Child(command(arguments), folder), []
+    child, failures = Child(command(arguments), folder), []
     step = draw.randint(1, 30)
     child.wait_for(lambda: any(step_of(p) >= step for p in output.rglob("state_*.safetensors")))
     child.send(number)
     status, text = child.end(), child.text()
     (path,) = output.iterdir()
     if status != 128 + number:
-        wrong.append(f"exit status {status}")
+        failures.append(f"exit status {status}")
     if f"resume with: emberlink train resume={path}" not in text or "Traceback" in text:
-        wrong.append(text)
+        failures.append(text)
     newest, run = RunFolder(path).states()[-1], RunFolder(path)
     header = checkpoint_file.read_header(newest)
     lines = (path / "metrics.jsonl").read_bytes() if (path / "metrics.jsonl").exists() else b""
     if header["sizes"][0]["metrics.jsonl"] != len(lines):
-        wrong.append("metrics.jsonl and the checkpoint are of different steps")
+        failures.append("metrics.jsonl and the checkpoint are of different steps")
     if step_of(run.checkpoint()) != header["step"] or temporary(path) or (path / "lock").exists():
-        wrong.append(f"left: {sorted(p.name for p in path.rglob('*'))}")
+        failures.append(f"left: {sorted(p.name for p in path.rglob('*'))}")
     # With the smallest possible number of episodes, so that it ends soon.
     done = -(-header["step"] // HORIZON)
 
@@ -68,9 +68,9 @@ def signal_trial(number: int, folder: Path, draw: random.Random) -> list[str]:
 
     again = Child(go_on, folder)
     if again.end() != 0:
-        wrong.append(again.text())
+        failures.append(again.text())
     shutil.rmtree(folder)
-    return wrong
+    return failures
 
 
 def full_disk_trial(folder: Path, draw: random.Random, *, mount: bool = False) -> list[str]:
@@ -87,7 +87,7 @@ def full_disk_trial(folder: Path, draw: random.Random, *, mount: bool = False) -
         reference(method, undisturbed)
     expected = outcome(undisturbed / "runs")
     sizes = sorted(p.stat().st_size for p in undisturbed.rglob("state_*"))
-    output, wrong = folder / "disk" / "runs", []
+    output, failures = folder / "disk" / "runs", []
     output.mkdir(parents=True)
     if mount:
         room = draw.randint(2 * sizes[0], 3 * sizes[0] + 60_000)
@@ -108,21 +108,21 @@ def full_disk_trial(folder: Path, draw: random.Random, *, mount: bool = False) -
         run = RunFolder(path)
         last = text.strip().splitlines()[-1]
         if status != 2 or "cannot be written" not in last or "Traceback" in text:
-            wrong.append(f"{status}: {text}")
+            failures.append(f"{status}: {text}")
         good = str(run.states()[-1]) if run.states() else "there is no checkpoint yet"
         if good not in last or f"emberlink train resume={path}" not in last:
-            wrong.append(f"does not name the last good checkpoint: {last}")
+            failures.append(f"does not name the last good checkpoint: {last}")
         if temporary(path):
-            wrong.append(f"left: {temporary(path)}")
+            failures.append(f"left: {temporary(path)}")
         if not all(file.read_bytes().endswith(b"\n") for file in path.glob("*.jsonl")):
-            wrong.append("half a line")
+            failures.append("half a line")
         if mount:
             subprocess.run(["mount", "-o", "remount,size=100m", str(output)], check=True)
         again = Child(training(method, output), folder)
         if again.end() != 0 or outcome(output) != expected:
-            wrong.append(f"cannot go on: {again.text()}")
+            failures.append(f"cannot be resumed: {again.text()}")
     finally:
         if mount:
             subprocess.run(["umount", str(output)], check=True)
     shutil.rmtree(folder)
-    return wrong
+    return failures

@@ -51,8 +51,8 @@ def trials(folder: Path, counts: dict[str, int], seed: int) -> dict[str, tuple[C
 
     def repeated(trial: Callable[[Path], list[str]]) -> Callable[[int], Result]:
         def many(count: int) -> Result:
-            found = [trial(folder / f"trial_{number}") for number in range(count)]
-            return count, [one for each in found for one in each]
+            results = [trial(folder / f"trial_{number}") for number in range(count)]
+            return count, [failure for result in results for failure in result]
 
         return many
 
@@ -81,11 +81,11 @@ def run(folder: Path, counts: dict[str, int], seed: int = 0) -> dict[str, tuple[
     results = {}
     for name, (many, count) in trials(folder, counts, seed).items():
         began = time.monotonic()
-        done, wrong = many(count)
-        results[name] = done, wrong
-        print(f"| {name} | {done} | {len(wrong)} | {time.monotonic() - began:.0f} |", flush=True)
-        for one in wrong[:5]:
-            print("   ", one[:1000], flush=True)
+        done, failures = many(count)
+        results[name] = done, failures
+        print(f"| {name} | {done} | {len(failures)} | {time.monotonic() - began:.0f} |", flush=True)
+        for failure in failures[:5]:
+            print("   ", failure[:1000], flush=True)
     return results
 
 
@@ -111,7 +111,7 @@ def main() -> int:
     print("| trial | how many | failures | seconds |\n|---|---|---|---|", flush=True)
     with tempfile.TemporaryDirectory() as folder:
         results = run(Path(folder), counts, options.seed)
-    return int(any(wrong for _, wrong in results.values()))
+    return int(any(failures for _, failures in results.values()))
 
 
 if __name__ == "__main__":

@@ -72,13 +72,13 @@ def planted_trial(folder: Path, draw: random.Random, *, pipes: bool) -> list[str
         for word in draw.choice(COMMANDS)
     ]
     status, text = ended(arguments, folder / "child")
-    wrong = []
+    failures = []
     if status not in (0, 2) or "Traceback" in text:
-        wrong.append(f"{arguments}: status {status}: {text}")
+        failures.append(f"{arguments}: status {status}: {text}")
     if contents(home) != before:
-        wrong.append(f"{arguments}: has changed files outside of the run folder")
+        failures.append(f"{arguments}: has changed files outside of the run folder")
     shutil.rmtree(folder)
-    return wrong
+    return failures
 
 
 def plant(path: Path, home: Path, draw: random.Random, *, pipes: bool) -> None:
@@ -116,11 +116,11 @@ def cache_trial(folder: Path, draw: random.Random) -> list[str]:
     before = (run / "eval.json").read_bytes()
     os.environ["EMBERLINK_CACHE"] = str(cache)
     status, text = ended(["eval", str(run)], folder / "child")
-    wrong = []
+    failures = []
     if status != 0 or (run / "eval.json").read_bytes() != before:
-        wrong.append(f"byte {place} of {file.name}: status {status}, other numbers, or {text}")
+        failures.append(f"byte {place} of {file.name}: status {status}, other numbers, or {text}")
     shutil.rmtree(folder)
-    return wrong
+    return failures
 
 
 def config_trial(folder: Path, draw: random.Random) -> list[str]:
@@ -136,20 +136,20 @@ def config_trial(folder: Path, draw: random.Random) -> list[str]:
     keys = [key for key in old if old[key] != new[key]]
     before = (run / "eval.json").read_bytes()
     status, said = ended(["eval", str(run), "--fires", "1"], folder / "child")
-    wrong = []
+    failures = []
     if status == 2:
         if said.count("\n") != 1 or "Traceback" in said:
-            wrong.append(f"{keys}: {said}")
+            failures.append(f"{keys}: {said}")
         if (run / "eval.json").read_bytes() != before:
-            wrong.append(f"{keys}: refused, and eval.json was written")
+            failures.append(f"{keys}: refused, and eval.json was written")
     elif status == 0:
         numbers = json.loads((run / "eval.json").read_bytes())["results"]
         if (
             not all(key.startswith(FREE) for key in keys)
             or numbers != json.loads(before)["results"]
         ):
-            wrong.append(f"{keys}: accepted")
+            failures.append(f"{keys}: accepted")
     else:
-        wrong.append(f"{keys}: status {status}: {said}")
+        failures.append(f"{keys}: status {status}: {said}")
     shutil.rmtree(folder)
-    return wrong
+    return failures
