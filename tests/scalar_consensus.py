@@ -55,10 +55,12 @@ class ScalarConsensus:
         }
         knows = {i: {j for j in hears[i] if finds[j]} for i in uavs if not finds[i]}
         while self.agree:
-            told = {i: knows[i].union(*(knows[j] for j in hears[i] if not finds[j])) for i in knows}
-            if told == knows:
+            forwarded = {
+                i: knows[i].union(*(knows[j] for j in hears[i] if not finds[j])) for i in knows
+            }
+            if forwarded == knows:
                 break
-            knows = told
+            knows = forwarded
 
         def worse(i: int, j: int) -> tuple[float, int]:
             """Returns the sort key of a discoverer; the lowest is followed."""

@@ -96,7 +96,7 @@ SETUPS = "known: paper, released, tuned"
     ],
     ids=lambda value: " ".join(value) if value and len(value) < 3 else "",
 )
-def test_bad_input_is_one_line_and_leaves_nothing(arguments, words, tmp_path, capsys):
+def test_bad_input_gives_one_line_and_leaves_no_files(arguments, words, tmp_path, capsys):
     output = tmp_path / "runs"
     method, *overrides = arguments
     # Short, in case the input is accepted.
@@ -191,7 +191,7 @@ def test_subprocess_prints_one_line_and_exits_with_2(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_too_little_memory_is_one_line(capsys, monkeypatch):
+def test_too_little_memory_gives_one_line(capsys, monkeypatch):
     def full(*_):
         raise RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried 99 bytes\nmore")
 

@@ -41,8 +41,8 @@ def expected(method: str, td) -> torch.Tensor:
     if method == "consensus":
         return torch.cat((features, td[keys.TARGET]), -1)
     if method == "positional":
-        everyone = torch.cat([features[..., uav, :] for uav in range(UAVS)], -1)
-        return torch.stack([everyone] * UAVS, -2)
+        all_features = torch.cat([features[..., uav, :] for uav in range(UAVS)], -1)
+        return torch.stack([all_features] * UAVS, -2)
     return features
 
 

@@ -20,14 +20,14 @@ def in_a_row(count: int, gap: float = 9.0) -> list[list[float]]:
     return [[gap * i, 0.0, 2.0] for i in range(count)]
 
 
-def told(position, new, *, config=None, world=WORLD, **more) -> TensorDict:
+def after_consensus(position, new, *, config=None, world=WORLD, **more) -> TensorDict:
     """Returns the first time step of an episode after consensus."""
     now = time_step(position, new, **more)
     return communication(now, config, world)._reset(now, now)
 
 
 def follows(position, new, **more) -> list[int]:
-    return told(position, new, **more)[keys.FOLLOWS][0].tolist()
+    return after_consensus(position, new, **more)[keys.FOLLOWS][0].tolist()
 
 
 @pytest.mark.parametrize("mirrored", [False, True])
@@ -100,10 +100,10 @@ def test_range_zero_and_infinite_range():
 
 
 def test_only_ranks_of_discoverers_are_compared():
-    everyone = ~torch.eye(3, dtype=torch.bool)
+    all_links = ~torch.eye(3, dtype=torch.bool)
     discovers = torch.tensor([False, True, False])
     rank = torch.tensor([math.inf, -1.0, 99.0])
-    known = known_discoverers(everyone, discovers)
+    known = known_discoverers(all_links, discovers)
     assert choose_leader(known, -rank.unsqueeze(-2), discovers).tolist() == [1, 1, 1]
 
 
@@ -216,10 +216,10 @@ def test_relative_targets_are_displacements():
     config = ConsensusConfig(target="relative")
     position = [[3.0, 4.0, 2.5], [8.0, 4.0, 1.5]]
     centre = [[3.25, 4.5], [0.0, 0.0]]
-    raw = told(position, [2, 0], centre=centre, config=config)
+    raw = after_consensus(position, [2, 0], centre=centre, config=config)
     assert raw[keys.OBSERVATION][0, :, 6:].tolist() == [[0.25, 0.5, 0], [-5, 0, 1]]
     world = WildfireConfig(grid=(21, 11), observation_scale="box")
-    scaled = told(position, [2, 0], centre=centre, config=config, world=world)
+    scaled = after_consensus(position, [2, 0], centre=centre, config=config, world=world)
     expected = torch.tensor([[0.25 / 10, 0.5 / 5, 0], [-5 / 10, 0, 1 / 1.5]])
     torch.testing.assert_close(scaled[keys.OBSERVATION][0, :, 6:], expected)
     assert scaled[keys.TARGET].equal(raw[keys.TARGET])
@@ -229,7 +229,9 @@ def test_relative_targets_are_displacements():
 def test_a_box_without_height_gives_no_nan(target):
     world = WildfireConfig(grid=(21, 11), altitude=(2.0, 2.0), observation_scale="box")
     config = ConsensusConfig(target=target)
-    rewritten = told([[3.0, 4.0, 2.0], [8.0, 4.0, 2.0]], [2, 0], config=config, world=world)
+    rewritten = after_consensus(
+        [[3.0, 4.0, 2.0], [8.0, 4.0, 2.0]], [2, 0], config=config, world=world
+    )
     assert rewritten[keys.OBSERVATION].isfinite().all()
 
 
@@ -289,9 +291,9 @@ def test_any_fire_makes_a_discoverer_in_released():
     assert follows(position, [0, 0], old=[5, 0], config=RELEASED) == [0, 0]
     calm = ConsensusConfig(discoverer="any_fire")
     where = {"centre": [[3.0, 1.0], [0.0, 0.0]], "old_centre": [[7.0, 2.0], [0.0, 0.0]]}
-    old_only = told(position, [0, 0], old=[5, 0], config=calm, **where)
+    old_only = after_consensus(position, [0, 0], old=[5, 0], config=calm, **where)
     assert old_only[keys.TARGET][0, 0].tolist() == [7.0, 2.0, 2.0]
-    both = told(position, [1, 0], old=[5, 0], config=calm, **where)
+    both = after_consensus(position, [1, 0], old=[5, 0], config=calm, **where)
     assert both[keys.TARGET][0, 0].tolist() == [3.0, 1.0, 2.0]
 
 
@@ -303,8 +305,8 @@ def test_jitter_changes_x_and_y_of_near_targets_only():
         "new": [9, 9, 0],
         "centre": [[20.0, 20.5], [41.0, 40.0], [0.0, 0.0]],
     }
-    calm = told(**more)[keys.TARGET]
-    noise = told(config=ConsensusConfig(jitter=0.75), **more)[keys.TARGET] - calm
+    calm = after_consensus(**more)[keys.TARGET]
+    noise = after_consensus(config=ConsensusConfig(jitter=0.75), **more)[keys.TARGET] - calm
     assert noise[:, 1:].abs().max() == 0
     assert noise[..., 2].abs().max() == 0
     near = noise[:, 0, :2]
@@ -314,7 +316,7 @@ def test_jitter_changes_x_and_y_of_near_targets_only():
     assert near.var().item() == pytest.approx(0.396, abs=0.02)
     assert (near.abs() > 1 - 1e-5).float().mean().item() == pytest.approx(0.182, abs=0.02)
     assert abs(torch.corrcoef(near.T)[0, 1]) < 0.05
-    later = told(config=ConsensusConfig(jitter=0.75), step=1, **more)[keys.TARGET] - calm
+    later = after_consensus(config=ConsensusConfig(jitter=0.75), step=1, **more)[keys.TARGET] - calm
     assert abs(torch.corrcoef(torch.stack((near[:, 0], later[:, 0, 0])))[0, 1]) < 0.05
 
 

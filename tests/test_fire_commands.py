@@ -481,10 +481,10 @@ def test_files_are_published_without_support_for_links(tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) == [path]
 
 
-@pytest.mark.parametrize("wrong", [float("nan"), -1.0])
-def test_invalid_times_are_not_written(wrong, tmp_path):
+@pytest.mark.parametrize("time", [float("nan"), -1.0])
+def test_invalid_times_are_not_written(time, tmp_path):
     fires = torch.zeros(1, 8, 8)
-    fires[0, 2, 3] = wrong
+    fires[0, 2, 3] = time
     for suffix in SUFFIXES:
         with pytest.raises(AssertionError, match="arrival times are 0 or more"):
             write_bank(tmp_path / f"a{suffix}", fires)

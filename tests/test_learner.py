@@ -128,13 +128,13 @@ def test_the_batch_of_another_uav_has_no_effect():
     plain.update(batch)
     other.update(changed)
     for name, stack in networks(plain).items():
-        mine, theirs = (
+        weights, others = (
             torch.cat([weight.flatten(1) for weight in network.parameters()], -1)
             for network in (stack, networks(other)[name])
         )
-        assert mine[0].equal(theirs[0]), name
+        assert weights[0].equal(others[0]), name
         for uav in range(1, UAVS):
-            assert not mine[uav].equal(theirs[uav]), name
+            assert not weights[uav].equal(others[uav]), name
 
 
 def test_each_uav_of_the_stack_equals_a_single_ddpg():

@@ -97,7 +97,7 @@ def test_a_configuration_keeps_its_learner(learner):
         ({"gamma": 2.0}, "learner.gamma=2.0: should be less than 1"),
     ],
 )
-def test_wrong_settings_of_a_learner(values, message):
+def test_invalid_settings_of_a_learner(values, message):
     plain = to_values(resolve("consensus"))
     learner = values if "hidden" in values else {**plain["learner"], **values}
     with pytest.raises(UserError) as error:
@@ -133,7 +133,7 @@ def test_td3_delays_the_actors_and_all_targets():
 
 
 def test_td3s_target_noise_is_clipped_and_seeded():
-    """The noise of a seed is the same in a stack and alone, whatever the global generator."""
+    """The noise of a seed is the same in a stack and alone, for any global generator."""
     options = "learner.target_noise=0.4", "learner.target_noise_clip=0.5", "learner.batch_size=512"
     key = "next", "agents", "target_noise"
     noise = {}

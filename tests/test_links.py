@@ -320,7 +320,7 @@ def test_every_file_is_opened_without_following_links(trained, run, tmp_path, mo
     assert not followed
 
 
-def test_an_evaluation_replaces_what_was_planted(run, outside, tmp_path, capsys, monkeypatch):
+def test_an_evaluation_replaces_links(run, outside, tmp_path, capsys, monkeypatch):
     """The links are at the names of figures, eval.json and caches."""
     cache = shutil.copytree(os.environ["EMBERLINK_CACHE"], tmp_path / "cache")
     monkeypatch.setenv("EMBERLINK_CACHE", str(cache))
@@ -373,7 +373,7 @@ def test_a_refused_resume_changes_no_file(name, kind, begun, run, outside, capsy
     assert {file.name for file in now if file not in before} <= {"lock"}
 
 
-def test_a_resumed_run_replaces_what_was_planted(run, outside, capsys):
+def test_a_resumed_run_replaces_links(run, outside, capsys):
     """The links are at all names that a resumed run writes or removes."""
     again = [path for path in (run / "figures").iterdir() if not path.is_symlink()]
     again += [run / "eval.json", run / "metrics.csv"]

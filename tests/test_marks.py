@@ -136,9 +136,9 @@ def test_seen_fire_has_a_colour_only_on_request():
     fire = np.zeros((30, 20), np.uint8)
     fire[25, 5], fire[27, 5] = 1, 2
     assert around(drawn(frame(fire_map=fire)), 25, 5) == {(255, 255, 255)}
-    told = drawn(frame(fire_map=fire), grey_seen=True)
-    assert around(told, 25, 5) == {panels.SEEN_FIRE}
-    assert around(told, 27, 5) == {(255, 255, 255)}
+    image = drawn(frame(fire_map=fire), grey_seen=True)
+    assert around(image, 25, 5) == {panels.SEEN_FIRE}
+    assert around(image, 27, 5) == {(255, 255, 255)}
 
 
 def test_panels_show_step_and_coverage():
@@ -189,12 +189,12 @@ def test_roles_are_derived_from_the_followed_uavs():
 def test_links_roles_and_targets_are_drawn_from_the_tensordict():
     nothing = torch.zeros(30, 20, dtype=torch.uint8)
     hears = torch.from_numpy(linked((0, 1)))
-    told = {
+    entries = {
         keys.HEARS[1]: hears,
         keys.FOLLOWS[1]: torch.tensor([0, 0, -1]),
         keys.TARGET[1]: torch.ones(3, 3),
     }
-    seen = record_episode.frame_data(tensordict(9, **told), nothing, hears=True)
+    seen = record_episode.frame_data(tensordict(9, **entries), nothing, hears=True)
     assert np.array_equal(seen.links, hears)
     assert seen.roles.tolist() == [0, 1, 2]
     assert np.array_equal(seen.target, np.ones((3, 3)))
@@ -203,7 +203,7 @@ def test_links_roles_and_targets_are_drawn_from_the_tensordict():
     assert links_alone.roles is links_alone.target is None
     for silent in (
         record_episode.frame_data(tensordict(6), nothing, hears=True),
-        record_episode.frame_data(tensordict(9, **told), nothing, hears=False),
+        record_episode.frame_data(tensordict(9, **entries), nothing, hears=False),
     ):
         assert silent.links is silent.roles is silent.target is None
 

@@ -305,7 +305,7 @@ def test_a_state_that_is_not_finite_is_not_saved(tmp_path):
         trainer.save()
 
 
-def test_a_learning_rate_that_blows_up(tmp_path):
+def test_a_learning_rate_that_diverges(tmp_path):
     """Without injection, the squares of the weights overflow after one update."""
     trainer = begun("independent", tmp_path, "learner.critic_lr=1e25")
     error = diverged(trainer)
@@ -448,9 +448,9 @@ def test_rollbacks_without_progress_end_the_training(tmp_path, monkeypatch, caps
     assert progress_of(mended)[:2] == (1 / 32, 0)
 
 
-@pytest.mark.parametrize("wrong", ["nan", "off", "true"])
-def test_settings_of_rollbacks(wrong, capsys):
-    assert main.main(["train", "consensus", f"on_nan={wrong}"]) == 2
+@pytest.mark.parametrize("value", ["nan", "off", "true"])
+def test_settings_of_rollbacks(value, capsys):
+    assert main.main(["train", "consensus", f"on_nan={value}"]) == 2
     assert "'stop' or 'rollback'" in capsys.readouterr().err
 
 

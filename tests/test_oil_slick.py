@@ -259,7 +259,7 @@ def lehr(minutes: float, knots: float) -> tuple[float, float]:
     return (calm + wind) * 4 / math.pi / breadth / 500, breadth / 500
 
 
-def test_the_numbers_are_those_of_the_sources():
+def test_values_equal_those_of_the_sources():
     config, episode = load_scenario("oil_slick"), 12.42 * 60 / 2
     rounded = {"core_radius": [], "head_ros": [], "length_to_breadth": [], "drift_rate": []}
     for age in (120, 180):

@@ -58,11 +58,11 @@ def test_packed_runs_omit_the_training_state(packed):
         assert values["output"] == "runs"  # no local paths
         assert str(run.parent) not in (mine / "config.yaml").read_text()
         config = RunFolder(run).config()
-        packed_actor, trained_actor = (
+        trained_actor, packed_actor = (
             load_actor(config, RunFolder(path).checkpoint()) for path in (run, mine)
         )
-        for name, weight in packed_actor.state_dict().items():
-            assert weight.equal(trained_actor.state_dict()[name])
+        for name, weight in trained_actor.state_dict().items():
+            assert weight.equal(packed_actor.state_dict()[name])
 
 
 def test_a_name_replaces_a_run_folder(shipped, tmp_path, capsys):

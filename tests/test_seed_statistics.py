@@ -29,9 +29,9 @@ def plain_iqm(values) -> float:
     return sum(kept) / len(kept)
 
 
-def plain_improvement(one, other) -> float:
+def plain_improvement(sample, reference) -> float:
     """Computes the probability of improvement, pair by pair."""
-    pairs = list(itertools.product(one, other))
+    pairs = list(itertools.product(sample, reference))
     return sum(1.0 if a > b else 0.5 if a == b else 0.0 for a, b in pairs) / len(pairs)
 
 
@@ -58,24 +58,27 @@ def test_iqm_of_few_seeds(values, expected):
 
 
 @pytest.mark.parametrize(
-    ("one", "other", "expected"),
+    ("sample", "reference", "expected"),
     [([2], [1], 1), ([1], [2], 0), ([1], [1], 0.5), ([1, 3], [2, 2], 0.5), ([1, 3], [1, 2], 0.625)],
 )
-def test_probability_of_improvement_by_hand(one, other, expected):
-    assert probability_of_improvement(np.asarray(one, float), np.asarray(other, float)) == expected
+def test_probability_of_improvement_by_hand(sample, reference, expected):
+    assert (
+        probability_of_improvement(np.asarray(sample, float), np.asarray(reference, float))
+        == expected
+    )
 
 
 @settings(deadline=None)
 @given(numbers, numbers)
-def test_statistics_equal_plain_python(one, other):
-    a, b = np.asarray(one), np.asarray(other)
-    assert iqm(a) == pytest.approx(plain_iqm(one))
-    assert probability_of_improvement(a, b) == pytest.approx(plain_improvement(one, other))
+def test_statistics_equal_plain_python(sample, reference):
+    a, b = np.asarray(sample), np.asarray(reference)
+    assert iqm(a) == pytest.approx(plain_iqm(sample))
+    assert probability_of_improvement(a, b) == pytest.approx(plain_improvement(sample, reference))
     assert probability_of_improvement(a, b) + probability_of_improvement(b, a) == pytest.approx(1)
 
 
 @pytest.mark.parametrize(
-    ("own", "others", "higher", "ratio"),
+    ("sample", "others", "higher", "ratio"),
     [
         ([6, 6], ([3, 3], [4, 4]), True, 1.5),
         ([20], ([30], [26]), False, 1.3),
@@ -85,9 +88,9 @@ def test_statistics_equal_plain_python(one, other):
         ([0], ([0], [0]), False, 1),
     ],
 )
-def test_ratio_to_the_best_other(own, others, higher, ratio):
+def test_ratio_to_the_best_other(sample, others, higher, ratio):
     share = iqm_ratio_share(
-        np.asarray(own, float), *(np.asarray(o, float) for o in others), higher=higher
+        np.asarray(sample, float), *(np.asarray(o, float) for o in others), higher=higher
     )
     assert as_ratio(float(share)) == pytest.approx(ratio)
 
@@ -112,9 +115,11 @@ def test_interval_equals_that_of_all_resamples(values):
 
 
 def test_interval_resamples_within_each_method():
-    one, other = [1.0, 4.0, 5.0], [2.0, 3.0, 6.0]
-    expected = plain_interval(plain_improvement, one, other)
-    assert interval(probability_of_improvement, one, other) == pytest.approx(expected, abs=1 / 9)
+    sample, reference = [1.0, 4.0, 5.0], [2.0, 3.0, 6.0]
+    expected = plain_interval(plain_improvement, sample, reference)
+    assert interval(probability_of_improvement, sample, reference) == pytest.approx(
+        expected, abs=1 / 9
+    )
     # Resampling both together would give the ends 0 and 1.
     apart = interval(probability_of_improvement, [1.0, 2.0, 3.0], [7.0, 8.0, 9.0])
     assert apart == (0, 0)
@@ -122,13 +127,13 @@ def test_interval_resamples_within_each_method():
 
 @settings(deadline=None, max_examples=25)
 @given(several, several)
-def test_intervals_contain_the_statistic_and_ignore_earlier_draws(one, other):
-    first = interval(iqm, one)
-    interval(probability_of_improvement, one, other)
-    assert interval(iqm, one) == first
+def test_intervals_contain_the_statistic_and_ignore_earlier_draws(sample, reference):
+    first = interval(iqm, sample)
+    interval(probability_of_improvement, sample, reference)
+    assert interval(iqm, sample) == first
     assert first is not None
-    assert min(one) <= first[0] <= first[1] <= max(one)
-    got = interval(probability_of_improvement, one, other)
+    assert min(sample) <= first[0] <= first[1] <= max(sample)
+    got = interval(probability_of_improvement, sample, reference)
     assert got is not None
     assert 0 <= got[0] <= got[1] <= 1
 

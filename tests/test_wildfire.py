@@ -147,7 +147,7 @@ def test_actions_are_clipped():
     assert act(env, [3.0, -7.0, 1.5])[keys.POSITION][0, 0].tolist() == [6, 4, 3]
 
 
-def test_reset_starts_in_the_box_and_has_seen_nothing():
+def test_reset_starts_in_the_box_without_seen_cells():
     env = world(num_envs=200, num_uavs=3, altitude=(2.0, 3.0))
     env.rollout(5)
     td = env.reset()

@@ -81,7 +81,7 @@ def test_four_methods_five_seeds(tell, tmp_path):
     tell(f"four methods x 5 seeds, the same each: {seconds / 60:.1f} min (goal: at most 20)")
 
 
-def test_nothing_waits_for_the_device():
+def test_no_step_synchronises_with_the_device():
     """torch raises an error if a step synchronises with the GPU."""
     setup = TrainingSetup(resolve("consensus", ["device=cuda", "episodes=1"]))
     starts = setup.learner.learning_starts

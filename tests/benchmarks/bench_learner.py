@@ -31,7 +31,7 @@ def test_update(benchmark, tell, method):
 
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("setup", ["paper", "tuned"])
-def test_share_of_what_is_not_the_update(tell, method, setup):
+def test_share_of_a_step_without_the_update(tell, method, setup):
     """The rest includes communication, noise, sampling and logging: goal 15 % in `paper`."""
     training = TrainingSetup(resolve(method, [f"setup={setup}", "env.horizon=1000"]))
     learner: Any = training.learner
