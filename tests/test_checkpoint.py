@@ -130,6 +130,7 @@ def test_nan_in_any_tensor_is_refused(stopped):
             assert name in refused(stopped, change)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("group", ["learner/networks", "learner/replay", "environments", "episode"])
 def test_a_state_with_an_extra_or_missing_tensor_is_refused(group, stopped):
     _, content = checkpoint_file.read(stopped)

@@ -91,6 +91,7 @@ def test_every_measure_has_a_direction():
     )
 
 
+@pytest.mark.slow
 def test_verdicts(tmp_path):
     """The ratios are 2, 1 and about 1.3, with little or much spread between seeds."""
     cases = {"holds": (60, 30, 0), "does not hold": (30, 30, 0), "undecided": (39, 30, 10)}
@@ -228,6 +229,7 @@ def plain(value):
     return [plain(v) for v in value] if isinstance(value, list | tuple) else value
 
 
+@pytest.mark.slow
 def test_episodes_are_not_independent_runs(runs, tmp_path):
     """Repeating each episode ten times does not change the intervals."""
     copy = shutil.copytree(runs, tmp_path / "copy")
@@ -244,6 +246,7 @@ def test_episodes_are_not_independent_runs(runs, tmp_path):
     assert plain(summary(only(copy))) != approximately(summary(only(runs)))
 
 
+@pytest.mark.slow
 def test_intervals_ignore_the_spread_within_a_run(tmp_path):
     for seed, mean in enumerate((20, 30, 40)):
         write_run(tmp_path / "calm", "consensus", seed, learned={"coverage": mean})
@@ -322,6 +325,7 @@ def fewer_fires(content):
         measured |= {name: values[:2] for name, values in measured.items()}
 
 
+@pytest.mark.slow
 def test_runs_with_other_evaluations_have_separate_sections(tmp_path, capsys):
     """An example is a smoke test in the same folder."""
     for seed in range(2):
@@ -751,6 +755,7 @@ def test_nothing_is_overwritten(runs, tmp_path, monkeypatch, capsys):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["compare", "compare_2", "taken"]
 
 
+@pytest.mark.slow
 @pytest.mark.drawn
 def test_a_real_run_has_a_timelapse(finished, tmp_path):
     assert main.main(["compare", str(finished.parent), "--output", str(tmp_path / "out")]) == 0

@@ -316,6 +316,7 @@ def flat(values: dict, prefix: str = "") -> Iterator[str]:
             yield prefix + key
 
 
+@pytest.mark.slow
 def test_every_key_of_every_group_is_fuzzed():
     fuzzed = set(KEYS).union(*COMM_KEYS.values()) | {"comm.name", "learner.name"}
     present: set[str] = set()

@@ -103,6 +103,7 @@ class Elsewhere(TorchFunctionMode):
         return func(*args, **kwargs)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("watch", "seeds"), [(Waiting, "seed=5"), (Elsewhere, "seeds=[5,6]")], ids=["waits", "moves"]
 )

@@ -62,6 +62,7 @@ def test_evaluations_have_a_hundred_fires():
     assert resolve("consensus").evaluation.episodes == 100
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["consensus", "independent"])
 def test_an_episode_does_not_depend_on_the_others(method, cache):
     config = small(method)
@@ -115,6 +116,7 @@ def test_follow_target_uses_the_consensus_of_the_setup():
                 assert evaluate.scripted_config(config, name) is config
 
 
+@pytest.mark.slow
 def test_eval_json_is_reproducible_to_the_byte(run, cache, played):
     assert main.main(["eval", str(run), "--fires", "3"]) == 0
     first = (run / "eval.json").read_bytes()

@@ -67,6 +67,7 @@ def test_a_full_disk_during_the_evaluation(tmp_path, capsys, monkeypatch):
     assert "is finished" in trained(capsys, f"resume={run.path}")[1]
 
 
+@pytest.mark.slow
 def test_an_interrupt_during_the_evaluation_of_the_second_seed(tmp_path, capsys, monkeypatch):
     played, evaluate = [], command.evaluate_run
 
@@ -274,6 +275,7 @@ def test_folders_named_like_temporary_files_are_kept(run, capsys):
     assert (run.path / "divergence_step_3.part").read_text() == "mine"
 
 
+@pytest.mark.slow
 def test_an_infinite_range_round_trips(tmp_path, capsys):
     arguments = ["consensus", *TINY, "comm.range=inf", f"output={tmp_path / 'runs'}"]
     assert trained(capsys, *arguments)[0] == 0
@@ -284,6 +286,7 @@ def test_an_infinite_range_round_trips(tmp_path, capsys):
     assert main.main(["compare", str(run.path), "--output", str(tmp_path / "out")]) == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("key", ["displacement", "num_uavs", "new_fire", "range"])
 def test_a_configuration_that_lacks_a_key_is_refused(key, tmp_path, capsys):
     """Its default may belong to another setup and change the evaluated world."""

@@ -110,6 +110,7 @@ def test_a_fire_depends_on_its_seed_only(test_fires: torch.Tensor):
     assert torch.equal(torch.get_rng_state(), state)
 
 
+@pytest.mark.slow
 def test_no_fire_is_in_both_splits(test_fires: torch.Tensor):
     train = make_fires(load_scenario("huygens"), fire_seeds("train", 50), GRID, HORIZON)
     both = torch.cat([train, test_fires[:50]]).flatten(1)

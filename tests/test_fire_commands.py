@@ -129,6 +129,7 @@ def test_preview_draws_its_numbers(capsys, tmp_path):
     assert area(name, plot.BURNT_OUT) < cell / 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("grid", ["[8,8]", "[8,64]", "[100,60]", "[256,200]"])
 @pytest.mark.parametrize("view", ["env.view_angle=5", "env.view_angle=80"])
 def test_preview_of_other_maps(grid, view, capsys):
@@ -438,6 +439,7 @@ def files_of_at_most(size: int):
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [0, 100, 2000])
 def test_a_full_disk_gives_one_line_and_leaves_no_files(size, capsys, tmp_path):
     for arguments in (

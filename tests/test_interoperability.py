@@ -63,6 +63,7 @@ def test_the_workers_of_a_parallel_environment_differ():
     assert not first[0].equal(first[1])
 
 
+@pytest.mark.slow
 def test_sizes_and_names():
     env = make(4)
     assert (env.num_envs, env.n_agents, env.max_steps) == (4, 3, 10)

@@ -60,6 +60,7 @@ def test_a_short_run_learns_and_evaluates(method, learner, tmp_path, capsys):
     capsys.readouterr()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("learner", LEARNERS)
 @pytest.mark.parametrize("more", [[], ["env.observation=window"], ["seeds=[1,2]"]])
 def test_all_uavs_of_a_seed_share_their_weights(learner, more, tmp_path):

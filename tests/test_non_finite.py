@@ -313,6 +313,7 @@ def test_a_learning_rate_that_diverges(tmp_path):
     assert replay(error.dump) == error.report
 
 
+@pytest.mark.slow
 def test_the_command_prints_one_line(tmp_path, monkeypatch, capsys):
     Poison(monkeypatch, "reward")
     assert main.main(["train", "consensus", *SMALL, f"output={tmp_path}"]) == 2

@@ -92,6 +92,7 @@ CASES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", CASES)
 def test_agrees_with_the_exact_solution(case: str):
     """The grid has sixty nodes a side, sampled at 30 x 30 and at 60 x 60 cells."""

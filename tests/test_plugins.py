@@ -88,6 +88,7 @@ def test_a_map_of_another_package_is_restored_bit_for_bit(installed, tmp_path):
     assert_same(whole, until(resume(stopped.run.path), None))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shared", [False, True])
 def test_consensus_on_windows_trains_and_resumes(shared, tmp_path):
     more = ["env.observation=window", f"learner.share_parameters={shared}", "episodes=2"]

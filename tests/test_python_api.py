@@ -139,6 +139,7 @@ def test_load_gives_the_trained_policy_and_its_environment(trained):
     assert larger.rollout(1, policy)[keys.ACTION].shape == (1, 1, 2, 3)
 
 
+@pytest.mark.slow
 def test_load_a_shipped_policy(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     policy = trainers.load("pretrained:consensus")

@@ -47,6 +47,7 @@ def test_more_than_ten_thousand_steps_are_compared():
     assert len(CASES) * ENVS * STEPS >= 10_000
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", range(len(CASES)))
 def test_equals_the_scalar_environment(case):
     grid, uavs, displacement, view_angle, altitude, (worth, exit_axes) = CASES[case]

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-COUNTS = {"kill -9": 12, "SIGTERM": 3, "SIGINT": 3, "file size limit": 3}
+COUNTS = {"kill -9": 8, "SIGTERM": 2, "SIGINT": 2, "file size limit": 2}
 SOAK = Path(__file__).parent / "soak" / "soak.py"
 
 
