@@ -88,6 +88,7 @@ def test_an_existing_copy_is_used_and_kept(shipped, tmp_path):
     assert (tmp_path / run.path / "note.txt").read_text() == "mine"
 
 
+@pytest.mark.slow
 def test_names_of_several_policies(shipped):
     def names(text: str) -> list[str]:
         return ["/".join(path.parts[-2:]) for path in pretrained.find(text)]
