@@ -29,7 +29,7 @@ from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.learners.ddpg import DDPGConfig
 from emberlink.trainers.training.setup import TrainingSetup
 
-EXAMPLES = 5000 if SOAK else 200
+EXAMPLES = 5000 if SOAK else 120
 FUZZ = settings(
     max_examples=EXAMPLES // 2,  # half of them valid, half invalid
     deadline=None,

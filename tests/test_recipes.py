@@ -15,7 +15,7 @@ from emberlink.trainers.training.trainer import Trainer
 
 METHODS = ["independent", "shared_memory", "positional", "consensus"]
 SETUPS = ["paper", "released", "tuned"]
-EPISODES, HORIZON, ENVS, BATCH = 3, 70, 2, 32
+EPISODES, HORIZON, ENVS, BATCH = 3, 40, 2, 32
 
 
 def short(method: str, output, *more: str, setup: str = "paper", seed: int = 0):

@@ -26,13 +26,13 @@ SEEDS = [3, 11]
     ("method", "setup"), [*zip(METHODS, ["released", "paper"] * 2, strict=True)]
 )
 def test_a_seed_of_a_stack_learns_the_same_as_alone(method, setup, tmp_path):
-    """About two hundred updates in float32, with operations in a different order."""
+    """About 150 updates in float32, with operations in a different order."""
     settings = [
-        *(f"setup={setup}", "env.horizon=60", "episodes=4", "num_envs=2", "env.num_uavs=3"),
+        *(f"setup={setup}", "env.horizon=40", "episodes=4", "num_envs=2", "env.num_uavs=3"),
         *("learner.batch_size=24", "learner.hidden=[24,16]", "evaluation.interval=0"),
     ]
     together = trained(resolve(method, [*settings, f"seeds={SEEDS}", f"output={tmp_path / 'a'}"]))
-    assert together.setup.learner.updates > 200
+    assert together.setup.learner.updates > 140
     assert len(together.runs) == len(SEEDS)
     for team, seed in enumerate(SEEDS):
         alone = trained(resolve(method, [*settings, f"seed={seed}", f"output={tmp_path / 'b'}"]))
