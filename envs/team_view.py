@@ -1,4 +1,4 @@
-"""What can be read of a `WildfireEnv` without changing it."""
+"""Defines what a `WildfireEnv` shows of itself: sizes, names, maps and pictures."""
 
 import torch
 from torch import Tensor

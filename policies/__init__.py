@@ -1,0 +1,1 @@
+"""The policies of the UAVs: networks, exploration noise, scripted baselines, trained weights."""

@@ -2,16 +2,24 @@
 
 import json
 from importlib.metadata import EntryPoint
+from typing import Any, cast
 
 import pytest
 import torch
+from tensordict.nn import TensorDictModule
 from test_recipes import METHODS
 
 from emberlink.envs.utils import plugins
 from emberlink.envs.utils.errors import UserError
 from emberlink.trainers.cli import main
-from emberlink.trainers.config.compose import from_values, resolve, to_values
+from emberlink.trainers.config.compose import (
+    _drop_settings_of_other_learners,
+    from_values,
+    resolve,
+    to_values,
+)
 from emberlink.trainers.learners import registry
+from emberlink.trainers.learners.base import Learner
 from emberlink.trainers.learners.ddpg import DDPG
 from emberlink.trainers.learners.td3 import TD3
 from emberlink.trainers.training.setup import TrainingSetup
@@ -112,6 +120,21 @@ def test_another_package_can_add_a_learner(monkeypatch):
     monkeypatch.setattr(plugins, "registered", lambda of: {"mine": point} if of == group else {})
     assert registry.known() == ["ddpg", "mine", "td3"]
     assert registry.find("mine") is TD3
+
+
+def test_a_setup_does_not_give_a_learner_the_settings_of_others():
+    values = {"name": "ddpg", "tau": 0.1, "policy_delay": 2, "unheard": 1}
+    _drop_settings_of_other_learners(values)
+    assert values == {"name": "ddpg", "tau": 0.1, "unheard": 1}
+
+
+def test_networks_of_seeds_that_cannot_be_told_apart_are_refused():
+    class Own:
+        actor = TensorDictModule(torch.nn.Linear(2, 2), in_keys=["a"], out_keys=["b"])
+
+    assert Learner.team_actor(cast(Any, Own()), 0, 1) is Own.actor
+    with pytest.raises(UserError, match="Own trains one seed at a time"):
+        Learner.team_actor(cast(Any, Own()), 0, 2)
 
 
 def test_td3_delays_the_actors_and_all_targets():

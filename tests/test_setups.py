@@ -4,14 +4,15 @@ import dataclasses
 
 import pytest
 
+from emberlink.comm._heading import HeadingConfig
 from emberlink.comm.consensus import ConsensusConfig
 from emberlink.configs import known
 from emberlink.envs.config import RewardConfig, WildfireConfig
 from emberlink.envs.fire.generator import scenarios
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import from_plain
-from emberlink.trainers.config.compose import flat, resolve, to_values
-from emberlink.trainers.config.schema import build_comm
+from emberlink.trainers.config.compose import flat, from_values, resolve, to_values
+from emberlink.trainers.config.schema import build_comm, with_all_settings
 
 METHODS = ["independent", "shared_memory", "positional", "consensus"]
 PAPER, RELEASED = "paper", "released"
@@ -131,6 +132,18 @@ def test_each_setup_has_a_fire_that_can_be_overridden(setup, fire):
     assert resolve("consensus", [f"setup={setup}"]).fire.name == fire
     for other in scenarios():
         assert resolve("consensus", [f"setup={setup}", f"fire={other}"]).fire.name == other
+
+
+def test_defaults_of_a_communication_module_are_written_out():
+    config = resolve("consensus", ["setup=tuned"])
+    values = to_values(config)
+    del values["comm"]["jitter"], values["comm"]["heading"]["circle"]
+    del values["baseline_comm"]["consensus"]["loss"]
+    completed = with_all_settings(from_values(values))
+    assert flat(completed.comm).keys() == flat(config.comm).keys()
+    assert completed.comm["jitter"] == ConsensusConfig().jitter
+    assert completed.comm["heading"]["circle"] == HeadingConfig().circle
+    assert completed.baseline_comm["consensus"]["loss"] == 0.0
 
 
 @pytest.mark.parametrize("value", ["Läufe", "日本", "meine Läufe (2)", "größer/ßß"])

@@ -2,6 +2,7 @@
 
 from typing import TYPE_CHECKING
 
+from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.lazy import lazy
 
 if TYPE_CHECKING:
@@ -16,6 +17,7 @@ __all__ = [
     "RunConfig",
     "TrainedPolicy",
     "Trainer",
+    "UserError",
     "compare",
     "evaluate",
     "load",

@@ -72,7 +72,9 @@ def _message(error: Exception) -> str | None:
 
     if isinstance(error, UserError):
         return str(error)
-    if isinstance(error, RuntimeError) and "alloc" in str(error):
+    # PyTorch has no error of its own for memory of the CPU.
+    allocator = "DefaultCPUAllocator" in str(error) or type(error).__name__ == "OutOfMemoryError"
+    if isinstance(error, RuntimeError) and allocator:
         return f"not enough memory: {str(error).splitlines()[0]}"
     return None
 

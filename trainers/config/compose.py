@@ -4,7 +4,7 @@ import threading
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from copy import deepcopy
-from dataclasses import replace
+from dataclasses import fields, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -25,7 +25,8 @@ from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import from_plain, plain, shown, unknown
 from emberlink.policies.scripted.registry import SCRIPTED
 from emberlink.trainers.config.overrides import all_keys, flat, full_key, parse, put
-from emberlink.trainers.config.schema import RunConfig
+from emberlink.trainers.config.schema import RunConfig, with_all_settings
+from emberlink.trainers.learners import registry as learners
 
 GROUPS = ("setup", "fire", "learner")
 """groups whose file is chosen by `GROUP=NAME`, besides the method"""
@@ -47,6 +48,7 @@ def resolve(method: str, overrides: Sequence[str] = (), **settings: Any) -> RunC
     given = [parse(text) for text in overrides]
     chosen = {"setup": "paper"} | {key: str(value) for key, value in given if key in GROUPS}
     values = _composed(str(method), chosen)
+    _drop_settings_of_other_learners(values["learner"])
     known = list(dict.fromkeys([*GROUPS, *all_keys(values)]))
     for key, value in given:
         if key in (*(f"{group}.name" for group in GROUPS), "fire.kind"):
@@ -60,7 +62,7 @@ def resolve(method: str, overrides: Sequence[str] = (), **settings: Any) -> RunC
     _put_settings(values, settings)
     _choose_seed(values, any(key == "seed" for key in [*dict(given), *settings]))
     values["baseline_comm"] = _baseline_comm(chosen["setup"])
-    config = from_values(values)
+    config = with_all_settings(from_values(values))
     return replace(config, fire=fires_of(config.fire).with_checksum())
 
 
@@ -198,6 +200,24 @@ def _baseline_comm(setup: str) -> dict[str, Any]:
         method: _interpolated(_composed(method, {"setup": setup}))["comm"]
         for method in sorted(methods)
     }
+
+
+def _drop_settings_of_other_learners(learner: dict[str, Any]) -> None:
+    """Removes the settings that a setup gives to another learner, such as `critic_lr` for DDPG.
+
+    A setting that no learner has stays, and is an error later.
+    """
+
+    def settings(name: str) -> set[str]:
+        return {field.name for field in fields(learners.find(name).config_type)}
+
+    if learner.get("name") not in learners.known():
+        return
+    foreign = learner.keys() - settings(learner["name"])
+    if foreign:
+        others = set().union(*map(settings, learners.known()))
+        for name in foreign & others:
+            del learner[name]
 
 
 def _choose_seed(values: dict[str, Any], seed_is_given: bool) -> None:

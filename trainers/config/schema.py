@@ -1,6 +1,7 @@
 """Defines the schema of a run's configuration."""
 
-from dataclasses import asdict
+from collections.abc import Mapping
+from dataclasses import asdict, replace
 from typing import Annotated, Any, Literal
 
 from pydantic import ConfigDict, Field, PlainValidator, SerializeAsAny, Strict, field_validator
@@ -125,6 +126,30 @@ def build_comm(config: RunConfig, num_envs: int) -> CommModule:
     """Returns a new communication module for `num_envs` environments."""
     settings = {key: value for key, value in config.comm.items() if key != "name"}
     return registry.build(config.comm["name"], config.env, settings, num_envs)
+
+
+def with_all_settings(config: RunConfig) -> RunConfig:
+    """Returns a configuration in which communication settings left to their defaults are written.
+
+    A run folder then keeps them if a later version of the module has other defaults.
+    """
+    comm = _filled(config.comm, comm_settings(config))
+    baseline_comm = {
+        method: _filled(values, asdict(choice.settings("comm", values, registry)))
+        for method, values in config.baseline_comm.items()
+    }
+    return replace(config, comm=comm, baseline_comm=baseline_comm)
+
+
+def _filled(given: Mapping[str, Any], complete: Mapping[str, Any]) -> dict[str, Any]:
+    """Returns the given settings, followed by those of `complete` that are missing."""
+    filled = dict(given)
+    for key, value in complete.items():
+        if isinstance(value, Mapping) and isinstance(given.get(key), Mapping):
+            filled[key] = _filled(given[key], value)
+        else:
+            filled.setdefault(key, value)
+    return filled
 
 
 def comm_settings(config: RunConfig) -> dict[str, Any]:

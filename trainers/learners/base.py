@@ -13,8 +13,9 @@ from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import Tensor
 from torchrl.data import Composite
 
+from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import Name
-from emberlink.policies.networks import Generators, make_actor
+from emberlink.policies.networks import Generators, make_actor, team_of
 from emberlink.trainers.learners.nan_guard import NonFiniteGuard
 
 STRICT = ConfigDict(extra="forbid", strict=True)
@@ -110,6 +111,22 @@ class Learner(ABC):
             share_parameters=config.share_parameters,
             generator=generator,
         )
+
+    def team_actor(self, team: int, teams: int) -> TensorDictModule:
+        """Returns the actors of one of several seeds without noise; they share memory with `actor`.
+
+        A learner with networks that `make_actor` does not make overrides it to train several seeds
+        in parallel.
+
+        Raises:
+            UserError: the networks of a seed cannot be told apart.
+        """
+        if teams > 1 and not hasattr(self.actor.module, "grouping"):
+            raise UserError(
+                f"seeds: {type(self).__name__} trains one seed at a time; its networks are not "
+                "those of make_actor, and it has no team_actor of its own"
+            )
+        return team_of(self.actor, team, teams)
 
     @abstractmethod
     def learn(self, rollout: TensorDictBase) -> list[Losses]:

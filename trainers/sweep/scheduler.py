@@ -164,5 +164,7 @@ class Scheduler:
 
 
 def _last_line(log: Path) -> str:
+    if not log.is_file():  # an executor may fail before its task writes
+        return "there is no log"
     lines = [line.strip() for line in log.read_text(errors="replace").splitlines()]
     return next((line for line in reversed(lines) if line), "the log is empty")

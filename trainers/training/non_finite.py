@@ -155,7 +155,7 @@ def error_of(setup: TrainingSetup, run: RunFolder) -> NonFiniteError:
         dump = _write(setup, run, report)
     except (OSError, UserError) as error:
         return NonFiniteError(f"{report}; its dump cannot be written: {error}", report, None)
-    return NonFiniteError(f"{report}; what reproduces it is in {dump}", report, dump)
+    return NonFiniteError(f"{report}; {dump} reproduces it", report, dump)
 
 
 def _write(setup: TrainingSetup, run: RunFolder, report: NonFiniteReport) -> Path:

@@ -121,5 +121,7 @@ def _restore(trainer: Trainer, runs: Sequence[RunFolder], chosen: Path | None) -
         hint = f"; the one before it: emberlink train resume={older[-1]}" if older else ""
         raise UserError(f"{error}{hint}") from None
     if len(runs) > 1 and state.folders != [run.path.name for run in runs]:
-        raise UserError(f"{path}: of the folders {shown(', '.join(state.folders))}")
+        raise UserError(
+            f"{path}: was saved for other run folders: {shown(', '.join(state.folders))}"
+        )
     return state.sizes

@@ -10,7 +10,6 @@ from torch import Tensor
 
 from emberlink.envs import keys
 from emberlink.envs.utils.errors import UserError
-from emberlink.policies.networks import team_of
 from emberlink.trainers.build import build_env, build_learner
 from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.learners.nan_guard import NonFiniteGuard
@@ -51,6 +50,7 @@ class TrainingSetup:
         )
         self.guard = NonFiniteGuard(config.device)
         self.learner = build_learner(config, self.env, self.guard)
+        self.team_actor(0)  # fails before the training, not at its first evaluation
         if self.horizon % self.learner.rollout_steps:
             raise UserError(
                 f"env.horizon={self.horizon}: must be a multiple of the "
@@ -91,7 +91,7 @@ class TrainingSetup:
 
     def team_actor(self, team: int) -> TensorDictModule:
         """Returns the actors of one seed without noise; they share memory with the learner."""
-        return team_of(self.learner.actor, team, self.teams)
+        return self.learner.team_actor(team, self.teams)
 
     def state_dict(self) -> dict[str, Tensor]:
         """Returns the state of the training, "group/name" -> tensor.
