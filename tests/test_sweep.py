@@ -16,7 +16,7 @@ from rich.console import Console
 from emberlink.trainers.cli.main import main
 from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.runs.run_folder import RunFolder
-from emberlink.trainers.sweep import claims, executors
+from emberlink.trainers.sweep import claims, executors, scheduler
 from emberlink.trainers.sweep.command import sweep
 from emberlink.trainers.sweep.jobs import identity, jobs_of
 
@@ -406,3 +406,10 @@ def test_a_resumed_sweep_equals_an_uninterrupted_one(tmp_path):
     (run,), (unbroken,) = runs_in(broken), runs_in(whole)
     for file in ("metrics.jsonl", "eval.json"):
         assert (run.path / file).read_bytes() == (unbroken.path / file).read_bytes()
+
+
+def test_a_task_that_failed_before_its_log_is_reported(tmp_path):
+    log = tmp_path / "log.txt"
+    assert scheduler._last_line(log) == "there is no log"
+    log.write_text("first\nlast\n\n")
+    assert scheduler._last_line(log) == "last"
