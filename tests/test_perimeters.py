@@ -11,7 +11,9 @@ import torch
 from fire_files import CORNER, KINDS, UTM, Ellipses, frame_of, raster_of, write_asc
 
 from emberlink.envs.fire_files.config import FileFireConfig
+from emberlink.envs.fire_files.perimeter_times import _time_of_day
 from emberlink.envs.fire_files.reader import read_fires
+from emberlink.envs.utils.errors import UserError
 
 GRID, HORIZON = (30, 30), 1000
 HOURS = (60.0, 120.0, 180.0, 240.0, 300.0)
@@ -304,6 +306,41 @@ def test_geomacs_date_and_time(tmp_path, times):
     frame.to_file(tmp_path / "wrong.shp")
     with pytest.raises(ValueError, match=r"feature 1 has DATE_=.*TIME_=2365; expected a date and"):
         read(tmp_path / "wrong.shp")
+
+
+@pytest.mark.parametrize(
+    "times",
+    [
+        ["1:55:00", "2:55:00", "3:55:00"],
+        ["01:55", "02:55:00", "355"],
+        ["12:05 AM", "01:05AM", "2:05 AM"],
+        ["11:05 AM", "12:05 PM", "1:05:00 PM"],
+        ["9:55 PM", "10:55 PM", "11:55 PM"],
+    ],
+)
+def test_forms_of_the_time_of_day(tmp_path, times):
+    squares(200, 300, 400, column="Elapsed_Mi", values=[0, 60, 120]).to_file(tmp_path / "e.shp")
+    frame = squares(200, 300, 400, column="DATE_", values=["2020-08-19"] * 3)
+    frame["TIME_"] = times
+    frame.to_file(tmp_path / "fire.shp")
+    assert torch.equal(read(tmp_path / "fire.shp"), read(tmp_path / "e.shp"))
+
+
+def test_the_hour_of_a_time_of_day():
+    hours = {
+        "12:05 AM": 5,
+        "11:55 PM": 1435,
+        "12:00 PM": 720,
+        "1:55:00": 115,
+        "155.0": 115,
+        "23": 23,
+    }
+    for text, minutes in hours.items():
+        assert _time_of_day(text) == datetime.timedelta(minutes=minutes)
+    wrong = ["24:00", "2400", "1:60", "0:00 AM", "13:00 PM", "1:5", "23000", "1.5", "-100"]
+    for text in [*wrong, "", "nan", "1:55:60", "1:55 XM", "2::3"]:
+        with pytest.raises(UserError, match="is not a time of day"):
+            _time_of_day(text)
 
 
 def test_columns_that_may_both_hold_the_times_are_named(tmp_path):

@@ -1,5 +1,6 @@
 """Reads the times of perimeters: calendar times as text, and columns of a table."""
 
+import re
 from collections.abc import Sequence
 from datetime import UTC, datetime, timedelta
 from email.utils import parsedate_to_datetime
@@ -38,6 +39,8 @@ _MAX_LENGTH = 40
 _DIGITS = {8: "%Y%m%d", 12: "%Y%m%d%H%M", 14: "%Y%m%d%H%M%S"}
 _AMERICAN = ("%m-%d-%Y", "%m-%d-%Y %H:%M", "%m-%d-%Y %H:%M:%S")
 _AMERICAN += ("%m-%d-%Y %I:%M %p", "%m-%d-%Y %I:%M:%S %p")
+_HHMM = re.compile(r"[0-9]{1,4}(\.0)?")
+_CLOCK = re.compile(r"([0-9]{1,2}):([0-9]{2})(?::([0-9]{2}))?(?: ?(AM|PM))?")
 
 
 def perimeter_times(frame: Any, wanted: str | None, unit: Units | None) -> tuple[np.ndarray, Clock]:
@@ -214,7 +217,7 @@ def _calendar(
 
 
 def _geomac(frame: Any, date_name: str, time_name: str) -> tuple[np.ndarray, Clock]:
-    """Joins GeoMAC's columns: a date, and the time of day as 2300, 155 or 23:00."""
+    """Joins GeoMAC's columns: a date, and the time of day."""
     dates: list[datetime] = []
     rows = zip(frame.index, frame[date_name], frame[time_name], strict=True)
     for feature, date, time in rows:
@@ -224,13 +227,24 @@ def _geomac(frame: Any, date_name: str, time_name: str) -> tuple[np.ndarray, Clo
         except UserError:
             raise UserError(
                 f"{feature} has {date_name}={str(date)[:40]}, {time_name}={str(time)[:40]}; "
-                "expected a date and a time such as 2300"
+                "expected a date and a time such as 2300, 23:00 or 11:00 PM"
             ) from None
     return _calendar(dates, f"{date_name}, {time_name}", frame.index)
 
 
 def _time_of_day(text: str) -> timedelta:
-    digits = text.strip().removesuffix(".0").replace(":", "").zfill(4)[:4]
-    if not digits.isdecimal() or int(digits[:2]) > 24 or int(digits[2:]) > 59:
+    """Reads 2300, 155 or 155.0 (HHMM), 23:00, 1:55:00, or 11:55 PM."""
+    text = text.strip()
+    if _HHMM.fullmatch(text):
+        number = int(text.removesuffix(".0"))
+        hour, minute, second, half = number // 100, number % 100, 0, None
+    elif match := _CLOCK.fullmatch(text):
+        hour, minute, second = (int(part or 0) for part in match.groups()[:3])
+        half = match[4]
+    else:
+        raise UserError(f"{text[:40]!r} is not a time of day")
+    if minute > 59 or second > 59 or not (1 <= hour <= 12 if half else hour <= 23):
         raise UserError(f"{text!r} is not a time of day")
-    return timedelta(hours=int(digits[:2]), minutes=int(digits[2:]))
+    if half:
+        hour = hour % 12 + (12 if half == "PM" else 0)
+    return timedelta(hours=hour, minutes=minute, seconds=second)

@@ -31,7 +31,7 @@ from emberlink.envs.utils.atomic_io import read_sealed, write_sealed
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import printable
 
-READER_VERSION = 4  # increase it if the same file gives another grid
+READER_VERSION = 5  # increase it if the same file gives another grid
 MAX_BEGINNINGS = 10
 """Places at which a raster's fire may begin without a warning."""
 COPY_FILE = "fires.npz"
