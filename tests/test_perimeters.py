@@ -343,6 +343,27 @@ def test_the_hour_of_a_time_of_day():
             _time_of_day(text)
 
 
+def test_date_and_time_beside_other_columns(tmp_path):
+    squares(200, 300, 400, column="Elapsed_Mi", values=[0, 60, 120]).to_file(tmp_path / "e.shp")
+    expected = read(tmp_path / "e.shp")
+    frame = squares(200, 300, 400, column="DATE_", values=["2020-08-19"] * 3)
+    frame["TIME_"] = ["1000", "1100", "1200"]
+    frame.to_file(tmp_path / "both.gpkg")
+    assert torch.equal(read(tmp_path / "both.gpkg", time_field="date_"), expected)
+    frame["date"] = ["2020-08-19", "2020-08-20", "2020-08-25"]
+    frame.to_file(tmp_path / "date.gpkg")
+    with pytest.raises(ValueError, match=r"DATE_, date may hold .* fire\.time_field=DATE_"):
+        read(tmp_path / "date.gpkg")
+    del frame["date"]
+    frame["perDatTime"] = [None] * 3
+    frame.to_file(tmp_path / "empty.gpkg")
+    assert torch.equal(read(tmp_path / "empty.gpkg"), expected)
+    frame["TIME_"] = ["1000", "1005", "1006"]
+    frame["perDatTime"] = [d.isoformat() for d in DATED]
+    frame.to_file(tmp_path / "whole.gpkg")
+    assert torch.equal(read(tmp_path / "whole.gpkg"), expected)
+
+
 def test_columns_that_may_both_hold_the_times_are_named(tmp_path):
     frame = squares(200, 300, 400, column="date", values=[d.isoformat() for d in DATED])
     frame["timestamp"] = ["2020-08-19", "2020-09-19", "2020-10-19"]

@@ -29,8 +29,10 @@ CALENDAR = (
     *("date_", "date", "time", "t", "begin"),
 )
 """Columns of the time at which a perimeter was mapped, in lower case."""
+_WHOLE = CALENDAR[: CALENDAR.index("acq_date")]  # with a date and a time of day
 EDITED = ("poly_datecurrent", "datecurrent")
 """Columns of the time at which a record was changed, for perimeters without another time."""
+_DATES = ("acq_date", "date", "time", "t", "begin")  # columns that may hold a date alone
 _DBF_LENGTH = 10  # maximum length of a column's name in a .dbf
 _MIN_MS = 1e11  # a number from here on is a date: milliseconds since 1970, or digits
 _CENTURIES = ("19", "20")  # the first digits of a year
@@ -62,11 +64,18 @@ def perimeter_times(frame: Any, wanted: str | None, unit: Units | None) -> tuple
     if wanted is not None:
         if wanted.lower() not in names:
             raise UserError(f"no column {wanted!r} (fire.time_field); there are {known}")
+        if wanted.lower() == "date_" and "time_" in names:
+            return _geomac(frame, names["date_"], names["time_"])
         return _of_column(frame[names[wanted.lower()]], unit)
     edited = known_columns(names, EDITED)
     columns = known_columns(names, tuple(ELAPSED)) or known_columns(names, CALENDAR) or edited
-    if "time_" in names and columns == [names.get("date_")]:
-        return _geomac(frame, columns[0], names["time_"])
+    if "time_" in names and names.get("date_") in columns:
+        whole = [name for name in known_columns(names, _WHOLE) if frame[name].notna().any()]
+        # The suggested column comes first. A date alone would lose the time of day.
+        date = [] if whole else [names["date_"]]
+        columns = [*whole, *date, *(name for name in columns if name.lower() in _DATES)]
+        if columns == date:
+            return _geomac(frame, names["date_"], names["time_"])
     if len(columns) > 1:
         raise UserError(
             f"the columns {', '.join(columns)} may hold the times; expected fire.time_field, such "
