@@ -1,6 +1,7 @@
 """Tests perimeters in every format, and compares them with the raster of the same fire."""
 
 import datetime
+import zipfile
 
 import geopandas
 import numpy as np
@@ -362,6 +363,30 @@ def test_date_and_time_beside_other_columns(tmp_path):
     frame["perDatTime"] = [d.isoformat() for d in DATED]
     frame.to_file(tmp_path / "whole.gpkg")
     assert torch.equal(read(tmp_path / "whole.gpkg"), expected)
+
+
+def test_a_kmz_holds_one_kml_in_lower_or_upper_case(tmp_path):
+    ring = "<outerBoundaryIs><LinearRing><coordinates>{}</coordinates></LinearRing>"
+    marks = ""
+    for k in (1, 2):
+        at = [(-117 + x * k / 100, 36 + y * k / 100) for x, y in ((0, 0), (1, 0), (1, 1), (0, 0))]
+        text = ring.format(" ".join(f"{x},{y}" for x, y in at)) + "</outerBoundaryIs>"
+        when = f"<TimeStamp><when>2020-08-19T1{k}:00:00Z</when></TimeStamp>"
+        marks += f"<Placemark>{when}<Polygon>{text}</Polygon></Placemark>"
+    text = f'<kml xmlns="http://www.opengis.net/kml/2.2"><Document>{marks}</Document></kml>'
+    fires = []
+    for number, names in enumerate((["doc.kml"], ["DOC.KML"], ["a/b.Kml"], ["a.kml", "B.KML"])):
+        path = tmp_path / f"{number}.kmz"
+        with zipfile.ZipFile(path, "w") as archive:
+            for name in names:
+                archive.writestr(name, text)
+        if len(names) == 1:
+            fires.append(read(path))
+            continue
+        with pytest.raises(ValueError, match=r"2 \.kml: a\.kml, B\.KML; expected one$"):
+            read(path)
+    assert torch.equal(fires[1], fires[0])
+    assert torch.equal(fires[2], fires[0])
 
 
 def test_columns_that_may_both_hold_the_times_are_named(tmp_path):

@@ -16,6 +16,7 @@ from emberlink.envs.fire_files.formats import (
     find_format,
     perimeter_files,
 )
+from emberlink.envs.fire_files.kmz import for_gdal
 from emberlink.envs.fire_files.perimeter_areas import area_at_zero, enclosed, make_valid, polygons
 from emberlink.envs.fire_files.perimeter_times import known_columns, perimeter_times
 from emberlink.envs.fire_files.projection import (
@@ -95,17 +96,13 @@ def _read_table(path: Path, layer: str | None) -> Any:
     suffix = path.suffix.lower()
     is_json, is_kml = suffix in GEOJSON.suffixes, suffix in (*KML.suffixes, *KMZ.suffixes)
     # Dates in GeoJSON as text, because GDAL loses zones that differ.
-    options = {"DATE_AS_STRING": "YES"} if is_json else {}
+    options: dict[str, Any] = {"DATE_AS_STRING": "YES"} if is_json else {}
     try:
-        layers = _choose_layers(pyogrio.list_layers(path.absolute()), layer, several=is_kml)
-        frame = _join(
-            [
-                pyogrio.read_dataframe(
-                    path.absolute(), layer=name, datetime_as_string=True, **options
-                )
-                for name in layers
-            ]
-        ).reset_index(drop=True)
+        with for_gdal(path) as source:
+            layers = _choose_layers(pyogrio.list_layers(source), layer, several=is_kml)
+            options["datetime_as_string"] = True
+            parts = [pyogrio.read_dataframe(source, layer=name, **options) for name in layers]
+        frame = _join(parts).reset_index(drop=True)
     except UserError:
         raise
     except Exception as error:  # GDAL, text and geometries raise many types
