@@ -389,6 +389,19 @@ def test_a_kmz_holds_one_kml_in_lower_or_upper_case(tmp_path):
     assert torch.equal(fires[2], fires[0])
 
 
+@pytest.mark.parametrize("column", ["FireName", "fire_nm", "FIRE_NAME"])
+def test_an_empty_column_of_incidents_is_skipped(tmp_path, column):
+    frame = squares(200, 300, 400, column="Elapsed_Mi", values=[0, 60, 90])
+    frame.iloc[:2].to_file(tmp_path / "two.gpkg")
+    frame["poly_IncidentName"] = [None] * 3
+    frame[column] = ["Creek", "Creek", "August"]
+    frame.to_file(tmp_path / "fire.gpkg")
+    with pytest.raises(ValueError, match="2 incidents: August, Creek"):
+        read(tmp_path / "fire.gpkg")
+    chosen = read(tmp_path / "fire.gpkg", incident="Creek")
+    assert torch.equal(chosen, read(tmp_path / "two.gpkg"))
+
+
 def test_columns_that_may_both_hold_the_times_are_named(tmp_path):
     frame = squares(200, 300, 400, column="date", values=[d.isoformat() for d in DATED])
     frame["timestamp"] = ["2020-08-19", "2020-09-19", "2020-10-19"]

@@ -299,6 +299,13 @@ def test_a_projection_file_of_an_asc(tmp_path):
     assert torch.isfinite(read(degrees, margin=0.1)).any()
 
 
+@pytest.mark.parametrize("write", [write_asc, write_tif])
+def test_an_incident_of_a_raster_is_refused(tmp_path, write):
+    path = write(tmp_path / f"fire.{write.__name__[6:]}", corner([[0, 5], [2, 4]], 2, 2))
+    with pytest.raises(ValueError, match=r"fire\.incident=Creek chooses among perimeters; .*$"):
+        read(path, incident="Creek")
+
+
 def test_the_largest_integer_is_no_time(tmp_path):
     for kind in ("uint16", "uint32", "int32", "int16"):
         never = np.iinfo(kind).max

@@ -32,6 +32,7 @@ from emberlink.envs.utils.validation import unknown
 
 MAX_TIMES = 500
 _INCIDENTS = ("poly_incidentname", "attr_incidentname", "incidentname", "incident", "fire_name")
+_INCIDENTS += ("firename", "fire_nm")
 _SHRUNK = 0.75  # minimum share of the burnt area that a perimeter inside it has
 _INSIDE = 0.99  # share of a perimeter inside the burnt area, from which it counts as inside
 
@@ -140,7 +141,8 @@ def _choose_layers(layers: Sequence[Any], wanted: str | None, *, several: bool) 
 
 def _choose_incident(frame: Any, wanted: str | None) -> Any:
     """Returns the features of the incident `wanted`, or of the only incident."""
-    columns = known_columns({str(name).lower(): str(name) for name in frame.columns}, _INCIDENTS)
+    known = known_columns({str(name).lower(): str(name) for name in frame.columns}, _INCIDENTS)
+    columns = [name for name in known if frame[name].notna().any()]
     if wanted == "*" or not (columns or wanted):
         return frame
     if not columns:
@@ -150,10 +152,10 @@ def _choose_incident(frame: Any, wanted: str | None) -> Any:
     if wanted is None and len(names) < 2:
         return frame
     if wanted is None:
-        known = sorted(names.values())
+        several = sorted(names.values())
         raise UserError(
-            f"perimeters of {len(known)} incidents: {', '.join(known[:30])}; expected "
-            f"fire.incident, such as fire.incident={known[0]}, or * for all as one fire"
+            f"perimeters of {len(several)} incidents: {', '.join(several[:30])}; expected "
+            f"fire.incident, such as fire.incident={several[0]}, or * for all as one fire"
         )
     if wanted.casefold() not in names:
         raise UserError(f"fire.incident={unknown(wanted, sorted(names.values()))}")
