@@ -16,6 +16,7 @@ from typing import Any
 from xml.parsers import expat
 
 from emberlink.envs.fire_files.kmz import kml_part
+from emberlink.envs.fire_files.sidecars import check_sidecars
 from emberlink.envs.utils.errors import UserError
 
 MAX_BYTES = 300_000_000
@@ -180,6 +181,7 @@ def find_format(path: Path) -> Format:
     candidates = FORMATS if not named or POINTS in named else named
     for candidate in candidates:
         if candidate.head.match(head):
+            check_sidecars(path)
             candidate.check(path)
             return candidate
     start = head[:16].decode("latin-1").encode("unicode_escape").decode()
