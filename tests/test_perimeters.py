@@ -1,6 +1,7 @@
 """Tests perimeters in every format, and compares them with the raster of the same fire."""
 
 import datetime
+import zipfile
 
 import geopandas
 import numpy as np
@@ -11,7 +12,9 @@ import torch
 from fire_files import CORNER, KINDS, UTM, Ellipses, frame_of, raster_of, write_asc
 
 from emberlink.envs.fire_files.config import FileFireConfig
+from emberlink.envs.fire_files.perimeter_times import _time_of_day
 from emberlink.envs.fire_files.reader import read_fires
+from emberlink.envs.utils.errors import UserError
 
 GRID, HORIZON = (30, 30), 1000
 HOURS = (60.0, 120.0, 180.0, 240.0, 300.0)
@@ -304,6 +307,99 @@ def test_geomacs_date_and_time(tmp_path, times):
     frame.to_file(tmp_path / "wrong.shp")
     with pytest.raises(ValueError, match=r"feature 1 has DATE_=.*TIME_=2365; expected a date and"):
         read(tmp_path / "wrong.shp")
+
+
+@pytest.mark.parametrize(
+    "times",
+    [
+        ["1:55:00", "2:55:00", "3:55:00"],
+        ["01:55", "02:55:00", "355"],
+        ["12:05 AM", "01:05AM", "2:05 AM"],
+        ["11:05 AM", "12:05 PM", "1:05:00 PM"],
+        ["9:55 PM", "10:55 PM", "11:55 PM"],
+    ],
+)
+def test_forms_of_the_time_of_day(tmp_path, times):
+    squares(200, 300, 400, column="Elapsed_Mi", values=[0, 60, 120]).to_file(tmp_path / "e.shp")
+    frame = squares(200, 300, 400, column="DATE_", values=["2020-08-19"] * 3)
+    frame["TIME_"] = times
+    frame.to_file(tmp_path / "fire.shp")
+    assert torch.equal(read(tmp_path / "fire.shp"), read(tmp_path / "e.shp"))
+
+
+def test_the_hour_of_a_time_of_day():
+    hours = {
+        "12:05 AM": 5,
+        "11:55 PM": 1435,
+        "12:00 PM": 720,
+        "1:55:00": 115,
+        "155.0": 115,
+        "23": 23,
+    }
+    for text, minutes in hours.items():
+        assert _time_of_day(text) == datetime.timedelta(minutes=minutes)
+    wrong = ["24:00", "2400", "1:60", "0:00 AM", "13:00 PM", "1:5", "23000", "1.5", "-100"]
+    for text in [*wrong, "", "nan", "1:55:60", "1:55 XM", "2::3"]:
+        with pytest.raises(UserError, match="is not a time of day"):
+            _time_of_day(text)
+
+
+def test_date_and_time_beside_other_columns(tmp_path):
+    squares(200, 300, 400, column="Elapsed_Mi", values=[0, 60, 120]).to_file(tmp_path / "e.shp")
+    expected = read(tmp_path / "e.shp")
+    frame = squares(200, 300, 400, column="DATE_", values=["2020-08-19"] * 3)
+    frame["TIME_"] = ["1000", "1100", "1200"]
+    frame.to_file(tmp_path / "both.gpkg")
+    assert torch.equal(read(tmp_path / "both.gpkg", time_field="date_"), expected)
+    frame["date"] = ["2020-08-19", "2020-08-20", "2020-08-25"]
+    frame.to_file(tmp_path / "date.gpkg")
+    with pytest.raises(ValueError, match=r"DATE_, date may hold .* fire\.time_field=DATE_"):
+        read(tmp_path / "date.gpkg")
+    del frame["date"]
+    frame["perDatTime"] = [None] * 3
+    frame.to_file(tmp_path / "empty.gpkg")
+    assert torch.equal(read(tmp_path / "empty.gpkg"), expected)
+    frame["TIME_"] = ["1000", "1005", "1006"]
+    frame["perDatTime"] = [d.isoformat() for d in DATED]
+    frame.to_file(tmp_path / "whole.gpkg")
+    assert torch.equal(read(tmp_path / "whole.gpkg"), expected)
+
+
+def test_a_kmz_holds_one_kml_in_lower_or_upper_case(tmp_path):
+    ring = "<outerBoundaryIs><LinearRing><coordinates>{}</coordinates></LinearRing>"
+    marks = ""
+    for k in (1, 2):
+        at = [(-117 + x * k / 100, 36 + y * k / 100) for x, y in ((0, 0), (1, 0), (1, 1), (0, 0))]
+        text = ring.format(" ".join(f"{x},{y}" for x, y in at)) + "</outerBoundaryIs>"
+        when = f"<TimeStamp><when>2020-08-19T1{k}:00:00Z</when></TimeStamp>"
+        marks += f"<Placemark>{when}<Polygon>{text}</Polygon></Placemark>"
+    text = f'<kml xmlns="http://www.opengis.net/kml/2.2"><Document>{marks}</Document></kml>'
+    fires = []
+    for number, names in enumerate((["doc.kml"], ["DOC.KML"], ["a/b.Kml"], ["a.kml", "B.KML"])):
+        path = tmp_path / f"{number}.kmz"
+        with zipfile.ZipFile(path, "w") as archive:
+            for name in names:
+                archive.writestr(name, text)
+        if len(names) == 1:
+            fires.append(read(path))
+            continue
+        with pytest.raises(ValueError, match=r"2 \.kml: a\.kml, B\.KML; expected one$"):
+            read(path)
+    assert torch.equal(fires[1], fires[0])
+    assert torch.equal(fires[2], fires[0])
+
+
+@pytest.mark.parametrize("column", ["FireName", "fire_nm", "FIRE_NAME"])
+def test_an_empty_column_of_incidents_is_skipped(tmp_path, column):
+    frame = squares(200, 300, 400, column="Elapsed_Mi", values=[0, 60, 90])
+    frame.iloc[:2].to_file(tmp_path / "two.gpkg")
+    frame["poly_IncidentName"] = [None] * 3
+    frame[column] = ["Creek", "Creek", "August"]
+    frame.to_file(tmp_path / "fire.gpkg")
+    with pytest.raises(ValueError, match="2 incidents: August, Creek"):
+        read(tmp_path / "fire.gpkg")
+    chosen = read(tmp_path / "fire.gpkg", incident="Creek")
+    assert torch.equal(chosen, read(tmp_path / "two.gpkg"))
 
 
 def test_columns_that_may_both_hold_the_times_are_named(tmp_path):

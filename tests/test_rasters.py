@@ -1,6 +1,7 @@
 """Tests rasters of arrival times against hand-computed numbers and a loop over cells."""
 
 import math
+import os
 import subprocess
 import sys
 import warnings
@@ -297,6 +298,34 @@ def test_a_projection_file_of_an_asc(tmp_path):
         read(degrees)
     (tmp_path / "deg.prj").write_text(rasterio.crs.CRS.from_string("EPSG:4326").to_wkt())
     assert torch.isfinite(read(degrees, margin=0.1)).any()
+
+
+@pytest.mark.parametrize("write", [write_asc, write_tif])
+def test_an_incident_of_a_raster_is_refused(tmp_path, write):
+    path = write(tmp_path / f"fire.{write.__name__[6:]}", corner([[0, 5], [2, 4]], 2, 2))
+    with pytest.raises(ValueError, match=r"fire\.incident=Creek chooses among perimeters; .*$"):
+        read(path, incident="Creek")
+
+
+@pytest.mark.parametrize(
+    "name", ["fire.prj", "fire.PRJ", "fire.cpg", "fire.tif.aux.xml", "fire.tif.msk", "fire.tif.ovr"]
+)
+def test_no_regular_file_beside_a_raster(tmp_path, name):
+    path = write_tif(tmp_path / "fire.tif", corner([[0, 5], [2, 4]], 2, 2))
+    part = tmp_path / name
+    for make in (part.mkdir, lambda: os.mkfifo(part), lambda: part.symlink_to("none")):
+        make()
+        with pytest.raises(ValueError, match=rf"fire\.tif: {name}, beside it, is no regular file$"):
+            read(path)
+        part.rmdir() if part.is_dir() else part.unlink()
+
+
+def test_a_large_projection_file_is_refused(tmp_path):
+    path = write_asc(tmp_path / "fire.asc", corner([[0, 5], [2, 4]], 2, 2))
+    wkt = rasterio.crs.CRS.from_string(UTM).to_wkt()
+    (tmp_path / "fire.prj").write_text(wkt + " " * 1_000_000)
+    with pytest.raises(ValueError, match=r"fire\.prj, beside it: it has more than 1000000 bytes$"):
+        read(path)
 
 
 def test_the_largest_integer_is_no_time(tmp_path):

@@ -55,7 +55,7 @@ def fire_bank(
     Args:
         config, grid, horizon: as in `make_fires`.
         split, count, start: as in `fire_seeds`.
-        cache_dir: folder of the file, `cache_folder()` by default. The file begins with the
+        cache_dir: folder of the file, `cache_folder()` by default. The file ends with the
             SHA-256 of its content. A damaged file is replaced. If the folder cannot be written
             to, a warning is issued and the fires are computed each time.
 

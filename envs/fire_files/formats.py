@@ -15,6 +15,8 @@ from pathlib import Path
 from typing import Any
 from xml.parsers import expat
 
+from emberlink.envs.fire_files.kmz import kml_part
+from emberlink.envs.fire_files.sidecars import check_sidecars
 from emberlink.envs.utils.errors import UserError
 
 MAX_BYTES = 300_000_000
@@ -86,15 +88,12 @@ def _parse_kml(content: bytes) -> None:
 
 
 def _check_kmz(path: Path) -> None:
-    """Checks each .kml in an archive."""
+    """Checks the .kml in an archive."""
     try:
         with zipfile.ZipFile(path) as archive:
-            parts = [part for part in archive.infolist() if part.filename.endswith(".kml")]
-            if not parts:
-                raise UserError("the archive holds no .kml; expected KMZ")
-            _check_size(sum(part.file_size for part in parts))
-            for part in parts:
-                _parse_kml(archive.read(part))
+            part = kml_part(archive)
+            _check_size(part.file_size)
+            _parse_kml(archive.read(part))
     except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError) as error:
         raise UserError(f"{error}; expected KMZ") from None
 
@@ -182,6 +181,7 @@ def find_format(path: Path) -> Format:
     candidates = FORMATS if not named or POINTS in named else named
     for candidate in candidates:
         if candidate.head.match(head):
+            check_sidecars(path)
             candidate.check(path)
             return candidate
     start = head[:16].decode("latin-1").encode("unicode_escape").decode()

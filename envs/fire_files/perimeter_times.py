@@ -1,5 +1,6 @@
 """Reads the times of perimeters: calendar times as text, and columns of a table."""
 
+import re
 from collections.abc import Sequence
 from datetime import UTC, datetime, timedelta
 from email.utils import parsedate_to_datetime
@@ -28,8 +29,10 @@ CALENDAR = (
     *("date_", "date", "time", "t", "begin"),
 )
 """Columns of the time at which a perimeter was mapped, in lower case."""
+_WHOLE = CALENDAR[: CALENDAR.index("acq_date")]  # with a date and a time of day
 EDITED = ("poly_datecurrent", "datecurrent")
 """Columns of the time at which a record was changed, for perimeters without another time."""
+_DATES = ("acq_date", "date", "time", "t", "begin")  # columns that may hold a date alone
 _DBF_LENGTH = 10  # maximum length of a column's name in a .dbf
 _MIN_MS = 1e11  # a number from here on is a date: milliseconds since 1970, or digits
 _CENTURIES = ("19", "20")  # the first digits of a year
@@ -38,6 +41,8 @@ _MAX_LENGTH = 40
 _DIGITS = {8: "%Y%m%d", 12: "%Y%m%d%H%M", 14: "%Y%m%d%H%M%S"}
 _AMERICAN = ("%m-%d-%Y", "%m-%d-%Y %H:%M", "%m-%d-%Y %H:%M:%S")
 _AMERICAN += ("%m-%d-%Y %I:%M %p", "%m-%d-%Y %I:%M:%S %p")
+_HHMM = re.compile(r"[0-9]{1,4}(\.0)?")
+_CLOCK = re.compile(r"([0-9]{1,2}):([0-9]{2})(?::([0-9]{2}))?(?: ?(AM|PM))?")
 
 
 def perimeter_times(frame: Any, wanted: str | None, unit: Units | None) -> tuple[np.ndarray, Clock]:
@@ -59,11 +64,18 @@ def perimeter_times(frame: Any, wanted: str | None, unit: Units | None) -> tuple
     if wanted is not None:
         if wanted.lower() not in names:
             raise UserError(f"no column {wanted!r} (fire.time_field); there are {known}")
+        if wanted.lower() == "date_" and "time_" in names:
+            return _geomac(frame, names["date_"], names["time_"])
         return _of_column(frame[names[wanted.lower()]], unit)
     edited = known_columns(names, EDITED)
     columns = known_columns(names, tuple(ELAPSED)) or known_columns(names, CALENDAR) or edited
-    if "time_" in names and columns == [names.get("date_")]:
-        return _geomac(frame, columns[0], names["time_"])
+    if "time_" in names and names.get("date_") in columns:
+        whole = [name for name in known_columns(names, _WHOLE) if frame[name].notna().any()]
+        # The suggested column comes first. A date alone would lose the time of day.
+        date = [] if whole else [names["date_"]]
+        columns = [*whole, *date, *(name for name in columns if name.lower() in _DATES)]
+        if columns == date:
+            return _geomac(frame, names["date_"], names["time_"])
     if len(columns) > 1:
         raise UserError(
             f"the columns {', '.join(columns)} may hold the times; expected fire.time_field, such "
@@ -214,7 +226,7 @@ def _calendar(
 
 
 def _geomac(frame: Any, date_name: str, time_name: str) -> tuple[np.ndarray, Clock]:
-    """Joins GeoMAC's columns: a date, and the time of day as 2300, 155 or 23:00."""
+    """Joins GeoMAC's columns: a date, and the time of day."""
     dates: list[datetime] = []
     rows = zip(frame.index, frame[date_name], frame[time_name], strict=True)
     for feature, date, time in rows:
@@ -224,13 +236,24 @@ def _geomac(frame: Any, date_name: str, time_name: str) -> tuple[np.ndarray, Clo
         except UserError:
             raise UserError(
                 f"{feature} has {date_name}={str(date)[:40]}, {time_name}={str(time)[:40]}; "
-                "expected a date and a time such as 2300"
+                "expected a date and a time such as 2300, 23:00 or 11:00 PM"
             ) from None
     return _calendar(dates, f"{date_name}, {time_name}", frame.index)
 
 
 def _time_of_day(text: str) -> timedelta:
-    digits = text.strip().removesuffix(".0").replace(":", "").zfill(4)[:4]
-    if not digits.isdecimal() or int(digits[:2]) > 24 or int(digits[2:]) > 59:
+    """Reads 2300, 155 or 155.0 (HHMM), 23:00, 1:55:00, or 11:55 PM."""
+    text = text.strip()
+    if _HHMM.fullmatch(text):
+        number = int(text.removesuffix(".0"))
+        hour, minute, second, half = number // 100, number % 100, 0, None
+    elif match := _CLOCK.fullmatch(text):
+        hour, minute, second = (int(part or 0) for part in match.groups()[:3])
+        half = match[4]
+    else:
+        raise UserError(f"{text[:40]!r} is not a time of day")
+    if minute > 59 or second > 59 or not (1 <= hour <= 12 if half else hour <= 23):
         raise UserError(f"{text!r} is not a time of day")
-    return timedelta(hours=int(digits[:2]), minutes=int(digits[2:]))
+    if half:
+        hour = hour % 12 + (12 if half == "PM" else 0)
+    return timedelta(hours=hour, minutes=minute, seconds=second)

@@ -16,6 +16,7 @@ from emberlink.envs.fire_files.formats import (
     find_format,
     perimeter_files,
 )
+from emberlink.envs.fire_files.kmz import for_gdal
 from emberlink.envs.fire_files.perimeter_areas import area_at_zero, enclosed, make_valid, polygons
 from emberlink.envs.fire_files.perimeter_times import known_columns, perimeter_times
 from emberlink.envs.fire_files.projection import (
@@ -31,6 +32,7 @@ from emberlink.envs.utils.validation import unknown
 
 MAX_TIMES = 500
 _INCIDENTS = ("poly_incidentname", "attr_incidentname", "incidentname", "incident", "fire_name")
+_INCIDENTS += ("firename", "fire_nm")
 _SHRUNK = 0.75  # minimum share of the burnt area that a perimeter inside it has
 _INSIDE = 0.99  # share of a perimeter inside the burnt area, from which it counts as inside
 
@@ -95,17 +97,13 @@ def _read_table(path: Path, layer: str | None) -> Any:
     suffix = path.suffix.lower()
     is_json, is_kml = suffix in GEOJSON.suffixes, suffix in (*KML.suffixes, *KMZ.suffixes)
     # Dates in GeoJSON as text, because GDAL loses zones that differ.
-    options = {"DATE_AS_STRING": "YES"} if is_json else {}
+    options: dict[str, Any] = {"DATE_AS_STRING": "YES"} if is_json else {}
     try:
-        layers = _choose_layers(pyogrio.list_layers(path.absolute()), layer, several=is_kml)
-        frame = _join(
-            [
-                pyogrio.read_dataframe(
-                    path.absolute(), layer=name, datetime_as_string=True, **options
-                )
-                for name in layers
-            ]
-        ).reset_index(drop=True)
+        with for_gdal(path) as source:
+            layers = _choose_layers(pyogrio.list_layers(source), layer, several=is_kml)
+            options["datetime_as_string"] = True
+            parts = [pyogrio.read_dataframe(source, layer=name, **options) for name in layers]
+        frame = _join(parts).reset_index(drop=True)
     except UserError:
         raise
     except Exception as error:  # GDAL, text and geometries raise many types
@@ -143,7 +141,8 @@ def _choose_layers(layers: Sequence[Any], wanted: str | None, *, several: bool) 
 
 def _choose_incident(frame: Any, wanted: str | None) -> Any:
     """Returns the features of the incident `wanted`, or of the only incident."""
-    columns = known_columns({str(name).lower(): str(name) for name in frame.columns}, _INCIDENTS)
+    known = known_columns({str(name).lower(): str(name) for name in frame.columns}, _INCIDENTS)
+    columns = [name for name in known if frame[name].notna().any()]
     if wanted == "*" or not (columns or wanted):
         return frame
     if not columns:
@@ -153,10 +152,10 @@ def _choose_incident(frame: Any, wanted: str | None) -> Any:
     if wanted is None and len(names) < 2:
         return frame
     if wanted is None:
-        known = sorted(names.values())
+        several = sorted(names.values())
         raise UserError(
-            f"perimeters of {len(known)} incidents: {', '.join(known[:30])}; expected "
-            f"fire.incident, such as fire.incident={known[0]}, or * for all as one fire"
+            f"perimeters of {len(several)} incidents: {', '.join(several[:30])}; expected "
+            f"fire.incident, such as fire.incident={several[0]}, or * for all as one fire"
         )
     if wanted.casefold() not in names:
         raise UserError(f"fire.incident={unknown(wanted, sorted(names.values()))}")

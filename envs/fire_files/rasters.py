@@ -15,6 +15,7 @@ from emberlink.envs.fire_files.config import Clock, Units
 from emberlink.envs.fire_files.formats import beside
 from emberlink.envs.fire_files.projection import check_projection, first_line, library, projections
 from emberlink.envs.fire_files.raster_source import RasterSource, check_spreads
+from emberlink.envs.fire_files.sidecars import read_sidecar
 from emberlink.envs.utils.errors import UserError
 
 MAX_CELLS = 50_000_000
@@ -214,7 +215,9 @@ def _prj(path: Path) -> Any:
         return None
     pyproj = library("pyproj", "a projection")
     try:
-        return pyproj.CRS.from_user_input(prj.read_text(encoding="utf-8"))
+        return pyproj.CRS.from_user_input(read_sidecar(prj))
+    except UserError:
+        raise
     except (pyproj.exceptions.CRSError, ValueError):
         return check_projection(path, None)
 

@@ -31,7 +31,7 @@ from emberlink.envs.utils.atomic_io import read_sealed, write_sealed
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import printable
 
-READER_VERSION = 4  # increase it if the same file gives another grid
+READER_VERSION = 5  # increase it if the same file gives another grid
 MAX_BEGINNINGS = 10
 """Places at which a raster's fire may begin without a warning."""
 COPY_FILE = "fires.npz"
@@ -87,6 +87,11 @@ def _read(
 ) -> tuple[list[np.ndarray], str, bool]:
     """Returns the fires in a file, [X, Y] each, a summary, and whether it looks doubtful."""
     kind = None if path.is_dir() else formats.find_format(path)
+    if config.incident is not None and kind is not None and kind not in formats.PERIMETERS:
+        raise UserError(
+            f"fire.incident={config.incident} chooses among perimeters; expected none for "
+            f"{kind.name}"
+        )
     bank = None
     if kind is formats.NUMPY:
         bank = read_numpy_bank(path)
