@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 from xml.parsers import expat
 
-from emberlink.envs.fire_files.kmz import kml_part
+from emberlink.envs.fire_files.kmz import kml_parts
 from emberlink.envs.fire_files.sidecars import check_sidecars
 from emberlink.envs.utils.errors import UserError
 
@@ -88,12 +88,12 @@ def _parse_kml(content: bytes) -> None:
 
 
 def _check_kmz(path: Path) -> None:
-    """Checks the .kml in an archive."""
+    """Checks each .kml in an archive."""
     try:
         with zipfile.ZipFile(path) as archive:
-            part = kml_part(archive)
-            _check_size(part.file_size)
-            _parse_kml(archive.read(part))
+            for part in kml_parts(archive):
+                _check_size(part.file_size)
+                _parse_kml(archive.read(part))
     except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError) as error:
         raise UserError(f"{error}; expected KMZ") from None
 

@@ -11,20 +11,23 @@ from emberlink.envs.utils.errors import UserError
 _MAX_NAMES = 5
 
 
-def kml_part(archive: zipfile.ZipFile) -> zipfile.ZipInfo:
-    """Returns the only .kml in an archive, in lower or upper case.
+def kml_parts(archive: zipfile.ZipFile) -> list[zipfile.ZipInfo]:
+    """Returns the .kml files in an archive, in lower or upper case, the main one first.
+
+    The main one is not in a folder; it may link to those in folders, such as `layers/fire.kml`.
 
     Raises:
-        UserError: there is none, or there are several.
+        UserError: there is none, or several could be the main one.
     """
     parts = [part for part in archive.infolist() if part.filename.lower().endswith(".kml")]
     if not parts:
         raise UserError("the archive holds no .kml; expected KMZ")
-    if len(parts) > 1:
-        names = ", ".join(part.filename[-60:] for part in parts[:_MAX_NAMES])
-        more = ", ..." if len(parts) > _MAX_NAMES else ""
-        raise UserError(f"the archive holds {len(parts)} .kml: {names}{more}; expected one")
-    return parts[0]
+    main = [part for part in parts if "/" not in part.filename] or parts
+    if len(main) > 1:
+        names = ", ".join(part.filename[-60:] for part in main[:_MAX_NAMES])
+        more = ", ..." if len(main) > _MAX_NAMES else ""
+        raise UserError(f"the archive holds {len(main)} .kml: {names}{more}; expected one")
+    return [*main, *(part for part in parts if part is not main[0])]
 
 
 @contextmanager
@@ -32,7 +35,7 @@ def for_gdal(path: Path) -> Iterator[Path]:
     """Yields the path of a file, or of a copy of the KML if GDAL would not find it in a KMZ."""
     if path.suffix.lower() == ".kmz":
         with zipfile.ZipFile(path) as archive:
-            part = kml_part(archive)
+            part = kml_parts(archive)[0]
             if not part.filename.endswith(".kml"):
                 with tempfile.TemporaryDirectory() as folder:
                     copy = Path(folder, f"{path.stem}.kml")
