@@ -1,13 +1,17 @@
 """Fixtures for all tests."""
 
 import io
+import random
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from matplotlib.figure import Figure
 from PIL import Image
 from tiny_run import train_tiny
+
+from emberlink.envs import wildfire
 
 
 @pytest.fixture(autouse=True, scope="session")
@@ -30,6 +34,13 @@ def _blank_figures(request, monkeypatch) -> None:
     blank = io.BytesIO()
     Image.new("RGB", (8, 8)).save(blank, "png")
     monkeypatch.setattr(Figure, "savefig", lambda _, path, **__: path.write_bytes(blank.getvalue()))
+
+
+@pytest.fixture(autouse=True)
+def _repeatable_seeds(monkeypatch) -> None:
+    """Draws the seeds of environments without a seed from a generator, the same in every run."""
+    draw = random.Random(0)
+    monkeypatch.setattr(wildfire, "secrets", SimpleNamespace(randbelow=draw.randrange))
 
 
 @pytest.fixture(scope="session")
