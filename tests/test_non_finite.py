@@ -320,8 +320,8 @@ def test_the_command_prints_one_line(tmp_path, monkeypatch, capsys):
     (run,) = tmp_path.iterdir()
     error = capsys.readouterr().err
     assert error == (
-        f"emberlink train: reward of UAV 1, seed 0, environment 1, is -inf at step 33; what "
-        f"reproduces it is in {run}/divergence_step_33; the last good checkpoint is "
+        f"emberlink train: reward of UAV 1, seed 0, environment 1, is -inf at step 33; "
+        f"{run}/divergence_step_33 reproduces it; the last good checkpoint is "
         f"{run}/checkpoints/state_000000030.safetensors, resume with: emberlink train "
         f"resume={run} on_nan=rollback\n"
     )
