@@ -54,10 +54,8 @@ def resume(path: Path, method: str | None = None, overrides: Sequence[str] = ())
         trainer.folders = folders
         if trainer.setup.step:
             trainer.saved = trainer.setup.step
+            # Also removes a checkpoint too many, if the run was killed before the removal.
             trainer.save_networks()
-            # A run that was killed between a save and the rotation has a file too many.
-            for run in runs:
-                run.rotate(config.keep_checkpoints, states=2)
     except BaseException:
         folders.close()
         raise

@@ -237,14 +237,14 @@ class Trainer:
         )
         checkpoints.write(self.run.state(setup.step), state, tensors)
         self.save_networks()
-        for run in self.runs:
-            run.rotate(self.config.keep_checkpoints, states=2)
         self.saved = setup.step
 
     def save_networks(self) -> None:
-        """Writes the networks of each seed."""
+        """Writes the networks of each seed, then removes older checkpoints."""
         for team, (config, run) in enumerate(zip(self.configs, self.runs, strict=True)):
             run.save(self.setup.learner.weights(team), config, self.setup.step)
+        for run in self.runs:
+            run.rotate(self.config.keep_checkpoints, states=2)
 
     def restore(self, path: Path, state: checkpoints.RunState, tensors: dict[str, Tensor]) -> None:
         """Restores a new setup from a training state.
