@@ -12,7 +12,7 @@ from emberlink.envs.fire.generator import scenarios
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import from_plain
 from emberlink.trainers.config.compose import flat, from_values, resolve, to_values
-from emberlink.trainers.config.schema import build_comm, with_all_settings
+from emberlink.trainers.config.schema import build_comm
 
 METHODS = ["independent", "shared_memory", "positional", "consensus"]
 PAPER, RELEASED = "paper", "released"
@@ -139,7 +139,7 @@ def test_defaults_of_a_communication_module_are_written_out():
     values = to_values(config)
     del values["comm"]["jitter"], values["comm"]["heading"]["circle"]
     del values["baseline_comm"]["consensus"]["loss"]
-    completed = with_all_settings(from_values(values))
+    completed = from_values(values)
     assert flat(completed.comm).keys() == flat(config.comm).keys()
     assert completed.comm["jitter"] == ConsensusConfig().jitter
     assert completed.comm["heading"]["circle"] == HeadingConfig().circle

@@ -25,7 +25,7 @@ from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import from_plain, plain, shown, unknown
 from emberlink.policies.scripted.registry import SCRIPTED
 from emberlink.trainers.config.overrides import all_keys, flat, full_key, parse, put
-from emberlink.trainers.config.schema import RunConfig, with_all_settings
+from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.learners import registry as learners
 
 GROUPS = ("setup", "fire", "learner")
@@ -62,7 +62,7 @@ def resolve(method: str, overrides: Sequence[str] = (), **settings: Any) -> RunC
     _put_settings(values, settings)
     _choose_seed(values, any(key == "seed" for key in [*dict(given), *settings]))
     values["baseline_comm"] = _baseline_comm(chosen["setup"])
-    config = with_all_settings(from_values(values))
+    config = from_values(values)
     return replace(config, fire=fires_of(config.fire).with_checksum())
 
 

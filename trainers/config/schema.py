@@ -1,7 +1,7 @@
 """Defines the schema of a run's configuration."""
 
 from collections.abc import Mapping
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from typing import Annotated, Any, Literal
 
 from pydantic import ConfigDict, Field, PlainValidator, SerializeAsAny, Strict, field_validator
@@ -110,16 +110,16 @@ class RunConfig:
 
     @field_validator("comm")
     @classmethod
-    def _check_comm(cls, value: dict[str, Any]) -> dict[str, Any]:
-        choice.settings("comm", value, registry)
-        return value
+    def _complete_comm(cls, value: dict[str, Any]) -> dict[str, Any]:
+        # A run folder keeps them if a later version of the module has other defaults.
+        return _completed("comm", value)
 
     @field_validator("baseline_comm")
     @classmethod
-    def _check_baseline_comm(cls, value: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
-        for method, comm in value.items():
-            choice.settings(f"baseline_comm.{method}", comm, registry)
-        return value
+    def _complete_baseline_comm(cls, value: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
+        return {
+            method: _completed(f"baseline_comm.{method}", comm) for method, comm in value.items()
+        }
 
 
 def build_comm(config: RunConfig, num_envs: int) -> CommModule:
@@ -128,17 +128,9 @@ def build_comm(config: RunConfig, num_envs: int) -> CommModule:
     return registry.build(config.comm["name"], config.env, settings, num_envs)
 
 
-def with_all_settings(config: RunConfig) -> RunConfig:
-    """Returns a configuration in which communication settings left to their defaults are written.
-
-    A run folder then keeps them if a later version of the module has other defaults.
-    """
-    comm = _filled(config.comm, comm_settings(config))
-    baseline_comm = {
-        method: _filled(values, asdict(choice.settings("comm", values, registry)))
-        for method, values in config.baseline_comm.items()
-    }
-    return replace(config, comm=comm, baseline_comm=baseline_comm)
+def _completed(key: str, given: dict[str, Any]) -> dict[str, Any]:
+    """Returns the settings of a communication module, followed by those left to their defaults."""
+    return _filled(given, asdict(choice.settings(key, given, registry)))
 
 
 def _filled(given: Mapping[str, Any], complete: Mapping[str, Any]) -> dict[str, Any]:
@@ -150,8 +142,3 @@ def _filled(given: Mapping[str, Any], complete: Mapping[str, Any]) -> dict[str, 
         else:
             filled.setdefault(key, value)
     return filled
-
-
-def comm_settings(config: RunConfig) -> dict[str, Any]:
-    """Returns all settings of a configuration's communication module, defaults included."""
-    return asdict(choice.settings("comm", config.comm, registry))

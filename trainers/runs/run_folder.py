@@ -16,7 +16,7 @@ from emberlink.envs.scenarios import fires_of
 from emberlink.envs.utils import atomic_io
 from emberlink.envs.utils.errors import UserError
 from emberlink.trainers.config.compose import flat, from_values, to_values
-from emberlink.trainers.config.schema import RunConfig, comm_settings
+from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.runs import compact_json
 from emberlink.trainers.runs.checkpoints import Checkpoints
 from emberlink.trainers.runs.json_lines import JsonLines
@@ -165,7 +165,7 @@ def _check_complete(values: Mapping[str, Any], config: RunConfig) -> None:
         UserError: a key is missing.
     """
     written, complete = flat(values), to_values(config)
-    world = {"env": complete["env"], "fire": complete["fire"], "comm": comm_settings(config)}
+    world = {key: complete[key] for key in ("env", "fire", "comm")}
     for key in flat(world):
         if key not in written:
             raise UserError(f"key {key!r} is missing")
