@@ -17,6 +17,7 @@ from emberlink.envs.utils.buffers import Buffers
 from emberlink.envs.utils.counter_rng import Use
 from emberlink.envs.utils.device import check_device
 from emberlink.envs.utils.errors import UserError
+from emberlink.envs.utils.validation import check_whole
 from emberlink.envs.world import motion
 from emberlink.envs.world.coverage_map import CoverageMap, Sighting
 from emberlink.envs.world.reward import view_reward
@@ -41,8 +42,9 @@ class WildfireEnv(Buffers, TeamView):
             seeding is truncated after horizon * (i + 1) / num_envs steps, rounded up.
 
     Raises:
-        UserError: an unknown scenario or device, arrival times whose shape does not fit, or a
-            number of environments that is no multiple of the number of seeds.
+        UserError: an unknown scenario or device, arrival times whose shape does not fit, seeds or a
+            number of environments that are not whole, or a number of environments that is no
+            multiple of the number of seeds.
     """
 
     _low: Tensor
@@ -67,6 +69,7 @@ class WildfireEnv(Buffers, TeamView):
         agent_done: bool = False,
         staggered: bool = False,
     ):
+        num_envs = check_whole("num_envs", num_envs)
         if num_envs < 1:
             raise UserError(f"num_envs={num_envs}: at least 1 is needed")
         check_device(str(device))

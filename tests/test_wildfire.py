@@ -11,6 +11,7 @@ from torchrl.envs import check_env_specs, step_mdp
 
 from emberlink.envs import WildfireConfig, WildfireEnv, keys
 from emberlink.envs.fire.generator import load_scenario, make_fires
+from emberlink.envs.utils.errors import UserError
 from emberlink.trainers import make_env
 
 METHODS = ("independent", "shared_memory", "positional", "consensus")
@@ -261,6 +262,11 @@ def test_other_bad_input_is_named():
             WildfireEnv(fire=nothing)
     with pytest.raises(ValueError, match="seed=-1"):
         WildfireEnv(seed=-1)
+    for number in (2.5, "x", True, torch.tensor(2.5)):
+        with pytest.raises(UserError, match=r"num_envs=.*expected a whole number"):
+            WildfireEnv(number)
+        with pytest.raises(UserError, match=r"seed=.*expected a whole number"):
+            WildfireEnv(2, seed=number)
     with pytest.raises(ValueError, match="num_envs=0"):
         WildfireEnv(0)
     for position in ([[5.0, 5, 9]], [[math.nan, 5, 2]], [[5.0, 5, 2], [5, 5, 2]]):

@@ -11,7 +11,6 @@ from torchrl.envs import TransformedEnv
 from emberlink.comm.base import Communication
 from emberlink.envs.scenarios import ScenarioConfig
 from emberlink.envs.utils.errors import UserError
-from emberlink.envs.utils.validation import shown
 from emberlink.envs.wildfire import WildfireEnv
 from emberlink.policies.networks.layers import Generators
 from emberlink.trainers.config.compose import override, resolve
@@ -48,9 +47,6 @@ def make_env(
         UserError: a method, setup or setting is not known, or a value is out of range.
     """
     check_device(str(device))
-    for name, number in (("num_envs", num_envs), ("seed", seed)):
-        if number is not None and (isinstance(number, bool) or not hasattr(number, "__index__")):
-            raise UserError(f"{name}={shown(number)}: expected a whole number")
     if isinstance(fire, Tensor) and fire.ndim in (2, 3):
         settings.setdefault("grid", list(fire.shape[-2:]))
     if "seeds" in settings:

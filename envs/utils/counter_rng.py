@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from emberlink.envs.utils.errors import UserError
+from emberlink.envs.utils.validation import check_whole
 
 _GOLDEN = -0x61C8864680B583EB  # 0x9E3779B97F4A7C15 as a signed 64-bit integer
 _MIX_A = -0x40A7B892E31B1A47  # 0xBF58476D1CE4E5B9
@@ -98,9 +99,11 @@ def check_seeds(seed: int | Sequence[int], num_envs: int) -> list[int]:
     """Returns one or several seeds as a list.
 
     Raises:
-        UserError: a seed is negative, or `num_envs` is not a multiple of the number of seeds.
+        UserError: a seed is negative or not a whole number, or `num_envs` is not a multiple of the
+            number of seeds.
     """
-    seeds = list(seed) if isinstance(seed, Sequence) else [int(seed)]
+    given = seed if isinstance(seed, Sequence) and not isinstance(seed, str) else [seed]
+    seeds = [check_whole("seed", number) for number in given]
     if min(seeds, default=-1) < 0:
         raise UserError(f"seed={seed}: expected a number of at least 0")
     if num_envs % len(seeds):

@@ -2,6 +2,7 @@
 
 import difflib
 import json
+import operator
 import reprlib
 from collections.abc import Iterable, Mapping
 from typing import Annotated, Any, TypeVar
@@ -40,6 +41,20 @@ def from_plain(config_type: type[T], values: Mapping[str, Any], key: str = "") -
         return TypeAdapter(config_type).validate_json(text)
     except ValidationError as error:
         raise UserError(describe(error, key)) from None
+
+
+def check_whole(name: str, number: Any) -> int:
+    """Returns a whole number, such as a tensor's or NumPy's, as an int.
+
+    Raises:
+        UserError: it is another number or no number; the message begins with `name`.
+    """
+    try:
+        if not isinstance(number, bool):
+            return operator.index(number)
+    except TypeError:
+        pass
+    raise UserError(f"{name}={shown(number)}: expected a whole number")
 
 
 def plain(value: Any, key: str = "", deepest: int = 16) -> Any:
