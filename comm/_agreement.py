@@ -3,6 +3,8 @@
 import torch
 from torch import Tensor
 
+from emberlink.envs.world.radio import reachable
+
 
 def known_discoverers(hears: Tensor, discovers: Tensor, *, agree: bool = True) -> Tensor:
     """Returns the discoverers that each UAV knows after the exchange, bool [..., n, n].
@@ -15,16 +17,11 @@ def known_discoverers(hears: Tensor, discovers: Tensor, *, agree: bool = True) -
         discovers: bool [..., n], whether a UAV is a discoverer.
         agree: whether non-discoverers share the discoverers that they hear.
     """
-    uavs = discovers.shape[-1]
     known = hears & discovers.unsqueeze(-2)
     if not agree:
         return known
-    # Each squaring doubles the number of hops; a path has at most n - 1 hops.
     others = ~discovers
-    identity = torch.eye(uavs, dtype=torch.bool, device=hears.device)
-    within = ((hears & others.unsqueeze(-1) & others.unsqueeze(-2)) | identity).float()
-    for _ in range((uavs - 1).bit_length()):
-        within = (within @ within).clamp_(max=1)
+    within = reachable(hears & others.unsqueeze(-1) & others.unsqueeze(-2)).float()
     return (within @ known.float()) > 0
 
 

@@ -6,14 +6,14 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
-from torchrl.data import Binary, Composite
+from torchrl.data import Binary, Composite, Unbounded
 from torchrl.envs import Transform
 
-from emberlink.comm._radio import Radio, RadioConfig
 from emberlink.envs import keys
 from emberlink.envs.config import WildfireConfig
 from emberlink.envs.utils.buffers import Buffers
 from emberlink.envs.utils.errors import UserError
+from emberlink.envs.world import radio
 
 
 class CommModule(Buffers, TensorDictModuleBase):
@@ -26,8 +26,8 @@ class CommModule(Buffers, TensorDictModuleBase):
     `forward` and `reset` write in place (`self.map.copy_(...)`). Buffers are saved with a
     checkpoint and must hold finite numbers. Constants are registered with `persistent=False`.
 
-    If `config` inherits from `RadioConfig`, or a subclass sets `radio`, the links of each step are
-    written under `keys.HEARS` before `shaping` and `forward` are called.
+    If `hears` is true, the links of each step, by the radio of the world (`env.radio`), are written
+    under `keys.HEARS` before `shaping` and `forward` are called.
 
     Args:
         world: the environment's constants.
@@ -37,11 +37,12 @@ class CommModule(Buffers, TensorDictModuleBase):
 
     config_type: ClassVar[type]
     """a pydantic dataclass: the settings under `comm` in a method's YAML file"""
+    hears: ClassVar[bool] = False
+    """whether the module reads `keys.HEARS`"""
 
     def __init__(self, world: WildfireConfig, config: Any, num_envs: int = 1):
         super().__init__()
         self.world, self.config, self.num_envs = world, config, num_envs
-        self.radio = Radio(config) if isinstance(config, RadioConfig) else None
         default: list[Any] = [keys.OBSERVATION]
         self.in_keys = getattr(self, "_in_keys", default)  # a subclass may define class attributes
         self.out_keys = getattr(self, "_out_keys", default)
@@ -70,6 +71,17 @@ class CommModule(Buffers, TensorDictModuleBase):
 
         Args:
             tensordict: the time step after the move, before `forward`.
+        """
+        return None
+
+    def bytes_sent(self, tensordict: TensorDictBase) -> Tensor | None:
+        """Returns the bytes that each UAV sends at a step, int64 [num_envs, n]; None for none.
+
+        It is called after `forward`. A message that several UAVs hear counts once. UAVs that have
+        failed, and those with a radio of range 0, send nothing, whatever is returned.
+
+        Args:
+            tensordict: the time step after `forward`.
         """
         return None
 
@@ -125,17 +137,38 @@ class Communication(Transform):
         self._listen(next_tensordict)
         bonus = self.module.shaping(next_tensordict)
         if bonus is not None:
+            if self.module.world.failures:
+                bonus = bonus.masked_fill(~next_tensordict.get(keys.ALIVE), 0.0)
             reward = next_tensordict.get(keys.REWARD) + bonus.unsqueeze(-1)
             next_tensordict.set(keys.REWARD, reward)
-        return self.module(next_tensordict)
+        return self._speak(self.module(next_tensordict))
 
     def _communicate(self, tensordict: TensorDictBase) -> TensorDictBase:
         self._listen(tensordict)
-        return self.module(tensordict)
+        return self._speak(self.module(tensordict))
 
     def _listen(self, tensordict: TensorDictBase) -> None:
-        if self.module.radio is not None:
-            tensordict.set(keys.HEARS, self.module.radio.links(tensordict))
+        """Writes the links of a step, if the module reads them."""
+        world = self.module.world
+        if self.module.hears:
+            links = radio.links(
+                world.radio,
+                tensordict.get(keys.POSITION),
+                tensordict.get(keys.RNG_KEY),
+                tensordict.get(keys.STEP),
+                alive=tensordict.get(keys.ALIVE) if world.failures else None,
+            )
+            tensordict.set(keys.HEARS, links)
+
+    def _speak(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes the bytes that the UAVs send, in a world in which they are measured."""
+        world = self.module.world
+        if world.measures == "all":
+            alive = tensordict.get(keys.ALIVE)
+            sent = self.module.bytes_sent(tensordict) if world.radio.range else None
+            sent = torch.zeros_like(alive, dtype=torch.int64) if sent is None else sent * alive
+            tensordict.set(keys.BYTES_SENT, sent)
+        return tensordict
 
     def _check_keys(self, tensordict: TensorDictBase) -> None:
         """Checks that the environment and the transforms before this one write every input key."""
@@ -148,8 +181,11 @@ class Communication(Transform):
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         spec = observation_spec.clone()
-        if self.module.radio is not None:
-            *batch, uavs = spec[keys.AGENTS].shape
+        *batch, uavs = spec[keys.AGENTS].shape
+        if self.module.hears:
             shape = torch.Size((*batch, uavs, uavs))
             spec[keys.HEARS] = Binary(shape=shape, device=spec.device, dtype=torch.bool)
+        if self.module.world.measures == "all":
+            shape = torch.Size((*batch, uavs))
+            spec[keys.BYTES_SENT] = Unbounded(shape, device=spec.device, dtype=torch.int64)
         return self.module.specs(spec)

@@ -11,18 +11,21 @@ from torchrl.data import Bounded, Composite, Unbounded
 
 from emberlink.comm._agreement import choose_leader, known_discoverers
 from emberlink.comm._heading import HeadingConfig, circling, heading_reward
-from emberlink.comm._radio import RadioConfig, pairwise_distance
 from emberlink.comm.base import CommModule
 from emberlink.envs import keys
 from emberlink.envs.config import WildfireConfig
 from emberlink.envs.utils import counter_rng
 from emberlink.envs.utils.counter_rng import Use
 from emberlink.envs.world import motion
+from emberlink.envs.world.radio import pairwise_distance
 from emberlink.envs.world.reward import left_box
+
+RECORD_BYTES = 16
+"""position and rank of a discoverer, four float32 numbers"""
 
 
 @dataclass(frozen=True, kw_only=True, config=ConfigDict(extra="forbid", strict=True))
-class ConsensusConfig(RadioConfig):
+class ConsensusConfig:
     """The settings of method 4; the defaults are the paper's text."""
 
     discoverer: Literal["new_fire", "any_fire"] = "new_fire"
@@ -49,6 +52,7 @@ class Consensus(CommModule):
     """
 
     config_type: ClassVar[type] = ConsensusConfig
+    hears: ClassVar[bool] = True
     low: Tensor
     high: Tensor
     waypoint: Tensor
@@ -133,6 +137,16 @@ class Consensus(CommModule):
             term = term.masked_fill(self.leaderless, 0.0)
         left = left_box(tensordict.get(keys.HIT_BOUNDARY), self.world.reward.exit_axes)
         return term.masked_fill(left, 0.0)
+
+    def bytes_sent(self, tensordict: TensorDictBase) -> Tensor:
+        """Returns 16 for each record of a discoverer that a UAV sends, int64 [num_envs, n].
+
+        A discoverer sends its own record. Others pass on those that they know, if they `agree`.
+        """
+        discovers = self._discovers(tensordict)
+        known = known_discoverers(tensordict.get(keys.HEARS), discovers, agree=self.config.agree)
+        passed_on = known.sum(-1) * self.config.agree
+        return RECORD_BYTES * torch.where(discovers, 1, passed_on)
 
     def _keep_for_shaping(
         self, tensordict: TensorDictBase, target: Tensor, follows: Tensor

@@ -1,15 +1,14 @@
 """Full communication: method 3 of the paper (section IV.E, algorithm 2)."""
 
-import math
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 from pydantic import ConfigDict
 from pydantic.dataclasses import dataclass
 from tensordict import TensorDictBase
+from torch import Tensor
 from torchrl.data import Composite, Unbounded
 
-from emberlink.comm._radio import Radio, RadioConfig
 from emberlink.comm.base import CommModule
 from emberlink.envs import keys
 from emberlink.envs.config import WildfireConfig
@@ -23,14 +22,21 @@ class PositionalConfig:
 class Positional(CommModule):
     """Concatenates the vectors of all UAVs, UAV 0 first, for every UAV: 6 n numbers.
 
-    All UAVs observe the same numbers in the same order, as in algorithm 2.
+    With a radio of unlimited range, all UAVs observe the same numbers in the same order, as in
+    algorithm 2. The vector of a UAV that is not heard is replaced by zeros.
     """
 
     config_type: ClassVar[type] = PositionalConfig
+    hears: ClassVar[bool] = True
+
+    _own: Tensor
 
     def __init__(self, world: WildfireConfig, config: PositionalConfig, num_envs: int = 1):
         super().__init__(world, config, num_envs)
-        self.radio = Radio(RadioConfig(range=math.inf))
+        inputs: list[Any] = [keys.OBSERVATION, keys.HEARS]
+        self.in_keys = inputs
+        own = torch.eye(world.num_uavs, dtype=torch.bool)
+        self.register_buffer("_own", own, persistent=False)
 
     def specs(self, observation: Composite) -> Composite:
         *batch, uavs, features = observation[keys.OBSERVATION].shape
@@ -40,5 +46,11 @@ class Positional(CommModule):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         vectors = tensordict.get(keys.OBSERVATION)
-        joined = vectors.flatten(-2).unsqueeze(-2)
-        return tensordict.set(keys.OBSERVATION, joined.repeat_interleave(vectors.shape[-2], -2))
+        known = (tensordict.get(keys.HEARS) | self._own).unsqueeze(-1)
+        joined = torch.where(known, vectors.unsqueeze(-3), 0.0)
+        return tensordict.set(keys.OBSERVATION, joined.flatten(-2))
+
+    def bytes_sent(self, tensordict: TensorDictBase) -> Tensor:
+        """Returns 24 for each UAV: the six float32 numbers of its own vector."""
+        links = tensordict.get(keys.HEARS)
+        return torch.full_like(links[..., 0], 4 * len(keys.FEATURES), dtype=torch.int64)

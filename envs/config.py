@@ -27,6 +27,16 @@ class RewardConfig:
     """the axes on which leaving the box is tested"""
 
 
+@dataclass(frozen=True, kw_only=True, config=ConfigDict(extra="forbid", strict=True))
+class RadioConfig:
+    """The radios of the UAVs and of the base station."""
+
+    range: Annotated[float, Field(ge=0)] = 10.0
+    """radios at a distance below this hear each other, cells; 0 turns them off, inf is no limit"""
+    loss: Annotated[float, Field(ge=0, le=1)] = 0.0
+    """probability that a radio does not hear another one in a step, each direction independently"""
+
+
 BASE_SIDE = 30
 """Cells of the shorter side for which lengths of a fire are given."""
 SIDES = (8, 256)
@@ -59,11 +69,26 @@ class WildfireConfig:
     """cells and steps as they are, or scaled: the box to [-1, 1], the horizon to [0, 1]"""
     reward: RewardConfig = RewardConfig()
     """the reward of a UAV"""
+    radio: RadioConfig = RadioConfig()
+    """the radios, through which UAVs hear each other and the base station"""
+    base: Annotated[tuple[float, float], Strict(False)] | None = None
+    """x and y of the base station on the ground, cells; None for no base station"""
+    failures: Annotated[float, Field(ge=0)] = 0.0
+    """expected number of UAVs that fail in an episode, each at a random step"""
+    measures: Literal["paper", "all"] = "paper"
+    """the measures of an episode: the paper's, or also the ages of sightings and the messages"""
 
     @model_validator(mode="after")
-    def _altitudes_in_order(self) -> "WildfireConfig":
+    def _check(self) -> "WildfireConfig":
         if self.altitude[0] > self.altitude[1]:
             raise UserError(f"altitude {self.altitude}: the lowest is above the highest")
+        if self.failures > self.num_uavs:
+            raise UserError(f"failures={self.failures:g}: the team has {self.num_uavs} UAVs")
+        if self.base is not None and not all(
+            0 <= place <= side - 1 for place, side in zip(self.base, self.grid, strict=True)
+        ):
+            corner = f"[{self.grid[0] - 1}, {self.grid[1] - 1}]"
+            raise UserError(f"base={list(self.base)}: outside of the map, [0, 0] to {corner}")
         return self
 
     @property

@@ -43,15 +43,33 @@ FOLLOWS: Final = (AGENTS, "follows")
 by communication."""
 HIT_BOUNDARY: Final = (AGENTS, "hit_boundary")
 """bool [..., 3]: the axes along which the last move would have left the box."""
+ALIVE: Final = (AGENTS, "alive")
+"""bool [...]: whether the UAV flies; one that has failed sees, says and hears nothing, does not
+move and gets no reward."""
+BYTES_SENT: Final = (AGENTS, "bytes_sent")
+"""int64 [...]: bytes that the UAV sent at this step. Written by communication."""
 
 RNG_KEY: Final = "rng_key"
 """int64 [num_envs]: the key of this episode's random numbers (`envs.utils.counter_rng`)."""
 STEP: Final = "step"
 """int64 [num_envs]: steps since the episode began."""
 SEEN: Final = "seen"
-"""int64 [num_envs]: burning cells that any UAV has seen this episode."""
+"""int64 [num_envs]: cells that any UAV has seen while they burned, in this episode."""
 BURNING: Final = "burning"
 """int64 [num_envs]: cells that burn now."""
+BURNT: Final = "burnt"
+"""int64 [num_envs]: cells that burn now or have burnt out, in this episode."""
+FRONT_AGE: Final = "front_age"
+"""float32 [num_envs]: mean steps since a burning cell was last seen by any UAV, from its ignition
+if it was not seen since; over all burning cells and steps so far. Only with `measures: all`."""
+FRONT_AGE_P95: Final = "front_age_p95"
+"""float32 [num_envs]: 95th percentile of the same steps. Only with `measures: all`."""
+BASE_SEEN: Final = "base_seen"
+"""int64 [num_envs]: cells of which the base has a sighting made while they burned. Only with a
+base."""
+BASE_AGE: Final = "base_age"
+"""float32 [num_envs]: as `FRONT_AGE`, with the last sighting that the base has. Only with a
+base."""
 
 FEATURES: Final = ("x", "y", "z", "new_fire", "old_fire", "timestep")
 """the numbers of a UAV's own observation, in order (paper, section IV.C)"""

@@ -9,6 +9,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from emberlink.envs import keys
+from emberlink.envs.config import WildfireConfig
 
 NAMES = (
     "mean_reward",
@@ -20,7 +21,13 @@ NAMES = (
     "boundary_exits",
     "fire_losses",
 )
-HIGHER_IS_BETTER = frozenset({"mean_reward", "coverage", "coverage_auc"})
+"""the measures of every episode, those of the paper first"""
+MEASURED = ("front_age", "front_age_p95", "bytes_per_step")
+"""the measures that `measures: all` adds"""
+OF_BASE = ("base_coverage", "base_age")
+"""the measures that a base station adds"""
+ALL = (*NAMES, *MEASURED, *OF_BASE)
+HIGHER_IS_BETTER = frozenset({"mean_reward", "coverage", "coverage_auc", "base_coverage"})
 """the measures of which more is better; of the others less is better"""
 
 
@@ -29,26 +36,27 @@ def mean_reward(reward: Tensor) -> Tensor:
     return reward.float().mean((-2, -1))
 
 
-def coverage(seen: Tensor, burning: Tensor) -> Tensor:
-    """Returns cells seen / cells burning at the end, in % (figure 6).
+def coverage(seen: Tensor, burnt: Tensor) -> Tensor:
+    """Returns cells seen while they burned / cells that have burnt, at the end, in % (figure 6).
 
     Args:
-        seen, burning: counts of cells after each step, [..., T].
+        seen, burnt: counts of cells after each step, [..., T]; in the paper's world cells burn for
+            ever, so that all burnt cells burn.
 
     Returns:
-        float32 [...]; 100 where nothing burns.
+        float32 [...]; 100 where nothing has burnt.
     """
-    return _ratio(seen, burning)[..., -1]
+    return _ratio(seen, burnt)[..., -1]
 
 
-def coverage_auc(seen: Tensor, burning: Tensor) -> Tensor:
-    """Returns cells seen / cells burning, in %, averaged over steps. Arguments as `coverage`."""
-    return _ratio(seen, burning).mean(-1)
+def coverage_auc(seen: Tensor, burnt: Tensor) -> Tensor:
+    """Returns cells seen / cells burnt, in %, averaged over steps. Arguments as `coverage`."""
+    return _ratio(seen, burnt).mean(-1)
 
 
-def time_to_full_coverage(seen: Tensor, burning: Tensor) -> Tensor:
-    """Returns the first step at which every burning cell is seen. Arguments as `coverage`."""
-    return _first_step(seen == burning)
+def time_to_full_coverage(seen: Tensor, burnt: Tensor) -> Tensor:
+    """Returns the first step at which every burnt cell has been seen. Arguments as `coverage`."""
+    return _first_step(seen == burnt)
 
 
 def tracking_first(on_fire: Tensor) -> Tensor:
@@ -72,6 +80,43 @@ def fire_losses(on_fire: Tensor) -> Tensor:
     return lost.sum(-2).float().mean(-1)
 
 
+def front_age(ages: Tensor) -> Tensor:
+    """Returns the mean age of sightings of the fire front, in steps.
+
+    The age of a burning cell is the number of steps since any UAV last saw it, or since its
+    ignition if none has. The mean is over all burning cells and steps.
+
+    Args:
+        ages: `keys.FRONT_AGE` after each step, the mean up to that step, [..., T].
+    """
+    return ages[..., -1]
+
+
+def front_age_p95(ages: Tensor) -> Tensor:
+    """Returns the 95th percentile of the ages of `front_age`; `keys.FRONT_AGE_P95` [..., T]."""
+    return ages[..., -1]
+
+
+def bytes_per_step(sent: Tensor) -> Tensor:
+    """Returns the bytes that a UAV sends in a step, mean over UAVs and steps: int64 [..., T, n]."""
+    return sent.double().mean((-2, -1)).float()
+
+
+def base_coverage(seen: Tensor, burnt: Tensor) -> Tensor:
+    """Returns the coverage by sightings that reached the base, in %.
+
+    Args:
+        seen: `keys.BASE_SEEN` after each step, [..., T].
+        burnt: as for `coverage`.
+    """
+    return _ratio(seen, burnt)[..., -1]
+
+
+def base_age(ages: Tensor) -> Tensor:
+    """Returns `front_age` with the sightings that reached the base; `keys.BASE_AGE` [..., T]."""
+    return ages[..., -1]
+
+
 def episode_metrics(steps: TensorDictBase) -> dict[str, Tensor]:
     """Returns every measure of one episode per environment.
 
@@ -79,33 +124,54 @@ def episode_metrics(steps: TensorDictBase) -> dict[str, Tensor]:
         steps: the "next" of each step of a `WildfireEnv`, batch size [..., T].
 
     Returns:
-        float32 [...] for each of `NAMES`.
+        float32 [...] for each of `NAMES`, and for those of `MEASURED` and `OF_BASE` that the
+        environment measures.
     """
     reward = steps[keys.REWARD].squeeze(-1)
-    seen, burning = steps[keys.SEEN], steps[keys.BURNING]
+    seen, burnt = steps[keys.SEEN], steps[keys.BURNT]
     on_fire = steps[keys.NEW_FIRE] + steps[keys.OLD_FIRE] > 0
     left = steps.get(keys.HIT_BOUNDARY).any(-1)
-    return {
+    measured = {
         "mean_reward": mean_reward(reward),
-        "coverage": coverage(seen, burning),
-        "coverage_auc": coverage_auc(seen, burning),
-        "time_to_full_coverage": time_to_full_coverage(seen, burning),
+        "coverage": coverage(seen, burnt),
+        "coverage_auc": coverage_auc(seen, burnt),
+        "time_to_full_coverage": time_to_full_coverage(seen, burnt),
         "tracking_first": tracking_first(on_fire),
         "tracking_last": tracking_last(on_fire),
         "boundary_exits": boundary_exits(left),
         "fire_losses": fire_losses(on_fire),
     }
+    if steps.get(keys.FRONT_AGE, None) is not None:
+        measured["front_age"] = front_age(steps[keys.FRONT_AGE])
+        measured["front_age_p95"] = front_age_p95(steps[keys.FRONT_AGE_P95])
+    if steps.get(keys.BYTES_SENT, None) is not None:
+        measured["bytes_per_step"] = bytes_per_step(steps[keys.BYTES_SENT])
+    if steps.get(keys.BASE_SEEN, None) is not None:
+        measured["base_coverage"] = base_coverage(steps[keys.BASE_SEEN], burnt)
+        measured["base_age"] = base_age(steps[keys.BASE_AGE])
+    return measured
+
+
+def names(world: WildfireConfig) -> tuple[str, ...]:
+    """Returns the measures of an episode with communication in a world."""
+    measured = MEASURED if world.measures == "all" else ()
+    return (*NAMES, *measured, *(OF_BASE if world.base is not None else ()))
 
 
 STEP_KEYS = (
     keys.REWARD,
     keys.SEEN,
-    keys.BURNING,
+    keys.BURNT,
     keys.NEW_FIRE,
     keys.OLD_FIRE,
     keys.HIT_BOUNDARY,
+    keys.FRONT_AGE,
+    keys.FRONT_AGE_P95,
+    keys.BYTES_SENT,
+    keys.BASE_SEEN,
+    keys.BASE_AGE,
 )
-"""the keys that `episode_metrics` reads"""
+"""the keys that `episode_metrics` reads; only some worlds have the last five"""
 
 
 def _ratio(seen: Tensor, burning: Tensor) -> Tensor:

@@ -1,6 +1,7 @@
 """Scenarios, made by the generator or read from files, behind one interface."""
 
 import dataclasses
+import math
 from pathlib import Path
 from typing import Annotated, Any, Protocol
 
@@ -10,11 +11,12 @@ from torch import Tensor
 
 from emberlink.envs.config import WildfireConfig
 from emberlink.envs.fire.cache import fire_bank
-from emberlink.envs.fire.generator import FireConfig, fire_seeds, load_scenario, make_fires
+from emberlink.envs.fire.generator import FireConfig, Split, fire_seeds, load_scenario, make_fires
 from emberlink.envs.fire_files import FileFireConfig, fire_sets, save_copy, with_checksum
 from emberlink.envs.fire_files.reader import COPY_FILE
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import TAG
+from emberlink.envs.world.burning import split_times, with_burn_time
 
 Grid = tuple[int, int]
 
@@ -27,19 +29,19 @@ class FireSource(Protocol):
     """
 
     def train(self, grid: Grid, horizon: int) -> Tensor:
-        """Returns the training fires: arrival times in steps, float32 [fires, X, Y]."""
+        """Returns the training fires: times in steps, see `world.burning.split_times`."""
         ...
 
     def validation(self, count: int, grid: Grid, horizon: int) -> Tensor:
-        """Returns the first validation fires, float32 [count, X, Y]; fewer are repeated."""
+        """Returns the times of the first `count` validation fires; fewer are repeated."""
         ...
 
     def test(self, count: int, grid: Grid, horizon: int) -> Tensor:
-        """Returns the first test fires, float32 [count, X, Y]; fewer are repeated."""
+        """Returns the times of the first `count` test fires; fewer are repeated."""
         ...
 
     def test_fire(self, index: int, grid: Grid, horizon: int) -> Tensor:
-        """Returns the test fire of that index, float32 [1, X, Y]."""
+        """Returns the times of the test fire of that index, as `test(1, ...)`."""
         ...
 
     def describe(self, count: int) -> dict[str, Any]:
@@ -67,19 +69,24 @@ class Generated:
 
     def train(self, grid: Grid, horizon: int) -> Tensor:
         """See `FireSource`."""
-        return fire_bank(self.config, "train", self.config.num_train_fires, grid, horizon)
+        return self._bank("train", self.config.num_train_fires, grid, horizon)
 
     def validation(self, count: int, grid: Grid, horizon: int) -> Tensor:
         """See `FireSource`."""
-        return fire_bank(self.config, "validation", count, grid, horizon)
+        return self._bank("validation", count, grid, horizon)
 
     def test(self, count: int, grid: Grid, horizon: int) -> Tensor:
         """See `FireSource`."""
-        return fire_bank(self.config, "test", count, grid, horizon)
+        return self._bank("test", count, grid, horizon)
 
     def test_fire(self, index: int, grid: Grid, horizon: int) -> Tensor:
         """See `FireSource`."""
-        return make_fires(self.config, fire_seeds("test", index + 1)[index:], grid, horizon)
+        arrival = make_fires(self.config, fire_seeds("test", index + 1)[index:], grid, horizon)
+        return with_burn_time(arrival, self.config.burn_time)
+
+    def _bank(self, split: Split, count: int, grid: Grid, horizon: int) -> Tensor:
+        arrival = fire_bank(self.config, split, count, grid, horizon)
+        return with_burn_time(arrival, self.config.burn_time)
 
     def describe(self, count: int) -> dict[str, Any]:
         """Returns their seeds, and the fields of the scenario that differ from their defaults."""
@@ -111,26 +118,31 @@ class FromFile:
 
     def train(self, grid: Grid, horizon: int) -> Tensor:
         """See `FireSource`."""
-        return fire_sets(self.config, grid, horizon).train
+        return self._with_burn_time(fire_sets(self.config, grid, horizon).train)
 
     def validation(self, count: int, grid: Grid, horizon: int) -> Tensor:
         """See `FireSource`."""
         fires = fire_sets(self.config, grid, horizon).validation
-        return fires[torch.arange(count) % len(fires)]
+        return self._with_burn_time(fires[torch.arange(count) % len(fires)])
 
     def test(self, count: int, grid: Grid, horizon: int) -> Tensor:
         """See `FireSource`."""
         fires = fire_sets(self.config, grid, horizon).test
-        return fires[torch.arange(count) % len(fires)]
+        return self._with_burn_time(fires[torch.arange(count) % len(fires)])
 
     def test_fire(self, index: int, grid: Grid, horizon: int) -> Tensor:
         """See `FireSource`."""
         return self.test(index + 1, grid, horizon)[index:]
 
+    def _with_burn_time(self, arrival: Tensor) -> Tensor:
+        return with_burn_time(arrival, self.config.burn_time)
+
     def describe(self, count: int) -> dict[str, Any]:
         """Returns how many they are, and the scenario with the checksum of its file."""
         values = dataclasses.asdict(self.config)
         del values["saved_copy"]
+        if math.isinf(values["burn_time"]):
+            del values["burn_time"]  # not a number of JSON
         return {"fires": count, "scenario": values}
 
     def with_checksum(self) -> "ScenarioConfig":
@@ -180,8 +192,8 @@ def load_fires(
         num_envs: environments.
 
     Returns:
-        Arrival times, float32 [fires, X, Y], and whether they are fixed: environment i always has
-        fire i, or the only one.
+        Arrival times, float32 [fires, X, Y], or arrival and burn-out times, [fires, 2, X, Y]; and
+        whether they are fixed: environment i always has fire i, or the only one.
 
     Raises:
         UserError: an unknown scenario, a file that cannot be read, or arrival times whose shape
@@ -201,11 +213,16 @@ def load_fires(
     bank = bank.clone(memory_format=torch.contiguous_format)
     shape = list(bank.shape)
     bank = bank.unsqueeze(0) if bank.ndim == 2 else bank
-    if bank.shape not in ((1, *config.grid), (num_envs, *config.grid)):
+    times = (2,) if bank.ndim == 4 else ()
+    if bank.shape not in ((1, *times, *config.grid), (num_envs, *times, *config.grid)):
         raise UserError(
             f"fire: arrival times of shape {shape}; expected {list(config.grid)} or "
-            f"{[num_envs, *config.grid]} (the grid of the config, num_envs={num_envs})"
+            f"{[num_envs, *config.grid]} (the grid of the config, num_envs={num_envs}), or arrival "
+            f"and burn-out times of shape {[num_envs, 2, *config.grid]}"
         )
     if bank.isnan().any():
         raise UserError("fire: arrival times hold NaN; a cell that never burns is inf")
+    arrival, burn_out = split_times(bank)
+    if burn_out is not None and (burn_out < arrival).any():
+        raise UserError("fire: a cell burns out before the fire arrives")
     return bank, True

@@ -4,19 +4,20 @@ import torch
 from torchrl.data import Binary, Bounded, Composite, TensorSpec, Unbounded
 
 from emberlink.envs import keys
+from emberlink.envs.config import WildfireConfig
 
 DONE_NAMES = ("done", "terminated", "truncated")
 
 
-def observation_spec(envs: int, uavs: int, window: int | None = None) -> Composite:
+def observation_spec(envs: int, world: WildfireConfig, window: int | None = None) -> Composite:
     """Returns the spec of all that a reset writes but done, batch size [envs]; see `keys`.
 
     Args:
         envs: number of environments.
-        uavs: UAVs per environment.
+        world: the team, and what is measured.
         window: cells along a side of the observed window; None without a window.
     """
-    agents = (envs, uavs)
+    agents = (envs, world.num_uavs)
 
     def real(*shape: int) -> Unbounded:
         return Unbounded(torch.Size(shape), dtype=torch.float32)
@@ -33,11 +34,17 @@ def observation_spec(envs: int, uavs: int, window: int | None = None) -> Composi
         keys.NEW_CENTRE[1]: real(*agents, 2),
         keys.OLD_CENTRE[1]: real(*agents, 2),
         keys.HIT_BOUNDARY[1]: Binary(shape=torch.Size((*agents, 3)), dtype=torch.bool),
+        keys.ALIVE[1]: Binary(shape=torch.Size(agents), dtype=torch.bool),
     }
     if window is not None:
         shape = torch.Size((*agents, 3, window, window))
         per_uav[keys.WINDOW[1]] = Binary(shape=shape, dtype=torch.bool)
-    per_env = {key: whole(envs) for key in (keys.RNG_KEY, keys.STEP, keys.SEEN, keys.BURNING)}
+    counts = [keys.RNG_KEY, keys.STEP, keys.SEEN, keys.BURNING, keys.BURNT]
+    per_env = {key: whole(envs) for key in counts}
+    if world.measures == "all":
+        per_env |= {key: real(envs) for key in (keys.FRONT_AGE, keys.FRONT_AGE_P95)}
+    if world.base is not None:
+        per_env |= {keys.BASE_SEEN: whole(envs), keys.BASE_AGE: real(envs)}
     return Composite({keys.AGENTS: Composite(per_uav, shape=agents), **per_env}, shape=(envs,))
 
 

@@ -9,6 +9,8 @@ from emberlink.envs.config import WildfireConfig
 from emberlink.envs.rendering import frame
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.world.coverage_map import CoverageMap
+from emberlink.envs.world.knowledge import Knowledge
+from emberlink.envs.world.measures import Measures
 
 
 class TeamView(EnvBase):
@@ -17,6 +19,7 @@ class TeamView(EnvBase):
     config: WildfireConfig
     _fire_name: str | None
     _map: CoverageMap
+    _measures: Measures | None
     _time: Tensor
     _position: Tensor
 
@@ -51,14 +54,30 @@ class TeamView(EnvBase):
 
     @property
     def fire_map(self) -> Tensor:
-        """The paper's map, uint8 [num_envs, X, Y]: 0 no fire, 1 seen fire, 2 unseen fire."""
-        burning = self.arrival_time <= self._time[:, None, None]
-        return burning.to(torch.uint8) * (2 - self._map.seen.to(torch.uint8))
+        """The paper's map, uint8 [num_envs, X, Y]: 0 no fire, 1 seen fire, 2 unseen fire.
+
+        A burnt-out cell is 3 if it was seen while it burned, else 4.
+        """
+        now = self._time[:, None, None]
+        fire = (self.arrival_time <= now).to(torch.uint8) * (2 - self._map.seen.to(torch.uint8))
+        if self.burn_out is not None:
+            fire += 2 * (self.burn_out <= now)
+        return fire
 
     @property
     def arrival_time(self) -> Tensor:
         """The fire of each environment: arrival times in steps, float32 [num_envs, X, Y]."""
         return self._map.arrival_time
+
+    @property
+    def burn_out(self) -> Tensor | None:
+        """Burn-out times in steps, float32 [num_envs, X, Y]; None if cells burn for ever."""
+        return self._map.burn_out
+
+    @property
+    def knowledge(self) -> Knowledge | None:
+        """What each UAV and the base, which is last, know; None in a world without a base."""
+        return None if self._measures is None else self._measures.knowledge
 
     def render(self, mode: str = "rgb_array", *, env: int = 0):
         """Draws one environment in the paper's colours, uint8 [height, width, 3].

@@ -20,6 +20,9 @@ from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import check_whole
 from emberlink.envs.world import motion
 from emberlink.envs.world.coverage_map import CoverageMap, Sighting
+from emberlink.envs.world.failures import draw_failures
+from emberlink.envs.world.measures import Measures
+from emberlink.envs.world.observation import observe
 from emberlink.envs.world.reward import view_reward
 from emberlink.envs.world.sensor import Sensor
 
@@ -32,7 +35,8 @@ class WildfireEnv(Buffers, TeamView):
         config: constants of the world and the team.
         fire: a scenario's name, its config (each reset draws one of its training fires), or
             arrival times in steps, inf where a cell never burns: [X, Y] for all environments or
-            [num_envs, X, Y] for one each.
+            [num_envs, X, Y] for one each; or arrival and burn-out times, [1, 2, X, Y] or
+            [num_envs, 2, X, Y].
         seed: of all random numbers; the first reset draws a fresh one if None. Environment i's
             randomness depends on (seed, i) alone. Several seeds share the environments in order,
             the same number for each, which are what they are with that seed alone.
@@ -57,6 +61,8 @@ class WildfireEnv(Buffers, TeamView):
     _position: Tensor
     _seen: Tensor
     _first_length: Tensor
+    _fail_step: Tensor | None
+    _all_alive: Tensor
 
     def __init__(
         self,
@@ -98,8 +104,14 @@ class WildfireEnv(Buffers, TeamView):
         self._map = CoverageMap(
             sensor, fires, horizon=config.horizon, envs=num_envs, uavs=config.num_uavs
         )
+        measured = config.measures == "all" or config.base is not None
+        self._measures = Measures(config, num_envs, sensor.area) if measured else None
         for name in ("_seed_key", "_episode", "_episode_key", "_step_key", "_time", "_seen"):
             self.register_buffer(name, torch.zeros(num_envs, dtype=torch.int64))
+        never = torch.full((num_envs, config.num_uavs), config.horizon + 1)
+        self.register_buffer("_fail_step", never if config.failures else None)
+        flies = torch.ones(num_envs, config.num_uavs, dtype=torch.bool)
+        self.register_buffer("_all_alive", flies, persistent=False)
         position = torch.zeros(num_envs, config.num_uavs, 3, dtype=torch.float64)
         self.register_buffer("_position", position)
         place = torch.arange(1, num_envs + 1)
@@ -108,7 +120,7 @@ class WildfireEnv(Buffers, TeamView):
 
     def _make_specs(self) -> None:
         envs, uavs = self.num_envs, self.n_agents
-        self.observation_spec = specs.observation_spec(envs, uavs, self._side)
+        self.observation_spec = specs.observation_spec(envs, self.config, self._side)
         self.action_spec = specs.action_spec(envs, uavs)
         self.reward_spec = specs.reward_spec(envs, uavs)
         self.done_spec = specs.done_spec(envs, uavs if self._agent_done else None)
@@ -158,6 +170,12 @@ class WildfireEnv(Buffers, TeamView):
         self._time.masked_fill_(mask, 0)
         self._seen.masked_fill_(mask, 0)
         self._map.start_episodes(mask, self._draw_fire())
+        if self._measures is not None:
+            self._measures.start_episodes(mask, *self._map.times)
+        if self._fail_step is not None:
+            team = self.config.num_uavs, self.config.horizon
+            drawn = draw_failures(self._episode_key, self.config.failures, *team)
+            self._fail_step.copy_(torch.where(mask[:, None], drawn, self._fail_step))
 
     def _draw_fire(self) -> Tensor:
         """Returns the index of each environment's next fire, int64 [num_envs]."""
@@ -189,21 +207,33 @@ class WildfireEnv(Buffers, TeamView):
         return Sighting(none, none.new_zeros((*none.shape, 2), dtype=torch.float32), classes)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        config = self.config
         self._time.add_(1)
-        position, hit_boundary = motion.move(
+        alive = self._alive()
+        position, hit_boundary = self._move(tensordict.get(keys.ACTION), alive)
+        self._position.copy_(position)
+        sighting, view = self._map.look(self._position, self._time.float(), alive)
+        if self._measures is not None:
+            self._measures.update(view, self._position, self._step_key, self._time, alive)
+        new, old, none = sighting.counts.unbind(-1)
+        reward = view_reward(new, old, none, hit_boundary, self.config.reward)
+        self._seen.add_(new.sum(-1).long())
+        return self._snapshot(position, sighting, hit_boundary, reward)
+
+    def _alive(self) -> Tensor | None:
+        """Returns which UAVs fly, bool [num_envs, n]; None if UAVs never fail."""
+        return None if self._fail_step is None else self._time.unsqueeze(-1) < self._fail_step
+
+    def _move(self, action: Tensor, alive: Tensor | None) -> tuple[Tensor, Tensor]:
+        """Returns the new positions and the axes of attempted exits; see `motion.move`."""
+        if alive is not None:
+            action = action.masked_fill(~alive.unsqueeze(-1), 0.0)
+        return motion.move(
             self._position,
-            tensordict.get(keys.ACTION),
-            displacement=config.displacement,
+            action,
+            displacement=self.config.displacement,
             low=self._low,
             high=self._high,
         )
-        self._position.copy_(position)
-        sighting = self._map.look(self._position, self._time.float())
-        new, old, none = sighting.counts.unbind(-1)
-        reward = view_reward(new, old, none, hit_boundary, config.reward)
-        self._seen.add_(new.sum(-1).long())
-        return self._snapshot(position, sighting, hit_boundary, reward)
 
     def _step_proc_data(self, next_tensordict_out: TensorDictBase) -> TensorDictBase:
         """Returns its argument: TorchRL would add missing entries here, and there are none."""
@@ -217,11 +247,12 @@ class WildfireEnv(Buffers, TeamView):
         reward: Tensor | None = None,
     ) -> TensorDict:
         """Returns the TensorDict of a reset (without reward) or of a step."""
-        counts, time = sighting.counts.long(), self._time.clone()
+        counts, time, alive = sighting.counts.long(), self._time.clone(), self._alive()
         new, old, none = counts.unbind(-1)
         new_centre, old_centre, _ = sighting.centres.unbind(-2)
+        box = self._low, self._high
         agents = {
-            keys.OBSERVATION[1]: self._observe(position, counts, time),
+            keys.OBSERVATION[1]: observe(position, counts, time, self.config, box),
             keys.POSITION[1]: position,
             keys.NEW_FIRE[1]: new,
             keys.OLD_FIRE[1]: old,
@@ -229,6 +260,7 @@ class WildfireEnv(Buffers, TeamView):
             keys.NEW_CENTRE[1]: new_centre,
             keys.OLD_CENTRE[1]: old_centre,
             keys.HIT_BOUNDARY[1]: hit_boundary,
+            keys.ALIVE[1]: self._all_alive.clone() if alive is None else alive,
         }
         if self._side is not None:
             agents[keys.WINDOW[1]] = sighting.classes.unflatten(-1, (self._side, self._side))
@@ -237,12 +269,15 @@ class WildfireEnv(Buffers, TeamView):
         done = self._done(time)
         if self._agent_done:
             agents |= {k: v.unsqueeze(-1).repeat(1, self.n_agents, 1) for k, v in done.items()}
+        burning, burnt = self._map.count(time)
         root = {
             keys.AGENTS: _tensordict(agents, position.shape[:-1], self.device),
             keys.RNG_KEY: self._step_key.clone(),
             keys.STEP: time,
             keys.SEEN: self._seen.clone(),
-            keys.BURNING: self._map.count_burning(time),
+            keys.BURNING: burning,
+            keys.BURNT: burnt,
+            **({} if self._measures is None else self._measures.values()),
             **done,
         }
         return _tensordict(root, self.batch_size, self.device)
@@ -255,14 +290,6 @@ class WildfireEnv(Buffers, TeamView):
         truncated = (time >= length).unsqueeze(-1)
         flags = truncated, torch.zeros_like(truncated), truncated.clone()
         return dict(zip(specs.DONE_NAMES, flags, strict=True))
-
-    def _observe(self, position: Tensor, counts: Tensor, time: Tensor) -> Tensor:
-        """Returns x, y, z, new-fire flag, old-fire flag, timestep: float32 [num_envs, n, 6]."""
-        clock = time.float().view(-1, 1, 1).expand(-1, position.shape[1], 1)
-        if self.config.observation_scale == "box":
-            position = motion.scale_to_box(position, self._low, self._high)
-            clock = clock / self.config.horizon
-        return torch.cat((position, counts[..., :2] > 0, clock), -1)
 
 
 def default_config(fire: Any) -> WildfireConfig:

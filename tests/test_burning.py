@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from emberlink.envs.world import burning
-from emberlink.envs.world.burning import BurningCounts
+from emberlink.envs.world.burning import PassedCounts
 
 
 @pytest.mark.parametrize("chunk", [1, 250, 2**22])
@@ -19,7 +19,7 @@ def test_counts_at_every_step(monkeypatch, chunk):
     fires[3, ::2] = math.inf
     fires[4] = fires[4].round()
     horizon = 40
-    counts = BurningCounts(fires, horizon)
+    counts = PassedCounts(fires, horizon)
     which = torch.arange(7)
     for step in range(horizon + 1):
         expected = (fires <= step).sum((1, 2))

@@ -7,7 +7,7 @@ import torch
 from single_ddpg import SingleActor, SingleCritic, copy_uav
 from tensordict import TensorDict
 
-from emberlink.envs import keys, specs
+from emberlink.envs import WildfireConfig, keys, specs
 from emberlink.policies.networks import stacked
 from emberlink.policies.networks.actor_critic import STATE_ACTION_VALUE, make_actor, make_critic
 from emberlink.policies.networks.stacked import StackedActor, StackedCritic
@@ -87,7 +87,10 @@ def test_uavs_start_from_different_weights_and_a_seed_repeats_them():
 
 
 def test_modules_read_and_write_the_keys_of_the_environment():
-    observation, action = specs.observation_spec(5, 4), specs.action_spec(5, 4)
+    observation, action = (
+        specs.observation_spec(5, WildfireConfig(num_uavs=4)),
+        specs.action_spec(5, 4),
+    )
     actor, critic = (
         make_actor(observation, action, HIDDEN),
         make_critic(observation, action, HIDDEN),

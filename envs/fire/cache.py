@@ -35,8 +35,10 @@ def bank_key(
     horizon: int,
     start: int = 0,
 ) -> str:
-    """Returns a hash of all values on which a bank of fires depends."""
-    parts = [GENERATOR_VERSION, dataclasses.asdict(config), split, count, *grid, horizon, start]
+    """Returns a hash of all values on which a bank of arrival times depends."""
+    ranges = dataclasses.asdict(config)
+    del ranges["burn_time"]
+    parts = [GENERATOR_VERSION, ranges, split, count, *grid, horizon, start]
     return hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:32]
 
 

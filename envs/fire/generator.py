@@ -3,8 +3,8 @@
 A fire is an arrival time per cell, in steps; a cell burns once `step >= arrival_time`. It starts as
 a ring, the edge of a disc whose inside is burnt out and never counts as fire, and spreads by the
 level set of `level_set`. Other waves, such as oil on water, are scenarios as well.
-Lengths of a scenario are in cells of a grid whose shorter side has 30 cells (`BASE_SIDE`). On
-another grid lengths and rates are scaled by min(X, Y)/30.
+Lengths of a scenario are in cells. With `lengths: scaled`, they are for a grid whose shorter side
+has 30 cells (`BASE_SIDE`); on another grid lengths and rates are scaled by min(X, Y)/30.
 """
 
 import dataclasses
@@ -106,9 +106,13 @@ class FireConfig:
     """Direction of the tide at phase 0, degrees counter-clockwise from +x."""
     two_sided: bool = False
     """Whether the back of the wavelet is as fast as its head."""
+    burn_time: Annotated[float, Field(ge=1)] = math.inf
+    """Steps for which a cell burns; inf for ever."""
+    lengths: Literal["scaled", "cells"] = "scaled"
+    """Whether lengths and rates are for a 30-cell side and scaled to the grid, or in its cells."""
 
 
-_FIXED = {"name", "num_train_fires", "two_sided"}
+_FIXED = {"name", "num_train_fires", "two_sided", "burn_time", "lengths"}
 # The position is part of a draw's key: append new fields, never reorder.
 _DRAWN = tuple(f.name for f in dataclasses.fields(FireConfig) if f.name not in _FIXED)
 
@@ -188,14 +192,19 @@ def make_fires(
 
 def _margin(config: FireConfig, grid: tuple[int, int]) -> int:
     """Returns the cells around the grid from which a tide can carry the front back."""
-    return math.ceil(config.tide_reach[1] * min(grid) / BASE_SIDE)
+    return math.ceil(config.tide_reach[1] * _scale(config, grid))
+
+
+def _scale(config: FireConfig, grid: tuple[int, int]) -> float:
+    """Returns the cells of a grid per cell of the scenario's lengths."""
+    return min(grid) / BASE_SIDE if config.lengths == "scaled" else 1.0
 
 
 def _spread(
     config: FireConfig, seeds: Tensor, grid: tuple[int, int], horizon: int, refine: int
 ) -> Tensor:
     """Computes the fires of some seeds together; see `make_fires`."""
-    scale = min(grid) / BASE_SIDE
+    scale = _scale(config, grid)
     draw = {field: _draw(config, field, seeds)[:, 0] for field in _DRAWN if "patch" not in field}
     fractions = torch.stack([draw["centre_x"], draw["centre_y"]], 1)
     centre = fractions * (torch.tensor(grid, device=seeds.device) - 1)
@@ -255,7 +264,7 @@ def _fuel(
     maximum = config.fuel_patches[1]
     if maximum == 0:
         return None
-    scale = min(grid) / BASE_SIDE
+    scale = _scale(config, grid)
     low = config.fuel_patches[0]
     count = low + (_unit("fuel_patches", seeds, 1) * (maximum - low + 1)).floor()
     bearing, distance, width, rate = (

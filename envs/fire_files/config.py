@@ -1,6 +1,7 @@
 """Configuration of fires that are read from files, and their units of time."""
 
 import dataclasses
+import math
 from datetime import datetime, timedelta
 from typing import Annotated, Any, Literal
 
@@ -70,6 +71,8 @@ class FileFireConfig:
     """Part of the grid left free on each side of the burnt area; None takes the file's extent."""
     ring_width: Annotated[float, Field(gt=0, le=30)] | None = 3.0
     """Width of the burning edge at step 0, cells of a 30-cell side; None burns nothing out."""
+    burn_time: Annotated[float, Field(ge=1)] = math.inf
+    """Steps for which a cell burns; inf for ever."""
     crs: _Text | None = None
     """Projection of a file that carries none, else the one to project it to."""
     time_field: _Text | None = None

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from emberlink.envs.utils.buffers import Buffers
-from emberlink.envs.world.burning import BurningCounts
+from emberlink.envs.world.burning import PassedCounts, split_times
 from emberlink.envs.world.sensor import Sensor
 
 _NEVER = torch.iinfo(torch.int32).max
@@ -23,6 +23,17 @@ class Sighting(NamedTuple):
     """bool [..., 3, W * W]: mask of the cells in the UAV's window"""
 
 
+class View(NamedTuple):
+    """The cells of every UAV's window."""
+
+    cells: Tensor
+    """int64 [envs, uavs, W * W]: indices in the flat padded maps of all environments"""
+    in_view: Tensor
+    """bool [envs, uavs, W * W]: whether the UAV sees the cell; True outside of the grid, too"""
+    burning: Tensor
+    """bool [envs, uavs, W * W]: whether the UAV sees the cell and it burns"""
+
+
 class CoverageMap(Buffers):
     """Stores the fire of every environment and the cells that its UAVs have seen.
 
@@ -33,17 +44,20 @@ class CoverageMap(Buffers):
 
     Args:
         sensor: the UAVs' camera.
-        fires: arrival times in steps, float32 [fires, X, Y]; inf for cells that never burn.
+        fires: arrival times in steps, float32 [fires, X, Y], inf for cells that never burn; or
+            arrival and burn-out times, float32 [fires, 2, X, Y].
         horizon: steps of an episode.
         envs: number of environments.
         uavs: UAVs per environment.
     """
 
     _fires: Tensor
+    _fires_end: Tensor | None
     _start: Tensor
     _uav: Tensor
     _never: Tensor
     _arrival_time: Tensor
+    _burn_out: Tensor | None
     _fire_index: Tensor
     _first_seen: Tensor
     _stamp: Tensor
@@ -51,9 +65,13 @@ class CoverageMap(Buffers):
     def __init__(self, sensor: Sensor, fires: Tensor, *, horizon: int, envs: int, uavs: int):
         super().__init__()
         self._sensor, self._uavs = sensor, uavs
-        self._burning = BurningCounts(fires, horizon)
+        arrival, burn_out = split_times(fires)
+        self._ignited = PassedCounts(arrival, horizon)
+        self._burnt_out = None if burn_out is None else PassedCounts(burn_out, horizon)
         # Padding is NaN: all comparisons with it are false, so it belongs to no class.
-        self.register_buffer("_fires", sensor.pad(fires, torch.nan), persistent=False)
+        self.register_buffer("_fires", sensor.pad(arrival, torch.nan), persistent=False)
+        ends = None if burn_out is None else sensor.pad(burn_out, torch.nan)
+        self.register_buffer("_fires_end", ends, persistent=False)
         self.register_buffer(
             "_start", torch.arange(envs).unsqueeze(-1) * sensor.area, persistent=False
         )
@@ -62,6 +80,7 @@ class CoverageMap(Buffers):
         )
         self.register_buffer("_never", torch.tensor(_NEVER, dtype=torch.int32), persistent=False)
         self.register_buffer("_arrival_time", self._fires[:1].repeat(envs, 1))
+        self.register_buffer("_burn_out", None if ends is None else ends[:1].repeat(envs, 1))
         self.register_buffer("_fire_index", torch.zeros(envs, dtype=torch.int64))
         first_seen = torch.full((envs, sensor.area), _NEVER, dtype=torch.int32)
         self.register_buffer("_first_seen", first_seen)
@@ -77,6 +96,16 @@ class CoverageMap(Buffers):
         return self._sensor.crop(self._arrival_time)
 
     @property
+    def burn_out(self) -> Tensor | None:
+        """The burn-out times in steps, float32 [envs, X, Y]; None if cells burn for ever."""
+        return None if self._burn_out is None else self._sensor.crop(self._burn_out)
+
+    @property
+    def times(self) -> tuple[Tensor, Tensor | None]:
+        """The arrival and burn-out times on the padded maps, float32 [envs, area], or None."""
+        return self._arrival_time, self._burn_out
+
+    @property
     def seen(self) -> Tensor:
         """Whether each cell burned when a UAV saw it, bool [envs, X, Y]."""
         return self._sensor.crop(self._first_seen < _NEVER)
@@ -88,16 +117,31 @@ class CoverageMap(Buffers):
             mask: bool [envs].
             fire: int64 [envs], the index of each environment's fire.
         """
-        self._arrival_time.copy_(torch.where(mask[:, None], self._fires[fire], self._arrival_time))
+        began = mask[:, None]
+        self._arrival_time.copy_(torch.where(began, self._fires[fire], self._arrival_time))
+        if self._burn_out is not None and self._fires_end is not None:
+            self._burn_out.copy_(torch.where(began, self._fires_end[fire], self._burn_out))
         self._fire_index.copy_(torch.where(mask, fire, self._fire_index))
-        self._first_seen.masked_fill_(mask[:, None], _NEVER)
+        self._first_seen.masked_fill_(began, _NEVER)
         self._stamp.copy_(torch.where(mask[:, None, None], self._uav, self._stamp))
 
-    def count_burning(self, step: Tensor) -> Tensor:
-        """Returns the number of cells that burn at steps, int64 [envs]; int64 [envs]."""
-        return self._burning.at(self._fire_index, step)
+    def count(self, step: Tensor) -> tuple[Tensor, Tensor]:
+        """Counts the cells that burn at a step, and those that burn or have burnt.
 
-    def look(self, position: Tensor, step: Tensor) -> Sighting:
+        Args:
+            step: int64 [envs], steps since the episode began.
+
+        Returns:
+            int64 [envs] each.
+        """
+        burnt = self._ignited.at(self._fire_index, step)
+        if self._burnt_out is None:
+            return burnt, burnt.clone()
+        return burnt - self._burnt_out.at(self._fire_index, step), burnt
+
+    def look(
+        self, position: Tensor, step: Tensor, alive: Tensor | None = None
+    ) -> tuple[Sighting, View]:
         """Classifies the cells in view of all UAVs and marks the burning ones as seen.
 
         It must be called exactly once per step.
@@ -105,17 +149,25 @@ class CoverageMap(Buffers):
         Args:
             position: float64 [envs, uavs, 3], cells.
             step: float32 [envs], steps since the episode began.
+            alive: bool [envs, uavs]; the others see nothing. All are alive if None.
 
         Returns:
-            The cells in view of each UAV, batch shape [envs, uavs].
+            The cells in view of each UAV by class, batch shape [envs, uavs], and their indices.
         """
         centre, cells, in_view = self._sensor.look(position, self._start)
+        if alive is not None:
+            in_view &= alive.unsqueeze(-1)
         stamp, first_seen, time = self._stamp, self._first_seen, step.view(-1, 1, 1)
         stamp.add_(self._uavs)
         arrival_time = self._arrival_time.take(cells)
         burning = in_view & (arrival_time <= time)
+        no_fire = in_view & (arrival_time > time)
+        if self._burn_out is not None:
+            burnt_out = burning & (self._burn_out.take(cells) <= time)
+            burning, no_fire = burning ^ burnt_out, no_fire | burnt_out
         claims = torch.where(burning, stamp, self._never)
         first_seen.view(-1).scatter_reduce_(0, cells.view(-1), claims.view(-1), "amin")
         new = first_seen.take(cells) == stamp
-        classes = torch.stack((new, burning ^ new, in_view & (arrival_time > time)), -2)
-        return Sighting(*self._sensor.count_classes(classes, centre), classes)
+        classes = torch.stack((new, burning ^ new, no_fire), -2)
+        sighting = Sighting(*self._sensor.count_classes(classes, centre), classes)
+        return sighting, View(cells, in_view, burning)

@@ -92,7 +92,7 @@ def render(runs: Sequence[str], console: Console, choices: Choices) -> int:
         UserError: a run, fire or output is wrong.
     """
     folders = [open_run(name) for name in runs]
-    scenario, index = find_fire(choices.fire, folders[0].config(device="cpu").fire)
+    scenario, index = find_fire(choices.fire, folders[0].config(device="cpu"))
     panels = [*_learned(folders, choices.checkpoints), *_scripted(folders, choices.policies)]
     _check_comparable(panels)
     config = panels[0].config.env
@@ -112,18 +112,18 @@ def render(runs: Sequence[str], console: Console, choices: Choices) -> int:
     return 0
 
 
-def find_fire(text: str | None, trained: ScenarioConfig) -> tuple[ScenarioConfig, int]:
+def find_fire(text: str | None, run: RunConfig) -> tuple[ScenarioConfig, int]:
     """Returns the scenario and the index of a held-out fire.
 
     Args:
         text: NAME, INDEX or NAME:INDEX. The default name is that of `shown_scenario`, and the
             default index is 0.
-        trained: training scenario of the run, which is known, too.
+        run: configuration of the run, whose training scenario is known, too.
 
     Raises:
         UserError: there is no such scenario or fire.
     """
-    usual = shown_scenario(trained)
+    usual, trained = shown_scenario(run), run.fire
     text = usual if text is None else text
     name, _, index = (
         text.rpartition(":")
@@ -137,7 +137,8 @@ def find_fire(text: str | None, trained: ScenarioConfig) -> tuple[ScenarioConfig
         raise UserError(
             f"fire {text!r}: there is no held-out fire {index!r}; known: 0 to {FIRES - 1}"
         )
-    return load_scenario(name) if name in scenarios() else trained, int(index)
+    own = name == trained.name and not run.evaluation.huygens
+    return trained if own or name not in scenarios() else load_scenario(name), int(index)
 
 
 def _learned(folders: Sequence[RunFolder], checkpoints: Sequence[Path]) -> Iterator[Panel]:

@@ -28,7 +28,7 @@ from emberlink.trainers.config.overrides import all_keys, flat, full_key, parse,
 from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.learners import registry as learners
 
-GROUPS = ("setup", "fire", "learner")
+GROUPS = ("setup", "world", "fire", "learner")
 """groups whose file is chosen by `GROUP=NAME`, besides the method"""
 _HYDRA = threading.RLock()
 
@@ -46,7 +46,9 @@ def resolve(method: str, overrides: Sequence[str] = (), **settings: Any) -> RunC
         UserError: the method, a key or a value is wrong; the message names it and what is known.
     """
     given = [parse(text) for text in overrides]
-    chosen = {"setup": "paper"} | {key: str(value) for key, value in given if key in GROUPS}
+    chosen = {"setup": "paper", "world": "paper"} | {
+        key: str(value) for key, value in given if key in GROUPS
+    }
     values = _composed(str(method), chosen)
     _drop_settings_of_other_learners(values["learner"])
     known = list(dict.fromkeys([*GROUPS, *all_keys(values)]))
@@ -59,9 +61,10 @@ def resolve(method: str, overrides: Sequence[str] = (), **settings: Any) -> RunC
         if key not in GROUPS:
             put(values, key, value)
     values = _interpolated(values) | {"method": method, "setup": chosen["setup"]}
+    values["world"] = chosen["world"]
     _put_settings(values, settings)
     _choose_seed(values, any(key == "seed" for key in [*dict(given), *settings]))
-    values["baseline_comm"] = _baseline_comm(chosen["setup"])
+    values["baseline_comm"] = _baseline_comm(chosen)
     config = from_values(values)
     return replace(config, fire=fires_of(config.fire).with_checksum())
 
@@ -71,8 +74,8 @@ def override(config: RunConfig, overrides: Sequence[str] = (), **settings: Any) 
 
     Args:
         config: configuration of the run.
-        overrides: texts `key=value`, as on the command line; `setup`, `fire` and `learner` cannot
-            change.
+        overrides: texts `key=value`, as on the command line; `setup`, `world`, `fire` and `learner`
+            cannot change.
         settings: as for `resolve`.
 
     Raises:
@@ -136,7 +139,7 @@ def _composed(method: str, chosen: Mapping[str, str]) -> dict[str, Any]:
     files = sorted(file for folder in folders for file in folder.glob("**/*.yaml"))
     stamps = tuple((file, file.stat().st_mtime_ns) for file in files)
     values = deepcopy(_compose(tuple(chosen.items()), tuple(folders), stamps))
-    for group in ("method", "setup"):
+    for group in ("method", "setup", "world"):
         if group in values:  # without the header, Hydra puts the content under the group
             file = find(group, chosen[group])
             raise UserError(f"{file} must begin with '# @package _global_'")
@@ -193,13 +196,11 @@ def _put_settings(values: dict[str, Any], settings: Mapping[str, Any]) -> None:
         put(values, full_key(values, key), plain(value, key))
 
 
-def _baseline_comm(setup: str) -> dict[str, Any]:
+def _baseline_comm(chosen: Mapping[str, str]) -> dict[str, Any]:
     """Returns method -> `comm` for the methods whose communication scripted policies use."""
     methods = {policy.recipe for policy in SCRIPTED.values() if policy.recipe}
-    return {
-        method: _interpolated(_composed(method, {"setup": setup}))["comm"]
-        for method in sorted(methods)
-    }
+    groups = {group: chosen[group] for group in ("setup", "world")}
+    return {method: _interpolated(_composed(method, groups))["comm"] for method in sorted(methods)}
 
 
 def _drop_settings_of_other_learners(learner: dict[str, Any]) -> None:

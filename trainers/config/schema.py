@@ -9,6 +9,7 @@ from pydantic.dataclasses import dataclass
 
 from emberlink.comm import registry
 from emberlink.comm.base import CommModule
+from emberlink.envs import metrics
 from emberlink.envs.config import WildfireConfig
 from emberlink.envs.scenarios import Scenario
 from emberlink.envs.utils.device import check_device as check_device
@@ -48,6 +49,10 @@ class EvaluationConfig:
     """episodes between evaluations during training; 0 for none"""
     interval_episodes: Many
     """episodes of an evaluation during training, each on another validation fire"""
+    huygens: bool
+    """whether to evaluate on fires of the scenario `huygens`, too, besides that of the training"""
+    headline: Literal[metrics.ALL]
+    """the measure that chooses the networks of best.safetensors on validation fires"""
 
 
 @dataclass(frozen=True, kw_only=True, config=_STRICT)
@@ -58,6 +63,8 @@ class RunConfig:
     """name of the method, a file in configs/method"""
     setup: Name
     """name of the setup, a file in configs/setup"""
+    world: Name
+    """name of the world, a file in configs/world"""
     replay: Literal["per_agent", "shared"]
     """whether each UAV has its own replay buffer, or all share one"""
     comm: dict[str, Any]

@@ -44,7 +44,7 @@ class ScriptedResults:
     Args:
         policy: name of the policy.
         config: configuration of the environment.
-        arrival: arrival times of the fires in steps, float32 [count, X, Y].
+        arrival: times of the fires in steps, float32 [count, X, Y] or [count, 2, X, Y].
         protocol: other plain values that the results depend on.
     """
 
@@ -53,6 +53,7 @@ class ScriptedResults:
     ):
         used = SCRIPTED[policy], registry.find(config.comm["name"])
         self._episodes, source = len(arrival), source_digest(*used)
+        self._measures = list(metrics.names(config.env))
         parts = {
             "policy": policy,
             "env": asdict(config.env),
@@ -77,7 +78,7 @@ class ScriptedResults:
             stored = parse_json(content.decode())
         except ValueError:
             return None
-        return stored if _whole(stored, self._episodes) else None
+        return stored if _whole(stored, self._measures, self._episodes) else None
 
     def write(self, measured: Measured) -> None:
         """Writes the results, or warns if the folder is not writable."""
@@ -115,11 +116,11 @@ def source_digest(*used: type) -> str | None:
     return digest.hexdigest()
 
 
-def _whole(stored: Any, episodes: int) -> bool:
+def _whole(stored: Any, measures: list[str], episodes: int) -> bool:
     """Returns whether a stored value has all measures of the given number of episodes."""
     return (
         isinstance(stored, dict)
-        and list(stored) == list(metrics.NAMES)
+        and list(stored) == measures
         and all(isinstance(column, list) and len(column) == episodes for column in stored.values())
         and all(
             isinstance(x, float) and math.isfinite(x) for column in stored.values() for x in column

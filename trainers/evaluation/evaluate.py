@@ -24,7 +24,7 @@ from emberlink.trainers.evaluation.baseline_cache import ScriptedResults
 from emberlink.trainers.evaluation.results import LEARNED, Measured, Results, means
 
 HELD_OUT_SCENARIO = "huygens"
-"""the scenario of every evaluation"""
+"""the scenario of evaluations with `evaluation.huygens`, besides that of the training"""
 START_SEED = 20_250_923
 """seed of test episode 0, including start positions; episode i has this seed plus i"""
 VALIDATION_START_SEED = 20_350_923
@@ -48,7 +48,7 @@ def play(
         at_step: called with the step when the environments have reached it, from 0 to the horizon.
 
     Returns:
-        The measures of `metrics.NAMES`, float32 [num_envs] each.
+        The measures of `metrics.names`, float32 [num_envs] each.
     """
     world: Any = env.base_env
     horizon: int = world.config.horizon
@@ -59,7 +59,7 @@ def play(
             if at_step is not None:
                 at_step(step - 1)
             td = env.step(policy(td))
-            steps.append(td.get("next").select(*metrics.STEP_KEYS))
+            steps.append(td.get("next").select(*metrics.STEP_KEYS, strict=False))
             td = step_mdp(td, keep_other=True)
     if at_step is not None:
         at_step(horizon)
@@ -67,14 +67,17 @@ def play(
     return metrics.episode_metrics(episode)
 
 
-def shown_scenario(trained: ScenarioConfig) -> str:
-    """Returns the name of the scenario to draw: the fire file of the training, else `huygens`."""
-    return trained.name if isinstance(trained, FileFireConfig) else HELD_OUT_SCENARIO
+def shown_scenario(config: RunConfig) -> str:
+    """Returns the name of the scenario to draw: `huygens`, or the fires of a file or a world."""
+    own = isinstance(config.fire, FileFireConfig) or not config.evaluation.huygens
+    return config.fire.name if own else HELD_OUT_SCENARIO
 
 
 def evaluation_scenarios(config: RunConfig) -> dict[str, ScenarioConfig]:
-    """Returns the scenarios of an evaluation by name: `huygens` and that of the training."""
-    scenarios: dict[str, ScenarioConfig] = {HELD_OUT_SCENARIO: load_scenario(HELD_OUT_SCENARIO)}
+    """Returns the scenarios of an evaluation by name: that of the training, maybe `huygens`."""
+    scenarios: dict[str, ScenarioConfig] = {}
+    if config.evaluation.huygens:
+        scenarios[HELD_OUT_SCENARIO] = load_scenario(HELD_OUT_SCENARIO)
     if config.fire not in scenarios.values():
         changed = config.fire.name in scenarios
         scenarios[config.fire.name + ("_as_trained" if changed else "")] = config.fire
@@ -89,8 +92,8 @@ def evaluation_fires(config: RunConfig, count: int) -> dict[str, Tensor]:
         count: number of fires per scenario.
 
     Returns:
-        Arrival times in steps, float32 [count, X, Y] each. A scenario with a single fire repeats
-        it; the start positions differ.
+        Times in steps, float32 [count, X, Y] or [count, 2, X, Y] each (`burning.split_times`). A
+        scenario with a single fire repeats it; the start positions differ.
     """
     grid, horizon = config.env.grid, config.env.horizon
     return {
@@ -100,10 +103,10 @@ def evaluation_fires(config: RunConfig, count: int) -> dict[str, Tensor]:
 
 
 def shown_fire(config: RunConfig) -> tuple[str, Tensor]:
-    """Returns the fire to draw: the name of its scenario and its arrival times, float32 [X, Y]."""
-    name = shown_scenario(config.fire)
+    """Returns the fire to draw: the name of its scenario and its times, for one environment."""
+    name = shown_scenario(config)
     fires = fires_of(evaluation_scenarios(config)[name])
-    return name, fires.test_fire(0, config.env.grid, config.env.horizon)[0]
+    return name, fires.test_fire(0, config.env.grid, config.env.horizon)
 
 
 def evaluate(
@@ -184,7 +187,7 @@ def play_scripted(
     Args:
         config: configuration of the run.
         name: a name in `SCRIPTED`.
-        arrival: arrival times in steps, float32 [fires, X, Y].
+        arrival: times in steps, float32 [fires, X, Y] or [fires, 2, X, Y].
         report: called with the name if the policy is evaluated.
     """
     world = scripted_config(config, name)
@@ -224,15 +227,15 @@ def play_blocks(
     Args:
         config: configuration of the environment.
         policy: returns the policy for an environment.
-        arrival: arrival times in steps, float32 [fires, X, Y].
+        arrival: times in steps, float32 [fires, X, Y] or [fires, 2, X, Y].
         start_seed: seed of episode 0; episode i has this seed plus i.
         block: environments per batch. The last batch is padded with episodes that are not counted.
 
     Returns:
-        The measures of `metrics.NAMES`, one number per fire.
+        The measures of `metrics.names`, one number per fire.
     """
     count = len(arrival)
-    measured: Measured = {name: [] for name in metrics.NAMES}
+    measured: Measured = {name: [] for name in metrics.names(config.env)}
     for start in range(0, count, block):
         episodes = torch.arange(start, start + block)
         env = build_env(

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from emberlink.envs.utils.errors import UserError
 from emberlink.trainers.runs import checkpoint_file
-from emberlink.trainers.training.non_finite import first_non_finite
+from emberlink.trainers.training.non_finite import FIRE_TIMES, first_non_finite
 from emberlink.trainers.training.rollback import Rollbacks
 from emberlink.trainers.training.setup import TrainingSetup
 
@@ -26,7 +26,7 @@ class RunState:
     sizes: list[dict[str, int]]
     """file -> size in bytes of the .jsonl files of each folder"""
     best: list[float | None]
-    """highest coverage of each seed so far, %"""
+    """best headline measure of each seed so far"""
     seconds: float
     """seconds of training so far"""
     rollbacks: dict[str, Any]
@@ -86,9 +86,9 @@ def restore(
 
 
 def _check_margins(setup: TrainingSetup, tensors: dict[str, Tensor]) -> None:
-    """Checks that arrival times are NaN in the padding around the grid, and only there."""
+    """Checks that times of fires are NaN in the padding around the grid, and only there."""
     for name, fresh in setup.env.base_env.state_dict().items():
-        if "arrival_time" in name and not fresh.isnan().equal(
+        if name.endswith(FIRE_TIMES) and not fresh.isnan().equal(
             tensors[f"environments/{name}"].isnan()
         ):
             raise UserError(f"environments/{name} holds NaN within the grid")

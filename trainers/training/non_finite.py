@@ -21,6 +21,10 @@ from emberlink.trainers.training.setup import TrainingSetup
 _TENSORS = "tensors.safetensors"
 
 
+FIRE_TIMES = ("_arrival_time", "_burn_out")
+"""ends of the names of tensors that are inf where nothing burns and NaN in the margin"""
+
+
 @dataclass(frozen=True)
 class NonFiniteReport:
     """The first NaN or Inf in training and its place."""
@@ -129,8 +133,11 @@ def _in_rollout(setup: TrainingSetup, steps: int) -> NonFiniteReport:
 def first_non_finite(state: Mapping[str, Tensor]) -> str | None:
     """Returns the name of the first tensor of a setup's state that is not finite, or None."""
     for name, value in state.items():
-        fires = "arrival_time" in name  # infinite where nothing burns, NaN in the margin
-        if not fires and value.is_floating_point() and not value.isfinite().all():
+        if (
+            not name.endswith(FIRE_TIMES)
+            and value.is_floating_point()
+            and not value.isfinite().all()
+        ):
             return name
     return None
 

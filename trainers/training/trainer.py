@@ -8,6 +8,7 @@ from typing import Any
 
 from torch import Tensor
 
+from emberlink.envs import metrics
 from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.evaluation import evaluate
 from emberlink.trainers.runs.run_folder import RunFolder
@@ -54,7 +55,7 @@ class Trainer:
         self.seconds = 0.0
         """seconds of training before `train` was called"""
         self.best: list[float | None] = [None] * self.setup.teams
-        """highest coverage of each seed, %; that of best.safetensors"""
+        """best headline measure of each seed; that of best.safetensors"""
         self.saved: int | None = None
         """step of the newest checkpoint"""
         self.changed_versions = ""
@@ -197,18 +198,18 @@ class Trainer:
         return lines
 
     def _keep_best(self, team: int, line: dict[str, Any]) -> None:
-        """Writes the networks of a seed if their coverage is the highest so far.
+        """Writes the networks of a seed if their headline measure is the best so far.
 
-        The coverage is that on validation fires or, without evaluations during training, that of
-        the episode.
+        It is measured on validation fires or, without evaluations during training, in the episode.
         """
-        evaluated = [value for name, value in line.items() if name.endswith("/coverage")]
+        headline = self.config.evaluation.headline
+        evaluated = [value for name, value in line.items() if name.endswith(f"/{headline}")]
         if self.config.evaluation.interval and not evaluated:
             return
-        coverage = sum(evaluated) / len(evaluated) if evaluated else line["coverage"]
-        best = self.best[team]
-        if best is None or coverage > best:
-            self.best[team] = coverage
+        measured = sum(evaluated) / len(evaluated) if evaluated else line[headline]
+        best, higher = self.best[team], headline in metrics.HIGHER_IS_BETTER
+        if best is None or (measured > best if higher else measured < best):
+            self.best[team] = measured
             weights = self.setup.learner.weights(team)
             self.runs[team].save_best(weights, self.configs[team], self.setup.step)
 

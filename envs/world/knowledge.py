@@ -1,0 +1,119 @@
+"""Stores what each UAV knows: the last step at which each cell was seen."""
+
+import torch
+from torch import Tensor
+
+from emberlink.envs.utils.buffers import Buffers
+from emberlink.envs.world import radio
+from emberlink.envs.world.coverage_map import View
+
+NEVER = -1
+"""last step at which a cell was seen that never was"""
+
+
+def step_type(horizon: int) -> torch.dtype:
+    """Returns the smallest integer type that holds the steps of an episode."""
+    return torch.int16 if horizon < torch.iinfo(torch.int16).max else torch.int32
+
+
+class Knowledge(Buffers):
+    """Stores a map per UAV of the last step at which each cell was seen, by it or by others.
+
+    At each step, a UAV takes over all that those know whose messages arrive, directly or passed
+    on: the larger step of each cell. Since a fire is a function of time, the step of the last look
+    gives what was seen there.
+
+    Two UAVs that stay in contact differ only in what they have seen at this step. So whole maps are
+    compared only where a message arrives that did not arrive at the step before.
+
+    Args:
+        envs: number of environments.
+        uavs: UAVs per environment; they are the first radios.
+        area: cells of a padded map (`Sensor.area`).
+        horizon: steps of an episode.
+        listeners: radios that look at nothing, such as a base station, after the UAVs.
+        fires: whether to store also which cells were seen while they burned.
+    """
+
+    last_seen: Tensor
+    """int16 [envs, radios, area] (int32 for long episodes), `NEVER` where nobody looked"""
+    seen_fire: Tensor | None
+    """bool [envs, radios, area]: whether there is a sighting of the cell while it burned"""
+    _reach: Tensor
+    _first: Tensor
+
+    def __init__(
+        self,
+        *,
+        envs: int,
+        uavs: int,
+        area: int,
+        horizon: int,
+        listeners: int = 0,
+        fires: bool = False,
+    ):
+        super().__init__()
+        shape = envs, uavs + listeners, area
+        self.register_buffer("last_seen", torch.full(shape, NEVER, dtype=step_type(horizon)))
+        self.register_buffer("seen_fire", torch.zeros(shape, dtype=torch.bool) if fires else None)
+        alone = torch.eye(shape[1], dtype=torch.bool)
+        self.register_buffer("_reach", alone.repeat(envs, 1, 1))
+        # A view's cell of environment e is at e * area; the map of radio r begins at
+        # (e * radios + r) * area.
+        env = torch.arange(envs).view(-1, 1, 1, 1) * (shape[1] - 1)
+        self.register_buffer(
+            "_first", (env + torch.arange(shape[1]).view(-1, 1, 1)) * area, persistent=False
+        )
+
+    def start_episodes(self, mask: Tensor) -> None:
+        """Forgets everything in the environments of a mask, bool [envs]."""
+        began = mask[:, None, None]
+        self.last_seen.masked_fill_(began, NEVER)
+        if self.seen_fire is not None:
+            self.seen_fire.masked_fill_(began, False)
+        alone = torch.eye(self._reach.shape[-1], dtype=torch.bool, device=mask.device)
+        self._reach.copy_(torch.where(began, alone, self._reach))
+
+    def update(self, view: View, step: Tensor, hears: Tensor) -> None:
+        """Adds the sightings and messages of a step.
+
+        Args:
+            view: the cells that the UAVs see.
+            step: int64 [envs], steps since the episode began.
+            hears: bool [envs, radios, radios], whether a radio (row) hears another one (column).
+        """
+        reach = radio.reachable(hears)
+        uavs = view.cells.shape[1]
+        knows = reach[..., :uavs].unsqueeze(-1)
+        index = (view.cells.unsqueeze(1) + self._first).flatten(1)
+        now = step.to(self.last_seen.dtype).view(-1, 1, 1, 1)
+        seen = torch.where(knows & view.in_view.unsqueeze(1), now, NEVER).flatten(1)
+        self.last_seen.view(-1).scatter_reduce_(0, index.view(-1), seen.view(-1), "amax")
+        if self.seen_fire is not None:
+            fire = (knows & view.burning.unsqueeze(1)).flatten()
+            flat = self.seen_fire.view(-1).view(torch.uint8)
+            flat.scatter_reduce_(0, index.view(-1), fire.view(torch.uint8), "amax")
+        self._merge(reach & ~self._reach)
+        self._reach.copy_(reach)
+
+    def _merge(self, new: Tensor) -> None:
+        """Takes over the maps of radios whose messages arrive for the first time.
+
+        Args:
+            new: bool [envs, radios, radios], whether a radio (row) takes over another's map.
+        """
+        maps = [self.last_seen] if self.seen_fire is None else [self.last_seen, self.seen_fire]
+        if new.is_cuda:
+            for source in range(new.shape[-1]):
+                takes = new[..., source].unsqueeze(-1)
+                for known in maps:
+                    other = known[:, source : source + 1]
+                    torch.maximum(known, torch.where(takes, other, known), out=known)
+            return
+        env, taker, source = new.nonzero(as_tuple=True)
+        if len(env):
+            for radio_index in source.unique().tolist():
+                rows = source == radio_index
+                where = env[rows], taker[rows]
+                for known in maps:
+                    known[where] = torch.maximum(known[where], known[env[rows], radio_index])

@@ -1,0 +1,158 @@
+"""Measures what the team and the base know of the fire at each step."""
+
+import torch
+from torch import Tensor
+
+from emberlink.envs import keys
+from emberlink.envs.config import WildfireConfig
+from emberlink.envs.utils.buffers import Buffers
+from emberlink.envs.utils.counter_rng import Use
+from emberlink.envs.world import radio
+from emberlink.envs.world.coverage_map import View
+from emberlink.envs.world.knowledge import NEVER, Knowledge, step_type
+from emberlink.envs.world.sighting_ages import SightingAges, cell_ages
+
+
+class FireTimes(Buffers):
+    """Stores the first step at which each cell burns and the first at which it no longer does.
+
+    Args:
+        envs: number of environments.
+        area: cells of a padded map (`Sensor.area`).
+        horizon: steps of an episode; later steps are stored as `horizon + 1`.
+    """
+
+    ignition: Tensor
+    """integers [envs, area]"""
+    end: Tensor
+    """integers [envs, area]"""
+
+    def __init__(self, envs: int, area: int, horizon: int):
+        super().__init__()
+        self._never = horizon + 1
+        for name in ("ignition", "end"):
+            steps = torch.full((envs, area), self._never, dtype=step_type(horizon))
+            self.register_buffer(name, steps)
+
+    def start_episodes(self, mask: Tensor, arrival: Tensor, burn_out: Tensor | None) -> None:
+        """Stores the fires of new episodes.
+
+        Args:
+            mask: bool [envs].
+            arrival, burn_out: float32 [envs, area], steps; NaN outside of the grid.
+        """
+        for steps, times in ((self.ignition, arrival), (self.end, burn_out)):
+            if times is not None:
+                known = times.nan_to_num(nan=self._never).clamp(0, self._never).ceil()
+                steps.copy_(torch.where(mask[:, None], known.to(steps.dtype), steps))
+
+    def burning(self, step: Tensor) -> Tensor:
+        """Returns whether each cell burns at a step, bool [envs, area]; [envs, 1]."""
+        return (self.ignition <= step) & (step < self.end)
+
+
+class Measures(Buffers):
+    """Measures the ages of sightings, and what reaches the base station.
+
+    Args:
+        world: the world and the team.
+        envs: number of environments.
+        area: cells of a padded map (`Sensor.area`).
+    """
+
+    team_seen: Tensor
+    """integers [envs, area]: the last step at which any UAV saw the cell"""
+    _base: Tensor
+
+    def __init__(self, world: WildfireConfig, envs: int, area: int):
+        super().__init__()
+        self._world = world
+        self.times = FireTimes(envs, area, world.horizon)
+        self.knowledge = self.base_ages = self.ages = None
+        if world.measures == "all":
+            self.ages = SightingAges(envs, world.horizon)
+            seen = torch.full((envs, area), NEVER, dtype=step_type(world.horizon))
+            self.register_buffer("team_seen", seen)
+        if world.base is not None:
+            self.knowledge = Knowledge(
+                envs=envs,
+                uavs=world.num_uavs,
+                area=area,
+                horizon=world.horizon,
+                listeners=1,
+                fires=True,
+            )
+            self.base_ages = SightingAges(envs, world.horizon)
+            base = torch.tensor([[*world.base, 0.0]], dtype=torch.float64)
+            self.register_buffer("_base", base.repeat(envs, 1, 1), persistent=False)
+
+    def start_episodes(self, mask: Tensor, arrival: Tensor, burn_out: Tensor | None) -> None:
+        """Starts new episodes; see `FireTimes.start_episodes`."""
+        self.times.start_episodes(mask, arrival, burn_out)
+        for part in (self.ages, self.base_ages, self.knowledge):
+            if part is not None:
+                part.start_episodes(mask)
+        if self.ages is not None:
+            self.team_seen.masked_fill_(mask[:, None], NEVER)
+
+    def update(
+        self, view: View, position: Tensor, rng_key: Tensor, step: Tensor, alive: Tensor | None
+    ) -> None:
+        """Adds one step.
+
+        Args:
+            view: the cells that the UAVs see.
+            position: float64 [envs, uavs, 3], cells.
+            rng_key: int64 [envs], `keys.RNG_KEY`.
+            step: int64 [envs], steps since the episode began.
+            alive: bool [envs, uavs]; all are alive if None.
+        """
+        now = step.to(self.times.end.dtype).view(-1, 1, 1)
+        if self.ages is not None:
+            seen = torch.where(view.in_view, now, NEVER)
+            flat = self.team_seen.view(-1)
+            flat.scatter_reduce_(0, view.cells.view(-1), seen.view(-1), "amax")
+            self._add_ages(self.ages, self.team_seen, step)
+        if self.knowledge is not None and self.base_ages is not None:
+            self.knowledge.update(view, step, self.hears(position, rng_key, step, alive))
+            self._add_ages(self.base_ages, self.knowledge.last_seen[:, -1], step)
+
+    def _add_ages(self, ages: SightingAges, last_seen: Tensor, step: Tensor) -> None:
+        """Adds the ages of the burning cells of all environments, from int [envs, area]."""
+        ignition = self.times.ignition
+        burning = self.times.burning(step.to(ignition.dtype).unsqueeze(-1)).flatten()
+        if burning.is_cuda:  # The number of burning cells would have to be read from the device.
+            cell, weight = torch.arange(len(burning), device=burning.device), burning.long()
+        else:
+            cell = burning.nonzero().squeeze(-1)
+            weight = torch.ones_like(cell)
+        env = cell // ignition.shape[1]
+        age = cell_ages(step.take(env), last_seen.take(cell), ignition.take(cell))
+        ages.add(age.clamp(min=0), env, weight)
+
+    def hears(
+        self, position: Tensor, rng_key: Tensor, step: Tensor, alive: Tensor | None
+    ) -> Tensor:
+        """Returns the links of the UAVs and the base, which is last, bool [envs, n + 1, n + 1].
+
+        The links between UAVs are those of `radio.links` without a base.
+        """
+        given = rng_key, step
+        places = torch.cat((position, self._base), 1)
+        lives = None if alive is None else torch.nn.functional.pad(alive, (0, 1), value=True)
+        every = radio.links(self._world.radio, places, *given, alive=lives, use=Use.REPORT_LOSS)
+        every[:, :-1, :-1] = radio.links(self._world.radio, position, *given, alive=alive)
+        return every
+
+    def values(self) -> dict[str, Tensor]:
+        """Returns the measures of the episode so far by key, [envs] each."""
+        values: dict[str, Tensor] = {}
+        if self.ages is not None:
+            values[keys.FRONT_AGE] = self.ages.mean()
+            values[keys.FRONT_AGE_P95] = self.ages.percentile(0.95)
+        if self.knowledge is not None and self.base_ages is not None:
+            seen_fire = self.knowledge.seen_fire
+            assert seen_fire is not None
+            values[keys.BASE_SEEN] = seen_fire[:, -1].sum(-1)
+            values[keys.BASE_AGE] = self.base_ages.mean()
+        return values
