@@ -4,7 +4,16 @@ from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Annotated, Any, Literal
 
-from pydantic import ConfigDict, Field, PlainValidator, SerializeAsAny, Strict, field_validator
+from pydantic import (
+    AfterValidator,
+    ConfigDict,
+    Field,
+    PlainValidator,
+    SerializeAsAny,
+    Strict,
+    field_validator,
+    model_validator,
+)
 from pydantic.dataclasses import dataclass
 
 from emberlink.comm import registry
@@ -14,7 +23,7 @@ from emberlink.envs.config import WildfireConfig
 from emberlink.envs.scenarios import Scenario
 from emberlink.envs.utils.device import check_device as check_device
 from emberlink.envs.utils.errors import UserError
-from emberlink.envs.utils.validation import Name
+from emberlink.envs.utils.validation import Name, unknown
 from emberlink.trainers.config import choice
 from emberlink.trainers.learners import registry as learners
 from emberlink.trainers.learners.base import LearnerConfig
@@ -39,6 +48,12 @@ LearnerChoice = Annotated[
 """settings of the learner `learner.name`"""
 
 
+def _check_measure(value: str) -> str:
+    if value not in metrics.ALL:
+        raise UserError(unknown(value, metrics.ALL))
+    return value
+
+
 @dataclass(frozen=True, kw_only=True, config=_STRICT)
 class EvaluationConfig:
     """The settings of evaluations of frozen policies on held-out fires."""
@@ -51,7 +66,7 @@ class EvaluationConfig:
     """episodes of an evaluation during training, each on another validation fire"""
     huygens: bool
     """whether to evaluate on fires of the scenario `huygens`, too, besides that of the training"""
-    headline: Literal[metrics.ALL]
+    headline: Annotated[str, AfterValidator(_check_measure)]
     """the measure that chooses the networks of best.safetensors on validation fires"""
 
 
@@ -102,6 +117,16 @@ class RunConfig:
     on_nan: Literal["stop", "rollback"] = "stop"
     """reaction to NaN or Inf: stop, or return to the last checkpoint and continue with smaller
     learning rates"""
+
+    @model_validator(mode="after")
+    def _check_headline(self) -> "RunConfig":
+        headline, known = self.evaluation.headline, metrics.names(self.env)
+        if headline not in known:
+            raise UserError(
+                f"evaluation.headline={headline} is not measured in this world (env.measures, "
+                f"env.base); known: {', '.join(known)}"
+            )
+        return self
 
     @field_validator("device")
     @classmethod

@@ -133,11 +133,8 @@ def _in_rollout(setup: TrainingSetup, steps: int) -> NonFiniteReport:
 def first_non_finite(state: Mapping[str, Tensor]) -> str | None:
     """Returns the name of the first tensor of a setup's state that is not finite, or None."""
     for name, value in state.items():
-        if (
-            not name.endswith(FIRE_TIMES)
-            and value.is_floating_point()
-            and not value.isfinite().all()
-        ):
+        fires = name.endswith(FIRE_TIMES)
+        if not fires and value.is_floating_point() and not value.isfinite().all():
             return name
     return None
 
