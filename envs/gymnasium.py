@@ -20,7 +20,8 @@ ID = "emberlink/WildfireTeam-v0"
 class WildfireTeamEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
     """One agent that observes all UAVs, float32 [n * features], and moves all, float32 [n * 3].
 
-    The reward is the mean over UAVs. `info` holds the numbers of cells seen and burning.
+    The reward is the mean over UAVs. An episode is terminated if all UAVs have failed. `info` holds
+    the numbers of cells seen and burning.
 
     Args:
         kwargs: as for `parallel_env`.
@@ -48,11 +49,13 @@ class WildfireTeamEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
     def step(self, action: NDArray[np.float32]):
         """Moves all UAVs at once."""
         rows = np.asarray(action, np.float32).reshape(-1, 3)
-        actions = dict(zip(self._team.possible_agents, rows, strict=True))
-        _, rewards, terminated, truncated, infos = self._team.step(actions)
-        reward = float(np.mean(list(rewards.values())))
-        ended = any(terminated.values()), any(truncated.values())
-        return self._team.state(), reward, *ended, _shared(infos)
+        every = self._team.possible_agents
+        actions = dict(zip(every, rows, strict=True))
+        flying = {agent: actions[agent] for agent in self._team.agents}
+        _, rewards, _, truncations, infos = self._team.step(flying)
+        reward, truncated = sum(rewards.values()) / len(every), any(truncations.values())
+        terminated = not truncated and not self._team.agents
+        return self._team.state(), reward, terminated, truncated, _shared(infos)
 
     def render(self):
         """Draws the environment; see `WildfireParallelEnv.render`."""

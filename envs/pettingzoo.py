@@ -63,9 +63,9 @@ def env(**kwargs: Any) -> AECEnv:
 class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
     """The UAVs of one environment as PettingZoo's agents "uav_0", "uav_1", ...
 
-    All agents are truncated together at the horizon, and never terminated. `infos` hold, for each
-    agent, the other tensors under ("agents", ...) of the TorchRL environment, and the numbers of
-    cells seen and burning. With `observation: window` an observation is a dictionary of
+    All agents are truncated together at the horizon. One that fails (`env.failures`) is terminated
+    and leaves `agents`. `infos` hold, for each agent, the other tensors under ("agents", ...) of the
+    TorchRL environment, and the numbers of cells seen and burning. With `observation: window` an observation is a dictionary of
     "observation", float32 [6], and "window", uint8 [3, W, W].
 
     Args:
@@ -158,15 +158,18 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
         self._now = step_mdp(stepped, keep_other=True)
         after = stepped.get("next")
         rewards = after.get(keys.REWARD)[0, :, 0].tolist()
-        terminated, truncated = bool(after.get("terminated")), bool(after.get("truncated"))
-        self.agents = [] if terminated or truncated else list(self.possible_agents)
+        lives = dict(zip(self.possible_agents, after.get(keys.ALIVE)[0].tolist(), strict=True))
+        flew, truncated = self.agents, bool(after.get("truncated"))
+        self.agents = [] if truncated else [agent for agent in flew if lives[agent]]
         self._show()
+        observations, infos = self._observations(after), self._infos(after)
+        rewards = dict(zip(self.possible_agents, rewards, strict=True))
         return (
-            self._observations(after),
-            dict(zip(self.possible_agents, rewards, strict=True)),
-            dict.fromkeys(self.possible_agents, terminated),
-            dict.fromkeys(self.possible_agents, truncated),
-            self._infos(after),
+            {agent: observations[agent] for agent in flew},
+            {agent: rewards[agent] for agent in flew},
+            {agent: not lives[agent] for agent in flew},
+            dict.fromkeys(flew, truncated),
+            {agent: infos[agent] for agent in flew},
         )
 
     def state(self) -> Array:
@@ -211,7 +214,8 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
         """Returns the actions in the order of the agents, float32 [n, 3]."""
         if set(actions) != set(self.agents):
             raise UserError(f"actions for {sorted(actions)}; the agents are {self.agents}")
-        rows = [np.asarray(actions[agent], np.float32) for agent in self.possible_agents]
+        hover = np.zeros(3, np.float32)
+        rows = [np.asarray(actions.get(agent, hover), np.float32) for agent in self.possible_agents]
         for agent, row in zip(self.possible_agents, rows, strict=True):
             if row.shape != (3,):
                 raise UserError(f"an action is an array of shape (3,), got {row.shape} for {agent}")

@@ -42,8 +42,8 @@ SETUPS = "known: paper, released, tuned"
         (["consensus", "learner.gama=0.9"], ["'learner.gama'", "did you mean learner.gamma?"]),
         (["consensus", "horizon=10"], ["'horizon'", "did you mean env.horizon?"]),
         (
-            ["independent", "comm.range=5"],
-            ["'comm.range'", "a setting of method consensus, not of independent"],
+            ["independent", "env.radio.range=5"],
+            ["'env.radio.range'", "a setting of method consensus, not of independent"],
         ),
         (["consensus", "zzz=1"], ["'zzz'", "known: setup, fire, learner, env", "num_envs"]),
         (["consensus", "method=independent"], ["'method'"]),
@@ -67,8 +67,8 @@ SETUPS = "known: paper, released, tuned"
         (["consensus", "learner=[1]"], ["learner '[1]' is not known"]),
         (["consensus", "logger=mlflow"], ["logger=mlflow", "'wandb', 'tensorboard', 'csv'"]),
         (["consensus", "replay=both"], ["replay=both", "'per_agent' or 'shared'"]),
-        (["consensus", "comm.rnge=3"], ["'comm.rnge'", "did you mean comm.range?"]),
-        (["consensus", "comm.range=-1"], ["comm.range=-1", "greater than or equal to 0"]),
+        (["consensus", "comm.rnge=3"], ["'comm.rnge'", "did you mean env.radio.range?"]),
+        (["consensus", "env.radio.range=-1"], ["env.radio.range=-1", "greater than or equal to 0"]),
         (["consensus", "comm.heading.form=cubic"], ["comm.heading.form=cubic", "'folded_linear'"]),
         (
             ["consensus", "comm.name=telepathy"],

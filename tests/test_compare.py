@@ -171,7 +171,7 @@ def test_scripted_policies_are_drawn_in_their_rows(tmp_path, monkeypatch):
 
     monkeypatch.setattr(Axes, "plot", watched)
     changed = ("comm.agree=false", "comm.wander=false")
-    for seed, keys in enumerate([(), changed, ("comm.loss=0.5",)]):
+    for seed, keys in enumerate([(), changed, ("env.radio.loss=0.5",)]):
         coverage = {"coverage": 90.0 - 10 * seed}
         run = write_run(
             tmp_path,
@@ -396,7 +396,9 @@ def test_an_evaluation_without_the_fire_trained_on(tmp_path):
 
 
 def test_groups_are_named_by_their_settings(tmp_path):
-    for seed, setting in enumerate(("comm.agree=false", "comm.range=inf", "comm.follow=nearest")):
+    for seed, setting in enumerate(
+        ("comm.agree=false", "env.radio.range=inf", "comm.follow=nearest")
+    ):
         write_run(tmp_path, "consensus", seed, overrides=(setting,))
     write_run(tmp_path, "consensus", 9)
     (section,), _ = gathered(tmp_path)
@@ -404,7 +406,7 @@ def test_groups_are_named_by_their_settings(tmp_path):
         "consensus",
         "consensus (comm.agree=false)",
         "consensus (comm.follow=nearest)",
-        "consensus (comm.range=inf)",
+        "consensus (env.radio.range=inf)",
     ]
 
 
@@ -424,7 +426,7 @@ def test_extra_evaluations_are_not_counted_as_runs(tmp_path, capsys):
     for seed in (0, 1):
         run = write_run(tmp_path, "consensus", seed, learned={"coverage": 80 + seed})
         write_run(tmp_path, "independent", seed, learned={"coverage": 30 + seed})
-        write_extra_evaluation(run, "eval_comm.loss=0.5.json", 60 + seed)
+        write_extra_evaluation(run, "eval_env.radio.loss=0.5.json", 60 + seed)
     for name, about in {
         "eval_step_7.json": {"checkpoint": "step_7.safetensors"},
         "eval_fires.json": {"fires": 4, "start_seed": 2},
@@ -439,14 +441,14 @@ def test_extra_evaluations_are_not_counted_as_runs(tmp_path, capsys):
     (coverage,) = [r for r in section["fires"]["huygens"] if r["measure"] == "coverage"]
     assert [(r["method"], r["iqm"]) for r in coverage["rows"]] == [
         ("consensus", 80.5),
-        ("consensus, evaluated with comm.loss=0.5", 60.5),
+        ("consensus, evaluated with env.radio.loss=0.5", 60.5),
         ("independent", 30.5),
     ]
     # Two evaluations of the same runs are not independent samples.
     assert [r["probability_of_improvement"] for r in coverage["rows"]] == [None, 1.0, None]
-    assert [r["evaluated_with"] for r in section["runs"]] == [{}] * 2 + [{"comm.loss": 0.5}] * 2 + [
-        {}
-    ] * 2
+    assert [r["evaluated_with"] for r in section["runs"]] == [{}] * 2 + [
+        {"env.radio.loss": 0.5}
+    ] * 2 + [{}] * 2
     assert {claim["method"] for claim in section["claims"]} == {"consensus"}
     assert section["curves"]["coverage"].keys() == {"consensus", "independent"}
     assert (tmp_path / "out" / "1_tuned_frozen_1_huygens.png").stat().st_size > 10_000
@@ -459,7 +461,7 @@ def test_scripted_policies_may_depend_on_the_messages(tmp_path):
             tmp_path,
             "consensus",
             seed,
-            overrides=(f"comm.loss={loss}",),
+            overrides=(f"env.radio.loss={loss}",),
             scripted=("follow_target",),
         )
         content = read_evaluation(run)
@@ -470,7 +472,7 @@ def test_scripted_policies_may_depend_on_the_messages(tmp_path):
     assert ranking(section, "coverage").scripted == {
         "follow_target": [
             Scripted(["consensus"], 40.0),
-            Scripted(["consensus (comm.loss=0.5)"], 20.0),
+            Scripted(["consensus (env.radio.loss=0.5)"], 20.0),
         ]
     }
     assert not [note for note in section.notes if "follow_target" in note]

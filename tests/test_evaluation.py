@@ -104,7 +104,7 @@ def test_all_policies_have_the_same_fires_and_starts(cache, monkeypatch):
 
 
 def test_follow_target_uses_the_consensus_of_the_setup():
-    base = small("consensus", "comm.range=3")
+    base = small("consensus", "env.radio.range=3")
     assert evaluate.scripted_config(base, "follow_target") == base
     for method in ("independent", "shared_memory", "positional"):
         for setup in ("paper", "released", "tuned"):
@@ -182,7 +182,7 @@ def test_a_scripted_policy_is_evaluated_once(cache, played):
     "change",
     [
         *("env.displacement=0.7", "env.reward.no_fire=-1.5", "env.num_uavs=3", "env.horizon=13"),
-        *("comm.range=4", "comm.heading.weight=2"),
+        *("env.radio.range=4", "comm.heading.weight=2"),
     ],
 )
 def test_the_file_name_depends_on_the_settings(change, cache, played):

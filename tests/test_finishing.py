@@ -277,7 +277,7 @@ def test_folders_named_like_temporary_files_are_kept(run, capsys):
 
 @pytest.mark.slow
 def test_an_infinite_range_round_trips(tmp_path, capsys):
-    arguments = ["consensus", *TINY, "comm.range=inf", f"output={tmp_path / 'runs'}"]
+    arguments = ["consensus", *TINY, "env.radio.range=inf", f"output={tmp_path / 'runs'}"]
     assert trained(capsys, *arguments)[0] == 0
     run = run_of(tmp_path / "runs")
     assert run.config().comm["range"] == float("inf")

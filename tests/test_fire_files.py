@@ -134,7 +134,7 @@ def test_a_run_is_evaluated_rendered_and_resumed_without_its_file(run, trained, 
         before = json.loads((run / "eval.json").read_text())["results"]
         assert main.main(["eval", str(run)]) == 0
         assert json.loads((run / "eval.json").read_text())["results"] == before
-        assert main.main(["eval", str(run), "comm.loss=0.5"]) == 0
+        assert main.main(["eval", str(run), "env.radio.loss=0.5"]) == 0
         picture = tmp_path / "a.png"
         assert main.main(["render", str(run), "--fire", "file:3", "--output", str(picture)]) == 0
         assert picture.stat().st_size > 1000

@@ -211,7 +211,7 @@ def test_links_roles_and_targets_are_drawn_from_the_tensordict():
 @pytest.mark.parametrize(("loss", "drawn"), [(0.0, True), (1.0, False)])
 def test_links_are_received_messages(loss, drawn):
     fire = torch.zeros(12, 12)
-    env = make_env("consensus", fire=fire, horizon=4, seed=0, **{"comm.loss": loss})
+    env = make_env("consensus", fire=fire, horizon=4, seed=0, **{"env.radio.loss": loss})
     policy = FollowTarget(env.base_env)
     frames = record_episode.record_episode(env, policy, env.transform.module, steps=range(5))
     assert len(frames) == 5

@@ -117,7 +117,7 @@ def test_evaluate_is_the_evaluation_of_the_training(trained):
     alone = trainers.evaluate(str(trained.path), episodes=1, scripted=False, device="cpu")
     assert alone["huygens"].keys() == {"learned"}
     assert alone["huygens"]["learned"]["coverage"] == results["huygens"]["learned"]["coverage"][:1]
-    deaf = trainers.evaluate(trained.path, scripted=False, **{"comm.loss": 1.0})
+    deaf = trainers.evaluate(trained.path, scripted=False, **{"env.radio.loss": 1.0})
     assert deaf.keys() == results.keys()
     assert sorted(trained.path.rglob("*")) == before
 

@@ -113,7 +113,7 @@ def test_changed_digits_of_a_configuration(run):
     ("old", "new", "said"),
     [
         ("view_angle: 30.0", "view_angle: 31.0", "env.view_angle=30.0"),
-        ("range: 10.0", "range: 70.0", "comm.range=10.0"),
+        ("range: 10.0", "range: 70.0", "env.radio.range=10.0"),
         ("tau: 0.001", "tau: 0.002", "learner.tau=0.001"),
     ],
 )

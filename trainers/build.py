@@ -101,5 +101,6 @@ def build_learner(config: RunConfig, env: TransformedEnv, guard: NonFiniteGuard)
         total_steps=config.episodes * config.env.horizon,
         guard=guard,
         device=config.device,
+        failures=config.env.failures > 0,
     )
     return registry.build(config.learner, context)

@@ -30,7 +30,7 @@ def add_eval(commands: Any) -> None:
         metavar="key=value",
         nargs="*",
         default=[],
-        help="keys of comm. or env. to change, such as comm.loss=0.5; "
+        help="keys of comm. or env. to change, such as env.radio.loss=0.5; "
         "the names of the files contain them",
     )
     evaluation.add_argument(

@@ -12,7 +12,7 @@ from emberlink.trainers.config.schema import NOT_LEARNT_WITH, RunConfig
 
 NOT_COMPARED = ("seed", "seeds", "output", "evaluation", *NOT_LEARNT_WITH)
 """first parts of keys that may differ within a group, since they do not affect training"""
-NOT_NOTED = ("seed", "seeds", "output", "baseline_comm")
+NOT_NOTED = ("seed", "seeds", "output", "baselines")
 """first parts of keys whose differences within a group are not reported in notes"""
 _OF_SECTION = ("env.horizon", "env.grid")
 """settings of the environment that are equal within a section, besides those of the fire"""

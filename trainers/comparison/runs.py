@@ -30,7 +30,7 @@ class Run:
         lines: lines of metrics.jsonl, one per training episode.
         evaluation: content of eval.json or of an eval_*.json.
         evaluated_with: dotted key -> value of each setting of the evaluation that differs from the
-            training, such as comm.loss; empty for eval.json.
+            training, such as env.radio.loss; empty for eval.json.
     """
 
     path: Path

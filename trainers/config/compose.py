@@ -51,6 +51,7 @@ def resolve(method: str, overrides: Sequence[str] = (), **settings: Any) -> RunC
     }
     values = _composed(str(method), chosen)
     _drop_settings_of_other_learners(values["learner"])
+    usual = deepcopy(values["env"])
     known = list(dict.fromkeys([*GROUPS, *all_keys(values)]))
     for key, value in given:
         if key in (*(f"{group}.name" for group in GROUPS), "fire.kind"):
@@ -64,7 +65,8 @@ def resolve(method: str, overrides: Sequence[str] = (), **settings: Any) -> RunC
     values["world"] = chosen["world"]
     _put_settings(values, settings)
     _choose_seed(values, any(key == "seed" for key in [*dict(given), *settings]))
-    values["baseline_comm"] = _baseline_comm(chosen)
+    radio = _changes(_interpolated(usual)["radio"], values["env"]["radio"])
+    values["baselines"] = _baselines(chosen, radio)
     config = from_values(values)
     return replace(config, fire=fires_of(config.fire).with_checksum())
 
@@ -82,7 +84,7 @@ def override(config: RunConfig, overrides: Sequence[str] = (), **settings: Any) 
         UserError: a key is not known, or a value does not fit.
     """
     values = to_values(config)
-    baseline_comm = values.pop("baseline_comm")
+    baselines, radio = values.pop("baselines"), dict(values["env"]["radio"])
     known = list(flat(values))
     for key, value in map(parse, overrides):
         if key in GROUPS:
@@ -94,7 +96,9 @@ def override(config: RunConfig, overrides: Sequence[str] = (), **settings: Any) 
         else:
             put(values, key, value)
     _put_settings(values, settings)
-    changed = from_values({**values, "baseline_comm": baseline_comm})
+    for baseline in baselines.values():
+        baseline["radio"] |= _changes(radio, values["env"]["radio"])
+    changed = from_values({**values, "baselines": baselines})
     # The run's own fire also holds the path of the run's copy of a fire file.
     return replace(changed, fire=config.fire) if changed.fire == config.fire else changed
 
@@ -196,11 +200,28 @@ def _put_settings(values: dict[str, Any], settings: Mapping[str, Any]) -> None:
         put(values, full_key(values, key), plain(value, key))
 
 
-def _baseline_comm(chosen: Mapping[str, str]) -> dict[str, Any]:
-    """Returns method -> `comm` for the methods whose communication scripted policies use."""
+def _baselines(chosen: Mapping[str, str], radio: Mapping[str, Any]) -> dict[str, Any]:
+    """Returns the settings of the methods whose communication scripted policies use.
+
+    Args:
+        chosen: group -> name of the chosen file.
+        radio: settings of the radio that the user changed; they hold for all methods.
+
+    Returns:
+        method -> "comm" and "radio" -> settings.
+    """
     methods = {policy.recipe for policy in SCRIPTED.values() if policy.recipe}
     groups = {group: chosen[group] for group in ("setup", "world")}
-    return {method: _interpolated(_composed(method, groups))["comm"] for method in sorted(methods)}
+    baselines = {}
+    for method in sorted(methods):
+        values = _interpolated(_composed(method, groups))
+        baselines[method] = {"comm": values["comm"], "radio": values["env"]["radio"] | radio}
+    return baselines
+
+
+def _changes(before: Mapping[str, Any], after: Mapping[str, Any]) -> dict[str, Any]:
+    """Returns the values of `after` that differ from those of `before`."""
+    return {key: value for key, value in after.items() if value != before.get(key)}
 
 
 def _drop_settings_of_other_learners(learner: dict[str, Any]) -> None:

@@ -19,7 +19,7 @@ from pydantic.dataclasses import dataclass
 from emberlink.comm import registry
 from emberlink.comm.base import CommModule
 from emberlink.envs import metrics
-from emberlink.envs.config import WildfireConfig
+from emberlink.envs.config import RadioConfig, WildfireConfig
 from emberlink.envs.scenarios import Scenario
 from emberlink.envs.utils.device import check_device as check_device
 from emberlink.envs.utils.errors import UserError
@@ -71,6 +71,21 @@ class EvaluationConfig:
 
 
 @dataclass(frozen=True, kw_only=True, config=_STRICT)
+class Baseline:
+    """The communication of a method, for the scripted policies that use it."""
+
+    comm: dict[str, Any]
+    """name and settings of the communication module"""
+    radio: RadioConfig
+    """settings of the radio with this method in the run's world"""
+
+    @field_validator("comm")
+    @classmethod
+    def _complete_comm(cls, value: dict[str, Any]) -> dict[str, Any]:
+        return _completed("comm", value)
+
+
+@dataclass(frozen=True, kw_only=True, config=_STRICT)
 class RunConfig:
     """All settings of a run."""
 
@@ -84,8 +99,8 @@ class RunConfig:
     """whether each UAV has its own replay buffer, or all share one"""
     comm: dict[str, Any]
     """name and settings of the communication module"""
-    baseline_comm: dict[str, dict[str, Any]] = Field(default_factory=dict)
-    """method -> `comm` of the methods whose communication scripted policies use, in this setup"""
+    baselines: dict[str, Baseline] = Field(default_factory=dict)
+    """method -> settings of the methods whose communication scripted policies use"""
     env: WildfireConfig
     """settings of the environment"""
     fire: Scenario
@@ -145,13 +160,6 @@ class RunConfig:
     def _complete_comm(cls, value: dict[str, Any]) -> dict[str, Any]:
         # A run folder keeps them if a later version of the module has other defaults.
         return _completed("comm", value)
-
-    @field_validator("baseline_comm")
-    @classmethod
-    def _complete_baseline_comm(cls, value: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
-        return {
-            method: _completed(f"baseline_comm.{method}", comm) for method, comm in value.items()
-        }
 
 
 def build_comm(config: RunConfig, num_envs: int) -> CommModule:

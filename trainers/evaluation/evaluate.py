@@ -210,8 +210,14 @@ def scripted_config(config: RunConfig, name: str) -> RunConfig:
     recipe = SCRIPTED[name].recipe
     if recipe is None:
         return config
-    comm = config.baseline_comm.get(recipe) or resolve(recipe, [f"setup={config.setup}"]).comm
-    return config if comm["name"] == config.comm["name"] else replace(config, comm=comm)
+    if recipe not in config.baselines:
+        # The policy is of a package that was not installed at the time of the training.
+        choices = [f"setup={config.setup}", f"world={config.world}"]
+        config = replace(config, baselines=resolve(recipe, choices).baselines)
+    baseline = config.baselines[recipe]
+    if baseline.comm["name"] == config.comm["name"]:
+        return config
+    return replace(config, comm=baseline.comm, env=replace(config.env, radio=baseline.radio))
 
 
 def play_blocks(

@@ -97,6 +97,7 @@ def record(config: RunConfig, results: Results, **about: Any) -> dict[str, Any]:
     return {
         "method": config.method,
         "setup": config.setup,
+        "world": config.world,
         "seed": config.seed,
         "start_seed": evaluate.START_SEED,
         **about,

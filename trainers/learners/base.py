@@ -66,6 +66,8 @@ class LearnerContext:
     """checks the batch, losses and gradients of each update"""
     device: str
     """device of networks and transitions"""
+    failures: bool = False
+    """whether UAVs can fail; nothing is learnt from one that is not `keys.ALIVE` after a step"""
 
 
 class Learner(ABC):

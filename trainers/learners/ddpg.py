@@ -38,4 +38,7 @@ class DDPG(OffPolicyLearner):
         critic: Any = self.loss.value_network
         with critic.module.sharing():
             losses = self.loss(batch)
-        return {"actor": losses["loss_actor"].mean(0), "critic": losses["loss_value"].mean(0)}
+        return {
+            "actor": self.mean_over_batch(losses["loss_actor"], batch),
+            "critic": self.mean_over_batch(losses["loss_value"], batch),
+        }

@@ -119,6 +119,20 @@ class OffPolicyLearner(Learner):
             actor: whether to compute the actors' losses, too.
         """
 
+    @staticmethod
+    def mean_over_batch(loss: Tensor, batch: TensorDictBase) -> Tensor:
+        """Returns the mean loss of each UAV, [uavs], over the transitions in which UAVs flew.
+
+        Args:
+            loss: [batch, uavs].
+            batch: batch size [batch]; without `keys.ALIVE`, UAVs cannot fail.
+        """
+        alive = batch.get(keys.ALIVE, None)
+        if alive is None:
+            return loss.mean(0)
+        weight = alive.to(loss.dtype)
+        return (loss * weight).sum(0) / weight.sum(0).clamp(min=1)
+
     def moves_actor(self, update: int) -> bool:
         """Returns whether an update, counted from 1, changes actors and target networks, too."""
         return True

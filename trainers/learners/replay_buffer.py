@@ -40,6 +40,7 @@ class ReplayMemory:
         uavs, shared = context.num_uavs, context.shared_replay
         self.teams, self.device = len(context.seeds), context.device
         self._keys = keys.observation_keys(context.observation_spec)
+        self._failures = context.failures
         size = -(-buffer_size // uavs) if shared else buffer_size
         # The run cannot fill more rows.
         self.capacity = min(size, context.total_steps * context.num_envs)
@@ -81,7 +82,7 @@ class ReplayMemory:
 
     def extend(self, rollout: TensorDictBase) -> None:
         """Stores a rollout, batch size [seeds * environments, steps]."""
-        self.extend_rows(to_rows(rollout, self.teams, self._keys))
+        self.extend_rows(to_rows(rollout, self.teams, self._keys, failures=self._failures))
 
     def extend_rows(self, rows: TensorDictBase) -> None:
         """Stores rows of `to_rows`."""
@@ -191,13 +192,16 @@ class _PreallocatedStorage(LazyTensorStorage):
         return self._storage[index]
 
 
-def to_rows(rollout: TensorDictBase, teams: int, observations: Sequence[Any]) -> TensorDict:
+def to_rows(
+    rollout: TensorDictBase, teams: int, observations: Sequence[Any], *, failures: bool = False
+) -> TensorDict:
     """Returns the transitions of a rollout as rows of a replay buffer.
 
     Args:
         rollout: batch size [teams * environments] or [teams * environments, steps].
         teams: number of seeds that are trained in parallel.
         observations: keys of the observation.
+        failures: whether to include "alive", from the end of each step.
 
     Returns:
         Batch size [environments * steps, teams * uavs]. Episodes are truncated and never
@@ -215,10 +219,12 @@ def to_rows(rollout: TensorDictBase, teams: int, observations: Sequence[Any]) ->
     def per_uav(key: str) -> Tensor:
         return arrange(rollout.get(("next", key)).unsqueeze(-2).expand(*rollout.shape, uavs, 1))
 
+    alive = {"alive": arrange(rollout.get(("next", *keys.ALIVE)))} if failures else {}
     following = {key[-1]: arrange(rollout.get(("next", *key))) for key in observations}
     return TensorDict(
         {
             **{key[-1]: arrange(rollout.get(key)) for key in observations},
+            **alive,
             "action": arrange(rollout.get(keys.ACTION)),
             "next": {
                 **following,

@@ -91,10 +91,10 @@ class TD3(OffPolicyLearner):
     def losses(self, batch: TensorDictBase, *, actor: bool = True) -> Losses:
         loss: Any = self.loss
         critic_loss, _ = loss.value_loss(batch)
-        losses = {"critic": critic_loss.mean(0)}
+        losses = {"critic": self.mean_over_batch(critic_loss, batch)}
         if actor:
             actor_loss, _ = loss.actor_loss(batch)
-            losses["actor"] = actor_loss.mean(0)
+            losses["actor"] = self.mean_over_batch(actor_loss, batch)
         return losses
 
     def gradients(self) -> dict[str, Tensor]:
