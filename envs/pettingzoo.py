@@ -64,9 +64,9 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
     """The UAVs of one environment as PettingZoo's agents "uav_0", "uav_1", ...
 
     All agents are truncated together at the horizon. One that fails (`env.failures`) is terminated
-    and leaves `agents`. `infos` hold, for each agent, the other tensors under ("agents", ...) of the
-    TorchRL environment, and the numbers of cells seen and burning. With `observation: window` an observation is a dictionary of
-    "observation", float32 [6], and "window", uint8 [3, W, W].
+    and leaves `agents`. `infos` hold, for each agent, the other tensors under ("agents", ...) of
+    the TorchRL environment, and the numbers of cells seen and burning. With `observation: window`
+    an observation is a dictionary of "observation", float32 [6], and "window", uint8 [3, W, W].
 
     Args:
         env: see `parallel_env`.

@@ -1,12 +1,15 @@
 """Tests the bonus for circling known fire against hand-computed numbers."""
 
+from dataclasses import replace
+
 import pytest
 import torch
-from time_steps import communication, time_step
+from time_steps import WORLD, communication, time_step
 
 from emberlink.comm._heading import HeadingConfig, circling
 from emberlink.comm.consensus import ConsensusConfig
 from emberlink.envs import keys
+from emberlink.envs.config import RadioConfig
 
 
 @pytest.mark.parametrize(
@@ -32,7 +35,7 @@ def test_circling_by_hand(target, move, bonus):
 
 def test_circling_is_for_discoverers_with_old_fire_only():
     heading = HeadingConfig(form="approach", weight=2.0, circle=5.0)
-    config = ConsensusConfig(discoverer="any_fire", heading=heading, range=5.0)
+    config = ConsensusConfig(discoverer="any_fire", heading=heading)
     # UAV 0 sees old fire only, UAV 1 old and new fire, UAV 2 hears UAV 1, UAV 3 hears no UAV.
     places = [[10.0, 10.0, 2.0], [30.0, 10.0, 2.0], [33.0, 10.0, 2.0], [50.0, 50.0, 2.0]]
     before = time_step(
@@ -42,7 +45,7 @@ def test_circling_is_for_discoverers_with_old_fire_only():
         centre=[[0.0, 0.0], [31.0, 10.0], [0.0, 0.0], [0.0, 0.0]],
         old_centre=[[9.0, 10.0], [28.0, 10.0], [0.0, 0.0], [0.0, 0.0]],
     )
-    talk = communication(before, config)
+    talk = communication(before, config, replace(WORLD, radio=RadioConfig(range=5.0)))
     before = talk._reset(before, before)
     assert before[keys.FOLLOWS].flatten().tolist() == [0, 1, 1, -1]
     after = time_step([[x, y + 0.5, z] for x, y, z in places], [0] * 4)

@@ -1,5 +1,7 @@
 """Tests the state of communication modules: frame skips, resets, checkpoints, transforms."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from tensordict import TensorDict
@@ -15,30 +17,30 @@ from torchrl.envs import (
 from visited_map import VisitedMap, VisitedMapConfig
 
 from emberlink.comm._heading import HeadingConfig
-from emberlink.comm._radio import neighbours
 from emberlink.comm.base import CommModule, Communication
 from emberlink.comm.consensus import Consensus, ConsensusConfig
 from emberlink.comm.positional import Positional, PositionalConfig
 from emberlink.envs import keys
-from emberlink.envs.config import WildfireConfig
+from emberlink.envs.config import RadioConfig, WildfireConfig
 from emberlink.envs.wildfire import WildfireEnv
+from emberlink.envs.world.radio import neighbours
 
 ENVS, UAVS = 3, 5
-WORLD = WildfireConfig(grid=(12, 10), num_uavs=UAVS, horizon=100)
+RADIO = RadioConfig(range=6.0)
+WORLD = WildfireConfig(grid=(12, 10), num_uavs=UAVS, horizon=100, radio=RADIO)
+LOSSY = replace(WORLD, radio=RadioConfig(range=6.0, loss=0.2))
 FIRE = 16 * torch.rand(12, 10, generator=torch.Generator().manual_seed(0))
 MODULES = {
     "consensus": lambda: Consensus(
-        WORLD,
+        LOSSY,
         ConsensusConfig(
             discoverer="any_fire",
             wander=False,
-            loss=0.2,
-            range=6.0,
             heading=HeadingConfig(form="approach", circle=2.0),
         ),
         ENVS,
     ),
-    "map": lambda: VisitedMap(WORLD, VisitedMapConfig(range=6.0), ENVS),
+    "map": lambda: VisitedMap(WORLD, VisitedMapConfig(), ENVS),
 }
 STATES = {"consensus": ["streak", "waypoint", "fire_score", "altitude_sum"], "map": ["map"]}
 
@@ -55,7 +57,7 @@ class Heard(VisitedMap):
 
 
 def test_links_are_computed_before_the_reward_is_shaped():
-    env = TransformedEnv(bare(), Communication(Heard(WORLD, VisitedMapConfig(range=6.0), ENVS)))
+    env = TransformedEnv(bare(), Communication(Heard(WORLD, VisitedMapConfig(), ENVS)))
     plain = bare()
     tds = [environment.reset() for environment in (env, plain)]
     for step in range(5):
@@ -211,7 +213,8 @@ def test_state_has_a_row_per_environment_and_is_written_in_place():
 
 @pytest.mark.parametrize(("limit", "loss"), [(6.0, 0.0), (6.0, 0.4), (float("inf"), 1.0)])
 def test_links_are_written_once(limit, loss):
-    module = VisitedMap(WORLD, VisitedMapConfig(range=limit, loss=loss), ENVS)
+    world = replace(WORLD, radio=RadioConfig(range=limit, loss=loss))
+    module = VisitedMap(world, VisitedMapConfig(), ENVS)
     env = TransformedEnv(bare(), Communication(module))
     rollout = env.rollout(10)["next"]
     hears, position = rollout[keys.HEARS], rollout[keys.POSITION].double()
@@ -226,6 +229,7 @@ def test_links_are_written_once(limit, loss):
 
 
 def test_positional_links_all_uavs():
-    env = TransformedEnv(bare(), Communication(Positional(WORLD, PositionalConfig(), ENVS)))
+    world = replace(WORLD, radio=RadioConfig(range=float("inf")))
+    env = TransformedEnv(bare(), Communication(Positional(world, PositionalConfig(), ENVS)))
     hears = env.reset()[keys.HEARS]
     assert hears.equal((~torch.eye(UAVS, dtype=torch.bool)).expand(ENVS, -1, -1))

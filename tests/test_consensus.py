@@ -1,5 +1,6 @@
 """Tests consensus on small networks with known results."""
 
+import dataclasses
 import math
 
 import pytest
@@ -10,14 +11,20 @@ from torch import Tensor
 
 from emberlink.comm._agreement import choose_leader, known_discoverers
 from emberlink.comm._heading import HeadingConfig
-from emberlink.comm._radio import Radio, RadioConfig, neighbours
 from emberlink.comm.consensus import Consensus, ConsensusConfig
 from emberlink.envs import keys
-from emberlink.envs.config import WildfireConfig
+from emberlink.envs.config import RadioConfig, WildfireConfig
+from emberlink.envs.world import radio
+from emberlink.envs.world.radio import neighbours
 
 
 def in_a_row(count: int, gap: float = 9.0) -> list[list[float]]:
     return [[gap * i, 0.0, 2.0] for i in range(count)]
+
+
+def within(limit: float) -> WildfireConfig:
+    """Returns a world with radios of a given range."""
+    return dataclasses.replace(WORLD, radio=RadioConfig(range=limit))
 
 
 def after_consensus(position, new, *, config=None, world=WORLD, **more) -> TensorDict:
@@ -94,9 +101,9 @@ def test_distance_is_taken_in_three_dimensions():
 def test_range_zero_and_infinite_range():
     position, new = in_a_row(4, gap=20), [0, 3, 0, 0]
     assert follows(position, new) == [-1, 1, -1, -1]
-    assert follows(position, new, config=ConsensusConfig(range=math.inf)) == [1, 1, 1, 1]
+    assert follows(position, new, world=within(math.inf)) == [1, 1, 1, 1]
     same = [[5.0, 5.0, 2.0]] * 3
-    assert follows(same, [0, 3, 0], config=ConsensusConfig(range=0.0)) == [-1, 1, -1]
+    assert follows(same, [0, 3, 0], world=within(0.0)) == [-1, 1, -1]
 
 
 def test_only_ranks_of_discoverers_are_compared():
@@ -141,13 +148,11 @@ def test_without_wandering_there_is_no_target_and_no_bonus():
 @pytest.mark.parametrize("loss", [0.0, 0.2, 0.5, 1.0])
 def test_the_share_of_lost_messages(loss):
     envs, uavs = 500, 6
-    radio = Radio(RadioConfig(loss=loss, range=math.inf))
+    config = RadioConfig(loss=loss, range=math.inf)
     position = torch.rand(envs, uavs, 3) * 20 + 1
+    key = torch.arange(envs)
     heard = torch.stack(
-        [
-            radio.links(time_step(position, torch.zeros(envs, uavs).long(), step=step))
-            for step in range(3)
-        ]
+        [radio.links(config, position, key, torch.full((envs,), step)) for step in range(3)]
     )
     assert not heard.diagonal(dim1=-2, dim2=-1).any()
     off = ~torch.eye(uavs, dtype=torch.bool)

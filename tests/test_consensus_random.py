@@ -13,7 +13,7 @@ from emberlink.comm._heading import HeadingConfig
 from emberlink.comm.base import Communication
 from emberlink.comm.consensus import Consensus, ConsensusConfig
 from emberlink.envs import keys
-from emberlink.envs.config import WildfireConfig
+from emberlink.envs.config import RadioConfig, WildfireConfig
 from emberlink.envs.utils import counter_rng
 from emberlink.envs.utils.counter_rng import Use
 
@@ -26,18 +26,17 @@ def test_random_networks_equal_plain_python(uavs):
     dice = random.Random(uavs)
     any_fire, form = uavs % 2 == 0, FORMS[uavs % 3]
     config = ConsensusConfig(
-        range=dice.choice([4.0, 7.0, 10.0]),
         discoverer="any_fire" if any_fire else "new_fire",
         heading=HeadingConfig(form=form),
         agree=uavs % 5 != 2,
         follow="nearest" if uavs % 4 in (1, 2) else "best",
-        loss=0.3 if uavs % 3 == 0 else 0.0,
     )
-    world = WildfireConfig()
+    radio = RadioConfig(range=dice.choice([4.0, 7.0, 10.0]), loss=0.3 if uavs % 3 == 0 else 0.0)
+    world = WildfireConfig(radio=radio)
     talk: Communication | None = None
     scalars = [
         ScalarConsensus(
-            config.range,
+            radio.range,
             any_fire=any_fire,
             agree=config.agree,
             nearest=config.follow == "nearest",
@@ -73,7 +72,7 @@ def test_random_networks_equal_plain_python(uavs):
         unit = counter_rng.uniform(
             counter_rng.step_key(now[keys.RNG_KEY], now[keys.STEP], Use.MESSAGE_LOSS), uavs * uavs
         )
-        lost = (unit < config.loss).unflatten(-1, (uavs, uavs))
+        lost = (unit < radio.loss).unflatten(-1, (uavs, uavs))
         for env in range(envs):
             scalars[env].lost = {tuple(pair) for pair in lost[env].nonzero().tolist()}
             was = None if before is None else before[env]
