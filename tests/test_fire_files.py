@@ -16,8 +16,8 @@ from tiny_run import TINY
 
 from emberlink.configs import known
 from emberlink.envs.fire.generator import load_scenario, make_fires, scenarios
-from emberlink.envs.fire_files.config import FileFireConfig
-from emberlink.envs.fire_files.reader import COPY_FILE, fire_sets, read_fires
+from emberlink.envs.fire_files.config import COPY_FILE, FileFireConfig
+from emberlink.envs.fire_files.reader import fire_sets, read_fires
 from emberlink.envs.scenarios import fires_of
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.wildfire import WildfireEnv
