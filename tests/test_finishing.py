@@ -21,6 +21,9 @@ from emberlink.trainers.terminal import SafeConsole
 from emberlink.trainers.training.resume import resume
 from emberlink.trainers.training.trainer import Trainer
 
+# In one process, which trains the shared run once.
+pytestmark = pytest.mark.xdist_group("finishing")
+
 
 def trained(capsys, *arguments: str | Path) -> tuple[int, str, str]:
     """Returns the exit status, the output and the errors of `emberlink train`."""
@@ -314,7 +317,6 @@ def tuned(tmp_path_factory) -> Path:
 
 
 @pytest.mark.slow
-@pytest.mark.xdist_group("tuned")
 @pytest.mark.parametrize("key", ["displacement", "num_uavs", "new_fire", "range"])
 def test_a_configuration_that_lacks_a_key_is_refused(key, tuned, tmp_path, capsys):
     """Its default may belong to another setup and change the evaluated world."""
