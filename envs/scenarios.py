@@ -9,11 +9,11 @@ import torch
 from pydantic import Discriminator, Tag
 from torch import Tensor
 
+from emberlink.envs import fire_files
 from emberlink.envs.config import WildfireConfig
 from emberlink.envs.fire.cache import fire_bank
 from emberlink.envs.fire.generator import FireConfig, Split, fire_seeds, load_scenario, make_fires
-from emberlink.envs.fire_files import FileFireConfig, fire_sets, save_copy, with_checksum
-from emberlink.envs.fire_files.reader import COPY_FILE
+from emberlink.envs.fire_files.config import COPY_FILE, FileFireConfig
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import TAG
 from emberlink.envs.world.burning import split_times, with_burn_time
@@ -118,16 +118,16 @@ class FromFile:
 
     def train(self, grid: Grid, horizon: int) -> Tensor:
         """See `FireSource`."""
-        return self._with_burn_time(fire_sets(self.config, grid, horizon).train)
+        return self._with_burn_time(fire_files.fire_sets(self.config, grid, horizon).train)
 
     def validation(self, count: int, grid: Grid, horizon: int) -> Tensor:
         """See `FireSource`."""
-        fires = fire_sets(self.config, grid, horizon).validation
+        fires = fire_files.fire_sets(self.config, grid, horizon).validation
         return self._with_burn_time(fires[torch.arange(count) % len(fires)])
 
     def test(self, count: int, grid: Grid, horizon: int) -> Tensor:
         """See `FireSource`."""
-        fires = fire_sets(self.config, grid, horizon).test
+        fires = fire_files.fire_sets(self.config, grid, horizon).test
         return self._with_burn_time(fires[torch.arange(count) % len(fires)])
 
     def test_fire(self, index: int, grid: Grid, horizon: int) -> Tensor:
@@ -147,11 +147,11 @@ class FromFile:
 
     def with_checksum(self) -> "ScenarioConfig":
         """See `FireSource`."""
-        return with_checksum(self.config)
+        return fire_files.with_checksum(self.config)
 
     def save_copy(self, folder: Path, grid: Grid, horizon: int) -> "ScenarioConfig":
         """See `FireSource`."""
-        save_copy(self.config, folder, grid, horizon)
+        fire_files.save_copy(self.config, folder, grid, horizon)
         return self.load_copy(folder)
 
     def load_copy(self, folder: Path) -> "ScenarioConfig":

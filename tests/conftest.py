@@ -1,17 +1,19 @@
-"""Fixtures for all tests."""
+"""Fixtures for all tests.
+
+The process that starts the others of pytest-xdist reads this file first, so what is slow to import
+is imported in the fixtures.
+"""
 
 import io
+import os
 import random
 import shutil
+from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-from matplotlib.figure import Figure
-from PIL import Image
 from tiny_run import train_tiny
-
-from emberlink.envs import wildfire
 
 
 @pytest.fixture(autouse=True, scope="session")
@@ -19,8 +21,17 @@ def _environment(tmp_path_factory):
     """Gives the tests and their subprocesses a temporary cache and no terminal."""
     with pytest.MonkeyPatch.context() as patch:
         patch.delenv("COLUMNS", raising=False)
-        patch.setenv("EMBERLINK_CACHE", str(tmp_path_factory.mktemp("cache")))
+        patch.setenv("EMBERLINK_CACHE", str(_cache(tmp_path_factory)))
         yield
+
+
+def _cache(tmp_path_factory) -> Path:
+    """Returns an empty folder, the same for all processes of pytest-xdist."""
+    if "PYTEST_XDIST_WORKER" not in os.environ:
+        return tmp_path_factory.mktemp("cache")
+    folder = tmp_path_factory.getbasetemp().parent / "cache"
+    folder.mkdir(exist_ok=True)
+    return folder
 
 
 @pytest.fixture(autouse=True)
@@ -31,14 +42,26 @@ def _blank_figures(request, monkeypatch) -> None:
     """
     if request.node.get_closest_marker("drawn"):
         return
-    blank = io.BytesIO()
-    Image.new("RGB", (8, 8)).save(blank, "png")
-    monkeypatch.setattr(Figure, "savefig", lambda _, path, **__: path.write_bytes(blank.getvalue()))
+    from matplotlib.figure import Figure
+
+    blank = _blank()
+    monkeypatch.setattr(Figure, "savefig", lambda _, path, **__: path.write_bytes(blank))
+
+
+@cache
+def _blank() -> bytes:
+    from PIL import Image
+
+    file = io.BytesIO()
+    Image.new("RGB", (8, 8)).save(file, "png")
+    return file.getvalue()
 
 
 @pytest.fixture(autouse=True)
 def _repeatable_seeds(monkeypatch) -> None:
     """Draws the seeds of environments without a seed from a generator, the same in every run."""
+    from emberlink.envs import wildfire
+
     draw = random.Random(0)
     monkeypatch.setattr(wildfire, "secrets", SimpleNamespace(randbelow=draw.randrange))
 

@@ -1,15 +1,13 @@
 """Tests that invalid input gives a one-line error, exit status 2, and no files."""
 
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 import torch
 import yaml
 from safetensors.torch import save_file
-from tiny_run import PROGRAM, TINY
+from tiny_run import TINY
 
 from emberlink.trainers.cli import main
 from emberlink.trainers.runs.run_folder import RunFolder
@@ -175,20 +173,6 @@ def test_invalid_checkpoint_file(run, capsys):
 
 def test_eval_on_a_missing_device(run, capsys):
     refused(["eval", str(run), "--device", "cuda:99"], capsys, "cuda:99", "known: cpu")
-
-
-@pytest.mark.slow
-def test_subprocess_prints_one_line_and_exits_with_2(tmp_path):
-    done = subprocess.run(
-        [sys.executable, "-c", PROGRAM, "train", "consensus", "env.horizn=3"],
-        capture_output=True,
-        text=True,
-        cwd=tmp_path,
-        check=False,
-    )
-    expected = "emberlink train: key 'env.horizn' is not known; did you mean env.horizon?\n"
-    assert (done.returncode, done.stdout, done.stderr) == (2, "", expected)
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_too_little_memory_gives_one_line(capsys, monkeypatch):

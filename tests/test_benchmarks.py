@@ -33,7 +33,7 @@ class Flops(TorchDispatchMode):
     [
         ("independent", 6, (40, 30), 64),
         ("positional", 24, (16, 24), 32),
-        ("consensus", 9, (400, 300), 512),
+        ("consensus", 9, (100, 75), 128),
     ],
 )
 @pytest.mark.parametrize("shared", [False, True])

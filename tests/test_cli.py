@@ -1,16 +1,11 @@
 """Tests the output and the files of the commands."""
 
 import json
-import os
 import shutil
-import signal
-import subprocess
-import sys
-import time
 from pathlib import Path
 
 import pytest
-from tiny_run import PROGRAM, TINY
+from tiny_run import TINY
 
 from emberlink.envs import metrics
 from emberlink.policies.scripted.registry import SCRIPTED
@@ -106,39 +101,3 @@ def test_eval_uses_the_given_checkpoint(run, capsys):
     assert (run / "eval.json").read_bytes() == newest
     for figure in ("coverage_other.png", "timelapse_huygens_other.png"):
         assert (run / "figures" / figure).exists()
-
-
-def wait_for(condition, process, seconds: float = 120) -> None:
-    end = time.monotonic() + seconds
-    while not condition():
-        assert process.poll() is None, process.communicate()
-        assert time.monotonic() < end
-        time.sleep(0.05)
-
-
-@pytest.mark.slow
-def test_an_interrupted_run_can_be_evaluated(tmp_path, capsys):
-    endless = [*TINY, "episodes=100000", f"output={tmp_path}"]
-    process = subprocess.Popen(
-        [sys.executable, "-c", PROGRAM, "train", "consensus", *endless],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        env={**os.environ, "OMP_NUM_THREADS": "1"},
-    )
-    try:
-        wait_for(lambda: any(tmp_path.glob("*/metrics.jsonl")), process)
-        process.send_signal(signal.SIGINT)
-        out, err = process.communicate(timeout=60)
-    finally:
-        process.kill()
-    assert process.returncode == 130, err
-    assert "Traceback" not in err
-    (folder,) = tmp_path.iterdir()
-    assert "stopped" in out
-    checkpoint = RunFolder(folder).checkpoint()
-    done = len((folder / "metrics.jsonl").read_text().splitlines())
-    assert done <= int(checkpoint.stem.removeprefix("step_")) / 15 < done + 1
-    assert not list(folder.rglob("*.part"))
-    assert main.main(["eval", str(folder)]) == 0
-    check_evaluation(folder, capsys.readouterr().out)

@@ -1,16 +1,19 @@
 """Tests closed and full outputs, encodings, signals and internal errors."""
 
+import io
 import os
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
-from test_cli import wait_for
+from test_cli import check_evaluation
 from tiny_run import PROGRAM, TINY
 
 from emberlink.trainers.cli import main
+from emberlink.trainers.runs.checkpoints import step_of
 from emberlink.trainers.runs.run_folder import RunFolder
 
 ENDLESS = [*TINY, "episodes=100000"]
@@ -26,6 +29,14 @@ def started(arguments: list[str], stdout: object) -> subprocess.Popen:
         # Under nohup SIGHUP is ignored, and subprocesses inherit that.
         preexec_fn=lambda: signal.signal(signal.SIGHUP, signal.SIG_DFL),
     )
+
+
+def wait_for(condition, process, seconds: float = 120) -> None:
+    end = time.monotonic() + seconds
+    while not condition():
+        assert process.poll() is None, process.communicate()
+        assert time.monotonic() < end
+        time.sleep(0.05)
 
 
 def check_saved(output: Path) -> None:
@@ -67,7 +78,8 @@ def test_a_full_output_is_an_error_and_unlocks_the_folder(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_lost_terminal_ends_the_training_with_a_checkpoint(tmp_path):
+def test_a_lost_terminal_ends_the_training_with_a_checkpoint(tmp_path, capsys):
+    """The run can then be evaluated."""
     process = started(["train", "independent", *ENDLESS, f"output={tmp_path}"], subprocess.PIPE)
     try:
         wait_for(lambda: any(tmp_path.glob("*/metrics.jsonl")), process, seconds=400)
@@ -76,32 +88,31 @@ def test_a_lost_terminal_ends_the_training_with_a_checkpoint(tmp_path):
     finally:
         process.kill()
     assert process.returncode == 129, error
+    assert "Traceback" not in error
+    assert "stopped" in out
     assert "resume with: emberlink train resume=" in out
     check_saved(tmp_path)
+    (folder,) = tmp_path.iterdir()
+    done = len((folder / "metrics.jsonl").read_text().splitlines())
+    assert done <= step_of(RunFolder(folder).checkpoint()) / 15 < done + 1
+    assert not list(folder.rglob("*.part"))
+    assert main.main(["eval", str(folder)]) == 0
+    check_evaluation(folder, capsys.readouterr().out)
 
 
-@pytest.mark.slow
-def test_commands_succeed_with_every_encoding(run, tmp_path):
-    commands = (
+@pytest.mark.parametrize("encoding", ["ascii", "cp1252"])
+def test_commands_succeed_with_every_encoding(encoding, run, tmp_path, monkeypatch):
+    for arguments in (
         ["compare", str(run), "--output", str(tmp_path / "report")],
         ["fire", "preview", "huygens:0", "--output", str(tmp_path)],
         ["list"],
         [],
-    )
-    program = (
-        "import sys\n"
-        "from emberlink.trainers.cli.main import main\n"
-        f"for place, arguments in enumerate({commands!r}):\n"
-        "    sys.stdout.reconfigure(encoding=('ascii', 'cp1252')[place % 2], errors='strict')\n"
-        "    assert main(arguments) == 0\n"
-        "    print('done')\n"
-    )
-    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-    ended = subprocess.run([sys.executable, "-c", program], capture_output=True, env=environment)
-    assert ended.returncode == 0, ended.stderr
-    parts = ended.stdout.split(b"done\n")
-    assert len(parts) == 5
-    assert all(parts[:4])
+    ):
+        printed = io.BytesIO()
+        monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(printed, encoding, errors="strict"))
+        assert main.main(arguments) == 0
+        sys.stdout.flush()
+        assert printed.getvalue()
     assert (tmp_path / "report" / "compare.html").exists()
 
 

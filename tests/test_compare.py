@@ -17,9 +17,9 @@ from synthetic_runs import read_evaluation, write_evaluation, write_run
 from emberlink.envs import metrics
 from emberlink.trainers import compare
 from emberlink.trainers.cli import main
-from emberlink.trainers.comparison import plots
 from emberlink.trainers.comparison.groups import gather
 from emberlink.trainers.comparison.rankings import numbers
+from emberlink.trainers.comparison.report import plots
 from emberlink.trainers.comparison.runs import Run, find, read
 from emberlink.trainers.comparison.scripted import Scripted
 from emberlink.trainers.config.compose import to_values
@@ -594,7 +594,7 @@ def test_the_page_is_self_contained(runs, tmp_path):
 
 def test_words_of_a_table_are_not_broken_on_narrow_screens():
     """A table scrolls in its own box; only paths may be broken anywhere."""
-    source = files("emberlink.trainers.comparison").joinpath("page.html").read_text("utf-8")
+    source = files("emberlink.trainers.comparison.report").joinpath("page.html").read_text("utf-8")
     style = source.split("<style>")[1].split("</style>")[0]
     rules = dict(re.findall(r"([^{}\n]+) \{([^{}]*)\}", style))
     broken = {name for name, rule in rules.items() if "anywhere" in rule}

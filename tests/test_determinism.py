@@ -13,16 +13,19 @@ from emberlink.envs.wildfire import WildfireEnv
 @pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS)
 def test_a_seed_repeats_its_run_byte_for_byte(method, tmp_path):
-    def lines(folder: str, seed: int) -> bytes:
+    def run(folder: str, seed: int) -> tuple[bytes, dict[str, torch.Tensor]]:
         torch.manual_seed(len(folder))  # earlier draws must not matter
         trainer = until(begun(method, tmp_path / folder, "episodes=2", f"seed={seed}"), None)
-        assert trainer.setup.learner.updates > 0
-        return (trainer.run.path / "metrics.jsonl").read_bytes()
+        learner = trainer.setup.learner
+        assert learner.updates > 0
+        return (trainer.run.path / "metrics.jsonl").read_bytes(), learner.weights()
 
-    first = lines("one", 7)
+    (first, weights), (again, same), (other, _) = run("one", 7), run("again", 7), run("another", 8)
     assert first.count(b"\n") == 2
-    assert lines("again", 7) == first
-    assert lines("another", 8) != first
+    assert first == again
+    assert first != other
+    for name, weight in weights.items():
+        assert weight.equal(same[name]), name
 
 
 @pytest.mark.parametrize("fire", ["paper", "huygens"])

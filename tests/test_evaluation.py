@@ -5,7 +5,6 @@ import itertools
 import json
 import math
 import os
-import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -222,28 +221,15 @@ def test_a_damaged_file_is_replaced(content, cache, played):
     assert not list(cache.glob("*.tmp"))
 
 
-LOADED = """
-import sys, torch
-from emberlink.trainers.evaluation import baseline_cache, evaluate
-from emberlink.trainers.config.compose import resolve
-config = resolve("consensus", ["setup=tuned", "env.horizon=3", "env.num_uavs=2"])
-for name in evaluate.SCRIPTED:
-    evaluate.play_scripted(config, name, torch.ones(1, 30, 30))
-known = {str(path.resolve()) for path in baseline_cache.sources()}
-for name, module in sys.modules.items():
-    if name.startswith(("emberlink.envs.", "emberlink.comm.", "emberlink.policies.")):
-        file = __import__("pathlib").Path(module.__file__).resolve()
-        if str(file) not in known:
-            print(name)
-"""
-
-
-@pytest.mark.slow
 def test_the_file_name_depends_on_all_source_files(cache):
-    done = subprocess.run(
-        [sys.executable, "-c", LOADED], capture_output=True, text=True, check=True
-    )
-    assert done.stdout == ""
+    config = small("consensus", "env.horizon=3")
+    for name in SCRIPTED:
+        evaluate.play_scripted(config, name, torch.ones(1, *config.env.grid))
+    known = {path.resolve() for path in baseline_cache.sources()}
+    rooms = ("emberlink.envs.", "emberlink.comm.", "emberlink.policies.")
+    loaded = {name: module for name, module in sys.modules.items() if name.startswith(rooms)}
+    assert len(loaded) > 30
+    assert [n for n, module in loaded.items() if Path(module.__file__).resolve() not in known] == []
 
 
 def test_the_file_name_depends_on_the_source_of_an_external_policy(tmp_path, monkeypatch):

@@ -9,14 +9,20 @@ import sys
 from pathlib import Path
 
 import pytest
+from inside import Inside
 from tiny_run import TINY
 
 from emberlink.trainers.cli import main
 from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.evaluation import command, plots
 from emberlink.trainers.runs.run_folder import RunFolder
+from emberlink.trainers.sweep.command import sweep
+from emberlink.trainers.terminal import SafeConsole
 from emberlink.trainers.training.resume import resume
 from emberlink.trainers.training.trainer import Trainer
+
+# In one process, which trains the shared run once.
+pytestmark = pytest.mark.xdist_group("finishing")
 
 
 def trained(capsys, *arguments: str | Path) -> tuple[int, str, str]:
@@ -186,38 +192,55 @@ def test_the_folder_stays_locked_until_the_evaluation_is_written(tmp_path, capsy
     assert not list((tmp_path / "runs").glob("*/lock"))
 
 
+KILLED = """
+import os, signal, sys
+from emberlink.trainers.runs.run_folder import RunFolder
+from emberlink.trainers.cli.main import main
+import emberlink.trainers.training.command
+
+def counted(real):
+    def wrapped(*given):
+        if next(calls) == call:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return real(*given)
+    return wrapped
+
+RunFolder.write = counted(RunFolder.write)
+RunFolder.write_config = counted(RunFolder.write_config)
+for call in (3, 4):
+    calls = iter(range(1, 99))
+    child = os.fork()  # after the imports, which take longer than the rest
+    if child == 0:
+        os._exit(main([*sys.argv[2:], f"output={sys.argv[1]}/{call}"]))
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == -signal.SIGKILL
+"""
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("call", [3, 4])
-def test_a_kill_during_the_creation_of_the_folders_of_seeds(call, tmp_path, capsys):
+def test_a_kill_during_the_creation_of_the_folders_of_seeds(tmp_path, capsys):
     """Either no folder looks like a run, or the run can be resumed with all its seeds."""
-    runs = tmp_path / "runs"
-    program = (
-        "import os, sys\n"
-        "from emberlink.trainers.runs.run_folder import RunFolder\n"
-        "from emberlink.trainers.cli.main import main\n"
-        "calls = iter(range(1, 99))\n"
-        "def counted(real):\n"
-        "    def wrapped(*given):\n"
-        f"        if next(calls) == {call}: os.kill(os.getpid(), 9)\n"
-        "        return real(*given)\n"
-        "    return wrapped\n"
-        "RunFolder.write = counted(RunFolder.write)\n"
-        "RunFolder.write_config = counted(RunFolder.write_config)\n"
-        "main(sys.argv[1:])\n"
-    )
-    arguments = ["train", "independent", *TINY, "seeds=[0,1]", f"output={runs}"]
-    ended = subprocess.run([sys.executable, "-c", program, *arguments], capture_output=True)
-    assert ended.returncode == -9
-    folders = sorted(runs.iterdir())
-    assert len(folders) == 2
-    first, second = map(RunFolder, folders)
-    assert first.has_config() >= second.has_config()
-    if first.has_config():
-        assert trained(capsys, f"resume={second.path}")[0] == 0
-        assert [RunFolder(path).config().seed for path in folders] == [0, 1]
-        assert first.evaluated()
-        assert second.evaluated()
-    assert main.main(["sweep", "independent", *TINY, "seeds=[0,1]", f"output={runs}"]) == 0
+    arguments = ["independent", *TINY, "seeds=[0,1]"]
+    program = [sys.executable, "-c", KILLED, str(tmp_path), "train", *arguments]
+    ended = subprocess.run(program, capture_output=True, text=True, check=False)
+    assert ended.returncode == 0, ended.stderr
+    started = []
+    for call in (3, 4):
+        runs = tmp_path / str(call)
+        folders = sorted(runs.iterdir())
+        assert len(folders) == 2
+        first, second = map(RunFolder, folders)
+        assert first.has_config() >= second.has_config()
+        started.append(first.has_config())
+        if first.has_config():
+            assert trained(capsys, f"resume={second.path}")[0] == 0
+            assert [RunFolder(path).config().seed for path in folders] == [0, 1]
+            assert first.evaluated()
+            assert second.evaluated()
+        repeated = [*arguments, f"output={runs}"]
+        assert sweep(repeated, SafeConsole(), executor=Inside()) == 0
+        complete = [RunFolder(file.parent) for file in runs.glob("*/config.yaml")]
+        assert [run.evaluated() for run in complete] == [True, True]
+    assert started == [False, True]
 
 
 def test_copies_of_a_user_are_not_part_of_the_run(run, capsys):
@@ -286,13 +309,18 @@ def test_an_infinite_range_round_trips(tmp_path, capsys):
     assert main.main(["compare", str(run.path), "--output", str(tmp_path / "out")]) == 0
 
 
+@pytest.fixture(scope="module")
+def tuned(tmp_path_factory) -> Path:
+    output = tmp_path_factory.mktemp("tuned")
+    assert main.main(["train", "consensus", *TINY, "setup=tuned", f"output={output}"]) == 0
+    return run_of(output).path
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("key", ["displacement", "num_uavs", "new_fire", "range"])
-def test_a_configuration_that_lacks_a_key_is_refused(key, tmp_path, capsys):
+def test_a_configuration_that_lacks_a_key_is_refused(key, tuned, tmp_path, capsys):
     """Its default may belong to another setup and change the evaluated world."""
-    arguments = ["consensus", *TINY, "setup=tuned", f"output={tmp_path / 'runs'}"]
-    assert trained(capsys, *arguments)[0] == 0
-    run = run_of(tmp_path / "runs")
+    run = RunFolder(shutil.copytree(tuned, tmp_path / "run"))
     file = run.path / "config.yaml"
     pattern = re.compile(rf"^ *{key}: .*\n|\b{key}: [^,}}\n]*, ", re.MULTILINE)
     text, count = pattern.subn("", file.read_text(), count=1)

@@ -3,6 +3,7 @@
 import dataclasses
 import math
 import warnings
+from functools import cache
 from importlib import resources
 from pathlib import Path
 from typing import Any, get_args
@@ -89,6 +90,7 @@ def test_paper_is_one_fire(paper: torch.Tensor):
     )
 
 
+@pytest.mark.xdist_group("test_fires")
 def test_huygens_counts(test_fires: torch.Tensor):
     count = burning_cells(test_fires, HORIZON)
     start, end = count[:, 0], count[:, -1]
@@ -101,6 +103,7 @@ def test_huygens_counts(test_fires: torch.Tensor):
     assert 0.15 < edge.isfinite().any(1).double().mean() < 0.3  # some fronts leave the box
 
 
+@pytest.mark.xdist_group("test_fires")
 def test_a_fire_depends_on_its_seed_only(test_fires: torch.Tensor):
     config, seeds = load_scenario("huygens"), fire_seeds("test", 200)
     some = torch.tensor([150, 0, 7])
@@ -110,19 +113,21 @@ def test_a_fire_depends_on_its_seed_only(test_fires: torch.Tensor):
     assert torch.equal(torch.get_rng_state(), state)
 
 
-@pytest.mark.slow
+@pytest.mark.xdist_group("test_fires")
 def test_no_fire_is_in_both_splits(test_fires: torch.Tensor):
     train = make_fires(load_scenario("huygens"), fire_seeds("train", 50), GRID, HORIZON)
     both = torch.cat([train, test_fires[:50]]).flatten(1)
     assert len(both.unique(dim=0)) == 100
 
 
+@pytest.mark.xdist_group("test_fires")
 def test_a_longer_horizon_continues_the_same_fire(test_fires: torch.Tensor):
     seeds = fire_seeds("test", 5)
     short = make_fires(load_scenario("huygens"), seeds, GRID, 400)
     assert torch.equal(short, test_fires[:5].masked_fill(test_fires[:5] > 400, math.inf))
 
 
+@pytest.mark.xdist_group("test_fires")
 def test_arrivals(test_fires: torch.Tensor):
     assert test_fires.dtype == torch.float32
     finite = test_fires[test_fires.isfinite()]
@@ -147,7 +152,16 @@ def test_fuel_slows_the_front():
     assert (many - few)[:, -1].double().mean() > 5
 
 
+@cache
+def central_cells(grid: tuple[int, int], fires: int) -> torch.Tensor:
+    """Returns the burning cells of some fires in the middle, at the start and at the end."""
+    config = FireConfig(**settings_of(centre_x=(0.45, 0.55), centre_y=(0.45, 0.55)))
+    grown = make_fires(config, fire_seeds("train", fires), grid, HORIZON)
+    return burning_cells(grown, HORIZON)[:, [0, -1]].double().sum(0)
+
+
 @pytest.mark.slow
+@pytest.mark.xdist_group("scales")
 @pytest.mark.parametrize(
     ("grid", "fires", "tolerance"),
     [
@@ -161,12 +175,8 @@ def test_fuel_slows_the_front():
 )
 def test_a_scenario_scales_with_the_shorter_side(grid, fires: int, tolerance: float):
     """Checks that areas scale with the square of min(X, Y)/30 at the start and at the end."""
-    config = FireConfig(**settings_of(centre_x=(0.45, 0.55), centre_y=(0.45, 0.55)))
-    seeds = fire_seeds("train", fires)
-    base = burning_cells(make_fires(config, seeds, GRID, HORIZON), HORIZON)
-    got = burning_cells(make_fires(config, seeds, grid, HORIZON), HORIZON)
     scale = (min(grid) / 30) ** 2
-    ratio = got[:, [0, -1]].double().sum(0) / base[:, [0, -1]].double().sum(0) / scale
+    ratio = central_cells(grid, fires) / central_cells(GRID, fires) / scale
     torch.testing.assert_close(ratio, torch.ones(2).double(), rtol=0, atol=tolerance)
 
 

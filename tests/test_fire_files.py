@@ -16,8 +16,8 @@ from tiny_run import TINY
 
 from emberlink.configs import known
 from emberlink.envs.fire.generator import load_scenario, make_fires, scenarios
-from emberlink.envs.fire_files.config import FileFireConfig
-from emberlink.envs.fire_files.reader import COPY_FILE, fire_sets, read_fires
+from emberlink.envs.fire_files.config import COPY_FILE, FileFireConfig
+from emberlink.envs.fire_files.reader import fire_sets, read_fires
 from emberlink.envs.scenarios import fires_of
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.wildfire import WildfireEnv
@@ -26,6 +26,8 @@ from emberlink.trainers.config.compose import from_values, override, resolve, to
 from emberlink.trainers.runs.run_folder import RunFolder
 
 GRID, HORIZON = (12, 10), 15
+# In one process, which trains the shared run once.
+pytestmark = pytest.mark.xdist_group("fire_files")
 SMALL = [*TINY, "env.grid=[12,10]"]
 
 

@@ -374,19 +374,22 @@ def test_a_run_folder_named_like_markup(run, tmp_path, capsys):
 
 @pytest.mark.slow
 def test_files_of_the_working_folder_are_not_executed(tmp_path, mark):
-    """Modules and settings in the working folder are ignored."""
+    """Modules and settings in the working folder are ignored; a mistake is one line."""
     bomb = f"import os\nos.mkdir({str(mark)!r})\n"
     for name in ("torch", "yaml", "hydra", "wandb", "comm", "configs", "sitecustomize"):
         (tmp_path / f"{name}.py").write_text(bomb)
     (tmp_path / "conf").mkdir()
     (tmp_path / "base.yaml").write_text("seed: 99\n")
+    before = sorted(tmp_path.rglob("*"))
     program = Path(sys.executable).with_name("emberlink")
     done = subprocess.run(
-        [program, "train", "consensus", "zzz=1"],
+        [program, "train", "consensus", "env.horizn=3"],
         capture_output=True,
         text=True,
         cwd=tmp_path,
         check=False,
     )
-    assert (done.returncode, done.stderr.count("\n")) == (2, 1)
+    expected = "emberlink train: key 'env.horizn' is not known; did you mean env.horizon?\n"
+    assert (done.returncode, done.stdout, done.stderr) == (2, "", expected)
     assert not mark.exists()
+    assert sorted(tmp_path.rglob("*")) == before

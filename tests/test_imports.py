@@ -88,7 +88,7 @@ def test_the_command_line_starts_without_torch(module):
 
 
 EFFECTS = """
-import random, threading, numpy, rich.style, torch
+import random, sys, threading, numpy, rich.style, torch
 import torchrl.envs, torchrl.collectors, torchrl.objectives
 import torchrl.record.loggers
 state = torch.get_rng_state(), random.getstate(), torch.get_num_threads()
@@ -99,6 +99,7 @@ import emberlink.trainers.training.trainer
 assert torch.equal(state[0], torch.get_rng_state())
 assert state[1:] == (random.getstate(), torch.get_num_threads())
 assert (threads, default) == (threading.active_count(), torch.get_default_dtype())
+assert "scipy" not in sys.modules  # only for fires of files
 """
 
 

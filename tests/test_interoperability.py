@@ -73,7 +73,9 @@ def test_sizes_and_names():
     assert repr(env) == (
         "WildfireEnv(num_envs=4, grid=(12, 10), num_uavs=3, horizon=10, fire=1 given, device=cpu)"
     )
-    assert "fire=huygens" in repr(WildfireEnv(1, WildfireConfig(grid=(8, 8)), "huygens"))
+    assert "fire=huygens" in repr(
+        WildfireEnv(1, WildfireConfig(grid=(8, 8), horizon=10), "huygens")
+    )
 
 
 @pytest.mark.filterwarnings("error")

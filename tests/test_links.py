@@ -30,6 +30,9 @@ from emberlink.trainers.runs.run_folder import RunFolder
 from emberlink.trainers.tracking.trackers import Trackers
 from emberlink.trainers.training import rollback
 
+# In one process, which trains the shared run once.
+pytestmark = pytest.mark.xdist_group("links")
+
 
 class Outside:
     """Holds a folder of the user and its initial contents."""
@@ -322,7 +325,8 @@ def test_every_file_is_opened_without_following_links(trained, run, tmp_path, mo
 
 def test_an_evaluation_replaces_links(run, outside, tmp_path, capsys, monkeypatch):
     """The links are at the names of figures, eval.json and caches."""
-    cache = shutil.copytree(os.environ["EMBERLINK_CACHE"], tmp_path / "cache")
+    incomplete = shutil.ignore_patterns("*.part")  # of another process of the tests
+    cache = shutil.copytree(os.environ["EMBERLINK_CACHE"], tmp_path / "cache", ignore=incomplete)
     monkeypatch.setenv("EMBERLINK_CACHE", str(cache))
     contents = {file: file.read_bytes() for file in cache.iterdir()}
     drawn = [file for file in (run / "figures").iterdir() if not file.is_symlink()]

@@ -183,10 +183,12 @@ def clean(tmp_path_factory):
 
     def of(method: str, learner: str = "ddpg") -> dict:
         if (method, learner) not in states:
-            more = "checkpoint_steps=1", f"learner={learner}"
-            trainer = begun(method, tmp_path_factory.mktemp("clean"), *more)
+            folder = tmp_path_factory.mktemp("clean")
+            trainer = begun(method, folder, f"learner={learner}")
             until(trainer, STEP - 1)
-            states[method, learner] = checkpoint_file.read(trainer.run.states()[-1])[1]
+            header, state = checkpoint_file.read(trainer.run.states()[-1])
+            assert header["step"] == STEP - 1
+            states[method, learner] = state
         return states[method, learner]
 
     return of

@@ -189,19 +189,8 @@ def test_console_script_starts(installed: Path, elsewhere):
 
 
 @pytest.mark.slow
-def test_console_script_trains(installed: Path, elsewhere):
-    cwd, env = elsewhere
-    tiny = ("env.horizon=20", "env.num_uavs=2", "learner.batch_size=8", "learner.hidden=[8,8]")
-    tiny = (*tiny, "episodes=1", "evaluation.episodes=1", "evaluation.interval=0")
-    printed = run(installed / "emberlink", "train", "independent", *tiny, cwd=cwd, env=env)
-    (folder,) = (cwd / "runs").iterdir()
-    assert Path(printed.strip().splitlines()[-1]) == folder.relative_to(cwd)
-    assert {"config.yaml", "metrics.jsonl", "eval.json"} <= {p.name for p in folder.iterdir()}
-    assert list((folder / "figures").glob("*.gif"))
-
-
-@pytest.mark.slow
 def test_an_extension_package_adds_a_method_a_setup_and_a_fire(installed: Path, elsewhere):
+    """Also tests that the console script of the wheel trains."""
     cwd, env = elsewhere
     python = installed / "python"
     before = {file: file.stat().st_mtime_ns for file in installed.parent.rglob("emberlink/**/*.py")}
@@ -209,8 +198,10 @@ def test_an_extension_package_adds_a_method_a_setup_and_a_fire(installed: Path, 
     source = write_package(cwd / "source")
     run(*pip, "--no-index", "--no-build-isolation", source, cwd=cwd)
     arguments = ("train", "headcount", "setup=small", *TINY)
-    run(installed / "emberlink", *arguments, cwd=cwd, env=env)
+    printed = run(installed / "emberlink", *arguments, cwd=cwd, env=env)
     (folder,) = (cwd / "runs").iterdir()
+    assert Path(printed.strip().splitlines()[-1]) == folder.relative_to(cwd)
+    assert list((folder / "figures").glob("*.gif"))
     written = yaml.safe_load((folder / "config.yaml").read_text())
     assert written["comm"] == {"name": "headcount", "scale": 0.5}
     assert (written["setup"], written["fire"]["name"]) == ("small", "faint")

@@ -12,7 +12,7 @@ import torch
 from fire_files import CORNER, KINDS, UTM, Ellipses, frame_of, raster_of, write_asc
 
 from emberlink.envs.fire_files.config import FileFireConfig
-from emberlink.envs.fire_files.perimeter_times import _time_of_day
+from emberlink.envs.fire_files.perimeters.times import _time_of_day
 from emberlink.envs.fire_files.reader import read_fires
 from emberlink.envs.utils.errors import UserError
 

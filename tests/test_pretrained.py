@@ -16,6 +16,8 @@ from emberlink.trainers.runs import pretrained
 from emberlink.trainers.runs.run_folder import RunFolder
 from emberlink.trainers.runs.seal import check_trained_with
 
+# The packed runs are trained once.
+pytestmark = pytest.mark.xdist_group("packed")
 DATA = Path(__file__).parent.parent / "docs" / "data"
 
 
@@ -43,7 +45,6 @@ def shipped(packed, tmp_path, monkeypatch) -> Path:
     return root
 
 
-@pytest.mark.slow
 def test_packed_runs_omit_the_training_state(packed):
     root, runs = packed
     for run, place in zip(runs, ("consensus/s3", "consensus/s10", "independent/s3"), strict=True):
@@ -80,7 +81,6 @@ def test_a_name_replaces_a_run_folder(shipped, tmp_path, capsys):
     assert "pretrained_tuned_consensus_s10/figures/side_by_side" in printed.replace("\n", "")
 
 
-@pytest.mark.slow
 def test_an_existing_copy_is_used_and_kept(shipped, tmp_path):
     run = pretrained.open_run("pretrained:consensus")
     (run.path / "note.txt").write_text("mine")
@@ -88,7 +88,6 @@ def test_an_existing_copy_is_used_and_kept(shipped, tmp_path):
     assert (tmp_path / run.path / "note.txt").read_text() == "mine"
 
 
-@pytest.mark.slow
 def test_names_of_several_policies(shipped):
     def names(text: str) -> list[str]:
         return ["/".join(path.parts[-2:]) for path in pretrained.find(text)]

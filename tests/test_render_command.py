@@ -16,9 +16,9 @@ from emberlink.envs.rendering import marks, video
 from emberlink.envs.utils.publish import published
 from emberlink.policies.scripted.registry import SCRIPTED
 from emberlink.trainers.build import build_actor, build_env
-from emberlink.trainers.cli import main, render
+from emberlink.trainers.cli import main
 from emberlink.trainers.config.compose import resolve
-from emberlink.trainers.evaluation import evaluate
+from emberlink.trainers.evaluation import evaluate, render
 from emberlink.trainers.runs.run_folder import RunFolder
 
 SHORT = ("setup=tuned", "learner.hidden=[8,8]", "env.horizon=12", "env.num_uavs=3")

@@ -11,12 +11,8 @@ from typing import Any, overload
 from tensordict.nn import TensorDictModule, TensorDictSequential
 
 from emberlink.envs.utils.errors import UserError
-from emberlink.trainers.comparison.report import (
-    Comparison,
-    compare_runs,
-    free_folder,
-    write_report,
-)
+from emberlink.trainers.comparison.report import free_folder, write_report
+from emberlink.trainers.comparison.results import Comparison, compare_runs
 from emberlink.trainers.config.compose import override, resolve
 from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.evaluation.actor import load_actor

@@ -1,13 +1,18 @@
 """Fires from files: reads rasters, perimeters, the paper's text and banks onto a grid."""
 
-from emberlink.envs.fire_files.config import FileFireConfig
-from emberlink.envs.fire_files.reader import (
-    FireSets,
-    fire_sets,
-    read_fires,
-    save_copy,
-    with_checksum,
-)
+from typing import TYPE_CHECKING
+
+from emberlink.envs.utils.lazy import lazy
+
+if TYPE_CHECKING:
+    from emberlink.envs.fire_files.config import FileFireConfig
+    from emberlink.envs.fire_files.reader import (
+        FireSets,
+        fire_sets,
+        read_fires,
+        save_copy,
+        with_checksum,
+    )
 
 __all__ = [
     "FileFireConfig",
@@ -17,3 +22,6 @@ __all__ = [
     "save_copy",
     "with_checksum",
 ]
+
+# The readers import scipy, which takes a third of a second.
+__getattr__ = lazy(__name__, {**dict.fromkeys(__all__, "reader"), "FileFireConfig": "config"})

@@ -12,6 +12,8 @@ from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import Name
 
 Units = Literal["steps", "seconds", "minutes", "hours", "days"]
+COPY_FILE = "fires.npz"
+"""Name of the file in a run folder that holds the run's copy of its fires."""
 SECONDS = {"seconds": 1.0, "minutes": 60.0, "hours": 3600.0, "days": 86400.0}
 _Number = Annotated[float, Field(allow_inf_nan=False)]
 _Time = _Number | Annotated[str, Field(min_length=1, max_length=40)]

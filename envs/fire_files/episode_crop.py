@@ -8,7 +8,7 @@ from scipy import ndimage
 
 from emberlink.envs.config import BASE_SIDE
 from emberlink.envs.fire_files.config import SECONDS, Clock, FileFireConfig, Units
-from emberlink.envs.fire_files.perimeter_times import in_utc, parse_time
+from emberlink.envs.fire_files.perimeters.times import in_utc, parse_time
 from emberlink.envs.fire_files.raster_source import Source, Window
 from emberlink.envs.utils.errors import UserError
 

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from emberlink.envs.config import check_grid
 from emberlink.envs.fire_files import formats
-from emberlink.envs.fire_files.config import FileFireConfig
+from emberlink.envs.fire_files.config import COPY_FILE, FileFireConfig
 from emberlink.envs.fire_files.episode_crop import on_grid
 from emberlink.envs.fire_files.grid_maps import (
     MAX_CELLS,
@@ -34,8 +34,6 @@ from emberlink.envs.utils.validation import printable
 READER_VERSION = 5  # increase it if the same file gives another grid
 MAX_BEGINNINGS = 10
 """Places at which a raster's fire may begin without a warning."""
-COPY_FILE = "fires.npz"
-"""Name of the file in a run folder that holds the run's copy of its fires."""
 _MAX_COPY = 12 * MAX_CELLS + 1_000_000  # bytes when unpacked: float32 of the cells of all sets
 _EVERY, _VALIDATION, _TEST = 5, 3, 4  # remainders of the numbers of validation and test fires
 

@@ -13,7 +13,7 @@ from emberlink.trainers.cli.eval import add_eval
 from emberlink.trainers.cli.fire import add_fire
 from emberlink.trainers.cli.list import add_list
 from emberlink.trainers.cli.parser import Parser
-from emberlink.trainers.cli.render_arguments import add_render
+from emberlink.trainers.cli.render import add_render
 from emberlink.trainers.cli.sweep import add_sweep
 from emberlink.trainers.cli.train import add_train
 

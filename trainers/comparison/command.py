@@ -8,9 +8,10 @@ from rich.table import Table
 from rich.text import Text
 
 from emberlink.trainers.comparison.bootstrap import FEW
-from emberlink.trainers.comparison.page import FLAG, counts, decision, lines, ratio
 from emberlink.trainers.comparison.rankings import Numbers, Ranking
-from emberlink.trainers.comparison.report import compare_runs, free_folder, write_report
+from emberlink.trainers.comparison.report import free_folder, write_report
+from emberlink.trainers.comparison.report.page import FLAG, counts, decision, lines, ratio
+from emberlink.trainers.comparison.results import compare_runs
 
 
 def compare(paths: Sequence[Path], console: Console, output: Path | None = None) -> int:

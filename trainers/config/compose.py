@@ -51,7 +51,7 @@ def resolve(method: str, overrides: Sequence[str] = (), **settings: Any) -> RunC
     }
     values = _composed(str(method), chosen)
     _drop_settings_of_other_learners(values["learner"])
-    usual = deepcopy(values["env"])
+    radio = dict(values["env"]["radio"])
     known = list(dict.fromkeys([*GROUPS, *all_keys(values)]))
     for key, value in given:
         if key in (*(f"{group}.name" for group in GROUPS), "fire.kind"):
@@ -65,8 +65,7 @@ def resolve(method: str, overrides: Sequence[str] = (), **settings: Any) -> RunC
     values["world"] = chosen["world"]
     _put_settings(values, settings)
     _choose_seed(values, any(key == "seed" for key in [*dict(given), *settings]))
-    radio = _changes(_interpolated(usual)["radio"], values["env"]["radio"])
-    values["baselines"] = _baselines(chosen, radio)
+    values["baselines"] = _baselines(chosen, _changes(radio, values["env"].get("radio")))
     config = from_values(values)
     return replace(config, fire=fires_of(config.fire).with_checksum())
 
@@ -97,7 +96,7 @@ def override(config: RunConfig, overrides: Sequence[str] = (), **settings: Any) 
             put(values, key, value)
     _put_settings(values, settings)
     for baseline in baselines.values():
-        baseline["radio"] |= _changes(radio, values["env"]["radio"])
+        baseline["radio"] |= _changes(radio, values["env"].get("radio"))
     changed = from_values({**values, "baselines": baselines})
     # The run's own fire also holds the path of the run's copy of a fire file.
     return replace(changed, fire=config.fire) if changed.fire == config.fire else changed
@@ -219,8 +218,10 @@ def _baselines(chosen: Mapping[str, str], radio: Mapping[str, Any]) -> dict[str,
     return baselines
 
 
-def _changes(before: Mapping[str, Any], after: Mapping[str, Any]) -> dict[str, Any]:
-    """Returns the values of `after` that differ from those of `before`."""
+def _changes(before: Mapping[str, Any], after: Any) -> dict[str, Any]:
+    """Returns the values of `after` that differ from those of `before`, if it is a mapping."""
+    if not isinstance(after, Mapping):
+        return {}
     return {key: value for key, value in after.items() if value != before.get(key)}
 
 

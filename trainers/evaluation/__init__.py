@@ -1,4 +1,4 @@
-"""Evaluates frozen policies and scripted baselines: measures, figures, eval.json."""
+"""Evaluates frozen policies and scripted baselines: measures, figures, eval.json, animations."""
 
 from emberlink.trainers.evaluation.actor import load_actor
 from emberlink.trainers.evaluation.report import evaluate_run

@@ -15,7 +15,7 @@ from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
 
-from emberlink.envs.fire_files.reader import COPY_FILE
+from emberlink.envs.fire_files.config import COPY_FILE
 from emberlink.envs.utils.errors import UserError
 from emberlink.trainers.learners.base import ACTOR
 from emberlink.trainers.runs import checkpoint_file

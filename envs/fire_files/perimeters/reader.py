@@ -17,8 +17,8 @@ from emberlink.envs.fire_files.formats import (
     perimeter_files,
 )
 from emberlink.envs.fire_files.kmz import for_gdal
-from emberlink.envs.fire_files.perimeter_areas import area_at_zero, enclosed, make_valid, polygons
-from emberlink.envs.fire_files.perimeter_times import known_columns, perimeter_times
+from emberlink.envs.fire_files.perimeters.areas import area_at_zero, enclosed, make_valid, polygons
+from emberlink.envs.fire_files.perimeters.times import known_columns, perimeter_times
 from emberlink.envs.fire_files.projection import (
     Bounds,
     check_projection,

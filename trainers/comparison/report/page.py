@@ -138,7 +138,7 @@ def counts(numbers: Numbers) -> list[int]:
 
 def html(report: Report) -> str:
     """Returns the page as HTML without external files."""
-    source = files("emberlink.trainers.comparison").joinpath("page.html").read_text("utf-8")
+    source = files("emberlink.trainers.comparison.report").joinpath("page.html").read_text("utf-8")
     environment = Environment(
         autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )

@@ -4,9 +4,9 @@ import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from emberlink.trainers.comparison import plots
-from emberlink.trainers.comparison.page import Chapter, Picture
 from emberlink.trainers.comparison.rankings import Numbers
+from emberlink.trainers.comparison.report import plots
+from emberlink.trainers.comparison.report.page import Chapter, Picture
 from emberlink.trainers.comparison.runs import newest_checkpoint
 from emberlink.trainers.evaluation import evaluate
 from emberlink.trainers.evaluation.actor import load_actor
