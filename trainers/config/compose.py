@@ -51,7 +51,7 @@ def resolve(method: str, overrides: Sequence[str] = (), **settings: Any) -> RunC
     }
     values = _composed(str(method), chosen)
     _drop_settings_of_other_learners(values["learner"])
-    radio = dict(values["env"]["radio"])
+    radio = _radio(values)
     known = list(dict.fromkeys([*GROUPS, *all_keys(values)]))
     for key, value in given:
         if key in (*(f"{group}.name" for group in GROUPS), "fire.kind"):
@@ -65,7 +65,7 @@ def resolve(method: str, overrides: Sequence[str] = (), **settings: Any) -> RunC
     values["world"] = chosen["world"]
     _put_settings(values, settings)
     _choose_seed(values, any(key == "seed" for key in [*dict(given), *settings]))
-    values["baselines"] = _baselines(chosen, _changes(radio, values["env"].get("radio")))
+    values["baselines"] = _baselines(chosen, _changes(radio, _radio(values)))
     config = from_values(values)
     return replace(config, fire=fires_of(config.fire).with_checksum())
 
@@ -83,7 +83,7 @@ def override(config: RunConfig, overrides: Sequence[str] = (), **settings: Any) 
         UserError: a key is not known, or a value does not fit.
     """
     values = to_values(config)
-    baselines, radio = values.pop("baselines"), dict(values["env"]["radio"])
+    baselines, radio = values.pop("baselines"), _radio(values)
     known = list(flat(values))
     for key, value in map(parse, overrides):
         if key in GROUPS:
@@ -96,7 +96,7 @@ def override(config: RunConfig, overrides: Sequence[str] = (), **settings: Any) 
             put(values, key, value)
     _put_settings(values, settings)
     for baseline in baselines.values():
-        baseline["radio"] |= _changes(radio, values["env"].get("radio"))
+        baseline["radio"] |= _changes(radio, _radio(values))
     changed = from_values({**values, "baselines": baselines})
     # The run's own fire also holds the path of the run's copy of a fire file.
     return replace(changed, fire=config.fire) if changed.fire == config.fire else changed
@@ -218,10 +218,15 @@ def _baselines(chosen: Mapping[str, str], radio: Mapping[str, Any]) -> dict[str,
     return baselines
 
 
-def _changes(before: Mapping[str, Any], after: Any) -> dict[str, Any]:
-    """Returns the values of `after` that differ from those of `before`, if it is a mapping."""
-    if not isinstance(after, Mapping):
-        return {}
+def _radio(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Returns a copy of the settings of the radio; empty if a user has replaced them by a value."""
+    env = values["env"]
+    radio = env.get("radio") if isinstance(env, Mapping) else None
+    return dict(radio) if isinstance(radio, Mapping) else {}
+
+
+def _changes(before: Mapping[str, Any], after: Mapping[str, Any]) -> dict[str, Any]:
+    """Returns the values of `after` that differ from those of `before`."""
     return {key: value for key, value in after.items() if value != before.get(key)}
 
 
