@@ -85,6 +85,27 @@ def interval(statistic: Callable[..., Any], *samples: Sequence[float]) -> Interv
     return float(low), float(high)
 
 
+def paired_interval(statistic: Callable[..., Any], *samples: Values) -> Interval | None:
+    """Returns the 95 % percentile bootstrap interval of a statistic of paired samples.
+
+    Args:
+        statistic: a function of arrays with the keyword `axis`.
+        samples: [episodes] each; entry i of all samples is drawn together.
+
+    Returns:
+        Lower and upper end; None with one episode, or if the statistic is not finite in a resample.
+    """
+    if len(samples[0]) < 2:
+        return None
+    generator = np.random.default_rng(BOOTSTRAP_SEED)
+    index = generator.integers(len(samples[0]), size=(RESAMPLES, len(samples[0])))
+    values = statistic(*(np.asarray(sample, float)[index] for sample in samples), axis=-1)
+    if not np.isfinite(values).all():
+        return None
+    tail = (1 - LEVEL) / 2
+    return float(np.quantile(values, tail)), float(np.quantile(values, 1 - tail))
+
+
 def band(values: Values) -> tuple[Values, Values] | None:
     """Returns the ends of the interval of the IQM, [episodes] each, of values [seeds, episodes]."""
     return _bootstrap(iqm, [values], 0) if len(values) > 1 else None

@@ -104,7 +104,8 @@ def gather(runs: Sequence[Run]) -> tuple[list[Section], list[str]]:
 def _section_key(run: Run) -> list[Any]:
     fire = to_values(run.config)["fire"]
     shared = [run.settings[key] for key in _OF_SECTION]
-    return [run.config.setup, fire, shared, run.evaluation.fires, run.evaluation.start_seed]
+    world = run.config.setup, run.config.world
+    return [*world, fire, shared, run.evaluation.fires, run.evaluation.start_seed]
 
 
 def _section_name(run: Run, firsts: Sequence[Run]) -> str:
@@ -114,9 +115,11 @@ def _section_name(run: Run, firsts: Sequence[Run]) -> str:
         run: a run of the section.
         firsts: one run of each section.
     """
-    setup, fire = run.config.setup, run.config.fire.name
-    alike = [r for r in firsts if (r.config.setup, r.config.fire.name) == (setup, fire)]
-    name = f"setup {setup}, trained on {fire}"
+    def names(other: Run) -> tuple[str, str, str]:
+        return other.config.setup, other.config.world, other.config.fire.name
+
+    alike = [other for other in firsts if names(other) == names(run)]
+    name = "setup {}, world {}, trained on {}".format(*names(run))
     name += _settings_apart(run, alike, lambda k: k.startswith("fire.") or k in _OF_SECTION)
     if len({other.evaluation.fires for other in alike}) > 1:
         name += f", {run.evaluation.fires} held-out fires"
@@ -208,7 +211,8 @@ def _typed(key: str, value: Any) -> str:
 def _defaults(config: RunConfig) -> dict[str, Any]:
     """Returns the default settings of a run's method and setup; empty if it is not installed."""
     try:
-        choices = [f"setup={config.setup}", f"fire={config.fire.name}"]
+        names = {"setup": config.setup, "world": config.world, "fire": config.fire.name}
+        choices = [f"{group}={name}" for group, name in names.items()]
         return flat(to_values(resolve(config.method, choices)))
     except UserError:
         return {}

@@ -14,10 +14,6 @@ from emberlink.trainers.comparison.scripted import REWARD, Scripted, different_r
 from emberlink.trainers.evaluation.evaluate import HELD_OUT_SCENARIO
 from emberlink.trainers.evaluation.results import CURVES, LEARNED
 
-MEASURES = (*(name for name in metrics.NAMES if name != REWARD), REWARD)
-"""all measures, with the reward last, since methods may have different rewards"""
-
-
 @dataclass(frozen=True)
 class Row:
     """The result of a group for one measure.
@@ -108,12 +104,29 @@ def numbers(section: Section) -> Numbers:
         section.runs[0].evaluation.results, key=lambda name: (name != HELD_OUT_SCENARIO, name)
     )
     notes: list[str] = []
-    rankings = {fire: [_ranking(section, fire, name, notes) for name in MEASURES] for fire in fires}
+    rankings = {
+        fire: [_ranking(section, fire, name, notes) for name in measures(section, fire)]
+        for fire in fires
+    }
     curves = {
         name: {group.label: _curve(group, name) for group in section.as_trained} for name in CURVES
     }
     unique = list(dict.fromkeys(notes))
     return Numbers(section, rankings, verdicts(section, fires), curves, unique)
+
+
+def measures(section: Section, fire: str) -> list[str]:
+    """Returns the measures of all runs of a section on a fire.
+
+    The headline of the world is first, and the reward last, since methods may have different ones.
+    """
+    headline = section.runs[0].config.evaluation.headline
+    known = [
+        name
+        for name in metrics.ALL
+        if all(name in run.evaluation.results[fire][LEARNED] for run in section.runs)
+    ]
+    return sorted(known, key=lambda name: (name == REWARD, name != headline))
 
 
 def _ranking(section: Section, fire: str, measure: str, notes: list[str]) -> Ranking:

@@ -99,10 +99,10 @@ class RunConfig:
     """whether each UAV has its own replay buffer, or all share one"""
     comm: dict[str, Any]
     """name and settings of the communication module"""
-    baselines: dict[str, Baseline] = Field(default_factory=dict)
-    """method -> settings of the methods whose communication scripted policies use"""
     env: WildfireConfig
     """settings of the environment"""
+    baselines: dict[str, Baseline] = Field(default_factory=dict)
+    """method -> settings of the methods whose communication scripted policies use"""
     fire: Scenario
     """training fires"""
     learner: LearnerChoice

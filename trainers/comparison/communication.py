@@ -1,0 +1,143 @@
+"""Computes the value of communication: how much of what messages can add is reached."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from emberlink.trainers.comparison import bootstrap
+from emberlink.trainers.comparison.bootstrap import Interval
+from emberlink.trainers.comparison.groups import Group, Section
+from emberlink.trainers.comparison.runs import Run
+from emberlink.trainers.evaluation.results import LEARNED
+
+RANGE, LOSS = "env.radio.range", "env.radio.loss"
+SCRIPTED = {"map_greedy": ("map_greedy_alone", "map_greedy_all")}
+"""scripted policy -> the same policy without messages, and with all messages"""
+
+Values = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class CommunicationValue:
+    """The value of communication of a group or a scripted policy on one fire.
+
+    Attributes:
+        fire: the fire of the evaluation.
+        policy: label of the group, or name of the scripted policy.
+        measure: the headline measure of the world.
+        how: "evaluated" if the same networks were evaluated with other radios, "retrained" if other
+            networks were trained with them, "scripted" for a scripted policy.
+        none, with_radio, full: mean of the measure with the radio off, with the radio of the world,
+            and with a radio without limits.
+        value: (with_radio - none) / (full - none); None if `none` and `full` do not differ.
+        interval: 95 % bootstrap interval over fires, paired; None if it is not finite.
+    """
+
+    fire: str
+    policy: str
+    measure: str
+    how: str
+    none: float
+    with_radio: float
+    full: float
+    value: float | None
+    interval: Interval | None
+
+
+def communication_values(section: Section) -> list[CommunicationValue]:
+    """Returns the value of communication wherever a section has all three evaluations."""
+    measure = section.runs[0].config.evaluation.headline
+    values: list[CommunicationValue] = []
+    for fire in section.runs[0].evaluation.results:
+        for group in section.as_trained:
+            if _radio(group.runs[0]) not in (_OFF, _FULL):
+                for how, others in (("evaluated", _evaluated), ("retrained", _retrained)):
+                    none, full = (others(section, group, radio) for radio in (_OFF, _FULL))
+                    if none is not None and full is not None:
+                        samples = [_per_fire(g.runs, fire, measure) for g in (none, group, full)]
+                        values.append(_value(fire, group.label, measure, how, samples))
+        results = section.runs[0].evaluation.results[fire]
+        for policy, (none, full) in SCRIPTED.items():
+            if {policy, none, full} <= results.keys():
+                samples = [np.asarray(results[name][measure]) for name in (none, policy, full)]
+                values.append(_value(fire, policy, measure, "scripted", samples))
+    return values
+
+
+_OFF, _FULL = (0.0, None), (float("inf"), 0.0)
+
+
+def _radio(run: Run) -> tuple[float, float | None]:
+    """Returns range and loss of a run's evaluation; a radio that is off has no loss."""
+    settings = {**run.settings, **run.evaluated_with}
+    reach = float(settings[RANGE])
+    return (reach, None) if reach == 0 else (reach, float(settings[LOSS]))
+
+
+def _evaluated(section: Section, group: Group, radio: tuple) -> Group | None:
+    """Returns the evaluation of a group's own networks with another radio."""
+    paths = {run.path for run in group.runs}
+    return next(
+        (
+            other
+            for other in section.groups
+            if not other.as_trained
+            and {run.path for run in other.runs} == paths
+            and set(other.runs[0].evaluated_with) <= {RANGE, LOSS}
+            and _radio(other.runs[0]) == radio
+        ),
+        None,
+    )
+
+
+def _retrained(section: Section, group: Group, radio: tuple) -> Group | None:
+    """Returns the group that was trained with another radio and equal settings otherwise."""
+
+    def rest(other: Group) -> dict[str, Any]:
+        ignored = ("evaluation", "seed", "output", "baselines", RANGE, LOSS)
+        settings = other.runs[0].settings.items()
+        return {key: value for key, value in settings if not key.startswith(ignored)}
+
+    return next(
+        (
+            other
+            for other in section.as_trained
+            if other.seeds == group.seeds
+            and _radio(other.runs[0]) == radio
+            and rest(other) == rest(group)
+        ),
+        None,
+    )
+
+
+def _per_fire(runs: Sequence[Run], fire: str, measure: str) -> Values:
+    """Returns the mean over seeds of a measure in each episode, [fires]."""
+    return np.mean([run.evaluation.results[fire][LEARNED][measure] for run in runs], axis=0)
+
+
+def _value(
+    fire: str, policy: str, measure: str, how: str, samples: Sequence[Values]
+) -> CommunicationValue:
+    none, with_radio, full = (float(sample.mean()) for sample in samples)
+    value = (with_radio - none) / (full - none) if full != none else None
+    return CommunicationValue(
+        fire=fire,
+        policy=policy,
+        measure=measure,
+        how=how,
+        none=none,
+        with_radio=with_radio,
+        full=full,
+        value=value,
+        interval=bootstrap.paired_interval(_share, *samples),
+    )
+
+
+def _share(none: Values, with_radio: Values, full: Values, axis: int = -1) -> Any:
+    """Returns (with_radio - none) / (full - none) of the means along an axis."""
+    gained = with_radio.mean(axis) - none.mean(axis)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return gained / (full.mean(axis) - none.mean(axis))
