@@ -10,7 +10,14 @@ from torch import Tensor
 
 from emberlink.envs.config import WildfireConfig
 from emberlink.envs.fire.cache import fire_bank
-from emberlink.envs.fire.generator import FireConfig, fire_seeds, load_scenario, make_fires
+from emberlink.envs.fire.generator import (
+    FireConfig,
+    GeneratedConfig,
+    fire_seeds,
+    load_scenario,
+    make_fires,
+)
+from emberlink.envs.fire.reaction import ReactionConfig
 from emberlink.envs.fire_files import FileFireConfig, fire_sets, save_copy, with_checksum
 from emberlink.envs.fire_files.reader import COPY_FILE
 from emberlink.envs.utils.errors import UserError
@@ -63,7 +70,7 @@ class FireSource(Protocol):
 class Generated:
     """Fires from seeds."""
 
-    config: FireConfig
+    config: GeneratedConfig
 
     def train(self, grid: Grid, horizon: int) -> Tensor:
         """See `FireSource`."""
@@ -147,18 +154,24 @@ class FromFile:
         return dataclasses.replace(self.config, saved_copy=str(folder / COPY_FILE))
 
 
-_KINDS: dict[type, Any] = {FireConfig: Generated, FileFireConfig: FromFile}
+_KINDS: dict[type, Any] = {
+    FireConfig: Generated,
+    ReactionConfig: Generated,
+    FileFireConfig: FromFile,
+}
 
 
 def _kind(value: Any) -> str:
-    """Returns the tag of a scenario; one without a `kind` is of the generator."""
+    """Returns the tag of a scenario; one without a `kind` is of the level set."""
     kind = value.get("kind") if isinstance(value, dict) else getattr(value, "kind", None)
-    return f"{TAG}file" if kind == "file" else f"{TAG}spread"
+    return f"{TAG}{kind}" if kind in ("file", "reaction") else f"{TAG}spread"
 
 
-ScenarioConfig = FireConfig | FileFireConfig
+ScenarioConfig = GeneratedConfig | FileFireConfig
 Scenario = Annotated[
-    Annotated[FireConfig, Tag(f"{TAG}spread")] | Annotated[FileFireConfig, Tag(f"{TAG}file")],
+    Annotated[FireConfig, Tag(f"{TAG}spread")]
+    | Annotated[ReactionConfig, Tag(f"{TAG}reaction")]
+    | Annotated[FileFireConfig, Tag(f"{TAG}file")],
     Discriminator(_kind),
 ]
 """A scenario as a field of a configuration."""

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from emberlink.envs.fire.generator import FireConfig, Split, fire_seeds, make_fires
+from emberlink.envs.fire.generator import GeneratedConfig, Split, fire_seeds, make_fires
 from emberlink.envs.utils.atomic_io import read_sealed, write_sealed
 
 GENERATOR_VERSION = 1  # increase it if the same config and seed give another fire
@@ -28,7 +28,7 @@ def cache_folder() -> Path:
 
 
 def bank_key(
-    config: FireConfig,
+    config: GeneratedConfig,
     split: Split,
     count: int,
     grid: tuple[int, int],
@@ -41,7 +41,7 @@ def bank_key(
 
 
 def fire_bank(
-    config: FireConfig,
+    config: GeneratedConfig,
     split: Split,
     count: int,
     grid: tuple[int, int],

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from emberlink.envs.config import WildfireConfig
 from emberlink.envs.fire.cache import GENERATOR_VERSION
-from emberlink.envs.fire.generator import FireConfig, Split, fire_seeds, make_fires
+from emberlink.envs.fire.generator import GeneratedConfig, Split, fire_seeds, make_fires
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.publish import free_name
 from emberlink.trainers.config.compose import to_values
@@ -48,7 +48,7 @@ def make(
         UserError: a name is not known, or the file cannot be written.
     """
     config = generated(scenario, overrides)
-    assert isinstance(config.fire, FireConfig)
+    assert isinstance(config.fire, GeneratedConfig)
     count = count or _usual_count(config, config.fire)[split]
     path = output or _free(f"{scenario}_{split}_{count}")
     check_bank(path, count, config.env.grid)
@@ -65,7 +65,7 @@ def make(
     return 0
 
 
-def _usual_count(config: RunConfig, fire: FireConfig) -> dict[Split, int]:
+def _usual_count(config: RunConfig, fire: GeneratedConfig) -> dict[Split, int]:
     """Returns the number of fires that a training or an evaluation uses."""
     evaluation = config.evaluation
     return {
@@ -75,7 +75,7 @@ def _usual_count(config: RunConfig, fire: FireConfig) -> dict[Split, int]:
     }
 
 
-def _make(fire: FireConfig, seeds: Tensor, world: WildfireConfig, console: Console) -> Tensor:
+def _make(fire: GeneratedConfig, seeds: Tensor, world: WildfireConfig, console: Console) -> Tensor:
     """Makes the fires of seeds and prints the progress."""
     parts = track(
         seeds.split(_AT_A_TIME),
