@@ -7,6 +7,7 @@ from emberlink.envs.utils.lazy import lazy
 if TYPE_CHECKING:
     from emberlink.envs.config import RewardConfig, WildfireConfig
     from emberlink.envs.fire.generator import FireConfig
+    from emberlink.envs.fire.reaction import ReactionConfig
     from emberlink.envs.fire_files.config import FileFireConfig
     from emberlink.envs.pettingzoo import parallel_env
     from emberlink.envs.wildfire import WildfireEnv
@@ -14,6 +15,7 @@ if TYPE_CHECKING:
 __all__ = [
     "FileFireConfig",
     "FireConfig",
+    "ReactionConfig",
     "RewardConfig",
     "WildfireConfig",
     "WildfireEnv",
@@ -25,6 +27,7 @@ __getattr__ = lazy(
     {
         "FileFireConfig": "fire_files.config",
         "FireConfig": "fire.generator",
+        "ReactionConfig": "fire.reaction",
         "RewardConfig": "config",
         "WildfireConfig": "config",
         "WildfireEnv": "wildfire",

@@ -12,7 +12,15 @@ from torch import Tensor
 from emberlink.envs import fire_files
 from emberlink.envs.config import WildfireConfig
 from emberlink.envs.fire.cache import fire_bank
-from emberlink.envs.fire.generator import FireConfig, Split, fire_seeds, load_scenario, make_fires
+from emberlink.envs.fire.generator import (
+    FireConfig,
+    GeneratedConfig,
+    Split,
+    fire_seeds,
+    load_scenario,
+    make_fires,
+)
+from emberlink.envs.fire.reaction import ReactionConfig
 from emberlink.envs.fire_files.config import COPY_FILE, FileFireConfig
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import TAG
@@ -65,7 +73,7 @@ class FireSource(Protocol):
 class Generated:
     """Fires from seeds."""
 
-    config: FireConfig
+    config: GeneratedConfig
 
     def train(self, grid: Grid, horizon: int) -> Tensor:
         """See `FireSource`."""
@@ -81,12 +89,16 @@ class Generated:
 
     def test_fire(self, index: int, grid: Grid, horizon: int) -> Tensor:
         """See `FireSource`."""
-        arrival = make_fires(self.config, fire_seeds("test", index + 1)[index:], grid, horizon)
-        return with_burn_time(arrival, self.config.burn_time)
+        seeds = fire_seeds("test", index + 1)[index:]
+        return self._with_burn_time(make_fires(self.config, seeds, grid, horizon))
 
     def _bank(self, split: Split, count: int, grid: Grid, horizon: int) -> Tensor:
-        arrival = fire_bank(self.config, split, count, grid, horizon)
-        return with_burn_time(arrival, self.config.burn_time)
+        return self._with_burn_time(fire_bank(self.config, split, count, grid, horizon))
+
+    def _with_burn_time(self, fires: Tensor) -> Tensor:
+        if isinstance(self.config, ReactionConfig):
+            return fires
+        return with_burn_time(fires, self.config.burn_time)
 
     def describe(self, count: int) -> dict[str, Any]:
         """Returns their seeds, and the fields of the scenario that differ from their defaults."""
@@ -159,18 +171,24 @@ class FromFile:
         return dataclasses.replace(self.config, saved_copy=str(folder / COPY_FILE))
 
 
-_KINDS: dict[type, Any] = {FireConfig: Generated, FileFireConfig: FromFile}
+_KINDS: dict[type, Any] = {
+    FireConfig: Generated,
+    ReactionConfig: Generated,
+    FileFireConfig: FromFile,
+}
 
 
 def _kind(value: Any) -> str:
-    """Returns the tag of a scenario; one without a `kind` is of the generator."""
+    """Returns the tag of a scenario; one without a `kind` is of the level set."""
     kind = value.get("kind") if isinstance(value, dict) else getattr(value, "kind", None)
-    return f"{TAG}file" if kind == "file" else f"{TAG}spread"
+    return f"{TAG}{kind}" if kind in ("file", "reaction") else f"{TAG}spread"
 
 
-ScenarioConfig = FireConfig | FileFireConfig
+ScenarioConfig = GeneratedConfig | FileFireConfig
 Scenario = Annotated[
-    Annotated[FireConfig, Tag(f"{TAG}spread")] | Annotated[FileFireConfig, Tag(f"{TAG}file")],
+    Annotated[FireConfig, Tag(f"{TAG}spread")]
+    | Annotated[ReactionConfig, Tag(f"{TAG}reaction")]
+    | Annotated[FileFireConfig, Tag(f"{TAG}file")],
     Discriminator(_kind),
 ]
 """A scenario as a field of a configuration."""

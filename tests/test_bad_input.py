@@ -46,7 +46,10 @@ SETUPS = "known: paper, released, tuned"
         (["consensus", "zzz=1"], ["'zzz'", "known: setup, fire, learner, env", "num_envs"]),
         (["consensus", "method=independent"], ["'method'"]),
         (["consensus", "setup=papr"], ["setup 'papr'", "did you mean paper?", SETUPS]),
-        (["consensus", "fire=zzz"], ["fire 'zzz'", "known: file, huygens, oil_slick, paper"]),
+        (
+            ["consensus", "fire=zzz"],
+            ["fire 'zzz'", "known: file, huygens, oil_slick, paper, reaction"],
+        ),
         (["consensus", "learner.batch_size=big"], ["learner.batch_size=big", "integer"]),
         (["consensus", "learner.batch_size=1.5"], ["learner.batch_size=1.5", "integer"]),
         (["consensus", "env.reward.exit=true"], ["env.reward.exit=True", "number"]),

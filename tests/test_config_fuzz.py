@@ -77,6 +77,8 @@ def leaves(schema: dict, root: dict, prefix: str = "") -> Iterator[tuple[str, di
 LEARNER = TypeAdapter(DDPGConfig).json_schema()
 LEARNER["properties"].pop("name")
 KEYS = dict(leaves(SCHEMA, SCHEMA)) | dict(leaves(LEARNER, LEARNER, "learner."))
+REACTION = dict(leaves(SCHEMA["$defs"]["ReactionConfig"], SCHEMA, "fire."))
+del REACTION["fire.kind"]  # without it, the keys are those of the level set
 COMM_KEYS = {
     name: {
         f"comm.{key}": below for key, below in leaves({"properties": {}, **below_root}, below_root)
@@ -171,8 +173,8 @@ def invalid_values(schema: dict) -> list:
 
 
 @functools.cache
-def recipe(method: str, setup: str) -> dict:
-    return to_values(resolve(method, [f"setup={setup}"]))
+def recipe(method: str, setup: str, *chosen: str) -> dict:
+    return to_values(resolve(method, [f"setup={setup}", *chosen]))
 
 
 def put(values: dict, key: str, value) -> dict:
@@ -251,7 +253,15 @@ def every_key() -> list[tuple[str, str, dict]]:
     ("method", "key", "schema"), every_key(), ids=lambda value: str(value)[:40]
 )
 def test_an_invalid_value_gives_one_line_that_names_the_key(method, key, schema):
-    values = recipe(method, "tuned")
+    refuse_changes(recipe(method, "tuned"), key, schema)
+
+
+@pytest.mark.parametrize(("key", "schema"), REACTION.items(), ids=lambda value: str(value)[:40])
+def test_an_invalid_value_of_the_heat_equation_gives_one_line(key, schema):
+    refuse_changes(recipe("consensus", "tuned", "fire=reaction"), key, schema)
+
+
+def refuse_changes(values: dict, key: str, schema: dict) -> None:
     for value in invalid_values(schema):
         refused(key, lambda value=value: from_values(put(values, key, value)))
     *path, last = key.split(".")
@@ -318,7 +328,8 @@ def flat(values: dict, prefix: str = "") -> Iterator[str]:
 
 @pytest.mark.slow
 def test_every_key_of_every_group_is_fuzzed():
-    fuzzed = set(KEYS).union(*COMM_KEYS.values()) | {"comm.name", "learner.name"}
+    fuzzed = set(KEYS | REACTION).union(*COMM_KEYS.values())
+    fuzzed |= {"comm.name", "learner.name", "fire.kind"}
     present: set[str] = set()
     for method in known("method"):
         for setup in known("setup"):

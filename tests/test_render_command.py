@@ -182,7 +182,7 @@ def test_errors_of_render(tmp_path, capsys):
     there.write_text("mine")
     cases = [
         ([tmp_path / "none"], ["no such run folder"]),
-        ([run, "--fire", "zzz"], ["fire 'zzz'", "known: huygens, oil_slick, paper"]),
+        ([run, "--fire", "zzz"], ["fire 'zzz'", "known: huygens, oil_slick, paper, reaction"]),
         ([run, "--fire", "65536"], ["'65536'", "0 to 65535"]),
         ([run, "--fire=-1"], ["'-1'", "0 to 65535"]),
         ([run, "--fire", "paper:x"], ["'paper:x'", "0 to 65535"]),

@@ -178,4 +178,4 @@ def test_defaults_in_code_equal_setup_paper():
 def test_the_table_has_all_setups_and_methods():
     assert known("method") == sorted(METHODS)
     assert known("setup") == ["paper", "released", "tuned"]
-    assert known("fire") == ["file", "huygens", "oil_slick", "paper"]
+    assert known("fire") == ["file", "huygens", "oil_slick", "paper", "reaction"]

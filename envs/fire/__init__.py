@@ -1,4 +1,4 @@
-"""Generated fires: scenarios, their seeds, and the level set by which a front spreads."""
+"""Generated fires: scenarios, their seeds, and the equations by which a front spreads."""
 
 from emberlink.envs.fire.cache import fire_bank
 from emberlink.envs.fire.generator import (
@@ -9,9 +9,11 @@ from emberlink.envs.fire.generator import (
     make_fires,
     scenarios,
 )
+from emberlink.envs.fire.reaction import ReactionConfig
 
 __all__ = [
     "FireConfig",
+    "ReactionConfig",
     "Split",
     "fire_bank",
     "fire_seeds",

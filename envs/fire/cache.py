@@ -13,7 +13,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from emberlink.envs.fire.generator import FireConfig, Split, fire_seeds, make_fires
+from emberlink.envs.fire.generator import GeneratedConfig, Split, fire_seeds, make_fires
+from emberlink.envs.fire.reaction import ReactionConfig
 from emberlink.envs.utils.atomic_io import read_sealed, write_sealed
 
 GENERATOR_VERSION = 1  # increase it if the same config and seed give another fire
@@ -28,7 +29,7 @@ def cache_folder() -> Path:
 
 
 def bank_key(
-    config: FireConfig,
+    config: GeneratedConfig,
     split: Split,
     count: int,
     grid: tuple[int, int],
@@ -37,13 +38,13 @@ def bank_key(
 ) -> str:
     """Returns a hash of all values on which a bank of arrival times depends."""
     ranges = dataclasses.asdict(config)
-    del ranges["burn_time"]
+    ranges.pop("burn_time", None)
     parts = [GENERATOR_VERSION, ranges, split, count, *grid, horizon, start]
     return hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:32]
 
 
 def fire_bank(
-    config: FireConfig,
+    config: GeneratedConfig,
     split: Split,
     count: int,
     grid: tuple[int, int],
@@ -62,12 +63,13 @@ def fire_bank(
             to, a warning is issued and the fires are computed each time.
 
     Returns:
-        float32 [count, X, Y] on the CPU, so that every device trains on the same fires.
+        As `make_fires`, on the CPU, so that every device trains on the same fires.
     """
     seeds = fire_seeds(split, count, start)
     folder = cache_folder() if cache_dir is None else Path(cache_dir)
     file = folder / f"fire-{bank_key(config, split, count, grid, horizon, start)}.npy"
-    stored = _read(file, (count, *grid))
+    times = (2,) if isinstance(config, ReactionConfig) else ()
+    stored = _read(file, (count, *times, *grid))
     if stored is not None:
         return stored
     fires = make_fires(config, seeds, grid, horizon)

@@ -2,7 +2,8 @@
 
 A fire is an arrival time per cell, in steps; a cell burns once `step >= arrival_time`. It starts as
 a ring, the edge of a disc whose inside is burnt out and never counts as fire, and spreads by the
-level set of `level_set`. Other waves, such as oil on water, are scenarios as well.
+level set of `level_set`, or by the heat equation of `reaction`. Other waves, such as oil on water,
+are scenarios as well.
 Lengths of a scenario are in cells. With `lengths: scaled`, they are for a grid whose shorter side
 has 30 cells (`BASE_SIDE`); on another grid lengths and rates are scaled by min(X, Y)/30.
 """
@@ -12,7 +13,7 @@ import math
 from typing import Annotated, Literal, get_args
 
 import torch
-from pydantic import AfterValidator, ConfigDict, Field, Strict, ValidationError
+from pydantic import ConfigDict, Field, ValidationError
 from pydantic.dataclasses import dataclass
 from torch import Tensor
 
@@ -21,8 +22,17 @@ from emberlink.envs.config import BASE_SIDE, check_grid
 from emberlink.envs.fire.advection import current, max_time_step, tide_speed
 from emberlink.envs.fire.ellipse import MAX_LENGTH_TO_BREADTH
 from emberlink.envs.fire.level_set import arrival_times, disc
+from emberlink.envs.fire.ranges import (
+    Degrees,
+    Fraction,
+    Length,
+    Ordered,
+    Pair,
+    Turn,
+    unit_draws,
+)
+from emberlink.envs.fire.reaction import ReactionConfig, reaction_fires
 from emberlink.envs.utils.config_files import read
-from emberlink.envs.utils.counter_rng import Use, fold_in, uniform
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import Name, describe
 
@@ -34,21 +44,8 @@ _MIN_NODES = 60  # along the shorter side: twice the resolution of 30 cells
 _MAX_NODES = 200_000  # computed together, so that the data fits in the processor's cache
 _MIN_RADIUS = 1e-6  # of a patch, cells, so that its square does not underflow
 
-
-def _ordered(pair: tuple[float, float]) -> tuple[float, float]:
-    if pair[0] > pair[1]:
-        raise UserError(f"a range is (low, high), got {pair}")
-    return pair
-
-
-_Ordered = AfterValidator(_ordered)
-_Pair = Strict(False)  # a list, as in YAML, is valid for a tuple
-_Degrees = Annotated[float, Field(ge=-360, le=360)]
-_Turn = Annotated[float, Field(ge=-3600, le=3600)]
-_Length = Annotated[float, Field(gt=0, le=30)]
 _Signed = Annotated[float, Field(ge=-30, le=30)]
 _Rate = Annotated[float, Field(gt=0, le=1)]
-_Fraction = Annotated[float, Field(ge=0, le=1)]
 _Ratio = Annotated[float, Field(ge=1, le=MAX_LENGTH_TO_BREADTH)]
 _Drift = Annotated[float, Field(ge=0, le=1)]
 _Reach = Annotated[float, Field(ge=0, le=30)]
@@ -68,41 +65,41 @@ class FireConfig:
     """Name of the scenario, that of its file."""
     num_train_fires: Annotated[int, Field(ge=1, lt=TEST_FROM)]
     """Number of fires to train on."""
-    head_ros: Annotated[tuple[_Rate, _Rate], _Pair, _Ordered]
+    head_ros: Annotated[tuple[_Rate, _Rate], Pair, Ordered]
     """Rate of spread of the head, cells per step."""
-    length_to_breadth: Annotated[tuple[_Ratio, _Ratio], _Pair, _Ordered]
+    length_to_breadth: Annotated[tuple[_Ratio, _Ratio], Pair, Ordered]
     """Length-to-breadth ratio of the elliptical wavelet, 1 without wind."""
-    azimuth: Annotated[tuple[_Degrees, _Degrees], _Pair, _Ordered]
+    azimuth: Annotated[tuple[Degrees, Degrees], Pair, Ordered]
     """Direction in which the head moves at step 0, degrees counter-clockwise from +x."""
-    wind_shift: Annotated[tuple[_Turn, _Turn], _Pair, _Ordered]
+    wind_shift: Annotated[tuple[Turn, Turn], Pair, Ordered]
     """Steady turning of that direction, degrees per 1000 steps, counter-clockwise."""
-    centre_x: Annotated[tuple[_Fraction, _Fraction], _Pair, _Ordered]
+    centre_x: Annotated[tuple[Fraction, Fraction], Pair, Ordered]
     """Centre of the initial disc along x, as a fraction of the box (0 to X - 1)."""
-    centre_y: Annotated[tuple[_Fraction, _Fraction], _Pair, _Ordered]
+    centre_y: Annotated[tuple[Fraction, Fraction], Pair, Ordered]
     """Centre of the initial disc along y, as a fraction of the box (0 to Y - 1)."""
-    core_radius: Annotated[tuple[_Length, _Length], _Pair, _Ordered]
+    core_radius: Annotated[tuple[Length, Length], Pair, Ordered]
     """Radius of the initial disc, cells."""
-    ring_width: Annotated[tuple[_Length, _Length], _Pair, _Ordered]
+    ring_width: Annotated[tuple[Length, Length], Pair, Ordered]
     """Width of the part of the disc that burns at step 0, cells; the rest is burnt out."""
-    fuel_patches: Annotated[tuple[_Count, _Count], _Pair, _Ordered]
+    fuel_patches: Annotated[tuple[_Count, _Count], Pair, Ordered]
     """Number of patches of slow fuel."""
-    patch_bearing: Annotated[tuple[_Degrees, _Degrees], _Pair, _Ordered]
+    patch_bearing: Annotated[tuple[Degrees, Degrees], Pair, Ordered]
     """Direction of a patch from the disc's centre, degrees from the initial azimuth."""
-    patch_distance: Annotated[tuple[_Signed, _Signed], _Pair, _Ordered]
+    patch_distance: Annotated[tuple[_Signed, _Signed], Pair, Ordered]
     """Distance of a patch's centre from the initial disc, cells, negative inside."""
-    patch_radius: Annotated[tuple[_Length, _Length], _Pair, _Ordered]
+    patch_radius: Annotated[tuple[Length, Length], Pair, Ordered]
     """Distance from a patch's centre at which its effect has fallen to 1/e, cells."""
-    patch_rate: Annotated[tuple[_Fraction, _Fraction], _Pair, _Ordered]
+    patch_rate: Annotated[tuple[Fraction, Fraction], Pair, Ordered]
     """Multiplier of the rate of spread at a patch's centre; 1 is no effect."""
-    drift_rate: Annotated[tuple[_Drift, _Drift], _Pair, _Ordered] = (0.0, 0.0)
+    drift_rate: Annotated[tuple[_Drift, _Drift], Pair, Ordered] = (0.0, 0.0)
     """Steady drift of the medium towards the azimuth, cells per step."""
-    tide_reach: Annotated[tuple[_Reach, _Reach], _Pair, _Ordered] = (0.0, 0.0)
+    tide_reach: Annotated[tuple[_Reach, _Reach], Pair, Ordered] = (0.0, 0.0)
     """Distance that the tide moves the medium between two turns, cells."""
-    tide_period: Annotated[tuple[_Period, _Period], _Pair, _Ordered] = (1000.0, 1000.0)
+    tide_period: Annotated[tuple[_Period, _Period], Pair, Ordered] = (1000.0, 1000.0)
     """Period of the tide, steps."""
-    tide_phase: Annotated[tuple[_Degrees, _Degrees], _Pair, _Ordered] = (0.0, 0.0)
+    tide_phase: Annotated[tuple[Degrees, Degrees], Pair, Ordered] = (0.0, 0.0)
     """Phase of the tide at step 0, degrees; the speed is greatest at 0."""
-    tide_bearing: Annotated[tuple[_Degrees, _Degrees], _Pair, _Ordered] = (0.0, 0.0)
+    tide_bearing: Annotated[tuple[Degrees, Degrees], Pair, Ordered] = (0.0, 0.0)
     """Direction of the tide at phase 0, degrees counter-clockwise from +x."""
     two_sided: bool = False
     """Whether the back of the wavelet is as fast as its head."""
@@ -117,22 +114,27 @@ _FIXED = {"name", "num_train_fires", "two_sided", "burn_time", "lengths"}
 _DRAWN = tuple(f.name for f in dataclasses.fields(FireConfig) if f.name not in _FIXED)
 
 
+GeneratedConfig = FireConfig | ReactionConfig
+"""a scenario whose fires are made from seeds"""
+
+
 def scenarios() -> list[str]:
-    """Returns the names of the generator's scenarios: files in `configs/fire` without `kind`."""
-    return [name for name in known("fire") if "kind" not in read("fire", name)]
+    """Returns the names of the generated scenarios in `configs/fire`."""
+    return [name for name in known("fire") if read("fire", name).get("kind") in (None, "reaction")]
 
 
-def load_scenario(name: str) -> FireConfig:
+def load_scenario(name: str) -> GeneratedConfig:
     """Returns the scenario in `configs/fire/<name>.yaml`.
 
     Raises:
         UserError: there is no such file, or a value in it is not valid.
     """
-    values = read("fire", name) if name in known("fire") else None
-    if values is None or "kind" in values:
+    if name not in scenarios():
         raise UserError(f"unknown fire {name!r}; known: {', '.join(scenarios())}")
+    values = read("fire", name)
+    config_type = ReactionConfig if "kind" in values else FireConfig
     try:
-        return FireConfig(**values)
+        return config_type(**values)
     except ValidationError as error:
         raise UserError(f"configs/fire/{name}.yaml: {describe(error)}") from None
 
@@ -164,13 +166,13 @@ def fire_seeds(split: Split, count: int, start: int = 0) -> Tensor:
 
 
 def make_fires(
-    config: FireConfig,
+    config: GeneratedConfig,
     seeds: Tensor,
     grid: tuple[int, int],
     horizon: int,
     device: torch.device | str | None = None,
 ) -> Tensor:
-    """Returns the arrival times of one fire per seed. A fire depends on its seed alone.
+    """Returns the times of one fire per seed. A fire depends on its seed alone.
 
     Args:
         config: the scenario.
@@ -180,14 +182,18 @@ def make_fires(
         device: where to compute.
 
     Returns:
-        float32 [fires, X, Y], steps: 0 burns from the start, inf never burns.
+        Arrival times in steps, float32 [fires, X, Y]: 0 burns from the start, inf never burns. Of a
+        `ReactionConfig` arrival and burn-out times, float32 [fires, 2, X, Y].
     """
     check_grid(grid)
+    seeds = seeds.to(device=device, dtype=torch.int64)
+    if isinstance(config, ReactionConfig):
+        return reaction_fires(config, seeds, grid, horizon)
     refine = math.ceil(_MIN_NODES / min(grid))
     sides = (side + 2 * _margin(config, grid) for side in grid)
     chunk = max(1, _MAX_NODES // (math.prod(sides) * refine**2))
-    parts = seeds.to(device=device, dtype=torch.int64).split(chunk)
-    return torch.cat([_spread(config, part, grid, horizon, refine) for part in parts])
+    parts = [_spread(config, part, grid, horizon, refine) for part in seeds.split(chunk)]
+    return torch.cat(parts)
 
 
 def _margin(config: FireConfig, grid: tuple[int, int]) -> int:
@@ -235,16 +241,10 @@ def _spread(
     return arrival.masked_fill(depth > draw["ring_width"][:, None, None] * scale, math.inf)
 
 
-def _unit(field: str, seeds: Tensor, count: int) -> Tensor:
-    """Returns uniform draws on (0, 1) for a field, float32 [fires, count]."""
-    key = torch.tensor([Use.FIRE_PARAMETER, _DRAWN.index(field)], device=seeds.device)
-    return uniform(fold_in(fold_in(seeds, key[0]), key[1]), count)
-
-
 def _draw(config: FireConfig, field: str, seeds: Tensor, count: int = 1) -> Tensor:
     """Returns uniform draws from the range of a field, float32 [fires, count]."""
     low, high = getattr(config, field)
-    return low + (high - low) * _unit(field, seeds, count)
+    return low + (high - low) * unit_draws(seeds, _DRAWN.index(field), count)
 
 
 def _axes(grid: tuple[int, int], device: torch.device) -> tuple[Tensor, Tensor]:
@@ -266,7 +266,8 @@ def _fuel(
         return None
     scale = _scale(config, grid)
     low = config.fuel_patches[0]
-    count = low + (_unit("fuel_patches", seeds, 1) * (maximum - low + 1)).floor()
+    drawn = unit_draws(seeds, _DRAWN.index("fuel_patches"), 1)
+    count = low + (drawn * (maximum - low + 1)).floor()
     bearing, distance, width, rate = (
         _draw(config, f"patch_{part}", seeds, maximum)
         for part in ("bearing", "distance", "radius", "rate")

@@ -123,7 +123,7 @@ def describe(error: ValidationError, prefix: str = "") -> str:
     if first["type"] in ("missing", "unexpected_keyword_argument"):
         wrong = "missing" if first["type"] == "missing" else "not known"
         return f"key {shown(key)!r} is {wrong}"
-    if message.startswith((f"{key}=", f"{key}.", f"{key}: ", f"key '{key}.")):
+    if not key or message.startswith((f"{key}=", f"{key}.", f"{key}: ", f"key '{key}.")):
         return message
     value = "" if isinstance(first["input"], dict) else f"={shown(first['input'])}"
     return f"{key}{value}: {message}"

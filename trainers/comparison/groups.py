@@ -115,6 +115,7 @@ def _section_name(run: Run, firsts: Sequence[Run]) -> str:
         run: a run of the section.
         firsts: one run of each section.
     """
+
     def names(other: Run) -> tuple[str, str, str]:
         return other.config.setup, other.config.world, other.config.fire.name
 

@@ -14,6 +14,7 @@ from emberlink.trainers.comparison.scripted import REWARD, Scripted, different_r
 from emberlink.trainers.evaluation.evaluate import HELD_OUT_SCENARIO
 from emberlink.trainers.evaluation.results import CURVES, LEARNED
 
+
 @dataclass(frozen=True)
 class Row:
     """The result of a group for one measure.

@@ -14,9 +14,10 @@ from torch import Tensor
 
 from emberlink.envs.config import WildfireConfig
 from emberlink.envs.fire.cache import GENERATOR_VERSION
-from emberlink.envs.fire.generator import FireConfig, Split, fire_seeds, make_fires
+from emberlink.envs.fire.generator import GeneratedConfig, Split, fire_seeds, make_fires
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.publish import free_name
+from emberlink.envs.world.burning import split_times
 from emberlink.trainers.config.compose import to_values
 from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.fires.bank_writer import check_bank, write_bank
@@ -48,7 +49,7 @@ def make(
         UserError: a name is not known, or the file cannot be written.
     """
     config = generated(scenario, overrides)
-    assert isinstance(config.fire, FireConfig)
+    assert isinstance(config.fire, GeneratedConfig)
     count = count or _usual_count(config, config.fire)[split]
     path = output or _free(f"{scenario}_{split}_{count}")
     check_bank(path, count, config.env.grid)
@@ -65,7 +66,7 @@ def make(
     return 0
 
 
-def _usual_count(config: RunConfig, fire: FireConfig) -> dict[Split, int]:
+def _usual_count(config: RunConfig, fire: GeneratedConfig) -> dict[Split, int]:
     """Returns the number of fires that a training or an evaluation uses."""
     evaluation = config.evaluation
     return {
@@ -75,7 +76,7 @@ def _usual_count(config: RunConfig, fire: FireConfig) -> dict[Split, int]:
     }
 
 
-def _make(fire: FireConfig, seeds: Tensor, world: WildfireConfig, console: Console) -> Tensor:
+def _make(fire: GeneratedConfig, seeds: Tensor, world: WildfireConfig, console: Console) -> Tensor:
     """Makes the fires of seeds and prints the progress."""
     parts = track(
         seeds.split(_AT_A_TIME),
@@ -84,7 +85,8 @@ def _make(fire: FireConfig, seeds: Tensor, world: WildfireConfig, console: Conso
         transient=True,
         disable=not console.is_terminal,
     )
-    return torch.cat([make_fires(fire, part, world.grid, world.horizon) for part in parts])
+    made = torch.cat([make_fires(fire, part, world.grid, world.horizon) for part in parts])
+    return split_times(made)[0]
 
 
 def import_files(arguments: Sequence[str], console: Console, output: Path) -> int:

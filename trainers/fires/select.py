@@ -14,6 +14,7 @@ from emberlink.envs.fire_files.reader import read_with_summary
 from emberlink.envs.scenarios import fires_of
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import shown, unknown
+from emberlink.envs.world.burning import split_times
 from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.config.schema import RunConfig
 
@@ -83,7 +84,8 @@ def _test_fire(config: RunConfig, text: str, index: str) -> Tensor:
         raise UserError(
             f"{shown(text)}: there is no test fire {index!r}; known: 0 to {MAX_TEST_FIRES - 1}"
         )
-    return fires_of(config.fire).test_fire(int(index), config.env.grid, config.env.horizon)[0]
+    fire = fires_of(config.fire).test_fire(int(index), config.env.grid, config.env.horizon)
+    return split_times(fire)[0][0]
 
 
 def generated(scenario: str, overrides: Sequence[str]) -> RunConfig:
