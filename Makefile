@@ -33,7 +33,7 @@ test-slow: $(INSTALLED)  ## run the slow tests (about 5 minutes)
 soak: $(INSTALLED)  ## kill, interrupt and damage trainings repeatedly (about half an hour)
 	@OMP_NUM_THREADS=1 $(BIN)/python tests/soak/soak.py $(SOAK)
 	@OMP_NUM_THREADS=1 EMBERLINK_SOAK=1 $(BIN)/python -m pytest -q -n $(WORKERS) \
-		tests/test_invariants.py tests/test_config_fuzz.py
+		tests/envs/test_invariants.py tests/trainers/config/test_config_fuzz.py
 
 bench: $(INSTALLED)  ## run the benchmarks (about half an hour; BENCH="-k update" selects some)
 	@$(BIN)/python -m pytest tests/benchmarks -q -p no:xdist -o python_files='bench_*.py' $(BENCH)

@@ -19,7 +19,7 @@ from emberlink.trainers.runs.run_folder import RunFolder
 
 # In one process, which trains the shared run once.
 pytestmark = pytest.mark.xdist_group("api")
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 SHORT = {
     "episodes": 2,
     "horizon": 15,
