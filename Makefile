@@ -24,11 +24,12 @@ help:  ## list the targets
 demo: $(INSTALLED)  ## train consensus for a few minutes and evaluate it, with figures and a GIF
 	@OMP_NUM_THREADS=$(THREADS) $(BIN)/emberlink train consensus setup=tuned $(DEMO)
 
+# Tests of a file run in one process, since they share trainings.
 test: $(INSTALLED)  ## run the tests, without the slow ones (about 5 minutes)
-	@OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n $(WORKERS) --dist loadgroup -m "not slow"
+	@OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n $(WORKERS) --dist loadfile -m "not slow"
 
 test-slow: $(INSTALLED)  ## run the slow tests (about 5 minutes)
-	@OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n $(WORKERS) --dist loadgroup -m slow
+	@OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n $(WORKERS) --dist loadfile -m slow
 
 soak: $(INSTALLED)  ## kill, interrupt and damage trainings repeatedly (about half an hour)
 	@OMP_NUM_THREADS=1 $(BIN)/python tests/soak/soak.py $(SOAK)
