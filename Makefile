@@ -24,16 +24,17 @@ help:  ## list the targets
 demo: $(INSTALLED)  ## train consensus for a few minutes and evaluate it, with figures and a GIF
 	@OMP_NUM_THREADS=$(THREADS) $(BIN)/emberlink train consensus setup=tuned $(DEMO)
 
+# Tests of a file run in one process, since they share trainings.
 test: $(INSTALLED)  ## run the tests, without the slow ones (about 5 minutes)
-	@OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n $(WORKERS) --dist loadgroup -m "not slow"
+	@OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n $(WORKERS) --dist loadfile -m "not slow"
 
 test-slow: $(INSTALLED)  ## run the slow tests (about 5 minutes)
-	@OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n $(WORKERS) --dist loadgroup -m slow
+	@OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n $(WORKERS) --dist loadfile -m slow
 
 soak: $(INSTALLED)  ## kill, interrupt and damage trainings repeatedly (about half an hour)
 	@OMP_NUM_THREADS=1 $(BIN)/python tests/soak/soak.py $(SOAK)
 	@OMP_NUM_THREADS=1 EMBERLINK_SOAK=1 $(BIN)/python -m pytest -q -n $(WORKERS) \
-		tests/test_invariants.py tests/test_config_fuzz.py
+		tests/envs/test_invariants.py tests/trainers/config/test_config_fuzz.py
 
 bench: $(INSTALLED)  ## run the benchmarks (about half an hour; BENCH="-k update" selects some)
 	@$(BIN)/python -m pytest tests/benchmarks -q -p no:xdist -o python_files='bench_*.py' $(BENCH)

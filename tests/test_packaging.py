@@ -24,9 +24,6 @@ PRIVATE = re.compile(
     r"(?<![\w.])/(?:work|root|home|Users)/\w|" + "|".join(map(re.escape, REGISTRIES))
 )
 
-# One process builds and installs the wheel for all of these tests.
-pytestmark = pytest.mark.xdist_group("wheel")
-
 
 def run(*command, cwd: Path, env: dict[str, str] | None = None, **options) -> str:
     """Returns the output of a command; fails with the output if the command fails."""

@@ -8,10 +8,8 @@ from pathlib import Path
 
 import pytest
 
-# All trials are done once.
-pytestmark = pytest.mark.xdist_group("trials")
 COUNTS = {"kill -9": 8, "SIGTERM": 1, "SIGINT": 1, "file size limit": 1}
-SOAK = Path(__file__).parent / "soak" / "soak.py"
+SOAK = Path(__file__).parents[2] / "soak" / "soak.py"
 
 
 @pytest.fixture(scope="module")

@@ -90,7 +90,6 @@ def test_paper_is_one_fire(paper: torch.Tensor):
     )
 
 
-@pytest.mark.xdist_group("test_fires")
 def test_huygens_counts(test_fires: torch.Tensor):
     count = burning_cells(test_fires, HORIZON)
     start, end = count[:, 0], count[:, -1]
@@ -103,7 +102,6 @@ def test_huygens_counts(test_fires: torch.Tensor):
     assert 0.15 < edge.isfinite().any(1).double().mean() < 0.3  # some fronts leave the box
 
 
-@pytest.mark.xdist_group("test_fires")
 def test_a_fire_depends_on_its_seed_only(test_fires: torch.Tensor):
     config, seeds = load_scenario("huygens"), fire_seeds("test", 200)
     some = torch.tensor([150, 0, 7])
@@ -113,21 +111,18 @@ def test_a_fire_depends_on_its_seed_only(test_fires: torch.Tensor):
     assert torch.equal(torch.get_rng_state(), state)
 
 
-@pytest.mark.xdist_group("test_fires")
 def test_no_fire_is_in_both_splits(test_fires: torch.Tensor):
     train = make_fires(load_scenario("huygens"), fire_seeds("train", 50), GRID, HORIZON)
     both = torch.cat([train, test_fires[:50]]).flatten(1)
     assert len(both.unique(dim=0)) == 100
 
 
-@pytest.mark.xdist_group("test_fires")
 def test_a_longer_horizon_continues_the_same_fire(test_fires: torch.Tensor):
     seeds = fire_seeds("test", 5)
     short = make_fires(load_scenario("huygens"), seeds, GRID, 400)
     assert torch.equal(short, test_fires[:5].masked_fill(test_fires[:5] > 400, math.inf))
 
 
-@pytest.mark.xdist_group("test_fires")
 def test_arrivals(test_fires: torch.Tensor):
     assert test_fires.dtype == torch.float32
     finite = test_fires[test_fires.isfinite()]
@@ -161,7 +156,6 @@ def central_cells(grid: tuple[int, int], fires: int) -> torch.Tensor:
 
 
 @pytest.mark.slow
-@pytest.mark.xdist_group("scales")
 @pytest.mark.parametrize(
     ("grid", "fires", "tolerance"),
     [

@@ -30,9 +30,6 @@ from emberlink.trainers.runs.run_folder import RunFolder
 from emberlink.trainers.tracking.trackers import Trackers
 from emberlink.trainers.training import rollback
 
-# In one process, which trains the shared run once.
-pytestmark = pytest.mark.xdist_group("links")
-
 
 class Outside:
     """Holds a folder of the user and its initial contents."""

@@ -12,7 +12,7 @@ from emberlink.envs.wildfire import WildfireEnv
 from emberlink.trainers import make_env
 from emberlink.trainers.config.compose import resolve
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 METHODS = ["independent", "shared_memory", "positional", "consensus"]
 OBSERVED = {"independent": 6, "shared_memory": 6, "positional": 30, "consensus": 9}
 UAVS, ENVS, HORIZON = 5, 3, 8

@@ -287,7 +287,6 @@ def test_fires() -> Tensor:
 
 
 @pytest.mark.slow
-@pytest.mark.xdist_group("slicks")
 def test_slicks_are_of_the_size_of_the_fires(test_fires: Tensor):
     count = burning_cells(test_fires, HORIZON)
     assert ((count[:, 0] >= 55) & (count[:, 0] <= 90)).all()
@@ -299,7 +298,6 @@ def test_slicks_are_of_the_size_of_the_fires(test_fires: Tensor):
 
 
 @pytest.mark.slow
-@pytest.mark.xdist_group("slicks")
 def test_all_of_the_disc_is_oil(test_fires: Tensor):
     """A ring as wide as its radius has no hole."""
     x, y = torch.meshgrid(torch.arange(30.0), torch.arange(30.0), indexing="ij")
@@ -310,7 +308,6 @@ def test_all_of_the_disc_is_oil(test_fires: Tensor):
 
 
 @pytest.mark.slow
-@pytest.mark.xdist_group("slicks")
 def test_a_slick_depends_on_its_seed_only(test_fires: Tensor):
     config, seeds = load_scenario("oil_slick"), fire_seeds("test", 100)
     assert torch.equal(make_fires(config, seeds[37:39], GRID, HORIZON), test_fires[37:39])

@@ -16,9 +16,7 @@ from emberlink.trainers.runs import pretrained
 from emberlink.trainers.runs.run_folder import RunFolder
 from emberlink.trainers.runs.seal import check_trained_with
 
-# The packed runs are trained once.
-pytestmark = pytest.mark.xdist_group("packed")
-DATA = Path(__file__).parent.parent / "docs" / "data"
+DATA = Path(__file__).parents[3] / "docs" / "data"
 
 
 @pytest.fixture(scope="module")

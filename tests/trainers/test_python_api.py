@@ -17,9 +17,7 @@ from emberlink.envs.utils.errors import UserError
 from emberlink.policies.scripted.registry import SCRIPTED
 from emberlink.trainers.runs.run_folder import RunFolder
 
-# In one process, which trains the shared run once.
-pytestmark = pytest.mark.xdist_group("api")
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 SHORT = {
     "episodes": 2,
     "horizon": 15,

@@ -26,8 +26,6 @@ from emberlink.trainers.config.compose import from_values, override, resolve, to
 from emberlink.trainers.runs.run_folder import RunFolder
 
 GRID, HORIZON = (12, 10), 15
-# In one process, which trains the shared run once.
-pytestmark = pytest.mark.xdist_group("fire_files")
 SMALL = [*TINY, "env.grid=[12,10]"]
 
 

@@ -21,9 +21,6 @@ from emberlink.trainers.terminal import SafeConsole
 from emberlink.trainers.training.resume import resume
 from emberlink.trainers.training.trainer import Trainer
 
-# In one process, which trains the shared run once.
-pytestmark = pytest.mark.xdist_group("finishing")
-
 
 def trained(capsys, *arguments: str | Path) -> tuple[int, str, str]:
     """Returns the exit status, the output and the errors of `emberlink train`."""
