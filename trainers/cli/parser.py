@@ -4,7 +4,7 @@ import argparse
 import difflib
 import sys
 from collections.abc import Callable, Sequence
-from typing import Any, NoReturn
+from typing import IO, Any, NoReturn
 
 
 class _Help(argparse.HelpFormatter):
@@ -35,6 +35,18 @@ class Parser(argparse.ArgumentParser):
             if text.startswith("-"):
                 self.error(self._unknown_option(text, list(args or ())))
         return parsed, unknown
+
+    def print(self, message: str, file: IO[str] | None) -> None:
+        """Writes a message to a file, or to standard error if it is None.
+
+        Raises:
+            OSError: it cannot be written. argparse itself would not report this.
+        """
+        stream = file or sys.stderr
+        if stream is not None:
+            stream.write(message)
+
+    _print_message = print  # argparse's name
 
     def error(self, message: str) -> NoReturn:
         """Prints the message and exits with status 2."""
