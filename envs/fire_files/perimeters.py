@@ -191,7 +191,7 @@ class PerimeterSource:
     """
 
     whole = False
-    beginnings = 1
+    doubts: Sequence[str] = ()
 
     def __init__(self, areas: Sequence[Any], times: np.ndarray, clock: Clock):
         if len(times) < 2:
