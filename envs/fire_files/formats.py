@@ -16,7 +16,7 @@ from typing import Any
 from xml.parsers import expat
 
 from emberlink.envs.fire_files.kmz import kml_parts
-from emberlink.envs.fire_files.sidecars import check_sidecars
+from emberlink.envs.fire_files.sidecars import check_sidecars, read_beside
 from emberlink.envs.utils.errors import UserError
 
 MAX_BYTES = 300_000_000
@@ -24,7 +24,6 @@ MAX_BYTES = 300_000_000
 MAX_FILES = 500
 """Files of perimeters in a folder."""
 _BESIDE = {".shp": (".shx", ".dbf", ".prj", ".cpg"), ".asc": (".prj",)}
-_BESIDE |= {".tif": (".tfw",), ".tiff": (".tfw",)}
 
 
 @dataclass(frozen=True)
@@ -251,8 +250,9 @@ def digest(path: Path) -> str:
         return content.hexdigest()
     _check_regular(path)
     try:
-        for suffix in ("", *_BESIDE.get(path.suffix.lower(), ())):
-            part = beside(path, suffix) if suffix else path
+        parts = {suffix: beside(path, suffix) for suffix in _BESIDE.get(path.suffix.lower(), ())}
+        others = {part.name[len(path.stem) :]: part for part in read_beside(path)}
+        for suffix, part in {"": path, **parts, **others}.items():
             if part is not None and part.is_file():
                 content.update(f"{suffix}:{part.stat().st_size}:".encode())
                 with part.open("rb") as file:

@@ -1,5 +1,6 @@
 """Samples arrival times on a raster at the cells of a grid."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
@@ -7,12 +8,15 @@ import numpy as np
 from scipy.ndimage import label, map_coordinates, minimum_filter
 
 from emberlink.envs.fire_files.config import Clock
+from emberlink.envs.fire_files.plausibility import doubts_of_growth
 from emberlink.envs.fire_files.projection import Bounds
 from emberlink.envs.utils.errors import UserError
 
 SAMPLES = 180
 """Sample points along the grid's shorter side. A cell of the grid gets the earliest of its samples.
 Rasters and perimeters are sampled at the same points."""
+MAX_BEGINNINGS = 10
+"""Places at which the fire of a raster may begin without a doubt."""
 _EDGE = 1e-6  # cells: tolerance, so that rounding does not move a centre across an edge
 
 
@@ -88,8 +92,8 @@ class Source(Protocol):
         ...
 
     @property
-    def beginnings(self) -> int:
-        """Number of places that burn before all cells around them."""
+    def doubts(self) -> Sequence[str]:
+        """Signs that the content is something other than arrival times, for the user."""
         ...
 
     def burnt(self, until: float) -> Bounds:
@@ -111,6 +115,7 @@ class RasterSource:
         clock: unit of the times.
         whole: as in `Source`.
         name: name of the values in the file, for messages.
+        doubts: signs, known already, that these are not arrival times.
     """
 
     def __init__(
@@ -121,12 +126,13 @@ class RasterSource:
         clock: Clock,
         whole: bool = False,
         name: str = "",
+        doubts: Sequence[str] = (),
     ):
         rows, columns = times.shape
         x, y = corner
         self.extent: Bounds = x, y - rows * cell[1], x + columns * cell[0], y
         self.times, self.clock, self.whole = times.astype(np.float64), clock, whole
-        self._corner, self._cell, self._name = corner, cell, name
+        self._corner, self._cell, self._name, self._doubts = corner, cell, name, doubts
         burning = times[np.isfinite(times)]
         self.first, self.last = float(burning.min()), float(burning.max())
         self.began = 0.0 if self._from_zero() else self.first
@@ -138,8 +144,17 @@ class RasterSource:
         count = self.beginnings
         places = "1 place" if count == 1 else f"{count} places"
         cells = np.isfinite(self.times).sum()
-        name = f"{self._name!r}: " if self._name else ""
+        name = f"{self._name}: " if self._name else ""
         return f"{name}{cells} cells burn from {first} to {last}, beginning at {places}"
+
+    @property
+    def doubts(self) -> list[str]:
+        """Signs that these are not arrival times; none of a map of the whole grid."""
+        if self.whole:
+            return []
+        many = ["it would begin at many places"] if self.beginnings > MAX_BEGINNINGS else []
+        growth = doubts_of_growth(self.times, self._cell, self.clock.unit)
+        return [*self._doubts, *many, *growth]
 
     @property
     def beginnings(self) -> int:

@@ -4,7 +4,7 @@ import logging
 import logging.handlers
 import math
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TextIO
@@ -13,6 +13,7 @@ import numpy as np
 
 from emberlink.envs.fire_files.config import Clock, Units
 from emberlink.envs.fire_files.formats import beside
+from emberlink.envs.fire_files.plausibility import doubts_of_names, doubts_of_values
 from emberlink.envs.fire_files.projection import check_projection, first_line, library, projections
 from emberlink.envs.fire_files.raster_source import RasterSource, check_spreads
 from emberlink.envs.fire_files.sidecars import read_sidecar
@@ -49,8 +50,10 @@ def read_geotiff(path: Path, unit: Units | None, crs: str | None) -> RasterSourc
         times = clean(dataset.read(1), never) * dataset.scales[0] + dataset.offsets[0]
         tagged: Units | None = "steps" if dataset.tags().get("units") == "steps" else None
         affine, source_crs = dataset.transform[:6], dataset.crs
-        name = (dataset.descriptions[0] or "")[:60]
-    return _on_plane(times, affine, source_crs, unit or tagged, crs, name)
+        name, measure = (dataset.descriptions[0] or "")[:60], (dataset.units[0] or "")[:20]
+        doubts = list(doubts_of_names([*_texts(dataset), path.stem], measure))
+    name = f"{name!r} ({measure})" if measure else repr(name) if name else ""
+    return _on_plane(times, affine, source_crs, unit or tagged, crs, name, doubts)
 
 
 def read_ascii(path: Path, unit: Units | None, crs: str | None) -> RasterSource:
@@ -83,7 +86,15 @@ def read_ascii(path: Path, unit: Units | None, crs: str | None) -> RasterSource:
     y = header.get("yllcorner", header.get("yllcenter", 0.0) - dy / 2)
     never = values == header["nodata_value"] if "nodata_value" in header else None
     affine = dx, 0.0, x, 0.0, -dy, y + shape[0] * dy
-    return _on_plane(clean(values, never), affine, _prj(path), unit, crs)
+    doubts = list(doubts_of_names([path.stem]))
+    return _on_plane(clean(values, never), affine, _prj(path), unit, crs, doubts=doubts)
+
+
+def _texts(dataset: Any) -> list[str]:
+    """Returns the texts in a GeoTIFF that name its values."""
+    tags = {**dataset.tags(), **dataset.tags(1)}
+    named = [tags[key] for key in ("TIFFTAG_IMAGEDESCRIPTION", "long_name") if key in tags]
+    return [text for text in (dataset.descriptions[0], *named) if text]
 
 
 @contextmanager
@@ -229,6 +240,7 @@ def _on_plane(
     unit: Units | None,
     crs: str | None,
     name: str = "",
+    doubts: Sequence[str] = (),
 ) -> RasterSource:
     """Returns cleaned times on a plane, north up.
 
@@ -245,6 +257,7 @@ def _on_plane(
             "the unit of the raster's times is not known; expected fire.units=minutes (FARSITE, "
             "FlamMap), seconds (ELMFIRE), hours, days or steps"
         )
+    doubts = [*doubts, *doubts_of_values(times, unit)]
     rows, columns = times.shape
     corners = [(a * u + b * v + c, d * u + e * v + f) for u in (0, columns) for v in (0, rows)]
     x, y = zip(*corners, strict=True)
@@ -252,7 +265,7 @@ def _on_plane(
     if chosen or b or d or a < 0 or e > 0:
         times, affine = _warp(times, (a, b, c, d, e, f), chosen)
         a, b, c, d, e, f = affine
-    return RasterSource(times, (c, f), (a, -e), Clock(unit), name=name)
+    return RasterSource(times, (c, f), (a, -e), Clock(unit), name=name, doubts=doubts)
 
 
 def _warp(

@@ -5,6 +5,7 @@ import hashlib
 import io
 import json
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -32,8 +33,6 @@ from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import printable
 
 READER_VERSION = 5  # increase it if the same file gives another grid
-MAX_BEGINNINGS = 10
-"""Places at which a raster's fire may begin without a warning."""
 _MAX_COPY = 12 * MAX_CELLS + 1_000_000  # bytes when unpacked: float32 of the cells of all sets
 _EVERY, _VALIDATION, _TEST = 5, 3, 4  # remainders of the numbers of validation and test fires
 
@@ -60,14 +59,14 @@ def read_with_summary(
 ) -> tuple[Tensor, str]:
     """Returns the fires as `read_fires` does, and a line that describes the file.
 
-    Warns if the fire of a raster begins at many places: the raster may hold elevation, for example.
+    Warns if a raster seems to hold something other than arrival times, such as elevation.
     """
     check_grid(grid)
     path = Path(config.path).expanduser()
     name = printable(str(path))
     try:
         with quiet():
-            fires, summary, many = _read(path, config, grid, horizon)
+            fires, summary, doubts = _read(path, config, grid, horizon)
     except UserError as error:
         raise UserError(f"{name}: {printable(str(error))}") from None
     except OSError as error:
@@ -75,15 +74,16 @@ def read_with_summary(
     except MemoryError:
         raise UserError(f"{name}: not enough memory to read it") from None
     summary = printable(summary)
-    if many:
-        warnings.warn(f"{name}: {summary}: are these arrival times?", stacklevel=3)
+    if doubts:
+        signs = printable("; ".join(doubts))
+        warnings.warn(f"{name}: {summary}; {signs}: are these arrival times?", stacklevel=3)
     return torch.from_numpy(np.stack(fires)), summary
 
 
 def _read(
     path: Path, config: FileFireConfig, grid: tuple[int, int], horizon: int
-) -> tuple[list[np.ndarray], str, bool]:
-    """Returns the fires in a file, [X, Y] each, a summary, and whether it looks doubtful."""
+) -> tuple[list[np.ndarray], str, Sequence[str]]:
+    """Returns the fires in a file, [X, Y] each, a summary, and signs that they are no fires."""
     kind = None if path.is_dir() else formats.find_format(path)
     if config.incident is not None and kind is not None and kind not in formats.PERIMETERS:
         raise UserError(
@@ -98,8 +98,7 @@ def _read(
     if bank is None:
         source = _read_one(path, kind, config)
         fire = on_grid(source, config, grid, horizon)
-        doubtful = not source.whole and source.beginnings > MAX_BEGINNINGS
-        return [fire], source.summary, doubtful
+        return [fire], source.summary, source.doubts
     _check_horizon(bank.horizon, config, horizon)
     fires: list[np.ndarray] = []
     for times in bank.fires:
@@ -107,7 +106,7 @@ def _read(
             fires.append(on_grid(map_of_grid(times), config, grid, horizon))
         except UserError as error:
             raise UserError(f"fire {len(fires)}: {error}") from None
-    return fires, f"a bank of {len(fires)} fires, in steps", False
+    return fires, f"a bank of {len(fires)} fires, in steps", ()
 
 
 def _check_horizon(written: int | None, config: FileFireConfig, horizon: int) -> None:

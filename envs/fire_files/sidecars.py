@@ -1,12 +1,16 @@
 """Checks and reads the small files that the libraries open beside a file."""
 
 import os
+from collections.abc import Sequence
 from pathlib import Path
 
 from emberlink.envs.utils.atomic_io import read_bytes
 from emberlink.envs.utils.errors import UserError
 
-_SUFFIXES = (".prj", ".cpg", ".aux.xml", ".msk", ".ovr")
+_GEOTIFF = (".aux.xml", ".msk", ".aux", ".tfw", ".tifw", ".tiffw", ".wld", ".tab")
+_READ = {".tif": _GEOTIFF, ".tiff": _GEOTIFF, ".gpkg": ("-wal", "-journal")}
+"""Endings of files that change what GDAL reads, besides those that `formats` knows."""
+_OPENED = (".prj", ".cpg", ".ovr", *_GEOTIFF, "-wal", "-shm", "-journal")
 _MAX_BYTES = 1_000_000  # of a .prj
 
 
@@ -16,11 +20,29 @@ def check_sidecars(path: Path) -> None:
     Raises:
         UserError: one is a pipe, a folder, a device or a broken link.
     """
-    for suffix in _SUFFIXES:
-        for ending in (suffix, suffix.upper()):
-            for part in (path.with_suffix(ending), path.with_name(path.name + ending)):
-                if os.path.lexists(part) and not part.is_file():
-                    raise UserError(f"{part.name}, beside it, is no regular file")
+    for part in _beside(path, _OPENED):
+        if not part.is_file():
+            raise UserError(f"{part.name}, beside it, is no regular file")
+
+
+def read_beside(path: Path) -> list[Path]:
+    """Returns the files beside a raster or GeoPackage that change what GDAL reads, by name."""
+    return [part for part in _beside(path, _READ.get(path.suffix.lower(), ())) if part.is_file()]
+
+
+def _beside(path: Path, endings: Sequence[str]) -> list[Path]:
+    """Returns what is beside a file with its name and an ending, in upper or lower case as in GDAL.
+
+    The ending follows the name, or replaces its suffix.
+    """
+    names = {f"{name}{ending}" for name in (path.stem, path.name) for ending in endings}
+    try:
+        there = os.listdir(path.parent) if names else []
+    except OSError:  # a folder that may be entered, but not listed
+        both = {*names, *(path.stem + ending.upper() for ending in endings)}
+        there = [name for name in both if os.path.lexists(path.with_name(name))]
+    lower = {name.lower() for name in names}
+    return sorted(path.with_name(name) for name in there if name.lower() in lower)
 
 
 def read_sidecar(path: Path) -> str:

@@ -17,7 +17,7 @@ def add_fire(commands: Any) -> None:
     group = command(
         commands,
         "fire",
-        lambda options, console: _help(group),
+        lambda options, console: _help(group, console),
         "preview fires, write them to files, import them",
         "Draws a fire and tells whether UAVs can keep up with it, writes generated fires "
         "to files, and imports fires from files.",
@@ -29,8 +29,8 @@ def add_fire(commands: Any) -> None:
     _add_import(actions)
 
 
-def _help(group: argparse.ArgumentParser) -> int:
-    group.print_help()
+def _help(group: argparse.ArgumentParser, console: "Console") -> int:
+    console.print(group.format_help(), soft_wrap=True, end="")
     return 0
 
 

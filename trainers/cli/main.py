@@ -6,6 +6,7 @@ import os
 import sys
 from collections.abc import Sequence
 from contextlib import suppress
+from typing import Any
 
 from emberlink.trainers.cli.compare import add_compare
 from emberlink.trainers.cli.doctor import add_doctor
@@ -16,6 +17,7 @@ from emberlink.trainers.cli.parser import Parser
 from emberlink.trainers.cli.render import add_render
 from emberlink.trainers.cli.sweep import add_sweep
 from emberlink.trainers.cli.train import add_train
+from emberlink.trainers.cli.warning_lines import one_line_warnings
 
 INTERRUPTED = 130
 """exit status after Ctrl-C"""
@@ -26,20 +28,33 @@ _BROKEN_PIPE = 141
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs a command and returns its exit status, which is 2 for a mistake of the user.
 
-    Only defects of the program end in a traceback.
+    The status is 1 if standard output cannot be written. Only defects of the program end in a
+    traceback.
     """
     if sys.platform == "win32":
         print("emberlink: runs on Linux and macOS; on Windows, use WSL", file=sys.stderr)
         return 2
+    try:
+        with one_line_warnings():
+            status = _parse_and_run(arguments)
+    except SystemExit as ended:  # of argparse, after a help or an error
+        raise SystemExit(_flush(ended.code)) from None
+    except BaseException:
+        _flush(1)
+        raise
+    return int(_flush(status) or 0)
+
+
+def _parse_and_run(arguments: Sequence[str] | None) -> int:
     parser = _parser()
     try:
         options = parser.parse_args(arguments)
         if options.command is None:
             parser.print_help()
             return 0
-        return _run(options)
-    finally:
-        _flush()
+    except OSError as error:  # of a help or the version
+        return _unwritable("emberlink", error)
+    return _run(options)
 
 
 def _run(options: argparse.Namespace) -> int:
@@ -55,6 +70,8 @@ def _run(options: argparse.Namespace) -> int:
     except OSError as error:
         if error.errno == errno.EPIPE:
             return _BROKEN_PIPE
+        if _is_output(error):
+            return _unwritable(f"emberlink {options.command}", error)
         if error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EIO):
             raise
         name = error.filename or "a file"
@@ -79,6 +96,12 @@ def _message(error: Exception) -> str | None:
     return None
 
 
+def _is_output(error: OSError) -> bool:
+    from emberlink.trainers.terminal import OutputError
+
+    return isinstance(error, OutputError)
+
+
 def _report(options: argparse.Namespace, message: str, status: int = 2) -> int:
     """Prints a message on one line and returns the exit status."""
     line = "".join(c if c.isprintable() else " " for c in " ".join(message.split()))
@@ -87,14 +110,31 @@ def _report(options: argparse.Namespace, message: str, status: int = 2) -> int:
     return status
 
 
-def _flush() -> None:
-    """Flushes standard output, and discards it if that fails, so that Python does not report it."""
+def _unwritable(program: str, error: OSError) -> int:
+    """Reports that standard output cannot be written and returns the exit status."""
+    if error.errno == errno.EPIPE:
+        return _BROKEN_PIPE
+    with suppress(OSError):
+        reason = error.strerror or error
+        print(f"{program}: standard output: cannot be written: {reason}", file=sys.stderr)
+    return 1
+
+
+def _flush(status: Any) -> Any:
+    """Flushes standard output and returns the exit status.
+
+    An output that cannot be flushed is discarded, so that Python does not report it at its end.
+    """
+    if sys.stdout is None:  # closed by the shell: >&-
+        return status
     try:
         sys.stdout.flush()
-    except OSError:
+    except OSError as error:
         null = os.open(os.devnull, os.O_WRONLY)
         os.dup2(null, sys.stdout.fileno())
         os.close(null)
+        return status or _unwritable("emberlink", error)
+    return status
 
 
 def _parser() -> Parser:
@@ -116,8 +156,8 @@ def _parser() -> Parser:
 class _Version(argparse.Action):
     """Prints the version of the installed package."""
 
-    def __call__(self, parser, *_: object) -> None:
+    def __call__(self, parser: Any, *_: object) -> None:
         from importlib.metadata import version
 
-        print(f"emberlink {version('emberlink')}")
+        parser.print(f"emberlink {version('emberlink')}\n", sys.stdout)
         parser.exit()

@@ -36,6 +36,18 @@ class Parser(argparse.ArgumentParser):
                 self.error(self._unknown_option(text, list(args or ())))
         return parsed, unknown
 
+    def print(self, message: str, file: Any = None) -> None:
+        """Writes a message to a file, or to standard error if it is None.
+
+        Raises:
+            OSError: it cannot be written. argparse itself would not report this.
+        """
+        stream = file or sys.stderr
+        if stream is not None:
+            stream.write(message)
+
+    _print_message = print  # argparse's name
+
     def error(self, message: str) -> NoReturn:
         """Prints the message and exits with status 2."""
         text = "".join(c if c.isprintable() else "?" for c in message)

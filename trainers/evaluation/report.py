@@ -13,6 +13,7 @@ from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.evaluation import evaluate, plots
 from emberlink.trainers.evaluation.results import LEARNED, Results
 from emberlink.trainers.runs.run_folder import RunFolder
+from emberlink.trainers.runs.seal import changed_evaluation
 from emberlink.trainers.runs.versions import versions
 from emberlink.trainers.terminal import OutputError
 
@@ -45,6 +46,9 @@ def evaluate_run(
     def say(fire: str, policy: str) -> None:
         report(f"{policy} on {fires} fires of {fire}")
 
+    changed = changed_evaluation(checkpoint, config)
+    for text in changed:
+        report(f"note: {text}")
     try:
         run.figures()  # an unusable folder is an error before the episodes, not after
         results = evaluate.evaluate(config, actor, fires=fires, report=say)
@@ -56,7 +60,8 @@ def evaluate_run(
             f"{run.path / 'figures'}: cannot be written: {error.strerror or error}"
         ) from None
     # Written last: an evaluation with this file is complete.
-    run.write(f"eval{label}.json", record(config, results, checkpoint=checkpoint.name, fires=fires))
+    about = {"checkpoint": checkpoint.name, "fires": fires, "changed": changed}
+    run.write(f"eval{label}.json", record(config, results, **about))
     return results
 
 

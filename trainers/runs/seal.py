@@ -4,7 +4,7 @@ The SHA-256 of the checkpoint covers its header, but not config.yaml.
 """
 
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -63,6 +63,24 @@ def check_same(path: Path, sealed: Mapping[str, Any], config: RunConfig) -> None
             f"{path}: made with {key}={shown(str(before))}; the run has {key}={shown(str(now))}: "
             f"put {shown(str(before))} back into config.yaml{hint}"
         )
+
+
+def changed_evaluation(path: Path, config: RunConfig) -> list[str]:
+    """Returns a text for each setting of evaluations that differs from the checkpoint's header.
+
+    They may be changed when a run is resumed, and are no part of what the networks learnt.
+
+    Args:
+        path: path of the checkpoint.
+        config: configuration of the run.
+    """
+    header = checkpoint_file.read_header(path)
+    before = header.get("config", {}).get("evaluation", {})
+    return [
+        f"evaluation.{key} is {value} here, {shown(str(before.get(key)))} in {path.name}"
+        for key, value in asdict(config.evaluation).items()
+        if value != before.get(key)
+    ]
 
 
 def to_header(config: RunConfig) -> dict[str, Any]:

@@ -1,5 +1,6 @@
 """Defines a rich console that supports any encoding, width and text."""
 
+import errno
 import os
 import sys
 from collections.abc import Iterator
@@ -76,6 +77,8 @@ class _StandardOutput:
 
     def write(self, text: str) -> int:
         stream = _stdout()
+        if stream is None:  # `>&-` in a shell
+            raise OutputError(errno.EBADF, "it is closed", "standard output")
         try:
             return stream.write(_encodable(text, getattr(stream, "encoding", None) or "utf-8"))
         except OSError as error:
@@ -83,7 +86,8 @@ class _StandardOutput:
 
     def flush(self) -> None:
         try:
-            _stdout().flush()
+            if (stream := _stdout()) is not None:
+                stream.flush()
         except OSError as error:
             raise _output_error(error) from None
 

@@ -16,6 +16,7 @@ from emberlink.envs.fire_files.formats import (
     find_format,
     perimeter_files,
 )
+from emberlink.envs.fire_files.kml_times import with_one_time
 from emberlink.envs.fire_files.kmz import for_gdal
 from emberlink.envs.fire_files.perimeters.areas import area_at_zero, enclosed, make_valid, polygons
 from emberlink.envs.fire_files.perimeters.times import known_columns, perimeter_times
@@ -47,7 +48,7 @@ def read_perimeters(path: Path, config: FileFireConfig) -> "PerimeterSource":
     Raises:
         UserError: a file, a feature or a column is wrong.
     """
-    frame = _choose_incident(_read_tables(path, config.layer), config.incident)
+    frame = _choose_incident(_read_tables(path, config), config.incident)
     times, clock = perimeter_times(frame, config.time_field, config.units)
     distinct = np.unique(times)
     if len(distinct) > MAX_TIMES:
@@ -59,19 +60,19 @@ def read_perimeters(path: Path, config: FileFireConfig) -> "PerimeterSource":
     return PerimeterSource(_project(frame, areas, config.crs), distinct, clock)
 
 
-def _read_tables(path: Path, layer: str | None) -> Any:
+def _read_tables(path: Path, config: FileFireConfig) -> Any:
     """Reads the features of a file, or of all files in a folder.
 
     The index of the table names the features in messages.
     """
     if not path.is_dir():
-        return _read_table(path, layer).rename(index="feature {}".format)
+        return _read_table(path, config).rename(index="feature {}".format)
     names, frames = [], []
     for part in perimeter_files(path):
         try:
             if find_format(part) not in PERIMETERS:
                 raise UserError("expected perimeters")
-            frame = _read_table(part, layer).rename(columns=str.lower)
+            frame = _read_table(part, config).rename(columns=str.lower)
         except UserError as error:
             raise UserError(f"{part.name}: {error}") from None
         names.append(part.name)
@@ -90,7 +91,7 @@ def _join(frames: Sequence[Any]) -> Any:
     return library("pandas").concat(same)
 
 
-def _read_table(path: Path, layer: str | None) -> Any:
+def _read_table(path: Path, config: FileFireConfig) -> Any:
     """Reads the features of a file, each of which has a geometry."""
     pyogrio = library("pyogrio")
     library("geopandas")
@@ -100,7 +101,7 @@ def _read_table(path: Path, layer: str | None) -> Any:
     options: dict[str, Any] = {"DATE_AS_STRING": "YES"} if is_json else {}
     try:
         with for_gdal(path) as source:
-            layers = _choose_layers(pyogrio.list_layers(source), layer, several=is_kml)
+            layers = _choose_layers(pyogrio.list_layers(source), config.layer, several=is_kml)
             options["datetime_as_string"] = True
             parts = [pyogrio.read_dataframe(source, layer=name, **options) for name in layers]
         frame = _join(parts).reset_index(drop=True)
@@ -112,6 +113,7 @@ def _read_table(path: Path, layer: str | None) -> Any:
         raise UserError(f"{first_line(error)}; expected perimeters") from None
     if is_kml:  # without hot spots, and without the columns of KML that are empty
         frame = frame[frame.geom_type != "Point"].dropna(axis="columns", how="all")
+        frame = with_one_time(frame) if config.time_field is None else frame
     if not hasattr(frame, "geometry") or len(frame) == 0:
         raise UserError("no feature with a geometry; expected perimeters")
     missing = frame.index[frame.geometry.isna() | frame.geometry.is_empty]
@@ -191,7 +193,7 @@ class PerimeterSource:
     """
 
     whole = False
-    beginnings = 1
+    doubts: Sequence[str] = ()
 
     def __init__(self, areas: Sequence[Any], times: np.ndarray, clock: Clock):
         if len(times) < 2:

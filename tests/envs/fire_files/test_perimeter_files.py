@@ -86,6 +86,50 @@ def test_kml_and_kmz_equal_geojson(tmp_path, frame, name):
         assert torch.allclose(got, expected, atol=1e-2)
 
 
+STAMP = "<TimeStamp><when>{}</when></TimeStamp>"
+SPAN = "<TimeSpan><begin>{}</begin><end>2021-01-01T00:00:00Z</end></TimeSpan>"
+DATA = "<ExtendedData><Data name='date'><value>{}</value></Data></ExtendedData>"
+LATE = "2021-01-01T00:00:00Z"
+
+
+def kml_with(frame, times):
+    """Returns KML whose placemarks have different elements of time; `{}` is the right one."""
+    texts = [kml_of(frame.iloc[[k]], time) for k, time in enumerate(times)]
+    parts = [text.split("<Document>")[1].split("</Document>")[0] for text in texts]
+    return f"{texts[0].split('<Document>')[0]}<Document>{''.join(parts)}</Document></kml>"
+
+
+@pytest.mark.parametrize(
+    "times",
+    [
+        (STAMP, DATA, SPAN),
+        (STAMP + DATA.format(LATE), STAMP, STAMP + DATA.format(LATE)),
+        (SPAN + DATA.format(LATE), SPAN + DATA.format(LATE), DATA),
+        (SPAN, STAMP, SPAN),
+    ],
+)
+def test_the_time_of_a_placemark_is_the_first_of_stamp_span_and_data(tmp_path, frame, times):
+    (tmp_path / "stamps.kml").write_text(kml_of(frame))
+    (tmp_path / "mixed.kml").write_text(kml_with(frame, times))
+    assert torch.equal(read(tmp_path / "mixed.kml"), read(tmp_path / "stamps.kml"))
+
+
+def test_the_data_of_a_placemark_can_be_chosen(tmp_path, frame):
+    (tmp_path / "stamps.kml").write_text(kml_of(frame))
+    (tmp_path / "both.kml").write_text(kml_with(frame, (STAMP.format(LATE) + DATA,) * 3))
+    got = read(tmp_path / "both.kml", time_field="date")
+    assert torch.equal(got, read(tmp_path / "stamps.kml"))
+
+
+def test_several_dates_in_the_data_of_a_placemark_are_refused(tmp_path, frame):
+    one = "<Data name='{}'><value>{{0}}</value></Data>"
+    data = f"<ExtendedData>{one.format('date')}{one.format('datetime')}</ExtendedData>"
+    (tmp_path / "fire.kml").write_text(kml_with(frame, (STAMP, data, STAMP)))
+    assert "the columns timestamp, date, datetime may hold the times" in refused(
+        tmp_path / "fire.kml"
+    )
+
+
 def test_kml_without_times_names_the_columns(tmp_path, frame):
     (tmp_path / "fire.kml").write_text(kml_of(frame, ""))
     assert "expected fire.time_field, one of Name" in refused(tmp_path / "fire.kml")

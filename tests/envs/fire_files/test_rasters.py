@@ -19,7 +19,8 @@ from scipy.ndimage import gaussian_filter
 from emberlink.envs.fire_files import rasters
 from emberlink.envs.fire_files.config import Clock, FileFireConfig
 from emberlink.envs.fire_files.raster_source import RasterSource, Window
-from emberlink.envs.fire_files.reader import read_fires
+from emberlink.envs.fire_files.reader import read_fires, with_checksum
+from emberlink.envs.utils.errors import UserError
 
 INF = math.inf
 PLAIN = {"units": "minutes", "ring_width": None, "margin": None}
@@ -308,7 +309,11 @@ def test_an_incident_of_a_raster_is_refused(tmp_path, write):
 
 
 @pytest.mark.parametrize(
-    "name", ["fire.prj", "fire.PRJ", "fire.cpg", "fire.tif.aux.xml", "fire.tif.msk", "fire.tif.ovr"]
+    "name",
+    [
+        *("fire.prj", "fire.PRJ", "fire.cpg", "fire.tfw", "fire.aux"),
+        *("fire.tif.aux.xml", "fire.tif.MSK", "fire.tif.ovr"),
+    ],
 )
 def test_no_regular_file_beside_a_raster(tmp_path, name):
     path = write_tif(tmp_path / "fire.tif", corner([[0, 5], [2, 4]], 2, 2))
@@ -432,6 +437,28 @@ def test_no_arrival_is_lost(rows, columns, side, x, y, seed):
                 assert got[i, j] <= expected[i, j]
             if expected[i, j] == times.min():
                 assert got[i, j] == times.min()
+
+
+@pytest.mark.parametrize("suffix", [".aux.xml", ".msk", ".MSK"])
+def test_the_checksum_of_a_raster_contains_the_files_that_gdal_reads_beside_it(tmp_path, suffix):
+    """A mask, or NODATA in .aux.xml, changes the fire."""
+    values = raster_of(Ellipses(), 300.0)
+    path = write_tif(tmp_path / "fire.tif", np.where(values < 0, 400.0, values), nodata=None)
+    config = FileFireConfig(path=str(path), units="minutes")
+    before, (fire,) = with_checksum(config), read_fires(config, (30, 30), 1000)
+    other = tmp_path / f"fire.tif{suffix}"
+    if suffix == ".aux.xml":
+        band = '<PAMRasterBand band="1"><NoDataValue>400</NoDataValue></PAMRasterBand>'
+        other.write_text(f"<PAMDataset>{band}</PAMDataset>")
+    else:
+        with rasterio.Env(GDAL_TIFF_INTERNAL_MASK=False), rasterio.open(path, "r+") as dataset:
+            dataset.write_mask(values >= 0)
+        (tmp_path / "fire.tif.msk").rename(other)
+    (changed,) = read_fires(config, (30, 30), 1000)
+    assert not torch.equal(changed, fire)
+    assert with_checksum(config) != before
+    with pytest.raises(UserError, match="has changed"):
+        with_checksum(before)
 
 
 def test_a_raster_without_arrival_times_gives_a_warning(tmp_path):

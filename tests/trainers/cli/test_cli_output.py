@@ -77,6 +77,75 @@ def test_a_full_output_is_an_error_and_unlocks_the_folder(tmp_path):
     assert not (folder / "lock").exists()
 
 
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs Linux's /dev/full")
+@pytest.mark.parametrize("unbuffered", ["", "1"])
+def test_a_full_output_of_other_commands_is_one_line(unbuffered):
+    """Status 0 would let a script go on without the text that it redirected to a full disk."""
+    program = (
+        "import os, sys\n"
+        "from emberlink.trainers.cli.main import main\n"
+        "for arguments in [], ['--help'], ['--version'], ['fire'], ['train', '-h'], ['list']:\n"
+        "    if os.fork() == 0:\n"
+        "        sys.exit(main(arguments))\n"
+        "    print(os.waitstatus_to_exitcode(os.wait()[1]), file=sys.stderr)\n"
+    )
+    with open("/dev/full", "w") as full:
+        ended = subprocess.run(
+            [sys.executable, "-c", program],
+            stdout=full,
+            stderr=subprocess.PIPE,
+            text=True,
+            env={**os.environ, "PYTHONUNBUFFERED": unbuffered},
+        )
+    reason = "standard output: cannot be written: No space left on device\n1\n"
+    assert ended.stderr == "".join(
+        f"emberlink{name}: {reason}" for name in ("", "", "", " fire", "", " list")
+    )
+
+
+def test_a_closed_output_is_one_line():
+    ended = subprocess.run(
+        [sys.executable, "-m", "emberlink.trainers.cli", "list", "methods"],
+        preexec_fn=lambda: os.close(1),
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert ended.returncode == 1
+    assert ended.stderr == "emberlink list: standard output: cannot be written: it is closed\n"
+
+
+WARNS = """
+import warnings
+from emberlink.trainers.cli import list, main
+def names(_):
+    warnings.warn("fires are\\nnot \\x1b[31m cached", stacklevel=2)
+    warnings.warn("of a library", RuntimeWarning, stacklevel=2)
+    return []
+list._names = names
+"""
+
+
+def test_a_warning_is_one_line_without_a_path():
+    program = WARNS + (
+        "before = warnings.formatwarning, warnings.showwarning\n"
+        "main.main(['list', 'methods'])\n"
+        "assert (warnings.formatwarning, warnings.showwarning) == before\n"
+    )
+    ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    line, other, *_ = ended.stderr.splitlines()
+    assert line == "emberlink: warning: fires are not ?[31m cached"
+    assert "RuntimeWarning: of a library" in other
+
+
+def test_a_warning_of_a_command_can_be_recorded(monkeypatch):
+    names: dict[str, object] = {}
+    exec(WARNS.replace("list._names = names", ""), names)
+    monkeypatch.setattr("emberlink.trainers.cli.list._names", names["names"])
+    with pytest.warns() as caught:
+        assert main.main(["list", "methods"]) == 0
+    assert [warning.category for warning in caught] == [UserWarning, RuntimeWarning]
+
+
 @pytest.mark.slow
 def test_a_lost_terminal_ends_the_training_with_a_checkpoint(tmp_path, capsys):
     """The run can then be evaluated."""

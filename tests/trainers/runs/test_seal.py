@@ -1,6 +1,8 @@
 """Tests that changes on disk are detected: cached files, and config.yaml of networks."""
 
+import json
 import re
+import shutil
 
 import numpy as np
 import pytest
@@ -153,3 +155,17 @@ def test_networks_without_a_header_are_refused(run, capsys):
         "not a readable checkpoint: damaged, or of another program (no header of emberlink)"
         in capsys.readouterr().err
     )
+
+
+def test_a_changed_setting_of_evaluations_is_said_and_recorded(run, tmp_path, capsys):
+    """It is not sealed, because a resumed run may change it."""
+    assert json.loads((run / "eval.json").read_text())["changed"] == []
+    folder = shutil.copytree(run, tmp_path / "changed")
+    values = yaml.safe_load((folder / "config.yaml").read_text())
+    values["evaluation"]["episodes"] = 1
+    (folder / "config.yaml").write_text(yaml.safe_dump(values))
+    assert main.main(["eval", str(folder)]) == 0
+    changed = f"evaluation.episodes is 1 here, 2 in {RunFolder(folder).checkpoint().name}"
+    assert f"note: {changed}\n" in capsys.readouterr().out
+    recorded = json.loads((folder / "eval.json").read_text())
+    assert (recorded["fires"], recorded["changed"]) == (1, [changed])
