@@ -1,0 +1,57 @@
+"""A scripted policy that searches as map_greedy and brings what it knows to the base."""
+
+import math
+
+import torch
+from torch import Tensor
+
+from emberlink.envs.wildfire import WildfireEnv
+from emberlink.policies.planning import HERE, Rally, chain, middle
+from emberlink.policies.scripted.map_greedy import MapGreedy
+
+
+class Courier(MapGreedy):
+    """Searches as `MapGreedy`, and forms a chain of radios to the base by the end of the episode.
+
+    Each UAV computes a chain of places from the base to the middle of the fire that it knows, one
+    radio range apart (`rally.chain`). UAV 0 holds the place next to the base, UAV 1 the next one,
+    and so on. UAVs that are not needed in the chain stay in range of its last place. A UAV that
+    knows of no fire has to be in range of the base. Until then UAVs search, and choose only cells
+    from which they still come to their place in time, 15 steps before the end. Without a base they
+    search as `MapGreedy`.
+    """
+
+    _base: Tensor
+    _rank: Tensor
+    _team: Tensor
+
+    def __init__(self, env: WildfireEnv):
+        super().__init__(env)
+        world, device = self.world, env.device
+        self.register_buffer("_base", torch.tensor(world.base or (0.0, 0.0), device=device))
+        rank = torch.arange(world.num_uavs, device=device).expand(env.num_envs, -1)
+        self.register_buffer("_rank", rank.clone())
+        self.register_buffer("_team", torch.tensor(world.num_uavs, device=device))
+
+    def _choose(
+        self, step: Tensor, ground: Tensor, burning: Tensor, weight: Tensor, distance: Tensor
+    ) -> Tensor:
+        cost, hears = distance + HERE, self._hears(ground)
+        if self.world.base is None:
+            return self.targets.choose(ground, weight, cost, hears)[0]
+        speed = self.world.displacement
+        rally = self._rally(burning)
+        cells = self.targets.columns, self.targets.rows
+        late = rally.too_late(cells, step.view(-1, 1, 1, 1) + distance / speed, speed)
+        target, value = self.targets.choose(
+            ground, weight, cost.masked_fill_(late, math.inf), hears
+        )
+        leaves = rally.leaves(ground, step, speed, self.period) & (value <= 0)
+        return torch.where(leaves.unsqueeze(-1), rally.place, target)
+
+    def _rally(self, burning: Tensor) -> Rally:
+        """Returns where each UAV has to be at the end, given the fire that it knows."""
+        known = burning.flatten(2).any(-1, keepdim=True)
+        centre = torch.where(known, middle(burning), self._base)
+        place, reach = chain(self.world, self._base, centre, self._rank, self._team)
+        return Rally(place, reach, torch.full_like(reach, self.world.horizon))
