@@ -113,6 +113,19 @@ def test_what_was_seen_is_at_the_base_in_the_end(kind):
     assert td[keys.BASE_SEEN].item() == 0
 
 
+def test_the_chain_closes_where_a_uav_has_failed():
+    fire = torch.full((40, 40), NEVER)
+    fire[24:31, 16:25] = 0
+    env = WildfireEnv(1, base_world(failures=1.0, horizon=230), fire, seed=1)
+    start = torch.tensor([[26.0, 20, 4], [25.0, 22, 4], [28.0, 18, 4]])
+    td, courier = env.reset(position=start), Courier(env)
+    env._fail_step.copy_(torch.tensor([[20, 231, 231]]))  # UAV 0 would be next to the base
+    for _ in range(230):
+        td = step_mdp(env.step(courier(td)), keep_other=True)
+    assert td[keys.ALIVE].tolist() == [[False, True, True]]
+    assert td[keys.BASE_SEEN].item() == td[keys.SEEN].item() == 63
+
+
 def test_the_courier_without_a_base_is_map_greedy():
     fire = torch.full((40, 40), NEVER)
     fire[24:31, 16:25] = 0

@@ -314,6 +314,10 @@ def test_coverage_of_each_policy():
         "random_waypoints": (82, 96),
         "lawnmower": (86, 98),
         "follow_target": (8, 35),
+        "map_greedy_alone": (91, 99),
+        "map_greedy": (96, 100),
+        "map_greedy_all": (96, 100),
+        "courier": (96, 100),
         "oracle": (99, 100),
     }
     assert bounds.keys() == SCRIPTED.keys()

@@ -31,6 +31,8 @@ class TeamMaps(Buffers):
 
     reach: Tensor
     """bool [envs, radios, radios]: whose messages arrive at each radio at this step"""
+    heard: Tensor
+    """float32 [envs, n, n]: the last step of which each UAV (row) has a message of another one"""
     _start: Tensor
     _base: Tensor
 
@@ -50,6 +52,7 @@ class TeamMaps(Buffers):
         )
         radios = world.num_uavs + listens
         self.register_buffer("reach", torch.zeros(envs, radios, radios, dtype=torch.bool))
+        self.register_buffer("heard", torch.zeros(envs, world.num_uavs, world.num_uavs))
         first = torch.arange(envs).unsqueeze(-1) * self._sensor.area
         self.register_buffer("_start", first, persistent=False)
         base = torch.tensor([[*(world.base or (0.0, 0.0)), 0.0]], dtype=torch.float64)
@@ -68,6 +71,17 @@ class TeamMaps(Buffers):
         hears = self._hears(tensordict, position, alive)
         self.known.update(View(cells, in_view, in_view), step, hears)
         self.reach.copy_(radio.reachable(hears))
+        self._update_heard(step, alive)
+
+    def _update_heard(self, step: Tensor, alive: Tensor) -> None:
+        """Stores whose messages arrived, also as those know it whose messages arrived."""
+        now, uavs = step.view(-1, 1, 1).float(), self._world.num_uavs
+        reach = self.reach[:, :uavs, :uavs]
+        self.heard.masked_fill_(now == 0, 0.0)
+        own = torch.eye(uavs, dtype=torch.bool, device=alive.device) & alive.unsqueeze(-1)
+        known = torch.where(own, now, self.heard)
+        told = torch.where(reach.unsqueeze(-1), known.unsqueeze(1), 0.0).amax(2)
+        self.heard.copy_(torch.maximum(self.heard, told))
 
     def _hears(self, tensordict: TensorDictBase, position: Tensor, alive: Tensor) -> Tensor:
         """Returns the links of a step, bool [envs, radios, radios]."""
