@@ -140,9 +140,10 @@ def test_the_courier_without_a_base_is_map_greedy():
 
 
 def test_the_oracle_flies_to_what_still_burns_when_it_arrives():
-    # (10, 20) burns out at step 8, 18 cells away; (20, 33) burns on; (20, 5) ignites too late.
+    # (6, 20), 12 cells from a place to see it, burns out at step 8; (20, 37), 15 cells away, burns
+    # on; (20, 5) ignites too late.
     fire = torch.full((1, 2, 40, 40), NEVER)
-    fire[0, :, 2, 20] = torch.tensor([0.0, 8.0])
+    fire[0, :, 6, 20] = torch.tensor([0.0, 8.0])
     fire[0, :, 20, 37] = torch.tensor([0.0, 50.0])
     fire[0, :, 20, 5] = torch.tensor([95.0, 99.0])
     config = base_world(num_uavs=1, base=None)
