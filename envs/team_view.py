@@ -21,6 +21,7 @@ class TeamView(EnvBase):
     _map: CoverageMap
     _measures: Measures | None
     _time: Tensor
+    _fail_step: Tensor | None
     _position: Tensor
 
     def __repr__(self) -> str:
@@ -73,6 +74,11 @@ class TeamView(EnvBase):
     def burn_out(self) -> Tensor | None:
         """Burn-out times in steps, float32 [num_envs, X, Y]; None if cells burn for ever."""
         return self._map.burn_out
+
+    @property
+    def fail_step(self) -> Tensor | None:
+        """The step from which each UAV has failed, int64 [num_envs, n]; None if none can fail."""
+        return self._fail_step
 
     @property
     def knowledge(self) -> Knowledge | None:

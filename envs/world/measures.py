@@ -6,7 +6,6 @@ from torch import Tensor
 from emberlink.envs import keys
 from emberlink.envs.config import WildfireConfig
 from emberlink.envs.utils.buffers import Buffers
-from emberlink.envs.utils.counter_rng import Use
 from emberlink.envs.world import radio
 from emberlink.envs.world.coverage_map import View
 from emberlink.envs.world.knowledge import NEVER, Knowledge, step_type
@@ -138,11 +137,7 @@ class Measures(Buffers):
         The links between UAVs are those of `radio.links` without a base.
         """
         given = rng_key, step
-        places = torch.cat((position, self._base), 1)
-        lives = None if alive is None else torch.nn.functional.pad(alive, (0, 1), value=True)
-        every = radio.links(self._world.radio, places, *given, alive=lives, use=Use.REPORT_LOSS)
-        every[:, :-1, :-1] = radio.links(self._world.radio, position, *given, alive=alive)
-        return every
+        return radio.links_with_base(self._world.radio, position, self._base, *given, alive)
 
     def values(self) -> dict[str, Tensor]:
         """Returns the measures of the episode so far by key, [envs] each."""

@@ -41,6 +41,29 @@ def links(
     return linked
 
 
+def links_with_base(
+    config: RadioConfig,
+    position: Tensor,
+    base: Tensor,
+    rng_key: Tensor,
+    step: Tensor,
+    alive: Tensor | None = None,
+) -> Tensor:
+    """Returns the links of the UAVs and the base, which is last, bool [envs, n + 1, n + 1].
+
+    The links between UAVs are those of `links` without a base.
+
+    Args:
+        config, position, rng_key, step, alive: see `links`.
+        base: float [envs, 1, 3], cells; the base never fails.
+    """
+    places = torch.cat((position, base), 1)
+    lives = None if alive is None else torch.nn.functional.pad(alive, (0, 1), value=True)
+    every = links(config, places, rng_key, step, alive=lives, use=Use.REPORT_LOSS)
+    every[:, :-1, :-1] = links(config, position, rng_key, step, alive=alive)
+    return every
+
+
 def reachable(hears: Tensor) -> Tensor:
     """Returns whose messages arrive at each radio, directly or passed on, bool [..., n, n].
 

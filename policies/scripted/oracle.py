@@ -8,6 +8,7 @@ from torch import Tensor
 
 from emberlink.envs import keys
 from emberlink.envs.wildfire import WildfireEnv
+from emberlink.policies.planning import Foresight
 from emberlink.policies.scripted.base import Scripted
 
 _STEP_COST = 1000.0  # cells; above any distance on a map, so that burning cells come first
@@ -27,16 +28,40 @@ class Oracle(Scripted):
         env: the environment that it acts in; its fire is read at every step.
     """
 
+    TARGET = "_oracle_target"
     columns: Tensor
     rows: Tensor
 
     def __init__(self, env: WildfireEnv):
         super().__init__(env)
         self._env = (env,)  # in a tuple, so that it is not registered as a submodule
+        foresees = env.burn_out is not None or self.world.base is not None
+        self._foresight = Foresight(env) if foresees else None
+        if foresees:
+            self.in_keys.append(keys.ALIVE)
+            self.out_keys.append(self.TARGET)
         self.register_buffer("columns", torch.arange(self.world.grid[0]).double().to(env.device))
         self.register_buffer("rows", torch.arange(self.world.grid[1]).double().to(env.device))
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        if self._foresight is None:
+            target = self._nearest_cells(tensordict)
+        else:
+            target = self._foreseen(tensordict, self._foresight)
+        ceiling = self.high[2:].expand_as(target[..., :1])
+        return self.fly(tensordict, torch.cat((target, ceiling), -1))
+
+    def _foreseen(self, tensordict: TensorDictBase, foresight: Foresight) -> Tensor:
+        """Returns the targets of `Foresight`, float32 [num_envs, n, 2]."""
+        target = self.carried(tensordict, self.TARGET, tensordict.get(keys.POSITION)[..., :2])
+        due = tensordict.get(keys.STEP) % foresight.period == 0
+        if due.any():
+            target = torch.where(due.view(-1, 1, 1), foresight.plan(tensordict), target)
+        tensordict.set(self.TARGET, target)
+        return target
+
+    def _nearest_cells(self, tensordict: TensorDictBase) -> Tensor:
+        """Returns the cell that is assigned to each UAV, float64 [num_envs, n, 2]."""
         position = tensordict.get(keys.POSITION)
         ground = position[..., :2].double()
         delay = self._delay(tensordict.get(keys.STEP))
@@ -49,8 +74,7 @@ class Oracle(Scripted):
             cell = torch.where(cost.isfinite().unsqueeze(-1), cell, xy)
             target.scatter_(1, uav, cell.unsqueeze(1))
             self._reserve(delay, cell)
-        ceiling = self.high[2:].expand_as(target[..., :1])
-        return self.fly(tensordict, torch.cat((target, ceiling), -1))
+        return target
 
     def _delay(self, step: Tensor) -> Tensor:
         """Returns the cost of the wait for each cell, float64 [num_envs, X, Y], cells.

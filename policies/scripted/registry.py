@@ -8,7 +8,8 @@ from emberlink.policies.scripted.base import Scripted
 _REGISTRY = Registry(Scripted, "emberlink.policies.scripted", "policy", group="emberlink.scripted")
 _ORDER = (
     *("stationary", "random_actions", "random_waypoints"),
-    *("lawnmower", "follow_target", "oracle"),
+    *("lawnmower", "follow_target"),
+    *("map_greedy_alone", "map_greedy", "map_greedy_all", "courier", "oracle"),
 )
 
 

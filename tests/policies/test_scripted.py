@@ -1,5 +1,6 @@
 """Tests scripted policies against hand-computed paths, and properties that they share."""
 
+import functools
 import itertools
 import math
 from dataclasses import replace
@@ -277,6 +278,33 @@ def test_a_policy_restarts_with_every_episode(name):
         td = step_mdp(env.step(td), keep_other=True)
 
 
+@functools.cache
+def world_of(name: str):
+    """Returns the configuration of a world with a short horizon."""
+    return resolve("consensus", ["setup=tuned", f"world={name}", "env.horizon=12"])
+
+
+@pytest.mark.parametrize("place", [name for name in known("world") if name != "file"])
+@pytest.mark.parametrize("name", SCRIPTED)
+def test_every_policy_in_every_world(name, place):
+    config = world_of(place)
+    arrival = fires((config.env.grid,), 2)
+    both = arrival if place == "paper" else torch.stack((arrival, arrival + 8), 1)
+
+    def actions(seeds, fire):
+        env = build_env(config, num_envs=len(seeds), fire=fire, seed=seeds, device="cpu")
+        return torch.stack(
+            [td[keys.ACTION] for td in episode(env, SCRIPTED[name](env.base_env), 12)]
+        )
+
+    batch = actions([5, 6], both)
+    assert batch.shape[1:3] == (2, config.env.num_uavs)
+    assert batch.isfinite().all()
+    assert batch.abs().max() <= 1
+    # The second environment alone equals the second of the batch.
+    assert actions([6], both[1:])[:, 0].equal(batch[:, 1])
+
+
 @pytest.mark.slow
 def test_coverage_of_each_policy():
     """The bounds are wide; docs/evaluation.md has the measured values."""
@@ -289,6 +317,10 @@ def test_coverage_of_each_policy():
         "random_waypoints": (82, 96),
         "lawnmower": (86, 98),
         "follow_target": (8, 35),
+        "map_greedy_alone": (91, 99),
+        "map_greedy": (96, 100),
+        "map_greedy_all": (96, 100),
+        "courier": (96, 100),
         "oracle": (99, 100),
     }
     assert bounds.keys() == SCRIPTED.keys()

@@ -1,0 +1,19 @@
+"""What scripted policies plan with: maps of what UAVs know, targets, and places to meet."""
+
+from emberlink.policies.planning.foresight import Foresight
+from emberlink.policies.planning.rally import Rally, chain
+from emberlink.policies.planning.targets import HERE, Targets, band, middle, plan_period
+from emberlink.policies.planning.team_maps import Messages, TeamMaps
+
+__all__ = [
+    "HERE",
+    "Foresight",
+    "Messages",
+    "Rally",
+    "Targets",
+    "TeamMaps",
+    "band",
+    "chain",
+    "middle",
+    "plan_period",
+]

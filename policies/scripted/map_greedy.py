@@ -1,0 +1,113 @@
+"""A scripted policy that searches where fire may burn unseen, with maps merged in radio range."""
+
+from typing import ClassVar
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from emberlink.envs import keys
+from emberlink.envs.wildfire import WildfireEnv
+from emberlink.policies.planning import HERE, Messages, Targets, TeamMaps, band, plan_period
+from emberlink.policies.scripted.base import Scripted
+
+_FLOWN = 2.0  # cells flown between two plans
+_NEAR = 2  # cells; within this distance of known fire a cell may have ignited
+_SPREAD = 50.0  # steps; time scale at which the chance of ignition near known fire grows
+_FAR = 0.04  # chance of a cell that nobody has seen, far from known fire
+_AGAIN = 0.02  # the same of a cell that was seen without fire, long ago
+_FORGET = 300.0  # steps; time scale of "long ago"
+_AROUND = 6  # cells; a fire is so large that cells seen without fire speak against fire around them
+_CLAIM = 2.0  # cells; half the side of the square that a UAV claims, about its view
+_EXACT = 2.0**16  # weights are multiples of its inverse, so that sums do not depend on their order
+
+
+class MapGreedy(Scripted):
+    """Flies to the cell with the highest chance of seeing new fire per distance.
+
+    Each UAV has a map of the last step at which it knows each cell to have been seen: by itself, or
+    by UAVs whose messages arrive, directly or passed on. From the map follows which cells burned
+    when they were last seen; no other state of the fire is read. A cell that was seen burning or
+    burnt out has no weight. A cell within 2 cells of known fire has a weight that grows with the
+    time since it was last seen, up to 1 if it never was. Other cells have a small weight: the less,
+    the more cells around them were seen without fire. The value of a target is the sum of the
+    weights in view from it, divided by its distance plus 2 cells.
+
+    UAVs choose anew whenever they can have flown 2 cells (every 10 steps at most), the one with
+    the highest value first. A UAV gives no weight to cells in view from the targets of those whose
+    messages it has. All fly at the maximum altitude.
+
+    The targets are carried in the TensorDict under "_map_greedy_target", the maps in the policy.
+    """
+
+    messages: ClassVar[Messages] = "in range"
+    TARGET = "_map_greedy_target"
+
+    _near_x: Tensor
+    _near_y: Tensor
+    _around_x: Tensor
+    _around_y: Tensor
+    _area: Tensor
+
+    def __init__(self, env: WildfireEnv):
+        super().__init__(env)
+        self.in_keys.append(keys.ALIVE)
+        self.out_keys.append(self.TARGET)
+        self.maps = TeamMaps(env, self.messages).to(env.device)
+        self.targets = Targets(env, claim=_CLAIM)
+        self.period = plan_period(_FLOWN, self.world.displacement)
+        for name, reach in (("near", _NEAR), ("around", _AROUND)):
+            for axis, side in zip("xy", self.world.grid, strict=True):
+                self.register_buffer(f"_{name}_{axis}", band(side, reach).to(env.device))
+        area = self._around_x.sum(-1, keepdim=True) * self._around_y.sum(0)
+        self.register_buffer("_area", area)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        self.maps.update(tensordict)
+        position = tensordict.get(keys.POSITION)
+        target = self.carried(tensordict, self.TARGET, position[..., :2])
+        due = tensordict.get(keys.STEP) % self.period == 0
+        if due.any():
+            target = torch.where(due.view(-1, 1, 1), self._plan(tensordict), target)
+        tensordict.set(self.TARGET, target)
+        ceiling = self.high[2:].float().expand_as(target[..., :1])
+        return self.fly(tensordict, torch.cat((target, ceiling), -1))
+
+    def _plan(self, tensordict: TensorDictBase) -> Tensor:
+        """Returns a new target of each UAV, float32 [num_envs, n, 2], cells."""
+        ground = tensordict.get(keys.POSITION)[..., :2]
+        last_seen = self.maps.last_seen()
+        ignited, burnt_out = self.maps.was_fire(last_seen)
+        burning = ignited & ~burnt_out
+        weight = self._weight(tensordict.get(keys.STEP), last_seen, ignited, burning)
+        distance = self.targets.distance(ground)
+        return self._choose(tensordict.get(keys.STEP), ground, burning, weight, distance)
+
+    def _weight(self, step: Tensor, last_seen: Tensor, ignited: Tensor, burning: Tensor) -> Tensor:
+        """Returns the chance that a look at a cell shows new fire, float32 [num_envs, n, X, Y].
+
+        Args:
+            step: int64 [num_envs].
+            last_seen: float [num_envs, n, X, Y], negative for never.
+            ignited, burning: bool [num_envs, n, X, Y], what is known of the fire.
+        """
+        never = last_seen < 0
+        age = step.view(-1, 1, 1, 1) - last_seen
+        near = self._near_x @ burning.float() @ self._near_y > 0
+        without_fire = (~never & ~ignited).float()
+        empty = self._around_x @ without_fire @ self._around_y / self._area
+        far = torch.where(never, _FAR * (1 - empty) ** 3, _AGAIN * (1 - (-age / _FORGET).exp()))
+        close = torch.where(never, 1.0, 1 - (-age / _SPREAD).exp())
+        weight = torch.where(near, close, far).masked_fill_(ignited, 0.0)
+        return weight.mul_(_EXACT).round_().div_(_EXACT)
+
+    def _choose(
+        self, step: Tensor, ground: Tensor, burning: Tensor, weight: Tensor, distance: Tensor
+    ) -> Tensor:
+        """Returns targets; `step` and `burning` are for subclasses."""
+        return self.targets.choose(ground, weight, distance + HERE, self._hears(ground))[0]
+
+    def _hears(self, ground: Tensor) -> Tensor:
+        """Returns whose targets each UAV knows, bool [num_envs, n, n]."""
+        uavs = ground.shape[1]
+        return self.maps.reach[:, :uavs, :uavs]

@@ -1,0 +1,12 @@
+"""A scripted policy that searches as map_greedy, as if all UAVs always heard each other."""
+
+from typing import ClassVar
+
+from emberlink.policies.planning import Messages
+from emberlink.policies.scripted.map_greedy import MapGreedy
+
+
+class MapGreedyAll(MapGreedy):
+    """Searches as `MapGreedy`; each UAV knows the sightings and targets of all, at any distance."""
+
+    messages: ClassVar[Messages] = "everyone"

@@ -1,0 +1,165 @@
+"""Tests how scripted policies come to a meeting place in time, and what the oracle foresees."""
+
+import math
+
+import pytest
+import torch
+from torchrl.envs import step_mdp
+
+from emberlink.envs import WildfireConfig, WildfireEnv, keys
+from emberlink.envs.world import radio
+from emberlink.policies.planning import Rally, Targets, chain, middle, plan_period
+from emberlink.policies.scripted.courier import Courier
+from emberlink.policies.scripted.map_greedy import MapGreedy
+from emberlink.policies.scripted.oracle import Oracle
+
+NEVER = math.inf
+BASE = torch.tensor([0.0, 30.0])
+
+
+def played(env, policy, steps: int, position=None):
+    """Returns the last time step of an episode."""
+    td = env.reset() if position is None else env.reset(position=torch.tensor(position))
+    for _ in range(steps):
+        td = step_mdp(env.step(policy(td)), keep_other=True)
+    return td
+
+
+# Rules
+
+
+def test_periods_and_middles_by_hand():
+    assert [plan_period(2.0, d) for d in (0.1, 0.2, 0.5, 2.0, 9.0)] == [10, 10, 4, 1, 1]
+    cells = torch.zeros(2, 4, 5, dtype=torch.bool)
+    cells[0, 1, 2] = cells[0, 3, 4] = cells[0, 2, 4] = True
+    assert torch.allclose(middle(cells), torch.tensor([[2.0, 10 / 3], [0, 0]]))
+
+
+def test_a_chain_by_hand():
+    config = WildfireConfig(grid=(60, 60), num_uavs=6)
+    centre = torch.tensor([40.0, 30.0]).expand(1, 6, 2)
+    rank = torch.arange(6).unsqueeze(0)
+    place, reach = chain(config, BASE, centre, rank, torch.tensor(6))
+    # 0.97 sqrt(10^2 - 4^2) = 8.89 cells to the base on the ground, then 9.7 each. Four reach 38.
+    first = 0.97 * math.sqrt(84)
+    along = [first, first + 9.7, first + 19.4, first + 29.1, first + 29.1, first + 29.1]
+    assert place[0, :, 0].tolist() == pytest.approx(along)
+    assert place[0, :, 1].tolist() == [30] * 6
+    assert reach[0].tolist() == pytest.approx([0.2] * 4 + [9.7] * 2)
+    points = torch.cat(
+        (torch.tensor([[0.0, 30, 0]]), torch.nn.functional.pad(place[0], (0, 1), value=4))
+    )
+    assert radio.reachable(radio.neighbours(points, 10.0)).all()
+    # Two UAVs: one holds a place, the other is in its range. No fire known: within the base's.
+    place, reach = chain(config, BASE, centre[:, :2], rank[:, :2], torch.tensor(2))
+    assert place[0, :, 0].tolist() == pytest.approx([first] * 2)
+    assert reach[0].tolist() == pytest.approx([0.2, 9.7])
+    place, reach = chain(config, BASE, BASE.expand(1, 2, 2), rank[:, :2], torch.tensor(2))
+    assert place.tolist() == [[[0, 30], [0, 30]]]
+    assert reach[0].tolist() == pytest.approx([first] * 2)
+
+
+def test_who_is_late_by_hand():
+    # 15 cells from a place of reach 5 at 0.5 cells a step: 20 steps, and 15 to pass messages on.
+    rally = Rally(torch.zeros(1, 1, 2), torch.full((1, 1), 5.0), torch.full((1, 1), 100.0))
+    cells = torch.arange(20.0), torch.arange(1.0)
+    for arrives, expected in ((65, False), (66, True)):
+        late = rally.too_late(cells, torch.full((1, 1, 20, 1), float(arrives)), 0.5)
+        assert late[0, 0, 15, 0].item() is expected
+        assert not late[0, 0, :6].any()  # in reach of the place
+    ground = torch.tensor([[[15.0, 0]]])
+    for step, expected in ((62, False), (63, True)):  # the next plan is two steps later
+        assert rally.leaves(ground, torch.tensor([step]), 0.5, 2).item() is expected
+    assert not rally.leaves(torch.tensor([[[3.0, 4]]]), torch.tensor([99]), 0.5, 2).item()
+
+
+def test_targets_by_hand():
+    env = WildfireEnv(1, WildfireConfig(grid=(20, 20), num_uavs=3), torch.zeros(20, 20))
+    targets = Targets(env, claim=2.0)
+    ground = torch.tensor([[[2.0, 2], [2, 2], [19, 19]]])
+    weight = torch.zeros(1, 3, 20, 20)
+    weight[..., 10, 10], weight[..., 16, 10] = 1.0, 0.5
+    cost = targets.distance(ground) + 2
+    every = torch.ones(1, 3, 3, dtype=torch.bool)
+    target, value = targets.choose(ground, weight.clone(), cost, every)
+    # UAV 0 claims (10, 10), seen from (8, 8) at a cost of 6 + 2. UAV 1, with the same value, comes
+    # second and sees (16, 10) from (14, 8) at 12 + 2. Nothing is left for UAV 2.
+    assert target.tolist() == [[[8, 8], [14, 8], [19, 19]]]
+    assert value[0].tolist() == pytest.approx([1 / 8, 0.5 / 14, 0.0])
+    alone = torch.eye(3, dtype=torch.bool).unsqueeze(0)
+    _, value = targets.choose(ground, weight, cost, alone)
+    assert value[0].tolist() == pytest.approx([1 / 8, 1 / 8, 1 / 9])
+
+
+# Policies
+
+
+def base_world(**settings) -> WildfireConfig:
+    given = {"grid": (40, 40), "num_uavs": 3, "displacement": 1.0, "horizon": 90}
+    return WildfireConfig(**given | {"base": (0.0, 20.0)} | settings)
+
+
+@pytest.mark.parametrize("kind", [Courier, Oracle])
+def test_what_was_seen_is_at_the_base_in_the_end(kind):
+    fire = torch.full((40, 40), NEVER)
+    fire[24:31, 16:25] = 0
+    env = WildfireEnv(1, base_world(), fire, seed=1)
+    start = [[26.0, 20, 4], [25.0, 22, 4], [28.0, 18, 4]]
+    td = played(env, kind(env), 60, start)
+    assert td[keys.BASE_SEEN].item() == 0
+    td = played(env, kind(env), 90, start)
+    assert td[keys.BASE_SEEN].item() == td[keys.SEEN].item() == 63
+    td = played(env, MapGreedy(env), 90, start)
+    assert td[keys.BASE_SEEN].item() == 0
+
+
+def test_the_chain_closes_where_a_uav_has_failed():
+    fire = torch.full((40, 40), NEVER)
+    fire[24:31, 16:25] = 0
+    env = WildfireEnv(1, base_world(failures=1.0, horizon=230), fire, seed=1)
+    start = torch.tensor([[26.0, 20, 4], [25.0, 22, 4], [28.0, 18, 4]])
+    td, courier = env.reset(position=start), Courier(env)
+    env._fail_step.copy_(torch.tensor([[20, 231, 231]]))  # UAV 0 would be next to the base
+    for _ in range(230):
+        td = step_mdp(env.step(courier(td)), keep_other=True)
+    assert td[keys.ALIVE].tolist() == [[False, True, True]]
+    assert td[keys.BASE_SEEN].item() == td[keys.SEEN].item() == 63
+
+
+def test_the_courier_without_a_base_is_map_greedy():
+    fire = torch.full((40, 40), NEVER)
+    fire[24:31, 16:25] = 0
+    env = WildfireEnv(1, base_world(base=None), fire, seed=1)
+    td = env.reset()
+    courier, greedy = Courier(env), MapGreedy(env)
+    for _ in range(90):
+        expected = greedy(td.clone())[keys.ACTION]
+        td = courier(td)
+        assert td[keys.ACTION].equal(expected)
+        td = step_mdp(env.step(td), keep_other=True)
+
+
+def test_the_oracle_flies_to_what_still_burns_when_it_arrives():
+    # (6, 20), 12 cells from a place to see it, burns out at step 8; (20, 37), 15 cells away, burns
+    # on; (20, 5) ignites too late.
+    fire = torch.full((1, 2, 40, 40), NEVER)
+    fire[0, :, 6, 20] = torch.tensor([0.0, 8.0])
+    fire[0, :, 20, 37] = torch.tensor([0.0, 50.0])
+    fire[0, :, 20, 5] = torch.tensor([95.0, 99.0])
+    config = base_world(num_uavs=1, base=None)
+    env = WildfireEnv(1, config, fire)
+    td = Oracle(env)(env.reset(position=torch.tensor([[20.0, 20, 4]])))
+    assert td[Oracle.TARGET].tolist()[0][0][1] == 35
+
+
+def test_the_oracle_saves_what_a_uav_has_seen_before_it_fails():
+    fire = torch.full((40, 40), NEVER)
+    fire[2:5, 2:5], fire[34:37, 34:37] = 0, 0
+    env = WildfireEnv(1, base_world(failures=1.0, num_uavs=2), fire, seed=0)
+    td = env.reset(position=torch.tensor([[3.0, 3, 4], [35.0, 35, 4]]))
+    env._fail_step.copy_(torch.tensor([[91, 70]]))
+    oracle = Oracle(env)
+    for _ in range(69):
+        td = step_mdp(env.step(oracle(td)), keep_other=True)
+    assert td[keys.ALIVE].all()
+    assert env.knowledge.seen_fire[0, 0].sum() == 18
