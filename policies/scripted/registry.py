@@ -1,8 +1,10 @@
 """Finds scripted policies by name: files of this folder, and entry points of other packages."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 
+from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.plugins import Registry
+from emberlink.envs.utils.validation import unknown
 from emberlink.policies.scripted.base import Scripted
 
 _REGISTRY = Registry(Scripted, "emberlink.policies.scripted", "policy", group="emberlink.scripted")
@@ -30,4 +32,16 @@ class _Policies(Mapping[str, type[Scripted]]):
 
 
 SCRIPTED: Mapping[str, type[Scripted]] = _Policies()
-"""the policies of every evaluation, by name and in this order"""
+"""the scripted policies by name, in the order of tables"""
+
+
+def to_play(wanted: Collection[str]) -> list[str]:
+    """Returns the policies of an evaluation: the wanted ones, and those of other packages.
+
+    Raises:
+        UserError: a name is not known.
+    """
+    for name in wanted:
+        if name not in SCRIPTED:
+            raise UserError(f"evaluation.scripted: {unknown(name, SCRIPTED)}")
+    return [name for name in SCRIPTED if name in wanted or name not in _ORDER]

@@ -23,7 +23,7 @@ from emberlink.envs.scenarios import fires_of
 from emberlink.envs.utils.config_files import find, read
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import from_plain, plain, shown, unknown
-from emberlink.policies.scripted.registry import SCRIPTED
+from emberlink.policies.scripted.registry import SCRIPTED, to_play
 from emberlink.trainers.config.overrides import all_keys, flat, full_key, parse, put
 from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.learners import registry as learners
@@ -67,6 +67,7 @@ def resolve(method: str, overrides: Sequence[str] = (), **settings: Any) -> RunC
     _choose_seed(values, any(key == "seed" for key in [*dict(given), *settings]))
     values["baselines"] = _baselines(chosen, _changes(radio, _radio(values)))
     config = from_values(values)
+    to_play(config.evaluation.scripted)
     return replace(config, fire=fires_of(config.fire).with_checksum())
 
 

@@ -66,6 +66,8 @@ class EvaluationConfig:
     """episodes of an evaluation during training, each on another validation fire"""
     huygens: bool
     """whether to evaluate on fires of the scenario `huygens`, too, besides that of the training"""
+    scripted: Annotated[tuple[Name, ...], Strict(False)]
+    """scripted policies to evaluate, besides those of other packages"""
     headline: Annotated[str, AfterValidator(_check_measure)]
     """the measure that chooses the networks of best.safetensors on validation fires"""
 

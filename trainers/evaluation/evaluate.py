@@ -16,7 +16,7 @@ from emberlink.envs.fire.generator import load_scenario
 from emberlink.envs.fire_files.config import FileFireConfig
 from emberlink.envs.scenarios import ScenarioConfig, fires_of
 from emberlink.envs.wildfire import WildfireEnv
-from emberlink.policies.scripted.registry import SCRIPTED
+from emberlink.policies.scripted.registry import SCRIPTED, to_play
 from emberlink.trainers.build import build_env
 from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.config.schema import RunConfig
@@ -142,7 +142,7 @@ def evaluate(
 
         say(LEARNED)
         results[fire] = {LEARNED: play_blocks(config, lambda _: actor, arrival)}
-        for name in SCRIPTED if scripted else ():
+        for name in to_play(config.evaluation.scripted) if scripted else ():
             results[fire][name] = play_scripted(config, name, arrival, report=say)
     return results
 

@@ -8,7 +8,7 @@ from typing import Any
 from emberlink.envs.rendering.frame import write_gif
 from emberlink.envs.scenarios import fires_of
 from emberlink.envs.utils.errors import UserError
-from emberlink.policies.scripted.registry import SCRIPTED
+from emberlink.policies.scripted.registry import to_play
 from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.evaluation import evaluate, plots
 from emberlink.trainers.evaluation.results import LEARNED, Results
@@ -111,7 +111,10 @@ def record(config: RunConfig, results: Results, **about: Any) -> dict[str, Any]:
         "environment": asdict(config.env),
         "communication": {
             LEARNED: config.comm,
-            **{name: evaluate.scripted_config(config, name).comm for name in SCRIPTED},
+            **{
+                name: evaluate.scripted_config(config, name).comm
+                for name in to_play(config.evaluation.scripted)
+            },
         },
         "device": config.device,
         "versions": versions(),
