@@ -10,7 +10,7 @@ from rich.text import Text
 from emberlink.trainers.comparison.bootstrap import FEW
 from emberlink.trainers.comparison.rankings import Numbers, Ranking
 from emberlink.trainers.comparison.report import free_folder, write_report
-from emberlink.trainers.comparison.report.page import FLAG, counts, decision, lines, ratio
+from emberlink.trainers.comparison.report.page import FLAG, counts, decision, lines, ratio, worth
 from emberlink.trainers.comparison.results import compare_runs
 
 
@@ -53,6 +53,8 @@ def _print_section(console: Console, numbers: Numbers) -> None:
                 f"{table.caption}; {FLAG} fewer than {FEW} seeds are too few for an interval"
             )
         console.print(table)
+    if numbers.communication:
+        console.print(_communication_table(numbers))
     if numbers.verdicts:
         table = Table(title=Text(f"{numbers.section.label}: the paper's claims"))
         for column in ("on", "claim", "best other", "ratio", "95 % interval", "verdict"):
@@ -62,6 +64,20 @@ def _print_section(console: Console, numbers: Numbers) -> None:
             cells = (verdict.fire, claim, verdict.best_other, *ratio(verdict), decision(verdict))
             table.add_row(*map(Text, cells))
         console.print(table)
+
+
+def _communication_table(numbers: Numbers) -> Table:
+    """Returns a table of the values of communication."""
+    measure = numbers.communication[0].measure
+    table = Table(
+        title=Text(f"{numbers.section.label}: the value of communication, by {measure}"),
+        caption="value: (with radio - off) / (no limits - off); interval over the fires",
+    )
+    for column in ("policy", "radios", "off", "with radio", "no limits", "value", "95 % interval"):
+        table.add_column(column, justify="left" if column in ("policy", "radios") else "right")
+    for value in numbers.communication:
+        table.add_row(*map(Text, (value.policy.replace("_", " "), value.how, *worth(value))))
+    return table
 
 
 def _rankings_table(rankings: Sequence[Ranking], title: str) -> Table:

@@ -9,6 +9,7 @@ from emberlink.envs import metrics
 from emberlink.trainers.comparison import bootstrap
 from emberlink.trainers.comparison.bootstrap import Interval
 from emberlink.trainers.comparison.claims import Verdict, verdicts
+from emberlink.trainers.comparison.communication import CommunicationValue, communication_values
 from emberlink.trainers.comparison.groups import Group, Section
 from emberlink.trainers.comparison.scripted import REWARD, Scripted, different_rewards, scripted
 from emberlink.trainers.evaluation.evaluate import HELD_OUT_SCENARIO
@@ -84,6 +85,7 @@ class Numbers:
         fires: fire of the evaluation -> ranking of each measure.
         verdicts: verdicts of the paper's claims.
         curves: measure -> label of the group -> curve.
+        communication: the value of communication, where all evaluations that it needs are present.
         notes: differences between runs.
     """
 
@@ -91,6 +93,7 @@ class Numbers:
     fires: dict[str, list[Ranking]]
     verdicts: list[Verdict]
     curves: dict[str, dict[str, Curve]]
+    communication: list[CommunicationValue]
     notes: list[str] = field(default_factory=list)
 
     @property
@@ -113,7 +116,8 @@ def numbers(section: Section) -> Numbers:
         name: {group.label: _curve(group, name) for group in section.as_trained} for name in CURVES
     }
     unique = list(dict.fromkeys(notes))
-    return Numbers(section, rankings, verdicts(section, fires), curves, unique)
+    told = verdicts(section, fires)
+    return Numbers(section, rankings, told, curves, communication_values(section), unique)
 
 
 def measures(section: Section, fire: str) -> list[str]:

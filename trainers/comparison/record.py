@@ -71,6 +71,7 @@ def _section(numbers: Numbers) -> dict[str, Any]:
             for fire, rankings in numbers.fires.items()
         },
         "claims": [asdict(verdict) for verdict in numbers.verdicts],
+        "communication": [asdict(value) for value in numbers.communication],
         "curves": {
             measure: {method: asdict(curve) for method, curve in by_method.items()}
             for measure, by_method in numbers.curves.items()

@@ -11,6 +11,7 @@ from jinja2 import Environment, StrictUndefined
 
 from emberlink.trainers.comparison import bootstrap
 from emberlink.trainers.comparison.claims import Verdict
+from emberlink.trainers.comparison.communication import CommunicationValue
 from emberlink.trainers.comparison.rankings import Numbers, Ranking, Row
 from emberlink.trainers.comparison.record import settings
 from emberlink.trainers.comparison.runs import LeftOut
@@ -131,6 +132,17 @@ def few(seeds: int) -> str:
     return "" if seeds >= bootstrap.FEW else f" (only {seeds} seed{'s' if seeds > 1 else ''})"
 
 
+def worth(value: CommunicationValue) -> tuple[str, ...]:
+    """Returns the cells of a value of communication: three means, the value and its interval."""
+    digits = DIGITS.get(value.measure, 1)
+    means = (f"{mean:.{digits}f}" for mean in (value.none, value.with_radio, value.full))
+    return (
+        *means,
+        NONE if value.value is None else f"{value.value:.2f}",
+        _interval(value.interval, 2),
+    )
+
+
 def counts(numbers: Numbers) -> list[int]:
     """Returns the number of seeds of each group."""
     return [len(group.runs) for group in numbers.section.groups]
@@ -146,6 +158,7 @@ def html(report: Report) -> str:
         "lines": lines,
         "heading": heading,
         "ratio": ratio,
+        "worth": worth,
         "decision": decision,
         "counts": counts,
     }

@@ -1,0 +1,84 @@
+"""Tests the value of communication on numbers that were computed by hand."""
+
+import json
+
+import numpy as np
+import pytest
+from synthetic_runs import read_evaluation, write_run
+
+from emberlink.trainers.cli import main
+from emberlink.trainers.comparison import bootstrap
+from emberlink.trainers.comparison.results import compare_runs
+
+OFF, FULL = "env.radio.range=0", "env.radio.range=.inf"
+
+
+def evaluate_otherwise(run, reach: float, coverage: list[float]) -> None:
+    """Writes an evaluation of a run's networks with another range."""
+    content = read_evaluation(run)
+    content["environment"] = {"radio": {"range": reach, "loss": 0.0}}
+    content["results"]["huygens"]["learned"]["coverage"] = coverage
+    (run / f"eval_env.radio.range={reach}.json").write_text(json.dumps(content))
+
+
+def test_networks_evaluated_with_other_radios(tmp_path, capsys):
+    for seed, more in ((0, 0.0), (1, 2.0)):
+        run = write_run(tmp_path, seed=seed, learned={"coverage": [50.0 + more, 60, 70, 80]})
+        evaluate_otherwise(run, 0.0, [40.0 + more, 50, 60, 70])
+        evaluate_otherwise(run, float("inf"), [60.0 + more, 80, 90, 90])
+    (value,) = compare_runs([tmp_path]).sections[0].communication
+    assert (value.policy, value.measure, value.how) == ("consensus", "coverage", "evaluated")
+    assert (value.none, value.with_radio, value.full) == (55.25, 65.25, 80.25)
+    assert value.value == pytest.approx(10 / 25)
+    assert value.interval is not None
+    low, high = value.interval
+    # each fire gains 10 of 20, 30, 30 or 20, so that all resamples are within 1/3 and 1/2
+    assert 1 / 3 <= low < 0.4 < high <= 0.5
+    assert main.main(["compare", str(tmp_path), "--output", str(tmp_path / "out")]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "the value of communication, by coverage" in said
+    assert "0.40" in said
+    page = (tmp_path / "out" / "compare.html").read_text()
+    assert "The value of communication" in page
+    (section,) = json.loads((tmp_path / "out" / "compare.json").read_text())["setups"]
+    assert section["communication"][0]["value"] == pytest.approx(0.4)
+
+
+def test_networks_trained_with_other_radios(tmp_path):
+    for override, coverage in (("", 60.0), (OFF, 50.0), (FULL, 70.0)):
+        overrides = (override,) if override else ()
+        name = f"run{override}".replace("=", "_")
+        write_run(tmp_path, name=name, overrides=overrides, learned={"coverage": coverage})
+    write_run(tmp_path, name="other", overrides=("comm.agree=false",), learned={"coverage": 1.0})
+    (value,) = compare_runs([tmp_path]).sections[0].communication
+    assert (value.how, value.value) == ("retrained", 0.5)
+    assert value.interval == (0.5, 0.5)
+
+
+def test_nothing_to_gain_has_no_value(tmp_path):
+    run = write_run(tmp_path, learned={"coverage": [50.0, 60, 70, 80]})
+    evaluate_otherwise(run, 0.0, [40.0, 50, 60, 70])
+    evaluate_otherwise(run, float("inf"), [40.0, 50, 60, 70])
+    (value,) = compare_runs([tmp_path]).sections[0].communication
+    assert (value.value, value.interval) == (None, None)
+
+
+def test_scripted_policies_have_a_value(tmp_path):
+    names = ("map_greedy_alone", "map_greedy", "map_greedy_all")
+    run = write_run(tmp_path, scripted=names)
+    content = read_evaluation(run)
+    for name, coverage in zip(names, (50.0, 55.0, 60.0), strict=True):
+        content["results"]["huygens"][name]["coverage"] = [coverage] * 4
+    (run / "eval.json").write_text(json.dumps(content))
+    (value,) = compare_runs([tmp_path]).sections[0].communication
+    assert (value.policy, value.how, value.value) == ("map_greedy", "scripted", 0.5)
+
+
+def test_the_paired_interval_draws_fires_together():
+    first = np.array([1.0, 2.0, 3.0, 4.0])
+
+    def difference(a, b, axis=-1):
+        return a.mean(axis) - b.mean(axis)
+
+    assert bootstrap.paired_interval(difference, first, first + 1) == (-1.0, -1.0)
+    assert bootstrap.paired_interval(difference, first[:1], first[:1]) is None
