@@ -1,8 +1,16 @@
 """The constants of the environment."""
 
+import math
 from typing import Annotated, Literal
 
-from pydantic import ConfigDict, Field, Strict, model_validator
+from pydantic import (
+    ConfigDict,
+    Field,
+    Strict,
+    ValidationInfo,
+    field_validator,
+    model_validator,
+)
 from pydantic.dataclasses import dataclass
 
 from emberlink.envs.utils.errors import UserError
@@ -78,17 +86,30 @@ class WildfireConfig:
     measures: Literal["paper", "all"] = "paper"
     """the measures of an episode: the paper's, or also the ages of sightings and the messages"""
 
+    @field_validator("base")
+    @classmethod
+    def _check_base(cls, value: tuple[float, float] | None, info: ValidationInfo):
+        grid = info.data.get("grid")
+        if (
+            value
+            and grid
+            and not all(0 <= x <= side - 1 for x, side in zip(value, grid, strict=True))
+        ):
+            raise UserError(f"outside of the map, [0, 0] to [{grid[0] - 1}, {grid[1] - 1}]")
+        return value
+
+    @field_validator("failures")
+    @classmethod
+    def _check_failures(cls, value: float, info: ValidationInfo):
+        uavs = info.data.get("num_uavs", math.inf)
+        if value > uavs:
+            raise UserError(f"the team has {uavs} UAVs")
+        return value
+
     @model_validator(mode="after")
-    def _check(self) -> "WildfireConfig":
+    def _altitudes_in_order(self) -> "WildfireConfig":
         if self.altitude[0] > self.altitude[1]:
             raise UserError(f"altitude {self.altitude}: the lowest is above the highest")
-        if self.failures > self.num_uavs:
-            raise UserError(f"failures={self.failures:g}: the team has {self.num_uavs} UAVs")
-        if self.base is not None and not all(
-            0 <= place <= side - 1 for place, side in zip(self.base, self.grid, strict=True)
-        ):
-            corner = f"[{self.grid[0] - 1}, {self.grid[1] - 1}]"
-            raise UserError(f"base={list(self.base)}: outside of the map, [0, 0] to {corner}")
         return self
 
     @property

@@ -184,7 +184,8 @@ def load(
     file = folder.checkpoint() if checkpoint is None else Path(checkpoint)
     check_trained_with(file, trained)
     config = override(trained, **settings)
-    if replace(trained, env=config.env, comm=config.comm) != config:
+    changed = {key: getattr(config, key) for key in ("env", "comm", "baselines")}
+    if replace(trained, **changed) != config:
         raise UserError(f"{', '.join(settings)}: only keys of env and comm can be changed")
     return TrainedPolicy(load_actor(config, file), config, file)
 

@@ -28,6 +28,8 @@ class Scripted(TensorDictModuleBase):
 
     recipe: ClassVar[str | None] = None
     """the method whose communication the policy needs; None if it needs none"""
+    hears: ClassVar[bool] = False
+    """whether the policy depends on the radio of the world"""
 
     low: torch.Tensor
     high: torch.Tensor

@@ -17,6 +17,7 @@ class FollowTarget(Scripted):
     """
 
     recipe: ClassVar[str | None] = "consensus"
+    hears: ClassVar[bool] = True
 
     def __init__(self, env: WildfireEnv):
         super().__init__(env)

@@ -40,6 +40,7 @@ class MapGreedy(Scripted):
     The targets are carried in the TensorDict under "_map_greedy_target", the maps in the policy.
     """
 
+    hears: ClassVar[bool] = True
     messages: ClassVar[Messages] = "in range"
     TARGET = "_map_greedy_target"
 

@@ -9,4 +9,5 @@ from emberlink.policies.scripted.map_greedy import MapGreedy
 class MapGreedyAll(MapGreedy):
     """Searches as `MapGreedy`; each UAV knows the sightings and targets of all, at any distance."""
 
+    hears: ClassVar[bool] = False
     messages: ClassVar[Messages] = "everyone"

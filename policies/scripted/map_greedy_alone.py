@@ -9,4 +9,5 @@ from emberlink.policies.scripted.map_greedy import MapGreedy
 class MapGreedyAlone(MapGreedy):
     """Searches as `MapGreedy`; each UAV knows its own sightings and target alone."""
 
+    hears: ClassVar[bool] = False
     messages: ClassVar[Messages] = "none"

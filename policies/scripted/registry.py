@@ -43,5 +43,5 @@ def to_play(wanted: Collection[str]) -> list[str]:
     """
     for name in wanted:
         if name not in SCRIPTED:
-            raise UserError(f"evaluation.scripted: {unknown(name, SCRIPTED)}")
+            raise UserError(unknown(name, SCRIPTED))
     return [name for name in SCRIPTED if name in wanted or name not in _ORDER]

@@ -88,7 +88,7 @@ def test_all_policies_have_the_same_fires_and_starts(cache, monkeypatch):
 
     monkeypatch.setattr(evaluate, "play", play)
     evaluate.evaluate(config, untrained(config), fires=4)
-    policies = 1 + len(SCRIPTED)
+    policies = 1 + len(POLICIES)
     assert len(begun) == 2 * policies
     seeds = fire_seeds("test", 4)
     for panel, scenario in enumerate(("huygens", "paper")):
@@ -110,7 +110,8 @@ def test_follow_target_uses_the_consensus_of_the_setup():
             config = resolve(method, [f"setup={setup}", "env.num_uavs=4"])
             changed = evaluate.scripted_config(config, "follow_target")
             assert changed.comm == resolve("consensus", [f"setup={setup}"]).comm
-            assert replace(changed, comm=config.comm) == config
+            assert changed.env.radio == resolve("consensus", [f"setup={setup}"]).env.radio
+            assert replace(changed, comm=config.comm, env=config.env) == config
             for name in SCRIPTED.keys() - {"follow_target"}:
                 assert evaluate.scripted_config(config, name) is config
 
@@ -145,7 +146,7 @@ def test_eval_json_describes_the_evaluation(run, cache):
         assert about["fire_seeds"] == [1_000_000, 1_000_001, 1_000_002]
         assert about["scenario"]["name"] == fire
         by_policy = content["results"][fire]
-        assert list(by_policy) == ["learned", *SCRIPTED] == list(content["communication"])
+        assert list(by_policy) == ["learned", *POLICIES] == list(content["communication"])
         for measured in by_policy.values():
             assert list(measured) == list(metrics.NAMES)
             for numbers in measured.values():
@@ -268,11 +269,13 @@ def test_a_cache_that_cannot_be_written_gives_a_warning(cache, monkeypatch):
     assert not list(cache_folder().glob("*.tmp"))
 
 
+POLICIES = resolve("consensus").evaluation.scripted
+"""the scripted policies of the paper's world"""
 RESULTS = {
     "huygens": {
         name: {measure: [1000.0, 1000.0] for measure in metrics.NAMES}
         | {"mean_reward": [-123.456, -123.456], "fire_losses": [499.5, 499.5]}
-        for name in ("learned", *SCRIPTED)
+        for name in ("learned", *POLICIES)
     }
 }
 NUMBERS = ["-123.5", *["1000.0"] * 6, "499.5"]
@@ -295,7 +298,7 @@ def test_narrow_tables_keep_every_number(columns, monkeypatch, capsys):
     assert (parts > 1) == (columns in ("40", "64", "72"))
     if columns not in ("0", None):
         assert max(map(len, lines)) <= int(columns)
-    for policy in ("shared_memory", *SCRIPTED):
+    for policy in ("shared_memory", *POLICIES):
         # At 80 columns, a name may take two lines.
         heads = (f"{policy} ", f"{policy.partition('_')[0]}_ ")
         rows = [line.split() for line in lines if line.startswith(heads)]

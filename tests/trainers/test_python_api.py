@@ -14,9 +14,10 @@ from tensordict.nn import TensorDictModule
 import emberlink.trainers as trainers
 from emberlink.envs import keys, metrics
 from emberlink.envs.utils.errors import UserError
-from emberlink.policies.scripted.registry import SCRIPTED
+from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.runs.run_folder import RunFolder
 
+POLICIES = resolve("consensus").evaluation.scripted
 ROOT = Path(__file__).parents[2]
 SHORT = {
     "episodes": 2,
@@ -77,7 +78,7 @@ def test_train_writes_the_same_folder_as_the_command(trained):
     assert written["results"] == trained.results
     assert list(trained.results) == ["huygens", "paper"]
     for by_policy in trained.results.values():
-        assert list(by_policy) == ["learned", *SCRIPTED]
+        assert list(by_policy) == ["learned", *POLICIES]
         for measured in by_policy.values():
             assert list(measured) == list(metrics.NAMES)
             assert {len(values) for values in measured.values()} == {2}

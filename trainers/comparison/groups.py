@@ -10,7 +10,7 @@ from emberlink.trainers.comparison.runs import Run
 from emberlink.trainers.config.compose import flat, resolve, to_values
 from emberlink.trainers.config.schema import NOT_LEARNT_WITH, RunConfig
 
-NOT_COMPARED = ("seed", "seeds", "output", "evaluation", *NOT_LEARNT_WITH)
+NOT_COMPARED = ("seed", "seeds", "output", "evaluation", "baselines", *NOT_LEARNT_WITH)
 """first parts of keys that may differ within a group, since they do not affect training"""
 NOT_NOTED = ("seed", "seeds", "output", "baselines")
 """first parts of keys whose differences within a group are not reported in notes"""

@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+from emberlink.envs import metrics
 from emberlink.policies.scripted.registry import SCRIPTED
 from emberlink.trainers.comparison.groups import Section
 from emberlink.trainers.evaluation.results import LEARNED
@@ -46,7 +47,7 @@ def scripted(
             notes.append(
                 f"{section.label}: {policy} was played for {len(all_values)} of the runs only"
             )
-        may_differ = measure == REWARD or _hears_messages(section, policy)
+        may_differ = measure == REWARD or _depends_on_radio(section, policy, measure)
         for group in values.values() if may_differ else [all_values]:
             if group and not _same(group):
                 notes.append(
@@ -73,7 +74,7 @@ def different_rewards(section: Section, fire: str) -> str:
             return f"the methods' rewards differ in {key}"
     policies = set.intersection(*(set(run.evaluation.results[fire]) for run in section.runs))
     for policy in sorted(policies - {LEARNED}):
-        if not _hears_messages(section, policy):
+        if not _depends_on_radio(section, policy, REWARD):
             values = _values(section, fire, REWARD, policy)
             if not _same([group[0] for group in values.values()]):
                 return f"the methods' rewards differ: {policy} earns differently with them"
@@ -92,11 +93,13 @@ def _values(section: Section, fire: str, measure: str, policy: str) -> dict[str,
     }
 
 
-def _hears_messages(section: Section, policy: str) -> bool:
-    """Returns whether a policy uses communication whose settings differ between runs."""
-    if policy not in SCRIPTED or SCRIPTED[policy].recipe is None:
+def _depends_on_radio(section: Section, policy: str, measure: str) -> bool:
+    """Returns whether runs may differ in a policy's measure, since their communication differs."""
+    hears = policy in SCRIPTED and SCRIPTED[policy].hears
+    if not hears and measure not in metrics.OF_BASE:
         return False
-    settings = [run.evaluation.communication.get(policy) for run in section.runs]
+    evaluations = [run.evaluation for run in section.runs]
+    settings = [(e.environment.get("radio"), e.communication.get(policy)) for e in evaluations]
     return any(other != settings[0] for other in settings)
 
 

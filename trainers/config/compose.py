@@ -23,9 +23,9 @@ from emberlink.envs.scenarios import fires_of
 from emberlink.envs.utils.config_files import find, read
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import from_plain, plain, shown, unknown
-from emberlink.policies.scripted.registry import SCRIPTED, to_play
+from emberlink.policies.scripted.registry import SCRIPTED
 from emberlink.trainers.config.overrides import all_keys, flat, full_key, parse, put
-from emberlink.trainers.config.schema import RunConfig
+from emberlink.trainers.config.schema import Baseline, RunConfig
 from emberlink.trainers.learners import registry as learners
 
 GROUPS = ("setup", "world", "fire", "learner")
@@ -65,10 +65,9 @@ def resolve(method: str, overrides: Sequence[str] = (), **settings: Any) -> RunC
     values["world"] = chosen["world"]
     _put_settings(values, settings)
     _choose_seed(values, any(key == "seed" for key in [*dict(given), *settings]))
-    values["baselines"] = _baselines(chosen, _changes(radio, _radio(values)))
     config = from_values(values)
-    to_play(config.evaluation.scripted)
-    return replace(config, fire=fires_of(config.fire).with_checksum())
+    baselines = _baselines(chosen, _changes(radio, _radio(values)))
+    return replace(config, baselines=baselines, fire=fires_of(config.fire).with_checksum())
 
 
 def override(config: RunConfig, overrides: Sequence[str] = (), **settings: Any) -> RunConfig:
@@ -84,7 +83,8 @@ def override(config: RunConfig, overrides: Sequence[str] = (), **settings: Any) 
         UserError: a key is not known, or a value does not fit.
     """
     values = to_values(config)
-    baselines, radio = values.pop("baselines"), _radio(values)
+    del values["baselines"]
+    radio = _radio(values)
     known = list(flat(values))
     for key, value in map(parse, overrides):
         if key in GROUPS:
@@ -96,9 +96,13 @@ def override(config: RunConfig, overrides: Sequence[str] = (), **settings: Any) 
         else:
             put(values, key, value)
     _put_settings(values, settings)
-    for baseline in baselines.values():
-        baseline["radio"] |= _changes(radio, _radio(values))
-    changed = from_values({**values, "baselines": baselines})
+    changed = from_values(values)
+    other = _changes(radio, _radio(values))
+    baselines = {
+        method: replace(baseline, radio=replace(baseline.radio, **other))
+        for method, baseline in config.baselines.items()
+    }
+    changed = replace(changed, baselines=baselines)
     # The run's own fire also holds the path of the run's copy of a fire file.
     return replace(changed, fire=config.fire) if changed.fire == config.fire else changed
 
@@ -200,7 +204,7 @@ def _put_settings(values: dict[str, Any], settings: Mapping[str, Any]) -> None:
         put(values, full_key(values, key), plain(value, key))
 
 
-def _baselines(chosen: Mapping[str, str], radio: Mapping[str, Any]) -> dict[str, Any]:
+def _baselines(chosen: Mapping[str, str], radio: Mapping[str, Any]) -> dict[str, Baseline]:
     """Returns the settings of the methods whose communication scripted policies use.
 
     Args:
@@ -208,14 +212,15 @@ def _baselines(chosen: Mapping[str, str], radio: Mapping[str, Any]) -> dict[str,
         radio: settings of the radio that the user changed; they hold for all methods.
 
     Returns:
-        method -> "comm" and "radio" -> settings.
+        method -> its communication.
     """
     methods = {policy.recipe for policy in SCRIPTED.values() if policy.recipe}
     groups = {group: chosen[group] for group in ("setup", "world")}
     baselines = {}
     for method in sorted(methods):
         values = _interpolated(_composed(method, groups))
-        baselines[method] = {"comm": values["comm"], "radio": values["env"]["radio"] | radio}
+        settings = {"comm": values["comm"], "radio": values["env"]["radio"] | radio}
+        baselines[method] = from_plain(Baseline, settings, f"baselines.{method}")
     return baselines
 
 

@@ -79,7 +79,7 @@ def full_key(values: Mapping[str, Any], key: str) -> str:
     if len(matching) > 1:
         raise UserError(f"key {key!r} is ambiguous: {', '.join(matching)}")
     if not matching:
-        raise UserError(f"key {unknown(key, names)}")
+        raise UserError(f"key {unknown(key, names, listed=False)}")
     return matching[0]
 
 

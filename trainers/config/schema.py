@@ -24,6 +24,7 @@ from emberlink.envs.scenarios import Scenario
 from emberlink.envs.utils.device import check_device as check_device
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import Name, unknown
+from emberlink.policies.scripted.registry import to_play
 from emberlink.trainers.config import choice
 from emberlink.trainers.learners import registry as learners
 from emberlink.trainers.learners.base import LearnerConfig
@@ -54,6 +55,11 @@ def _check_measure(value: str) -> str:
     return value
 
 
+def _check_policies(value: tuple[str, ...]) -> tuple[str, ...]:
+    to_play(value)
+    return value
+
+
 @dataclass(frozen=True, kw_only=True, config=_STRICT)
 class EvaluationConfig:
     """The settings of evaluations of frozen policies on held-out fires."""
@@ -66,7 +72,7 @@ class EvaluationConfig:
     """episodes of an evaluation during training, each on another validation fire"""
     huygens: bool
     """whether to evaluate on fires of the scenario `huygens`, too, besides that of the training"""
-    scripted: Annotated[tuple[Name, ...], Strict(False)]
+    scripted: Annotated[tuple[str, ...], Strict(False), AfterValidator(_check_policies)]
     """scripted policies to evaluate, besides those of other packages"""
     headline: Annotated[str, AfterValidator(_check_measure)]
     """the measure that chooses the networks of best.safetensors on validation fires"""

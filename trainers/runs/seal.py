@@ -4,7 +4,7 @@ The SHA-256 of the checkpoint covers its header, but not config.yaml.
 """
 
 from collections.abc import Mapping
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -76,9 +76,10 @@ def changed_evaluation(path: Path, config: RunConfig) -> list[str]:
     """
     header = checkpoint_file.read_header(path)
     before = header.get("config", {}).get("evaluation", {})
+    now = to_values(config)["evaluation"]
     return [
         f"evaluation.{key} is {value} here, {shown(str(before.get(key)))} in {path.name}"
-        for key, value in asdict(config.evaluation).items()
+        for key, value in now.items()
         if value != before.get(key)
     ]
 

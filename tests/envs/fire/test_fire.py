@@ -32,7 +32,7 @@ GRID, HORIZON = (30, 30), 1000
 RANGES = [
     f.name
     for f in dataclasses.fields(FireConfig)
-    if f.name not in {"name", "num_train_fires", "two_sided"}
+    if f.name not in {"name", "num_train_fires", "two_sided", "burn_time", "lengths"}
 ]
 
 
@@ -355,7 +355,9 @@ def test_the_cache_key_depends_on_every_setting(monkeypatch: pytest.MonkeyPatch)
 
     keys = [key(), key(split="test"), key(count=3), key(grid=(10, 12)), key(horizon=51)]
     keys += [key(start=1), key({**base, "name": "other"}), key({**base, "num_train_fires": 3})]
-    keys.append(key({**base, "two_sided": True}))
+    keys += [key({**base, "two_sided": True}), key({**base, "lengths": "cells"})]
+    # Burn-out is computed from the arrival times in a bank.
+    assert key({**base, "burn_time": 3.0}) == keys[0]
     for field in RANGES:
         low, high = base[field]
         more = 1 if field == "fuel_patches" else 0.001
@@ -363,7 +365,7 @@ def test_the_cache_key_depends_on_every_setting(monkeypatch: pytest.MonkeyPatch)
         keys.append(key({**base, field: other}))
     monkeypatch.setattr(bank_module, "GENERATOR_VERSION", 999)
     keys.append(key())
-    assert len(set(keys)) == len(keys) == 10 + len(RANGES)
+    assert len(set(keys)) == len(keys) == 11 + len(RANGES)
 
 
 @pytest.mark.parametrize("field", RANGES)

@@ -1,6 +1,7 @@
 """Tests `fire=file` from the command line to the evaluation, and the run's copy of its fires."""
 
 import json
+import math
 import shutil
 import sys
 from pathlib import Path
@@ -119,6 +120,7 @@ def test_a_run_describes_its_fires(trained):
     assert "saved_copy" not in fire
     evaluation = json.loads((run / "eval.json").read_text())
     assert set(evaluation["results"]) == {"huygens", "file"}
+    assert fire.pop("burn_time") == math.inf  # JSON has no such number
     assert evaluation["held_out"]["file"]["scenario"] == fire
     with np.load(run / COPY_FILE) as kept:
         expected = read_fires(RunFolder(run).config().fire, GRID, HORIZON)

@@ -8,10 +8,12 @@ import pytest
 from tiny_run import TINY
 
 from emberlink.envs import metrics
-from emberlink.policies.scripted.registry import SCRIPTED
 from emberlink.trainers.cli import main
+from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.runs import checkpoint_file
 from emberlink.trainers.runs.run_folder import RunFolder
+
+POLICIES = resolve("consensus").evaluation.scripted
 
 
 @pytest.mark.parametrize("arguments", [["trane"], ["train"], ["eval"], ["eval", "x", "--fires=0"]])
@@ -59,11 +61,11 @@ def check_evaluation(folder: Path, out: str, *, episodes: int = 2) -> None:
     assert out.rstrip().splitlines()[-1] == str(folder)
     words = set(out.split())
     assert {word for name in metrics.NAMES for word in name.split("_")} <= words
-    assert set(SCRIPTED) <= words
+    assert set(POLICIES) <= words
     assert "test fires: huygens" in out
     results = json.loads((folder / "eval.json").read_text())["results"]
     for by_policy in results.values():
-        assert list(by_policy) == ["learned", *SCRIPTED]
+        assert list(by_policy) == ["learned", *POLICIES]
         for measured in by_policy.values():
             assert measured.keys() == set(metrics.NAMES)
             assert {len(values) for values in measured.values()} == {episodes}

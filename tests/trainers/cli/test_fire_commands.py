@@ -308,7 +308,7 @@ def test_a_file_named_like_a_scenario_is_read_by_its_path(capsys, tmp_path):
     assert ran(capsys, "preview", "./huygens", "fire.units=minutes")[0].startswith("huygens: 30")
 
 
-KNOWN = "known: huygens, oil_slick, paper, reaction"
+KNOWN = "known: front, huygens, oil_slick, paper, reaction, swarm"
 
 
 @pytest.mark.parametrize(

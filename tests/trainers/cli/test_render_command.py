@@ -182,7 +182,10 @@ def test_errors_of_render(tmp_path, capsys):
     there.write_text("mine")
     cases = [
         ([tmp_path / "none"], ["no such run folder"]),
-        ([run, "--fire", "zzz"], ["fire 'zzz'", "known: huygens, oil_slick, paper, reaction"]),
+        (
+            [run, "--fire", "zzz"],
+            ["fire 'zzz'", "known: front, huygens, oil_slick, paper, reaction, swarm"],
+        ),
         ([run, "--fire", "65536"], ["'65536'", "0 to 65535"]),
         ([run, "--fire=-1"], ["'-1'", "0 to 65535"]),
         ([run, "--fire", "paper:x"], ["'paper:x'", "0 to 65535"]),
@@ -245,6 +248,7 @@ def test_settings_of_starts_and_fires_must_agree():
     """Start positions and fires depend on exactly these settings."""
     base = resolve("independent", SHORT).env
     other = {"reward", "observation", "observation_scale", "displacement", "view_angle"}
+    other |= {"radio", "base", "failures", "measures"}
     assert {field.name for field in dataclasses.fields(base)} == other | set(render.SHARED)
 
 

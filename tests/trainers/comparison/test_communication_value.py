@@ -10,7 +10,7 @@ from emberlink.trainers.cli import main
 from emberlink.trainers.comparison import bootstrap
 from emberlink.trainers.comparison.results import compare_runs
 
-OFF, FULL = "env.radio.range=0", "env.radio.range=.inf"
+OFF, FULL = "env.radio.range=0", "env.radio.range=inf"
 
 
 def evaluate_otherwise(run, reach: float, coverage: list[float]) -> None:

@@ -85,7 +85,7 @@ def test_measures_where_lower_is_better(tmp_path):
 
 
 def test_every_measure_has_a_direction():
-    assert set(metrics.NAMES) >= metrics.HIGHER_IS_BETTER
+    assert set(metrics.ALL) >= metrics.HIGHER_IS_BETTER
     assert {"tracking_first", "boundary_exits", "fire_losses", "time_to_full_coverage"}.isdisjoint(
         metrics.HIGHER_IS_BETTER
     )
@@ -308,12 +308,12 @@ def test_setups_fires_and_configurations_have_separate_sections(tmp_path):
     write_run(tmp_path, "consensus", 0, name="p", overrides=("fire=paper",), scenarios=both)
     sections, notes = gathered(tmp_path)
     assert [(s.label, [(g.label, g.seeds) for g in s.groups]) for s in sections] == [
-        ("setup released, trained on paper", [("consensus", [0])]),
+        ("setup released, world paper, trained on paper", [("consensus", [0])]),
         (
-            "setup tuned, trained on huygens",
+            "setup tuned, world paper, trained on huygens",
             [("consensus", [0]), ("consensus (learner.batch_size=64)", [1, 2])],
         ),
-        ("setup tuned, trained on paper", [("consensus", [0])]),
+        ("setup tuned, world paper, trained on paper", [("consensus", [0])]),
     ]
     assert [s.trained_on for s in sections] == ["", "huygens", "paper"]
     assert any("the methods differ in learner.batch_size" in note for note in notes)
@@ -337,7 +337,7 @@ def test_runs_with_other_evaluations_have_separate_sections(tmp_path, capsys):
     sections = {
         numbers.section.label: numbers.section.runs for numbers in compare([tmp_path]).sections
     }
-    usual = "setup tuned, trained on huygens (env.horizon="
+    usual = "setup tuned, world paper, trained on huygens (env.horizon="
     assert {label: [run.path.name for run in runs] for label, runs in sections.items()} == {
         f"{usual}40), 2 held-out fires, start_seed 1": ["few"],
         f"{usual}40), 4 held-out fires, start_seed 1": ["consensus_tuned_s0", "consensus_tuned_s1"],
@@ -414,8 +414,9 @@ def write_extra_evaluation(run, name, coverage, **about):
     """Writes an additional evaluation of a run, with lost messages."""
     content = read_evaluation(run)
     config = RunFolder(run).config()
-    comm = {"learned": {**config.comm, "loss": 0.5}}
-    content |= {"environment": to_values(config)["env"], "communication": comm, **about}
+    env = to_values(config)["env"]
+    env["radio"]["loss"] = 0.5
+    content |= {"environment": env, "communication": {"learned": config.comm}, **about}
     content["results"]["huygens"]["learned"]["coverage"] = [coverage] * 4
     (run / name).write_text(json.dumps(content))
 
@@ -465,7 +466,8 @@ def test_scripted_policies_may_depend_on_the_messages(tmp_path):
             scripted=("follow_target",),
         )
         content = read_evaluation(run)
-        content["communication"] = {"follow_target": {"name": "consensus", "loss": loss}}
+        content["communication"] = {"follow_target": {"name": "consensus"}}
+        content["environment"] = {"radio": {"range": 10.0, "loss": loss}}
         content["results"]["huygens"]["follow_target"]["coverage"] = [coverage] * 4
         write_evaluation(run, content)
     section = only(tmp_path)
@@ -483,7 +485,9 @@ def test_settings_without_effect_on_training_are_noted_and_do_not_split_groups(t
     write_run(tmp_path, "consensus", 1, overrides=("logger=csv", "output=elsewhere"))
     (section,), notes = gathered(tmp_path)
     assert [g.seeds for g in section.groups] == [[0, 1]]
-    assert notes == ["setup tuned, trained on huygens, consensus: one group, though logger differ"]
+    assert notes == [
+        "setup tuned, world paper, trained on huygens, consensus: one group, though logger differ"
+    ]
 
 
 def test_a_seed_is_counted_once(tmp_path):

@@ -108,13 +108,13 @@ def test_an_invalid_entry_point_is_named_in_the_error(monkeypatch):
 
 def test_a_run_folder_does_not_need_its_yaml_files(folder, tmp_path, monkeypatch):
     write(
-        folder, {"setup_method/small_consensus.yaml": "# @package _global_\ncomm:\n  range: 4.0\n"}
+        folder, {"setup_method/small_consensus.yaml": "# @package _global_\ncomm:\n  jitter: 0.5\n"}
     )
     arguments = ["train", "alone", "setup=small", *TINY, f"output={tmp_path / 'runs'}"]
     assert main.main(arguments) == 0
     (run,) = (tmp_path / "runs").iterdir()
     before = json.loads((run / "eval.json").read_text())
-    assert before["communication"]["follow_target"]["range"] == 4.0
+    assert before["communication"]["follow_target"]["jitter"] == 0.5
     shutil.rmtree(folder)
     monkeypatch.delenv("EMBERLINK_CONFIGS")
     monkeypatch.setenv("EMBERLINK_CACHE", str(tmp_path / "cache"))

@@ -73,11 +73,12 @@ def test_a_broken_package_is_named_in_one_line(installed, name, message):
 
 
 def test_a_map_of_another_package_is_restored_bit_for_bit(installed, tmp_path):
-    given = {"name": "visited_map", "range": 8.0, "loss": 0.1}
+    given = {"name": "visited_map"}
+    radio = {"range": 8.0, "loss": 0.1}
 
     def begin() -> Trainer:
         settings = [*SMALL, f"output={tmp_path / 'runs'}"]
-        trainer = Trainer(resolve("shared_memory", settings, comm=given))
+        trainer = Trainer(resolve("shared_memory", settings, comm=given, radio=radio))
         trainer.start()
         return trainer
 

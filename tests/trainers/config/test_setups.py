@@ -1,6 +1,7 @@
 """Compares the constants of the recipes with the table of agreed values."""
 
 import dataclasses
+import math
 
 import pytest
 
@@ -56,7 +57,6 @@ SWITCHES = {
     "consensus": ("shared", "consensus"),
 }
 CONSENSUS = {
-    "range": (10.0, 10.0),
     "discoverer": ("new_fire", "any_fire"),
     "jitter": (0.0, 0.75),
     "target": ("absolute", "absolute"),
@@ -112,9 +112,11 @@ def test_methods_differ_only_in_listed_settings(setup):
         values = flat(to_values(config))
         assert {key: values[key] for key in listed} == listed
         for key in values.keys() - listed.keys():
-            if key.split(".")[0] not in ("method", "replay", "comm"):
+            if key.split(".")[0] not in ("method", "replay", "comm") and key != "env.radio.range":
                 common.setdefault(key, set()).add(repr(values[key]))
     assert all(len(values) == 1 for values in common.values())
+    ranges = {method: config.env.radio.range for method, config in every.items()}
+    assert ranges == {**dict.fromkeys(METHODS, 10.0), "positional": math.inf}
     for listed in OWN[setup].values():  # listed settings differ from those of the other methods
         for key, value in listed.items():
             assert repr(value) not in common.get(key, set())
@@ -138,12 +140,12 @@ def test_defaults_of_a_communication_module_are_written_out():
     config = resolve("consensus", ["setup=tuned"])
     values = to_values(config)
     del values["comm"]["jitter"], values["comm"]["heading"]["circle"]
-    del values["baseline_comm"]["consensus"]["loss"]
+    del values["baselines"]["consensus"]["comm"]["jitter"]
     completed = from_values(values)
     assert flat(completed.comm).keys() == flat(config.comm).keys()
     assert completed.comm["jitter"] == ConsensusConfig().jitter
     assert completed.comm["heading"]["circle"] == HeadingConfig().circle
-    assert completed.baseline_comm["consensus"]["loss"] == 0.0
+    assert completed.baselines["consensus"].comm["jitter"] == ConsensusConfig().jitter
 
 
 @pytest.mark.parametrize("value", ["Läufe", "日本", "meine Läufe (2)", "größer/ßß"])
@@ -178,4 +180,7 @@ def test_defaults_in_code_equal_setup_paper():
 def test_the_table_has_all_setups_and_methods():
     assert known("method") == sorted(METHODS)
     assert known("setup") == ["paper", "released", "tuned"]
-    assert known("fire") == ["file", "huygens", "oil_slick", "paper", "reaction"]
+    assert known("fire") == [
+        *("file", "front", "huygens", "oil_slick", "paper", "reaction", "swarm"),
+    ]
+    assert known("world") == ["blackout", "file", "front", "paper", "relay", "swarm"]

@@ -74,15 +74,15 @@ class Poison:
         getattr(self, place)()
 
     def observation(self) -> None:
-        observe = WildfireEnv._observe
+        snapshot = WildfireEnv._snapshot
 
-        def poisoned(world, position, counts, time):
-            observation = observe(world, position, counts, time)
-            if self.is_due(world, time):
-                observation[self.env, self.uav % UAVS, 4] = math.nan
-            return observation
+        def poisoned(world, *given):
+            now = snapshot(world, *given)
+            if self.is_due(world, now[keys.STEP]):
+                now[keys.OBSERVATION][self.env, self.uav % UAVS, 4] = math.nan
+            return now
 
-        self.monkeypatch.setattr(WildfireEnv, "_observe", poisoned)
+        self.monkeypatch.setattr(WildfireEnv, "_snapshot", poisoned)
 
     def reward(self) -> None:
         step = WildfireEnv._step
