@@ -65,6 +65,7 @@ def train(
     method: str,
     *,
     setup: str = ...,
+    world: str = ...,
     fire: str | None = ...,
     seeds: None = ...,
     progress: Callable[[Progress], None] | None = ...,
@@ -76,6 +77,7 @@ def train(
     method: str,
     *,
     setup: str = ...,
+    world: str = ...,
     fire: str | None = ...,
     seeds: Sequence[int],
     progress: Callable[[Progress], None] | None = ...,
@@ -86,6 +88,7 @@ def train(
     method: str,
     *,
     setup: str = "paper",
+    world: str = "paper",
     fire: str | None = None,
     seeds: Sequence[int] | None = None,
     progress: Callable[[Progress], None] | None = None,
@@ -97,7 +100,8 @@ def train(
     Args:
         method: independent, shared_memory, positional, consensus, or a method of your own.
         setup: paper, released, tuned, or a setup of your own.
-        fire: name of a scenario; that of the setup if None.
+        world: paper, front, relay, swarm, blackout, file, or a world of your own.
+        fire: name of a scenario; that of the setup or the world if None.
         seeds: seeds to train in parallel, with a run folder for each, in place of `seed=`.
         progress: called after each step of the environments; an exception in it ends the training.
         evaluate_after: whether to evaluate at the end, which writes eval.json, figures and a GIF.
@@ -113,7 +117,7 @@ def train(
         NonFiniteError: a number became NaN or infinite, and `on_nan` is "stop" or the rollbacks
             failed.
     """
-    chosen = [f"setup={setup}", *([] if fire is None else [f"fire={fire}"])]
+    chosen = [f"setup={setup}", f"world={world}", *([] if fire is None else [f"fire={fire}"])]
     several = {} if seeds is None else {"seeds": list(seeds)}
     trainer = Trainer(resolve(method, chosen, **settings, **several))
     with _quiet():

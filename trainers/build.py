@@ -24,6 +24,7 @@ def make_env(
     method: str | RunConfig,
     setup: str | None = None,
     *,
+    world: str | None = None,
     num_envs: int = 1,
     fire: str | ScenarioConfig | Tensor | None = None,
     seed: int | None = None,
@@ -36,6 +37,8 @@ def make_env(
         method: independent, shared_memory, positional, consensus, or a method of your own; or the
             configuration of a run, such as `load("pretrained:consensus").config`.
         setup: paper (if None), released, tuned, or a setup of your own; not with a configuration.
+        world: paper (if None), front, relay, swarm, blackout, file, or a world of your own; not
+            with a configuration.
         num_envs: number of environments, the batch size.
         fire: see `WildfireEnv`; the scenario of the setup or of the run if None.
         seed: seed of all random numbers of the environment; a random one if None.
@@ -52,11 +55,12 @@ def make_env(
     if "seeds" in settings:
         raise UserError(f"seeds={settings['seeds']}: only for training; an environment takes seed=")
     if isinstance(method, str):
-        config = resolve(method, [f"setup={setup or 'paper'}"], **settings)
-    elif isinstance(method, RunConfig) and setup is None:
+        choices = [f"setup={setup or 'paper'}", f"world={world or 'paper'}"]
+        config = resolve(method, choices, **settings)
+    elif isinstance(method, RunConfig) and setup is None and world is None:
         config = override(method, **settings)
     else:
-        raise UserError("expected a method and a setup, or a RunConfig alone")
+        raise UserError("expected a method, a setup and a world, or a RunConfig alone")
     fire = config.fire if fire is None else fire
     return build_env(config, num_envs=num_envs, fire=fire, seed=seed, device=device)
 

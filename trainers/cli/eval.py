@@ -20,7 +20,7 @@ def add_eval(commands: Any) -> None:
         "Loads the newest checkpoint of a run, plays the frozen policies and the scripted ones on "
         "the same test fires, prints a table, and writes eval.json, figures and a GIF to the run "
         "folder.",
-        "emberlink eval runs/2026-01-31_12-00-00_consensus_tuned_s0 --fires 64",
+        "emberlink eval runs/2026-01-31_12-00-00_consensus_tuned_paper_s0 --fires 64",
     )
     evaluation.add_argument(
         "folder", metavar="RUN", help="a run folder, or pretrained:METHOD, pretrained:SETUP/METHOD"

@@ -8,7 +8,13 @@ from emberlink.trainers.cli.parser import command
 if TYPE_CHECKING:
     from rich.console import Console
 
-_GROUPS = {"methods": "method", "setups": "setup", "fires": "fire", "learners": "learner"}
+_GROUPS = {
+    "methods": "method",
+    "setups": "setup",
+    "worlds": "world",
+    "fires": "fire",
+    "learners": "learner",
+}
 _KINDS = (*_GROUPS, "policies")
 
 
@@ -18,7 +24,7 @@ def add_list(commands: Any) -> None:
         commands,
         "list",
         _list,
-        "list methods, setups, fires, learners, scripted policies",
+        "list methods, setups, worlds, fires, learners, scripted policies",
         "Prints the names that other commands accept, one per line.",
         "emberlink list methods",
     )

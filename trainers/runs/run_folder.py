@@ -42,7 +42,7 @@ class RunFolder(JsonLines, Checkpoints):
             UserError: the folder cannot be created.
         """
         stamp = datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
-        name = f"{stamp}_{config.method}_{config.setup}_s{config.seed}"
+        name = f"{stamp}_{config.method}_{config.setup}_{config.world}_s{config.seed}"
         try:
             path = _new_folder(Path(config.output) / name)
             (path / "checkpoints").mkdir()

@@ -56,9 +56,9 @@ class Job:
 
     @property
     def name(self) -> str:
-        """The method, the setup and the seeds."""
+        """The method, the setup, the world and the seeds."""
         seeds = ",".join(str(config.seed) for config in self.configs)
-        return f"{self.method}, {self.configs[0].setup}, seed {seeds}"
+        return f"{self.method}, {self.configs[0].setup}, {self.configs[0].world}, seed {seeds}"
 
     @property
     def output(self) -> Path:

@@ -125,7 +125,8 @@ class Scheduler:
 
     def _start(self, job: Job, locks: Claim) -> None:
         seeds = "-".join(str(config.seed) for config in job.configs)
-        stem = f"{job.configs[0].setup}_{job.method}_s{seeds}"
+        first = job.configs[0]
+        stem = f"{first.setup}_{first.world}_{job.method}_s{seeds}"
         try:
             logs = inner_folder(job.output, "logs")
             job.log = Path(f"{free_name(logs, stem, ['.txt'])}.txt")

@@ -16,9 +16,9 @@ from emberlink.envs.fire_files.formats import (
     find_format,
     perimeter_files,
 )
-from emberlink.envs.fire_files.perimeters.kml_times import with_one_time
 from emberlink.envs.fire_files.kmz import for_gdal
 from emberlink.envs.fire_files.perimeters.areas import area_at_zero, enclosed, make_valid, polygons
+from emberlink.envs.fire_files.perimeters.kml_times import with_one_time
 from emberlink.envs.fire_files.perimeters.times import known_columns, perimeter_times
 from emberlink.envs.fire_files.projection import (
     Bounds,
