@@ -90,11 +90,8 @@ class WildfireConfig:
     @classmethod
     def _check_base(cls, value: tuple[float, float] | None, info: ValidationInfo):
         grid = info.data.get("grid")
-        if (
-            value
-            and grid
-            and not all(0 <= x <= side - 1 for x, side in zip(value, grid, strict=True))
-        ):
+        places = zip(value or (), grid or (), strict=False)  # nothing to check without both
+        if not all(0 <= place <= side - 1 for place, side in places):
             raise UserError(f"outside of the map, [0, 0] to [{grid[0] - 1}, {grid[1] - 1}]")
         return value
 

@@ -20,7 +20,7 @@ def add_render(commands: Any) -> None:
         "Plays the frozen policies of one or more runs on the same held-out fire from the same "
         "start positions, and draws fire, UAVs, their roles and the links of their network. Writes "
         "a GIF and an MP4 to the first run's figures. No existing file is replaced.",
-        "emberlink render runs/2026-01-31_12-00-00_consensus_tuned_paper_s0 --policy random_waypoints",
+        "emberlink render runs/2026-01-31_12-00-00_consensus_tuned_paper_s0 --policy oracle",
     )
     add = rendering.add_argument
     add("runs", metavar="RUN", nargs="+", help="a run folder")
