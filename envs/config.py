@@ -90,8 +90,9 @@ class WildfireConfig:
     @classmethod
     def _check_base(cls, value: tuple[float, float] | None, info: ValidationInfo):
         grid = info.data.get("grid")
-        places = zip(value or (), grid or (), strict=False)  # nothing to check without both
-        if not all(0 <= place <= side - 1 for place, side in places):
+        if value is None or grid is None:
+            return value
+        if not all(0 <= place <= side - 1 for place, side in zip(value, grid, strict=True)):
             raise UserError(f"outside of the map, [0, 0] to [{grid[0] - 1}, {grid[1] - 1}]")
         return value
 
