@@ -189,7 +189,10 @@ def test_compare_writes_the_report_of_the_command(trained, tmp_path):
         (lambda run: trainers.load("pretrained:tuned"), "is ambiguous"),
         (lambda run: trainers.load(run, checkpoint="nowhere.safetensors"), "nowhere.safetensors"),
         (lambda run: trainers.compare(["nowhere"]), "there is no such run folder"),
-        (lambda run: trainers.make_env(None), "expected a method and a setup, or a RunConfig"),
+        (
+            lambda run: trainers.make_env(None),
+            "expected a method, a setup and a world, or a RunConfig",
+        ),
         (lambda run: trainers.make_env("consensus", seeds=[1]), "an environment takes seed="),
     ],
 )
@@ -236,3 +239,13 @@ def test_the_examples_of_the_documentation_run(tmp_path, monkeypatch):
         exec(block, names)  # the page's text
     assert names["run"].path.is_dir()
     assert torch.is_tensor(names["reward"])
+
+
+def test_environments_of_worlds():
+    env = trainers.make_env("consensus", "tuned", world="relay", num_envs=2, seed=0)
+    assert env.base_env.config.base == (0.0, 30.0)
+    now = env.rollout(2)["next"]
+    assert now[keys.BASE_SEEN].shape == (2, 2)
+    assert now[keys.BYTES_SENT].shape == (2, 2, 6)
+    with pytest.raises(UserError, match="world 'rely' is not known; did you mean relay"):
+        trainers.make_env("consensus", world="rely")

@@ -44,13 +44,19 @@ def runs_in(folder) -> list[RunFolder]:
 def test_every_combination_once():
     jobs = jobs_of(["consensus", "independent", "setup=paper,tuned", "seed=0,2,2"])
     assert names(jobs) == [
-        f"{method}, {setup}, seed {seed}"
+        f"{method}, {setup}, paper, seed {seed}"
         for method in ("consensus", "independent")
         for setup in ("paper", "tuned")
         for seed in (0, 2)
     ]
     assert jobs[3].configs[0].seed == 2
     assert jobs[3].configs[0].setup == "tuned"
+
+
+def test_worlds_are_combined_too():
+    jobs = jobs_of(["consensus", "world=front,relay"])
+    assert names(jobs) == ["consensus, paper, front, seed 0", "consensus, paper, relay, seed 0"]
+    assert [job.configs[0].env.base for job in jobs] == [None, (0.0, 30.0)]
 
 
 def test_lists_and_ranges_follow_hydras_syntax():
@@ -69,7 +75,7 @@ def test_lists_and_ranges_follow_hydras_syntax():
 def test_all_methods_by_default_and_stacks_of_seeds():
     jobs = jobs_of(["seeds=[3,4]"])
     assert names(jobs) == [
-        f"{method}, paper, seed 3,4"
+        f"{method}, paper, paper, seed 3,4"
         for method in ("consensus", "independent", "positional", "shared_memory")
     ]
     assert [config.seed for config in jobs[0].configs] == [3, 4]

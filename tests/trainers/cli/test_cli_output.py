@@ -247,7 +247,8 @@ def test_names_are_listed_on_separate_lines(kind, names, capsys):
 def test_an_unknown_kind_gives_one_line(capsys):
     assert main.main(["list", "method"]) == 2
     assert capsys.readouterr().err == (
-        "emberlink list: 'method' is not known; known: methods, setups, fires, learners, policies\n"
+        "emberlink list: 'method' is not known; known: methods, setups, worlds, fires, learners, "
+        "policies\n"
     )
 
 
