@@ -15,6 +15,7 @@ from emberlink.trainers.comparison.page import Report, html
 from emberlink.trainers.comparison.rankings import Numbers, numbers
 from emberlink.trainers.comparison.record import to_json, to_values
 from emberlink.trainers.comparison.runs import LeftOut, read_all
+from emberlink.trainers.terminal import OutputError
 
 
 @dataclass(frozen=True)
@@ -115,6 +116,8 @@ def write_report(
             (path / "compare.html").write_text(page, encoding="utf-8")
             (path / "compare.json").write_text(to_json(whole.to_values()), encoding="utf-8")
             path.replace(folder)
+    except OutputError:
+        raise
     except OSError as error:
         raise UserError(
             f"--output {folder}: cannot be written: {error.strerror or error}"
