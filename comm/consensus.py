@@ -83,7 +83,7 @@ class Consensus(CommModule):
         self.register_buffer("high", high, persistent=False)
         agents = num_envs, world.num_uavs
         for name in ("waypoint", "position", "target"):
-            self.register_buffer(name, torch.zeros(*agents, 3))
+            self.register_buffer(name, torch.zeros(*agents, 3, dtype=torch.float32))
         for name in ("streak", "fire_score"):
             self.register_buffer(name, torch.zeros(agents, dtype=torch.int64))
         for name in ("leaderless", "old_fire_only"):
@@ -93,7 +93,7 @@ class Consensus(CommModule):
     def specs(self, observation: Composite) -> Composite:
         shape, device = observation[keys.AGENTS].shape, observation.device
         features = observation[keys.OBSERVATION].shape[-1] + 3
-        vector = Unbounded(torch.Size((*shape, features)), device=device)
+        vector = Unbounded(torch.Size((*shape, features)), device=device, dtype=torch.float32)
         points = torch.Size((*shape, 3))
         low, high = (
             side.to(device, torch.float32).expand(points) for side in (self.low, self.high)

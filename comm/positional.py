@@ -41,7 +41,9 @@ class Positional(CommModule):
     def specs(self, observation: Composite) -> Composite:
         *batch, uavs, features = observation[keys.OBSERVATION].shape
         shape = torch.Size((*batch, uavs, uavs * features))
-        observation[keys.OBSERVATION] = Unbounded(shape, device=observation.device)
+        observation[keys.OBSERVATION] = Unbounded(
+            shape, device=observation.device, dtype=torch.float32
+        )
         return observation
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

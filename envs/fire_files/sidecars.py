@@ -53,6 +53,6 @@ def read_sidecar(path: Path) -> str:
         UnicodeDecodeError: it is not UTF-8.
     """
     try:
-        return read_bytes(path, _MAX_BYTES).decode("utf-8")
+        return read_bytes(path, _MAX_BYTES).decode("utf-8-sig")
     except OSError as error:
         raise UserError(f"{path.name}, beside it: {error.strerror or error}") from None

@@ -34,7 +34,9 @@ def initial_weights(
     """
     generators = team_generators(generator)
     teams = [
-        torch.empty(groups // len(generators), *shape).uniform_(-bound, bound, generator=of_team)
+        torch.empty(groups // len(generators), *shape, dtype=torch.float32).uniform_(
+            -bound, bound, generator=of_team
+        )
         for of_team in generators
     ]
     return nn.Parameter(torch.cat(teams).to(device))
@@ -83,8 +85,12 @@ class StackedLayerNorm(nn.Module):
 
     def __init__(self, groups: int, features: int, *, device: torch.device | str | None = None):
         super().__init__()
-        self.weight = nn.Parameter(torch.ones(groups, 1, features, device=device))
-        self.bias = nn.Parameter(torch.zeros(groups, 1, features, device=device))
+        self.weight = nn.Parameter(
+            torch.ones(groups, 1, features, dtype=torch.float32, device=device)
+        )
+        self.bias = nn.Parameter(
+            torch.zeros(groups, 1, features, dtype=torch.float32, device=device)
+        )
 
     def forward(self, x: Tensor) -> Tensor:
         """Maps [groups, rows, features] to the same shape."""

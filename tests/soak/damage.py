@@ -1,6 +1,7 @@
 """Generates damaged checkpoints and checkpoints of other configurations."""
 
 import json
+import math
 import random
 from collections.abc import Callable
 from pathlib import Path
@@ -91,7 +92,9 @@ def with_nan(path: Path, draw: random.Random) -> None:
         values = content[name].view(-1)
         # A fire has infinity in cells that never burn, and NaN in its margin.
         places = values.isfinite().nonzero().flatten().tolist()
-        values[draw.choice(places)] = draw.choice((float("nan"), float("inf")))
+        # An arrival time of infinity is valid, too.
+        bad = [math.nan] if name.endswith("_arrival_time") else [math.nan, math.inf]
+        values[draw.choice(places)] = draw.choice(bad)
 
     sealed_again(path, change)
 

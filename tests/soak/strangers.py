@@ -124,7 +124,10 @@ def cache_trial(folder: Path, draw: random.Random) -> list[str]:
 
 
 def config_trial(folder: Path, draw: random.Random) -> list[str]:
-    """Changes a digit of config.yaml; checks that it is refused or does not change the numbers."""
+    """Changes a digit of config.yaml; checks that it is refused, or does not change the numbers.
+
+    A change of a setting of evaluations must be mentioned.
+    """
     run = folder / "run"
     shutil.copytree(finished(folder.parent, draw.choice(METHODS)), run)
     text = (run / "config.yaml").read_text()
@@ -149,6 +152,8 @@ def config_trial(folder: Path, draw: random.Random) -> list[str]:
             or numbers != json.loads(before)["results"]
         ):
             failures.append(f"{keys}: accepted")
+        if any(key.startswith("evaluation.") and f"note: {key} is " not in said for key in keys):
+            failures.append(f"{keys}: not mentioned in {said}")
     else:
         failures.append(f"{keys}: status {status}: {said}")
     shutil.rmtree(folder)

@@ -38,11 +38,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         with one_line_warnings():
             status = _parse_and_run(arguments)
     except SystemExit as ended:  # of argparse, after a help or an error
-        raise SystemExit(_flush(ended.code)) from None
+        raise SystemExit(_flush(int(ended.code or 0))) from None
     except BaseException:
         _flush(1)
         raise
-    return int(_flush(status) or 0)
+    return _flush(status)
 
 
 def _parse_and_run(arguments: Sequence[str] | None) -> int:
@@ -120,7 +120,7 @@ def _unwritable(program: str, error: OSError) -> int:
     return 1
 
 
-def _flush(status: Any) -> Any:
+def _flush(status: int) -> int:
     """Flushes standard output and returns the exit status.
 
     An output that cannot be flushed is discarded, so that Python does not report it at its end.
@@ -159,5 +159,5 @@ class _Version(argparse.Action):
     def __call__(self, parser: Any, *_: object) -> None:
         from importlib.metadata import version
 
-        parser.print(f"emberlink {version('emberlink')}\n", sys.stdout)
+        parser._print_message(f"emberlink {version('emberlink')}\n", sys.stdout)
         parser.exit()

@@ -4,6 +4,7 @@ import argparse
 import difflib
 import sys
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from typing import Any, NoReturn
 
 
@@ -36,7 +37,7 @@ class Parser(argparse.ArgumentParser):
                 self.error(self._unknown_option(text, list(args or ())))
         return parsed, unknown
 
-    def print(self, message: str, file: Any = None) -> None:
+    def _print_message(self, message: str, file: Any = None) -> None:
         """Writes a message to a file, or to standard error if it is None.
 
         Raises:
@@ -46,12 +47,11 @@ class Parser(argparse.ArgumentParser):
         if stream is not None:
             stream.write(message)
 
-    _print_message = print  # argparse's name
-
     def error(self, message: str) -> NoReturn:
         """Prints the message and exits with status 2."""
         text = "".join(c if c.isprintable() else "?" for c in message)
-        print(f"{self.prog}: {text} (see {self.prog} --help)", file=sys.stderr)
+        with suppress(OSError):  # the terminal may be gone
+            print(f"{self.prog}: {text} (see {self.prog} --help)", file=sys.stderr)
         raise SystemExit(2)
 
     def _unknown_option(self, text: str, arguments: Sequence[str]) -> str:

@@ -90,7 +90,7 @@ def evaluate_and_print(
             actor,
             checkpoint=checkpoint,
             fires=fires or config.evaluation.episodes,
-            report=lambda text: console.print(f"  {text}", style="dim"),
+            report=lambda text: console.print(f"  {text}", style="dim", soft_wrap=True),
             label=label,
         )
         for run, config, actor, checkpoint in seeds

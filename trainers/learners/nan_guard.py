@@ -25,7 +25,7 @@ class NonFiniteGuard:
     """
 
     def __init__(self, device: torch.device | str):
-        self.bad = torch.zeros((), device=device)
+        self.bad = torch.zeros((), dtype=torch.float32, device=device)
         """1 after a detection, else 0; Adam skips a step if its `found_inf` is 1"""
         self._counts = torch.zeros(3, dtype=torch.int64, device=device)
         self._place, self._steps, self._updates = self._counts.unbind()
@@ -101,7 +101,7 @@ class NonFiniteGuard:
 
     def _send(self) -> tuple[Any, Tensor]:
         with torch.cuda.device(self.bad.device):
-            arriving = torch.empty((), pin_memory=True)
+            arriving = torch.empty((), dtype=torch.float32, pin_memory=True)
             arriving.copy_(self.bad, non_blocking=True)
             event = torch.cuda.Event()
             event.record()

@@ -88,6 +88,7 @@ class OffPolicyLearner(Learner):
             terminated=TERMINATED,
         )
         self.loss.make_value_estimator(gamma=config.gamma)
+        self.loss.value_estimator.float()  # gamma, also if the default dtype is another
         # Registers an updater with the loss; `_move_targets` performs the updates.
         SoftUpdate(self.loss, tau=config.tau)
         parts: list[Any] = [self.actor, OrnsteinUhlenbeck(config.exploration)]

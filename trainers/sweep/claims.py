@@ -57,7 +57,7 @@ def claim(output: Path, identities: Iterable[Identity]) -> Claim | None:
         return None
     except OSError as error:
         taken.release()
-        raise UserError(f"output={output}: {error.strerror or error}") from None
+        raise UserError(f"{error.filename or output}: {error.strerror or error}") from None
     return taken
 
 

@@ -133,7 +133,7 @@ class Scheduler:
             handle = self._executor.submit(Task(job.arguments, job.log, locks.handles))
         except OSError as error:
             locks.release()
-            raise UserError(f"output={job.output}: {error.strerror or error}") from None
+            raise UserError(f"{error.filename or job.output}: {error.strerror or error}") from None
         self._running[job] = _Running(handle, locks)
         self._progress.begin(job)
 

@@ -325,6 +325,14 @@ def test_no_regular_file_beside_a_raster(tmp_path, name):
         part.rmdir() if part.is_dir() else part.unlink()
 
 
+def test_a_byte_order_mark_before_a_projection(tmp_path):
+    path = write_asc(tmp_path / "fire.asc", raster_of(Ellipses(), 300.0))
+    fire = read(path, (30, 30))
+    wkt = rasterio.crs.CRS.from_string(UTM).to_wkt()
+    (tmp_path / "fire.prj").write_text(wkt, encoding="utf-8-sig")
+    assert torch.equal(read(path, (30, 30)), fire)
+
+
 def test_a_large_projection_file_is_refused(tmp_path):
     path = write_asc(tmp_path / "fire.asc", corner([[0, 5], [2, 4]], 2, 2))
     wkt = rasterio.crs.CRS.from_string(UTM).to_wkt()

@@ -103,6 +103,15 @@ def test_a_full_output_of_other_commands_is_one_line(unbuffered):
     )
 
 
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs Linux's /dev/full")
+def test_a_wrong_argument_has_status_2_also_if_it_cannot_be_said():
+    with open("/dev/full", "w") as full:
+        ended = subprocess.run(
+            [sys.executable, "-m", "emberlink.trainers.cli", "eval"], stderr=full
+        )
+    assert ended.returncode == 2
+
+
 def test_a_closed_output_is_one_line():
     ended = subprocess.run(
         [sys.executable, "-m", "emberlink.trainers.cli", "list", "methods"],

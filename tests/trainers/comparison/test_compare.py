@@ -1,5 +1,6 @@
 """Tests `emberlink compare`: its grouping of runs, its numbers and its page."""
 
+import errno
 import html.parser
 import json
 import re
@@ -24,6 +25,7 @@ from emberlink.trainers.comparison.runs import Run, find, read
 from emberlink.trainers.comparison.scripted import Scripted
 from emberlink.trainers.config.compose import to_values
 from emberlink.trainers.runs.run_folder import RunFolder
+from emberlink.trainers.terminal import OutputError
 
 METHODS = ("consensus", "independent", "positional", "shared_memory")
 
@@ -207,6 +209,18 @@ def test_invalid_output_folder(runs, tmp_path, capsys):
         assert said.count("\n") == 1
     assert (tmp_path / "file").read_text() == "mine"
     assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "link"]
+
+
+def test_a_full_output_is_not_taken_for_the_folder(runs, tmp_path, capsys, monkeypatch):
+    def fail(*_):
+        raise OutputError(errno.ENOSPC, "No space left on device", "standard output")
+
+    monkeypatch.setattr("emberlink.trainers.comparison.report.chapters.draw", fail)
+    assert main.main(["compare", str(runs), "--output", str(tmp_path / "new")]) == 1
+    assert capsys.readouterr().err == (
+        "emberlink compare: standard output: cannot be written: No space left on device\n"
+    )
+    assert list(tmp_path.iterdir()) == []
 
 
 def summary(section):

@@ -433,7 +433,7 @@ def test_the_logs_of_a_sweep(tmp_path, outside, capsys):
     plant(runs / "logs", "link to a folder", outside)
     status, error = run_command(["sweep", "independent", *TINY, f"output={runs}"], capsys)
     assert status == 2
-    assert "it is a link" in error
+    assert f"{runs / 'logs'}: it is a link" in error
 
 
 @pytest.mark.parametrize(

@@ -4,10 +4,12 @@ import pytest
 import torch
 from test_recipes import METHODS
 from test_resume import begun, until
+from torchrl.envs import check_env_specs
 
 from emberlink.envs import keys
 from emberlink.envs.config import WildfireConfig
 from emberlink.envs.wildfire import WildfireEnv
+from emberlink.trainers import make_env
 
 
 @pytest.mark.slow
@@ -26,6 +28,22 @@ def test_a_seed_repeats_its_run_byte_for_byte(method, tmp_path):
     assert first != other
     for name, weight in weights.items():
         assert weight.equal(same[name]), name
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_the_default_dtype_does_not_change_a_training(method, tmp_path):
+    """A program that uses emberlink may prefer float64."""
+    usual = until(begun(method, tmp_path / "usual"), 15)
+    torch.set_default_dtype(torch.float64)
+    try:
+        other = until(begun(method, tmp_path / "other"), 15)
+        check_env_specs(make_env(method))
+    finally:
+        torch.set_default_dtype(torch.float32)
+    assert other.setup.learner.updates > 0
+    weights = other.setup.learner.actor.state_dict()
+    for name, value in usual.setup.learner.actor.state_dict().items():
+        assert weights[name].equal(value), name
 
 
 @pytest.mark.parametrize("fire", ["paper", "huygens"])

@@ -11,6 +11,7 @@ from emberlink.trainers.comparison.record import to_json
 from emberlink.trainers.comparison.report import chapters
 from emberlink.trainers.comparison.report.page import Report, html
 from emberlink.trainers.comparison.results import Comparison
+from emberlink.trainers.terminal import OutputError
 
 
 def free_folder(output: Path | None) -> Path:
@@ -65,6 +66,8 @@ def write_report(
             (path / "compare.html").write_text(page, encoding="utf-8")
             (path / "compare.json").write_text(to_json(whole.to_values()), encoding="utf-8")
             path.replace(folder)
+    except OutputError:
+        raise
     except OSError as error:
         raise UserError(
             f"--output {folder}: cannot be written: {error.strerror or error}"
