@@ -11,6 +11,7 @@ from robustness import SOAK
 
 from emberlink.configs import known
 from emberlink.envs import keys
+from emberlink.envs.world.burning import with_burn_time
 from emberlink.trainers.build import build_env
 from emberlink.trainers.config.compose import from_values, resolve, to_values
 
@@ -40,6 +41,13 @@ def random_settings(rng: np.random.Generator) -> dict:
         "view_angle": angle,
         "displacement": float(rng.choice([1e-3, 0.1, 1.0, 5.5, 256.0])),
         "observation_scale": str(rng.choice(["raw", "box"])),
+        "radio": {
+            "range": float(rng.choice([0.0, 3.0, 10.0, math.inf])),
+            "loss": float(rng.choice([0.0, 0.5, 1.0])),
+        },
+        "base": [None, [0.0, 0.0], [7.0, 3.5]][rng.integers(3)],
+        "failures": float(rng.choice([0.0, 0.5, 1.0])),
+        "measures": str(rng.choice(["paper", "all"])),
     }
     values["env"]["reward"] = {
         "exit_axes": str(rng.choice(["xyz", "xy"])),
@@ -48,14 +56,12 @@ def random_settings(rng: np.random.Generator) -> dict:
     if values["comm"]["name"] == "consensus":
         heading = ["folded_linear", "folded_exponential", "linear", "approach"]
         values["comm"] |= {
-            "range": float(rng.choice([0.0, 3.0, 10.0, math.inf])),
             "discoverer": str(rng.choice(["new_fire", "any_fire"])),
             "jitter": float(rng.choice([0.0, 0.75, 1e6])),
             "target": str(rng.choice(["absolute", "relative"])),
             "agree": bool(rng.integers(2)),
             "follow": str(rng.choice(["best", "nearest"])),
             "wander": bool(rng.integers(2)),
-            "loss": float(rng.choice([0.0, 0.5, 1.0])),
             "heading": {
                 "form": str(rng.choice(heading)),
                 "weight": float(rng.normal(0, 3)),
@@ -79,7 +85,11 @@ def random_fire(rng: np.random.Generator, config, generator: torch.Generator):
     if kind == 3:
         return arrival.round() - 1  # burning since before the start, and at whole steps
     never = torch.rand(shape, generator=generator) < 0.5
-    return arrival.masked_fill(never, math.inf) if kind == 4 else -arrival * 1e30
+    arrival = arrival.masked_fill(never, math.inf) if kind == 4 else -arrival * 1e30
+    if rng.integers(2):
+        return arrival
+    each = arrival if arrival.ndim == 3 else arrival.unsqueeze(0)
+    return with_burn_time(each, float(rng.choice([1.0, 2.5, 1e6])))
 
 
 def random_actions(shape: torch.Size, generator: torch.Generator) -> torch.Tensor:
@@ -114,15 +124,25 @@ def check(td, before, env, config, looked: torch.Tensor) -> None:
     assert (new >= 0).all()
     assert (old >= 0).all()
     assert (none >= 0).all()
-    total = footprint(position, config) * looked[:, None]
+    alive = td[keys.ALIVE]
+    assert alive.all() or config.failures
+    total = footprint(position, config) * looked[:, None] * alive
     assert torch.equal(new + old + none, total)
-    burning = world.arrival_time <= td[keys.STEP][:, None, None]
-    seen = world._map.seen
-    assert not (seen & ~burning).any()
+    now = td[keys.STEP][:, None, None]
+    burnt, seen = world.arrival_time <= now, world._map.seen
+    burning = burnt if world.burn_out is None else burnt & (now < world.burn_out)
+    assert not (seen & ~burnt).any()
     assert torch.equal(td[keys.SEEN], seen.sum((1, 2)))
     assert torch.equal(td[keys.BURNING], burning.sum((1, 2)))
+    assert torch.equal(td[keys.BURNT], burnt.sum((1, 2)))
+    if config.base is not None:
+        assert (td[keys.BASE_SEEN] <= td[keys.SEEN]).all()
+    if config.base is not None and config.measures == "all":
+        assert (td[keys.BASE_AGE] >= td[keys.FRONT_AGE]).all()
     if before is not None:
-        assert (td[keys.BURNING] >= before[keys.BURNING]).all()
+        assert (td[keys.BURNT] >= before[keys.BURNT]).all()
+        assert not (alive & ~before[keys.ALIVE]).any()
+        assert not td[keys.REWARD][~alive].any()
         assert torch.equal(td[keys.SEEN] - before[keys.SEEN], new.sum(1))
         assert torch.equal(td[keys.STEP], before[keys.STEP] + 1)
     for key, value in td.items(include_nested=True, leaves_only=True):

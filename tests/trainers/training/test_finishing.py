@@ -300,7 +300,7 @@ def test_an_infinite_range_round_trips(tmp_path, capsys):
     arguments = ["consensus", *TINY, "env.radio.range=inf", f"output={tmp_path / 'runs'}"]
     assert trained(capsys, *arguments)[0] == 0
     run = run_of(tmp_path / "runs")
-    assert run.config().comm["range"] == float("inf")
+    assert run.config().env.radio.range == float("inf")
     assert trained(capsys, f"resume={run.path}", "episodes=3")[0] == 0
     assert main.main(["eval", str(run.path), "--fires", "2"]) == 0
     assert main.main(["compare", str(run.path), "--output", str(tmp_path / "out")]) == 0
