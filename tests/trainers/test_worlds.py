@@ -1,0 +1,86 @@
+"""Tests that methods, learners and other views of the environment work in every world."""
+
+import json
+
+import pytest
+import torch
+from tiny_run import TINY
+from torchrl.envs.utils import check_env_specs
+
+from emberlink.configs import known
+from emberlink.envs import WildfireConfig, keys, metrics, parallel_env
+from emberlink.trainers import make_env
+from emberlink.trainers.cli import main
+from emberlink.trainers.config.compose import resolve
+from emberlink.trainers.learners.off_policy import OffPolicyLearner
+from emberlink.trainers.learners.replay_buffer import to_rows
+
+WORLDS = [world for world in known("world") if world != "file"]
+
+
+@pytest.mark.parametrize("world", WORLDS)
+@pytest.mark.parametrize("method", known("method"))
+def test_every_method_has_an_environment_in_every_world(method, world):
+    small = {"num_envs": 2, "seed": 0, "num_train_fires": 2}
+    env = make_env(method, "tuned", world=world, **small)
+    check_env_specs(env)
+    steps = env.rollout(3)["next"]
+    measured = metrics.episode_metrics(steps)
+    assert tuple(measured) == metrics.names(env.base_env.config)
+    assert resolve(method, [f"world={world}"]).evaluation.headline in measured
+    assert all(value.isfinite().all() for value in measured.values())
+
+
+def test_failed_uavs_do_not_count_in_losses():
+    loss = torch.tensor([[1.0, 10.0], [3.0, 20.0], [100.0, 30.0]])
+    alive = torch.tensor([[True, False], [True, False], [False, False]])
+    batch = {keys.ALIVE: alive}
+    assert OffPolicyLearner.mean_over_batch(loss, batch).tolist() == [2.0, 0.0]
+    assert OffPolicyLearner.mean_over_batch(loss, {}).tolist() == loss.mean(0).tolist()
+
+
+def test_rows_say_who_was_alive_after_a_step():
+    env = make_env("independent", world="blackout", num_envs=2, seed=0, num_train_fires=2)
+    first = env.reset()
+    env.base_env._fail_step.copy_(torch.arange(12).view(2, 6))
+    rollout = env.rollout(3, auto_reset=False, tensordict=first)
+    rows = to_rows(rollout, 1, [keys.OBSERVATION], failures=True)
+    assert rows["alive"].equal(rollout["next", "agents", "alive"].flatten(0, 1))
+    assert not rows["alive"].all()
+    assert "alive" not in to_rows(rollout, 1, [keys.OBSERVATION])
+
+
+@pytest.mark.slow
+def test_a_run_in_a_world_is_trained_resumed_and_evaluated(tmp_path, capsys):
+    output = f"output={tmp_path / 'runs'}"
+    assert main.main(["train", "consensus", *TINY, "world=blackout", output]) == 0
+    (run,) = (tmp_path / "runs").iterdir()
+    before = json.loads((run / "eval.json").read_text())
+    (fire,) = before["results"]
+    assert fire == "front"
+    assert list(before["results"][fire]["learned"]) == list(metrics.ALL)
+    assert main.main(["eval", str(run)]) == 0
+    assert json.loads((run / "eval.json").read_text()) == before
+    assert main.main(["train", f"resume={run}", "episodes=3"]) == 0
+    assert "base_coverage" in (run / "metrics.jsonl").read_text().splitlines()[-1]
+
+
+def test_failed_uavs_leave_pettingzoo():
+    world = WildfireConfig(grid=(8, 8), num_uavs=3, horizon=12, failures=3.0)
+    env = parallel_env(config=world, fire="paper", seed=0)
+    env.reset(seed=1)
+    env._core._fail_step.copy_(torch.tensor([[4, 13, 2]]))
+    flying = {1: 3, 2: 2, 3: 2, **dict.fromkeys(range(4, 12), 1), 12: 0}
+    for step, count in flying.items():
+        before = list(env.agents)
+        actions = {agent: env.action_space(agent).sample() for agent in before}
+        observations, rewards, terminations, truncations, infos = env.step(actions)
+        for part in (observations, rewards, terminations, truncations, infos):
+            assert list(part) == before
+        assert len(env.agents) == count
+        assert [agent for agent, ended in terminations.items() if ended] == {
+            2: ["uav_2"],
+            4: ["uav_0"],
+        }.get(step, [])
+        assert all(rewards[agent] == 0 for agent in before if terminations[agent])
+    assert all(truncations.values())
