@@ -15,8 +15,9 @@ from torchrl.envs import EnvBase, TransformedEnv, step_mdp
 from emberlink.envs import keys
 from emberlink.envs.config import WildfireConfig
 from emberlink.envs.rendering.window import Window
+from emberlink.envs.scenarios import default_config
 from emberlink.envs.utils.errors import UserError
-from emberlink.envs.wildfire import WildfireEnv, default_config
+from emberlink.envs.wildfire import WildfireEnv
 
 Array = NDArray[np.float32]
 Observation = Array | dict[str, NDArray[Any]]

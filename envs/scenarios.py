@@ -199,6 +199,13 @@ def fires_of(scenario: ScenarioConfig) -> FireSource:
     return _KINDS[type(scenario)](scenario)
 
 
+def default_config(fire: Any) -> WildfireConfig:
+    """Returns the default config, on the grid of the fire where that is a tensor."""
+    if isinstance(fire, Tensor) and fire.ndim in (2, 3):
+        return WildfireConfig(grid=(fire.shape[-2], fire.shape[-1]))
+    return WildfireConfig()
+
+
 def load_fires(
     fire: str | ScenarioConfig | Tensor, config: WildfireConfig, num_envs: int
 ) -> tuple[Tensor, bool]:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from emberlink.envs import keys, specs
 from emberlink.envs.config import WildfireConfig
-from emberlink.envs.scenarios import ScenarioConfig, load_fires
+from emberlink.envs.scenarios import ScenarioConfig, default_config, load_fires
 from emberlink.envs.team_view import TeamView
 from emberlink.envs.utils import counter_rng
 from emberlink.envs.utils.buffers import Buffers
@@ -290,13 +290,6 @@ class WildfireEnv(Buffers, TeamView):
         truncated = (time >= length).unsqueeze(-1)
         flags = truncated, torch.zeros_like(truncated), truncated.clone()
         return dict(zip(specs.DONE_NAMES, flags, strict=True))
-
-
-def default_config(fire: Any) -> WildfireConfig:
-    """Returns the default config, on the grid of the fire where that is a tensor."""
-    if isinstance(fire, Tensor) and fire.ndim in (2, 3):
-        return WildfireConfig(grid=(fire.shape[-2], fire.shape[-1]))
-    return WildfireConfig()
 
 
 def _tensordict(source: dict, batch_size: torch.Size, device: torch.device | None) -> TensorDict:

@@ -6,11 +6,15 @@ same form. A raster without such a sign may still be one of these.
 
 import re
 from collections.abc import Iterable, Iterator
+from typing import Any
 
 import numpy as np
+from scipy.ndimage import label, minimum_filter
 
 from emberlink.envs.fire_files.config import SECONDS, Units
 
+MAX_BEGINNINGS = 10
+"""Places at which the fire of a raster may begin without a doubt."""
 _NAMES = ("elevation", "altitude", "slope", "aspect", "canopy", "crown", "fuel", "fbfm", "flame")
 _NAMES += ("intensity", "probability", "burnprob", "rateofspread", "spreadrate")
 _WORDS = ("dem", "dtm", "dsm", "ros", "flin")  # too short to be looked for within other words
@@ -84,6 +88,22 @@ def doubts_of_growth(times: np.ndarray, cell: tuple[float, float], unit: Units) 
     radius = np.sqrt(len(burning) * cell[0] * cell[1] / np.pi)
     if radius > _FASTEST * minutes:
         yield f"the fire would spread by {radius / minutes * 0.06:.3g} km/h on all sides"
+
+
+def beginnings(times: np.ndarray) -> int:
+    """Returns the number of places that burn before all cells around them.
+
+    Args:
+        times: arrival times, [rows, columns]; 2000 x 2000 cells around the first are looked at.
+    """
+    row, column = np.unravel_index(times.argmin(), times.shape)
+    times = times[max(row - 1000, 0) : row + 1000, max(column - 1000, 0) : column + 1000]
+    burns, earliest = np.isfinite(times), times == minimum_filter(times, 3)
+    # Of cells that burn at the same time, one may have an earlier neighbour: no beginning.
+    later = minimum_filter(np.where(burns & ~earliest, times, np.inf), 3) == times
+    places: Any = label(burns & earliest, np.ones((3, 3)))
+    reached = np.unique(places[0][burns & earliest & later])
+    return int(places[1] - len(reached))
 
 
 def _looks_like_classes(times: np.ndarray, burning: np.ndarray, unit: Units) -> bool:

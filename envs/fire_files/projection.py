@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from emberlink.envs.fire_files.formats import beside
+from emberlink.envs.fire_files.sidecars import read_sidecar
 from emberlink.envs.utils.errors import UserError
 
 Bounds = tuple[float, float, float, float]
@@ -153,3 +154,17 @@ def _utm(bounds: Bounds) -> Any:
         )
     zone = min(int((x + 180) // 6), 59) + 1
     return _parse_crs(f"EPSG:{(32600 if y >= 0 else 32700) + zone}")
+
+
+def read_prj(path: Path) -> Any:
+    """Returns the projection in the .prj beside a file, None if there is none."""
+    prj = beside(path, ".prj")
+    if prj is None:
+        return None
+    pyproj = library("pyproj", "a projection")
+    try:
+        return pyproj.CRS.from_user_input(read_sidecar(prj))
+    except UserError:
+        raise
+    except (pyproj.exceptions.CRSError, ValueError):
+        return check_projection(path, None)

@@ -2,21 +2,19 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
-from scipy.ndimage import label, map_coordinates, minimum_filter
+from scipy.ndimage import map_coordinates, minimum_filter
 
 from emberlink.envs.fire_files.config import Clock
-from emberlink.envs.fire_files.plausibility import doubts_of_growth
+from emberlink.envs.fire_files.plausibility import MAX_BEGINNINGS, beginnings, doubts_of_growth
 from emberlink.envs.fire_files.projection import Bounds
 from emberlink.envs.utils.errors import UserError
 
 SAMPLES = 180
 """Sample points along the grid's shorter side. A cell of the grid gets the earliest of its samples.
 Rasters and perimeters are sampled at the same points."""
-MAX_BEGINNINGS = 10
-"""Places at which the fire of a raster may begin without a doubt."""
 _EDGE = 1e-6  # cells: tolerance, so that rounding does not move a centre across an edge
 
 
@@ -141,7 +139,7 @@ class RasterSource:
     def summary(self) -> str:
         """Description of the content, for the user."""
         first, last = self.clock.format(self.first), self.clock.format(self.last)
-        count = self.beginnings
+        count = beginnings(self.times)
         places = "1 place" if count == 1 else f"{count} places"
         cells = np.isfinite(self.times).sum()
         name = f"{self._name}: " if self._name else ""
@@ -152,21 +150,9 @@ class RasterSource:
         """Signs that these are not arrival times; none of a map of the whole grid."""
         if self.whole:
             return []
-        many = ["it would begin at many places"] if self.beginnings > MAX_BEGINNINGS else []
+        many = ["it would begin at many places"] if beginnings(self.times) > MAX_BEGINNINGS else []
         growth = doubts_of_growth(self.times, self._cell, self.clock.unit)
         return [*self._doubts, *many, *growth]
-
-    @property
-    def beginnings(self) -> int:
-        """Number of places that burn before all cells around them, in 2000 x 2000 cells at most."""
-        row, column = np.unravel_index(self.times.argmin(), self.times.shape)
-        times = self.times[max(row - 1000, 0) : row + 1000, max(column - 1000, 0) : column + 1000]
-        burns, earliest = np.isfinite(times), times == minimum_filter(times, 3)
-        # Of cells that burn at the same time, one may have an earlier neighbour: no beginning.
-        later = minimum_filter(np.where(burns & ~earliest, times, np.inf), 3) == times
-        places: Any = label(burns & earliest, np.ones((3, 3)))
-        reached = np.unique(places[0][burns & earliest & later])
-        return int(places[1] - len(reached))
 
     def burnt(self, until: float) -> Bounds:
         """Returns the bounds of the area burnt by a time: to the front, or to the edges of cells.

@@ -12,11 +12,9 @@ from typing import Any, TextIO
 import numpy as np
 
 from emberlink.envs.fire_files.config import Clock, Units
-from emberlink.envs.fire_files.formats import beside
 from emberlink.envs.fire_files.plausibility import doubts_of_names, doubts_of_values
-from emberlink.envs.fire_files.projection import check_projection, first_line, library, projections
+from emberlink.envs.fire_files.projection import first_line, library, projections, read_prj
 from emberlink.envs.fire_files.raster_source import RasterSource, check_spreads
-from emberlink.envs.fire_files.sidecars import read_sidecar
 from emberlink.envs.utils.errors import UserError
 
 MAX_CELLS = 50_000_000
@@ -87,7 +85,7 @@ def read_ascii(path: Path, unit: Units | None, crs: str | None) -> RasterSource:
     never = values == header["nodata_value"] if "nodata_value" in header else None
     affine = dx, 0.0, x, 0.0, -dy, y + shape[0] * dy
     doubts = list(doubts_of_names([path.stem]))
-    return _on_plane(clean(values, never), affine, _prj(path), unit, crs, doubts=doubts)
+    return _on_plane(clean(values, never), affine, read_prj(path), unit, crs, doubts=doubts)
 
 
 def _texts(dataset: Any) -> list[str]:
@@ -217,20 +215,6 @@ def _is_valid(key: str, text: str) -> bool:
     if _KEYS[key] is _SIZE:
         return 0 < value < math.inf
     return math.isfinite(value) if _KEYS[key] is _PLACE else True
-
-
-def _prj(path: Path) -> Any:
-    """Returns the projection in the .prj beside a file, None if there is none."""
-    prj = beside(path, ".prj")
-    if prj is None:
-        return None
-    pyproj = library("pyproj", "a projection")
-    try:
-        return pyproj.CRS.from_user_input(read_sidecar(prj))
-    except UserError:
-        raise
-    except (pyproj.exceptions.CRSError, ValueError):
-        return check_projection(path, None)
 
 
 def _on_plane(

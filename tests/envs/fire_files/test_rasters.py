@@ -18,6 +18,7 @@ from scipy.ndimage import gaussian_filter
 
 from emberlink.envs.fire_files import rasters
 from emberlink.envs.fire_files.config import Clock, FileFireConfig
+from emberlink.envs.fire_files.plausibility import beginnings
 from emberlink.envs.fire_files.raster_source import RasterSource, Window
 from emberlink.envs.fire_files.reader import read_fires, with_checksum
 from emberlink.envs.utils.errors import UserError
@@ -482,7 +483,7 @@ def test_a_raster_without_arrival_times_gives_a_warning(tmp_path):
     times = raster_of(merging, 300.0)
     hours = np.where(times < 0, times, np.floor(times / 60))
     for values, units in ((times, "minutes"), (hours, "hours")):
-        assert source_of(values).beginnings == 2
+        assert beginnings(source_of(values).times) == 2
         with warnings.catch_warnings():
             warnings.simplefilter("error")
             read(write_asc(tmp_path / "fire.asc", values), (30, 30), units=units)
