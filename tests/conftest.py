@@ -4,10 +4,12 @@ The process that starts the others of pytest-xdist reads this file first, so wha
 is imported in the fixtures.
 """
 
+import importlib
 import io
 import os
 import random
 import shutil
+import warnings
 from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
@@ -32,6 +34,14 @@ def _cache(tmp_path_factory) -> Path:
     folder = tmp_path_factory.getbasetemp().parent / "cache"
     folder.mkdir(exist_ok=True)
     return folder
+
+
+@pytest.fixture(autouse=True, scope="session")
+def _torchrl_is_imported() -> None:
+    """Imports TorchRL's collectors: they warn at the import, which would be in some test."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        importlib.import_module("torchrl.collectors")
 
 
 @pytest.fixture(autouse=True)
