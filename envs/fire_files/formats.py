@@ -48,16 +48,29 @@ def _check_size(size: int) -> None:
 
 
 def _check_json(path: Path) -> None:
-    """Parses the whole file, because GDAL returns the features before a damage."""
+    """Parses the whole file, because GDAL returns the features before a damage.
+
+    A link to a projection is refused, because GDAL would fetch it from the network.
+    """
     _check_length(path)
+    links: list[str] = []
+
+    def look(values: dict[str, Any]) -> dict[str, Any]:
+        crs = values.get("crs")
+        if isinstance(crs, dict) and str(crs.get("type")).lower() in ("link", "url"):
+            links.append(str(crs.get("properties"))[:80])
+        return values
+
     try:
-        content = json.loads(path.read_bytes().decode("utf-8-sig"))
+        content = json.loads(path.read_bytes().decode("utf-8-sig"), object_hook=look)
     except RecursionError:
         raise UserError("too many levels; expected GeoJSON") from None
     except UnicodeDecodeError as error:
         raise UserError(f"byte {error.start} is not UTF-8; expected GeoJSON in UTF-8") from None
     except ValueError as error:
         raise UserError(f"{error}; expected GeoJSON") from None
+    if links:
+        raise UserError(f"its crs is a link: {links[0]}; expected one with a name, or none")
     if content.get("type") not in ("FeatureCollection", "Feature"):
         raise UserError(f"type {str(content.get('type'))[:40]!r}; expected a FeatureCollection")
 

@@ -1,5 +1,7 @@
 """Tests perimeters as published by agencies: KML, KMZ, a file per date, several incidents."""
 
+import json
+import socket
 import zipfile
 
 import geopandas
@@ -194,6 +196,23 @@ def test_the_files_of_a_folder_may_have_different_projections(tmp_path, frame):
     assert torch.allclose(read(folder), read(tmp_path / "all.gpkg"), atol=1)
     frame.iloc[1:].to_crs(UTM).set_crs(None, allow_override=True).to_file(folder / "b.geojson")
     assert "b.geojson: no projection, which a.gpkg has" in refused(folder)
+
+
+@pytest.mark.parametrize("place", ["collection", "geometry"])
+@pytest.mark.parametrize("kind", ["link", "Url"])
+def test_a_linked_projection_is_not_fetched(tmp_path, frame, place, kind, monkeypatch):
+    """The owner of a file would learn who reads it."""
+    monkeypatch.setenv("GDAL_HTTP_TIMEOUT", "1")  # so that a fetch would not block
+    content = json.loads(frame.to_json())
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        address = f"http://127.0.0.1:{server.getsockname()[1]}/crs"
+        place = content if place == "collection" else content["features"][0]["geometry"]
+        place["crs"] = {"type": kind, "properties": {"href": address, "url": address}}
+        (tmp_path / "fire.geojson").write_text(json.dumps(content))
+        assert "its crs is a link: {'href': 'http" in refused(tmp_path / "fire.geojson")
+        server.setblocking(False)
+        with pytest.raises(BlockingIOError):
+            server.accept()
 
 
 def test_an_error_in_a_folder_names_the_file(tmp_path, frame):
