@@ -9,10 +9,11 @@ from contextlib import contextmanager
 def one_line_warnings() -> Iterator[None]:
     """Prints each `UserWarning` as `emberlink: warning: ...`, until the end of the context.
 
-    Other categories are not meant for users and keep their place. Only the text that is printed
-    changes, so that warnings can still be recorded, ignored, or turned into errors.
+    The same text is printed once, also if several parts of the program warn of it. Other categories
+    are not meant for users and keep their place. Only what is printed changes: warnings can still
+    be recorded, ignored, or turned into errors.
     """
-    before = warnings.formatwarning
+    before, printed = warnings.formatwarning, set[str]()
 
     def formatted(
         message: Warning | str,
@@ -24,6 +25,9 @@ def one_line_warnings() -> Iterator[None]:
         if not issubclass(category, UserWarning):
             return before(message, category, filename, lineno, line)
         text = " ".join(str(message).split())
+        if text in printed:
+            return ""
+        printed.add(text)
         return f"emberlink: warning: {''.join(c if c.isprintable() else '?' for c in text)}\n"
 
     warnings.formatwarning = formatted

@@ -127,7 +127,8 @@ WARNS = """
 import warnings
 from emberlink.trainers.cli import list, main
 def names(_):
-    warnings.warn("fires are\\nnot \\x1b[31m cached", stacklevel=2)
+    for _ in range(2):
+        warnings.warn("fires are\\nnot \\x1b[31m cached", stacklevel=2)
     warnings.warn("of a library", RuntimeWarning, stacklevel=2)
     return []
 list._names = names
@@ -136,6 +137,7 @@ list._names = names
 
 def test_a_warning_is_one_line_without_a_path():
     program = WARNS + (
+        "warnings.simplefilter('always')\n"
         "before = warnings.formatwarning, warnings.showwarning\n"
         "main.main(['list', 'methods'])\n"
         "assert (warnings.formatwarning, warnings.showwarning) == before\n"
@@ -152,7 +154,7 @@ def test_a_warning_of_a_command_can_be_recorded(monkeypatch):
     monkeypatch.setattr("emberlink.trainers.cli.list._names", names["names"])
     with pytest.warns() as caught:
         assert main.main(["list", "methods"]) == 0
-    assert [warning.category for warning in caught] == [UserWarning, RuntimeWarning]
+    assert [warning.category for warning in caught] == [UserWarning, UserWarning, RuntimeWarning]
 
 
 @pytest.mark.slow
