@@ -21,7 +21,7 @@ class WildfireTeamEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
     """One agent that observes all UAVs, float32 [n * features], and moves all, float32 [n * 3].
 
     The reward is the mean over UAVs. An episode is terminated if all UAVs have failed. `info` holds
-    the numbers of cells seen and burning.
+    the numbers of cells `seen`, `burning` and `burnt`.
 
     Args:
         kwargs: as for `parallel_env`.
@@ -68,7 +68,7 @@ class WildfireTeamEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
 
 def _shared(infos: dict[str, dict[str, Any]]) -> dict[str, int]:
     first = next(iter(infos.values()))
-    return {key: first[key] for key in ("seen", "burning")}
+    return {key: first[key] for key in ("seen", "burning", "burnt")}
 
 
 gymnasium.register(id=ID, entry_point=f"{__name__}:WildfireTeamEnv")

@@ -66,8 +66,9 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
 
     All agents are truncated together at the horizon. One that fails (`env.failures`) is terminated
     and leaves `agents`. `infos` hold, for each agent, the other tensors under ("agents", ...) of
-    the TorchRL environment, and the numbers of cells seen and burning. With `observation: window`
-    an observation is a dictionary of "observation", float32 [6], and "window", uint8 [3, W, W].
+    the TorchRL environment, and the numbers of cells `seen`, `burning` and `burnt`. With
+    `observation: window` an observation is a dictionary of "observation", float32 [6], and
+    "window", uint8 [3, W, W].
 
     Args:
         env: see `parallel_env`.
@@ -239,7 +240,7 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
             for key in agents.keys()  # noqa: SIM118  (a TensorDict iterates over its rows)
             if key not in _NOT_INFO
         }
-        shared = {key: int(td.get(key)) for key in (keys.SEEN, keys.BURNING)}
+        shared = {key: int(td.get(key)) for key in (keys.SEEN, keys.BURNING, keys.BURNT)}
         return {
             agent: {key: value[i] for key, value in values.items()} | shared
             for i, agent in enumerate(self.possible_agents)

@@ -1,6 +1,8 @@
 """Defines what a `WildfireEnv` shows of itself: sizes, names, maps and pictures."""
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 from torchrl.envs import EnvBase
 
@@ -97,4 +99,11 @@ class TeamView(EnvBase):
             self.fire_map[env].cpu().numpy(),
             self._position[env].cpu().numpy(),
             view_angle=self.config.view_angle,
+            alive=self._alive_now(env),
+            base=self.config.base,
         )
+
+    def _alive_now(self, env: int) -> NDArray[np.bool_] | None:
+        """Returns which UAVs of an environment fly, bool [n]; None if none can fail."""
+        failed = self._fail_step
+        return None if failed is None else (self._time[env] < failed[env]).cpu().numpy()

@@ -1,6 +1,6 @@
 """Draws frames of an episode in the paper's colours (section IV.A) and writes animations."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -13,19 +13,27 @@ NO_FIRE = (0, 0, 0)
 FIRE = (255, 255, 255)
 FIELD_OF_VIEW = (255, 255, 0)
 UAV = (0, 0, 255)
+BURNT_OUT = (72, 72, 72)
+"""colour of a burnt-out cell that was seen while it burned"""
+MISSED = (150, 60, 0)
+"""colour of a burnt-out cell that was not seen while it burned"""
+FAILED = (150, 150, 150)
+BASE = (230, 0, 230)
 MAX_COLOURS = 256
 """colours in the palette of a GIF"""
 
 
 class Chart:
-    """Draws a map: no fire black, fire white, fields of view yellow.
+    """Draws a map: no fire black, fire white, burnt-out cells dark, fields of view yellow.
 
     Args:
-        fire_map: [X, Y], 0 no fire, 1 seen fire, 2 unseen fire.
+        fire_map: uint8 [X, Y], see `WildfireEnv.fire_map`.
         position: [n, 3], cells.
         view_angle: half the opening angle of the cameras, degrees.
         scale: pixels per cell.
         seen_fire: the colour of seen fire.
+        alive: bool [n], the UAVs that have not failed; the others see nothing. All if None.
+        base: x and y of the base station, cells; None without one.
     """
 
     def __init__(
@@ -36,15 +44,18 @@ class Chart:
         view_angle: float,
         scale: int,
         seen_fire: tuple[int, int, int] = FIRE,
+        alive: NDArray[np.bool_] | None = None,
+        base: Sequence[float] | None = None,
     ):
         self.scale = scale
         self._rows = fire_map.shape[1]
         self.image = Image.new("RGB", (fire_map.shape[0] * scale, self._rows * scale), NO_FIRE)
         self.draw = ImageDraw.Draw(self.image)
-        views = [self.square(x, y, view_radius(z, view_angle)) for x, y, z in position.tolist()]
+        flying = position if alive is None else position[alive]
+        views = [self.square(x, y, view_radius(z, view_angle)) for x, y, z in flying.tolist()]
         for box in views:
             self.draw.rectangle(box, fill=FIELD_OF_VIEW)
-        for value, colour in ((1, seen_fire), (2, FIRE)):
+        for value, colour in ((1, seen_fire), (2, FIRE), (3, BURNT_OUT), (4, MISSED)):
             cells = Image.fromarray(np.uint8(255) * (fire_map.T[::-1] == value))
             mask = cells.resize(self.image.size, Image.Resampling.NEAREST)
             self.image.paste(colour, mask=mask)
@@ -53,6 +64,9 @@ class Chart:
             # The black line keeps the edge visible over fire and over other views.
             self.draw.rectangle((left - 1, top - 1, right + 1, bottom + 1), outline=NO_FIRE)
             self.draw.rectangle((left, top, right, bottom), outline=FIELD_OF_VIEW, width=line)
+        if base is not None:
+            x, y = base
+            draw_base(self.draw, self.point(x, y), max(0.6 * scale, 6.0))
 
     def point(self, x: float, y: float) -> tuple[float, float]:
         """Returns the pixel of a point in cells; x grows to the right and y upwards."""
@@ -63,9 +77,33 @@ class Chart:
         (across, down), reach = self.point(x, y), max(half * self.scale, 0.5)
         return across - reach, down - reach, across + reach - 1, down + reach - 1
 
-    def uav(self, x: float, y: float) -> None:
-        """Draws a UAV as a blue disc."""
-        self.draw.ellipse(self.square(x, y, max(0.45, 4 / self.scale)), fill=UAV)
+    def uav(self, x: float, y: float, *, alive: bool = True) -> None:
+        """Draws a UAV as a blue disc, or as a grey cross if it has failed."""
+        half = max(0.45, 4 / self.scale)
+        if alive:
+            self.draw.ellipse(self.square(x, y, half), fill=UAV)
+        else:
+            draw_cross(self.draw, self.point(x, y), half * self.scale, FAILED)
+
+
+def draw_base(draw: ImageDraw.ImageDraw, place: tuple[float, float], half: float) -> None:
+    """Draws the base station as a magenta square with a white edge, 2 * half pixels wide."""
+    x, y = place
+    draw.rectangle((x - half, y - half, x + half, y + half), fill=BASE, outline=FIRE, width=2)
+
+
+def draw_cross(
+    draw: ImageDraw.ImageDraw,
+    place: tuple[float, float],
+    half: float,
+    colour: tuple[int, int, int],
+) -> None:
+    """Draws a diagonal cross with dark edges, 2 * half pixels wide."""
+    x, y = place
+    for width, fill in ((4, NO_FIRE), (2, colour)):
+        for turn in (1, -1):
+            ends = (x - half, y - turn * half), (x + half, y + turn * half)
+            draw.line(ends, fill=fill, width=width)
 
 
 def frame(
@@ -74,22 +112,25 @@ def frame(
     *,
     view_angle: float,
     size: int = 360,
+    alive: NDArray[np.bool_] | None = None,
+    base: Sequence[float] | None = None,
 ) -> NDArray[np.uint8]:
     """Returns one frame: no fire black, fire white, fields of view yellow, UAVs blue.
 
     Args:
-        fire_map: [X, Y], 0 no fire, 1 seen fire, 2 unseen fire.
+        fire_map: uint8 [X, Y], see `WildfireEnv.fire_map`.
         position: [n, 3], cells.
         view_angle: half the opening angle of the cameras, degrees.
         size: approximate pixels of the longer side of the grid.
+        alive, base: see `Chart`.
 
     Returns:
         uint8 [Y * scale, X * scale, 3]; x grows to the right and y upwards.
     """
     scale = max(2, size // max(fire_map.shape))
-    chart = Chart(fire_map, position, view_angle=view_angle, scale=scale)
-    for x, y, _ in position.tolist():
-        chart.uav(x, y)
+    chart = Chart(fire_map, position, view_angle=view_angle, scale=scale, alive=alive, base=base)
+    for index, (x, y, _) in enumerate(position.tolist()):
+        chart.uav(x, y, alive=alive is None or bool(alive[index]))
     return np.asarray(chart.image)
 
 

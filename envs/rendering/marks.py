@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import ImageDraw
 
-from emberlink.envs.rendering.frame import NO_FIRE, UAV, Chart
+from emberlink.envs.rendering.frame import FAILED, NO_FIRE, UAV, Chart, draw_cross
 
 LINK = (0, 200, 255)
 LINK_WIDTHS = {NO_FIRE: 4, LINK: 2}
@@ -33,11 +33,11 @@ class FrameData:
     step: int
     """steps since the episode began"""
     seen: int
-    """burning cells that a UAV has seen"""
-    burning: int
-    """cells that burn"""
+    """cells that a UAV has seen while they burned"""
+    burnt: int
+    """cells that burn or have burnt out"""
     fire_map: NDArray[np.uint8]
-    """[X, Y]: 0 no fire, 1 seen fire, 2 unseen fire"""
+    """[X, Y], see `WildfireEnv.fire_map`"""
     position: NDArray[np.float32]
     """[n, 3], cells"""
     links: NDArray[np.bool_] | None = None
@@ -46,11 +46,19 @@ class FrameData:
     """[n], indices into `ROLES`; None without roles"""
     target: NDArray[np.float32] | None = None
     """[n, 3], the target of each UAV, cells; None without targets"""
+    alive: NDArray[np.bool_] | None = None
+    """[n], the UAVs that have not failed; all of them if None"""
+    base: tuple[float, float] | None = None
+    """x and y of the base station, cells; None without one"""
 
     @property
     def coverage(self) -> float:
-        """Cells seen / cells burning, in %; 100 where nothing burns."""
-        return 100 * self.seen / self.burning if self.burning else 100.0
+        """Cells seen / cells burnt, in %; 100 where nothing has burnt."""
+        return 100 * self.seen / self.burnt if self.burnt else 100.0
+
+    def flies(self, uav: int) -> bool:
+        """Returns whether a UAV has not failed."""
+        return self.alive is None or bool(self.alive[uav])
 
 
 def draw_marks(chart: Chart, data: FrameData) -> None:
@@ -66,13 +74,17 @@ def draw_marks(chart: Chart, data: FrameData) -> None:
                 chart.draw.line((places[i], places[j]), fill=colour, width=width)
     if data.target is not None:
         for index, (x, y, _) in enumerate(data.target.tolist()):
+            if not data.flies(index):
+                continue
             role = None if data.roles is None else int(data.roles[index])
             end, colour = chart.point(x, y), TARGET if role is None else ROLE_COLOURS[role]
             if len(places) <= MANY:
                 dashes(chart.draw, places[index], end, colour)
-            cross(chart.draw, end, half * 0.6, colour)
+            draw_cross(chart.draw, end, half * 0.6, colour)
     for index, (x, y, _) in enumerate(data.position.tolist()):
-        if data.roles is None:
+        if not data.flies(index):
+            draw_cross(chart.draw, places[index], half, FAILED)
+        elif data.roles is None:
             chart.uav(x, y)
         else:
             uav(chart.draw, places[index], half, int(data.roles[index]))
@@ -97,20 +109,6 @@ def dashes(
         if dash % 2 == 0:
             points = (tuple(np.add(start, offset * (stop / length))) for stop in (near, far))
             draw.line(tuple(points), fill=colour)
-
-
-def cross(
-    draw: ImageDraw.ImageDraw,
-    place: tuple[float, float],
-    half: float,
-    colour: tuple[int, int, int],
-) -> None:
-    """Draws a target as a cross with dark edges."""
-    x, y = place
-    for width, fill in ((4, NO_FIRE), (2, colour)):
-        for turn in (1, -1):
-            ends = (x - half, y - turn * half), (x + half, y + turn * half)
-            draw.line(ends, fill=fill, width=width)
 
 
 def uav(

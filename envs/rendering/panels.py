@@ -10,7 +10,17 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from emberlink.envs.rendering import marks
-from emberlink.envs.rendering.frame import FIELD_OF_VIEW, FIRE, NO_FIRE, Chart
+from emberlink.envs.rendering.frame import (
+    BURNT_OUT,
+    FAILED,
+    FIELD_OF_VIEW,
+    FIRE,
+    MISSED,
+    NO_FIRE,
+    Chart,
+    draw_base,
+    draw_cross,
+)
 from emberlink.envs.rendering.marks import ROLE_COLOURS, ROLES, TARGET, FrameData
 
 SEEN_FIRE = (140, 140, 140)
@@ -90,6 +100,8 @@ class Screen:
                 view_angle=episode.view_angle,
                 scale=self.scale,
                 seen_fire=SEEN_FIRE if self._grey_seen else FIRE,
+                alive=data.alive,
+                base=data.base,
             )
             marks.draw_marks(chart, data)
             image.paste(chart.image, self.map_corner(panel))
@@ -142,6 +154,15 @@ class Screen:
             shown.append(("hear each other", _link))
         if any(target):
             shown.append(("target", _cross(ROLE_COLOURS[0] if any(roles) else TARGET)))
+        if any(occurs("base")):
+            shown.append(("base", _base))
+        frames = [frame for episode in self._episodes for frame in episode.frames]
+        if any(not frame.flies(uav) for frame in frames for uav in range(len(frame.position))):
+            shown.append(("failed", _failed))
+        burnt_out = (("burnt out, seen", BURNT_OUT, 3), ("burnt out, not seen", MISSED, 4))
+        for text, colour, value in burnt_out:
+            if any((frame.fire_map == value).any() for frame in frames):
+                shown.append((text, _box(colour)))
         return shown
 
 
@@ -191,6 +212,14 @@ def _link(draw: ImageDraw.ImageDraw, x: float, y: float) -> None:
 def _cross(colour: tuple[int, int, int]) -> Sample:
     def sample(draw: Any, x: float, y: float) -> None:
         marks.dashes(draw, (x - 8, y), (x + 5, y), colour)
-        marks.cross(draw, (x + 5, y), 4, colour)
+        draw_cross(draw, (x + 5, y), 4, colour)
 
     return sample
+
+
+def _base(draw: ImageDraw.ImageDraw, x: float, y: float) -> None:
+    draw_base(draw, (x, y), 6)
+
+
+def _failed(draw: ImageDraw.ImageDraw, x: float, y: float) -> None:
+    draw_cross(draw, (x, y), 6, FAILED)

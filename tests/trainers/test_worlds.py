@@ -61,6 +61,9 @@ def test_a_run_in_a_world_is_trained_resumed_and_evaluated(tmp_path, capsys):
     assert list(before["results"][fire]["learned"]) == list(metrics.ALL)
     assert main.main(["eval", str(run)]) == 0
     assert json.loads((run / "eval.json").read_text()) == before
+    picture = run / "one.png"
+    assert main.main(["render", str(run), "--policy", "courier", "--output", str(picture)]) == 0
+    assert picture.exists()
     assert main.main(["train", f"resume={run}", "episodes=3"]) == 0
     assert "base_coverage" in (run / "metrics.jsonl").read_text().splitlines()[-1]
 

@@ -42,11 +42,18 @@ def record_episode(
                 td = step_mdp(env.step(policy(td)), keep_other=True)
             if step in steps:
                 fire_map = world.fire_map[member]
-                frames.append(frame_data(td[member], fire_map, hears=hears))
+                base = world.config.base
+                frames.append(frame_data(td[member], fire_map, hears=hears, base=base))
     return frames
 
 
-def frame_data(td: TensorDictBase, fire_map: Tensor, *, hears: bool) -> FrameData:
+def frame_data(
+    td: TensorDictBase,
+    fire_map: Tensor,
+    *,
+    hears: bool,
+    base: tuple[float, float] | None = None,
+) -> FrameData:
     """Returns the data for drawing one environment at one step.
 
     Links, roles and targets are included if the communication module writes them.
@@ -55,6 +62,7 @@ def frame_data(td: TensorDictBase, fire_map: Tensor, *, hears: bool) -> FrameDat
         td: output of a reset or a step, batch size [].
         fire_map: uint8 [X, Y], see `WildfireEnv.fire_map`.
         hears: whether the policy reads an output of the communication module.
+        base: place of the base station, cells; None without one.
     """
     links = td.get(keys.HEARS, None) if hears else None
     follows = td.get(keys.FOLLOWS, None) if hears else None
@@ -62,12 +70,14 @@ def frame_data(td: TensorDictBase, fire_map: Tensor, *, hears: bool) -> FrameDat
     return FrameData(
         step=int(td.get(keys.STEP)),
         seen=int(td.get(keys.SEEN)),
-        burning=int(td.get(keys.BURNING)),
+        burnt=int(td.get(keys.BURNT)),
         fire_map=_array(fire_map),
         position=_array(td.get(keys.POSITION)),
         links=None if links is None else _array(links),
         roles=None if follows is None else _array(roles(follows)),
         target=None if target is None else _array(target),
+        alive=_array(td.get(keys.ALIVE)),
+        base=base,
     )
 
 

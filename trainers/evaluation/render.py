@@ -203,7 +203,7 @@ def _play(
     env = build_env(
         config,
         num_envs=BLOCK,
-        fire=arrival.expand(BLOCK, -1, -1),
+        fire=arrival.expand(BLOCK, *arrival.shape[1:]),
         seed=[START_SEED + index] * BLOCK,
         device=config.device,
     )

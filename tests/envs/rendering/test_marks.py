@@ -7,7 +7,7 @@ from tensordict import TensorDict
 
 from emberlink.envs import keys
 from emberlink.envs.rendering import marks, panels
-from emberlink.envs.rendering.frame import UAV
+from emberlink.envs.rendering.frame import BASE, BURNT_OUT, FAILED, FIELD_OF_VIEW, MISSED, UAV
 from emberlink.envs.rendering.marks import LINK, ROLE_COLOURS, ROLES, FrameData
 from emberlink.envs.rendering.panels import Episode, Screen
 from emberlink.policies.scripted.follow_target import FollowTarget
@@ -21,7 +21,7 @@ def frame(**changes) -> FrameData:
     values = {
         "step": 4,
         "seen": 3,
-        "burning": 8,
+        "burnt": 8,
         "fire_map": np.zeros((30, 20), np.uint8),
         "position": np.array(WHERE, np.float32),
     }
@@ -132,6 +132,46 @@ def test_the_legend_has_the_visible_marks_only():
     assert words(frame(), grey_seen=True)[:2] == ["fire", "fire, seen"]
 
 
+def test_the_legend_has_what_only_some_worlds_have():
+    burnt = np.zeros((30, 20), np.uint8)
+    burnt[4, 4], burnt[5, 5] = 3, 4
+    lost = frame(alive=np.array([True, False, True]), base=(0.0, 9.0), fire_map=burnt)
+    words = [word for word, _ in screen(frame(), lost)._legend()]
+    assert words[3:] == ["base", "failed", "burnt out, seen", "burnt out, not seen"]
+
+
+def test_burnt_out_cells_are_dark_and_missed_ones_differ():
+    burnt = np.zeros((30, 20), np.uint8)
+    burnt[25, 5], burnt[27, 5] = 3, 4
+    image = drawn(frame(fire_map=burnt))
+    assert around(image, 25, 5) == {BURNT_OUT}
+    assert around(image, 27, 5) == {MISSED}
+
+
+def test_a_failed_uav_is_a_grey_cross_without_a_view_or_a_target():
+    target = np.array([(2, 12, 1)] * 3, np.float32)
+    image = drawn(frame(alive=np.array([False, False, True]), target=target))
+    assert around(image, 12, 2) >= {FAILED}
+    assert not around(image, 12, 2, reach=9) & {UAV, FIELD_OF_VIEW}
+    assert UAV in around(image, 22, 12)
+    image = drawn(frame(alive=np.zeros(3, bool), target=target))
+    assert not all_of(image) & {UAV, FIELD_OF_VIEW, marks.TARGET}
+
+
+def test_the_base_is_drawn():
+    assert around(drawn(frame(base=(20, 5))), 20, 5) == {BASE}
+    assert BASE not in all_of(drawn(frame()))
+
+
+def test_the_environment_draws_failed_uavs_and_the_base():
+    env = make_env("consensus", "tuned", world="blackout", seed=1)
+    env.reset()
+    env.base_env._fail_step.fill_(0)
+    shown = all_of(env.base_env.render())
+    assert {BASE, FAILED} <= shown
+    assert not shown & {UAV, FIELD_OF_VIEW}
+
+
 def test_seen_fire_has_a_colour_only_on_request():
     fire = np.zeros((30, 20), np.uint8)
     fire[25, 5], fire[27, 5] = 1, 2
@@ -145,7 +185,7 @@ def test_panels_show_step_and_coverage():
     first, second = screen(frame()).picture(0), screen(frame(seen=4)).picture(0)
     assert not np.array_equal(first[:50], second[:50])
     assert frame().coverage == 37.5
-    assert frame(seen=0, burning=0).coverage == 100
+    assert frame(seen=0, burnt=0).coverage == 100
 
 
 @pytest.mark.parametrize("grid", [(8, 8), (30, 30), (60, 40), (8, 256), (256, 8), (256, 256)])
@@ -175,7 +215,8 @@ def tensordict(features: int, **agents) -> TensorDict:
         "position": torch.tensor(WHERE, dtype=torch.float32),
         **agents,
     }
-    counts = {name: torch.tensor(5) for name in (keys.STEP, keys.SEEN, keys.BURNING)}
+    counts = {name: torch.tensor(5) for name in (keys.STEP, keys.SEEN, keys.BURNT)}
+    entries = {keys.ALIVE[1]: torch.ones(3, dtype=torch.bool), **entries}
     return TensorDict({keys.AGENTS: TensorDict(entries, [3]), **counts}, [])
 
 
