@@ -21,7 +21,7 @@ COUNT = (keys.AGENTS, "count")
 class Counting(TensorDictModuleBase):
     """Writes the number of its decisions as the action."""
 
-    in_keys, out_keys = [keys.STEP], [keys.ACTION, COUNT]  # noqa: RUF012
+    in_keys, out_keys = [keys.STEP], [keys.ACTION, COUNT]
 
     def forward(self, tensordict):
         before = tensordict.get(COUNT, None)

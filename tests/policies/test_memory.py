@@ -37,7 +37,7 @@ def drawn(*shape: int, seed: int = 0) -> torch.Tensor:
 
 def test_memories_are_the_files_on_disk():
     assert memory.known() == ["gru", "none", "stack"]
-    with pytest.raises(UserError, match="policy.memory='lstm' is not known; known: gru, none"):
+    with pytest.raises(UserError, match=r"policy.memory='lstm' is not known; known: gru, none"):
         resolve("consensus", ["learner=ippo", "policy.memory=lstm"])
 
 
