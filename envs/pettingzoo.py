@@ -11,13 +11,8 @@ from numpy.typing import NDArray
 from pettingzoo import AECEnv, ParallelEnv
 from pettingzoo.utils.conversions import parallel_to_aec
 from tensordict import TensorDictBase
-from torchrl.envs import (
-    EnvBase,
-    ExplorationType,
-    TransformedEnv,
-    set_exploration_type,
-    step_mdp,
-)
+from torchrl.envs import EnvBase, TransformedEnv, step_mdp
+from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from emberlink.envs import keys
 from emberlink.envs.config import WildfireConfig

@@ -109,7 +109,7 @@ def test_an_episode_that_begins_again_forgets_the_one_before(case, trained):
 def test_runs_of_all_learners_are_rendered_and_compared(trained, tmp_path, capsys):
     runs = [trained(case) for case in ("ddpg", "td3", "ippo", "mappo")]
     output = tmp_path / "film.gif"
-    assert main.main(["render", *map(str, runs), "-o", str(output)]) == 0
+    assert main.main(["render", *map(str, runs), "--output", str(output)]) == 0
     assert output.stat().st_size > 1000
     comparison = compare(runs)
     (section,) = comparison.sections
@@ -120,7 +120,7 @@ def test_runs_of_all_learners_are_rendered_and_compared(trained, tmp_path, capsy
 def test_a_sweep_over_learners(tmp_path, capsys):
     settings = [*SMALL, "learner=ippo,mappo", "seed=0,1", "evaluation.episodes=1"]
     assert main.main(["sweep", "independent", *settings, f"output={tmp_path}"]) == 0
-    runs = [RunFolder(path) for path in tmp_path.iterdir() if path.is_dir()]
+    runs = [RunFolder(path.parent) for path in tmp_path.glob("*/config.yaml")]
     assert sorted((run.config().learner.name, run.config().seed) for run in runs) == [
         ("ippo", 0),
         ("ippo", 1),
