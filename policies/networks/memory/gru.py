@@ -36,11 +36,12 @@ class GRU(Memory):
     def forward(self, x: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
         x = self.input(x.flatten(1, 2)).unflatten(1, x.shape[1:3]).tanh()
         weights = self.input_weight, self.state_weight, self.input_bias, self.state_bias
+        train = torch.is_grad_enabled()  # cuDNN computes gradients in this mode alone
         outputs, states = [], []
         for sequence, before, *of_group in zip(x, state, *weights, strict=True):
             # [rows, decisions, units]: one layer, biases, no dropout, one direction
             output, after = torch.gru(
-                sequence, before[None], of_group, True, 1, 0.0, False, False, True
+                sequence, before[None], of_group, True, 1, 0.0, train, False, True
             )
             outputs.append(output)
             states.append(after[0])

@@ -113,7 +113,7 @@ def test_runs_of_all_learners_are_rendered_and_compared(trained, tmp_path, capsy
     assert output.stat().st_size > 1000
     comparison = compare(runs)
     (section,) = comparison.sections
-    assert len(section.groups) == 4
+    assert len(section.section.groups) == 4
     capsys.readouterr()
 
 
