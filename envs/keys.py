@@ -4,6 +4,7 @@ Tensors per UAV stand under "agents", with batch size [num_envs, num_uavs]; tens
 stand at the root, with batch size [num_envs].
 """
 
+from collections.abc import Sequence
 from typing import Final
 
 from torchrl.data import Composite
@@ -83,3 +84,9 @@ def observation_keys(spec: Composite) -> list[tuple[str, str]]:
     """
     present = spec.keys(True, True)
     return [key for key in (OBSERVATION, WINDOW) if key in present]
+
+
+def observation_shapes(spec: Composite) -> list[Sequence[int]]:
+    """Returns the shapes of those tensors, per UAV."""
+    batch = spec.ndim + 1
+    return [spec[key].shape[batch:] for key in observation_keys(spec)]

@@ -1,6 +1,7 @@
 """The environment for PettingZoo: a `ParallelEnv` over `WildfireEnv`."""
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any, ClassVar
 
 import numpy as np
@@ -11,6 +12,7 @@ from pettingzoo import AECEnv, ParallelEnv
 from pettingzoo.utils.conversions import parallel_to_aec
 from tensordict import TensorDictBase
 from torchrl.envs import EnvBase, TransformedEnv, step_mdp
+from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from emberlink.envs import keys
 from emberlink.envs.config import WildfireConfig
@@ -173,6 +175,23 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
             dict.fromkeys(flew, truncated),
             {agent: infos[agent] for agent in flew},
         )
+
+    def act(self, policy: Callable[[TensorDictBase], TensorDictBase]) -> dict[str, Array]:
+        """Returns the actions of a policy for `step`; what the policy remembers is kept.
+
+        Args:
+            policy: writes ("agents", "action"), such as `emberlink.trainers.load` returns.
+
+        Raises:
+            UserError: no episode is running.
+        """
+        if self._now is None or not self.agents:
+            raise UserError("no episode is running: call reset() before act()")
+        with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
+            self._now = policy(self._now)
+        actions = self._now.get(keys.ACTION)[0].cpu().numpy().copy()
+        chosen = dict(zip(self.possible_agents, actions, strict=True))
+        return {agent: chosen[agent] for agent in self.agents}
 
     def state(self) -> Array:
         """Returns the vectors of all UAVs one after another, float32 [n * features].

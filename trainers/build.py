@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
-from tensordict.nn import TensorDictModule
 from torch import Tensor
 from torchrl.envs import TransformedEnv
 
@@ -12,6 +11,7 @@ from emberlink.comm.base import Communication
 from emberlink.envs.scenarios import ScenarioConfig
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.wildfire import WildfireEnv
+from emberlink.policies.hold import hold
 from emberlink.policies.networks.layers import Generators
 from emberlink.trainers.config.compose import override, resolve
 from emberlink.trainers.config.schema import RunConfig, build_comm, check_device
@@ -78,13 +78,15 @@ def build_env(
     return TransformedEnv(world, Communication(build_comm(config, num_envs).to(world.device)))
 
 
-def build_actor(
-    config: RunConfig, env: TransformedEnv, generator: Generators = None
-) -> TensorDictModule:
-    """Returns new actors of a configuration's learner for an environment."""
+def build_actor(config: RunConfig, env: TransformedEnv, generator: Generators = None) -> Any:
+    """Returns new actors of a configuration's learner for an environment.
+
+    They are a TensorDict module with the networks in `module`.
+    """
     learner = registry.find(config.learner.name)
     specs = env.observation_spec, env.full_action_spec
-    return learner.make_actor(config.learner, *specs, generator)
+    actor = learner.make_actor(config.learner, *specs, generator, config.policy)
+    return hold(actor, config.policy.hold)
 
 
 def build_learner(config: RunConfig, env: TransformedEnv, guard: NonFiniteGuard) -> Learner:
@@ -102,7 +104,10 @@ def build_learner(config: RunConfig, env: TransformedEnv, guard: NonFiniteGuard)
         num_envs=config.num_envs,
         seeds=config.seeds or (config.seed,),
         shared_replay=config.replay == "shared",
-        total_steps=config.episodes * config.env.horizon,
+        total_steps=config.episodes * config.env.horizon // config.policy.hold,
+        policy=config.policy,
+        world=config.env,
+        horizon=config.env.horizon // config.policy.hold,
         guard=guard,
         device=config.device,
         failures=config.env.failures > 0,

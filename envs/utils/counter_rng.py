@@ -45,6 +45,7 @@ class Use(IntEnum):
     FIRE_PARAMETER = 0xF12E
     REPLAY_SAMPLE = 2**40
     TARGET_NOISE = 2**40 + 1
+    MINIBATCH = 2**40 + 2
 
 
 def _shift(x: Tensor, bits: int) -> Tensor:

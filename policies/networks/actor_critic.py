@@ -23,6 +23,7 @@ def make_actor(
     hidden: Sequence[int],
     *,
     share_parameters: bool = False,
+    agent_index: bool = False,
     generator: Generators = None,
 ) -> TensorDictModule:
     """Returns the actors of all UAVs, which map the observation to ("agents", "action").
@@ -31,6 +32,7 @@ def make_actor(
         observation_spec, action_spec: of the environment, batch size [num_envs].
         hidden: units of the hidden layers, 1 to 8 layers.
         share_parameters: whether all UAVs of a team use the same weights.
+        agent_index: whether the networks also read which of the UAVs they act for.
         generator: of the initial weights. Several generators create the same number of teams,
             which share no weights; see `Grouping`.
 
@@ -38,7 +40,7 @@ def make_actor(
         ValueError: the number of layers or the shape of an observation is not supported.
     """
     specs = observation_spec, action_spec
-    network = _build(StackedActor, *specs, hidden, share_parameters, generator)
+    network = _build(StackedActor, *specs, hidden, share_parameters, agent_index, generator)
     in_keys: list[Any] = keys.observation_keys(observation_spec)
     return TensorDictModule(network, in_keys=in_keys, out_keys=[keys.ACTION])
 
@@ -49,6 +51,7 @@ def make_critic(
     hidden: Sequence[int],
     *,
     share_parameters: bool = False,
+    agent_index: bool = False,
     generator: Generators = None,
 ) -> ValueOperator:
     """Returns the critics of all UAVs, which map observation and action to `STATE_ACTION_VALUE`.
@@ -56,7 +59,7 @@ def make_critic(
     Arguments and errors are those of `make_actor`.
     """
     specs = observation_spec, action_spec
-    network = _build(StackedCritic, *specs, hidden, share_parameters, generator)
+    network = _build(StackedCritic, *specs, hidden, share_parameters, agent_index, generator)
     in_keys: list[Any] = [*keys.observation_keys(observation_spec), keys.ACTION]
     return ValueOperator(network, in_keys=in_keys, out_keys=[STATE_ACTION_VALUE])
 
@@ -67,24 +70,25 @@ def _build(
     action: Composite,
     hidden: Sequence[int],
     share_parameters: bool,
+    agent_index: bool,
     generator: Generators,
 ) -> StackedActor | StackedCritic:
     """Returns a new network with the sizes of an environment's specs."""
     *batch, actions = action[keys.ACTION].shape
     device: Any = observation.device
-    shapes = [observation[key].shape[len(batch) :] for key in keys.observation_keys(observation)]
     return network(
         batch[-1],
-        shapes,
+        keys.observation_shapes(observation),
         actions,
         hidden,
         share_parameters=share_parameters,
+        agent_index=agent_index,
         device=device,
         generator=generator,
     )
 
 
-def team_of(network: TensorDictModule, team: int, teams: int) -> TensorDictModule:
+def team_of(network: Any, team: int, teams: int) -> Any:
     """Returns the networks of one of several teams; their weights share memory with `network`."""
     if teams == 1:
         return network

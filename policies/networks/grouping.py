@@ -55,3 +55,13 @@ class Grouping:
         if batch[-1] != self.uavs:
             x = x.transpose(0, 1)
         return x.reshape(*batch, x.shape[-1])
+
+    def with_index(self, x: Tensor) -> Tensor:
+        """Appends to the features of each UAV, [..., features], a 1 at its index and 0 elsewhere.
+
+        Args:
+            x: [..., uavs, features] or [..., teams * uavs, features].
+        """
+        index = torch.eye(self.uavs, dtype=x.dtype, device=x.device)
+        index = index.repeat(x.shape[-2] // self.uavs, 1)
+        return torch.cat((x, index.expand(*x.shape[:-1], -1)), -1)

@@ -6,6 +6,7 @@ The first dimension of every weight is the group: a UAV, or a team whose UAVs sh
 
 import math
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -42,6 +43,28 @@ def initial_weights(
     return nn.Parameter(torch.cat(teams).to(device))
 
 
+def orthogonal_weights(
+    groups: int,
+    *shape: int,
+    gain: float,
+    device: torch.device | str | None = None,
+    generator: Generators = None,
+) -> nn.Parameter:
+    """Draws weights [groups, *shape] that are orthogonal in each group (Saxe et al. 2014, ICLR).
+
+    Args:
+        groups, shape, device, generator: as for `initial_weights`.
+        gain: factor of the orthogonal matrix.
+    """
+    generators = team_generators(generator)
+    weights = [
+        nn.init.orthogonal_(torch.empty(shape, dtype=torch.float32), gain, generator=of_team)
+        for of_team in generators
+        for _ in range(groups // len(generators))
+    ]
+    return nn.Parameter(torch.stack(weights).to(device))
+
+
 class StackedLinear(nn.Module):
     """Applies a linear map per group.
 
@@ -50,6 +73,7 @@ class StackedLinear(nn.Module):
         inputs, outputs: number of features of the input and of the output.
         bound: weights and biases are initialised uniformly in [-bound, bound]; if None, 1 /
             sqrt(inputs), as in the DDPG paper (Lillicrap et al. 2016, section 7).
+        gain: if given, weights are orthogonal with this factor instead, and biases are 0.
         device: of the weights.
         generator: of the initial weights.
     """
@@ -61,10 +85,18 @@ class StackedLinear(nn.Module):
         outputs: int,
         *,
         bound: float | None = None,
+        gain: float | None = None,
         device: torch.device | str | None = None,
         generator: Generators = None,
     ):
         super().__init__()
+        if gain is not None:
+            more: Any = {"device": device, "generator": generator}
+            self.weight = orthogonal_weights(groups, inputs, outputs, gain=gain, **more)
+            self.bias = nn.Parameter(
+                torch.zeros(groups, 1, outputs, dtype=torch.float32, device=device)
+            )
+            return
         bound = 1 / math.sqrt(inputs) if bound is None else bound
         start = {"bound": bound, "device": device, "generator": generator}
         self.weight = initial_weights(groups, inputs, outputs, **start)

@@ -37,6 +37,7 @@ class _Network(nn.Module):
         actions: number of components of an action.
         hidden: units of the hidden layers, 1 to 8 layers. Each is followed by a LayerNorm.
         share_parameters: whether the UAVs of a team share their weights.
+        agent_index: whether the index of the UAV is an input, too.
         device: of the weights.
         generator: of the initial weights; several generators create the same number of teams.
 
@@ -53,6 +54,7 @@ class _Network(nn.Module):
         hidden: Sequence[int] = (400, 300),
         *,
         share_parameters: bool = False,
+        agent_index: bool = False,
         device: torch.device | str | None = None,
         generator: Generators = None,
     ):
@@ -61,7 +63,9 @@ class _Network(nn.Module):
             raise ValueError(f"hidden={list(hidden)}: 1 to {len(LAYER_NAMES)} layers are possible")
         self.grouping = Grouping(uavs, len(team_generators(generator)), shared=share_parameters)
         self.names, self.widest = LAYER_NAMES[: len(hidden)], max(hidden)
-        self._dims = len(observations[0])
+        self._dims, self._indexed = len(observations[0]), agent_index
+        if agent_index:
+            observations = [(observations[0][0] + uavs,), *observations[1:]]
         groups = self.grouping.groups
         start: dict[str, Any] = {"device": device, "generator": generator}
         self.encoder = ObservationEncoder(groups, observations, **start)
@@ -81,6 +85,8 @@ class _Network(nn.Module):
         return [getattr(self, name + kind) for name in self.names for kind in ("", "_norm")]
 
     def _encode(self, observations: Sequence[Tensor], batch: torch.Size) -> list[Tensor]:
+        if self._indexed:
+            observations = [self.grouping.with_index(observations[0]), *observations[1:]]
         tensors = [self.grouping.split(x, batch) for x in observations]
         return self._parts(self.encoder(tensors))
 

@@ -143,7 +143,7 @@ def test_the_team_as_one_agent_of_gymnasium():
     check_env(env.unwrapped, skip_render_check=True)
     first, info = env.reset(seed=3, options={"position": np.full((3, 3), 2.0)})
     assert first.reshape(3, 6)[:, :3].tolist() == [[2, 2, 2]] * 3
-    assert set(info) == {"seen", "burning"}
+    assert set(info) == {"seen", "burning", "burnt"}
     core = make(1, seed=3)
     core.reset(position=torch.full((3, 3), 2.0))
     for step in range(1, 11):

@@ -24,7 +24,9 @@ from emberlink.envs.scenarios import Scenario
 from emberlink.envs.utils.device import check_device as check_device
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import Name, unknown
+from emberlink.policies.networks import memory
 from emberlink.policies.scripted.registry import to_play
+from emberlink.policies.settings import PolicyConfig
 from emberlink.trainers.config import choice
 from emberlink.trainers.learners import registry as learners
 from emberlink.trainers.learners.base import LearnerConfig
@@ -115,6 +117,8 @@ class RunConfig:
     """training fires"""
     learner: LearnerChoice
     """settings of the learning algorithm"""
+    policy: PolicyConfig = PolicyConfig()
+    """what the policies remember, and how often they decide"""
     evaluation: EvaluationConfig
     """settings of the evaluations"""
     episodes: Count
@@ -161,6 +165,12 @@ class RunConfig:
     def _check_seeds(cls, value: tuple[int, ...]) -> tuple[int, ...]:
         if len(set(value)) < len(value):
             raise UserError(f"seeds={list(value)}: a seed is repeated")
+        return value
+
+    @field_validator("policy")
+    @classmethod
+    def _check_memory(cls, value: PolicyConfig) -> PolicyConfig:
+        memory.find(value.memory)
         return value
 
     @field_validator("comm")

@@ -3,19 +3,22 @@
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass as plain_dataclass
+from dataclasses import field
 from typing import Annotated, Any, ClassVar
 
 import torch
 from pydantic import ConfigDict, Field, Strict
 from pydantic.dataclasses import dataclass
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModule, TensorDictModuleBase
+from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.data import Composite
 
+from emberlink.envs.config import WildfireConfig
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import Name
 from emberlink.policies.networks import Generators, make_actor, team_of
+from emberlink.policies.settings import PolicyConfig
 from emberlink.trainers.learners.nan_guard import NonFiniteGuard
 
 STRICT = ConfigDict(extra="forbid", strict=True)
@@ -61,11 +64,17 @@ class LearnerContext:
     shared_replay: bool
     """whether UAVs of a team learn from each other's transitions"""
     total_steps: int
-    """steps of the batch of environments in the whole run"""
+    """decisions of the batch of environments in the whole run; steps if actions are not held"""
     guard: NonFiniteGuard
     """checks the batch, losses and gradients of each update"""
     device: str
     """device of networks and transitions"""
+    policy: PolicyConfig = field(default_factory=PolicyConfig)
+    """the policies' memory and inputs"""
+    world: WildfireConfig = field(default_factory=WildfireConfig)
+    """the world and the team"""
+    horizon: int = 1000
+    """decisions of an episode; steps if actions are not held"""
     failures: bool = False
     """whether UAVs can fail; nothing is learnt from one that is not `keys.ALIVE` after a step"""
 
@@ -83,14 +92,15 @@ class Learner(ABC):
     """
 
     config_type: ClassVar[type[LearnerConfig]]
-    actor: TensorDictModule
-    """the actors of all UAVs, without exploration noise"""
+    actor: Any
+    """the actors of all UAVs, without exploration noise, a TensorDict module with the networks in
+    `module`"""
     explorer: TensorDictModuleBase
     """the policy that collects transitions"""
     rollout_steps: int = 1
-    """steps of the batch of environments per call of `learn`; must divide the horizon"""
+    """decisions of the batch of environments per call of `learn`; must divide the horizon"""
     learning_starts: int = 0
-    """steps of the batch of environments before the first update"""
+    """decisions of the batch of environments before the first update"""
     updates: int = 0
     """updates made so far"""
 
@@ -104,17 +114,29 @@ class Learner(ABC):
         observation_spec: Composite,
         action_spec: Composite,
         generator: Generators = None,
-    ) -> TensorDictModule:
-        """Returns new actors for as many seeds as there are generators."""
+        policy: PolicyConfig | None = None,
+    ) -> Any:
+        """Returns new actors for as many seeds as there are generators.
+
+        Raises:
+            UserError: the policy has a memory, and the networks have none.
+        """
+        policy = policy or PolicyConfig()
+        if policy.memory != "none":
+            raise UserError(
+                f"policy.memory={policy.memory}: the networks of learner={config.name} have no "
+                "memory; those of ippo and mappo have"
+            )
         return make_actor(
             observation_spec,
             action_spec,
             config.hidden,
             share_parameters=config.share_parameters,
+            agent_index=policy.agent_index,
             generator=generator,
         )
 
-    def team_actor(self, team: int, teams: int) -> TensorDictModule:
+    def team_actor(self, team: int, teams: int) -> Any:
         """Returns the actors of one of several seeds without noise; they share memory with `actor`.
 
         A learner with networks that `make_actor` does not make overrides it to train several seeds
@@ -133,6 +155,9 @@ class Learner(ABC):
     @abstractmethod
     def learn(self, rollout: TensorDictBase) -> list[Losses]:
         """Learns from a rollout, batch size [seeds * num_envs, rollout_steps].
+
+        Where actions are held for several steps, a transition leads from one decision to the next
+        (`policies.hold.decisions`).
 
         Returns:
             The losses of each update; an empty list if there was no update.

@@ -25,12 +25,13 @@ class DDPG(OffPolicyLearner):
 
     def make_loss(self, context: LearnerContext, generators: list[torch.Generator]) -> DDPGLoss:
         specs = context.observation_spec, context.action_spec
-        self.actor = self.make_actor(self.config, *specs, generators)
+        self.actor = self.make_actor(self.config, *specs, generators, context.policy)
         critic = make_critic(
             *specs,
             self.config.hidden,
             generator=generators,
             share_parameters=self.config.share_parameters,
+            agent_index=context.policy.agent_index,
         )
         return DDPGLoss(self.actor, critic, delay_actor=True, delay_value=True, reduction="none")
 

@@ -48,13 +48,14 @@ class TD3(OffPolicyLearner):
 
     def make_loss(self, context: LearnerContext, generators: list[torch.Generator]) -> TD3Loss:
         specs, config = (context.observation_spec, context.action_spec), self.config
-        self.actor = self.make_actor(config, *specs, generators)
+        self.actor = self.make_actor(config, *specs, generators, context.policy)
         critics: list[TensorDictModule] = [
             make_critic(
                 *specs,
                 config.hidden,
                 generator=generators,
                 share_parameters=config.share_parameters,
+                agent_index=context.policy.agent_index,
             )
             for _ in range(_CRITICS)
         ]

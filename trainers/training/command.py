@@ -123,7 +123,9 @@ def _is_finished(trainer: Trainer) -> bool:
 
 
 def _learns(trainer: Trainer) -> bool:
-    return trainer.setup.learner.learning_starts <= trainer.setup.total_steps
+    setup = trainer.setup
+    starts = setup.learner.learning_starts * trainer.config.policy.hold
+    return starts <= setup.total_steps
 
 
 def _train(trainer: Trainer, console: Console) -> None:

@@ -3,13 +3,14 @@
 from collections.abc import Mapping
 from dataclasses import replace
 from itertools import islice
+from typing import Any
 
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModule
 from torch import Tensor
 
 from emberlink.envs import keys
 from emberlink.envs.utils.errors import UserError
+from emberlink.policies.hold import decisions, hold
 from emberlink.trainers.build import build_env, build_learner
 from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.learners.nan_guard import NonFiniteGuard
@@ -30,7 +31,7 @@ class TrainingSetup:
         config: configuration of the run.
 
     Raises:
-        UserError: the horizon is not a multiple of the learner's `rollout_steps`.
+        UserError: the horizon is not a multiple of the steps of a rollout.
     """
 
     def __init__(self, config: RunConfig):
@@ -51,17 +52,19 @@ class TrainingSetup:
         self.guard = NonFiniteGuard(config.device)
         self.learner = build_learner(config, self.env, self.guard)
         self.team_actor(0)  # fails before the training, not at its first evaluation
-        if self.horizon % self.learner.rollout_steps:
+        self.rollout_steps = self.learner.rollout_steps * config.policy.hold
+        """steps of the batch of environments in a rollout"""
+        if self.horizon % self.rollout_steps:
             raise UserError(
-                f"env.horizon={self.horizon}: must be a multiple of the "
-                f"{self.learner.rollout_steps} steps that the learner takes at once"
+                f"env.horizon={self.horizon}: must be a multiple of the {self.rollout_steps} steps "
+                f"that the learner takes at once (policy.hold={config.policy.hold})"
             )
         self.collector = make_collector(
             self.env,
-            self.learner.explorer,
+            hold(self.learner.explorer, config.policy.hold),
             horizon=self.horizon,
             total_steps=self.total_steps,
-            rollout_steps=self.learner.rollout_steps,
+            rollout_steps=self.rollout_steps,
         )
         self.record = EpisodeRecord(self.teams)
         observed = keys.observation_keys(self.env.observation_spec)
@@ -78,20 +81,21 @@ class TrainingSetup:
         steps = rollout.shape[1]
         self.step += steps
         self.guard.record_rollout(rollout.select(*self._checked), steps)
-        self.record.add(rollout, self.learner.learn(rollout))
+        transitions = decisions(rollout, self.config.policy.hold)
+        self.record.add(rollout, self.learner.learn(transitions))
 
     def dry_run(self, steps: int) -> None:
         """Collects and learns for some steps without writing files."""
-        for rollout in islice(self.collector, -(-steps // self.learner.rollout_steps)):
+        for rollout in islice(self.collector, -(-steps // self.rollout_steps)):
             self.learn(rollout)
 
     def seed_config(self, team: int) -> RunConfig:
         """Returns the configuration of one of the seeds."""
         return replace(self.config, seed=self.seeds[team])
 
-    def team_actor(self, team: int) -> TensorDictModule:
-        """Returns the actors of one seed without noise; they share memory with the learner."""
-        return self.learner.team_actor(team, self.teams)
+    def team_actor(self, team: int) -> Any:
+        """Returns the actors of one seed without noise; they share weights with the learner."""
+        return hold(self.learner.team_actor(team, self.teams), self.config.policy.hold)
 
     def state_dict(self) -> dict[str, Tensor]:
         """Returns the state of the training, "group/name" -> tensor.

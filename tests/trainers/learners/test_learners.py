@@ -21,42 +21,50 @@ from emberlink.trainers.config.compose import (
 from emberlink.trainers.learners import registry
 from emberlink.trainers.learners.base import Learner
 from emberlink.trainers.learners.ddpg import DDPG
+from emberlink.trainers.learners.ippo import IPPO
+from emberlink.trainers.learners.mappo import MAPPO
 from emberlink.trainers.learners.td3 import TD3
 from emberlink.trainers.training.setup import TrainingSetup
 from emberlink.trainers.training.trainer import Trainer
 
 SMALL = [
-    *("env.horizon=15", "env.num_uavs=3", "num_envs=2", "episodes=2", "learner.batch_size=8"),
+    *("env.horizon=15", "env.num_uavs=3", "num_envs=2", "episodes=2"),
     *("learner.hidden=[8,8]", "evaluation.interval=0", "evaluation.episodes=1"),
 ]
-LEARNERS = ["ddpg", "td3"]
+LEARNERS = {
+    "ddpg": ["learner=ddpg", "learner.batch_size=8"],
+    "ippo": ["learner=ippo", "policy.memory=gru"],
+    "mappo": ["learner=mappo", "policy.memory=gru"],
+    "td3": ["learner=td3", "learner.batch_size=8"],
+}
 
 
 def made(learner: str, *more: str, method: str = "consensus") -> TrainingSetup:
-    return TrainingSetup(resolve(method, [f"learner={learner}", *SMALL, *more]))
+    return TrainingSetup(resolve(method, [*LEARNERS[learner], *SMALL, *more]))
 
 
 @pytest.mark.parametrize("learner", LEARNERS)
 @pytest.mark.parametrize("hidden", [[8], [8, 6, 4]])
 def test_networks_may_have_one_hidden_layer_or_several(learner, hidden):
     setup = made(learner, f"learner.hidden={hidden}")
-    setup.dry_run(steps=10)
+    setup.dry_run(steps=15)
     assert setup.learner.updates > 0
     assert not setup.guard.poll(wait=True)
 
 
 def test_learners_are_the_files_on_disk():
-    assert registry.known() == LEARNERS
-    assert [registry.find(name) for name in LEARNERS] == [DDPG, TD3]
-    with pytest.raises(UserError, match=r"'sac' is not known; known: ddpg, td3"):
+    assert registry.known() == list(LEARNERS)
+    assert [registry.find(name) for name in LEARNERS] == [DDPG, IPPO, MAPPO, TD3]
+    with pytest.raises(UserError, match=r"'sac' is not known; known: ddpg, ippo, mappo, td3"):
         registry.find("sac")
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("learner", ["td3", "ippo", "mappo"])
 @pytest.mark.parametrize("method", METHODS)
-def test_a_short_run_of_td3_learns_and_evaluates(method, tmp_path, capsys):
+def test_a_short_run_learns_and_evaluates(method, learner, tmp_path, capsys):
     """The same for ddpg is in test_recipes and test_cli."""
-    arguments = ["train", method, "learner=td3", *SMALL, f"output={tmp_path}"]
+    arguments = ["train", method, *LEARNERS[learner], *SMALL, f"output={tmp_path}"]
     assert main.main(arguments) == 0
     (run,) = tmp_path.iterdir()
     lines = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
@@ -72,13 +80,14 @@ def test_a_short_run_of_td3_learns_and_evaluates(method, tmp_path, capsys):
 @pytest.mark.parametrize("learner", LEARNERS)
 @pytest.mark.parametrize("more", [[], ["env.observation=window"], ["seeds=[1,2]"]])
 def test_all_uavs_of_a_seed_share_their_weights(learner, more, tmp_path):
-    settings = [f"learner={learner}", *SMALL, "learner.share_parameters=true", *more]
+    settings = [*LEARNERS[learner], *SMALL, "learner.share_parameters=true", *more]
     config = resolve("consensus", [*settings, f"output={tmp_path}"])
     trainer = Trainer(config)
     initial = {name: w.clone() for name, w in trainer.setup.learner.weights().items()}
     trainer.start()
     assert trainer.train()
-    name = "actor_network_params.module.second.weight"
+    layer = "hidden.1" if learner in ("ippo", "mappo") else "second"
+    name = f"actor_network_params.module.{layer}.weight"
     weights = trainer.setup.learner.weights()
     assert weights[name].shape[0] == 1
     assert not weights[name].equal(initial[name])
@@ -100,8 +109,8 @@ def test_a_configuration_keeps_its_learner(learner):
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({"hidden": [8, 8]}, "learner.name is missing; known: ddpg, td3"),
-        ({"name": "sac"}, "learner.name='sac' is not known; known: ddpg, td3"),
+        ({"hidden": [8, 8]}, "learner.name is missing; known: ddpg, ippo"),
+        ({"name": "sac"}, "learner.name='sac' is not known; known: ddpg, ippo"),
         ({"policy_delay": 3}, "learner.policy_delay is not a setting of ddpg"),
         ({"gamma": 2.0}, "learner.gamma=2.0: should be less than 1"),
     ],
@@ -118,7 +127,7 @@ def test_another_package_can_add_a_learner(monkeypatch):
     group = "emberlink.learners"
     point = EntryPoint("mine", "emberlink.trainers.learners.td3:TD3", group)
     monkeypatch.setattr(plugins, "registered", lambda of: {"mine": point} if of == group else {})
-    assert registry.known() == ["ddpg", "mine", "td3"]
+    assert registry.known() == ["ddpg", "ippo", "mappo", "mine", "td3"]
     assert registry.find("mine") is TD3
 
 

@@ -21,6 +21,7 @@ from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.learners.ddpg import DDPG
 from emberlink.trainers.learners.nan_guard import NonFiniteGuard, row_norms
 from emberlink.trainers.learners.off_policy import OffPolicyLearner
+from emberlink.trainers.learners.on_policy import OnPolicyLearner
 from emberlink.trainers.learners.td3 import TD3
 from emberlink.trainers.runs import checkpoint_file
 from emberlink.trainers.runs.run_folder import RunFolder
@@ -462,3 +463,37 @@ def test_gradient_norms_are_per_uav():
     tensors = [torch.randn(3, 4, 5, generator=generator), torch.randn(3, 1, 7, generator=generator)]
     wanted = [[math.sqrt(sum(x * x for x in uav.flatten().tolist())) for uav in t] for t in tensors]
     torch.testing.assert_close(torch.stack(row_norms(tensors)), torch.tensor(wanted))
+
+
+@pytest.mark.parametrize(("learner", "weight"), [("ippo", "output"), ("mappo", "network.output")])
+def test_learners_from_whole_episodes_stop_and_name_the_value(
+    learner, weight, tmp_path, monkeypatch
+):
+    """The third of the eight updates after the second episode has a gradient that is NaN."""
+    original, bad = OnPolicyLearner.losses, [11]
+
+    def poisoned(learner, batch):
+        losses = original(learner, batch)
+        if learner.updates in bad:
+            values = learner.parameters[f"critic.{weight}.weight"]
+            losses["critic"] = losses["critic"] + (0 * values).sum().sqrt()
+        return losses
+
+    monkeypatch.setattr(OnPolicyLearner, "losses", poisoned)
+    settings = [text for text in SMALL if "batch_size" not in text]
+    memory = [f"learner={learner}", "policy.memory=gru", "policy.hold=2"]
+    trainer = Trainer(resolve("consensus", [*settings, *memory, f"output={tmp_path}"]))
+    trainer.start()
+    error = diverged(trainer)
+    wanted = {"tensor": f"gradient of critic.{weight}.weight", "uav": None, "seed": 0}
+    wanted |= {"environment": None, "step": 40, "update": 11, "value": "nan"}
+    check_report(error.report, wanted)
+    assert error.dump is not None
+    assert replay(error.dump) == error.report
+    bad.clear()
+    assert replay(error.dump) is None
+    for value in trainer.setup.learner.weights().values():
+        assert value.isfinite().all()
+    again = resume(trainer.run.path)
+    assert again.setup.step == 30
+    again.close()

@@ -23,8 +23,7 @@ from emberlink.trainers.training.trainer import Progress, Trainer
 HORIZON, EPISODES = 20, 4
 SMALL = [
     *(f"env.horizon={HORIZON}", f"episodes={EPISODES}", "env.num_uavs=2", "num_envs=2"),
-    # A replay buffer of 60 rows is full after 30 of the 80 steps.
-    *("learner.hidden=[8,8]", "learner.batch_size=16", "learner.buffer_size=60"),
+    *("learner.hidden=[8,8]",),
     *("evaluation.interval=0", "evaluation.interval_episodes=1", "evaluation.episodes=1"),
 ]
 
@@ -34,8 +33,14 @@ def replay(trainer: Trainer) -> ReplayMemory:
     return learner.replay
 
 
+# A replay buffer of 60 rows is full after 30 of the 80 steps.
+REPLAY = ["learner.batch_size=16", "learner.buffer_size=60"]
+ON_POLICY = ["policy.memory=gru", "policy.units=6"]
+
+
 def begun(method: str, output: Path, *more: str) -> Trainer:
-    trainer = Trainer(resolve(method, [*SMALL, f"output={output}", *more]))
+    own = ON_POLICY if {"learner=ippo", "learner=mappo"} & {*more} else REPLAY
+    trainer = Trainer(resolve(method, [*SMALL, *own, f"output={output}", *more]))
     trainer.start()
     return trainer
 
@@ -113,7 +118,7 @@ def whole(tmp_path_factory):
 @pytest.mark.slow
 # Before the first update; within, at and after the end of an episode; before the last step. At
 # step 33 of 80 the replay buffer has just wrapped around.
-@pytest.mark.parametrize("learner", ["ddpg", "td3"])
+@pytest.mark.parametrize("learner", ["ddpg", "td3", "ippo", "mappo"])
 @pytest.mark.parametrize(
     ("method", "steps"),
     [*zip(METHODS, [[1, 33], [40], [41, 42, 79], [33, 40, 79]], strict=True)],
@@ -124,12 +129,23 @@ def test_a_resumed_run_equals_the_uninterrupted_run(method, steps, learner, whol
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("method", "learner"), [("consensus", "ddpg"), ("positional", "td3")])
+@pytest.mark.parametrize(
+    ("method", "learner"), [("consensus", "ddpg"), ("positional", "td3"), ("independent", "ippo")]
+)
 def test_seeds_side_by_side_are_resumed_together(method, learner, whole, tmp_path):
     more = "seeds=[0,1,2]", f"learner={learner}"
     stopped = stopped_at([27, 60], method, tmp_path, *more)
     assert len(stopped.runs) == 3
     assert_same(whole(method, *more), stopped)
+
+
+@pytest.mark.parametrize(
+    ("learner", "memory"), [("ippo", "gru"), ("mappo", "stack"), ("ddpg", "none")]
+)
+def test_held_actions_and_memories_are_resumed(learner, memory, whole, tmp_path):
+    """The run stops within an episode, and at its end."""
+    held = f"learner={learner}", f"policy.memory={memory}", "policy.hold=2", "env.failures=1"
+    assert_same(whole("consensus", *held), stopped_at([10, 26, 40], "consensus", tmp_path, *held))
 
 
 @pytest.mark.slow

@@ -1,0 +1,181 @@
+"""Networks with a memory, which map sequences of observations."""
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from emberlink.policies.networks.encoders import ObservationEncoder
+from emberlink.policies.networks.grouping import Grouping
+from emberlink.policies.networks.layers import Generators, StackedLinear, team_generators
+from emberlink.policies.networks.memory.registry import find
+from emberlink.policies.settings import PolicyConfig
+
+FIRST_LOG_STD = -0.5
+"""initial logarithm of the standard deviation of the actions"""
+
+
+class SequenceNetwork(nn.Module):
+    """An encoder, a memory, hidden layers with a tanh each, and a linear map.
+
+    Weights are orthogonal at the beginning, those of the last map are scaled by `gain`.
+
+    Args:
+        uavs: number of UAVs in a team.
+        observations: shape of each tensor of an observation, per UAV: [features] or
+            [channels, W, W].
+        outputs: number of outputs per UAV.
+        hidden: units of the hidden layers.
+        policy: the memory, and whether the index of a UAV is an input.
+        gain: factor of the weights of the last map.
+        share_parameters: whether the UAVs of a team share their weights.
+        device: of the weights.
+        generator: of the initial weights; several generators create the same number of teams.
+    """
+
+    def __init__(
+        self,
+        uavs: int,
+        observations: Sequence[Sequence[int]],
+        outputs: int,
+        hidden: Sequence[int],
+        *,
+        policy: PolicyConfig,
+        gain: float,
+        share_parameters: bool = True,
+        device: torch.device | str | None = None,
+        generator: Generators = None,
+    ):
+        super().__init__()
+        self.grouping = Grouping(uavs, len(team_generators(generator)), shared=share_parameters)
+        self.agent_index = policy.agent_index
+        first, *others = observations
+        shapes = [(first[0] + uavs * policy.agent_index,), *others]
+        groups, start = self.grouping.groups, {"device": device, "generator": generator}
+        self.encoder = ObservationEncoder(groups, shapes, **start)
+        self.memory = find(policy.memory)(groups, self.encoder.features, policy, **start)
+        inputs, self.hidden = self.memory.features, nn.ModuleList()
+        for units in hidden:
+            self.hidden.append(StackedLinear(groups, inputs, units, gain=math.sqrt(2), **start))
+            inputs = units
+        self.output = StackedLinear(groups, inputs, outputs, gain=gain, **start)
+
+    def forward(self, *observations: Tensor) -> Any:
+        """Maps whole episodes, [envs, decisions, uavs, ...], to [envs, decisions, uavs, outputs].
+
+        The memory is empty before the first decision.
+        """
+        envs, decisions, uavs = observations[0].shape[:3]
+        batch = torch.Size((envs, uavs))
+        arranged = [
+            self.grouping.split(x.transpose(1, 2), batch) for x in self._indexed(observations)
+        ]
+        output, _ = self._run(arranged, self._empty(arranged[0]))
+        joined = self.grouping.join(output.flatten(2), batch)
+        return joined.unflatten(-1, (decisions, -1)).transpose(1, 2)
+
+    def step(self, observations: Sequence[Tensor], state: Tensor | None) -> tuple[Tensor, Tensor]:
+        """Maps the observations of one decision.
+
+        Args:
+            observations: [*batch, uavs, ...] each.
+            state: [*batch, uavs, size], from the decision before; None for an empty memory.
+
+        Returns:
+            Outputs, [*batch, uavs, outputs], and the new state, [*batch, uavs, size].
+        """
+        batch = observations[0].shape[:-1]
+        split = self.grouping.split
+        arranged = [split(x, batch).unsqueeze(2) for x in self._indexed(observations)]
+        before = self._empty(arranged[0]) if state is None else split(state, batch)
+        output, after = self._run(arranged, before)
+        return self.grouping.join(output.squeeze(2), batch), self.grouping.join(after, batch)
+
+    def _run(self, tensors: Sequence[Tensor], state: Tensor) -> tuple[Tensor, Tensor]:
+        """Maps tensors [groups, rows, decisions, ...] and returns the state after the last."""
+        rows, decisions = tensors[0].shape[1:3]
+        encoded = self.encoder([x.flatten(1, 2) for x in tensors])
+        x, state = self.memory(encoded.unflatten(1, (rows, decisions)), state)
+        x = x.flatten(1, 2)
+        for layer in self.hidden:
+            x = layer(x).tanh()
+        return self.output(x).unflatten(1, (rows, decisions)), state
+
+    def _empty(self, x: Tensor) -> Tensor:
+        return x.new_zeros(*x.shape[:2], self.memory.size)
+
+    def _indexed(self, observations: Sequence[Tensor]) -> Sequence[Tensor]:
+        if not self.agent_index:
+            return observations
+        first, *others = observations
+        return [self.grouping.with_index(first), *others]
+
+
+class GaussianNetwork(SequenceNetwork):
+    """Maps observations to the means of actions; their standard deviations are weights.
+
+    Arguments are those of `SequenceNetwork`.
+    """
+
+    def __init__(self, *args: Any, device: torch.device | str | None = None, **more: Any):
+        super().__init__(*args, gain=0.01, device=device, **more)
+        actions = self.output.bias.shape[-1]
+        shape = self.grouping.groups, 1, actions
+        self.log_std = nn.Parameter(
+            torch.full(shape, FIRST_LOG_STD, dtype=torch.float32, device=device)
+        )
+
+    def forward(self, *observations: Tensor) -> tuple[Tensor, Tensor]:
+        """Returns means and standard deviations of whole episodes, see `SequenceNetwork`."""
+        mean = super().forward(*observations)
+        batch = torch.Size((mean.shape[0], mean.shape[2]))
+        return mean, self.std(batch).unsqueeze(1).expand_as(mean)
+
+    def std(self, batch: torch.Size) -> Tensor:
+        """Returns the standard deviations of a batch [*batch, uavs], [*batch, uavs, actions]."""
+        rows = math.prod(batch) // self.grouping.groups
+        return self.grouping.join(self.log_std.exp().expand(-1, rows, -1), batch)
+
+
+class TeamNetwork(nn.Module):
+    """Maps what all UAVs of a team observe to an output for each of them.
+
+    Args:
+        uavs: number of UAVs in a team.
+        observations: shape of each tensor of an observation, per UAV.
+        low, high: corners of the box, cells.
+        more: `hidden`, `policy`, `gain`, `device` and `generator` of `SequenceNetwork`.
+    """
+
+    middle: Tensor
+    half_width: Tensor
+
+    def __init__(
+        self,
+        uavs: int,
+        observations: Sequence[Sequence[int]],
+        low: Sequence[float],
+        high: Sequence[float],
+        **more: Any,
+    ):
+        super().__init__()
+        first, *windows = observations
+        shapes = [(uavs * (first[0] + 3),), *((uavs * n, *sides) for n, *sides in windows)]
+        self.network = SequenceNetwork(1, shapes, uavs, **more)
+        corners = torch.tensor([low, high], dtype=torch.float32, device=more.get("device"))
+        self.register_buffer("middle", corners.mean(0), persistent=False)
+        self.register_buffer("half_width", (corners[1] - corners[0]) / 2 + 1e-6, persistent=False)
+
+    def forward(self, position: Tensor, *observations: Tensor) -> Tensor:
+        """Maps positions and observations, [envs, decisions, uavs, ...], to outputs [..., uavs, 1].
+
+        Args:
+            position: float32 [envs, decisions, uavs, 3], cells.
+            observations: the tensors of the observation.
+        """
+        first, *windows = observations
+        vectors = torch.cat((first, (position - self.middle) / self.half_width), -1)
+        team = [vectors.flatten(2), *(x.flatten(2, 3) for x in windows)]
+        return self.network(*(x.unsqueeze(2) for x in team)).transpose(2, 3)

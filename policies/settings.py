@@ -1,0 +1,22 @@
+"""The settings of the policies that hold for all learners."""
+
+from typing import Annotated
+
+from pydantic import ConfigDict, Field
+from pydantic.dataclasses import dataclass
+
+
+@dataclass(frozen=True, kw_only=True, config=ConfigDict(extra="forbid", strict=True))
+class PolicyConfig:
+    """What a policy remembers, and how often it decides."""
+
+    memory: Annotated[str, Field(min_length=1)] = "none"
+    """name of a file in policies/networks/memory: none, gru or stack"""
+    units: Annotated[int, Field(ge=1, le=8192)] = 64
+    """units of the memory `gru`"""
+    decisions: Annotated[int, Field(ge=2, le=1000)] = 8
+    """decisions whose observations the memory `stack` holds, the current one included"""
+    hold: Annotated[int, Field(ge=1, le=1_000_000)] = 1
+    """steps for which an action is held; divides the horizon"""
+    agent_index: bool = False
+    """whether the networks also read which of the UAVs they act for"""

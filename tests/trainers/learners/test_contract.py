@@ -1,0 +1,147 @@
+"""Tests that every learner goes through every command, with memories and held actions."""
+
+import json
+from functools import cache
+from pathlib import Path
+
+import pytest
+import torch
+from torchrl.envs import ExplorationType, set_exploration_type, step_mdp
+
+from emberlink.envs import keys, parallel_env
+from emberlink.policies.gaussian import MEMORY
+from emberlink.trainers import compare, load, make_env
+from emberlink.trainers.cli import main
+from emberlink.trainers.evaluation.evaluate import play
+from emberlink.trainers.evaluation.record_episode import record_episode
+from emberlink.trainers.runs.run_folder import RunFolder
+
+HORIZON = 20
+SMALL = [
+    *("setup=tuned", f"env.horizon={HORIZON}", "env.num_uavs=3", "num_envs=4", "episodes=2"),
+    *("learner.hidden=[8,8]", "evaluation.interval=1", "evaluation.interval_episodes=2"),
+    *("evaluation.episodes=2", "evaluation.scripted=[lawnmower]"),
+]
+CASES = {
+    "ddpg": ["learner=ddpg", "policy.hold=5", "learner.batch_size=8"],
+    "td3": ["learner=td3", "policy.agent_index=true", "learner.batch_size=8"],
+    "ippo": ["learner=ippo", "policy.memory=gru", "policy.hold=5"],
+    "mappo": ["learner=mappo", "policy.memory=stack", "policy.agent_index=true"],
+    "ippo-own": ["learner=ippo", "policy.memory=gru", "learner.share_parameters=false"],
+}
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """Returns a function that gives the run folder of a case, trained by the command."""
+
+    @cache
+    def of(case: str) -> Path:
+        folder = tmp_path_factory.mktemp(case)
+        assert main.main(["train", "consensus", *SMALL, *CASES[case], f"output={folder}"]) == 0
+        (run,) = folder.iterdir()
+        return run
+
+    return of
+
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_a_run_trains_and_its_evaluation_can_be_repeated(case, trained, capsys):
+    run = trained(case)
+    lines = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
+    assert len(lines) == 2
+    for line in lines:
+        assert line.keys() >= {"loss_actor", "loss_critic", "coverage", "huygens/coverage"}
+    before = json.loads((run / "eval.json").read_text())["results"]
+    assert main.main(["eval", str(run)]) == 0
+    assert json.loads((run / "eval.json").read_text())["results"] == before
+    capsys.readouterr()
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_a_loaded_policy_needs_no_further_code(case, trained):
+    """TorchRL's rollout, PettingZoo and the evaluation give the same episode."""
+    policy = load(trained(case))
+
+    def env():
+        return make_env(policy.config, num_envs=1, seed=7)
+
+    with set_exploration_type(ExplorationType.DETERMINISTIC), torch.no_grad():
+        rollout = env().rollout(HORIZON, policy)
+    flight = rollout["next", *keys.POSITION][0]
+    assert flight.shape == (HORIZON, 3, 3)
+    measured = play(env(), policy)
+    assert measured["coverage"].isfinite().all()
+    world = env()
+    frames = record_episode(world, policy, world.transform.module, steps=[HORIZON])
+    assert frames[0].position.tolist() == flight[-1].tolist()
+    pettingzoo = parallel_env(env())
+    pettingzoo.reset()
+    for step in range(HORIZON):
+        *_, infos = pettingzoo.step(pettingzoo.act(policy))
+        for uav in range(3):
+            assert infos[f"uav_{uav}"]["position"].tolist() == flight[step, uav].tolist()
+    assert not pettingzoo.agents
+
+
+@pytest.mark.parametrize("case", ["ippo", "mappo"])
+def test_an_episode_that_begins_again_forgets_the_one_before(case, trained):
+    """Environment 0 begins again after 7 steps; environment 1 goes on."""
+    policy = load(trained(case))
+    env = make_env(policy.config, num_envs=2, seed=7)
+    with torch.no_grad():
+        td = env.reset()
+        for _ in range(7):
+            td = step_mdp(env.step(policy(td)))
+        before = td.clone()
+        td = env.reset(td.set("_reset", torch.tensor([[True], [False]])))
+        fresh = policy(td.exclude(MEMORY, ("agents", "held")).clone())
+        acted, unchanged = policy(td.clone()), policy(before)
+    for key in (keys.ACTION, MEMORY):
+        assert acted[key][0].equal(fresh[key][0])
+        assert acted[key][1].equal(unchanged[key][1])
+    assert acted[MEMORY].any()
+
+
+def test_runs_of_all_learners_are_rendered_and_compared(trained, tmp_path, capsys):
+    runs = [trained(case) for case in ("ddpg", "td3", "ippo", "mappo")]
+    output = tmp_path / "film.gif"
+    assert main.main(["render", *map(str, runs), "--output", str(output)]) == 0
+    assert output.stat().st_size > 1000
+    comparison = compare(runs)
+    (section,) = comparison.sections
+    assert len(section.section.groups) == 4
+    capsys.readouterr()
+
+
+def test_a_sweep_over_learners(tmp_path, capsys):
+    settings = [*SMALL, "learner=ippo,mappo", "seed=0,1", "evaluation.episodes=1"]
+    assert main.main(["sweep", "independent", *settings, f"output={tmp_path}"]) == 0
+    runs = [RunFolder(path.parent) for path in tmp_path.glob("*/config.yaml")]
+    assert sorted((run.config().learner.name, run.config().seed) for run in runs) == [
+        ("ippo", 0),
+        ("ippo", 1),
+        ("mappo", 0),
+        ("mappo", 1),
+    ]
+    assert all(run.evaluated() for run in runs)
+    capsys.readouterr()
+
+
+@pytest.mark.parametrize("case", ["ippo", "mappo", "ippo-own"])
+def test_seeds_side_by_side_learn_the_same_as_alone(case, tmp_path):
+    settings = ["train", "independent", *SMALL, *CASES[case], "evaluation.interval=0"]
+    assert main.main([*settings, "seeds=[3,11]", f"output={tmp_path / 'both'}"]) == 0
+    both = sorted((tmp_path / "both").iterdir(), key=lambda run: RunFolder(run).config().seed)
+    for seed, run in zip((3, 11), both, strict=True):
+        assert main.main([*settings, f"seed={seed}", f"output={tmp_path / str(seed)}"]) == 0
+        (alone,) = (tmp_path / str(seed)).iterdir()
+        lines = zip(RunFolder(run).lines(), RunFolder(alone).lines(), strict=True)
+        for line, single in lines:
+            assert line == pytest.approx(single, rel=1e-3, abs=1e-3)
+        together, own = load(run).module[0], load(alone).module[0]
+        for stacked, single in zip(together.parameters(), own.parameters(), strict=True):
+            torch.testing.assert_close(stacked, single, rtol=1e-3, atol=1e-4)

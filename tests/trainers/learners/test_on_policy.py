@@ -1,0 +1,220 @@
+"""Tests the learners from whole episodes: IPPO and MAPPO."""
+
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from emberlink.envs import keys
+from emberlink.envs.utils.errors import UserError
+from emberlink.policies.gaussian import LOG_PROB
+from emberlink.trainers.config.compose import resolve
+from emberlink.trainers.learners.advantages import Advantages
+from emberlink.trainers.learners.proximal import ADVANTAGE, RETURN, clip_by_row, mean_of_uavs
+from emberlink.trainers.training.setup import TrainingSetup
+
+LEARNERS = ["ippo", "mappo"]
+SMALL = [
+    *("env.horizon=12", "env.num_uavs=3", "num_envs=4", "episodes=4", "learner.hidden=[8]"),
+    *("policy.memory=gru", "policy.units=6", "policy.hold=2"),
+]
+
+
+def made(learner: str, *more: str, method: str = "consensus") -> TrainingSetup:
+    return TrainingSetup(resolve(method, ["setup=tuned", f"learner={learner}", *SMALL, *more]))
+
+
+def column(*values: float) -> Tensor:
+    """Returns one environment and one UAV, float32 [1, decisions, 1, 1]."""
+    return torch.tensor(values)[None, :, None, None]
+
+
+def test_advantages_of_two_decisions_that_the_horizon_truncates():
+    """With a discount of 0.5 and lambda 0.5; the last observation has the value 8."""
+    estimator = Advantages(0.5, 0.5, (1, 1), "cpu")
+    alive = torch.tensor([[[True], [True]]])
+    advantage, returns = estimator.estimate(column(2, 4, 8), column(1, 3), alive)
+    # Temporal differences: 1 + 0.5 * 4 - 2 = 1, and 3 + 0.5 * 8 - 4 = 3.
+    # Advantages: 1 + 0.25 * 3 = 1.75, and 3. Returns: 3.75 and 7, whose deviation is 1.625.
+    assert estimator.spread.item() == pytest.approx(1.625)
+    assert returns.flatten().tolist() == pytest.approx([3.75 / 1.625, 7 / 1.625])
+    assert advantage.flatten().tolist() == pytest.approx([-1, 1])
+
+
+def test_values_are_in_units_of_the_earlier_spread():
+    estimator = Advantages(0.5, 0.5, (1, 1), "cpu")
+    estimator.spread.fill_(2.0)
+    _, returns = estimator.estimate(column(1, 2, 4), column(1, 3), None)
+    spread = 0.9 * 2 + 0.1 * 1.625
+    assert estimator.spread.item() == pytest.approx(spread)
+    assert returns.flatten().tolist() == pytest.approx([3.75 / spread, 7 / spread])
+
+
+def test_a_failure_ends_what_is_learnt_before_it():
+    """The UAV fails in the third decision; its rewards and values there have no effect."""
+    alive = torch.tensor([[[True], [True], [False], [False]]])
+    estimates = []
+    for after in (0.0, 100.0):
+        estimator = Advantages(0.5, 0.5, (1, 1), "cpu")
+        value, reward = column(2, 4, 8, after, after), column(1, 3, after, after)
+        estimates.append([x[:, :2] for x in estimator.estimate(value, reward, alive)])
+        assert estimator.spread.item() == pytest.approx(1.625)
+    for first, second in zip(*estimates, strict=True):
+        assert first.equal(second)
+    assert estimates[0][0].flatten().tolist() == pytest.approx([-1, 1])
+
+
+@pytest.mark.parametrize("networks", [1, 2])
+def test_every_network_of_every_seed_has_its_own_scale(networks):
+    estimator = Advantages(0.9, 0.8, (2, networks), "cpu")
+    generator = torch.Generator().manual_seed(0)
+    value, reward = (torch.randn(6, n, 2, 1, generator=generator) for n in (5, 4))
+    reward[3:] *= 10
+    advantage, returns = estimator.estimate(value, reward, None)
+    assert estimator.spread.shape == (2, networks)
+    for seed in range(2):
+        envs = slice(3 * seed, 3 * seed + 3)
+        for network in range(networks):
+            uavs = slice(None) if networks == 1 else slice(network, network + 1)
+            alone = Advantages(0.9, 0.8, (1, 1), "cpu")
+            expected = alone.estimate(value[envs][:, :, uavs], reward[envs][:, :, uavs], None)
+            assert estimator.spread[seed, network].item() == pytest.approx(alone.spread.item())
+            torch.testing.assert_close(advantage[envs][:, :, uavs], expected[0])
+            torch.testing.assert_close(returns[envs][:, :, uavs], expected[1])
+
+
+def test_losses_are_means_over_the_decisions_in_flight():
+    loss = torch.tensor([[[1.0, 2.0], [3.0, 4.0]], [[5.0, 6.0], [7.0, 8.0]]])
+    assert mean_of_uavs(loss, None, 1).tolist() == [4, 5]
+    assert mean_of_uavs(loss, None, 2).tolist() == [2, 3, 6, 7]
+    alive = torch.tensor([[[True, False], [True, False]], [[False, False], [True, True]]])
+    assert mean_of_uavs(loss, alive, 1).tolist() == pytest.approx([11 / 3, 8])
+
+
+def test_gradients_are_shortened_per_row():
+    first, second = torch.tensor([[3.0, 0.0], [0.3, 0.0]]), torch.tensor([[4.0], [0.4]])
+    clip_by_row([first, second], 1.0)
+    torch.testing.assert_close(first, torch.tensor([[0.6, 0.0], [0.3, 0.0]]))
+    torch.testing.assert_close(second, torch.tensor([[0.8], [0.4]]))
+
+
+def first_batches(setup: TrainingSetup) -> list[Any]:
+    """Returns the batches of the first iteration and makes no update."""
+    learner: Any = setup.learner
+    batches: list[Any] = []
+    learner.update = lambda batch: batches.append(batch) or {}
+    setup.dry_run(12)
+    return batches
+
+
+@pytest.mark.parametrize("learner", LEARNERS)
+def test_the_first_update_knows_the_density_of_the_actions(learner):
+    """Ratios are 1 before the first update, so the sequence pass equals the steps."""
+    setup = made(learner, "env.horizon=12")
+    batch = first_batches(setup)[0]
+    loss: Any = setup.learner
+    log_prob = loss.loss._get_cur_log_prob(batch.copy().auto_batch_size_(2))[0]
+    torch.testing.assert_close(log_prob, batch[LOG_PROB], rtol=1e-4, atol=1e-4)
+    actor_loss = setup.learner.losses(batch)["actor"]
+    expected = -batch[ADVANTAGE][..., 0].mean((0, 1))
+    torch.testing.assert_close(actor_loss, expected, rtol=1e-3, atol=1e-4)
+
+
+def test_a_pass_uses_every_episode_once_in_an_order_of_the_seed():
+    settings = ["num_envs=6", "learner.minibatches=4", "learner.epochs=2"]
+    both = first_batches(made("ippo", *settings, "seeds=[3,4]"))
+    torch.manual_seed(1)
+    alone = first_batches(made("ippo", *settings, "seed=4"))
+    assert [len(batch) for batch in both] == [4, 4, 2, 2] * 2
+    assert [len(batch) for batch in alone] == [2, 2, 1, 1] * 2
+    for batch, single in zip(both, alone, strict=True):
+        for key in (keys.ACTION, RETURN):
+            torch.testing.assert_close(batch[key][len(single) :], single[key])
+    returns = [torch.cat([x[RETURN] for x in alone[k : k + 4]]) for k in (0, 4)]
+    orders = [r.flatten(1).sum(1) for r in returns]
+    assert orders[0].sort().values.equal(orders[1].sort().values)
+
+
+@pytest.mark.parametrize("learner", LEARNERS)
+def test_the_learning_rate_falls_to_zero_and_can_be_scaled(learner):
+    setup = made(learner, "learner.lr=0.5")
+    (entry,) = setup.learner.optimizer.param_groups  # pyright: ignore[reportAttributeAccessIssue]
+    rates = []
+    for episode in range(4):
+        setup.learner.scale_lr(0.5 if episode == 2 else 1.0)
+        setup.dry_run(12)
+        rates.append(entry["lr"])
+    assert rates == pytest.approx([0.5, 0.375, 0.125, 0.125])
+
+
+@pytest.mark.parametrize("learner", LEARNERS)
+@pytest.mark.parametrize("share", ["true", "false"])
+def test_actions_of_failed_uavs_have_no_effect(learner, share):
+    """The batch of an iteration is changed where UAVs have failed."""
+    more = "env.failures=3", f"learner.share_parameters={share}", "learner.entropy=0.01"
+    setup = made(learner, *more)
+    batch = first_batches(setup)[0]
+    dead = ~batch[keys.ALIVE]
+    assert 0 < dead.float().mean() < 1
+    changed = batch.clone()
+    changed[keys.ACTION][dead] += 1
+    changed[RETURN][dead] -= 5
+    changed[ADVANTAGE][dead] += 5
+    own, other = setup.learner.losses(batch), setup.learner.losses(changed)
+    assert own.keys() == {"actor", "critic", "entropy"}
+    for name, value in own.items():
+        assert value.equal(other[name]), name
+
+
+def test_uavs_without_shared_weights_learn_alone():
+    setup = made("ippo", "learner.share_parameters=false")
+    batch = first_batches(setup)[0]
+    learner: Any = setup.learner
+    learner.losses(batch)["actor"][1].backward()
+    gradient = learner.parameters["actor.memory.state_weight"].grad
+    assert gradient[1].any()
+    assert not gradient[[0, 2]].any()
+
+
+@pytest.mark.parametrize("learner", LEARNERS)
+def test_a_run_without_memory_or_with_a_stack_learns_too(learner):
+    for kind in ("none", "stack"):
+        setup = made(learner, f"policy.memory={kind}", "env.observation=window")
+        before = {name: value.clone() for name, value in setup.learner.weights().items()}
+        setup.dry_run(12)
+        assert setup.learner.updates == 16
+        assert not setup.guard.poll(wait=True)
+        for name, value in setup.learner.weights().items():
+            assert not value.equal(before[name]), name
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        (["learner=ddpg", "policy.memory=gru"], "policy.memory=gru: the networks of learner=ddpg"),
+        (["learner=td3", "policy.memory=stack"], "policy.memory=stack: the networks of"),
+        (["learner=ippo", "env.horizon=15", "policy.hold=10"], "env.horizon=15: must be a"),
+    ],
+)
+def test_what_does_not_fit_is_refused(settings, message):
+    with pytest.raises(UserError) as error:
+        TrainingSetup(resolve("independent", settings))
+    assert str(error.value).startswith(message)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("setting", "message"),
+    [
+        ("learner.clip=1.5", "learner.clip=1.5: should be less than 1"),
+        ("learner.gae_lambda=2.0", "learner.gae_lambda=2.0: should be"),
+        ("policy.hold=0", "policy.hold=0: should be"),
+        ("policy.hould=2", "policy.hould"),
+        ("learner.tau=0.1", "learner.tau"),
+    ],
+)
+def test_settings_out_of_range(setting, message):
+    with pytest.raises(UserError) as error:
+        resolve("independent", ["learner=ippo", setting])
+    assert message in str(error.value)
