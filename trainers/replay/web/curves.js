@@ -90,8 +90,8 @@ export class Curves {
       cursor: { sync: { key: "steps" }, drag: { x: false, y: false }, y: false, points: { show: false } },
       legend: { live: true },
       axes: [axis, { ...axis, size: 58 }],
-      series: [{ label: "step" }, ...[...hidden, ...shown].map(({ values: _, ...line }) => ({
-        ...line,
+      series: [{ label: "step" }, ...[...hidden, ...shown].map(({ label, stroke, dash, width, alpha }) => ({
+        label, stroke, dash, width, alpha,
         points: { show: false },
         value: (_chart, number) => (number === null ? "\u2013" : fixed(number, digits)),
       }))],

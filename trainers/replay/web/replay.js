@@ -136,12 +136,13 @@ class Player {
 
   /** Chooses the UAV that was clicked on a map. */
   choose(map, event) {
-    const near = Array.from({ length: map.panel.uavs }, (_, uav) => {
+    const far = Array.from({ length: map.panel.uavs }, (_, uav) => {
       const [right, down] = map.radio(uav);
-      return [Math.hypot(right - event.offsetX, down - event.offsetY), uav];
-    }).sort((one, other) => one[0] - other[0])[0];
-    if (near[0] > 20) return;
-    find("uav").value = near[1];
+      return Math.hypot(right - event.offsetX, down - event.offsetY);
+    });
+    const nearest = Math.min(...far);
+    if (nearest > 20) return;
+    find("uav").value = far.indexOf(nearest);
     find("uav").dispatchEvent(new Event("change"));
   }
 
@@ -151,14 +152,16 @@ class Player {
     find("play").setAttribute("aria-label", on ? "Pause" : "Play");
     document.body.dataset.playing = on;
     if (!on) return this.settle();
-    let [before, due] = [performance.now(), 0];
+    let [before, due] = [null, 0];
+    const run = Symbol("run");
+    this.run = run;
     const tick = (now) => {
-      if (!this.playing) return;
-      due += ((now - before) / 1000) * Number(find("speed").value);
+      if (!this.playing || this.run !== run) return;
+      due += ((now - (before ?? now)) / 1000) * Number(find("speed").value);
       before = now;
-      const whole = Math.floor(due);
-      due -= whole;
-      if (whole) this.go(Math.min(this.data.horizon, this.step + Math.min(whole, 100)));
+      const whole = Math.min(100, Math.floor(due)); // after a long wait it does not jump far
+      due -= Math.floor(due);
+      if (whole > 0) this.go(Math.min(this.data.horizon, this.step + whole));
       if (this.step === this.data.horizon) this.play(false);
       else requestAnimationFrame(tick);
     };
