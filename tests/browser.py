@@ -10,8 +10,8 @@ import pytest
 NAMES = ("chromium", "chromium-browser", "google-chrome")
 QUIET = ("--no-sandbox", "--disable-gpu", "--no-first-run", "--disable-background-networking")
 MISSING = (
-    "no browser: the tests of replays need Chromium (Debian: apt-get install chromium), or the path "
-    "of one in EMBERLINK_BROWSER"
+    "no browser: the tests of replays need Chromium (Debian: apt-get install chromium), or its "
+    "path in EMBERLINK_BROWSER"
 )
 
 

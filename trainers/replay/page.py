@@ -9,7 +9,6 @@ from importlib.resources import files
 from pathlib import Path
 
 from jinja2 import Environment, StrictUndefined
-from markupsafe import Markup
 
 from emberlink.trainers.replay.pack import Shown, pack
 
@@ -50,11 +49,11 @@ def _page(shown: Sequence[Shown], fire: str) -> str:
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True)
     return environment.from_string(_read("web", "page.html")).render(
         fire=fire,
-        style=Markup(_read("web", "page.css")),
-        uplot_style=Markup(_read("uplot", "uPlot.min.css")),
-        uplot=Markup(_read("uplot", "uPlot.iife.min.js")),
+        style=_read("web", "page.css"),
+        uplot_style=_read("uplot", "uPlot.min.css"),
+        uplot=_read("uplot", "uPlot.iife.min.js"),
         uplot_licence=_read("uplot", "LICENSE"),
-        script=Markup(script()),
+        script=script(),
         data=base64.b64encode(pack(shown, fire)).decode(),
     )
 

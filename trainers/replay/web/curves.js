@@ -21,7 +21,7 @@ const MEASURES = [
 export function panelStyle(palette, place) {
   return {
     stroke: palette.named(PANEL_COLOURS[place % PANEL_COLOURS.length]),
-    dash: DASHES[place % DASHES.length],
+    dash: DASHES[(place + Math.floor(place / PANEL_COLOURS.length)) % DASHES.length],
   };
 }
 
