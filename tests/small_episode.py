@@ -18,7 +18,7 @@ STEPS = 40
 LIMITED = (
     *("setup=tuned", "env.num_uavs=3", f"env.horizon={STEPS}", f"env.grid=[{SIDES[0]},{SIDES[1]}]"),
     *("env.altitude=[1.0,3.5]", "env.measures=all", "env.base=[3.0,4.0]", "env.failures=1.5"),
-    *("env.radio.range=5", "env.radio.loss=0.4"),
+    *("env.radio.range=5", "env.radio.loss=0.4", "env.displacement=1.0"),
 )
 """a base, a radio that loses messages, UAVs that fail"""
 
@@ -41,7 +41,7 @@ class Episode:
     burn_out: Any = None
 
 
-def play_small(*overrides: str, seed: int = 3, member: int = 1, burn_time: float = 12.0) -> Episode:
+def play_small(*overrides: str, seed: int = 5, member: int = 1, burn_time: float = 12.0) -> Episode:
     """Plays an episode of consensus in two environments and records one of them."""
     config = resolve("consensus", [*LIMITED, *overrides])
     draw = torch.Generator().manual_seed(seed)
@@ -55,9 +55,11 @@ def play_small(*overrides: str, seed: int = 3, member: int = 1, burn_time: float
     recorder = Recorder(member=member)
     episode = Episode(config, None, arrival=arrival[member], burn_out=arrival[member] + burn_time)
     td = returned = env.reset()
+    action = torch.zeros(2, config.env.num_uavs, 3)
     for step in range(config.env.horizon + 1):
         if step:
-            action = torch.rand(2, config.env.num_uavs, 3, generator=draw) * 2 - 1
+            if step % 7 == 1:  # UAVs meet and part
+                action = torch.rand(2, config.env.num_uavs, 3, generator=draw) * 2 - 1
             td = env.step(td.set(keys.ACTION, action))
             returned, td = td["next"], step_mdp(td, keep_other=True)
         recorder.add(world, returned)
