@@ -16,7 +16,7 @@ UNFINISHED := $(VENV)/emberlink-unfinished
 PIP := $(BIN)/python -m pip install -q --disable-pip-version-check -c constraints.txt
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-slow soak bench guard lint typecheck install clean
+.PHONY: help demo test test-slow soak bench guard lint typecheck install browser clean
 
 help:  ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## /  make \1\t/p' $(MAKEFILE_LIST) | expand -t 20
@@ -28,8 +28,16 @@ demo: $(INSTALLED)  ## train consensus for a few minutes and evaluate it, with f
 test: $(INSTALLED)  ## run the tests, without the slow ones (about 5 minutes)
 	@OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n $(WORKERS) --dist loadfile -m "not slow"
 
-test-slow: $(INSTALLED)  ## run the slow tests (about 5 minutes)
+test-slow: $(INSTALLED) browser  ## run the slow tests (about 5 minutes)
 	@OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n $(WORKERS) --dist loadfile -m slow
+
+# Replays are tested in Chromium, which Debian's package installs.
+browser:  ## install Chromium for test-slow if it is missing (on Debian and as root only)
+	@for name in "$$EMBERLINK_BROWSER" chromium chromium-browser google-chrome; do \
+		if [ -n "$$name" ] && command -v "$$name" >/dev/null; then exit 0; fi; done; \
+	if [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null; then echo "installing chromium" >&2; apt-get update -qq && \
+		DEBIAN_FRONTEND=noninteractive apt-get install -qq -y --no-install-recommends chromium >/dev/null; \
+	else echo "there is no Chromium: the tests of replays will fail" >&2; fi
 
 soak: $(INSTALLED)  ## kill, interrupt and damage trainings repeatedly (about half an hour)
 	@OMP_NUM_THREADS=1 $(BIN)/python tests/soak/soak.py $(SOAK)
@@ -46,6 +54,7 @@ lint: $(INSTALLED)  ## check style, layout and the direction of imports
 	@$(BIN)/ruff check .
 	@$(BIN)/ruff format --check .
 	@PYTHONPATH=.typing $(BIN)/lint-imports
+	@$(BIN)/oxlint trainers/replay/web
 
 typecheck: $(INSTALLED)  ## check the types
 	@$(BIN)/basedpyright --pythonpath $(BIN)/python

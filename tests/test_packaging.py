@@ -119,8 +119,8 @@ def test_wheel_holds_the_package_and_nothing_else(wheel: Path):
         if path.is_file()
         and path.relative_to(ROOT).parts[0] in FOLDERS
         and (
-            path.suffix in (".py", ".yaml", ".html")
-            or path.name == "py.typed"
+            path.suffix in (".py", ".yaml", ".html", ".js", ".css")
+            or path.name in ("py.typed", "LICENSE")
             or "pretrained" in path.parts
         )
     }

@@ -16,14 +16,23 @@ def add_render(commands: Any) -> None:
         commands,
         "render",
         _render,
-        "an episode as GIF and MP4; several runs side by side",
+        "an episode as GIF and MP4, or as a page to play; several runs side by side",
         "Plays the frozen policies of one or more runs on the same held-out fire from the same "
         "start positions, and draws fire, UAVs, their roles and the links of their network. Writes "
-        "a GIF and an MP4 to the first run's figures. No existing file is replaced.",
-        "emberlink render runs/2026-01-31_12-00-00_consensus_tuned_paper_s0 --policy oracle",
+        "a GIF and an MP4 to the first run's figures, or with --output FILE.html one page that "
+        "plays the episodes in a browser. A text KEY=VALUE changes a setting of the run before it. "
+        "No existing file is replaced.",
+        "emberlink render pretrained:consensus pretrained:consensus env.radio.range=0 "
+        "--output replay.html",
     )
     add = rendering.add_argument
-    add("runs", metavar="RUN", nargs="+", help="a run folder")
+    add(
+        "runs",
+        metavar="RUN",
+        nargs="+",
+        help="a run folder, or pretrained:METHOD; after it KEY=VALUE, such as env.radio.range=0, "
+        "for other settings of env and comm",
+    )
     add(
         "--policy",
         metavar="NAME",
@@ -49,7 +58,8 @@ def add_render(commands: Any) -> None:
         "--output",
         metavar="PATH",
         type=Path,
-        help="a folder, or a new file that ends in .gif, .mp4 or .png (one picture)",
+        help="a folder, or a new file that ends in .html (a page to play), .gif, .mp4 or .png (one "
+        "picture)",
     )
     add("--step", metavar="STEP", type=_step, help="step of a .png (default: the last)")
     add("--frames", type=positive, default=126, help="maximum number of frames (default: 126)")

@@ -11,7 +11,7 @@ from torch import Tensor
 from torchrl.envs import TransformedEnv, set_exploration_type, step_mdp
 from torchrl.envs.utils import ExplorationType
 
-from emberlink.envs import metrics
+from emberlink.envs import keys, metrics
 from emberlink.envs.fire.generator import load_scenario
 from emberlink.envs.fire_files.config import FileFireConfig
 from emberlink.envs.scenarios import ScenarioConfig, fires_of
@@ -33,19 +33,22 @@ BLOCK = 50
 """environments in a batch of an evaluation, even if fewer episodes are needed"""
 
 Policy = Callable[[TensorDictBase], TensorDictBase]
+Watch = Callable[[WildfireEnv, TensorDictBase], None]
+"""called at each step, from 0 to the horizon, with the environments and what they returned: the
+result of the reset, or the "next" of the step"""
 
 
 def play(
     env: TransformedEnv,
     policy: Policy,
-    at_step: Callable[[int], None] | None = None,
+    watch: Watch | None = None,
 ) -> dict[str, Tensor]:
     """Plays one episode in each environment without exploration noise.
 
     Args:
         env: environments with communication.
         policy: writes ("agents", "action").
-        at_step: called with the step when the environments have reached it, from 0 to the horizon.
+        watch: see `Watch`.
 
     Returns:
         The measures of `metrics.names`, float32 [num_envs] each.
@@ -55,14 +58,14 @@ def play(
     steps: list[TensorDictBase] = []
     with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
         td = env.reset()
-        for step in range(1, horizon + 1):
-            if at_step is not None:
-                at_step(step - 1)
+        if watch is not None:
+            watch(world, td)
+        for _ in range(horizon):
             td = env.step(policy(td))
+            if watch is not None:
+                watch(world, td.get("next"))
             steps.append(td.get("next").select(*metrics.STEP_KEYS, strict=False))
             td = step_mdp(td, keep_other=True)
-    if at_step is not None:
-        at_step(horizon)
     episode: Any = torch.stack(cast(Any, steps), dim=1)
     return metrics.episode_metrics(episode)
 
@@ -116,6 +119,7 @@ def evaluate(
     fires: int,
     scripted: bool = True,
     report: Callable[[str, str], None] | None = None,
+    watch: Watch | None = None,
 ) -> Results:
     """Evaluates a frozen policy and the scripted ones on test fires with the same start positions.
 
@@ -129,11 +133,13 @@ def evaluate(
         fires: number of test fires, one episode each.
         scripted: whether to evaluate the scripted policies, too.
         report: called with the names of the fire and the policy before each evaluation.
+        watch: watches the first batch of the frozen policy on the fires of `shown_fire`.
 
     Returns:
         fire -> policy -> measure -> one number per episode.
     """
     results: Results = {}
+    shown = shown_scenario(config)
     for fire, arrival in evaluation_fires(config, fires).items():
 
         def say(policy: str, fire: str = fire) -> None:
@@ -141,7 +147,8 @@ def evaluate(
                 report(fire, policy)
 
         say(LEARNED)
-        results[fire] = {LEARNED: play_blocks(config, lambda _: actor, arrival)}
+        watched = watch if fire == shown else None
+        results[fire] = {LEARNED: play_blocks(config, lambda _: actor, arrival, watch=watched)}
         for name in to_play(config.evaluation.scripted) if scripted else ():
             results[fire][name] = play_scripted(config, name, arrival, report=say)
     return results
@@ -227,6 +234,7 @@ def play_blocks(
     *,
     start_seed: int = START_SEED,
     block: int = BLOCK,
+    watch: Watch | None = None,
 ) -> Measured:
     """Plays one episode on each fire, in batches.
 
@@ -236,6 +244,7 @@ def play_blocks(
         arrival: times in steps, float32 [fires, X, Y] or [fires, 2, X, Y].
         start_seed: seed of episode 0; episode i has this seed plus i.
         block: environments per batch. The last batch is padded with episodes that are not counted.
+        watch: watches the first batch.
 
     Returns:
         The measures of `metrics.names`, one number per fire.
@@ -252,7 +261,8 @@ def play_blocks(
             device=config.device,
         )
         world: Any = env.base_env
-        for name, values in play(env, policy(world)).items():
+        played = play(env, policy(world), None if start else watch)
+        for name, values in played.items():
             measured[name] += values[: count - start].tolist()
     return measured
 
@@ -262,13 +272,12 @@ def film(
 ) -> tuple[list[np.ndarray], list[int]]:
     """Returns frames of test episode 0 on a fire, uint8 [height, width, 3], and their steps."""
     env = build_env(config, num_envs=1, fire=fire, seed=START_SEED, device=config.device)
-    world: Any = env.base_env
     horizon = config.env.horizon
     wanted = set(np.linspace(0, horizon, min(frames, horizon + 1)).round().astype(int).tolist())
     pictures: list[np.ndarray] = []
 
-    def draw(step: int) -> None:
-        if step in wanted:
+    def draw(world: WildfireEnv, td: TensorDictBase) -> None:
+        if int(td.get(keys.STEP)[0]) in wanted:
             pictures.append(world.render())
 
     play(env, policy, draw)

@@ -1,4 +1,4 @@
-"""Evaluates the frozen policy of a run and writes eval.json, figures and a GIF."""
+"""Evaluates the frozen policy of a run and writes eval.json, figures, a GIF and a replay."""
 
 from collections.abc import Callable
 from dataclasses import asdict
@@ -11,7 +11,11 @@ from emberlink.envs.utils.errors import UserError
 from emberlink.policies.scripted.registry import to_play
 from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.evaluation import evaluate, plots
+from emberlink.trainers.evaluation.panels import follows_advice, title_of
 from emberlink.trainers.evaluation.results import LEARNED, Results
+from emberlink.trainers.replay.pack import Shown
+from emberlink.trainers.replay.page import Replay
+from emberlink.trainers.replay.record import Recorder
 from emberlink.trainers.runs.run_folder import RunFolder
 from emberlink.trainers.runs.seal import changed_evaluation
 from emberlink.trainers.runs.versions import versions
@@ -28,7 +32,7 @@ def evaluate_run(
     report: Callable[[str], None],
     label: str = "",
 ) -> Results:
-    """Evaluates a frozen policy and writes eval.json, the figures and a GIF.
+    """Evaluates a frozen policy and writes eval.json, the figures, a GIF and a replay.
 
     Args:
         run: folder of the files.
@@ -51,8 +55,13 @@ def evaluate_run(
         report(f"note: {text}")
     try:
         run.figures()  # an unusable folder is an error before the episodes, not after
-        results = evaluate.evaluate(config, actor, fires=fires, report=say)
+        recorder = Recorder(advised=follows_advice(config, actor))
+        results = evaluate.evaluate(config, actor, fires=fires, report=say, watch=recorder.add)
         _draw(run, config, actor, results, report, label)
+        with run.figure(f"replay{label}.html") as path:
+            title = title_of(config, label.strip("_"))
+            shown = Shown(title=title, recording=recorder.recording())
+            Replay([shown], f"{evaluate.shown_scenario(config)}:0").save(path)
     except OutputError:
         raise
     except OSError as error:

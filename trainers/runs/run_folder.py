@@ -23,7 +23,7 @@ from emberlink.trainers.runs.json_lines import JsonLines
 from emberlink.trainers.runs.safe_read import MAX_JSON, parse_json, read_text, read_yaml
 
 _PARTIAL = ("config.yaml", "metrics.csv", "*.json", "*.jsonl", "fires.npz")
-_PARTIAL_FIGURES = ("*.png.[0-9]*.part", "*.gif.[0-9]*.part")
+_PARTIAL_FIGURES = tuple(f"*.{kind}.[0-9]*.part" for kind in ("png", "gif", "html"))
 _PARTIAL_DUMPS = "divergence_step_*.part"
 
 

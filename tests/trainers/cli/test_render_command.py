@@ -18,7 +18,7 @@ from emberlink.policies.scripted.registry import SCRIPTED
 from emberlink.trainers.build import build_actor, build_env
 from emberlink.trainers.cli import main
 from emberlink.trainers.config.compose import resolve
-from emberlink.trainers.evaluation import evaluate, render
+from emberlink.trainers.evaluation import evaluate, panels, render
 from emberlink.trainers.runs.run_folder import RunFolder
 
 SHORT = ("setup=tuned", "learner.hidden=[8,8]", "env.horizon=12", "env.num_uavs=3")
@@ -136,7 +136,7 @@ def test_panels_have_the_same_fire_and_the_same_starts(tmp_path, monkeypatch):
 def test_an_episode_equals_that_of_the_evaluation(tmp_path, monkeypatch):
     run = RunFolder(make_run(tmp_path))
     config = run.config()
-    actor = render.load_actor(config, run.checkpoint())
+    actor = panels.load_actor(config, run.checkpoint())
     results = evaluate.evaluate(config, actor, fires=3, scripted=False)["huygens"]
     covered = results[evaluate.LEARNED]["coverage"]
     assert len(set(covered)) > 1
@@ -195,7 +195,7 @@ def test_errors_of_render(tmp_path, capsys):
         ([run, team], ["env.num_uavs=4", "has 3"]),
         ([run, "--output", there], ["there.gif exists already"]),
         ([run, "--output", tmp_path / "no" / "a.gif"], [str(tmp_path / "no"), "no such folder"]),
-        ([run, "--output", tmp_path / "no"], ["no such folder", ".gif, .mp4, .png"]),
+        ([run, "--output", tmp_path / "no"], ["no such folder", ".gif, .mp4, .png, .html"]),
         ([run, "--step", "3"], ["step=3", ".png"]),
         ([run, "--output", tmp_path / "a.png", "--step", "13"], ["step=13", "0 to 12"]),
         ([run, "--checkpoint", tmp_path / "x"], ["not a readable checkpoint"]),
@@ -249,7 +249,7 @@ def test_settings_of_starts_and_fires_must_agree():
     base = resolve("independent", SHORT).env
     other = {"reward", "observation", "observation_scale", "displacement", "view_angle"}
     other |= {"radio", "base", "failures", "measures"}
-    assert {field.name for field in dataclasses.fields(base)} == other | set(render.SHARED)
+    assert {field.name for field in dataclasses.fields(base)} == other | set(panels.SHARED)
 
 
 def test_an_incomplete_video_is_an_error(tmp_path, monkeypatch):

@@ -1,12 +1,14 @@
 """Tests `emberlink compare`: its grouping of runs, its numbers and its page."""
 
 import errno
+import html
 import html.parser
 import json
 import re
 import shutil
 from importlib.resources import files
 from itertools import permutations
+from urllib.parse import unquote
 
 import numpy as np
 import pytest
@@ -791,3 +793,16 @@ def test_help_of_compare_has_a_description_and_an_example(capsys):
         main.main(["compare", "--help"])
     assert ended.value.code == 0
     assert "example:\n  emberlink compare" in capsys.readouterr().out
+
+
+def test_the_page_links_to_the_replays_of_runs(runs, tmp_path):
+    folder = shutil.copytree(runs, tmp_path / "my runs & <b>")
+    with_replay = sorted(folder.iterdir())[0]
+    (with_replay / "figures").mkdir(exist_ok=True)
+    (with_replay / "figures" / "replay.html").write_text("a replay")
+    compare([folder], output=tmp_path / "report")
+    page = (tmp_path / "report" / "compare.html").read_text()
+    (address,) = re.findall(r'<a href="([^"]*)">replay</a>', page)
+    target = (tmp_path / "report" / unquote(html.unescape(address))).resolve()
+    assert target == (with_replay / "figures" / "replay.html").resolve()
+    assert not address.startswith("/")

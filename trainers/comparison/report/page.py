@@ -2,7 +2,7 @@
 
 import base64
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
@@ -75,12 +75,14 @@ class Report:
         chapters: one chapter per section.
         left_out: folders and files that are not compared, with the reason.
         notes: differences between runs.
+        replays: run folder -> address of its replay, for the runs that have one.
     """
 
     command: str
     chapters: Sequence[Chapter]
     left_out: Sequence[LeftOut]
     notes: Sequence[str]
+    replays: Mapping[Path, str]
 
 
 def lines(ranking: Ranking) -> Iterator[Line]:

@@ -5,6 +5,7 @@ import tempfile
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from urllib.parse import quote
 
 from emberlink.envs.utils.errors import UserError
 from emberlink.trainers.comparison.record import to_json
@@ -35,6 +36,17 @@ def free_folder(output: Path | None) -> Path:
     return output
 
 
+def _replays(comparison: Comparison, folder: Path) -> dict[Path, str]:
+    """Returns the address of each run's replay, relative to the folder of the report."""
+    runs = (run for numbers in comparison.sections for run in numbers.section.runs)
+    pages = {run.path: run.path / "figures" / "replay.html" for run in runs}
+    return {
+        path: quote(os.path.relpath(page.resolve(), folder.resolve()))
+        for path, page in pages.items()
+        if page.is_file()
+    }
+
+
 def write_report(
     comparison: Comparison, folder: Path, say: Callable[[str], None] = lambda _: None
 ) -> Comparison:
@@ -62,7 +74,8 @@ def write_report(
                 for place, section in enumerate(comparison.sections, 1)
             ]
             whole = replace(comparison, notes=tuple(notes))
-            page = html(Report(whole.command, drawn, whole.left_out, notes))
+            replays = _replays(comparison, folder)
+            page = html(Report(whole.command, drawn, whole.left_out, notes, replays))
             (path / "compare.html").write_text(page, encoding="utf-8")
             (path / "compare.json").write_text(to_json(whole.to_values()), encoding="utf-8")
             path.replace(folder)

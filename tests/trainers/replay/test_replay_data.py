@@ -1,0 +1,338 @@
+"""Tests what a replay holds: its numbers, its size, its text and its files."""
+
+import base64
+import dataclasses
+import gzip
+import json
+import math
+import os
+import re
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+import torch
+from scalar_world import ScalarWorld
+from small_episode import SIDES, STEPS, play_small
+from test_render_command import make_run, refused, rendered
+from unpack_replay import bit, data_of
+
+from emberlink.envs import WildfireConfig, keys
+from emberlink.trainers import load
+from emberlink.trainers.cli import main
+from emberlink.trainers.evaluation import panels
+from emberlink.trainers.replay.pack import Shown
+from emberlink.trainers.replay.page import Replay, script
+from emberlink.trainers.replay.record import Recording
+
+HOSTILE = "</script><script>alert(1)</script><img src=x onerror=alert(2)>{{ 7*7 }}\"'&amp;"
+
+
+@pytest.fixture(scope="module")
+def episode():
+    return play_small()
+
+
+@pytest.fixture(scope="module")
+def data(episode):
+    return data_of(Replay([Shown(title="one", recording=episode.recording)], "small:0").html)
+
+
+def test_numbers_of_every_step_are_those_of_the_environment(episode, data):
+    (panel,) = data["panels"]
+    whole = {"seen": keys.SEEN, "burning": keys.BURNING, "burnt": keys.BURNT}
+    ages = {"front_age": keys.FRONT_AGE, "front_age_p95": keys.FRONT_AGE_P95}
+    of_base = {"base_seen": keys.BASE_SEEN, "base_age": keys.BASE_AGE}
+    assert data["horizon"] == STEPS
+    for step, now in enumerate(episode.steps):
+        for name, key in {**whole, **ages, **of_base}.items():
+            assert panel[name][0][step] == now[key].item(), (name, step)
+        for uav in range(3):
+            if step:
+                assert panel["reward"][uav][step] == now[keys.REWARD][uav].item()
+            for axis in range(3):
+                shown = panel["position"][3 * uav + axis][step] / 100
+                assert f"{shown:.2f}" == f"{now[keys.POSITION][uav, axis].item():.2f}"
+            assert panel["follows"][uav][step] == now[keys.FOLLOWS][uav]
+            for axis in range(2):
+                target = panel["target"][2 * uav + axis][step] / 100
+                assert target == pytest.approx(now[keys.TARGET][uav, axis].item(), abs=0.00501)
+            assert (step < panel["fails"][uav]) == now[keys.ALIVE][uav].item()
+
+
+def test_the_world_has_all_that_a_replay_shows(episode):
+    assert any(not now[keys.ALIVE].all() for now in episode.steps)
+    assert episode.recording.steps["lost"].any()
+    assert episode.known[-1][-1] > 0  # something reached the base
+
+
+def test_knowledge_follows_from_the_data_alone(episode, data):
+    """The browser computes it in the same way, from fields of view, links and fire."""
+    (panel,) = data["panels"]
+    radios = panel["uavs"] + 1
+    burn_out = [[time if time <= STEPS else math.inf for time in row] for row in _map(data["end"])]
+    scalar = ScalarWorld(_map(data["ignition"]), burn_out, 30.0, panel["uavs"])
+    for step in range(1, STEPS + 1):
+        hears = [
+            [bit(panel["hears"], radios * i + j, step) for j in range(radios)]
+            for i in range(radios)
+        ]
+        assert hears == episode.hears[step].tolist()
+        position, alive = _squares(panel, step)
+        scalar.slope = 1.0  # the squares are given by their middle and half their side
+        _step(scalar, step, position, alive, hears)
+        for radio in range(radios):
+            known = [
+                [scalar.last_seen(radio, (i, j)) for j in range(SIDES[1])] for i in range(SIDES[0])
+            ]
+            assert known == episode.knowledge[step][radio].tolist(), (step, radio)
+        assert scalar.seen_fire() == panel["seen"][0][step]
+
+
+def _map(rows) -> list[list[int]]:
+    (flat,) = rows
+    return [flat[x * SIDES[1] : (x + 1) * SIDES[1]] for x in range(SIDES[0])]
+
+
+def _squares(panel, step: int):
+    """Returns the bounds of each field of view, and whether there is one."""
+    bounds = [[panel["view"][4 * uav + side][step] for side in range(4)] for uav in range(3)]
+    return bounds, [left <= right for left, right, _, _ in bounds]
+
+
+def _step(scalar: ScalarWorld, step: int, bounds, alive, hears) -> None:
+    """Adds a step to a scalar world whose UAVs see the cells within bounds."""
+    for uav, (left, right, low, high) in enumerate(bounds):
+        for i, j in scalar.cells:
+            if alive[uav] and left <= i <= right and low <= j <= high:
+                scalar.seen[i, j].append(step)
+                scalar.known[uav][i, j].add(step)
+    away = [(-99.0, -99.0, 0.0)] * len(bounds)
+    scalar.step(step, away, alive, hears)
+
+
+def test_fields_of_view_are_those_of_the_camera(episode, data):
+    (panel,) = data["panels"]
+    slope = math.tan(math.radians(episode.config.env.view_angle))
+    for step, now in enumerate(episode.steps):
+        for uav, (x, y, z) in enumerate(now[keys.POSITION].double().tolist()):
+            sees = step > 0 and now[keys.ALIVE][uav]
+            left, right, low, high = (panel["view"][4 * uav + side][step] for side in range(4))
+            for i in range(SIDES[0]):
+                for j in range(SIDES[1]):
+                    inside = abs(i - x) <= z * slope and abs(j - y) <= z * slope
+                    assert (left <= i <= right and low <= j <= high) == (sees and inside)
+
+
+def test_links_are_the_messages_received_and_the_others_in_range_are_lost(episode, data):
+    (panel,) = data["panels"]
+    for step, now in enumerate(episode.steps):
+        places = [*now[keys.POSITION].double().tolist(), [3.0, 4.0, 0.0]]
+        alive = [*now[keys.ALIVE].tolist(), True]
+        for taker, here in enumerate(places):
+            for source, there in enumerate(places):
+                near = taker != source and math.dist(here, there) < 5
+                near = near and alive[taker] and alive[source]
+                heard, lost = (
+                    bit(panel[name], 4 * taker + source, step) for name in ("hears", "lost")
+                )
+                assert heard + lost == near
+                if max(taker, source) < 3:
+                    assert heard == now[keys.HEARS][taker, source].item()
+
+
+def test_fire_is_that_of_the_environment(episode, data):
+    seen = episode.fire_map
+    for step in range(STEPS + 1):
+        for i, (ignition, end) in enumerate(
+            zip(_map(data["ignition"]), _map(data["end"]), strict=True)
+        ):
+            state = [
+                (t >= start) + (t >= stop)
+                for t, start, stop in zip([step] * 10, ignition, end, strict=True)
+            ]
+            assert state == [[0, 1, 1, 2, 2][cell] for cell in seen[step][i].tolist()]
+
+
+def test_worlds_without_a_base_or_measures_are_recorded_with_ages():
+    recorded = play_small("env.base=null", "env.failures=0", "env.radio.loss=0", burn_time=math.inf)
+    plain = play_small(
+        *("env.base=null", "env.failures=0", "env.radio.loss=0", "env.measures=paper"),
+        burn_time=math.inf,
+    )
+    first, second = (one.recording.steps for one in (recorded, plain))
+    assert set(first) == set(second)
+    for name, values in first.items():
+        assert np.array_equal(values, second[name]), name
+    assert keys.FRONT_AGE not in plain.steps[-1].keys()  # noqa: SIM118
+    expected = [now[keys.FRONT_AGE].item() for now in recorded.steps]
+    assert second["front_age"].tolist() == expected
+    (panel,) = data_of(Replay([Shown(title="", recording=plain.recording)], "x:0").html)["panels"]
+    assert panel["base"] is None
+    assert "lost" not in panel
+    assert panel["fails"] == [STEPS + 1] * 3
+
+
+def test_a_hostile_name_is_text(episode):
+    page = Replay([Shown(title=HOSTILE, recording=episode.recording)], HOSTILE).html
+    plain = Replay([Shown(title="one", recording=episode.recording)], "x:0").html
+    assert data_of(page)["panels"][0]["title"] == HOSTILE
+    assert _tags(page) == _tags(plain)
+    frame = Replay([Shown(title=HOSTILE, recording=episode.recording)], HOSTILE)._repr_html_()
+    assert [tag for tag, _ in _tags(frame)] == ["iframe"]
+
+
+def _tags(page: str) -> list:
+    """Returns the elements of a page with the names of their attributes."""
+    found = []
+
+    class Reader(HTMLParser):
+        def handle_starttag(self, tag, attrs):
+            found.append((tag, [name for name, _ in attrs]))
+
+    Reader().feed(page)
+    return found
+
+
+def test_the_page_needs_nothing_else(episode):
+    page = Replay([Shown(title="one", recording=episode.recording)], "x:0").html
+    for name in ("src", "href"):
+        linked = re.findall(rf'<\w+[^>]* {name}="([^"]*)"', page)
+        assert all(address.startswith("data:") for address in linked)
+    assert "default-src 'none'" in page
+    assert not re.search(r"^(import|export) ", script(), re.MULTILINE)
+
+
+def test_the_same_episode_gives_the_same_bytes(episode):
+    shown = [Shown(title="one", recording=episode.recording)]
+    assert Replay(shown, "x:0").html == Replay(shown, "x:0").html
+
+
+def synthetic(uavs: int, side: int, *, loss: float) -> Recording:
+    """Returns 1000 steps of random flights, which compress worse than those of any policy."""
+    draw = np.random.default_rng(0)
+    moves = draw.uniform(-1, 1, (1001, uavs, 3)).astype(np.float32)
+    position = np.abs(moves.cumsum(0) * 3) % (side - 1)
+    cells = position[..., :2].astype(np.int16)
+    view = np.stack((cells[..., 0], cells[..., 0] + 4, cells[..., 1], cells[..., 1] + 4), -1).clip(
+        0, side - 1
+    )
+    near = draw.random((1, uavs, uavs)) < 0.3
+    hears = near & (draw.random((1001, uavs, uavs)) >= loss)
+    counts = {name: draw.integers(0, 5, 1001).cumsum() for name in ("seen", "burning", "burnt")}
+    steps = {
+        **{"position": position, "view": view, "hears": hears, "lost": near & ~hears},
+        **{"alive": np.ones((1001, uavs), bool), **counts},
+        "reward": draw.normal(size=(1001, uavs)).astype(np.float32),
+        **{name: draw.random(1001).astype(np.float32) for name in ("front_age", "front_age_p95")},
+        "follows": draw.integers(-1, uavs, (1001, uavs)),
+        "target": position[:, ::-1],
+    }
+    ignition = draw.integers(0, 1002, (side, side))
+    world = WildfireConfig(grid=(side, side), num_uavs=uavs)
+    return Recording(world=world, ignition=ignition, end=ignition + 150, steps=steps)
+
+
+@pytest.mark.parametrize(("uavs", "side", "limit"), [(6, 60, 500_000), (24, 100, 2_000_000)])
+def test_a_page_is_small(uavs, side, limit):
+    worst = synthetic(uavs, side, loss=0.5)
+    assert len(Replay([Shown(title="worst", recording=worst)], "x:0").html.encode()) < limit
+
+
+def test_render_writes_a_page_of_several_runs(tmp_path, capsys):
+    run = make_run(tmp_path)
+    out = tmp_path / "replay.html"
+    lines = rendered(
+        capsys,
+        run,
+        run,
+        "env.radio.range=0",
+        "--policy",
+        "stationary",
+        "--fire",
+        "paper:3",
+        "--output",
+        out,
+    )
+    assert lines[-1] == str(out)
+    data = data_of(out.read_text())
+    assert data["fire"] == "paper:3"
+    assert [panel["title"] for panel in data["panels"]] == [
+        *("consensus, setup tuned, seed 0", "consensus, setup tuned, seed 0, env.radio.range=0"),
+        "stationary (scripted)",
+    ]
+    with_radio, without, _ = data["panels"]
+    assert [row[0] for row in with_radio["position"]] == [row[0] for row in without["position"]]
+    assert any(map(any, with_radio["hears"]))
+    assert not any(map(any, without["hears"]))
+    refused([run, "--output", out], capsys, "replay.html exists already")
+    refused([run, "--output", tmp_path / "b.html", "--step", 3], capsys, "#t=STEP")
+    refused(["env.radio.range=0", run], capsys, "after the run")
+    refused([run, "env.radio.range=-1"], capsys, "env.radio.range")
+    refused(
+        [run, "env.grid=[40,30]", run, "--output", tmp_path / "b.html"], capsys, "must be the same"
+    )
+
+
+def test_the_last_numbers_are_those_of_the_evaluation(tmp_path):
+    """The page in figures/ shows the first episode of eval.json, to the last bit."""
+    run = make_run(tmp_path, "consensus", "evaluation.episodes=2", "evaluation.scripted=[]")
+    assert main.main(["eval", str(run)]) == 0
+    evaluated = json.loads((run / "eval.json").read_text())["results"]["huygens"]["learned"]
+    (panel,) = data_of((run / "figures" / "replay.html").read_text())["panels"]
+    covered = torch.tensor(100 * panel["seen"][0][-1]).float() / panel["burnt"][0][-1]
+    assert covered.item() == pytest.approx(evaluated["coverage"][0], abs=0)
+    rewards = np.array(panel["reward"])[:, 1:]
+    assert rewards.mean() == pytest.approx(evaluated["mean_reward"][0], rel=1e-6)
+
+
+def test_nothing_is_written_through_a_link(tmp_path, episode):
+    (tmp_path / "mine").write_text("mine")
+    target = tmp_path / "replay.html"
+    os.symlink(tmp_path / "mine", target)
+    run = make_run(tmp_path)
+    assert main.main(["render", str(run), "--output", str(target)]) == 2
+    assert (tmp_path / "mine").read_text() == "mine"
+
+
+def test_replay_from_python_equals_that_of_the_command(tmp_path, capsys):
+    run = make_run(tmp_path)
+    out = tmp_path / "replay.html"
+    rendered(capsys, run, run, "env.radio.range=0.0", "--output", out)
+    deaf = load(run, **{"env.radio.range": 0.0})
+    shown = load(run).replay(deaf)
+    assert shown.html == out.read_text()
+    assert shown._repr_html_().startswith('<iframe srcdoc="&lt;!DOCTYPE html&gt;')
+
+
+def test_panels_tell_their_settings(tmp_path):
+    run = str(make_run(tmp_path))
+    (panel,) = panels.learned([run, "env.radio.range=3"], [])
+    assert panel.config.env.radio.range == 3
+    header = data_of(panels.replay([panel], "paper:1").html)
+    assert header["panels"][0]["range"] == 3
+    assert header["grid"] == [30, 30]
+
+
+def test_damage_is_found_by_the_checksum(episode):
+    page = Replay([Shown(title="one", recording=episode.recording)], "x:0").html
+    (text,) = re.findall(r'id="data">([^<]*)<', page)
+    packed = bytearray(base64.b64decode(text))
+    packed[len(packed) // 2] ^= 1
+    with pytest.raises((OSError, EOFError, gzip.zlib.error)):
+        gzip.decompress(bytes(packed))
+
+
+def test_long_episodes_use_wider_integers(episode):
+    steps = {
+        name: np.concatenate([values[:1], np.repeat(values[1:2], 70_000, 0)])
+        for name, values in episode.recording.steps.items()
+    }
+    ignition = np.full(SIDES, 69_000)
+    long = dataclasses.replace(
+        episode.recording, steps=steps, ignition=ignition, end=ignition + 900
+    )
+    data = data_of(Replay([Shown(title="", recording=long)], "x:0").html)
+    assert data["horizon"] == 70_000
+    assert set(data["ignition"][0]) == {69_000}
+    assert set(data["end"][0]) == {69_900}

@@ -1,0 +1,170 @@
+"""Records an episode for the replay: fire, tracks, fields of view, links and measures."""
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from emberlink.envs import keys
+from emberlink.envs.config import WildfireConfig
+from emberlink.envs.wildfire import WildfireEnv
+from emberlink.envs.world import motion, radio
+from emberlink.envs.world.coverage_map import View
+from emberlink.envs.world.measures import Measures
+from emberlink.envs.world.sensor import Sensor
+
+COUNTS = {"seen": keys.SEEN, "burning": keys.BURNING, "burnt": keys.BURNT}
+AGES = {"front_age": keys.FRONT_AGE, "front_age_p95": keys.FRONT_AGE_P95}
+OF_BASE = {"base_seen": keys.BASE_SEEN, "base_age": keys.BASE_AGE}
+ADVICE = {"follows": keys.FOLLOWS, "target": keys.TARGET}
+"""what a communication module tells the UAVs"""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class Recording:
+    """One episode: T steps, n UAVs, r radios (the UAVs, and the base last if there is one)."""
+
+    world: WildfireConfig
+    ignition: NDArray[Any]
+    """[X, Y]: the first step at which each cell burns, T + 1 for never"""
+    end: NDArray[Any]
+    """[X, Y]: the first step at which each cell no longer burns, T + 1 for never"""
+    steps: dict[str, NDArray[Any]]
+    """name -> numbers after each step, [T + 1, ...]:
+
+    - position: float32 [n, 3], cells; alive: bool [n]; reward: float32 [n], 0 at step 0
+    - view: int [n, 4], the first and last cell in view along x, then along y; (1, 0, 1, 0) for none
+    - hears: bool [r, r], whether a radio (row) heard another one (column); lost: bool [r, r],
+      whether it was in range but the message was lost
+    - `COUNTS` and `AGES`, `OF_BASE` with a base, `ADVICE` if the policy follows it
+    """
+
+    @property
+    def horizon(self) -> int:
+        """The number of steps, T."""
+        return len(self.steps["position"]) - 1
+
+
+class Recorder:
+    """Records the episode of one environment; `add` is called at each step.
+
+    The ages are measured in every world, with the environment's own rules.
+
+    Args:
+        member: index of the environment.
+        advised: whether the policy reads what the communication tells it.
+    """
+
+    def __init__(self, *, member: int = 0, advised: bool = True):
+        self._member, self._advised = member, advised
+        self._steps: dict[str, list[NDArray[Any]]] = {}
+        self._observer: _Observer | None = None
+
+    def add(self, world: WildfireEnv, td: TensorDictBase) -> None:
+        """Adds one step.
+
+        Args:
+            world: the environments, at this step.
+            td: what they returned: the result of a reset, or the "next" of a step.
+        """
+        now = td[self._member : self._member + 1].cpu()
+        if self._observer is None:
+            self._observer = _Observer(world, self._member)
+        for name, value in {**self._observer.look(now), **self._told(now)}.items():
+            self._steps.setdefault(name, []).append(value[0].numpy().copy())
+
+    def _told(self, now: TensorDictBase) -> dict[str, Tensor]:
+        """Returns what the environment and the communication wrote."""
+        wanted = {"position": keys.POSITION, "alive": keys.ALIVE, **COUNTS}
+        told = {name: now.get(key) for name, key in wanted.items()}
+        reward = now.get(keys.REWARD, None)
+        told["reward"] = torch.zeros(1, len(told["alive"][0])) if reward is None else reward[..., 0]
+        if self._advised:
+            advice = {name: now.get(key, None) for name, key in ADVICE.items()}
+            told |= {name: value for name, value in advice.items() if value is not None}
+        return told
+
+    def recording(self) -> Recording:
+        """Returns what was recorded."""
+        assert self._observer is not None, "no step was recorded"
+        ignition, end = self._observer.fire
+        steps = {name: np.stack(values) for name, values in self._steps.items()}
+        return Recording(world=self._observer.config, ignition=ignition, end=end, steps=steps)
+
+
+class _Observer:
+    """Repeats what one environment computes and does not show: views, links and ages.
+
+    Args:
+        world: the environments, after their reset.
+        member: index of the environment.
+    """
+
+    def __init__(self, world: WildfireEnv, member: int):
+        self.config = world.config
+        ceiling = motion.corners(self.config.low, self.config.high)[1][2].item()
+        view_angle = self.config.view_angle
+        self._sensor = Sensor(self.config.grid, view_angle=view_angle, ceiling=ceiling)
+        measured = dataclasses.replace(self.config, measures="all")
+        self._measures = Measures(measured, 1, self._sensor.area)
+        arrival, burn_out = world.arrival_time[[member]].cpu(), world.burn_out
+        self._measures.start_episodes(
+            torch.ones(1, dtype=torch.bool),
+            self._sensor.pad(arrival, torch.nan),
+            None if burn_out is None else self._sensor.pad(burn_out[[member]].cpu(), torch.nan),
+        )
+        base = self.config.base
+        self._base = torch.zeros(1, 0, 3) if base is None else torch.tensor([[[*base, 0.0]]])
+
+    @property
+    def fire(self) -> tuple[NDArray[Any], NDArray[Any]]:
+        """The first step of each cell's fire and the first after it, [X, Y]."""
+        times = self._measures.times
+        crop = self._sensor.crop
+        return crop(times.ignition)[0].numpy(), crop(times.end)[0].numpy()
+
+    def look(self, now: TensorDictBase) -> dict[str, Tensor]:
+        """Returns the views, links and ages of a time step of batch size [1]."""
+        position, alive = now.get(keys.POSITION).double(), now.get(keys.ALIVE)
+        key, step = now.get(keys.RNG_KEY), now.get(keys.STEP)
+        view = self._view(position, alive, step)
+        if step > 0:  # nobody looks at the reset
+            self._measures.update(view, position, key, step, alive)
+        seen = {"view": self._bounds(view) if step > 0 else _no_view(alive)}
+        given = key, step, alive
+        if self.config.base is None:
+            hears = radio.links(self.config.radio, position, *given[:2], alive=alive)
+        else:
+            hears = self._measures.hears(position, *given)
+        lives = torch.nn.functional.pad(alive, (0, self._base.shape[1]), value=True)
+        places = torch.cat((position, self._base.double()), 1)
+        near = radio.neighbours(places, self.config.radio.range)
+        near &= lives.unsqueeze(-1) & lives.unsqueeze(-2)
+        values = self._measures.values()
+        ages = {name: values[key] for name, key in {**AGES, **OF_BASE}.items() if key in values}
+        return {**seen, "hears": hears, "lost": near & ~hears, **ages}
+
+    def _view(self, position: Tensor, alive: Tensor, step: Tensor) -> View:
+        _, cells, in_view = self._sensor.look(position, torch.zeros(1, 1, dtype=torch.int64))
+        in_view &= alive.unsqueeze(-1)
+        return View(cells, in_view, in_view & self._measures.times.burning(step)[0].take(cells))
+
+    def _bounds(self, view: View) -> Tensor:
+        """Returns the first and last cells in view along x and y, int16 [1, n, 4]."""
+        seen = torch.zeros(view.cells.shape[1], self._sensor.area, dtype=torch.bool)
+        inside = self._sensor.crop(seen.scatter_(1, view.cells[0], view.in_view[0]))
+        none = torch.tensor([1, 0, 1, 0])
+        bounds = []
+        for axis in (2, 1):
+            line = inside.any(axis).int()
+            bounds += [line.argmax(-1), line.shape[-1] - 1 - line.flip(-1).argmax(-1)]
+        found = torch.stack(bounds, -1)
+        return torch.where(inside.any(2).any(1)[:, None], found, none).short().unsqueeze(0)
+
+
+def _no_view(alive: Tensor) -> Tensor:
+    return torch.tensor([1, 0, 1, 0], dtype=torch.int16).expand(*alive.shape, 4)

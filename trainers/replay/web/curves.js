@@ -1,0 +1,120 @@
+// Draws the measures against the step with uPlot; all charts share a cursor, which is the step.
+
+import { fixed, ratio } from "./unpack.js";
+import { uavColour } from "./map.js";
+
+const PANEL_COLOURS = ["--panel-0", "--panel-1", "--panel-2", "--panel-3"];
+const DASHES = [[], [8, 4], [2, 3], [8, 3, 2, 3]];
+const MANY_UAVS = 8; // above this number, a chart shows the number of the chosen UAV only
+const HEIGHT = 170;
+
+/** The charts of a page: title, digits, and for each line its name and numbers by step. */
+const MEASURES = [
+  ["coverage", "Coverage, %", 1, (p, step) => ratio(p.seen(step), p.burnt(step))],
+  ["front_age", "Front age: mean steps since burning cells were seen, up to the step", 2,
+    (p, step) => p.front_age(step)],
+  ["base_coverage", "Base coverage, %", 1,
+    (p, step) => (p.base_seen ? ratio(p.base_seen(step), p.burnt(step)) : null)],
+];
+
+/** Returns the colour and the dashes of a panel's lines. */
+export function panelStyle(palette, place) {
+  return {
+    stroke: palette.named(PANEL_COLOURS[place % PANEL_COLOURS.length]),
+    dash: DASHES[(place + Math.floor(place / PANEL_COLOURS.length)) % DASHES.length],
+  };
+}
+
+/** The charts below the maps. `seek` is called with a step that was clicked. */
+export class Curves {
+  constructor(parent, data, seek) {
+    Object.assign(this, { parent, data, seek, hovered: false });
+    this.steps = Float64Array.from({ length: data.horizon + 1 }, (_, step) => step);
+    parent.addEventListener("mouseenter", () => { this.hovered = true; });
+    parent.addEventListener("mouseleave", () => {
+      this.hovered = false;
+      this.show(this.step);
+    });
+    new ResizeObserver(() => this.resize()).observe(parent);
+  }
+
+  /** Draws all charts anew, in the colours of a palette. */
+  build(palette, uav) {
+    this.charts?.forEach((chart) => chart.destroy());
+    this.parent.replaceChildren();
+    const { panels } = this.data;
+    this.charts = MEASURES
+      .filter(([name]) => name !== "base_coverage" || panels.some((panel) => panel.base_seen))
+      .map(([name, title, digits, value]) => this.chart(palette, name, title, digits,
+        panels.map((panel, place) => ({
+          label: panel.title,
+          values: Array.from(this.steps, (step) => value(panel, step)),
+          ...panelStyle(palette, place),
+          width: 2,
+        }))));
+    panels.forEach((panel, place) => this.charts.push(this.rewards(palette, panel, place, uav)));
+    this.show(this.step ?? 0);
+  }
+
+  rewards(palette, panel, place, uav) {
+    const lines = Array.from({ length: panel.uavs }, (_, number) => ({
+      label: `UAV ${number}`,
+      values: Array.from(this.steps, (step) => (step ? panel.reward(step, number) : null)),
+      stroke: uavColour(palette, number),
+      width: number === uav ? 2.5 : 1,
+      alpha: number === uav ? 1 : 0.55,
+    }));
+    lines.push(lines.splice(uav, 1)[0]); // the chosen one on top
+    const title = `Reward per UAV: ${panel.title}`;
+    return this.chart(palette, `reward-${place}`, title, 2, lines);
+  }
+
+  chart(palette, name, title, digits, lines) {
+    const box = document.createElement("figure");
+    const heading = document.createElement("figcaption");
+    heading.textContent = title;
+    box.append(heading);
+    box.dataset.chart = name;
+    this.parent.append(box);
+    const axis = {
+      stroke: palette.named("--ink"),
+      grid: { stroke: palette.named("--grid"), width: 1 },
+      ticks: { stroke: palette.named("--grid"), width: 1 },
+    };
+    const shown = lines.length <= MANY_UAVS ? lines : lines.slice(-1);
+    const hidden = lines.filter((line) => !shown.includes(line));
+    const chart = new uPlot({
+      width: box.clientWidth,
+      height: HEIGHT,
+      scales: { x: { time: false } },
+      cursor: { sync: { key: "steps" }, drag: { x: false, y: false }, y: false, points: { show: false } },
+      legend: { live: true },
+      axes: [axis, { ...axis, size: 58 }],
+      series: [{ label: "step" }, ...[...hidden, ...shown].map(({ label, stroke, dash, width, alpha }) => ({
+        label, stroke, dash, width, alpha,
+        points: { show: false },
+        value: (_chart, number) => (number === null ? "\u2013" : fixed(number, digits)),
+      }))],
+    }, [this.steps, ...[...hidden, ...shown].map((line) => line.values)], box);
+    const rows = box.querySelectorAll(".u-series");
+    hidden.forEach((_, place) => { rows[place + 1].hidden = true; });
+    chart.over.addEventListener("click", () => this.seek(chart.cursor.idx));
+    return chart;
+  }
+
+  /** Puts the cursor of all charts on a step, unless the mouse is on one. */
+  show(step) {
+    this.step = step;
+    if (this.hovered) return;
+    for (const chart of this.charts ?? []) {
+      chart.setCursor({ left: chart.valToPos(step, "x"), top: 0 });
+    }
+  }
+
+  resize() {
+    for (const chart of this.charts ?? []) {
+      chart.setSize({ width: chart.root.parentElement.clientWidth, height: HEIGHT });
+    }
+    if (this.charts) this.show(this.step);
+  }
+}

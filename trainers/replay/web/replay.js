@@ -1,0 +1,258 @@
+// Plays the episodes of the page: controls, layers, keys and numbers.
+
+import { fixed, ratio, unpack } from "./unpack.js";
+import { firstSeen, Knowledge } from "./knowledge.js";
+import { colours, MapView } from "./map.js";
+import { Curves, panelStyle } from "./curves.js";
+
+const find = (name) => document.getElementById(name);
+
+/** What a panel says about a step: name, text before the number, number, digits, text after. */
+function numbers(panel, step) {
+  const rows = [
+    ["coverage", "coverage", ratio(panel.seen(step), panel.burnt(step)), 1, " %"],
+    ["seen", "seen", panel.seen(step), 0, " cells"],
+    ["burnt", "of", panel.burnt(step), 0, " burnt"],
+    ["burning", "burning now", panel.burning(step), 0, ""],
+    ["front_age", "front age so far", panel.front_age(step), 2, " steps"],
+    ["front_age_p95", "its 95th percentile", panel.front_age_p95(step), 0, ""],
+  ];
+  if (panel.base_seen) {
+    const covered = ratio(panel.base_seen(step), panel.burnt(step));
+    rows.push(
+      ["base_coverage", "base coverage", covered, 1, " %"],
+      ["base_seen", "known to the base", panel.base_seen(step), 0, " cells"],
+      ["base_age", "base age so far", panel.base_age(step), 2, " steps"],
+    );
+  }
+  return rows;
+}
+
+/** The numbers of the chosen UAV. */
+function uavNumbers(panel, knowledge, step, uav) {
+  const rows = [
+    ["known", "knows", knowledge.known(uav), 0, " cells of fire"],
+    ...["x", "y", "z"].map((name, axis) =>
+      [name, name, panel.position(step, uav * 3 + axis) / 100, 2, ""]),
+  ];
+  return step ? [["reward", "reward", panel.reward(step, uav), 2, ""], ...rows] : rows;
+}
+
+/** Replaces a text and a list of numbers. */
+function list(box, text, rows) {
+  box.replaceChildren(text, ...rows.map(([name, label, value, digits, unit]) => {
+    const entry = document.createElement("span");
+    const number = document.createElement("b");
+    number.dataset.number = name;
+    number.textContent = fixed(value, digits);
+    entry.append(`${label} `, number, unit);
+    return entry;
+  }));
+}
+
+class Player {
+  constructor(data) {
+    Object.assign(this, { data, step: 0, playing: false });
+    this.layers = [...document.querySelectorAll("#layers input")];
+    this.panels = data.panels.map((panel, place) => this.makePanel(panel, place));
+    this.curves = new Curves(find("curves"), data, (step) => this.seek(step));
+    const most = Math.max(...data.panels.map((panel) => panel.uavs));
+    find("uav").replaceChildren(...Array.from({ length: most }, (_, uav) => new Option(`UAV ${uav}`, uav)));
+    find("about").textContent = `${data.columns} \u00d7 ${data.rows} cells, ${most} UAVs, ${data.horizon} steps`;
+    find("slider").max = data.horizon;
+    find("last").textContent = data.horizon;
+    find("oldest").textContent = this.panels[0].map.oldest;
+    this.offer();
+    this.listen();
+    this.restyle();
+  }
+
+  makePanel(panel, place) {
+    const box = find("panel").content.firstElementChild.cloneNode(true);
+    const part = (name) => box.querySelector(`.${name}`);
+    part("title").textContent = panel.title;
+    box.style.setProperty("--aspect", this.data.columns / this.data.rows);
+    find("panels").append(box);
+    const knowledge = new Knowledge(this.data, panel);
+    const canvas = part("map");
+    const map = new MapView(canvas, this.data, panel, knowledge, firstSeen(this.data, panel));
+    canvas.addEventListener("click", (event) => this.choose(map, event));
+    return { panel, place, box, part, knowledge, map, canvas };
+  }
+
+  /** Leaves out the layers that no panel has. */
+  offer() {
+    const { panels, horizon } = this.data;
+    const burnsOut = this.data.end.some((step) => step <= horizon);
+    const offered = {
+      base: panels.some((panel) => panel.base),
+      lost: panels.some((panel) => panel.lost),
+      roles: panels.some((panel) => panel.follows),
+      failed: panels.some((panel) => panel.fails.some((step) => step <= horizon)),
+    };
+    for (const [name, there] of Object.entries({ ...offered, burnt: burnsOut })) {
+      const control = find(name)?.closest("label");
+      const entries = document.querySelectorAll(`#legend .of-${name}`);
+      for (const part of [...entries, ...(control ? [control] : [])]) part.hidden = !there;
+    }
+  }
+
+  listen() {
+    const act = (name, action) => find(name).addEventListener("click", action);
+    act("play", () => this.play(!this.playing));
+    act("first", () => this.seek(0));
+    act("back", () => this.seek(this.step - 1));
+    act("forth", () => this.seek(this.step + 1));
+    act("end", () => this.seek(this.data.horizon));
+    find("slider").addEventListener("input", (event) => this.seek(Number(event.target.value)));
+    find("layers").addEventListener("change", () => this.draw());
+    find("uav").addEventListener("change", () => {
+      this.curves.build(this.palette, this.uav);
+      this.draw();
+    });
+    document.addEventListener("keydown", (event) => this.key(event));
+    window.addEventListener("hashchange", () => this.seek(hashStep() ?? this.step));
+    matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => this.restyle());
+    new ResizeObserver(() => this.draw()).observe(find("panels"));
+  }
+
+  get uav() {
+    return Number(find("uav").value);
+  }
+
+  /** Handles the keys of the page, except where a control has its own use for them. */
+  key(event) {
+    const { target, key } = event;
+    if (event.altKey || event.ctrlKey || event.metaKey || target.closest?.("select, #curves a")) return;
+    const slider = target.id === "slider";
+    const choice = target.type === "radio";
+    const pressed = target.closest?.("button, summary, input") && !slider;
+    const jump = { Home: 0, End: this.data.horizon, ArrowLeft: this.step - 1, ArrowRight: this.step + 1 }[key];
+    if (key === " " && !pressed) this.play(!this.playing);
+    else if (jump !== undefined && !(choice && key.startsWith("Arrow"))) this.seek(jump);
+    else return;
+    event.preventDefault();
+  }
+
+  /** Chooses the UAV that was clicked on a map. */
+  choose(map, event) {
+    const far = Array.from({ length: map.panel.uavs }, (_, uav) => {
+      const [right, down] = map.radio(uav);
+      return Math.hypot(right - event.offsetX, down - event.offsetY);
+    });
+    const nearest = Math.min(...far);
+    if (nearest > 20) return;
+    find("uav").value = far.indexOf(nearest);
+    find("uav").dispatchEvent(new Event("change"));
+  }
+
+  play(on) {
+    if (on && this.step === this.data.horizon) this.go(0);
+    this.playing = on;
+    find("play").setAttribute("aria-label", on ? "Pause" : "Play");
+    document.body.dataset.playing = on;
+    if (!on) return this.settle();
+    let [before, due] = [null, 0];
+    const run = Symbol("run");
+    this.run = run;
+    const tick = (now) => {
+      if (!this.playing || this.run !== run) return;
+      due += ((now - (before ?? now)) / 1000) * Number(find("speed").value);
+      before = now;
+      const whole = Math.min(100, Math.floor(due)); // after a long wait it does not jump far
+      due -= Math.floor(due);
+      if (whole > 0) this.go(Math.min(this.data.horizon, this.step + whole));
+      if (this.step === this.data.horizon) this.play(false);
+      else requestAnimationFrame(tick);
+    };
+    return requestAnimationFrame(tick);
+  }
+
+  /** Stops at a step. */
+  seek(step) {
+    if (this.playing) this.play(false);
+    this.go(Math.min(this.data.horizon, Math.max(0, step)));
+    this.settle();
+  }
+
+  go(step) {
+    this.step = step;
+    this.draw();
+  }
+
+  /** Writes the step into the address and tells it to screen readers. */
+  settle() {
+    const covered = this.panels.map(({ panel }) =>
+      `${panel.title}: coverage ${fixed(ratio(panel.seen(this.step), panel.burnt(this.step)), 1)} %`);
+    find("said").textContent = `Step ${this.step}. ${covered.join(". ")}`;
+    this.panels.forEach(({ canvas }, place) => {
+      canvas.setAttribute("aria-label", `Map at step ${this.step}. ${covered[place]}`);
+    });
+    // A frame without an address of its own, as in Jupyter, would change that of its page.
+    if (location.protocol !== "about:") history.replaceState(null, "", `#t=${this.step}`);
+  }
+
+  /** Reads the colours of the style again: light and dark differ. */
+  restyle() {
+    this.palette = colours();
+    this.panels.forEach(({ place, part }) => {
+      const { stroke, dash } = panelStyle(this.palette, place);
+      part("swatch").setAttribute("stroke", stroke);
+      part("swatch").setAttribute("stroke-dasharray", dash.join(" "));
+    });
+    this.curves.build(this.palette, this.uav);
+    this.draw();
+  }
+
+  draw() {
+    const { step, uav, palette } = this;
+    const options = { palette, uav };
+    for (const layer of this.layers) {
+      if (layer.type === "checkbox") options[layer.id] = layer.checked;
+      else if (layer.checked) options.view = layer.value;
+    }
+    for (const { panel, part, knowledge, map } of this.panels) {
+      knowledge.seek(step);
+      const own = Math.min(uav, panel.uavs - 1);
+      map.draw(step, { ...options, uav: own, view: options.view === "base" && !panel.base ? "team" : options.view });
+      list(part("of-team"), "", numbers(panel, step));
+      const role = map.role(own);
+      const told = role === null || !map.flies(own) ? "" : `, ${this.data.roles[role]}`;
+      const who = `UAV ${own}${map.flies(own) ? "" : ", failed"}${told}:`;
+      list(part("of-uav"), who, uavNumbers(panel, knowledge, step, own));
+    }
+    find("slider").value = step;
+    find("slider").setAttribute("aria-valuetext", `step ${step} of ${this.data.horizon}`);
+    find("step").textContent = step;
+    document.body.dataset.view = options.heat ? "heat" : options.view;
+    this.curves.show(step);
+  }
+}
+
+function hashStep() {
+  const step = /^#t=(\d{1,9})$/.exec(location.hash);
+  return step ? Number(step[1]) : null;
+}
+
+function fail(text) {
+  find("message").textContent = text;
+  find("message").hidden = false;
+  find("page").hidden = true;
+}
+
+async function start() {
+  if (typeof DecompressionStream === "undefined") {
+    return fail("This browser is too old for this page: it has no DecompressionStream.");
+  }
+  let data;
+  try {
+    data = await unpack(find("data").textContent.trim());
+  } catch (error) {
+    return fail(`The data of this page are damaged and cannot be shown (${error.message}).`);
+  }
+  find("page").hidden = false;
+  const player = new Player(data);
+  return player.seek(hashStep() ?? 0);
+}
+
+start();

@@ -1,0 +1,71 @@
+// Reads the data of the page, which replay/pack.py wrote.
+
+const TYPES = {
+  u1: Uint8Array, i1: Int8Array, u2: Uint16Array, i2: Int16Array,
+  u4: Uint32Array, i4: Int32Array, f4: Float32Array,
+};
+const VERSION = 1;
+
+/** Returns the episodes that a text in base64 holds; throws an error if it is damaged. */
+export async function unpack(text) {
+  const packed = Uint8Array.from(atob(text), (character) => character.charCodeAt(0));
+  const plain = new Blob([packed]).stream().pipeThrough(new DecompressionStream("gzip"));
+  const buffer = await new Response(plain).arrayBuffer();
+  const length = new DataView(buffer).getUint32(0, true);
+  const header = JSON.parse(new TextDecoder().decode(new Uint8Array(buffer, 4, length)));
+  if (header.version !== VERSION) throw new Error(`unknown version ${header.version}`);
+  const [columns, rows] = header.grid;
+  const read = (entry) => array(buffer, 4 + length, entry);
+  return {
+    ...header, columns, rows,
+    ignition: read(header.ignition).values,
+    end: read(header.end).values,
+    panels: header.panels.map((panel) => unpackPanel(panel, read, header.horizon)),
+  };
+}
+
+/** Returns a panel with its arrays in place of their descriptions. */
+function unpackPanel(panel, read, horizon) {
+  const radios = panel.uavs + (panel.base ? 1 : 0);
+  const unpacked = { ...panel, radios, horizon };
+  for (const [name, entry] of Object.entries(panel)) {
+    if (!entry?.type) continue;
+    const { values, width } = read(entry);
+    if (name === "hears" || name === "lost") {
+      unpacked[name] = (step, taker, source) =>
+        (values[(taker * radios + source) * width + (step >> 3)] >> (step & 7)) & 1;
+    } else {
+      // Row by row: what it is of, such as x of UAV 0, then the steps.
+      unpacked[name] = (step, row = 0) => values[row * width + step];
+    }
+  }
+  return unpacked;
+}
+
+/** Returns the values of an array and the length of its last axis. */
+function array(buffer, start, { type, shape, at, delta }) {
+  const length = shape.reduce((product, side) => product * side, 1);
+  const width = shape[shape.length - 1];
+  const values = new TYPES[type](buffer, start + at, length);
+  if (delta) {
+    for (let index = 0; index < length; index++) {
+      if (index % width) values[index] += values[index - 1];
+    }
+  }
+  return { values, width };
+}
+
+/** Formats a number with digits after the point, halves to even, as Python does. */
+export function fixed(value, digits) {
+  const scaled = value * 10 ** digits;
+  const below = Math.floor(scaled);
+  const half = scaled - below === 0.5 && Math.abs(value) < 2 ** 31;
+  const text = half ? ((below + (below % 2 !== 0)) / 10 ** digits).toFixed(digits)
+    : value.toFixed(digits);
+  return text.replace("-", "\u2212");
+}
+
+/** Returns seen / all cells in %, in float32 as the environment computes it. */
+export function ratio(seen, all) {
+  return all > 0 ? Math.fround(Math.fround(100 * seen) / all) : 100;
+}
