@@ -48,7 +48,7 @@ def parse(text: str) -> tuple[str, Any]:
 
 
 def _with_infinity(value: Any) -> Any:
-    """Returns a value with the text `.inf`, YAML's infinity, as a number: Hydra knows `inf` only."""
+    """Returns a value with YAML's infinity, `.inf`, as a number; Hydra knows `inf` only."""
     if isinstance(value, list):
         return [_with_infinity(item) for item in value]
     infinite = isinstance(value, str) and value in _INFINITY
