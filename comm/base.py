@@ -17,7 +17,7 @@ from emberlink.envs.world import radio
 
 
 class CommModule(Buffers, TensorDictModuleBase):
-    """Rewrites the UAVs' observations from what they hear of each other.
+    """Rewrites the UAVs' observations, such as from the messages that they receive.
 
     A subclass in its own file, `comm/<name>.py`, is a new communication method; the file name is
     its name.

@@ -2,8 +2,9 @@
 
 import dataclasses
 import math
+from abc import ABC, abstractmethod
 from pathlib import Path
-from typing import Annotated, Any, Protocol
+from typing import Annotated, Any
 
 import torch
 from pydantic import Discriminator, Tag
@@ -29,66 +30,65 @@ from emberlink.envs.world.burning import split_times, with_burn_time
 Grid = tuple[int, int]
 
 
-class FireSource(Protocol):
+class FireSource(ABC):
     """The fires of a scenario, in three sets: `train`, `validation` and `test`.
 
     The validation fires choose among the checkpoints of a training, the test fires measure its
-    result. Generated fires of different sets never have a seed in common.
+    result. Generated fires of different sets never have a seed in common. A scenario without files
+    is its own copy.
     """
 
+    config: Any
+
+    @abstractmethod
     def train(self, grid: Grid, horizon: int) -> Tensor:
         """Returns the training fires: times in steps, see `world.burning.split_times`."""
-        ...
 
+    @abstractmethod
     def validation(self, count: int, grid: Grid, horizon: int) -> Tensor:
         """Returns the times of the first `count` validation fires; fewer are repeated."""
-        ...
 
+    @abstractmethod
     def test(self, count: int, grid: Grid, horizon: int) -> Tensor:
         """Returns the times of the first `count` test fires; fewer are repeated."""
-        ...
 
     def test_fire(self, index: int, grid: Grid, horizon: int) -> Tensor:
         """Returns the times of the test fire of that index, as `test(1, ...)`."""
-        ...
+        return self.test(index + 1, grid, horizon)[index:]
 
+    @abstractmethod
     def describe(self, count: int) -> dict[str, Any]:
         """Returns plain values that identify the first `count` test fires."""
-        ...
 
     def with_checksum(self) -> "ScenarioConfig":
         """Returns the scenario with the checksums of its files."""
-        ...
+        return self.config
 
     def save_copy(self, folder: Path, grid: Grid, horizon: int) -> "ScenarioConfig":
         """Copies the fires of files into a run folder and returns `load_copy(folder)`."""
-        ...
+        return self.config
 
     def load_copy(self, folder: Path) -> "ScenarioConfig":
         """Returns the scenario that reads its fires from the copy in a run folder."""
-        ...
+        return self.config
 
 
 @dataclasses.dataclass(frozen=True)
-class Generated:
+class Generated(FireSource):
     """Fires from seeds."""
 
     config: GeneratedConfig
 
     def train(self, grid: Grid, horizon: int) -> Tensor:
-        """See `FireSource`."""
         return self._bank("train", self.config.num_train_fires, grid, horizon)
 
     def validation(self, count: int, grid: Grid, horizon: int) -> Tensor:
-        """See `FireSource`."""
         return self._bank("validation", count, grid, horizon)
 
     def test(self, count: int, grid: Grid, horizon: int) -> Tensor:
-        """See `FireSource`."""
         return self._bank("test", count, grid, horizon)
 
     def test_fire(self, index: int, grid: Grid, horizon: int) -> Tensor:
-        """See `FireSource`."""
         seeds = fire_seeds("test", index + 1)[index:]
         return self._with_burn_time(make_fires(self.config, seeds, grid, horizon))
 
@@ -109,42 +109,23 @@ class Generated:
         }
         return {"fire_seeds": fire_seeds("test", count).tolist(), "scenario": values}
 
-    def with_checksum(self) -> "ScenarioConfig":
-        """Returns the scenario: it has no files."""
-        return self.config
-
-    def save_copy(self, folder: Path, grid: Grid, horizon: int) -> "ScenarioConfig":
-        """Returns the scenario: it has no files."""
-        return self.config
-
-    def load_copy(self, folder: Path) -> "ScenarioConfig":
-        """Returns the scenario: it has no files."""
-        return self.config
-
 
 @dataclasses.dataclass(frozen=True)
-class FromFile:
+class FromFile(FireSource):
     """Fires of files."""
 
     config: FileFireConfig
 
     def train(self, grid: Grid, horizon: int) -> Tensor:
-        """See `FireSource`."""
         return self._with_burn_time(fire_files.fire_sets(self.config, grid, horizon).train)
 
     def validation(self, count: int, grid: Grid, horizon: int) -> Tensor:
-        """See `FireSource`."""
         fires = fire_files.fire_sets(self.config, grid, horizon).validation
         return self._with_burn_time(fires[torch.arange(count) % len(fires)])
 
     def test(self, count: int, grid: Grid, horizon: int) -> Tensor:
-        """See `FireSource`."""
         fires = fire_files.fire_sets(self.config, grid, horizon).test
         return self._with_burn_time(fires[torch.arange(count) % len(fires)])
-
-    def test_fire(self, index: int, grid: Grid, horizon: int) -> Tensor:
-        """See `FireSource`."""
-        return self.test(index + 1, grid, horizon)[index:]
 
     def _with_burn_time(self, arrival: Tensor) -> Tensor:
         return with_burn_time(arrival, self.config.burn_time)
@@ -158,16 +139,13 @@ class FromFile:
         return {"fires": count, "scenario": values}
 
     def with_checksum(self) -> "ScenarioConfig":
-        """See `FireSource`."""
         return fire_files.with_checksum(self.config)
 
     def save_copy(self, folder: Path, grid: Grid, horizon: int) -> "ScenarioConfig":
-        """See `FireSource`."""
         fire_files.save_copy(self.config, folder, grid, horizon)
         return self.load_copy(folder)
 
     def load_copy(self, folder: Path) -> "ScenarioConfig":
-        """See `FireSource`."""
         return dataclasses.replace(self.config, saved_copy=str(folder / COPY_FILE))
 
 

@@ -1,4 +1,4 @@
-"""Defines what a `WildfireEnv` shows of itself: sizes, names, maps and pictures."""
+"""Defines the public attributes of `WildfireEnv`: sizes, names, maps and pictures."""
 
 import numpy as np
 import torch
@@ -84,7 +84,7 @@ class TeamView(EnvBase):
 
     @property
     def knowledge(self) -> Knowledge | None:
-        """What each UAV and the base, which is last, know; None in a world without a base."""
+        """The knowledge of each UAV and, last, of the base; None in a world without a base."""
         return None if self._measures is None else self._measures.knowledge
 
     def render(self, mode: str = "rgb_array", *, env: int = 0):

@@ -34,12 +34,11 @@ def bank_key(
     count: int,
     grid: tuple[int, int],
     horizon: int,
-    start: int = 0,
 ) -> str:
     """Returns a hash of all values on which a bank of arrival times depends."""
     ranges = dataclasses.asdict(config)
     ranges.pop("burn_time", None)
-    parts = [GENERATOR_VERSION, ranges, split, count, *grid, horizon, start]
+    parts = [GENERATOR_VERSION, ranges, split, count, *grid, horizon]
     return hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:32]
 
 
@@ -49,25 +48,21 @@ def fire_bank(
     count: int,
     grid: tuple[int, int],
     horizon: int,
-    *,
-    start: int = 0,
-    cache_dir: str | os.PathLike[str] | None = None,
 ) -> Tensor:
     """Returns the first `count` fires of a split, computed once and then read from a file.
 
+    The file, in `cache_folder()`, ends with the SHA-256 of its content. A damaged file is replaced.
+    If the folder cannot be written to, a warning is issued and the fires are computed each time.
+
     Args:
         config, grid, horizon: as in `make_fires`.
-        split, count, start: as in `fire_seeds`.
-        cache_dir: folder of the file, `cache_folder()` by default. The file ends with the
-            SHA-256 of its content. A damaged file is replaced. If the folder cannot be written
-            to, a warning is issued and the fires are computed each time.
+        split, count: as in `fire_seeds`.
 
     Returns:
         As `make_fires`, on the CPU, so that every device trains on the same fires.
     """
-    seeds = fire_seeds(split, count, start)
-    folder = cache_folder() if cache_dir is None else Path(cache_dir)
-    file = folder / f"fire-{bank_key(config, split, count, grid, horizon, start)}.npy"
+    seeds = fire_seeds(split, count)
+    file = cache_folder() / f"fire-{bank_key(config, split, count, grid, horizon)}.npy"
     times = (2,) if isinstance(config, ReactionConfig) else ()
     stored = _read(file, (count, *times, *grid))
     if stored is not None:

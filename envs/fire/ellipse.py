@@ -51,17 +51,3 @@ def ellipse_rates(
     back = head * (1 - eccentricity) / (1 + eccentricity)
     a = (head + back) / 2
     return a, a / ratio, (head - back) / 2
-
-
-def front_speed(normal: Tensor, a: Tensor, b: Tensor, c: Tensor, azimuth: float | Tensor) -> Tensor:
-    """Returns the speed of a straight front along its outward normal, cells per step.
-
-    This is F(n) = c (n·w) + sqrt(b² + (a² − b²)(n·w)²), the support function of the wavelet.
-
-    Args:
-        normal: angle of the normal in radians; all arguments are broadcast together.
-        a, b, c: from `ellipse_rates`.
-        azimuth: direction of maximum spread in radians.
-    """
-    along = torch.cos(normal - azimuth)
-    return c * along + torch.sqrt(b**2 + (a**2 - b**2) * along**2)

@@ -139,29 +139,20 @@ def load_scenario(name: str) -> GeneratedConfig:
         raise UserError(f"configs/fire/{name}.yaml: {describe(error)}") from None
 
 
-def fire_seeds(split: Split, count: int, start: int = 0) -> Tensor:
+def fire_seeds(split: Split, count: int) -> Tensor:
     """Returns the seeds of the first `count` fires of a split, int64 [count].
 
     Training seeds are 0 to 999,999, test seeds 1,000,000 to 1,999,999 and validation seeds
-    2,000,000 to 2,999,999, so the three sets are disjoint for every `start`.
-
-    Args:
-        split: "train", "validation" or "test".
-        count: number of seeds.
-        start: the first training seed. Validation and test seeds always start at 0.
+    2,000,000 to 2,999,999, so the three sets are disjoint.
 
     Raises:
         UserError: the split is not known, or the seeds would not lie in its interval.
     """
     if split not in get_args(Split):
         raise UserError(f"unknown split {split!r}; known: {', '.join(get_args(Split))}")
-    if count < 1 or start < 0:
-        raise UserError(f"expected count >= 1 and start >= 0, got {count} and {start}")
-    if split != "train" and start:
-        raise UserError(f"{split} fires are the same for everyone: start must be 0, got {start}")
-    if start + count > TEST_FROM:
-        raise UserError(f"a split has {TEST_FROM} seeds, got start {start} and count {count}")
-    first = {"train": start, "test": TEST_FROM, "validation": VALIDATION_FROM}[split]
+    if not 1 <= count <= TEST_FROM:
+        raise UserError(f"expected a count of 1 to {TEST_FROM} seeds, got {count}")
+    first = {"train": 0, "test": TEST_FROM, "validation": VALIDATION_FROM}[split]
     return torch.arange(first, first + count)
 
 

@@ -23,6 +23,8 @@ MAX_BYTES = 300_000_000
 """Bytes of a text file."""
 MAX_FILES = 500
 """Files of perimeters in a folder."""
+_SAFE_NAME = re.compile(r"\w[\w.:+-]*")  # part of a shell's command as it is
+_FIRMS = re.compile(rb'(?:\xef\xbb\xbf)?(?:"?country_id"?,)?"?latitude"?,"?longitude"?,')
 _BESIDE = {".shp": (".shx", ".dbf", ".prj", ".cpg"), ".asc": (".prj",)}
 
 
@@ -221,19 +223,20 @@ def perimeter_files(folder: Path) -> list[Path]:
 
 def _refuse_convertible(path: Path, head: bytes) -> None:
     """Raises a UserError that says how to convert a format that is not read."""
+    name = path.name if _SAFE_NAME.fullmatch(path.name) else "FILE"
     if head[:3] == b"CDF" or head[:4] == b"\x89HDF":
         raise UserError(
             "NetCDF, as of WRF-SFIRE; expected a GeoTIFF: gdal_translate -b LAST -a_ullr 0 HEIGHT "
-            f"WIDTH 0 NETCDF:{path.name}:TIGN_G fire.tif (number of the last time; metres), read "
+            f"WIDTH 0 NETCDF:{name}:TIGN_G fire.tif (number of the last time; metres), read "
             "with fire.units=seconds and fire.end, the seconds of that time"
         )
-    if head[:19] == b"latitude,longitude,":
+    if _FIRMS.match(head):
         raise UserError(
             "points, as of FIRMS; expected perimeters: ogr2ogr -a_srs EPSG:4326 -oo "
             "X_POSSIBLE_NAMES=longitude -oo Y_POSSIBLE_NAMES=latitude -dialect sqlite -sql "
             "\"SELECT acq_date || 'T' || substr('000' || acq_time, -4, 2) || ':' || "
             "substr('000' || acq_time, -2) AS datetime, ST_Buffer(geometry, 0.002) AS geometry "
-            f'FROM [{path.stem}]" fire.gpkg {path.name}'
+            f'FROM [{Path(name).stem}]" fire.gpkg {name}'
         )
     if path.name.startswith("ForestGrid") and path.suffix == ".csv":
         raise UserError(

@@ -11,18 +11,30 @@ _GEOTIFF = (".aux.xml", ".msk", ".aux", ".tfw", ".tifw", ".tiffw", ".wld", ".tab
 _READ = {".tif": _GEOTIFF, ".tiff": _GEOTIFF, ".gpkg": ("-wal", "-journal")}
 """Endings of files that change what GDAL reads, besides those that `formats` knows."""
 _OPENED = (".prj", ".cpg", ".ovr", *_GEOTIFF, "-wal", "-shm", "-journal")
+_IMAGES = (".msk", ".ovr")
+_TIFF = (b"II*\0", b"II+\0", b"MM\0*", b"MM\0+")
 _MAX_BYTES = 1_000_000  # of a .prj
 
 
 def check_sidecars(path: Path) -> None:
-    """Checks that the files beside a file are regular. A pipe would block for ever.
+    """Checks that the files beside a file are regular, and that masks and overviews are TIFF.
+
+    A pipe would block for ever. GDAL opens masks and overviews of any format; one in its XML format
+    VRT can make it fetch from the network.
 
     Raises:
-        UserError: one is a pipe, a folder, a device or a broken link.
+        UserError: one is a pipe, a folder, a device or a broken link, or of another format.
     """
     for part in _beside(path, _OPENED):
         if not part.is_file():
             raise UserError(f"{part.name}, beside it, is no regular file")
+        if part.suffix.lower() in _IMAGES and not _begins_with(part, _TIFF):
+            raise UserError(f"{part.name}, beside it, is no TIFF; expected one, or no such file")
+
+
+def _begins_with(path: Path, heads: tuple[bytes, ...]) -> bool:
+    with path.open("rb") as file:
+        return file.read(4).startswith(heads)
 
 
 def read_beside(path: Path) -> list[Path]:

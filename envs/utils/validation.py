@@ -3,7 +3,9 @@
 import difflib
 import json
 import operator
+import re
 import reprlib
+import shlex
 from collections.abc import Iterable, Mapping
 from typing import Annotated, Any, TypeVar
 
@@ -102,6 +104,15 @@ def shown(value: Any) -> str:
 def printable(text: str) -> str:
     """Returns the text on one line, with escapes for characters that cannot be printed."""
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
+
+
+def as_argument(key: str, value: str) -> str:
+    """Returns `key=value` as it is written in a shell, for a message."""
+    words = ("true", "false", "null", "nan", "inf")  # Hydra reads them as other types
+    if re.fullmatch(r"[^\W\d][\w-]*", value) and value.lower() not in words:
+        return f"{key}={value}"
+    escaped = value.replace('"', '\\"')
+    return shlex.quote(f'{key}="{escaped}"')
 
 
 def describe(error: ValidationError, prefix: str = "") -> str:

@@ -1,4 +1,4 @@
-"""What scripted policies plan with: maps of what UAVs know, targets, and places to meet."""
+"""Plans of scripted policies: maps of the UAVs' knowledge, targets, and places to meet."""
 
 from emberlink.policies.planning.foresight import Foresight
 from emberlink.policies.planning.rally import Rally, chain

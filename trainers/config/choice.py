@@ -6,31 +6,19 @@ with its own settings.
 
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
-from typing import Any, Protocol
+from typing import Any
 
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import from_plain, shown
 
 
-class Registry(Protocol):
-    """Finds classes by name. Each has a `config_type`, the pydantic dataclass of its settings."""
-
-    def known(self) -> list[str]:
-        """Returns the names in alphabetical order."""
-        ...
-
-    def find(self, name: str) -> Any:
-        """Returns the class of a name; raises a UserError if the name is not known."""
-        ...
-
-
-def settings(key: str, values: Any, registry: Registry) -> Any:
+def settings(key: str, values: Any, registry: Any) -> Any:
     """Returns the settings as an instance of the named class's `config_type`.
 
     Args:
         key: key of the settings in the configuration, for messages.
         values: name and settings as plain values, or an instance of a `config_type`.
-        registry: finds the class of the name.
+        registry: module with `known()` and `find(name)`; each class has a `config_type`.
 
     Raises:
         UserError: the name or a setting is missing or not known, or a value does not fit.

@@ -68,7 +68,7 @@ def check_same(path: Path, sealed: Mapping[str, Any], config: RunConfig) -> None
 def changed_evaluation(path: Path, config: RunConfig) -> list[str]:
     """Returns a text for each setting of evaluations that differs from the checkpoint's header.
 
-    They may be changed when a run is resumed, and are no part of what the networks learnt.
+    They may be changed when a run is resumed, and do not affect training.
 
     Args:
         path: path of the checkpoint.

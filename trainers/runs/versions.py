@@ -21,7 +21,7 @@ def _installed() -> dict[str, str]:
 
 
 def changed(before: Mapping[str, str]) -> str:
-    """Describes the packages whose version is not what it was; an empty text if there are none.
+    """Describes the packages whose version has changed; an empty text if there are none.
 
     Args:
         before: what `versions` returned.

@@ -1,5 +1,6 @@
 """Runs `emberlink train`: trains, shows the progress, evaluates."""
 
+import shlex
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -104,7 +105,7 @@ def _announce(trainer: Trainer, console: Console) -> None:
     if _is_finished(trainer):
         console.print(
             f"{trainer.run.path} is finished, {config.episodes} episodes; nothing is left to do. "
-            f"More: emberlink train resume={trainer.run.path} episodes={2 * config.episodes}",
+            f"More: {_resume_command(trainer)} episodes={2 * config.episodes}",
             soft_wrap=True,
         )
     elif not _learns(trainer):
@@ -197,10 +198,14 @@ def _print_how_to_resume(trainer: Trainer, console: Console) -> None:
         if networks:
             console.print(
                 f"stopped; the newest networks are {networks[-1]}\n"
-                f"evaluate them with: emberlink eval {run.path}",
+                f"evaluate them with: emberlink eval {shlex.quote(str(run.path))}",
                 soft_wrap=True,
             )
-    console.print(f"resume with: emberlink train resume={trainer.run.path}", soft_wrap=True)
+    console.print(f"resume with: {_resume_command(trainer)}", soft_wrap=True)
+
+
+def _resume_command(trainer: Trainer) -> str:
+    return f"emberlink train {shlex.quote(f'resume={trainer.run.path}')}"
 
 
 def _resume_hint(trainer: Trainer, error: Exception | None = None) -> str:
@@ -208,9 +213,7 @@ def _resume_hint(trainer: Trainer, error: Exception | None = None) -> str:
     config: RunConfig = trainer.config
     # Without a rollback, the run would end at the same step again.
     diverged = isinstance(error, NonFiniteError) and config.on_nan == "stop"
-    command = f"emberlink train resume={trainer.run.path}" + (
-        " on_nan=rollback" if diverged else ""
-    )
+    command = _resume_command(trainer) + (" on_nan=rollback" if diverged else "")
     states = trainer.run.states()
     if not states:
         return f"there is no checkpoint; begin again with: {command}"

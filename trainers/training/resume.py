@@ -1,5 +1,6 @@
 """Resumes a stopped run exactly where its newest checkpoint was made."""
 
+import shlex
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -116,7 +117,8 @@ def _restore(trainer: Trainer, runs: Sequence[RunFolder], chosen: Path | None) -
         trainer.restore(path, state, tensors)
     except UserError as error:
         older = [state for state in states if 0 <= step_of(state) < step_of(path)]
-        hint = f"; the one before it: emberlink train resume={older[-1]}" if older else ""
+        argument = shlex.quote(f"resume={older[-1]}") if older else ""
+        hint = f"; the one before it: emberlink train {argument}" if older else ""
         raise UserError(f"{error}{hint}") from None
     if len(runs) > 1 and state.folders != [run.path.name for run in runs]:
         raise UserError(

@@ -29,7 +29,7 @@ from emberlink.envs.fire_files.projection import (
 )
 from emberlink.envs.fire_files.raster_source import Window
 from emberlink.envs.utils.errors import UserError
-from emberlink.envs.utils.validation import unknown
+from emberlink.envs.utils.validation import as_argument, unknown
 
 MAX_TIMES = 500
 _INCIDENTS = ("poly_incidentname", "attr_incidentname", "incidentname", "incident", "fire_name")
@@ -157,7 +157,7 @@ def _choose_incident(frame: Any, wanted: str | None) -> Any:
         several = sorted(names.values())
         raise UserError(
             f"perimeters of {len(several)} incidents: {', '.join(several[:30])}; expected "
-            f"fire.incident, such as fire.incident={several[0]}, or * for all as one fire"
+            f"{as_argument('fire.incident', several[0])}, or fire.incident=* for all as one fire"
         )
     if wanted.casefold() not in names:
         raise UserError(f"fire.incident={unknown(wanted, sorted(names.values()))}")

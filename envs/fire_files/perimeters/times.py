@@ -243,7 +243,7 @@ def _geomac(frame: Any, date_name: str, time_name: str) -> tuple[np.ndarray, Clo
 
 def _time_of_day(text: str) -> timedelta:
     """Reads 2300, 155 or 155.0 (HHMM), 23:00, 1:55:00, or 11:55 PM."""
-    text = text.strip()
+    text = text.strip().upper()
     if _HHMM.fullmatch(text):
         number = int(text.removesuffix(".0"))
         hour, minute, second, half = number // 100, number % 100, 0, None

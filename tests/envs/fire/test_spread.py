@@ -6,11 +6,17 @@ import pytest
 import torch
 from torch import Tensor
 
-from emberlink.envs.fire.ellipse import ellipse_rates, front_speed, length_to_breadth
+from emberlink.envs.fire.ellipse import ellipse_rates, length_to_breadth
 from emberlink.envs.fire.level_set import arrival_times, disc
 
 SIDE, CORE, HEAD, HORIZON = 30.0, 3.0, 0.01, 1000.0
 STRAIGHT, TURNING = 0.0, math.pi
+
+
+def front_speed(normal, a, b, c, azimuth) -> Tensor:
+    """Returns the speed of a straight front along its outward normal: the support function."""
+    along = torch.cos(normal - azimuth)
+    return c * along + torch.sqrt(b**2 + (a**2 - b**2) * along**2)
 
 
 def exact_arrival(n: int, ratio: float, azimuth, horizon: float = HORIZON) -> Tensor:

@@ -1,6 +1,7 @@
 """Tests perimeters as published by agencies: KML, KMZ, a file per date, several incidents."""
 
 import json
+import shlex
 import socket
 import zipfile
 
@@ -15,6 +16,7 @@ from fire_files import UTM, Ellipses, frame_of
 from emberlink.envs.fire_files.config import FileFireConfig
 from emberlink.envs.fire_files.reader import read_fires, with_checksum
 from emberlink.envs.utils.errors import UserError
+from emberlink.trainers.config.overrides import parse
 
 HOURS = (60.0, 120.0, 180.0)
 DATES = [f"2020-08-19T{hour}:00:00Z" for hour in (22, 23)] + ["2020-08-19T17:00:00-07:00"]
@@ -258,9 +260,7 @@ def test_an_incident_is_chosen_among_several(tmp_path, frame, suffix, column):
     path = tmp_path / f"both.{suffix}"
     both.to_file(path)
     message = refused(path)
-    assert "2 incidents: August, Creek; expected fire.incident, such as fire.incident=August" in (
-        message
-    )
+    assert "2 incidents: August, Creek; expected fire.incident=August, or fire.inc" in message
     assert torch.equal(read(path, incident="august"), read(tmp_path / f"one.{suffix}"))
     assert read(path, incident="Creek").isfinite().any()
     both.drop(columns=column).to_file(tmp_path / f"all.{suffix}")
@@ -287,11 +287,35 @@ def test_other_formats_are_named_with_a_command_that_converts_them(tmp_path):
     message = refused(firms)
     assert "FIRMS" in message
     assert "ogr2ogr" in message
+    for start in ("\ufefflatitude,longitude,", "country_id,latitude,longitude,"):
+        firms.write_text(start + "bright_ti4,acq_date\n", encoding="utf-8")
+        assert "FIRMS" in refused(firms)
     grid = tmp_path / "ForestGrid07.csv"
     grid.write_text("0,0,0,0\n0,1,0,0\n")
     message = refused(grid)
     assert "Cell2Fire" in message
     assert "ForestGrid*.csv" in message
+
+
+@pytest.mark.parametrize("content", [b"CDF\x01", b"latitude,longitude,acq_date"])
+@pytest.mark.parametrize("name", ["a;reboot;.nc", "$(reboot).nc", "-o a.nc", "`a`.nc"])
+def test_a_name_is_no_part_of_a_command_unless_it_is_plain(tmp_path, content, name):
+    path = tmp_path / name
+    path.write_bytes(content)
+    command = refused(path).partition("expected")[2]
+    assert name.removesuffix(".nc") not in command
+    assert "FILE" in command
+
+
+@pytest.mark.parametrize(
+    "name", ["Elk Creek", "O'Brien", 'A "B" \\ C', "A,B", "12", "null", "$HOME"]
+)
+def test_the_suggested_incident_can_be_copied(tmp_path, frame, name):
+    frame.assign(incident=[name, *["~"] * (len(frame) - 1)]).to_file(tmp_path / "fire.gpkg")
+    message = refused(tmp_path / "fire.gpkg")
+    suggested = message.partition("expected ")[2].partition(", or ")[0]
+    (argument,) = shlex.split(suggested)
+    assert parse(argument) == ("fire.incident", name)
 
 
 def test_the_command_for_cell2fire_writes_a_bank(tmp_path, monkeypatch):

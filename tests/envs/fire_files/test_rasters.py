@@ -2,6 +2,7 @@
 
 import math
 import os
+import socket
 import subprocess
 import sys
 import warnings
@@ -326,6 +327,29 @@ def test_no_regular_file_beside_a_raster(tmp_path, name):
         part.rmdir() if part.is_dir() else part.unlink()
 
 
+@pytest.mark.parametrize("ending", [".msk", ".MSK", ".ovr"])
+def test_a_virtual_mask_is_not_fetched(tmp_path, ending, monkeypatch):
+    """GDAL would open it, and the owner of the file would learn who reads it."""
+    monkeypatch.setenv("GDAL_HTTP_TIMEOUT", "1")  # so that a fetch would not block
+    path = write_tif(tmp_path / "fire.tif", corner([[0, 5], [2, 4]], 2, 2), nodata=None)
+    part = '{0}="0" {1}="0" xSize="8" ySize="8"'.format
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        address = f"/vsicurl/http://127.0.0.1:{server.getsockname()[1]}/mask.tif"
+        (tmp_path / f"fire.tif{ending}").write_text(
+            '<VRTDataset rasterXSize="8" rasterYSize="8"><Metadata>'
+            '<MDI key="INTERNAL_MASK_FLAGS_1">2</MDI></Metadata>'
+            '<VRTRasterBand dataType="Byte" band="1"><SimpleSource>'
+            f"<SourceFilename>{address}</SourceFilename><SourceBand>1</SourceBand>"
+            f"<SrcRect {part('xOff', 'yOff')}/><DstRect {part('xOff', 'yOff')}/>"
+            "</SimpleSource></VRTRasterBand></VRTDataset>"
+        )
+        with pytest.raises(UserError, match=rf"fire\.tif{ending}, beside it, is no TIFF"):
+            read(path)
+        server.setblocking(False)
+        with pytest.raises(BlockingIOError):
+            server.accept()
+
+
 def test_a_byte_order_mark_before_a_projection(tmp_path):
     path = write_asc(tmp_path / "fire.asc", raster_of(Ellipses(), 300.0))
     fire = read(path, (30, 30))
@@ -357,6 +381,16 @@ def test_a_mask_marks_cells_that_never_burn(tmp_path):
     path = write_tif(tmp_path / "fire.tif", times, nodata=None)
     with rasterio.Env(GDAL_TIFF_INTERNAL_MASK=True), rasterio.open(path, "r+") as dataset:
         dataset.write_mask(times != 3)
+    assert torch.isfinite(read(path, horizon=3)).sum() == 4
+
+
+def test_a_mask_beside_the_file_marks_cells_that_never_burn(tmp_path):
+    times = np.full((8, 8), 3.0, "float32")
+    times[:2, :2] = [[0, 2], [4, 6]]
+    path = write_tif(tmp_path / "fire.tif", times, nodata=None)
+    with rasterio.Env(GDAL_TIFF_INTERNAL_MASK=False), rasterio.open(path, "r+") as dataset:
+        dataset.write_mask(times != 3)
+    assert (tmp_path / "fire.tif.msk").is_file()
     assert torch.isfinite(read(path, horizon=3)).sum() == 4
 
 

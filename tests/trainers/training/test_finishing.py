@@ -3,10 +3,13 @@
 import errno
 import os
 import re
+import shlex
 import shutil
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from inside import Inside
@@ -18,6 +21,7 @@ from emberlink.trainers.evaluation import command, plots
 from emberlink.trainers.runs.run_folder import RunFolder
 from emberlink.trainers.sweep.command import sweep
 from emberlink.trainers.terminal import SafeConsole
+from emberlink.trainers.training.command import _resume_hint
 from emberlink.trainers.training.resume import resume
 from emberlink.trainers.training.trainer import Trainer
 
@@ -348,3 +352,10 @@ def test_metrics_are_flushed_before_the_state(tmp_path, monkeypatch):
     del synced[:]
     run.write("eval.json", {})
     assert [Path(path).name.split(".")[0] for path in synced] == ["eval", run.path.name]
+
+
+def test_the_command_to_resume_can_be_copied():
+    run = RunFolder("a b;c/x_s0")
+    trainer: Any = SimpleNamespace(run=run, config=SimpleNamespace(on_nan="stop"))
+    words = shlex.split(_resume_hint(trainer).partition("with: ")[2])
+    assert words == ["emberlink", "train", "resume=a b;c/x_s0"]
