@@ -16,7 +16,7 @@ UNFINISHED := $(VENV)/emberlink-unfinished
 PIP := $(BIN)/python -m pip install -q --disable-pip-version-check -c constraints.txt
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-slow soak bench guard lint typecheck install browser clean
+.PHONY: help demo test test-slow soak bench guard lint typecheck docs install browser clean
 
 help:  ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## /  make \1\t/p' $(MAKEFILE_LIST) | expand -t 20
@@ -58,6 +58,10 @@ lint: $(INSTALLED)  ## check style, layout and the direction of imports
 
 typecheck: $(INSTALLED)  ## check the types
 	@$(BIN)/basedpyright --pythonpath $(BIN)/python
+
+docs: $(INSTALLED)  ## build the documentation site in build/docs; warnings are errors (about 2 minutes)
+	@OMP_NUM_THREADS=1 $(BIN)/sphinx-build -q -W -E -b html docs build/docs
+	@echo "build/docs/index.html"
 
 install: $(INSTALLED)  ## only create .venv
 

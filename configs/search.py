@@ -4,6 +4,7 @@ A group is a folder such as `method` or `fire`. Each file in it is a choice of t
 """
 
 import os
+import re
 import warnings
 from collections.abc import Sequence
 from importlib.util import find_spec
@@ -39,6 +40,27 @@ def known(group: str, within: Sequence[Path] | None = None) -> list[str]:
     searched = folders() if within is None else within
     files = (file for folder in searched for file in (folder / group).glob("*.yaml"))
     return sorted({file.stem for file in files if file.is_file()})
+
+
+def describe(group: str, name: str) -> str:
+    """Returns the first sentence of the comment at the beginning of a choice's file.
+
+    Args:
+        group: name of the group.
+        name: a choice in `known(group)`.
+
+    Returns:
+        The sentence without its full stop; "" if the file does not begin with a comment.
+    """
+    file = next(path for folder in folders() if (path := folder / group / f"{name}.yaml").is_file())
+    words: list[str] = []
+    for line in file.read_text(encoding="utf-8", errors="replace").splitlines():
+        if not line.startswith("#"):
+            break
+        if not line.startswith("# @package"):
+            words += line.lstrip("# ").split()
+    text = "".join(c for c in " ".join(words) if c.isprintable())
+    return re.split(r"\.(?= |$)", text, maxsplit=1)[0]
 
 
 def _package(name: str) -> list[Path]:

@@ -25,8 +25,8 @@ def add_list(commands: Any) -> None:
         "list",
         _list,
         "list methods, setups, worlds, fires, learners, scripted policies",
-        "Prints the names that other commands accept, one per line.",
-        "emberlink list methods",
+        "Prints the names that other commands accept and what they stand for, one per line.",
+        "emberlink list worlds",
     )
     listing.add_argument(
         "kinds", metavar="KIND", nargs="*", default=[], help=f"{', '.join(_KINDS)} (default: all)"
@@ -43,14 +43,31 @@ def _list(options: argparse.Namespace, console: "Console") -> int:
     for kind in kinds:
         if len(kinds) > 1:
             console.print(f"{kind}:", style="bold")
-        indent = "  " if len(kinds) > 1 else ""
-        for name in _names(kind):
-            console.print(f"{indent}{name}", soft_wrap=True)
+        _print(described(kind), "  " if len(kinds) > 1 else "", console)
     return 0
 
 
-def _names(kind: str) -> list[str]:
-    from emberlink.configs import known
+def described(kind: str) -> list[tuple[str, str]]:
+    """Returns the names of a kind and a sentence about each, "" where there is none."""
+    import inspect
+
+    from emberlink.configs import describe, known
     from emberlink.policies.scripted.registry import SCRIPTED
 
-    return list(SCRIPTED) if kind == "policies" else known(_GROUPS[kind])
+    if kind != "policies":
+        return [(name, describe(_GROUPS[kind], name)) for name in known(_GROUPS[kind])]
+    texts = {name: inspect.getdoc(policy) or "" for name, policy in SCRIPTED.items()}
+    return [(name, " ".join(text.split("\n\n")[0].split())) for name, text in texts.items()]
+
+
+def _print(rows: list[tuple[str, str]], indent: str, console: "Console") -> None:
+    """Prints names and descriptions in two columns; on a terminal, descriptions are wrapped."""
+    import textwrap
+
+    column = max((len(name) for name, _ in rows), default=0) + 2
+    width = console.width - len(indent) - column if console.is_terminal else 10_000
+    for name, text in rows:
+        first, *rest = textwrap.wrap(text, max(width, 20)) or [""]
+        console.print(f"{indent}{name:{column}}{first}".rstrip(), soft_wrap=True, highlight=False)
+        for line in rest:
+            console.print(" " * (len(indent) + column) + line, soft_wrap=True, highlight=False)

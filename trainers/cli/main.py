@@ -8,6 +8,8 @@ from collections.abc import Sequence
 from contextlib import suppress
 from typing import Any
 
+import shtab
+
 from emberlink.trainers.cli.compare import add_compare
 from emberlink.trainers.cli.doctor import add_doctor
 from emberlink.trainers.cli.eval import add_eval
@@ -144,6 +146,7 @@ def _parser() -> Parser:
         epilog="Runs on Linux and macOS.",
     )
     parser.add_argument("--version", action=_Version, nargs=0, help="print the version and exit")
+    shtab.add_argument_to(parser, "--completion", help="print a shell's completion script and exit")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND")
     for add in (
         *(add_train, add_eval, add_compare, add_render),

@@ -17,6 +17,9 @@ _SPECIAL = r"\[\]{}\"'`=,$\\\x00-\x1f"
 _PLAIN_TEXT = re.compile(rf"(?P<key>[A-Za-z_][\w.]*)=(?P<value>[^\s{_SPECIAL}][^{_SPECIAL}]*)")
 
 
+_INFINITY = (".inf", "+.inf", "-.inf")
+
+
 def parse(text: str) -> tuple[str, Any]:
     """Returns the key and the value of a `key=value`, read as Hydra reads it.
 
@@ -41,7 +44,15 @@ def parse(text: str) -> tuple[str, Any]:
         raise UserError(f"{shown(text)!r}: expected key=value without a sign before the key")
     if isinstance(value, dict):
         raise UserError(f"{shown(text)!r}: give its keys one by one, as {key}.KEY=VALUE")
-    return key, value
+    return key, _with_infinity(value)
+
+
+def _with_infinity(value: Any) -> Any:
+    """Returns a value with YAML's infinity, `.inf`, as a number; Hydra knows `inf` only."""
+    if isinstance(value, list):
+        return [_with_infinity(item) for item in value]
+    infinite = isinstance(value, str) and value in _INFINITY
+    return float(value.replace(".", "", 1)) if infinite else value
 
 
 def put(values: dict[str, Any], key: str, value: Any) -> None:

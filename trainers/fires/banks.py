@@ -1,7 +1,9 @@
 """Runs `emberlink fire make` and `emberlink fire import`, which write fires to a file."""
 
+import math
 import os
 import re
+import warnings
 from collections.abc import Iterator, Sequence
 from importlib.metadata import version
 from pathlib import Path
@@ -86,7 +88,14 @@ def _make(fire: GeneratedConfig, seeds: Tensor, world: WildfireConfig, console: 
         disable=not console.is_terminal,
     )
     made = torch.cat([make_fires(fire, part, world.grid, world.horizon) for part in parts])
-    return split_times(made)[0]
+    arrival, burn_out = split_times(made)
+    if burn_out is not None or math.isfinite(getattr(fire, "burn_time", math.inf)):
+        warnings.warn(
+            "a file of fires holds arrival times only, without the times at which cells burn out; "
+            "fire.burn_time=STEPS gives one for all cells when the file is read",
+            stacklevel=2,
+        )
+    return arrival
 
 
 def import_files(arguments: Sequence[str], console: Console, output: Path) -> int:

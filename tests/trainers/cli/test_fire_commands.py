@@ -4,6 +4,7 @@ import json
 import os
 import resource
 import sys
+import warnings
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -491,3 +492,12 @@ def test_invalid_times_are_not_written(time, tmp_path):
         with pytest.raises(AssertionError, match="arrival times are 0 or more"):
             write_bank(tmp_path / f"a{suffix}", fires)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_make_says_that_burn_out_times_are_not_written():
+    arguments = ["fire", "make", "front", "--count", "1", "env.horizon=20", "--output", "a.npy"]
+    with pytest.warns(UserWarning, match="without the times at which cells burn out"):
+        assert main.main(arguments) == 0
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", UserWarning)
+        assert main.main([*arguments[:-1], "b.npy", "fire.burn_time=.inf"]) == 0

@@ -148,6 +148,13 @@ def test_defaults_of_a_communication_module_are_written_out():
     assert completed.baselines["consensus"].comm["jitter"] == ConsensusConfig().jitter
 
 
+@pytest.mark.parametrize("text", [".inf", "inf", "+.inf"])
+def test_infinity_is_written_as_in_yaml(text):
+    assert resolve("independent", [f"env.radio.range={text}"]).env.radio.range == math.inf
+    with pytest.raises(UserError, match=r"env.radio.range=-inf"):
+        resolve("independent", ["env.radio.range=-.inf"])
+
+
 @pytest.mark.parametrize("value", ["Läufe", "日本", "meine Läufe (2)", "größer/ßß"])
 def test_letters_outside_of_hydras_grammar_need_no_quotes(value):
     assert resolve("consensus", [f"output={value}"]).output == value

@@ -11,7 +11,7 @@ from emberlink.trainers.sweep.executors.base import Executor
 _REGISTRY = Registry(
     Executor, "emberlink.trainers.sweep.executors", "executor", group="emberlink.executors"
 )
-known = _REGISTRY.known
+known, find = _REGISTRY.known, _REGISTRY.find
 
 
 def make(name: str, settings: dict[str, Any]) -> Executor:

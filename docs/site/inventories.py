@@ -1,0 +1,47 @@
+"""Writes the inventories by which API pages link to other projects, without network access."""
+
+import zlib
+from pathlib import Path
+
+_RL = "reference/generated/{name}.html#{name}"
+_TD = "reference/generated/{name}.html#{name}"
+PROJECTS = {
+    "torchrl": (
+        "https://docs.pytorch.org/rl/0.14/",
+        {
+            "torchrl.envs.EnvBase": _RL,
+            "torchrl.envs.TransformedEnv": _RL,
+            "torchrl.envs.Transform": _RL,
+            "torchrl.objectives.DDPGLoss": _RL,
+            "torchrl.objectives.TD3Loss": _RL,
+        },
+    ),
+    "tensordict": (
+        "https://docs.pytorch.org/tensordict/stable/",
+        {
+            "tensordict.nn.TensorDictModule": _TD,
+            "tensordict.nn.TensorDictSequential": _TD,
+            "tensordict.nn.TensorDictModuleBase": _TD,
+        },
+    ),
+    "pettingzoo": (
+        "https://pettingzoo.farama.org/",
+        {"pettingzoo.utils.env.ParallelEnv": "api/parallel/#{name}"},
+    ),
+}
+"""project -> (address of its documentation, class -> page)"""
+
+
+def write_inventories(folder: Path) -> dict[str, tuple[str, str]]:
+    """Writes an `objects.inv` for each project and returns `intersphinx_mapping`."""
+    folder.mkdir(parents=True, exist_ok=True)
+    mapping = {}
+    for project, (address, classes) in PROJECTS.items():
+        head = f"# Sphinx inventory version 2\n# Project: {project}\n# Version: \n"
+        lines = [f"{name} py:class 1 {page.format(name=name)} -" for name, page in classes.items()]
+        file = folder / f"{project}.inv"
+        note = "# The remainder of this file is compressed using zlib.\n"
+        content = zlib.compress("".join(f"{line}\n" for line in lines).encode())
+        file.write_bytes((head + note).encode() + content)
+        mapping[project] = (address, str(file.resolve()))
+    return mapping

@@ -1,0 +1,189 @@
+"""Directives that print reference tables from the program itself: keys, measures, commands."""
+
+import argparse
+import inspect
+import math
+import re
+import typing
+from collections.abc import Iterator, Mapping
+from dataclasses import MISSING, fields, is_dataclass
+from typing import Any, ClassVar
+
+from docutils import nodes
+from sphinx.application import Sphinx
+from sphinx.pycode import ModuleAnalyzer
+from sphinx.util.docutils import SphinxDirective
+
+from emberlink.comm import registry as communication
+from emberlink.envs import FileFireConfig, FireConfig, ReactionConfig, metrics
+from emberlink.trainers import RunConfig, resolve
+from emberlink.trainers.cli.main import _parser
+from emberlink.trainers.config.compose import to_values
+from emberlink.trainers.learners import registry as learners
+from emberlink.trainers.sweep.executors import registry as executors
+
+_BOUNDS = {"ge": "≥", "gt": ">", "le": "≤", "lt": "<"}
+_SKIPPED = {"baselines", "comm", "learner", "fire", "saved_copy", "sha256", "test_sha256"}
+
+
+def setup(app: Sphinx) -> dict[str, Any]:
+    """Registers the directives."""
+    app.add_directive("configuration-keys", ConfigurationKeys)
+    app.add_directive("measures", Measures)
+    app.add_directive("command-help", CommandHelp)
+    app.add_directive("choices", Choices)
+    return {"parallel_read_safe": True}
+
+
+class _Generated(SphinxDirective):
+    """A directive whose content is Markdown that `text` returns."""
+
+    required_arguments: ClassVar[int] = 0
+    optional_arguments: ClassVar[int] = 1
+
+    def text(self) -> str:
+        """Returns the content."""
+        raise NotImplementedError
+
+    def run(self) -> list[nodes.Node]:
+        return self.parse_text_to_nodes(self.text(), allow_section_headings=True)
+
+
+class ConfigurationKeys(_Generated):
+    """A table of keys: `run`, `learner NAME`, `comm NAME`, `executor NAME` or `fire KIND`."""
+
+    optional_arguments = 2
+
+    def text(self) -> str:
+        kind, name = [*self.arguments, ""][:2]
+        rows = list(_rows(kind, name))
+        head = "| key | default | meaning; type and range |\n|---|---|---|\n"
+        return head + "\n".join(f"| {' | '.join(row)} |" for row in rows)
+
+
+class Measures(_Generated):
+    """A table of all measures."""
+
+    def text(self) -> str:
+        lines = ["| measure | better | meaning |", "|---|---|---|"]
+        for name in metrics.ALL:
+            better = "more" if name in metrics.HIGHER_IS_BETTER else "less"
+            lines.append(f"| `{name}` | {better} | {_first(getattr(metrics, name).__doc__)} |")
+        return "\n".join(lines)
+
+
+class CommandHelp(_Generated):
+    """The help of every command."""
+
+    def text(self) -> str:
+        parser = _parser()
+        (commands,) = (
+            action.choices
+            for action in parser._actions
+            if isinstance(action, argparse._SubParsersAction)
+        )
+        parts = [f"```text\n{parser.format_help()}```"]
+        for name, command in commands.items():
+            parts.append(f"## emberlink {name}\n\n```text\n{command.format_help()}```")
+        return "\n\n".join(parts)
+
+
+class Choices(_Generated):
+    """The names that `emberlink list KIND` prints, with their descriptions."""
+
+    required_arguments = 1
+
+    def text(self) -> str:
+        from emberlink.trainers.cli.list import described
+
+        lines = [f"- `{name}`: {text}" for name, text in described(self.arguments[0])]
+        return "\n".join(lines)
+
+
+def _rows(kind: str, name: str) -> Iterator[tuple[str, ...]]:
+    """Yields the rows of a table of keys."""
+    if kind == "run":
+        yield from _keys(RunConfig, "", to_values(resolve("independent")))
+    elif kind == "fire":
+        types = {"spread": FireConfig, "reaction": ReactionConfig, "file": FileFireConfig}
+        yield from _keys(types[name], "fire.", {})
+    else:
+        registry = {"learner": learners, "comm": communication, "executor": executors}[kind]
+        values = to_values(resolve("independent", [f"learner={name}"])) if kind == "learner" else {}
+        yield from _keys(registry.find(name).config_type, f"{kind}.", values.get(kind, {}))
+
+
+def _keys(cls: type, prefix: str, values: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
+    """Yields the row of each key of a configuration class, and of the classes in it."""
+    meanings = _meanings(cls)
+    hints = typing.get_type_hints(cls, include_extras=True)
+    for field in fields(cls):
+        hint, name = hints[field.name], field.name
+        inner = typing.get_args(hint)[0] if typing.get_origin(hint) is typing.Annotated else hint
+        if name in _SKIPPED:
+            continue
+        if is_dataclass(inner):
+            yield from _keys(inner, f"{prefix}{name}.", values.get(name, {}))
+            continue
+        default = values[name] if name in values else _default(field)
+        shown = "by choice" if default is MISSING else f"`{_plain(default)}`"
+        yield f"`{prefix}{name}`", shown, f"{meanings.get(name, '')}; {_type(hint)}"
+
+
+def _default(field: Any) -> Any:
+    given = field.default
+    return getattr(given, "default", given) if type(given).__name__ == "FieldInfo" else given
+
+
+def _meanings(cls: type) -> dict[str, str]:
+    """Returns the docstring of each attribute of a class, on one line."""
+    found: dict[str, str] = {}
+    for base in reversed(cls.__mro__):
+        if base.__module__.startswith("emberlink"):
+            documented = ModuleAnalyzer.for_module(base.__module__).find_attr_docs()
+            for (owner, name), lines in documented.items():
+                if owner == base.__qualname__:
+                    found[name] = " ".join(lines).strip().replace("|", "\\|")
+    return found
+
+
+def _type(hint: Any) -> str:
+    """Returns a type and its range as text, such as "int ≥ 1"."""
+    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    if origin is typing.Annotated:
+        bounds = [text for part in arguments[1:] for text in _bounds(part)]
+        return f"{_type(arguments[0])} {' and '.join(bounds)}".strip()
+    if origin is typing.Literal:
+        return ", ".join(f"`{value}`" for value in arguments)
+    if origin in (typing.Union, type(int | None)):
+        return " or ".join(_type(part) for part in arguments)
+    if origin is tuple:
+        if arguments[-1] is Ellipsis:
+            return f"list of {_type(arguments[0])}"
+        return f"[{', '.join(_type(part) for part in arguments)}]"
+    return "null" if hint is type(None) else getattr(hint, "__name__", str(hint))
+
+
+def _bounds(part: Any) -> Iterator[str]:
+    for item in getattr(part, "metadata", [part]):
+        for name, sign in _BOUNDS.items():
+            limit = getattr(item, name, None)
+            if isinstance(limit, int | float):
+                yield f"{sign} {limit:g}"
+
+
+def _plain(value: Any) -> str:
+    """Returns a value as YAML shows it."""
+    if isinstance(value, list | tuple):
+        return f"[{', '.join(map(_plain, value))}]"
+    if isinstance(value, float):
+        return ".inf" if math.isinf(value) else f"{value:g}"
+    if value is None or isinstance(value, bool):
+        return {None: "null", True: "true", False: "false"}[value]
+    return str(value)
+
+
+def _first(doc: str | None) -> str:
+    """Returns the text of a docstring before its arguments, on one line."""
+    text = inspect.cleandoc(doc or "").split("\n\nArgs:")[0].split("\n\nReturns:")[0]
+    return re.sub(r"\s+", " ", text).removeprefix("Returns ").replace("|", "\\|")

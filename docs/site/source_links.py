@@ -1,0 +1,31 @@
+"""Shows links to files outside of the site as paths: the site holds the pages only."""
+
+import re
+from pathlib import Path
+from typing import Any
+
+from sphinx.application import Sphinx
+
+_LINK = re.compile(r"\[(?P<text>[^\]]+)\]\((?P<target>(?!https?:)[^)\s#]+)(?P<anchor>#[^)]*)?\)")
+
+
+def setup(app: Sphinx) -> dict[str, Any]:
+    """Registers the extension."""
+    app.connect("source-read", _rewrite)
+    return {"parallel_read_safe": True}
+
+
+def _rewrite(app: Sphinx, page: str, source: list[str]) -> None:
+    """Replaces links to files that are not part of the site in the source of a page."""
+    folder = Path(app.srcdir, page).parent
+    root = Path(app.srcdir).parent
+
+    def replace(match: re.Match[str]) -> str:
+        target = (folder / match["target"]).resolve()
+        in_site = target.is_relative_to(app.srcdir) and "data" not in target.parts
+        if in_site or not target.exists():
+            return match[0]  # a link to nowhere is a warning of Sphinx
+        path, text = str(target.relative_to(root)), match["text"].strip("`")
+        return f"`{path}`" if text in path else f"{match['text']} (`{path}`)"
+
+    source[0] = _LINK.sub(replace, source[0])

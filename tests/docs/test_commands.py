@@ -1,0 +1,148 @@
+"""Runs the commands of the documentation, shortened: small networks, few steps, one episode."""
+
+import re
+import shlex
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from fire_files import Ellipses, frame_of, raster_of, write_asc, write_tif
+from inside import Inside
+from rich.console import Console
+from tiny_run import TINY
+
+from emberlink.trainers.cli.main import main
+from emberlink.trainers.sweep.command import sweep
+
+ROOT = Path(__file__).parents[2]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
+VARIABLES = re.compile(r"^(?:[A-Z_]+=\S+ )+")
+SMALL = [*(word for word in TINY if "num_uavs" not in word), "evaluation.scripted=[]"]
+YAML = r"`(?:\w+/)*((?:method|setup|world|learner)/\w+\.yaml)`[^`]*```yaml\n(.*?)```"
+ENTRY_POINTS = """[emberlink.comm]
+headcount = extensions_block:Headcount
+visited = communication_block:Visited
+[emberlink.learners]
+slow_actor = learners_block:SlowActor
+"""
+
+
+def commands_of(page: Path) -> Iterator[str]:
+    """Yields the commands of a page: indented lines, without comments and continued lines."""
+    text = page.read_text().replace("\\\n", " ")
+    for line in re.findall(r"^    (.*)$", text, re.MULTILINE):
+        command = VARIABLES.sub("", re.sub(r"\s+#.*$", "", line)).strip()
+        if command.startswith("emberlink ") and not command.split()[1].endswith(":"):
+            yield re.sub(r"\s+", " ", command)
+
+
+def is_synopsis(command: str) -> bool:
+    """Returns whether a line describes arguments, such as `emberlink fire import FILE…`."""
+    return bool(re.search(r" \[(-|key)|FILE…|\bMETHOD\b", command))
+
+
+COMMANDS = sorted({c for page in PAGES for c in commands_of(page) if not is_synopsis(c)})
+
+
+@pytest.fixture(scope="module")
+def prepared(tmp_path_factory) -> Path:
+    """Makes a folder with the fires, YAML files and modules that the commands read."""
+    folder = tmp_path_factory.mktemp("docs")
+    fire = Ellipses()
+    write_asc(folder / "ArrivalTime.asc", raster_of(fire, 240))
+    write_tif(folder / "time_of_arrival.tif", raster_of(fire, 240) * 60)
+    frame_of(fire, range(60, 301, 60)).to_file(folder / "Perimeters.shp")
+    days = frame_of(fire, (60, 120, 240)).rename(columns={"Elapsed_Mi": "DateCurrent"})
+    days["DateCurrent"] = [f"2020-08-{day}T13:00:00" for day in (18, 19, 20)]
+    days.to_file(folder / "perimeters.geojson")
+    for page in ("communication", "extensions", "learners", "worlds"):
+        text = (ROOT / "docs" / f"{page}.md").read_text()
+        for name, content in re.findall(YAML, text, re.DOTALL):
+            (folder / "mine" / name).parent.mkdir(parents=True, exist_ok=True)
+            (folder / "mine" / name).write_text(content)
+        for block in re.findall(r"```python\n(.*?)```", text, re.DOTALL)[:1]:
+            (folder / f"{page}_block.py").write_text(block)
+    (folder / "blocks-1.dist-info").mkdir()
+    (folder / "blocks-1.dist-info" / "METADATA").write_text("Name: blocks\nVersion: 1\n")
+    (folder / "blocks-1.dist-info" / "entry_points.txt").write_text(ENTRY_POINTS)
+    return folder
+
+
+@pytest.fixture
+def place(prepared, finished, tmp_path, monkeypatch) -> Path:
+    """Enters a copy of that folder with a finished run in runs/."""
+    folder = Path(shutil.copytree(prepared, tmp_path / "here"))
+    shutil.copytree(finished, folder / "runs" / "one")
+    monkeypatch.chdir(folder)
+    monkeypatch.syspath_prepend(str(folder))
+    monkeypatch.setenv("EMBERLINK_CONFIGS", "mine")
+    return folder
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("command", COMMANDS)
+def test_a_command_of_the_documentation_runs(command, place):
+    if "=BANK" in command:
+        assert main(["fire", "import", "ArrivalTime.asc", "fire.units=minutes", *BANK]) == 0
+    verb, *rest = shortened(shlex.split(command)[1:])
+    if verb == "sweep":
+        assert sweep(rest, Console(quiet=True), executor=Inside()) == 0
+    else:
+        assert main([verb, *rest]) == 0
+
+
+BANK = ["env.horizon=15", "--output", "bank.npy"]
+PLACES = {"RUN": "runs/one", "runs/…": "runs/one", "runs/a": "runs/one", "runs/b": "runs/one"}
+
+
+def shortened(words: list[str]) -> list[str]:
+    """Returns the arguments of a shorter command for the folder of `place`."""
+    verb, *rest = (PLACES.get(word, word) for word in words)
+    rest = [
+        re.sub("=(RUN|runs/…)$", "=runs/one", word).replace("BANK", "bank.npy") for word in rest
+    ]
+    rest = [re.sub("^docs/", f"{ROOT}/docs/", word) for word in rest]
+    if verb in ("train", "sweep") and not rest[0].startswith("resume="):
+        return [verb, *SHORT[verb](rest)]
+    return [verb, *rest, *SHORT.get(verb, lambda _: [])(rest)]
+
+
+def _train(rest: list[str]) -> list[str]:
+    """Returns the arguments of a training of a second."""
+    from_file = any(word.endswith("=file") for word in rest)
+    fires = [] if from_file else ["fire.num_train_fires=2", "evaluation.huygens=false"]
+    return [*_without_sizes(rest), *SMALL, *fires, "output=trained"]
+
+
+def _sweep(rest: list[str]) -> list[str]:
+    """Returns the arguments of a sweep of one method and one value of each key."""
+    methods = [word for word in rest if "=" not in word][:1] or ["independent"]
+    keys = [word for word in _without_sizes(rest) if "=" in word]
+    keys = [
+        re.sub(r"^seeds?=.*", "seed=0", re.sub(r"^(setup|world)=(\w+),.*", r"\1=\2", w))
+        for w in keys
+    ]
+    return [*methods, *keys, *SMALL, "fire.num_train_fires=2", "output=swept"]
+
+
+def _without_sizes(rest: list[str]) -> list[str]:
+    sizes = ("episodes=", "num_envs=", "evaluation.episodes=", "env.horizon=", "output=")
+    return [word for word in rest if not word.startswith(sizes)]
+
+
+def _eval(rest: list[str]) -> list[str]:
+    return ["--fires", "1", *(["env.horizon=20"] if rest[0].startswith("pretrained") else [])]
+
+
+def _render(rest: list[str]) -> list[str]:
+    return ["--step", "3"] if "--step" in rest else ["--frames", "2"]
+
+
+SHORT = {"train": _train, "sweep": _sweep, "eval": _eval, "render": _render}
+
+
+def test_there_are_commands():
+    verbs = {command.split()[1] for command in COMMANDS}
+    assert {"train", "eval", "compare", "render", "sweep", "fire", "list", "doctor"} <= verbs
+    assert len(COMMANDS) > 50
