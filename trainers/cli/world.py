@@ -87,12 +87,12 @@ def _add_sweep(actions: Any) -> None:
     _add_axis(
         sweep, "speeds", float, "0.5,0.75,1,1.5,2", "fire.head_ros in multiples of the world's"
     )
-    _add_axis(sweep, "grids", int, "30,45,60,80", "cells along each side of the map")
-    _add_axis(sweep, "teams", int, "2,4,6,9,12", "numbers of UAVs")
+    _add_axis(sweep, "grids", int, "30,45,60,75", "cells along each side of the map")
+    _add_axis(sweep, "teams", int, "2,4,6,8,12", "numbers of UAVs")
     _add_axis(sweep, "ranges", float, "5,10,15,20,40", "ranges of the radio, cells")
     number = between(2, _MOST_FIRES)
     sweep.add_argument(
-        "--fires", metavar="N", type=number, default=12, help="fires per world (default: 12)"
+        "--fires", metavar="N", type=number, default=8, help="fires per world (default: 8)"
     )
     sweep.set_defaults(command="world sweep")
 

@@ -50,8 +50,8 @@ def base_config(overrides: Sequence[str]) -> RunConfig:
     """Returns the world from which those of a sweep are derived; `front` by default.
 
     Raises:
-        UserError: a key or value is wrong, a key is an axis of the sweep, or the fires have no
-            `fire.head_ros`.
+        UserError: a key or value is wrong, a key is an axis of the sweep, the fires have no
+            `fire.head_ros`, or there is a base.
     """
     for text in overrides:
         key = text.partition("=")[0]
@@ -60,6 +60,8 @@ def base_config(overrides: Sequence[str]) -> RunConfig:
     config = world_config(["world=front", *overrides])
     if not isinstance(config.fire, FireConfig):
         raise UserError(f"fire={config.fire.name}: a sweep needs fires with fire.head_ros")
+    if config.env.base is not None:
+        raise UserError(f"env.base={list(config.env.base)}: a sweep needs a world without a base")
     return config
 
 

@@ -59,12 +59,18 @@ def played(
         split: test fires as in an evaluation, or validation fires as during a training.
         report: called with the name if the policy is played.
     """
-    source, world = fires_of(config.fire), config.env
-    if split == "test":
-        arrival = source.test(fires, world.grid, world.horizon)
-        return play_scripted(config, policy, arrival, report=report)
+    if split == "validation":
+        return play_validation(config, policy, fires, report)
+    arrival = fires_of(config.fire).test(fires, config.env.grid, config.env.horizon)
+    return play_scripted(config, policy, arrival, report=report)
+
+
+def play_validation(
+    config: RunConfig, policy: str, fires: int, report: Callable[[str], None] = lambda _: None
+) -> Measured:
+    """Returns the measures of a scripted policy on validation fires; arguments as `played`."""
     config = scripted_config(config, policy)
-    arrival = source.validation(fires, world.grid, world.horizon)
+    arrival = fires_of(config.fire).validation(fires, config.env.grid, config.env.horizon)
     protocol = {"start_seed": VALIDATION_START_SEED, "block": min(fires, BLOCK)}
     cache = ScriptedResults(policy, config, arrival, protocol)
     measured = cache.read()

@@ -1,7 +1,7 @@
 """Draws the gains of a sweep of worlds."""
 
-import io
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes as Panel
@@ -18,17 +18,15 @@ _UNCLEAR = (0.93, 0.93, 0.93, 1.0)
 _FONT = 8
 
 
-def sweep_figure(lines: Sequence[Line], axes: Axes, headline: str, title: str) -> bytes:
+def sweep_figure(path: Path, lines: Sequence[Line], axes: Axes, headline: str, title: str) -> None:
     """Draws a panel per grid and speed of the fire: teams down, ranges across.
 
     Args:
+        path: a .png file.
         lines: the worlds of a sweep.
         axes: the values of the sweep.
         headline: the measure in which gains are counted.
         title: title of the figure.
-
-    Returns:
-        The content of a .png file.
     """
     by_world = {World(**{name: line[name] for name in World._fields}): line for line in lines}
     gains = [line[key][0] for line in lines for key in ("gain", "gain_all")]
@@ -60,9 +58,7 @@ def sweep_figure(lines: Sequence[Line], axes: Axes, headline: str, title: str) -
     bar = figure.colorbar(scale, ax=panels, shrink=0.6, aspect=40, pad=0.01)
     bar.set_label(f"{headline} gained by messages, points", fontsize=_FONT + 1)
     bar.ax.tick_params(labelsize=_FONT)
-    content = io.BytesIO()
-    figure.savefig(content, format="png", dpi=200, metadata={"Software": None})
-    return content.getvalue()
+    figure.savefig(path, format="png", dpi=200, metadata={"Software": None})
 
 
 def _panel(panel: Panel, worlds: Sequence[Sequence[Line]], scale: ScalarMappable) -> None:

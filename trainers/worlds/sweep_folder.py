@@ -2,7 +2,8 @@
 
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from emberlink.trainers.runs.safe_read import MAX_JSON, parse_json, read_text
 from emberlink.trainers.worlds.axes import World
 
 Line = dict[str, Any]
-_SETTINGS, _LINES, _FIGURE = "sweep.json", "worlds.jsonl", "sweep.png"
+_SETTINGS, _LINES, FIGURE = "sweep.json", "worlds.jsonl", "sweep.png"
 
 
 class SweepFolder:
@@ -38,12 +39,16 @@ class SweepFolder:
             empty = not any(name != "lock" for name in os.listdir(path))
         except OSError as error:
             raise UserError(f"{path}: cannot be used: {error.strerror or error}") from None
-        self._lock = Lock(path)
+        self._lock = Lock(path, "sweeping")
         try:
             if empty:
-                self._write(_SETTINGS, (compact_json.dumps(dict(settings)) + "\n").encode())
+                text = compact_json.dumps(dict(settings)) + "\n"
+                atomic_io.write_bytes(path / _SETTINGS, text.encode())
             self._check(settings)
             self.lines = self._read_lines()
+        except OSError as error:
+            self._lock.release()
+            raise UserError(f"{path}: cannot be used: {error.strerror or error}") from None
         except BaseException:
             self._lock.release()
             raise
@@ -59,17 +64,15 @@ class SweepFolder:
         JsonLines(self.path).append(_LINES, line)
         self.lines[world] = line
 
-    def write_figure(self, picture: bytes) -> Path:
-        """Writes sweep.png, or leaves the earlier one, and returns its path."""
-        return self._write(_FIGURE, picture)
-
-    def _write(self, name: str, content: bytes) -> Path:
-        path = self.path / name
+    @contextmanager
+    def figure(self) -> Iterator[Path]:
+        """Yields a path for a figure, which is renamed to sweep.png at the end."""
+        path = self.path / FIGURE
         try:
-            atomic_io.write_bytes(path, content)
+            with atomic_io.replaced(path) as partial:
+                yield partial
         except OSError as error:
             raise UserError(f"{path}: cannot be written: {error.strerror or error}") from None
-        return path
 
     def _check(self, settings: Mapping[str, Any]) -> None:
         """Checks that the folder has the settings of this sweep."""
