@@ -5,6 +5,7 @@ from itertools import product
 
 import numpy as np
 import pytest
+from PIL import Image
 from rich.console import Console
 
 from emberlink.envs.scenarios import fires_of
@@ -13,15 +14,20 @@ from emberlink.trainers.cli import main
 from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.evaluation import evaluate
 from emberlink.trainers.runs.lock import Lock
-from emberlink.trainers.worlds import check, sweep, worth
+from emberlink.trainers.worlds import check, plot, sweep, worth
 from emberlink.trainers.worlds.axes import Axes, World, base_config, derived
 from emberlink.trainers.worlds.conditions import conditions
+from emberlink.trainers.worlds.play import play_validation
 from emberlink.trainers.worlds.plot import sweep_figure
 from emberlink.trainers.worlds.sweep_folder import SweepFolder
+from emberlink.trainers.worlds.variants import NO_LIMITS, NO_RADIO, play_ranges
 
 POLICIES = ("random_waypoints", "map_greedy_alone", "map_greedy_all", "oracle")
 TINY = ("env.grid=[12,12]", "env.horizon=12", "env.num_uavs=2")
-AXES = ("--speeds", "1,2", "--grids", "12", "--teams", "2", "--ranges", "0.1,1000", "--fires", "2")
+SWEPT = (
+    *("env.horizon=40", "fire.core_radius=[3,4]"),
+    *("--speeds", "1,2", "--grids", "20", "--teams", "3", "--ranges", "0.1,1000", "--fires", "2"),
+)
 
 
 def made_up(coverage, ages=None):
@@ -53,7 +59,7 @@ def test_what_merging_adds_is_in_points_and_in_percent_of_the_age():
     assert merging.figures == {"coverage, points": 12.5, "front_age, % less": 25.0}
 
 
-def fake(coverage, age=30.0):
+def made_up_play(coverage, age=30.0):
     """Returns a replacement of `played` with made-up measures of two fires."""
     shares = dict(zip(POLICIES, coverage, strict=True))
 
@@ -71,7 +77,7 @@ def fake(coverage, age=30.0):
 def test_check_prints_figure_and_bound_and_ends_with_a_status(
     oracle, status, monkeypatch, capsys, tmp_path
 ):
-    monkeypatch.setattr(check, "played", fake((30.0, 70.0, 81.0, oracle)))
+    monkeypatch.setattr(check, "played", made_up_play((30.0, 70.0, 81.0, oracle)))
     file = tmp_path / "out.json"
     assert main.main(["world", "check", "front", "--json", str(file)]) == status
     out = capsys.readouterr().out
@@ -116,8 +122,10 @@ def test_check_plays_on_validation_fires_as_an_evaluation_does(tmp_path):
 
 
 def test_a_gain_is_a_mean_of_differences_with_its_standard_error():
-    before, after = np.array([10.0, 20.0, 30.0]), np.array([11.0, 22.0, 33.0])
-    assert sweep._gain(before, after) == [2.0, 0.577]  # differences 1, 2, 3: 1 / sqrt(3)
+    assert sweep._gain([10.0, 20.0, 30.0], [11.0, 22.0, 33.0]) == [
+        2.0,
+        0.577,
+    ]  # differences 1, 2, 3: 1 / sqrt(3)
 
 
 def test_noise_is_no_worth():
@@ -161,14 +169,20 @@ def test_worlds_of_a_sweep_differ_in_speed_grid_team_and_range_only():
     assert len(set(axes.worlds())) == 24
 
 
-def test_policies_that_do_not_use_the_radio_are_played_once_without_a_base():
-    world = World(1.0, 60, 6, 25.0)
-    assert sweep._reference(base_config([]), world) == world._replace(range=10.0)
-    assert sweep._reference(base_config(["world=relay"]), world) == world
+def test_ranges_in_one_batch_give_what_the_policies_give_one_by_one():
+    keys = ("env.horizon=60", "env.radio.loss=0.3", "env.failures=1", "fire.core_radius=[3,4]")
+    config = derived(base_config(keys), World(1.0, 20, 4, 7.0))
+    together = play_ranges(config, [NO_RADIO, 7.0, NO_LIMITS], 3)
+    alone = [
+        play_validation(config, policy, 3)
+        for policy in ("map_greedy_alone", "map_greedy", "map_greedy_all")
+    ]
+    assert together == alone
+    assert len({tuple(measured["front_age"]) for measured in together}) == 3
 
 
 def start(folder, *arguments) -> int:
-    return main.main(["world", "sweep", str(folder), "env.horizon=12", *AXES, *arguments])
+    return main.main(["world", "sweep", str(folder), *SWEPT, *arguments])
 
 
 @pytest.fixture(scope="module")
@@ -184,6 +198,7 @@ def test_a_sweep_measures_no_gain_out_of_range_and_the_whole_gain_without_limits
     assert [(w["speed"], w["range"]) for w in lines] == list(product((1, 2), (0.1, 1000)))
     for deaf, hearing in (lines[:2], lines[2:]):
         assert deaf["gain"] == [0, 0]
+        assert deaf["front_age"][1] == deaf["front_age"][2] != deaf["front_age"][3]
         assert deaf["headline"][1] == deaf["headline"][2]
         assert hearing["gain"] == hearing["gain_all"] == deaf["gain_all"]
         assert hearing["headline"][2] == hearing["headline"][3]
@@ -195,7 +210,7 @@ def test_a_stopped_sweep_is_resumed_bit_for_bit(swept, tmp_path, monkeypatch, ca
     append, written = SweepFolder.append, []
 
     def stop(folder, world, values):
-        if len(written) == 2:
+        if len(written) == 3:
             raise KeyboardInterrupt
         written.append(world)
         append(folder, world, values)
@@ -208,19 +223,29 @@ def test_a_stopped_sweep_is_resumed_bit_for_bit(swept, tmp_path, monkeypatch, ca
     monkeypatch.setattr(SweepFolder, "append", append)
     capsys.readouterr()
     assert start(folder) == 0
-    assert "4 worlds, of which 2 are done" in capsys.readouterr().out
+    assert "4 worlds, of which 3 are done" in capsys.readouterr().out
     for name in ("worlds.jsonl", "sweep.json"):
         assert (folder / name).read_bytes() == (swept / name).read_bytes()
 
 
 @pytest.mark.drawn
-def test_the_figure_shows_clear_gains_as_colours():
+def test_the_figure_shows_clear_gains_as_colours_and_noise_as_grey(tmp_path):
     axes = Axes([1.0], [60], [6, 12], [5.0, 10.0])
     lines = [line(world, [8.0, 1.0]) for world in axes.worlds()]
     noise = [line(world, [8.0, 9.0], full=(8.0, 9.0)) for world in axes.worlds()]
-    clear, unclear = (sweep_figure(part, axes, "coverage", "a title") for part in (lines, noise))
-    assert clear.startswith(b"\x89PNG")
-    assert clear != unclear
+    for name, part in (("clear", lines), ("noise", noise)):
+        sweep_figure(tmp_path / name, part, axes, "coverage", "a title")
+    clear, unclear = (_colours(tmp_path / name) for name in ("clear", "noise"))
+    grey = tuple(round(255 * part) for part in plot._UNCLEAR[:3])
+    assert grey in unclear - clear
+    assert any(blue > red + 50 for red, _, blue in clear - unclear)
+
+
+def _colours(path) -> set[tuple[int, int, int]]:
+    """Returns the colours that many pixels have."""
+    with Image.open(path) as picture:
+        counted = picture.convert("RGB").getcolors(1 << 24)
+    return {colour for count, colour in counted if count > 1000}
 
 
 def refused(capsys, *arguments) -> str:
@@ -264,7 +289,7 @@ def test_bad_input_of_check(arguments, message, capsys):
         (["--grids", "30.5"], "'30.5' is not a list of whole numbers above 0"),
         (["--speeds", "0"], "'0' is not a list of numbers above 0"),
         (["--fires", "1"], "'1' is not a whole number 2 to"),
-        (["world=relay", "--grids", "20"], "env.base=[0"),
+        (["world=relay"], "env.base=[0.0, 30.0]: a sweep needs a world without a base"),
     ],
 )
 def test_bad_input_of_sweep(arguments, message, capsys, tmp_path):
@@ -273,16 +298,15 @@ def test_bad_input_of_sweep(arguments, message, capsys, tmp_path):
 
 
 def test_a_folder_of_something_else_is_left_alone(swept, tmp_path, capsys):
-    tiny = ("env.horizon=12", *AXES)
     assert "other settings (validation_fires)" in refused(
-        capsys, "sweep", swept, *tiny, "--fires", "3"
+        capsys, "sweep", swept, *SWEPT, "--fires", "3"
     )
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "thesis.txt").touch()
-    message = refused(capsys, "sweep", tmp_path / "full", *tiny)
+    message = refused(capsys, "sweep", tmp_path / "full", *SWEPT)
     assert "not empty, and not the folder of a sweep" in message
     (tmp_path / "file").touch()
-    assert "cannot be used" in refused(capsys, "sweep", tmp_path / "file", *tiny)
+    assert "cannot be used" in refused(capsys, "sweep", tmp_path / "file", *SWEPT)
 
 
 def test_nothing_is_written_through_a_link_or_after_a_damaged_line(swept, tmp_path, capsys):
@@ -291,17 +315,17 @@ def test_nothing_is_written_through_a_link_or_after_a_damaged_line(swept, tmp_pa
     (folder / "sweep.json").write_bytes((swept / "sweep.json").read_bytes())
     (folder / "worlds.jsonl").symlink_to(other)
     other.write_text("")
-    assert "link" in refused(capsys, "sweep", folder, "env.horizon=12", *AXES)
+    assert "link" in refused(capsys, "sweep", folder, *SWEPT)
     assert other.read_text() == ""
     (folder / "worlds.jsonl").unlink()
     (folder / "worlds.jsonl").write_text('{"speed": 1}\n')
-    message = refused(capsys, "sweep", folder, "env.horizon=12", *AXES)
+    message = refused(capsys, "sweep", folder, *SWEPT)
     assert "line 1 is not of a sweep of worlds" in message
 
 
 def test_two_sweeps_do_not_share_a_folder(swept, capsys):
     lock = Lock(swept, "sweeping")
     try:
-        assert "is sweeping here" in refused(capsys, "sweep", swept, "env.horizon=12", *AXES)
+        assert "is sweeping here" in refused(capsys, "sweep", swept, *SWEPT)
     finally:
         lock.release()
