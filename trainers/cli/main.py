@@ -19,7 +19,8 @@ from emberlink.trainers.cli.parser import Parser
 from emberlink.trainers.cli.render import add_render
 from emberlink.trainers.cli.sweep import add_sweep
 from emberlink.trainers.cli.train import add_train
-from emberlink.trainers.cli.warning_lines import one_line_warnings
+from emberlink.trainers.cli.world import add_world
+from emberlink.trainers.terminal.warning_lines import one_line_warnings
 
 INTERRUPTED = 130
 """exit status after Ctrl-C"""
@@ -150,7 +151,7 @@ def _parser() -> Parser:
     commands = parser.add_subparsers(dest="command", metavar="COMMAND")
     for add in (
         *(add_train, add_eval, add_compare, add_render),
-        *(add_sweep, add_fire, add_list, add_doctor),
+        *(add_sweep, add_fire, add_world, add_list, add_doctor),
     ):
         add(commands)
     return parser

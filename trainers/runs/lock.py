@@ -1,4 +1,4 @@
-"""Locks a run folder, so that only one process trains in it."""
+"""Locks a folder, so that only one process trains or sweeps in it."""
 
 import errno
 import os
@@ -17,20 +17,21 @@ _MAX_HOLDER = 1000
 
 
 class Lock:
-    """Holds an exclusive lock on the file `lock` of a run folder until `release`.
+    """Holds an exclusive lock on the file `lock` of a folder until `release`.
 
     The operating system releases the lock when the process ends, also after SIGKILL. The file holds
     the process number and the host name, for error messages.
 
     Args:
-        folder: the run folder.
+        folder: the folder.
+        doing: what processes do in it, for error messages.
 
     Raises:
         UserError: another process holds the lock, `lock` is a link or not a regular file, or the
             file system has no locks.
     """
 
-    def __init__(self, folder: Path):
+    def __init__(self, folder: Path, doing: str = "training"):
         self.path = folder / "lock"
         # No fallback to a lock without the operating system: its file would outlive the process.
         self._lock = FileLock(
@@ -44,7 +45,7 @@ class Lock:
             folder.stat()  # an error if it is missing: FileLock would create it
             self._lock.acquire()
         except Timeout:
-            raise UserError(f"{folder}: {self._holder()} is training here") from None
+            raise UserError(f"{folder}: {self._holder()} is {doing} here") from None
         except OSError as error:
             raise UserError(f"{self.path}: cannot be locked: {_reason(error)}") from None
 

@@ -1,8 +1,13 @@
-"""Prints text, tables and the progress of trainings to terminals, pipes and files."""
+"""Prints text, tables, warnings and the progress of trainings to terminals, pipes and files."""
 
-from emberlink.trainers.terminal.console import OutputError, SafeConsole
-from emberlink.trainers.terminal.progress import TrainingProgress
-from emberlink.trainers.terminal.table import print_table
+from typing import TYPE_CHECKING
+
+from emberlink.envs.utils.lazy import lazy
+
+if TYPE_CHECKING:
+    from emberlink.trainers.terminal.console import OutputError, SafeConsole
+    from emberlink.trainers.terminal.progress import TrainingProgress
+    from emberlink.trainers.terminal.table import print_table
 
 __all__ = [
     "OutputError",
@@ -10,3 +15,13 @@ __all__ = [
     "TrainingProgress",
     "print_table",
 ]
+
+__getattr__ = lazy(
+    __name__,
+    {
+        "OutputError": "console",
+        "SafeConsole": "console",
+        "TrainingProgress": "progress",
+        "print_table": "table",
+    },
+)
