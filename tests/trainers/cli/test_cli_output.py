@@ -131,7 +131,7 @@ def names(_):
         warnings.warn("fires are\\nnot \\x1b[31m cached", stacklevel=2)
     warnings.warn("of a library", RuntimeWarning, stacklevel=2)
     return []
-list._names = names
+list.described = names
 """
 
 
@@ -150,8 +150,8 @@ def test_a_warning_is_one_line_without_a_path():
 
 def test_a_warning_of_a_command_can_be_recorded(monkeypatch):
     names: dict[str, object] = {}
-    exec(WARNS.replace("list._names = names", ""), names)
-    monkeypatch.setattr("emberlink.trainers.cli.list._names", names["names"])
+    exec(WARNS.replace("list.described = names", ""), names)
+    monkeypatch.setattr("emberlink.trainers.cli.list.described", names["names"])
     with pytest.warns() as caught:
         assert main.main(["list", "methods"]) == 0
     assert [warning.category for warning in caught] == [UserWarning, UserWarning, RuntimeWarning]
@@ -252,7 +252,9 @@ def test_eval_takes_a_single_run(run, capsys):
 )
 def test_names_are_listed_on_separate_lines(kind, names, capsys):
     assert main.main(["list", kind]) == 0
-    assert set(names) <= set(capsys.readouterr().out.splitlines())
+    lines = [line.split(maxsplit=1) for line in capsys.readouterr().out.splitlines()]
+    assert set(names) <= {name for name, _ in lines}
+    assert all(len(text) > 10 for _, text in lines)
 
 
 def test_an_unknown_kind_gives_one_line(capsys):
