@@ -146,4 +146,5 @@ def test_uses_keep_their_numbers():
         "FIRE_PARAMETER": 0xF12E,
         "REPLAY_SAMPLE": 2**40,
         "TARGET_NOISE": 2**40 + 1,
+        "MINIBATCH": 2**40 + 2,
     }

@@ -79,7 +79,7 @@ def test_all_policies_have_the_same_fires_and_starts(cache, monkeypatch):
     config = small("independent", "fire=paper")
     begun: dict = {}
 
-    def play(env, policy):
+    def play(env, policy, *_):
         td = env.reset()
         world = env.base_env
         seen = td["agents", "position"].tolist(), world.arrival_time.tolist()

@@ -268,13 +268,14 @@ def header(text: str) -> bytes:
 @pytest.mark.parametrize("kind", BANKS)
 def test_a_cached_bank_of_fires_is_computed_again(kind, tmp_path, mark, monkeypatch):
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("EMBERLINK_CACHE", str(tmp_path / "cache"))
     config = load_scenario("paper")
     arguments = config, "train", 1, (9, 9), 5
-    right = fire_bank(*arguments, cache_dir=tmp_path / "cache")
+    right = fire_bank(*arguments)
     file = tmp_path / "cache" / f"fire-{bank_key(*arguments)}.npy"
     whole = file.read_bytes()
     file.write_bytes(BANKS[kind](mark))
-    assert torch.equal(fire_bank(*arguments, cache_dir=tmp_path / "cache"), right)
+    assert torch.equal(fire_bank(*arguments), right)
     assert file.read_bytes() == whole
     assert not mark.exists()
 

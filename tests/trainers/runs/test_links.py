@@ -327,7 +327,7 @@ def test_an_evaluation_replaces_links(run, outside, tmp_path, capsys, monkeypatc
     monkeypatch.setenv("EMBERLINK_CACHE", str(cache))
     contents = {file: file.read_bytes() for file in cache.iterdir()}
     drawn = [file for file in (run / "figures").iterdir() if not file.is_symlink()]
-    assert len(drawn) == 4
+    assert len(drawn) == 5
     assert len(contents) > 1
     names = [*drawn, run / "eval.json", *contents]
     for path, kind in zip(names, itertools.cycle(SOME)):

@@ -48,14 +48,15 @@ def test_a_change_of_any_bit_of_a_cached_file_is_detected(tmp_path):
         assert read_sealed(path, 100) is None
 
 
-def test_a_cached_bank_with_a_changed_bit_is_computed_again(tmp_path):
+def test_a_cached_bank_with_a_changed_bit_is_computed_again(tmp_path, monkeypatch):
+    monkeypatch.setenv("EMBERLINK_CACHE", str(tmp_path))
     arguments = load_scenario("paper"), "train", 1, (9, 9), 5
-    right = fire_bank(*arguments, cache_dir=tmp_path)
+    right = fire_bank(*arguments)
     (file,) = tmp_path.iterdir()
     whole = file.read_bytes()
     for changed in list(flips(whole))[::61]:
         file.write_bytes(changed)
-        assert torch.equal(fire_bank(*arguments, cache_dir=tmp_path), right)
+        assert torch.equal(fire_bank(*arguments), right)
         assert file.read_bytes() == whole
 
 
