@@ -58,7 +58,7 @@ def sweep_figure(path: Path, lines: Sequence[Line], axes: Axes, headline: str, t
     bar = figure.colorbar(scale, ax=panels, shrink=0.6, aspect=40, pad=0.01)
     bar.set_label(f"{headline} gained by messages, points", fontsize=_FONT + 1)
     bar.ax.tick_params(labelsize=_FONT)
-    figure.savefig(path, format="png", dpi=200, metadata={"Software": None})
+    figure.savefig(path, format="png", dpi=160, metadata={"Software": None})
 
 
 def _panel(panel: Panel, worlds: Sequence[Sequence[Line]], scale: ScalarMappable) -> None:
