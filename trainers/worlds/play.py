@@ -71,11 +71,11 @@ def play_validation(
     """Returns the measures of a scripted policy on validation fires; arguments as `played`."""
     config = scripted_config(config, policy)
     arrival = fires_of(config.fire).validation(fires, config.env.grid, config.env.horizon)
-    protocol = {"start_seed": VALIDATION_START_SEED, "block": min(fires, BLOCK)}
-    cache = ScriptedResults(policy, config, arrival, protocol)
+    start, block = VALIDATION_START_SEED, min(fires, BLOCK)
+    cache = ScriptedResults(policy, config, arrival, {"start_seed": start, "block": block})
     measured = cache.read()
     if measured is None:
         report(policy)
-        measured = play_blocks(config, SCRIPTED[policy], arrival, **protocol)
+        measured = play_blocks(config, SCRIPTED[policy], arrival, start_seed=start, block=block)
         cache.write(measured)
     return measured
