@@ -51,7 +51,9 @@ def prepared(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("docs")
     fire = Ellipses()
     write_asc(folder / "ArrivalTime.asc", raster_of(fire, 240))
-    write_tif(folder / "time_of_arrival.tif", raster_of(fire, 240) * 60)
+    seconds = raster_of(fire, 240)
+    seconds[seconds > 0] *= 60
+    write_tif(folder / "time_of_arrival.tif", seconds, crs=None)
     frame_of(fire, range(60, 301, 60)).to_file(folder / "Perimeters.shp")
     days = frame_of(fire, (60, 120, 240)).rename(columns={"Elapsed_Mi": "DateCurrent"})
     days["DateCurrent"] = [f"2020-08-{day}T13:00:00" for day in (18, 19, 20)]
@@ -108,14 +110,19 @@ def shortened(words: list[str]) -> list[str]:
     rest = [re.sub("^docs/", f"{ROOT}/docs/", word) for word in rest]
     if verb in ("train", "sweep") and not rest[0].startswith("resume="):
         return [verb, *SHORT[verb](rest)]
-    return [verb, *rest, *SHORT.get(verb, lambda _: [])(rest)]
+    more = SHORT.get(verb, lambda _: [])(rest)
+    return [verb, *rest] if verb == "train" else [verb, *rest, *more]
 
 
 def _train(rest: list[str]) -> list[str]:
     """Returns the arguments of a training of a second."""
     from_file = any(word.endswith("=file") for word in rest)
     fires = [] if from_file else ["fire.num_train_fires=2", "evaluation.huygens=false"]
-    return [*_without_sizes(rest), *SMALL, *fires, "output=trained"]
+    small = (
+        [word for word in SMALL if "batch_size" not in word] if "learner=ippo" in rest else SMALL
+    )
+    held = ["env.horizon=20"] if "policy.hold=10" in rest else []
+    return [*_without_sizes(rest), *small, *held, *fires, "output=trained"]
 
 
 def _sweep(rest: list[str]) -> list[str]:

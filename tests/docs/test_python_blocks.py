@@ -4,6 +4,7 @@ import re
 from pathlib import Path
 
 import pytest
+from fire_files import Ellipses, raster_of, write_asc
 
 ROOT = Path(__file__).parents[2]
 PAGES = [
@@ -18,6 +19,7 @@ PAGES = [
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
 def test_the_blocks_of_a_page_run(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
+    write_asc(tmp_path / "ArrivalTime.asc", raster_of(Ellipses(), 240))
     names = {"__name__": "page"}
     for number, block in enumerate(re.findall(r"```python\n(.*?)```", page.read_text(), re.DOTALL)):
         exec(compile(block, f"{page.name}, block {number}", "exec"), names)
