@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from test_resume import SMALL, assert_same, stopped_at, until
+from test_resume import REPLAY, SMALL, assert_same, stopped_at, until
 
 from emberlink.comm import registry
 from emberlink.envs.utils.errors import UserError
@@ -93,7 +93,7 @@ def test_a_map_of_another_package_is_restored_bit_for_bit(installed, tmp_path):
 @pytest.mark.parametrize("shared", [False, True])
 def test_consensus_on_windows_trains_and_resumes(shared, tmp_path):
     more = ["env.observation=window", f"learner.share_parameters={shared}", "episodes=2"]
-    trainer = Trainer(resolve("consensus", [*SMALL, *more, f"output={tmp_path}"]))
+    trainer = Trainer(resolve("consensus", [*SMALL, *REPLAY, *more, f"output={tmp_path}"]))
     trainer.start()
     before = [weight.detach().clone() for weight in trainer.setup.learner.actor.parameters()]
     until(trainer, None)
