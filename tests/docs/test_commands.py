@@ -90,7 +90,7 @@ def test_a_command_of_the_documentation_runs(command, place):
     verb, *rest = shortened(shlex.split(command)[1:])
     if verb == "sweep":
         assert sweep(rest, Console(quiet=True), executor=Inside()) == 0
-    elif [verb, rest[0]] == ["world", "check"]:
+    elif [verb, *rest][:2] == ["world", "check"]:
         # 1: a world of a few steps does not satisfy all conditions
         assert main([verb, *rest]) in (0, 1)
     else:
@@ -108,10 +108,10 @@ def shortened(words: list[str]) -> list[str]:
         re.sub("=(RUN|runs/…)$", "=runs/one", word).replace("BANK", "bank.npy") for word in rest
     ]
     rest = [re.sub("^docs/", f"{ROOT}/docs/", word) for word in rest]
-    if verb in ("train", "sweep") and not rest[0].startswith("resume="):
-        return [verb, *SHORT[verb](rest)]
-    more = SHORT.get(verb, lambda _: [])(rest)
-    return [verb, *rest] if verb == "train" else [verb, *rest, *more]
+    if any(word.startswith("resume=") for word in rest) or verb not in SHORT:
+        return [verb, *rest]
+    short = SHORT[verb](rest)
+    return [verb, *short] if verb in ("train", "sweep") else [verb, *rest, *short]
 
 
 def _train(rest: list[str]) -> list[str]:
