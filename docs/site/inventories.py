@@ -3,25 +3,24 @@
 import zlib
 from pathlib import Path
 
-_RL = "reference/generated/{name}.html#{name}"
-_TD = "reference/generated/{name}.html#{name}"
+_GENERATED = "reference/generated/{name}.html#{name}"
 PROJECTS = {
     "torchrl": (
         "https://docs.pytorch.org/rl/0.14/",
         {
-            "torchrl.envs.EnvBase": _RL,
-            "torchrl.envs.TransformedEnv": _RL,
-            "torchrl.envs.Transform": _RL,
-            "torchrl.objectives.DDPGLoss": _RL,
-            "torchrl.objectives.TD3Loss": _RL,
+            "torchrl.envs.EnvBase": _GENERATED,
+            "torchrl.envs.TransformedEnv": _GENERATED,
+            "torchrl.envs.Transform": _GENERATED,
+            "torchrl.objectives.DDPGLoss": _GENERATED,
+            "torchrl.objectives.TD3Loss": _GENERATED,
         },
     ),
     "tensordict": (
         "https://docs.pytorch.org/tensordict/stable/",
         {
-            "tensordict.nn.TensorDictModule": _TD,
-            "tensordict.nn.TensorDictSequential": _TD,
-            "tensordict.nn.TensorDictModuleBase": _TD,
+            "tensordict.nn.TensorDictModule": _GENERATED,
+            "tensordict.nn.TensorDictSequential": _GENERATED,
+            "tensordict.nn.TensorDictModuleBase": _GENERATED,
         },
     ),
     "pettingzoo": (

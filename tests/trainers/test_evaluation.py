@@ -157,10 +157,9 @@ def test_eval_json_describes_the_evaluation(run, cache):
 # The cache of results of scripted policies
 
 
-def lawnmower(config, fires: int = 2):
-    return evaluate.play_scripted(
-        config, "lawnmower", evaluate.evaluation_fires(config, fires)["huygens"]
-    )
+def lawnmower(config, fires: int = 2, **protocol: int):
+    fires_of_test = evaluate.evaluation_fires(config, fires)["huygens"]
+    return evaluate.play_scripted(config, "lawnmower", fires_of_test, **protocol)
 
 
 def stored(file: Path) -> dict:
@@ -197,12 +196,13 @@ def test_other_fires_policies_protocols_and_sources_have_separate_files(cache, p
     lawnmower(config, fires=3)
     evaluate.play_scripted(config, "oracle", evaluate.evaluation_fires(config, 2)["huygens"])
     assert len(played) == 3
-    monkeypatch.setattr(evaluate, "START_SEED", 5)
-    lawnmower(config)
+    lawnmower(config, start_seed=5)
     assert len(played) == 4
+    lawnmower(config, block=1)
+    assert len(played) == 6  # a batch of each of the two fires
     monkeypatch.setattr(baseline_cache, "source_digest", lambda *_: "other")
     lawnmower(config)
-    assert len(played) == 5
+    assert len(played) == 7
 
 
 @pytest.mark.parametrize(

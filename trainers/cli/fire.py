@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from emberlink.trainers.cli.parser import command, positive
+from emberlink.trainers.cli.parser import command, command_group, positive
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -14,24 +14,17 @@ _KEYS = "keys of setup, env. and fire., as for train, such as setup=tuned, 'env.
 
 def add_fire(commands: Any) -> None:
     """Adds the group of commands to the parser."""
-    group = command(
+    actions = command_group(
         commands,
         "fire",
-        lambda options, console: _help(group, console),
         "preview fires, write them to files, import them",
         "Draws a fire and tells whether UAVs can keep up with it, writes generated fires "
         "to files, and imports fires from files.",
         "emberlink fire preview huygens:3",
     )
-    actions = group.add_subparsers(dest="action", metavar="ACTION")
     _add_preview(actions)
     _add_make(actions)
     _add_import(actions)
-
-
-def _help(group: argparse.ArgumentParser, console: "Console") -> int:
-    console.print(group.format_help(), soft_wrap=True, end="")
-    return 0
 
 
 def _add_preview(actions: Any) -> None:

@@ -105,6 +105,23 @@ def command(
     return parser
 
 
+def command_group(commands: Any, name: str, summary: str, description: str, example: str) -> Any:
+    """Adds a command with subcommands, which alone prints its help.
+
+    Arguments are those of `command`.
+
+    Returns:
+        The object to which `command` adds the subcommands.
+    """
+
+    def print_help(_: argparse.Namespace, console: Any) -> int:
+        console.print(group.format_help(), soft_wrap=True, end="")
+        return 0
+
+    group = command(commands, name, print_help, summary, description, example)
+    return group.add_subparsers(dest="action", metavar="ACTION")
+
+
 def positive(text: str) -> int:
     """Converts an argument to a whole number above 0."""
     if not text.isdecimal() or int(text) < 1:

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from emberlink.trainers.cli.parser import between, command
+from emberlink.trainers.cli.parser import between, command, command_group
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -16,23 +16,16 @@ _MOST_FIRES = 65_536  # as in an evaluation
 
 def add_world(commands: Any) -> None:
     """Adds the group of commands to the parser."""
-    group = command(
+    actions = command_group(
         commands,
         "world",
-        lambda options, console: _help(group, console),
         "test whether worlds are calibrated, compare many worlds",
         "Plays scripted policies to find out whether a world is hard enough and what messages "
         "are worth in it.",
         "emberlink world check front",
     )
-    actions = group.add_subparsers(dest="action", metavar="ACTION")
     _add_check(actions)
     _add_sweep(actions)
-
-
-def _help(group: argparse.ArgumentParser, console: "Console") -> int:
-    console.print(group.format_help(), soft_wrap=True, end="")
-    return 0
 
 
 def _add_check(actions: Any) -> None:

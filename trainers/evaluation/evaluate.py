@@ -187,6 +187,8 @@ def play_scripted(
     name: str,
     arrival: Tensor,
     *,
+    start_seed: int = START_SEED,
+    block: int = BLOCK,
     report: Callable[[str], None] = lambda _: None,
 ) -> Measured:
     """Returns the measures of a scripted policy, from the cache if they are in it.
@@ -195,15 +197,16 @@ def play_scripted(
         config: configuration of the run.
         name: a name in `SCRIPTED`.
         arrival: times in steps, float32 [fires, X, Y] or [fires, 2, X, Y].
+        start_seed, block: as in `play_blocks`.
         report: called with the name if the policy is evaluated.
     """
     world = scripted_config(config, name)
-    protocol = {"start_seed": START_SEED, "block": BLOCK}
+    protocol = {"start_seed": start_seed, "block": block}
     cache = ScriptedResults(name, world, arrival, protocol)
     measured = cache.read()
     if measured is None:
         report(name)
-        measured = play_blocks(world, SCRIPTED[name], arrival)
+        measured = play_blocks(world, SCRIPTED[name], arrival, start_seed=start_seed, block=block)
         cache.write(measured)
     return measured
 

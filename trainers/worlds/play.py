@@ -5,17 +5,9 @@ from typing import Literal
 
 from emberlink.envs.scenarios import fires_of
 from emberlink.envs.utils.errors import UserError
-from emberlink.policies.scripted.registry import SCRIPTED
 from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.config.schema import RunConfig
-from emberlink.trainers.evaluation.baseline_cache import ScriptedResults
-from emberlink.trainers.evaluation.evaluate import (
-    BLOCK,
-    VALIDATION_START_SEED,
-    play_blocks,
-    play_scripted,
-    scripted_config,
-)
+from emberlink.trainers.evaluation.evaluate import BLOCK, VALIDATION_START_SEED, play_scripted
 from emberlink.trainers.evaluation.results import Measured
 
 Split = Literal["test", "validation"]
@@ -69,13 +61,6 @@ def play_validation(
     config: RunConfig, policy: str, fires: int, report: Callable[[str], None] = lambda _: None
 ) -> Measured:
     """Returns the measures of a scripted policy on validation fires; arguments as `played`."""
-    config = scripted_config(config, policy)
     arrival = fires_of(config.fire).validation(fires, config.env.grid, config.env.horizon)
     start, block = VALIDATION_START_SEED, min(fires, BLOCK)
-    cache = ScriptedResults(policy, config, arrival, {"start_seed": start, "block": block})
-    measured = cache.read()
-    if measured is None:
-        report(policy)
-        measured = play_blocks(config, SCRIPTED[policy], arrival, start_seed=start, block=block)
-        cache.write(measured)
-    return measured
+    return play_scripted(config, policy, arrival, start_seed=start, block=block, report=report)
