@@ -1,6 +1,7 @@
 """Tests that imports run one way: envs <- comm <- trainers, envs <- policies <- trainers."""
 
 import ast
+import importlib
 import subprocess
 import sys
 from pathlib import Path
@@ -109,3 +110,27 @@ def test_imports_have_no_side_effects(tmp_path):
     )
     assert (done.returncode, done.stdout) == (0, ""), done.stderr
     assert list(tmp_path.iterdir()) == []
+
+
+ROOMS = [
+    file.parent.relative_to(ROOT).as_posix()
+    for folder in FOLDERS
+    for file in sorted((ROOT / folder).rglob("*.py"))
+    if file.name == "__init__.py"
+]
+
+
+@pytest.mark.parametrize("room", ROOMS)
+def test_a_folder_says_what_it_is_for_and_its_public_names_exist(room):
+    package = importlib.import_module("emberlink." + room.replace("/", "."))
+    assert package.__doc__
+    assert package.__doc__.strip().endswith(".")
+    for name in getattr(package, "__all__", []):
+        assert getattr(package, name) is not None
+    with pytest.raises(AttributeError):
+        package.no_such_name  # noqa: B018
+
+
+def test_every_folder_with_code_is_a_package():
+    folders = {file.parent for folder in FOLDERS for file in (ROOT / folder).rglob("*.py")}
+    assert {folder.relative_to(ROOT).as_posix() for folder in folders} == set(ROOMS)

@@ -1,1 +1,1 @@
-"""The command line: one file per command, run by `main.main`."""
+"""The command line: one file per command. `main.main` runs it; nothing else is public."""

@@ -23,6 +23,6 @@ def add_doctor(commands: Any) -> None:
 
 
 def _doctor(options: argparse.Namespace, console: "Console") -> int:
-    from emberlink.trainers.cli.self_test import doctor
+    from emberlink.trainers.training.self_test import doctor
 
     return doctor(console)

@@ -25,6 +25,12 @@ def add_render(commands: Any) -> None:
         "emberlink render pretrained:consensus pretrained:consensus env.radio.range=0 "
         "--output replay.html",
     )
+    _add_episodes(rendering)
+    _add_output(rendering)
+
+
+def _add_episodes(rendering: argparse.ArgumentParser) -> None:
+    """Adds the arguments that choose what is played."""
     add = rendering.add_argument
     add(
         "runs",
@@ -54,6 +60,11 @@ def add_render(commands: Any) -> None:
         default=[],
         help="a checkpoint in place of the newest; one for each run",
     )
+
+
+def _add_output(rendering: argparse.ArgumentParser) -> None:
+    """Adds the arguments that choose what is written."""
+    add = rendering.add_argument
     add(
         "--output",
         metavar="PATH",
