@@ -41,7 +41,7 @@ class FrameData:
     position: NDArray[np.float32]
     """[n, 3], cells"""
     links: NDArray[np.bool_] | None = None
-    """[n, n], whether a UAV (row) hears another one (column); None without communication"""
+    """[r, r], whether a radio (row) hears another one; the base is last; None for no links"""
     roles: NDArray[np.int64] | None = None
     """[n], indices into `ROLES`; None without roles"""
     target: NDArray[np.float32] | None = None
@@ -66,12 +66,13 @@ def draw_marks(chart: Chart, data: FrameData) -> None:
     places = [chart.point(x, y) for x, y, _ in data.position.tolist()]
     half = mark_size(chart.scale)
     if data.links is not None:
+        radios = [*places, *([chart.point(*data.base)] if data.base else [])]
         pairs = np.argwhere(np.triu(data.links | data.links.T, 1)).tolist()
         # The dark edges of many links would hide the map.
         widths = LINK_WIDTHS if len(places) <= MANY else {LINK: 1}
         for colour, width in widths.items():
             for i, j in pairs:
-                chart.draw.line((places[i], places[j]), fill=colour, width=width)
+                chart.draw.line((radios[i], radios[j]), fill=colour, width=width)
     if data.target is not None:
         for index, (x, y, _) in enumerate(data.target.tolist()):
             if not data.flies(index):

@@ -7,66 +7,86 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
-from torchrl.envs import TransformedEnv, set_exploration_type, step_mdp
-from torchrl.envs.utils import ExplorationType
+from torchrl.envs import TransformedEnv
 
-from emberlink.comm.base import CommModule
 from emberlink.envs import keys
+from emberlink.envs.config import WildfireConfig
 from emberlink.envs.rendering.marks import ROLES, FrameData
+from emberlink.envs.wildfire import WildfireEnv
+from emberlink.envs.world import radio
+from emberlink.trainers.evaluation.evaluate import play
 
 
 def record_episode(
     env: TransformedEnv,
     policy: TensorDictModuleBase,
-    comm: CommModule,
     *,
     steps: Collection[int],
+    advised: bool,
     member: int = 0,
 ) -> list[FrameData]:
     """Returns the frames of one episode without exploration noise.
 
+    Links are included if the policy or a base station receives messages.
+
     Args:
         env: environments with communication.
         policy: writes ("agents", "action").
-        comm: communication module of the environment.
         steps: steps to record, from 0 to the horizon.
+        advised: whether the policy reads an output of the communication module.
         member: index of the environment to record.
     """
-    world: Any = env.base_env
-    hears = any(key in comm.out_keys for key in policy.in_keys)
     frames: list[FrameData] = []
-    with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
-        td = env.reset()
-        for step in range(world.config.horizon + 1):
-            if step > 0:
-                td = step_mdp(env.step(policy(td)), keep_other=True)
-            if step in steps:
-                fire_map = world.fire_map[member]
-                base = world.config.base
-                frames.append(frame_data(td[member], fire_map, hears=hears, base=base))
+
+    def add(world: WildfireEnv, td: TensorDictBase) -> None:
+        now = td[member]
+        if int(now.get(keys.STEP)) in steps:
+            base = world.config.base
+            told = advised and now.get(keys.HEARS, None) is not None
+            listens = told or base is not None or getattr(policy, "hears", False)
+            links = links_of(world.config, td[member : member + 1]) if listens else None
+            frames.append(
+                frame_data(now, world.fire_map[member], links=links, advised=advised, base=base)
+            )
+
+    play(env, policy, add)
     return frames
+
+
+def links_of(world: WildfireConfig, td: TensorDictBase) -> Tensor:
+    """Returns which radios hear each other, bool [r, r]: the UAVs, and the base last if any.
+
+    Args:
+        world: constants of the environment.
+        td: output of a reset or a step of one environment, batch size [1].
+    """
+    position, alive = td.get(keys.POSITION).double(), td.get(keys.ALIVE)
+    given = td.get(keys.RNG_KEY), td.get(keys.STEP)
+    if world.base is None:
+        return radio.links(world.radio, position, *given, alive=alive)[0]
+    base = position.new_tensor([[[*world.base, 0.0]]])
+    return radio.links_with_base(world.radio, position, base, *given, alive)[0]
 
 
 def frame_data(
     td: TensorDictBase,
     fire_map: Tensor,
     *,
-    hears: bool,
+    links: Tensor | None,
+    advised: bool,
     base: tuple[float, float] | None = None,
 ) -> FrameData:
     """Returns the data for drawing one environment at one step.
 
-    Links, roles and targets are included if the communication module writes them.
-
     Args:
         td: output of a reset or a step, batch size [].
         fire_map: uint8 [X, Y], see `WildfireEnv.fire_map`.
-        hears: whether the policy reads an output of the communication module.
+        links: bool [r, r], which radios hear each other; None to draw no links.
+        advised: whether to draw the roles and targets that the communication module writes.
         base: place of the base station, cells; None without one.
     """
-    links = td.get(keys.HEARS, None) if hears else None
-    follows = td.get(keys.FOLLOWS, None) if hears else None
-    target = td.get(keys.TARGET, None) if hears else None
+    follows = td.get(keys.FOLLOWS, None) if advised else None
+    target = td.get(keys.TARGET, None) if advised else None
     return FrameData(
         step=int(td.get(keys.STEP)),
         seen=int(td.get(keys.SEEN)),

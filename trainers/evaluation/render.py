@@ -17,12 +17,12 @@ from emberlink.envs.rendering.video import write_mp4
 from emberlink.envs.scenarios import fires_of
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.publish import free_name, new_file, published
-from emberlink.trainers.config.schema import build_comm
 from emberlink.trainers.evaluation.evaluate import BLOCK
 from emberlink.trainers.evaluation.panels import (
     Panel,
     check_comparable,
     find_fire,
+    follows_advice,
     learned,
     replay,
     scripted,
@@ -130,8 +130,9 @@ def _play(
     """Plays episode `index` of the evaluation and returns its frames."""
     config, env = panel.config, panel.env(arrival, index)
     world: Any = env.base_env
-    policy, comm = panel.policy(world), build_comm(config, 1)
-    frames = record_episode(env, policy, comm, steps=set(steps), member=index % BLOCK)
+    policy = panel.policy(world)
+    advised = follows_advice(config, policy)
+    frames = record_episode(env, policy, steps=set(steps), advised=advised, member=index % BLOCK)
     console.print(f"  {panel.title}: coverage {frames[-1].coverage:.1f} %", style="dim")
     return Episode(title=panel.title, view_angle=config.env.view_angle, frames=frames)
 

@@ -1,5 +1,7 @@
 """Tests the pixels of links, roles, targets, panels and legend."""
 
+import math
+
 import numpy as np
 import pytest
 import torch
@@ -11,6 +13,8 @@ from emberlink.envs.rendering.frame import BASE, BURNT_OUT, FAILED, FIELD_OF_VIE
 from emberlink.envs.rendering.marks import LINK, ROLE_COLOURS, ROLES, FrameData
 from emberlink.envs.rendering.panels import Episode, Screen
 from emberlink.policies.scripted.follow_target import FollowTarget
+from emberlink.policies.scripted.map_greedy import MapGreedy
+from emberlink.policies.scripted.map_greedy_alone import MapGreedyAlone
 from emberlink.trainers import make_env
 from emberlink.trainers.evaluation import record_episode
 
@@ -231,20 +235,23 @@ def test_links_roles_and_targets_are_drawn_from_the_tensordict():
     nothing = torch.zeros(30, 20, dtype=torch.uint8)
     hears = torch.from_numpy(linked((0, 1)))
     entries = {
-        keys.HEARS[1]: hears,
         keys.FOLLOWS[1]: torch.tensor([0, 0, -1]),
         keys.TARGET[1]: torch.ones(3, 3),
     }
-    seen = record_episode.frame_data(tensordict(9, **entries), nothing, hears=True)
+
+    def data(td, **choices):
+        return record_episode.frame_data(td, nothing, **choices)
+
+    seen = data(tensordict(9, **entries), links=hears, advised=True)
     assert np.array_equal(seen.links, hears)
     assert seen.roles.tolist() == [0, 1, 2]
     assert np.array_equal(seen.target, np.ones((3, 3)))
-    links_alone = record_episode.frame_data(tensordict(18, hears=hears), nothing, hears=True)
+    links_alone = data(tensordict(18), links=hears, advised=True)
     assert np.array_equal(links_alone.links, hears)
     assert links_alone.roles is links_alone.target is None
     for silent in (
-        record_episode.frame_data(tensordict(6), nothing, hears=True),
-        record_episode.frame_data(tensordict(9, **entries), nothing, hears=False),
+        data(tensordict(6), links=None, advised=True),
+        data(tensordict(9, **entries), links=None, advised=False),
     ):
         assert silent.links is silent.roles is silent.target is None
 
@@ -254,6 +261,35 @@ def test_links_are_received_messages(loss, drawn):
     fire = torch.zeros(12, 12)
     env = make_env("consensus", fire=fire, horizon=4, seed=0, **{"env.radio.loss": loss})
     policy = FollowTarget(env.base_env)
-    frames = record_episode.record_episode(env, policy, env.transform.module, steps=range(5))
+    frames = record_episode.record_episode(env, policy, steps=range(5), advised=True)
     assert len(frames) == 5
     assert all(frame.links.any() == drawn for frame in frames)
+
+
+@pytest.mark.parametrize(
+    ("policy", "base", "shape"),
+    [
+        (MapGreedy, None, (3, 3)),
+        (MapGreedyAlone, None, None),
+        (MapGreedyAlone, [0, 6], (4, 4)),
+        (MapGreedy, [0, 6], (4, 4)),
+    ],
+)
+def test_links_of_every_policy_that_hears_and_of_the_base_are_drawn(policy, base, shape):
+    fire = torch.zeros(12, 12)
+    settings = {"env.base": base, "env.radio.range": 7.0, "env.num_uavs": 3}
+    env = make_env("independent", fire=fire, horizon=4, seed=0, **settings)
+    frames = record_episode.record_episode(env, policy(env.base_env), steps=range(5), advised=False)
+    for shown in frames:
+        assert (None if shown.links is None else shown.links.shape) == shape
+        if shape:
+            places = [*shown.position.tolist(), *([[*base, 0.0]] if base else [])]
+            near = [[0 < math.dist(a, b) < 7 for b in places] for a in places]
+            assert shown.links.tolist() == near
+
+
+def test_a_link_to_the_base_is_drawn():
+    links = np.zeros((4, 4), bool)
+    links[0, 3] = True
+    shown = frame(links=links, base=(WHERE[0][0], WHERE[0][1] + 6.0))
+    assert LINK in around(drawn(shown), int(WHERE[0][0]), int(WHERE[0][1]) + 3)

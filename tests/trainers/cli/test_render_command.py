@@ -127,10 +127,9 @@ def test_panels_have_the_same_fire_and_the_same_starts(tmp_path, monkeypatch):
         assert (now.links is not None) == (method in ("consensus", "positional"))
         assert (now.roles is not None) == (now.target is not None) == (method == "consensus")
     for name, episode in zip(SCRIPTED, episodes[len(methods) :], strict=True):
-        listens = SCRIPTED[name].recipe is not None
-        assert {v is not None for v in (episode.frames[-1].links, episode.frames[-1].roles)} == {
-            listens
-        }
+        now = episode.frames[-1]
+        assert (now.links is not None) == SCRIPTED[name].hears
+        assert (now.roles is not None) == (SCRIPTED[name].recipe is not None)
 
 
 def test_an_episode_equals_that_of_the_evaluation(tmp_path, monkeypatch):

@@ -76,7 +76,7 @@ def test_a_loaded_policy_needs_no_further_code(case, trained):
     measured = play(env(), policy)
     assert measured["coverage"].isfinite().all()
     world = env()
-    frames = record_episode(world, policy, world.transform.module, steps=[HORIZON])
+    frames = record_episode(world, policy, steps=[HORIZON], advised=False)
     assert frames[0].position.tolist() == flight[-1].tolist()
     pettingzoo = parallel_env(env())
     pettingzoo.reset()
