@@ -1,6 +1,7 @@
 """Finds and reads YAML files of configuration groups."""
 
-from collections.abc import Sequence
+import re
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,9 @@ from yaml import YAMLError
 from emberlink.configs import folders, known
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import unknown
+
+_KEY = re.compile(r"(?:key ')?([a-z_]+(?:\.\w+)*)")
+_NONE = object()
 
 
 def find(group: str, name: str, within: Sequence[Path] | None = None) -> Path:
@@ -32,6 +36,29 @@ def find(group: str, name: str, within: Sequence[Path] | None = None) -> Path:
     if len(existing) != 1:
         raise UserError(f"{group} {name!r} is in several folders: {', '.join(map(str, existing))}")
     return existing[0]
+
+
+def place_of(error: Exception, chosen: Mapping[str, str], given: Collection[str]) -> str:
+    """Returns an error's message, with the user's file in front in which its key stands, if any.
+
+    Args:
+        error: begins with the key of the configuration that is wrong.
+        chosen: group -> name of the chosen file.
+        given: keys that the user gave elsewhere, such as on the command line.
+    """
+    text = str(error)
+    key = _KEY.match(text)
+    if key is None or key[1] in given:
+        return text
+    own = folders()[-1]
+    for group, name in chosen.items():
+        file = find(group, name)
+        value: Any = read(group, name)
+        for part in key[1].split("."):
+            value = value.get(part, _NONE) if isinstance(value, dict) else _NONE
+        if value is not _NONE and own not in file.parents:
+            return f"{file}: {text}"
+    return text
 
 
 def read(group: str, name: str) -> dict[str, Any]:

@@ -20,7 +20,7 @@ from yaml import YAMLError
 
 from emberlink import configs
 from emberlink.envs.scenarios import fires_of
-from emberlink.envs.utils.config_files import find, read
+from emberlink.envs.utils.config_files import find, place_of, read
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import from_plain, plain, shown, unknown
 from emberlink.policies.scripted.registry import SCRIPTED
@@ -65,7 +65,11 @@ def resolve(method: str, overrides: Sequence[str] = (), **settings: Any) -> RunC
     values["world"] = chosen["world"]
     _put_settings(values, settings)
     _choose_seed(values, any(key == "seed" for key in [*dict(given), *settings]))
-    config = from_values(values)
+    try:
+        config = from_values(values)
+    except UserError as error:
+        given_keys = {key for key, _ in given} | settings.keys()
+        raise UserError(place_of(error, {"method": method, **chosen}, given_keys)) from None
     baselines = _baselines(chosen, _changes(radio, _radio(values)))
     return replace(config, baselines=baselines, fire=fires_of(config.fire).with_checksum())
 

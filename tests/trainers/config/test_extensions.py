@@ -66,7 +66,10 @@ def test_a_duplicate_name_is_an_error(folder):
     [
         ("replay: shared\n", r"mine.yaml must begin with '# @package _global_'"),
         ("# @package _global_\na: [\n", r"mine.yaml"),
-        ("# @package _global_\nreplay: shared\nreplai: shared\n", "'replai' is not known"),
+        (
+            "# @package _global_\nreplay: shared\nreplai: shared\n",
+            r"mine.yaml: key 'replai' is not",
+        ),
         ("# @package _global_\nreplay: shared\ncomm:\n  name: no_comm\n  x: 1\n", "comm.x is not"),
     ],
 )
@@ -76,6 +79,18 @@ def test_an_invalid_file_of_a_user(text, message, folder):
         resolve("mine")
     assert "\n" not in str(error.value)
     assert resolve("consensus").method == "consensus"
+
+
+def test_a_wrong_value_of_a_user_s_world_names_the_file(folder):
+    text = "# @package _global_\ndefaults:\n  - relay\nenv:\n  {}\n"
+    for wrong in ("windd: 3", "base: [70, 0]", "num_uavs: 0", "radio: {range: -1}"):
+        write(folder, {"world/mine.yaml": text.format(wrong)})
+        with pytest.raises(UserError, match=r"^.*/world/mine.yaml: .*env\.") as error:
+            resolve("consensus", ["setup=tuned", "world=mine"])
+        assert wrong.partition(":")[0] in str(error.value)
+    write(folder, {"world/mine.yaml": text.format("num_uavs: 4")})
+    with pytest.raises(UserError, match=r"^env\.num_uavs=0"):
+        resolve("consensus", ["setup=tuned", "world=mine", "env.num_uavs=0"])
 
 
 def entry_point(monkeypatch, group: str, name: str, value: str) -> None:
