@@ -59,6 +59,12 @@ class TeamMaps(Buffers):
         base = base.repeat(envs if listens else 0, 1, 1)
         self.register_buffer("_base", base, persistent=False)
 
+    @property
+    def sends(self) -> bool:
+        """Whether the UAVs send their maps."""
+        in_range = self._messages == "in range" and self._world.radio.range > 0
+        return in_range or self._messages == "everyone"
+
     def update(self, tensordict: TensorDictBase) -> None:
         """Adds the sightings and messages of a time step; forgets all where an episode begins."""
         step = tensordict.get(keys.STEP)

@@ -56,6 +56,16 @@ class Scripted(TensorDictModuleBase):
         """Returns the random key of a step for a `counter_rng.Use`, int64 [num_envs]."""
         return counter_rng.step_key(tensordict.get(keys.RNG_KEY), tensordict.get(keys.STEP), use)
 
+    def bytes_sent(self, tensordict: TensorDictBase) -> torch.Tensor | None:
+        """Returns the bytes that each UAV sends at a step, int64 [num_envs, n]; zeros by default.
+
+        If None, the bytes that the communication module counts are those of the policy.
+
+        Args:
+            tensordict: the time step.
+        """
+        return torch.zeros_like(tensordict.get(keys.ALIVE), dtype=torch.int64)
+
     def fly(self, tensordict: TensorDictBase, target: torch.Tensor) -> TensorDictBase:
         """Writes the action that flies straight to a target at full speed and stops there.
 

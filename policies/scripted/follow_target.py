@@ -23,5 +23,8 @@ class FollowTarget(Scripted):
         super().__init__(env)
         self.in_keys.append(keys.TARGET)
 
+    def bytes_sent(self, tensordict: TensorDictBase) -> None:
+        """Returns None: the consensus module sends the messages."""
+
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         return self.fly(tensordict, tensordict.get(keys.TARGET))

@@ -1,5 +1,6 @@
 """A scripted policy that searches where fire may burn unseen, with maps merged in radio range."""
 
+import math
 from typing import ClassVar
 
 import torch
@@ -62,6 +63,11 @@ class MapGreedy(Scripted):
                 self.register_buffer(f"_{name}_{axis}", band(side, reach).to(env.device))
         area = self._around_x.sum(-1, keepdim=True) * self._around_y.sum(0)
         self.register_buffer("_area", area)
+
+    def bytes_sent(self, tensordict: TensorDictBase) -> Tensor:
+        """Returns the bytes of a map (int16 per cell) and of a target (two float32) per UAV."""
+        sends = self.maps.sends * (2 * math.prod(self.world.grid) + 8)
+        return sends * tensordict.get(keys.ALIVE).long()
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         self.maps.update(tensordict)

@@ -9,7 +9,7 @@ from torchrl.envs.utils import check_env_specs
 
 from emberlink.configs import known
 from emberlink.envs import WildfireConfig, keys, metrics, parallel_env
-from emberlink.trainers import make_env
+from emberlink.trainers import load, make_env, train
 from emberlink.trainers.cli import main
 from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.learners.off_policy import OffPolicyLearner
@@ -29,6 +29,20 @@ def test_every_method_has_an_environment_in_every_world(method, world):
     assert tuple(measured) == metrics.names(env.base_env.config)
     assert resolve(method, [f"world={world}"]).evaluation.headline in measured
     assert all(value.isfinite().all() for value in measured.values())
+
+
+@pytest.mark.parametrize("method", ["consensus", "independent"])
+def test_a_training_in_relay_is_that_in_front(method, tmp_path):
+    """A base changes neither rewards nor observations, so docs/worlds.md uses networks of front."""
+    small = {"episodes": 2, "horizon": 15, "num_envs": 2, "num_train_fires": 2, "batch_size": 8}
+    shared = {"setup": "tuned", "evaluate_after": False, "interval": 0, **small}
+    front, relay = (
+        load(train(method, world=world, output=str(tmp_path / world), **shared).path).state_dict()
+        for world in ("front", "relay")
+    )
+    assert any(value.abs().sum() > 0 for value in front.values())
+    assert front.keys() == relay.keys()
+    assert all(torch.equal(front[name], relay[name]) for name in front)
 
 
 def test_failed_uavs_do_not_count_in_losses():

@@ -14,8 +14,10 @@ from emberlink.trainers.comparison.runs import Run
 from emberlink.trainers.evaluation.results import LEARNED
 
 RANGE, LOSS = "env.radio.range", "env.radio.loss"
-SCRIPTED = {"map_greedy": ("map_greedy_alone", "map_greedy_all")}
-"""scripted policy -> the same policy without messages, and with all messages"""
+SCRIPTED = ("map_greedy", "courier")
+"""scripted policies whose value of communication is computed"""
+_SAME = {"map_greedy": ("map_greedy_alone", "map_greedy_all")}
+"""scripted policy -> those that act, without a base, as it does with the other two radios"""
 
 Values = NDArray[np.float64]
 
@@ -59,12 +61,32 @@ def communication_values(section: Section) -> list[CommunicationValue]:
                     if none is not None and full is not None:
                         samples = [_per_fire(g.runs, fire, measure) for g in (none, group, full)]
                         values.append(_value(fire, group.label, measure, how, samples))
-        results = section.runs[0].evaluation.results[fire]
-        for policy, (none, full) in SCRIPTED.items():
-            if {policy, none, full} <= results.keys():
-                samples = [np.asarray(results[name][measure]) for name in (none, policy, full)]
+        for policy in SCRIPTED:
+            samples = _scripted(section, fire, policy, measure)
+            if samples is not None:
                 values.append(_value(fire, policy, measure, "scripted", samples))
     return values
+
+
+def _scripted(section: Section, fire: str, policy: str, measure: str) -> list[Values] | None:
+    """Returns a scripted policy's measure with the radio off, that of the world, and no limits.
+
+    None if an evaluation is missing. Without a base no evaluation with another radio is needed.
+    """
+    trained = [run for group in section.as_trained for run in group.runs]
+    limited = [run for run in trained if _radio(run) not in (_OFF, _FULL)]
+    if not limited:
+        return None
+    world = limited[0]
+    others = [
+        next((run for run in section.runs if _radio(run) == radio), None) for radio in (_OFF, _FULL)
+    ]
+    choices = [(others[0], policy), (world, policy), (others[1], policy)]
+    if world.config.env.base is None and policy in _SAME:
+        none, full = _SAME[policy]
+        choices = [(world, none), (world, policy), (world, full)]
+    played = [run and run.evaluation.results[fire].get(name) for run, name in choices]
+    return [np.asarray(p[measure]) for p in played if p] if all(played) else None
 
 
 _OFF, _FULL = (0.0, None), (float("inf"), 0.0)

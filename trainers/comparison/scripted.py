@@ -96,7 +96,8 @@ def _values(section: Section, fire: str, measure: str, policy: str) -> dict[str,
 def _depends_on_radio(section: Section, policy: str, measure: str) -> bool:
     """Returns whether runs may differ in a policy's measure, since their communication differs."""
     hears = policy in SCRIPTED and SCRIPTED[policy].hears
-    if not hears and measure not in metrics.OF_BASE:
+    has_base = section.runs[0].config.env.base is not None
+    if not hears and not has_base and measure not in metrics.OF_BASE:
         return False
     evaluations = [run.evaluation for run in section.runs]
     settings = [(e.environment.get("radio"), e.communication.get(policy)) for e in evaluations]

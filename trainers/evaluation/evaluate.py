@@ -16,6 +16,7 @@ from emberlink.envs.fire.generator import load_scenario
 from emberlink.envs.fire_files.config import FileFireConfig
 from emberlink.envs.scenarios import ScenarioConfig, fires_of
 from emberlink.envs.wildfire import WildfireEnv
+from emberlink.policies.scripted.base import Scripted
 from emberlink.policies.scripted.registry import SCRIPTED, to_play
 from emberlink.trainers.build import build_env
 from emberlink.trainers.config.compose import resolve
@@ -62,12 +63,21 @@ def play(
             watch(world, td)
         for _ in range(horizon):
             td = env.step(policy(td))
+            _count_messages(policy, td.get("next"))
             if watch is not None:
                 watch(world, td.get("next"))
             steps.append(td.get("next").select(*metrics.STEP_KEYS, strict=False))
             td = step_mdp(td, keep_other=True)
     episode: Any = torch.stack(cast(Any, steps), dim=1)
     return metrics.episode_metrics(episode)
+
+
+def _count_messages(policy: Policy, td: TensorDictBase) -> None:
+    """Replaces the bytes sent by those of a scripted policy, in a world that measures them."""
+    if isinstance(policy, Scripted) and td.get(keys.BYTES_SENT, None) is not None:
+        sent = policy.bytes_sent(td)
+        if sent is not None:
+            td.set(keys.BYTES_SENT, sent)
 
 
 def shown_scenario(config: RunConfig) -> str:

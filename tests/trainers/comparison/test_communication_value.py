@@ -6,9 +6,12 @@ import numpy as np
 import pytest
 from synthetic_runs import read_evaluation, write_run
 
+from emberlink.policies.scripted.registry import SCRIPTED
 from emberlink.trainers.cli import main
 from emberlink.trainers.comparison import bootstrap
 from emberlink.trainers.comparison.results import compare_runs
+from emberlink.trainers.config.compose import resolve
+from emberlink.trainers.evaluation.evaluate import evaluation_fires, play_blocks
 
 OFF, FULL = "env.radio.range=0", "env.radio.range=inf"
 
@@ -72,6 +75,54 @@ def test_scripted_policies_have_a_value(tmp_path):
     (run / "eval.json").write_text(json.dumps(content))
     (value,) = compare_runs([tmp_path]).sections[0].communication
     assert (value.policy, value.how, value.value) == ("map_greedy", "scripted", 0.5)
+
+
+def scripted_run(folder, base, results: dict[str, dict[str, float]]):
+    """Writes a run with evaluations of scripted policies: file name -> policy -> coverage."""
+    names = list(dict.fromkeys(name for played in results.values() for name in played))
+    overrides = () if base is None else (f"env.base={base}",)
+    run = write_run(folder, scripted=names, overrides=("env.radio.range=10", *overrides))
+    content = read_evaluation(run)
+    for name, played in results.items():
+        for policy, coverage in played.items():
+            content["results"]["huygens"][policy]["coverage"] = [coverage] * 4
+        if name != "eval.json":
+            reach = float(name.removeprefix("eval_env.radio.range=").removesuffix(".json"))
+            content["environment"] = {"radio": {"range": reach, "loss": 0.0}}
+        (run / name).write_text(json.dumps(content))
+
+
+def test_with_a_base_scripted_policies_need_the_other_radios(tmp_path):
+    """Without messages to each other, UAVs of map_greedy_alone still report to the base."""
+    own = {"map_greedy_alone": 70.0, "map_greedy": 80.0, "map_greedy_all": 90.0, "courier": 85.0}
+    scripted_run(tmp_path / "one", [0, 0], {"eval.json": own})
+    assert compare_runs([tmp_path / "one"]).sections[0].communication == []
+    off, full = ({**own, "map_greedy": a, "courier": b} for a, b in ((40.0, 45.0), (90.0, 95.0)))
+    results = {"eval.json": own, f"eval_{OFF}.json": off, f"eval_{FULL}.json": full}
+    scripted_run(tmp_path / "three", [0, 0], results)
+    compared = compare_runs([tmp_path / "three"])
+    values = [v for v in compared.sections[0].communication if v.how == "scripted"]
+    assert [(v.policy, v.none, v.with_radio, v.full, v.value) for v in values] == [
+        ("map_greedy", 40.0, 80.0, 90.0, 0.8),
+        ("courier", 45.0, 85.0, 95.0, 0.8),
+    ]
+    assert not [note for note in compared.notes if "does not have the same" in note]
+
+
+def test_without_a_base_map_greedy_plays_as_alone_and_as_all_with_the_other_radios():
+    pairs = (("map_greedy_alone", "0"), ("map_greedy_all", ".inf"))
+    for other, reach in pairs:
+        choices = ("world=front", "env.horizon=60", "env.grid=[20,20]", "env.num_uavs=3")
+        world = resolve("independent", choices)
+        changed = resolve("independent", [*choices, f"env.radio.range={reach}"])
+        fires = evaluation_fires(world, 2)["front"]
+        expected = play_blocks(world, SCRIPTED[other], fires, block=2)
+        actual = play_blocks(changed, SCRIPTED["map_greedy"], fires, block=2)
+        assert {k: v for k, v in actual.items() if k != "bytes_per_step"} == {
+            k: v for k, v in expected.items() if k != "bytes_per_step"
+        }
+        sent = 0.0 if reach == "0" else 2 * 20 * 20 + 8
+        assert expected["bytes_per_step"] == actual["bytes_per_step"] == [sent, sent]
 
 
 def test_the_paired_interval_draws_fires_together():
