@@ -10,8 +10,13 @@ from emberlink.envs import keys
 from emberlink.envs.utils.errors import UserError
 from emberlink.policies.gaussian import LOG_PROB
 from emberlink.trainers.config.compose import resolve
-from emberlink.trainers.learners.advantages import Advantages
-from emberlink.trainers.learners.proximal import ADVANTAGE, RETURN, clip_by_row, mean_of_uavs
+from emberlink.trainers.learners.on_policy.advantages import Advantages
+from emberlink.trainers.learners.on_policy.proximal import (
+    ADVANTAGE,
+    RETURN,
+    clip_by_row,
+    mean_of_uavs,
+)
 from emberlink.trainers.training.setup import TrainingSetup
 
 LEARNERS = ["ippo", "mappo"]

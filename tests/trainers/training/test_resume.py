@@ -14,7 +14,7 @@ from test_recipes import METHODS
 
 from emberlink.trainers.cli import main
 from emberlink.trainers.config.compose import resolve
-from emberlink.trainers.learners.replay_buffer import ReplayMemory
+from emberlink.trainers.learners.off_policy.replay_buffer import ReplayMemory
 from emberlink.trainers.runs import checkpoint_file
 from emberlink.trainers.runs.run_folder import RunFolder
 from emberlink.trainers.training.resume import resume

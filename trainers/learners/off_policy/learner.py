@@ -28,7 +28,7 @@ from emberlink.trainers.learners.base import (
     Positive,
     generators,
 )
-from emberlink.trainers.learners.replay_buffer import DONE, TERMINATED, ReplayMemory
+from emberlink.trainers.learners.off_policy.replay_buffer import DONE, TERMINATED, ReplayMemory
 from emberlink.trainers.learners.tensors import (
     copy_into,
     group,

@@ -1,0 +1,5 @@
+"""The base of learners from a replay buffer with target networks (DDPG, TD3), and its parts."""
+
+from emberlink.trainers.learners.off_policy.learner import OffPolicyConfig, OffPolicyLearner
+
+__all__ = ["OffPolicyConfig", "OffPolicyLearner"]
