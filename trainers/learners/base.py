@@ -124,15 +124,14 @@ class Learner(ABC):
         policy = policy or PolicyConfig()
         if policy.memory != "none":
             raise UserError(
-                f"policy.memory={policy.memory}: the networks of learner={config.name} have no "
-                "memory; those of ippo and mappo have"
+                f"policy.memory={policy.memory}: the networks of learner={config.name} have none"
             )
         return make_actor(
             observation_spec,
             action_spec,
             config.hidden,
             share_parameters=config.share_parameters,
-            agent_index=policy.agent_index,
+            policy=policy,
             generator=generator,
         )
 
