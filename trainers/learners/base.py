@@ -46,6 +46,11 @@ class LearnerConfig:
     share_parameters: bool = False
     """whether all UAVs of a seed use the same weights; if not, each UAV has its own"""
 
+    @property
+    def reads_map(self) -> bool:
+        """Whether the learner reads the true map of the fire, `keys.TRUE_MAP`, in training."""
+        return False
+
 
 @plain_dataclass(frozen=True, kw_only=True)
 class LearnerContext:

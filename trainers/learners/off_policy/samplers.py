@@ -109,14 +109,15 @@ class SequenceSampler(TeamSampler):
         self._offset = torch.arange(-burn_in, sequence, device=device)[:, None]
 
     def sample(self, storage: TensorStorage, batch_size: int) -> tuple[tuple[Tensor, ...], dict]:
-        """Returns rows and columns, int64 [batch_size, decisions, teams * uavs] each, and fills
-        `info["begins"]`, bool [batch_size, teams * uavs]: whether a sequence has no burn-in.
+        """Returns rows and columns, int64 [sequences, decisions, teams * uavs] each.
 
-        The rows of a missing burn-in are those of the first decision.
+        There are as many sequences as have `batch_size` decisions to learn from, rounded up. The
+        rows of a missing burn-in are those of the first decision. "begins", in the dict, tells
+        which sequences have none, bool [sequences, teams * uavs].
         """
         first, possible = self._starts()
         ends = possible.cumsum(0)
-        number, columns = self._draw(batch_size, ends[-1] * self.envs)
+        number, columns = self._draw(-(-batch_size // self.sequence), ends[-1] * self.envs)
         number, env = number // self.envs, number % self.envs
         place = torch.searchsorted(ends, number, right=True)
         start = first[place] + number - (ends - possible)[place]

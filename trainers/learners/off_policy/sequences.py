@@ -49,8 +49,6 @@ class SequenceMemory(ReplayMemory):
                 f"{context.num_envs} environments; {wanted} are needed for learner.burn_in="
                 f"{burn_in} and learner.sequence={sequence}"
             )
-        self.entries = -(-batch_size // sequence)
-        """sequences per UAV in a sample"""
         self.learning_starts = max(self.learning_starts, sequence)
 
     def _make_sampler(self, uavs: int, **more: Any) -> TeamSampler:
@@ -79,7 +77,7 @@ class SequenceMemory(ReplayMemory):
         Observations are those of the burn-in and of the decisions to learn from, and under "next"
         also the one after. All other tensors are those of the decisions to learn from.
         """
-        drawn: Any = self._buffer.sample(self.entries, return_info=True)
+        drawn: Any = self._buffer.sample(return_info=True)
         sample, info = drawn
         begins, past = info["begins"], self.burn_in
 
