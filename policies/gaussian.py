@@ -35,7 +35,7 @@ class MemoryActor(TensorDictModuleBase):
 
     def __init__(self, network: GaussianNetwork | RecurrentActor, observation_spec: Composite):
         super().__init__()
-        self.module = network
+        self.module: Any = network
         self._observed = keys.observation_keys(observation_spec)
         remembers = network.memory.size > 0
         reads: list[Any] = [*self._observed, *([keys.STEP] if remembers else [])]

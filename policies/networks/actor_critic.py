@@ -85,8 +85,8 @@ def build(
         more: other arguments of the network.
     """
     *batch, actions = action[keys.ACTION].shape
-    shapes, device = keys.observation_shapes(observation), observation.device
-    return network(batch[-1], shapes, actions, hidden, device=device, **more)
+    shapes, device = keys.observation_shapes(observation), {"device": observation.device}
+    return network(batch[-1], shapes, actions, hidden, **device, **more)
 
 
 def team_of(network: Any, team: int, teams: int) -> Any:

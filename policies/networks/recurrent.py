@@ -6,6 +6,7 @@ Salakhutdinov 2022, ICML).
 """
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -135,7 +136,8 @@ class RecurrentCritic(StackedCritic, _Remembering):
             x = self.recall(observations, begins, burn_in)[:, :, -decisions:]
             return self._map(to_features, self._hidden_layers(), x)
 
-        features = self._cache.get(observations, self.first.weight, compute)
+        first: Any = self.first
+        features = self._cache.get(observations, first.weight, compute)
         actions = self._parts(self.grouping.split(action, batch).flatten(1, 2))
         values = apply_layers(to_value, [self.action, self.value], actions, features)
         return self._join_sequences(values, batch, decisions)

@@ -33,6 +33,7 @@ class MAPPO(OnPolicyLearner):
     """
 
     config_type = MAPPOConfig
+    config: Any
 
     def make_critic(
         self, context: LearnerContext, generators: list[torch.Generator]

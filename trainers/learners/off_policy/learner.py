@@ -67,8 +67,11 @@ class OffPolicyLearner(Learner):
 
     def _make_replay(self, context: LearnerContext) -> ReplayMemory:
         config = self.config
-        sizes = {"batch_size": config.batch_size, "buffer_size": config.buffer_size}
-        sizes["joint"] = config.critic == "team"
+        sizes: dict[str, Any] = {
+            "batch_size": config.batch_size,
+            "buffer_size": config.buffer_size,
+            "joint": config.critic == "team",
+        }
         if context.policy.memory == "none":
             return ReplayMemory(context, **sizes)
         lengths = {"sequence": config.sequence, "burn_in": config.burn_in}
