@@ -6,6 +6,7 @@ from typing import Any
 import pytest
 import torch
 from torch import Tensor
+from torchrl.envs import check_env_specs
 
 from emberlink.envs import keys
 from emberlink.envs.utils.errors import UserError
@@ -210,6 +211,7 @@ def test_only_mappos_critic_reads_the_true_map():
     assert keys.TRUE_MAP in learner.critic.in_keys
     assert keys.TRUE_MAP not in learner.explorer.in_keys
     assert keys.TRUE_MAP not in make_env(setup.config).reset()
+    check_env_specs(setup.env)
     batch = first_batches(made("mappo", "learner.critic_map=true"))[0]
     changed = batch.clone()
     changed[keys.TRUE_MAP][:, 2] = 2 - changed[keys.TRUE_MAP][:, 2]
