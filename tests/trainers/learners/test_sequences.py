@@ -288,3 +288,41 @@ def test_decision_by_decision_equals_the_whole_sequence(kind, more):
         action, state = network.step([x[:, :, k] for x in observed], state)
         torch.testing.assert_close(action, whole[:, :, k], rtol=1e-5, atol=1e-6)
     torch.testing.assert_close(network(observed, begins, 4, 5), whole[:, :, 4:])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("kind", "learnt"), [("none", False), ("stack", True), ("gru", True)])
+def test_what_needs_a_memory_is_learnt_with_one(kind, learnt):
+    """The best action is 0.8 times the observation before, which is random."""
+    more = ["env.num_uavs=2", "num_envs=8", "learner.gamma=0.0", "learner.batch_size=64"]
+    rates = ["learner.actor_lr=0.003", "learner.critic_lr=0.01", "policy.units=16"]
+    hidden = ["learner.hidden=[32]", f"policy.memory={kind}", "episodes=20", "env.horizon=20"]
+    learner: Any = made("ddpg", *more, *rates, *hidden, method="independent").learner
+    generator = torch.Generator().manual_seed(1)
+
+    def drawn(*shape: int) -> Tensor:
+        return 2 * torch.rand(*shape, generator=generator) - 1
+
+    done = torch.zeros(8, 1, 1, dtype=torch.bool)
+    for _ in range(10):
+        seen, action = drawn(8, 21, 2, 6), drawn(8, 20, 2, 3)
+        before = torch.cat((torch.zeros(8, 1, 2, 3), seen[:, :19, :, :3]), 1)
+        reward = -(action - 0.8 * before).square().sum(-1, keepdim=True)
+        for k in range(20):
+            now = {"observation": seen[:, k, None], "action": action[:, k, None]}
+            after = {"observation": seen[:, k + 1, None], "reward": reward[:, k, None]}
+            following = {keys.AGENTS: after, "done": done, "terminated": done.clone()}
+            step = TensorDict({keys.AGENTS: now, "next": following}, batch_size=[8, 1])
+            learner.replay.extend(step)
+    for _ in range(400):
+        learner.update(learner.sample())
+    seen, state, errors = drawn(8, 20, 2, 6), None, []
+    with torch.no_grad():
+        for k in range(1, 20):
+            if kind == "none":
+                action = learner.actor.module(seen[:, k])
+            else:
+                action, state = learner.actor.module.step([seen[:, k]], state)
+            errors.append((action - 0.8 * seen[:, k - 1, :, :3]).square().mean())
+    error = torch.stack(errors[1:]).mean().item()  # 0.21 for actions of 0
+    assert error < 0.06 if learnt else error > 0.15
