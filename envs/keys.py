@@ -71,6 +71,8 @@ base."""
 BASE_AGE: Final = "base_age"
 """float32 [num_envs]: as `FRONT_AGE`, with the last sighting that the base has. Only with a
 base."""
+TRUE_MAP: Final = "true_map"
+"""uint8 [num_envs, X, Y]: `WildfireEnv.fire_map`. Only with `true_map=True`; no UAV knows it."""
 
 FEATURES: Final = ("x", "y", "z", "new_fire", "old_fire", "timestep")
 """the numbers of a UAV's own observation, in order (paper, section IV.C)"""

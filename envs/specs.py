@@ -1,6 +1,7 @@
 """The tensors that the environment reads and writes, as TorchRL specs."""
 
 import torch
+from tensordict import TensorDict
 from torchrl.data import Binary, Bounded, Composite, TensorSpec, Unbounded
 
 from emberlink.envs import keys
@@ -9,13 +10,16 @@ from emberlink.envs.config import WildfireConfig
 DONE_NAMES = ("done", "terminated", "truncated")
 
 
-def observation_spec(envs: int, world: WildfireConfig, window: int | None = None) -> Composite:
+def observation_spec(
+    envs: int, world: WildfireConfig, window: int | None = None, true_map: bool = False
+) -> Composite:
     """Returns the spec of all that a reset writes but done, batch size [envs]; see `keys`.
 
     Args:
         envs: number of environments.
         world: the team, and what is measured.
         window: cells along a side of the observed window; None without a window.
+        true_map: whether the map is written, too.
     """
     agents = (envs, world.num_uavs)
 
@@ -40,11 +44,14 @@ def observation_spec(envs: int, world: WildfireConfig, window: int | None = None
         shape = torch.Size((*agents, 3, window, window))
         per_uav[keys.WINDOW[1]] = Binary(shape=shape, dtype=torch.bool)
     counts = [keys.RNG_KEY, keys.STEP, keys.SEEN, keys.BURNING, keys.BURNT]
-    per_env = {key: whole(envs) for key in counts}
+    per_env: dict[str, TensorSpec] = {key: whole(envs) for key in counts}
     if world.measures == "all":
         per_env |= {key: real(envs) for key in (keys.FRONT_AGE, keys.FRONT_AGE_P95)}
     if world.base is not None:
         per_env |= {keys.BASE_SEEN: whole(envs), keys.BASE_AGE: real(envs)}
+    if true_map:
+        shape = torch.Size((envs, *world.grid))
+        per_env[keys.TRUE_MAP] = Unbounded(shape, dtype=torch.uint8)
     return Composite({keys.AGENTS: Composite(per_uav, shape=agents), **per_env}, shape=(envs,))
 
 
@@ -79,3 +86,13 @@ def done_spec(envs: int, uavs: int | None = None) -> Composite:
     if uavs is not None:
         root[keys.AGENTS] = Composite(flags(envs, uavs), shape=(envs, uavs))
     return Composite(root, shape=(envs,))
+
+
+def known_tensordict(
+    source: dict, batch_size: torch.Size, device: torch.device | None
+) -> TensorDict:
+    """Returns a TensorDict of tensors whose shapes and device are known to be right.
+
+    Checking them takes a quarter of a step of one environment.
+    """
+    return TensorDict._new_unsafe(source, batch_size=batch_size, device=device)

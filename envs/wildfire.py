@@ -44,6 +44,7 @@ class WildfireEnv(Buffers, TeamView):
         agent_done: whether done, terminated and truncated stand under "agents" too, per UAV.
         staggered: whether environments are out of phase: the first episode of environment i after
             seeding is truncated after horizon * (i + 1) / num_envs steps, rounded up.
+        true_map: whether the map is written under `keys.TRUE_MAP`, too.
 
     Raises:
         UserError: an unknown scenario or device, arrival times whose shape does not fit, seeds or a
@@ -74,6 +75,7 @@ class WildfireEnv(Buffers, TeamView):
         *,
         agent_done: bool = False,
         staggered: bool = False,
+        true_map: bool = False,
     ):
         num_envs = check_whole("num_envs", num_envs)
         if num_envs < 1:
@@ -81,7 +83,7 @@ class WildfireEnv(Buffers, TeamView):
         check_device(str(device))
         super().__init__(device=device, batch_size=torch.Size([num_envs]))
         self.config = default_config(fire) if config is None else config
-        self._agent_done, self._staggered = agent_done, staggered
+        self._agent_done, self._staggered, self._shows_map = agent_done, staggered, true_map
         self._fire_name = fire if isinstance(fire, str) else getattr(fire, "name", None)
         self._make_world(fire)
         self._make_specs()
@@ -120,7 +122,8 @@ class WildfireEnv(Buffers, TeamView):
 
     def _make_specs(self) -> None:
         envs, uavs = self.num_envs, self.n_agents
-        self.observation_spec = specs.observation_spec(envs, self.config, self._side)
+        shown = self._side, self._shows_map
+        self.observation_spec = specs.observation_spec(envs, self.config, *shown)
         self.action_spec = specs.action_spec(envs, uavs)
         self.reward_spec = specs.reward_spec(envs, uavs)
         self.done_spec = specs.done_spec(envs, uavs if self._agent_done else None)
@@ -271,16 +274,17 @@ class WildfireEnv(Buffers, TeamView):
             agents |= {k: v.unsqueeze(-1).repeat(1, self.n_agents, 1) for k, v in done.items()}
         burning, burnt = self._map.count(time)
         root = {
-            keys.AGENTS: _tensordict(agents, position.shape[:-1], self.device),
+            keys.AGENTS: specs.known_tensordict(agents, position.shape[:-1], self.device),
             keys.RNG_KEY: self._step_key.clone(),
             keys.STEP: time,
             keys.SEEN: self._seen.clone(),
             keys.BURNING: burning,
             keys.BURNT: burnt,
             **({} if self._measures is None else self._measures.values()),
+            **({keys.TRUE_MAP: self.fire_map} if self._shows_map else {}),
             **done,
         }
-        return _tensordict(root, self.batch_size, self.device)
+        return specs.known_tensordict(root, self.batch_size, self.device)
 
     def _done(self, time: Tensor) -> dict[str, Tensor]:
         """Returns the flags of each environment, bool [num_envs, 1]."""
@@ -290,11 +294,3 @@ class WildfireEnv(Buffers, TeamView):
         truncated = (time >= length).unsqueeze(-1)
         flags = truncated, torch.zeros_like(truncated), truncated.clone()
         return dict(zip(specs.DONE_NAMES, flags, strict=True))
-
-
-def _tensordict(source: dict, batch_size: torch.Size, device: torch.device | None) -> TensorDict:
-    """Returns a TensorDict of tensors whose shapes and device are known to be right.
-
-    Checking them takes a quarter of a step of one environment.
-    """
-    return TensorDict._new_unsafe(source, batch_size=batch_size, device=device)

@@ -12,6 +12,7 @@ from torchrl.data import Composite
 from emberlink.envs import keys
 from emberlink.envs.utils import counter_rng
 from emberlink.envs.utils.counter_rng import Use
+from emberlink.policies.networks.recurrent import RecurrentActor
 from emberlink.policies.networks.sequence import GaussianNetwork
 
 MEAN = (keys.AGENTS, "mean")
@@ -28,13 +29,13 @@ class MemoryActor(TensorDictModuleBase):
     The memory is empty at step 0 of an episode, and without a state in the TensorDict.
 
     Args:
-        network: the actors of all UAVs.
+        network: the actors of all UAVs; its `step` gives mean actions and the memory's state.
         observation_spec: of the environment.
     """
 
-    def __init__(self, network: GaussianNetwork, observation_spec: Composite):
+    def __init__(self, network: GaussianNetwork | RecurrentActor, observation_spec: Composite):
         super().__init__()
-        self.module = network
+        self.module: Any = network
         self._observed = keys.observation_keys(observation_spec)
         remembers = network.memory.size > 0
         reads: list[Any] = [*self._observed, *([keys.STEP] if remembers else [])]

@@ -46,7 +46,7 @@ def matched(
     """Yields name, the UAV's slice of the stack, and the single network's parameter."""
     assert not list(stack.encoder.parameters())  # a vector
     for name, layer in stack.named_children():
-        if name == "encoder":
+        if name in ("encoder", "memory"):
             continue
         assert isinstance(layer, StackedLinear | StackedLayerNorm)
         module = single.get_submodule(name)

@@ -72,9 +72,10 @@ def build_env(
     fire: str | ScenarioConfig | Tensor,
     seed: int | Sequence[int] | None,
     device: torch.device | str,
+    true_map: bool = False,
 ) -> TransformedEnv:
     """Returns the environment and communication of a configuration; see `WildfireEnv`."""
-    world = WildfireEnv(num_envs, config.env, fire, seed, device)
+    world = WildfireEnv(num_envs, config.env, fire, seed, device, true_map=true_map)
     return TransformedEnv(world, Communication(build_comm(config, num_envs).to(world.device)))
 
 

@@ -2,7 +2,7 @@
 
 import copy
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 from tensordict.nn import TensorDictModule
 from torchrl.data import Composite
@@ -11,7 +11,10 @@ from torchrl.modules import ValueOperator
 from emberlink.envs import keys
 from emberlink.policies.networks.grouping import Grouping
 from emberlink.policies.networks.layers import Generators
-from emberlink.policies.networks.stacked import StackedActor, StackedCritic
+from emberlink.policies.networks.stacked import StackedActor, StackedCritic, StackedNetwork
+from emberlink.policies.settings import PolicyConfig
+
+Network = TypeVar("Network", bound=StackedNetwork)
 
 STATE_ACTION_VALUE = (keys.AGENTS, "state_action_value")
 """float32 [..., uavs, 1]: the critics' output"""
@@ -23,7 +26,7 @@ def make_actor(
     hidden: Sequence[int],
     *,
     share_parameters: bool = False,
-    agent_index: bool = False,
+    policy: PolicyConfig | None = None,
     generator: Generators = None,
 ) -> TensorDictModule:
     """Returns the actors of all UAVs, which map the observation to ("agents", "action").
@@ -32,7 +35,7 @@ def make_actor(
         observation_spec, action_spec: of the environment, batch size [num_envs].
         hidden: units of the hidden layers, 1 to 8 layers.
         share_parameters: whether all UAVs of a team use the same weights.
-        agent_index: whether the networks also read which of the UAVs they act for.
+        policy: whether the networks also read which of the UAVs they act for; without a memory.
         generator: of the initial weights. Several generators create the same number of teams,
             which share no weights; see `Grouping`.
 
@@ -40,7 +43,8 @@ def make_actor(
         ValueError: the number of layers or the shape of an observation is not supported.
     """
     specs = observation_spec, action_spec
-    network = _build(StackedActor, *specs, hidden, share_parameters, agent_index, generator)
+    more = {"share_parameters": share_parameters, "policy": policy, "generator": generator}
+    network = build(StackedActor, *specs, hidden, **more)
     in_keys: list[Any] = keys.observation_keys(observation_spec)
     return TensorDictModule(network, in_keys=in_keys, out_keys=[keys.ACTION])
 
@@ -51,7 +55,7 @@ def make_critic(
     hidden: Sequence[int],
     *,
     share_parameters: bool = False,
-    agent_index: bool = False,
+    policy: PolicyConfig | None = None,
     generator: Generators = None,
 ) -> ValueOperator:
     """Returns the critics of all UAVs, which map observation and action to `STATE_ACTION_VALUE`.
@@ -59,33 +63,30 @@ def make_critic(
     Arguments and errors are those of `make_actor`.
     """
     specs = observation_spec, action_spec
-    network = _build(StackedCritic, *specs, hidden, share_parameters, agent_index, generator)
+    more = {"share_parameters": share_parameters, "policy": policy, "generator": generator}
+    network = build(StackedCritic, *specs, hidden, **more)
     in_keys: list[Any] = [*keys.observation_keys(observation_spec), keys.ACTION]
     return ValueOperator(network, in_keys=in_keys, out_keys=[STATE_ACTION_VALUE])
 
 
-def _build(
-    network: type[StackedActor] | type[StackedCritic],
+def build(
+    network: type[Network],
     observation: Composite,
     action: Composite,
     hidden: Sequence[int],
-    share_parameters: bool,
-    agent_index: bool,
-    generator: Generators,
-) -> StackedActor | StackedCritic:
-    """Returns a new network with the sizes of an environment's specs."""
+    **more: Any,
+) -> Network:
+    """Returns a new network with the sizes of an environment's specs.
+
+    Args:
+        network: its type.
+        observation, action: specs of the environment, batch size [num_envs].
+        hidden: units of the hidden layers.
+        more: other arguments of the network.
+    """
     *batch, actions = action[keys.ACTION].shape
-    device: Any = observation.device
-    return network(
-        batch[-1],
-        keys.observation_shapes(observation),
-        actions,
-        hidden,
-        share_parameters=share_parameters,
-        agent_index=agent_index,
-        device=device,
-        generator=generator,
-    )
+    shapes, device = keys.observation_shapes(observation), {"device": observation.device}
+    return network(batch[-1], shapes, actions, hidden, **device, **more)
 
 
 def team_of(network: Any, team: int, teams: int) -> Any:

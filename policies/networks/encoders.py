@@ -1,5 +1,6 @@
 """Encodes the tensors of an observation as one vector of features."""
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -36,7 +37,7 @@ class WindowEncoder(nn.Module):
 
     Args:
         groups: number of groups of weights.
-        shape: [channels, W, W] of the window.
+        shape: [channels, W, W] of the window, or [channels, X, Y] of a map.
         device: of the weights.
         generator: of the initial weights.
     """
@@ -50,13 +51,12 @@ class WindowEncoder(nn.Module):
         generator: Generators = None,
     ):
         super().__init__()
-        channels, side, _ = shape
-        self.pool = -(-side // MAX_SIDE)
+        channels, *sides = shape
+        self.pool = -(-max(sides) // MAX_SIDE)
         more = {"device": device, "generator": generator}
         self.first = StackedConv2d(groups, channels, CHANNELS, **more)
         self.second = StackedConv2d(groups, CHANNELS, CHANNELS, stride=2, **more)
-        pooled = -(-side // self.pool)
-        self.features = CHANNELS * ((pooled + 1) // 2) ** 2
+        self.features = CHANNELS * math.prod((-(-side // self.pool) + 1) // 2 for side in sides)
 
     def forward(self, x: Tensor) -> Tensor:
         """Maps bool or float [groups, rows, channels, W, W] to float32 [groups, rows, features]."""

@@ -65,3 +65,42 @@ class Grouping:
         index = torch.eye(self.uavs, dtype=x.dtype, device=x.device)
         index = index.repeat(x.shape[-2] // self.uavs, 1)
         return torch.cat((x, index.expand(*x.shape[:-1], -1)), -1)
+
+    def of_team(self, x: Tensor, dims: int, uav_dim: int | None = None) -> Tensor:
+        """Joins the first features of all UAVs of a team, those of the UAV itself first.
+
+        Those of UAV k + 1 follow, and so on; UAV 0 follows the last one.
+
+        Args:
+            x: [*batch, features, ...].
+            dims: number of dimensions of the batch.
+            uav_dim: the dimension of the batch with UAVs, [uavs] or [teams * uavs]; the last one
+                if None.
+
+        Returns:
+            [*batch, uavs * features, ...].
+        """
+        uav_dim = dims - 1 if uav_dim is None else uav_dim
+        own = torch.arange(self.uavs, device=x.device)
+        order = (own[:, None] + own) % self.uavs
+        x = x.unflatten(uav_dim, (-1, self.uavs))
+        # [..., teams, uavs, members, ...] -> members in front of the features
+        members = x.index_select(uav_dim + 1, order.flatten()).unflatten(uav_dim + 1, order.shape)
+        return (
+            members.flatten(uav_dim, uav_dim + 1).movedim(uav_dim + 1, dims).flatten(dims, dims + 1)
+        )
+
+    def joint(self, own: Tensor, taken: Tensor) -> Tensor:
+        """Joins a UAV's own action and the actions of the other UAVs, in the order of `of_team`.
+
+        Args:
+            own: [batch, uavs, ..., actions].
+            taken: the actions of the others, of the same shape; those of `own` if it has no
+                components.
+
+        Returns:
+            [batch, uavs, ..., uavs * actions].
+        """
+        others = taken if taken.shape[-1] else own
+        team = self.of_team(others, own.ndim - 1, 1)
+        return torch.cat((own, team[..., own.shape[-1] :]), -1)

@@ -16,6 +16,9 @@ from emberlink.policies.settings import PolicyConfig
 FIRST_LOG_STD = -0.5
 """initial logarithm of the standard deviation of the actions"""
 
+FIRE = (1, 2)
+"""cells of the true map that a critic reads, each kind as a channel: seen and unseen fire"""
+
 
 class SequenceNetwork(nn.Module):
     """An encoder, a memory, hidden layers with a tanh each, and a linear map.
@@ -140,12 +143,13 @@ class GaussianNetwork(SequenceNetwork):
 
 
 class TeamNetwork(nn.Module):
-    """Maps what all UAVs of a team observe to an output for each of them.
+    """Maps what all UAVs of a team observe, and the true map, to an output for each of them.
 
     Args:
         uavs: number of UAVs in a team.
         observations: shape of each tensor of an observation, per UAV.
         low, high: corners of the box, cells.
+        grid: cells of the map along x and y; None without a map.
         more: `hidden`, `policy`, `gain`, `device` and `generator` of `SequenceNetwork`.
     """
 
@@ -158,24 +162,31 @@ class TeamNetwork(nn.Module):
         observations: Sequence[Sequence[int]],
         low: Sequence[float],
         high: Sequence[float],
+        *,
+        grid: Sequence[int] | None = None,
         **more: Any,
     ):
         super().__init__()
         first, *windows = observations
         shapes = [(uavs * (first[0] + 3),), *((uavs * n, *sides) for n, *sides in windows)]
-        self.network = SequenceNetwork(1, shapes, uavs, **more)
+        shapes += [] if grid is None else [(len(FIRE), *grid)]
+        self.network, self.grid = SequenceNetwork(1, shapes, uavs, **more), grid
         corners = torch.tensor([low, high], dtype=torch.float32, device=more.get("device"))
         self.register_buffer("middle", corners.mean(0), persistent=False)
         self.register_buffer("half_width", (corners[1] - corners[0]) / 2 + 1e-6, persistent=False)
 
-    def forward(self, position: Tensor, *observations: Tensor) -> Tensor:
+    def forward(self, position: Tensor, *inputs: Tensor) -> Tensor:
         """Maps positions and observations, [envs, decisions, uavs, ...], to outputs [..., uavs, 1].
 
         Args:
             position: float32 [envs, decisions, uavs, 3], cells.
-            observations: the tensors of the observation.
+            inputs: the tensors of the observation, and the map if there is one, uint8
+                [envs, decisions, X, Y].
         """
+        observations = inputs if self.grid is None else inputs[:-1]
         first, *windows = observations
         vectors = torch.cat((first, (position - self.middle) / self.half_width), -1)
         team = [vectors.flatten(2), *(x.flatten(2, 3) for x in windows)]
+        if self.grid is not None:
+            team.append(torch.stack([inputs[-1] == kind for kind in FIRE], 2))
         return self.network(*(x.unsqueeze(2) for x in team)).transpose(2, 3)

@@ -17,6 +17,8 @@ from emberlink.policies.networks.layers import (
     StackedLinear,
     team_generators,
 )
+from emberlink.policies.networks.memory.registry import find
+from emberlink.policies.settings import PolicyConfig
 
 MAX_BATCHED = 2**17
 """Maximum size of a group's activations for which a CPU computes all groups in one batched product.
@@ -27,7 +29,7 @@ FINAL_BOUND = 3e-3
 """bound of the initial weights of the last layer (Lillicrap et al. 2016, section 7)"""
 
 
-class _Network(nn.Module):
+class StackedNetwork(nn.Module):
     """The common part of actors and critics: an encoder and hidden layers.
 
     Args:
@@ -37,7 +39,8 @@ class _Network(nn.Module):
         actions: number of components of an action.
         hidden: units of the hidden layers, 1 to 8 layers. Each is followed by a LayerNorm.
         share_parameters: whether the UAVs of a team share their weights.
-        agent_index: whether the index of the UAV is an input, too.
+        policy: the memory, and whether the index of the UAV is an input, too.
+        team: whether the inputs of a UAV are the observations and actions of its whole team.
         device: of the weights.
         generator: of the initial weights; several generators create the same number of teams.
 
@@ -54,22 +57,28 @@ class _Network(nn.Module):
         hidden: Sequence[int] = (400, 300),
         *,
         share_parameters: bool = False,
-        agent_index: bool = False,
+        policy: PolicyConfig | None = None,
+        team: bool = False,
         device: torch.device | str | None = None,
         generator: Generators = None,
     ):
         super().__init__()
+        policy = policy or PolicyConfig()
         if not 1 <= len(hidden) <= len(LAYER_NAMES):
             raise ValueError(f"hidden={list(hidden)}: 1 to {len(LAYER_NAMES)} layers are possible")
         self.grouping = Grouping(uavs, len(team_generators(generator)), shared=share_parameters)
         self.names, self.widest = LAYER_NAMES[: len(hidden)], max(hidden)
-        self._dims, self._indexed = len(observations[0]), agent_index
-        if agent_index:
+        self._dims, self._indexed, self._team = len(observations[0]), policy.agent_index, team
+        if team:
+            observations = [(n * uavs, *sides) for n, *sides in observations]
+            actions *= uavs
+        if policy.agent_index:
             observations = [(observations[0][0] + uavs,), *observations[1:]]
         groups = self.grouping.groups
         start: dict[str, Any] = {"device": device, "generator": generator}
         self.encoder = ObservationEncoder(groups, observations, **start)
-        inputs = self.encoder.features
+        self.memory = find(policy.memory)(groups, self.encoder.features, policy, **start)
+        inputs = self.memory.features
         for name, units in zip(self.names, hidden, strict=True):
             self.add_module(name, StackedLinear(groups, inputs, units, **start))
             self.add_module(f"{name}_norm", StackedLayerNorm(groups, units, device=device))
@@ -85,6 +94,8 @@ class _Network(nn.Module):
         return [getattr(self, name + kind) for name in self.names for kind in ("", "_norm")]
 
     def _encode(self, observations: Sequence[Tensor], batch: torch.Size) -> list[Tensor]:
+        if self._team:
+            observations = [self.grouping.of_team(x, len(batch)) for x in observations]
         if self._indexed:
             observations = [self.grouping.with_index(observations[0]), *observations[1:]]
         tensors = [self.grouping.split(x, batch) for x in observations]
@@ -105,10 +116,11 @@ class _Network(nn.Module):
         return self.grouping.join(x, batch)
 
 
-class StackedActor(_Network):
+class StackedActor(StackedNetwork):
     """Maps observations to actions in [-1, 1].
 
-    A ReLU follows each hidden layer, and a tanh the last layer. Arguments are those of `_Network`.
+    A ReLU follows each hidden layer, and a tanh the last layer. Arguments are those of
+    `StackedNetwork`.
     """
 
     def _add_output(self, actions: int, inputs: int, **start: Any) -> None:
@@ -119,14 +131,14 @@ class StackedActor(_Network):
         """Maps the tensors of an observation, [*batch, uavs, ...], to [*batch, uavs, actions]."""
         batch = observations[0].shape[: -self._dims]
         layers = [*self._hidden_layers(), self.action]
-        return self._join(apply_layers(_action, layers, self._encode(observations, batch)), batch)
+        return self._join(apply_layers(to_action, layers, self._encode(observations, batch)), batch)
 
 
-class StackedCritic(_Network):
+class StackedCritic(StackedNetwork):
     """Maps observations and actions to values.
 
     A linear map of the action is added to the normalised last hidden layer before its ReLU.
-    Arguments are those of `_Network`.
+    Arguments are those of `StackedNetwork`.
     """
 
     def _add_output(self, actions: int, inputs: int, **start: Any) -> None:
@@ -141,12 +153,14 @@ class StackedCritic(_Network):
         batch = action.shape[:-1]
 
         def compute(observations: Sequence[Tensor]) -> list[Tensor]:
-            return apply_layers(_features, self._hidden_layers(), self._encode(observations, batch))
+            return apply_layers(
+                to_features, self._hidden_layers(), self._encode(observations, batch)
+            )
 
         first: Any = self.first
         features = self._cache.get(observations, first.weight, compute)
         actions = self._parts(self.grouping.split(action, batch))
-        values = apply_layers(_value, [self.action, self.value], actions, features)
+        values = apply_layers(to_value, [self.action, self.value], actions, features)
         return self._join(values, batch)
 
     def sharing(self) -> AbstractContextManager[None]:
@@ -173,7 +187,7 @@ def apply_layers(
 # ReLU and tanh are computed in place: no gradient needs the output of the layer before.
 
 
-def _features(layers: Sequence[Layer], x: Tensor) -> Tensor:
+def to_features(layers: Sequence[Layer], x: Tensor) -> Tensor:
     """Returns the last hidden layer before its ReLU, given a linear map and a norm per layer."""
     *before, last, last_norm = layers
     for linear, norm in zip(before[::2], before[1::2], strict=True):
@@ -181,11 +195,11 @@ def _features(layers: Sequence[Layer], x: Tensor) -> Tensor:
     return last_norm(last(x))
 
 
-def _action(layers: Sequence[Layer], x: Tensor) -> Tensor:
+def to_action(layers: Sequence[Layer], x: Tensor) -> Tensor:
     *hidden, last = layers
-    return last(_features(hidden, x).relu_()).tanh_()
+    return last(to_features(hidden, x).relu_()).tanh_()
 
 
-def _value(layers: Sequence[Layer], action: Tensor, features: Tensor) -> Tensor:
+def to_value(layers: Sequence[Layer], action: Tensor, features: Tensor) -> Tensor:
     from_action, last = layers
     return last((features + from_action(action)).relu_())

@@ -13,7 +13,7 @@ from emberlink.envs import keys
 from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.learners.base import LearnerContext
 from emberlink.trainers.learners.nan_guard import NonFiniteGuard
-from emberlink.trainers.learners.replay_buffer import ReplayMemory, to_rows
+from emberlink.trainers.learners.off_policy.replay_buffer import ReplayMemory, to_rows
 from emberlink.trainers.training.trainer import Trainer
 
 MILLION = 1_000_000

@@ -141,6 +141,13 @@ def test_windows_of_any_size_have_a_bounded_number_of_features(side, features):
     assert out.shape == (2, 4, features) == (2, 4, encoder.features)
 
 
+def test_a_map_may_have_sides_of_different_lengths():
+    """A map of 40 x 12 cells is pooled to 14 x 4; the second convolution halves both sides."""
+    encoder = WindowEncoder(1, (2, 40, 12))
+    assert encoder.features == 16 * 7 * 2
+    assert encoder(torch.ones(1, 3, 2, 40, 12, dtype=torch.bool)).shape == (1, 3, encoder.features)
+
+
 def test_unsupported_observations_are_errors():
     with pytest.raises(ValueError, match=r"no encoder for an observation of shape \[2, 3\]"):
         ObservationEncoder(1, [(2, 3)])

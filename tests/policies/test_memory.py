@@ -85,13 +85,15 @@ def test_a_stack_holds_the_last_inputs_the_oldest_first():
     assert state[0, 0].tolist() == [5, 6, 7, 8]
 
 
-def test_the_gru_is_that_of_torch():
+@pytest.mark.parametrize("groups", [1, 2])
+def test_the_gru_is_that_of_torch(groups):
     config = PolicyConfig(memory="gru", units=4)
-    ours = GRU(2, 3, config, generator=torch.Generator().manual_seed(1))
-    x, state = drawn(2, 5, 6, 3), drawn(2, 5, 4, seed=1)
+    ours = GRU(groups, 3, config, generator=torch.Generator().manual_seed(1))
+    x, state = drawn(groups, 5, 6, 3), drawn(groups, 5, 4, seed=1)
     nn.init.normal_(ours.input_bias)
+    nn.init.normal_(ours.state_bias)
     outputs, states = ours(x, state)
-    for group in range(2):
+    for group in range(groups):
         theirs = nn.GRU(4, 4, batch_first=True)
         parts = {
             "weight_ih_l0": ours.input_weight,

@@ -153,8 +153,8 @@ def test_critics_reuse_features_of_the_observation(large, monkeypatch):
     fixed = {name: weight.detach() for name, weight in critic.named_parameters()}
     target = {name: weight.detach() for name, weight in other.named_parameters()}
     made = []
-    features = stacked._features
-    monkeypatch.setattr(stacked, "_features", lambda *given: made.append(1) or features(*given))
+    features = stacked.to_features
+    monkeypatch.setattr(stacked, "to_features", lambda *given: made.append(1) or features(*given))
 
     def values() -> list[torch.Tensor]:
         call = torch.func.functional_call

@@ -13,7 +13,7 @@ from emberlink.trainers import load, make_env, train
 from emberlink.trainers.cli import main
 from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.learners.off_policy import OffPolicyLearner
-from emberlink.trainers.learners.replay_buffer import to_rows
+from emberlink.trainers.learners.off_policy.replay_buffer import to_rows
 
 WORLDS = [world for world in known("world") if world != "file"]
 

@@ -46,6 +46,11 @@ class LearnerConfig:
     share_parameters: bool = False
     """whether all UAVs of a seed use the same weights; if not, each UAV has its own"""
 
+    @property
+    def reads_map(self) -> bool:
+        """Whether the learner reads the true map of the fire, `keys.TRUE_MAP`, in training."""
+        return False
+
 
 @plain_dataclass(frozen=True, kw_only=True)
 class LearnerContext:
@@ -124,15 +129,14 @@ class Learner(ABC):
         policy = policy or PolicyConfig()
         if policy.memory != "none":
             raise UserError(
-                f"policy.memory={policy.memory}: the networks of learner={config.name} have no "
-                "memory; those of ippo and mappo have"
+                f"policy.memory={policy.memory}: the networks of learner={config.name} have none"
             )
         return make_actor(
             observation_spec,
             action_spec,
             config.hidden,
             share_parameters=config.share_parameters,
-            agent_index=policy.agent_index,
+            policy=policy,
             generator=generator,
         )
 

@@ -7,7 +7,6 @@ from pydantic.dataclasses import dataclass
 from tensordict import TensorDictBase
 from torchrl.objectives import DDPGLoss
 
-from emberlink.policies.networks import make_critic
 from emberlink.trainers.learners.base import STRICT, LearnerContext, Losses
 from emberlink.trainers.learners.off_policy import OffPolicyConfig, OffPolicyLearner
 
@@ -24,16 +23,8 @@ class DDPG(OffPolicyLearner):
     critic_name = "value"
 
     def make_loss(self, context: LearnerContext, generators: list[torch.Generator]) -> DDPGLoss:
-        specs = context.observation_spec, context.action_spec
-        self.actor = self.make_actor(self.config, *specs, generators, context.policy)
-        critic = make_critic(
-            *specs,
-            self.config.hidden,
-            generator=generators,
-            share_parameters=self.config.share_parameters,
-            agent_index=context.policy.agent_index,
-        )
-        return DDPGLoss(self.actor, critic, delay_actor=True, delay_value=True, reduction="none")
+        actor, (critic,) = self.make_networks(context, generators)
+        return DDPGLoss(actor, critic, delay_actor=True, delay_value=True, reduction="none")
 
     def losses(self, batch: TensorDictBase, *, actor: bool = True) -> Losses:
         critic: Any = self.loss.value_network

@@ -10,7 +10,7 @@ from emberlink.envs import keys
 from emberlink.policies.networks.sequence import SequenceNetwork
 from emberlink.trainers.learners.base import STRICT, LearnerContext
 from emberlink.trainers.learners.on_policy import OnPolicyConfig, OnPolicyLearner
-from emberlink.trainers.learners.proximal import VALUE
+from emberlink.trainers.learners.on_policy.proximal import VALUE
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)

@@ -10,21 +10,30 @@ from emberlink.envs import keys
 from emberlink.policies.networks.sequence import TeamNetwork
 from emberlink.trainers.learners.base import STRICT, LearnerContext
 from emberlink.trainers.learners.on_policy import OnPolicyConfig, OnPolicyLearner
-from emberlink.trainers.learners.proximal import VALUE
+from emberlink.trainers.learners.on_policy.proximal import VALUE
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class MAPPOConfig(OnPolicyConfig):
     """The settings of MAPPO."""
 
+    critic_map: bool = False
+    """whether the critic, in training, also reads the true map: fire that a UAV has seen or none"""
+
+    @property
+    def reads_map(self) -> bool:
+        return self.critic_map
+
 
 class MAPPO(OnPolicyLearner):
     """Values the observations and positions of the whole team, with one number for each UAV.
 
-    The critic has one set of weights per seed and is used in training alone.
+    With `critic_map`, it also reads the true map, which no actor does. The critic has one set of
+    weights per seed and is used in training alone.
     """
 
     config_type = MAPPOConfig
+    config: Any
 
     def make_critic(
         self, context: LearnerContext, generators: list[torch.Generator]
@@ -38,8 +47,10 @@ class MAPPO(OnPolicyLearner):
             hidden=self.config.hidden,
             policy=context.policy,
             gain=1.0,
+            grid=world.grid if self.config.critic_map else None,
             device=context.device,
             generator=generators,
         )
         observed: list[Any] = [keys.POSITION, *keys.observation_keys(spec)]
+        observed += [keys.TRUE_MAP] if self.config.critic_map else []
         return TensorDictModule(network, in_keys=observed, out_keys=[VALUE])

@@ -7,10 +7,7 @@ _REGISTRY = Registry(
     Learner,
     "emberlink.trainers.learners",
     "learner.name",
-    other_files=(
-        *("advantages", "base", "nan_guard", "off_policy", "on_policy"),
-        *("proximal", "registry", "replay_buffer", "tensors"),
-    ),
+    other_files=("base", "nan_guard", "off_policy", "on_policy", "registry", "tensors"),
     group="emberlink.learners",
 )
 known, find = _REGISTRY.known, _REGISTRY.find

@@ -6,14 +6,13 @@ import torch
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModule, TensorDictModuleBase
+from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.objectives import TD3Loss
 
 from emberlink.envs import keys
 from emberlink.envs.utils import counter_rng
 from emberlink.envs.utils.counter_rng import Use
-from emberlink.policies.networks import make_critic
 from emberlink.trainers.learners.base import STRICT, Count, LearnerContext, Losses, NotNegative
 from emberlink.trainers.learners.off_policy import OffPolicyConfig, OffPolicyLearner
 
@@ -47,22 +46,11 @@ class TD3(OffPolicyLearner):
         self._keys = counter_rng.fold_in(seeds, Use.TARGET_NOISE)
 
     def make_loss(self, context: LearnerContext, generators: list[torch.Generator]) -> TD3Loss:
-        specs, config = (context.observation_spec, context.action_spec), self.config
-        self.actor = self.make_actor(config, *specs, generators, context.policy)
-        critics: list[TensorDictModule] = [
-            make_critic(
-                *specs,
-                config.hidden,
-                generator=generators,
-                share_parameters=config.share_parameters,
-                agent_index=context.policy.agent_index,
-            )
-            for _ in range(_CRITICS)
-        ]
-        actor: Any = _SmoothedActor(self.actor)
+        actor, critics = self.make_networks(context, generators, _CRITICS)
+        smoothed: Any = _SmoothedActor(actor, critics[0])
         bounds: Any = (-1.0, 1.0)
         loss = TD3Loss(
-            actor,
+            smoothed,
             critics,  # a list, so that TorchRL does not draw weights itself
             bounds=bounds,
             policy_noise=0.0,  # `sample` draws the noise
@@ -81,10 +69,10 @@ class TD3(OffPolicyLearner):
         """Draws a batch and the noise on the target actors' actions."""
         batch, config = self.replay.sample(), self.config
         action = batch.get(keys.ACTION)
-        size, _, features = action.shape
         key = counter_rng.fold_in(self._keys, self.replay.draws)
         normal = counter_rng.normal(key, action.numel() // self.teams)
-        noise = normal.view(self.teams, size, -1, features).transpose(0, 1).reshape(action.shape)
+        by_team = normal.view(self.teams, len(action), -1, *action.shape[2:])
+        noise = by_team.transpose(0, 1).reshape(action.shape)
         clip = config.target_noise_clip
         batch.set(("next", *_TARGET_NOISE), (noise * config.target_noise).clamp(-clip, clip))
         return batch
@@ -120,12 +108,16 @@ class TD3(OffPolicyLearner):
 
 
 class _SmoothedActor(TensorDictModuleBase):
-    """Adds the noise in a batch, if there is any, to the actors' actions and clips them."""
+    """Adds the noise in a batch, if there is any, to the actors' actions and clips them.
 
-    def __init__(self, actor: TensorDictModule):
+    It passes on what the critics read.
+    """
+
+    def __init__(self, actor: TensorDictModuleBase, critic: TensorDictModuleBase):
         super().__init__()
         self.actor = actor
-        reads: list[Any] = [*actor.in_keys, _TARGET_NOISE]
+        passed = [key for key in critic.in_keys if key != keys.ACTION]
+        reads: list[Any] = list(dict.fromkeys([*actor.in_keys, _TARGET_NOISE, *passed]))
         writes: list[Any] = list(actor.out_keys)
         self.in_keys, self.out_keys = reads, writes
 

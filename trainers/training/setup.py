@@ -48,6 +48,7 @@ class TrainingSetup:
             fire=config.fire,
             seed=self.seeds,
             device=config.device,
+            true_map=config.learner.reads_map,
         )
         self.guard = NonFiniteGuard(config.device)
         self.learner = build_learner(config, self.env, self.guard)

@@ -9,9 +9,10 @@ from emberlink.policies.settings import PolicyConfig
 
 
 class GRU(Memory):
-    """Applies a linear map with a tanh, then torch's GRU, with `policy.units` units each.
+    """Applies a linear map with a tanh, then a GRU, with `policy.units` units each.
 
-    A GRU of torch has the weights of one group, so several groups are computed one after another.
+    A GRU of torch has the weights of one group. Several groups are computed together, one decision
+    after another; on a CPU, this takes less than half of the time of one group after another.
     """
 
     def __init__(
@@ -35,14 +36,26 @@ class GRU(Memory):
 
     def forward(self, x: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
         x = self.input(x.flatten(1, 2)).unflatten(1, x.shape[1:3]).tanh()
+        return self._one_group(x, state) if len(x) == 1 else self._groups(x, state)
+
+    def _one_group(self, x: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
         weights = self.input_weight, self.state_weight, self.input_bias, self.state_bias
         train = torch.is_grad_enabled()  # cuDNN computes gradients in this mode alone
-        outputs, states = [], []
-        for sequence, before, *of_group in zip(x, state, *weights, strict=True):
-            # [rows, decisions, units]: one layer, biases, no dropout, one direction
-            output, after = torch.gru(
-                sequence, before[None], of_group, True, 1, 0.0, train, False, True
-            )
-            outputs.append(output)
-            states.append(after[0])
-        return torch.stack(outputs), torch.stack(states)
+        # [rows, decisions, units]: one layer, biases, no dropout, one direction
+        of_group = [weight[0] for weight in weights]
+        output, after = torch.gru(x[0], state, of_group, True, 1, 0.0, train, False, True)
+        return output[None], after
+
+    def _groups(self, x: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
+        rows, units = x.shape[1], self.size
+        by_decision = x.transpose(1, 2).flatten(1, 2)
+        from_inputs = torch.baddbmm(self.input_bias[:, None], by_decision, self.input_weight.mT)
+        states = []
+        for from_input in from_inputs.unflatten(1, (-1, rows)).unbind(1):
+            from_state = torch.baddbmm(self.state_bias[:, None], state, self.state_weight.mT)
+            both = from_input[..., : 2 * units] + from_state[..., : 2 * units]
+            reset, keep = both.sigmoid().chunk(2, -1)
+            new = from_input[..., 2 * units :].addcmul(reset, from_state[..., 2 * units :]).tanh()
+            state = torch.lerp(new, state, keep)
+            states.append(state)
+        return torch.stack(states, 2), state

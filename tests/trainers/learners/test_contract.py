@@ -27,6 +27,15 @@ CASES = {
     "td3": ["learner=td3", "policy.agent_index=true", "learner.batch_size=8"],
     "ippo": ["learner=ippo", "policy.memory=gru", "policy.hold=5"],
     "mappo": ["learner=mappo", "policy.memory=stack", "policy.agent_index=true"],
+    "ddpg-gru": [
+        *("learner=ddpg", "policy.memory=gru", "policy.hold=2", "learner.batch_size=8"),
+        *("learner.sequence=4", "learner.burn_in=3"),
+    ],
+    "td3-team": [
+        *("learner=td3", "policy.memory=stack", "learner.critic=team", "learner.batch_size=8"),
+        *("learner.sequence=4", "learner.burn_in=3", "learner.share_parameters=true"),
+    ],
+    "mappo-map": ["learner=mappo", "learner.critic_map=true", "policy.hold=4"],
     "ippo-own": ["learner=ippo", "policy.memory=gru", "learner.share_parameters=false"],
 }
 
@@ -87,14 +96,14 @@ def test_a_loaded_policy_needs_no_further_code(case, trained):
     assert not pettingzoo.agents
 
 
-@pytest.mark.parametrize("case", ["ippo", "mappo"])
+@pytest.mark.parametrize("case", ["ippo", "mappo", "ddpg-gru", "td3-team"])
 def test_an_episode_that_begins_again_forgets_the_one_before(case, trained):
-    """Environment 0 begins again after 7 steps; environment 1 goes on."""
+    """Environment 0 begins again after 8 steps; environment 1 goes on."""
     policy = load(trained(case))
     env = make_env(policy.config, num_envs=2, seed=7)
     with torch.no_grad():
         td = env.reset()
-        for _ in range(7):
+        for _ in range(8):
             td = step_mdp(env.step(policy(td)))
         before = td.clone()
         td = env.reset(td.set("_reset", torch.tensor([[True], [False]])))
@@ -131,7 +140,7 @@ def test_a_sweep_over_learners(tmp_path, capsys):
     capsys.readouterr()
 
 
-@pytest.mark.parametrize("case", ["ippo", "mappo", "ippo-own"])
+@pytest.mark.parametrize("case", ["ippo", "mappo", "ippo-own", "ddpg-gru", "td3-team"])
 def test_seeds_side_by_side_learn_the_same_as_alone(case, tmp_path):
     settings = ["train", "independent", *SMALL, *CASES[case], "evaluation.interval=0"]
     assert main.main([*settings, "seeds=[3,11]", f"output={tmp_path / 'both'}"]) == 0

@@ -13,7 +13,7 @@ from emberlink.policies.exploration import ExplorationConfig
 from emberlink.trainers.learners.base import LearnerContext
 from emberlink.trainers.learners.ddpg import DDPG, DDPGConfig
 from emberlink.trainers.learners.nan_guard import NonFiniteGuard
-from emberlink.trainers.learners.replay_buffer import DONE, TERMINATED
+from emberlink.trainers.learners.off_policy.replay_buffer import DONE, TERMINATED
 
 UAVS, FEATURES, ACTIONS, HIDDEN, BATCH = 3, 9, 3, (16, 12), 24
 RATES = {

@@ -11,6 +11,7 @@ from test_recipes import METHODS
 
 from emberlink.envs.utils import plugins
 from emberlink.envs.utils.errors import UserError
+from emberlink.policies.settings import PolicyConfig
 from emberlink.trainers.cli import main
 from emberlink.trainers.config.compose import (
     _drop_settings_of_other_learners,
@@ -144,6 +145,13 @@ def test_networks_of_seeds_that_cannot_be_told_apart_are_refused():
     assert Learner.team_actor(cast(Any, Own()), 0, 1) is Own.actor
     with pytest.raises(UserError, match="Own trains one seed at a time"):
         Learner.team_actor(cast(Any, Own()), 0, 2)
+
+
+def test_a_learner_without_a_memory_refuses_one():
+    config: Any = resolve("consensus")
+    spec: Any = None
+    with pytest.raises(UserError, match=r"the networks of learner=ddpg have none"):
+        Learner.make_actor(config.learner, spec, spec, policy=PolicyConfig(memory="gru"))
 
 
 def test_td3_delays_the_actors_and_all_targets():

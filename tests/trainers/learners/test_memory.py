@@ -9,7 +9,12 @@ from emberlink.envs import keys
 from emberlink.trainers import make_env
 from emberlink.trainers.learners.base import LearnerContext
 from emberlink.trainers.learners.nan_guard import NonFiniteGuard
-from emberlink.trainers.learners.replay_buffer import DONE, TERMINATED, ReplayMemory, to_rows
+from emberlink.trainers.learners.off_policy.replay_buffer import (
+    DONE,
+    TERMINATED,
+    ReplayMemory,
+    to_rows,
+)
 
 UAVS = 4
 

@@ -1,17 +1,26 @@
 """Tests the learners from whole episodes: IPPO and MAPPO."""
 
+from itertools import islice
 from typing import Any
 
 import pytest
 import torch
 from torch import Tensor
+from torchrl.envs import check_env_specs
 
 from emberlink.envs import keys
 from emberlink.envs.utils.errors import UserError
 from emberlink.policies.gaussian import LOG_PROB
+from emberlink.trainers import make_env
 from emberlink.trainers.config.compose import resolve
-from emberlink.trainers.learners.advantages import Advantages
-from emberlink.trainers.learners.proximal import ADVANTAGE, RETURN, clip_by_row, mean_of_uavs
+from emberlink.trainers.learners.on_policy.advantages import Advantages
+from emberlink.trainers.learners.on_policy.proximal import (
+    ADVANTAGE,
+    RETURN,
+    VALUE,
+    clip_by_row,
+    mean_of_uavs,
+)
 from emberlink.trainers.training.setup import TrainingSetup
 
 LEARNERS = ["ippo", "mappo"]
@@ -189,11 +198,33 @@ def test_a_run_without_memory_or_with_a_stack_learns_too(learner):
             assert not value.equal(before[name]), name
 
 
+def test_only_mappos_critic_reads_the_true_map():
+    """The map is that of the environment before each decision; evaluations do not have it."""
+    setup = made("mappo", "learner.critic_map=true", "env.grid=[12,9]")
+    maps = [setup.env.base_env.fire_map.clone()]
+    for rollout in islice(setup.collector, 6):
+        assert rollout[keys.TRUE_MAP][:, 0].equal(maps[-1])
+        maps.append(rollout["next", keys.TRUE_MAP][:, -1])
+    assert maps[-1].shape == (4, 12, 9)
+    assert maps[-1].any()
+    learner: Any = setup.learner
+    assert keys.TRUE_MAP in learner.critic.in_keys
+    assert keys.TRUE_MAP not in learner.explorer.in_keys
+    assert keys.TRUE_MAP not in make_env(setup.config).reset()
+    check_env_specs(setup.env)
+    batch = first_batches(made("mappo", "learner.critic_map=true"))[0]
+    changed = batch.clone()
+    changed[keys.TRUE_MAP][:, 2] = 2 - changed[keys.TRUE_MAP][:, 2]
+    learner = made("mappo", "learner.critic_map=true").learner
+    before, after = (learner.critic(x)[VALUE] for x in (batch, changed))
+    assert before[:, :2].equal(after[:, :2])
+    assert not before[:, 2:].isclose(after[:, 2:]).any()
+    assert learner.losses(batch)["actor"].equal(learner.losses(changed)["actor"])
+
+
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        (["learner=ddpg", "policy.memory=gru"], "policy.memory=gru: the networks of learner=ddpg"),
-        (["learner=td3", "policy.memory=stack"], "policy.memory=stack: the networks of"),
         (["learner=ippo", "env.horizon=15", "policy.hold=10"], "env.horizon=15: must be a"),
     ],
 )

@@ -497,3 +497,27 @@ def test_learners_from_whole_episodes_stop_and_name_the_value(
     again = resume(trainer.run.path)
     assert again.setup.step == 30
     again.close()
+
+
+@pytest.mark.parametrize("more", [["policy.memory=gru"], ["learner.critic=team"]])
+def test_the_update_of_a_sequence_or_a_team_can_be_repeated(more, tmp_path, monkeypatch):
+    """The gradient of UAV 1's critic is NaN in the ninth update."""
+    original, bad = DDPG.losses, [9]
+
+    def poisoned(learner, batch, **more):
+        losses = original(learner, batch, **more)
+        if learner.updates in bad:
+            values = learner.parameters["critic.value.weight"]
+            losses["critic"] = losses["critic"] + (0 * values[1]).sum().sqrt()
+        return losses
+
+    monkeypatch.setattr(DDPG, "losses", poisoned)
+    more = [*more, "learner.sequence=4", "learner.burn_in=2"]
+    trainer = begun("independent", tmp_path, *more)
+    error = diverged(trainer)
+    assert error.report.tensor == "gradient of critic.value.weight"
+    assert (error.report.uav, error.report.update) == (1, 9)
+    assert error.dump is not None
+    assert replay(error.dump) == error.report
+    bad.clear()
+    assert replay(error.dump) is None

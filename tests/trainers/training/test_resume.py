@@ -14,7 +14,7 @@ from test_recipes import METHODS
 
 from emberlink.trainers.cli import main
 from emberlink.trainers.config.compose import resolve
-from emberlink.trainers.learners.replay_buffer import ReplayMemory
+from emberlink.trainers.learners.off_policy.replay_buffer import ReplayMemory
 from emberlink.trainers.runs import checkpoint_file
 from emberlink.trainers.runs.run_folder import RunFolder
 from emberlink.trainers.training.resume import resume
@@ -139,12 +139,23 @@ def test_seeds_side_by_side_are_resumed_together(method, learner, whole, tmp_pat
     assert_same(whole(method, *more), stopped)
 
 
+# A replay buffer has wrapped around after 15 of the 40 decisions.
 @pytest.mark.parametrize(
-    ("learner", "memory"), [("ippo", "gru"), ("mappo", "stack"), ("ddpg", "none")]
+    "more",
+    [
+        ["learner=ippo"],
+        ["learner=mappo", "policy.memory=stack", "learner.critic_map=true"],
+        ["learner=ddpg"],
+        ["learner=ddpg", "policy.memory=gru", "learner.sequence=4", "learner.burn_in=3"],
+        [
+            *("learner=td3", "policy.memory=stack", "learner.sequence=3", "learner.burn_in=4"),
+            "learner.critic=team",
+        ],
+    ],
 )
-def test_held_actions_and_memories_are_resumed(learner, memory, whole, tmp_path):
+def test_held_actions_and_memories_are_resumed(more, whole, tmp_path):
     """The run stops within an episode, and at its end."""
-    held = f"learner={learner}", f"policy.memory={memory}", "policy.hold=2", "env.failures=1"
+    held = *more, "policy.hold=2", "env.failures=1"
     assert_same(whole("consensus", *held), stopped_at([10, 26, 40], "consensus", tmp_path, *held))
 
 

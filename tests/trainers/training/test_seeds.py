@@ -105,7 +105,7 @@ def test_seeds_of_a_stack_differ_in_all_random_values():
         assert not collected[key][0].isclose(collected[key][1]).any(), key
     learner.replay.extend(collected)
     sampler, storage = learner.replay._sampler, learner.replay._buffer.storage
-    sampler.filled.fill_(1000)
+    sampler.written.fill_(1000)
     (rows, columns), _ = sampler.sample(storage, 24)
     assert (rows[:, :6] == rows[:, 6:]).float().mean() < 0.05
     assert columns[:, :6].max() < 6 <= columns[:, 6:].min()

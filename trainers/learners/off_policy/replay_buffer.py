@@ -8,19 +8,14 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import LazyTensorStorage, ReplayBuffer, RoundRobinWriter
-from torchrl.data.replay_buffers.samplers import RandomSampler
-from torchrl.data.replay_buffers.storages import TensorStorage
 
 from emberlink.envs import keys
-from emberlink.envs.utils import counter_rng
-from emberlink.envs.utils.counter_rng import Use
 from emberlink.trainers.learners.base import LearnerContext
+from emberlink.trainers.learners.off_policy.samplers import TeamSampler
 from emberlink.trainers.learners.tensors import flatten, group, prefixed, unflatten
 
 DONE = (keys.AGENTS, "done")
 TERMINATED = (keys.AGENTS, "terminated")
-
-_ROWS, _COLUMNS = range(2)
 
 
 class ReplayMemory:
@@ -34,9 +29,12 @@ class ReplayMemory:
         batch_size: transitions per UAV in a sample.
         buffer_size: capacity in transitions of a UAV. A shared buffer has this capacity for all
             UAVs together.
+        joint: whether the UAVs of a team sample the same rows, see `TeamSampler`.
     """
 
-    def __init__(self, context: LearnerContext, *, batch_size: int, buffer_size: int):
+    def __init__(
+        self, context: LearnerContext, *, batch_size: int, buffer_size: int, joint: bool = False
+    ):
         uavs, shared = context.num_uavs, context.shared_replay
         self.teams, self.device = len(context.seeds), context.device
         self._keys = keys.observation_keys(context.observation_spec)
@@ -51,9 +49,10 @@ class ReplayMemory:
         self.learning_starts = -(-self.needed // context.num_envs) if fits else never
         self.written = 0
         """rows written so far, including overwritten ones"""
-        self._sampler = TeamSampler(
+        self._sampler = self._make_sampler(
             uavs,
             shared=shared,
+            joint=joint,
             rows=self.capacity,
             seeds=context.seeds,
             device=context.device,
@@ -64,8 +63,10 @@ class ReplayMemory:
             writer=RoundRobinWriter(compilable=True),
             sampler=self._sampler,
             batch_size=batch_size,
-            transform=_to_batch,
         )
+
+    def _make_sampler(self, uavs: int, **more: Any) -> TeamSampler:
+        return TeamSampler(uavs, **more)
 
     def __len__(self) -> int:
         return len(self._buffer)
@@ -91,7 +92,7 @@ class ReplayMemory:
 
     def sample(self) -> TensorDict:
         """Samples a batch for each UAV: batch size [batch], with the keys of a rollout."""
-        return self._buffer.sample()
+        return _to_batch(self._buffer.sample())
 
     def state_dict(self, *, transitions: bool = True) -> dict[str, Tensor]:
         """Returns the counters and the filled rows, which are not copied."""
@@ -114,66 +115,7 @@ class ReplayMemory:
         if self.written > self.capacity and behind:
             # Writing the first rows again moves the write position behind the newest row.
             self._buffer.extend(content[:behind])
-
-
-class TeamSampler(RandomSampler):
-    """Samples a batch for each UAV, uniformly, from a storage of shape [rows, teams * uavs].
-
-    A sample is a function of the seed and the number of earlier samples. It is the same on every
-    device and does not depend on other seeds that are trained in parallel.
-
-    Args:
-        uavs: UAVs per team.
-        shared: whether a UAV samples from the transitions of its team, or only from its own.
-        rows: capacity of the storage.
-        seeds: seed of each team.
-        device: device of the storage and the indices.
-    """
-
-    def __init__(
-        self,
-        uavs: int,
-        *,
-        shared: bool,
-        rows: int,
-        seeds: Sequence[int],
-        device: torch.device | str,
-    ):
-        super().__init__()
-        self.uavs, self.shared, self.rows = uavs, shared, rows
-        # On the device, so that CUDA graphs read their current values.
-        self.draws = torch.zeros((), dtype=torch.int64, device=device)
-        self.filled = torch.zeros((), dtype=torch.int64, device=device)
-        self._keys = counter_rng.fold_in(torch.tensor(seeds, device=device), Use.REPLAY_SAMPLE)
-        self._team = torch.arange(len(seeds), device=device)[:, None, None] * uavs
-        self._own = torch.arange(uavs, device=device)
-
-    def extend(self, index: Tensor) -> None:
-        """Counts the rows that the buffer has written."""
-        self.filled.add_(len(index)).clamp_(max=self.rows)
-
-    def sample(self, storage: TensorStorage, batch_size: int) -> tuple[tuple[Tensor, Tensor], dict]:
-        """Returns rows and columns, int64 [batch_size, teams * uavs] each.
-
-        Entry [:, k] is the batch of UAV k.
-        """
-        if len(storage) == 0:
-            raise RuntimeError("cannot sample from an empty replay memory")
-        key = counter_rng.fold_in(self._keys, self.draws)
-        self.draws += 1
-
-        def draw(use: int, limit: int | Tensor) -> Tensor:
-            numbers = counter_rng.integers(
-                counter_rng.fold_in(key, use), batch_size * self.uavs, limit
-            )
-            return numbers.view(-1, batch_size, self.uavs)
-
-        rows = draw(_ROWS, self.filled)
-        column = draw(_COLUMNS, self.uavs) if self.shared else self._own.expand_as(rows)
-        rows, columns = (
-            of_teams.transpose(0, 1).flatten(1) for of_teams in (rows, column + self._team)
-        )
-        return (rows, columns), {}
+        self._sampler.written.fill_(self.written)
 
 
 class _PreallocatedStorage(LazyTensorStorage):
@@ -184,7 +126,7 @@ class _PreallocatedStorage(LazyTensorStorage):
         self._storage.zero_()
 
     def get(self, index: tuple[Tensor, Tensor]) -> TensorDictBase:
-        """Returns the rows that `TeamSampler` sampled.
+        """Returns the rows that a sampler chose.
 
         TorchRL's method first slices the storage to the filled rows. A CUDA graph would record the
         size of that slice.

@@ -3,32 +3,27 @@
 from abc import abstractmethod
 from collections.abc import Mapping
 from functools import partial
-from typing import Annotated, Any, ClassVar
+from typing import Any, ClassVar
 
 import torch
-from pydantic import Field, model_validator
-from pydantic.dataclasses import dataclass
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictSequential
 from torch import Tensor
+from torchrl.data import Composite
 from torchrl.objectives import LossModule, SoftUpdate, group_optimizers
 
 from emberlink.envs import keys
-from emberlink.envs.utils.errors import UserError
-from emberlink.policies.exploration import ExplorationConfig, OrnsteinUhlenbeck
-from emberlink.policies.networks import STATE_ACTION_VALUE
-from emberlink.trainers.learners.base import (
-    STRICT,
-    Count,
-    Learner,
-    LearnerConfig,
-    LearnerContext,
-    Losses,
-    NotNegative,
-    Positive,
-    generators,
-)
-from emberlink.trainers.learners.replay_buffer import DONE, TERMINATED, ReplayMemory
+from emberlink.policies.exploration import OrnsteinUhlenbeck
+from emberlink.policies.gaussian import MemoryActor
+from emberlink.policies.networks import STATE_ACTION_VALUE, Generators, build
+from emberlink.policies.networks.recurrent import RecurrentActor
+from emberlink.policies.settings import PolicyConfig
+from emberlink.trainers.learners.base import Learner, LearnerContext, Losses, generators
+from emberlink.trainers.learners.off_policy.config import OffPolicyConfig
+from emberlink.trainers.learners.off_policy.networks import SequenceActor, with_taken
+from emberlink.trainers.learners.off_policy.networks import critics as make_critics
+from emberlink.trainers.learners.off_policy.replay_buffer import DONE, TERMINATED, ReplayMemory
+from emberlink.trainers.learners.off_policy.sequences import SequenceMemory
 from emberlink.trainers.learners.tensors import (
     copy_into,
     group,
@@ -37,38 +32,6 @@ from emberlink.trainers.learners.tensors import (
     prefixed,
 )
 from emberlink.trainers.rollout.cuda_graphs import graphed
-
-
-@dataclass(frozen=True, kw_only=True, config=STRICT)
-class OffPolicyConfig(LearnerConfig):
-    """The settings of learners with a replay buffer and target networks."""
-
-    gamma: Annotated[float, Field(ge=0, lt=1)]
-    """discount per step"""
-    actor_lr: Positive
-    """learning rate of the actors' Adam"""
-    critic_lr: Positive
-    """learning rate of the critics' Adam"""
-    critic_weight_decay: NotNegative
-    """L2 penalty in the critics' Adam"""
-    tau: Annotated[float, Field(gt=0, le=0.5)]
-    """soft update of the target networks: target += tau * (network - target)"""
-    updates_per_step: Count
-    """updates of every UAV's networks per step of the batch of environments"""
-    batch_size: Annotated[int, Field(ge=1, le=1_000_000)]
-    """transitions per update and UAV"""
-    buffer_size: Count
-    """capacity of a replay buffer, in transitions of a UAV"""
-    exploration: ExplorationConfig
-    """exploration noise"""
-
-    @model_validator(mode="after")
-    def _a_batch_fits(self) -> "OffPolicyConfig":
-        if self.batch_size > self.buffer_size:
-            raise UserError(
-                f"batch_size={self.batch_size} is larger than buffer_size={self.buffer_size}"
-            )
-        return self
 
 
 class OffPolicyLearner(Learner):
@@ -95,14 +58,64 @@ class OffPolicyLearner(Learner):
         self.explorer = TensorDictSequential(*parts)
         self.parameters = self._trained("actor") | self._trained(self.critic_name, "critic")
         self._make_optimizer()
-        self.replay = ReplayMemory(
-            context, batch_size=config.batch_size, buffer_size=config.buffer_size
-        )
+        self.replay = self._make_replay(context)
         self.learning_starts = self.replay.learning_starts
         self._graphs = {
             moves: graphed(partial(self._sample_and_update, moves), context.device)
             for moves in (False, True)
         }
+
+    def _make_replay(self, context: LearnerContext) -> ReplayMemory:
+        config = self.config
+        sizes: dict[str, Any] = {
+            "batch_size": config.batch_size,
+            "buffer_size": config.buffer_size,
+            "joint": config.critic == "team",
+        }
+        if context.policy.memory == "none":
+            return ReplayMemory(context, **sizes)
+        lengths = {"sequence": config.sequence, "burn_in": config.burn_in}
+        return SequenceMemory(context, **sizes, **lengths)
+
+    @classmethod
+    def make_actor(
+        cls,
+        config: Any,
+        observation_spec: Composite,
+        action_spec: Composite,
+        generator: Generators = None,
+        policy: PolicyConfig | None = None,
+    ) -> Any:
+        """Returns new actors, with a memory or without."""
+        specs = observation_spec, action_spec
+        if policy is None or policy.memory == "none":
+            return super().make_actor(config, *specs, generator, policy)
+        network = build(
+            RecurrentActor,
+            *specs,
+            config.hidden,
+            share_parameters=config.share_parameters,
+            policy=policy,
+            generator=generator,
+        )
+        return MemoryActor(network, observation_spec)
+
+    def make_networks(
+        self, context: LearnerContext, generators: list[torch.Generator], critics: int = 1
+    ) -> tuple[Any, list[Any]]:
+        """Sets `actor` and returns the actors and critics for TorchRL's loss of a batch.
+
+        Args:
+            context: context of the learner.
+            generators: of the initial weights, one per seed.
+            critics: number of critics of each UAV.
+        """
+        specs, config = (context.observation_spec, context.action_spec), self.config
+        self.actor = self.make_actor(config, *specs, generators, context.policy)
+        actor = self.actor
+        if context.policy.memory != "none":
+            actor = SequenceActor(actor.module, context, config)
+        return actor, [make_critics(config, context, generators) for _ in range(critics)]
 
     @abstractmethod
     def make_loss(self, context: LearnerContext, generators: list[torch.Generator]) -> LossModule:
@@ -125,10 +138,13 @@ class OffPolicyLearner(Learner):
         """Returns the mean loss of each UAV, [uavs], over the transitions in which UAVs flew.
 
         Args:
-            loss: [batch, uavs].
+            loss: [batch, uavs], or [batch, uavs, decisions].
             batch: batch size [batch]; without `keys.ALIVE`, UAVs cannot fail.
         """
         alive = batch.get(keys.ALIVE, None)
+        if loss.ndim == 3:
+            loss = loss.transpose(1, 2).flatten(0, 1)
+            alive = None if alive is None else alive.transpose(1, 2).flatten(0, 1)
         if alive is None:
             return loss.mean(0)
         weight = alive.to(loss.dtype)
@@ -170,6 +186,8 @@ class OffPolicyLearner(Learner):
     def _update(self, batch: TensorDictBase, actor: bool) -> Losses:
         """Performs an update; after a detection of the guard, no weight changes."""
         self.guard.record_batch(batch)
+        if self.config.critic == "team":
+            batch = with_taken(batch)
         losses = self.losses(batch, actor=actor)
         torch.stack([*losses.values()]).sum().backward()
         losses = {name: value.detach() for name, value in losses.items()}

@@ -19,7 +19,6 @@ from emberlink.policies.gaussian import LOG_PROB, GaussianExplorer, MemoryActor
 from emberlink.policies.networks import Generators
 from emberlink.policies.networks.sequence import GaussianNetwork
 from emberlink.policies.settings import PolicyConfig
-from emberlink.trainers.learners.advantages import Advantages
 from emberlink.trainers.learners.base import (
     ACTOR,
     STRICT,
@@ -32,7 +31,8 @@ from emberlink.trainers.learners.base import (
     Positive,
     generators,
 )
-from emberlink.trainers.learners.proximal import (
+from emberlink.trainers.learners.on_policy.advantages import Advantages
+from emberlink.trainers.learners.on_policy.proximal import (
     ADVANTAGE,
     RETURN,
     VALUE,

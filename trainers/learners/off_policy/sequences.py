@@ -1,0 +1,104 @@
+"""Samples sequences of decisions, from which networks with a memory learn."""
+
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+
+from emberlink.envs import keys
+from emberlink.envs.utils.errors import UserError
+from emberlink.trainers.learners.base import LearnerContext
+from emberlink.trainers.learners.off_policy.replay_buffer import ReplayMemory
+from emberlink.trainers.learners.off_policy.samplers import SequenceSampler, TeamSampler
+
+BEGINS = (keys.AGENTS, "begins")
+"""bool [batch, uavs]: whether a sequence begins with its episode and has no burn-in"""
+
+
+class SequenceMemory(ReplayMemory):
+    """Stores the transitions of all UAVs and samples sequences for each UAV, see `SequenceSampler`.
+
+    Args:
+        context: context of the learner.
+        batch_size: transitions to learn from per UAV in a sample, rounded up to whole sequences.
+        sequence: decisions to learn from in a sequence.
+        burn_in: decisions before, which prepare the memory.
+        more: `buffer_size` and `joint` of `ReplayMemory`.
+
+    Raises:
+        UserError: the episode is shorter than a sequence, or the buffer cannot hold enough.
+    """
+
+    def __init__(
+        self, context: LearnerContext, *, batch_size: int, sequence: int, burn_in: int, **more: Any
+    ):
+        self._context, self.sequence, self.burn_in = context, sequence, burn_in
+        if sequence > context.horizon:
+            raise UserError(
+                f"learner.sequence={sequence}: an episode has {context.horizon} decisions "
+                f"(env.horizon / policy.hold)"
+            )
+        super().__init__(context, batch_size=batch_size, **more)
+        held = self.capacity // context.num_envs
+        # At least one sequence fits while the buffer is full, whatever decision is overwritten.
+        wanted = burn_in + 2 * sequence - 1
+        if held < min(wanted, context.total_steps):
+            raise UserError(
+                f"learner.buffer_size={more['buffer_size']}: holds {held} decisions of "
+                f"{context.num_envs} environments; {wanted} are needed for learner.burn_in="
+                f"{burn_in} and learner.sequence={sequence}"
+            )
+        self.learning_starts = max(self.learning_starts, sequence)
+
+    def _make_sampler(self, uavs: int, **more: Any) -> TeamSampler:
+        return SequenceSampler(
+            uavs,
+            burn_in=self.burn_in,
+            sequence=self.sequence,
+            horizon=self._context.horizon,
+            envs=self._context.num_envs,
+            **more,
+        )
+
+    @property
+    def ready(self) -> bool:
+        """Whether the buffer holds a full batch, and a sequence."""
+        return super().ready and self.written >= self.sequence * self._context.num_envs
+
+    def extend(self, rollout: TensorDictBase) -> None:
+        """Stores a rollout, batch size [seeds * environments, steps], step by step."""
+        for step in rollout.split(1, 1):
+            super().extend(step)
+
+    def sample(self) -> TensorDict:
+        """Samples sequences for each UAV: batch size [batch], [batch, uavs, decisions, ...] each.
+
+        Observations are those of the burn-in and of the decisions to learn from, and under "next"
+        also the one after. All other tensors are those of the decisions to learn from.
+        """
+        drawn: Any = self._buffer.sample(return_info=True)
+        sample, info = drawn
+        begins, past = info["begins"], self.burn_in
+
+        def learnt(name: Any) -> Tensor:
+            return sample.get(name).transpose(1, 2)[:, :, past:]
+
+        observed, following = {}, {}
+        for _, name in self._keys:
+            observed[name] = sample.get(name).transpose(1, 2)
+            # The transition of a missing burn-in does not lead to the first observation.
+            before = observed[name][:, :, : past + 1]
+            following[name] = torch.cat((before, learnt(("next", name))), 2)
+        kept = ["action", *(["alive"] if self._failures else [])]
+        agents = {**observed, **{name: learnt(name) for name in kept}, "begins": begins}
+        after = {name: learnt(("next", name)) for name in ("reward", "done", "terminated")}
+        after |= {**following, "begins": begins.clone()}
+        batch, size = begins.shape, begins.shape[:1]
+        return TensorDict(
+            {
+                keys.AGENTS: TensorDict(agents, batch_size=batch),
+                "next": TensorDict({keys.AGENTS: TensorDict(after, batch)}, batch_size=size),
+            },
+            batch_size=size,
+        )

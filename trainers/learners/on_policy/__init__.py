@@ -1,0 +1,5 @@
+"""The base of learners from whole episodes (IPPO, MAPPO), and its parts."""
+
+from emberlink.trainers.learners.on_policy.learner import OnPolicyConfig, OnPolicyLearner
+
+__all__ = ["OnPolicyConfig", "OnPolicyLearner"]
