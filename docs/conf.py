@@ -45,6 +45,7 @@ intersphinx_mapping = write_inventories(HERE.parent / "build" / "inventories")
 html_static_path = ["_static"]
 html_css_files = ["site.css"]
 html_theme = "pydata_sphinx_theme"
+html_context = {"default_mode": "auto"}
 html_title = f"emberlink {version}"
 html_copy_source = False
 html_show_sourcelink = False

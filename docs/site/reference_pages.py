@@ -76,16 +76,17 @@ class CommandHelp(_Generated):
     """The help of every command."""
 
     def text(self) -> str:
-        parser = _parser()
-        (commands,) = (
-            action.choices
-            for action in parser._actions
-            if isinstance(action, argparse._SubParsersAction)
-        )
-        parts = [f"```text\n{parser.format_help()}```"]
-        for name, command in commands.items():
-            parts.append(f"## emberlink {name}\n\n```text\n{command.format_help()}```")
-        return "\n\n".join(parts)
+        first, *others = _helps(_parser())
+        return "\n\n".join([first[1], *(f"## {name}\n\n{text}" for name, text in others)])
+
+
+def _helps(parser: argparse.ArgumentParser) -> Iterator[tuple[str, str]]:
+    """Yields the name and the help of a command, then those of its subcommands."""
+    yield parser.prog, f"```text\n{parser.format_help()}```"
+    for action in parser._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            for command in action.choices.values():
+                yield from _helps(command)
 
 
 class Choices(_Generated):
