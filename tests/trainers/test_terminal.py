@@ -179,6 +179,15 @@ def test_a_file_gets_lines_during_and_after_episodes(capsys):
     assert max(map(len, printed)) <= 80
 
 
+def test_the_headline_of_the_world_is_printed(capsys):
+    evaluated = {"front/coverage": 50.0, "front/base_coverage": 12.34, "front/front_age": 40.0}
+    for headline, text in (("base_coverage", "front 12.3 %"), ("front_age", "front 40.0")):
+        progress = TrainingProgress(SafeConsole(), steps=2000, episodes=2, headline=headline)
+        progress.episode(1, [{**LINE, **evaluated}])
+        last = capsys.readouterr().out.splitlines()[-1]
+        assert last == f"  without noise, on validation fires: {headline} {text}"
+
+
 def test_a_terminal_shows_a_bar_and_the_lines(monkeypatch):
     stream = Stream("utf-8")
     monkeypatch.setattr(sys, "stdout", stream)

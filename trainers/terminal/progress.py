@@ -83,6 +83,7 @@ class TrainingProgress:
         episodes: number of episodes of the whole training.
         step: number of steps done before.
         learns: whether there will be any updates.
+        headline: the measure of evaluations that is printed.
         clock: returns the time in seconds.
     """
 
@@ -94,9 +95,10 @@ class TrainingProgress:
         episodes: int,
         step: int = 0,
         learns: bool = True,
+        headline: str = "coverage",
         clock: Callable[[], float] = time.monotonic,
     ):
-        self._console, self._clock = console, clock
+        self._console, self._clock, self._headline = console, clock, headline
         self._steps, self._episodes, self._learns = steps, episodes, learns
         self._left = TimeLeft(steps, learns=learns)
         self._left.add(clock(), step, 0)
@@ -158,10 +160,11 @@ class TrainingProgress:
             f"episode {episode}/{self._episodes}: coverage {means['coverage']:.1f} %, "
             f"mean reward {means['mean_reward']:.2f}, {self._pace(means['updates'])}"
         )
-        evaluated = [name.removesuffix("/coverage") for name in means if name.endswith("/coverage")]
+        end, unit = f"/{self._headline}", " %" if "coverage" in self._headline else ""
+        evaluated = [name.removesuffix(end) for name in means if name.endswith(end)]
         if evaluated:
-            shown = ", ".join(f"{fire} {means[f'{fire}/coverage']:.1f} %" for fire in evaluated)
-            self.note(f"  without noise, on validation fires: coverage {shown}")
+            shown = ", ".join(f"{fire} {means[fire + end]:.1f}{unit}" for fire in evaluated)
+            self.note(f"  without noise, on validation fires: {self._headline} {shown}")
 
     def note(self, text: str, style: str = "") -> None:
         """Prints a line above the bar."""

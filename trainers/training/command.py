@@ -144,6 +144,7 @@ def _train(trainer: Trainer, console: Console) -> None:
         episodes=trainer.config.episodes,
         step=setup.step,
         learns=_learns(trainer),
+        headline=trainer.config.evaluation.headline,
     )
 
     def report(state: Progress) -> None:
