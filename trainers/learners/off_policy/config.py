@@ -15,7 +15,7 @@ class OffPolicyConfig(LearnerConfig):
     """The settings of learners with a replay buffer and target networks."""
 
     gamma: Annotated[float, Field(ge=0, lt=1)]
-    """discount per step"""
+    """discount per decision"""
     actor_lr: Positive
     """learning rate of the actors' Adam"""
     critic_lr: Positive
@@ -25,7 +25,7 @@ class OffPolicyConfig(LearnerConfig):
     tau: Annotated[float, Field(gt=0, le=0.5)]
     """soft update of the target networks: target += tau * (network - target)"""
     updates_per_step: Count
-    """updates of every UAV's networks per step of the batch of environments"""
+    """updates of every UAV's networks per decision of the batch of environments"""
     batch_size: Annotated[int, Field(ge=1, le=1_000_000)]
     """transitions per update and UAV; with a memory, rounded up to whole sequences"""
     buffer_size: Count
