@@ -1,7 +1,12 @@
 """Measures UAV-steps per second of the environment, and of VMAS in the same run."""
 
+from dataclasses import replace
+
 import pytest
 from workloads import flying, in_turns, make, steps_for, vmas_flying
+
+from emberlink.envs.wildfire import WildfireEnv
+from emberlink.trainers.config.compose import resolve
 
 GOALS = {None: 1_000_000, "consensus": 300_000}
 
@@ -26,6 +31,20 @@ def test_one_environment(benchmark, tell, method):
     benchmark.extra_info["steps_per_second"] = rate
     goal = f", {rate / 2000:.2f} x the goal of 2,000" if method is None else ""
     tell(f"{method or 'environment alone':17}     1 environment : {rate:12,.0f} steps/s{goal}")
+
+
+@pytest.mark.parametrize("num_envs", [16, 64, 256])
+def test_knowledge_maps(tell, num_envs):
+    """In `relay`: 60 x 60 cells, six UAVs, a base."""
+    steps = 200
+    relay = resolve("independent", ["world=relay", "env.measures=paper"]).env
+    worlds = (replace(relay, base=None), relay, replace(relay, measures="all"))
+    works = [flying(WildfireEnv(num_envs, world), steps) for world in worlds]
+    alone, maps, measured = (6 * num_envs * steps / taken for taken in in_turns(5, *works))
+    tell(
+        f"{num_envs:5} environments: {alone:9,.0f} UAV-steps/s, with knowledge maps "
+        f"{maps:9,.0f}, {maps / 100_000:.2f} x the goal; maps and all measures {measured:9,.0f}"
+    )
 
 
 @pytest.mark.parametrize("scenario", ["discovery", "sampling", "simple_spread"])
