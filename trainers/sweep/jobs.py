@@ -1,5 +1,6 @@
 """Defines the jobs of a sweep: every combination of methods and values."""
 
+import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product
@@ -45,6 +46,7 @@ class Job:
         found: the runs on disk, by seed.
         log: the file with the output of the process.
         failed: the reason if the process failed, else empty.
+        restarts: how often the process was started again after it ended without saving.
     """
 
     method: str
@@ -53,6 +55,7 @@ class Job:
     found: dict[int, FoundRun] = field(default_factory=dict)
     log: Path = Path()
     failed: str = ""
+    restarts: int = 0
 
     @property
     def name(self) -> str:
@@ -89,6 +92,11 @@ class Job:
         for run in self.found.values():
             seeds |= set(run.stack)
         return {identity(replace(first, seed=seed)) for seed in seeds}
+
+    @property
+    def names(self) -> set[str]:
+        """The hashes of `identities`."""
+        return set(map(hash_of, self.identities))
 
     @property
     def arguments(self) -> list[str]:
@@ -149,6 +157,17 @@ def identity(config: RunConfig) -> Identity:
     return tuple(
         sorted((k, str(v)) for k, v in values.items() if k.split(".")[0] not in _MAY_DIFFER)
     )
+
+
+def hash_of(identity: Identity) -> str:
+    """Returns a name of a run: a hash of its configuration."""
+    return hashlib.sha256(repr(identity).encode()).hexdigest()[:32]
+
+
+def folder_name(config: RunConfig) -> str:
+    """Returns the name of the folder of a run that a sweep creates."""
+    name = f"{config.method}_{config.setup}_{config.world}_s{config.seed}"
+    return f"{name}_{hash_of(identity(config))[:8]}"
 
 
 def job_for(configs: list[RunConfig], overrides: Sequence[str]) -> Job:

@@ -1,10 +1,12 @@
-"""Handles SIGINT, SIGTERM and SIGHUP, so that a training can finish its step and save."""
+"""Handles signals that end a training, so that it can finish its step and save."""
 
 import signal
 from collections.abc import Callable
 from types import FrameType
 
-_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+_NOTICES = (signal.SIGUSR1, signal.SIGUSR2)
+"""signals that a cluster sends before it ends a process; they may follow another signal"""
+_SIGNALS = (signal.SIGINT, signal.SIGTERM, *_NOTICES)
 
 
 class Interrupted(KeyboardInterrupt):
@@ -12,7 +14,10 @@ class Interrupted(KeyboardInterrupt):
 
 
 class Interruption:
-    """Calls `stop` at the first SIGINT, SIGTERM or SIGHUP and raises `Interrupted` at the second.
+    """Calls `stop` at the first signal and raises `Interrupted` at the second.
+
+    The signals are SIGINT, SIGTERM, SIGHUP, SIGUSR1 and SIGUSR2. The last two never count as the
+    second: clusters send SIGTERM and SIGUSR2 together.
 
     Args:
         stop: called at the first signal; requests the end of the training after a step.
@@ -39,12 +44,12 @@ class Interruption:
 
     @property
     def status(self) -> int:
-        """The exit status after the signal: 130 for SIGINT, 143 for SIGTERM, 129 for SIGHUP."""
+        """The exit status after the signal: 128 and its number, such as 130 for SIGINT."""
         return 128 + (self.received or signal.SIGINT)
 
     def _handle(self, number: int, _: FrameType | None) -> None:
         first = self.received is None
         self.received = self.received or number
-        if not first or self.at_once:
+        if self.at_once or not (first or number in _NOTICES):
             raise Interrupted
         self._stop()

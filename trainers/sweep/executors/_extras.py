@@ -1,0 +1,22 @@
+"""Checks that the package of an executor is installed."""
+
+from importlib.util import find_spec
+
+from emberlink.envs.utils.errors import UserError
+
+
+def require(executor: str, package: str, extra: str) -> None:
+    """Checks that a package is installed.
+
+    Args:
+        executor: name of the executor that needs it.
+        package: name of the package.
+        extra: the extra of emberlink that installs it.
+
+    Raises:
+        UserError: it is not installed; the message says how to install it.
+    """
+    if find_spec(package) is None:
+        raise UserError(
+            f"executor={executor}: {package} is not installed: pip install 'emberlink[{extra}]'"
+        )
