@@ -208,7 +208,7 @@ class Scheduler:
         job.log = Path(f"{free_name(logs, stem, ['.txt'])}.txt")
         tokens = {lease.path.name.rpartition(".")[0]: lease.record.token for lease in leases}
         output, restarts = job.output.absolute(), self._executor.restarts
-        return Task(job.arguments, job.log, tokens, output, restarts)
+        return Task(job.arguments, job.log.absolute(), tokens, output, restarts)
 
     def _create_folders(self, job: Job) -> None:
         """Creates the run folders, so that each start of the task resumes the same runs."""

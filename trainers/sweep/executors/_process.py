@@ -32,6 +32,7 @@ def start(task: Task, threads: int, gpu: int | None = None) -> subprocess.Popen:
             stdout=log,
             stderr=subprocess.STDOUT,
             env=settings,
+            cwd=task.place,
             start_new_session=True,
         )
 

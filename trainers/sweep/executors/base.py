@@ -25,10 +25,11 @@ class Task:
 
     Attributes:
         arguments: arguments of `emberlink train`.
-        log: file for the output.
+        log: file for the output; an absolute path.
         leases: run -> token of the lease that the sweep holds; see trainers/sweep/leases.py.
-        output: folder of the run folders.
+        output: folder of the run folders; an absolute path.
         restarts: how often the run may be started again after it ended without saving.
+        place: working directory, to which paths in the arguments are relative.
     """
 
     arguments: Sequence[str]
@@ -36,6 +37,7 @@ class Task:
     leases: Mapping[str, str] = field(default_factory=dict)
     output: Path = Path()
     restarts: int = 3
+    place: Path = field(default_factory=Path.cwd)
 
     @property
     def command(self) -> list[str]:
