@@ -108,7 +108,7 @@ def test_slurm_runs_come_back_after_a_preemption(local, tmp_path):
 
 
 def test_slurm_runs_come_back_after_their_time(local, tmp_path):
-    """SLURM's notice arrives in the middle of the training; the rest is done by another sweep."""
+    """SLURM's notice arrives in the middle; the sweep is killed; another executor does the rest."""
     folder, daemons = tmp_path / "sweep", tmp_path / "slurm"
     folder.mkdir()
     daemons.mkdir()
@@ -117,9 +117,16 @@ def test_slurm_runs_come_back_after_their_time(local, tmp_path):
         sweeps.wait_for(lambda: len(sweeps.training(folder)) == 2, process)
         subprocess.run(["scancel", "--signal=USR2", "1"], env=env, check=True)
         sweeps.wait_for(lambda: sweeps.resumed(folder), process)
+        jobs = sorted((folder / "runs/logs/submitit").glob("*_submitted.pkl"))
+        process.kill()
+        process.wait()
+        process = sweeps.start(folder, "executor=submitit", "executor.share=2", env=env)
+        sweeps.wait_for(lambda: sweeps.finished(folder) > 4, process)
         process.terminate()
         assert process.wait(sweeps.PATIENCE) == 128 + signal.SIGTERM
         assert subprocess.check_output(["squeue", "--noheader"], env=env) == b""
+    # The second sweep has followed the jobs of the first.
+    assert jobs == sorted((folder / "runs/logs/submitit").glob("*_submitted.pkl"))
     done = [run for run in sweeps.runs_in(folder) if run.evaluated()]
     before = {run.path: (run.path / "eval.json").stat().st_mtime_ns for run in done}
     sweeps.finish(sweeps.start(folder), folder)

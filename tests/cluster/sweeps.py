@@ -51,6 +51,11 @@ def training(folder: Path) -> list[RunFolder]:
     return [run for run in runs_in(folder) if 2 <= len(run.lines()) <= 10]
 
 
+def finished(folder: Path) -> int:
+    """Returns the number of finished runs."""
+    return sum(run.evaluated() for run in runs_in(folder))
+
+
 def wait_for(condition: Callable[[], object], process: subprocess.Popen | None = None) -> None:
     """Waits until a condition is true."""
     deadline = time.monotonic() + PATIENCE

@@ -10,9 +10,12 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
 
 from emberlink.configs import known
+from emberlink.envs.utils.atomic_io import inner_folder
+from emberlink.envs.utils.publish import free_name
 from emberlink.trainers.config.compose import flat, resolve, to_values
 from emberlink.trainers.config.schema import NOT_LEARNT_WITH, RunConfig
 from emberlink.trainers.runs.run_folder import RunFolder
+from emberlink.trainers.training.folders import RunFolders
 
 _MAY_DIFFER = ("output", "seeds", *NOT_LEARNT_WITH)
 """first parts of keys that may differ between configurations of the same run"""
@@ -123,6 +126,34 @@ class Job:
             run = runs.get(identity(config))
             if run is not None:
                 self.found[config.seed] = run
+
+    def create_folders(self) -> int:
+        """Creates a folder for each run, and returns their number.
+
+        Each start of the training resumes these runs.
+        """
+        config = resolve(self.method, self.overrides)
+        configs = [replace(config, seed=seed) for seed in config.seeds or (config.seed,)]
+        RunFolders.create(configs, [folder_name(config) for config in configs]).close()
+        return len(configs)
+
+    def open_log(self) -> None:
+        """Sets `log` to the path of a new file.
+
+        Raises:
+            OSError: the folder of the logs cannot be created.
+        """
+        seeds = "-".join(str(config.seed) for config in self.configs)
+        first = self.configs[0]
+        stem = f"{first.setup}_{first.world}_{self.method}_s{seeds}"
+        self.log = Path(f"{free_name(inner_folder(self.output, 'logs'), stem, ['.txt'])}.txt")
+
+    def last_line(self) -> str:
+        """Returns the last line of the log, or why there is none."""
+        if not self.log.is_file():  # an executor may fail before its task writes
+            return "there is no log"
+        lines = [line.strip() for line in self.log.read_text(errors="replace").splitlines()]
+        return next((line for line in reversed(lines) if line), "the log is empty")
 
 
 def jobs_of(arguments: Sequence[str]) -> list[Job]:

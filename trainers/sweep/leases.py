@@ -73,6 +73,11 @@ class Lease:
         self.path, self.record = path, record
         self._beaten = time.monotonic()
 
+    @property
+    def run(self) -> str:
+        """The name of the run."""
+        return self.path.name.rpartition(".")[0]
+
     def beat(self) -> bool:
         """Writes a sign of life, and returns whether the lease is still held."""
         if self.path.with_name(_next(self.path.name)).exists():

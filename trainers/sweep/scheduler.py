@@ -2,17 +2,13 @@
 
 import signal
 import time
-from dataclasses import dataclass, field, replace
-from pathlib import Path
+from dataclasses import dataclass, field
 from typing import Any
 
-from emberlink.envs.utils.atomic_io import inner_folder
 from emberlink.envs.utils.errors import UserError
-from emberlink.envs.utils.publish import free_name
-from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.sweep import question
 from emberlink.trainers.sweep.executors import Executor, QueueFullError, Task
-from emberlink.trainers.sweep.jobs import Job, folder_name
+from emberlink.trainers.sweep.jobs import Job
 from emberlink.trainers.sweep.leases import SWEEP, TRAINING, Heart, Lease, Leases
 from emberlink.trainers.sweep.manifest import Manifest
 from emberlink.trainers.sweep.plan import plan
@@ -20,7 +16,6 @@ from emberlink.trainers.sweep.progress import SweepProgress
 from emberlink.trainers.sweep.run_index import RunIndex
 from emberlink.trainers.sweep.worker import HELD
 from emberlink.trainers.terminal.signals import Interruption
-from emberlink.trainers.training.folders import RunFolders
 
 _NOTICES = (signal.SIGHUP, signal.SIGTERM, signal.SIGUSR1, signal.SIGUSR2)
 _SAVED = {128 + number for number in _NOTICES}
@@ -200,25 +195,15 @@ class Scheduler:
     def _task(self, job: Job, leases: list[Lease]) -> Task:
         """Returns the task of a job, whose run folders are created first if it is new."""
         if not job.found:
-            self._create_folders(job)
-        seeds = "-".join(str(config.seed) for config in job.configs)
-        first = job.configs[0]
-        stem = f"{first.setup}_{first.world}_{job.method}_s{seeds}"
-        logs = inner_folder(job.output, "logs")
-        job.log = Path(f"{free_name(logs, stem, ['.txt'])}.txt")
-        tokens = {lease.path.name.rpartition(".")[0]: lease.record.token for lease in leases}
+            created = job.create_folders()
+            self._index.update()
+            # Folders of other sweeps may have been found, too: the next job is planned again.
+            self._planned_with += created
+            job.find_runs(self._index.runs)
+        job.open_log()
+        tokens = {lease.run: lease.record.token for lease in leases}
         output, restarts = job.output.absolute(), self._executor.restarts
         return Task(job.arguments, job.log.absolute(), tokens, output, restarts)
-
-    def _create_folders(self, job: Job) -> None:
-        """Creates the run folders, so that each start of the task resumes the same runs."""
-        config = resolve(job.method, job.overrides)
-        configs = [replace(config, seed=seed) for seed in config.seeds or (config.seed,)]
-        RunFolders.create(configs, [folder_name(config) for config in configs]).close()
-        self._index.update()
-        # Folders of other sweeps may have been found, too: the next job is planned again.
-        self._planned_with += len(configs)
-        job.find_runs(self._index.runs)
 
     def _look(self) -> None:
         """Updates the progress of running jobs and handles those that have ended."""
@@ -250,7 +235,7 @@ class Scheduler:
             self._again(job, f"{what}, is started again")
         else:
             after = f" after {job.restarts} restarts" if job.restarts else ""
-            job.failed = f"exit status {status}{after}: {_last_line(job.log)} (log: {job.log})"
+            job.failed = f"exit status {status}{after}: {job.last_line()} (log: {job.log})"
             self._manifest.set(job, "failed", note=job.failed, restarts=job.restarts)
             self._progress.end(job, job.failed)
 
@@ -304,10 +289,3 @@ def _newest(job: Job) -> str:
     """Returns the name of the newest checkpoint of a job; empty if there is none."""
     states = [state.name for run in job.found.values() for state in run.folder.states()[-1:]]
     return max(states, default="")
-
-
-def _last_line(log: Path) -> str:
-    if not log.is_file():  # an executor may fail before its task writes
-        return "there is no log"
-    lines = [line.strip() for line in log.read_text(errors="replace").splitlines()]
-    return next((line for line in reversed(lines) if line), "the log is empty")

@@ -15,7 +15,7 @@ from emberlink.trainers.cli.main import main
 from emberlink.trainers.runs.run_folder import RunFolder
 from emberlink.trainers.sweep import executors
 from emberlink.trainers.sweep.executors import Task, _extras, _process, local
-from emberlink.trainers.sweep.executors.submitit import minutes
+from emberlink.trainers.sweep.executors._times import minutes
 
 
 @pytest.mark.parametrize(
@@ -56,6 +56,15 @@ def test_a_missing_package_is_named_in_one_line(
     assert main(["sweep", "independent", f"executor={name}"]) == 2
     error = capsys.readouterr().err
     assert error == f"emberlink sweep: executor={name}: {said}\n"
+    assert not any(tmp_path.iterdir())
+
+
+def test_a_machine_without_slurm_is_named(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(_extras, "find_spec", lambda _: True)
+    monkeypatch.setenv("PATH", "")
+    assert main(["sweep", "independent", "executor=submitit"]) == 2
+    assert "there is no sbatch here" in capsys.readouterr().err
     assert not any(tmp_path.iterdir())
 
 

@@ -19,7 +19,7 @@ from rich.console import Console
 from emberlink.trainers.cli.main import main
 from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.runs.run_folder import RunFolder
-from emberlink.trainers.sweep import executors, manifest, scheduler
+from emberlink.trainers.sweep import executors, manifest
 from emberlink.trainers.sweep.command import sweep
 from emberlink.trainers.sweep.jobs import folder_name, jobs_of
 from emberlink.trainers.sweep.leases import SWEEP, TRAINING, Leases
@@ -421,7 +421,10 @@ def test_a_resumed_sweep_equals_an_uninterrupted_one(tmp_path):
 
 
 def test_a_task_that_failed_before_its_log_is_reported(tmp_path):
-    log = tmp_path / "log.txt"
-    assert scheduler._last_line(log) == "there is no log"
-    log.write_text("first\nlast\n\n")
-    assert scheduler._last_line(log) == "last"
+    (job,) = jobs_of(["independent", f"output={tmp_path}"])
+    job.open_log()
+    assert job.last_line() == "there is no log"
+    job.log.write_text("first\nlast\n\n")
+    assert job.last_line() == "last"
+    job.log.write_text("\n")
+    assert job.last_line() == "the log is empty"

@@ -1,6 +1,8 @@
-"""Checks that the package of an executor is installed."""
+"""Imports the packages of executors, which are extras of emberlink."""
 
+from importlib import import_module
 from importlib.util import find_spec
+from typing import Any
 
 from emberlink.envs.utils.errors import UserError
 
@@ -20,3 +22,8 @@ def require(executor: str, package: str, extra: str) -> None:
         raise UserError(
             f"executor={executor}: {package} is not installed: pip install 'emberlink[{extra}]'"
         )
+
+
+def load(name: str) -> Any:
+    """Returns a module of such a package; type checkers do not need the package."""
+    return import_module(name)

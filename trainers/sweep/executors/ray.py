@@ -67,7 +67,7 @@ class _Owner:
     """
 
     def __init__(self, options: dict[str, Any]):
-        import ray
+        ray = _extras.load("ray")
 
         self._function = ray.remote(_train).options(**options)
         self._tasks: dict[str, Any] = {}
@@ -85,7 +85,7 @@ class _Owner:
 
     def cancel(self, name: str) -> None:
         """Requests that a task saves and ends."""
-        import ray
+        ray = _extras.load("ray")
 
         ray.cancel(self._tasks[name], force=False)
 
@@ -97,7 +97,7 @@ class _Owner:
 
 def _status(task: Any) -> int | None:
     """Returns the exit status of a Ray task, or None if it has not ended."""
-    import ray
+    ray = _extras.load("ray")
 
     if not ray.wait([task], timeout=0)[0]:
         return None
@@ -120,6 +120,7 @@ class RayExecutor(Executor):
         self._config = config
         self.seeds, self.restarts = config.seeds, config.restarts
         self._owner = ""
+        self._cancelled: set[tuple[str, str]] = set()
         self._polled: dict[str, tuple[float, dict[str, int | None]]] = {}
 
     def slots(self, tasks: int) -> int:
@@ -127,7 +128,7 @@ class RayExecutor(Executor):
         return self._config.workers or max(tasks, 1)
 
     def submit(self, task: Task) -> tuple[str, str]:
-        import ray
+        ray = _extras.load("ray")
 
         name = secrets.token_hex(8)
         try:
@@ -147,9 +148,12 @@ class RayExecutor(Executor):
         return tasks.get(name, DIED)
 
     def cancel(self, handle: tuple[str, str]) -> None:
-        import ray
+        ray = _extras.load("ray")
 
         owner, name = handle
+        if handle in self._cancelled:
+            return
+        self._cancelled.add(handle)
         try:
             ray.get(ray.get_actor(owner, _NAMESPACE).cancel.remote(name))
         except (ray.exceptions.RayError, ValueError):
@@ -165,7 +169,7 @@ class RayExecutor(Executor):
 
     def _ask(self, owner: str) -> dict[str, int | None]:
         """Returns the status of each task of an owner; none if the owner has ended."""
-        import ray
+        ray = _extras.load("ray")
 
         try:
             return ray.get(ray.get_actor(owner, _NAMESPACE).poll.remote())
@@ -176,8 +180,7 @@ class RayExecutor(Executor):
 
     def _own(self) -> Any:
         """Returns the actor that owns this sweep's tasks, on this machine if possible."""
-        import ray
-        from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
+        ray, scheduling = _extras.load("ray"), _extras.load("ray.util.scheduling_strategies")
 
         if self._owner:
             return ray.get_actor(self._owner, _NAMESPACE)
@@ -195,7 +198,7 @@ class RayExecutor(Executor):
             name=self._owner,
             namespace=_NAMESPACE,
             lifetime="detached",
-            scheduling_strategy=NodeAffinitySchedulingStrategy(here, soft=True),
+            scheduling_strategy=scheduling.NodeAffinitySchedulingStrategy(here, soft=True),
         ).remote(options)
 
     def _connect(self) -> None:
@@ -204,7 +207,7 @@ class RayExecutor(Executor):
         Raises:
             UserError: there is none at the address.
         """
-        import ray
+        ray = _extras.load("ray")
 
         if ray.is_initialized():
             return

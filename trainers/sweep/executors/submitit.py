@@ -1,13 +1,13 @@
 """Runs trainings as SLURM jobs, through submitit."""
 
-import re
+import shutil
 import signal
 import subprocess
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass as plain_dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, ConfigDict, Field
 from pydantic.dataclasses import dataclass
@@ -15,10 +15,8 @@ from pydantic.dataclasses import dataclass
 from emberlink.envs.utils.atomic_io import inner_folder, write_bytes
 from emberlink.envs.utils.errors import UserError
 from emberlink.trainers.sweep.executors import _extras, _process
+from emberlink.trainers.sweep.executors._times import minutes
 from emberlink.trainers.sweep.executors.base import DIED, Executor, QueueFullError, Task
-
-if TYPE_CHECKING:
-    import submitit
 
 _STATUS, _STOP = ".status", ".stop"
 """suffixes of files beside a log: the exit status of the task; a request to save and end"""
@@ -27,26 +25,6 @@ _GRACE = 120.0
 """seconds for which a job waits for its end after its runs were interrupted"""
 _LOOK = 10.0
 """seconds between two looks at SLURM's queue"""
-_TIME = re.compile(r"(?:(\d+)-)?(\d+)(?::(\d+))?(?::(\d+))?")
-
-
-def minutes(text: int | str) -> int:
-    """Returns the minutes of a time in one of the forms of sbatch, at least 1.
-
-    Raises:
-        UserError: it has another form.
-    """
-    found = _TIME.fullmatch(str(text))
-    if not found:
-        raise UserError("expected minutes, or H:MM:SS, or D-HH:MM:SS")
-    days, first, second, third = found.groups()
-    if days is not None:
-        parts = [int(days) * 24 + int(first), int(second or 0), int(third or 0)]
-    elif third is not None:
-        parts = [int(first), int(second), int(third)]
-    else:
-        parts = [0, int(first), int(second or 0)]
-    return max(parts[0] * 60 + parts[1] + (parts[2] > 0), 1)
 
 
 def _check_time(value: int | str) -> int | str:
@@ -106,7 +84,7 @@ class _Batch:
 
     def __call__(self) -> None:
         """Runs the trainings that have not ended."""
-        from submitit.core.utils import UncompletedJobError
+        utils = _extras.load("submitit.core.utils")
 
         # SLURM sends SIGTERM before it preempts a job. submitit would ignore it.
         signal.signal(signal.SIGTERM, lambda *_: self._ask_to_save())
@@ -115,19 +93,19 @@ class _Batch:
                 self._running[task.log] = _process.start(task, self._threads)
         try:
             self._follow()
-        except UncompletedJobError:  # submitit does not requeue the job again
+        except utils.UncompletedJobError:  # submitit does not requeue the job again
             for log in self._running:
                 _end(log, 128 + signal.SIGUSR2)
             raise
 
-    def checkpoint(self) -> "submitit.core.utils.DelayedSubmission":
+    def checkpoint(self) -> Any:
         """Waits until the trainings have saved; called by submitit at SIGUSR2."""
-        from submitit.core.utils import DelayedSubmission
-
         self._ask_to_save()
         for process in self._running.values():
             process.wait()
-        return DelayedSubmission(_Batch(self._tasks, self._threads))
+        return _extras.load("submitit").helpers.DelayedSubmission(
+            _Batch(self._tasks, self._threads)
+        )
 
     def _ask_to_save(self) -> None:
         for process in self._running.values():
@@ -179,6 +157,10 @@ class SubmititExecutor(Executor):
         self._looked = 0.0
 
     def slots(self, tasks: int) -> int:
+        if self._config.cluster == "slurm" and shutil.which("sbatch") is None:
+            raise UserError(
+                "executor=submitit: there is no sbatch here; SLURM's login nodes have it"
+            )
         return self._config.workers or max(tasks, 1)
 
     def submit(self, task: Task) -> _Handle:
@@ -209,7 +191,7 @@ class SubmititExecutor(Executor):
     def cancel(self, handle: _Handle) -> None:
         write_bytes(_file(handle.task, _STOP), b"")
         if handle.job is None:
-            self._waiting.remove(handle)
+            self._waiting = [other for other in self._waiting if other is not handle]
             _end(handle.task.log, 128 + signal.SIGTERM)
         elif self._config.cluster == "slurm":
             _slurm("scancel", "--state=PENDING", handle.job.job_id)
@@ -218,13 +200,11 @@ class SubmititExecutor(Executor):
         return f"{handle.job.job_id} {handle.task.log.absolute()}" if handle.job else ""
 
     def find(self, name: str) -> _Handle | None:
-        from submitit import SlurmJob
-
         number, _, log = name.partition(" ")
         task = Task((), Path(log))
         if self._config.cluster == "local" or _file(task, _STATUS).exists():
             return None
-        job = SlurmJob(folder=task.log.parent / "submitit", job_id=number)
+        job = _extras.load("submitit").SlurmJob(folder=task.log.parent / "submitit", job_id=number)
         return _Handle(task, job, time.monotonic()) if self._is_known(job) else None
 
     def _submit(self) -> None:
@@ -247,8 +227,7 @@ class SubmititExecutor(Executor):
         self._waiting = []
 
     def _make(self, folder: Path) -> Any:
-        import submitit
-
+        submitit = _extras.load("submitit")
         config, wall = self._config, minutes(self._config.time)
         # %j is replaced by the number of the job.
         if config.cluster == "local":
