@@ -120,8 +120,9 @@ def test_slurm_runs_come_back_after_their_time(local, tmp_path):
         jobs = sorted((folder / "runs/logs/submitit").glob("*_submitted.pkl"))
         process.kill()
         process.wait()
+        said = sweeps.finished(folder)
         process = sweeps.start(folder, "executor=submitit", "executor.share=2", env=env)
-        sweeps.wait_for(lambda: sweeps.finished(folder) > 4, process)
+        sweeps.wait_for(lambda: sweeps.finished(folder) > said + 1, process)
         process.terminate()
         assert process.wait(sweeps.PATIENCE) == 128 + signal.SIGTERM
         assert subprocess.check_output(["squeue", "--noheader"], env=env) == b""
