@@ -31,12 +31,14 @@ class _Running:
         leases: leases of the job's runs, until the training has them.
         newest: name of the newest checkpoint at the start.
         begun: whether the training has begun.
+        task: the executor's name of the task; empty until it is known.
     """
 
     handle: Any
     leases: list[Lease] = field(default_factory=list)
     newest: str = ""
     begun: bool = False
+    task: str = ""
 
 
 class Scheduler:
@@ -181,12 +183,13 @@ class Scheduler:
             self._slots = len(self._running)
             self._waiting.insert(0, job)
             return
-        self._running[job] = _Running(handle, leases, _newest(job))
+        task = self._executor.name_of(handle)
+        self._running[job] = _Running(handle, leases, _newest(job), task=task)
         self._manifest.set(
             job,
             "queued",
             executor=self._manifest.executor,
-            task=self._executor.name_of(handle),
+            task=task,
             log=str(job.log.relative_to(job.output)),
             restarts=job.restarts,
             note="",
@@ -212,6 +215,10 @@ class Scheduler:
                 running.begun = True
                 self._manifest.set(job, "running")
                 self._progress.begin(job)
+            task = running.task or self._executor.name_of(running.handle)
+            if task != running.task:  # known when the job of several tasks is submitted
+                running.task = task
+                self._manifest.set(job, "running" if running.begun else "queued", task=task)
             self._progress.follow(job)
             status = self._executor.poll(running.handle)
             if status is not None:

@@ -221,6 +221,37 @@ def test_a_later_sweep_follows_a_task_that_was_left(tmp_path, monkeypatch):
     assert third.submitted == []  # it is finished
 
 
+class Late(Cluster):
+    """Gives a task its name when the task has been polled."""
+
+    def name_of(self, handle):
+        return "task 7" if self.polled else ""
+
+    polled = False
+
+    def poll(self, handle):
+        self.polled = True
+        return super().poll(handle)
+
+
+def test_a_name_that_is_known_later_is_recorded(tmp_path, monkeypatch):
+    def leave(*_):
+        assert [row.task for row in manifest.read(tmp_path).values()] == ["task 7"]
+        return question.LEAVE
+
+    executor = Late(None)
+
+    def interrupt():
+        time.sleep(0.5)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    monkeypatch.setattr(question, "ask", leave)
+    thread = threading.Thread(target=interrupt)
+    thread.start()
+    assert swept(tmp_path, executor) == 130
+    thread.join()
+
+
 def test_a_task_that_has_vanished_is_submitted_again(tmp_path, monkeypatch):
     first = Cluster(None)
     interrupted(first, question.LEAVE, monkeypatch, tmp_path)
