@@ -16,7 +16,7 @@ UNFINISHED := $(VENV)/emberlink-unfinished
 PIP := $(BIN)/python -m pip install -q --disable-pip-version-check -c constraints.txt
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-slow soak bench guard lint typecheck docs install browser clean
+.PHONY: help demo test test-slow test-cluster soak bench guard lint typecheck docs install browser clean
 
 help:  ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## /  make \1\t/p' $(MAKEFILE_LIST) | expand -t 20
@@ -38,6 +38,11 @@ browser:  ## install Chromium for test-slow if it is missing (on Debian and as r
 	if [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null; then echo "installing chromium" >&2; apt-get update -qq && \
 		DEBIAN_FRONTEND=noninteractive apt-get install -qq -y --no-install-recommends chromium >/dev/null; \
 	else echo "there is no Chromium: the tests of replays will fail" >&2; fi
+
+# Files cluster_*.py, so that no other target runs them. A missing program is an error.
+test-cluster: $(INSTALLED)  ## test sweeps on SLURM and Ray (15 to 20 minutes; root; docs/cluster.md)
+	@$(BIN)/python -c 'import submitit, ray' 2>/dev/null || $(PIP) -e '.[slurm,ray]'
+	@OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -p no:xdist -o python_files='cluster_*.py' tests/cluster
 
 soak: $(INSTALLED)  ## kill, interrupt and damage trainings repeatedly (about half an hour)
 	@OMP_NUM_THREADS=1 $(BIN)/python tests/soak/soak.py $(SOAK)

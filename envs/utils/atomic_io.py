@@ -18,6 +18,7 @@ _LINK = "it is a link, and nothing is written through links"
 _DIGEST = 64
 """hexadecimal digits of a SHA-256"""
 _NOT_REGULAR = "it is not a regular file"
+_NO_LINKS = {errno.EPERM, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS, errno.EMLINK}
 _READ = os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC
 _CREATE = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
 _CHANGE = os.O_RDWR | os.O_APPEND | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC
@@ -78,14 +79,18 @@ def inner_folder(root: Path, *names: str) -> Path:
 
 
 @contextmanager
-def temporary(path: Path) -> Iterator[Path]:
+def temporary(path: Path, tag: str = "") -> Iterator[Path]:
     """Yields a new empty file in the folder of `path`, and removes it at the end if it exists.
+
+    Args:
+        path: the file is named after it.
+        tag: distinguishes processes on several machines that write to the same path.
 
     Raises:
         OSError: the file cannot be created.
     """
     # The process number distinguishes processes that write to the same folder.
-    partial = path.with_name(f"{path.name}.{os.getpid()}{PART}")
+    partial = path.with_name(f"{path.name}.{os.getpid()}{tag}{PART}")
     remove(partial)
     os.close(os.open(partial, _CREATE, 0o666))
     try:
@@ -96,25 +101,43 @@ def temporary(path: Path) -> Iterator[Path]:
 
 
 @contextmanager
-def replaced(path: Path) -> Iterator[Path]:
+def replaced(path: Path, tag: str = "") -> Iterator[Path]:
     """Yields a new empty file, which is renamed to `path` when the block ends without an error.
 
-    A link, a pipe or a device at `path` is replaced; the target of a link is not changed.
+    A link, a pipe or a device at `path` is replaced; the target of a link is not changed. Arguments
+    are those of `temporary`.
 
     Raises:
         OSError: the file cannot be written; `path` is unchanged.
     """
-    with temporary(path) as partial:
+    with temporary(path, tag) as partial:
         yield partial
         sync(partial)
         partial.replace(path)
     sync(path.parent)
 
 
-def write_bytes(path: Path, content: bytes) -> None:
+def write_bytes(path: Path, content: bytes, tag: str = "") -> None:
     """Writes a file completely, or leaves the earlier one; see `replaced`."""
-    with replaced(path) as partial:
+    with replaced(path, tag) as partial:
         partial.write_bytes(content)
+
+
+def link_new(partial: Path, path: Path) -> None:
+    """Gives a complete file the name `path`, which only one of several processes can do.
+
+    Raises:
+        FileExistsError: something exists at `path`.
+        OSError: the file cannot be renamed.
+    """
+    try:
+        os.link(partial, path)
+    except OSError as error:
+        if error.errno not in _NO_LINKS:
+            raise
+        # Some file systems have no hard links; an empty file reserves the name.
+        path.open("x").close()
+        partial.replace(path)
 
 
 def write_sealed(path: Path, content: bytes | memoryview) -> None:

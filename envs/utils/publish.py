@@ -1,16 +1,13 @@
 """Writes new files without replacing existing ones."""
 
-import errno
 import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-from emberlink.envs.utils.atomic_io import sync, temporary
+from emberlink.envs.utils.atomic_io import link_new, sync, temporary
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import shown
-
-_NO_LINKS = {errno.EPERM, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS, errno.EMLINK}
 
 
 @contextmanager
@@ -28,23 +25,11 @@ def published(path: Path) -> Iterator[Path]:
         with temporary(path) as partial:
             yield partial
             sync(partial)
-            _take(partial, path)
+            link_new(partial, path)
     except FileExistsError:
         raise UserError(f"{path} exists already; nothing is overwritten") from None
     except OSError as error:
         raise UserError(f"{shown(str(path))}: {error.strerror or error}") from None
-
-
-def _take(partial: Path, path: Path) -> None:
-    """Renames a file to `path` unless something exists there."""
-    try:
-        os.link(partial, path)
-    except OSError as error:
-        if error.errno not in _NO_LINKS:
-            raise
-        # Some file systems have no hard links; an empty file reserves the name.
-        path.open("x").close()
-        partial.replace(path)
 
 
 def new_file(output: Path, suffixes: Sequence[str]) -> Path:

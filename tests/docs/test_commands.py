@@ -13,7 +13,9 @@ from rich.console import Console
 from tiny_run import TINY
 
 from emberlink.trainers.cli.main import main
+from emberlink.trainers.sweep import manifest
 from emberlink.trainers.sweep.command import sweep
+from emberlink.trainers.sweep.manifest import Row
 
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -88,7 +90,12 @@ def test_a_command_of_the_documentation_runs(command, place):
     if "=BANK" in command:
         assert main(["fire", "import", "ArrivalTime.asc", "fire.units=minutes", *BANK]) == 0
     verb, *rest = shortened(shlex.split(command)[1:])
-    if verb == "sweep":
+    if [verb, *rest][:2] == ["sweep", "status"]:
+        row = Row(run="a", name="a", folder="one", state="finished", episodes=2)
+        manifest.write(Path("runs"), [row])
+        assert main([verb, *rest]) == 0
+    elif verb == "sweep":
+        # In this process, whatever the executor: that of a cluster needs the cluster.
         assert sweep(rest, Console(quiet=True), executor=Inside()) == 0
     elif [verb, *rest][:2] == ["world", "check"]:
         # 1: a world of a few steps does not satisfy all conditions
@@ -127,6 +134,8 @@ def _train(rest: list[str]) -> list[str]:
 
 def _sweep(rest: list[str]) -> list[str]:
     """Returns the arguments of a sweep of one method and one value of each key."""
+    if rest[0] == "status":
+        return rest
     methods = [word for word in rest if "=" not in word][:1] or ["independent"]
     keys = [word for word in _without_sizes(rest) if "=" in word]
     keys = [

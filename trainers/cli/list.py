@@ -14,6 +14,7 @@ _GROUPS = {
     "worlds": "world",
     "fires": "fire",
     "learners": "learner",
+    "executors": "executor",
 }
 _KINDS = (*_GROUPS, "policies")
 
@@ -24,7 +25,7 @@ def add_list(commands: Any) -> None:
         commands,
         "list",
         _list,
-        "list methods, setups, worlds, fires, learners, scripted policies",
+        "list methods, setups, worlds, fires, learners, executors, scripted policies",
         "Prints the names that other commands accept and what they stand for, one per line.",
         "emberlink list worlds",
     )

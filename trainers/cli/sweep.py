@@ -18,15 +18,17 @@ def add_sweep(commands: Any) -> None:
         "train methods x seeds x setups",
         "Trains and evaluates every combination, several runs at a time. Finished runs in the "
         "output folder are skipped, and stopped ones are resumed, so that the same command can be "
-        "repeated.",
+        "repeated. `status FOLDER` prints the state of each run in an output folder.",
         "emberlink sweep consensus positional setup=paper,tuned seed=0,1,2 output=runs",
-        usage="emberlink sweep [--jobs N] [--dry-run] [METHOD ...] [key=value,value ...]",
+        usage="emberlink sweep [--jobs N] [--dry-run] [METHOD ...] [key=value,value ...]\n"
+        "       emberlink sweep status FOLDER",
     )
     sweep.add_argument(
         "arguments",
         metavar="METHOD | key=value,value",
         nargs="+",
-        help="methods (default: all); keys as for train, with one value or several",
+        help="methods (default: all); keys as for train, with one value or several; "
+        "executor=local, submitit (SLURM) or ray, and its keys executor.KEY=value",
     )
     sweep.add_argument(
         "--jobs", metavar="N", type=positive, help="runs at a time (default: one per core)"
@@ -36,5 +38,8 @@ def add_sweep(commands: Any) -> None:
 
 def _sweep(options: argparse.Namespace, console: "Console") -> int:
     from emberlink.trainers.sweep.command import sweep
+    from emberlink.trainers.sweep.status import status
 
+    if options.arguments[0] == "status":
+        return status(options.arguments[1:], console)
     return sweep(options.arguments, console, at_a_time=options.jobs, dry=options.dry_run)

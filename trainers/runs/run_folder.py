@@ -35,14 +35,18 @@ class RunFolder(JsonLines, Checkpoints):
     """
 
     @classmethod
-    def create(cls, config: RunConfig) -> "RunFolder":
+    def create(cls, config: RunConfig, name: str = "") -> "RunFolder":
         """Creates a new run folder in `config.output`, without config.yaml.
+
+        Args:
+            config: configuration of the run.
+            name: name of the folder; made of the date and the configuration if empty.
 
         Raises:
             UserError: the folder cannot be created.
         """
         stamp = datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
-        name = f"{stamp}_{config.method}_{config.setup}_{config.world}_s{config.seed}"
+        name = name or f"{stamp}_{config.method}_{config.setup}_{config.world}_s{config.seed}"
         try:
             path = _new_folder(Path(config.output) / name)
             (path / "checkpoints").mkdir()

@@ -1,5 +1,7 @@
 """Runs `emberlink sweep`: trains every combination, and resumes stopped runs."""
 
+import re
+import shlex
 from collections.abc import Sequence
 
 import yaml
@@ -10,12 +12,15 @@ from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import shown
 from emberlink.trainers.sweep import executors
 from emberlink.trainers.sweep.jobs import Job, jobs_of
-from emberlink.trainers.sweep.plan import plan
+from emberlink.trainers.sweep.manifest import Manifest
+from emberlink.trainers.sweep.plan import plan, stacked
 from emberlink.trainers.sweep.progress import SweepProgress
 from emberlink.trainers.sweep.run_index import RunIndex
 from emberlink.trainers.sweep.scheduler import Scheduler
+from emberlink.trainers.tracking import loggers
 
 _EXECUTOR = "executor"
+_TIME = re.compile(r"[\d-]+(:\d+)+")
 
 
 def sweep(
@@ -36,12 +41,12 @@ def sweep(
         executor: runs the trainings; replaces the executor of the arguments.
 
     Returns:
-        0; 1 if a run failed; 130 or 143 after a signal.
+        0; 1 if a run failed; 128 and the number of a signal, such as 130, after it.
 
     Raises:
         UserError: an argument is wrong, or the output folder cannot be written.
     """
-    executor = executor or _executor([a for a in arguments if _is_executor(a)], at_a_time)
+    name, executor = _executor(arguments, at_a_time) if executor is None else ("", executor)
     wanted = jobs_of([a for a in arguments if not _is_executor(a)])
     outputs = {job.output: RunIndex(job.output) for job in wanted}
     if len(outputs) > 1:
@@ -50,7 +55,7 @@ def sweep(
     index.update()
     for path, why in index.unreadable.items():
         console.print(f"note: {path} is left out: {why}", style="yellow", soft_wrap=True)
-    jobs = plan(wanted, index.runs)
+    jobs = stacked(plan(wanted, index.runs), executor.seeds)
     total = sum(len(job.configs) for job in jobs)
     done = sum(len(job.configs) for job in jobs if job.finished)
     console.print(f"{total} runs, of which {done} are finished -> {output}")
@@ -58,11 +63,20 @@ def sweep(
         for job in jobs:
             console.print(f"  {job.name}: {job.state}", highlight=False)
         return 0
-    scheduler = Scheduler(jobs, index, executor, SweepProgress(console, total, done))
+    for job in jobs:
+        loggers.check_installed(job.configs[0])
+    progress = SweepProgress(console, total, done)
+    scheduler = Scheduler(jobs, index, executor, progress, Manifest(output, name))
     status = scheduler.work()
     _print_table(scheduler.jobs, console)
     if status == 0:
         console.print(f"compare them with: emberlink compare {output}", soft_wrap=True)
+    elif scheduler.left:
+        console.print(
+            f"{scheduler.left} trainings are left running or queued; "
+            f"look in with: emberlink sweep status {shlex.quote(str(output))}",
+            soft_wrap=True,
+        )
     elif status > 1:
         console.print("stopped; the same command resumes the runs")
     return status
@@ -72,20 +86,23 @@ def _is_executor(text: str) -> bool:
     return text.partition("=")[0].split(".")[0] == _EXECUTOR and "=" in text
 
 
-def _executor(arguments: Sequence[str], workers: int | None) -> executors.Executor:
-    """Returns the executor of the arguments `executor=NAME` and `executor.KEY=VALUE`."""
+def _executor(arguments: Sequence[str], workers: int | None) -> tuple[str, executors.Executor]:
+    """Returns the name and the executor of `executor=NAME` and `executor.KEY=VALUE`."""
     name = "local"
     settings: dict[str, object] = {} if workers is None else {"workers": workers}
-    for text in arguments:
+    for text in filter(_is_executor, arguments):
         key, _, value = text.partition("=")
         if key == _EXECUTOR:
             name = value
         else:
             try:
-                settings[key.partition(".")[2]] = yaml.safe_load(value)
+                # YAML would read 4:00:00 as a number of base 60.
+                settings[key.partition(".")[2]] = (
+                    value if _TIME.fullmatch(value) else yaml.safe_load(value)
+                )
             except yaml.YAMLError:
                 raise UserError(f"{shown(text)!r} is not of the form key=value") from None
-    return executors.make(name, settings)
+    return name, executors.make(name, settings)
 
 
 def _print_table(jobs: Sequence[Job], console: Console) -> None:

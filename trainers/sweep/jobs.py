@@ -1,5 +1,6 @@
 """Defines the jobs of a sweep: every combination of methods and values."""
 
+import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product
@@ -9,9 +10,12 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
 
 from emberlink.configs import known
+from emberlink.envs.utils.atomic_io import inner_folder
+from emberlink.envs.utils.publish import free_name
 from emberlink.trainers.config.compose import flat, resolve, to_values
 from emberlink.trainers.config.schema import NOT_LEARNT_WITH, RunConfig
 from emberlink.trainers.runs.run_folder import RunFolder
+from emberlink.trainers.training.folders import RunFolders
 
 _MAY_DIFFER = ("output", "seeds", *NOT_LEARNT_WITH)
 """first parts of keys that may differ between configurations of the same run"""
@@ -45,6 +49,7 @@ class Job:
         found: the runs on disk, by seed.
         log: the file with the output of the process.
         failed: the reason if the process failed, else empty.
+        restarts: how often the process was started again after it ended without saving.
     """
 
     method: str
@@ -53,6 +58,7 @@ class Job:
     found: dict[int, FoundRun] = field(default_factory=dict)
     log: Path = Path()
     failed: str = ""
+    restarts: int = 0
 
     @property
     def name(self) -> str:
@@ -91,6 +97,11 @@ class Job:
         return {identity(replace(first, seed=seed)) for seed in seeds}
 
     @property
+    def names(self) -> set[str]:
+        """The hashes of `identities`."""
+        return set(map(hash_of, self.identities))
+
+    @property
     def arguments(self) -> list[str]:
         """The arguments of `emberlink train` for a new or resumed training.
 
@@ -115,6 +126,34 @@ class Job:
             run = runs.get(identity(config))
             if run is not None:
                 self.found[config.seed] = run
+
+    def create_folders(self) -> int:
+        """Creates a folder for each run, and returns their number.
+
+        Each start of the training resumes these runs.
+        """
+        config = resolve(self.method, self.overrides)
+        configs = [replace(config, seed=seed) for seed in config.seeds or (config.seed,)]
+        RunFolders.create(configs, [folder_name(config) for config in configs]).close()
+        return len(configs)
+
+    def open_log(self) -> None:
+        """Sets `log` to the path of a new file.
+
+        Raises:
+            OSError: the folder of the logs cannot be created.
+        """
+        seeds = "-".join(str(config.seed) for config in self.configs)
+        first = self.configs[0]
+        stem = f"{first.setup}_{first.world}_{self.method}_s{seeds}"
+        self.log = Path(f"{free_name(inner_folder(self.output, 'logs'), stem, ['.txt'])}.txt")
+
+    def last_line(self) -> str:
+        """Returns the last line of the log, or why there is none."""
+        if not self.log.is_file():  # an executor may fail before its task writes
+            return "there is no log"
+        lines = [line.strip() for line in self.log.read_text(errors="replace").splitlines()]
+        return next((line for line in reversed(lines) if line), "the log is empty")
 
 
 def jobs_of(arguments: Sequence[str]) -> list[Job]:
@@ -149,6 +188,17 @@ def identity(config: RunConfig) -> Identity:
     return tuple(
         sorted((k, str(v)) for k, v in values.items() if k.split(".")[0] not in _MAY_DIFFER)
     )
+
+
+def hash_of(identity: Identity) -> str:
+    """Returns a name of a run: a hash of its configuration."""
+    return hashlib.sha256(repr(identity).encode()).hexdigest()[:32]
+
+
+def folder_name(config: RunConfig) -> str:
+    """Returns the name of the folder of a run that a sweep creates."""
+    name = f"{config.method}_{config.setup}_{config.world}_s{config.seed}"
+    return f"{name}_{hash_of(identity(config))[:8]}"
 
 
 def job_for(configs: list[RunConfig], overrides: Sequence[str]) -> Job:

@@ -2,9 +2,18 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 from emberlink.trainers.config.schema import RunConfig
-from emberlink.trainers.sweep.jobs import FoundRun, Identity, Job, identity, is_finished, job_for
+from emberlink.trainers.sweep.jobs import (
+    FoundRun,
+    Identity,
+    Job,
+    identity,
+    is_finished,
+    job_for,
+    key_of,
+)
 
 
 def plan(jobs: Sequence[Job], runs: Mapping[Identity, FoundRun]) -> list[Job]:
@@ -33,6 +42,38 @@ def plan(jobs: Sequence[Job], runs: Mapping[Identity, FoundRun]) -> list[Job]:
                 stacks[stack] = part
             planned.append(part)
     return planned
+
+
+def stacked(jobs: Sequence[Job], seeds: int) -> list[Job]:
+    """Returns jobs that train up to `seeds` new seeds of the same configuration in parallel.
+
+    Args:
+        jobs: jobs, from `plan`.
+        seeds: maximum number of seeds of a job.
+    """
+    if seeds == 1:
+        return list(jobs)
+    groups: dict[Any, list[Job]] = {}
+    for job in jobs:
+        first = job.configs[0]
+        alone = not job.found and len(job.configs) == 1 and not first.seeds
+        key = (job.output, identity(replace(first, seed=0)), first.device) if alone else id(job)
+        groups.setdefault(key, []).append(job)
+    merged = []
+    for group in groups.values():
+        for first in range(0, len(group), seeds):
+            merged.append(_merged(group[first : first + seeds]))
+    return merged
+
+
+def _merged(jobs: Sequence[Job]) -> Job:
+    """Returns one job for the seeds of several jobs."""
+    if len(jobs) == 1:
+        return jobs[0]
+    seeds = tuple(job.configs[0].seed for job in jobs)
+    others = [text for text in jobs[0].overrides if key_of(text) not in ("seed", "seeds")]
+    overrides = [*others, f"seeds=[{','.join(map(str, seeds))}]"]
+    return Job(jobs[0].method, overrides, [replace(job.configs[0], seeds=seeds) for job in jobs])
 
 
 def _parts(job: Job) -> list[list[RunConfig]]:

@@ -1,10 +1,11 @@
-"""Shows the progress of a sweep."""
+"""Shows the progress of a sweep from the files of its runs."""
 
 from typing import Any
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
+from emberlink.trainers.runs.run_folder import RunFolder
 from emberlink.trainers.sweep.jobs import Job
 
 
@@ -28,35 +29,65 @@ class SweepProgress(Progress):
         )
         self._all = self.add_task("all", total=total, completed=done, unit="runs", coverage="")
         self._bars: dict[Job, TaskID] = {}
+        self._sizes: dict[Job, int] = {}
 
     def begin(self, job: Job) -> None:
-        """Adds a bar for a started job."""
-        self._bars[job] = self.add_task(
-            job.name, total=job.configs[0].episodes, unit="episodes", coverage=""
-        )
+        """Adds a bar for a job that has begun to train, unless there is one."""
+        if job not in self._bars:
+            self._bars[job] = self.add_task(
+                job.name, total=job.configs[0].episodes, unit="episodes", coverage=""
+            )
 
     def follow(self, job: Job) -> None:
         """Updates the bar of a job from its metrics.jsonl: number of episodes and last coverage."""
-        shown: dict[str, Any] = {}
         for run in list(job.found.values())[:1]:
-            try:
-                lines = run.folder.lines()
-            except (OSError, ValueError):  # the file is being created or truncated
+            size = _size(run.folder)
+            if size == self._sizes.get(job, 0):
                 continue
-            if lines:
-                shown = {"completed": len(lines), "coverage": f"{lines[-1]['coverage']:.1f} %"}
-                if len(lines) == job.configs[0].episodes:
-                    shown["coverage"] += ", being evaluated"
-        self.update(self._bars[job], **shown)
+            self._sizes[job] = size
+            self.begin(job)
+            self.update(self._bars[job], **_shown(run.folder, job.configs[0].episodes))
 
     def wait(self, job: Job) -> None:
         """Prints a line for a job that waits for another sweep."""
-        text = f"  {job.name}: waits, another sweep is training it"
-        self.console.print(text, highlight=False, soft_wrap=True)
+        self.say(job, "waits, another sweep is training it")
 
-    def end(self, job: Job, state: str) -> None:
-        """Removes a job's bar and prints a line."""
+    def say(self, job: Job, text: str) -> None:
+        """Prints a line about a job."""
+        self.console.print(f"  {job.name}: {text}", highlight=False, soft_wrap=True)
+
+    def end(self, job: Job, state: str, *, again: bool = False) -> None:
+        """Removes a job's bar and prints a line.
+
+        Args:
+            job: the job.
+            state: how it ended.
+            again: whether it will be run again.
+        """
         if job in self._bars:
             self.remove_task(self._bars.pop(job))
-        self.advance(self._all, len(job.configs))
-        self.console.print(f"  {job.name}: {state}", highlight=False, soft_wrap=True)
+        self._sizes.pop(job, None)
+        if not again:
+            self.advance(self._all, len(job.configs))
+        self.say(job, state)
+
+
+def _size(run: RunFolder) -> int:
+    try:
+        return (run.path / "metrics.jsonl").stat().st_size
+    except OSError:
+        return 0
+
+
+def _shown(run: RunFolder, episodes: int) -> dict[str, Any]:
+    """Returns the number of episodes and the last coverage of a run."""
+    try:
+        lines = run.lines()
+    except (OSError, ValueError):  # the file is being created or truncated
+        return {}
+    if not lines:
+        return {}
+    coverage = f"{lines[-1]['coverage']:.1f} %"
+    if len(lines) == episodes:
+        coverage += ", being evaluated"
+    return {"completed": len(lines), "coverage": coverage}

@@ -1,10 +1,15 @@
-"""Handles SIGINT, SIGTERM and SIGHUP, so that a training can finish its step and save."""
+"""Handles signals that end a training, so that it can finish its step and save."""
 
 import signal
+import time
 from collections.abc import Callable
 from types import FrameType
 
-_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+_NOTICES = (signal.SIGUSR1, signal.SIGUSR2)
+"""signals that a cluster sends before it ends a process; they may follow another signal"""
+_TOGETHER = 2.0
+"""seconds in which several SIGTERM are one"""
+_SIGNALS = (signal.SIGINT, signal.SIGTERM, *_NOTICES)
 
 
 class Interrupted(KeyboardInterrupt):
@@ -12,14 +17,18 @@ class Interrupted(KeyboardInterrupt):
 
 
 class Interruption:
-    """Calls `stop` at the first SIGINT, SIGTERM or SIGHUP and raises `Interrupted` at the second.
+    """Calls `stop` at the first signal and raises `Interrupted` at the second.
+
+    The signals are SIGINT, SIGTERM, SIGHUP, SIGUSR1 and SIGUSR2. Clusters send several of them
+    together. The last two therefore never count as the second, and another SIGTERM does only after
+    `_TOGETHER` seconds.
 
     Args:
         stop: called at the first signal; requests the end of the training after a step.
     """
 
     def __init__(self, stop: Callable[[], None]):
-        self._stop = stop
+        self._stop, self._since, self._raised = stop, 0.0, False
         self._before: dict[signal.Signals, signal._HANDLER] = {}
         self.received: int | None = None
         """number of the first signal; None before it"""
@@ -33,18 +42,25 @@ class Interruption:
         self._before = {number: signal.signal(number, self._handle) for number in signals}
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, _: object, error: BaseException | None, __: object) -> None:
         for number, handler in self._before.items():
             signal.signal(number, handler)
+        # A context manager of tensordict replaces the exception by another one.
+        if self._raised and isinstance(error, Exception):
+            raise Interrupted from error
 
     @property
     def status(self) -> int:
-        """The exit status after the signal: 130 for SIGINT, 143 for SIGTERM, 129 for SIGHUP."""
+        """The exit status after the signal: 128 and its number, such as 130 for SIGINT."""
         return 128 + (self.received or signal.SIGINT)
 
     def _handle(self, number: int, _: FrameType | None) -> None:
         first = self.received is None
         self.received = self.received or number
-        if not first or self.at_once:
+        if first:
+            self._since = time.monotonic()
+        again = number == signal.SIGTERM and time.monotonic() - self._since < _TOGETHER
+        if self.at_once or not (first or again or number in _NOTICES):
+            self._raised = True
             raise Interrupted
         self._stop()

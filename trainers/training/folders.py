@@ -43,9 +43,15 @@ class RunFolders:
             raise
 
     @classmethod
-    def create(cls, configs: Sequence[RunConfig]) -> "RunFolders":
-        """Creates a folder for each seed; the configurations are written last."""
-        runs = [RunFolder.create(config) for config in configs]
+    def create(cls, configs: Sequence[RunConfig], names: Sequence[str] = ()) -> "RunFolders":
+        """Creates a folder for each seed; the configurations are written last.
+
+        Args:
+            configs: configuration of each seed.
+            names: names of the folders; made of the date and the configuration if empty.
+        """
+        given = names or [""] * len(configs)
+        runs = [RunFolder.create(c, name) for c, name in zip(configs, given, strict=True)]
         if len(runs) > 1:
             for run in runs:
                 run.write(SEED_RUNS, {"folders": [other.path.name for other in runs]})

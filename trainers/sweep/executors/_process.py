@@ -1,28 +1,44 @@
-"""Runs `emberlink train` in a child process that ends with its parent.
-
-    python -m emberlink.trainers.sweep.executors._process ARGUMENT...
-
-The standard input is a pipe from the parent, which writes nothing to it. When the parent ends, for
-whatever reason, the pipe is closed, and this process sends itself SIGTERM: the training saves.
-"""
+"""Starts the process of a task; the process ends with its parent."""
 
 import os
-import runpy
-import signal
-import sys
-import threading
+import subprocess
 
-_COMMAND_LINE = "emberlink.trainers.cli"
-"""run by `runpy`, since importing it would be circular"""
+from emberlink.envs.utils.atomic_io import open_in_place
+from emberlink.trainers.sweep.executors.base import Task
 
 
-def _end_with_parent() -> None:
-    while os.read(0, 1):
-        pass
-    os.kill(os.getpid(), signal.SIGTERM)
+def start(task: Task, threads: int, gpu: int | None = None) -> subprocess.Popen:
+    """Starts a task as a child process, whose output is appended to the log.
+
+    The child saves and ends when its standard input is closed, as it is when this process ends.
+
+    Args:
+        task: the task.
+        threads: threads of the training; `OMP_NUM_THREADS` overrides it.
+        gpu: the only GPU that the training sees; None for all.
+
+    Raises:
+        OSError: the log cannot be written.
+    """
+    settings = {"OMP_NUM_THREADS": str(threads), **os.environ, "COLUMNS": "120"}
+    if gpu is not None:
+        seen = os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",")
+        settings["CUDA_VISIBLE_DEVICES"] = seen[gpu] if gpu < len(seen) and seen[gpu] else str(gpu)
+    with open_in_place(task.log, create=True) as log:
+        # In a new session, so that Ctrl-C reaches only the sweep, which cancels the tasks.
+        return subprocess.Popen(
+            task.command,
+            stdin=subprocess.PIPE,
+            stdout=log,
+            stderr=subprocess.STDOUT,
+            env=settings,
+            cwd=task.place,
+            start_new_session=True,
+        )
 
 
-if __name__ == "__main__":
-    threading.Thread(target=_end_with_parent, daemon=True).start()
-    sys.argv[1:1] = ["train"]
-    runpy.run_module(_COMMAND_LINE, run_name="__main__", alter_sys=True)
+def leave(process: subprocess.Popen) -> None:
+    """Lets a child go on when this process ends."""
+    if process.stdin is not None and process.poll() is None:
+        process.stdin.write(b"-")
+        process.stdin.close()

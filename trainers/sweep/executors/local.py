@@ -2,15 +2,13 @@
 
 import os
 import subprocess
-import sys
 from typing import Annotated
 
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
+from emberlink.trainers.sweep.executors import _process
 from emberlink.trainers.sweep.executors.base import Executor, Task
-
-_PROGRAM = "emberlink.trainers.sweep.executors._process"
 
 
 @dataclass(frozen=True, kw_only=True, config=ConfigDict(extra="forbid", strict=True))
@@ -21,6 +19,12 @@ class LocalConfig:
     """runs at a time; the number of cores if None"""
     threads: Annotated[int, Field(ge=1)] | None = None
     """threads of each run; if None, the number of cores divided by the runs at a time"""
+    seeds: Annotated[int, Field(ge=1)] = 1
+    """seeds of a method that are trained in one process"""
+    gpus: Annotated[int, Field(ge=1)] | None = None
+    """GPUs that share the runs in turn; if None, `device` alone chooses the GPU"""
+    restarts: Annotated[int, Field(ge=0)] = 3
+    """how often a run is started again after it was killed"""
 
 
 class LocalExecutor(Executor):
@@ -30,9 +34,11 @@ class LocalExecutor(Executor):
 
     def __init__(self, config: LocalConfig):
         self._config = config
+        self.seeds, self.restarts = config.seeds, config.restarts
         affinity = getattr(os, "sched_getaffinity", None)
         self._cores = (len(affinity(0)) if affinity else os.cpu_count()) or 1
         self._threads = config.threads or 1
+        self._gpus: list[tuple[subprocess.Popen, int]] = []
 
     def slots(self, tasks: int) -> int:
         workers = min(self._config.workers or self._cores, max(tasks, 1))
@@ -40,19 +46,13 @@ class LocalExecutor(Executor):
         return workers
 
     def submit(self, task: Task) -> subprocess.Popen:
-        settings = {"OMP_NUM_THREADS": str(self._threads), **os.environ, "COLUMNS": "120"}
-        with task.log.open("x") as log:
-            # In a new session, so that Ctrl-C reaches only the sweep, which cancels the tasks.
-            # -P: modules of the working directory are not imported.
-            return subprocess.Popen(
-                [sys.executable, "-P", "-m", _PROGRAM, *task.arguments],
-                stdin=subprocess.PIPE,  # closed when this process ends
-                stdout=log,
-                stderr=subprocess.STDOUT,
-                env=settings,
-                pass_fds=task.locks,
-                start_new_session=True,
-            )
+        gpus = range(self._config.gpus or 0)
+        running = [gpu for handle, gpu in self._gpus if handle.poll() is None]
+        gpu = min(gpus, key=running.count, default=None)
+        handle = _process.start(task, self._threads, gpu)
+        if gpu is not None:
+            self._gpus.append((handle, gpu))
+        return handle
 
     def poll(self, handle: subprocess.Popen) -> int | None:
         status = handle.poll()
@@ -62,3 +62,6 @@ class LocalExecutor(Executor):
 
     def cancel(self, handle: subprocess.Popen) -> None:
         handle.terminate()
+
+    def leave(self, handle: subprocess.Popen) -> None:
+        _process.leave(handle)

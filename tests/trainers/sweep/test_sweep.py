@@ -1,5 +1,6 @@
 """Tests emberlink sweep: every combination is trained once, and repeating it resumes."""
 
+import json
 import multiprocessing
 import os
 import signal
@@ -18,9 +19,12 @@ from rich.console import Console
 from emberlink.trainers.cli.main import main
 from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.runs.run_folder import RunFolder
-from emberlink.trainers.sweep import claims, executors, scheduler
+from emberlink.trainers.sweep import executors, manifest
 from emberlink.trainers.sweep.command import sweep
-from emberlink.trainers.sweep.jobs import identity, jobs_of
+from emberlink.trainers.sweep.jobs import folder_name, jobs_of
+from emberlink.trainers.sweep.leases import SWEEP, TRAINING, Leases
+from emberlink.trainers.sweep.run_index import RunIndex
+from emberlink.trainers.training.folders import SEED_RUNS, find_runs
 
 SMALL = [
     "setup=tuned",
@@ -124,6 +128,11 @@ def configs_of(arguments) -> list:
     return [replace(config, seed=seed) for seed in config.seeds or (config.seed,)]
 
 
+def about(arguments) -> tuple[list[RunFolder], list[str]]:
+    """Returns the run folders of a task, and its other arguments."""
+    return find_runs(Path(arguments[0].removeprefix("resume="))), list(arguments[1:])
+
+
 class Instant(executors.Executor):
     """Finishes each task immediately, as an alternative to the executor with processes."""
 
@@ -135,20 +144,12 @@ class Instant(executors.Executor):
         return 2
 
     def submit(self, task):
-        arguments = list(task.arguments)
-        self.submitted.append(arguments)
-        if self._fails(arguments):
+        self.submitted.append(described(task.arguments))
+        if self._fails(self.submitted[-1]):
             task.log.write_text("\nemberlink train: no such thing\n\n")
             return 2
-        if arguments[0].startswith("resume="):
-            first = RunFolder(arguments[0].removeprefix("resume="))
-            seeds = first.config(device="cpu").seeds or (first.config(device="cpu").seed,)
-            for run in runs_in(first.path.parent):
-                if run.config(device="cpu").seed in seeds:
-                    finish(run)
-        else:
-            for config in configs_of(arguments):
-                finish(begin(config), config.episodes)
+        for run in about(task.arguments)[0]:
+            finish(run, run.config(device="cpu").episodes)
         return 0
 
     def poll(self, handle):
@@ -158,17 +159,27 @@ class Instant(executors.Executor):
         pass
 
 
+def described(arguments) -> list[str]:
+    """Returns the arguments of a task; `new METHOD SEEDS` stands for a folder of the sweep."""
+    runs, others = about(arguments)
+    configs = [run.config(device="cpu") for run in runs]
+    if runs[0].path.name != folder_name(configs[0]):
+        return [arguments[0], *others]
+    seeds = sorted(config.seed for config in configs)
+    return [f"new {configs[0].method} {','.join(map(str, seeds))}", *others]
+
+
 def swept(arguments, executor=None) -> list[list[str]]:
-    """Returns the arguments of the trainings that a sweep submits, without the settings."""
+    """Returns the arguments of the trainings that a sweep submits."""
     executor = executor or Instant()
     assert sweep([*SMALL, *arguments], Console(width=200), executor=executor) == 0
-    return [[text for text in task if text not in SMALL] for task in executor.submitted]
+    return executor.submitted
 
 
 def test_finished_runs_are_skipped(tmp_path, capsys):
     output = f"output={tmp_path}"
     assert swept(["independent", "episodes=1", output, "seed=0"]) == [
-        ["independent", "episodes=1", output, "seed=0"]
+        ["new independent 0", "device=cpu"]
     ]
     (first,) = runs_in(tmp_path)
     before = {file: file.stat().st_mtime_ns for file in first.path.rglob("*")}
@@ -179,10 +190,12 @@ def test_finished_runs_are_skipped(tmp_path, capsys):
 
 
 def test_a_failing_run_does_not_stop_the_others(tmp_path, capsys):
-    executor = Instant(fails=lambda arguments: "seed=0" in arguments)
+    executor = Instant(fails=lambda task: task[0].endswith(" 0"))
     arguments = [*SMALL, "independent", f"output={tmp_path}", "seed=0,1,2"]
     assert sweep(arguments, Console(width=300), executor=executor) == 1
-    assert len(runs_in(tmp_path)) == 2
+    assert [len(run.lines()) for run in runs_in(tmp_path)] == [0, 15, 15]
+    states = {row.name[-1]: row.state for row in manifest.read(tmp_path).values()}
+    assert states == {"0": "failed", "1": "finished", "2": "finished"}
     said = capsys.readouterr().out
     assert "exit status 2: emberlink train: no such thing (log: " in said
     assert "compare them with" not in said
@@ -192,10 +205,8 @@ def test_a_run_folder_is_read_once(tmp_path, monkeypatch):
     output = f"output={tmp_path}"
     swept(["independent", output, "seed=range(0,3)"])
     read = []
-    config = RunFolder.config
-    monkeypatch.setattr(
-        RunFolder, "config", lambda self, **about: read.append(self.path) or config(self, **about)
-    )
+    add = RunIndex._add
+    monkeypatch.setattr(RunIndex, "_add", lambda self, run: read.append(run.path) or add(self, run))
     jobs = [*SMALL, "independent", output, "seed=range(0,6)"]
 
     class Slow(Instant):
@@ -243,14 +254,15 @@ def test_a_run_without_metrics_is_not_finished(tmp_path):
     swept(["independent", output])
     (run,) = runs_in(tmp_path)
     (run.path / "metrics.jsonl").write_text("")
-    assert swept(["independent", output]) == [[f"resume={run.path}", "device=cpu"]]
+    assert swept(["independent", output]) == [["new independent 0", "device=cpu"]]
+    assert runs_in(tmp_path)[0].path == run.path
 
 
 def test_a_seed_in_two_stacks_is_trained_once(tmp_path):
     output = f"output={tmp_path}"
     assert swept(["independent", output, "seeds=[0,1],[1,2]"]) == [
-        ["independent", output, "seeds=[0,1]"],
-        ["independent", output, "seeds=[2]"],
+        ["new independent 0,1", "device=cpu"],
+        ["new independent 2", "device=cpu"],
     ]
     assert [run.config().seed for run in runs_in(tmp_path)] == [0, 1, 2]
 
@@ -259,7 +271,7 @@ def test_a_stack_uses_runs_that_were_trained_separately(tmp_path):
     output = f"output={tmp_path}"
     swept(["independent", output, "seed=0,1"])
     assert swept(["independent", output, "seeds=[0,1,2,3]"]) == [
-        ["independent", output, "seeds=[2,3]"]
+        ["new independent 2,3", "device=cpu"]
     ]
     assert swept(["independent", output, "seed=range(0,4)"]) == []
 
@@ -270,26 +282,28 @@ def test_a_stack_is_resumed_as_a_whole(tmp_path):
     stack = [
         begin(config) for config in configs_of(["independent", *SMALL, output, "seeds=[0,1,2]"])
     ]
+    for run in stack:
+        run.write(SEED_RUNS, {"folders": [other.path.name for other in stack]})
     finish(stack[0])
     assert swept(["independent", output, "seed=range(0,4)"]) == [
         [f"resume={stack[1].path}", "device=cpu"],
-        ["independent", output, "seed=3"],
+        ["new independent 3", "device=cpu"],
     ]
 
 
 class Later(Instant):
-    """Takes a second for a task and creates its run folder at the end."""
+    """Takes a second for a task."""
 
     def submit(self, task):
         with (task.log.parent / "submitted").open("a") as file:
-            file.write(f"{task.arguments[-1]}\n")
-        return time.monotonic() + 1, configs_of(task.arguments)
+            file.write(f"{described(task.arguments)[0]}\n")
+        return time.monotonic() + 1, about(task.arguments)[0]
 
     def poll(self, handle):
         if time.monotonic() < handle[0]:
             return None
-        for config in handle[1]:
-            finish(begin(config), config.episodes)
+        for run in handle[1]:
+            finish(run)
         return 0
 
 
@@ -306,70 +320,61 @@ def test_two_simultaneous_sweeps_train_every_run_once(tmp_path):
     for process in both:
         process.join()
     assert [process.exitcode for process in both] == [0, 0]
-    submitted = (tmp_path / "logs" / "submitted").read_text().split()
-    assert sorted(submitted) == [f"seed={seed}" for seed in range(4)]
+    submitted = (tmp_path / "logs" / "submitted").read_text().splitlines()
+    assert sorted(submitted) == [f"new independent {seed}" for seed in range(4)]
 
 
 PARENT = """
-import os, sys
+import json, os, sys
 from pathlib import Path
 from emberlink.trainers.sweep.executors import Task, make
-task = Task(sys.argv[2:], Path(sys.argv[1]), [int(os.environ["LOCK"])])
-print(make("local", {}).submit(task).pid, flush=True)
+log, output, leases = Path(sys.argv[1]), Path(sys.argv[2]), json.loads(sys.argv[3])
+print(make("local", {}).submit(Task(sys.argv[4:], log, leases, output)).pid, flush=True)
 os.read(0, 1)
 """
 
 
 def test_a_killed_sweep_ends_its_trainings(tmp_path):
-    """A run stays claimed until its training has ended."""
+    """A run stays leased until its training has ended."""
     (job,) = jobs_of(["independent", *SMALL, "episodes=10000", f"output={tmp_path}"])
-    claim = claims.claim(tmp_path, job.identities)
-    assert claim is not None
-    arguments = [tmp_path / "log.txt", *job.arguments]
+    (name,), leases = job.names, Leases(tmp_path)
+    ours = leases.take(name, SWEEP)
+    run = begin(job.configs[0])
+    tokens = json.dumps({name: ours.record.token})
     parent = subprocess.Popen(
-        [sys.executable, "-c", PARENT, *arguments],
+        [
+            sys.executable,
+            "-c",
+            PARENT,
+            tmp_path / "log.txt",
+            tmp_path,
+            tokens,
+            f"resume={run.path}",
+        ],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
-        pass_fds=claim.handles,
-        env={**os.environ, "LOCK": str(claim.handles[0])},
     )
     assert parent.stdout is not None
     child = int(parent.stdout.readline())
-    claim.release()
-    assert claims.claim(tmp_path, job.identities) is None
+    deadline = time.monotonic() + 60
+    while not run.lines():
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    assert leases.newest(name).role == TRAINING
+    assert leases.take(name, SWEEP) is None
     os.kill(child, 0)
     parent.kill()
     parent.wait()
-    deadline = time.monotonic() + 60
-    while (again := claims.claim(tmp_path, job.identities)) is None:
+    while leases.take(name, SWEEP) is None:
         assert time.monotonic() < deadline
         time.sleep(0.05)
-    again.release()
-    # A zombie process may remain, but holds no lock.
-    status = Path(f"/proc/{child}/stat")
-    assert not status.exists() or status.read_text().split()[2] == "Z"
-
-
-def test_claims_are_per_run(tmp_path):
-    first_seed, second_seed = (
-        identity(c) for c in configs_of(["independent", *SMALL, "seeds=[0,1]"])
-    )
-    first = claims.claim(tmp_path, [first_seed])
-    assert first is not None
-    assert claims.claim(tmp_path, [second_seed, first_seed]) is None
-    free = claims.claim(tmp_path, [second_seed])
-    assert free is not None
-    first.release()
-    free.release()
-    both = claims.claim(tmp_path, [second_seed, first_seed])
-    assert both is not None
-    both.release()
+    assert run.states()
 
 
 @pytest.mark.parametrize(
     ("argument", "said"),
     [
-        ("executor=slurm", "executor='slurm' is not known; known: local"),
+        ("executor=slurm", "executor='slurm' is not known; known: local, ray, submitit"),
         ("executor.cores=2", "'executor.cores' is not known; known: executor.workers"),
         ("executor.workers=0", "executor.workers=0"),
         ("executor.workers=two", "executor.workers=two"),
@@ -384,7 +389,7 @@ def test_executors_are_chosen_and_checked(argument, said, capsys, tmp_path, monk
 
 
 def test_every_executor_has_a_file_and_settings():
-    assert executors.known() == ["local"]
+    assert executors.known() == ["local", "ray", "submitit"]
     executor = executors.make("local", {"workers": 3})
     assert (executor.slots(9), executor.slots(2)) == (3, 2)
 
@@ -416,7 +421,10 @@ def test_a_resumed_sweep_equals_an_uninterrupted_one(tmp_path):
 
 
 def test_a_task_that_failed_before_its_log_is_reported(tmp_path):
-    log = tmp_path / "log.txt"
-    assert scheduler._last_line(log) == "there is no log"
-    log.write_text("first\nlast\n\n")
-    assert scheduler._last_line(log) == "last"
+    (job,) = jobs_of(["independent", f"output={tmp_path}"])
+    job.open_log()
+    assert job.last_line() == "there is no log"
+    job.log.write_text("first\nlast\n\n")
+    assert job.last_line() == "last"
+    job.log.write_text("\n")
+    assert job.last_line() == "the log is empty"

@@ -1,0 +1,200 @@
+"""Tests the keys of executors, missing packages, and trainings that outlive their sweep."""
+
+import os
+import pty
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from tiny_run import TINY
+
+from emberlink.trainers.cli.main import main
+from emberlink.trainers.runs.run_folder import RunFolder
+from emberlink.trainers.sweep import executors
+from emberlink.trainers.sweep.executors import Task, _extras, _process, local
+from emberlink.trainers.sweep.executors._times import minutes
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        (90, 90),
+        ("90", 90),
+        ("90:00", 90),
+        ("90:30", 91),
+        ("4:00:00", 240),
+        ("0:00:01", 1),
+        ("1-0", 1440),
+        ("1-12", 2160),
+        ("2-3:04", 3064),
+        ("2-3:04:05", 3065),
+    ],
+)
+def test_times_have_the_forms_of_sbatch(text, expected):
+    assert minutes(text) == expected
+
+
+@pytest.fixture
+def nothing_installed(monkeypatch):
+    monkeypatch.setattr(_extras, "find_spec", lambda _: None)
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("submitit", "submitit is not installed: pip install 'emberlink[slurm]'"),
+        ("ray", "ray is not installed: pip install 'emberlink[ray]'"),
+    ],
+)
+def test_a_missing_package_is_named_in_one_line(
+    name, said, nothing_installed, tmp_path, capsys, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    assert main(["sweep", "independent", f"executor={name}"]) == 2
+    error = capsys.readouterr().err
+    assert error == f"emberlink sweep: executor={name}: {said}\n"
+    assert not any(tmp_path.iterdir())
+
+
+def test_a_machine_without_slurm_is_named(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(_extras, "find_spec", lambda _: True)
+    monkeypatch.setenv("PATH", "")
+    assert main(["sweep", "independent", "executor=submitit"]) == 2
+    assert "there is no sbatch here" in capsys.readouterr().err
+    assert not any(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["executor=submitit", "executor.time=soon"], "executor.time=soon"),
+        (["executor=submitit", "executor.time=4:00:00:00"], "executor.time=4:00:00:00"),
+        (["executor=submitit", "executor.cluster=debug"], "executor.cluster=debug"),
+        (["executor=submitit", "executor.address=auto"], "'executor.address' is not known"),
+        (["executor=ray", "executor.gpus=-1"], "executor.gpus=-1"),
+        (["executor=ray", "executor.resources={a: 0}"], "executor.resources"),
+        (["executor.seeds=0"], "executor.seeds=0"),
+        (["executor.restarts=-1"], "executor.restarts=-1"),
+    ],
+)
+def test_wrong_keys_are_named_in_one_line(arguments, said, tmp_path, capsys, monkeypatch):
+    """The keys are checked before the packages."""
+    monkeypatch.chdir(tmp_path)
+    assert main(["sweep", "independent", *arguments]) == 2
+    error = capsys.readouterr().err
+    assert said in error
+    assert error.count("\n") == 1
+    assert not any(tmp_path.iterdir())
+
+
+def test_importing_an_executor_imports_no_package_of_an_extra():
+    code = "import sys; from emberlink.trainers.sweep.executors import ray, submitit;"
+    code += "print({'ray', 'submitit', 'torch'} & {*sys.modules})"
+    assert subprocess.check_output([sys.executable, "-c", code], text=True) == "set()\n"
+
+
+class Started:
+    """Stands for a process that runs until a test ends it."""
+
+    def __init__(self):
+        self.status = None
+
+    def poll(self):
+        return self.status
+
+
+def test_gpus_are_shared_in_turn(monkeypatch, tmp_path):
+    given: list[int | None] = []
+
+    def start(task, threads, gpu=None):
+        given.append(gpu)
+        return Started()
+
+    monkeypatch.setattr(local._process, "start", start)
+    executor = executors.make("local", {"workers": 4, "gpus": 2})
+    handles = [executor.submit(Task([], tmp_path / "log")) for _ in range(4)]
+    assert given == [0, 1, 0, 1]
+    handles[1].status = 0
+    executor.submit(Task([], tmp_path / "log"))
+    assert given[-1] == 1
+
+
+def test_a_process_sees_its_share_of_threads_and_gpus(monkeypatch, tmp_path):
+    code = "import os; print(os.environ['OMP_NUM_THREADS'], os.environ['CUDA_VISIBLE_DEVICES'])"
+    monkeypatch.setattr(Task, "command", [sys.executable, "-c", code])
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "4,7")
+    _process.start(Task([], tmp_path / "log"), threads=3, gpu=1).wait()
+    assert (tmp_path / "log").read_text() == "3 7\n"
+
+
+LONG = [*(word for word in TINY if word != "episodes=2"), "episodes=4000", "checkpoint_steps=50"]
+
+
+@pytest.mark.slow
+def test_ctrl_c_at_a_terminal_leaves_a_local_training_running(tmp_path):
+    """`sweep status` sees it, the same sweep waits for it, and SIGTERM saves it."""
+    sweep = [sys.executable, "-m", "emberlink.trainers.cli", "sweep"]
+    terminal, end = pty.openpty()
+    process = subprocess.Popen(
+        [*sweep, "independent", *LONG, f"output={tmp_path}"],
+        stdin=end,
+        stdout=end,
+        stderr=end,
+        start_new_session=True,
+        env={**os.environ, "TERM": "xterm"},
+    )
+    os.close(end)
+    wait_for(lambda: any(run.lines() for run in runs_in(tmp_path)), terminal)
+    process.send_signal(signal.SIGINT)
+    wait_for(lambda: b"[l]eave" in read.output, terminal)
+    os.write(terminal, b"what\nl\n")
+    wait_for(lambda: process.poll() is not None, terminal)
+    assert process.returncode == 130
+    assert b"sweep status" in read.output
+    (run,) = runs_in(tmp_path)
+    done = len(run.lines())
+    time.sleep(1)
+    wait_for(lambda: len(run.lines()) > done + 1)
+    said = subprocess.check_output([*sweep, "status", tmp_path], text=True)
+    assert "running" in said
+    holder = int(said.split("process ")[1].split()[0])
+    os.kill(holder, signal.SIGTERM)
+    wait_for(lambda: run.states())
+    wait_for(lambda: not Path(f"/proc/{holder}").exists() or zombie(holder))
+    assert "stopped" in subprocess.check_output([*sweep, "status", tmp_path], text=True)
+
+
+def runs_in(folder) -> list[RunFolder]:
+    return [RunFolder(file.parent) for file in folder.glob("*/config.yaml")]
+
+
+def zombie(process: int) -> bool:
+    return Path(f"/proc/{process}/stat").read_text().split()[2] == "Z"
+
+
+def read(terminal: int) -> None:
+    """Reads what a terminal shows."""
+    os.set_blocking(terminal, False)
+    try:
+        read.output += os.read(terminal, 1 << 16)
+    except OSError:
+        return
+
+
+read.output = b""
+
+
+def wait_for(condition, terminal: int | None = None) -> None:
+    deadline = time.monotonic() + 120
+    while not condition():
+        assert time.monotonic() < deadline, read.output
+        if terminal is not None:
+            read(terminal)
+        time.sleep(0.1)
+    if terminal is not None:
+        read(terminal)

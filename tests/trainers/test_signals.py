@@ -1,0 +1,81 @@
+"""Tests signals that end a training: which save, and which end it at once."""
+
+import os
+import signal
+
+import pytest
+import torch
+from tensordict import TensorDict
+from tiny_run import TINY
+
+from emberlink.trainers.cli.main import main
+from emberlink.trainers.runs.run_folder import RunFolder
+from emberlink.trainers.terminal import signals
+from emberlink.trainers.terminal.signals import Interrupted, Interruption
+from emberlink.trainers.training.trainer import Trainer
+
+INT, TERM, USR1, USR2 = signal.SIGINT, signal.SIGTERM, signal.SIGUSR1, signal.SIGUSR2
+
+
+def send(*numbers) -> Interruption:
+    """Sends signals to a waiting training and returns what it received."""
+    interruption = Interruption(lambda: None)
+    with interruption:
+        for number in numbers:
+            os.kill(os.getpid(), number)
+    return interruption
+
+
+@pytest.mark.parametrize(
+    "numbers", [(TERM,), (USR2,), (USR1, USR1), (TERM, USR2), (TERM, TERM), (USR2, TERM, USR2)]
+)
+def test_signals_that_a_cluster_sends_together_let_the_training_save(numbers):
+    interruption = send(*numbers)
+    assert interruption.received == numbers[0]
+    assert interruption.status == 128 + numbers[0]
+
+
+@pytest.mark.parametrize("numbers", [(INT, INT), (TERM, INT), (USR2, INT)])
+def test_a_second_signal_of_the_user_ends_at_once(numbers):
+    with pytest.raises(Interrupted):
+        send(*numbers)
+
+
+def test_a_later_sigterm_ends_at_once(monkeypatch):
+    monkeypatch.setattr(signals, "_TOGETHER", 0.0)
+    with pytest.raises(Interrupted):
+        send(TERM, TERM)
+
+
+def test_a_signal_within_a_context_of_tensordict_is_not_an_error():
+    """The context manager converts itself to a truth value after an exception, which fails."""
+    module = torch.nn.Linear(1, 1)
+    parameters = TensorDict.from_module(module)
+
+    def end() -> None:
+        with Interruption(lambda: None), parameters.to_module(module):
+            os.kill(os.getpid(), INT)
+            os.kill(os.getpid(), INT)
+
+    with pytest.raises(Interrupted):
+        end()
+
+
+@pytest.mark.parametrize("number", [USR1, USR2])
+def test_a_notice_saves_at_the_next_step(number, tmp_path, monkeypatch, capsys):
+    stopped = []
+    progress = Trainer._progress
+
+    def step(self, **more):
+        if self.setup.step == 7:
+            os.kill(os.getpid(), number)
+            stopped.append(self.setup.step)
+        return progress(self, **more)
+
+    monkeypatch.setattr(Trainer, "_progress", step)
+    assert main(["train", "independent", *TINY, f"output={tmp_path}"]) == 128 + number
+    assert stopped == [7]
+    (folder,) = tmp_path.iterdir()
+    (state,) = RunFolder(folder).states()
+    assert state.name == "state_000000007.safetensors"
+    assert f"resume with: emberlink train resume={folder}" in capsys.readouterr().out

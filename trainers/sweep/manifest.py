@@ -1,0 +1,165 @@
+"""Reads and writes the manifest of a sweep: a row for each run, in the output folder."""
+
+import json
+import os
+import secrets
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from emberlink.envs.utils.atomic_io import write_bytes
+from emberlink.envs.utils.errors import UserError
+from emberlink.trainers.runs.safe_read import MAX_JSON, parse_json, read_text
+from emberlink.trainers.sweep.jobs import Job, folder_name, hash_of, identity, is_finished
+
+FILE = "sweep.json"
+"""file of the manifest, in the output folder"""
+_FORMAT = 1
+STATES = ("new", "queued", "running", "stopped", "failed", "finished")
+"""values of `Row.state`"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Row:
+    """A run of a sweep.
+
+    Attributes:
+        run: hash of the configuration.
+        name: method, setup, world and seed.
+        folder: name of the run folder.
+        state: one of `STATES`.
+        episodes: number of episodes of the whole training.
+        executor: name of the executor that trained it last; empty if there was none.
+        task: name of the task that the executor knows; may be empty.
+        log: log of the newest task, relative to the output folder.
+        restarts: how often the run was started again after it ended without saving.
+        note: the reason if the run failed.
+    """
+
+    run: str
+    name: str
+    folder: str
+    state: str
+    episodes: int
+    executor: str = ""
+    task: str = ""
+    log: str = ""
+    restarts: int = 0
+    note: str = ""
+
+
+def read(output: Path) -> dict[str, Row]:
+    """Returns the rows of a manifest by `Row.run`; none if there is no manifest.
+
+    Raises:
+        UserError: the file is not a manifest.
+    """
+    path = output / FILE
+    try:
+        content = parse_json(read_text(path, MAX_JSON))
+        rows = [Row(**row) for row in content["runs"]]
+        if content["format"] != _FORMAT or any(row.state not in STATES for row in rows):
+            raise UserError("of another version")
+    except FileNotFoundError:
+        return {}
+    except (ValueError, TypeError, KeyError) as error:
+        raise UserError(f"{path}: not a manifest of a sweep: {error}") from None
+    return {row.run: row for row in rows}
+
+
+def write(output: Path, rows: Iterable[Row]) -> None:
+    """Writes the manifest completely, or leaves the earlier one.
+
+    Rows of other runs, which another sweep into the folder wrote, are kept.
+
+    Args:
+        output: folder of the run folders.
+        rows: the new rows.
+
+    Raises:
+        UserError: the file cannot be written, or the earlier one is not a manifest.
+    """
+    all_rows = {**read(output), **{row.run: row for row in rows}}
+    content = {"format": _FORMAT, "runs": [asdict(row) for row in all_rows.values()]}
+    try:
+        output.mkdir(parents=True, exist_ok=True)
+        text = json.dumps(content, indent=1) + "\n"
+        # Sweeps on several machines may have the same process number.
+        write_bytes(output / FILE, text.encode(), tag=f"-{secrets.token_hex(4)}")
+    except OSError as error:
+        where = error.filename or os.fspath(output)
+        raise UserError(f"{where}: {error.strerror or error}") from None
+
+
+class Manifest:
+    """The rows of the jobs of one sweep command; each change is written at once.
+
+    Args:
+        output: folder of the run folders.
+        executor: name of the executor.
+    """
+
+    def __init__(self, output: Path, executor: str = ""):
+        self._output, self.executor = output, executor
+        self.rows: dict[str, Row] = {}
+
+    def load(self, jobs: Iterable[Job]) -> None:
+        """Reads the earlier rows, updates those of the jobs, and writes all.
+
+        Raises:
+            UserError: the earlier file is not a manifest, or it cannot be written.
+        """
+        jobs = list(jobs)
+        earlier = read(self._output)
+        for job in jobs:
+            for row in _rows(job):
+                old = earlier.get(row.run)
+                if old is not None:
+                    state = row.state if row.state == "finished" or not job.found else old.state
+                    row = replace(old, state=state, folder=row.folder, episodes=row.episodes)
+                elif job.found and row.state != "finished":
+                    row = replace(row, state="stopped")
+                self.rows[row.run] = row
+        write(self._output, self.rows.values())
+
+    def set(self, job: Job, state: str, **changes: Any) -> None:
+        """Changes the rows of a job and writes the manifest.
+
+        Args:
+            job: the job.
+            state: one of `STATES`.
+            changes: other attributes of the rows.
+        """
+        for row in _rows(job):
+            old = self.rows.get(row.run, row)
+            self.rows[row.run] = replace(old, state=state, folder=row.folder, **changes)
+        write(self._output, self.rows.values())
+
+    def of(self, job: Job) -> list[Row]:
+        """Returns the rows of a job."""
+        return [self.rows[row.run] for row in _rows(job) if row.run in self.rows]
+
+    def task(self, job: Job) -> str:
+        """Returns the name of the task that trained a job last on an executor of this name."""
+        tasks = {(row.executor, row.task) for row in self.of(job)}
+        executor, task = tasks.pop() if len(tasks) == 1 else ("", "")
+        return task if executor == self.executor else ""
+
+
+def _rows(job: Job) -> list[Row]:
+    """Returns a new row for each run of a job."""
+    rows = []
+    for config in job.configs:
+        found = job.found.get(config.seed)
+        finished = found is not None and is_finished(found.folder, config)
+        rows.append(
+            Row(
+                run=hash_of(identity(config)),
+                name=f"{job.method}, {config.setup}, {config.world}, seed {config.seed}",
+                folder=found.folder.path.name if found else folder_name(config),
+                state="finished" if finished else "new",
+                episodes=config.episodes,
+            )
+        )
+    return rows

@@ -1,0 +1,34 @@
+"""Asks what to do with running trainings after Ctrl-C."""
+
+import sys
+
+from emberlink.trainers.sweep.progress import SweepProgress
+
+STOP, LEAVE, CONTINUE = "s", "l", "c"
+"""answers: save and stop the trainings, leave them running, go on with the sweep"""
+
+
+def ask(progress: SweepProgress, running: int) -> str:
+    """Returns the user's answer; `STOP` without a terminal.
+
+    Args:
+        progress: is hidden during the question.
+        running: number of running trainings.
+    """
+    if sys.stdin is None or not sys.stdin.isatty() or not progress.console.is_terminal:
+        return STOP
+    progress.stop()
+    answer = ""
+    while answer not in (STOP, LEAVE, CONTINUE):
+        progress.console.print(
+            f"{running} trainings are running or queued: [s]top and save them, [l]eave them "
+            "running, or [c]ontinue? ",
+            end="",
+            markup=False,
+            highlight=False,
+        )
+        line = sys.stdin.readline()
+        answer = line.strip().lower()[:1] if line else STOP
+    if answer == CONTINUE:
+        progress.start()
+    return answer
