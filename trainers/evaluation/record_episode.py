@@ -39,7 +39,7 @@ def record_episode(
     frames: list[FrameData] = []
 
     def add(world: WildfireEnv, td: TensorDictBase) -> None:
-        now = td[member]
+        now: Any = td[member]
         if int(now.get(keys.STEP)) in steps:
             base = world.config.base
             told = advised and now.get(keys.HEARS, None) is not None
