@@ -13,6 +13,7 @@ PROJECTS = {
             "torchrl.envs.Transform": _GENERATED,
             "torchrl.objectives.DDPGLoss": _GENERATED,
             "torchrl.objectives.TD3Loss": _GENERATED,
+            "torchrl.objectives.ClipPPOLoss": _GENERATED,
         },
     ),
     "tensordict": (

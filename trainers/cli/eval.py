@@ -18,8 +18,8 @@ def add_eval(commands: Any) -> None:
         _eval,
         "evaluate the frozen policies of a run",
         "Loads the newest checkpoint of a run, plays the frozen policies and the scripted ones on "
-        "the same test fires, prints a table, and writes eval.json, figures and a GIF to the run "
-        "folder.",
+        "the same test fires, prints a table, and writes eval.json, figures, a GIF and a replay "
+        "page to the run folder.",
         "emberlink eval runs/2026-01-31_12-00-00_consensus_tuned_paper_s0 --fires 64",
     )
     evaluation.add_argument(

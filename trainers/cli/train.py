@@ -17,7 +17,8 @@ def add_train(commands: Any) -> None:
         _train,
         "train one of the methods and evaluate it",
         "Trains a method, evaluates the frozen policies on test fires, and writes a run folder "
-        "with config.yaml, metrics.jsonl, checkpoints, eval.json, figures and a GIF.",
+        "with config.yaml, metrics.jsonl, checkpoints, eval.json, figures, a GIF and a replay "
+        "page.",
         "emberlink train consensus setup=tuned episodes=20 seed=1",
         usage="emberlink train METHOD [key=value ...]\n"
         "       emberlink train resume=RUN [key=value ...]",

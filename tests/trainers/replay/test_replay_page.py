@@ -1,7 +1,10 @@
 """Tests a replay in a browser."""
 
+import base64
 import dataclasses
+import gzip
 import html
+import json
 import re
 
 import pytest
@@ -334,11 +337,56 @@ def test_damaged_data_give_a_message(browser, replay, tmp_path):
         path = tmp_path / f"{place}.html"
         path.write_text(replay.html.replace(packed, damaged))
         tab = Tab(browser, f"file://{path}")
-        tab.page.wait_for_selector("#message:not([hidden])")
+        tab.page.wait_for_selector("#message:not(.late)")
         assert "damaged" in tab.page.inner_text("#message")
         assert not tab.page.is_visible("#page")
         assert tab.problems == []
         tab.close()
+
+
+def test_a_file_without_its_end_gives_a_message(browser, replay, tmp_path):
+    for share in (0.5, 0.9, 0.97):
+        path = tmp_path / f"{share}.html"
+        path.write_text(replay.html[: int(len(replay.html) * share)])
+        tab = Tab(browser, f"file://{path}")
+        tab.page.wait_for_function(
+            "getComputedStyle(document.getElementById('message')).visibility === 'visible'"
+        )
+        assert "damaged" in tab.page.inner_text("#message")
+        assert not tab.page.is_visible("#page")
+        tab.close()
+
+
+def repacked(replay, change) -> str:
+    """Returns the page with another header, and a checksum that fits."""
+    (packed,) = re.findall(r'id="data">([^<]*)<', replay.html)
+    content = gzip.decompress(base64.b64decode(packed))
+    length = int.from_bytes(content[:4], "little")
+    header = json.loads(content[4 : 4 + length])
+    change(header)
+    text = json.dumps(header).encode()
+    text += b" " * (-(len(text) + 4) % 8)
+    data = gzip.compress(len(text).to_bytes(4, "little") + text + content[4 + length :])
+    return replay.html.replace(packed, base64.b64encode(data).decode())
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda header: header["panels"].clear(), "no episode"),
+        (lambda header: header["panels"][0].pop("position"), "position is missing"),
+        (lambda header: header.update(horizon=2000), "steps of 2001"),
+    ],
+)
+def test_data_that_do_not_fit_give_a_message(change, message, browser, replay, tmp_path):
+    path = tmp_path / "page.html"
+    path.write_text(repacked(replay, change))
+    tab = Tab(browser, f"file://{path}")
+    tab.page.wait_for_selector("#message:not(.late)")
+    assert message in tab.page.inner_text("#message")
+    assert not tab.page.is_visible("#page")
+    assert tab.problems == []
+    tab.close()
 
 
 def test_jupyter_shows_the_page_inline(browser, replay, tmp_path):

@@ -108,7 +108,7 @@ export class MapView {
     if (heat) {
       return (cell) => {
         const lit = burns(data, cell, step);
-        if (last[cell] < 0 && !lit) return unknown;
+        if (last[cell] < 0 && !(lit && radio === panel.radios)) return unknown;
         return this.warm(step - Math.max(last[cell], lit ? data.ignition[cell] : 0), palette.heat);
       };
     }

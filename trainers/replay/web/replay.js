@@ -230,13 +230,13 @@ class Player {
 }
 
 function hashStep() {
-  const step = /^#t=(\d{1,9})$/.exec(location.hash);
+  const step = /^#t=(\d{1,300})$/.exec(location.hash);
   return step ? Number(step[1]) : null;
 }
 
 function fail(text) {
   find("message").textContent = text;
-  find("message").hidden = false;
+  find("message").classList.remove("late");
   find("page").hidden = true;
 }
 
@@ -250,6 +250,7 @@ async function start() {
   } catch (error) {
     return fail(`The data of this page are damaged and cannot be shown (${error.message}).`);
   }
+  find("message").hidden = true;
   find("page").hidden = false;
   const player = new Player(data);
   return player.seek(hashStep() ?? 0);

@@ -5,16 +5,18 @@ const TYPES = {
   u4: Uint32Array, i4: Int32Array, f4: Float32Array,
 };
 const VERSION = 1;
+const BITS = ["hears", "lost"]; // a bit per step
+const NEEDED = ["position", "view", "hears", "reward", "seen", "burning", "burnt"];
 
 /** Returns the episodes that a text in base64 holds; throws an error if it is damaged. */
 export async function unpack(text) {
   const packed = Uint8Array.from(atob(text), (character) => character.charCodeAt(0));
-  const plain = new Blob([packed]).stream().pipeThrough(new DecompressionStream("gzip"));
-  const buffer = await new Response(plain).arrayBuffer();
+  const buffer = await decompress(packed);
   const length = new DataView(buffer).getUint32(0, true);
   const header = JSON.parse(new TextDecoder().decode(new Uint8Array(buffer, 4, length)));
   if (header.version !== VERSION) throw new Error(`unknown version ${header.version}`);
   const [columns, rows] = header.grid;
+  if (!header.panels.length) throw new Error("no episode");
   const read = (entry) => array(buffer, 4 + length, entry);
   return {
     ...header, columns, rows,
@@ -24,6 +26,16 @@ export async function unpack(text) {
   };
 }
 
+/** Returns the content of bytes compressed with gzip. */
+async function decompress(packed) {
+  const plain = new Blob([packed]).stream().pipeThrough(new DecompressionStream("gzip"));
+  try {
+    return await new Response(plain).arrayBuffer();
+  } catch {
+    throw new Error("not whole, or not compressed with gzip");
+  }
+}
+
 /** Returns a panel with its arrays in place of their descriptions. */
 function unpackPanel(panel, read, horizon) {
   const radios = panel.uavs + (panel.base ? 1 : 0);
@@ -31,13 +43,18 @@ function unpackPanel(panel, read, horizon) {
   for (const [name, entry] of Object.entries(panel)) {
     if (!entry?.type) continue;
     const { values, width } = read(entry);
-    if (name === "hears" || name === "lost") {
+    const steps = BITS.includes(name) ? width * 8 : width;
+    if (steps < horizon + 1) throw new Error(`${name} has ${steps} steps of ${horizon + 1}`);
+    if (BITS.includes(name)) {
       unpacked[name] = (step, taker, source) =>
         (values[(taker * radios + source) * width + (step >> 3)] >> (step & 7)) & 1;
     } else {
       // Row by row: what it is of, such as x of UAV 0, then the steps.
       unpacked[name] = (step, row = 0) => values[row * width + step];
     }
+  }
+  for (const name of NEEDED) {
+    if (typeof unpacked[name] !== "function") throw new Error(`${name} is missing`);
   }
   return unpacked;
 }
