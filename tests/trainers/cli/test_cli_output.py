@@ -261,7 +261,7 @@ def test_an_unknown_kind_gives_one_line(capsys):
     assert main.main(["list", "method"]) == 2
     assert capsys.readouterr().err == (
         "emberlink list: 'method' is not known; known: methods, setups, worlds, fires, learners, "
-        "policies\n"
+        "executors, policies\n"
     )
 
 
