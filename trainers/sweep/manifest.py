@@ -3,13 +3,14 @@
 import json
 import os
 import secrets
-from collections.abc import Iterable
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
 from emberlink.envs.utils.atomic_io import write_bytes
 from emberlink.envs.utils.errors import UserError
+from emberlink.envs.utils.validation import shown
 from emberlink.trainers.runs.safe_read import MAX_JSON, parse_json, read_text
 from emberlink.trainers.sweep.jobs import Job, folder_name, hash_of, identity, is_finished
 
@@ -49,6 +50,9 @@ class Row:
     note: str = ""
 
 
+_EMPTY = Row(run="", name="", folder="", state="", episodes=0)
+
+
 def read(output: Path) -> dict[str, Row]:
     """Returns the rows of a manifest by `Row.run`; none if there is no manifest.
 
@@ -56,9 +60,11 @@ def read(output: Path) -> dict[str, Row]:
         UserError: the file is not a manifest.
     """
     path = output / FILE
+    if not os.path.lexists(path):
+        return {}
     try:
         content = parse_json(read_text(path, MAX_JSON))
-        rows = [Row(**row) for row in content["runs"]]
+        rows = [_row(row) for row in content["runs"]]
         if content["format"] != _FORMAT or any(row.state not in STATES for row in rows):
             raise UserError("of another version")
     except FileNotFoundError:
@@ -66,6 +72,19 @@ def read(output: Path) -> dict[str, Row]:
     except (ValueError, TypeError, KeyError) as error:
         raise UserError(f"{path}: not a manifest of a sweep: {error}") from None
     return {row.run: row for row in rows}
+
+
+def _row(values: Mapping[str, Any]) -> Row:
+    """Returns a row, after a check of its types and of the places that it names."""
+    row = Row(**values)
+    for field in fields(Row):
+        value = getattr(row, field.name)
+        if type(value) is not type(getattr(_EMPTY, field.name)):
+            raise UserError(f"{field.name}={shown(value)}")
+    inside = Path(row.folder).name == row.folder and ".." not in (row.folder, *Path(row.log).parts)
+    if not row.folder or not inside or Path(row.log).is_absolute():
+        raise UserError(f"a run in {shown(row.folder)} with the log {shown(row.log)}")
+    return row
 
 
 def write(output: Path, rows: Iterable[Row]) -> None:

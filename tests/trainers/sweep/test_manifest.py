@@ -88,6 +88,32 @@ def test_a_file_that_is_no_manifest_is_named_in_one_line(tmp_path, content, caps
     assert error.count("\n") == 1
 
 
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        *(("run", ["a"]), ("folder", 5), ("episodes", "x"), ("episodes", True), ("name", 7)),
+        *(("restarts", "z"), ("note", None), ("state", "lost"), ("log", "/etc/passwd")),
+        *(("folder", "../../etc"), ("folder", "/dev"), ("folder", ".."), ("folder", "")),
+        ("log", "logs/../../x"),
+    ],
+)
+def test_a_row_with_a_wrong_value_is_named_in_one_line(tmp_path, key, value, capsys):
+    row = {"run": "a", "name": "b", "folder": "c", "state": "new", "episodes": 2, key: value}
+    (tmp_path / manifest.FILE).write_text(json.dumps({"format": 1, "runs": [row]}))
+    for command in (["status", str(tmp_path)], [*KEYS, f"output={tmp_path}"]):
+        assert main(["sweep", *command]) == 2
+        error = capsys.readouterr().err
+        assert f"{tmp_path / manifest.FILE}: not a manifest of a sweep" in error
+        assert error.count("\n") == 1
+
+
+def test_an_output_below_a_file_is_named(tmp_path, capsys):
+    (tmp_path / "file").write_text("")
+    assert main(["sweep", *KEYS, f"output={tmp_path / 'file' / 'x'}"]) == 2
+    assert "Not a directory" in (error := capsys.readouterr().err)
+    assert "manifest" not in error
+
+
 @pytest.mark.parametrize("arguments", [[], ["a", "b"], ["nowhere"]])
 def test_status_of_no_folder_is_one_line(arguments, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
