@@ -60,8 +60,8 @@ class TeamMaps(Buffers):
         self.register_buffer("_base", base, persistent=False)
 
     @property
-    def sends(self) -> bool:
-        """Whether the UAVs send their maps."""
+    def sends(self) -> bool | Tensor:
+        """Whether the UAVs send their maps; a tensor is bool [envs, 1]."""
         in_range = self._messages == "in range" and self._world.radio.range > 0
         return in_range or self._messages == "everyone"
 

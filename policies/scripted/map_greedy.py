@@ -66,8 +66,8 @@ class MapGreedy(Scripted):
 
     def bytes_sent(self, tensordict: TensorDictBase) -> Tensor:
         """Returns the bytes of a map (int16 per cell) and of a target (two float32) per UAV."""
-        sends = self.maps.sends * (2 * math.prod(self.world.grid) + 8)
-        return sends * tensordict.get(keys.ALIVE).long()
+        size = 2 * math.prod(self.world.grid) + 8
+        return size * tensordict.get(keys.ALIVE).long() * self.maps.sends
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         self.maps.update(tensordict)

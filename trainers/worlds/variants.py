@@ -47,6 +47,11 @@ class _RangedMaps(TeamMaps):
         self._radio = replace(env.config.radio, range=inf)
         self.register_buffer("_ranges", ranges.view(-1, 1, 1))
 
+    @property
+    def sends(self) -> Tensor:
+        """Whether the UAVs of an environment send their maps, bool [envs, 1]."""
+        return self._ranges.squeeze(-1) > 0
+
     def _hears(self, tensordict: TensorDictBase, position: Tensor, alive: Tensor) -> Tensor:
         near = radio.pairwise_distance(position) < self._ranges
         given = tensordict.get(keys.RNG_KEY), tensordict.get(keys.STEP)
