@@ -47,8 +47,8 @@ def runs_in(folder: Path) -> list[RunFolder]:
 
 
 def training(folder: Path) -> list[RunFolder]:
-    """Returns the runs that have begun to train and are not near their end."""
-    return [run for run in runs_in(folder) if 2 <= len(run.lines()) <= 10]
+    """Returns the runs that have saved a checkpoint and are not near their end."""
+    return [run for run in runs_in(folder) if 4 <= len(run.lines()) <= 11]
 
 
 def finished(folder: Path) -> int:
