@@ -1,4 +1,4 @@
-"""Builds environments and networks from a configuration."""
+"""Builds environments, networks and learners from a configuration."""
 
 from collections.abc import Sequence
 from typing import Any

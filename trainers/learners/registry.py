@@ -1,4 +1,4 @@
-"""Finds learners by name: files of this folder, and entry points of other packages."""
+"""Finds learners by name, in this folder and among entry points, and builds them."""
 
 from emberlink.envs.utils.plugins import Registry
 from emberlink.trainers.learners.base import Learner, LearnerConfig, LearnerContext

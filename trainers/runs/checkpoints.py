@@ -1,4 +1,4 @@
-"""Finds, writes and removes the checkpoints of a run folder."""
+"""Finds, writes and removes the checkpoints of a run folder, whose names hold the step."""
 
 import re
 from collections.abc import Mapping

@@ -1,4 +1,4 @@
-"""Defines the jobs of a sweep: every combination of methods and values."""
+"""Defines the jobs of a sweep, one per combination of values, and finds their runs on disk."""
 
 import hashlib
 from collections.abc import Mapping, Sequence

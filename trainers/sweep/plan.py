@@ -1,4 +1,4 @@
-"""Adapts the jobs of a sweep to the runs on disk."""
+"""Splits and joins jobs by seeds, so that stopped trainings of several seeds go on together."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace

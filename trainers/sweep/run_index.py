@@ -1,4 +1,4 @@
-"""Reads the run folders in an output folder."""
+"""Lists the run folders in an output folder by their configuration."""
 
 from pathlib import Path
 

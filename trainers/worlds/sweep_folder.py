@@ -1,4 +1,4 @@
-"""Reads and writes the folder of a sweep of worlds."""
+"""Reads and writes the folder of a sweep of worlds: settings, results, figure."""
 
 import json
 import os
