@@ -1,4 +1,4 @@
-"""Assigns cells to UAVs: the sum of weights in view per cost, and claims among UAVs."""
+"""Assigns cells to UAVs, and how often: weights in view per cost, and claims among UAVs."""
 
 import torch
 from torch import Tensor

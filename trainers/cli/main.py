@@ -1,4 +1,4 @@
-"""Parses the command line, runs a command, and reports errors."""
+"""Runs the command that was typed, and turns errors into one line and an exit status."""
 
 import argparse
 import errno

@@ -1,4 +1,4 @@
-"""Defines the parser of the command line and functions shared by its commands."""
+"""Defines the parser of the command line, its usage errors, and functions shared by commands."""
 
 import argparse
 import difflib

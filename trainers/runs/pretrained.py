@@ -1,4 +1,4 @@
-"""Opens the trained policies of the package, such as `pretrained:consensus`.
+"""Opens the trained policies of the package (`pretrained:consensus`), and adds runs to them.
 
 Each is a reduced run folder, policies/pretrained/SETUP/METHOD/sSEED, with config.yaml,
 metrics.jsonl, eval.json, and a checkpoint of the actors. Finished runs are packed with
