@@ -49,7 +49,7 @@ def parallel_env(
     """
     if env is not None and (kwargs or max_cycles is not None):
         given = sorted([*kwargs, *(["max_cycles"] if max_cycles is not None else [])])
-        raise UserError(f"a ready environment takes no further settings, got {given}")
+        raise UserError(f"settings cannot be given with an existing environment, got {given}")
     if max_cycles is not None:
         config = kwargs.get("config") or default_config(kwargs.get("fire"))
         kwargs["config"] = dataclasses.replace(config, horizon=max_cycles)
@@ -234,7 +234,7 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
     def _stacked(self, actions: dict[str, Array]) -> Array:
         """Returns the actions in the order of the agents, float32 [n, 3]."""
         if set(actions) != set(self.agents):
-            raise UserError(f"actions for {sorted(actions)}; the agents are {self.agents}")
+            raise UserError(f"got actions for {sorted(actions)}; expected those of {self.agents}")
         hover = np.zeros(3, np.float32)
         rows = [np.asarray(actions.get(agent, hover), np.float32) for agent in self.possible_agents]
         for agent, row in zip(self.possible_agents, rows, strict=True):

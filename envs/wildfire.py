@@ -79,7 +79,7 @@ class WildfireEnv(Buffers, TeamView):
     ):
         num_envs = check_whole("num_envs", num_envs)
         if num_envs < 1:
-            raise UserError(f"num_envs={num_envs}: at least 1 is needed")
+            raise UserError(f"num_envs={num_envs}: expected at least 1")
         check_device(str(device))
         super().__init__(device=device, batch_size=torch.Size([num_envs]))
         self.config = default_config(fire) if config is None else config

@@ -16,8 +16,8 @@ HELD = (keys.AGENTS, "held")
 class Held(TensorDictModuleBase):
     """Lets a policy decide at every k-th step of an episode and repeats its actions in between.
 
-    What the policy carries from step to step, such as a memory or noise, changes at decisions
-    alone. Environments may be at different steps.
+    State that the policy carries, such as a memory or noise, changes only at decisions.
+    Environments may be at different steps.
 
     Args:
         policy: writes ("agents", "action").

@@ -8,7 +8,7 @@ from pydantic.dataclasses import dataclass
 
 @dataclass(frozen=True, kw_only=True, config=ConfigDict(extra="forbid", strict=True))
 class PolicyConfig:
-    """What a policy remembers, and how often it decides."""
+    """Stores the settings of a policy's memory and of the interval between its decisions."""
 
     memory: Annotated[str, Field(min_length=1)] = "none"
     """name of a file in policies/networks/memory: none, gru or stack"""

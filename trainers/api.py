@@ -11,6 +11,7 @@ from typing import Any, overload
 from tensordict.nn import TensorDictModule, TensorDictSequential
 
 from emberlink.envs.utils.errors import UserError
+from emberlink.envs.utils.validation import check_whole
 from emberlink.trainers.comparison.report import free_folder, write_report
 from emberlink.trainers.comparison.results import Comparison, compare_runs
 from emberlink.trainers.config.compose import flat, override, resolve, to_values
@@ -152,7 +153,7 @@ def train(
             failed.
     """
     chosen = [f"setup={setup}", f"world={world}", *([] if fire is None else [f"fire={fire}"])]
-    several = {} if seeds is None else {"seeds": list(seeds)}
+    several = {} if seeds is None else {"seeds": seeds}
     trainer = Trainer(resolve(method, chosen, **settings, **several))
     with _quiet():
         trainer.start()
@@ -193,7 +194,9 @@ def evaluate(
         UserError: there is no such run, a file in it is damaged, or a setting does not fit.
     """
     policy = load(run, checkpoint=checkpoint, device=device, **settings)
-    count = policy.config.evaluation.episodes if episodes is None else episodes
+    count = policy.config.evaluation.episodes
+    if episodes is not None:
+        count = check_whole("episodes", episodes)
     if count < 1:
         raise UserError(f"episodes={count}: expected at least 1")
     return evaluate_policy(policy.config, policy, fires=count, scripted=scripted, report=progress)
@@ -234,7 +237,7 @@ def load(
     return TrainedPolicy(load_actor(config, file), config, file, changes)
 
 
-def compare(paths: Sequence[Reference], output: Reference | None = None) -> Comparison:
+def compare(paths: Reference | Sequence[Reference], output: Reference | None = None) -> Comparison:
     """Compares finished runs by setup and method.
 
     Args:
@@ -250,7 +253,8 @@ def compare(paths: Sequence[Reference], output: Reference | None = None) -> Comp
             not empty.
     """
     folder = None if output is None else free_folder(Path(output))
-    comparison = compare_runs([Path(path) for path in paths])
+    several = [paths] if isinstance(paths, str | os.PathLike) else paths
+    comparison = compare_runs([Path(path) for path in several])
     return comparison if folder is None else write_report(comparison, folder)
 
 

@@ -29,7 +29,7 @@ _MIDDLE = 0.35  # mean rank of the times at the edge, below which a fire would e
 
 
 def doubts_of_names(texts: Iterable[str], unit: str = "") -> Iterator[str]:
-    """Yields the signs in the description of a band, in tags and in the name of a file.
+    """Yields reasons to doubt that names (of a band, a tag, a file) mean arrival times.
 
     Args:
         texts: any text; one that names a time is no sign.
@@ -50,7 +50,7 @@ def doubts_of_names(texts: Iterable[str], unit: str = "") -> Iterator[str]:
 
 
 def doubts_of_values(times: np.ndarray, unit: Units) -> Iterator[str]:
-    """Yields the signs in the values of a raster.
+    """Yields reasons to doubt that the values of a raster are arrival times.
 
     Args:
         times: [rows, columns] as in the file, inf for never.

@@ -104,7 +104,7 @@ class Source(Protocol):
 
 
 class RasterSource:
-    """Arrival times on a raster whose rows run from north to south.
+    """Samples arrival times on a raster whose rows run from north to south.
 
     Args:
         times: float [rows, columns], inf for never.

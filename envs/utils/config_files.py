@@ -54,8 +54,11 @@ def place_of(error: Exception, chosen: Mapping[str, str], given: Collection[str]
     for group, name in chosen.items():
         file = find(group, name)
         value: Any = read(group, name)
-        for part in key[1].split("."):
-            value = value.get(part, _NONE) if isinstance(value, dict) else _NONE
+        parts = key[1].split(".")
+        # Files of fires and learners hold the keys below the name of their group.
+        for part in parts[1:] if group in ("fire", "learner") and parts[0] == group else parts:
+            if not isinstance(value, list):  # the numbers of a list stand in one file
+                value = value.get(part, _NONE) if isinstance(value, dict) else _NONE
         if value is not _NONE and own not in file.parents:
             return f"{file}: {text}"
     return text

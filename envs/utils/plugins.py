@@ -14,8 +14,20 @@ T = TypeVar("T")
 
 
 def registered(group: str) -> dict[str, EntryPoint]:
-    """Returns the entry points of a group, such as "emberlink.comm", by name."""
-    return {point.name: point for point in entry_points.read(group)}
+    """Returns the entry points of a group, such as "emberlink.comm", by name.
+
+    Raises:
+        UserError: two packages have an entry point of the same name.
+    """
+    points: dict[str, EntryPoint] = {}
+    for point in entry_points.read(group):
+        other = points.setdefault(point.name, point)
+        if other.value != point.value:
+            raise UserError(
+                f"entry point {point.name!r} of {group} is in two packages: {other.value} and "
+                f"{point.value}; remove or rename one"
+            )
+    return points
 
 
 @dataclass(frozen=True)

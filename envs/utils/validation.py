@@ -23,6 +23,19 @@ TAG = "kind:"
 Name = Annotated[str, Field(pattern=r"^\w[\w.+-]*$", max_length=100)]
 """text that can be part of file names and measures"""
 
+_EXPECTED = {
+    "dataclass_type": "expected keys and values",
+    "dict_type": "expected keys and values",
+    "tuple_type": "expected a list",
+    "too_long": "expected at most {max_length} values",
+    "too_short": "expected at least {min_length} values",
+    "int_type": "expected a whole number",
+    "float_type": "expected a number",
+    "bool_type": "expected true or false",
+    "string_type": "expected text",
+}
+"""type of a pydantic error -> its message; the others keep pydantic's"""
+
 
 def from_plain(config_type: type[T], values: Mapping[str, Any], key: str = "") -> T:
     """Returns a configuration from plain values, such as those of a YAML file.
@@ -79,7 +92,8 @@ def plain(value: Any, key: str = "", deepest: int = 16) -> Any:
     if isinstance(value, Mapping):
         for name in value:
             if not isinstance(name, str) or not name.isprintable():
-                raise UserError(f"key {shown(name)} in {key or 'the configuration'} is not a name")
+                where = key or "the configuration"
+                raise UserError(f"{where}: the key {shown(name)} is not a name")
         prefix = f"{key}." if key else ""
         return {name: plain(item, prefix + name, deepest - 1) for name, item in value.items()}
     if isinstance(value, list | tuple):
@@ -130,7 +144,8 @@ def describe(error: ValidationError, prefix: str = "") -> str:
     key = ".".join([prefix, *parts] if prefix else parts)
     if isinstance(cause := first.get("ctx", {}).get("error"), ValidationError):
         return describe(cause, key)
-    message = first["msg"].removeprefix("Value error, ").replace("Input should", "should", 1)
+    usual = first["msg"].removeprefix("Value error, ").replace("Input should", "should", 1)
+    message = _EXPECTED.get(first["type"], usual).format(**first.get("ctx", {}))
     if first["type"] in ("missing", "unexpected_keyword_argument"):
         wrong = "missing" if first["type"] == "missing" else "not known"
         return f"key {shown(key)!r} is {wrong}"

@@ -50,6 +50,8 @@ def compare_runs(paths: Sequence[Path]) -> Comparison:
             or a file is damaged.
     """
     runs, left_out = read_all(paths)
+    if not paths:
+        raise UserError("nothing to compare: expected at least one run folder")
     if not runs:
         reasons = "".join(f"; {path}: {why}" for path, why in left_out[:1])
         raise UserError(f"no finished run among {len(left_out)}: nothing to compare{reasons}")

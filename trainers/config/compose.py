@@ -2,7 +2,7 @@
 
 import threading
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from copy import deepcopy
 from dataclasses import fields, replace
 from functools import lru_cache
@@ -45,6 +45,8 @@ def resolve(method: str, overrides: Sequence[str] = (), **settings: Any) -> RunC
     Raises:
         UserError: the method, a key or a value is wrong; the message names it and what is known.
     """
+    if isinstance(overrides, str):
+        raise UserError(f"{shown(overrides)!r}: expected a list of texts key=value")
     given = [parse(text) for text in overrides]
     chosen = {"setup": "paper", "world": "paper"} | {
         key: str(value) for key, value in given if key in GROUPS
@@ -69,7 +71,10 @@ def resolve(method: str, overrides: Sequence[str] = (), **settings: Any) -> RunC
         config = from_values(values)
     except UserError as error:
         given_keys = {key for key, _ in given} | settings.keys()
-        raise UserError(place_of(error, {"method": method, **chosen}, given_keys)) from None
+        own = f"{chosen['setup']}_{method}"
+        files = {"setup_method": own} if own in configs.known("setup_method") else {}
+        files |= {"method": method, **chosen}
+        raise UserError(place_of(error, files, given_keys)) from None
     baselines = _baselines(chosen, _changes(radio, _radio(values)))
     return replace(config, baselines=baselines, fire=fires_of(config.fire).with_checksum())
 
@@ -240,7 +245,7 @@ def _changes(before: Mapping[str, Any], after: Mapping[str, Any]) -> dict[str, A
     return {key: value for key, value in after.items() if value != before.get(key)}
 
 
-def _drop_settings_of_other_learners(learner: dict[str, Any]) -> None:
+def _drop_settings_of_other_learners(learner: Any) -> None:
     """Removes the settings that a setup gives to another learner, such as `critic_lr` for DDPG.
 
     A setting that no learner has stays, and is an error later.
@@ -249,13 +254,14 @@ def _drop_settings_of_other_learners(learner: dict[str, Any]) -> None:
     def settings(name: str) -> set[str]:
         return {field.name for field in fields(learners.find(name).config_type)}
 
-    if learner.get("name") not in learners.known():
+    if not isinstance(learner, dict) or learner.get("name") not in learners.known():
         return
     foreign = learner.keys() - settings(learner["name"])
-    if foreign:
-        others = set().union(*map(settings, learners.known()))
-        for name in foreign & others:
-            del learner[name]
+    for other in learners.known() if foreign else ():
+        # Another package's learner that cannot be imported is an error only where it is chosen.
+        with suppress(UserError):
+            for name in foreign & settings(other) & learner.keys():
+                del learner[name]
 
 
 def _choose_seed(values: dict[str, Any], seed_is_given: bool) -> None:
@@ -273,7 +279,10 @@ def _choose_seed(values: dict[str, Any], seed_is_given: bool) -> None:
 
 def _not_known(key: str, known: Sequence[str], method: str) -> str:
     """Returns a message that a method does not have a key, with the methods that have it."""
-    others = [name for name in configs.known("method") if key in all_keys(read("method", name))]
+    others = []
+    for name in configs.known("method"):
+        with suppress(UserError):  # a file that cannot be read is an error only where it is chosen
+            others += [name] if key in all_keys(read("method", name)) else []
     if others:
         return f"key {key!r} is a setting of method {', '.join(others)}, not of {method}"
     return f"key {unknown(key, known, listed=False)}"

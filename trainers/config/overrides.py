@@ -97,7 +97,7 @@ def full_key(values: Mapping[str, Any], key: str) -> str:
 def all_keys(values: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
     """Yields the dotted keys of nested mappings, including those of inner mappings."""
     for key, value in values.items():
-        yield prefix + key
+        yield f"{prefix}{key}"
         if isinstance(value, Mapping):
             yield from all_keys(value, f"{prefix}{key}.")
 
@@ -107,5 +107,5 @@ def flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     result: dict[str, Any] = {}
     for key, value in values.items():
         below = flat(value, f"{prefix}{key}.") if isinstance(value, Mapping) else None
-        result |= {prefix + key: value} if below is None else below
+        result |= {f"{prefix}{key}": value} if below is None else below
     return result

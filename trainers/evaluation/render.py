@@ -115,7 +115,7 @@ def _steps(choices: Choices, horizon: int, suffixes: Sequence[str]) -> list[int]
     """Returns the steps to draw."""
     if suffixes != [".png"]:
         if choices.step is not None:
-            raise UserError(f"step={choices.step}: only of a picture, --output FILE.png")
+            raise UserError(f"step={choices.step}: needs a picture as output, --output FILE.png")
         frames = min(choices.frames, horizon + 1)
         return np.linspace(0, horizon, frames).round().astype(int).tolist()
     step = horizon if choices.step is None else choices.step

@@ -73,6 +73,10 @@ def find(text: str) -> list[Path]:
     matching = [path for path in folders if path.parts[-3:][: len(wanted)] == tuple(wanted)]
     usual = [path for path in folders if path.parts[-3:-1] == (USUAL_SETUP, name)]
     if not matching and not usual:
+        seeds = [path.name[1:] for path in folders if [*path.parts[-3:-1]] == wanted[:2]]
+        if seeds:
+            known = f"{'/'.join(wanted[:2])} has the seeds {', '.join(seeds)}"
+            raise UserError(f"{text}: no such trained policy; {known}")
         known = ", ".join(sorted({"/".join(path.parts[-3:-1]) for path in folders})) or "none"
         raise UserError(f"{text}: no such trained policy; known: {known}")
     return matching or usual

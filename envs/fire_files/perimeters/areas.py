@@ -62,8 +62,8 @@ def polygons(area: Any) -> list[Any]:
 def area_at_zero(areas: Sequence[Any], times: np.ndarray) -> Any:
     """Returns the area that burnt at time 0, before the first perimeter.
 
-    The four edges of the whole fire move at the speeds that they have from the first perimeter to
-    the second. The box around each polygon shrinks with them, to a point at most.
+    The edges of the fire's bounding box are extrapolated backwards with their speeds between the
+    first two perimeters. The box around each polygon shrinks with them, to a point at most.
 
     Args:
         areas: shapely polygons, one for each time.

@@ -1,4 +1,4 @@
-"""What a network remembers from decision to decision; one kind per file."""
+"""Memories of networks, which carry information from one decision to the next; one per file."""
 
 from emberlink.policies.networks.memory.base import Memory
 from emberlink.policies.networks.memory.registry import find, known

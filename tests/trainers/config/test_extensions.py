@@ -93,6 +93,38 @@ def test_a_wrong_value_of_a_user_s_world_names_the_file(folder):
         resolve("consensus", ["setup=tuned", "world=mine", "env.num_uavs=0"])
 
 
+@pytest.mark.parametrize(
+    ("file", "text", "arguments"),
+    [
+        ("setup/mine.yaml", "# @package _global_\nlearner: td3\n", ["setup=mine"]),
+        ("setup/mine.yaml", "# @package _global_\nlearner: {1: 3}\n", ["setup=mine"]),
+        ("setup/mine.yaml", "# @package _global_\nenv: {radio: {1: 3}}\n", ["setup=mine"]),
+        (
+            "setup_method/small_consensus.yaml",
+            "# @package _global_\nlearner:\n  gamma: 3\n",
+            ["setup=small"],
+        ),
+        ("fire/mine.yaml", "defaults:\n  - huygens\nhead_ros: [9, 1]\n", ["fire=mine"]),
+    ],
+)
+def test_a_wrong_value_in_any_file_of_a_user_names_the_file(file, text, arguments, folder):
+    write(folder, {file: text})
+    with pytest.raises(UserError, match=rf"^.*/{file}: ") as error:
+        resolve("consensus", arguments)
+    assert "\n" not in str(error.value)
+
+
+def test_a_broken_file_of_another_method_is_no_error(folder):
+    write(folder, {"method/broken.yaml": "- 1\n"})
+    with pytest.raises(UserError, match=r"key 'comm.range' is not known"):
+        resolve("consensus", ["comm.range=5"])
+
+
+def test_a_broken_learner_of_another_package_is_no_error(monkeypatch):
+    entry_point(monkeypatch, "emberlink.learners", "other", "nowhere:Learner")
+    assert resolve("consensus", ["setup=tuned", "learner=ippo"]).learner.name == "ippo"
+
+
 def entry_point(monkeypatch, group: str, name: str, value: str) -> None:
     point = metadata.EntryPoint(name, value, group)
     monkeypatch.setattr(
@@ -115,6 +147,14 @@ def test_an_invalid_entry_point_is_named_in_the_error(monkeypatch):
         registry.find("no_comm")
     entry_point(monkeypatch, "emberlink.comm", "other", "emberlink.comm.consensus:Consensus")
     assert registry.find("other") is Consensus
+    monkeypatch.setattr(
+        "emberlink.configs.entry_points.read",
+        lambda group: [metadata.EntryPoint("one", value, group) for value in ("a:A", "b:B")],
+    )
+    with pytest.raises(
+        UserError, match=r"'one' of emberlink\.comm is in two packages: a:A and b:B"
+    ):
+        registry.find("one")
     for value in ("nowhere.configs", "json.decoder"):
         entry_point(monkeypatch, "emberlink.configs", "other", value)
         with pytest.warns(UserWarning, match=f"emberlink.configs: there is no package {value}"):

@@ -107,7 +107,7 @@ def test_shipped_policies_can_be_compared(shipped, tmp_path):
     [
         ("pretrained:consensos", "tuned/consensus, tuned/independent"),
         ("pretrained:tuned", "is ambiguous"),
-        ("pretrained:tuned/consensus/4", "no such trained policy"),
+        ("pretrained:tuned/consensus/4", "policy; tuned/consensus has the seeds 3, 10"),
         ("pretrained:", "no such trained policy"),
         ("pretrained:../../tuned", "no such trained policy"),
     ],
