@@ -4,6 +4,7 @@ import ast
 import importlib
 import subprocess
 import sys
+from collections import Counter
 from pathlib import Path
 
 import pytest
@@ -66,6 +67,7 @@ def test_every_form_of_import_is_detected():
 
 LOADED = """
 import sys
+from collections import Counter
 before = set(sys.modules)
 import {module}
 heavy = {{"torch", "torchrl", "tensordict", "hydra", "wandb", "matplotlib", "pydantic"}}
@@ -135,3 +137,39 @@ def test_every_folder_with_code_is_a_package():
     folders = {file.parent for folder in FOLDERS for file in (ROOT / folder).rglob("*.py")}
     # comm has no __init__.py: it would hide Jupyter's package of that name in this folder.
     assert {folder.relative_to(ROOT).as_posix() for folder in folders} == {*ROOMS, "comm"}
+
+
+SOURCES = [path for folder in FOLDERS for path in sorted((ROOT / folder).rglob("*.py"))]
+
+
+def lines_of_functions(source: str) -> dict[str, int]:
+    """Returns the lines of each function, from its `def` to its end."""
+    functions = (
+        node
+        for node in ast.walk(ast.parse(source))
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
+    )
+    return {node.name: node.end_lineno - node.lineno + 1 for node in functions}
+
+
+def test_files_and_functions_are_short():
+    assert lines_of_functions("@one\ndef f():\n    def g():\n        pass\n\n    g()\n") == {
+        "f": 5,
+        "g": 2,
+    }
+    texts = {path.relative_to(ROOT).as_posix(): path.read_text() for path in SOURCES}
+    assert [name for name, text in texts.items() if len(text.splitlines()) > 300] == []
+    long = [
+        f"{name}: {function}"
+        for name, text in texts.items()
+        for function, lines in lines_of_functions(text).items()
+        if lines > 50
+    ]
+    assert long == []
+
+
+def test_folders_hold_few_files():
+    """A folder has at most 12 files besides `__init__.py` and `__main__.py`."""
+    files = [path for path in SOURCES if not path.name.startswith("__")]
+    counts = Counter(path.parent.relative_to(ROOT).as_posix() for path in files)
+    assert {folder: count for folder, count in counts.items() if count > 12} == {}
