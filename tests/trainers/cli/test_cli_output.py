@@ -246,7 +246,7 @@ def test_eval_takes_a_single_run(run, capsys):
     ("kind", "names"),
     [
         ("methods", ["consensus", "independent", "positional", "shared_memory"]),
-        ("setups", ["paper", "released", "tuned"]),
+        ("setups", ["paper", "released", "strong", "tuned"]),
         ("policies", ["stationary", "oracle"]),
     ],
 )
