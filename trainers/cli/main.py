@@ -154,7 +154,7 @@ def _parser() -> Parser:
         "--completion",
         action=PrintScript,
         choices=list(SCRIPTS),
-        help="print a shell's completion script and exit",
+        help="print a completion script, which the shell evaluates, and exit",
     )
     commands = parser.add_subparsers(dest="command", metavar="COMMAND")
     for add in (
