@@ -245,7 +245,9 @@ export class MapView {
       const colour = ROLE_COLOURS[this.role(uav) ?? 2];
       const target = this.point(...[0, 1].map((axis) => this.panel.target(this.step, uav * 2 + axis) / 100));
       if (this.panel.uavs <= MANY || uav === this.options.uav) {
-        this.line(colour, 1.25, [4, 4]);
+        this.line("--view-edge", 3, [4, 4]); // white on light ground needs an edge
+        this.stroke(this.radio(uav), target);
+        this.line(colour, 1.5, [4, 4]);
         this.stroke(this.radio(uav), target);
       }
       this.cross(target, 0.6 * this.half, "--view-edge", 4);
