@@ -22,6 +22,7 @@ extensions = [
     "sphinx.ext.autodoc",
     "sphinx.ext.intersphinx",
     "sphinx.ext.napoleon",
+    "maths",
     "reference_pages",
     "source_links",
 ]
@@ -29,7 +30,8 @@ exclude_patterns = ["data", "site"]
 nitpicky = False
 
 myst_heading_anchors = 4
-myst_enable_extensions = ["colon_fence"]
+myst_enable_extensions = ["colon_fence", "dollarmath"]
+html_math_renderer = "mathml"
 nb_execution_mode = "force"
 nb_execution_timeout = 300
 nb_execution_raise_on_error = True
@@ -43,6 +45,7 @@ napoleon_use_rtype = False
 intersphinx_mapping = write_inventories(HERE.parent / "build" / "inventories")
 
 html_static_path = ["_static"]
+html_extra_path = ["replay.html"]
 html_css_files = ["site.css"]
 html_theme = "pydata_sphinx_theme"
 html_context = {"default_mode": "auto"}

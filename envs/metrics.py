@@ -32,16 +32,22 @@ HIGHER_IS_BETTER = frozenset({"mean_reward", "coverage", "coverage_auc", "base_c
 
 
 def mean_reward(reward: Tensor) -> Tensor:
-    """Returns the mean reward over UAVs and steps (figure 5): [..., T, n] -> [...]."""
+    """Returns the mean reward over UAVs and steps (the paper's figure 5). It depends on the setup.
+
+    Args:
+        reward: [..., T, n].
+    """
     return reward.float().mean((-2, -1))
 
 
 def coverage(seen: Tensor, burnt: Tensor) -> Tensor:
-    """Returns cells seen while they burned / cells that have burnt, at the end, in % (figure 6).
+    """Returns the share of burnt cells that a UAV saw, at the end of the episode, in % (figure 6).
+
+    Seen are the cells that any UAV has seen while they burned. Burnt are the cells that burn or
+    have burnt out. Where cells burn for ever, it is the share of burning cells that have been seen.
 
     Args:
-        seen, burnt: counts of cells after each step, [..., T]; in the paper's world cells burn for
-            ever, so that all burnt cells burn.
+        seen, burnt: counts of cells after each step, [..., T].
 
     Returns:
         float32 [...]; 100 where nothing has burnt.
@@ -50,32 +56,58 @@ def coverage(seen: Tensor, burnt: Tensor) -> Tensor:
 
 
 def coverage_auc(seen: Tensor, burnt: Tensor) -> Tensor:
-    """Returns cells seen / cells burnt, in %, averaged over steps. Arguments as `coverage`."""
+    """Returns the share of `coverage` averaged over all steps, in %.
+
+    Args:
+        seen, burnt: as for `coverage`.
+    """
     return _ratio(seen, burnt).mean(-1)
 
 
 def time_to_full_coverage(seen: Tensor, burnt: Tensor) -> Tensor:
-    """Returns the first step at which every burnt cell has been seen. Arguments as `coverage`."""
+    """Returns the first step at which every burnt cell has been seen while it burned.
+
+    The horizon if there is none.
+
+    Args:
+        seen, burnt: as for `coverage`.
+    """
     return _first_step(seen == burnt)
 
 
 def tracking_first(on_fire: Tensor) -> Tensor:
-    """Returns the first step at which any UAV sees fire (figure 7). on_fire bool [..., T, n]."""
+    """Returns the first step at which any UAV sees fire; the horizon if there is none (figure 7).
+
+    Args:
+        on_fire: whether a UAV sees fire, bool [..., T, n].
+    """
     return _tracking(on_fire).amin(-1)
 
 
 def tracking_last(on_fire: Tensor) -> Tensor:
-    """Returns the first step by which every UAV has seen fire (figure 7). bool [..., T, n]."""
+    """Returns the first step by which every UAV has seen fire; the horizon if none (figure 7).
+
+    Args:
+        on_fire: as for `tracking_first`.
+    """
     return _tracking(on_fire).amax(-1)
 
 
 def boundary_exits(left: Tensor) -> Tensor:
-    """Returns attempted moves out of the box, mean over UAVs (figure 8). bool [..., T, n]."""
+    """Returns the attempted moves out of the box in x, y or z, mean over UAVs (figure 8).
+
+    Args:
+        left: whether a move would have left the box, bool [..., T, n].
+    """
     return left.sum(-2).float().mean(-1)
 
 
 def fire_losses(on_fire: Tensor) -> Tensor:
-    """Returns how often a UAV lost sight of fire, mean over UAVs (figure 9). bool [..., T, n]."""
+    """Returns how often a UAV lost sight of fire, mean over UAVs (figure 9).
+
+    Args:
+        on_fire: as for `tracking_first`.
+    """
     lost = on_fire[..., :-1, :] & ~on_fire[..., 1:, :]
     return lost.sum(-2).float().mean(-1)
 
@@ -93,17 +125,32 @@ def front_age(ages: Tensor) -> Tensor:
 
 
 def front_age_p95(ages: Tensor) -> Tensor:
-    """Returns the 95th percentile of the ages of `front_age`; `keys.FRONT_AGE_P95` [..., T]."""
+    """Returns the 95th percentile of the ages of `front_age`.
+
+    Above 511 steps it is rounded down by less than 1 %.
+
+    Args:
+        ages: `keys.FRONT_AGE_P95` after each step, [..., T].
+    """
     return ages[..., -1]
 
 
 def bytes_per_step(sent: Tensor) -> Tensor:
-    """Returns the bytes that a UAV sends in a step, mean over UAVs and steps: int64 [..., T, n]."""
+    """Returns the bytes that a UAV sends in a step, mean over UAVs and steps.
+
+    Of the scripted policies, those of `map_greedy` send their map (2 bytes a cell) and target (8
+    bytes), the others nothing.
+
+    Args:
+        sent: `keys.BYTES_SENT` after each step, int64 [..., T, n].
+    """
     return sent.double().mean((-2, -1)).float()
 
 
 def base_coverage(seen: Tensor, burnt: Tensor) -> Tensor:
-    """Returns the coverage by sightings that reached the base, in %.
+    """Returns the share of burnt cells of which a sighting reached the base, at the end, in %.
+
+    The sighting was made while the cell burned.
 
     Args:
         seen: `keys.BASE_SEEN` after each step, [..., T].
@@ -113,7 +160,11 @@ def base_coverage(seen: Tensor, burnt: Tensor) -> Tensor:
 
 
 def base_age(ages: Tensor) -> Tensor:
-    """Returns `front_age` with the sightings that reached the base; `keys.BASE_AGE` [..., T]."""
+    """Returns `front_age` with the sightings that reached the base.
+
+    Args:
+        ages: `keys.BASE_AGE` after each step, [..., T].
+    """
     return ages[..., -1]
 
 

@@ -22,6 +22,16 @@ from emberlink.trainers.config.compose import to_values
 from emberlink.trainers.learners import registry as learners
 from emberlink.trainers.sweep.executors import registry as executors
 
+_WORDS = {
+    int: "whole number",
+    float: "number",
+    str: "text",
+    bool: "true or false",
+    dict: "names and values",
+    type(None): "null",
+}
+_NO_LIMIT = 1e12
+"""a limit that only excludes infinity"""
 _BOUNDS = {"ge": "≥", "gt": ">", "le": "≤", "lt": "<"}
 _SKIPPED = {"baselines", "comm", "learner", "fire", "saved_copy", "sha256", "test_sha256"}
 
@@ -133,7 +143,11 @@ def _keys(cls: type, prefix: str, values: Mapping[str, Any]) -> Iterator[tuple[s
 
 def _default(field: Any) -> Any:
     given = field.default
-    return getattr(given, "default", given) if type(given).__name__ == "FieldInfo" else given
+    if type(given).__name__ == "FieldInfo":
+        given = given.default_factory() if given.default_factory else given.default
+    elif given is MISSING and field.default_factory is not MISSING:
+        given = field.default_factory()
+    return given
 
 
 def _meanings(cls: type) -> dict[str, str]:
@@ -144,7 +158,8 @@ def _meanings(cls: type) -> dict[str, str]:
             documented = ModuleAnalyzer.for_module(base.__module__).find_attr_docs()
             for (owner, name), lines in documented.items():
                 if owner == base.__qualname__:
-                    found[name] = " ".join(lines).strip().replace("|", "\\|")
+                    text = " ".join(lines).strip().replace("|", "\\|")
+                    found[name] = re.sub(r"\bNone\b", "null", text)
     return found
 
 
@@ -160,17 +175,19 @@ def _type(hint: Any) -> str:
         return " or ".join(_type(part) for part in arguments)
     if origin is tuple:
         if arguments[-1] is Ellipsis:
-            return f"list of {_type(arguments[0])}"
-        return f"[{', '.join(_type(part) for part in arguments)}]"
-    return "null" if hint is type(None) else getattr(hint, "__name__", str(hint))
+            return f"list, each {_type(arguments[0])}"
+        parts = [_type(part) for part in arguments]
+        return f"{len(parts)} values, each {parts[0]}" if len({*parts}) == 1 else ", ".join(parts)
+    return _WORDS.get(hint, getattr(hint, "__name__", str(hint)))
 
 
 def _bounds(part: Any) -> Iterator[str]:
     for item in getattr(part, "metadata", [part]):
         for name, sign in _BOUNDS.items():
             limit = getattr(item, name, None)
-            if isinstance(limit, int | float):
-                yield f"{sign} {limit:g}"
+            if isinstance(limit, int | float) and abs(limit) < _NO_LIMIT:
+                whole = f"{limit:,.0f}"
+                yield f"{sign} {whole if limit == int(limit) else f'{limit:f}'.rstrip('0')}"
 
 
 def _plain(value: Any) -> str:

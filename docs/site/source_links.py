@@ -1,5 +1,10 @@
-"""Shows links to files outside of the site as paths: the site holds the pages only."""
+"""Changes links to files: those outside of the site become paths, copied pages are opened.
 
+The site holds the pages only, and the files of `html_extra_path`. Sphinx would offer those for
+download.
+"""
+
+import os
 import re
 from pathlib import Path
 from typing import Any
@@ -16,12 +21,16 @@ def setup(app: Sphinx) -> dict[str, Any]:
 
 
 def _rewrite(app: Sphinx, page: str, source: list[str]) -> None:
-    """Replaces links to files that are not part of the site in the source of a page."""
+    """Replaces links to files that are not pages of the site in the source of a page."""
     folder = Path(app.srcdir, page).parent
     root = Path(app.srcdir).parent
+    copied = [Path(app.srcdir, name).resolve() for name in app.config.html_extra_path]
 
     def replace(match: re.Match[str]) -> str:
         target = (folder / match["target"]).resolve()
+        if target in copied:
+            address = Path(os.path.relpath(target, folder)).as_posix()
+            return f'<a href="{address}{match["anchor"] or ""}">{match["text"]}</a>'
         in_site = target.is_relative_to(app.srcdir) and "data" not in target.parts
         if in_site or not target.exists():
             return match[0]  # a link to nowhere is a warning of Sphinx

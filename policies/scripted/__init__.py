@@ -1,6 +1,20 @@
 """Scripted policies: baselines that learned policies are compared with."""
 
-from emberlink.policies.scripted.base import Scripted
-from emberlink.policies.scripted.registry import SCRIPTED
+from typing import TYPE_CHECKING
 
-__all__ = ["SCRIPTED", "Scripted"]
+from emberlink.envs.utils.lazy import lazy
+
+if TYPE_CHECKING:
+    from emberlink.policies.scripted.base import Scripted
+    from emberlink.policies.scripted.registry import SCRIPTED
+
+__all__ = ["ORDER", "SCRIPTED", "Scripted"]
+
+ORDER = (
+    *("stationary", "random_actions", "random_waypoints"),
+    *("lawnmower", "follow_target"),
+    *("map_greedy_alone", "map_greedy", "map_greedy_all", "courier", "oracle"),
+)
+"""the names of emberlink's own, in the order of tables"""
+
+__getattr__ = lazy(__name__, {"SCRIPTED": "registry", "Scripted": "base"})

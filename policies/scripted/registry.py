@@ -5,14 +5,10 @@ from collections.abc import Collection, Iterator, Mapping
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.plugins import Registry
 from emberlink.envs.utils.validation import unknown
+from emberlink.policies.scripted import ORDER
 from emberlink.policies.scripted.base import Scripted
 
 _REGISTRY = Registry(Scripted, "emberlink.policies.scripted", "policy", group="emberlink.scripted")
-_ORDER = (
-    *("stationary", "random_actions", "random_waypoints"),
-    *("lawnmower", "follow_target"),
-    *("map_greedy_alone", "map_greedy", "map_greedy_all", "courier", "oracle"),
-)
 
 
 class _Policies(Mapping[str, type[Scripted]]):
@@ -25,7 +21,7 @@ class _Policies(Mapping[str, type[Scripted]]):
 
     def __iter__(self) -> Iterator[str]:
         known = _REGISTRY.known()
-        return iter([*_ORDER, *(name for name in known if name not in _ORDER)])
+        return iter([*ORDER, *(name for name in known if name not in ORDER)])
 
     def __len__(self) -> int:
         return len(_REGISTRY.known())
@@ -44,4 +40,4 @@ def to_play(wanted: Collection[str]) -> list[str]:
     for name in wanted:
         if name not in SCRIPTED:
             raise UserError(unknown(name, SCRIPTED))
-    return [name for name in SCRIPTED if name in wanted or name not in _ORDER]
+    return [name for name in SCRIPTED if name in wanted or name not in ORDER]

@@ -3,20 +3,13 @@
 import argparse
 from typing import TYPE_CHECKING, Any
 
+from emberlink.trainers.cli.completion import KINDS
 from emberlink.trainers.cli.parser import command
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-_GROUPS = {
-    "methods": "method",
-    "setups": "setup",
-    "worlds": "world",
-    "fires": "fire",
-    "learners": "learner",
-    "executors": "executor",
-}
-_KINDS = (*_GROUPS, "policies")
+_KINDS = (*KINDS, "policies")
 
 
 def add_list(commands: Any) -> None:
@@ -56,7 +49,7 @@ def described(kind: str) -> list[tuple[str, str]]:
     from emberlink.policies.scripted.registry import SCRIPTED
 
     if kind != "policies":
-        return [(name, describe(_GROUPS[kind], name)) for name in known(_GROUPS[kind])]
+        return [(name, describe(KINDS[kind], name)) for name in known(KINDS[kind])]
     texts = {name: inspect.getdoc(policy) or "" for name, policy in SCRIPTED.items()}
     return [(name, " ".join(text.split("\n\n")[0].split())) for name, text in texts.items()]
 

@@ -8,9 +8,8 @@ from collections.abc import Sequence
 from contextlib import suppress
 from typing import Any
 
-import shtab
-
 from emberlink.trainers.cli.compare import add_compare
+from emberlink.trainers.cli.completion import SCRIPTS, PrintScript, complete
 from emberlink.trainers.cli.doctor import add_doctor
 from emberlink.trainers.cli.eval import add_eval
 from emberlink.trainers.cli.fire import add_fire
@@ -50,7 +49,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _parse_and_run(arguments: Sequence[str] | None) -> int:
     parser = _parser()
+    words = sys.argv[1:] if arguments is None else arguments
     try:
+        if words[:1] == ["--complete"]:  # of the script that --completion prints
+            sys.stdout.writelines(f"{word}\n" for word in complete(words[1:], parser))
+            return 0
         options = parser.parse_args(arguments)
         if options.command is None:
             parser.print_help()
@@ -147,7 +150,12 @@ def _parser() -> Parser:
         epilog="Runs on Linux and macOS.",
     )
     parser.add_argument("--version", action=_Version, nargs=0, help="print the version and exit")
-    shtab.add_argument_to(parser, "--completion", help="print a shell's completion script and exit")
+    parser.add_argument(
+        "--completion",
+        action=PrintScript,
+        choices=list(SCRIPTS),
+        help="print a completion script, which the shell evaluates, and exit",
+    )
     commands = parser.add_subparsers(dest="command", metavar="COMMAND")
     for add in (
         *(add_train, add_eval, add_compare, add_render),

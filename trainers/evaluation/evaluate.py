@@ -281,7 +281,12 @@ def play_blocks(
 
 
 def film(
-    config: RunConfig, policy: Policy, *, fire: Tensor | ScenarioConfig, frames: int = 100
+    config: RunConfig,
+    policy: Policy,
+    *,
+    fire: Tensor | ScenarioConfig,
+    frames: int = 100,
+    watch: Watch | None = None,
 ) -> tuple[list[np.ndarray], list[int]]:
     """Returns frames of test episode 0 on a fire, uint8 [height, width, 3], and their steps."""
     env = build_env(config, num_envs=1, fire=fire, seed=START_SEED, device=config.device)
@@ -292,6 +297,8 @@ def film(
     def draw(world: WildfireEnv, td: TensorDictBase) -> None:
         if int(td.get(keys.STEP)[0]) in wanted:
             pictures.append(world.render())
+        if watch is not None:
+            watch(world, td)
 
     play(env, policy, draw)
     return pictures, sorted(wanted)

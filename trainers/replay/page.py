@@ -27,7 +27,7 @@ class Replay:
     """
 
     def __init__(self, shown: Sequence[Shown], fire: str):
-        self.html = _page(shown, fire)
+        self.html = page_of(pack(shown, fire), fire)
         """the whole page"""
 
     def save(self, path: Path) -> None:
@@ -45,7 +45,13 @@ class Replay:
         )
 
 
-def _page(shown: Sequence[Shown], fire: str) -> str:
+def page_of(data: bytes, fire: str) -> str:
+    """Returns the page of packed episodes.
+
+    Args:
+        data: result of `pack`.
+        fire: name of the fire.
+    """
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True)
     return environment.from_string(_read("web", "page.html")).render(
         fire=fire,
@@ -54,7 +60,7 @@ def _page(shown: Sequence[Shown], fire: str) -> str:
         uplot=_read("uplot", "uPlot.iife.min.js"),
         uplot_licence=_read("uplot", "LICENSE"),
         script=script(),
-        data=base64.b64encode(pack(shown, fire)).decode(),
+        data=base64.b64encode(data).decode(),
     )
 
 

@@ -16,6 +16,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from matplotlib.axes import Axes
 from synthetic_runs import read_evaluation, write_evaluation, write_run
+from unpack_replay import data_of
 
 from emberlink.envs import metrics
 from emberlink.trainers import compare
@@ -807,3 +808,14 @@ def test_the_page_links_to_the_replays_of_runs(runs, tmp_path):
     target = (tmp_path / "report" / unquote(html.unescape(address))).resolve()
     assert target == (with_replay / "figures" / "replay.html").resolve()
     assert not address.startswith("/")
+
+
+def test_the_page_links_to_a_replay_also_of_runs_without_one(run, tmp_path):
+    shutil.rmtree(run / "figures")  # as the trained policies that come with emberlink
+    compare([run], output=tmp_path / "report")
+    page = (tmp_path / "report" / "compare.html").read_text()
+    assert re.findall(r'<a href="([^"]*)">Replay</a>', page) == ["1_paper_replay.html"]
+    header = data_of((tmp_path / "report" / "1_paper_replay.html").read_text())
+    assert [panel["title"] for panel in header["panels"]] == ["consensus, seed 0"]
+    assert header["fire"] == "huygens:0"
+    assert header["horizon"] == 15

@@ -8,6 +8,7 @@ import math
 import os
 import re
 from html.parser import HTMLParser
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -22,7 +23,7 @@ from emberlink.trainers import load
 from emberlink.trainers.cli import main
 from emberlink.trainers.evaluation import panels
 from emberlink.trainers.replay.pack import Shown
-from emberlink.trainers.replay.page import Replay, script
+from emberlink.trainers.replay.page import Replay, page_of, script
 from emberlink.trainers.replay.record import Recording
 
 HOSTILE = "</script><script>alert(1)</script><img src=x onerror=alert(2)>{{ 7*7 }}\"'&amp;"
@@ -336,3 +337,9 @@ def test_long_episodes_use_wider_integers(episode):
     assert data["horizon"] == 70_000
     assert set(data["ignition"][0]) == {69_000}
     assert set(data["end"][0]) == {69_900}
+
+
+def test_the_page_of_the_documentation_has_the_current_code():
+    page = (Path(__file__).parents[3] / "docs" / "replay.html").read_text()
+    (text,) = re.findall(r'id="data">([^<]*)<', page)
+    assert page == page_of(base64.b64decode(text), data_of(page)["fire"])

@@ -272,25 +272,6 @@ def test_hostile_names_are_text(tab):
     assert tab.page.locator("h1 b, .title b, .u-label b, figcaption b").count() == 0
 
 
-def test_it_is_usable_on_a_phone(browser, file):
-    phone = {"viewport": {"width": 400, "height": 800}, "has_touch": True, "is_mobile": True}
-    tab = Tab(browser, f"file://{file}", **phone)
-    tab.page.wait_for_selector("#curves .uplot")
-    assert tab.page.evaluate("document.documentElement.scrollWidth") <= 400
-    controls = ("#first", "#back", "#play", "#forth", "#end", "#slider", "#speed", "#heat", "#uav")
-    for control in controls:
-        tab.page.locator(control).scroll_into_view_if_needed()
-        box = tab.page.locator(control).bounding_box()
-        assert box["x"] >= 0, control
-        assert box["x"] + box["width"] <= 400, control
-    for canvas in tab.page.locator("canvas.map").all():
-        assert canvas.bounding_box()["width"] > 300
-    tab.page.tap("#forth")
-    assert step_of(tab) == 1
-    assert tab.problems == []
-    tab.close()
-
-
 def test_dark_pages_have_other_colours(browser, file):
     found = []
     for scheme in ("light", "dark"):

@@ -1,25 +1,38 @@
-"""Draws the figures of a section of the report."""
+"""Draws the figures of a section of the report and writes its replay."""
 
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 from emberlink.trainers.comparison.rankings import Numbers
 from emberlink.trainers.comparison.report import plots
-from emberlink.trainers.comparison.report.page import Chapter, Picture
+from emberlink.trainers.comparison.report.page import Chapter, Picture, ReplayFile
 from emberlink.trainers.comparison.runs import newest_checkpoint
 from emberlink.trainers.evaluation import evaluate
 from emberlink.trainers.evaluation.actor import load_actor
+from emberlink.trainers.evaluation.panels import follows_advice
 from emberlink.trainers.evaluation.plots import timelapse
+from emberlink.trainers.replay import Recorder, Replay
+from emberlink.trainers.replay.pack import Shown
 
 FRAMES = 5
 """frames of a timelapse"""
 
 
+@dataclass(frozen=True)
+class _Film:
+    """An episode: its timelapse, the name of its fire, and what a replay shows of it."""
+
+    timelapse: Picture
+    fire: str
+    shown: Shown
+
+
 def draw(
     folder: Path, place: int, numbers: Numbers, notes: list[str], say: Callable[[str], None]
 ) -> Chapter:
-    """Draws the figures and timelapses of a section.
+    """Draws the figures and timelapses of a section, and writes its replays.
 
     Args:
         folder: folder of the report.
@@ -40,8 +53,9 @@ def draw(
         path = folder / f"{stem}_figure_{number}.png"
         plots.figure(path, numbers, measures)
         pictures.append(Picture(path, _caption(numbers, number, caption)))
-    films = list(_timelapses(folder, stem, numbers, notes, say))
-    return Chapter(numbers, frozen, pictures, films)
+    films = list(_films(folder, stem, numbers, notes, say))
+    replays = list(_replays(folder, stem, films))
+    return Chapter(numbers, frozen, pictures, [film.timelapse for film in films], replays)
 
 
 def _as_file_name(name: str) -> str:
@@ -76,25 +90,39 @@ def _caption(numbers: Numbers, number: int, content: str) -> str:
     return text
 
 
-def _timelapses(
+def _films(
     folder: Path, stem: str, numbers: Numbers, notes: list[str], say: Callable[[str], None]
-) -> Iterator[Picture]:
-    """Draws a timelapse of the first seed of each method and yields the figures."""
+) -> Iterator[_Film]:
+    """Plays an episode of the first seed of each method and draws its timelapse."""
     for place, group in enumerate(numbers.section.as_trained, 1):
         run = group.runs[0]
         newest = newest_checkpoint(run.path)
         if newest is None:
-            notes.append(f"{run.path}: has no checkpoint, so there is no timelapse of it")
+            notes.append(f"{run.path}: has no checkpoint, so there is no timelapse or replay of it")
             continue
         say(f"timelapse of {group.label}")
         actor = load_actor(run.config, newest)
         fire, arrival = evaluate.shown_fire(run.config)
-        pictures, steps = evaluate.film(run.config, actor, fire=arrival, frames=FRAMES)
+        recorder = Recorder(advised=follows_advice(run.config, actor))
+        pictures, steps = evaluate.film(
+            run.config, actor, fire=arrival, frames=FRAMES, watch=recorder.add
+        )
         path = folder / f"{stem}_timelapse_{place}.png"
         timelapse(path, pictures, steps, group.label)
-        yield Picture(
-            path,
+        caption = (
             f"{group.label}, seed {run.config.seed}: the frozen policy of {newest.name} on the "
             f"first held-out fire of {fire}, from the same start positions as every other method. "
-            "Fire white, field of view yellow, UAVs blue.",
+            "Fire white, field of view yellow, UAVs blue."
         )
+        title = f"{group.label}, seed {run.config.seed}"
+        shown = Shown(title=title, recording=recorder.recording())
+        yield _Film(Picture(path, caption), fire, shown)
+
+
+def _replays(folder: Path, stem: str, films: Sequence[_Film]) -> Iterator[ReplayFile]:
+    """Writes a page for each fire that plays the methods side by side."""
+    for place, fire in enumerate(dict.fromkeys(film.fire for film in films)):
+        shown = [film.shown for film in films if film.fire == fire]
+        path = folder / f"{stem}_replay{f'_{place + 1}' if place else ''}.html"
+        Replay(shown, f"{fire}:0").save(path)
+        yield ReplayFile(path, fire, len(shown))

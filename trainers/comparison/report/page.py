@@ -50,6 +50,21 @@ class Picture:
 
 
 @dataclass(frozen=True)
+class ReplayFile:
+    """A page beside the report that plays one episode of several methods.
+
+    Attributes:
+        path: the page.
+        fire: name of the scenario of the fire.
+        methods: number of methods on the page.
+    """
+
+    path: Path
+    fire: str
+    methods: int
+
+
+@dataclass(frozen=True)
 class Chapter:
     """The part of the page about one section.
 
@@ -58,12 +73,14 @@ class Chapter:
         frozen: figure of the frozen policies for each fire of the evaluation.
         figures: figures of the training.
         timelapses: timelapse of each method.
+        replays: replay of the methods for each fire of a timelapse.
     """
 
     numbers: Numbers
     frozen: Sequence[Picture]
     figures: Sequence[Picture]
     timelapses: Sequence[Picture]
+    replays: Sequence[ReplayFile]
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Writes compare.html, compare.json and the figures of a comparison."""
+"""Writes compare.html, compare.json, the figures and the replays of a comparison."""
 
 import os
 import tempfile
@@ -50,7 +50,7 @@ def _replays(comparison: Comparison, folder: Path) -> dict[Path, str]:
 def write_report(
     comparison: Comparison, folder: Path, say: Callable[[str], None] = lambda _: None
 ) -> Comparison:
-    """Writes compare.html, compare.json and the figures into a new or empty folder.
+    """Writes compare.html, compare.json, figures and replays into a new or empty folder.
 
     Args:
         comparison: result of `compare_runs`.

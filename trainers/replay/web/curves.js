@@ -1,7 +1,7 @@
 // Draws the measures against the step with uPlot; all charts share a cursor, which is the step.
 
 import { fixed, ratio } from "./unpack.js";
-import { uavColour } from "./map.js";
+import { uavStyle } from "./map.js";
 
 const PANEL_COLOURS = ["--panel-0", "--panel-1", "--panel-2", "--panel-3"];
 const DASHES = [[], [8, 4], [2, 3], [8, 3, 2, 3]];
@@ -56,11 +56,12 @@ export class Curves {
     this.show(this.step ?? 0);
   }
 
-  rewards(palette, panel, place, uav) {
+  rewards(palette, panel, place, chosen) {
+    const uav = Math.min(chosen, panel.uavs - 1); // panels may have teams of different sizes
     const lines = Array.from({ length: panel.uavs }, (_, number) => ({
       label: `UAV ${number}`,
       values: Array.from(this.steps, (step) => (step ? panel.reward(step, number) : null)),
-      stroke: uavColour(palette, number),
+      ...uavStyle(palette, number),
       width: number === uav ? 2.5 : 1,
       alpha: number === uav ? 1 : 0.55,
     }));

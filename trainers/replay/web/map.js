@@ -5,6 +5,7 @@ import { burns } from "./knowledge.js";
 const TRAIL = 80; // steps
 const MANY = 16; // UAVs above which links are thin and targets have no lines
 const UAV_COLOURS = ["--uav-0", "--uav-1", "--uav-2", "--uav-3", "--uav-4", "--uav-5"];
+const UAV_DASHES = [[], [9, 5], [2, 4], [12, 4, 2, 4]]; // of lines; with the colours 24 pairs
 const HEAT = ["--heat-0", "--heat-1", "--heat-2", "--heat-3", "--heat-4"];
 const ROLE_COLOURS = ["--discoverer", "--seeker", "--wanderer"];
 const SHAPES = [ // of the roles: corners right and down of the middle
@@ -21,9 +22,15 @@ export function colours() {
   return { named, bytes, heat: HEAT.map(bytes) };
 }
 
-/** Returns the colour of a UAV. */
-export function uavColour(palette, uav) {
-  return palette.named(UAV_COLOURS[uav % UAV_COLOURS.length]);
+/** Returns the colour and the dashes of a UAV's lines, and the colour of its number. */
+export function uavStyle(palette, uav) {
+  const name = UAV_COLOURS[uav % UAV_COLOURS.length];
+  const [red, green, blue] = palette.bytes(name);
+  return {
+    stroke: palette.named(name),
+    dash: UAV_DASHES[Math.floor(uav / UAV_COLOURS.length) % UAV_DASHES.length],
+    ink: 0.299 * red + 0.587 * green + 0.114 * blue > 140 ? "#000000" : "#ffffff",
+  };
 }
 
 /** Draws one panel: cells in colours, then lines and marks. */
@@ -46,7 +53,7 @@ export class MapView {
       [canvas.width, canvas.height] = size;
     }
     this.scale = width / data.columns;
-    this.half = Math.min(9, Math.max(5, 0.55 * this.scale));
+    this.half = Math.min(9.5, Math.max(7.5, 0.55 * this.scale)); // there is room for a number
     this.step = step;
     this.options = options;
     const pen = canvas.getContext("2d");
@@ -159,15 +166,19 @@ export class MapView {
     this.pen.strokeStyle = colour.startsWith("--") ? this.options.palette.named(colour) : colour;
     this.pen.lineWidth = width;
     this.pen.setLineDash(dashes);
+    this.pen.lineDashOffset = 0;
   }
 
   drawTrails() {
     const { pen, panel } = this;
     for (let uav = 0; uav < panel.uavs; uav++) {
-      this.line(uavColour(this.options.palette, uav), uav === this.options.uav ? 3.5 : 2.25);
+      const { stroke, dash } = uavStyle(this.options.palette, uav);
+      this.line(stroke, uav === this.options.uav ? 3.5 : 2.25, dash);
       for (let step = Math.max(1, this.step - TRAIL + 1); step <= this.step; step++) {
         pen.globalAlpha = 1 - (this.step - step) / TRAIL;
-        this.stroke(this.point(...this.place(uav, step - 1)), this.point(...this.place(uav, step)));
+        const [from, to] = [step - 1, step].map((at) => this.point(...this.place(uav, at)));
+        this.stroke(from, to);
+        pen.lineDashOffset += Math.hypot(to[0] - from[0], to[1] - from[1]); // dashes go on
       }
     }
     pen.globalAlpha = 1;
@@ -234,7 +245,9 @@ export class MapView {
       const colour = ROLE_COLOURS[this.role(uav) ?? 2];
       const target = this.point(...[0, 1].map((axis) => this.panel.target(this.step, uav * 2 + axis) / 100));
       if (this.panel.uavs <= MANY || uav === this.options.uav) {
-        this.line(colour, 1.25, [4, 4]);
+        this.line("--view-edge", 3, [4, 4]); // white on light ground needs an edge
+        this.stroke(this.radio(uav), target);
+        this.line(colour, 1.5, [4, 4]);
         this.stroke(this.radio(uav), target);
       }
       this.cross(target, 0.6 * this.half, "--view-edge", 4);
@@ -253,7 +266,9 @@ export class MapView {
   }
 
   drawUavs() {
-    for (let uav = 0; uav < this.panel.uavs; uav++) {
+    const { uav: chosen } = this.options;
+    const others = Array.from({ length: this.panel.uavs }, (_, uav) => uav).filter((uav) => uav !== chosen);
+    for (const uav of [...others, chosen]) { // the chosen one on top
       const place = this.radio(uav);
       if (this.flies(uav)) this.drawUav(uav, place);
       else if (this.options.failed) {
@@ -261,6 +276,16 @@ export class MapView {
         this.cross(place, this.half, "--failed", 3);
       }
     }
+  }
+
+  disc(right, down, radius, colour) {
+    const { pen } = this;
+    pen.beginPath();
+    pen.arc(right, down, radius, 0, 2 * Math.PI);
+    pen.fillStyle = colour;
+    pen.fill();
+    this.line("--view-edge", 1.5);
+    pen.stroke();
   }
 
   drawUav(uav, [right, down]) {
@@ -276,18 +301,12 @@ export class MapView {
       this.line("--view-edge", 1.5);
       pen.stroke();
     }
-    pen.beginPath();
-    pen.arc(right, down, half, 0, 2 * Math.PI);
-    pen.fillStyle = uavColour(palette, uav);
-    pen.fill();
-    const chosen = uav === this.options.uav;
-    this.line(chosen ? "--ring" : "--view-edge", chosen ? 3 : 1.5);
-    pen.stroke();
-    if (half >= 6) {
-      pen.fillStyle = "#ffffff";
-      pen.font = `700 ${Math.round(half * 1.25)}px system-ui, sans-serif`;
-      [pen.textAlign, pen.textBaseline] = ["center", "middle"];
-      pen.fillText(String(uav), right, down + 0.5);
-    }
+    const { stroke, ink } = uavStyle(palette, uav);
+    if (uav === this.options.uav) this.disc(right, down, half + 2.5, palette.named("--ring"));
+    this.disc(right, down, half, stroke);
+    pen.fillStyle = ink;
+    pen.font = `700 ${Math.round(half * (uav < 10 ? 1.3 : 1.15))}px system-ui, sans-serif`;
+    [pen.textAlign, pen.textBaseline] = ["center", "middle"];
+    pen.fillText(String(uav), right, down + 0.5);
   }
 }
