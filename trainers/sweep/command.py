@@ -1,15 +1,12 @@
 """Runs `emberlink sweep`: trains every combination, and resumes stopped runs."""
 
-import re
 import shlex
 from collections.abc import Sequence
 
-import yaml
 from rich.console import Console
 from rich.table import Table
 
 from emberlink.envs.utils.errors import UserError
-from emberlink.envs.utils.validation import shown
 from emberlink.trainers.sweep import executors
 from emberlink.trainers.sweep.jobs import Job, jobs_of
 from emberlink.trainers.sweep.manifest import Manifest
@@ -20,7 +17,6 @@ from emberlink.trainers.sweep.scheduler import Scheduler
 from emberlink.trainers.tracking import loggers
 
 _EXECUTOR = "executor"
-_TIME = re.compile(r"[\d-]+(:\d+)+")
 
 
 def sweep(
@@ -89,20 +85,14 @@ def _is_executor(text: str) -> bool:
 def _executor(arguments: Sequence[str], workers: int | None) -> tuple[str, executors.Executor]:
     """Returns the name and the executor of `executor=NAME` and `executor.KEY=VALUE`."""
     name = "local"
-    settings: dict[str, object] = {} if workers is None else {"workers": workers}
+    texts: dict[str, str] = {} if workers is None else {"workers": str(workers)}
     for text in filter(_is_executor, arguments):
         key, _, value = text.partition("=")
         if key == _EXECUTOR:
             name = value
         else:
-            try:
-                # YAML would read 4:00:00 as a number of base 60.
-                settings[key.partition(".")[2]] = (
-                    value if _TIME.fullmatch(value) else yaml.safe_load(value)
-                )
-            except yaml.YAMLError:
-                raise UserError(f"{shown(text)!r} is not of the form key=value") from None
-    return name, executors.make(name, settings)
+            texts[key.partition(".")[2]] = value
+    return name, executors.from_texts(name, texts)
 
 
 def _print_table(jobs: Sequence[Job], console: Console) -> None:

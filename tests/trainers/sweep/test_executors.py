@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 from tiny_run import TINY
 
+from emberlink.envs.utils.errors import UserError
 from emberlink.trainers.cli.main import main
 from emberlink.trainers.runs.run_folder import RunFolder
 from emberlink.trainers.sweep import executors
@@ -21,7 +22,6 @@ from emberlink.trainers.sweep.executors._times import minutes
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
-        (90, 90),
         ("90", 90),
         ("90:00", 90),
         ("90:30", 91),
@@ -35,6 +35,22 @@ from emberlink.trainers.sweep.executors._times import minutes
 )
 def test_times_have_the_forms_of_sbatch(text, expected):
     assert minutes(text) == expected
+
+
+@pytest.mark.parametrize("text", ["0", "0:00", "0-0", "-5", "1.5", "1:2:3:4", "1-", "", "None"])
+def test_other_times_are_errors(text):
+    with pytest.raises(UserError, match="expected minutes"):
+        minutes(text)
+
+
+def test_settings_that_are_texts_keep_their_form(monkeypatch):
+    monkeypatch.setattr(_extras, "find_spec", lambda _: True)
+    texts = {"account": "007", "partition": "12", "memory": "4000", "time": "4:00:00", "cpus": "2"}
+    config = executors.from_texts("submitit", texts)._config
+    assert (config.account, config.partition, config.memory) == ("007", "12", "4000")
+    assert (config.time, config.cpus) == ("4:00:00", 2)
+    config = executors.from_texts("submitit", {"partition": "null", "account": ""})._config
+    assert (config.partition, config.account, config.time) == (None, None, "60")
 
 
 @pytest.fixture
@@ -75,7 +91,13 @@ def test_a_machine_without_slurm_is_named(tmp_path, capsys, monkeypatch):
         (["executor=submitit", "executor.time=4:00:00:00"], "executor.time=4:00:00:00"),
         (["executor=submitit", "executor.cluster=debug"], "executor.cluster=debug"),
         (["executor=submitit", "executor.address=auto"], "'executor.address' is not known"),
+        (["executor=submitit", "executor.time=null"], "executor.time=None: expected minutes"),
+        (["executor=submitit", "executor.time=1"], "executor.notice=90: must be shorter than"),
+        (["executor=submitit", "executor.options={qos: low"], "executor.options={qos: low"),
         (["executor=ray", "executor.gpus=-1"], "executor.gpus=-1"),
+        (["executor=ray", "executor.gpus=1.5"], "executor.gpus=1.5: expected a fraction of 1 or"),
+        (["executor=ray", "executor.gpus=.nan"], "executor.gpus=nan"),
+        (["executor=ray", "executor.resources={a: 2.5}"], "executor.resources.a=2.5: expected a"),
         (["executor=ray", "executor.resources={a: 0}"], "executor.resources"),
         (["executor.seeds=0"], "executor.seeds=0"),
         (["executor.restarts=-1"], "executor.restarts=-1"),

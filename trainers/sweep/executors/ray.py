@@ -7,7 +7,7 @@ import threading
 import time
 from typing import Annotated, Any
 
-from pydantic import ConfigDict, Field
+from pydantic import AfterValidator, ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
 from emberlink.envs.utils.errors import UserError
@@ -19,7 +19,17 @@ _STOPPED = 128 + signal.SIGTERM
 _IDLE = 60.0
 """seconds after which the owner of ended tasks ends, too"""
 
+
+def _whole_above_1(value: float) -> float:
+    if value > 1 and value % 1:
+        raise UserError("expected a fraction of 1 or a whole number")
+    return value
+
+
 Positive = Annotated[int, Field(ge=1)]
+Part = Annotated[
+    float, Field(ge=0, strict=False, allow_inf_nan=False), AfterValidator(_whole_above_1)
+]
 
 
 @dataclass(frozen=True, kw_only=True, config=ConfigDict(extra="forbid", strict=True))
@@ -30,11 +40,11 @@ class RayConfig:
     """address of the cluster, or local"""
     cpus: Positive = 1
     """cores of a run"""
-    gpus: Annotated[float, Field(ge=0, strict=False)] = 0.0
+    gpus: Part = 0.0
     """GPUs of a run; a fraction shares one"""
     memory: Positive | None = None
     """bytes of a run"""
-    resources: dict[str, Annotated[float, Field(gt=0, strict=False)]] = Field(default_factory=dict)
+    resources: dict[str, Annotated[Part, Field(gt=0)]] = Field(default_factory=dict)
     """other resources of a run"""
     seeds: Positive = 1
     """seeds of a method that are trained in one process"""

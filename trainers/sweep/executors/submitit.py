@@ -9,7 +9,7 @@ from dataclasses import dataclass as plain_dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, ConfigDict, Field
+from pydantic import BeforeValidator, ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
 from emberlink.envs.utils.atomic_io import inner_folder, write_bytes
@@ -27,9 +27,9 @@ _LOOK = 10.0
 """seconds between two looks at SLURM's queue"""
 
 
-def _check_time(value: int | str) -> int | str:
-    minutes(value)
-    return value
+def _time(value: object) -> str:
+    minutes(str(value))
+    return str(value)
 
 
 Positive = Annotated[int, Field(ge=1)]
@@ -46,7 +46,7 @@ class SubmititConfig:
     """partition; SLURM's default if None"""
     account: str | None = None
     """account; SLURM's default if None"""
-    time: Annotated[int | str, AfterValidator(_check_time)] = 60
+    time: Annotated[str, BeforeValidator(_time)] = "60"
     """time of a job: minutes, or as in sbatch"""
     cpus: Positive = 1
     """cores of a job"""
@@ -68,6 +68,12 @@ class SubmititConfig:
     """runs at a time; all if None"""
     options: dict[str, str | int] = Field(default_factory=dict)
     """other options of sbatch"""
+
+    def __post_init__(self) -> None:
+        if self.notice >= 60 * minutes(self.time):
+            raise UserError(
+                f"executor.notice={self.notice}: must be shorter than executor.time={self.time}"
+            )
 
 
 class _Batch:
