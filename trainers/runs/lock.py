@@ -16,6 +16,10 @@ _MAX_HOLDER = 1000
 """bytes of a lock file that are read"""
 
 
+class LockedError(UserError):
+    """Reports that another process holds a lock."""
+
+
 class Lock:
     """Holds an exclusive lock on the file `lock` of a folder until `release`.
 
@@ -27,7 +31,8 @@ class Lock:
         doing: what processes do in it, for error messages.
 
     Raises:
-        UserError: another process holds the lock, `lock` is a link or not a regular file, or the
+        LockedError: another process holds the lock.
+        UserError: `lock` is a link or not a regular file, or the
             file system has no locks.
     """
 
@@ -45,7 +50,7 @@ class Lock:
             folder.stat()  # an error if it is missing: FileLock would create it
             self._lock.acquire()
         except Timeout:
-            raise UserError(f"{folder}: {self._holder()} is {doing} here") from None
+            raise LockedError(f"{folder}: {self._holder()} is {doing} here") from None
         except OSError as error:
             raise UserError(f"{self.path}: cannot be locked: {_reason(error)}") from None
 

@@ -96,11 +96,14 @@ def _executor(arguments: Sequence[str], workers: int | None) -> tuple[str, execu
 
 
 def _print_table(jobs: Sequence[Job], console: Console) -> None:
-    """Prints the state and the run folders of each job."""
+    """Prints the state and the run folders of each job, and why jobs failed."""
     table = Table("run", "state")
     table.add_column("folder", overflow="fold")
     for job in jobs:
-        state = job.failed or ("finished" if job.finished else "not finished")
+        state = "failed" if job.failed else "finished" if job.finished else "not finished"
         folders = "\n".join(run.folder.path.name for run in job.found.values())
         table.add_row(job.name, state, folders or "-")
     console.print(table)
+    for job in jobs:
+        if job.failed:
+            console.print(f"{job.name}: {job.failed}", soft_wrap=True)

@@ -85,6 +85,12 @@ class Job:
         return "finished" if self.finished else "unfinished" if self.found else "new"
 
     @property
+    def newest_state(self) -> str:
+        """The name of the newest checkpoint; empty if there is none."""
+        states = [state.name for run in self.found.values() for state in run.folder.states()[-1:]]
+        return max(states, default="")
+
+    @property
     def identities(self) -> set[Identity]:
         """The identities of all runs that the process trains.
 

@@ -36,6 +36,7 @@ class Row:
         log: log of the newest task, relative to the output folder.
         restarts: how often the run was started again after it ended without saving.
         note: the reason if the run failed.
+        changes: number of changes so far; the version with more changes is the newer one.
     """
 
     run: str
@@ -48,6 +49,7 @@ class Row:
     log: str = ""
     restarts: int = 0
     note: str = ""
+    changes: int = 0
 
 
 _EMPTY = Row(run="", name="", folder="", state="", episodes=0)
@@ -87,20 +89,13 @@ def _row(values: Mapping[str, Any]) -> Row:
     return row
 
 
-def write(output: Path, rows: Iterable[Row]) -> None:
+def _write(output: Path, rows: Mapping[str, Row]) -> None:
     """Writes the manifest completely, or leaves the earlier one.
 
-    Rows of other runs, which another sweep into the folder wrote, are kept.
-
-    Args:
-        output: folder of the run folders.
-        rows: the new rows.
-
     Raises:
-        UserError: the file cannot be written, or the earlier one is not a manifest.
+        UserError: the file cannot be written.
     """
-    all_rows = {**read(output), **{row.run: row for row in rows}}
-    content = {"format": _FORMAT, "runs": [asdict(row) for row in all_rows.values()]}
+    content = {"format": _FORMAT, "runs": [asdict(row) for row in rows.values()]}
     try:
         output.mkdir(parents=True, exist_ok=True)
         text = json.dumps(content, indent=1) + "\n"
@@ -113,6 +108,9 @@ def write(output: Path, rows: Iterable[Row]) -> None:
 
 class Manifest:
     """The rows of the jobs of one sweep command; each change is written at once.
+
+    Other sweeps may write into the same file. Of each row, the newest version is kept; a version
+    that another sweep has overwritten at the same time is written again with the next change.
 
     Args:
         output: folder of the run folders.
@@ -129,18 +127,18 @@ class Manifest:
         Raises:
             UserError: the earlier file is not a manifest, or it cannot be written.
         """
-        jobs = list(jobs)
-        earlier = read(self._output)
+        rows = read(self._output)
         for job in jobs:
             for row in _rows(job):
-                old = earlier.get(row.run)
+                old = rows.get(row.run)
                 if old is not None:
                     state = row.state if row.state == "finished" or not job.found else old.state
-                    row = replace(old, state=state, folder=row.folder, episodes=row.episodes)
+                    new = replace(old, state=state, folder=row.folder, episodes=row.episodes)
+                    row = _changed(old, new)
                 elif job.found and row.state != "finished":
                     row = replace(row, state="stopped")
-                self.rows[row.run] = row
-        write(self._output, self.rows.values())
+                rows[row.run] = self.rows[row.run] = row
+        _write(self._output, rows)
 
     def set(self, job: Job, state: str, **changes: Any) -> None:
         """Changes the rows of a job and writes the manifest.
@@ -150,10 +148,14 @@ class Manifest:
             state: one of `STATES`.
             changes: other attributes of the rows.
         """
+        rows = read(self._output)
+        for run, row in self.rows.items():
+            rows[run] = self.rows[run] = max(rows.get(run, row), row, key=lambda row: row.changes)
         for row in _rows(job):
-            old = self.rows.get(row.run, row)
-            self.rows[row.run] = replace(old, state=state, folder=row.folder, **changes)
-        write(self._output, self.rows.values())
+            old = rows.get(row.run, row)
+            new = _changed(old, replace(old, state=state, folder=row.folder, **changes))
+            rows[row.run] = self.rows[row.run] = new
+        _write(self._output, rows)
 
     def of(self, job: Job) -> list[Row]:
         """Returns the rows of a job."""
@@ -164,6 +166,11 @@ class Manifest:
         tasks = {(row.executor, row.task) for row in self.of(job)}
         executor, task = tasks.pop() if len(tasks) == 1 else ("", "")
         return task if executor == self.executor else ""
+
+
+def _changed(old: Row, new: Row) -> Row:
+    """Returns the new version of a row."""
+    return new if new == old else replace(new, changes=old.changes + 1)
 
 
 def _rows(job: Job) -> list[Row]:

@@ -14,6 +14,7 @@ from emberlink.trainers.sweep.manifest import Manifest
 from emberlink.trainers.sweep.plan import plan
 from emberlink.trainers.sweep.progress import SweepProgress
 from emberlink.trainers.sweep.run_index import RunIndex
+from emberlink.trainers.sweep.slots import Slots
 from emberlink.trainers.sweep.worker import HELD
 from emberlink.trainers.terminal.signals import Interruption
 
@@ -68,7 +69,8 @@ class Scheduler:
         self._index, self._executor, self._progress = index, executor, progress
         self._manifest, self._leases, self._heart = manifest, Leases(index.output), Heart()
         self._waiting = [job for job in jobs if not job.finished]
-        self._slots = executor.slots(len(self._waiting))
+        self._slots = Slots(executor.slots(len(self._waiting)))
+        self._accepted = False
         self._running: dict[Job, _Running] = {}
         self._blocked: set[Job] = set()
         self._planned_with = index.size
@@ -117,7 +119,7 @@ class Scheduler:
             if handle is not None:
                 self._waiting.remove(job)
                 job.log = self._index.output / next(iter(self._manifest.of(job))).log
-                self._running[job] = _Running(handle, newest=_newest(job))
+                self._running[job] = _Running(handle, newest=job.newest_state)
 
     def _holder(self, run: str) -> str:
         """Returns the role of the process that holds a run, or an empty text."""
@@ -126,7 +128,7 @@ class Scheduler:
 
     def _submit(self) -> None:
         """Submits jobs that no other process holds until all slots are taken."""
-        while not self._stopping and len(self._running) < self._slots:
+        while not self._stopping and self._slots.has_room(len(self._running)):
             taken = self._claim_next()
             if taken is None:
                 return
@@ -176,15 +178,17 @@ class Scheduler:
         except OSError as error:
             self._heart.release(leases, "not started")
             raise UserError(f"{error.filename or job.output}: {error.strerror or error}") from None
-        except QueueFullError:
+        except QueueFullError as error:
             self._heart.release(leases, "not started")
-            if not self._running:
+            if not (self._accepted or self._running):
                 raise
-            self._slots = len(self._running)
             self._waiting.insert(0, job)
+            if self._slots.refused(len(self._running), str(error)):
+                self._progress.say(job, f"waits, {error}")
             return
+        self._accepted = True
         task = self._executor.name_of(handle)
-        self._running[job] = _Running(handle, leases, _newest(job), task=task)
+        self._running[job] = _Running(handle, leases, job.newest_state, task=task)
         self._manifest.set(
             job,
             "queued",
@@ -258,7 +262,7 @@ class Scheduler:
 
         Trainings that were interrupted and have saved some progress are not counted.
         """
-        if status in _SAVED and _newest(job) > running.newest:
+        if status in _SAVED and job.newest_state > running.newest:
             return True
         if (status >= 0 and status not in _SAVED) or job.restarts >= self._executor.restarts:
             return False
@@ -290,9 +294,3 @@ class Scheduler:
         self._stopping = True
         for running in self._running.values():
             self._executor.cancel(running.handle)
-
-
-def _newest(job: Job) -> str:
-    """Returns the name of the newest checkpoint of a job; empty if there is none."""
-    states = [state.name for run in job.found.values() for state in run.folder.states()[-1:]]
-    return max(states, default="")

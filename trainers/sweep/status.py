@@ -17,6 +17,8 @@ from emberlink.trainers.sweep.manifest import Row
 def status(arguments: Sequence[str], console: Console) -> int:
     """Prints a row for each run of a sweep: its state, its episodes, and where it is trained.
 
+    Below, there is a line for each run that failed.
+
     Nothing is written. The sweep may still be running, in another shell or on another machine.
 
     Args:
@@ -36,11 +38,15 @@ def status(arguments: Sequence[str], console: Console) -> int:
     table = Table("run", "state", "episodes", "coverage", "where")
     table.add_column("folder", overflow="fold")
     counts: Counter[str] = Counter()
+    failed: list[Row] = []
     for row in rows.values():
         state, where = _state(row, output, leases)
-        counts[state.partition(":")[0]] += 1
+        counts[state] += 1
+        failed += [row] if state == "failed" else []
         table.add_row(row.name, state, *_progress(row, output), where, row.folder)
     console.print(table)
+    for row in failed:
+        console.print(f"{row.name}: {row.note}", soft_wrap=True)
     console.print(f"{len(rows)} runs: " + ", ".join(f"{n} {state}" for state, n in counts.items()))
     return 0
 
@@ -53,8 +59,7 @@ def _state(row: Row, output: Path, leases: Leases) -> tuple[str, str]:
     holder = leases.newest(row.run)
     if holder is None or not leases.is_held(row.run, holder):
         # The process that was to change the state may have been killed.
-        state = "stopped" if row.state in ("running", "finished") else row.state
-        return (f"failed: {row.note}" if state == "failed" else state), ""
+        return "stopped" if row.state in ("running", "finished") else row.state, ""
     seen = f"{holder.holder}, {leases.since(row.run):.0f} s ago"
     return {TRAINING: "running", SWEEP: "queued"}[holder.role], seen
 

@@ -17,9 +17,12 @@ import signal
 import sys
 import threading
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
+from emberlink.envs.utils.errors import UserError
+from emberlink.trainers.runs.lock import Lock, LockedError
 from emberlink.trainers.sweep import leases
 
 HELD = 75
@@ -61,6 +64,31 @@ def _take(task: dict[str, Any]) -> list[leases.Lease] | int:
     return DIED_TOO_OFTEN
 
 
+def _wait_for_folders(arguments: Sequence[str]) -> bool:
+    """Waits for the locks of the run folders, and returns whether they are free.
+
+    A process that was suspended until it lost its lease holds them until it wakes up and ends.
+    """
+    from emberlink.trainers.training.folders import find_runs  # imports torch
+
+    folder = Path(arguments[0].removeprefix("resume="))
+    if not folder.is_dir():
+        return True  # the training reports it
+    began = time.monotonic()
+    while True:
+        try:
+            for run in find_runs(folder):
+                Lock(run.path).release()
+            return True
+        except LockedError as error:
+            if time.monotonic() - began > 1.5 * leases.PATIENCE:
+                print(error)
+                return False
+            time.sleep(_INTERVAL)
+        except UserError:
+            return True
+
+
 def _lost(lease: leases.Lease) -> NoReturn:
     """Ends the process at once: another one may already train the run."""
     print(
@@ -83,6 +111,9 @@ def main() -> int:
     heart.start()
     status = 1
     try:
+        if not _wait_for_folders(sys.argv[1:]):
+            status = HELD
+            return status
         sys.argv[1:1] = ["train"]
         runpy.run_module(_COMMAND_LINE, run_name="__main__", alter_sys=True)
         status = 0

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from tiny_run import TINY
@@ -15,7 +16,7 @@ from emberlink.envs.utils.errors import UserError
 from emberlink.trainers.cli.main import main
 from emberlink.trainers.runs.run_folder import RunFolder
 from emberlink.trainers.sweep import executors
-from emberlink.trainers.sweep.executors import Task, _extras, _process, local
+from emberlink.trainers.sweep.executors import Task, _extras, _process, local, submitit
 from emberlink.trainers.sweep.executors._times import minutes
 
 
@@ -111,6 +112,85 @@ def test_wrong_keys_are_named_in_one_line(arguments, said, tmp_path, capsys, mon
     assert said in error
     assert error.count("\n") == 1
     assert not any(tmp_path.iterdir())
+
+
+class Sbatch:
+    """Stands for submitit's executor; refuses jobs while `refuses` is a message."""
+
+    refuses = ""
+
+    def __init__(self):
+        self.jobs: list[int] = []
+
+    def submit(self, batch):
+        print("sbatch: error: printed by submitit", file=sys.stderr)
+        if self.refuses:
+            raise RuntimeError(self.refuses)
+        self.jobs.append(len(batch._tasks))
+        return SimpleNamespace(job_id=str(len(self.jobs)))
+
+
+@pytest.fixture
+def slurm(monkeypatch, tmp_path):
+    """An executor with two runs of a job, and what stands for sbatch."""
+    monkeypatch.setattr(_extras, "find_spec", lambda _: True)
+    executor, sbatch = executors.make("submitit", {"share": 2, "partition": "nope"}), Sbatch()
+    monkeypatch.setattr(executor, "_make", lambda folder: sbatch)
+    listed = "1 Priority\n2 Resources\n3 PartitionTimeLimit\n"
+    monkeypatch.setattr(submitit, "_slurm", lambda *command: listed)
+    return executor, sbatch, [Task([], tmp_path / f"{n}.txt", output=tmp_path) for n in range(6)]
+
+
+def test_a_job_that_slurm_never_takes_is_one_line_with_the_settings(slurm, capsys):
+    executor, sbatch, tasks = slurm
+    sbatch.refuses = "sbatch: error: invalid partition: nope\nsbatch: error: failed: Invalid name"
+    handle = executor.submit(tasks[0])
+    with pytest.raises(UserError) as error:
+        executor.submit(tasks[1])
+    assert not isinstance(error.value, executors.QueueFullError)
+    assert str(error.value) == (
+        "executor=submitit executor.partition=nope executor.time=60 executor.cpus=1: "
+        "invalid partition: nope; failed: Invalid name"
+    )
+    assert capsys.readouterr().err == ""
+    assert executor.poll(handle) is None
+
+
+def test_tasks_that_slurm_refuses_are_submitted_later(slurm, monkeypatch):
+    executor, sbatch, tasks = slurm
+    first = [executor.submit(task) for task in tasks[:2]]
+    sbatch.refuses = "Job violates accounting/QOS policy"
+    handle = executor.submit(tasks[2])
+    with pytest.raises(executors.QueueFullError):
+        executor.submit(tasks[3])
+    assert [executor.poll(one) for one in (*first, handle)] == [None] * 3
+    sbatch.refuses = ""
+    assert executor.poll(handle) is None
+    assert sbatch.jobs == [2]
+    monkeypatch.setattr(submitit, "_RETRY", 0.0)
+    executor.poll(handle)
+    assert sbatch.jobs == [2, 1]
+    assert handle.job.job_id == "2"
+
+
+def test_an_unusual_reason_for_which_jobs_wait_is_told_once(slurm):
+    executor, _, tasks = slurm
+    handles = [executor.submit(task) for task in tasks]
+    with pytest.warns(UserWarning, match="PartitionTimeLimit .*executor.time=60") as said:
+        assert [executor.poll(handle) for handle in handles] == [None] * 6
+    assert len(said) == 1
+
+
+def test_a_job_that_ends_before_its_training_is_explained(slurm, tmp_path, monkeypatch):
+    executor, _, tasks = slurm
+    handle, _ = executor.submit(tasks[0]), executor.submit(tasks[1])
+    (tmp_path / "1.err").write_text("srun: error\nModuleNotFoundError: No module\n\n")
+    handle.job = SimpleNamespace(job_id="9", paths=SimpleNamespace(stderr=tmp_path / "1.err"))
+    handle.seen -= 100
+    assert executor.poll(handle) == executors.DIED
+    said = tasks[0].log.read_text()
+    assert "ModuleNotFoundError: No module" in said
+    assert str(tmp_path / "1.err") in said
 
 
 def test_importing_an_executor_imports_no_package_of_an_extra():

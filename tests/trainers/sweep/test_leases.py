@@ -10,6 +10,7 @@ from dataclasses import replace
 
 import pytest
 
+from emberlink.trainers.runs.lock import Lock
 from emberlink.trainers.sweep import leases, worker
 from emberlink.trainers.sweep.leases import PATIENCE, SWEEP, TRAINING, Heart, Leases
 
@@ -195,6 +196,27 @@ def test_a_task_whose_run_is_held_ends(tmp_path, clock, monkeypatch, capsys):
     monkeypatch.setattr(leases.time, "sleep", sleep)
     assert worker._take(task(tmp_path, "of an earlier sweep")) == worker.HELD
     assert "another process is training this run" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("wakes", [True, False])
+def test_a_task_waits_for_a_suspended_holder_to_leave_the_folder(
+    tmp_path, clock, monkeypatch, capsys, wakes
+):
+    folder = tmp_path / "run"
+    folder.mkdir()
+    held, slept = Lock(folder), []
+
+    def sleep(seconds):
+        clock.now += seconds
+        slept.append(seconds)
+        if wakes and len(slept) == 3:
+            held.release()
+
+    monkeypatch.setattr(leases.time, "sleep", sleep)
+    assert worker._wait_for_folders([f"resume={folder}", "device=cpu"]) is wakes
+    assert ("is training here" in capsys.readouterr().out) is not wakes
+    assert wakes or sum(slept) > PATIENCE
+    held.release()
 
 
 def test_the_heart_writes_signs_of_life_and_reports_a_loss(tmp_path, monkeypatch):

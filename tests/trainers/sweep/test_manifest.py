@@ -65,14 +65,14 @@ def test_the_file_is_replaced_and_a_link_is_not_followed(tmp_path):
     outside = tmp_path / "outside"
     outside.write_text("kept")
     (tmp_path / "runs").mkdir()
-    manifest.write(tmp_path / "runs", [])
+    Manifest(tmp_path / "runs").load([])
     before = (tmp_path / "runs" / manifest.FILE).stat().st_ino
-    manifest.write(tmp_path / "runs", [])
+    Manifest(tmp_path / "runs").load([])
     assert (tmp_path / "runs" / manifest.FILE).stat().st_ino != before
     (tmp_path / "runs" / manifest.FILE).unlink()
     (tmp_path / "runs" / manifest.FILE).symlink_to(outside)
     with pytest.raises(ValueError, match="not a manifest"):
-        manifest.write(tmp_path / "runs", [])
+        Manifest(tmp_path / "runs").load([])
     assert outside.read_text() == "kept"
     assert [path.name for path in (tmp_path / "runs").iterdir()] == [manifest.FILE]
 
@@ -154,10 +154,38 @@ def test_status_reads_the_files_of_the_runs(tmp_path, capsys, monkeypatch):
     assert "process " in lines["1"]
     assert "stopped" in lines["2"]
     assert "queued" in lines["3"]
-    assert "failed: exit status 2" in lines["4"]
+    assert " failed " in said
+    assert lines["4"] == "independent, paper, paper, seed 4: exit status 2: no such thing"
     assert "new" in lines["5"]
     assert "6 runs: " in said
     assert before == {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")}
+
+
+def test_a_sweep_keeps_newer_rows_of_another_sweep_of_the_same_runs(tmp_path):
+    first, second = Manifest(tmp_path, "submitit"), Manifest(tmp_path, "local")
+    (a, b), (same_a, same_b) = jobs(tmp_path, "seed=0,1"), jobs(tmp_path, "seed=0,1")
+    first.load([a, b])
+    second.load([same_a, same_b])
+    first.set(a, "queued", task="7", executor="submitit")
+    second.set(same_b, "running", executor="local")
+    rows = list(manifest.read(tmp_path).values())
+    assert [(row.state, row.task) for row in rows] == [("queued", "7"), ("running", "")]
+    # The other sweep takes the run over.
+    second.set(same_a, "failed", note="no such thing")
+    first.set(b, "stopped")
+    rows = list(manifest.read(tmp_path).values())
+    assert [(row.state, row.note) for row in rows] == [("failed", "no such thing"), ("stopped", "")]
+
+
+def test_a_change_that_was_overwritten_is_written_again(tmp_path):
+    ours = Manifest(tmp_path, "local")
+    a, b = jobs(tmp_path, "seed=0,1")
+    ours.load([a, b])
+    before = (tmp_path / manifest.FILE).read_bytes()
+    ours.set(a, "failed")
+    (tmp_path / manifest.FILE).write_bytes(before)  # by a sweep that had read it before
+    ours.set(b, "running")
+    assert [row.state for row in manifest.read(tmp_path).values()] == ["failed", "running"]
 
 
 def test_a_dry_run_writes_nothing(tmp_path):

@@ -10,7 +10,7 @@ from rich.console import Console
 
 from emberlink.envs.utils.errors import UserError
 from emberlink.trainers.runs.run_folder import RunFolder
-from emberlink.trainers.sweep import executors, manifest, question
+from emberlink.trainers.sweep import executors, manifest, question, slots
 from emberlink.trainers.sweep.command import sweep
 from emberlink.trainers.sweep.leases import TRAINING, Leases
 from emberlink.trainers.sweep.worker import HELD
@@ -139,6 +139,35 @@ def test_a_full_queue_takes_the_other_runs_later(tmp_path):
     assert swept(tmp_path, executor, "seed=range(0,5)") == 0
     assert executor.most == 2
     assert len(executor.submitted) == 5
+
+
+class Unreachable(Scripted):
+    """Refuses the second and third submission, although nothing is full."""
+
+    asked, most, running = 0, 0, 0
+
+    def submit(self, task):
+        self.asked += 1
+        if self.asked in (2, 3):
+            raise executors.QueueFullError("executor=cluster: cannot be reached")
+        self.running += 1
+        self.most = max(self.most, self.running)
+        return super().submit(task)
+
+    def poll(self, handle):
+        if self.most < 3 and self.submitted[0] is handle[0]:
+            return None
+        self.running -= 1
+        return super().poll(handle)
+
+
+def test_a_cluster_that_is_not_reached_for_a_while_gets_all_runs(tmp_path, monkeypatch, capsys):
+    """The first task goes on until three run at a time."""
+    monkeypatch.setattr(slots, "RETRY", 0.05)
+    executor = Unreachable(*[finishes] * 4)
+    assert swept(tmp_path, executor, "seed=range(0,4)") == 0
+    assert len(executor.submitted) == 4
+    assert capsys.readouterr().out.count("executor=cluster: cannot be reached") == 1
 
 
 def test_a_queue_that_takes_nothing_is_an_error(tmp_path):

@@ -4,8 +4,10 @@ import shutil
 import signal
 import subprocess
 import time
-from collections.abc import Sequence
+import warnings
+from contextlib import redirect_stderr, suppress
 from dataclasses import dataclass as plain_dataclass
+from io import StringIO
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -14,17 +16,19 @@ from pydantic.dataclasses import dataclass
 
 from emberlink.envs.utils.atomic_io import inner_folder, write_bytes
 from emberlink.envs.utils.errors import UserError
-from emberlink.trainers.sweep.executors import _extras, _process
+from emberlink.trainers.sweep.executors import _extras
+from emberlink.trainers.sweep.executors._slurm_job import STATUS, STOP, Batch, end, file_of
 from emberlink.trainers.sweep.executors._times import minutes
 from emberlink.trainers.sweep.executors.base import DIED, Executor, QueueFullError, Task
 
-_STATUS, _STOP = ".status", ".stop"
-"""suffixes of files beside a log: the exit status of the task; a request to save and end"""
-_SAVED = (128 + signal.SIGTERM, 128 + signal.SIGUSR2, -signal.SIGTERM, -signal.SIGUSR2)
-_GRACE = 120.0
-"""seconds for which a job waits for its end after its runs were interrupted"""
 _LOOK = 10.0
 """seconds between two looks at SLURM's queue"""
+_RETRY = 60.0
+"""seconds after which a job that SLURM did not accept is submitted again"""
+_FOR_SBATCH = ("partition", "account", "time", "cpus", "gpus", "memory", "options")
+"""settings that become options of sbatch"""
+_USUAL = ("None", "Priority", "Resources", "BeginTime", "Cleaning", "Prolog")
+"""reasons for which every job may wait in SLURM's queue"""
 
 
 def _time(value: object) -> str:
@@ -76,69 +80,6 @@ class SubmititConfig:
             )
 
 
-class _Batch:
-    """Trains the runs of a job; submitit runs it.
-
-    Args:
-        tasks: the trainings.
-        threads: threads of each training.
-    """
-
-    def __init__(self, tasks: Sequence[Task], threads: int):
-        self._tasks, self._threads = tasks, threads
-        self._running: dict[Path, subprocess.Popen] = {}
-
-    def __call__(self) -> None:
-        """Runs the trainings that have not ended."""
-        utils = _extras.load("submitit.core.utils")
-
-        # SLURM sends SIGTERM before it preempts a job. submitit would ignore it.
-        signal.signal(signal.SIGTERM, lambda *_: self._ask_to_save())
-        for task in self._tasks:
-            if not _file(task, _STATUS).exists():
-                self._running[task.log] = _process.start(task, self._threads)
-        try:
-            self._follow()
-        except utils.UncompletedJobError:  # submitit does not requeue the job again
-            for log in self._running:
-                _end(log, 128 + signal.SIGUSR2)
-            raise
-
-    def checkpoint(self) -> Any:
-        """Waits until the trainings have saved; called by submitit at SIGUSR2."""
-        self._ask_to_save()
-        for process in self._running.values():
-            process.wait()
-        return _extras.load("submitit").helpers.DelayedSubmission(
-            _Batch(self._tasks, self._threads)
-        )
-
-    def _ask_to_save(self) -> None:
-        for process in self._running.values():
-            # Never counts as a second signal, so that the training saves in any case.
-            process.send_signal(signal.SIGUSR2)
-
-    def _follow(self) -> None:
-        """Waits until the trainings have ended, and stops those that are to be stopped."""
-        told: set[Path] = set()
-        ended: dict[Path, float] = {}
-        while self._running:
-            time.sleep(0.5)
-            for log, process in list(self._running.items()):
-                stop = log.with_suffix(_STOP).exists()
-                if stop and log not in told:
-                    told.add(log)
-                    process.terminate()
-                status = process.poll()
-                if status is None:
-                    continue
-                since = time.monotonic() - ended.setdefault(log, time.monotonic())
-                if status in _SAVED and not stop and since < _GRACE:
-                    continue  # SLURM requeues the job, or ends it
-                del self._running[log]
-                _end(log, status)
-
-
 @plain_dataclass(eq=False)
 class _Handle:
     """A submitted task; `job` is None until its job is submitted."""
@@ -159,8 +100,10 @@ class SubmititExecutor(Executor):
         self._config = config
         self.seeds, self.restarts = config.seeds, config.restarts
         self._waiting: list[_Handle] = []
-        self._queue: set[str] | None = None
-        self._looked = 0.0
+        self._accepted, self._refused = False, -_RETRY
+        self._queue: dict[str, str] | None = None
+        self._looked = -_LOOK
+        self._said: set[str] = set()
 
     def slots(self, tasks: int) -> int:
         if self._config.cluster == "slurm" and shutil.which("sbatch") is None:
@@ -172,7 +115,7 @@ class SubmititExecutor(Executor):
     def submit(self, task: Task) -> _Handle:
         handle = _Handle(task)
         self._waiting.append(handle)
-        if len(self._waiting) == self._config.share:
+        if len(self._waiting) >= self._config.share:
             try:
                 self._submit()
             except UserError:
@@ -181,10 +124,9 @@ class SubmititExecutor(Executor):
         return handle
 
     def poll(self, handle: _Handle) -> int | None:
-        if self._waiting:
-            self._submit()
+        self._submit_rest()
         try:
-            return int(_file(handle.task, _STATUS).read_text())
+            return int(file_of(handle.task, STATUS).read_text())
         except (OSError, ValueError):
             pass
         now = time.monotonic()
@@ -192,13 +134,16 @@ class SubmititExecutor(Executor):
             handle.seen = now
             return None
         # Another machine may show the status a little later.
-        return DIED if now - handle.seen > 3 * _LOOK or self._config.cluster == "local" else None
+        if now - handle.seen <= 3 * _LOOK and self._config.cluster == "slurm":
+            return None
+        _explain(handle)
+        return DIED
 
     def cancel(self, handle: _Handle) -> None:
-        write_bytes(_file(handle.task, _STOP), b"")
+        write_bytes(file_of(handle.task, STOP), b"")
         if handle.job is None:
             self._waiting = [other for other in self._waiting if other is not handle]
-            _end(handle.task.log, 128 + signal.SIGTERM)
+            end(handle.task.log, 128 + signal.SIGTERM)
         elif self._config.cluster == "slurm":
             _slurm("scancel", "--state=PENDING", handle.job.job_id)
 
@@ -208,29 +153,45 @@ class SubmititExecutor(Executor):
     def find(self, name: str) -> _Handle | None:
         number, _, log = name.partition(" ")
         task = Task((), Path(log))
-        if self._config.cluster == "local" or _file(task, _STATUS).exists():
+        if self._config.cluster == "local" or file_of(task, STATUS).exists():
             return None
         job = _extras.load("submitit").SlurmJob(folder=task.log.parent / "submitit", job_id=number)
         return _Handle(task, job, time.monotonic()) if self._is_known(job) else None
+
+    def _submit_rest(self) -> None:
+        """Submits the tasks that wait although no others have followed."""
+        if not self._waiting or time.monotonic() - self._refused < _RETRY:
+            return
+        with suppress(QueueFullError):
+            self._submit()
 
     def _submit(self) -> None:
         """Submits one job for the waiting tasks.
 
         Raises:
-            QueueFullError: SLURM does not accept the job.
+            QueueFullError: SLURM does not accept the job now.
+            UserError: SLURM has never accepted a job.
         """
         tasks = [handle.task for handle in self._waiting]
         folder = inner_folder(tasks[0].output, "logs", "submitit")
+        threads = max(self._config.cpus // self._config.share, 1)
         try:
-            executor = self._make(folder)
-            job = executor.submit(_Batch(tasks, max(self._config.cpus // self._config.share, 1)))
-        except (RuntimeError, OSError, subprocess.CalledProcessError) as error:
-            output = getattr(error, "stderr", None) or str(error)
-            text = output.decode(errors="replace") if isinstance(output, bytes) else output
-            raise QueueFullError(f"executor=submitit: {' '.join(text.split())[-300:]}") from None
+            # submitit prints sbatch's messages, too.
+            with redirect_stderr(StringIO()):
+                job = self._make(folder).submit(Batch(tasks, threads))
+        except (RuntimeError, OSError, ValueError, subprocess.CalledProcessError) as error:
+            self._refused = time.monotonic()
+            wrong = QueueFullError if self._accepted else UserError
+            raise wrong(f"executor=submitit{self._given()}: {_reason(error)}") from None
+        self._accepted = True
         for handle in self._waiting:
             handle.job, handle.seen = job, time.monotonic()
         self._waiting = []
+
+    def _given(self) -> str:
+        """Returns the settings that sbatch gets, for messages."""
+        values = {key: getattr(self._config, key) for key in _FOR_SBATCH}
+        return "".join(f" executor.{key}={value}" for key, value in values.items() if value)
 
     def _make(self, folder: Path) -> Any:
         submitit = _extras.load("submitit")
@@ -265,17 +226,38 @@ class SubmititExecutor(Executor):
             return not job.done()
         if time.monotonic() - self._looked > _LOOK:
             self._looked = time.monotonic()
-            listed = _slurm("squeue", "--me", "--noheader", "--format=%A")
-            self._queue = None if listed is None else set(listed.split())
-        return self._queue is None or job.job_id in self._queue
+            listed = _slurm("squeue", "--me", "--noheader", "--format=%A %r")
+            self._queue = (
+                None
+                if listed is None
+                else dict(line.split(maxsplit=1) for line in listed.splitlines())
+            )
+        if self._queue is None:
+            return True
+        self._warn(self._queue.get(job.job_id, "None"))
+        return job.job_id in self._queue
+
+    def _warn(self, reason: str) -> None:
+        """Warns once of each unusual reason for which jobs wait, such as too long a time."""
+        if reason not in (*_USUAL, *self._said):
+            self._said.add(reason)
+            message = f"jobs wait in SLURM's queue: {reason} (executor=submitit{self._given()})"
+            warnings.warn(message, stacklevel=2)
 
 
-def _file(task: Task, suffix: str) -> Path:
-    return task.log.with_suffix(suffix)
+def _reason(error: Exception) -> str:
+    """Returns the message of sbatch in one line."""
+    lines = [line.strip().removeprefix("sbatch: error: ") for line in str(error).splitlines()]
+    return "; ".join(filter(None, lines))[-300:]
 
 
-def _end(log: Path, status: int) -> None:
-    write_bytes(log.with_suffix(_STATUS), str(status).encode())
+def _explain(handle: _Handle) -> None:
+    """Writes the last line of a job's own log to the log of a training that has not begun."""
+    if not handle.task.log.exists() and handle.job.paths.stderr.is_file():
+        said = handle.job.paths.stderr.read_text(errors="replace").split("\n")
+        line = next((line.strip() for line in reversed(said) if line.strip()), "no message")
+        text = f"the training has not begun: {line} ({handle.job.paths.stderr})\n"
+        write_bytes(handle.task.log, text.encode())
 
 
 def _slurm(*command: str) -> str | None:
