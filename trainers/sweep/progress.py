@@ -62,7 +62,7 @@ class SweepProgress(Progress):
         Args:
             job: the job.
             state: how it ended.
-            again: whether it will be run again.
+            again: whether it is to be run again, and is not counted.
         """
         if job in self._bars:
             self.remove_task(self._bars.pop(job))

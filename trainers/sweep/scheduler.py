@@ -238,7 +238,7 @@ class Scheduler:
             self._progress.end(job, "finished")
         elif self._stopping:
             self._manifest.set(job, "stopped")
-            self._progress.end(job, "stopped")
+            self._progress.end(job, "stopped", again=True)
         elif status == HELD:
             self._again(job, "waits, another sweep is training it")
         elif self._may_restart(job, status, running):

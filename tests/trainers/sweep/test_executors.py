@@ -2,10 +2,13 @@
 
 import os
 import pty
+import re
 import signal
+import socket
 import subprocess
 import sys
 import time
+from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -112,6 +115,47 @@ def test_wrong_keys_are_named_in_one_line(arguments, said, tmp_path, capsys, mon
     assert said in error
     assert error.count("\n") == 1
     assert not any(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        ({"cpus": 3}, "no node has CPU=3"),
+        ({"cpus": 2, "gpus": 0.5}, "no node has CPU=2, GPU=0.5"),
+        ({"resources": {"big": 1}}, "no node has CPU=1, big=1"),
+        ({"memory": 3 * 10**9}, "no node has CPU=1, memory=3e"),
+        ({"cpus": 2}, ""),
+        ({"gpus": 0.5}, ""),
+    ],
+)
+def test_runs_that_no_node_can_take_are_told(settings, said, monkeypatch):
+    monkeypatch.setattr(_extras, "find_spec", lambda _: True)
+    nodes = [
+        {"Alive": True, "Resources": {"CPU": 2.0, "memory": 2e9}},
+        {"Alive": True, "Resources": {"CPU": 1.0, "GPU": 1.0}},
+        {"Alive": False, "Resources": {"CPU": 64.0, "GPU": 8.0, "memory": 1e12, "big": 1}},
+    ]
+    monkeypatch.setattr(_extras, "load", lambda _: SimpleNamespace(nodes=lambda: nodes))
+    executor = executors.make("ray", settings)
+    with pytest.warns(UserWarning, match=said) if said else nullcontext():
+        executor._check_nodes()
+
+
+@pytest.mark.parametrize("address", ["127.0.0.1:1", "ray://127.0.0.1:1", "[::1]:1", "h:99999999"])
+def test_an_address_without_a_cluster_is_named_in_one_line(address, monkeypatch):
+    monkeypatch.setattr(_extras, "find_spec", lambda _: True)
+    executor = executors.make("ray", {"address": address})
+    with pytest.raises(UserError, match=re.escape(f"executor.address={address}: ")):
+        executor._check_address()
+
+
+def test_an_address_that_answers_is_tried(monkeypatch):
+    monkeypatch.setattr(_extras, "find_spec", lambda _: True)
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        address = f"127.0.0.1:{server.getsockname()[1]}"
+        executors.make("ray", {"address": address})._check_address()
+    for address in ("auto", "local"):
+        executors.make("ray", {"address": address})._check_address()
 
 
 class Sbatch:

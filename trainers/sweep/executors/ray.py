@@ -3,8 +3,10 @@
 import os
 import secrets
 import signal
+import socket
 import threading
 import time
+import warnings
 from typing import Annotated, Any
 
 from pydantic import AfterValidator, ConfigDict, Field
@@ -16,6 +18,8 @@ from emberlink.trainers.sweep.executors.base import DIED, Executor, QueueFullErr
 
 _NAMESPACE = "emberlink"
 _STOPPED = 128 + signal.SIGTERM
+_ANSWER = 10.0
+"""seconds for which a cluster may need to answer"""
 _IDLE = 60.0
 """seconds after which the owner of ended tasks ends, too"""
 
@@ -135,6 +139,7 @@ class RayExecutor(Executor):
 
     def slots(self, tasks: int) -> int:
         self._connect()
+        self._check_nodes()
         return self._config.workers or max(tasks, 1)
 
     def submit(self, task: Task) -> tuple[str, str]:
@@ -211,6 +216,17 @@ class RayExecutor(Executor):
             scheduling_strategy=scheduling.NodeAffinitySchedulingStrategy(here, soft=True),
         ).remote(options)
 
+    def _check_nodes(self) -> None:
+        """Warns if no node is large enough for a run, which then waits for such a node."""
+        ray, config = _extras.load("ray"), self._config
+
+        wanted = {"CPU": config.cpus, "GPU": config.gpus, "memory": config.memory or 0}
+        wanted = {key: value for key, value in {**wanted, **config.resources}.items() if value}
+        nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
+        if not any(all(node.get(k, 0) >= v for k, v in wanted.items()) for node in nodes):
+            text = ", ".join(f"{key}={value:g}" for key, value in wanted.items())
+            warnings.warn(f"executor=ray: no node has {text}; the runs wait for one", stacklevel=2)
+
     def _connect(self) -> None:
         """Connects to the cluster.
 
@@ -221,6 +237,7 @@ class RayExecutor(Executor):
 
         if ray.is_initialized():
             return
+        self._check_address()
         path = os.environ.get("PYTHONPATH")
         try:
             ray.init(
@@ -233,3 +250,14 @@ class RayExecutor(Executor):
         except (ConnectionError, ValueError, RuntimeError) as error:
             text = " ".join(str(error).split())[:200]
             raise UserError(f"executor.address={self._config.address}: {text}") from None
+
+    def _check_address(self) -> None:
+        """Checks that a HOST:PORT answers; Ray would try for minutes and print its own messages."""
+        host, _, port = self._config.address.rpartition("://")[2].rpartition(":")
+        if not host or not port.isdecimal():
+            return
+        try:
+            socket.create_connection((host.strip("[]"), int(port)), _ANSWER).close()
+        except (OSError, OverflowError) as error:
+            reason = getattr(error, "strerror", None) or error
+            raise UserError(f"executor.address={self._config.address}: {reason}") from None
