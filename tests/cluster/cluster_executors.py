@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 import sweeps
 from rich.console import Console
-from slurm import INSTALL, cluster, missing
+from slurm import INSTALL, cluster, kill_node, missing, node
 
 from emberlink.trainers.sweep import executors
 from emberlink.trainers.sweep.command import sweep
@@ -107,7 +107,34 @@ def test_slurm_runs_come_back_after_a_preemption(local, tmp_path):
     assert sweeps.results(folder) == local
 
 
-def test_slurm_runs_come_back_after_their_time(local, tmp_path):
+def test_slurm_requeues_a_run_at_the_end_of_its_time_and_when_its_node_dies(tmp_path):
+    """The time is two minutes and the notice 50 s, so SLURM interrupts it after 10 to 70 s."""
+    folder, daemons = tmp_path / "sweep of läufe", tmp_path / "slurm"
+    folder.mkdir()
+    daemons.mkdir()
+    keys = ("executor=submitit", "executor.time=2", "executor.notice=50", "seed=0")
+    with cluster(daemons) as env:
+        process = sweeps.start(folder, *keys, "episodes=9999", env=env, methods=["independent"])
+        sweeps.wait_for(lambda: sweeps.resumed(folder) == 1, process)
+        (run,) = sweeps.runs_in(folder)
+        before = len(run.lines())
+        sweeps.wait_for(lambda: len(run.lines()) > before + 5, process)
+        kill_node(daemons)
+        listed = ["squeue", "--noheader", "--format=%t"]
+        sweeps.wait_for(lambda: subprocess.check_output(listed, env=env) == b"PD\n", process)
+        with node(daemons, env):
+            seen = sweeps.resumed(folder)
+            sweeps.wait_for(lambda: sweeps.resumed(folder) > seen, process)
+            process.terminate()
+            assert process.wait(sweeps.PATIENCE) == 128 + signal.SIGTERM
+    said = "".join(log.read_text() for log in (folder / "runs/logs/submitit").glob("*.out"))
+    assert "Requeued job" in said
+    episodes = [line["episode"] for line in run.lines()]
+    assert episodes == list(range(1, len(episodes) + 1))
+    assert len(episodes) >= before
+
+
+def test_slurm_runs_come_back_after_a_signal(local, tmp_path):
     """SLURM's notice arrives in the middle; the sweep is killed; another executor does the rest."""
     folder, daemons = tmp_path / "sweep", tmp_path / "slurm"
     folder.mkdir()

@@ -9,17 +9,19 @@ Debian's packages slurmctld, slurmd and munge. All files are in FOLDER: a config
 import os
 import secrets
 import shutil
+import signal
 import socket
 import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 PROGRAMS = ("slurmctld", "slurmd", "munged", "sbatch", "squeue")
 INSTALL = "apt-get install slurmctld slurmd munge"
 CORES = 2
+HOST = socket.gethostname().split(".")[0]
 CONFIG = """\
 ClusterName=emberlink
 SlurmctldHost={host}(127.0.0.1)
@@ -48,6 +50,7 @@ PreemptType=preempt/partition_prio
 PreemptMode=REQUEUE
 JobRequeue=1
 KillWait=5
+SlurmdTimeout=20
 ReturnToService=2
 SlurmdParameters=config_overrides
 SchedulerParameters=sched_interval=5,bf_interval=5
@@ -83,9 +86,8 @@ def cluster(folder: Path) -> Iterator[dict[str, str]]:
     key.chmod(0o400)
     config = folder / "slurm.conf"
     ports = [_free_port(), _free_port()]
-    host = socket.gethostname().split(".")[0]
     numbers = {"port": ports[0], "node_port": ports[1], "cores": CORES}
-    config.write_text(CONFIG.format(folder=folder, host=host, **numbers))
+    config.write_text(CONFIG.format(folder=folder, host=HOST, **numbers))
     path = f"{os.environ.get('PATH', '')}:/usr/sbin:/sbin"
     environment = {**os.environ, "PATH": path, "SLURM_CONF": str(config)}
     munge = [f"--key-file={key}", f"--socket={folder}/munge.socket"]
@@ -95,7 +97,7 @@ def cluster(folder: Path) -> Iterator[dict[str, str]]:
         for command in (
             ["munged", "--foreground", "--force", *munge],
             ["slurmctld", "-D", "-f", str(config)],
-            ["slurmd", "-D", "-f", str(config), "-N", host],
+            ["slurmd", "-D", "-f", str(config), "-N", HOST],
         ):
             log = (folder / f"{command[0]}.out").open("wb")
             started.append(
@@ -114,6 +116,32 @@ def cluster(folder: Path) -> Iterator[dict[str, str]]:
                 process.wait(30)
             except subprocess.TimeoutExpired:
                 process.kill()
+
+
+def kill_node(folder: Path) -> None:
+    """Kills slurmd and all that it has started, as if the machine had lost its power."""
+    listed = subprocess.check_output(["ps", "-e", "-o", "pid,ppid,args"], text=True)
+    rows = [line.split(maxsplit=2) for line in listed.splitlines()[1:]]
+    steps = [int(pid) for pid, _, text in rows if text.startswith("slurmstepd: [")]
+    dying = [int((folder / "slurmd.pid").read_text()), *steps]
+    for process in dying:  # grows
+        dying += [int(pid) for pid, parent, _ in rows if int(parent) == process]
+    for process in {*dying}:
+        with suppress(ProcessLookupError):
+            os.kill(process, signal.SIGKILL)
+
+
+@contextmanager
+def node(folder: Path, environment: dict[str, str]) -> Iterator[None]:
+    """Runs slurmd again after `kill_node`."""
+    command = ["slurmd", "-D", "-f", str(folder / "slurm.conf"), "-N", HOST]
+    with (folder / "slurmd.out").open("ab") as log:
+        process = subprocess.Popen(command, env=environment, stdout=log, stderr=log)
+    try:
+        yield
+    finally:
+        process.terminate()
+        process.wait(30)
 
 
 def _wait_until_idle(environment: dict[str, str], folder: Path) -> None:

@@ -5,7 +5,7 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from tiny_run import TINY
@@ -22,11 +22,15 @@ RUNS = 12
 PATIENCE = 900.0
 
 
-def start(folder: Path, *more: str, env: Mapping[str, str] | None = None) -> subprocess.Popen:
+def start(
+    folder: Path, *more: str, env: Mapping[str, str] | None = None, methods: Sequence[str] = ()
+) -> subprocess.Popen:
     """Starts the sweep as a process in a folder; its output is in `sweep.txt`."""
+    keys = {text.partition("=")[0] for text in more}
+    kept = [text for text in ARGUMENTS if text.partition("=")[0] not in keys]
     with (folder / "sweep.txt").open("ab") as log:
         return subprocess.Popen(
-            [sys.executable, "-m", "emberlink.trainers.cli", "sweep", *ARGUMENTS, *more],
+            [sys.executable, "-m", "emberlink.trainers.cli", "sweep", *methods, *kept, *more],
             cwd=folder,
             env={**(env or os.environ)},
             stdin=subprocess.DEVNULL,

@@ -2,6 +2,7 @@
 
 import shlex
 from collections.abc import Sequence
+from dataclasses import replace
 
 from rich.console import Console
 from rich.table import Table
@@ -65,12 +66,13 @@ def sweep(
     scheduler = Scheduler(jobs, index, executor, progress, Manifest(output, name))
     status = scheduler.work()
     _print_table(scheduler.jobs, console)
+    where = shlex.quote(str(output))
     if status == 0:
-        console.print(f"compare them with: emberlink compare {output}", soft_wrap=True)
+        console.print(f"compare them with: emberlink compare {where}", soft_wrap=True)
     elif scheduler.left:
         console.print(
             f"{scheduler.left} trainings are left running or queued; "
-            f"look in with: emberlink sweep status {shlex.quote(str(output))}",
+            f"look in with: emberlink sweep status {where}",
             soft_wrap=True,
         )
     elif status > 1:
@@ -96,13 +98,14 @@ def _executor(arguments: Sequence[str], workers: int | None) -> tuple[str, execu
 
 
 def _print_table(jobs: Sequence[Job], console: Console) -> None:
-    """Prints the state and the run folders of each job, and why jobs failed."""
-    table = Table("run", "state")
-    table.add_column("folder", overflow="fold")
+    """Prints the state and the folder of each run, and why jobs failed."""
+    table = Table("run", "state", "folder")
     for job in jobs:
         state = "failed" if job.failed else "finished" if job.finished else "not finished"
-        folders = "\n".join(run.folder.path.name for run in job.found.values())
-        table.add_row(job.name, state, folders or "-")
+        for config in job.configs:
+            run = job.found.get(config.seed)
+            name = replace(job, configs=[config]).name
+            table.add_row(name, state, run.folder.path.name if run else "-")
     console.print(table)
     for job in jobs:
         if job.failed:

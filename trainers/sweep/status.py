@@ -10,7 +10,7 @@ from rich.table import Table
 from emberlink.envs.utils.errors import UserError
 from emberlink.trainers.runs.run_folder import RunFolder
 from emberlink.trainers.sweep import manifest
-from emberlink.trainers.sweep.leases import SWEEP, TRAINING, Leases
+from emberlink.trainers.sweep.leases import PATIENCE, SWEEP, TRAINING, Leases
 from emberlink.trainers.sweep.manifest import Row
 
 
@@ -60,8 +60,9 @@ def _state(row: Row, output: Path, leases: Leases) -> tuple[str, str]:
     if holder is None or not leases.is_held(row.run, holder):
         # The process that was to change the state may have been killed.
         return "stopped" if row.state in ("running", "finished") else row.state, ""
-    seen = f"{holder.holder}, {leases.since(row.run):.0f} s ago"
-    return {TRAINING: "running", SWEEP: "queued"}[holder.role], seen
+    since = leases.since(row.run)
+    state = {TRAINING: "running", SWEEP: "queued"}[holder.role]
+    return "silent" if since > 2 * PATIENCE else state, f"{holder.holder}, {since:.0f} s ago"
 
 
 def _progress(row: Row, output: Path) -> tuple[str, str]:

@@ -96,7 +96,7 @@ def test_a_machine_without_slurm_is_named(tmp_path, capsys, monkeypatch):
         (["executor=submitit", "executor.cluster=debug"], "executor.cluster=debug"),
         (["executor=submitit", "executor.address=auto"], "'executor.address' is not known"),
         (["executor=submitit", "executor.time=null"], "executor.time=None: expected minutes"),
-        (["executor=submitit", "executor.time=1"], "executor.notice=90: must be shorter than"),
+        (["executor=submitit", "executor.time=2"], "executor.notice=90: executor.time=2 must be"),
         (["executor=submitit", "executor.options={qos: low"], "executor.options={qos: low"),
         (["executor=ray", "executor.gpus=-1"], "executor.gpus=-1"),
         (["executor=ray", "executor.gpus=1.5"], "executor.gpus=1.5: expected a fraction of 1 or"),
@@ -215,6 +215,13 @@ def test_tasks_that_slurm_refuses_are_submitted_later(slurm, monkeypatch):
     executor.poll(handle)
     assert sbatch.jobs == [2, 1]
     assert handle.job.job_id == "2"
+
+
+def test_a_job_of_a_moved_folder_is_not_followed(slurm, tmp_path):
+    """Its number may be that of another job."""
+    executor, _, tasks = slurm
+    assert executor.find(f"1 {tmp_path / 'moved' / '0.txt'}") is None
+    assert executor.find(f"7 {tasks[0].log}") is None
 
 
 def test_an_unusual_reason_for_which_jobs_wait_is_told_once(slurm):

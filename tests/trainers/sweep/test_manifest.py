@@ -1,6 +1,9 @@
 """Tests the manifest of a sweep, and `emberlink sweep status`, which reads it."""
 
 import json
+import os
+import time
+from dataclasses import replace
 
 import pytest
 from rich.console import Console
@@ -159,6 +162,20 @@ def test_status_reads_the_files_of_the_runs(tmp_path, capsys, monkeypatch):
     assert "new" in lines["5"]
     assert "6 runs: " in said
     assert before == {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")}
+
+
+def test_a_training_without_a_sign_of_life_is_silent(tmp_path, monkeypatch, capsys):
+    """The sweep may have ended before its machine died, so nobody has noticed it."""
+    monkeypatch.setenv("COLUMNS", "200")
+    Manifest(tmp_path, "local").load(jobs(tmp_path, "seed=0"))
+    (row,) = manifest.read(tmp_path).values()
+    lease = Leases(tmp_path).take(row.run, TRAINING)
+    lease._write(replace(lease.record, host="node7", system="another boot", process=5))
+    os.utime(lease.path, (time.time() - 1000,) * 2)
+    assert main(["sweep", "status", str(tmp_path)]) == 0
+    said = capsys.readouterr().out
+    assert " silent " in said
+    assert "process 5 on node7, 1000 s ago" in said
 
 
 def test_a_sweep_keeps_newer_rows_of_another_sweep_of_the_same_runs(tmp_path):

@@ -201,6 +201,16 @@ def test_a_failing_run_does_not_stop_the_others(tmp_path, capsys):
     assert "compare them with" not in said
 
 
+def test_the_table_has_a_row_for_each_run_and_the_next_command_is_quoted(tmp_path, capsys):
+    output = tmp_path / "my runs"
+    swept(["independent", f"output={output}", "seeds=[0,1]"])
+    said = capsys.readouterr().out
+    for run in runs_in(output):
+        name = f"independent, tuned, paper, seed {run.config().seed}"
+        assert f"{name} finished {run.path.name}" in " ".join(said.replace("│", " ").split())
+    assert f"emberlink compare '{output}'" in said.replace("\n", "")
+
+
 def test_a_run_folder_is_read_once(tmp_path, monkeypatch):
     output = f"output={tmp_path}"
     swept(["independent", output, "seed=range(0,3)"])

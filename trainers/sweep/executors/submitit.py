@@ -74,9 +74,11 @@ class SubmititConfig:
     """other options of sbatch"""
 
     def __post_init__(self) -> None:
-        if self.notice >= 60 * minutes(self.time):
+        # SLURM sends the signal up to a minute earlier; the process must have started.
+        if self.notice + 60 >= 60 * minutes(self.time):
             raise UserError(
-                f"executor.notice={self.notice}: must be shorter than executor.time={self.time}"
+                f"executor.notice={self.notice}: executor.time={self.time} must be more than a "
+                "minute longer"
             )
 
 
@@ -153,7 +155,9 @@ class SubmititExecutor(Executor):
     def find(self, name: str) -> _Handle | None:
         number, _, log = name.partition(" ")
         task = Task((), Path(log))
-        if self._config.cluster == "local" or file_of(task, STATUS).exists():
+        # The folder of an output that was moved is missing; a job of this number is another one.
+        gone = not task.log.parent.is_dir() or file_of(task, STATUS).exists()
+        if gone or self._config.cluster == "local":
             return None
         job = _extras.load("submitit").SlurmJob(folder=task.log.parent / "submitit", job_id=number)
         return _Handle(task, job, time.monotonic()) if self._is_known(job) else None
