@@ -194,7 +194,7 @@ class Leases:
     def deaths(self, run: str, token: str) -> int:
         """Returns how many trainings have ended without a word since the lease with a token.
 
-        Only the leases before the newest one are counted.
+        Only the leases that `newest` has found are counted, not one that was taken since.
         """
         count, number = 0, self._newest.get(run, 0)
         while number:

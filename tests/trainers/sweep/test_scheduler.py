@@ -1,5 +1,7 @@
 """Tests restarts, requeues, full queues and Ctrl-C of sweeps, with executors made for it."""
 
+import io
+import multiprocessing
 import os
 import signal
 import threading
@@ -13,6 +15,7 @@ from emberlink.trainers.runs.run_folder import RunFolder
 from emberlink.trainers.sweep import executors, manifest, question, slots
 from emberlink.trainers.sweep.command import sweep
 from emberlink.trainers.sweep.leases import TRAINING, Leases
+from emberlink.trainers.sweep.progress import SweepProgress
 from emberlink.trainers.sweep.worker import HELD
 
 RUN = ["independent", "episodes=1", "evaluation.interval=0"]
@@ -88,6 +91,26 @@ def test_a_run_is_started_again_a_bounded_number_of_times(tmp_path, capsys):
     assert states(tmp_path) == ["failed"]
     # The same command again tries it again.
     assert swept(tmp_path, Scripted(finishes)) == 0
+
+
+class Retrying(Scripted):
+    """Starts a training four times, which dies each time, before it reports that it died."""
+
+    def submit(self, task):
+        ((run, token),) = task.leases.items()
+        for _ in range(4):
+            fork = multiprocessing.get_context("fork")
+            process = fork.Process(target=lambda: Leases(task.output).take(run, TRAINING, token))
+            process.start()
+            process.join()
+        return super().submit(task)
+
+
+def test_restarts_by_the_cluster_are_counted(tmp_path, capsys):
+    executor = Retrying(*[executors.DIED] * 9)
+    assert swept(tmp_path, executor) == 1
+    assert len(executor.submitted) == 1
+    assert "exit status -9 after 3 restarts" in capsys.readouterr().out
 
 
 def test_a_preempted_run_that_has_saved_is_requeued_without_a_bound(tmp_path):
@@ -211,6 +234,23 @@ def test_ctrl_c_leaves_the_trainings_running(tmp_path, monkeypatch, capsys):
     assert Leases(tmp_path).take(run, TRAINING, token) is not None
 
 
+class Terminal(io.StringIO):
+    def isatty(self):
+        return True
+
+
+@pytest.mark.parametrize(
+    ("may_leave", "answer"), [(True, question.LEAVE), (False, question.CONTINUE)]
+)
+def test_a_cluster_that_ends_with_the_sweep_cannot_be_left(monkeypatch, may_leave, answer):
+    monkeypatch.setattr("sys.stdin", Terminal("what\nl\nc\n"))
+    shown = io.StringIO()
+    progress = SweepProgress(Console(file=shown, force_terminal=True, width=200), 1, 0)
+    assert question.ask(progress, 2, may_leave) == answer
+    assert ("[l]eave" in shown.getvalue()) is may_leave
+    progress.stop()
+
+
 def test_ctrl_c_may_be_taken_back(tmp_path, monkeypatch):
     began = time.monotonic()
     executor = Scripted(lambda run: finishes(run) if time.monotonic() - began > 1 else None)
@@ -271,6 +311,9 @@ def test_a_name_that_is_known_later_is_recorded(tmp_path, monkeypatch):
     executor = Late(None)
 
     def interrupt():
+        deadline = time.monotonic() + 30
+        while not executor.polled and time.monotonic() < deadline:
+            time.sleep(0.01)
         time.sleep(0.5)
         os.kill(os.getpid(), signal.SIGINT)
 

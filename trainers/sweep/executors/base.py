@@ -67,6 +67,9 @@ class Executor(ABC):
     seeds: int = 1
     """seeds of a method that are trained in one process"""
 
+    may_leave: bool = True
+    """whether tasks can go on when this process ends"""
+
     @abstractmethod
     def __init__(self, config: Any): ...
 

@@ -133,6 +133,7 @@ class RayExecutor(Executor):
         _extras.require("ray", "ray", "ray")
         self._config = config
         self.seeds, self.restarts = config.seeds, config.restarts
+        self.may_leave = config.address != "local"
         self._owner = ""
         self._cancelled: set[tuple[str, str]] = set()
         self._polled: dict[str, tuple[float, dict[str, int | None]]] = {}
