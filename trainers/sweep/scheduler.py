@@ -266,8 +266,7 @@ class Scheduler:
             return True
         for lease in running.leases[:1]:  # the cluster may have started it again, too
             self._leases.newest(lease.run)
-            deaths = self._leases.deaths(lease.run, lease.record.token)
-            job.restarts += max(deaths - 1, 0)
+            job.restarts += max(self._leases.deaths(lease.run, lease.record.token) - 1, 0)
         if (status >= 0 and status not in _SAVED) or job.restarts >= self._executor.restarts:
             return False
         job.restarts += 1
@@ -281,8 +280,7 @@ class Scheduler:
         self._interrupted = False
         answer = question.STOP
         if interruption.received == signal.SIGINT and self._running and not self._stopping:
-            may_leave = self._executor.may_leave
-            answer = question.ask(self._progress, len(self._running), may_leave)
+            answer = question.ask(self._progress, len(self._running), self._executor.may_leave)
         if answer == question.STOP:
             self._stop()
         elif answer == question.CONTINUE:
