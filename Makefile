@@ -40,7 +40,7 @@ browser:  ## install Chromium for test-slow if it is missing (on Debian and as r
 	else echo "there is no Chromium: the tests of replays will fail" >&2; fi
 
 # Files cluster_*.py, so that no other target runs them. A missing program is an error.
-test-cluster: $(INSTALLED)  ## test sweeps on SLURM and Ray (15 to 20 minutes; root; docs/cluster.md)
+test-cluster: $(INSTALLED)  ## test sweeps on SLURM and Ray (15 to 40 minutes; root; docs/cluster.md)
 	@$(BIN)/python -c 'import submitit, ray' 2>/dev/null || $(PIP) -e '.[slurm,ray]'
 	@OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -p no:xdist -o python_files='cluster_*.py' tests/cluster
 

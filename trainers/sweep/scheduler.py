@@ -178,9 +178,9 @@ class Scheduler:
         except OSError as error:
             self._heart.release(leases, "not started")
             raise UserError(f"{error.filename or job.output}: {error.strerror or error}") from None
-        except QueueFullError as error:
+        except UserError as error:
             self._heart.release(leases, "not started")
-            if not (self._accepted or self._running):
+            if not (isinstance(error, QueueFullError) and (self._accepted or self._running)):
                 raise
             self._waiting.insert(0, job)
             if self._slots.refused(len(self._running), str(error)):

@@ -193,6 +193,21 @@ def test_a_cluster_that_is_not_reached_for_a_while_gets_all_runs(tmp_path, monke
     assert capsys.readouterr().out.count("executor=cluster: cannot be reached") == 1
 
 
+class Wrong(Scripted):
+    """Reports a wrong setting."""
+
+    def submit(self, task):
+        raise UserError("executor=wrong: no such partition")
+
+
+def test_the_leases_are_free_after_a_wrong_setting(tmp_path):
+    for _ in range(2):
+        with pytest.raises(UserError, match="no such partition"):
+            swept(tmp_path, Wrong())
+    (row,) = manifest.read(tmp_path).values()
+    assert Leases(tmp_path).newest(row.run).ended == "not started"
+
+
 def test_a_queue_that_takes_nothing_is_an_error(tmp_path):
     with pytest.raises(UserError, match="executor=full: no more"):
         swept(tmp_path, Full(0), "seed=0,1")
