@@ -3,6 +3,7 @@
 import shlex
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 
 from rich.console import Console
 from rich.table import Table
@@ -66,18 +67,30 @@ def sweep(
     scheduler = Scheduler(jobs, index, executor, progress, Manifest(output, name))
     status = scheduler.work()
     _print_table(scheduler.jobs, console)
+    _print_end(status, scheduler.left, output, console)
+    return status
+
+
+def _print_end(status: int, left: int, output: Path, console: Console) -> None:
+    """Prints the command that follows a sweep.
+
+    Args:
+        status: as of `sweep`.
+        left: number of trainings that still run or wait.
+        output: folder of the runs.
+        console: prints the text.
+    """
     where = shlex.quote(str(output))
     if status == 0:
         console.print(f"compare them with: emberlink compare {where}", soft_wrap=True)
-    elif scheduler.left:
+    elif left:
         console.print(
-            f"{scheduler.left} trainings are left running or queued; "
-            f"look in with: emberlink sweep status {where}",
+            f"{left} trainings are left running or queued; "
+            f"show their states with: emberlink sweep status {where}",
             soft_wrap=True,
         )
     elif status > 1:
         console.print("stopped; the same command resumes the runs")
-    return status
 
 
 def _is_executor(text: str) -> bool:

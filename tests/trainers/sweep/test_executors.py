@@ -217,9 +217,11 @@ def test_tasks_that_slurm_refuses_are_submitted_later(slurm, monkeypatch):
     assert handle.job.job_id == "2"
 
 
-def test_a_job_of_a_moved_folder_is_not_followed(slurm, tmp_path):
+def test_a_job_of_a_moved_folder_is_not_followed(slurm, tmp_path, monkeypatch):
     """Its number may be that of another job."""
     executor, _, tasks = slurm
+    jobs = SimpleNamespace(SlurmJob=lambda **about: SimpleNamespace(**about))
+    monkeypatch.setattr(_extras, "load", lambda name: jobs)
     assert executor.find(f"1 {tmp_path / 'moved' / '0.txt'}") is None
     assert executor.find(f"7 {tasks[0].log}") is None
 

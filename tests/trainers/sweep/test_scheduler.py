@@ -243,7 +243,8 @@ def test_ctrl_c_leaves_the_trainings_running(tmp_path, monkeypatch, capsys):
     assert interrupted(executor, question.LEAVE, monkeypatch, tmp_path) == 130
     assert executor.left == executor.submitted
     assert not executor.cancelled
-    assert "look in with: emberlink sweep status" in capsys.readouterr().out.replace("\n", " ")
+    printed = capsys.readouterr().out.replace("\n", " ")
+    assert "show their states with: emberlink sweep status" in printed
     # The lease of the sweep is free, for the task and for other sweeps.
     ((run, token),) = executor.submitted[0].leases.items()
     assert Leases(tmp_path).take(run, TRAINING, token) is not None
