@@ -43,6 +43,8 @@ class RadioConfig:
     """radios at a distance below this hear each other, cells; 0 turns them off, inf is no limit"""
     loss: Annotated[float, Field(ge=0, le=1)] = 0.0
     """probability that a radio does not hear another one in a step, each direction independently"""
+    bandwidth: Annotated[int, Field(ge=0, le=1_000_000_000)] | None = None
+    """bytes that a UAV can say in a step, for methods that heed it; None for no limit"""
 
 
 BASE_SIDE = 30
@@ -71,8 +73,9 @@ class WildfireConfig:
     """half the opening angle of the camera, degrees"""
     displacement: Annotated[float, Field(gt=0, le=256)] = 1.0
     """cells per unit of action"""
-    observation: Literal["vector", "window"] = "vector"
-    """six numbers per UAV, or also the classes of the cells in view (see `keys.WINDOW`)"""
+    observation: Literal["vector", "window", "sight"] = "vector"
+    """six numbers per UAV, or also the classes of the cells in view (see `keys.WINDOW`), or what
+    the camera shows, for methods that keep maps (see `keys.SIGHT`)"""
     observation_scale: Literal["raw", "box"] = "raw"
     """cells and steps as they are, or scaled: the box to [-1, 1], the horizon to [0, 1]"""
     reward: RewardConfig = RewardConfig()

@@ -18,6 +18,12 @@ WINDOW: Final = (AGENTS, "window")
 fire in view, by x and y offset from the cell nearest to the UAV, which is in the middle; False
 outside of the grid and of the field of view. W is odd and fits the view from the highest altitude.
 Only with `observation: window`."""
+SIGHT: Final = (AGENTS, "sight")
+"""uint8 [..., W, W]: what the camera shows of the same cells: 0 nothing, 1 no fire, 2 fire, 3 burnt
+out. It holds nothing of what others have seen. Only with `observation: sight`."""
+CROPS: Final = (AGENTS, "crops")
+"""uint8 [..., scales, channels, S, S]: pictures of what the UAV knows, around it. Written by
+communication."""
 ACTION: Final = (AGENTS, "action")
 """float32 [..., 3] in [-1, 1]: a displacement in x, y and z."""
 REWARD: Final = (AGENTS, "reward")
@@ -85,7 +91,7 @@ def observation_keys(spec: Composite) -> list[tuple[str, str]]:
         spec: an environment's observation spec.
     """
     present = spec.keys(True, True)
-    return [key for key in (OBSERVATION, WINDOW) if key in present]
+    return [key for key in (OBSERVATION, WINDOW, CROPS) if key in present]
 
 
 def observation_shapes(spec: Composite) -> list[Sequence[int]]:

@@ -24,7 +24,10 @@ from emberlink.envs.wildfire import WildfireEnv
 Array = NDArray[np.float32]
 Observation = Array | dict[str, NDArray[Any]]
 
-_NOT_INFO = (keys.OBSERVATION[1], keys.WINDOW[1], keys.ACTION[1], keys.REWARD[1])
+_NOT_INFO = (
+    *(keys.OBSERVATION[1], keys.WINDOW[1], keys.CROPS[1]),
+    *(keys.ACTION[1], keys.REWARD[1]),
+)
 
 
 def parallel_env(
@@ -70,7 +73,7 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
     and leaves `agents`. `infos` hold, for each agent, the other tensors under ("agents", ...) of
     the TorchRL environment, and the numbers of cells `seen`, `burning` and `burnt`. With
     `observation: window` an observation is a dictionary of "observation", float32 [6], and
-    "window", uint8 [3, W, W].
+    "window", uint8 [3, W, W]; with method `maps` it has "crops" in place of the window.
 
     Args:
         env: see `parallel_env`.
@@ -98,10 +101,10 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
         self._now: TensorDictBase | None = None
         self.possible_agents = core.group_map[keys.AGENTS]
         self.agents: list[str] = []
-        vector, window = _spaces(env, core)
+        vector, pictures = _spaces(env, core)
         # One space object per agent, kept: PettingZoo seeds and compares them by identity.
         self.observation_spaces: dict[str, Space] = {
-            agent: _observation_space(vector, window) for agent in self.possible_agents
+            agent: _observation_space(vector, pictures) for agent in self.possible_agents
         }
         self.action_spaces: dict[str, Space] = {
             agent: Box(-1.0, 1.0, (3,), np.float32) for agent in self.possible_agents
@@ -244,12 +247,13 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
 
     def _observations(self, td: TensorDictBase) -> dict[str, Observation]:
         vectors = td.get(keys.OBSERVATION)[0].cpu().numpy().copy()
-        if keys.WINDOW not in td.keys(True):
+        _, *others = keys.observation_keys(self._env.observation_spec)
+        if not others:
             return dict(zip(self.possible_agents, vectors, strict=True))
-        windows = td.get(keys.WINDOW)[0].to(torch.uint8).cpu().numpy().copy()
+        pictures = {key[1]: td.get(key)[0].to(torch.uint8).cpu().numpy().copy() for key in others}
         return {
-            agent: {keys.OBSERVATION[1]: vector, keys.WINDOW[1]: window}
-            for agent, vector, window in zip(self.possible_agents, vectors, windows, strict=True)
+            agent: {keys.OBSERVATION[1]: vectors[i], **{k: v[i] for k, v in pictures.items()}}
+            for i, agent in enumerate(self.possible_agents)
         }
 
     def _infos(self, td: TensorDictBase) -> dict[str, dict[str, Any]]:
@@ -266,21 +270,25 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
         }
 
 
-def _spaces(env: EnvBase, core: WildfireEnv) -> tuple[Box, Box | None]:
-    """Returns the spaces of the vector and of the window, if there is one."""
+def _spaces(env: EnvBase, core: WildfireEnv) -> tuple[Box, dict[str, Box]]:
+    """Returns the spaces of the vector, and of the other tensors of an observation by name."""
     low, high = _bounds(core.config, env.observation_spec[keys.OBSERVATION].shape[-1])
-    window = None
-    if keys.WINDOW in keys.observation_keys(env.observation_spec):
-        window = Box(0, 1, env.observation_spec[keys.WINDOW].shape[-3:], np.uint8)
-    return Box(low, high, dtype=np.float32), window
+    _, *others = keys.observation_keys(env.observation_spec)
+    pictures: dict[str, Box] = {}
+    for key in others:
+        spec = env.observation_spec[key]
+        largest = 1 if spec.dtype == torch.bool else 255
+        pictures[key[1]] = Box(0, largest, spec.shape[2:], np.uint8)
+    return Box(low, high, dtype=np.float32), pictures
 
 
-def _observation_space(vector: Box, window: Box | None) -> Space:
+def _observation_space(vector: Box, pictures: dict[str, Box]) -> Space:
     """Returns a new space of one agent's observations."""
     copied = Box(vector.low, vector.high, dtype=np.float32)
-    if window is None:
+    if not pictures:
         return copied
-    return Dict({keys.OBSERVATION[1]: copied, keys.WINDOW[1]: Box(0, 1, window.shape, np.uint8)})
+    other = {name: Box(box.low, box.high, dtype=np.uint8) for name, box in pictures.items()}
+    return Dict({keys.OBSERVATION[1]: copied, **other})
 
 
 def _bounds(config: WildfireConfig, features: int) -> tuple[Array, Array]:

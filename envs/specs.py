@@ -11,14 +11,14 @@ DONE_NAMES = ("done", "terminated", "truncated")
 
 
 def observation_spec(
-    envs: int, world: WildfireConfig, window: int | None = None, true_map: bool = False
+    envs: int, world: WildfireConfig, window: int, true_map: bool = False
 ) -> Composite:
     """Returns the spec of all that a reset writes but done, batch size [envs]; see `keys`.
 
     Args:
         envs: number of environments.
         world: the team, and what is measured.
-        window: cells along a side of the observed window; None without a window.
+        window: cells along a side of the window in view.
         true_map: whether the map is written, too.
     """
     agents = (envs, world.num_uavs)
@@ -40,9 +40,12 @@ def observation_spec(
         keys.HIT_BOUNDARY[1]: Binary(shape=torch.Size((*agents, 3)), dtype=torch.bool),
         keys.ALIVE[1]: Binary(shape=torch.Size(agents), dtype=torch.bool),
     }
-    if window is not None:
+    if world.observation == "window":
         shape = torch.Size((*agents, 3, window, window))
         per_uav[keys.WINDOW[1]] = Binary(shape=shape, dtype=torch.bool)
+    if world.observation == "sight":
+        shape = torch.Size((*agents, window, window))
+        per_uav[keys.SIGHT[1]] = Unbounded(shape, dtype=torch.uint8)
     counts = [keys.RNG_KEY, keys.STEP, keys.SEEN, keys.BURNING, keys.BURNT]
     per_env: dict[str, TensorSpec] = {key: whole(envs) for key in counts}
     if world.measures == "all":

@@ -101,7 +101,7 @@ class WildfireEnv(Buffers, TeamView):
         self.register_buffer("_low", low, persistent=False)
         self.register_buffer("_high", high, persistent=False)
         sensor = Sensor(config.grid, view_angle=config.view_angle, ceiling=high[2].item())
-        self._side = sensor.side if config.observation == "window" else None
+        self._side = sensor.side
         fires, self._one_fire_each = load_fires(fire, config, num_envs)
         self._map = CoverageMap(
             sensor, fires, horizon=config.horizon, envs=num_envs, uavs=config.num_uavs
@@ -206,7 +206,7 @@ class WildfireEnv(Buffers, TeamView):
     def _no_sighting(self) -> Sighting:
         """Returns the sighting at reset: no UAV has looked yet."""
         none = torch.zeros_like(self._position)
-        classes = none.new_zeros((*none.shape, (self._side or 0) ** 2), dtype=torch.bool)
+        classes = none.new_zeros((*none.shape, self._side**2), dtype=torch.bool)
         return Sighting(none, none.new_zeros((*none.shape, 2), dtype=torch.float32), classes)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -265,8 +265,11 @@ class WildfireEnv(Buffers, TeamView):
             keys.HIT_BOUNDARY[1]: hit_boundary,
             keys.ALIVE[1]: self._all_alive.clone() if alive is None else alive,
         }
-        if self._side is not None:
-            agents[keys.WINDOW[1]] = sighting.classes.unflatten(-1, (self._side, self._side))
+        square = self._side, self._side
+        if self.config.observation == "window":
+            agents[keys.WINDOW[1]] = sighting.classes.unflatten(-1, square)
+        if self.config.observation == "sight":
+            agents[keys.SIGHT[1]] = sighting.shown().unflatten(-1, square)
         if reward is not None:
             agents[keys.REWARD[1]] = reward.unsqueeze(-1)
         done = self._done(time)

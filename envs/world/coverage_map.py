@@ -21,6 +21,14 @@ class Sighting(NamedTuple):
     """float32 [..., 3, 2]: mean (i, j) of the cells; 0 if there are none"""
     classes: Tensor
     """bool [..., 3, W * W]: mask of the cells in the UAV's window"""
+    burnt_out: Tensor | None = None
+    """bool [..., W * W]: mask of those cells without fire that burned earlier; None for none"""
+
+    def shown(self) -> Tensor:
+        """Returns what the camera shows of the window, uint8 [..., W * W]; see `keys.SIGHT`."""
+        new, old, none = self.classes.to(torch.uint8).unbind(-2)
+        shown = none + 2 * (new + old)
+        return shown if self.burnt_out is None else shown.add(self.burnt_out, alpha=2)
 
 
 class View(NamedTuple):
@@ -159,7 +167,7 @@ class CoverageMap(Buffers):
             in_view &= alive.unsqueeze(-1)
         stamp, first_seen, time = self._stamp, self._first_seen, step.view(-1, 1, 1)
         stamp.add_(self._uavs)
-        arrival_time = self._arrival_time.take(cells)
+        arrival_time, burnt_out = self._arrival_time.take(cells), None
         burning = in_view & (arrival_time <= time)
         no_fire = in_view & (arrival_time > time)
         if self._burn_out is not None:
@@ -169,5 +177,6 @@ class CoverageMap(Buffers):
         first_seen.view(-1).scatter_reduce_(0, cells.view(-1), claims.view(-1), "amin")
         new = first_seen.take(cells) == stamp
         classes = torch.stack((new, burning ^ new, no_fire), -2)
-        sighting = Sighting(*self._sensor.count_classes(classes, centre), classes)
+        counted = self._sensor.count_classes(classes, centre)
+        sighting = Sighting(*counted, classes, burnt_out)
         return sighting, View(cells, in_view, burning)

@@ -74,6 +74,21 @@ class Knowledge(Buffers):
         alone = torch.eye(self._reach.shape[-1], dtype=torch.bool, device=mask.device)
         self._reach.copy_(torch.where(began, alone, self._reach))
 
+    def see(self, view: View, stored: Tensor) -> None:
+        """Adds what each UAV sees to its own map alone.
+
+        Args:
+            view: the cells that the UAVs see.
+            stored: integers [envs, uavs, cells], the step of each sighting, or a number that is
+                larger for later steps.
+        """
+        index = view.cells + self._first[:, : view.cells.shape[1], :, 0]
+        values = torch.where(view.in_view, stored, NEVER).to(self.last_seen.dtype)
+        self.last_seen.view(-1).scatter_reduce_(0, index.view(-1), values.view(-1), "amax")
+        if self.seen_fire is not None:
+            flat = self.seen_fire.view(-1).view(torch.uint8)
+            flat.scatter_reduce_(0, index.view(-1), view.burning.view(torch.uint8).view(-1), "amax")
+
     def update(self, view: View, step: Tensor, hears: Tensor) -> None:
         """Adds the sightings and messages of a step.
 

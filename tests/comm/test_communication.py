@@ -14,6 +14,7 @@ from emberlink.trainers.config.compose import resolve
 
 ROOT = Path(__file__).parents[2]
 METHODS = ["independent", "shared_memory", "positional", "consensus"]
+EVERY = [*METHODS, "maps"]
 OBSERVED = {"independent": 6, "shared_memory": 6, "positional": 30, "consensus": 9}
 UAVS, ENVS, HORIZON = 5, 3, 8
 
@@ -62,7 +63,7 @@ def test_root_and_next_observations_are_rewritten_alike(method):
     assert not same[:, ended].all()
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", EVERY)
 def test_communication_does_not_change_the_world(method):
     env = recipe(method)
     plain = WildfireEnv(ENVS, env.base_env.config, ablaze(), seed=4)
@@ -82,7 +83,7 @@ def test_communication_does_not_change_the_world(method):
 
 def test_registered_modules_are_the_files_on_disk():
     files = {file.stem for file in (ROOT / "comm").glob("[!_]*.py")} - {"base", "registry"}
-    assert registry.known() == sorted(files) == ["consensus", "no_comm", "positional"]
+    assert registry.known() == sorted(files) == ["consensus", "maps", "no_comm", "positional"]
     for name in registry.known():
         module = registry.find(name)
         assert issubclass(module, base.CommModule)
@@ -91,15 +92,15 @@ def test_registered_modules_are_the_files_on_disk():
 
 def test_every_recipe_names_a_module():
     recipes = sorted(file.stem for file in (ROOT / "configs" / "method").glob("*.yaml"))
-    assert recipes == sorted(METHODS)
+    assert recipes == sorted(EVERY)
     used = {resolve(method).comm["name"] for method in recipes}
     assert used == set(registry.known())
 
 
 @pytest.mark.parametrize("name", ["consensu", "", "base", "../no_comm"])
 def test_an_unknown_module_gives_an_error_with_the_known_names(name):
-    with pytest.raises(ValueError, match=r"known: consensus, no_comm, positional$") as error:
+    with pytest.raises(ValueError, match=r"known: consensus, maps, no_comm, positional$") as error:
         registry.find(name)
     assert repr(name) in str(error.value)
-    with pytest.raises(ValueError, match="known: consensus, no_comm, positional"):
+    with pytest.raises(ValueError, match="known: consensus, maps, no_comm, positional"):
         resolve("independent", [f"comm.name='{name}'"])

@@ -22,7 +22,7 @@ from emberlink.envs import WildfireConfig, WildfireEnv, keys, parallel_env, pett
 from emberlink.trainers import make_env
 
 pytestmark = pytest.mark.filterwarnings("error")
-METHODS = ("independent", "shared_memory", "positional", "consensus")
+METHODS = ("independent", "shared_memory", "positional", "consensus", "maps")
 FIRE = torch.linspace(0, 60, 12 * 10).view(12, 10)
 
 
@@ -64,8 +64,12 @@ def test_recipes_pass_the_api_test(method):
 
 def compare(td: TensorDict, observations, infos, agents) -> None:
     for i, agent in enumerate(agents):
-        assert observations[agent].dtype == np.float32
-        assert np.array_equal(observations[agent], td[keys.OBSERVATION][0, i].numpy())
+        given = observations[agent]
+        if isinstance(given, dict):
+            assert np.array_equal(given["crops"], td[keys.CROPS][0, i].numpy())
+            given = given["observation"]
+        assert given.dtype == np.float32
+        assert np.array_equal(given, td[keys.OBSERVATION][0, i].numpy())
         for key in ("position", "new_fire", "old_fire", "no_fire", "hit_boundary"):
             assert np.array_equal(infos[agent][key], td[keys.AGENTS, key][0, i].numpy())
         assert infos[agent]["seen"] == td[keys.SEEN].item()

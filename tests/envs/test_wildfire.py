@@ -14,7 +14,7 @@ from emberlink.envs.fire.generator import load_scenario, make_fires
 from emberlink.envs.utils.errors import UserError
 from emberlink.trainers import make_env
 
-METHODS = ("independent", "shared_memory", "positional", "consensus")
+METHODS = ("independent", "shared_memory", "positional", "consensus", "maps")
 SETUPS = ("paper", "released", "tuned")
 EVERYWHERE = torch.zeros(12, 12)
 NOWHERE = torch.full((12, 12), math.inf)

@@ -123,7 +123,8 @@ def load_weights(
     Args:
         path: a checkpoint file.
         expected: tensors with the expected names, shapes and types.
-        config: configuration with the expected method and number of UAVs; not checked if None.
+        config: configuration with the expected method, and the number of UAVs if each has its own
+            weights; not checked if None.
 
     Returns:
         The weights with the names of `expected`.
@@ -151,7 +152,8 @@ def load_weights(
 
 def _check_header(path: Path, header: Mapping[str, Any], config: RunConfig) -> None:
     expected = _network_header(config, 0)
-    for name in ("method", "uavs"):
+    # Shared weights fly in a team of any size, if what a UAV observes does not depend on it.
+    for name in ("method",) if config.learner.share_parameters else ("method", "uavs"):
         if header.get(name, expected[name]) != expected[name]:
             raise UserError(
                 f"{path}: a checkpoint of {name}={header[name]}; "

@@ -27,7 +27,7 @@ def refused(arguments: list[str], capsys, *words: str) -> str:
     return err
 
 
-METHODS = "known: consensus, independent, positional, shared_memory"
+METHODS = "known: consensus, independent, maps, positional, shared_memory"
 SETUPS = "known: paper, released, tuned"
 
 

@@ -245,7 +245,7 @@ def test_eval_takes_a_single_run(run, capsys):
 @pytest.mark.parametrize(
     ("kind", "names"),
     [
-        ("methods", ["consensus", "independent", "positional", "shared_memory"]),
+        ("methods", ["consensus", "independent", "maps", "positional", "shared_memory"]),
         ("setups", ["paper", "released", "strong", "tuned"]),
         ("policies", ["stationary", "oracle"]),
     ],

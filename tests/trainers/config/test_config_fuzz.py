@@ -54,6 +54,7 @@ CAPS = {
 FIXED = {
     "device": ["cpu"],
     "output": ["runs", "a b/c-ü"],
+    "env.radio.bandwidth": [None, 0, 50],
     "env.base": [None, [0.0, 7.0], [3.5, 0.25]],
     "env.failures": [0.0, 0.5, 1.0],
     "evaluation.scripted": [[], ["oracle"], ["map_greedy", "courier"]],

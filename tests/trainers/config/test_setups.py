@@ -122,6 +122,23 @@ def test_methods_differ_only_in_listed_settings(setup):
             assert repr(value) not in common.get(key, set())
 
 
+@pytest.mark.parametrize("setup", OWN)
+def test_maps_differ_from_the_other_methods_in_listed_settings(setup):
+    maps, other = (resolve(m, [f"setup={setup}"]) for m in ("maps", "shared_memory"))
+    values, others = flat(to_values(maps)), flat(to_values(other))
+    differ = {
+        key
+        for key, value in values.items()
+        if value != others.get(key) and key.split(".")[0] not in ("method", "comm")
+    }
+    own = {"env.observation", "learner.share_parameters", "learner.buffer_size"}
+    tuned = {"env.reward.new_fire", "policy.hold", *CORRELATED}
+    assert differ == own | (tuned if setup == "tuned" else set())
+    assert (maps.comm["name"], maps.replay, maps.env.observation) == ("maps", "shared", "sight")
+    assert maps.comm["period"] == maps.policy.hold == (10 if setup == "tuned" else 1)
+    assert resolve("maps", ["policy.hold=5"]).comm["period"] == 5
+
+
 def test_paper_is_the_default():
     for method in METHODS:
         assert resolve(method) == resolve(method, ["setup=paper"])
@@ -185,7 +202,7 @@ def test_defaults_in_code_equal_setup_paper():
 
 
 def test_the_table_has_all_setups_and_methods():
-    assert known("method") == sorted(METHODS)
+    assert known("method") == sorted([*METHODS, "maps"])
     assert known("setup") == ["paper", "released", "tuned"]
     assert known("fire") == [
         *("file", "front", "huygens", "oil_slick", "paper", "reaction", "swarm"),

@@ -80,7 +80,7 @@ def test_all_methods_by_default_and_stacks_of_seeds():
     jobs = jobs_of(["seeds=[3,4]"])
     assert names(jobs) == [
         f"{method}, paper, paper, seed 3,4"
-        for method in ("consensus", "independent", "positional", "shared_memory")
+        for method in ("consensus", "independent", "maps", "positional", "shared_memory")
     ]
     assert [config.seed for config in jobs[0].configs] == [3, 4]
 

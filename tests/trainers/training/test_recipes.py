@@ -1,4 +1,4 @@
-"""Tests all four recipes under all three setups: a short training and its files."""
+"""Tests all recipes under all three setups: a short training and its files."""
 
 import json
 import math
@@ -39,9 +39,9 @@ def trained(config) -> Trainer:
 @pytest.mark.parametrize(
     "setup", ["paper", *(pytest.param(s, marks=pytest.mark.slow) for s in SETUPS[1:])]
 )
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", [*METHODS, "maps"])
 def test_a_recipe_trains(method, setup, tmp_path):
-    config = short(method, tmp_path, setup=setup)
+    config = short(method, tmp_path, "policy.hold=1", setup=setup)
     trainer = Trainer(config)
     initial = {name: weight.clone() for name, weight in trainer.setup.learner.weights().items()}
     trainer.start()
@@ -54,7 +54,9 @@ def test_a_recipe_trains(method, setup, tmp_path):
     assert RunFolder(run.path).config() == config
     check_lines(run, config)
     networks = trainer.setup.learner.weights()
-    assert len(networks) == 2 * (10 + 12)  # actor and critic, and the target of each
+    pictures = 12 if method == "maps" else 0  # two pictures, three convolutions each
+    # actor and critic, and the target of each
+    assert len(networks) == 2 * (10 + 12 + 2 * pictures)
     for name, weight in networks.items():
         assert weight.isfinite().all(), name
         assert not weight.equal(initial[name]), name
@@ -85,7 +87,8 @@ def check_actor(run: RunFolder, config, trainer: Trainer) -> None:
     loaded = load_actor(config, checkpoint)
     rollout = trainer.setup.env.rollout(5, trainer.setup.learner.actor)
     for step in range(5):
-        again = loaded(rollout[:, step].select(keys.OBSERVATION))
+        observed = keys.observation_keys(trainer.setup.env.observation_spec)
+        again = loaded(rollout[:, step].select(*observed))
         assert again[keys.ACTION].equal(rollout[:, step][keys.ACTION])
     assert rollout[keys.ACTION].abs().max() > 0
 

@@ -121,7 +121,10 @@ def whole(tmp_path_factory):
 @pytest.mark.parametrize("learner", ["ddpg", "td3", "ippo", "mappo"])
 @pytest.mark.parametrize(
     ("method", "steps"),
-    [*zip(METHODS, [[1, 33], [40], [41, 42, 79], [33, 40, 79]], strict=True)],
+    [
+        *zip(METHODS, [[1, 33], [40], [41, 42, 79], [33, 40, 79]], strict=True),
+        ("maps", [1, 33, 40, 79]),
+    ],
 )
 def test_a_resumed_run_equals_the_uninterrupted_run(method, steps, learner, whole, tmp_path):
     more = [] if learner == "ddpg" else [f"learner={learner}"]

@@ -1,0 +1,198 @@
+"""Draws what UAVs know as pictures around them, at several scales."""
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from emberlink.envs.utils.buffers import Buffers
+
+CHANNELS = ("fire", "seen", "burnt_out", "near", "age", "outside", "uavs", "base")
+"""what the channels of a picture show, see `Crops`"""
+LARGEST_SCALE = 16
+"""cells along the side of a pixel; sums over a pixel fit into the bits of a field"""
+_FULL = 255
+_OLD = 1000.0  # steps; the age of the darkest known cells
+_SPREAD = 50.0  # steps; time scale at which the chance of ignition near known fire grows
+_DRAWN = 2**21  # cells of maps that are drawn at a time
+# Bits of an int64 at which the sum over a pixel begins: counts of 10 bits, sums of bytes of 16.
+_FIRE, _SEEN, _BURNT_OUT, _NEAR, _AGE, _END = 0, 10, 20, 30, 46, 62
+
+
+def age_byte(age: int) -> int:
+    """Returns the brightness of an age in steps: 0 for none, 254 from 1000 steps on."""
+    return min(_FULL - 1, round((_FULL - 1) * math.log1p(age) / math.log1p(_OLD)))
+
+
+def chance_byte(age: int) -> int:
+    """Returns the chance that a cell without fire near a fire burns, `age` steps after a look."""
+    return round(_FULL * (1 - math.exp(-age / _SPREAD)))
+
+
+class Crops(Buffers):
+    """Draws pictures of S x S pixels; the cell nearest to the UAV is in pixel (S // 2, S // 2).
+
+    The channels hold bytes. `fire`, `seen` and `burnt_out` are the shares of the pixel's cells that
+    burned at the last look, that were seen while they burned, and that had burnt out at the last
+    look. `near` is the mean chance that a cell burns by now that is at most `spread` cells away
+    from known fire and was without fire at the last look, or never seen. `age` is the mean of
+    `age_byte` over the cells of the grid, 255 for a cell that was never seen. `outside` is the
+    share of cells outside of the grid. `uavs` shows other UAVs as they are known, 255 less
+    `age_byte`, and `base` the base station, 255.
+
+    The sums over pixels come from one summed-area table of all channels, whose sums are fields of
+    an int64; they are exact.
+
+    Args:
+        grid: cells along x and y.
+        pixels: S.
+        scales: cells along the side of a pixel in each picture, at most `LARGEST_SCALE`.
+        spread: cells.
+        horizon: steps of an episode.
+    """
+
+    _fields: Tensor
+    _ages: Tensor
+    _edges: Tensor
+
+    def __init__(
+        self,
+        grid: tuple[int, int],
+        *,
+        pixels: int,
+        scales: Sequence[int],
+        spread: int,
+        horizon: int,
+    ):
+        super().__init__()
+        self.grid, self.pixels, self.scales, self.spread = grid, pixels, tuple(scales), spread
+        fields = []
+        for age in range(horizon + 2):
+            old, chance = age_byte(age) << _AGE, chance_byte(age) << _NEAR
+            never = (_FULL << _AGE) + (_FULL << _NEAR)
+            fields += [never, (1 << _BURNT_OUT) + old, (1 << _FIRE) + old, chance + old]
+        self.register_buffer("_fields", torch.tensor(fields), persistent=False)
+        ages = torch.tensor([age_byte(age) for age in range(horizon + 2)])
+        self.register_buffer("_ages", ages, persistent=False)
+        edges = [
+            [(pixel - pixels // 2) * scale - scale // 2 for pixel in range(pixels + 1)]
+            for scale in scales
+        ]
+        self.register_buffer("_edges", torch.tensor(edges), persistent=False)
+
+    @property
+    def shape(self) -> tuple[int, int, int, int]:
+        """Scales, channels, and pixels along both sides."""
+        return len(self.scales), len(CHANNELS), self.pixels, self.pixels
+
+    def draw(
+        self, known: Tensor, seen: Tensor, step: Tensor, centre: Tensor, points: tuple[Tensor, ...]
+    ) -> Tensor:
+        """Returns the pictures, uint8 [rows, *shape].
+
+        Args:
+            known: integers [rows, X, Y], 4 times the step of the last look plus what was seen (0 no
+                fire, 1 fire, 2 burnt out), -1 for never.
+            seen: bool [rows, X, Y], whether a cell was seen while it burned.
+            step: int64 [rows], steps since the episode began.
+            centre: int64 [rows, 2], the cell nearest to the UAV.
+            points: cells of other UAVs, int64 [rows, k, 2], the step at which they are known,
+                int64 [rows, k], -1 for never, and the cell of the base, int64 [rows, 0 or 1, 2].
+        """
+        block = max(1, _DRAWN // (self.grid[0] * self.grid[1]))
+        parts = zip(*(x.split(block) for x in (known, seen, step, centre, *points)), strict=True)
+        drawn = [self._draw(*part) for part in parts]
+        return drawn[0] if len(drawn) == 1 else torch.cat(drawn)
+
+    def _draw(
+        self,
+        known: Tensor,
+        seen: Tensor,
+        step: Tensor,
+        centre: Tensor,
+        uavs: Tensor,
+        heard: Tensor,
+        base: Tensor,
+    ) -> Tensor:
+        table = self._summed(known, seen, step)
+        age = self._ages.take((step.unsqueeze(-1) - heard).clamp(min=0))
+        bright = torch.where(heard >= 0, _FULL - age, 0)
+        pictures = []
+        for edges, scale in zip(self._edges, self.scales, strict=True):
+            channels = self._sums(table, centre, edges, scale)
+            at = centre.unsqueeze(1), edges, scale
+            channels.append(self._marks(uavs, bright, *at))
+            channels.append(self._marks(base, torch.full_like(base[..., 0], _FULL), *at))
+            pictures.append(torch.stack(channels, 1))
+        return torch.stack(pictures, 1)
+
+    def _summed(self, known: Tensor, seen: Tensor, step: Tensor) -> Tensor:
+        """Returns the sums of all fields over the cells below and left, int64 [rows, X+1, Y+1]."""
+        index = 4 * step.view(-1, 1, 1) + 3 - known
+        fields = self._fields.take(index)
+        if self.spread:
+            near = _widened((known & 3 == 1) & (known >= 0), self.spread)
+        else:
+            near = torch.zeros_like(seen)
+        fields.bitwise_and_(torch.where(near, -1, ~(0xFFFF << _NEAR)))
+        fields += seen.long() << _SEEN
+        # The sums overflow; their differences, which fit into the fields, are exact all the same.
+        return torch.nn.functional.pad(fields.cumsum(2).cumsum(1), (1, 0, 1, 0))
+
+    def _sums(self, table: Tensor, centre: Tensor, edges: Tensor, scale: int) -> list[Tensor]:
+        """Returns the channels that are sums over pixels, int64 [rows, S, S] each."""
+        x, y = (
+            (centre[:, axis : axis + 1] + edges).clamp(0, side)
+            for axis, side in enumerate(self.grid)
+        )
+        row = torch.arange(len(table), device=table.device).view(-1, 1, 1)
+        place = (row * table.shape[1] + x.unsqueeze(-1)) * table.shape[2] + y.unsqueeze(1)
+        sums = table.take(place).diff(dim=1).diff(dim=2)
+        inside = x.diff(dim=1).unsqueeze(-1) * y.diff(dim=1).unsqueeze(1)
+
+        def field(first: int, end: int) -> Tensor:
+            return (sums >> first) & ((1 << (end - first)) - 1)
+
+        cells = scale * scale
+        shares = [
+            _rounded(_FULL * field(first, first + 10), cells)
+            for first in (_FIRE, _SEEN, _BURNT_OUT)
+        ]
+        near = _rounded(field(_NEAR, _AGE), cells)
+        age = _rounded(field(_AGE, _END), inside.clamp(min=1))
+        return [*shares, near, age, _rounded(_FULL * (cells - inside), cells)]
+
+    def _marks(
+        self, cell: Tensor, value: Tensor, centre: Tensor, edges: Tensor, scale: int
+    ) -> Tensor:
+        """Returns a channel with the largest value of the points in each pixel, [rows, S, S].
+
+        Args:
+            cell: int64 [rows, k, 2].
+            value: int64 [rows, k].
+            centre: int64 [rows, 1, 2].
+            edges, scale: of the pixels.
+        """
+        pixel = torch.div(cell - centre - edges[0], scale, rounding_mode="floor")
+        shown = ((pixel >= 0) & (pixel < self.pixels)).all(-1)
+        x, y = pixel.clamp(0, self.pixels - 1).unbind(-1)
+        plane = value.new_zeros(len(cell), self.pixels * self.pixels)
+        plane.scatter_reduce_(1, x * self.pixels + y, value * shown, "amax")
+        return plane.unflatten(1, (self.pixels, self.pixels)).to(torch.uint8)
+
+
+def _rounded(total: Tensor, count: Tensor | int) -> Tensor:
+    """Returns total / count, rounded half up; float32 is exact enough for sums of a pixel."""
+    return (total / count).add_(0.5).to(torch.uint8)
+
+
+def _widened(mask: Tensor, reach: int) -> Tensor:
+    """Returns whether a cell of a mask, bool [rows, X, Y], is within `reach` along x and y."""
+    for axis in (1, 2):
+        wide, side = mask.clone(), mask.shape[axis]
+        for by in range(1, min(reach, side - 1) + 1):
+            wide.narrow(axis, by, side - by).logical_or_(mask.narrow(axis, 0, side - by))
+            wide.narrow(axis, 0, side - by).logical_or_(mask.narrow(axis, by, side - by))
+        mask = wide
+    return mask

@@ -1,0 +1,196 @@
+"""Shared maps: UAVs keep maps of what they know, exchange them by radio, and look at them."""
+
+from typing import Annotated, Any, ClassVar
+
+import torch
+from pydantic import ConfigDict, Field, Strict
+from pydantic.dataclasses import dataclass
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.data import Composite, Unbounded
+
+from emberlink.comm._crops import LARGEST_SCALE, Crops
+from emberlink.comm._messages import CellMessages, pass_on_places
+from emberlink.comm.base import CommModule
+from emberlink.envs import keys
+from emberlink.envs.config import WildfireConfig
+from emberlink.envs.world import motion
+from emberlink.envs.world.coverage_map import View
+from emberlink.envs.world.knowledge import Knowledge
+from emberlink.envs.world.sensor import Sensor
+
+
+@dataclass(frozen=True, kw_only=True, config=ConfigDict(extra="forbid", strict=True))
+class MapsConfig:
+    """The settings under `comm`."""
+
+    pixels: Annotated[int, Field(ge=8, le=64)] = 24
+    """pixels along the side of a picture"""
+    scales: Annotated[
+        tuple[Annotated[int, Field(ge=1, le=LARGEST_SCALE)], ...],
+        Field(min_length=1, max_length=4),
+        Strict(False),
+    ] = (1, 5)
+    """cells along the side of a pixel, in each picture"""
+    spread: Annotated[int, Field(ge=0, le=16)] = 2
+    """cells around known fire that may burn by now, along x and y; 0 for none"""
+    position: bool = False
+    """whether a UAV also observes its own x and y"""
+    period: Annotated[int, Field(ge=1, le=1_000_000)] = 1
+    """steps from one drawing of the pictures to the next; those of `policy.hold` suffice"""
+
+
+class Maps(CommModule):
+    """Keeps a map per UAV of what it saw and was told, and shows it to the UAV as pictures.
+
+    At each step, a UAV says to those that hear it what is new to one of them: cells, and positions
+    of UAVs. What it hears it can pass on at the next step. A UAV observes its altitude, the time
+    and pictures of its own map (`Crops`), and nothing else.
+    """
+
+    config_type: ClassVar[type] = MapsConfig
+    hears: ClassVar[bool] = True
+    stamp: Tensor
+    """int64 [num_envs, n, n]: steps at which UAVs know positions of UAVs, -1 for never"""
+    place: Tensor
+    """float32 [num_envs, n, n, 3]: these positions, cells"""
+    crops: Tensor
+    """uint8 [num_envs, n, ...]: the pictures last drawn"""
+    said: Tensor
+    """int64 [num_envs, n]: the bytes said at the last step"""
+    low: Tensor
+    high: Tensor
+    _start: Tensor
+    _base: Tensor
+
+    def __init__(self, world: WildfireConfig, config: MapsConfig, num_envs: int = 1):
+        super().__init__(world, config, num_envs)
+        inputs: list[Any] = [keys.SIGHT, keys.POSITION, keys.HEARS, keys.ALIVE, keys.STEP]
+        outputs: list[Any] = [keys.OBSERVATION, keys.CROPS]
+        self.in_keys, self.out_keys = inputs, outputs
+        low, high = motion.corners(world.low, world.high)
+        self.register_buffer("low", low, persistent=False)
+        self.register_buffer("high", high, persistent=False)
+        ceiling = high[2].item()
+        self.sensor = Sensor(world.grid, view_angle=world.view_angle, ceiling=ceiling)
+        uavs, area = world.num_uavs, self.sensor.area
+        # Steps are stored times 4, plus what was seen.
+        last = 4 * world.horizon + 3
+        self.known = Knowledge(envs=num_envs, uavs=uavs, area=area, horizon=last, fires=True)
+        self.messages = CellMessages(num_envs, uavs, area)
+        self.pictures = Crops(
+            world.grid,
+            pixels=config.pixels,
+            scales=config.scales,
+            spread=config.spread,
+            horizon=world.horizon,
+        )
+        agents = num_envs, uavs
+        self.register_buffer("stamp", torch.full((*agents, uavs), -1))
+        self.register_buffer("place", torch.zeros(*agents, uavs, 3, dtype=torch.float32))
+        drawn = torch.zeros(*agents, *self.pictures.shape, dtype=torch.uint8)
+        self.register_buffer("crops", drawn)
+        self.register_buffer("said", torch.zeros(agents, dtype=torch.int64))
+        first = torch.arange(num_envs).unsqueeze(-1) * area
+        self.register_buffer("_start", first, persistent=False)
+        base = torch.tensor([] if world.base is None else [world.base]).view(-1, 2)
+        self.register_buffer("_base", base.round().long(), persistent=False)
+
+    def specs(self, observation: Composite) -> Composite:
+        shape, device = observation[keys.AGENTS].shape, observation.device
+        features = 4 if self.config.position else 2
+        vector = Unbounded(torch.Size((*shape, features)), device=device, dtype=torch.float32)
+        pictures = torch.Size((*shape, *self.pictures.shape))
+        observation[keys.OBSERVATION] = vector
+        observation[keys.CROPS] = Unbounded(pictures, device=device, dtype=torch.uint8)
+        return observation
+
+    def reset(self, tensordict: TensorDictBase, mask: Tensor) -> None:
+        """Forgets everything."""
+        self.known.start_episodes(mask)
+        self.messages.start_episodes(mask)
+        self.stamp.masked_fill_(mask[:, None, None], -1)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        self._look(tensordict)
+        self._talk(tensordict)
+        self._draw(tensordict)
+        tensordict.set(keys.CROPS, self.crops.clone())
+        return tensordict.set(keys.OBSERVATION, self._vector(tensordict))
+
+    def bytes_sent(self, tensordict: TensorDictBase) -> Tensor:
+        """Returns 5 for each cell and 16 for each position that a UAV said, int64 [num_envs, n]."""
+        return self.said.clone()
+
+    def sightings(self) -> tuple[Tensor, Tensor]:
+        """Returns the last look of each UAV at each cell, as it knows it.
+
+        Returns:
+            The step, int64 [num_envs, n, X, Y], -1 for never, and what was seen: 0 no fire, 1 fire,
+            2 burnt out; 3 for never.
+        """
+        known = self.sensor.crop(self.known.last_seen).long()
+        return known >> 2, known & 3
+
+    def _look(self, tensordict: TensorDictBase) -> None:
+        """Adds what each UAV sees, and where it is, to what it knows."""
+        position, step = tensordict.get(keys.POSITION), tensordict.get(keys.STEP)
+        sight = tensordict.get(keys.SIGHT).flatten(-2)
+        cells = self.sensor.look(position.double(), self._start)[1]
+        view = View(cells, sight > 0, sight == 2)
+        self.known.see(view, 4 * step.view(-1, 1, 1) + sight - 1)
+        self.messages.saw(view)
+        alive = tensordict.get(keys.ALIVE)
+        own = self.stamp.diagonal(dim1=1, dim2=2)
+        own.copy_(torch.where(alive, step.unsqueeze(-1), own))
+        self.place.diagonal(dim1=1, dim2=2).copy_(position.mT)
+
+    def _talk(self, tensordict: TensorDictBase) -> None:
+        """Passes on what is new to those that hear it, and counts the bytes."""
+        hears, limit = tensordict.get(keys.HEARS), self.world.radio.bandwidth
+        places = pass_on_places(self.stamp, self.place, hears, limit)
+        left = (0 if limit is None else limit) - places
+        cells = self.messages.pass_on(self.known, hears, limit, left)
+        self.said.copy_(places + cells)
+
+    def _draw(self, tensordict: TensorDictBase) -> None:
+        """Draws the pictures of the environments in which they are due."""
+        step = tensordict.get(keys.STEP)
+        due = step % self.config.period == 0
+        if due.is_cuda:  # The environments would have to be read from the device.
+            every = self._pictures(tensordict, torch.arange(len(step), device=step.device))
+            self.crops.copy_(torch.where(due.view(-1, *[1] * (every.ndim - 1)), every, self.crops))
+            return
+        env = due.nonzero().squeeze(-1)
+        if len(env):
+            self.crops[env] = self._pictures(tensordict, env)
+
+    def _pictures(self, tensordict: TensorDictBase, env: Tensor) -> Tensor:
+        """Returns the pictures of some environments, uint8 [len(env), n, ...]."""
+        uavs, seen = self.world.num_uavs, self.known.seen_fire
+        assert seen is not None
+        own = torch.eye(uavs, dtype=torch.bool, device=env.device)
+        heard = self.stamp[env].masked_fill(own, -1)
+        others = self.place[env][..., :2].round().long()
+        centre = tensordict.get(keys.POSITION)[env][..., :2].round().long()
+        base = self._base.expand(len(env), uavs, *self._base.shape)
+        step = tensordict.get(keys.STEP)[env].unsqueeze(-1).expand(-1, uavs)
+        drawn = self.pictures.draw(
+            self.sensor.crop(self.known.last_seen[env]).flatten(0, 1),
+            self.sensor.crop(seen[env]).flatten(0, 1),
+            step.flatten(),
+            centre.flatten(0, 1),
+            tuple(x.flatten(0, 1) for x in (others, heard, base)),
+        )
+        return drawn.unflatten(0, (len(env), uavs))
+
+    def _vector(self, tensordict: TensorDictBase) -> Tensor:
+        """Returns altitude and time, and x and y if a UAV observes them, float32 [num_envs, n, k].
+
+        The box is scaled to [-1, 1], the horizon to [0, 1].
+        """
+        scaled = motion.scale_to_box(tensordict.get(keys.POSITION), self.low, self.high)
+        clock = tensordict.get(keys.STEP).float().view(-1, 1, 1) / self.world.horizon
+        clock = clock.expand(-1, scaled.shape[1], 1)
+        parts = [scaled[..., 2:], clock, *([scaled[..., :2]] if self.config.position else [])]
+        return torch.cat(parts, -1)

@@ -1,0 +1,107 @@
+"""Tests the pictures of method `maps` against a scalar implementation."""
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scalar_maps import age_byte, picture
+
+from emberlink.comm import _crops
+from emberlink.comm._crops import Crops
+
+NAMES = ("none", "fire", "burnt out")
+HORIZON = 400
+
+
+def draw(grid, known, seen, step, centre, others, base, **more) -> torch.Tensor:
+    """Draws the pictures of one UAV."""
+    crops = Crops(grid, horizon=HORIZON, **more)
+    points = torch.tensor([[cell for cell, _ in others]]).view(1, -1, 2)
+    heard = torch.tensor([[when for _, when in others]]).view(1, -1)
+    station = torch.tensor([[base]] if base else []).view(1, -1, 2)
+    given = known[None], seen[None], torch.tensor([step]), torch.tensor([centre])
+    return crops.draw(*given, (points, heard, station))[0]
+
+
+def check(grid, seed, step, centre, *, pixels=8, scales=(1, 3), spread=2, base=None):
+    generator = torch.Generator().manual_seed(seed)
+    when = torch.randint(-step // 2 - 1, step + 1, grid, generator=generator)
+    what = torch.randint(0, 3, grid, generator=generator)
+    known = torch.where(when < 0, -1, 4 * when + what).to(torch.int16)
+    seen = torch.rand(grid, generator=generator) < 0.3
+    others = [((3, 2), step), ((grid[0] - 1, grid[1] - 1), 0), ((3, 2), -1), ((0, 5), step // 2)]
+    drawn = draw(
+        *(grid, known, seen, step, centre, others, base),
+        pixels=pixels,
+        scales=scales,
+        spread=spread,
+    )
+    looks = {
+        (x, y): (int(when[x, y]), NAMES[what[x, y]])
+        for x in range(grid[0])
+        for y in range(grid[1])
+        if when[x, y] >= 0
+    }
+    fires = {(int(x), int(y)) for x, y in seen.nonzero()}
+    heard = [(cell, at) for cell, at in others if at >= 0]
+    for index, scale in enumerate(scales):
+        form = {"pixels": pixels, "scale": scale, "spread": spread}
+        expected = picture(looks, fires, grid, centre, heard, base, step, **form)
+        assert drawn[index].tolist() == expected, scale
+
+
+@pytest.mark.parametrize("centre", [(0, 0), (0, 11), (13, 0), (13, 11), (7, 0), (6, 5)])
+@pytest.mark.parametrize("scales", [(1, 3), (4, 2, 5)])
+def test_pictures_at_corners_edges_and_in_the_middle(centre, scales):
+    check((14, 12), 1, 60, centre, scales=scales, base=(0, 6))
+
+
+@settings(max_examples=15, deadline=None, derandomize=True)
+@given(
+    grid=st.tuples(st.integers(8, 20), st.integers(8, 20)),
+    step=st.integers(0, HORIZON),
+    place=st.tuples(st.floats(0, 1), st.floats(0, 1)),
+    pixels=st.integers(8, 11),
+    scale=st.integers(1, 16),
+    spread=st.integers(0, 4),
+)
+def test_pictures_of_any_size(grid, step, place, pixels, scale, spread):
+    centre = tuple(round(at * (side - 1)) for at, side in zip(place, grid, strict=True))
+    check(grid, step, step, centre, pixels=pixels, scales=(scale,), spread=spread)
+
+
+def test_the_largest_sums_fit_into_their_bits():
+    grid, side = (256, 256), _crops.LARGEST_SCALE
+    crops = Crops(grid, pixels=8, scales=(side,), spread=2, horizon=HORIZON)
+    never = torch.full((1, *grid), -1, dtype=torch.int16)
+    points = torch.zeros(1, 0, 2).long(), torch.zeros(1, 0).long(), torch.zeros(1, 0, 2).long()
+    given = torch.ones(1, *grid, dtype=torch.bool), torch.tensor([HORIZON])
+    middle = torch.tensor([[128, 128]])
+    fire, seen, out, near, age, outside, _, _ = crops.draw(never, *given, middle, points)[0, 0]
+    assert (age == 255).all()
+    assert (seen == 255).all()
+    assert not any(channel.any() for channel in (fire, out, near, outside))
+    never[0, 128, 128] = 4 * HORIZON + 1
+    chance = crops.draw(never, *given, middle, points)[0, 0, 3]
+    assert chance.sum() == round(255 * 24 / 256)
+
+
+def test_large_batches_are_drawn_in_parts(monkeypatch):
+    crops = Crops((10, 9), pixels=8, scales=(1, 2), spread=1, horizon=HORIZON)
+    generator = torch.Generator().manual_seed(0)
+    known = torch.randint(-1, 200, (7, 10, 9), generator=generator)
+    known = known.masked_fill(known % 4 == 3, -1)
+    seen, step = known % 4 == 1, torch.full((7,), 60)
+    centre = torch.stack((torch.arange(7), torch.arange(7)), -1)
+    points = centre.unsqueeze(1), step.unsqueeze(1), torch.zeros(7, 0, 2).long()
+    whole = crops.draw(known, seen, step, centre, points)
+    monkeypatch.setattr(_crops, "_DRAWN", 180)
+    assert crops.draw(known, seen, step, centre, points).equal(whole)
+
+
+def test_ages_are_logarithmic():
+    assert [_crops.age_byte(age) for age in (0, 1, 10, 100, 1000, 5000)] == [
+        age_byte(age) for age in (0, 1, 10, 100, 1000, 5000)
+    ]
+    assert _crops.age_byte(0) == 0
+    assert _crops.age_byte(10**6) == 254

@@ -1,0 +1,113 @@
+"""Tests what UAVs tell each other with method `maps` against a scalar implementation."""
+
+import pytest
+import torch
+from scalar_maps import Teller
+
+from emberlink.comm import _messages
+from emberlink.comm._messages import CELL_BYTES, PLACE_BYTES, CellMessages, pass_on_places
+from emberlink.envs.world.coverage_map import View
+from emberlink.envs.world.knowledge import Knowledge
+
+ENVS, UAVS, AREA, STEPS = 3, 5, 40, 25
+
+
+def draw(seed: int, *shape: int) -> torch.Tensor:
+    return torch.rand(*shape, generator=torch.Generator().manual_seed(seed))
+
+
+def looks(step: int) -> tuple[View, torch.Tensor]:
+    """Returns what the UAVs see at a step, and the codes: the state of a cell is that of a step."""
+    cells = torch.stack([draw(97 * step + k, AREA).argsort()[:6] for k in range(ENVS * UAVS)])
+    cells = cells.view(ENVS, UAVS, 6)
+    state = (draw(7 * step + 1, ENVS, AREA) * 3).long()
+    code = state.unsqueeze(1).expand(-1, UAVS, -1).gather(2, cells)
+    in_view = draw(step + 500, ENVS, UAVS, 6) < 0.8
+    start = torch.arange(ENVS).view(-1, 1, 1) * AREA
+    return View(cells + start, in_view, in_view & (code == 1)), code
+
+
+def hearing(step: int, density: float) -> torch.Tensor:
+    """Returns links that mostly last for some steps."""
+    slow = draw(step // 4, ENVS, UAVS, UAVS) < density
+    return slow & ~torch.eye(UAVS, dtype=torch.bool) & (draw(step, ENVS, UAVS, UAVS) < 0.9)
+
+
+def dense(*arguments):
+    return _messages._pass_on_dense(*arguments) * CELL_BYTES
+
+
+@pytest.mark.parametrize("function", ["sparse", "dense"])
+@pytest.mark.parametrize("limit", [None, 0, 23, 60])
+@pytest.mark.parametrize("density", [0.3, 0.8])
+def test_maps_and_bytes_equal_those_of_dictionaries(function, limit, density):
+    known = Knowledge(envs=ENVS, uavs=UAVS, area=AREA, horizon=4 * STEPS + 3, fires=True)
+    messages = CellMessages(ENVS, UAVS, AREA)
+    tellers = [Teller(UAVS) for _ in range(ENVS)]
+    said_any = 0
+    for step in range(1, STEPS):
+        view, code = looks(step)
+        known.see(view, 4 * step + code)
+        messages.saw(view)
+        hears = hearing(step, density)
+        spent = (draw(step + 900, ENVS, UAVS) * 20).long()
+        left = (0 if limit is None else limit) - spent
+        given = known.last_seen, known.seen_fire, hears, limit, left
+        sent = dense(*given) if function == "dense" else messages.pass_on(known, *given[2:])
+        for env, teller in enumerate(tellers):
+            for uav in range(UAVS):
+                seen = view.in_view[env, uav]
+                cells = (view.cells[env, uav][seen] - env * AREA).tolist()
+                codes = code[env, uav][seen].tolist()
+                teller.see(uav, dict(zip(cells, codes, strict=True)), step)
+            budget = None if limit is None else [int(b) // CELL_BYTES for b in left[env]]
+            counts = teller.talk(hears[env].tolist(), budget)
+            assert sent[env].tolist() == [CELL_BYTES * count for count in counts], (step, env)
+            said_any += sum(counts)
+            for uav in range(UAVS):
+                last = {
+                    cell: (number // 4, number % 4)
+                    for cell, number in enumerate(known.last_seen[env, uav].tolist())
+                    if number >= 0
+                }
+                assert last == teller.looks[uav], (step, env, uav)
+                burnt = set(known.seen_fire[env, uav].nonzero().flatten().tolist())
+                assert burnt == teller.fires[uav]
+    assert (said_any > 0) == (limit != 0)
+
+
+@pytest.mark.parametrize("limit", [None, 2 * PLACE_BYTES])
+def test_positions_are_passed_on_a_hop_a_step_and_the_newest_first(limit):
+    uavs = 4
+    stamp, place = torch.full((1, uavs, uavs), -1), torch.zeros(1, uavs, uavs, 3)
+    hears = torch.zeros(1, uavs, uavs, dtype=torch.bool)
+    for uav in range(uavs - 1):  # a chain
+        hears[0, uav, uav + 1] = hears[0, uav + 1, uav] = True
+    expected = {(uav, uav): 0 for uav in range(uavs)}
+    for step in range(12):
+        own = torch.arange(uavs)
+        stamp[0, own, own], place[0, own, own] = step, 10.0 * step + own[:, None].float()
+        expected |= {(uav, uav): step for uav in range(uavs)}
+        before = dict(expected)
+        sent = pass_on_places(stamp, place, hears, limit)
+        for speaker in range(uavs):
+            hearers = [h for h in (speaker - 1, speaker + 1) if 0 <= h < uavs]
+            new = [
+                k
+                for k in range(uavs)
+                if any(before.get((speaker, k), -1) > before.get((h, k), -1) for h in hearers)
+            ]
+            new.sort(key=lambda k, s=speaker: (before[s, k], k), reverse=True)
+            said = new if limit is None else new[: limit // PLACE_BYTES]
+            assert sent[0, speaker] == PLACE_BYTES * len(said)
+            for hearer in hearers:
+                for k in said:
+                    expected[hearer, k] = max(expected.get((hearer, k), -1), before[speaker, k])
+        for uav in range(uavs):
+            for other in range(uavs):
+                known = expected.get((uav, other), -1)
+                assert stamp[0, uav, other] == known
+                if known >= 0:
+                    assert (place[0, uav, other] == 10.0 * known + other).all()
+    if limit is None:
+        assert stamp[0, 0].tolist() == [11, 11, 10, 9]

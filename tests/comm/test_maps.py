@@ -1,0 +1,229 @@
+"""Tests that UAVs with method `maps` observe what they know, and nothing else."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.envs import TransformedEnv, check_env_specs
+
+from emberlink.comm.base import Communication
+from emberlink.comm.maps import Maps, MapsConfig
+from emberlink.envs import keys
+from emberlink.envs.config import RadioConfig, WildfireConfig
+from emberlink.envs.utils.errors import UserError
+from emberlink.envs.wildfire import WildfireEnv
+from emberlink.policies.scripted.map_greedy import MapGreedy
+from emberlink.trainers import make_env
+
+OBSERVED = (keys.OBSERVATION, keys.CROPS)
+
+
+def environment(fire, position, *, config=None, **world) -> TransformedEnv:
+    """Returns an environment and resets it with given positions, [envs, n, 3]."""
+    envs, uavs, _ = position.shape
+    grid = tuple(fire.shape[-2:])
+    more = {"grid": grid, "num_uavs": uavs, "horizon": 60, "observation": "sight", **world}
+    world = WildfireConfig(displacement=1.0, measures="all", **more)
+    env = WildfireEnv(envs, world, fire, seed=3)
+    module = Maps(world, config or MapsConfig(pixels=8, scales=(1, 2)), envs)
+    return TransformedEnv(env, Communication(module))
+
+
+def fly(env, position, actions) -> list:
+    """Returns the time steps of a flight, from the reset on."""
+    td = env.reset(position=position)
+    steps = [td]
+    for action in actions:
+        td = env.step(TensorDict({keys.ACTION: action}, env.batch_size))["next"]
+        steps.append(td)
+    return steps
+
+
+def burning(seed: int = 0, side: int = 30) -> torch.Tensor:
+    """Returns a fire that spreads and burns out after 20 steps."""
+    place = torch.arange(side).float()
+    middle = side / 2 + seed
+    arrival = torch.maximum((place[:, None] - middle).abs(), (place - middle).abs()) * 2 - 6
+    return torch.stack((arrival, arrival + 20))[None]
+
+
+def random_flight(steps: int, uavs: int, envs: int = 1, seed: int = 0) -> torch.Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    return torch.rand(steps, envs, uavs, 3, generator=generator) * 2 - 1
+
+
+def test_specs_and_shapes():
+    env = make_env("maps", num_envs=2, horizon=6, num_uavs=3, fire=burning()[0, 0])
+    check_env_specs(env)
+    assert env.rollout(5)["next"][keys.CROPS].shape == (2, 5, 3, 2, 8, 24, 24)
+    assert keys.observation_keys(env.observation_spec) == list(OBSERVED)
+    more = make_env("maps", "tuned", world="relay", **{"comm.position": True})
+    assert more.observation_spec[keys.OBSERVATION].shape == (1, 6, 4)
+
+
+def test_what_a_uav_sees_is_what_is_there():
+    position = torch.tensor([[[15.0, 15.0, 4.0], [3.0, 4.0, 2.0]]])
+    env = environment(burning(), position)
+    steps = fly(env, position, random_flight(50, 2))
+    assert not steps[0][keys.SIGHT].any()
+    world, scene = env.base_env, []
+    for td in steps[1:]:
+        now = td[keys.STEP].item()
+        arrival, end = world.arrival_time[0], world.burn_out[0]
+        shown = 1 + (arrival <= now).long() + (end <= now)
+        for uav in range(2):
+            x, y, z = td[keys.POSITION][0, uav].double().tolist()
+            i, j, reach = round(x), round(y), z * 3**-0.5
+            for a in range(-2, 3):
+                for b in range(-2, 3):
+                    cell = i + a, j + b
+                    seen = abs(cell[0] - x) <= reach and abs(cell[1] - y) <= reach
+                    inside = all(0 <= place < 30 for place in cell)
+                    expected = shown[cell] if seen and inside else 0
+                    assert td[keys.SIGHT][0, uav, a + 2, b + 2] == expected
+        scene.append(td[keys.SIGHT])
+    assert set(torch.stack(scene).unique().tolist()) == {0, 1, 2, 3}
+
+
+def test_a_disconnected_uav_learns_nothing_and_in_contact_everything():
+    """In two worlds, the other UAV flies elsewhere, over another fire."""
+    here, steps = [5.0, 5.0, 3.0], 20
+    away = [[25.0, 25.0, 3.0], [20.0, 27.0, 3.0]]
+    own, near = random_flight(steps, 1, seed=1), burning()[..., :14, :]
+    flights, observed = [], []
+    for other, seed in zip(away, (2, 3), strict=True):
+        position = torch.tensor([[here, other]])
+        actions = torch.cat((own, random_flight(steps, 1, seed=seed)), 2)
+        actions[..., :2] *= 0.4  # so that they stay apart
+        fire = torch.cat((near, burning(seed)[..., 14:, :]), -2)
+        config = MapsConfig(pixels=8, scales=(1, 4))
+        env = environment(fire, position, config=config, radio=RadioConfig(range=10.0))
+        flights.append(fly(env, position, actions))
+        assert not any(td[keys.HEARS].any() for td in flights[-1])
+        assert not any(td[keys.BYTES_SENT].any() for td in flights[-1])
+        observed.append((env, flights[-1][-1]))
+    for one, two in zip(*flights, strict=True):
+        assert one[keys.SIGHT][0, 0].equal(two[keys.SIGHT][0, 0])
+        for key in OBSERVED:
+            assert one[key][0, 0].equal(two[key][0, 0])
+    for env, last in observed:
+        maps = env.transform.module
+        assert maps.known.seen_fire[0, 1].any()
+        alone = maps.known.last_seen.clone()
+        towards = torch.tensor([[[1.0, 1.0, 0.0], [-1.0, -1.0, 0.0]]])
+        td = last
+        while not td[keys.HEARS].all(-1).any() and not td[keys.HEARS].any():
+            td = env.step(TensorDict({keys.ACTION: towards}, [1]))["next"]
+        assert maps.known.last_seen[0, 0].equal(maps.known.last_seen[0, 1])
+        assert (maps.known.last_seen[0, 0] >= alone.amax(1)[0]).all()
+        assert maps.stamp[0, 0, 1] == td[keys.STEP]
+        assert maps.place[0, 0, 1].equal(td[keys.POSITION][0, 1])
+        assert td[keys.CROPS][0, 0, 1, 6].any()  # it sees the other one in the far picture
+        known = (alone >= 0).sum(-1)[0]
+        assert td[keys.BYTES_SENT].min() > 16
+        assert (td[keys.BYTES_SENT][0] <= 16 + 5 * (known + 40 * 25)).all()
+
+
+def test_without_a_radio_nothing_is_said():
+    position = torch.tensor([[[10.0, 10.0, 3.0], [11.0, 10.0, 3.0]]])
+    env = environment(burning(), position, radio=RadioConfig(range=0.0))
+    for td in fly(env, position, random_flight(10, 2)):
+        assert not td[keys.CROPS][..., 6, :, :].any()
+        assert not td[keys.BYTES_SENT].any()
+
+
+def test_a_limit_is_kept_and_less_becomes_known():
+    position = torch.rand(1, 6, 3) * 12 + torch.tensor([8.0, 8.0, 0.0])
+    position[..., 2] = 4.0
+    known = {}
+    for limit in (None, 400, 100, 7):
+        env = environment(burning(), position, radio=RadioConfig(range=6.0, bandwidth=limit))
+        steps = fly(env, position, random_flight(30, 6))
+        sent = torch.stack([td[keys.BYTES_SENT] for td in steps])
+        assert sent.max() > 0 or limit == 7
+        assert limit is None or sent.max() <= limit
+        known[limit] = (env.transform.module.known.last_seen >= 0).sum().item()
+    assert known[None] >= known[400] > known[100] > known[7]
+
+
+def test_moving_the_world_does_not_change_the_pictures():
+    """The pictures reach 14 cells far and do not touch the edge."""
+    side, shift, config = 70, (11, -7), MapsConfig(pixels=8, scales=(1, 3))
+    arrival = torch.full((side, side), torch.inf)
+    arrival[30:40, 28:37] = 4 * torch.rand(10, 9, generator=torch.Generator().manual_seed(1))
+    moved = arrival.roll(shift, (0, 1))
+    position = torch.tensor([[[32.3, 30.6, 3.0], [36.0, 33.1, 2.0]]])
+    actions = random_flight(12, 2)
+    env = environment(arrival[None], position, config=config)
+    first = fly(env, position, actions)
+    position = position + torch.tensor([*shift, 0])
+    env = environment(moved[None], position, config=config)
+    for one, two in zip(first, fly(env, position, actions), strict=True):
+        for key in OBSERVED:
+            assert one[key].equal(two[key])
+    assert first[-1][keys.CROPS][..., (0, 1, 3, 6), :, :].flatten(0, 2).amax((0, 2, 3)).all()
+
+
+def flight_of(envs: range, **world) -> list:
+    """Flies in some of four environments with different fires."""
+    fire = torch.cat([burning(seed, 20) for seed in range(4)])
+    generator = torch.Generator().manual_seed(0)
+    position = torch.rand(4, 3, 3, generator=generator) * 12 + 3
+    position[..., 2] = 3.0
+    chosen = list(envs)
+    env = environment(fire[chosen], position[chosen], **world)
+    return fly(env, position[chosen], random_flight(25, 3, 4)[:, chosen])
+
+
+def test_a_batch_equals_single_environments():
+    together = flight_of(range(4))
+    for env in range(4):
+        for step, alone in enumerate(flight_of(range(env, env + 1))):
+            for key in (*OBSERVED, keys.BYTES_SENT):
+                assert together[step][key][env].equal(alone[key][0])
+    assert together[-1][keys.CROPS].any()
+
+
+def test_pictures_are_drawn_when_they_are_due():
+    every = flight_of(range(4))
+    some = flight_of(range(4), config=MapsConfig(pixels=8, scales=(1, 2), period=5))
+    for step, (one, two) in enumerate(zip(every, some, strict=True)):
+        drawn = every[step - step % 5]
+        assert two[keys.CROPS].equal(drawn[keys.CROPS])
+        assert one[keys.OBSERVATION].equal(two[keys.OBSERVATION])
+
+
+def test_failed_uavs_neither_see_nor_hear():
+    position = torch.tensor([[[14.0, 15.0, 4.0], [15.0, 15.0, 4.0], [16.0, 15.0, 4.0]]])
+    env = environment(burning(), position, failures=3.0)
+    steps = fly(env, position, random_flight(59, 3))
+    maps = env.transform.module
+    for uav in range(3):
+        alive = [td[keys.ALIVE][0, uav].item() for td in steps]
+        if not all(alive):
+            last = alive.index(False) - 1
+            assert maps.known.last_seen[0, uav].max() < 4 * (last + 1)
+            assert maps.stamp[0, uav].max() == last
+    assert not all(td[keys.ALIVE].all() for td in steps)
+
+
+def test_the_camera_is_needed():
+    with pytest.raises(UserError, match="sight"):
+        make_env("maps", **{"env.observation": "vector"}).reset()
+
+
+def test_sightings_are_those_of_the_scripted_search():
+    position = torch.tensor([[[10.0, 10.0, 3.0], [20.0, 20.0, 3.0]]])
+    env = environment(burning(), position, radio=RadioConfig(range=0.0))
+    policy = MapGreedy(env.base_env)
+    td = env.reset()
+    for _ in range(60):
+        td = env.step(policy(td))["next"]
+    policy(td)
+    step, what = env.transform.module.sightings()
+    theirs = policy.maps.last_seen()
+    assert theirs.equal(step.float())
+    ignited, burnt_out = policy.maps.was_fire(theirs)
+    assert ((what == 1) | (what == 2)).equal(ignited)
+    assert (what == 2).equal(burnt_out)
+    assert burnt_out.any()
+    assert (ignited & ~burnt_out).any()
