@@ -18,6 +18,7 @@ from emberlink.trainers.config.schema import RunConfig, build_comm, check_device
 from emberlink.trainers.learners import registry
 from emberlink.trainers.learners.base import Learner, LearnerContext
 from emberlink.trainers.learners.nan_guard import NonFiniteGuard
+from emberlink.trainers.rollout.teacher import Teacher
 
 
 def make_env(
@@ -73,10 +74,18 @@ def build_env(
     seed: int | Sequence[int] | None,
     device: torch.device | str,
     true_map: bool = False,
+    teacher: bool = False,
 ) -> TransformedEnv:
-    """Returns the environment and communication of a configuration; see `WildfireEnv`."""
+    """Returns the environment and communication of a configuration; see `WildfireEnv`.
+
+    With `teacher`, a teacher's actions are written, too (`Teacher`).
+    """
     world = WildfireEnv(num_envs, config.env, fire, seed, device, true_map=true_map)
-    return TransformedEnv(world, Communication(build_comm(config, num_envs).to(world.device)))
+    module = build_comm(config, num_envs).to(world.device)
+    env = TransformedEnv(world, Communication(module))
+    if teacher:
+        env.append_transform(Teacher(world, module, config.policy.hold))
+    return env
 
 
 def build_actor(config: RunConfig, env: TransformedEnv, generator: Generators = None) -> Any:

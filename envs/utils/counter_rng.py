@@ -41,6 +41,7 @@ class Use(IntEnum):
     SCRIPTED_WAYPOINT = 200
     SCRIPTED_ACTION = 201
     EXPLORATION_NOISE = 300
+    TEACHER = 301
     # for `fold_in` with a seed; distinct from the indices of environments
     FIRE_PARAMETER = 0xF12E
     REPLAY_SAMPLE = 2**40

@@ -1,7 +1,7 @@
 """A scripted policy that searches where fire may burn unseen, with maps merged in radio range."""
 
 import math
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 from tensordict import TensorDictBase
@@ -39,6 +39,10 @@ class MapGreedy(Scripted):
     messages it has. All fly at the maximum altitude.
 
     The targets are carried in the TensorDict under "_map_greedy_target", the maps in the policy.
+
+    Args:
+        env: the environment that it acts in.
+        maps: what the UAVs know, with the methods of `TeamMaps`; maps of its own if None.
     """
 
     hears: ClassVar[bool] = True
@@ -51,11 +55,11 @@ class MapGreedy(Scripted):
     _around_y: Tensor
     _area: Tensor
 
-    def __init__(self, env: WildfireEnv):
+    def __init__(self, env: WildfireEnv, maps: Any = None):
         super().__init__(env)
         self.in_keys.append(keys.ALIVE)
         self.out_keys.append(self.TARGET)
-        self.maps = TeamMaps(env, self.messages).to(env.device)
+        self.maps = TeamMaps(env, self.messages).to(env.device) if maps is None else maps
         self.targets = Targets(env, claim=_CLAIM)
         self.period = plan_period(_FLOWN, self.world.displacement)
         for name, reach in (("near", _NEAR), ("around", _AROUND)):

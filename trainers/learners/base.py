@@ -51,6 +51,11 @@ class LearnerConfig:
         """Whether the learner reads the true map of the fire, `keys.TRUE_MAP`, in training."""
         return False
 
+    @property
+    def teacher(self) -> bool:
+        """Whether the learner reads what a teacher would do, `keys.TEACHER`, in training."""
+        return False
+
 
 @plain_dataclass(frozen=True, kw_only=True)
 class LearnerContext:

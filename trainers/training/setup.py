@@ -49,6 +49,7 @@ class TrainingSetup:
             seed=self.seeds,
             device=config.device,
             true_map=config.learner.reads_map,
+            teacher=config.learner.teacher,
         )
         self.guard = NonFiniteGuard(config.device)
         self.learner = build_learner(config, self.env, self.guard)

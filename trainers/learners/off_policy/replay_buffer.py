@@ -149,35 +149,47 @@ def to_rows(
         Batch size [environments * steps, teams * uavs]. Episodes are truncated and never
         terminated, so values beyond the horizon are bootstrapped.
     """
-    dims = rollout.ndim
-    rows, uavs = math.prod(rollout.shape) // teams, rollout.get(keys.ACTION).shape[dims]
+    shape = rollout.shape
 
-    def arrange(value: Tensor) -> Tensor:
-        """Maps [*batch, uavs, ...] to [rows, teams * uavs, ...]."""
-        rest = value.shape[dims + 1 :]
-        value = value.reshape(teams, rows, uavs, *rest)
-        return value.transpose(0, 1).reshape(rows, teams * uavs, *rest)
+    def arranged(key: Any) -> Tensor:
+        return arrange(rollout.get(key), len(shape), teams)
+
+    action = arranged(keys.ACTION)
+    rows, columns = action.shape[:2]
 
     def per_uav(key: str) -> Tensor:
-        return arrange(rollout.get(("next", key)).unsqueeze(-2).expand(*rollout.shape, uavs, 1))
+        flags = rollout.get(("next", key)).unsqueeze(-2)
+        return arrange(flags.expand(*shape, columns // teams, 1), len(shape), teams)
 
-    alive = {"alive": arrange(rollout.get(("next", *keys.ALIVE)))} if failures else {}
-    following = {key[-1]: arrange(rollout.get(("next", *key))) for key in observations}
+    alive = {"alive": arranged(("next", *keys.ALIVE))} if failures else {}
     return TensorDict(
         {
-            **{key[-1]: arrange(rollout.get(key)) for key in observations},
+            **{key[-1]: arranged(key) for key in observations},
             **alive,
-            "action": arrange(rollout.get(keys.ACTION)),
+            "action": action,
             "next": {
-                **following,
-                "reward": arrange(rollout.get(("next", *keys.REWARD))),
+                **{key[-1]: arranged(("next", *key)) for key in observations},
+                "reward": arranged(("next", *keys.REWARD)),
                 "done": per_uav("done"),
                 "terminated": per_uav("terminated"),
             },
         },
-        batch_size=(rows, teams * uavs),
+        batch_size=(rows, columns),
         device=rollout.device,
     )
+
+
+def arrange(value: Tensor, dims: int, teams: int) -> Tensor:
+    """Maps a tensor of a rollout, [*batch, uavs, ...], to rows, [rows, teams * uavs, ...].
+
+    Args:
+        value: the tensor.
+        dims: number of dimensions of the batch, the first of which is [teams * environments].
+        teams: number of seeds that are trained in parallel.
+    """
+    rows, (uavs, *rest) = math.prod(value.shape[:dims]) // teams, value.shape[dims:]
+    value = value.reshape(teams, rows, uavs, *rest)
+    return value.transpose(0, 1).reshape(rows, teams * uavs, *rest)
 
 
 def _to_batch(sample: TensorDictBase) -> TensorDict:

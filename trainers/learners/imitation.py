@@ -1,0 +1,235 @@
+"""Imitation of a scripted teacher on what the student visits (DAgger, Ross et al. 2011, AISTATS)."""
+
+from collections.abc import Mapping
+from typing import Annotated, Any
+
+import torch
+from pydantic import Field
+from pydantic.dataclasses import dataclass
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor, nn
+from torchrl.data import Composite
+from torchrl.envs.utils import ExplorationType, exploration_type
+
+from emberlink.envs import keys
+from emberlink.envs.utils import counter_rng
+from emberlink.envs.utils.counter_rng import Use
+from emberlink.envs.utils.errors import UserError
+from emberlink.envs.utils.validation import Name
+from emberlink.policies.gaussian import MEAN
+from emberlink.policies.networks import Generators
+from emberlink.policies.settings import PolicyConfig
+from emberlink.trainers.learners import registry
+from emberlink.trainers.learners.base import (
+    ACTOR,
+    STRICT,
+    Count,
+    Learner,
+    LearnerConfig,
+    LearnerContext,
+    Losses,
+    Positive,
+    generators,
+)
+from emberlink.trainers.learners.off_policy.learner import OffPolicyLearner
+from emberlink.trainers.learners.off_policy.replay_buffer import ReplayMemory, arrange
+from emberlink.trainers.learners.tensors import (
+    copy_into,
+    group,
+    load_optimizer,
+    optimizer_tensors,
+    prefixed,
+)
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class ImitationConfig(LearnerConfig):
+    """The settings of imitation."""
+
+    share_parameters: bool = True
+    """whether all UAVs of a seed use the same weights; if not, each UAV has its own"""
+    actor_of: Name
+    """learner whose actors are trained: they can start it"""
+    teacher_share: Annotated[float, Field(ge=0, le=1)]
+    """share of decisions that the teacher takes at the beginning; it falls linearly to 0"""
+    lr: Positive
+    """learning rate of Adam at the beginning; it falls linearly to 0 at the end of the run"""
+    updates_per_step: Count
+    """updates per decision of the batch of environments"""
+    samples: Annotated[int, Field(ge=1, le=1_000_000)]
+    """decisions per update and UAV"""
+    buffer_size: Count
+    """capacity of a buffer of decisions, in decisions of a UAV"""
+
+    @property
+    def teacher(self) -> bool:
+        return True
+
+
+class Imitation(Learner):
+    """Trains actors to act as the teacher would, where they and the teacher have flown.
+
+    Each UAV's decision is the teacher's with a probability that falls to 0. What the UAV observed
+    and what the teacher would have done is kept in a buffer. An update draws from it; the loss is
+    the smooth L1 distance to the teacher's action.
+    """
+
+    config_type = ImitationConfig
+
+    def __init__(self, config: ImitationConfig, context: LearnerContext):
+        if context.policy.memory != "none":
+            raise UserError(
+                f"policy.memory={context.policy.memory}: learner={config.name} learns from single "
+                "decisions, without a memory"
+            )
+        self.config, self.context, self.teams = config, context, len(context.seeds)
+        self.guard = context.guard
+        specs = context.observation_spec, context.action_spec
+        self.actor = self.make_actor(config, *specs, generators(context.seeds), context.policy)
+        self.explorer: Any = Mixture(self.actor, context.device)
+        sizes = {"batch_size": config.samples, "buffer_size": config.buffer_size}
+        self.replay = Demonstrations(context, **sizes)
+        self.learning_starts = self.replay.learning_starts
+        network: nn.Module = self.actor.module
+        self.parameters = {f"actor.{name}": value for name, value in network.named_parameters()}
+        values = list(self.parameters.values())
+        self.optimizer = torch.optim.Adam(values, lr=config.lr, fused=True)
+        self.optimizer.found_inf = self.guard.bad  # pyright: ignore[reportAttributeAccessIssue]
+        self._lr_scale, self._count = 1.0, 0
+        self._advance(0)
+
+    @classmethod
+    def make_actor(
+        cls,
+        config: Any,
+        observation_spec: Composite,
+        action_spec: Composite,
+        generator: Generators = None,
+        policy: PolicyConfig | None = None,
+    ) -> Any:
+        """Returns new actors of the learner `actor_of`."""
+        learner = registry.find(config.actor_of)
+        if issubclass(learner, cls):
+            raise UserError(f"learner.actor_of={config.actor_of}: has no actors of its own")
+        return learner.make_actor(config, observation_spec, action_spec, generator, policy)
+
+    def _advance(self, decisions: int) -> None:
+        """Counts decisions, and lowers the teacher's share and the learning rate."""
+        self._count += decisions
+        left = max(0.0, 1 - self._count / self.context.total_steps)
+        self.explorer.share.fill_(self.config.teacher_share * left)
+        for entry in self.optimizer.param_groups:
+            entry["lr"] = self.config.lr * self._lr_scale * left
+
+    def learn(self, rollout: TensorDictBase) -> list[Losses]:
+        self.replay.extend(rollout)
+        losses = []
+        if self.replay.ready:
+            losses = [self.update(self.replay.sample()) for _ in range(self.config.updates_per_step)]
+        self._advance(rollout.shape[1])
+        return losses
+
+    def update(self, batch: TensorDictBase) -> Losses:
+        """Performs one step of the optimizer; after a detection of the guard, no weight changes."""
+        self.updates += 1
+        self.guard.record_batch(batch)
+        losses = self.losses(batch)
+        networks = self.teams if self.config.share_parameters else len(losses["imitation"])
+        losses["imitation"].unflatten(0, (networks, -1)).mean(1).sum().backward()
+        losses = {name: value.detach() for name, value in losses.items()}
+        gradients = {name: v.grad for name, v in self.parameters.items() if v.grad is not None}
+        self.guard.check_gradients(losses, gradients)
+        self.optimizer.step()
+        self.optimizer.zero_grad()
+        return losses
+
+    def losses(self, batch: TensorDictBase) -> Losses:
+        """Computes the loss with gradients, one number per UAV of all seeds."""
+        acted = self.actor(batch.copy())
+        # The mean of a normal distribution before it is clipped, else the action.
+        action = acted.get(MEAN) if MEAN in self.actor.out_keys else acted.get(keys.ACTION)
+        loss = nn.functional.smooth_l1_loss(action, batch.get(keys.TEACHER), reduction="none")
+        return {"imitation": OffPolicyLearner.mean_over_batch(loss.mean(-1), batch)}
+
+    def scale_lr(self, scale: float) -> None:
+        self._lr_scale = scale
+        self._advance(0)
+
+    def networks(self) -> dict[str, Tensor]:
+        """Returns the weights of all seeds' actors by name, not copied."""
+        return {ACTOR + name: value for name, value in self.actor.module.state_dict().items()}
+
+    def weights(self, team: int = 0) -> dict[str, Tensor]:
+        return {
+            name: value.detach().unflatten(0, (self.teams, -1))[team]
+            for name, value in self.networks().items()
+        }
+
+    def state_dict(self, *, transitions: bool = True) -> dict[str, Tensor]:
+        counters = {"updates": torch.tensor(self.updates), "decisions": torch.tensor(self._count)}
+        return prefixed(
+            networks=self.networks(),
+            optimizer=optimizer_tensors(self.optimizer),
+            counters=counters,
+            replay=self.replay.state_dict(transitions=transitions),
+        )
+
+    def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
+        copy_into(self.networks(), group(state, "networks"))
+        load_optimizer(self.optimizer, group(state, "optimizer"))
+        self.updates = int(state["counters/updates"])
+        self._count = int(state["counters/decisions"])
+        self.replay.load_state_dict(group(state, "replay"))
+        self._advance(0)
+
+
+class Mixture(TensorDictModuleBase):
+    """Takes the teacher's action with a probability, for each UAV and decision, else the actor's.
+
+    Random numbers come from each environment's random key. With exploration off, and without a
+    teacher, all actions are the actor's.
+
+    Args:
+        actor: the actors of all UAVs.
+        device: of the share.
+    """
+
+    share: Tensor
+    """float32 []: the probability"""
+
+    def __init__(self, actor: Any, device: torch.device | str):
+        super().__init__()
+        self.actor = actor
+        self.register_buffer("share", torch.zeros((), device=device))
+        reads: list[Any] = list(dict.fromkeys([*actor.in_keys, keys.RNG_KEY, keys.STEP]))
+        writes: list[Any] = list(actor.out_keys)
+        self.in_keys, self.out_keys = reads, writes
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        acted = self.actor(tensordict)
+        teacher = tensordict.get(keys.TEACHER, None)
+        if teacher is None or exploration_type() not in (None, ExplorationType.RANDOM):
+            return acted
+        step = tensordict.get(keys.STEP)
+        key = counter_rng.step_key(tensordict.get(keys.RNG_KEY), step, Use.TEACHER)
+        taken = counter_rng.uniform(key, teacher.shape[-2]) < self.share
+        return acted.set(
+            keys.ACTION, torch.where(taken.unsqueeze(-1), teacher, acted.get(keys.ACTION))
+        )
+
+
+class Demonstrations(ReplayMemory):
+    """Stores what UAVs observed and what the teacher would have done; see `ReplayMemory`."""
+
+    def extend(self, rollout: TensorDictBase) -> None:
+        """Stores the decisions of a rollout, batch size [seeds * environments, decisions]."""
+        kept = [*self._keys, keys.TEACHER, *([keys.ALIVE] if self._failures else [])]
+        rows = {key[-1]: arrange(rollout.get(key), rollout.ndim, self.teams) for key in kept}
+        size = rows[keys.TEACHER[1]].shape[:2]
+        self.extend_rows(TensorDict(rows, batch_size=size, device=rollout.device))
+
+    def sample(self) -> TensorDict:
+        """Samples a batch for each UAV: batch size [batch], with the keys of a rollout."""
+        sample = self._buffer.sample()
+        return TensorDict({keys.AGENTS: sample}, batch_size=sample.shape[:1])

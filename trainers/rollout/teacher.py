@@ -1,0 +1,107 @@
+"""Adds a teacher's actions to an environment: those of map_greedy, by what each UAV knows."""
+
+from dataclasses import replace
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.data import Composite, Unbounded
+from torchrl.envs import Transform
+
+from emberlink.comm.maps import Maps
+from emberlink.envs import keys
+from emberlink.envs.utils.errors import UserError
+from emberlink.envs.wildfire import WildfireEnv
+from emberlink.policies.scripted.map_greedy import MapGreedy
+
+
+class KnownMaps:
+    """The maps of method `maps`, in the form in which map_greedy reads maps.
+
+    A UAV knows the targets of those that it hears at a step: it has their maps and positions.
+
+    Args:
+        maps: the communication module of the environment.
+    """
+
+    sends = True
+    reach: Tensor
+
+    def __init__(self, maps: Maps):
+        self._maps = maps
+
+    def update(self, tensordict: TensorDictBase) -> None:
+        """Reads the links of a time step; the module has updated the maps."""
+        self.reach = tensordict.get(keys.HEARS)
+
+    def last_seen(self) -> Tensor:
+        """Returns the last step at which each UAV knows each cell seen, float [envs, n, X, Y]."""
+        return self._maps.sightings()[0].float()
+
+    def was_fire(self, last_seen: Tensor) -> tuple[Tensor, Tensor]:
+        """Returns whether cells had ignited and had burnt out when they were last seen."""
+        seen = self._maps.sightings()[1]
+        return (seen == 1) | (seen == 2), seen == 2
+
+
+class Teacher(Transform):
+    """Writes the actions of map_greedy under `keys.TEACHER`, made from the maps of the UAVs.
+
+    It stands behind the communication, knows what each UAV knows and nothing else, and does not
+    change the environment. An action leads as far to the target as a UAV flies with it in the steps
+    for which actions are held. New targets are chosen whenever the UAVs decide, and if they decide
+    at each step, as often as map_greedy chooses them.
+
+    Args:
+        env: the environment without transforms.
+        maps: its communication module.
+        hold: steps for which an action is held.
+
+    Raises:
+        UserError: the module keeps no maps, or the environment is on a GPU.
+    """
+
+    target: Tensor
+    """float32 [num_envs, n, 2]: targets of the UAVs, cells"""
+
+    def __init__(self, env: WildfireEnv, maps: Any, hold: int):
+        super().__init__()
+        if not isinstance(maps, Maps):
+            name = type(maps).__name__
+            raise UserError(f"the teacher flies by the maps of method maps; {name} keeps none")
+        if torch.device(env.device or "cpu").type != "cpu":
+            raise UserError(f"device={env.device}: the teacher needs device=cpu")
+        policy = MapGreedy(env, KnownMaps(maps))
+        world = policy.world
+        policy.world = replace(world, displacement=world.displacement * hold)
+        policy.period = 1 if hold > 1 else policy.period
+        self._hold = hold
+        self._policy = (policy,)  # not registered: it has no state but the targets
+        self.register_buffer("target", torch.zeros(env.num_envs, env.n_agents, 2))
+
+    def _reset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
+        return self._teach(tensordict_reset, tensordict.get("_reset", None))
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        return self._teach(next_tensordict, None)
+
+    def _teach(self, tensordict: TensorDictBase, began: Tensor | None) -> TensorDictBase:
+        """Writes the actions; the targets change where episodes began, everywhere if None."""
+        (policy,) = self._policy
+        decides = tensordict.get(keys.STEP) % self._hold == 0
+        if not decides.any():  # nobody acts
+            return tensordict.set(keys.TEACHER, torch.zeros_like(tensordict.get(keys.POSITION)))
+        given: Any = tensordict.select(*policy.in_keys, keys.HEARS)
+        acted = policy(given.set(policy.TARGET, self.target.clone()))
+        mask = decides if began is None else began.flatten() & decides
+        self.target.copy_(torch.where(mask.view(-1, 1, 1), acted.get(policy.TARGET), self.target))
+        return tensordict.set(keys.TEACHER, acted.get(keys.ACTION))
+
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
+        spec: Any = observation_spec.clone()
+        shape = spec[keys.POSITION].shape
+        spec[keys.TEACHER] = Unbounded(shape, device=spec.device, dtype=torch.float32)
+        return spec
