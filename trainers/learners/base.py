@@ -176,6 +176,17 @@ class Learner(ABC):
     def update(self, batch: TensorDictBase) -> Losses:
         """Performs one update with a batch that the guard recorded."""
 
+    def start_from(self, weights: Mapping[str, Tensor]) -> None:
+        """Begins the run with the actors of another run, in all seeds.
+
+        Args:
+            weights: the weights of one seed's actors by name, as those of `weights`.
+
+        Raises:
+            ValueError: a weight is missing or has another shape.
+        """
+        raise UserError(f"learner.warm_start: learner={type(self).__name__} has no warm start")
+
     @abstractmethod
     def scale_lr(self, scale: float) -> None:
         """Sets all learning rates to those of the configuration times a factor."""
@@ -202,6 +213,13 @@ class Learner(ABC):
         Raises:
             ValueError: the state does not fit this configuration.
         """
+
+
+def copy_to_seeds(network: torch.nn.Module, weights: Mapping[str, Tensor], teams: int) -> None:
+    """Copies the actors of one seed, as in `Learner.weights`, to all seeds of a network."""
+    with torch.no_grad():
+        for name, place in network.state_dict().items():
+            place.unflatten(0, (teams, -1)).copy_(weights[ACTOR + name])
 
 
 def generators(seeds: tuple[int, ...]) -> list[torch.Generator]:

@@ -1,4 +1,4 @@
-"""Imitation of a scripted teacher on what the student visits (DAgger, Ross et al. 2011, AISTATS)."""
+"""Imitation of a scripted teacher on what the student visits (DAgger, Ross et al. 2011)."""
 
 from collections.abc import Mapping
 from typing import Annotated, Any
@@ -126,7 +126,8 @@ class Imitation(Learner):
         self.replay.extend(rollout)
         losses = []
         if self.replay.ready:
-            losses = [self.update(self.replay.sample()) for _ in range(self.config.updates_per_step)]
+            updates = range(self.config.updates_per_step)
+            losses = [self.update(self.replay.sample()) for _ in updates]
         self._advance(rollout.shape[1])
         return losses
 

@@ -15,7 +15,7 @@ from emberlink.trainers.runs.run_folder import RunFolder
 from emberlink.trainers.runs.seal import to_header
 from emberlink.trainers.runs.versions import changed, versions
 from emberlink.trainers.tracking.trackers import Trackers
-from emberlink.trainers.training import checkpoints, non_finite, rollback
+from emberlink.trainers.training import checkpoints, non_finite, rollback, warm_start
 from emberlink.trainers.training.folders import RunFolders, empty
 from emberlink.trainers.training.rollback import Rollbacks
 from emberlink.trainers.training.setup import TrainingSetup
@@ -83,6 +83,7 @@ class Trainer:
 
     def start(self) -> RunFolder:
         """Creates the run folders, one per seed, and returns the first."""
+        warm_start.start(self.setup.learner, self.config)  # before there are files
         teams = range(self.setup.teams)
         self.folders = RunFolders.create([self.setup.seed_config(team) for team in teams])
         self.config = replace(self.config, fire=self.configs[0].fire)

@@ -83,7 +83,7 @@ SETUPS = "known: paper, released, tuned"
         (["consensus", "comm.heading.form=cubic"], ["comm.heading.form=cubic", "'folded_linear'"]),
         (
             ["consensus", "comm.name=telepathy"],
-            ["comm.name='telepathy'", "known: consensus, no_comm, positional"],
+            ["comm.name='telepathy'", "known: consensus, maps, no_comm, positional"],
         ),
         (["consensus", "comm.name=no_comm"], ["comm.", "not a setting of no_comm; known: none"]),
         (["consensus", "learner.hidden=[10000000,8]"], ["learner.hidden.0=10000000", "8192"]),

@@ -212,6 +212,8 @@ def valid_values(draw) -> dict:
     values = copy.deepcopy(recipe(method, draw(st.sampled_from(known("setup")))))
     for key, schema in {**KEYS, **COMM_KEYS[values["comm"]["name"]]}.items():
         values = put(values, key, draw(values_of(key, schema)))
+    if values["comm"]["name"] == "maps":
+        values = put(values, "env.observation", "sight")
     learner = values["learner"]
     learner["buffer_size"] = max(learner["buffer_size"], learner["batch_size"])
     return values

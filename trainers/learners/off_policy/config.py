@@ -38,6 +38,10 @@ class OffPolicyConfig(LearnerConfig):
     """whether a UAV's critic reads what the UAV observes and does, or what its team does"""
     exploration: ExplorationConfig
     """exploration noise"""
+    warm_start: str = ""
+    """run folder, or `pretrained:…`, whose actors the run begins with; none if empty"""
+    anchor: NotNegative = 0.0
+    """weight of the distance to the actions of `warm_start`; it falls linearly to 0 at the end"""
 
     @model_validator(mode="after")
     def _a_batch_fits(self) -> "OffPolicyConfig":

@@ -13,12 +13,20 @@ from torchrl.data import Composite
 from torchrl.objectives import LossModule, SoftUpdate, group_optimizers
 
 from emberlink.envs import keys
+from emberlink.envs.utils.errors import UserError
 from emberlink.policies.exploration import OrnsteinUhlenbeck
 from emberlink.policies.gaussian import MemoryActor
 from emberlink.policies.networks import STATE_ACTION_VALUE, Generators, build
 from emberlink.policies.networks.recurrent import RecurrentActor
 from emberlink.policies.settings import PolicyConfig
-from emberlink.trainers.learners.base import Learner, LearnerContext, Losses, generators
+from emberlink.trainers.learners.anchor import Anchor
+from emberlink.trainers.learners.base import (
+    Learner,
+    LearnerContext,
+    Losses,
+    copy_to_seeds,
+    generators,
+)
 from emberlink.trainers.learners.off_policy.config import OffPolicyConfig
 from emberlink.trainers.learners.off_policy.networks import SequenceActor, with_taken
 from emberlink.trainers.learners.off_policy.networks import critics as make_critics
@@ -42,8 +50,10 @@ class OffPolicyLearner(Learner):
 
     def __init__(self, config: OffPolicyConfig, context: LearnerContext):
         self.config, self.teams = config, len(context.seeds)
+        self._observed: list[Any] = keys.observation_keys(context.observation_spec)
         self.guard = context.guard
         self.loss = self.make_loss(context, generators(context.seeds))
+        self.anchor = self._make_anchor(context)
         self.loss.set_keys(
             state_action_value=STATE_ACTION_VALUE,
             reward=keys.REWARD,
@@ -60,10 +70,22 @@ class OffPolicyLearner(Learner):
         self._make_optimizer()
         self.replay = self._make_replay(context)
         self.learning_starts = self.replay.learning_starts
+        decisions = context.total_steps - self.learning_starts
+        self._updates_of_run = max(1, decisions * config.updates_per_step)
         self._graphs = {
             moves: graphed(partial(self._sample_and_update, moves), context.device)
             for moves in (False, True)
         }
+
+    def _make_anchor(self, context: LearnerContext) -> Anchor | None:
+        if not (self.config.warm_start and self.config.anchor):
+            return None
+        if context.policy.memory != "none":
+            raise UserError(
+                f"learner.anchor={self.config.anchor}: with learner={self.config.name} only "
+                "for policies without a memory"
+            )
+        return Anchor(self.actor.module, self.config.anchor, context.device)
 
     def _make_replay(self, context: LearnerContext) -> ReplayMemory:
         config = self.config
@@ -170,6 +192,8 @@ class OffPolicyLearner(Learner):
             return []
         losses = []
         for _ in range(self.config.updates_per_step):
+            if self.anchor is not None:
+                self.anchor.advance(self.updates / self._updates_of_run)
             self.updates += 1
             update = self._graphs[self.moves_actor(self.updates)]()
             losses.append({name: value.clone() for name, value in update.items()})
@@ -189,6 +213,8 @@ class OffPolicyLearner(Learner):
         if self.config.critic == "team":
             batch = with_taken(batch)
         losses = self.losses(batch, actor=actor)
+        if actor and self.anchor is not None:
+            losses["anchor"] = self._distance(self.anchor, batch)
         torch.stack([*losses.values()]).sum().backward()
         losses = {name: value.detach() for name, value in losses.items()}
         self.guard.check_gradients(losses, self.gradients())
@@ -197,6 +223,23 @@ class OffPolicyLearner(Learner):
         if actor:
             self._move_targets()
         return losses
+
+    def _distance(self, anchor: Anchor, batch: TensorDictBase) -> Tensor:
+        """Returns the mean distance of each UAV's actions to those of the anchor, [uavs]."""
+        observed = [batch.get(key) for key in self._observed]
+        with torch.no_grad():
+            theirs = anchor.network(*observed)
+        network: Any = self.actor.module
+        return self.mean_over_batch(anchor.loss(network(*observed), theirs), batch)
+
+    def start_from(self, weights: Mapping[str, Tensor]) -> None:
+        """Begins with the actors of another run, and target actors like them."""
+        for policy in (self.actor.module, *([self.anchor.network] if self.anchor else [])):
+            copy_to_seeds(policy, weights, self.teams)
+        networks, targets = (
+            getattr(self.loss, f"{name}_network_params") for name in ("actor", "target_actor")
+        )
+        targets.data.update_(networks.data)
 
     def _move_targets(self) -> None:
         """Performs the soft update of the target networks."""
@@ -254,6 +297,7 @@ class OffPolicyLearner(Learner):
             networks=self.networks(),
             optimizer=optimizer_tensors(self.optimizer),
             counters={"updates": torch.tensor(self.updates)},
+            anchor=self.anchor.network.state_dict() if self.anchor else {},
             replay=self.replay.state_dict(transitions=transitions),
         )
 
@@ -261,4 +305,6 @@ class OffPolicyLearner(Learner):
         copy_into(self.networks(), group(state, "networks"))
         load_optimizer(self.optimizer, group(state, "optimizer"))
         self.updates = int(state["counters/updates"])
+        if self.anchor is not None:
+            copy_into(self.anchor.network.state_dict(), group(state, "anchor"))
         self.replay.load_state_dict(group(state, "replay"))

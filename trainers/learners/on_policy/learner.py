@@ -2,11 +2,9 @@
 
 from abc import abstractmethod
 from collections.abc import Iterator, Mapping
-from typing import Annotated, Any
+from typing import Any
 
 import torch
-from pydantic import Field
-from pydantic.dataclasses import dataclass
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor
@@ -19,19 +17,17 @@ from emberlink.policies.gaussian import LOG_PROB, GaussianExplorer, MemoryActor
 from emberlink.policies.networks import Generators
 from emberlink.policies.networks.sequence import GaussianNetwork
 from emberlink.policies.settings import PolicyConfig
+from emberlink.trainers.learners.anchor import Anchor
 from emberlink.trainers.learners.base import (
     ACTOR,
-    STRICT,
-    Count,
     Learner,
-    LearnerConfig,
     LearnerContext,
     Losses,
-    NotNegative,
-    Positive,
+    copy_to_seeds,
     generators,
 )
 from emberlink.trainers.learners.on_policy.advantages import Advantages
+from emberlink.trainers.learners.on_policy.config import OnPolicyConfig
 from emberlink.trainers.learners.on_policy.proximal import (
     ADVANTAGE,
     RETURN,
@@ -51,30 +47,6 @@ from emberlink.trainers.learners.tensors import (
 )
 
 _CRITIC = "critic_network_params.module."
-
-
-@dataclass(frozen=True, kw_only=True, config=STRICT)
-class OnPolicyConfig(LearnerConfig):
-    """The settings of learners from whole episodes."""
-
-    share_parameters: bool = True
-    """whether all UAVs of a seed use the same weights; if not, each UAV has its own"""
-    gamma: Annotated[float, Field(ge=0, lt=1)]
-    """discount per decision"""
-    gae_lambda: Annotated[float, Field(ge=0, le=1)]
-    """factor of generalised advantage estimation (Schulman et al. 2016), per decision"""
-    clip: Annotated[float, Field(gt=0, lt=1)]
-    """largest change of an action's probability in an iteration, as a ratio"""
-    epochs: Count
-    """passes over the episodes of an iteration"""
-    minibatches: Count
-    """updates of a pass; each uses whole episodes of some of the environments"""
-    lr: Positive
-    """learning rate of Adam at the beginning; it falls linearly to 0 at the end of the run"""
-    gradient_norm: Positive
-    """largest Euclidean norm of the gradient of a network"""
-    entropy: NotNegative
-    """weight of the entropy of the actions in the actors' loss"""
 
 
 class OnPolicyLearner(Learner):
@@ -98,6 +70,9 @@ class OnPolicyLearner(Learner):
         self.loss = make_loss(
             self.actor, self.critic, clip=config.clip, entropy=config.entropy, device=self.device
         )
+        anchored = config.warm_start and config.anchor
+        network = self.actor.module
+        self.anchor = Anchor(network, config.anchor, self.device) if anchored else None
         self.parameters = {f"actor.{k}": v for k, v in self.actor.module.named_parameters()}
         self.parameters |= {f"critic.{k}": v for k, v in self.critic.module.named_parameters()}
         values = list(self.parameters.values())
@@ -158,6 +133,8 @@ class OnPolicyLearner(Learner):
         self._decisions = []
         self._estimate(episode, rollout.get("next")[:, -1:])
         self._set_lr()
+        if self.anchor is not None:
+            self.anchor.advance((self._count - self.context.horizon) / self.context.total_steps)
         return [self.update(batch) for batch in self._batches(episode)]
 
     def _transitions(self, rollout: TensorDictBase) -> TensorDict:
@@ -235,11 +212,19 @@ class OnPolicyLearner(Learner):
         computed = self.loss(batch.copy().auto_batch_size_(2))
         alive = batch.get(keys.ALIVE, None)
         names = {"actor": "loss_objective", "critic": "loss_critic", "entropy": "loss_entropy"}
-        return {
+        losses = {
             name: mean_of_uavs(computed.get(key), alive, self.teams)
             for name, key in names.items()
             if key in computed.keys()  # noqa: SIM118  (a TensorDict iterates over its rows)
         }
+        if self.anchor is not None:
+            observed = [batch.get(key) for key in self._observed]
+            with torch.no_grad():
+                theirs, _ = self.anchor.network(*observed)
+            mean, _ = self.actor.module(*observed)
+            distance = self.anchor.loss(mean, theirs)
+            losses["anchor"] = mean_of_uavs(distance, alive, self.teams)
+        return losses
 
     def _set_lr(self) -> None:
         """Lowers the learning rate linearly; the last iteration still has a share of it."""
@@ -247,6 +232,10 @@ class OnPolicyLearner(Learner):
         share = max(0.0, 1 - done / self.context.total_steps)
         for entry in self.optimizer.param_groups:
             entry["lr"] = self.config.lr * self._lr_scale * share
+
+    def start_from(self, weights: Mapping[str, Tensor]) -> None:
+        for policy in (self.actor.module, *([self.anchor.network] if self.anchor else [])):
+            copy_to_seeds(policy, weights, self.teams)
 
     def scale_lr(self, scale: float) -> None:
         self._lr_scale = scale
@@ -274,6 +263,7 @@ class OnPolicyLearner(Learner):
             optimizer=optimizer_tensors(self.optimizer),
             counters=counters,
             spread={"returns": self.advantages.spread},
+            anchor=self.anchor.network.state_dict() if self.anchor else {},
             episode=episode,
         )
 
@@ -283,5 +273,7 @@ class OnPolicyLearner(Learner):
         self.updates = int(state["counters/updates"])
         self._count = int(state["counters/decisions"])
         copy_into({"returns": self.advantages.spread}, group(state, "spread"))
+        if self.anchor is not None:
+            copy_into(self.anchor.network.state_dict(), group(state, "anchor"))
         episode = group(state, "episode")
         self._decisions = list(unflatten(episode, 2, self.device).split(1, 1)) if episode else []

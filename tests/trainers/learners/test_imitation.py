@@ -1,0 +1,236 @@
+"""Tests imitation of map_greedy by the UAVs' maps, and trainings that begin with its actors."""
+
+import json
+import math
+
+import pytest
+import torch
+
+from emberlink.envs import keys
+from emberlink.envs.utils.errors import UserError
+from emberlink.policies.scripted.map_greedy import MapGreedy
+from emberlink.trainers.build import build_env
+from emberlink.trainers.cli import main
+from emberlink.trainers.config.compose import resolve
+from emberlink.trainers.learners.base import ACTOR
+from emberlink.trainers.training.resume import resume
+from emberlink.trainers.training.setup import TrainingSetup
+from emberlink.trainers.training.trainer import Trainer
+
+WORLD = [
+    "world=front",
+    "env.num_uavs=3",
+    "num_envs=2",
+    "fire.num_train_fires=2",
+    "env.grid=[30,30]",
+]
+SHORT = [
+    *("env.horizon=20", "episodes=4", "learner.hidden=[8,8]", "checkpoint_steps=4"),
+    *("evaluation.interval=0", "evaluation.episodes=1", "evaluation.scripted=[]"),
+    *("comm.pixels=8", "policy.hold=2"),
+]
+TINY = ["learner.samples=4", "learner.buffer_size=60"]
+OFF_POLICY = ["learner.batch_size=4", "learner.buffer_size=60", "learner.share_parameters=true"]
+
+
+def settings(learner: str, *more: str) -> list[str]:
+    return ["setup=tuned", *WORLD, *SHORT, f"learner={learner}", *more]
+
+
+def taught(hold: int, *more: str):
+    config = resolve("maps", [*WORLD, f"policy.hold={hold}", "env.horizon=120", *more])
+    fire = torch.full((30, 30), math.inf)
+    fire[8:20, 9:21] = 3 * torch.rand(12, 12, generator=torch.Generator().manual_seed(0))
+    times = torch.stack((fire, fire + 60))[None].repeat(2, 1, 1, 1)
+    return build_env(config, num_envs=2, fire=times, seed=5, device="cpu", teacher=True)
+
+
+def test_without_a_radio_the_teacher_is_map_greedy():
+    env = taught(1, "env.radio.range=0")
+    policy = MapGreedy(env.base_env)
+    td = env.reset()
+    for step in range(60):
+        acted = policy(td.clone())
+        assert td[keys.TEACHER].equal(acted[keys.ACTION]), step
+        assert td[keys.TEACHER].any()
+        acted = env.step(acted)
+        td = acted["next"].set(policy.TARGET, acted[policy.TARGET])
+
+
+def test_the_teacher_reads_the_maps_of_the_uavs_alone():
+    env = taught(1)
+    td = env.reset()
+    for _ in range(25):
+        td = env.step(td.set(keys.ACTION, td[keys.TEACHER]))["next"]
+    teacher, maps = env.transform[1], env.transform[0].module
+    before = teacher._teach(td.clone(), None)[keys.TEACHER]
+    for name, value in env.base_env.state_dict().items():
+        value.zero_()
+        assert name
+    assert teacher._teach(td.clone(), None)[keys.TEACHER].equal(before)
+    maps.known.last_seen.fill_(-1)
+    due = td.clone().set(keys.STEP, torch.full((2,), 30))
+    after = teacher._teach(due, None)[keys.TEACHER]
+    assert not after.equal(before)
+
+
+def test_held_actions_end_at_the_target():
+    env = taught(10)
+    td = env.reset()
+    for _ in range(3):
+        action, target = td[keys.TEACHER], env.transform[1].target.clone()
+        start = td[keys.POSITION]
+        for _ in range(10):
+            td = env.step(td.set(keys.ACTION, action))["next"]
+        moved = td[keys.POSITION] - start
+        wanted = torch.cat((target - start[..., :2], 4 - start[..., 2:]), -1)
+        near = wanted.abs().amax(-1) <= 2  # cells flown in ten steps
+        torch.testing.assert_close(moved[near], wanted[near], atol=1e-4, rtol=0)
+        assert (moved[~near].abs().amax(-1) - 2).abs().max() < 1e-4
+
+
+def test_the_share_of_the_teacher_falls_and_is_taken():
+    setup = TrainingSetup(resolve("maps", settings("imitation", *TINY, "episodes=20")))
+    explorer, td = setup.learner.explorer, setup.env.reset()
+    for share in (1.0, 0.0, 0.5):
+        explorer.share.fill_(share)
+        acted = explorer(td.clone())
+        taken = (acted[keys.ACTION] == td[keys.TEACHER]).all(-1)
+        assert share == 0.5 or (taken == bool(share)).all()
+    setup.learner._advance(0)
+    shares = []
+    for _ in range(3):
+        setup.dry_run(100)
+        shares.append(explorer.share.item())
+    assert shares == pytest.approx([0.6, 0.4, 0.2])
+
+
+def test_the_loss_falls_and_is_that_of_smooth_l1():
+    more = ["learner.samples=16", "learner.lr=0.003", "learner.updates_per_step=4"]
+    setup = TrainingSetup(resolve("maps", settings("imitation", *TINY, *more)))
+    losses, learner = [], setup.learner
+    setup.dry_run(20)
+    batch = learner.replay.sample()
+    loss = learner.losses(batch)["imitation"]
+    acted = learner.actor(batch.clone())
+    difference = (acted[keys.AGENTS, "mean"] - batch[keys.TEACHER]).abs()
+    smooth = torch.where(difference < 1, difference.square() / 2, difference - 0.5)
+    assert loss.detach().allclose(smooth.mean((0, 2)))
+    for _ in range(60):
+        losses.append(learner.update(batch)["imitation"].mean().item())
+    assert losses[-1] < 0.5 * losses[0]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["maps", *settings("imitation"), "policy.memory=gru"], "single decisions"),
+        (["maps", *settings("imitation"), "learner.actor_of=imitation"], "no actors of its own"),
+        (["consensus", "learner=imitation"], "Consensus keeps none"),
+        (["maps", *settings("ippo"), "learner.warm_start=nowhere"], "nowhere"),
+    ],
+)
+def test_what_cannot_be_imitated_is_one_line(arguments, said, tmp_path, capsys):
+    assert main.main(["train", *arguments, f"output={tmp_path}"]) == 2
+    assert said in " ".join(capsys.readouterr().err.split())
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.fixture(scope="module")
+def imitated(tmp_path_factory):
+    """Trains actors for each kind of learner and returns the run folders."""
+    runs = {}
+    for name in ("ippo", "ddpg"):
+        folder = tmp_path_factory.mktemp(name)
+        more = [*TINY, f"learner.actor_of={name}", f"output={folder}"]
+        assert main.main(["train", "maps", *settings("imitation", *more)]) == 0
+        (runs[name],) = folder.iterdir()
+    return runs
+
+
+def test_an_imitation_is_recorded_and_evaluated(imitated):
+    lines = [
+        json.loads(line) for line in (imitated["ippo"] / "metrics.jsonl").read_text().splitlines()
+    ]
+    assert len(lines) == 4
+    assert all(0 < line["loss_imitation"] < 2 for line in lines[1:])
+    assert json.loads((imitated["ippo"] / "eval.json").read_text())
+    assert main.main(["eval", str(imitated["ippo"]), "env.num_uavs=5", "--fires", "1"]) == 0
+
+
+LEARNERS = [
+    ("ippo", "ippo", ["learner.minibatches=2", "seeds=[3,4]"]),
+    ("ddpg", "ddpg", OFF_POLICY),
+    pytest.param("mappo", "ippo", [], marks=pytest.mark.slow),
+    pytest.param("td3", "ddpg", OFF_POLICY, marks=pytest.mark.slow),
+]
+
+
+@pytest.mark.parametrize(("learner", "actor_of", "more"), LEARNERS)
+def test_a_run_begins_with_the_actors_of_another(learner, actor_of, more, imitated, tmp_path):
+    start = [f"learner.warm_start={imitated[actor_of]}", "learner.anchor=0.5"]
+    trainer = Trainer(resolve("maps", [*settings(learner, *more, *start), f"output={tmp_path}"]))
+    mine = trainer.setup.learner
+    trainer.start()
+    theirs = TrainingSetup(
+        resolve("maps", settings("imitation", *TINY, f"learner.actor_of={actor_of}"))
+    )
+    resumed = resume(imitated[actor_of])
+    resumed.close()
+    expected = resumed.setup.learner.weights()
+    assert theirs.learner.weights().keys() == expected.keys()
+    for team in range(len(trainer.setup.seeds)):
+        weights = mine.weights(team)
+        for name, value in expected.items():
+            assert weights[name].equal(value), name
+            target = name.replace(ACTOR, "target_" + ACTOR)
+            assert target not in weights or weights[target].equal(value)
+    trainer.train()
+    assert all("loss_anchor" in line for line in trainer.run.lines()[1:])
+    assert mine.anchor.weight < 0.3
+    assert any(not mine.weights()[name].equal(value) for name, value in expected.items())
+    frozen = mine.anchor.network.state_dict()
+    for name, value in expected.items():
+        assert frozen[name.removeprefix(ACTOR)][:1].equal(value.view(1, *value.shape[1:]))
+
+
+def test_actors_of_another_network_are_refused(imitated, tmp_path, capsys):
+    start = f"learner.warm_start={imitated['ddpg']}"
+    arguments = ["train", "maps", *settings("ippo", start), f"output={tmp_path}"]
+    assert main.main(arguments) == 2
+    assert "learner.warm_start=" in " ".join(capsys.readouterr().err.split())
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_memory_has_no_anchor():
+    more = [*OFF_POLICY, "learner.anchor=1", "learner.warm_start=x", "policy.memory=gru"]
+    with pytest.raises(UserError, match="without a memory"):
+        TrainingSetup(resolve("maps", settings("ddpg", *more, "learner.sequence=2")))
+
+
+def finished(config, stop: int | None):
+    trainer = Trainer(config)
+    trainer.start()
+    if stop is not None:
+        trainer.train(lambda progress: trainer.stop() if progress.step >= stop else None)
+        trainer = resume(trainer.run.path)
+    trainer.train()
+    return trainer
+
+
+@pytest.mark.parametrize(
+    ("learner", "more"), [("imitation", TINY), ("ippo", []), ("ddpg", OFF_POLICY)]
+)
+def test_a_resumed_run_is_the_same_bit_for_bit(learner, more, imitated, tmp_path):
+    if learner != "imitation":
+        more = [*more, f"learner.warm_start={imitated[learner]}", "learner.anchor=0.5"]
+    states, lines = [], []
+    for stop in (None, 34):
+        config = resolve("maps", [*settings(learner, *more), f"output={tmp_path / str(stop)}"])
+        trainer = finished(config, stop)
+        states.append(trainer.setup.state_dict())
+        lines.append(trainer.run.lines())
+    assert states[0].keys() == states[1].keys()
+    for name, value in states[0].items():
+        assert value.nan_to_num(7).equal(states[1][name].nan_to_num(7)), name
+    assert lines[0] == lines[1]

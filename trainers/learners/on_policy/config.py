@@ -1,0 +1,36 @@
+"""Defines the settings of learners from whole episodes."""
+
+from typing import Annotated
+
+from pydantic import Field
+from pydantic.dataclasses import dataclass
+
+from emberlink.trainers.learners.base import STRICT, Count, LearnerConfig, NotNegative, Positive
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class OnPolicyConfig(LearnerConfig):
+    """The settings of learners from whole episodes."""
+
+    share_parameters: bool = True
+    """whether all UAVs of a seed use the same weights; if not, each UAV has its own"""
+    gamma: Annotated[float, Field(ge=0, lt=1)]
+    """discount per decision"""
+    gae_lambda: Annotated[float, Field(ge=0, le=1)]
+    """factor of generalised advantage estimation (Schulman et al. 2016), per decision"""
+    clip: Annotated[float, Field(gt=0, lt=1)]
+    """largest change of an action's probability in an iteration, as a ratio"""
+    epochs: Count
+    """passes over the episodes of an iteration"""
+    minibatches: Count
+    """updates of a pass; each uses whole episodes of some of the environments"""
+    lr: Positive
+    """learning rate of Adam at the beginning; it falls linearly to 0 at the end of the run"""
+    gradient_norm: Positive
+    """largest Euclidean norm of the gradient of a network"""
+    entropy: NotNegative
+    """weight of the entropy of the actions in the actors' loss"""
+    warm_start: str = ""
+    """run folder, or `pretrained:…`, whose actors the run begins with; none if empty"""
+    anchor: NotNegative = 0.0
+    """weight of the distance to the actions of `warm_start`; it falls linearly to 0 at the end"""
