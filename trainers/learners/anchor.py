@@ -22,6 +22,12 @@ class Anchor:
         # On the device, where CUDA graphs read its current value.
         self.weight = torch.tensor(weight, dtype=torch.float32, device=device)
 
+    @classmethod
+    def of(cls, network: nn.Module, config: Any, device: torch.device | str) -> "Anchor | None":
+        """Returns the anchor of a learner with settings `warm_start` and `anchor`; None without."""
+        wanted = config.warm_start and config.anchor
+        return cls(network, config.anchor, device) if wanted else None
+
     def advance(self, done: float) -> None:
         """Sets the weight after a share of the run."""
         self.weight.fill_(self._first * max(0.0, 1 - done))

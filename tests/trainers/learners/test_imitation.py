@@ -204,7 +204,7 @@ def test_actors_of_another_network_are_refused(imitated, tmp_path, capsys):
 
 def test_a_memory_has_no_anchor():
     more = [*OFF_POLICY, "learner.anchor=1", "learner.warm_start=x", "policy.memory=gru"]
-    with pytest.raises(UserError, match="without a memory"):
+    with pytest.raises(UserError, match=r"needs policy.memory=none"):
         TrainingSetup(resolve("maps", settings("ddpg", *more, "learner.sequence=2")))
 
 

@@ -53,7 +53,10 @@ class OffPolicyLearner(Learner):
         self._observed: list[Any] = keys.observation_keys(context.observation_spec)
         self.guard = context.guard
         self.loss = self.make_loss(context, generators(context.seeds))
-        self.anchor = self._make_anchor(context)
+        self.anchor = Anchor.of(self.actor.module, config, context.device)
+        if self.anchor is not None and context.policy.memory != "none":
+            name = f"learner={config.name}"
+            raise UserError(f"learner.anchor={config.anchor}: {name} needs policy.memory=none")
         self.loss.set_keys(
             state_action_value=STATE_ACTION_VALUE,
             reward=keys.REWARD,
@@ -76,16 +79,6 @@ class OffPolicyLearner(Learner):
             moves: graphed(partial(self._sample_and_update, moves), context.device)
             for moves in (False, True)
         }
-
-    def _make_anchor(self, context: LearnerContext) -> Anchor | None:
-        if not (self.config.warm_start and self.config.anchor):
-            return None
-        if context.policy.memory != "none":
-            raise UserError(
-                f"learner.anchor={self.config.anchor}: with learner={self.config.name} only "
-                "for policies without a memory"
-            )
-        return Anchor(self.actor.module, self.config.anchor, context.device)
 
     def _make_replay(self, context: LearnerContext) -> ReplayMemory:
         config = self.config

@@ -70,9 +70,7 @@ class OnPolicyLearner(Learner):
         self.loss = make_loss(
             self.actor, self.critic, clip=config.clip, entropy=config.entropy, device=self.device
         )
-        anchored = config.warm_start and config.anchor
-        network = self.actor.module
-        self.anchor = Anchor(network, config.anchor, self.device) if anchored else None
+        self.anchor = Anchor.of(self.actor.module, config, self.device)
         self.parameters = {f"actor.{k}": v for k, v in self.actor.module.named_parameters()}
         self.parameters |= {f"critic.{k}": v for k, v in self.critic.module.named_parameters()}
         values = list(self.parameters.values())
