@@ -88,7 +88,7 @@ class Imitation(Learner):
         specs = context.observation_spec, context.action_spec
         self.actor = self.make_actor(config, *specs, generators(context.seeds), context.policy)
         self.explorer: Any = Mixture(self.actor, context.device)
-        sizes = {"batch_size": config.samples, "buffer_size": config.buffer_size}
+        sizes: dict[str, Any] = {"batch_size": config.samples, "buffer_size": config.buffer_size}
         self.replay = Demonstrations(context, **sizes)
         self.learning_starts = self.replay.learning_starts
         network: nn.Module = self.actor.module

@@ -55,8 +55,7 @@ class OffPolicyLearner(Learner):
         self.loss = self.make_loss(context, generators(context.seeds))
         self.anchor = Anchor.of(self.actor.module, config, context.device)
         if self.anchor is not None and context.policy.memory != "none":
-            name = f"learner={config.name}"
-            raise UserError(f"learner.anchor={config.anchor}: {name} needs policy.memory=none")
+            raise UserError(f"learner.anchor: learner={config.name} needs policy.memory=none")
         self.loss.set_keys(
             state_action_value=STATE_ACTION_VALUE,
             reward=keys.REWARD,
@@ -229,10 +228,8 @@ class OffPolicyLearner(Learner):
         """Begins with the actors of another run, and target actors like them."""
         for policy in (self.actor.module, *([self.anchor.network] if self.anchor else [])):
             copy_to_seeds(policy, weights, self.teams)
-        networks, targets = (
-            getattr(self.loss, f"{name}_network_params") for name in ("actor", "target_actor")
-        )
-        targets.data.update_(networks.data)
+        loss: Any = self.loss
+        loss.target_actor_network_params.data.update_(loss.actor_network_params.data)
 
     def _move_targets(self) -> None:
         """Performs the soft update of the target networks."""
