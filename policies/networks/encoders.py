@@ -106,10 +106,10 @@ class PictureEncoder(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """Maps uint8 [groups, rows, pictures, channels, S, S] to [groups, rows, features]."""
-        groups, encoded = len(x), []
-        for layers, picture in zip(self.pictures, x.unbind(2), strict=True):
-            y = picture.transpose(0, 1).flatten(1, 2).float() / 255
-            for layer in layers:  # pyright: ignore[reportGeneralTypeIssues]
+        groups, encoded, every = len(x), [], list[Any](self.pictures)
+        for layers, picture in zip(every, x.unbind(2), strict=True):
+            y = picture.transpose(0, 1).flatten(1, 2).to(layers[0].weight.dtype) / 255
+            for layer in layers:
                 y = layer(y).relu_()
             encoded.append(y.unflatten(1, (groups, -1)).transpose(0, 1).flatten(2))
         return torch.cat(encoded, -1)

@@ -9,7 +9,12 @@ from torchrl.objectives import DDPGLoss, TD3Loss
 
 from emberlink.envs import keys
 from emberlink.policies.networks import STATE_ACTION_VALUE, make_actor, make_critic, team_of
-from emberlink.policies.networks.encoders import ObservationEncoder, WindowEncoder
+from emberlink.policies.networks.encoders import (
+    PICTURE_CHANNELS,
+    ObservationEncoder,
+    PictureEncoder,
+    WindowEncoder,
+)
 from emberlink.policies.networks.grouping import Grouping
 from emberlink.policies.networks.stacked import StackedActor, StackedCritic
 
@@ -218,3 +223,35 @@ def test_ddpg_of_torchrl_fits_a_reward_seen_in_the_window(shared):
         optimizer.step()
         optimizer.zero_grad()
     assert values[-1] < 0.2 * values[0]
+
+
+def test_pictures_pass_three_convolutions_with_weights_of_their_group():
+    generators = [torch.Generator().manual_seed(seed) for seed in (1, 2)]
+    encoder = PictureEncoder(2, [2, 3, 9, 12], generator=generators).double()
+    pictures = torch.randint(0, 256, (2, 4, 2, 3, 9, 12), dtype=torch.uint8)
+    encoded = encoder(pictures)
+    assert encoded.shape == (2, 4, encoder.features)
+    for group in range(2):
+        for row in range(4):
+            parts = []
+            for picture, layers in enumerate(encoder.pictures):
+                x = pictures[group, row, picture].double() / 255
+                for layer in layers:
+                    weight, bias = layer.weight[group], layer.bias[group]
+                    x = nn.functional.conv2d(x[None], weight, bias, stride=2, padding=1)[0].relu()
+                parts.append(x.flatten())
+            torch.testing.assert_close(encoded[group, row], torch.cat(parts))
+    # The weights of a team do not depend on the others.
+    alone = PictureEncoder(1, [2, 3, 9, 12], generator=torch.Generator().manual_seed(2))
+    for mine, stacked in zip(alone.parameters(), encoder.parameters(), strict=True):
+        assert mine[0].double().equal(stacked[1])
+
+
+def test_pictures_take_about_a_million_multiplications():
+    multiplications, side, inputs = 0, 24, 8
+    for outputs in PICTURE_CHANNELS:
+        side //= 2
+        multiplications += 9 * inputs * outputs * side**2
+        inputs = outputs
+    hidden = 2 * inputs * side**2 * 128 + 128 * 128
+    assert 1e6 < 2 * multiplications + hidden < 1.3e6

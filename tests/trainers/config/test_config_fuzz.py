@@ -59,6 +59,7 @@ FIXED = {
     "env.failures": [0.0, 0.5, 1.0],
     "evaluation.scripted": [[], ["oracle"], ["map_greedy", "courier"]],
     "evaluation.headline": ["coverage", "fire_losses"],
+    "learner.warm_start": [""],
     "policy.memory": ["none"],  # DDPG learns none
     "policy.hold": [1],  # others must fit the horizon
 }

@@ -23,8 +23,7 @@ SEEDS = [3, 11]
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("method", "setup"),
-    [*zip(METHODS, ["released", "paper"] * 2, strict=True), ("maps", "released")],
+    ("method", "setup"), [*zip(METHODS, ["released", "paper"] * 2, strict=True)]
 )
 def test_a_seed_of_a_stack_learns_the_same_as_alone(method, setup, tmp_path):
     """About 150 updates in float32, with operations in a different order."""
