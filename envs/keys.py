@@ -88,6 +88,10 @@ FEATURES: Final = ("x", "y", "z", "new_fire", "old_fire", "timestep")
 """the numbers of a UAV's own observation, in order (paper, section IV.C)"""
 
 
+NETWORKS_READ: Final = (OBSERVATION, WINDOW, CROPS)
+"""the tensors per UAV that networks read, in order"""
+
+
 def observation_keys(spec: Composite) -> list[tuple[str, str]]:
     """Returns the keys of the tensors per UAV that networks read, in a fixed order.
 
@@ -95,7 +99,7 @@ def observation_keys(spec: Composite) -> list[tuple[str, str]]:
         spec: an environment's observation spec.
     """
     present = spec.keys(True, True)
-    return [key for key in (OBSERVATION, WINDOW, CROPS) if key in present]
+    return [key for key in NETWORKS_READ if key in present]
 
 
 def observation_shapes(spec: Composite) -> list[Sequence[int]]:

@@ -24,10 +24,7 @@ from emberlink.envs.wildfire import WildfireEnv
 Array = NDArray[np.float32]
 Observation = Array | dict[str, NDArray[Any]]
 
-_NOT_INFO = (
-    *(keys.OBSERVATION[1], keys.WINDOW[1], keys.CROPS[1]),
-    *(keys.ACTION[1], keys.REWARD[1]),
-)
+_NOT_INFO = {k for _, k in (*keys.NETWORKS_READ, keys.ACTION, keys.REWARD)}
 
 
 def parallel_env(
@@ -277,8 +274,7 @@ def _spaces(env: EnvBase, core: WildfireEnv) -> tuple[Box, dict[str, Box]]:
     pictures: dict[str, Box] = {}
     for key in others:
         spec = env.observation_spec[key]
-        largest = 1 if spec.dtype == torch.bool else 255
-        pictures[key[1]] = Box(0, largest, spec.shape[2:], np.uint8)
+        pictures[key[1]] = Box(0, 1 if spec.dtype == torch.bool else 255, spec.shape[2:], np.uint8)
     return Box(low, high, dtype=np.float32), pictures
 
 

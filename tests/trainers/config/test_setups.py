@@ -203,7 +203,7 @@ def test_defaults_in_code_equal_setup_paper():
 
 def test_the_table_has_all_setups_and_methods():
     assert known("method") == sorted([*METHODS, "maps"])
-    assert known("setup") == ["paper", "released", "tuned"]
+    assert known("setup") == ["paper", "released", "strong", "tuned"]
     assert known("fire") == [
         *("file", "front", "huygens", "oil_slick", "paper", "reaction", "swarm"),
     ]
