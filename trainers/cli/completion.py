@@ -1,14 +1,13 @@
-"""Completes command lines: `--completion SHELL` prints a script, which asks for the words.
+"""Completes names and keys on command lines; the library argcomplete does the rest.
 
-The script runs `emberlink --complete WORD...` at each press of the tab key. That imports no torch.
+A completer is called at each press of the tab key. It imports no torch.
 """
 
 import argparse
 import glob
-import shlex
 import sys
-from collections.abc import Iterator, Mapping, Sequence
-from importlib.resources import files
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from importlib.resources import files as package_files
 from pathlib import Path
 from typing import Any
 
@@ -16,52 +15,7 @@ from emberlink import configs
 from emberlink.configs import entry_points
 from emberlink.policies.scripted import ORDER
 
-SCRIPTS = {
-    "bash": r"""
-_emberlink() {
-    local line="${COMP_LINE:0:COMP_POINT}" words=() prefix="" IFS=$' \t'
-    read -ra words <<< "$line"
-    [[ $line == *[$' \t'] ]] && words+=("")
-    local breaks="${COMP_WORDBREAKS//[^=:]/}" current="${words[${#words[@]}-1]}"
-    [[ -n $breaks ]] && prefix="${current%"${current##*[$breaks]}"}"
-    IFS=$'\n'
-    COMPREPLY=($(emberlink --complete "${words[@]:1}" 2>/dev/null))
-    COMPREPLY=("${COMPREPLY[@]#"$prefix"}")
-    [[ ${#COMPREPLY[@]} == 1 && ${COMPREPLY[0]} == *[=:./] ]] && compopt -o nospace 2>/dev/null
-    return 0
-}
-complete -o default -F _emberlink emberlink
-""",
-    "zsh": r"""#compdef emberlink
-_emberlink() {
-    local -a found
-    found=("${(@f)$(emberlink --complete "${(@)words[2,CURRENT-1]}" "$PREFIX" 2>/dev/null)}")
-    found=(${found:#})
-    (( ${#found} )) || { _files; return }
-    compadd -S '' -- ${(M)found:#*[=:./]}
-    compadd -- ${found:#*[=:./]}
-}
-if [[ $zsh_eval_context[-1] == loadautofunc ]]; then
-    _emberlink "$@"
-else
-    compdef _emberlink emberlink
-fi
-""",
-    "fish": r"""
-function __emberlink
-    set -l words (commandline -opc)
-    set -l current (commandline -ct)
-    set -l found (emberlink --complete $words[2..-1] "$current" 2>/dev/null)
-    if set -q found[1]
-        printf '%s\n' $found
-    else
-        __fish_complete_path "$current"
-    end
-end
-complete -c emberlink -f -a '(__emberlink)'
-""",
-}
-"""shell -> its script"""
+SHELLS = ("bash", "zsh", "fish")
 KINDS = {
     "methods": "method",
     "setups": "setup",
@@ -72,100 +26,106 @@ KINDS = {
 }
 """kind of `emberlink list` -> group of YAML files"""
 _GROUPS = tuple(group for group in KINDS.values() if group != "method")
-_POSITIONALS = {"METHOD": "method", "SOURCE": "fire", "SCENARIO": "fire", "NAME": "world"}
-_MANY = ("*", "+")
 
 
 class PrintScript(argparse.Action):
     """Prints the script of a shell."""
 
     def __call__(self, parser: Any, namespace: Any, values: Any, *_: Any) -> None:
-        parser._print_message(SCRIPTS[values].lstrip(), sys.stdout)
+        import argcomplete
+
+        parser._print_message(argcomplete.shellcode(["emberlink"], shell=values), sys.stdout)
         parser.exit()
 
 
-def complete(words: Sequence[str], parser: argparse.ArgumentParser) -> list[str]:
-    """Returns what the last word may become; nothing where a file is expected.
+def answer(parser: argparse.ArgumentParser) -> None:
+    """Answers the script of a shell and exits, if it asks for words."""
+    import argcomplete
 
-    Args:
-        words: the words after `emberlink`; the last one is to be completed and may be empty.
-        parser: of the whole command line.
-    """
-    *before, current = words or [""]
-    given: list[str] = []
-    for word in before:
-        if word in (commands := _commands(parser)):
-            parser, given = commands[word], []
-        else:
-            given.append(word)
-    return [name for name in _candidates(parser, given, current) if name.startswith(current)]
+    argcomplete.autocomplete(parser, always_complete_options=False, exit_method=sys.exit)
 
 
-def _candidates(
-    parser: argparse.ArgumentParser, given: Sequence[str], current: str
-) -> Iterator[str]:
-    options = {name: action for action in parser._actions for name in action.option_strings}
-    last = options.get(given[-1]) if given else None
-    if last is not None and last.nargs != 0:
-        yield from _values_of(last)
-    elif current.startswith("-"):
-        yield from options
-    elif commands := _commands(parser):
-        yield from commands
-    else:
-        yield from _arguments(parser, given, current)
+# Completers get the beginning of a word and the arguments before it, as argcomplete defines.
 
 
-def _commands(parser: argparse.ArgumentParser) -> Mapping[str, argparse.ArgumentParser]:
-    for action in parser._actions:
-        if isinstance(action, argparse._SubParsersAction):
-            return action.choices
-    return {}
+def kinds(**_: Any) -> list[str]:
+    """Returns the kinds of `emberlink list`."""
+    return [*KINDS, "policies"]
 
 
-def _values_of(option: argparse.Action) -> Sequence[str]:
-    if option.choices is not None:
-        return list(map(str, option.choices))
-    names = {"NAME": _policies, "FIRE": lambda: configs.known("fire")}
-    return names[str(option.metavar)]() if option.metavar in names else []
-
-
-def _arguments(
-    parser: argparse.ArgumentParser, given: Sequence[str], current: str
-) -> Iterator[str]:
-    """Yields what the arguments without a leading "-" may be."""
-    named = [word for word in given if "=" not in word and not word.startswith("-")]
-    for action in parser._actions:
-        kinds = [] if action.option_strings else str(action.metavar).split(" | ")
-        if "=" not in current and (action.nargs in _MANY or not named):
-            for kind in kinds:
-                yield from _names(kind, current)
-        sweep = kinds[-1:] == ["key=value,value"]
-        if sweep and not given:
-            yield "status"
-        if sweep or (kinds[-1:] == ["key=value"] and (given or current)):
-            groups = _GROUPS if sweep else _GROUPS[:-1]  # the last one is the executor
-            yield from _settings(given, current, groups)
-
-
-def _names(kind: str, current: str) -> Sequence[str]:
-    if kind == "KIND":
-        return [*KINDS, "policies"]
-    if kind == "RUN":
-        return [*_pretrained(current), *_folders(current)]
-    return configs.known(_POSITIONALS[kind]) if kind in _POSITIONALS else []
-
-
-def _policies() -> list[str]:
+def policies(**_: Any) -> list[str]:
+    """Returns the names of scripted policies."""
     others = [point.name for point in entry_points.read("emberlink.scripted")]
     return [*ORDER, *sorted(others)]
+
+
+def fires(**_: Any) -> Sequence[str]:
+    """Returns the names of scenarios."""
+    return configs.known("fire")
+
+
+def fires_and_files(prefix: str, **_: Any) -> list[str]:
+    """Returns the names of scenarios, and files."""
+    return [*fires(), *_files(prefix)]
+
+
+def runs(prefix: str, **_: Any) -> list[str]:
+    """Returns the names of trained policies, and folders."""
+    return [*_pretrained(prefix), *_folders(prefix)]
+
+
+def settings(prefix: str, parsed_args: argparse.Namespace, **_: Any) -> Iterable[str]:
+    """Returns key=value of a run."""
+    return _settings(prefix, _given(parsed_args), _GROUPS[:-1])  # the last one is the executor
+
+
+def method_or_settings(prefix: str, parsed_args: argparse.Namespace, **_: Any) -> Iterator[str]:
+    """Yields methods, and key=value where a word has begun."""
+    yield from configs.known("method")
+    if prefix:
+        yield from settings(prefix, parsed_args)
+
+
+def sweep_arguments(prefix: str, parsed_args: argparse.Namespace, **_: Any) -> Iterator[str]:
+    """Yields methods, `status`, and key=value of runs and of the executor."""
+    yield from configs.known("method")
+    if not getattr(parsed_args, "arguments", None):
+        yield "status"
+    yield from _settings(prefix, _given(parsed_args), _GROUPS)
+
+
+def worlds_and_settings(prefix: str, parsed_args: argparse.Namespace, **_: Any) -> Iterator[str]:
+    """Yields worlds, and key=value after one or where a word has begun."""
+    yield from configs.known("world")
+    if prefix or getattr(parsed_args, "arguments", None):
+        yield from settings(prefix, parsed_args)
+
+
+def files_and_settings(prefix: str, parsed_args: argparse.Namespace, **_: Any) -> Iterator[str]:
+    """Yields files, and key=value after one or where a word has begun."""
+    yield from _files(prefix)
+    if prefix or getattr(parsed_args, "arguments", None):
+        yield from settings(prefix, parsed_args)
+
+
+def _files(prefix: str) -> list[str]:
+    from argcomplete.completers import FilesCompleter
+
+    return FilesCompleter()(prefix)
+
+
+def _given(parsed_args: argparse.Namespace) -> list[str]:
+    """Returns the words of a command line that are texts."""
+    values = vars(parsed_args).values()
+    lists = (value if isinstance(value, list) else [value] for value in values)
+    return [word for words in lists for word in words if isinstance(word, str)]
 
 
 def _pretrained(current: str) -> list[str]:
     """Returns the names of trained policies up to their next part."""
     if not current.startswith("pretrained:"):
         return ["pretrained:"]
-    shipped = Path(str(files("emberlink.policies"))) / "pretrained"
+    shipped = Path(str(package_files("emberlink.policies"))) / "pretrained"
     forms: dict[str, None] = {}
     for path in sorted(shipped.glob("*/*/*/config.yaml")):
         setup, method, seed = path.parts[-4:-1]
@@ -178,30 +138,39 @@ def _pretrained(current: str) -> list[str]:
 def _folders(current: str) -> list[str]:
     """Returns the folders whose path begins with a text; those of runs without a final slash."""
     found = sorted(glob.glob(f"{glob.escape(current)}*/"))
-    plain = (path for path in found if shlex.quote(path) == path)
-    return [path[:-1] if Path(path, "config.yaml").is_file() else path for path in plain]
+    return [path[:-1] if Path(path, "config.yaml").is_file() else path for path in found]
 
 
-def _settings(given: Sequence[str], current: str, groups: Sequence[str]) -> Iterator[str]:
-    """Yields key=value: the keys up to their next part, or the values of a key."""
+def _settings(current: str, given: Sequence[str], groups: Sequence[str]) -> Iterable[str]:
+    """Returns key=value: the keys up to their next part, or the values of a key."""
     key, equals, value = current.partition("=")
-    if equals:
-        start = f"{key}={value[: value.rfind(',') + 1]}"  # of a list of values, the last one
-        names = configs.known(key) if key in groups else []
-        if key == "resume":
-            names = _folders(value)
-        yield from (start + name for name in names)
-        return
-    chosen = dict(word.split("=", 1) for word in given if "=" in word)
-    tree: Any = _tree(chosen, given, "executor" in groups)
-    *parts, _ = key.split(".")
+    if not equals:
+        chosen = dict(word.split("=", 1) for word in given if "=" in word)
+        return _keys(_tree(chosen, given, "executor" in groups), current, groups)
+    start = f"{key}={value[: value.rfind(',') + 1]}"  # of a list of values, the last one
+    names = configs.known(key) if key in groups else []
+    if key == "resume":
+        names = _folders(value)
+    return [start + name for name in names]
+
+
+def _keys(tree: Any, current: str, groups: Sequence[str]) -> list[str]:
+    """Returns the keys that begin with a text, up to their next part.
+
+    A single key does not end in ".", since shells write a space after it: those within it follow.
+    """
+    *parts, _ = current.split(".")
+    inner = tree
     for part in parts:
-        tree = tree.get(part, {}) if isinstance(tree, dict) else {}
+        inner = inner.get(part, {}) if isinstance(inner, dict) else {}
     start = "".join(f"{part}." for part in parts)
-    for name, inner in tree.items() if isinstance(tree, dict) else ():
-        yield f"{start}{name}{'.' if inner and isinstance(inner, dict) else '='}"
-    if not parts:
-        yield from (f"{group}=" for group in groups)
+    found = [] if parts else [f"{group}=" for group in groups]
+    for name, value in inner.items() if isinstance(inner, dict) else ():
+        found.append(f"{start}{name}{'.' if value and isinstance(value, dict) else '='}")
+    found = [key for key in found if key.startswith(current)]
+    if len(found) == 1 and found[0].endswith("."):
+        return _keys(tree, found[0], groups)
+    return found
 
 
 def _tree(chosen: Mapping[str, str], methods: Sequence[str], sweep: bool) -> dict[str, Any]:

@@ -4,6 +4,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from emberlink.trainers.cli import completion
 from emberlink.trainers.cli.parser import command, positive
 
 if TYPE_CHECKING:
@@ -23,11 +24,15 @@ def add_eval(commands: Any) -> None:
         "emberlink eval runs/2026-01-31_12-00-00_consensus_tuned_paper_s0 --fires 64",
     )
     evaluation.add_argument(
-        "folder", metavar="RUN", help="a run folder, or pretrained:METHOD, pretrained:SETUP/METHOD"
+        "folder",
+        metavar="RUN",
+        completer=completion.runs,
+        help="a run folder, or pretrained:METHOD, pretrained:SETUP/METHOD",
     )
     evaluation.add_argument(
         "overrides",
         metavar="key=value",
+        completer=completion.settings,
         nargs="*",
         default=[],
         help="keys of comm. or env. to change, such as env.radio.loss=0.5; "

@@ -4,6 +4,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from emberlink.trainers.cli import completion
 from emberlink.trainers.cli.parser import command, command_group, positive
 
 if TYPE_CHECKING:
@@ -41,10 +42,17 @@ def _add_preview(actions: Any) -> None:
     preview.add_argument(
         "source",
         metavar="SOURCE",
+        completer=completion.fires_and_files,
         help="a scenario (huygens, or huygens:3 for its test fire 3) or a file "
         "(or bank.tif:3 for fire 3 in it)",
     )
-    preview.add_argument("overrides", metavar="key=value", nargs="*", help=_KEYS)
+    preview.add_argument(
+        "overrides",
+        metavar="key=value",
+        completer=completion.settings,
+        nargs="*",
+        help=_KEYS,
+    )
     preview.add_argument(
         "--output", metavar="PATH", type=Path, help="a folder, or a new file that ends in .png"
     )
@@ -61,8 +69,19 @@ def _add_make(actions: Any) -> None:
         "GeoTIFF with a band per fire, or NumPy [fires, x, y] with a .json file.",
         "emberlink fire make huygens --count 64 --split test --output fires.tif 'env.grid=[60,60]'",
     )
-    make.add_argument("scenario", metavar="SCENARIO", help="a file in configs/fire: huygens, ...")
-    make.add_argument("overrides", metavar="key=value", nargs="*", help=_KEYS)
+    make.add_argument(
+        "scenario",
+        metavar="SCENARIO",
+        completer=completion.fires,
+        help="a file in configs/fire: huygens, ...",
+    )
+    make.add_argument(
+        "overrides",
+        metavar="key=value",
+        completer=completion.settings,
+        nargs="*",
+        help=_KEYS,
+    )
     make.add_argument(
         "--count",
         metavar="N",
@@ -97,6 +116,7 @@ def _add_import(actions: Any) -> None:
     imported.add_argument(
         "arguments",
         metavar="FILE | key=value",
+        completer=completion.files_and_settings,
         nargs="+",
         help="files with one fire or more; " + _KEYS,
     )

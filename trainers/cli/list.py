@@ -3,7 +3,7 @@
 import argparse
 from typing import TYPE_CHECKING, Any
 
-from emberlink.trainers.cli.completion import KINDS
+from emberlink.trainers.cli.completion import KINDS, kinds
 from emberlink.trainers.cli.parser import command
 
 if TYPE_CHECKING:
@@ -23,7 +23,12 @@ def add_list(commands: Any) -> None:
         "emberlink list worlds",
     )
     listing.add_argument(
-        "kinds", metavar="KIND", nargs="*", default=[], help=f"{', '.join(_KINDS)} (default: all)"
+        "kinds",
+        metavar="KIND",
+        completer=kinds,
+        nargs="*",
+        default=[],
+        help=f"{', '.join(_KINDS)} (default: all)",
     )
 
 

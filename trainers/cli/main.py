@@ -9,7 +9,7 @@ from contextlib import suppress
 from typing import Any
 
 from emberlink.trainers.cli.compare import add_compare
-from emberlink.trainers.cli.completion import SCRIPTS, PrintScript, complete
+from emberlink.trainers.cli.completion import SHELLS, PrintScript, answer
 from emberlink.trainers.cli.doctor import add_doctor
 from emberlink.trainers.cli.eval import add_eval
 from emberlink.trainers.cli.fire import add_fire
@@ -49,11 +49,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _parse_and_run(arguments: Sequence[str] | None) -> int:
     parser = _parser()
-    words = sys.argv[1:] if arguments is None else arguments
+    if "_ARGCOMPLETE" in os.environ:  # of the script that --completion prints
+        answer(parser)
     try:
-        if words[:1] == ["--complete"]:  # of the script that --completion prints
-            sys.stdout.writelines(f"{word}\n" for word in complete(words[1:], parser))
-            return 0
         options = parser.parse_args(arguments)
         if options.command is None:
             parser.print_help()
@@ -153,7 +151,7 @@ def _parser() -> Parser:
     parser.add_argument(
         "--completion",
         action=PrintScript,
-        choices=list(SCRIPTS),
+        choices=SHELLS,
         help="print a completion script, which the shell evaluates, and exit",
     )
     commands = parser.add_subparsers(dest="command", metavar="COMMAND")

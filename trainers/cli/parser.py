@@ -23,6 +23,13 @@ class Parser(argparse.ArgumentParser):
 
     _is_intermixed = False
 
+    def add_argument(self, *names: str, completer: Any = None, **options: Any) -> argparse.Action:
+        """Adds an argument, with a function of `completion` that returns its words."""
+        argument = super().add_argument(*names, **options)
+        if completer is not None:
+            argument.completer = completer  # pyright: ignore[reportAttributeAccessIssue]
+        return argument
+
     def parse_known_args(self, args=None, namespace=None):  # pyright: ignore
         """Parses as argparse does; unknown options are errors."""
         if self._is_intermixed or self._subparsers is not None:
@@ -81,7 +88,7 @@ def command(
     description: str,
     example: str,
     usage: str | None = None,
-) -> argparse.ArgumentParser:
+) -> Parser:
     """Adds a command and returns its parser.
 
     Args:

@@ -4,7 +4,8 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from emberlink.trainers.cli.parser import between, command, positive
+from emberlink.trainers.cli import completion
+from emberlink.trainers.cli.parser import Parser, between, command, positive
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -29,12 +30,13 @@ def add_render(commands: Any) -> None:
     _add_output(rendering)
 
 
-def _add_episodes(rendering: argparse.ArgumentParser) -> None:
+def _add_episodes(rendering: Parser) -> None:
     """Adds the arguments that choose what is played."""
     add = rendering.add_argument
     add(
         "runs",
         metavar="RUN",
+        completer=completion.runs,
         nargs="+",
         help="a run folder, or pretrained:METHOD; after it KEY=VALUE, such as env.radio.range=0, "
         "for other settings of env and comm",
@@ -42,6 +44,7 @@ def _add_episodes(rendering: argparse.ArgumentParser) -> None:
     add(
         "--policy",
         metavar="NAME",
+        completer=completion.policies,
         action="append",
         default=[],
         help="a scripted policy to draw, too; may be given several times",
@@ -49,6 +52,7 @@ def _add_episodes(rendering: argparse.ArgumentParser) -> None:
     add(
         "--fire",
         metavar="FIRE",
+        completer=completion.fires,
         help="a held-out fire: NAME, INDEX or NAME:INDEX, such as huygens:3 (default: huygens:0, "
         "or the first of the file that the first run was trained on)",
     )
@@ -62,7 +66,7 @@ def _add_episodes(rendering: argparse.ArgumentParser) -> None:
     )
 
 
-def _add_output(rendering: argparse.ArgumentParser) -> None:
+def _add_output(rendering: Parser) -> None:
     """Adds the arguments that choose what is written."""
     add = rendering.add_argument
     add(

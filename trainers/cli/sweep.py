@@ -3,6 +3,7 @@
 import argparse
 from typing import TYPE_CHECKING, Any
 
+from emberlink.trainers.cli import completion
 from emberlink.trainers.cli.parser import command, positive
 
 if TYPE_CHECKING:
@@ -26,6 +27,7 @@ def add_sweep(commands: Any) -> None:
     sweep.add_argument(
         "arguments",
         metavar="METHOD | key=value,value",
+        completer=completion.sweep_arguments,
         nargs="+",
         help="methods (default: all); keys as for train, with one value or several; "
         "executor=local, submitit (SLURM) or ray, and its keys executor.KEY=value",

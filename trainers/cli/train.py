@@ -3,6 +3,7 @@
 import argparse
 from typing import TYPE_CHECKING, Any
 
+from emberlink.trainers.cli import completion
 from emberlink.trainers.cli.parser import command
 
 if TYPE_CHECKING:
@@ -26,12 +27,14 @@ def add_train(commands: Any) -> None:
     train.add_argument(
         "method",
         metavar="METHOD",
+        completer=completion.method_or_settings,
         help="a method: independent, shared_memory, positional, consensus, or your own "
         "(see emberlink list methods); or resume=RUN, to resume the training of a run folder",
     )
     train.add_argument(
         "overrides",
         metavar="key=value",
+        completer=completion.settings,
         nargs="*",
         default=[],
         help="any key of configs/base.yaml or of the chosen setup, such as setup=tuned, "

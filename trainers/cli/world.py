@@ -5,6 +5,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from emberlink.trainers.cli import completion
 from emberlink.trainers.cli.parser import between, command, command_group
 
 if TYPE_CHECKING:
@@ -41,6 +42,7 @@ def _add_check(actions: Any) -> None:
     check.add_argument(
         "arguments",
         metavar="NAME | key=value",
+        completer=completion.worlds_and_settings,
         nargs="*",
         help="worlds (default: all that evaluate the needed policies); " + _KEYS,
     )
@@ -73,6 +75,7 @@ def _add_sweep(actions: Any) -> None:
     sweep.add_argument(
         "overrides",
         metavar="key=value",
+        completer=completion.settings,
         nargs="*",
         default=[],
         help="world=NAME (default: front), and " + _KEYS,

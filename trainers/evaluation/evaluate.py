@@ -4,7 +4,6 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, cast
 
-import numpy as np
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
@@ -278,27 +277,3 @@ def play_blocks(
         for name, values in played.items():
             measured[name] += values[: count - start].tolist()
     return measured
-
-
-def film(
-    config: RunConfig,
-    policy: Policy,
-    *,
-    fire: Tensor | ScenarioConfig,
-    frames: int = 100,
-    watch: Watch | None = None,
-) -> tuple[list[np.ndarray], list[int]]:
-    """Returns frames of test episode 0 on a fire, uint8 [height, width, 3], and their steps."""
-    env = build_env(config, num_envs=1, fire=fire, seed=START_SEED, device=config.device)
-    horizon = config.env.horizon
-    wanted = set(np.linspace(0, horizon, min(frames, horizon + 1)).round().astype(int).tolist())
-    pictures: list[np.ndarray] = []
-
-    def draw(world: WildfireEnv, td: TensorDictBase) -> None:
-        if int(td.get(keys.STEP)[0]) in wanted:
-            pictures.append(world.render())
-        if watch is not None:
-            watch(world, td)
-
-    play(env, policy, draw)
-    return pictures, sorted(wanted)

@@ -1,8 +1,9 @@
-"""Records the data for drawing an episode."""
+"""Records pictures of an episode, or the data for drawing it."""
 
 from collections.abc import Collection
 from typing import Any
 
+import numpy as np
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
@@ -12,9 +13,36 @@ from torchrl.envs import TransformedEnv
 from emberlink.envs import keys
 from emberlink.envs.config import WildfireConfig
 from emberlink.envs.rendering.marks import ROLES, FrameData
+from emberlink.envs.scenarios import ScenarioConfig
 from emberlink.envs.wildfire import WildfireEnv
 from emberlink.envs.world import radio
-from emberlink.trainers.evaluation.evaluate import play
+from emberlink.trainers.build import build_env
+from emberlink.trainers.config.schema import RunConfig
+from emberlink.trainers.evaluation.evaluate import START_SEED, Policy, Watch, play
+
+
+def film(
+    config: RunConfig,
+    policy: Policy,
+    *,
+    fire: Tensor | ScenarioConfig,
+    frames: int = 100,
+    watch: Watch | None = None,
+) -> tuple[list[np.ndarray], list[int]]:
+    """Returns frames of test episode 0 on a fire, uint8 [height, width, 3], and their steps."""
+    env = build_env(config, num_envs=1, fire=fire, seed=START_SEED, device=config.device)
+    horizon = config.env.horizon
+    wanted = set(np.linspace(0, horizon, min(frames, horizon + 1)).round().astype(int).tolist())
+    pictures: list[np.ndarray] = []
+
+    def draw(world: WildfireEnv, td: TensorDictBase) -> None:
+        if int(td.get(keys.STEP)[0]) in wanted:
+            pictures.append(world.render())
+        if watch is not None:
+            watch(world, td)
+
+    play(env, policy, draw)
+    return pictures, sorted(wanted)
 
 
 def record_episode(

@@ -12,6 +12,7 @@ from emberlink.policies.scripted.registry import to_play
 from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.evaluation import evaluate, plots
 from emberlink.trainers.evaluation.panels import follows_advice, title_of
+from emberlink.trainers.evaluation.record_episode import film
 from emberlink.trainers.evaluation.results import LEARNED, Results
 from emberlink.trainers.replay.pack import Shown
 from emberlink.trainers.replay.page import Replay
@@ -91,7 +92,7 @@ def _draw(
             plots.training_curves(path, lines, title)
     report("one episode for the animation")
     name, arrival = evaluate.shown_fire(config)
-    pictures, steps = evaluate.film(config, actor, fire=arrival)
+    pictures, steps = film(config, actor, fire=arrival)
     with run.figure(f"episode_{name}{label}.gif") as path:
         write_gif(path, pictures)
     with run.figure(f"timelapse_{name}{label}.png") as path:

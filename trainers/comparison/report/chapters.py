@@ -13,6 +13,7 @@ from emberlink.trainers.evaluation import evaluate
 from emberlink.trainers.evaluation.actor import load_actor
 from emberlink.trainers.evaluation.panels import follows_advice
 from emberlink.trainers.evaluation.plots import timelapse
+from emberlink.trainers.evaluation.record_episode import film
 from emberlink.trainers.replay import Recorder, Replay
 from emberlink.trainers.replay.pack import Shown
 
@@ -104,9 +105,7 @@ def _films(
         actor = load_actor(run.config, newest)
         fire, arrival = evaluate.shown_fire(run.config)
         recorder = Recorder(advised=follows_advice(run.config, actor))
-        pictures, steps = evaluate.film(
-            run.config, actor, fire=arrival, frames=FRAMES, watch=recorder.add
-        )
+        pictures, steps = film(run.config, actor, fire=arrival, frames=FRAMES, watch=recorder.add)
         path = folder / f"{stem}_timelapse_{place}.png"
         timelapse(path, pictures, steps, group.label)
         caption = (
@@ -121,8 +120,8 @@ def _films(
 
 def _replays(folder: Path, stem: str, films: Sequence[_Film]) -> Iterator[ReplayFile]:
     """Writes a page for each fire that plays the methods side by side."""
-    for place, fire in enumerate(dict.fromkeys(film.fire for film in films)):
-        shown = [film.shown for film in films if film.fire == fire]
+    for place, fire in enumerate(dict.fromkeys(one.fire for one in films)):
+        shown = [one.shown for one in films if one.fire == fire]
         path = folder / f"{stem}_replay{f'_{place + 1}' if place else ''}.html"
         Replay(shown, f"{fire}:0").save(path)
         yield ReplayFile(path, fire, len(shown))
