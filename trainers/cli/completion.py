@@ -32,9 +32,9 @@ class PrintScript(argparse.Action):
     """Prints the script of a shell."""
 
     def __call__(self, parser: Any, namespace: Any, values: Any, *_: Any) -> None:
-        import argcomplete
+        from argcomplete.shell_integration import shellcode
 
-        parser._print_message(argcomplete.shellcode(["emberlink"], shell=values), sys.stdout)
+        parser._print_message(shellcode(["emberlink"], shell=values), sys.stdout)
         parser.exit()
 
 
