@@ -13,8 +13,10 @@ import pytest
 from emberlink.trainers.cli import main
 from emberlink.trainers.cli.completion import SHELLS
 
+RADIO = [f"env.radio.{name}=" for name in ("range", "loss", "bandwidth")]
 SETUPS = [f"setup={name}" for name in ("paper", "released", "strong", "tuned")]
 METHODS = ["consensus", "independent", "positional", "shared_memory"]
+"""the methods with trained policies"""
 
 
 ASKED = {
@@ -55,7 +57,7 @@ def completed(tmp_path, monkeypatch):
         ("tra", ["train"]),
         ("--comp", ["--completion"]),
         ("--completion ", ["bash", "zsh", "fish"]),
-        ("train ", METHODS),
+        ("train ", sorted([*METHODS, "maps"])),
         ("train c", ["consensus", "checkpoint_interval=", "checkpoint_steps="]),
         (
             "train consensus setup=",
@@ -63,8 +65,8 @@ def completed(tmp_path, monkeypatch):
         ),
         ("train consensus learner=t", ["learner=td3"]),
         ("train consensus env.r", ["env.radio.", "env.reward."]),
-        ("train consensus env.ra", ["env.radio.range=", "env.radio.loss="]),
-        ("train consensus env.radio.", ["env.radio.range=", "env.radio.loss="]),
+        ("train consensus env.ra", RADIO),
+        ("train consensus env.radio.", RADIO),
         ("train consensus seed=", []),
         ("train consensus comm.heading.w", ["comm.heading.weight="]),
         ("train independent comm.", []),
@@ -78,7 +80,7 @@ def completed(tmp_path, monkeypatch):
         ("eval pretrained:", [*(f"pretrained:{name}" for name in METHODS), "pretrained:tuned/"]),
         ("eval pretrained:tuned/c", ["pretrained:tuned/consensus"]),
         ("compare x pretrained:tuned/consensus/s3", ["pretrained:tuned/consensus/s3"]),
-        ("eval x --checkpoint f env.rad", ["env.radio.range=", "env.radio.loss="]),
+        ("eval x --checkpoint f env.rad", RADIO),
         ("render x --policy cour", ["courier"]),
         ("render x --fire hu", ["huygens"]),
         ("fire preview oil", ["oil_slick"]),
