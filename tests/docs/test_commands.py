@@ -125,11 +125,15 @@ def _train(rest: list[str]) -> list[str]:
     """Returns the arguments of a training of a second."""
     from_file = any(word.endswith("=file") for word in rest)
     fires = [] if from_file else ["fire.num_train_fires=2", "evaluation.huygens=false"]
-    small = (
-        [word for word in SMALL if "batch_size" not in word] if "learner=ippo" in rest else SMALL
-    )
-    held = ["env.horizon=20"] if "policy.hold=10" in rest else []
-    return [*_without_sizes(rest), *small, *held, *fires, "output=trained"]
+    return [*_without_sizes(rest), *_small(rest), *fires, "output=trained"]
+
+
+def _small(rest: list[str]) -> list[str]:
+    """Returns the settings of a small training, which the chosen learner has."""
+    on_policy = {"learner=ippo", "setup=strong"} & {*rest}
+    small = [word for word in SMALL if not on_policy or "batch_size" not in word]
+    held = {"policy.hold=10", "setup=strong"} & {*rest}
+    return [*small, "env.horizon=20"] if held else small
 
 
 def _sweep(rest: list[str]) -> list[str]:
@@ -142,7 +146,7 @@ def _sweep(rest: list[str]) -> list[str]:
         re.sub(r"^seeds?=.*", "seed=0", re.sub(r"^(setup|world)=(\w+),.*", r"\1=\2", w))
         for w in keys
     ]
-    return [*methods, *keys, *SMALL, "fire.num_train_fires=2", "output=swept"]
+    return [*methods, *keys, *_small(keys), "fire.num_train_fires=2", "output=swept"]
 
 
 def _without_sizes(rest: list[str]) -> list[str]:
