@@ -134,7 +134,7 @@ def train(
 
     Args:
         method: independent, shared_memory, positional, consensus, or a method of your own.
-        setup: paper, released, tuned, or a setup of your own.
+        setup: paper, released, tuned, strong, or a setup of your own.
         world: paper, front, relay, swarm, blackout, file, or a world of your own.
         fire: name of a scenario; that of the setup or the world if None.
         seeds: seeds to train in parallel, with a run folder for each, in place of `seed=`.

@@ -37,7 +37,8 @@ def make_env(
     Args:
         method: independent, shared_memory, positional, consensus, or a method of your own; or the
             configuration of a run, such as `load("pretrained:consensus").config`.
-        setup: paper (if None), released, tuned, or a setup of your own; not with a configuration.
+        setup: paper (if None), released, tuned, strong, or a setup of your own; not with a
+            configuration.
         world: paper (if None), front, relay, swarm, blackout, file, or a world of your own; not
             with a configuration.
         num_envs: number of environments, the batch size.

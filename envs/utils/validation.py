@@ -145,7 +145,8 @@ def describe(error: ValidationError, prefix: str = "") -> str:
     if isinstance(cause := first.get("ctx", {}).get("error"), ValidationError):
         return describe(cause, key)
     usual = first["msg"].removeprefix("Value error, ").replace("Input should", "should", 1)
-    message = _EXPECTED.get(first["type"], usual).format(**first.get("ctx", {}))
+    expected = _EXPECTED.get(first["type"])
+    message = usual if expected is None else expected.format(**first.get("ctx", {}))
     if first["type"] in ("missing", "unexpected_keyword_argument"):
         wrong = "missing" if first["type"] == "missing" else "not known"
         return f"key {shown(key)!r} is {wrong}"

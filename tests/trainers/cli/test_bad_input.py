@@ -28,7 +28,7 @@ def refused(arguments: list[str], capsys, *words: str) -> str:
 
 
 METHODS = "known: consensus, independent, maps, positional, shared_memory"
-SETUPS = "known: paper, released, tuned"
+SETUPS = "known: paper, released, strong, tuned"
 
 
 @pytest.mark.parametrize(

@@ -335,7 +335,7 @@ KNOWN = "known: front, huygens, oil_slick, paper, reaction, swarm"
         (["preview", "paper", "fire.units=minutes"], ["'fire.units'"]),
         (["preview", "paper", "seed=3"], ["'seed=3'", "keys of setup, env. and fire. only"]),
         (["preview", "paper", "fire=huygens"], ["'fire=huygens'", "without a key"]),
-        (["preview", "paper", "setup=zzz"], ["setup 'zzz'", "known: paper, released, tuned"]),
+        (["preview", "paper", "setup=zzz"], ["setup 'zzz'", "known: paper, released, strong"]),
         (["preview", "paper", "env.grid=[4,30]"], ["env.grid.0=4"]),
         (["preview", "paper", "again"], ["'again'", "key=value"]),
         (["preview", "paper", "--output", "there.png"], ["there.png exists already"]),

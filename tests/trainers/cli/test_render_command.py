@@ -124,7 +124,7 @@ def test_panels_have_the_same_fire_and_the_same_starts(tmp_path, monkeypatch):
     for method, episode in zip(methods, episodes, strict=False):
         assert episode.title == f"{method}, setup tuned, seed 0"
         now = episode.frames[-1]
-        assert (now.links is not None) == (method in ("consensus", "positional"))
+        assert (now.links is not None) == (method in ("consensus", "maps", "positional"))
         assert (now.roles is not None) == (now.target is not None) == (method == "consensus")
     for name, episode in zip(SCRIPTED, episodes[len(methods) :], strict=True):
         now = episode.frames[-1]
