@@ -143,6 +143,7 @@ def test_uses_keep_their_numbers():
         "SCRIPTED_WAYPOINT": 200,
         "SCRIPTED_ACTION": 201,
         "EXPLORATION_NOISE": 300,
+        "TEACHER": 301,
         "FIRE_PARAMETER": 0xF12E,
         "REPLAY_SAMPLE": 2**40,
         "TARGET_NOISE": 2**40 + 1,

@@ -88,7 +88,7 @@ def test_uavs_start_from_different_weights_and_a_seed_repeats_them():
 
 def test_modules_read_and_write_the_keys_of_the_environment():
     observation, action = (
-        specs.observation_spec(5, WildfireConfig(num_uavs=4)),
+        specs.observation_spec(5, WildfireConfig(num_uavs=4), window=5),
         specs.action_spec(5, 4),
     )
     actor, critic = (
