@@ -116,7 +116,7 @@ class Crops(Buffers):
         base: Tensor,
     ) -> Tensor:
         table = self._summed(known, seen, step)
-        age = self._ages.take((step.unsqueeze(-1) - heard).clamp(min=0))
+        age = self._ages.take((step.unsqueeze(-1) - heard).clamp(0, len(self._ages) - 1))
         bright = torch.where(heard >= 0, _FULL - age, 0)
         pictures = []
         for edges, scale in zip(self._edges, self.scales, strict=True):
@@ -130,7 +130,8 @@ class Crops(Buffers):
     def _summed(self, known: Tensor, seen: Tensor, step: Tensor) -> Tensor:
         """Returns the sums of all fields over the cells below and left, int64 [rows, X+1, Y+1]."""
         index = 4 * step.view(-1, 1, 1) + 3 - known
-        fields = self._fields.take(index)
+        # An environment may be stepped beyond its horizon, without a reset.
+        fields = self._fields.take(index.clamp_(0, len(self._fields) - 1))
         if self.spread:
             near = _widened((known & 3 == 1) & (known >= 0), self.spread)
         else:

@@ -210,7 +210,7 @@ def put(values: dict, key: str, value) -> dict:
 def valid_values(draw) -> dict:
     """Returns a recipe with a random valid value for every key."""
     method = draw(st.sampled_from(known("method")))
-    values = copy.deepcopy(recipe(method, draw(st.sampled_from(known("setup")))))
+    values = copy.deepcopy(recipe(method, draw(st.sampled_from(known("setup"))), "learner=ddpg"))
     for key, schema in {**KEYS, **COMM_KEYS[values["comm"]["name"]]}.items():
         values = put(values, key, draw(values_of(key, schema)))
     if values["comm"]["name"] == "maps":
@@ -301,7 +301,7 @@ def refuse_changes(values: dict, key: str, schema: dict) -> None:
 @given(st.data())
 def test_several_invalid_values_give_one_line_that_names_a_key(data):
     method = data.draw(st.sampled_from(known("method")))
-    values = recipe(method, data.draw(st.sampled_from(known("setup"))))
+    values = recipe(method, data.draw(st.sampled_from(known("setup"))), "learner=ddpg")
     there = {**KEYS, **COMM_KEYS[values["comm"]["name"]]}
     chosen = data.draw(st.lists(st.sampled_from(sorted(there)), min_size=1, max_size=3))
     for key in chosen:
@@ -364,7 +364,7 @@ def test_every_key_of_every_group_is_fuzzed():
     for method in known("method"):
         for setup in known("setup"):
             for fire in scenarios():
-                config = resolve(method, [f"setup={setup}", f"fire={fire}"])
+                config = resolve(method, [f"setup={setup}", f"fire={fire}", "learner=ddpg"])
                 present |= {key for key in flat(to_values(config)) if "baselines" not in key}
     assert present == fuzzed
     assert set(CAPS) | set(FIXED) <= fuzzed  # every listed key still exists
