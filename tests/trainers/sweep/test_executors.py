@@ -98,6 +98,7 @@ def test_a_machine_without_slurm_is_named(tmp_path, capsys, monkeypatch):
         (["executor=submitit", "executor.time=null"], "executor.time=None: expected minutes"),
         (["executor=submitit", "executor.time=2"], "executor.notice=90: executor.time=2 must be"),
         (["executor=submitit", "executor.options={qos: low"], "executor.options={qos: low"),
+        (["executor=submitit", "executor.options={qos: [1]}"], "options.qos=[1]: expected text"),
         (["executor=ray", "executor.gpus=-1"], "executor.gpus=-1"),
         (["executor=ray", "executor.gpus=1.5"], "executor.gpus=1.5: expected a fraction of 1 or"),
         (["executor=ray", "executor.gpus=.nan"], "executor.gpus=nan"),

@@ -11,7 +11,7 @@ from io import StringIO
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BeforeValidator, ConfigDict, Field
+from pydantic import BeforeValidator, ConfigDict, Field, PlainValidator
 from pydantic.dataclasses import dataclass
 
 from emberlink.envs.utils.atomic_io import inner_folder, write_bytes
@@ -34,6 +34,12 @@ _USUAL = ("None", "Priority", "Resources", "BeginTime", "Cleaning", "Prolog")
 def _time(value: object) -> str:
     minutes(str(value))
     return str(value)
+
+
+def _option(value: object) -> str | int:
+    if isinstance(value, bool) or not isinstance(value, str | int):
+        raise UserError("expected text or a whole number")
+    return value
 
 
 Positive = Annotated[int, Field(ge=1)]
@@ -70,7 +76,7 @@ class SubmititConfig:
     """how often a run is started again after its job ended without saving"""
     workers: Positive | None = None
     """runs at a time; all if None"""
-    options: dict[str, str | int] = Field(default_factory=dict)
+    options: dict[str, Annotated[str | int, PlainValidator(_option)]] = Field(default_factory=dict)
     """other options of sbatch"""
 
     def __post_init__(self) -> None:
