@@ -54,7 +54,11 @@ def _blank_figures(request, monkeypatch) -> None:
         return
     from matplotlib.figure import Figure
 
+    from emberlink.trainers.evaluation import plots
+
     blank = _blank()
+    for name in ("coverage_bars", "timelapse"):
+        monkeypatch.setattr(plots, name, lambda path, *_: path.write_bytes(blank))
     monkeypatch.setattr(Figure, "savefig", lambda _, path, **__: path.write_bytes(blank))
 
 

@@ -10,7 +10,7 @@ has 30 cells (`BASE_SIDE`); on another grid lengths and rates are scaled by min(
 
 import dataclasses
 import math
-from typing import Annotated, Literal, get_args
+from typing import Annotated, Any, Literal, get_args
 
 import torch
 from pydantic import ConfigDict, Field, ValidationError
@@ -120,7 +120,11 @@ GeneratedConfig = FireConfig | ReactionConfig
 
 def scenarios() -> list[str]:
     """Returns the names of the generated scenarios in `configs/fire`."""
-    return [name for name in known("fire") if read("fire", name).get("kind") in (None, "reaction")]
+    return [name for name in known("fire") if _is_generated(read("fire", name))]
+
+
+def _is_generated(values: dict[str, Any]) -> bool:
+    return values.get("kind") in (None, "reaction")
 
 
 def load_scenario(name: str) -> GeneratedConfig:
@@ -129,9 +133,9 @@ def load_scenario(name: str) -> GeneratedConfig:
     Raises:
         UserError: there is no such file, or a value in it is not valid.
     """
-    if name not in scenarios():
+    values = read("fire", name) if name in known("fire") else None
+    if values is None or not _is_generated(values):
         raise UserError(f"unknown fire {name!r}; known: {', '.join(scenarios())}")
-    values = read("fire", name)
     config_type = ReactionConfig if "kind" in values else FireConfig
     try:
         return config_type(**values)

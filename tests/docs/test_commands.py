@@ -161,7 +161,9 @@ def _eval(rest: list[str]) -> list[str]:
 
 
 def _render(rest: list[str]) -> list[str]:
-    return ["--step", "3"] if "--step" in rest else ["--frames", "2"]
+    alone = sum(word.startswith("pretrained") for word in rest) == 1
+    short = ["env.horizon=60"] if alone else []
+    return [*short, "--step", "3"] if "--step" in rest else [*short, "--frames", "2"]
 
 
 def _world(rest: list[str]) -> list[str]:

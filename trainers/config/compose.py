@@ -163,7 +163,7 @@ def _composed(method: str, chosen: Mapping[str, str]) -> dict[str, Any]:
     return values
 
 
-@lru_cache(maxsize=64)
+@lru_cache(maxsize=256)
 def _compose(
     chosen: tuple[tuple[str, str], ...], folders: tuple[Path, ...], stamps: tuple
 ) -> dict[str, Any]:

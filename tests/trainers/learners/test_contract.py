@@ -6,6 +6,8 @@ from pathlib import Path
 
 import pytest
 import torch
+from inside import Inside
+from rich.console import Console
 from torchrl.envs import ExplorationType, set_exploration_type, step_mdp
 
 from emberlink.envs import keys, parallel_env
@@ -15,6 +17,7 @@ from emberlink.trainers.cli import main
 from emberlink.trainers.evaluation.evaluate import play
 from emberlink.trainers.evaluation.record_episode import record_episode
 from emberlink.trainers.runs.run_folder import RunFolder
+from emberlink.trainers.sweep.command import sweep
 
 HORIZON = 20
 SMALL = [
@@ -128,7 +131,8 @@ def test_runs_of_all_learners_are_rendered_and_compared(trained, tmp_path, capsy
 
 def test_a_sweep_over_learners(tmp_path, capsys):
     settings = [*SMALL, "learner=ippo,mappo", "seed=0,1", "evaluation.episodes=1"]
-    assert main.main(["sweep", "independent", *settings, f"output={tmp_path}"]) == 0
+    arguments = ["independent", *settings, f"output={tmp_path}"]
+    assert sweep(arguments, Console(quiet=True), executor=Inside()) == 0
     runs = [RunFolder(path.parent) for path in tmp_path.glob("*/config.yaml")]
     assert sorted((run.config().learner.name, run.config().seed) for run in runs) == [
         ("ippo", 0),

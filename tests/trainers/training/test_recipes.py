@@ -14,7 +14,7 @@ from emberlink.trainers.training.trainer import Trainer
 
 METHODS = ["independent", "shared_memory", "positional", "consensus"]
 SETUPS = ["paper", "released", "tuned"]
-EPISODES, HORIZON, ENVS, BATCH = 3, 40, 2, 32
+EPISODES, HORIZON, ENVS, BATCH = 3, 25, 2, 32
 
 
 def short(method: str, output, *more: str, setup: str = "paper", seed: int = 0):
@@ -41,7 +41,8 @@ def trained(config) -> Trainer:
 )
 @pytest.mark.parametrize("method", [*METHODS, "maps"])
 def test_a_recipe_trains(method, setup, tmp_path):
-    config = short(method, tmp_path, "policy.hold=1", setup=setup)
+    pixels = ["comm.pixels=8"] if method == "maps" else []
+    config = short(method, tmp_path, "policy.hold=1", *pixels, setup=setup)
     trainer = Trainer(config)
     initial = {name: weight.clone() for name, weight in trainer.setup.learner.weights().items()}
     trainer.start()

@@ -128,6 +128,7 @@ def whole(tmp_path_factory):
 )
 def test_a_resumed_run_equals_the_uninterrupted_run(method, steps, learner, whole, tmp_path):
     more = [] if learner == "ddpg" else [f"learner={learner}"]
+    more += ["comm.pixels=8"] if method == "maps" else []
     assert_same(whole(method, *more), stopped_at(steps, method, tmp_path, *more))
 
 
