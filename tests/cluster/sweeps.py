@@ -12,22 +12,24 @@ from tiny_run import TINY
 
 from emberlink.trainers.runs.run_folder import RunFolder
 
-ARGUMENTS = [
+METHODS = ("independent", "shared_memory", "positional", "consensus")
+SETTINGS = [
     *(word for word in TINY if not word.startswith("episodes=")),
     *("episodes=16", "checkpoint_steps=30", "seed=0,1,2", "output=runs"),
     *("evaluation.scripted=[]", "evaluation.huygens=false", "fire.num_train_fires=2"),
 ]
-"""all methods x three seeds; a training takes a few seconds"""
+ARGUMENTS = [*METHODS, *SETTINGS]
+"""four methods x three seeds; a training takes a few seconds"""
 RUNS = 12
 PATIENCE = 900.0
 
 
 def start(
-    folder: Path, *more: str, env: Mapping[str, str] | None = None, methods: Sequence[str] = ()
+    folder: Path, *more: str, env: Mapping[str, str] | None = None, methods: Sequence[str] = METHODS
 ) -> subprocess.Popen:
     """Starts the sweep as a process in a folder; its output is in `sweep.txt`."""
     keys = {text.partition("=")[0] for text in more}
-    kept = [text for text in ARGUMENTS if text.partition("=")[0] not in keys]
+    kept = [text for text in SETTINGS if text.partition("=")[0] not in keys]
     with (folder / "sweep.txt").open("ab") as log:
         return subprocess.Popen(
             [sys.executable, "-m", "emberlink.trainers.cli", "sweep", *methods, *kept, *more],
