@@ -71,7 +71,10 @@ class TrainedPolicy(TensorDictSequential):
         self.changes = tuple(changes)
 
     def replay(
-        self, *others: "TrainedPolicy", fire: str | None = None, policies: Sequence[str] = ()
+        self,
+        *others: "TrainedPolicy",
+        fire: str | int | None = None,
+        policies: Sequence[str] = (),
     ) -> Replay:
         """Returns a page that plays an episode of the evaluation; Jupyter shows it inline.
 

@@ -13,7 +13,7 @@ _SILENT = 150  # steps; a UAV not heard of for so long counts as lost where UAVs
 
 
 class Courier(MapGreedy):
-    """Searches as `MapGreedy`, and forms a chain of radios to the base by the end of the episode.
+    """Searches as `map_greedy`, and forms a chain of radios to the base by the end of the episode.
 
     Each UAV computes a chain of places from the base to the middle of the fire that it knows, one
     radio range apart (`rally.chain`). UAV 0 holds the place next to the base, UAV 1 the next one,

@@ -7,7 +7,7 @@ from emberlink.policies.scripted.map_greedy import MapGreedy
 
 
 class MapGreedyAll(MapGreedy):
-    """Searches as `MapGreedy`; each UAV knows the sightings and targets of all, at any distance."""
+    """Searches as `map_greedy`; each UAV knows what all have seen and plan, at any distance."""
 
     hears: ClassVar[bool] = False
     messages: ClassVar[Messages] = "everyone"

@@ -7,7 +7,7 @@ from emberlink.policies.scripted.map_greedy import MapGreedy
 
 
 class MapGreedyAlone(MapGreedy):
-    """Searches as `MapGreedy`; each UAV knows its own sightings and target alone."""
+    """Searches as `map_greedy`; each UAV knows its own sightings and target alone."""
 
     hears: ClassVar[bool] = False
     messages: ClassVar[Messages] = "none"

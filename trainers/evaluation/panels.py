@@ -37,6 +37,7 @@ FIRES = 65_536
 SHARED = ("grid", "num_uavs", "horizon", "altitude")
 """settings that must be equal for all panels; fires and start positions depend on them"""
 _SETTING = re.compile(r"(comm|env)\.[\w.]+=")
+_KEY = re.compile(r"[\w.]+")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -94,7 +95,10 @@ def _with_settings(arguments: Sequence[str]) -> list[tuple[str, list[str]]]:
     """Returns each run with the settings that follow it."""
     runs: list[tuple[str, list[str]]] = []
     for text in arguments:
+        key = text.partition("=")[0]
         if not _SETTING.match(text):
+            if _KEY.fullmatch(key) and key != text and not Path(text).exists():
+                raise UserError(f"{text!r}: only keys under env and comm can be changed here")
             runs.append((text, []))
         elif runs:
             runs[-1][1].append(text)
@@ -140,7 +144,7 @@ def _plain(value: Any) -> str:
     return str(list(value)) if isinstance(value, tuple) else str(value)
 
 
-def find_fire(text: str | None, run: RunConfig) -> tuple[ScenarioConfig, int]:
+def find_fire(text: str | int | None, run: RunConfig) -> tuple[ScenarioConfig, int]:
     """Returns the scenario and the index of a held-out fire.
 
     Args:
@@ -152,7 +156,7 @@ def find_fire(text: str | None, run: RunConfig) -> tuple[ScenarioConfig, int]:
         UserError: there is no such scenario or fire.
     """
     usual, trained = shown_scenario(run), run.fire
-    text = usual if text is None else text
+    text = usual if text is None else str(text)
     name, _, index = (
         text.rpartition(":")
         if ":" in text
@@ -177,7 +181,7 @@ def follows_advice(config: RunConfig, policy: Any) -> bool:
 
 def replay(
     panels: Sequence[Panel],
-    fire: str | None,
+    fire: str | int | None,
     report: Callable[[str], None] = lambda _: None,
 ) -> Replay:
     """Plays the same episode of each panel and returns a page of them.

@@ -27,7 +27,7 @@ _AT_ONCE = 100
 
 
 class RangedMapGreedy(MapGreedy):
-    """Searches as `MapGreedy`, with another range of the radio in each environment.
+    """Searches as `map_greedy`, with another range of the radio in each environment.
 
     Args:
         env: the environment that it acts in; without a base, so that only policies hear the radio.

@@ -310,7 +310,9 @@ def test_panels_tell_their_settings(tmp_path):
     run = str(make_run(tmp_path))
     (panel,) = panels.learned([run, "env.radio.range=3"], [])
     assert panel.config.env.radio.range == 3
-    header = data_of(panels.replay([panel], "paper:1").html)
+    page = panels.replay([panel], "paper:1").html
+    assert data_of(panels.replay([panel], 1).html)["fire"] == "huygens:1"
+    header = data_of(page)
     assert header["panels"][0]["range"] == 3
     assert header["grid"] == [30, 30]
 

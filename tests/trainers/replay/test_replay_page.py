@@ -289,6 +289,35 @@ def test_dark_pages_have_other_colours(browser, file):
     assert found[0][1] != found[1][1] == changed
 
 
+@pytest.mark.parametrize("change", ["uav", "colours"])
+def test_the_curves_are_drawn_anew_at_the_step(tab, change):
+    tab.page.set_viewport_size({"width": 1200, "height": 900})
+    go_to(tab, 17)
+    if change == "uav":
+        tab.page.select_option("#uav", "3")
+    else:
+        tab.page.emulate_media(color_scheme="dark")
+    tab.page.wait_for_timeout(100)
+    found = tab.page.locator("#curves figure").evaluate_all(
+        """boxes => boxes.map(box => [
+            box.querySelector('.u-value').textContent,
+            box.querySelector('.uplot').offsetWidth - box.clientWidth,
+            box.querySelector('.u-cursor-x').style.transform])"""
+    )
+    assert len(found) > 3
+    assert {(step, wider) for step, wider, _ in found} == {("17", 0)}
+    assert all(re.match(r"translate\([1-9]", place) for _, _, place in found)
+
+
+def test_a_page_whose_program_is_damaged_gives_a_message(browser, replay, tmp_path):
+    (tmp_path / "page.html").write_text(replay.html.replace("new uPlot(", "new uPl0t("))
+    tab = Tab(browser, f"file://{tmp_path / 'page.html'}")
+    tab.page.wait_for_selector("#message:not(.late)")
+    assert "damaged" in tab.page.inner_text("#message")
+    assert not tab.page.is_visible("#page")
+    tab.close()
+
+
 def test_controls_have_names_for_screen_readers(tab):
     unnamed = tab.page.evaluate(
         """[...document.querySelectorAll('button, input, select, canvas.map')].filter(control =>
@@ -319,7 +348,9 @@ def test_damaged_data_give_a_message(browser, replay, tmp_path):
         path.write_text(replay.html.replace(packed, damaged))
         tab = Tab(browser, f"file://{path}")
         tab.page.wait_for_selector("#message:not(.late)")
-        assert "damaged" in tab.page.inner_text("#message")
+        said = tab.page.inner_text("#message")
+        assert "damaged" in said
+        assert "!" not in damaged or said.endswith("(not in base64).")
         assert not tab.page.is_visible("#page")
         assert tab.problems == []
         tab.close()

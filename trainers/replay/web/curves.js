@@ -41,19 +41,25 @@ export class Curves {
   /** Draws all charts anew, in the colours of a palette. */
   build(palette, uav) {
     this.charts?.forEach((chart) => chart.destroy());
-    this.parent.replaceChildren();
     const { panels } = this.data;
-    this.charts = MEASURES
+    const charts = MEASURES
       .filter(([name]) => name !== "base_coverage" || panels.some((panel) => panel.base_seen))
-      .map(([name, title, digits, value]) => this.chart(palette, name, title, digits,
-        panels.map((panel, place) => ({
+      .map(([name, title, digits, value]) => ({
+        name, title, digits,
+        lines: panels.map((panel, place) => ({
           label: panel.title,
           values: Array.from(this.steps, (step) => value(panel, step)),
           ...panelStyle(palette, place),
           width: 2,
-        }))));
-    panels.forEach((panel, place) => this.charts.push(this.rewards(palette, panel, place, uav)));
-    this.show(this.step ?? 0);
+        })),
+      }));
+    charts.push(...panels.map((panel, place) => this.rewards(palette, panel, place, uav)));
+    // The width of a box depends on the number of boxes.
+    const boxes = charts.map(({ name, title }) => this.box(name, title));
+    this.parent.replaceChildren(...boxes);
+    this.charts = charts.map((chart, place) => this.chart(palette, chart, boxes[place]));
+    this.step ??= 0;
+    queueMicrotask(() => this.show(this.step)); // uPlot sets its scales in a microtask, too
   }
 
   rewards(palette, panel, place, chosen) {
@@ -66,17 +72,19 @@ export class Curves {
       alpha: number === uav ? 1 : 0.55,
     }));
     lines.push(lines.splice(uav, 1)[0]); // the chosen one on top
-    const title = `Reward per UAV: ${panel.title}`;
-    return this.chart(palette, `reward-${place}`, title, 2, lines);
+    return { name: `reward-${place}`, title: `Reward per UAV: ${panel.title}`, digits: 2, lines };
   }
 
-  chart(palette, name, title, digits, lines) {
+  box(name, title) {
     const box = document.createElement("figure");
     const heading = document.createElement("figcaption");
     heading.textContent = title;
     box.append(heading);
     box.dataset.chart = name;
-    this.parent.append(box);
+    return box;
+  }
+
+  chart(palette, { digits, lines }, box) {
     const axis = {
       stroke: palette.named("--ink"),
       grid: { stroke: palette.named("--grid"), width: 1 },

@@ -237,6 +237,7 @@ function hashStep() {
 function fail(text) {
   find("message").textContent = text;
   find("message").classList.remove("late");
+  find("message").hidden = false;
   find("page").hidden = true;
 }
 
@@ -252,8 +253,12 @@ async function start() {
   }
   find("message").hidden = true;
   find("page").hidden = false;
-  const player = new Player(data);
-  return player.seek(hashStep() ?? 0);
+  try {
+    return new Player(data).seek(hashStep() ?? 0);
+  } catch (error) {
+    fail(`This page is damaged and cannot be shown (${error.message}).`);
+    throw error;
+  }
 }
 
 start();

@@ -10,8 +10,7 @@ const NEEDED = ["position", "view", "hears", "reward", "seen", "burning", "burnt
 
 /** Returns the episodes that a text in base64 holds; throws an error if it is damaged. */
 export async function unpack(text) {
-  const packed = Uint8Array.from(atob(text), (character) => character.charCodeAt(0));
-  const buffer = await decompress(packed);
+  const buffer = await decompress(decoded(text));
   const length = new DataView(buffer).getUint32(0, true);
   const header = JSON.parse(new TextDecoder().decode(new Uint8Array(buffer, 4, length)));
   if (header.version !== VERSION) throw new Error(`unknown version ${header.version}`);
@@ -24,6 +23,15 @@ export async function unpack(text) {
     end: read(header.end).values,
     panels: header.panels.map((panel) => unpackPanel(panel, read, header.horizon)),
   };
+}
+
+/** Returns the bytes of a text in base64. */
+function decoded(text) {
+  try {
+    return Uint8Array.from(atob(text), (character) => character.charCodeAt(0));
+  } catch {
+    throw new Error("not in base64");
+  }
 }
 
 /** Returns the content of bytes compressed with gzip. */
