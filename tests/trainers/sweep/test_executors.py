@@ -150,6 +150,21 @@ def test_an_address_without_a_cluster_is_named_in_one_line(address, monkeypatch)
         executor._check_address()
 
 
+@pytest.mark.parametrize(("address", "told"), [("127.0.0.1:1", True), ("auto", False)])
+def test_a_cluster_that_refuses_may_ask_for_a_token(address, told, monkeypatch):
+    def init(*_, **__):
+        raise ConnectionError("refused")
+
+    fake = SimpleNamespace(is_initialized=lambda: False, init=init)
+    monkeypatch.setattr(_extras, "find_spec", lambda _: True)
+    monkeypatch.setattr(_extras, "load", lambda _: fake)
+    executor = executors.make("ray", {"address": address})
+    monkeypatch.setattr(executor, "_check_address", lambda: None)
+    with pytest.raises(UserError, match="refused") as caught:
+        executor._connect()
+    assert ("RAY_AUTH_MODE=token" in str(caught.value)) == told
+
+
 def test_an_address_that_answers_is_tried(monkeypatch):
     monkeypatch.setattr(_extras, "find_spec", lambda _: True)
     with socket.create_server(("127.0.0.1", 0)) as server:

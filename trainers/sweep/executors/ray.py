@@ -250,6 +250,8 @@ class RayExecutor(Executor):
             )
         except (ConnectionError, ValueError, RuntimeError) as error:
             text = " ".join(str(error).split())[:200]
+            if isinstance(error, ConnectionError) and ":" in self._config.address:
+                text += "; if the cluster asks for a token, set RAY_AUTH_MODE=token"
             raise UserError(f"executor.address={self._config.address}: {text}") from None
 
     def _check_address(self) -> None:
