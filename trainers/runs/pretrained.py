@@ -1,7 +1,8 @@
 """Opens the trained policies of the package (`pretrained:consensus`), and adds runs to them.
 
 Each is a reduced run folder, policies/pretrained/SETUP/METHOD/sSEED, with config.yaml,
-metrics.jsonl, eval.json, and a checkpoint of the actors. Finished runs are packed with
+metrics.jsonl, eval.json, and a checkpoint of the actors. SETUP is `collection`: the setup, and the
+world if it is not `paper`. Finished runs are packed with
 
     python -m emberlink.trainers.runs.pretrained RUN... --into policies/pretrained
 """
@@ -17,6 +18,7 @@ from pathlib import Path
 
 from emberlink.envs.fire_files.config import COPY_FILE
 from emberlink.envs.utils.errors import UserError
+from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.learners.base import ACTOR
 from emberlink.trainers.runs import checkpoint_file
 from emberlink.trainers.runs.run_folder import RunFolder
@@ -38,7 +40,8 @@ def open_run(text: str, output: Path | str = "runs") -> RunFolder:
 
     Args:
         text: a run folder, or `pretrained:METHOD`, `pretrained:SETUP/METHOD` or
-            `pretrained:SETUP/METHOD/SEED`.
+            `pretrained:SETUP/METHOD/SEED`, where SETUP is such as `tuned` or, for the world
+            front, `strong_front`.
         output: folder of run folders.
 
     Raises:
@@ -60,7 +63,8 @@ def find(text: str) -> list[Path]:
     """Returns the folders of the trained policies that match a name, lowest seed first.
 
     Args:
-        text: see `open_run`; `pretrained:SETUP` matches all policies of a setup.
+        text: see `open_run`; `pretrained:SETUP` matches all policies of a setup. A method alone
+            means those of the setup tuned, or of all setups if tuned has none.
 
     Raises:
         UserError: there is no such policy.
@@ -71,7 +75,8 @@ def find(text: str) -> list[Path]:
     if len(wanted) == 3:
         wanted[2] = f"s{wanted[2].removeprefix('s')}"
     matching = [path for path in folders if path.parts[-3:][: len(wanted)] == tuple(wanted)]
-    usual = [path for path in folders if path.parts[-3:-1] == (USUAL_SETUP, name)]
+    of_method = [path for path in folders if path.parts[-2] == name]
+    usual = [path for path in of_method if path.parts[-3] == USUAL_SETUP] or of_method
     if not matching and not usual:
         seeds = [path.name[1:] for path in folders if [*path.parts[-3:-1]] == wanted[:2]]
         if seeds:
@@ -98,6 +103,11 @@ def find_one(text: str) -> Path:
     return policies[0]
 
 
+def collection(config: RunConfig) -> str:
+    """Returns the folder of a run's trained policies: its setup, and its world unless `paper`."""
+    return config.setup if config.world == "paper" else f"{config.setup}_{config.world}"
+
+
 def pack(run: RunFolder, into: Path) -> Path:
     """Copies a finished run to the trained policies, without training states and critics.
 
@@ -115,7 +125,7 @@ def pack(run: RunFolder, into: Path) -> Path:
     config = replace(trained, output="runs", logger="none", device="cpu")
     if len(run.lines()) < config.episodes or not (run.path / "eval.json").exists():
         raise UserError(f"{run.path}: not finished, or not evaluated")
-    target = into / config.setup / config.method / f"s{config.seed}"
+    target = into / collection(config) / config.method / f"s{config.seed}"
     if target.exists():
         raise UserError(f"{target}: exists already")
     newest = run.checkpoint()

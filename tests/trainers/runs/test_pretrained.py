@@ -16,17 +16,30 @@ from emberlink.trainers.runs import pretrained
 from emberlink.trainers.runs.run_folder import RunFolder
 from emberlink.trainers.runs.seal import check_trained_with
 
+PACKED = (
+    ("consensus", 3, "paper"),
+    ("consensus", 10, "paper"),
+    ("independent", 3, "paper"),
+    ("positional", 1, "front"),
+)
+FOLDERS = (
+    "tuned/consensus/s3",
+    "tuned/consensus/s10",
+    "tuned/independent/s3",
+    "tuned_front/positional/s1",
+)
 DATA = Path(__file__).parents[3] / "docs" / "data"
 
 
 @pytest.fixture(scope="module")
 def packed(tmp_path_factory) -> tuple[Path, list[Path]]:
-    """Packs two seeds of one method and one of another; returns them and their runs."""
+    """Packs two seeds of one method, one of another, and one in another world; returns all."""
     folder = tmp_path_factory.mktemp("packed")
     root, runs = folder / "shipped", []
-    for method, seed in (("consensus", 3), ("consensus", 10), ("independent", 3)):
+    for method, seed, world in PACKED:
         output = folder / f"{method}{seed}"
-        arguments = [method, "setup=tuned", *TINY, f"seed={seed}", f"output={output}"]
+        arguments = [method, "setup=tuned", f"world={world}", *TINY, f"seed={seed}"]
+        arguments += [f"output={output}"]
         assert main(["train", *arguments]) == 0
         (run,) = output.iterdir()
         runs.append(run)
@@ -45,8 +58,8 @@ def shipped(packed, tmp_path, monkeypatch) -> Path:
 
 def test_packed_runs_omit_the_training_state(packed):
     root, runs = packed
-    for run, place in zip(runs, ("consensus/s3", "consensus/s10", "independent/s3"), strict=True):
-        mine = root / "tuned" / place
+    for run, place in zip(runs, FOLDERS, strict=True):
+        mine = root / place
         files = {file.relative_to(mine).as_posix() for file in mine.rglob("*") if file.is_file()}
         checkpoint = RunFolder(run).checkpoint().name
         expected = {"config.yaml", "metrics.jsonl", "eval.json", f"checkpoints/{checkpoint}"}
@@ -93,6 +106,17 @@ def test_names_of_several_policies(shipped):
     assert names("pretrained:tuned") == ["consensus/s3", "consensus/s10", "independent/s3"]
     assert names("pretrained:consensus") == ["consensus/s3", "consensus/s10"]
     assert names("pretrained:tuned/consensus/10") == ["consensus/s10"]
+    assert names("pretrained:tuned_front") == ["positional/s1"]
+    assert names("pretrained:positional") == ["positional/s1"]  # tuned has none
+
+
+def test_a_method_of_two_other_setups_is_ambiguous(shipped, capsys):
+    shutil.copytree(shipped / "tuned_front", shipped / "strong_front")
+    try:
+        assert main(["eval", "pretrained:positional"]) == 2
+    finally:
+        shutil.rmtree(shipped / "strong_front")
+    assert "ambiguous: strong_front/positional, tuned_front/positional" in capsys.readouterr().err
 
 
 def test_shipped_policies_can_be_compared(shipped, tmp_path):
@@ -105,7 +129,7 @@ def test_shipped_policies_can_be_compared(shipped, tmp_path):
 @pytest.mark.parametrize(
     ("name", "said"),
     [
-        ("pretrained:consensos", "tuned/consensus, tuned/independent"),
+        ("pretrained:consensos", "tuned/consensus, tuned/independent, tuned_front/positional"),
         ("pretrained:tuned", "is ambiguous"),
         ("pretrained:tuned/consensus/4", "policy; tuned/consensus has the seeds 3, 10"),
         ("pretrained:", "no such trained policy"),
@@ -147,7 +171,8 @@ def test_every_shipped_policy_loads():
     for folder in folders:
         run = RunFolder(folder)
         config = run.config()
-        assert folder.parts[-3:] == (config.setup, config.method, f"s{config.seed}")
+        expected = (pretrained.collection(config), config.method, f"s{config.seed}")
+        assert folder.parts[-3:] == expected
         check_trained_with(run.checkpoint(), config)
         actor = load_actor(config, run.checkpoint())
         assert all(torch.isfinite(weight).all() for weight in actor.parameters())
