@@ -194,6 +194,16 @@ def test_a_run_begins_with_the_actors_of_another(learner, actor_of, more, imitat
         assert frozen[name.removeprefix(ACTOR)][:1].equal(value.view(1, *value.shape[1:]))
 
 
+@pytest.mark.parametrize("warm", [False, True])
+def test_the_first_noise_is_that_of_the_configuration(warm, imitated, tmp_path):
+    start = [f"learner.warm_start={imitated['ippo']}"] if warm else []
+    more = [*start, "learner.log_std=-1.5", f"output={tmp_path}"]
+    trainer = Trainer(resolve("maps", settings("ippo", *more)))
+    trainer.start()
+    noise = trainer.setup.learner.weights()["actor_network_params.module.log_std"]
+    assert (noise == -1.5).all()
+
+
 def test_actors_of_another_network_are_refused(imitated, tmp_path, capsys):
     start = f"learner.warm_start={imitated['ddpg']}"
     arguments = ["train", "maps", *settings("ippo", start), f"output={tmp_path}"]

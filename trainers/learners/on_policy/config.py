@@ -30,6 +30,8 @@ class OnPolicyConfig(LearnerConfig):
     """largest Euclidean norm of the gradient of a network"""
     entropy: NotNegative
     """weight of the entropy of the actions in the actors' loss"""
+    log_std: Annotated[float, Field(ge=-10, le=2)] = -0.5
+    """logarithm of the standard deviation of the actions at the beginning, after a warm start, too"""
     warm_start: str = ""
     """run folder, or `pretrained:…`, whose actors the run begins with; none if empty"""
     anchor: NotNegative = 0.0

@@ -66,6 +66,7 @@ class OnPolicyLearner(Learner):
             config, context.observation_spec, context.action_spec, new, context.policy
         )
         self.critic: Any = self.make_critic(context, new)
+        self._set_log_std()
         self.explorer = GaussianExplorer(self.actor)
         self.loss = make_loss(
             self.actor, self.critic, clip=config.clip, entropy=config.entropy, device=self.device
@@ -234,6 +235,13 @@ class OnPolicyLearner(Learner):
     def start_from(self, weights: Mapping[str, Tensor]) -> None:
         for policy in (self.actor.module, *([self.anchor.network] if self.anchor else [])):
             copy_to_seeds(policy, weights, self.teams)
+        self._set_log_std()
+
+    def _set_log_std(self) -> None:
+        """Sets the standard deviation of the actions to that of the beginning of a run."""
+        network: Any = self.actor.module
+        with torch.no_grad():
+            network.log_std.fill_(self.config.log_std)
 
     def scale_lr(self, scale: float) -> None:
         self._lr_scale = scale
