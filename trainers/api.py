@@ -16,6 +16,7 @@ from emberlink.trainers.comparison.report import free_folder, write_report
 from emberlink.trainers.comparison.results import Comparison, compare_runs
 from emberlink.trainers.config.compose import flat, override, resolve, to_values
 from emberlink.trainers.config.schema import RunConfig
+from emberlink.trainers.config.transfer import in_world
 from emberlink.trainers.evaluation import panels
 from emberlink.trainers.evaluation.actor import load_actor
 from emberlink.trainers.evaluation.evaluate import evaluate as evaluate_policy
@@ -188,7 +189,8 @@ def evaluate(
         checkpoint: file of networks; the newest of the run if None.
         device: device of the episodes; that of the run if None.
         progress: called with the names of the fire and the policy before each evaluation.
-        settings: settings of `env` or `comm` to change, as for `train`; the networks must fit.
+        settings: `world`, or settings of `env` or `comm` to change, as for `train`; the networks
+            must fit.
 
     Returns:
         fire -> policy ("learned", or a scripted one) -> measure -> one number per episode.
@@ -218,7 +220,8 @@ def load(
         run: a run folder, or `pretrained:METHOD`.
         checkpoint: file of networks; the newest of the run if None.
         device: device of the networks; that of the run if None.
-        settings: settings of `env` or `comm` to change, as for `train`; the networks must fit.
+        settings: `world`, or settings of `env` or `comm` to change, as for `train`; the networks
+            must fit.
 
     Raises:
         UserError: there is no such run, a file in it is damaged, or a setting does not fit.
@@ -227,15 +230,18 @@ def load(
     trained = folder.config(**({} if device is None else {"device": device}))
     file = folder.checkpoint() if checkpoint is None else Path(checkpoint)
     check_trained_with(file, trained)
-    config = override(trained, **settings)
+    there = in_world(trained, str(settings.pop("world", trained.world)))
+    config = override(there, **settings)
     changed = {key: getattr(config, key) for key in ("env", "comm", "baselines")}
-    if replace(trained, **changed) != config:
-        raise UserError(f"{', '.join(settings)}: only keys of env and comm can be changed")
+    if replace(there, **changed) != config:
+        raise UserError(
+            f"{', '.join(settings)}: only world and keys of env and comm can be changed"
+        )
     before, now = (flat(to_values(each)) for each in (trained, config))
     changes = [
         f"{key}={value}"
         for key, value in now.items()
-        if key.startswith(("env.", "comm.")) and before.get(key) != value
+        if key.startswith(("world", "env.", "comm.")) and before.get(key) != value
     ]
     return TrainedPolicy(load_actor(config, file), config, file, changes)
 

@@ -189,7 +189,10 @@ def test_compare_writes_the_report_of_the_command(trained, tmp_path):
         (lambda run: trainers.make_env("consensus", env=3), "env=3: expected keys and values"),
         (lambda run: trainers.compare("nowhere"), "nowhere: there is no such run folder"),
         (lambda run: trainers.compare([]), "expected at least one run folder"),
-        (lambda run: trainers.evaluate(run, gamma=0.5), "gamma: only keys of env and comm"),
+        (
+            lambda run: trainers.evaluate(run, gamma=0.5),
+            "gamma: only world and keys of env and comm",
+        ),
         (lambda run: trainers.evaluate(run, num_uavs=3), "this configuration"),
         (lambda run: trainers.load("pretrained:nothing"), "no such trained policy; known: "),
         (lambda run: trainers.load("pretrained:tuned"), "is ambiguous"),

@@ -35,7 +35,7 @@ def add_eval(commands: Any) -> None:
         completer=completion.settings,
         nargs="*",
         default=[],
-        help="keys of comm. or env. to change, such as env.radio.loss=0.5; "
+        help="keys of comm. or env. to change, such as env.radio.loss=0.5, or world=NAME; "
         "the names of the files contain them",
     )
     evaluation.add_argument(

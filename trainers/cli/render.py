@@ -39,7 +39,7 @@ def _add_episodes(rendering: Parser) -> None:
         completer=completion.runs,
         nargs="+",
         help="a run folder, or pretrained:METHOD; after it KEY=VALUE, such as env.radio.range=0, "
-        "for other settings of env and comm",
+        "for other settings of env and comm, or world=NAME",
     )
     add(
         "--policy",

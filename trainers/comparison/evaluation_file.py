@@ -26,6 +26,7 @@ class Evaluation:
 
     method: str
     setup: str
+    world: str
     seed: int
     start_seed: int
     """seed of the start positions"""

@@ -143,7 +143,7 @@ def evaluated_otherwise(run: Run) -> tuple[list[Run], list[LeftOut]]:
         changed = _changed_settings(run, evaluation)
         why = [
             f"{name} is {getattr(evaluation, name)}, in eval.json {getattr(run.evaluation, name)}"
-            for name in ("checkpoint", "fires", "start_seed")
+            for name in ("world", "checkpoint", "fires", "start_seed")
             if getattr(evaluation, name) != getattr(run.evaluation, name)
         ]
         why += [f"{key}={changed[key]}" for key in ("env.horizon", "env.grid") if key in changed]
@@ -157,7 +157,7 @@ def evaluated_otherwise(run: Run) -> tuple[list[Run], list[LeftOut]]:
 def _changed_settings(run: Run, evaluation: Evaluation) -> dict[str, Any]:
     """Returns the settings of an evaluation that differ from the training, by dotted key."""
     learned = evaluation.communication.get(LEARNED, {})
-    settings = flat({"env": evaluation.environment, "comm": learned})
+    settings = flat({"world": evaluation.world, "env": evaluation.environment, "comm": learned})
     return {key: value for key, value in settings.items() if run.settings.get(key) != value}
 
 

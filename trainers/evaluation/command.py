@@ -7,8 +7,8 @@ from pathlib import Path
 from rich.console import Console
 
 from emberlink.envs.utils.errors import UserError
-from emberlink.trainers.config.compose import override
 from emberlink.trainers.config.schema import RunConfig, check_device
+from emberlink.trainers.config.transfer import evaluated_with
 from emberlink.trainers.evaluation.actor import load_actor
 from emberlink.trainers.evaluation.evaluate import Policy
 from emberlink.trainers.evaluation.report import evaluate_run
@@ -18,8 +18,8 @@ from emberlink.trainers.runs.pretrained import open_run
 from emberlink.trainers.runs.run_folder import RunFolder
 from emberlink.trainers.runs.seal import check_trained_with
 
-_CHANGEABLE = ("comm.", "env.")
-"""prefixes of the keys that can be changed in an evaluation"""
+_CHANGEABLE = ("comm.", "env.", "world=")
+"""beginnings of the settings that can be changed in an evaluation"""
 
 
 def evaluate_folder(
@@ -36,7 +36,7 @@ def evaluate_folder(
     Args:
         name: a run folder, or `pretrained:METHOD`.
         console: prints the table.
-        overrides: texts `key=value` that change the environment or the communication.
+        overrides: texts `key=value` that change the environment, the communication or the world.
         checkpoint: file of networks; the newest of the run if None.
         fires: number of test fires, one episode each; that of the run if None.
         device: device of the evaluation; that of the run if None.
@@ -56,10 +56,10 @@ def evaluate_folder(
             raise UserError(f"{text!r}: one run is evaluated at a time; compare takes several runs")
         if not text.startswith(_CHANGEABLE):
             raise UserError(
-                f"{text!r}: an evaluation can change keys of {' and '.join(_CHANGEABLE)} only"
+                f"{text!r}: an evaluation can change the world and keys of comm. and env. only"
             )
-        config = override(config, [text])
         label += "_" + re.sub(r"[^\w.=+-]", "-", text)
+    config = evaluated_with(config, overrides)
     actor = load_actor(config, checkpoint)
     evaluate_and_print([(run, config, actor, checkpoint)], console, label=label, fires=fires)
     return 0

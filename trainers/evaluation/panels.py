@@ -16,8 +16,8 @@ from emberlink.envs.utils.errors import UserError
 from emberlink.envs.wildfire import WildfireEnv
 from emberlink.policies.scripted.registry import SCRIPTED
 from emberlink.trainers.build import build_env
-from emberlink.trainers.config.compose import override
 from emberlink.trainers.config.schema import RunConfig, build_comm
+from emberlink.trainers.config.transfer import evaluated_with
 from emberlink.trainers.evaluation.actor import load_actor
 from emberlink.trainers.evaluation.evaluate import (
     BLOCK,
@@ -36,7 +36,7 @@ FIRES = 65_536
 """number of held-out fires of a scenario, the maximum of an evaluation"""
 SHARED = ("grid", "num_uavs", "horizon", "altitude")
 """settings that must be equal for all panels; fires and start positions depend on them"""
-_SETTING = re.compile(r"(comm|env)\.[\w.]+=")
+_SETTING = re.compile(r"((comm|env)\.[\w.]+|world)=")
 _KEY = re.compile(r"[\w.]+")
 
 
@@ -85,9 +85,10 @@ def learned(arguments: Sequence[str], checkpoints: Sequence[Path]) -> Iterator[P
         trained = run.config(device="cpu")
         checkpoint = checkpoints[place] if checkpoints else run.checkpoint()
         check_trained_with(checkpoint, trained)
-        config = override(trained, changes) if changes else trained
+        config = evaluated_with(trained, changes)
         actor = load_actor(config, checkpoint)
-        title = title_of(config, *changes, *([checkpoint.stem] if checkpoints else []))
+        others = [text for text in changes if not text.startswith("world=")]
+        title = title_of(config, *others, *([checkpoint.stem] if checkpoints else []))
         yield Panel(title, config, lambda env, actor=actor: actor)
 
 
@@ -98,7 +99,9 @@ def _with_settings(arguments: Sequence[str]) -> list[tuple[str, list[str]]]:
         key = text.partition("=")[0]
         if not _SETTING.match(text):
             if _KEY.fullmatch(key) and key != text and not Path(text).exists():
-                raise UserError(f"{text!r}: only keys under env and comm can be changed here")
+                raise UserError(
+                    f"{text!r}: only the world and keys under env and comm can be changed here"
+                )
             runs.append((text, []))
         elif runs:
             runs[-1][1].append(text)

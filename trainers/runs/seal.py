@@ -68,14 +68,18 @@ def check_same(path: Path, sealed: Mapping[str, Any], config: RunConfig) -> None
 def changed_evaluation(path: Path, config: RunConfig) -> list[str]:
     """Returns a text for each setting of evaluations that differs from the checkpoint's header.
 
-    They may be changed when a run is resumed, and do not affect training.
+    They may be changed when a run is resumed, and do not affect training. In another world than
+    that of the training, the one text is that world.
 
     Args:
         path: path of the checkpoint.
         config: configuration of the run.
     """
     header = checkpoint_file.read_header(path)
-    before = header.get("config", {}).get("evaluation", {})
+    trained = header.get("config", {})
+    if trained.get("world") != config.world:
+        return [f"world is {config.world} here, {shown(str(trained.get('world')))} in training"]
+    before = trained.get("evaluation", {})
     now = to_values(config)["evaluation"]
     return [
         f"evaluation.{key} is {value} here, {shown(str(before.get(key)))} in {path.name}"

@@ -181,7 +181,8 @@ def test_errors_of_render(tmp_path, capsys):
     there.write_text("mine")
     cases = [
         ([tmp_path / "none"], ["no such run folder"]),
-        ([run, "world=relay"], ["'world=relay'", "only keys under env and comm"]),
+        ([run, "world=moon"], ["world 'moon'", "known: blackout, "]),
+        ([run, "seed=1"], ["'seed=1'", "only the world and keys under env and comm"]),
         (
             [run, "--fire", "zzz"],
             ["fire 'zzz'", "known: front, huygens, oil_slick, paper, reaction, swarm"],

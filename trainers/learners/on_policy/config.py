@@ -31,7 +31,7 @@ class OnPolicyConfig(LearnerConfig):
     entropy: NotNegative
     """weight of the entropy of the actions in the actors' loss"""
     log_std: Annotated[float, Field(ge=-10, le=2)] = -0.5
-    """logarithm of the standard deviation of the actions at the beginning, after a warm start, too"""
+    """logarithm of the standard deviation of the actions at the beginning, also of a warm start"""
     warm_start: str = ""
     """run folder, or `pretrained:…`, whose actors the run begins with; none if empty"""
     anchor: NotNegative = 0.0

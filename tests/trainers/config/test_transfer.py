@@ -1,0 +1,103 @@
+"""Tests evaluations of a run in another world than that of its training."""
+
+import json
+
+import pytest
+from tiny_run import TINY
+
+from emberlink import trainers
+from emberlink.envs.utils.errors import UserError
+from emberlink.trainers.cli.main import main
+from emberlink.trainers.config.compose import flat, resolve, to_values
+from emberlink.trainers.config.transfer import evaluated_with, in_world
+
+WORLDS = ("paper", "front", "relay", "blackout", "swarm")
+
+
+@pytest.mark.parametrize("there", WORLDS)
+@pytest.mark.parametrize("here", WORLDS)
+def test_a_run_without_settings_of_its_own_is_as_if_made_in_the_other_world(here, there):
+    run, expected = (
+        resolve("maps", ["setup=strong", f"world={name}", "evaluation.interval=3"])
+        for name in (here, there)
+    )
+    assert to_values(in_world(run, there)) == to_values(expected)
+
+
+def test_settings_of_the_run_are_kept_unless_the_worlds_differ_in_them():
+    own = ["env.view_angle=40", "env.num_uavs=4", "env.radio.loss=0.5", "env.altitude=[1,3]"]
+    run = resolve("consensus", ["setup=tuned", "world=front", *own])
+    moved = in_world(run, "swarm").env
+    assert (moved.view_angle, moved.radio.loss, moved.altitude) == (40, 0.5, (1, 3))
+    assert (moved.num_uavs, moved.grid) == (24, (100, 100))  # those of swarm
+    assert in_world(run, "relay").env.num_uavs == 4  # front and relay have six
+    assert in_world(run, "relay").env.base == (0, 30)
+    assert in_world(in_world(run, "relay"), "front").env.base is None
+    assert in_world(run, "front") is run
+
+
+def test_settings_after_the_world_change_it():
+    run = resolve("maps", ["setup=tuned", "world=front"])
+    moved = evaluated_with(run, ["env.radio.range=0", "world=swarm", "env.num_uavs=3"])
+    assert (moved.world, moved.env.num_uavs, moved.env.radio.range) == ("swarm", 3, 0)
+    keys = {key for key, value in flat(to_values(moved)).items() if "learner" in key}
+    assert {key: flat(to_values(moved))[key] for key in keys} == {
+        key: flat(to_values(run))[key] for key in keys
+    }
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("runs")
+    assert main(["train", "independent", "setup=tuned", *TINY, f"output={folder}"]) == 0
+    (path,) = folder.iterdir()
+    return path
+
+
+def test_an_evaluation_in_another_world(run, tmp_path, capsys):
+    assert main(["eval", str(run), "world=relay"]) == 0
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "note: world is relay here, paper in training" in printed
+    assert "huygens" not in printed
+    written = json.loads((run / "eval_world=relay.json").read_text())
+    assert written["world"] == "relay"
+    assert set(written["results"]) == {"front"}
+    assert "courier" in written["results"]["front"]
+    assert "base_coverage" in written["results"]["front"]["learned"]
+    by_python = trainers.evaluate(run, world="relay", scripted=False)
+    assert by_python["front"]["learned"] == written["results"]["front"]["learned"]
+    assert (run / "figures" / "replay_world=relay.html").exists()
+    assert main(["compare", str(run), "--output", str(tmp_path / "compared")]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "is left out: evaluated otherwise: world is relay, in eval.json paper" in said
+
+
+def test_a_replay_in_another_world(run, tmp_path, capsys):
+    page = tmp_path / "replay.html"
+    settings = ["world=relay", "env.radio.range=0"]
+    assert main(["render", str(run), *settings, "--output", str(page)]) == 0
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "independent, setup tuned, world relay, seed 0, env.radio.range=0: coverage" in printed
+    assert page.exists()
+
+
+@pytest.mark.parametrize(
+    ("setting", "said"),
+    [
+        ("world=moon", "known: blackout, file, front, paper, relay, swarm"),
+        ("world=file", "fire.path"),
+        ("fire=front", "can change the world and keys of comm. and env. only"),
+        ("world=swarm", "a checkpoint of uavs=2; this configuration has uavs=24"),
+    ],
+)
+def test_worlds_that_a_run_cannot_be_evaluated_in(setting, said, run, capsys):
+    files = sorted(run.rglob("*"))
+    assert main(["eval", str(run), setting]) == 2
+    error = capsys.readouterr().err
+    assert said in " ".join(error.split())
+    assert sorted(run.rglob("*")) == files
+
+
+def test_the_api_names_what_can_be_changed(run):
+    with pytest.raises(UserError, match="only world and keys of env and comm"):
+        trainers.load(run, world="front", seed=2)

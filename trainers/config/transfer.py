@@ -1,0 +1,55 @@
+"""Changes settings of a trained run for an evaluation, also its world."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+from emberlink.trainers.config.compose import from_values, override, resolve, to_values
+from emberlink.trainers.config.overrides import flat, parse, put
+from emberlink.trainers.config.schema import RunConfig
+
+_OF_A_WORLD = ("env.", "evaluation.")
+"""prefixes of the keys that a world sets, besides its fire"""
+
+
+def evaluated_with(config: RunConfig, overrides: Sequence[str]) -> RunConfig:
+    """Returns the configuration of an evaluation with other settings than those of the training.
+
+    Args:
+        config: configuration of the run.
+        overrides: texts `key=value`, as on the command line. `world=NAME` is applied first.
+
+    Raises:
+        UserError: a key or a value is wrong.
+    """
+    worlds = [str(value) for key, value in map(parse, overrides) if key == "world"]
+    others = [text for text in overrides if parse(text)[0] != "world"]
+    for world in worlds:
+        config = in_world(config, world)
+    return override(config, others) if others else config
+
+
+def in_world(config: RunConfig, world: str) -> RunConfig:
+    """Returns a run's configuration in another world.
+
+    The fire is that of the world. Of `env` and `evaluation`, the keys in which the two worlds
+    differ have the values of the other world; the run keeps the rest.
+
+    Args:
+        config: configuration of the run.
+        world: name of a file in configs/world.
+
+    Raises:
+        UserError: the world is not known, or needs other settings.
+    """
+    if world == config.world:
+        return config
+    setup = f"setup={config.setup}"
+    here = flat(to_values(resolve(config.method, [setup, f"world={config.world}"])))
+    there = resolve(config.method, [setup, f"world={world}"])
+    values = to_values(config)
+    del values["baselines"]
+    for key, value in flat(to_values(there)).items():
+        if key.startswith(_OF_A_WORLD) and value != here.get(key):
+            put(values, key, value)
+    changed = from_values(values | {"world": world})
+    return replace(changed, fire=there.fire, baselines=there.baselines)
