@@ -29,6 +29,8 @@ class RewardConfig:
     """per cell in view that burns and was seen before"""
     no_fire: Number = -10.0
     """per cell in view that does not burn"""
+    base: Number = 0.0
+    """per cell of which the base learns that it burned, to each UAV whose messages arrive there"""
     exit: Number = -100.0
     """replaces the whole reward of a step whose move would have left the box"""
     exit_axes: Literal["xyz", "xy"] = "xyz"

@@ -23,7 +23,7 @@ from emberlink.envs.world.coverage_map import CoverageMap, Sighting
 from emberlink.envs.world.failures import draw_failures
 from emberlink.envs.world.measures import Measures
 from emberlink.envs.world.observation import observe
-from emberlink.envs.world.reward import view_reward
+from emberlink.envs.world.reward import step_reward
 from emberlink.envs.world.sensor import Sensor
 
 
@@ -218,7 +218,8 @@ class WildfireEnv(Buffers, TeamView):
         if self._measures is not None:
             self._measures.update(view, self._position, self._step_key, self._time, alive)
         new, old, none = sighting.counts.unbind(-1)
-        reward = view_reward(new, old, none, hit_boundary, self.config.reward)
+        told = None if self._measures is None else self._measures.told
+        reward = step_reward(new, old, none, hit_boundary, self.config.reward, told)
         self._seen.add_(new.sum(-1).long())
         return self._snapshot(position, sighting, hit_boundary, reward)
 

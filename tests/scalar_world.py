@@ -21,6 +21,7 @@ class ScalarWorld:
         self.known = [{cell: set() for cell in self.cells} for _ in range(uavs + 1)]
         self.ages: list[int] = []
         self.base_ages: list[int] = []
+        self.told: list[int] = []  # cells of which the base learnt in the last step, per UAV
 
     def burns(self, cell, step) -> bool:
         i, j = cell
@@ -35,6 +36,7 @@ class ScalarWorld:
             alive: whether each UAV flies.
             hears: [radios][radios], whether a radio (row) hears another one; the base is last.
         """
+        before = self.base_seen()
         for uav, (x, y, z) in enumerate(position):
             for i, j in self.cells:
                 if alive[uav] and abs(i - x) <= z * self.slope and abs(j - y) <= z * self.slope:
@@ -52,6 +54,12 @@ class ScalarWorld:
                 looks, reported = self.seen[cell], self.known[-1][cell]
                 self.ages.append(step - max([ignition, *looks]))
                 self.base_ages.append(step - max([ignition, *reported]))
+
+        arrives = {self.uavs}  # the radios whose messages arrive at the base
+        for _ in range(self.uavs):
+            arrives |= {source for taker in arrives for source, h in enumerate(hears[taker]) if h}
+        news = self.base_seen() - before
+        self.told = [news if uav in arrives else 0 for uav in range(self.uavs)]
 
     def burning(self, step: int) -> int:
         return sum(self.burns(cell, step) for cell in self.cells)

@@ -39,7 +39,9 @@ class Knowledge(Buffers):
     """int16 [envs, radios, area] (int32 for long episodes), `NEVER` where nobody looked"""
     seen_fire: Tensor | None
     """bool [envs, radios, area]: whether there is a sighting of the cell while it burned"""
-    _reach: Tensor
+    reach: Tensor
+    """bool [envs, radios, radios]: whether messages of a radio (column) arrived at another (row) in
+    the last step, directly or passed on"""
     _first: Tensor
 
     def __init__(
@@ -57,7 +59,7 @@ class Knowledge(Buffers):
         self.register_buffer("last_seen", torch.full(shape, NEVER, dtype=step_type(horizon)))
         self.register_buffer("seen_fire", torch.zeros(shape, dtype=torch.bool) if fires else None)
         alone = torch.eye(shape[1], dtype=torch.bool)
-        self.register_buffer("_reach", alone.repeat(envs, 1, 1))
+        self.register_buffer("reach", alone.repeat(envs, 1, 1))
         # A view's cell of environment e is at e * area; the map of radio r begins at
         # (e * radios + r) * area.
         env = torch.arange(envs).view(-1, 1, 1, 1) * (shape[1] - 1)
@@ -71,8 +73,8 @@ class Knowledge(Buffers):
         self.last_seen.masked_fill_(began, NEVER)
         if self.seen_fire is not None:
             self.seen_fire.masked_fill_(began, False)
-        alone = torch.eye(self._reach.shape[-1], dtype=torch.bool, device=mask.device)
-        self._reach.copy_(torch.where(began, alone, self._reach))
+        alone = torch.eye(self.reach.shape[-1], dtype=torch.bool, device=mask.device)
+        self.reach.copy_(torch.where(began, alone, self.reach))
 
     def see(self, view: View, stored: Tensor) -> None:
         """Adds what each UAV sees to its own map alone.
@@ -108,12 +110,12 @@ class Knowledge(Buffers):
             fire = (knows & view.burning.unsqueeze(1)).flatten()
             flat = self.seen_fire.view(-1).view(torch.uint8)
             flat.scatter_reduce_(0, index.view(-1), fire.view(torch.uint8), "amax")
-        new = reach & ~self._reach
+        new = reach & ~self.reach
         if new.is_cuda:
             self._merge_dense(new)
         else:
             self._merge_sparse(new)
-        self._reach.copy_(reach)
+        self.reach.copy_(reach)
 
     def _maps(self) -> list[Tensor]:
         return [self.last_seen] if self.seen_fire is None else [self.last_seen, self.seen_fire]

@@ -61,13 +61,18 @@ class Measures(Buffers):
 
     team_seen: Tensor
     """integers [envs, area]: the last step at which any UAV saw the cell"""
+    base_seen: Tensor
+    """int64 [envs]: number of cells of which a sighting in flames has reached the base"""
+    told: Tensor | None
+    """int64 [envs, uavs]: for UAVs whose messages arrived at the base in the last step, the number
+    of cells of which it learnt that they burned, else 0; None without a base"""
     _base: Tensor
 
     def __init__(self, world: WildfireConfig, envs: int, area: int):
         super().__init__()
         self._world = world
         self.times = FireTimes(envs, area, world.horizon)
-        self.knowledge = self.base_ages = self.ages = None
+        self.knowledge = self.base_ages = self.ages = self.told = None
         if world.measures == "all":
             self.ages = SightingAges(envs, world.horizon)
             seen = torch.full((envs, area), NEVER, dtype=step_type(world.horizon))
@@ -82,6 +87,7 @@ class Measures(Buffers):
                 fires=True,
             )
             self.base_ages = SightingAges(envs, world.horizon)
+            self.register_buffer("base_seen", torch.zeros(envs, dtype=torch.int64))
             base = torch.tensor([[*world.base, 0.0]], dtype=torch.float64)
             self.register_buffer("_base", base.repeat(envs, 1, 1), persistent=False)
 
@@ -93,6 +99,8 @@ class Measures(Buffers):
                 part.start_episodes(mask)
         if self.ages is not None:
             self.team_seen.masked_fill_(mask[:, None], NEVER)
+        if self.knowledge is not None:
+            self.base_seen.masked_fill_(mask, 0)
 
     def update(
         self, view: View, position: Tensor, rng_key: Tensor, step: Tensor, alive: Tensor | None
@@ -115,6 +123,14 @@ class Measures(Buffers):
         if self.knowledge is not None and self.base_ages is not None:
             self.knowledge.update(view, step, self.hears(position, rng_key, step, alive))
             self._add_ages(self.base_ages, self.knowledge.last_seen[:, -1], step)
+            self._tell(self.knowledge)
+
+    def _tell(self, knowledge: Knowledge) -> None:
+        """Counts the cells of which the base learnt in this step, for those who told it."""
+        assert knowledge.seen_fire is not None
+        seen = knowledge.seen_fire[:, -1].sum(-1)
+        self.told = (seen - self.base_seen).unsqueeze(-1) * knowledge.reach[:, -1, :-1]
+        self.base_seen.copy_(seen)
 
     def _add_ages(self, ages: SightingAges, last_seen: Tensor, step: Tensor) -> None:
         """Adds the ages of the burning cells of all environments, from int [envs, area]."""
@@ -146,8 +162,6 @@ class Measures(Buffers):
             values[keys.FRONT_AGE] = self.ages.mean()
             values[keys.FRONT_AGE_P95] = self.ages.percentile(0.95)
         if self.knowledge is not None and self.base_ages is not None:
-            seen_fire = self.knowledge.seen_fire
-            assert seen_fire is not None
-            values[keys.BASE_SEEN] = seen_fire[:, -1].sum(-1)
+            values[keys.BASE_SEEN] = self.base_seen.clone()
             values[keys.BASE_AGE] = self.base_ages.mean()
         return values

@@ -17,13 +17,19 @@ def left_box(hit_boundary: Tensor, axes: Literal["xyz", "xy"]) -> Tensor:
     return hit_boundary[..., : len(axes)].any(-1)
 
 
-def view_reward(
-    new: Tensor, old: Tensor, none: Tensor, hit_boundary: Tensor, config: RewardConfig
+def step_reward(
+    new: Tensor,
+    old: Tensor,
+    none: Tensor,
+    hit_boundary: Tensor,
+    config: RewardConfig,
+    told: Tensor | None = None,
 ) -> Tensor:
-    """Returns the reward for the cells in view, or the penalty for leaving the box.
+    """Returns the reward for the cells in view and for news, or the penalty for leaving the box.
 
     Args:
         new, old, none: [...], number of cells of new fire, old fire and no fire in view.
+        told: integers [...], number of burning cells of which the base learns; None for none.
         hit_boundary: bool [..., 3], the axes along which the move would have left the box.
         config: reward per cell of each class, and the penalty.
 
@@ -32,4 +38,6 @@ def view_reward(
     """
     reward = config.new_fire * new
     reward.add_(old, alpha=config.old_fire).add_(none, alpha=config.no_fire)
+    if told is not None:
+        reward.add_(told, alpha=config.base)
     return reward.masked_fill_(left_box(hit_boundary, config.exit_axes), config.exit).float()

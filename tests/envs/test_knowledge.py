@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scalar_world import ScalarWorld, percentile
 
 from emberlink.envs import WildfireConfig, WildfireEnv, keys
-from emberlink.envs.config import RadioConfig
+from emberlink.envs.config import RadioConfig, RewardConfig
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.world import radio
 from emberlink.envs.world.burning import with_burn_time
@@ -20,6 +20,7 @@ from emberlink.envs.world.knowledge import Knowledge
 from emberlink.envs.world.sighting_ages import SightingAges, age_limits, cell_ages
 
 ENVS = 3
+COUNTS = (keys.NEW_FIRE, keys.OLD_FIRE, keys.NO_FIRE)
 
 
 def action(generator: torch.Generator, uavs: int) -> torch.Tensor:
@@ -45,6 +46,7 @@ def test_every_step_equals_plain_python(seed, uavs, limit, loss, failures, burn_
         base=(0.0, 4.0),
         failures=failures,
         measures="all",
+        reward=RewardConfig(base=0.5),
     )
     generator = torch.Generator().manual_seed(seed)
     arrival = torch.rand(ENVS, 9, 8, generator=generator) * 24 - 2
@@ -82,6 +84,11 @@ def test_every_step_equals_plain_python(seed, uavs, limit, loss, failures, burn_
             }
             for key, value in expected.items():
                 assert now[key][e].item() == pytest.approx(value, rel=1e-6), key
+            for uav, told in enumerate(scalar.told):
+                new, old, none = (now[key][e, uav].item() for key in COUNTS)
+                inside = new - 4 * old - 10 * none + 0.5 * told
+                left = now[keys.HIT_BOUNDARY][e, uav].any()
+                assert now[keys.REWARD][e, uav].item() == (-100 if left else inside)
     maps = env._map._sensor.crop(env.knowledge.last_seen)
     for e, scalar in enumerate(scalars):
         for node in range(uavs + 1):

@@ -9,7 +9,7 @@ from pydantic import ValidationError
 
 from emberlink.comm._heading import HEADING_FORMS, HeadingConfig, heading_reward
 from emberlink.envs.config import RewardConfig
-from emberlink.envs.world.reward import left_box, view_reward
+from emberlink.envs.world.reward import left_box, step_reward
 
 INSIDE = [False, False, False]
 RELEASED = RewardConfig(new_fire=12.0, old_fire=6.0, no_fire=-4.0, exit=-150.0, exit_axes="xy")
@@ -29,20 +29,27 @@ RELEASED = RewardConfig(new_fire=12.0, old_fire=6.0, no_fire=-4.0, exit=-150.0, 
         ((3, 5, 17), [True, True, True], -100, -150),
     ],
 )
-def test_view_reward(counts, hit_boundary, paper, released):
+def test_step_reward(counts, hit_boundary, paper, released):
     classes, out = [torch.tensor([count]) for count in counts], torch.tensor([hit_boundary])
-    assert view_reward(*classes, out, RewardConfig()).tolist() == [paper]
-    assert view_reward(*classes, out, RELEASED).tolist() == [released]
-    assert view_reward(*classes, out, RELEASED).dtype == torch.float32
+    assert step_reward(*classes, out, RewardConfig()).tolist() == [paper]
+    assert step_reward(*classes, out, RELEASED).tolist() == [released]
+    assert step_reward(*classes, out, RELEASED).dtype == torch.float32
 
 
-def test_view_reward_is_elementwise():
+@pytest.mark.parametrize(("told", "left", "expected"), [(0, 0, 7), (8, 0, 11), (8, 1, -100)])
+def test_reward_for_what_the_base_learns(told, left, expected):
+    config = RewardConfig(new_fire=1.0, old_fire=0.0, no_fire=0.0, base=0.5)
+    counts, out = torch.tensor([7, 2, 3]), torch.tensor([bool(left), False, False])
+    assert step_reward(*counts, out, config, torch.tensor(told)) == expected
+
+
+def test_step_reward_is_elementwise():
     new, old, none = torch.randint(0, 9, (3, 5, 4))
     hit_boundary = torch.rand(5, 4, 3) < 0.3
-    together = view_reward(new, old, none, hit_boundary, RELEASED)
+    together = step_reward(new, old, none, hit_boundary, RELEASED)
     assert together.shape == (5, 4)
     for at in [(0, 0), (2, 3), (4, 1)]:
-        alone = view_reward(new[at], old[at], none[at], hit_boundary[at], RELEASED)
+        alone = step_reward(new[at], old[at], none[at], hit_boundary[at], RELEASED)
         assert together[at] == alone
 
 
