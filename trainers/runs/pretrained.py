@@ -15,6 +15,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
+from typing import Any
 
 from emberlink.envs.fire_files.config import COPY_FILE
 from emberlink.envs.utils.errors import UserError
@@ -122,7 +123,8 @@ def pack(run: RunFolder, into: Path) -> Path:
         UserError: the run is not finished, or the new folder exists.
     """
     trained = run.config()
-    config = replace(trained, output="runs", logger="none", device="cpu")
+    learner = _without_path(trained.learner)
+    config = replace(trained, output="runs", logger="none", device="cpu", learner=learner)
     if len(run.lines()) < config.episodes or not (run.path / "eval.json").exists():
         raise UserError(f"{run.path}: not finished, or not evaluated")
     target = into / collection(config) / config.method / f"s{config.seed}"
@@ -141,6 +143,14 @@ def pack(run: RunFolder, into: Path) -> Path:
         if (run.path / file).is_file():
             shutil.copyfile(run.path / file, target / file)
     return target
+
+
+def _without_path(learner: Any) -> Any:
+    """Returns the settings of a learner with `warm_start=runs/NAME` in place of a path."""
+    start = getattr(learner, "warm_start", "")
+    if not start or is_name(start):
+        return learner
+    return replace(learner, warm_start=f"runs/{Path(start).name}")
 
 
 def _shipped() -> Path:

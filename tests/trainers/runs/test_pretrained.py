@@ -77,6 +77,18 @@ def test_packed_runs_omit_the_training_state(packed):
             assert weight.equal(packed_actor.state_dict()[name])
 
 
+def test_a_packed_run_names_no_path_of_its_warm_start(packed, tmp_path):
+    _, (start, *_) = packed
+    arguments = ["setup=tuned", *TINY, f"learner.warm_start={start}", f"output={tmp_path / 'runs'}"]
+    assert main(["train", "consensus", *arguments]) == 0
+    (run,) = (tmp_path / "runs").iterdir()
+    mine = RunFolder(pretrained.pack(RunFolder(run), tmp_path / "shipped"))
+    assert mine.config().learner.warm_start == f"runs/{start.name}"
+    for file in (mine.path / "config.yaml", mine.checkpoint()):
+        assert str(start.parent).encode() not in file.read_bytes()
+    check_trained_with(mine.checkpoint(), mine.config())
+
+
 def test_a_name_replaces_a_run_folder(shipped, tmp_path, capsys):
     assert main(["eval", "pretrained:consensus"]) == 0
     folder = tmp_path / "runs" / "pretrained_tuned_consensus_s3"
