@@ -16,6 +16,7 @@ from emberlink.trainers.cli.completion import SHELLS
 RADIO = [f"env.radio.{name}=" for name in ("range", "loss", "bandwidth")]
 SETUPS = [f"setup={name}" for name in ("paper", "released", "strong", "tuned")]
 METHODS = ["consensus", "independent", "positional", "shared_memory"]
+PRETRAINED = sorted([*METHODS, "maps", "strong_front/", "tuned/"])
 """the methods with trained policies"""
 
 
@@ -77,7 +78,7 @@ def completed(tmp_path, monkeypatch):
         ("list wor", ["worlds"]),
         ("list worlds f", ["fires"]),
         ("eval pre", ["pretrained:"]),
-        ("eval pretrained:", [*(f"pretrained:{name}" for name in METHODS), "pretrained:tuned/"]),
+        ("eval pretrained:", [f"pretrained:{name}" for name in PRETRAINED]),
         ("eval pretrained:tuned/c", ["pretrained:tuned/consensus"]),
         ("compare x pretrained:tuned/consensus/s3", ["pretrained:tuned/consensus/s3"]),
         ("eval x --checkpoint f env.rad", RADIO),
