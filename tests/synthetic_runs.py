@@ -69,6 +69,7 @@ def write_run(
         {
             "method": method,
             "setup": config["setup"],
+            "world": config["world"],
             "seed": seed,
             "start_seed": 1,
             "checkpoint": "step_000000120.safetensors",
