@@ -1,6 +1,7 @@
 """Tests evaluations of a run in another world than that of its training."""
 
 import json
+from itertools import pairwise
 
 import pytest
 from tiny_run import TINY
@@ -11,11 +12,10 @@ from emberlink.trainers.cli.main import main
 from emberlink.trainers.config.compose import flat, resolve, to_values
 from emberlink.trainers.config.transfer import evaluated_with, in_world
 
-WORLDS = ("paper", "front", "relay", "blackout", "swarm")
+ROUND = ("paper", "front", "relay", "blackout", "swarm", "paper", "relay", "front", "paper")
 
 
-@pytest.mark.parametrize("there", WORLDS)
-@pytest.mark.parametrize("here", WORLDS)
+@pytest.mark.parametrize(("here", "there"), pairwise(ROUND))
 def test_a_run_without_settings_of_its_own_is_as_if_made_in_the_other_world(here, there):
     run, expected = (
         resolve("maps", ["setup=strong", f"world={name}", "evaluation.interval=3"])
