@@ -36,6 +36,8 @@ class MapsConfig:
     """cells around known fire that may burn by now, along x and y; 0 for none"""
     position: bool = False
     """whether a UAV also observes its own x and y"""
+    role: bool = False
+    """whether a UAV also observes its number, so that UAVs in one place can act differently"""
     period: Annotated[int, Field(ge=1, le=1_000_000)] = 1
     """steps from one drawing of the pictures to the next; those of `policy.hold` suffice"""
 
@@ -98,7 +100,7 @@ class Maps(CommModule):
 
     def specs(self, observation: Composite) -> Composite:
         shape, device = observation[keys.AGENTS].shape, observation.device
-        features = 4 if self.config.position else 2
+        features = 2 + 2 * self.config.position + self.config.role
         vector = Unbounded(torch.Size((*shape, features)), device=device, dtype=torch.float32)
         pictures = torch.Size((*shape, *self.pictures.shape))
         observation[keys.OBSERVATION] = vector
@@ -185,12 +187,17 @@ class Maps(CommModule):
         return drawn.unflatten(0, (len(env), uavs))
 
     def _vector(self, tensordict: TensorDictBase) -> Tensor:
-        """Returns altitude and time, and x and y if a UAV observes them, float32 [num_envs, n, k].
+        """Returns altitude, time, and what else is wanted, float32 [num_envs, n, k].
 
-        The box is scaled to [-1, 1], the horizon to [0, 1].
+        The box is scaled to [-1, 1], the horizon to [0, 1]. UAV i has the number i / 8, whatever
+        the size of the team.
         """
         scaled = motion.scale_to_box(tensordict.get(keys.POSITION), self.low, self.high)
         clock = tensordict.get(keys.STEP).float().view(-1, 1, 1) / self.world.horizon
-        clock = clock.expand(-1, scaled.shape[1], 1)
-        parts = [scaled[..., 2:], clock, *([scaled[..., :2]] if self.config.position else [])]
+        parts = [scaled[..., 2:], clock.expand(-1, scaled.shape[1], 1)]
+        if self.config.position:
+            parts.append(scaled[..., :2])
+        if self.config.role:
+            number = torch.arange(scaled.shape[1], device=scaled.device) / 8
+            parts.append(number.view(-1, 1).expand(len(scaled), -1, 1))
         return torch.cat(parts, -1)

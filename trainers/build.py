@@ -75,17 +75,17 @@ def build_env(
     seed: int | Sequence[int] | None,
     device: torch.device | str,
     true_map: bool = False,
-    teacher: bool = False,
+    teacher: str | None = None,
 ) -> TransformedEnv:
     """Returns the environment and communication of a configuration; see `WildfireEnv`.
 
-    With `teacher`, a teacher's actions are written, too (`Teacher`).
+    With the name of a scripted policy as `teacher`, its actions are written, too (`Teacher`).
     """
     world = WildfireEnv(num_envs, config.env, fire, seed, device, true_map=true_map)
     module = build_comm(config, num_envs).to(world.device)
     env = TransformedEnv(world, Communication(module))
-    if teacher:
-        env.append_transform(Teacher(world, module, config.policy.hold))
+    if teacher is not None:
+        env.append_transform(Teacher(world, module, teacher, config.policy.hold))
     return env
 
 

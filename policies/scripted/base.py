@@ -43,6 +43,8 @@ class Scripted(TensorDictModuleBase):
         low, high = motion.corners(self.world.low, self.world.high)
         self.radius = view_radius(high[2].item(), self.world.view_angle)
         """half the side of the square in view from the maximum altitude, cells"""
+        self.stride = self.world.displacement
+        """cells that a UAV flies with one action, along x, y and z each"""
         self.register_buffer("low", low)
         self.register_buffer("high", high)
         self.to(env.device)
@@ -76,7 +78,7 @@ class Scripted(TensorDictModuleBase):
         Returns:
             The same TensorDict.
         """
-        step = (target - tensordict.get(keys.POSITION)) / self.world.displacement
+        step = (target - tensordict.get(keys.POSITION)) / self.stride
         action = (step / step.abs().amax(-1, keepdim=True).clamp(min=1)).float()
         return tensordict.set(keys.ACTION, action * _BELOW_ONE)
 

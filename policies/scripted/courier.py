@@ -1,6 +1,7 @@
 """A scripted policy that searches as map_greedy and brings what it knows to the base."""
 
 import math
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -28,8 +29,8 @@ class Courier(MapGreedy):
     _base: Tensor
     _before: Tensor
 
-    def __init__(self, env: WildfireEnv):
-        super().__init__(env)
+    def __init__(self, env: WildfireEnv, maps: Any = None):
+        super().__init__(env, maps)
         world, device = self.world, env.device
         self.register_buffer("_base", torch.tensor(world.base or (0.0, 0.0), device=device))
         uavs = world.num_uavs

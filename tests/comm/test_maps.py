@@ -58,6 +58,10 @@ def test_specs_and_shapes():
     assert keys.observation_keys(env.observation_spec) == list(OBSERVED)
     more = make_env("maps", "tuned", world="relay", **{"comm.position": True})
     assert more.observation_spec[keys.OBSERVATION].shape == (1, 6, 4)
+    more = make_env("maps", "tuned", world="relay", **{"comm.position": True, "comm.role": True})
+    assert more.observation_spec[keys.OBSERVATION].shape == (1, 6, 5)
+    observed = more.reset()[keys.OBSERVATION]
+    assert observed[0, :, 4].tolist() == [0, 0.125, 0.25, 0.375, 0.5, 0.625]
 
 
 def test_what_a_uav_sees_is_what_is_there():

@@ -52,9 +52,9 @@ class LearnerConfig:
         return False
 
     @property
-    def teacher(self) -> bool:
-        """Whether the learner reads what a teacher would do, `keys.TEACHER`, in training."""
-        return False
+    def reads_teacher(self) -> str | None:
+        """The scripted policy whose actions, `keys.TEACHER`, it learns from; None for none."""
+        return None
 
 
 @plain_dataclass(frozen=True, kw_only=True)

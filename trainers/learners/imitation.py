@@ -51,6 +51,8 @@ class ImitationConfig(LearnerConfig):
     """whether all UAVs of a seed use the same weights; if not, each UAV has its own"""
     actor_of: Name
     """learner whose actors are trained: they can start it"""
+    teacher: Name
+    """scripted policy that is imitated: `map_greedy` or another one that plans by the same maps"""
     teacher_share: Annotated[float, Field(ge=0, le=1)]
     """share of decisions that the teacher takes at the beginning; it falls linearly to 0"""
     lr: Positive
@@ -63,8 +65,8 @@ class ImitationConfig(LearnerConfig):
     """capacity of a buffer of decisions, in decisions of a UAV"""
 
     @property
-    def teacher(self) -> bool:
-        return True
+    def reads_teacher(self) -> str:
+        return self.teacher
 
 
 class Imitation(Learner):

@@ -1,6 +1,5 @@
-"""Adds a teacher's actions to an environment: those of map_greedy, by what each UAV knows."""
+"""Adds the actions of a scripted teacher, made from what each UAV knows, to an environment."""
 
-from dataclasses import replace
 from typing import Any
 
 import torch
@@ -12,12 +11,14 @@ from torchrl.envs import Transform
 from emberlink.comm.maps import Maps
 from emberlink.envs import keys
 from emberlink.envs.utils.errors import UserError
+from emberlink.envs.utils.validation import unknown
 from emberlink.envs.wildfire import WildfireEnv
 from emberlink.policies.scripted.map_greedy import MapGreedy
+from emberlink.policies.scripted.registry import SCRIPTED
 
 
 class KnownMaps:
-    """The maps of method `maps`, in the form in which map_greedy reads maps.
+    """The maps of method `maps`, in the form in which scripted policies read maps.
 
     A UAV knows the targets of those that it hears at a step: it has their maps and positions.
 
@@ -35,6 +36,11 @@ class KnownMaps:
         """Reads the links of a time step; the module has updated the maps."""
         self.reach = tensordict.get(keys.HEARS)
 
+    @property
+    def heard(self) -> Tensor:
+        """The last step at which each UAV (row) knows of another one, float32 [envs, n, n]."""
+        return self._maps.stamp.clamp(min=0).float()
+
     def last_seen(self) -> Tensor:
         """Returns the last step at which each UAV knows each cell seen, float [envs, n, X, Y]."""
         return self._maps.sightings()[0].float()
@@ -46,36 +52,37 @@ class KnownMaps:
 
 
 class Teacher(Transform):
-    """Writes the actions of map_greedy under `keys.TEACHER`, made from the maps of the UAVs.
+    """Writes the actions of a scripted policy under `keys.TEACHER`, made from the maps of the UAVs.
 
     It stands behind the communication, knows what each UAV knows and nothing else, and does not
     change the environment. An action leads as far to the target as a UAV flies with it in the steps
     for which actions are held. New targets are chosen whenever the UAVs decide, and if they decide
-    at each step, as often as map_greedy chooses them.
+    at each step, as often as the policy chooses them.
 
     Args:
         env: the environment without transforms.
         maps: its communication module.
+        name: `map_greedy`, or a policy that inherits from it, such as `courier`.
         hold: steps for which an action is held.
 
     Raises:
-        UserError: the module keeps no maps, or the environment is on a GPU.
+        UserError: the module keeps no maps, the policy plans by other maps, or the environment is
+            on a GPU.
     """
 
     target: Tensor
     """float32 [num_envs, n, 2]: targets of the UAVs, cells"""
 
-    def __init__(self, env: WildfireEnv, maps: Any, hold: int):
+    def __init__(self, env: WildfireEnv, maps: Any, name: str, hold: int):
         super().__init__()
         if not isinstance(maps, Maps):
-            name = type(maps).__name__
-            raise UserError(f"the teacher flies by the maps of method maps; {name} keeps none")
+            kind = type(maps).__name__
+            raise UserError(f"the teacher flies by the maps of method maps; {kind} keeps none")
         if torch.device(env.device or "cpu").type != "cpu":
             raise UserError(f"device={env.device}: the teacher needs device=cpu")
-        policy = MapGreedy(env, KnownMaps(maps))
-        world = policy.world
-        policy.world = replace(world, displacement=world.displacement * hold)
-        policy.period = 1 if hold > 1 else policy.period
+        policy = find(name)(env, KnownMaps(maps))
+        policy.stride *= hold
+        policy.period = hold if hold > 1 else policy.period
         self._hold = hold
         self._policy = (policy,)  # not registered: it has no state but the targets
         self.register_buffer("target", torch.zeros(env.num_envs, env.n_agents, 2))
@@ -105,3 +112,19 @@ class Teacher(Transform):
         shape = spec[keys.POSITION].shape
         spec[keys.TEACHER] = Unbounded(shape, device=spec.device, dtype=torch.float32)
         return spec
+
+
+def find(name: str) -> type[MapGreedy]:
+    """Returns the scripted policy of a name, which plans by the maps that UAVs share in range.
+
+    Raises:
+        UserError: there is none of this name; the message lists those that there are.
+    """
+    known = {
+        other: policy
+        for other, policy in SCRIPTED.items()
+        if issubclass(policy, MapGreedy) and policy.messages == "in range"
+    }
+    if name not in known:
+        raise UserError(f"learner.teacher: {unknown(name, known)}")
+    return known[name]

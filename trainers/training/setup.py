@@ -49,7 +49,7 @@ class TrainingSetup:
             seed=self.seeds,
             device=config.device,
             true_map=config.learner.reads_map,
-            teacher=config.learner.teacher,
+            teacher=config.learner.reads_teacher,
         )
         self.guard = NonFiniteGuard(config.device)
         self.learner = build_learner(config, self.env, self.guard)
