@@ -19,6 +19,8 @@ from emberlink.envs.world.coverage_map import View
 from emberlink.envs.world.knowledge import Knowledge
 from emberlink.envs.world.sensor import Sensor
 
+_FAR = 50.0  # cells; unit of distances in the vector that a UAV observes
+
 
 @dataclass(frozen=True, kw_only=True, config=ConfigDict(extra="forbid", strict=True))
 class MapsConfig:
@@ -38,6 +40,8 @@ class MapsConfig:
     """whether a UAV also observes its own x and y"""
     role: bool = False
     """whether a UAV also observes its number, so that UAVs in one place can act differently"""
+    home: bool = False
+    """whether a UAV also observes the way to the base, and how far it can still fly"""
     period: Annotated[int, Field(ge=1, le=1_000_000)] = 1
     """steps from one drawing of the pictures to the next; those of `policy.hold` suffice"""
 
@@ -64,6 +68,7 @@ class Maps(CommModule):
     high: Tensor
     _start: Tensor
     _base: Tensor
+    _place: Tensor
 
     def __init__(self, world: WildfireConfig, config: MapsConfig, num_envs: int = 1):
         super().__init__(world, config, num_envs)
@@ -97,10 +102,12 @@ class Maps(CommModule):
         self.register_buffer("_start", first, persistent=False)
         base = torch.tensor([] if world.base is None else [world.base]).view(-1, 2)
         self.register_buffer("_base", base.round().long(), persistent=False)
+        self.register_buffer("_place", base.float(), persistent=False)
 
     def specs(self, observation: Composite) -> Composite:
         shape, device = observation[keys.AGENTS].shape, observation.device
-        features = 2 + 2 * self.config.position + self.config.role
+        config = self.config
+        features = 2 + 2 * config.position + config.role + 3 * config.home
         vector = Unbounded(torch.Size((*shape, features)), device=device, dtype=torch.float32)
         pictures = torch.Size((*shape, *self.pictures.shape))
         observation[keys.OBSERVATION] = vector
@@ -186,11 +193,20 @@ class Maps(CommModule):
         )
         return drawn.unflatten(0, (len(env), uavs))
 
+    def _way_home(self, tensordict: TensorDictBase) -> list[Tensor]:
+        """Returns the way to the base and the distance that can still be flown, see `_vector`."""
+        ground = tensordict.get(keys.POSITION)[..., :2].float()
+        way = torch.zeros_like(ground) if self.world.base is None else self._place - ground
+        steps = self.world.horizon - tensordict.get(keys.STEP).float()
+        left = (steps * self.world.displacement / _FAR).clamp(max=1).view(-1, 1, 1)
+        return [way / _FAR, left.expand(-1, ground.shape[1], 1)]
+
     def _vector(self, tensordict: TensorDictBase) -> Tensor:
         """Returns altitude, time, and what else is wanted, float32 [num_envs, n, k].
 
         The box is scaled to [-1, 1], the horizon to [0, 1]. UAV i has the number i / 8, whatever
-        the size of the team.
+        the size of the team. The way to the base along x and y (0 without a base) and the distance
+        that can still be flown, at most 1, are in units of 50 cells.
         """
         scaled = motion.scale_to_box(tensordict.get(keys.POSITION), self.low, self.high)
         clock = tensordict.get(keys.STEP).float().view(-1, 1, 1) / self.world.horizon
@@ -200,4 +216,6 @@ class Maps(CommModule):
         if self.config.role:
             number = torch.arange(scaled.shape[1], device=scaled.device) / 8
             parts.append(number.view(-1, 1).expand(len(scaled), -1, 1))
+        if self.config.home:
+            parts += self._way_home(tensordict)
         return torch.cat(parts, -1)

@@ -75,17 +75,17 @@ def build_env(
     seed: int | Sequence[int] | None,
     device: torch.device | str,
     true_map: bool = False,
-    teacher: str | None = None,
+    teacher: tuple[str, float] | None = None,
 ) -> TransformedEnv:
     """Returns the environment and communication of a configuration; see `WildfireEnv`.
 
-    With the name of a scripted policy as `teacher`, its actions are written, too (`Teacher`).
+    With a `teacher`, as in `LearnerConfig.reads_teacher`, its actions are written, too.
     """
     world = WildfireEnv(num_envs, config.env, fire, seed, device, true_map=true_map)
     module = build_comm(config, num_envs).to(world.device)
     env = TransformedEnv(world, Communication(module))
     if teacher is not None:
-        env.append_transform(Teacher(world, module, teacher, config.policy.hold))
+        env.append_transform(Teacher(world, module, *teacher, config.policy.hold))
     return env
 
 

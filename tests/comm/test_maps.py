@@ -64,6 +64,19 @@ def test_specs_and_shapes():
     assert observed[0, :, 4].tolist() == [0, 0.125, 0.25, 0.375, 0.5, 0.625]
 
 
+def test_a_uav_observes_the_way_to_the_base_and_how_far_it_can_fly():
+    config, position = MapsConfig(pixels=8, home=True), torch.tensor([[[5.0, 5, 3], [25, 10, 3]]])
+    more = {"config": config, "radio": RadioConfig(range=3.0)}
+    for base, ways in (((0.0, 15.0), [[-5, 10], [-25, 5]]), (None, [[0, 0], [0, 0]])):
+        env = environment(burning(), position, base=base, **more)
+        steps = fly(env, position, torch.zeros(30, 1, 2, 3))
+        assert env.observation_spec[keys.OBSERVATION].shape == (1, 2, 5)
+        for step, left in ((0, 1.0), (10, 1.0), (30, 0.6)):  # of 60 steps, at one cell a step
+            observed = steps[step][keys.OBSERVATION][0]
+            torch.testing.assert_close(observed[:, 2:4], torch.tensor(ways) / 50.0)
+            assert observed[:, 4].tolist() == pytest.approx([left, left])
+
+
 def test_what_a_uav_sees_is_what_is_there():
     position = torch.tensor([[[15.0, 15.0, 4.0], [3.0, 4.0, 2.0]]])
     env = environment(burning(), position)

@@ -53,6 +53,8 @@ class ImitationConfig(LearnerConfig):
     """learner whose actors are trained: they can start it"""
     teacher: Name
     """scripted policy that is imitated: `map_greedy` or another one that plans by the same maps"""
+    teacher_range: Annotated[float, Field(gt=0, le=1)]
+    """range of the radio that the teacher plans with, as a share of the true one"""
     teacher_share: Annotated[float, Field(ge=0, le=1)]
     """share of decisions that the teacher takes at the beginning; it falls linearly to 0"""
     lr: Positive
@@ -65,8 +67,8 @@ class ImitationConfig(LearnerConfig):
     """capacity of a buffer of decisions, in decisions of a UAV"""
 
     @property
-    def reads_teacher(self) -> str:
-        return self.teacher
+    def reads_teacher(self) -> tuple[str, float]:
+        return self.teacher, self.teacher_range
 
 
 class Imitation(Learner):

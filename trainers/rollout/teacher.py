@@ -1,5 +1,6 @@
 """Adds the actions of a scripted teacher, made from what each UAV knows, to an environment."""
 
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -63,6 +64,7 @@ class Teacher(Transform):
         env: the environment without transforms.
         maps: its communication module.
         name: `map_greedy`, or a policy that inherits from it, such as `courier`.
+        share: share of the range of the radio that the policy plans with.
         hold: steps for which an action is held.
 
     Raises:
@@ -73,7 +75,7 @@ class Teacher(Transform):
     target: Tensor
     """float32 [num_envs, n, 2]: targets of the UAVs, cells"""
 
-    def __init__(self, env: WildfireEnv, maps: Any, name: str, hold: int):
+    def __init__(self, env: WildfireEnv, maps: Any, name: str, share: float, hold: int):
         super().__init__()
         if not isinstance(maps, Maps):
             kind = type(maps).__name__
@@ -81,6 +83,9 @@ class Teacher(Transform):
         if torch.device(env.device or "cpu").type != "cpu":
             raise UserError(f"device={env.device}: the teacher needs device=cpu")
         policy = find(name)(env, KnownMaps(maps))
+        radio = policy.world.radio
+        planned = replace(radio, range=share * radio.range)
+        policy.world = replace(policy.world, radio=planned)
         policy.stride *= hold
         policy.period = hold if hold > 1 else policy.period
         self._hold = hold

@@ -38,12 +38,12 @@ def settings(learner: str, *more: str) -> list[str]:
     return ["setup=tuned", *WORLD, *SHORT, f"learner={learner}", *more]
 
 
-def taught(hold: int, *more: str, teacher: str = "map_greedy"):
+def taught(hold: int, *more: str, teacher: str = "map_greedy", share: float = 1.0):
     config = resolve("maps", [*WORLD, f"policy.hold={hold}", "env.horizon=120", *more])
     fire = torch.full((30, 30), math.inf)
     fire[8:20, 9:21] = 3 * torch.rand(12, 12, generator=torch.Generator().manual_seed(0))
     times = torch.stack((fire, fire + 60))[None].repeat(2, 1, 1, 1)
-    return build_env(config, num_envs=2, fire=times, seed=5, device="cpu", teacher=teacher)
+    return build_env(config, num_envs=2, fire=times, seed=5, device="cpu", teacher=(teacher, share))
 
 
 def test_without_a_radio_the_teacher_is_map_greedy():
@@ -88,6 +88,21 @@ def test_a_taught_team_tells_the_base_what_it_knows(hold):
         seen.append(td[keys.BASE_SEEN].tolist())
     assert seen[0] == [0, 0]
     assert min(seen[1]) > 140  # of 144 cells
+
+
+def test_a_teacher_can_plan_with_a_shorter_range():
+    more = ["world=relay", "env.base=[0,15]", "env.grid=[30,30]", "env.num_uavs=6"]
+    places = []
+    for planned, share in ((10.0, 0.5), (5.0, 1.0), (10.0, 1.0)):
+        env = taught(1, *more, f"env.radio.range={planned}", teacher="courier", share=share)
+        (policy,) = env.transform[1]._policy
+        burning = torch.zeros(2, 6, 30, 30, dtype=torch.bool)
+        burning[..., 20, 15] = True
+        policy.maps.reach = torch.zeros(2, 6, 6, dtype=torch.bool)
+        places.append(policy._rally(torch.zeros(2), burning).place)
+        assert env.base_env.config.radio.range == planned
+    assert places[0].equal(places[1])
+    assert not places[0].equal(places[2])
 
 
 def test_the_teacher_reads_the_maps_of_the_uavs_alone():
