@@ -1,5 +1,6 @@
 """Shared maps: UAVs keep maps of what they know, exchange them by radio, and look at them."""
 
+from dataclasses import replace
 from typing import Annotated, Any, ClassVar
 
 import torch
@@ -14,7 +15,7 @@ from emberlink.comm._messages import CellMessages, pass_on_places
 from emberlink.comm.base import CommModule
 from emberlink.envs import keys
 from emberlink.envs.config import WildfireConfig
-from emberlink.envs.world import motion
+from emberlink.envs.world import motion, radio
 from emberlink.envs.world.coverage_map import View
 from emberlink.envs.world.knowledge import Knowledge
 from emberlink.envs.world.sensor import Sensor
@@ -38,10 +39,9 @@ class MapsConfig:
     """cells around known fire that may burn by now, along x and y; 0 for none"""
     position: bool = False
     """whether a UAV also observes its own x and y"""
-    role: bool = False
-    """whether a UAV also observes its number, so that UAVs in one place can act differently"""
-    home: bool = False
-    """whether a UAV also observes the way to the base, and how far it can still fly"""
+    home: Annotated[float, Field(ge=0, le=1)] = 0.0
+    """share of the radio's range between places of a chain from the base to the fire; with more
+    than 0, a UAV also observes the way to its place, and how far it can still fly"""
     period: Annotated[int, Field(ge=1, le=1_000_000)] = 1
     """steps from one drawing of the pictures to the next; those of `policy.hold` suffice"""
 
@@ -64,6 +64,8 @@ class Maps(CommModule):
     """uint8 [num_envs, n, ...]: the pictures last drawn"""
     said: Tensor
     """int64 [num_envs, n]: the bytes said at the last step"""
+    home: Tensor
+    """float32 [num_envs, n, 3]: each UAV's place in a chain to the base and its reach, cells"""
     low: Tensor
     high: Tensor
     _start: Tensor
@@ -97,6 +99,7 @@ class Maps(CommModule):
         self.register_buffer("place", torch.zeros(*agents, uavs, 3, dtype=torch.float32))
         drawn = torch.zeros(*agents, *self.pictures.shape, dtype=torch.uint8)
         self.register_buffer("crops", drawn)
+        self.register_buffer("home", torch.zeros(*agents, 3))
         self.register_buffer("said", torch.zeros(agents, dtype=torch.int64))
         first = torch.arange(num_envs).unsqueeze(-1) * area
         self.register_buffer("_start", first, persistent=False)
@@ -106,8 +109,7 @@ class Maps(CommModule):
 
     def specs(self, observation: Composite) -> Composite:
         shape, device = observation[keys.AGENTS].shape, observation.device
-        config = self.config
-        features = 2 + 2 * config.position + config.role + 3 * config.home
+        features = 2 + 2 * self.config.position + 3 * (self.config.home > 0)
         vector = Unbounded(torch.Size((*shape, features)), device=device, dtype=torch.float32)
         pictures = torch.Size((*shape, *self.pictures.shape))
         observation[keys.OBSERVATION] = vector
@@ -163,16 +165,23 @@ class Maps(CommModule):
         self.said.copy_(places + cells)
 
     def _draw(self, tensordict: TensorDictBase) -> None:
-        """Draws the pictures of the environments in which they are due."""
+        """Draws the pictures of the environments in which they are due, and looks for home."""
         step = tensordict.get(keys.STEP)
         due = step % self.config.period == 0
         if due.is_cuda:  # The environments would have to be read from the device.
-            every = self._pictures(tensordict, torch.arange(len(step), device=step.device))
-            self.crops.copy_(torch.where(due.view(-1, *[1] * (every.ndim - 1)), every, self.crops))
+            env = torch.arange(len(step), device=step.device)
+        else:
+            env = due.nonzero().squeeze(-1)
+        if not len(env):
             return
-        env = due.nonzero().squeeze(-1)
-        if len(env):
-            self.crops[env] = self._pictures(tensordict, env)
+        stores = [(self.crops, self._pictures(tensordict, env))]
+        if self.config.home and self.world.base is not None:
+            stores.append((self.home, self._find_home(tensordict, env)))
+        for store, new in stores:
+            if due.is_cuda:
+                store.copy_(torch.where(due.view(-1, *[1] * (new.ndim - 1)), new, store))
+            else:
+                store[env] = new
 
     def _pictures(self, tensordict: TensorDictBase, env: Tensor) -> Tensor:
         """Returns the pictures of some environments, uint8 [len(env), n, ...]."""
@@ -193,29 +202,44 @@ class Maps(CommModule):
         )
         return drawn.unflatten(0, (len(env), uavs))
 
+    def _find_home(self, tensordict: TensorDictBase, env: Tensor) -> Tensor:
+        """Returns the place and reach of UAVs in a chain to the fire, float32 [len(env), n, 3]."""
+        radio_range = self.config.home * self.world.radio.range
+        world = replace(self.world, radio=replace(self.world.radio, range=radio_range))
+        heard = self.stamp[env].clamp(min=0)
+        flies = radio.believed_to_fly(world, tensordict.get(keys.STEP)[env], heard)
+        known = self.sensor.crop(self.known.last_seen[env])
+        burning = (known >= 0) & (known & 3 == 1)
+        place, reach = radio.chain_to_fire(world, self._place[0], burning, flies)
+        anywhere = 2.0 * max(world.grid)  # no number of the state may be infinite
+        return torch.cat((place, reach.clamp(max=anywhere).unsqueeze(-1)), -1)
+
     def _way_home(self, tensordict: TensorDictBase) -> list[Tensor]:
-        """Returns the way to the base and the distance that can still be flown, see `_vector`."""
-        ground = tensordict.get(keys.POSITION)[..., :2].float()
-        way = torch.zeros_like(ground) if self.world.base is None else self._place - ground
+        """Returns the way home and the distance that can still be flown, see `_vector`.
+
+        Home is the edge of the circle around a UAV's place in the chain in which it has to be. The
+        way is 0 inside of it, and without a base.
+        """
+        place, reach = self.home[..., :2], self.home[..., 2:]
+        way = place - tensordict.get(keys.POSITION)[..., :2].float()
+        distance = torch.linalg.vector_norm(way, dim=-1, keepdim=True)
+        way = way * (1 - reach / distance.clamp(min=1e-6)).clamp(min=0)
+        way = torch.zeros_like(way) if self.world.base is None else way
         steps = self.world.horizon - tensordict.get(keys.STEP).float()
         left = (steps * self.world.displacement / _FAR).clamp(max=1).view(-1, 1, 1)
-        return [way / _FAR, left.expand(-1, ground.shape[1], 1)]
+        return [way / _FAR, left.expand(-1, way.shape[1], 1)]
 
     def _vector(self, tensordict: TensorDictBase) -> Tensor:
         """Returns altitude, time, and what else is wanted, float32 [num_envs, n, k].
 
-        The box is scaled to [-1, 1], the horizon to [0, 1]. UAV i has the number i / 8, whatever
-        the size of the team. The way to the base along x and y (0 without a base) and the distance
-        that can still be flown, at most 1, are in units of 50 cells.
+        The box is scaled to [-1, 1], the horizon to [0, 1]. The way home along x and y and the
+        distance that can still be flown, at most 1, are in units of 50 cells.
         """
         scaled = motion.scale_to_box(tensordict.get(keys.POSITION), self.low, self.high)
         clock = tensordict.get(keys.STEP).float().view(-1, 1, 1) / self.world.horizon
         parts = [scaled[..., 2:], clock.expand(-1, scaled.shape[1], 1)]
         if self.config.position:
             parts.append(scaled[..., :2])
-        if self.config.role:
-            number = torch.arange(scaled.shape[1], device=scaled.device) / 8
-            parts.append(number.view(-1, 1).expand(len(scaled), -1, 1))
         if self.config.home:
             parts += self._way_home(tensordict)
         return torch.cat(parts, -1)

@@ -1,12 +1,16 @@
-"""Models the radio: computes which UAVs hear each other in a step."""
+"""Models the radio: computes which UAVs hear each other in a step, and places for a chain."""
 
 import torch
 from torch import Tensor
 
-from emberlink.envs.config import RadioConfig
+from emberlink.envs.config import RadioConfig, WildfireConfig
 from emberlink.envs.utils import counter_rng
 from emberlink.envs.utils.counter_rng import Use
 from emberlink.envs.world import motion
+
+_NEARER = 0.97  # of the range, so that rounding and small errors of position break no link
+_RELAY_REACH = 0.2  # cells; distance at which a relay is at its place
+_SILENT = 150  # steps; a UAV not heard of for so long counts as lost where UAVs fail
 
 
 def links(
@@ -90,3 +94,84 @@ def neighbours(position: Tensor, limit: float) -> Tensor:
     """Returns whether each other point of [..., n, 3] is nearer than `limit`, bool [..., n, n]."""
     near = pairwise_distance(position) < limit
     return near & ~torch.eye(near.shape[-1], dtype=torch.bool, device=near.device)
+
+
+def chain(
+    world: WildfireConfig, base: Tensor, centre: Tensor, rank: Tensor, count: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Returns the place of each UAV in a chain of radios from the base towards a fire.
+
+    UAVs hold places at distances of one radio range from the base to the middle of the fire, as
+    many as needed; at least one UAV is left over. The others have to be in range of the last place.
+
+    Args:
+        world: the world and the team.
+        base: float32 [2], cells.
+        centre: float32 [envs, n, 2], the middle of the fire, cells.
+        rank: int64 [envs, n], place of each UAV in the chain, 0 next to the base.
+        count: int64, broadcast against [envs, n], UAVs in the team.
+
+    Returns:
+        Place, float32 [envs, n, 2], and reach, float32 [envs, n], as in `Rally`.
+    """
+    hop = _NEARER * world.radio.range
+    height = world.altitude[1]
+    first = _NEARER * max(world.radio.range**2 - height**2, 0.0) ** 0.5
+    way = centre - base
+    distance = torch.linalg.vector_norm(way, dim=-1)
+    needed = ((distance - first) / max(hop, 1e-6)).ceil()
+    relays = torch.minimum(needed, (count - 1).float()).clamp(min=0)
+    link = torch.minimum(rank.float(), relays - 1).clamp(min=0)
+    along = torch.where(relays > 0, (first + hop * link).minimum(distance), 0.0)
+    place = base + way * (along / distance.clamp(min=1e-6)).unsqueeze(-1)
+    reach = torch.where(relays > 0, hop, first)
+    return place, torch.where(rank < relays, _RELAY_REACH, reach)
+
+
+def middle(cells: Tensor) -> Tensor:
+    """Returns the mean place of the cells of a mask, bool [..., X, Y], float32 [..., 2].
+
+    It is 0 without any cells.
+    """
+    count = cells.sum((-2, -1)).clamp(min=1)
+    sides = (torch.arange(side, device=cells.device) for side in cells.shape[-2:])
+    sums = ((cells.sum(axis) * side).sum(-1) for axis, side in zip((-1, -2), sides, strict=True))
+    return torch.stack([total / count for total in sums], -1)
+
+
+def chain_to_fire(
+    world: WildfireConfig, base: Tensor, burning: Tensor, flies: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Returns the place of each UAV in a `chain` to the middle of the fire that it knows.
+
+    UAVs take their places in the order of their numbers. Without known fire, all are at the base.
+
+    Args:
+        world: the world and the team.
+        base: float32 [2], cells.
+        burning: bool [envs, n, X, Y], the cells that each UAV knows to burn.
+        flies: bool [envs, n, n], the UAVs of which each UAV (row) believes that they fly.
+
+    Returns:
+        Place, float32 [envs, n, 2], cells, and reach, float32 [envs, n]: the greatest distance from
+        it, cells.
+    """
+    known = burning.flatten(2).any(-1, keepdim=True)
+    centre = torch.where(known, middle(burning), base)
+    rank = flies.tril(-1).sum(-1)
+    return chain(world, base, centre, rank, flies.sum(-1))
+
+
+def believed_to_fly(world: WildfireConfig, step: Tensor, heard: Tensor) -> Tensor:
+    """Returns whether each UAV (row) believes that another one flies, bool [envs, n, n].
+
+    In a world in which UAVs fail, a UAV of which nothing was heard for 150 steps counts as lost.
+
+    Args:
+        world: the world and the team.
+        step: int64 [envs].
+        heard: [envs, n, n], the last step of which a UAV knows of another one.
+    """
+    if not world.failures:
+        return torch.ones_like(heard, dtype=torch.bool)
+    return step.view(-1, 1, 1) - heard < _SILENT

@@ -1,8 +1,8 @@
 """Plans of scripted policies: maps of the UAVs' knowledge, targets, and places to meet."""
 
 from emberlink.policies.planning.foresight import Foresight
-from emberlink.policies.planning.rally import Rally, chain
-from emberlink.policies.planning.targets import HERE, Targets, band, middle, plan_period
+from emberlink.policies.planning.rally import Rally
+from emberlink.policies.planning.targets import HERE, Targets, band, plan_period
 from emberlink.policies.planning.team_maps import Messages, TeamMaps
 
 __all__ = [
@@ -13,7 +13,5 @@ __all__ = [
     "Targets",
     "TeamMaps",
     "band",
-    "chain",
-    "middle",
     "plan_period",
 ]

@@ -9,10 +9,10 @@ from torch import Tensor
 from emberlink.envs import keys
 from emberlink.envs.utils.buffers import Buffers
 from emberlink.envs.wildfire import WildfireEnv
-from emberlink.envs.world import motion
+from emberlink.envs.world import motion, radio
 from emberlink.envs.world.sensor import Sensor
-from emberlink.policies.planning.rally import Rally, chain
-from emberlink.policies.planning.targets import HERE, Targets, middle, plan_period
+from emberlink.policies.planning.rally import Rally
+from emberlink.policies.planning.targets import HERE, Targets, plan_period
 
 _FLOWN = 1.0  # cells flown between two plans
 _CLAIM = 3.0  # cells; half the side of the square that a UAV claims
@@ -27,7 +27,7 @@ class Foresight(Buffers):
     The value of a target is the number of cells in view from it that nobody has seen burn and that
     burn when the UAV arrives, divided by its distance plus 2 cells. The UAV with the highest value
     chooses first and claims 7 x 7 cells. With a base, cells count that no flying UAV and not the
-    base has a sighting of, and UAVs have places to be at the end (`rally.chain`), assigned to the
+    base has a sighting of, and UAVs have places to be at the end (`radio.chain`), assigned to the
     nearest UAVs. A UAV that will fail meets another one before.
 
     Args:
@@ -121,14 +121,14 @@ class Foresight(Buffers):
         ignition, end = self._times()
         late = (ignition <= self._world.horizon) & (end > self._world.horizon - _LATE)
         envs, uavs = lasting.shape
-        centre, count = middle(late), lasting.sum(-1, keepdim=True)
+        centre, count = radio.middle(late), lasting.sum(-1, keepdim=True)
         rank = torch.full_like(lasting, uavs, dtype=torch.int64)
         env = torch.arange(envs, device=ground.device)
         for link in range(uavs):
             here = torch.full_like(count, link)
-            place, _ = chain(self._world, self._base, centre, here, count)
+            place, _ = radio.chain(self._world, self._base, centre, here, count)
             apart = torch.linalg.vector_norm(ground - place, dim=-1)
             apart.masked_fill_(~lasting | (rank < uavs), math.inf)
             nearest, uav = apart.min(-1)
             rank[env, uav] = torch.where(nearest.isfinite(), link, rank[env, uav])
-        return chain(self._world, self._base, centre, rank, count)
+        return radio.chain(self._world, self._base, centre, rank, count)

@@ -92,17 +92,6 @@ def band(side: int, reach: float) -> Tensor:
     return ((place.unsqueeze(-1) - place).abs() <= reach).float()
 
 
-def middle(cells: Tensor) -> Tensor:
-    """Returns the mean place of the cells of a mask, bool [..., X, Y], float32 [..., 2].
-
-    It is 0 without any cells.
-    """
-    count = cells.sum((-2, -1)).clamp(min=1)
-    sides = (torch.arange(side, device=cells.device) for side in cells.shape[-2:])
-    sums = ((cells.sum(axis) * side).sum(-1) for axis, side in zip((-1, -2), sides, strict=True))
-    return torch.stack([total / count for total in sums], -1)
-
-
 def plan_period(flown: float, displacement: float) -> int:
     """Returns the steps in which a UAV flies `flown` cells, from 1 to 10."""
     return min(10, max(1, round(flown / displacement)))

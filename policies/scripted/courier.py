@@ -7,17 +7,16 @@ import torch
 from torch import Tensor
 
 from emberlink.envs.wildfire import WildfireEnv
-from emberlink.policies.planning import HERE, Rally, chain, middle
+from emberlink.envs.world import radio
+from emberlink.policies.planning import HERE, Rally
 from emberlink.policies.scripted.map_greedy import MapGreedy
-
-_SILENT = 150  # steps; a UAV not heard of for so long counts as lost where UAVs fail
 
 
 class Courier(MapGreedy):
     """Searches as `map_greedy`, and forms a chain of radios to the base by the end of the episode.
 
     Each UAV computes a chain of places from the base to the middle of the fire that it knows, one
-    radio range apart (`rally.chain`). UAV 0 holds the place next to the base, UAV 1 the next one,
+    radio range apart (`radio.chain`). UAV 0 holds the place next to the base, UAV 1 the next one,
     and so on. UAVs that are not needed in the chain stay in range of its last place. A UAV that
     knows of no fire has to be in range of the base. In a world in which UAVs fail, a UAV takes no
     account of those of which it has heard nothing for 150 steps, directly or through others.
@@ -27,15 +26,11 @@ class Courier(MapGreedy):
     """
 
     _base: Tensor
-    _before: Tensor
 
     def __init__(self, env: WildfireEnv, maps: Any = None):
         super().__init__(env, maps)
         world, device = self.world, env.device
         self.register_buffer("_base", torch.tensor(world.base or (0.0, 0.0), device=device))
-        uavs = world.num_uavs
-        before = torch.ones(uavs, uavs, dtype=torch.bool, device=device).tril(-1)
-        self.register_buffer("_before", before)
 
     def _choose(
         self, step: Tensor, ground: Tensor, burning: Tensor, weight: Tensor, distance: Tensor
@@ -55,11 +50,6 @@ class Courier(MapGreedy):
 
     def _rally(self, step: Tensor, burning: Tensor) -> Rally:
         """Returns where each UAV has to be at the end, given the fire and the UAVs it knows."""
-        known = burning.flatten(2).any(-1, keepdim=True)
-        centre = torch.where(known, middle(burning), self._base)
-        flies = torch.ones_like(self.maps.heard, dtype=torch.bool)
-        if self.world.failures:
-            flies = step.view(-1, 1, 1) - self.maps.heard < _SILENT
-        rank, team = (flies & self._before).sum(-1), flies.sum(-1)
-        place, reach = chain(self.world, self._base, centre, rank, team)
+        flies = radio.believed_to_fly(self.world, step, self.maps.heard)
+        place, reach = radio.chain_to_fire(self.world, self._base, burning, flies)
         return Rally(place, reach, torch.full_like(reach, self.world.horizon))

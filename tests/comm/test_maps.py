@@ -58,23 +58,30 @@ def test_specs_and_shapes():
     assert keys.observation_keys(env.observation_spec) == list(OBSERVED)
     more = make_env("maps", "tuned", world="relay", **{"comm.position": True})
     assert more.observation_spec[keys.OBSERVATION].shape == (1, 6, 4)
-    more = make_env("maps", "tuned", world="relay", **{"comm.position": True, "comm.role": True})
-    assert more.observation_spec[keys.OBSERVATION].shape == (1, 6, 5)
-    observed = more.reset()[keys.OBSERVATION]
-    assert observed[0, :, 4].tolist() == [0, 0.125, 0.25, 0.375, 0.5, 0.625]
 
 
-def test_a_uav_observes_the_way_to_the_base_and_how_far_it_can_fly():
-    config, position = MapsConfig(pixels=8, home=True), torch.tensor([[[5.0, 5, 3], [25, 10, 3]]])
-    more = {"config": config, "radio": RadioConfig(range=3.0)}
-    for base, ways in (((0.0, 15.0), [[-5, 10], [-25, 5]]), (None, [[0, 0], [0, 0]])):
-        env = environment(burning(), position, base=base, **more)
-        steps = fly(env, position, torch.zeros(30, 1, 2, 3))
-        assert env.observation_spec[keys.OBSERVATION].shape == (1, 2, 5)
+def test_a_uav_observes_the_way_home_and_how_far_it_can_fly():
+    """The fire burns in one cell 20 cells from the base; two radios of 9 cells reach it."""
+    fire = torch.full((1, 30, 30), torch.inf)
+    fire[0, 20, 15] = 1.0
+    position = torch.tensor([[[20.0, 15, 3], [21, 15, 3], [20, 16, 3], [29.0, 15, 3]]])
+    config = MapsConfig(pixels=8, home=0.9)
+    hop, first = 0.97 * 9, 0.97 * (81 - 16) ** 0.5
+    reached = [(first, 0.2), (first + hop, 0.2), (first + hop, hop), (first + hop, hop)]
+    for base, heard in (((0.0, 15.0), 10.0), ((0.0, 15.0), torch.inf), (None, 10.0)):
+        more = {"base": base, "radio": RadioConfig(range=heard)}
+        env = environment(fire, position, config=config, **more)
+        steps = fly(env, position, torch.zeros(30, 1, 4, 3))
+        assert env.observation_spec[keys.OBSERVATION].shape == (1, 4, 5)
         for step, left in ((0, 1.0), (10, 1.0), (30, 0.6)):  # of 60 steps, at one cell a step
             observed = steps[step][keys.OBSERVATION][0]
-            torch.testing.assert_close(observed[:, 2:4], torch.tensor(ways) / 50.0)
-            assert observed[:, 4].tolist() == pytest.approx([left, left])
+            assert observed[:, 4].tolist() == pytest.approx([left] * 4)
+            for uav, (along, reach) in enumerate(reached):
+                if step == 0:  # no fire is known
+                    along, reach = 0.0, first
+                way = torch.tensor([along, 15.0]) - position[0, uav, :2]
+                way *= max(0.0, 1 - reach / way.norm()) / 50 if base and heard == 10 else 0.0
+                torch.testing.assert_close(observed[uav, 2:4], way)
 
 
 def test_what_a_uav_sees_is_what_is_there():

@@ -8,7 +8,7 @@ from torchrl.envs import step_mdp
 
 from emberlink.envs import WildfireConfig, WildfireEnv, keys
 from emberlink.envs.world import radio
-from emberlink.policies.planning import Rally, Targets, chain, middle, plan_period
+from emberlink.policies.planning import Rally, Targets, plan_period
 from emberlink.policies.scripted.courier import Courier
 from emberlink.policies.scripted.map_greedy import MapGreedy
 from emberlink.policies.scripted.oracle import Oracle
@@ -32,14 +32,14 @@ def test_periods_and_middles_by_hand():
     assert [plan_period(2.0, d) for d in (0.1, 0.2, 0.5, 2.0, 9.0)] == [10, 10, 4, 1, 1]
     cells = torch.zeros(2, 4, 5, dtype=torch.bool)
     cells[0, 1, 2] = cells[0, 3, 4] = cells[0, 2, 4] = True
-    assert torch.allclose(middle(cells), torch.tensor([[2.0, 10 / 3], [0, 0]]))
+    assert torch.allclose(radio.middle(cells), torch.tensor([[2.0, 10 / 3], [0, 0]]))
 
 
 def test_a_chain_by_hand():
     config = WildfireConfig(grid=(60, 60), num_uavs=6)
     centre = torch.tensor([40.0, 30.0]).expand(1, 6, 2)
     rank = torch.arange(6).unsqueeze(0)
-    place, reach = chain(config, BASE, centre, rank, torch.tensor(6))
+    place, reach = radio.chain(config, BASE, centre, rank, torch.tensor(6))
     # 0.97 sqrt(10^2 - 4^2) = 8.89 cells to the base on the ground, then 9.7 each. Four reach 38.
     first = 0.97 * math.sqrt(84)
     along = [first, first + 9.7, first + 19.4, first + 29.1, first + 29.1, first + 29.1]
@@ -51,10 +51,10 @@ def test_a_chain_by_hand():
     )
     assert radio.reachable(radio.neighbours(points, 10.0)).all()
     # Two UAVs: one holds a place, the other is in its range. No fire known: within the base's.
-    place, reach = chain(config, BASE, centre[:, :2], rank[:, :2], torch.tensor(2))
+    place, reach = radio.chain(config, BASE, centre[:, :2], rank[:, :2], torch.tensor(2))
     assert place[0, :, 0].tolist() == pytest.approx([first] * 2)
     assert reach[0].tolist() == pytest.approx([0.2, 9.7])
-    place, reach = chain(config, BASE, BASE.expand(1, 2, 2), rank[:, :2], torch.tensor(2))
+    place, reach = radio.chain(config, BASE, BASE.expand(1, 2, 2), rank[:, :2], torch.tensor(2))
     assert place.tolist() == [[[0, 30], [0, 30]]]
     assert reach[0].tolist() == pytest.approx([first] * 2)
 
