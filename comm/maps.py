@@ -51,7 +51,8 @@ class Maps(CommModule):
 
     At each step, a UAV says to those that hear it what is new to one of them: cells, and positions
     of UAVs. What it hears it can pass on at the next step. A UAV observes its altitude, the time
-    and pictures of its own map (`Crops`), and nothing else.
+    and pictures of its own map (`Crops`); with `home`, also the way to its place in a chain of
+    radios from the base to the fire that it knows. It observes nothing else.
     """
 
     config_type: ClassVar[type] = MapsConfig
