@@ -20,7 +20,7 @@ from emberlink.envs.world.coverage_map import View
 from emberlink.envs.world.knowledge import Knowledge
 from emberlink.envs.world.sensor import Sensor
 
-_FAR = 50.0  # cells; unit of distances in the vector that a UAV observes
+_NEAR = 10.0  # cells; unit of the way home, which is clipped beyond it
 
 
 @dataclass(frozen=True, kw_only=True, config=ConfigDict(extra="forbid", strict=True))
@@ -41,7 +41,7 @@ class MapsConfig:
     """whether a UAV also observes its own x and y"""
     home: Annotated[float, Field(ge=0, le=1)] = 0.0
     """share of the radio's range between places of a chain from the base to the fire; with more
-    than 0, a UAV also observes the way to its place, and how far it can still fly"""
+    than 0, a UAV also observes the way to its place, and what it can fly beyond it"""
     period: Annotated[int, Field(ge=1, le=1_000_000)] = 1
     """steps from one drawing of the pictures to the next; those of `policy.hold` suffice"""
 
@@ -216,7 +216,7 @@ class Maps(CommModule):
         return torch.cat((place, reach.clamp(max=anywhere).unsqueeze(-1)), -1)
 
     def _way_home(self, tensordict: TensorDictBase) -> list[Tensor]:
-        """Returns the way home and the distance that can still be flown, see `_vector`.
+        """Returns the way home and what can be flown beyond it, see `_vector`.
 
         Home is the edge of the circle around a UAV's place in the chain in which it has to be. The
         way is 0 inside of it, and without a base.
@@ -226,15 +226,15 @@ class Maps(CommModule):
         distance = torch.linalg.vector_norm(way, dim=-1, keepdim=True)
         way = way * (1 - reach / distance.clamp(min=1e-6)).clamp(min=0)
         way = torch.zeros_like(way) if self.world.base is None else way
-        steps = self.world.horizon - tensordict.get(keys.STEP).float()
-        left = (steps * self.world.displacement / _FAR).clamp(max=1).view(-1, 1, 1)
-        return [way / _FAR, left.expand(-1, way.shape[1], 1)]
+        steps = self.world.horizon - tensordict.get(keys.STEP).float().view(-1, 1, 1)
+        spare = steps * self.world.displacement - way.abs().amax(-1, keepdim=True)
+        return [(part / _NEAR).clamp(-1, 1) for part in (way, spare)]
 
     def _vector(self, tensordict: TensorDictBase) -> Tensor:
         """Returns altitude, time, and what else is wanted, float32 [num_envs, n, k].
 
-        The box is scaled to [-1, 1], the horizon to [0, 1]. The way home along x and y and the
-        distance that can still be flown, at most 1, are in units of 50 cells.
+        The box is scaled to [-1, 1], the horizon to [0, 1]. The way home along x and y, and what
+        can be flown beyond it, are in units of 10 cells, and clipped to [-1, 1].
         """
         scaled = motion.scale_to_box(tensordict.get(keys.POSITION), self.low, self.high)
         clock = tensordict.get(keys.STEP).float().view(-1, 1, 1) / self.world.horizon
