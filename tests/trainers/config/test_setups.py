@@ -208,3 +208,16 @@ def test_the_table_has_all_setups_and_methods():
         *("file", "front", "huygens", "oil_slick", "paper", "reaction", "swarm"),
     ]
     assert known("world") == ["blackout", "file", "front", "paper", "relay", "swarm"]
+
+
+def test_every_key_of_a_configuration_can_be_set():
+    for learner in known("learner"):
+        config = resolve("maps" if learner == "imitation" else "consensus", [f"learner={learner}"])
+        values = {
+            key: value
+            for key, value in flat(to_values(config)).items()
+            if key.partition(".")[0] not in ("method", "setup", "world", "baselines")
+            and key not in ("learner.name", "comm.name", "fire.kind", "fire.name")
+        }
+        assert "env.reward.base" in values
+        assert resolve(config.method, [f"learner={learner}"], **values) == config
