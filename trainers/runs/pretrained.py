@@ -26,7 +26,8 @@ from emberlink.trainers.runs.run_folder import RunFolder
 from emberlink.trainers.runs.seal import check_trained_with, to_header
 
 PREFIX = "pretrained:"
-USUAL_SETUP = "tuned"
+USUAL_SETUPS = ("tuned", "strong_front")
+"""where a method without a setup is looked for, in this order"""
 
 
 def is_name(text: str) -> bool:
@@ -65,7 +66,7 @@ def find(text: str) -> list[Path]:
 
     Args:
         text: see `open_run`; `pretrained:SETUP` matches all policies of a setup. A method alone
-            means those of the setup tuned, or of all setups if tuned has none.
+            means those of the first of `USUAL_SETUPS` that has it, or of all setups if none has.
 
     Raises:
         UserError: there is no such policy.
@@ -77,7 +78,9 @@ def find(text: str) -> list[Path]:
         wanted[2] = f"s{wanted[2].removeprefix('s')}"
     matching = [path for path in folders if path.parts[-3:][: len(wanted)] == tuple(wanted)]
     of_method = [path for path in folders if path.parts[-2] == name]
-    usual = [path for path in of_method if path.parts[-3] == USUAL_SETUP] or of_method
+    usual = of_method
+    for setup in reversed(USUAL_SETUPS):
+        usual = [path for path in of_method if path.parts[-3] == setup] or usual
     if not matching and not usual:
         seeds = [path.name[1:] for path in folders if [*path.parts[-3:-1]] == wanted[:2]]
         if seeds:

@@ -210,14 +210,21 @@ def test_the_table_has_all_setups_and_methods():
     assert known("world") == ["blackout", "file", "front", "paper", "relay", "swarm"]
 
 
-def test_every_key_of_a_configuration_can_be_set():
-    for learner in known("learner"):
-        config = resolve("maps" if learner == "imitation" else "consensus", [f"learner={learner}"])
-        values = {
-            key: value
-            for key, value in flat(to_values(config)).items()
-            if key.partition(".")[0] not in ("method", "setup", "world", "baselines")
-            and key not in ("learner.name", "comm.name", "fire.kind", "fire.name")
-        }
-        assert "env.reward.base" in values
-        assert resolve(config.method, [f"learner={learner}"], **values) == config
+def every_choice():
+    yield from ({"learner": name} for name in known("learner"))
+    yield from ({"fire": name} for name in known("fire") if name != "file")
+    yield from ({"setup": name} for name in known("setup"))
+
+
+@pytest.mark.parametrize("choice", every_choice(), ids=str)
+def test_every_key_of_a_configuration_can_be_set(choice):
+    chosen = [f"{group}={name}" for group, name in choice.items()]
+    config = resolve("maps", chosen)
+    values = {
+        key: value
+        for key, value in flat(to_values(config)).items()
+        if key.partition(".")[0] not in ("method", "setup", "world", "baselines")
+        and key not in ("learner.name", "comm.name", "fire.kind", "fire.name")
+    }
+    assert {"env.reward.base", "env.radio.range"} <= values.keys()
+    assert resolve("maps", chosen, **values) == config

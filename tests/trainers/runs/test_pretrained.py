@@ -123,12 +123,17 @@ def test_names_of_several_policies(shipped):
 
 
 def test_a_method_of_two_other_setups_is_ambiguous(shipped, capsys):
-    shutil.copytree(shipped / "tuned_front", shipped / "strong_front")
+    for other in ("strong_relay", "strong_front"):
+        shutil.copytree(shipped / "tuned_front", shipped / other)
     try:
+        (found,) = pretrained.find("pretrained:positional")
+        assert found.parts[-3] == "strong_front"
+        shutil.rmtree(shipped / "strong_front")
         assert main(["eval", "pretrained:positional"]) == 2
     finally:
-        shutil.rmtree(shipped / "strong_front")
-    assert "ambiguous: strong_front/positional, tuned_front/positional" in capsys.readouterr().err
+        for other in shipped.glob("strong_*"):
+            shutil.rmtree(other)
+    assert "ambiguous: strong_relay/positional, tuned_front/positional" in capsys.readouterr().err
 
 
 def test_shipped_policies_can_be_compared(shipped, tmp_path):
