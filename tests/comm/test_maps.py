@@ -120,8 +120,9 @@ def test_a_disconnected_uav_learns_nothing_and_in_contact_everything():
         actions = torch.cat((own, random_flight(steps, 1, seed=seed)), 2)
         actions[..., :2] *= 0.4  # so that they stay apart
         fire = torch.cat((near, burning(seed)[..., 14:, :]), -2)
-        config = MapsConfig(pixels=8, scales=(1, 4))
-        env = environment(fire, position, config=config, radio=RadioConfig(range=10.0))
+        config = MapsConfig(pixels=8, scales=(1, 4), home=0.9)
+        more = {"base": (0.0, 15.0), "radio": RadioConfig(range=10.0)}
+        env = environment(fire, position, config=config, **more)
         flights.append(fly(env, position, actions))
         assert not any(td[keys.HEARS].any() for td in flights[-1])
         assert not any(td[keys.BYTES_SENT].any() for td in flights[-1])
