@@ -186,7 +186,8 @@ def _split(runs: Iterable[Run], key: Callable[[Run], Any]) -> list[list[Run]]:
 def _settings_apart(run: Run, others: Sequence[Run], counts: Callable[[str], bool]) -> str:
     """Returns the settings that distinguish a run from others with the same name, in brackets.
 
-    Settings with the default of the run's method and setup are left out. The text can be empty.
+    Settings with the default of the run's method and setup are left out, and those that its learner
+    does not have. The text can be empty.
 
     Args:
         run: the run.
@@ -196,9 +197,9 @@ def _settings_apart(run: Run, others: Sequence[Run], counts: Callable[[str], boo
     keys = [key for key in _differing(others) if counts(key)]
     defaults = _defaults(run.config) if keys else {}
     apart = [
-        _typed(key, run.settings.get(key))
+        _typed(key, run.settings[key])
         for key in keys
-        if key not in defaults or run.settings.get(key) != defaults[key]
+        if key in run.settings and (key not in defaults or run.settings[key] != defaults[key])
     ]
     return f" ({', '.join(apart)})" if apart else ""
 
@@ -206,6 +207,7 @@ def _settings_apart(run: Run, others: Sequence[Run], counts: Callable[[str], boo
 def _typed(key: str, value: Any) -> str:
     """Returns a setting as on the command line."""
     words = {None: "null", True: "true", False: "false"}
+    key = key.replace("learner.name", "learner")
     return f"{key}={words[value] if value is None or isinstance(value, bool) else value}"
 
 

@@ -427,6 +427,17 @@ def test_groups_are_named_by_their_settings(tmp_path):
     ]
 
 
+def test_groups_of_other_learners_are_named_by_what_chooses_them(tmp_path):
+    for seed, setting in enumerate(("learner=td3", "learner=ippo", "learner.critic=team")):
+        write_run(tmp_path, "consensus", seed, overrides=(setting,))
+    (section,), _ = gathered(tmp_path)
+    labels = [group.label for group in section.groups]
+    assert labels[0] == "consensus (learner.critic=team)"
+    assert labels[1].startswith("consensus (learner=ippo")
+    assert labels[2].startswith("consensus (learner=td3")
+    assert not any("null" in label for label in labels)
+
+
 def write_extra_evaluation(run, name, coverage, **about):
     """Writes an additional evaluation of a run, with lost messages."""
     content = read_evaluation(run)
