@@ -212,8 +212,7 @@ class Maps(CommModule):
         known = self.sensor.crop(self.known.last_seen[env])
         burning = (known >= 0) & (known & 3 == 1)
         place, reach = radio.chain_to_fire(world, self._place[0], burning, flies)
-        anywhere = 2.0 * max(world.grid)  # no number of the state may be infinite
-        return torch.cat((place, reach.clamp(max=anywhere).unsqueeze(-1)), -1)
+        return torch.cat((place, reach.unsqueeze(-1)), -1)
 
     def _way_home(self, tensordict: TensorDictBase) -> list[Tensor]:
         """Returns the way home and what can be flown beyond it, see `_vector`.

@@ -114,9 +114,11 @@ def chain(
     Returns:
         Place, float32 [envs, n, 2], and reach, float32 [envs, n], as in `Rally`.
     """
-    hop = _NEARER * world.radio.range
     height = world.altitude[1]
-    first = _NEARER * max(world.radio.range**2 - height**2, 0.0) ** 0.5
+    far = 10.0 * (sum(world.grid) + height)  # as good as any longer range, and finite
+    heard = min(world.radio.range, far)
+    hop = _NEARER * heard
+    first = _NEARER * max(heard**2 - height**2, 0.0) ** 0.5
     way = centre - base
     distance = torch.linalg.vector_norm(way, dim=-1)
     needed = ((distance - first) / max(hop, 1e-6)).ceil()

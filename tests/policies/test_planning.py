@@ -7,6 +7,7 @@ import torch
 from torchrl.envs import step_mdp
 
 from emberlink.envs import WildfireConfig, WildfireEnv, keys
+from emberlink.envs.config import RadioConfig
 from emberlink.envs.world import radio
 from emberlink.policies.planning import Rally, Targets, plan_period
 from emberlink.policies.scripted.courier import Courier
@@ -33,6 +34,18 @@ def test_periods_and_middles_by_hand():
     cells = torch.zeros(2, 4, 5, dtype=torch.bool)
     cells[0, 1, 2] = cells[0, 3, 4] = cells[0, 2, 4] = True
     assert torch.allclose(radio.middle(cells), torch.tensor([[2.0, 10 / 3], [0, 0]]))
+
+
+@pytest.mark.parametrize("heard", [math.inf, 1e308])
+def test_a_chain_of_radios_that_hear_everything_needs_no_relay(heard):
+    config = WildfireConfig(
+        num_uavs=6, grid=(60, 60), base=(0.0, 30.0), radio=RadioConfig(range=heard)
+    )
+    centre = torch.full((1, 6, 2), 59.0)
+    place, reach = radio.chain(config, BASE, centre, torch.arange(6)[None], torch.tensor(6))
+    assert place.equal(BASE.expand(1, 6, 2))
+    assert reach.isfinite().all()
+    assert reach.min() > 60
 
 
 def test_a_chain_by_hand():
