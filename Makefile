@@ -13,7 +13,8 @@ VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/emberlink-installed
 UNFINISHED := $(VENV)/emberlink-unfinished
-PIP := $(BIN)/python -m pip install -q --disable-pip-version-check -c constraints.txt
+# Python compiles a module when it is first imported; to compile all at once takes half a minute.
+PIP := $(BIN)/python -m pip install -q --no-compile --disable-pip-version-check -c constraints.txt
 
 .DEFAULT_GOAL := help
 .PHONY: help demo test test-slow test-cluster soak bench guard lint typecheck docs install browser clean

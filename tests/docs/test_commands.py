@@ -118,7 +118,7 @@ def shortened(words: list[str]) -> list[str]:
     if any(word.startswith("resume=") for word in rest) or verb not in SHORT:
         return [verb, *rest]
     short = SHORT[verb](rest)
-    return [verb, *short] if verb in ("train", "sweep") else [verb, *rest, *short]
+    return [verb, *short] if verb in ("train", "sweep", "render") else [verb, *rest, *short]
 
 
 def _train(rest: list[str]) -> list[str]:
@@ -161,9 +161,11 @@ def _eval(rest: list[str]) -> list[str]:
 
 
 def _render(rest: list[str]) -> list[str]:
-    alone = sum(word.startswith("pretrained") for word in rest) == 1
-    short = ["env.horizon=60"] if alone else []
-    return [*short, "--step", "3"] if "--step" in rest else [*short, "--frames", "2"]
+    """Returns the arguments of a render of three steps or two frames."""
+    episodes: list[str] = []
+    for word in rest:
+        episodes += [word, "env.horizon=60"] if word.startswith("pretrained") else [word]
+    return [*episodes, "--step", "3"] if "--step" in rest else [*episodes, "--frames", "2"]
 
 
 def _world(rest: list[str]) -> list[str]:

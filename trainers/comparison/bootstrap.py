@@ -16,6 +16,8 @@ LEVEL = 0.95
 """confidence level of an interval"""
 RESAMPLES = 10_000
 """number of resamples of an interval"""
+BAND_RESAMPLES = 2_000
+"""number of resamples of each interval of a curve"""
 BOOTSTRAP_SEED = 20_210_830
 """seed of the resamples of every interval"""
 FEW = 5
@@ -108,15 +110,17 @@ def paired_interval(statistic: Callable[..., Any], *samples: Values) -> Interval
 
 def band(values: Values) -> tuple[Values, Values] | None:
     """Returns the ends of the interval of the IQM, [episodes] each, of values [seeds, episodes]."""
-    return _bootstrap(iqm, [values], 0) if len(values) > 1 else None
+    return _bootstrap(iqm, [values], 0, BAND_RESAMPLES) if len(values) > 1 else None
 
 
-def _bootstrap(statistic: Callable[..., Any], samples: Sequence[Values], axis: int) -> Any:
+def _bootstrap(
+    statistic: Callable[..., Any], samples: Sequence[Values], axis: int, resamples: int = RESAMPLES
+) -> Any:
     result = stats.bootstrap(
         samples,
         statistic,
         axis=axis,
-        n_resamples=RESAMPLES,
+        n_resamples=resamples,
         batch=1000,
         confidence_level=LEVEL,
         method="percentile",

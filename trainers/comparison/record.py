@@ -21,6 +21,7 @@ def settings() -> dict[str, Any]:
         "interval": "percentile bootstrap, stratified by method (scipy.stats.bootstrap)",
         "level": bootstrap.LEVEL,
         "resamples": bootstrap.RESAMPLES,
+        "curve_resamples": bootstrap.BAND_RESAMPLES,
         "bootstrap_seed": bootstrap.BOOTSTRAP_SEED,
         "few_seeds": bootstrap.FEW,
     }

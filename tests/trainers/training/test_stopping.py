@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-COUNTS = {"kill -9": 8, "SIGTERM": 1, "SIGINT": 1, "file size limit": 1}
+COUNTS = {"kill -9": 6, "SIGTERM": 1, "SIGINT": 1, "file size limit": 1}
 SOAK = Path(__file__).parents[2] / "soak" / "soak.py"
 
 
