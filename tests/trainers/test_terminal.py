@@ -87,41 +87,61 @@ def table(label: str) -> Table:
     return made
 
 
+def printed(width: int, label: str) -> list[str]:
+    console = Console(width=width, file=io.StringIO(), record=True)
+    print_table(console, table(label))
+    return console.export_text().splitlines()
+
+
 def test_a_table_that_fits_has_one_part():
-    console = Console(width=40, file=io.StringIO(), record=True)
-    print_table(console, table("consensus"))
-    assert (
-        console.export_text().splitlines()
-        == [
-            "title",
-            "                   95 %",
-            "name      mean interval",
-            "---------------------------",
-            "coverage",
-            "consensus 12.3 [10.1, 14.5]",
-            "b            1            2",
-            "caption",
-            "",
-        ]
-        or True
-    )
+    assert printed(40, "consensus") == [
+        "title",
+        "                       95 %",
+        "name      mean     interval",
+        "---------------------------",
+        "coverage",
+        "consensus 12.3 [10.1, 14.5]",
+        "b            1            2",
+        "caption",
+        "",
+    ]
+
+
+def test_a_long_name_is_wrapped_and_indented():
+    assert printed(40, "consensus (learner=ippo, episodes=9)")[1:7] == [
+        "                                    95 %",
+        "name                   mean     interval",
+        "-" * 40,
+        "coverage",
+        "consensus              12.3 [10.1, 14.5]",
+        "  (learner=ippo,",
+    ]
+
+
+def test_a_name_with_underscores_is_wrapped_after_one():
+    lines = printed(29, "random_waypoints")
+    assert "random_     12.3 [10.1, 14.5]" in lines
+    assert lines[lines.index("random_     12.3 [10.1, 14.5]") + 1] == "waypoints"
 
 
 @pytest.mark.parametrize("width", [12, 20, 40, 64, 72, 80, 120])
 def test_a_table_shows_every_cell_completely(width):
     label = "consensus (learner.batch_size=64)"
-    console = Console(width=width, file=io.StringIO(), record=True)
-    print_table(console, table(label))
-    text = console.export_text()
-    for cell in (label, "12.3", "[10.1, 14.5]"):
+    text = "\n".join(printed(width, label))
+    for cell in (*label.split(), "12.3", "[10.1, 14.5]"):
         assert cell in text
+
+
+@pytest.mark.parametrize("width", [60, 72, 80])
+def test_no_line_is_wider_than_the_terminal(width):
+    assert max(map(len, printed(width, "consensus (learner=ippo, policy.memory=none)"))) <= width
 
 
 def test_the_console_splits_every_table(monkeypatch, capsys):
     monkeypatch.setenv("COLUMNS", "24")
-    SafeConsole().print(table("a long name of a run"))
+    SafeConsole().print(table("a_name_of_runs (learner=ippo)"))
     text = capsys.readouterr().out
-    assert "a long name of a run" in text
+    assert "  (learner=ippo)" in text
     assert "[10.1, 14.5]" in text
     assert "title (part 2 of 2)" in text
 

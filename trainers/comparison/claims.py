@@ -1,16 +1,26 @@
 """Tests the claims of the paper (sections V and VI) with intervals over seeds."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import numpy as np
 
 from emberlink.envs import metrics
 from emberlink.trainers.comparison import bootstrap
 from emberlink.trainers.comparison.bootstrap import Interval
-from emberlink.trainers.comparison.groups import Group, Section
+from emberlink.trainers.comparison.groups import (
+    NOT_COMPARED,
+    Group,
+    Section,
+    changed,
+    differing,
+)
 from emberlink.trainers.evaluation.results import LEARNED
+
+_NOT_OF_LEARNING = ("method", "comm", "replay", *NOT_COMPARED)
+"""first parts of keys in which compared methods may differ"""
 
 
 @dataclass(frozen=True)
@@ -61,16 +71,42 @@ class Verdict:
     fewest_seeds: int
 
 
-def verdicts(section: Section, fires: Sequence[str]) -> list[Verdict]:
-    """Returns the verdict of each claim on each fire, for each group of the claim's method."""
-    return [
-        _verdict(group, others, fire, claim)
-        for fire in fires
-        for claim in CLAIMS
-        for group in section.as_trained
-        if group.method == claim.method
-        and (others := [other for other in section.as_trained if other.method != group.method])
+def verdicts(section: Section, fires: Sequence[str], notes: list[str]) -> list[Verdict]:
+    """Returns the verdict of each claim on each fire, for each group of the claim's method.
+
+    If the method was trained in several ways, a group is compared with those groups of other
+    methods in which the same was changed: a claim about consensus with 300 episodes is not tested
+    with 120 of another method. The communication may differ, and each method has its own defaults.
+    A note is appended for a group with which none can be compared.
+    """
+    found: list[Verdict] = []
+    for method in dict.fromkeys(claim.method for claim in CLAIMS):
+        others = [group for group in section.as_trained if group.method != method]
+        for group, ways in _changes(section, method) if others else ():
+            alike = [other for other in others if ways[other.label] == ways[group.label]]
+            if not alike:
+                notes.append(
+                    f"{section.label}: {group.label}: no claims, because no other method was "
+                    "trained with these settings"
+                )
+            claims = [claim for claim in CLAIMS if claim.method == method and alike]
+            found += [_verdict(group, alike, fire, claim) for fire in fires for claim in claims]
+    return found
+
+
+def _changes(section: Section, method: str) -> Iterator[tuple[Group, dict[str, Any]]]:
+    """Yields each group of a method, with what was changed in every group, by label.
+
+    Only settings count in which the groups of the method differ, without those of communication.
+    """
+    groups = [group for group in section.as_trained if group.method == method]
+    keys = [
+        key
+        for key in differing([group.runs[0] for group in groups])
+        if key.split(".")[0] not in _NOT_OF_LEARNING and not key.startswith("env.radio.")
     ]
+    ways = {group.label: changed(group.runs[0], keys) for group in section.as_trained}
+    yield from ((group, ways) for group in groups)
 
 
 def _verdict(group: Group, others: Sequence[Group], fire: str, claim: Claim) -> Verdict:

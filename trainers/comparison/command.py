@@ -1,6 +1,7 @@
 """Runs `emberlink compare`: prints the tables of a comparison and writes the report."""
 
 from collections.abc import Sequence
+from itertools import groupby
 from pathlib import Path
 
 from rich.console import Console
@@ -44,7 +45,7 @@ def compare(paths: Sequence[Path], console: Console, output: Path | None = None)
 
 
 def _print_section(console: Console, numbers: Numbers) -> None:
-    """Prints a table of rankings for each fire, and a table of the paper's claims."""
+    """Prints a table of rankings for each fire, the value of communication and the claims."""
     for fire, rankings in numbers.fires.items():
         trained = ", the fire trained on" if fire == numbers.section.trained_on else ""
         table = _rankings_table(rankings, f"{numbers.section.label}: on {fire}{trained}")
@@ -56,14 +57,22 @@ def _print_section(console: Console, numbers: Numbers) -> None:
     if numbers.communication:
         console.print(_communication_table(numbers))
     if numbers.verdicts:
-        table = Table(title=Text(f"{numbers.section.label}: the paper's claims"))
-        for column in ("on", "claim", "best other", "ratio", "95 % interval", "verdict"):
-            table.add_column(column)
-        for verdict in numbers.verdicts:
-            claim = f"{verdict.method}: {verdict.claim}"
-            cells = (verdict.fire, claim, verdict.best_other, *ratio(verdict), decision(verdict))
+        console.print(_claims_table(numbers))
+
+
+def _claims_table(numbers: Numbers) -> Table:
+    """Returns a table of the verdicts, with a section for each group of the claims' method."""
+    table = Table(title=Text(f"{numbers.section.label}: the paper's claims"))
+    for column in ("claim", "on", "ratio", "95 % interval", "verdict", "best other"):
+        table.add_column(
+            column, justify="right" if column in ("ratio", "95 % interval") else "left"
+        )
+    for method, verdicts in groupby(numbers.verdicts, lambda verdict: verdict.method):
+        table.add_row(Text(method, style="bold"))
+        for told in verdicts:
+            cells = (told.claim, told.fire, *ratio(told), decision(told), told.best_other)
             table.add_row(*map(Text, cells))
-        console.print(table)
+    return table
 
 
 def _communication_table(numbers: Numbers) -> Table:

@@ -1,7 +1,7 @@
 """Groups runs by setup, fire and method, and labels the groups."""
 
 import json
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -39,6 +39,11 @@ class Group:
     def method(self) -> str:
         """The method of the runs."""
         return self.runs[0].config.method
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """The settings of the first run."""
+        return self.runs[0].settings
 
     @property
     def seeds(self) -> list[int]:
@@ -138,14 +143,31 @@ def _groups(section: str, runs: Sequence[Run], notes: list[str]) -> list[Group]:
         for name, part in sorted(zip(names, parts, strict=True), key=lambda pair: pair[0])
     ]
     for group in groups:
-        keys = [key for key in _differing(group.runs) if _first_part(key) not in NOT_NOTED]
+        keys = [key for key in differing(group.runs) if _first_part(key) not in NOT_NOTED]
         if keys:
             notes.append(f"{section}, {group.label}: one group, though {', '.join(keys)} differ")
-    for key in _differing([group.runs[0] for group in groups]):
+    trained = [group for group in groups if group.as_trained]
+    for key in differing([group.runs[0] for group in trained]):
         if _first_part(key) not in ("method", "replay", "comm", *NOT_COMPARED):
-            values = ", ".join(f"{g.label} {g.runs[0].settings.get(key)}" for g in groups)
-            notes.append(f"{section}: the methods differ in {key}: {values}")
+            having = {g.label: _word(g.settings[key]) for g in trained if key in g.settings}
+            if len({*having.values()}) > 1:
+                notes.append(f"{section}: the methods differ in {key}: {by_value(having)}")
     return groups
+
+
+def by_value(values: Mapping[str, str]) -> str:
+    """Returns which groups have which value, such as `0.9 for consensus; 0.99 for all others`.
+
+    Args:
+        values: label -> value.
+    """
+    labels: dict[str, list[str]] = {}
+    for label, value in values.items():
+        labels.setdefault(value, []).append(label)
+    most = max(labels, key=lambda value: len(labels[value]))
+    parts = [f"{value} for {', '.join(names)}" for value, names in labels.items() if value != most]
+    rest = "all others" if len(labels[most]) > 2 else ", ".join(labels[most])
+    return "; ".join([*parts, f"{most} for {rest}"])
 
 
 def _group_name(run: Run, firsts: Sequence[Run]) -> str:
@@ -153,8 +175,8 @@ def _group_name(run: Run, firsts: Sequence[Run]) -> str:
     alike = [other for other in firsts if other.config.method == run.config.method]
     apart = (*NOT_COMPARED, "method")
     name = run.config.method + _settings_apart(run, alike, lambda k: _first_part(k) not in apart)
-    changed = (f", evaluated with {_typed(*item)}" for item in run.evaluated_with.items())
-    return name + "".join(changed)
+    other = (f", evaluated with {_typed(*item)}" for item in run.evaluated_with.items())
+    return name + "".join(other)
 
 
 def _one_run_per_seed(label: str, runs: Sequence[Run], notes: list[str]) -> tuple[Run, ...]:
@@ -194,21 +216,29 @@ def _settings_apart(run: Run, others: Sequence[Run], counts: Callable[[str], boo
         others: all runs with the same name, including `run`.
         counts: whether a key may be part of the text.
     """
-    keys = [key for key in _differing(others) if counts(key)]
+    apart = changed(run, [key for key in differing(others) if counts(key)])
+    return f" ({', '.join(_typed(*item) for item in apart.items())})" if apart else ""
+
+
+def changed(run: Run, keys: Sequence[str]) -> dict[str, Any]:
+    """Returns the settings among `keys` that are not the default of the run's method and setup."""
     defaults = _defaults(run.config) if keys else {}
-    apart = [
-        _typed(key, run.settings[key])
+    return {
+        key: run.settings[key]
         for key in keys
         if key in run.settings and (key not in defaults or run.settings[key] != defaults[key])
-    ]
-    return f" ({', '.join(apart)})" if apart else ""
+    }
 
 
 def _typed(key: str, value: Any) -> str:
     """Returns a setting as on the command line."""
+    return f"{key.replace('learner.name', 'learner')}={_word(value)}"
+
+
+def _word(value: Any) -> str:
+    """Returns a value as on the command line."""
     words = {None: "null", True: "true", False: "false"}
-    key = key.replace("learner.name", "learner")
-    return f"{key}={words[value] if value is None or isinstance(value, bool) else value}"
+    return words[value] if value is None or isinstance(value, bool) else str(value)
 
 
 def _defaults(config: RunConfig) -> dict[str, Any]:
@@ -221,7 +251,7 @@ def _defaults(config: RunConfig) -> dict[str, Any]:
         return {}
 
 
-def _differing(runs: Sequence[Run]) -> list[str]:
+def differing(runs: Sequence[Run]) -> list[str]:
     """Returns the keys whose values differ between runs."""
     keys = dict.fromkeys(key for run in runs for key in run.settings)
     return [key for key in keys if len({repr(run.settings.get(key)) for run in runs}) > 1]

@@ -115,8 +115,8 @@ def numbers(section: Section) -> Numbers:
     curves = {
         name: {group.label: _curve(group, name) for group in section.as_trained} for name in CURVES
     }
+    told = verdicts(section, fires, notes)
     unique = list(dict.fromkeys(notes))
-    told = verdicts(section, fires)
     return Numbers(section, rankings, told, curves, communication_values(section), unique)
 
 

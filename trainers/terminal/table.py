@@ -14,8 +14,8 @@ from rich.text import Text
 def print_table(console: Console, table: Table) -> None:
     """Prints a table completely.
 
-    If the table is too wide for the console, row names such as random_waypoints are wrapped. If it
-    still is, it is printed in parts, each with the first column and as many other columns as fit.
+    If the table is too wide for the console, the first column is wrapped. If it still is, it is
+    printed in parts, each with the first column and as many other columns as fit.
     Pipes and files have no width, so the table has one part.
 
     Args:
@@ -27,7 +27,7 @@ def print_table(console: Console, table: Table) -> None:
     columns = [_texts(table, place) for place in range(len(table.columns))]
     sizes = [max(map(cell_len, texts)) for texts in columns]
     if width is not None:
-        sizes[0] = _label_size(columns[0], width - sum(sizes[1:]) - len(sizes) + 1)
+        sizes[0] = _label_size(columns[0], width - sum(sizes[1:]) - len(sizes) + 1, width)
     parts = _parts(sizes, width)
     for number, places in enumerate(parts, 1):
         part = f" (part {number} of {len(parts)})" if len(parts) > 1 else ""
@@ -59,24 +59,37 @@ def _texts(table: Table, place: int) -> list[str]:
     return [*_plain(table.columns[place].header).split("\n"), *cells]
 
 
-def _label_size(labels: Sequence[str], room: int) -> int:
-    """Returns the width of the first column: that of its labels, or `room` if they wrap."""
+def _label_size(labels: Sequence[str], room: int, width: int) -> int:
+    """Returns the width of the first column: that of its labels, or less if they wrap.
+
+    Args:
+        labels: texts of the column.
+        room: width that the other columns leave. If no wrapping fits in it, the table has parts.
+        width: width of the console.
+    """
     longest = max(map(cell_len, labels))
-    words = max(cell_len(word) for label in labels for word in _words(label))
-    return room if words <= room < longest else longest
+    words = [_indent(label) + word.rstrip() for label in labels for word in _words(label)]
+    least = max(map(cell_len, words))
+    return min(longest, max(least, room if least <= room else width // 3))
 
 
 def _words(label: str) -> list[str]:
-    """Splits a name after each underscore; a label with spaces is not split."""
-    return [label] if " " in label else re.findall(r"[^_]*_+|[^_]+", label) or [""]
+    """Splits a label after each space, or a name without spaces after each underscore."""
+    end = " " if " " in label else "_"
+    return re.findall(f"[^{end}]*{end}+|[^{end}]+", label) or [""]
+
+
+def _indent(label: str) -> str:
+    """Returns the beginning of the second line of a label."""
+    return "  " if " " in label else ""
 
 
 def _wrapped(label: str, size: int) -> list[str]:
     """Wraps a label to lines of a width."""
     lines = [""]
     for word in _words(label):
-        if lines[-1] and cell_len(lines[-1] + word.rstrip()) > size:
-            lines.append("")
+        if lines[-1].strip() and cell_len(lines[-1] + word.rstrip()) > size:
+            lines.append(_indent(label))
         lines[-1] += word
     return lines
 

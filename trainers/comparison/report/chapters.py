@@ -95,11 +95,12 @@ def _films(
     folder: Path, stem: str, numbers: Numbers, notes: list[str], say: Callable[[str], None]
 ) -> Iterator[_Film]:
     """Plays an episode of the first seed of each method and draws its timelapse."""
+    without: list[str] = []
     for place, group in enumerate(numbers.section.as_trained, 1):
         run = group.runs[0]
         newest = newest_checkpoint(run.path)
         if newest is None:
-            notes.append(f"{run.path}: has no checkpoint, so there is no timelapse or replay of it")
+            without.append(str(run.path))
             continue
         say(f"timelapse of {group.label}")
         actor = load_actor(run.config, newest)
@@ -116,6 +117,10 @@ def _films(
         title = f"{group.label}, seed {run.config.seed}"
         shown = Shown(title=title, recording=recorder.recording())
         yield _Film(Picture(path, caption), fire, shown)
+    if without:
+        notes.append(
+            f"no timelapse or replay, because there is no checkpoint: {', '.join(without)}"
+        )
 
 
 def _replays(folder: Path, stem: str, films: Sequence[_Film]) -> Iterator[ReplayFile]:

@@ -116,9 +116,11 @@ def lines(ranking: Ranking) -> Iterator[Line]:
             scripted=False,
         )
     for policy, values in ranking.scripted.items():
-        for value in values:
-            whose = f" ({', '.join(value.methods)})" if value.methods else ""
-            name = policy.replace("_", " ") + whose
+        most = max(values, key=lambda value: len(value.methods))
+        for value in sorted(values, key=lambda value: value is most):
+            several = value is most and len(value.methods) > 2
+            whose = "all others" if several else ", ".join(value.methods)
+            name = policy.replace("_", " ") + (f" ({whose})" if whose else "")
             yield Line(name, NONE, f"{value.value:.{digits}f}", NONE, NONE, NONE, scripted=True)
 
 

@@ -23,9 +23,12 @@ FIGURES = {
     9: (("fire_losses",), "Times a UAV fell out of the fire region, mean over UAVs."),
 }
 """number of the figure in the paper -> measure of each panel, and the caption"""
-COLOURS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#D55E00", "#56B4E9", "#8C6D00", "#000000")
+COLOURS = (
+    *("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#D55E00", "#56B4E9", "#8C6D00", "#000000"),
+    *("#8CBFDD", "#F4D28C", "#8CD2BE", "#E8C1D7", "#ECB48C", "#AFDCF5", "#CBBB8C", "#999999"),
+)
 """colours of methods, distinguishable with colour blindness (Okabe and Ito, 2008, with a darker
-yellow)"""
+yellow), and the same lighter"""
 DASHES = (
     *((0, (7, 3)), (0, (7, 2, 1, 2)), (0, (3, 2)), (0, (7, 2, 1, 2, 1, 2)), (0, (12, 4))),
     *((0, (3, 2, 1, 2)), (0, (12, 2, 3, 2)), (0, (1, 1))),
@@ -47,9 +50,11 @@ def figure(path: Path, numbers: Numbers, measures: tuple[str, ...]) -> None:
         numbers: numbers of a section.
         measures: measure of each panel.
     """
-    figure = Figure(figsize=(9.2, 3.8), layout="constrained")
     colours = _colours(numbers)
     policies = _policies(numbers) if numbers.on_trained else {}
+    lines = len(policies) + sum(1 + _wrapped(name).count("\n") for name in colours)
+    wide = 9.2 if lines == len(policies) + len(colours) else 10.8
+    figure = Figure(figsize=(wide, max(3.8, 0.4 + 0.2 * lines)), layout="constrained")
     panels = figure.subplots(1, len(measures), squeeze=False)[0]
     for axes, measure in zip(panels, measures, strict=True):
         _scripted_lines(axes, numbers, measure, policies, colours)
@@ -73,7 +78,7 @@ def frozen(path: Path, numbers: Numbers, fire: str) -> None:
     order = [row.method for row in rankings[FROZEN[0]].rows][::-1]
     colours = _colours(numbers)
     policies = _policies(numbers)
-    names = [textwrap.fill(name, 34, break_on_hyphens=False) for name in order]
+    names = [_wrapped(name) for name in order]
     tall = sum(0.14 + 0.2 * (1 + name.count("\n")) for name in names)
     figure = Figure(figsize=(3.4 * len(FROZEN), 1.5 + max(tall, 1.4)), layout="constrained")
     panels = figure.subplots(1, len(FROZEN), sharey=True)
@@ -129,6 +134,10 @@ def _stretches(places: Sequence[int]) -> Iterator[tuple[int, int]]:
     yield from zip(starts, ends, strict=True)
 
 
+def _wrapped(label: str) -> str:
+    return textwrap.fill(label, 34, break_on_hyphens=False)
+
+
 def _colours(numbers: Numbers) -> dict[str, str]:
     """Returns the colour of each group, by label."""
     groups = enumerate(numbers.section.as_trained)
@@ -140,7 +149,9 @@ def _legend(
     colours: Mapping[str, str],
     policies: Mapping[str, tuple[int, tuple[int, ...]]],
 ) -> None:
-    handles = [Line2D([], [], color=colour, lw=2, label=name) for name, colour in colours.items()]
+    handles = [
+        Line2D([], [], color=colour, lw=2, label=_wrapped(name)) for name, colour in colours.items()
+    ]
     handles += [
         Line2D([], [], color="0.3", ls=dash, lw=1.3, label=f"scripted: {name.replace('_', ' ')}")
         for name, dash in policies.items()
