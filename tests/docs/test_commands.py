@@ -13,6 +13,7 @@ from rich.console import Console
 from tiny_run import TINY
 
 from emberlink.trainers.cli.main import main
+from emberlink.trainers.comparison import bootstrap
 from emberlink.trainers.sweep import manifest
 from emberlink.trainers.sweep.command import sweep
 from emberlink.trainers.sweep.manifest import Row
@@ -81,6 +82,7 @@ def place(prepared, finished, tmp_path, monkeypatch) -> Path:
     monkeypatch.chdir(folder)
     monkeypatch.syspath_prepend(str(folder))
     monkeypatch.setenv("EMBERLINK_CONFIGS", "mine")
+    monkeypatch.setattr(bootstrap, "RESAMPLES", 200)
     return folder
 
 

@@ -83,7 +83,8 @@ def interval(statistic: Callable[..., Any], *samples: Sequence[float]) -> Interv
     """
     if min(map(len, samples)) < 2:
         return None
-    low, high = _bootstrap(statistic, [np.asarray(sample, float) for sample in samples], -1)
+    values = [np.asarray(sample, float) for sample in samples]
+    low, high = _bootstrap(statistic, values, -1, RESAMPLES)
     return float(low), float(high)
 
 
@@ -114,7 +115,7 @@ def band(values: Values) -> tuple[Values, Values] | None:
 
 
 def _bootstrap(
-    statistic: Callable[..., Any], samples: Sequence[Values], axis: int, resamples: int = RESAMPLES
+    statistic: Callable[..., Any], samples: Sequence[Values], axis: int, resamples: int
 ) -> Any:
     result = stats.bootstrap(
         samples,
