@@ -178,7 +178,19 @@ def _world(rest: list[str]) -> list[str]:
     return ["env.horizon=5", *axes]
 
 
-SHORT = {"world": _world, "train": _train, "sweep": _sweep, "eval": _eval, "render": _render}
+def _fire(rest: list[str]) -> list[str]:
+    """Returns the option of a file of two fires."""
+    return ["--count", "2"] if rest[0] == "make" else []
+
+
+SHORT = {
+    "world": _world,
+    "fire": _fire,
+    "train": _train,
+    "sweep": _sweep,
+    "eval": _eval,
+    "render": _render,
+}
 
 
 def test_there_are_commands():

@@ -326,7 +326,7 @@ def test_coverage_of_each_policy():
     assert bounds.keys() == SCRIPTED.keys()
     for name, (least, most) in bounds.items():
         played = config if name == "follow_target" else silent
-        env = build_env(played, num_envs=12, fire="huygens", seed=11, device="cpu")
+        env = build_env(played, num_envs=6, fire="huygens", seed=11, device="cpu")
         measured = play(env, SCRIPTED[name](env.base_env))
         assert measured.keys() == set(metrics.NAMES)
         assert least <= measured["coverage"].mean().item() <= most, name
