@@ -12,7 +12,7 @@ from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.runs.checkpoints import step_of
 from emberlink.trainers.runs.run_folder import RunFolder
 from emberlink.trainers.runs.seal import MAY_CHANGE, check_same, differences
-from emberlink.trainers.training import checkpoints
+from emberlink.trainers.training import checkpoints, warm_start
 from emberlink.trainers.training.folders import RunFolders, Sizes, check_seeds, empty, find_runs
 from emberlink.trainers.training.trainer import Trainer
 
@@ -106,6 +106,7 @@ def _restore(trainer: Trainer, runs: Sequence[RunFolder], chosen: Path | None) -
                 f"{runs[0].path}: holds networks alone (checkpoints/state_*.safetensors is "
                 f"missing); they can be evaluated: emberlink eval {runs[0].path}"
             )
+        warm_start.start(trainer.setup.learner, trainer.config)
         return empty(runs)
     path = chosen or states[-1]
     try:

@@ -279,6 +279,8 @@ class Trainer:
             state, tensors = checkpoints.read(states[-1])
             self.restore(states[-1], state, tensors)
             sizes = state.sizes
+        else:
+            warm_start.start(self.setup.learner, self.config)
         self.rollbacks, self.seconds, self.best = rollbacks, seconds, best
         self.setup.learner.scale_lr(rollbacks.lr_scale)
         self._began = time.monotonic()

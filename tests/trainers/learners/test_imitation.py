@@ -14,6 +14,7 @@ from emberlink.trainers.build import build_env
 from emberlink.trainers.cli import main
 from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.learners.base import ACTOR
+from emberlink.trainers.training.non_finite import NonFiniteError, NonFiniteReport
 from emberlink.trainers.training.resume import resume
 from emberlink.trainers.training.setup import TrainingSetup
 from emberlink.trainers.training.trainer import Trainer
@@ -209,6 +210,28 @@ def test_an_imitation_is_recorded_and_evaluated(imitated):
     assert all(0 < line["loss_imitation"] < 2 for line in lines[1:])
     assert json.loads((imitated["ippo"] / "eval.json").read_text())
     assert main.main(["eval", str(imitated["ippo"]), "env.num_uavs=5", "--fires", "1"]) == 0
+
+
+def test_a_run_without_a_checkpoint_begins_with_these_actors_again(imitated, tmp_path):
+    start = [f"learner.warm_start={imitated['ippo']}", "learner.anchor=0.5", "on_nan=rollback"]
+    trainer = Trainer(resolve("maps", [*settings("ippo", *start), f"output={tmp_path}"]))
+    trainer.start()
+    expected = trainer.setup.learner.weights()
+    trainer.close()  # as if the process had been killed
+
+    def check(learner):
+        actor = {name: value for name, value in expected.items() if name.startswith(ACTOR)}
+        weights, frozen = learner.weights(), learner.anchor.network.state_dict()
+        for name, value in actor.items():
+            assert weights[name].equal(value), name
+            assert frozen[name.removeprefix(ACTOR)].view_as(value).equal(value), name
+
+    resumed = resume(trainer.run.path)
+    check(resumed.setup.learner)
+    report = NonFiniteReport("reward", 0, 0, 0, step=1, update=None, value="nan")
+    resumed.roll_back(NonFiniteError(str(report), report, None))
+    check(resumed.setup.learner)
+    resumed.close()
 
 
 LEARNERS = [
