@@ -1,9 +1,8 @@
 """Tests the claims of the paper (sections V and VI) with intervals over seeds."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
 
 import numpy as np
 
@@ -16,6 +15,7 @@ from emberlink.trainers.comparison.groups import (
     Section,
     changed,
     differing,
+    first_part,
 )
 from emberlink.trainers.evaluation.results import LEARNED
 
@@ -81,32 +81,27 @@ def verdicts(section: Section, fires: Sequence[str], notes: list[str]) -> list[V
     """
     found: list[Verdict] = []
     for method in dict.fromkeys(claim.method for claim in CLAIMS):
+        claims = [claim for claim in CLAIMS if claim.method == method]
+        groups = [group for group in section.as_trained if group.method == method]
         others = [group for group in section.as_trained if group.method != method]
-        for group, ways in _changes(section, method) if others else ():
-            alike = [other for other in others if ways[other.label] == ways[group.label]]
-            if not alike:
+        keys = [key for key in differing([group.runs[0] for group in groups]) if _learning(key)]
+        ways = [changed(other.runs[0], keys) for other in others]
+        for group in groups if others else ():
+            way = changed(group.runs[0], keys)
+            alike = [other for other, its in zip(others, ways, strict=True) if its == way]
+            if alike:
+                found += [_verdict(group, alike, fire, claim) for fire in fires for claim in claims]
+            else:
                 notes.append(
                     f"{section.label}: {group.label}: no claims, because no other method was "
                     "trained with these settings"
                 )
-            claims = [claim for claim in CLAIMS if claim.method == method and alike]
-            found += [_verdict(group, alike, fire, claim) for fire in fires for claim in claims]
     return found
 
 
-def _changes(section: Section, method: str) -> Iterator[tuple[Group, dict[str, Any]]]:
-    """Yields each group of a method, with what was changed in every group, by label.
-
-    Only settings count in which the groups of the method differ, without those of communication.
-    """
-    groups = [group for group in section.as_trained if group.method == method]
-    keys = [
-        key
-        for key in differing([group.runs[0] for group in groups])
-        if key.split(".")[0] not in _NOT_OF_LEARNING and not key.startswith("env.radio.")
-    ]
-    ways = {group.label: changed(group.runs[0], keys) for group in section.as_trained}
-    yield from ((group, ways) for group in groups)
+def _learning(key: str) -> bool:
+    """Returns whether compared methods must have the same value of a key."""
+    return first_part(key) not in _NOT_OF_LEARNING and not key.startswith("env.radio.")
 
 
 def _verdict(group: Group, others: Sequence[Group], fire: str, claim: Claim) -> Verdict:

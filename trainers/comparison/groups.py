@@ -143,12 +143,12 @@ def _groups(section: str, runs: Sequence[Run], notes: list[str]) -> list[Group]:
         for name, part in sorted(zip(names, parts, strict=True), key=lambda pair: pair[0])
     ]
     for group in groups:
-        keys = [key for key in differing(group.runs) if _first_part(key) not in NOT_NOTED]
+        keys = [key for key in differing(group.runs) if first_part(key) not in NOT_NOTED]
         if keys:
             notes.append(f"{section}, {group.label}: one group, though {', '.join(keys)} differ")
     trained = [group for group in groups if group.as_trained]
     for key in differing([group.runs[0] for group in trained]):
-        if _first_part(key) not in ("method", "replay", "comm", *NOT_COMPARED):
+        if first_part(key) not in ("method", "replay", "comm", *NOT_COMPARED):
             having = {g.label: _word(g.settings[key]) for g in trained if key in g.settings}
             if len({*having.values()}) > 1:
                 notes.append(f"{section}: the methods differ in {key}: {by_value(having)}")
@@ -174,7 +174,7 @@ def _group_name(run: Run, firsts: Sequence[Run]) -> str:
     """Returns the label of a run's group, given one run of each group of the section."""
     alike = [other for other in firsts if other.config.method == run.config.method]
     apart = (*NOT_COMPARED, "method")
-    name = run.config.method + _settings_apart(run, alike, lambda k: _first_part(k) not in apart)
+    name = run.config.method + _settings_apart(run, alike, lambda k: first_part(k) not in apart)
     other = (f", evaluated with {_typed(*item)}" for item in run.evaluated_with.items())
     return name + "".join(other)
 
@@ -194,7 +194,7 @@ def _one_run_per_seed(label: str, runs: Sequence[Run], notes: list[str]) -> tupl
 
 def _trained_with(run: Run) -> dict[str, Any]:
     """Returns the settings that affect training, without the seed."""
-    return {k: v for k, v in run.settings.items() if _first_part(k) not in NOT_COMPARED}
+    return {k: v for k, v in run.settings.items() if first_part(k) not in NOT_COMPARED}
 
 
 def _split(runs: Iterable[Run], key: Callable[[Run], Any]) -> list[list[Run]]:
@@ -257,7 +257,8 @@ def differing(runs: Sequence[Run]) -> list[str]:
     return [key for key in keys if len({repr(run.settings.get(key)) for run in runs}) > 1]
 
 
-def _first_part(key: str) -> str:
+def first_part(key: str) -> str:
+    """Returns the part of a key before the first dot."""
     return key.split(".")[0]
 
 
