@@ -130,8 +130,9 @@ class Crops(Buffers):
     def _summed(self, known: Tensor, seen: Tensor, step: Tensor) -> Tensor:
         """Returns the sums of all fields over the cells below and left, int64 [rows, X+1, Y+1]."""
         index = 4 * step.view(-1, 1, 1) + 3 - known
-        # An environment may be stepped beyond its horizon, without a reset.
-        fields = self._fields.take(index.clamp_(0, len(self._fields) - 1))
+        # An environment may be stepped beyond its horizon, without a reset; a look keeps its kind.
+        index = index.minimum((index & 3) + (len(self._fields) - 4)).clamp_(min=0)
+        fields = self._fields.take(index)
         if self.spread:
             near = _widened((known & 3 == 1) & (known >= 0), self.spread)
         else:

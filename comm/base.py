@@ -174,9 +174,12 @@ class Communication(Transform):
         """Checks that the environment and the transforms before this one write every input key."""
         for key in self.module.in_keys:
             if key != keys.HEARS and tensordict.get(key, None) is None:
+                source = "the environment or a transform before the communication"
+                if key in (keys.WINDOW, keys.SIGHT):
+                    source = f"env.observation={key[-1]}"
                 raise UserError(
-                    f"key {key} is missing: {type(self.module).__name__} reads it, and the "
-                    "environment or a transform before the communication does not give it"
+                    f"key {key} is missing: {type(self.module).__name__} reads it; it comes from "
+                    f"{source}"
                 )
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:

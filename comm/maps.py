@@ -105,7 +105,7 @@ class Maps(CommModule):
         first = torch.arange(num_envs).unsqueeze(-1) * area
         self.register_buffer("_start", first, persistent=False)
         base = torch.tensor([] if world.base is None else [world.base]).view(-1, 2)
-        self.register_buffer("_base", base.round().long(), persistent=False)
+        self.register_buffer("_base", _nearest(base), persistent=False)
         self.register_buffer("_place", base.float(), persistent=False)
 
     def specs(self, observation: Composite) -> Composite:
@@ -190,8 +190,8 @@ class Maps(CommModule):
         assert seen is not None
         own = torch.eye(uavs, dtype=torch.bool, device=env.device)
         heard = self.stamp[env].masked_fill(own, -1)
-        others = self.place[env][..., :2].round().long()
-        centre = tensordict.get(keys.POSITION)[env][..., :2].round().long()
+        others = _nearest(self.place[env][..., :2])
+        centre = _nearest(tensordict.get(keys.POSITION)[env][..., :2])
         base = self._base.expand(len(env), uavs, *self._base.shape)
         step = tensordict.get(keys.STEP)[env].unsqueeze(-1).expand(-1, uavs)
         drawn = self.pictures.draw(
@@ -243,3 +243,8 @@ class Maps(CommModule):
         if self.config.home:
             parts += self._way_home(tensordict)
         return torch.cat(parts, -1)
+
+
+def _nearest(place: Tensor) -> Tensor:
+    """Returns the nearest cells, int64; halves are rounded up, wherever they are in the grid."""
+    return (place + 0.5).floor().long()

@@ -137,7 +137,7 @@ def train(
     """Trains a method, evaluates its frozen policy, and writes a run folder.
 
     Args:
-        method: independent, shared_memory, positional, consensus, or a method of your own.
+        method: independent, shared_memory, positional, consensus, maps, or a method of your own.
         setup: paper, released, tuned, strong, or a setup of your own.
         world: paper, front, relay, swarm, blackout, file, or a world of your own.
         fire: name of a scenario; that of the setup or the world if None.

@@ -35,8 +35,8 @@ def make_env(
     """Returns the environment of a method with its communication.
 
     Args:
-        method: independent, shared_memory, positional, consensus, or a method of your own; or the
-            configuration of a run, such as `load("pretrained:consensus").config`.
+        method: independent, shared_memory, positional, consensus, maps, or a method of your own; or
+            the configuration of a run, such as `load("pretrained:consensus").config`.
         setup: paper (if None), released, tuned, strong, or a setup of your own; not with a
             configuration.
         world: paper (if None), front, relay, swarm, blackout, file, or a world of your own; not

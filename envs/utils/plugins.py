@@ -53,23 +53,26 @@ class Registry(Generic[T]):
         """Returns the names in alphabetical order."""
         return sorted({*self._files(), *self._points()})
 
-    def find(self, name: str) -> type[T]:
+    def find(self, name: str, key: str = "") -> type[T]:
         """Returns the class of a name.
+
+        Args:
+            name: of a file or of an entry point.
+            key: configuration key that holds the name, for messages, if not `self.key`.
 
         Raises:
             UserError: the name is not known or not unique, or the entry point cannot be imported or
                 is not such a class.
         """
+        key = key or self.key
         points, files = self._points(), self._files()
         if name in points and name in files:
-            raise UserError(
-                f"{self.key}={name}: also an entry point, {points[name].value}; rename it"
-            )
+            raise UserError(f"{key}={name}: also an entry point, {points[name].value}; rename it")
         if name in points:
             return self._load(points[name])
         if name in files:
             return self._class_in(name)
-        raise UserError(f"{self.key}={name!r} is not known; known: {', '.join(self.known())}")
+        raise UserError(f"{key}={name!r} is not known; known: {', '.join(self.known())}")
 
     def _points(self) -> dict[str, EntryPoint]:
         return registered(self.group or self.package)

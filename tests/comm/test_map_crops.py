@@ -86,6 +86,19 @@ def test_the_largest_sums_fit_into_their_bits():
     assert chance.sum() == round(255 * 24 / 256)
 
 
+def test_beyond_the_horizon_what_was_never_seen_stays_so():
+    known = torch.full((9, 9), -1)
+    known[4, 4], known[4, 5], known[4, 6] = 4 * 9 + 1, 4 * 9, 4 * 9 + 2
+    form = {"pixels": 8, "scales": (1,), "spread": 0}
+    fire, _, out, _, age, *_ = draw(
+        (9, 9), known, known == 37, 5 * HORIZON, (4, 4), [], None, **form
+    )[0]
+    assert fire[4, 4] == out[4, 6] == 255
+    assert fire.sum() == out.sum() == 255
+    assert age[4, 3] == 255
+    assert age[4, 4] == age[4, 5] == age[4, 6] == age_byte(HORIZON + 1)
+
+
 def test_large_batches_are_drawn_in_parts(monkeypatch):
     crops = Crops((10, 9), pixels=8, scales=(1, 2), spread=1, horizon=HORIZON)
     generator = torch.Generator().manual_seed(0)

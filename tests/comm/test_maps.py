@@ -171,13 +171,14 @@ def test_a_limit_is_kept_and_less_becomes_known():
     assert known[None] >= known[400] > known[100] > known[7]
 
 
-def test_moving_the_world_does_not_change_the_pictures():
+@pytest.mark.parametrize("aside", [0.0, 0.2])  # 32.3 + 0.2 is between two cells
+def test_moving_the_world_does_not_change_the_pictures(aside):
     """The pictures reach 14 cells far and do not touch the edge."""
     side, shift, config = 70, (11, -7), MapsConfig(pixels=8, scales=(1, 3))
     arrival = torch.full((side, side), torch.inf)
     arrival[30:40, 28:37] = 4 * torch.rand(10, 9, generator=torch.Generator().manual_seed(1))
     moved = arrival.roll(shift, (0, 1))
-    position = torch.tensor([[[32.3, 30.6, 3.0], [36.0, 33.1, 2.0]]])
+    position = torch.tensor([[[32.3 + aside, 30.6, 3.0], [36.0, 33.1, 2.0]]])
     actions = random_flight(12, 2)
     env = environment(arrival[None], position, config=config)
     first = fly(env, position, actions)

@@ -42,7 +42,7 @@ def torchrls(setup: TrainingSetup) -> Collector:
 
 
 @pytest.mark.parametrize("seeds", ["seed=5", "seeds=[5,6]"])
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", [*METHODS, "maps"])
 def test_our_collector_equals_torchrls(method, seeds):
     setup = TrainingSetup(resolve(method, [*SMALL, seeds, "learner.exploration.theta=0.2"]))
     torch.nn.init.normal_(setup.learner.actor.module.action.weight, std=0.3)

@@ -28,7 +28,7 @@ def add_train(commands: Any) -> None:
         "method",
         metavar="METHOD",
         completer=completion.method_or_settings,
-        help="a method: independent, shared_memory, positional, consensus, or your own "
+        help="a method: independent, shared_memory, positional, consensus, maps, or your own "
         "(see emberlink list methods); or resume=RUN, to resume the training of a run folder",
     )
     train.add_argument(

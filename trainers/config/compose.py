@@ -196,6 +196,8 @@ def _own_hydra() -> Iterator[None]:
 
 def _interpolated(values: dict[str, Any]) -> dict[str, Any]:
     """Returns the values with each `${key}` replaced by the value of the key."""
+    if not any(mark in str(values) for mark in ("${", "???")):
+        return values  # OmegaConf takes several milliseconds.
     try:
         whole: Any = OmegaConf.to_container(
             OmegaConf.create(values), resolve=True, throw_on_missing=True

@@ -6,6 +6,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from emberlink.envs.utils.errors import UserError
+
 
 class Anchor:
     """Keeps a frozen copy of actors, whose actions the learned actors may leave at a cost.
@@ -24,9 +26,17 @@ class Anchor:
 
     @classmethod
     def of(cls, network: nn.Module, config: Any, device: torch.device | str) -> "Anchor | None":
-        """Returns the anchor of a learner with settings `warm_start` and `anchor`; None without."""
-        wanted = config.warm_start and config.anchor
-        return cls(network, config.anchor, device) if wanted else None
+        """Returns the anchor of a learner with settings `warm_start` and `anchor`; None without.
+
+        Raises:
+            UserError: there is an anchor, but no run whose actors it keeps.
+        """
+        if config.anchor and not config.warm_start:
+            raise UserError(
+                f"learner.anchor={config.anchor:g}: needs learner.warm_start, the run whose "
+                "actions the actors stay near to"
+            )
+        return cls(network, config.anchor, device) if config.anchor else None
 
     def advance(self, done: float) -> None:
         """Sets the weight after a share of the run."""

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from typing import Annotated, Any
 
 import torch
-from pydantic import Field
+from pydantic import Field, model_validator
 from pydantic.dataclasses import dataclass
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
@@ -66,6 +66,12 @@ class ImitationConfig(LearnerConfig):
     buffer_size: Count
     """capacity of a buffer of decisions, in decisions of a UAV"""
 
+    @model_validator(mode="after")
+    def _decisions_fit(self) -> "ImitationConfig":
+        if self.samples > self.buffer_size:
+            raise UserError(f"samples={self.samples} is larger than buffer_size={self.buffer_size}")
+        return self
+
     @property
     def reads_teacher(self) -> tuple[str, float]:
         return self.teacher, self.teacher_range
@@ -113,7 +119,7 @@ class Imitation(Learner):
         policy: PolicyConfig | None = None,
     ) -> Any:
         """Returns new actors of the learner `actor_of`."""
-        learner = registry.find(config.actor_of)
+        learner = registry.find(config.actor_of, "learner.actor_of")
         if issubclass(learner, cls):
             raise UserError(f"learner.actor_of={config.actor_of}: has no actors of its own")
         return learner.make_actor(config, observation_spec, action_spec, generator, policy)

@@ -153,7 +153,8 @@ def load_weights(
 def _check_header(path: Path, header: Mapping[str, Any], config: RunConfig) -> None:
     expected = _network_header(config, 0)
     # Shared weights fly in a team of any size, if what a UAV observes does not depend on it.
-    for name in ("method",) if config.learner.share_parameters else ("method", "uavs"):
+    any_team = config.learner.share_parameters and not config.policy.agent_index
+    for name in ("method",) if any_team else ("method", "uavs"):
         if header.get(name, expected[name]) != expected[name]:
             raise UserError(
                 f"{path}: a checkpoint of {name}={header[name]}; "

@@ -1,13 +1,19 @@
 """Begins a run with the actors of another run (`learner.warm_start`)."""
 
+import warnings
 from typing import Any
 
 from emberlink.envs.utils.errors import UserError
+from emberlink.trainers.config.compose import to_values
+from emberlink.trainers.config.overrides import flat
 from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.learners.base import ACTOR, Learner
 from emberlink.trainers.runs.checkpoints import load_weights
 from emberlink.trainers.runs.pretrained import open_run
 from emberlink.trainers.runs.seal import check_trained_with
+
+_OBSERVED = ("comm.", "env.observation", "policy.hold")
+"""beginnings of the keys of settings that change what a UAV observes, or for how long it acts"""
 
 
 def start(learner: Learner, config: RunConfig) -> None:
@@ -28,7 +34,9 @@ def start(learner: Learner, config: RunConfig) -> None:
         return
     run = open_run(name, config.output)
     checkpoint = run.checkpoint()
-    check_trained_with(checkpoint, run.config())
+    theirs = run.config()
+    check_trained_with(checkpoint, theirs)
+    _warn_of_other_observations(name, theirs, config)
     network: Any = learner.actor.module
     teams = len(config.seeds or (config.seed,))
     expected = {
@@ -40,3 +48,15 @@ def start(learner: Learner, config: RunConfig) -> None:
     except UserError as error:
         raise UserError(f"learner.warm_start={name}: {error}") from None
     learner.start_from(weights)
+
+
+def _warn_of_other_observations(name: str, theirs: RunConfig, mine: RunConfig) -> None:
+    """Warns of settings that give the same observations another meaning."""
+    before, now = flat(to_values(theirs)), flat(to_values(mine))
+    for key in (key for key in now if key.startswith(_OBSERVED) and key in before):
+        if before[key] != now[key]:
+            warnings.warn(
+                f"learner.warm_start={name}: its actors were trained with {key}={before[key]}, "
+                f"this run has {now[key]}",
+                stacklevel=3,
+            )

@@ -2,6 +2,7 @@
 
 import json
 import math
+import warnings
 
 import pytest
 import torch
@@ -175,6 +176,16 @@ def test_the_loss_falls_and_is_that_of_smooth_l1():
     [
         (["maps", *settings("imitation"), "policy.memory=gru"], "single decisions"),
         (["maps", *settings("imitation"), "learner.actor_of=imitation"], "no actors of its own"),
+        (["maps", *settings("imitation"), "learner.actor_of=none"], "learner.actor_of='none'"),
+        (
+            ["maps", *settings("imitation"), "learner.samples=9", "learner.buffer_size=8"],
+            "samples=9 is larger than buffer_size=8",
+        ),
+        (["maps", *settings("ippo"), "learner.anchor=1"], "learner.anchor=1: needs"),
+        (
+            ["maps", *settings("ippo"), "env.observation=window"],
+            "Maps reads it; it comes from env.observation=sight",
+        ),
         (["consensus", "learner=imitation"], "Consensus keeps none"),
         (
             ["maps", *settings("imitation"), "learner.teacher=curier"],
@@ -286,6 +297,20 @@ def test_actors_of_another_network_are_refused(imitated, tmp_path, capsys):
     assert main.main(arguments) == 2
     assert "learner.warm_start=" in " ".join(capsys.readouterr().err.split())
     assert not list(tmp_path.iterdir())
+
+
+def test_pictures_of_other_scales_are_warned_of(imitated, tmp_path):
+    def prepare(*more: str) -> None:
+        start = f"learner.warm_start={imitated['ippo']}", f"output={tmp_path}"
+        trainer = Trainer(resolve("maps", settings("ippo", *start, *more)))
+        trainer.start()
+        trainer.close()
+
+    with pytest.warns(UserWarning, match=r"comm.scales=\[1, 5\], this run has \[1, 3\]"):
+        prepare("comm.scales=[1,3]")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", UserWarning)
+        prepare()
 
 
 def test_a_memory_has_no_anchor():

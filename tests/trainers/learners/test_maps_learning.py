@@ -94,6 +94,13 @@ def test_weights_of_each_uav_fit_one_team_only(tmp_path, capsys):
     assert "uavs=2; this configuration has uavs=3" in " ".join(capsys.readouterr().err.split())
 
 
+def test_weights_with_an_agent_index_fit_one_team_only(tmp_path, capsys):
+    run = trained(tmp_path, "policy.agent_index=true")
+    capsys.readouterr()
+    assert main.main(["eval", str(run), "env.num_uavs=3", "--fires", "1"]) == 2
+    assert "uavs=2; this configuration has uavs=3" in " ".join(capsys.readouterr().err.split())
+
+
 def test_what_a_uav_observes_does_not_depend_on_the_team(tmp_path):
     shapes = set()
     for uavs, grid in ((1, "[20,20]"), (3, "[60,50]"), (24, "[128,128]")):

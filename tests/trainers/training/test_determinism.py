@@ -13,7 +13,7 @@ from emberlink.trainers import make_env
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", [*METHODS, "maps"])
 def test_a_seed_repeats_its_run_byte_for_byte(method, tmp_path):
     def run(folder: str, seed: int) -> tuple[bytes, dict[str, torch.Tensor]]:
         torch.manual_seed(len(folder))  # earlier draws must not matter
@@ -30,7 +30,7 @@ def test_a_seed_repeats_its_run_byte_for_byte(method, tmp_path):
         assert weight.equal(same[name]), name
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", [*METHODS, "maps"])
 def test_the_default_dtype_does_not_change_a_training(method, tmp_path):
     """A program that uses emberlink may prefer float64."""
     usual = until(begun(method, tmp_path / "usual"), 15)
