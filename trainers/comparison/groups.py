@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -208,8 +209,8 @@ def _split(runs: Iterable[Run], key: Callable[[Run], Any]) -> list[list[Run]]:
 def _settings_apart(run: Run, others: Sequence[Run], counts: Callable[[str], bool]) -> str:
     """Returns the settings that distinguish a run from others with the same name, in brackets.
 
-    Settings with the default of the run's method and setup are left out, and those that its learner
-    does not have. The text can be empty.
+    Settings with the default of the run's method, setup and learner are left out, and those that
+    its learner does not have. The text can be empty.
 
     Args:
         run: the run.
@@ -221,7 +222,7 @@ def _settings_apart(run: Run, others: Sequence[Run], counts: Callable[[str], boo
 
 
 def changed(run: Run, keys: Sequence[str]) -> dict[str, Any]:
-    """Returns the settings among `keys` that are not the default of the run's method and setup."""
+    """Returns the settings among `keys` that are not the default of method, setup and learner."""
     defaults = _defaults(run.config) if keys else {}
     return {
         key: run.settings[key]
@@ -242,13 +243,18 @@ def _word(value: Any) -> str:
 
 
 def _defaults(config: RunConfig) -> dict[str, Any]:
-    """Returns the default settings of a run's method and setup; empty if it is not installed."""
-    try:
-        names = {"setup": config.setup, "world": config.world, "fire": config.fire.name}
-        choices = [f"{group}={name}" for group, name in names.items()]
-        return flat(to_values(resolve(config.method, choices)))
-    except UserError:
-        return {}
+    """Returns the default settings of a run's method, setup and learner.
+
+    `learner.name` is that of the setup. Settings of what is not installed are left out.
+    """
+    names = {"setup": config.setup, "world": config.world, "fire": config.fire.name}
+    choices = [f"{group}={name}" for group, name in names.items()]
+    defaults: dict[str, Any] = {}
+    for more in ([f"learner={config.learner.name}"], []):
+        with suppress(UserError):
+            usual = flat(to_values(resolve(config.method, [*choices, *more])))
+            defaults = (defaults or usual) | {"learner.name": usual["learner.name"]}
+    return defaults
 
 
 def differing(runs: Sequence[Run]) -> list[str]:

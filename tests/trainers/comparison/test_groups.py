@@ -67,6 +67,13 @@ def test_a_setting_that_a_learner_lacks_is_no_difference(tmp_path):
     assert not any("learner.batch_size" in note for note in notes)
 
 
+def test_the_settings_that_come_with_a_learner_do_not_name_a_group(tmp_path):
+    for name, change in enumerate(("learner=mappo", "learner.clip=0.1", "learner=ddpg")):
+        write_run(tmp_path, "consensus", name=f"{name}", overrides=("setup=strong", change))
+    labels = [group.label for group in only(tmp_path).section.groups]
+    assert labels == ["consensus", "consensus (learner.clip=0.1)", "consensus (learner=ddpg)"]
+
+
 def test_a_policy_with_the_same_number_for_most_groups_names_the_others_only():
     few, most = Scripted(["a"], 1.0), Scripted(["b", "c", "d"], 2.0)
     ranking = Ranking("coverage", True, [], {"follow_target": [most, few]}, "")
