@@ -16,20 +16,26 @@ from emberlink.envs.config import WildfireConfig
 
 @dataclass(frozen=True, kw_only=True, config=ConfigDict(extra="forbid", strict=True))
 class PositionalConfig:
-    """No settings."""
+    """The settings under `comm`."""
+
+    own_first: bool = False
+    """whether the vectors begin with the UAV's own one, and that of UAV 0 follows the last one"""
 
 
 class Positional(CommModule):
-    """Concatenates the vectors of all UAVs, UAV 0 first, for every UAV: 6 n numbers.
+    """Concatenates the vectors of all UAVs for every UAV: 6 n numbers.
 
-    With a radio of unlimited range, all UAVs observe the same numbers in the same order, as in
-    algorithm 2. The vector of a UAV that is not heard is replaced by zeros.
+    UAV 0 is first. With a radio of unlimited range, all UAVs then observe the same numbers in the
+    same order, as in algorithm 2. With `own_first`, the UAV itself is first. The vector of a UAV
+    that is not heard is replaced by zeros.
     """
 
     config_type: ClassVar[type] = PositionalConfig
     hears: ClassVar[bool] = True
 
     _own: Tensor
+    _order: Tensor
+    """int64 [n, n]: the UAVs whose vectors each UAV (row) observes, in their order"""
 
     def __init__(self, world: WildfireConfig, config: PositionalConfig, num_envs: int = 1):
         super().__init__(world, config, num_envs)
@@ -37,6 +43,10 @@ class Positional(CommModule):
         self.in_keys = inputs
         own = torch.eye(world.num_uavs, dtype=torch.bool)
         self.register_buffer("_own", own, persistent=False)
+        order = torch.arange(world.num_uavs).repeat(world.num_uavs, 1)
+        if config.own_first:
+            order = (order + order.mT) % world.num_uavs
+        self.register_buffer("_order", order, persistent=False)
 
     def specs(self, observation: Composite) -> Composite:
         *batch, uavs, features = observation[keys.OBSERVATION].shape
@@ -50,6 +60,8 @@ class Positional(CommModule):
         vectors = tensordict.get(keys.OBSERVATION)
         known = (tensordict.get(keys.HEARS) | self._own).unsqueeze(-1)
         joined = torch.where(known, vectors.unsqueeze(-3), 0.0)
+        if self.config.own_first:
+            joined = joined.take_along_dim(self._order.unsqueeze(-1), -2)
         return tensordict.set(keys.OBSERVATION, joined.flatten(-2))
 
     def bytes_sent(self, tensordict: TensorDictBase) -> Tensor:

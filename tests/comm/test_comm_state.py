@@ -228,6 +228,22 @@ def test_links_are_written_once(limit, loss):
         assert 0.3 < 1 - hears.sum() / near.sum() < 0.5
 
 
+def test_a_uav_observes_its_own_vector_first():
+    """Without limit, in turn: those of UAVs 1, 2, …, 0 for UAV 1; what is not heard is 0."""
+    for reach in (float("inf"), 4.0):
+        world = replace(WORLD, radio=RadioConfig(range=reach))
+        own = TransformedEnv(
+            bare(), Communication(Positional(world, PositionalConfig(own_first=True), ENVS))
+        )
+        usual = TransformedEnv(bare(), Communication(Positional(world, PositionalConfig(), ENVS)))
+        mine, theirs = own.reset()[keys.OBSERVATION], usual.reset()[keys.OBSERVATION]
+        for uav in range(UAVS):
+            for place in range(UAVS):
+                other = (uav + place) % UAVS
+                shown = mine[:, uav, 6 * place : 6 * place + 6]
+                assert shown.equal(theirs[:, uav, 6 * other : 6 * other + 6])
+
+
 def test_positional_links_all_uavs():
     world = replace(WORLD, radio=RadioConfig(range=float("inf")))
     env = TransformedEnv(bare(), Communication(Positional(world, PositionalConfig(), ENVS)))
