@@ -35,7 +35,7 @@ class Positional(CommModule):
 
     _own: Tensor
     _order: Tensor
-    """int64 [n, n]: the UAVs whose vectors each UAV (row) observes, in their order"""
+    """int64 [n * n]: of all pairs of an observer and a UAV, numbered in order, the order shown"""
 
     def __init__(self, world: WildfireConfig, config: PositionalConfig, num_envs: int = 1):
         super().__init__(world, config, num_envs)
@@ -43,10 +43,9 @@ class Positional(CommModule):
         self.in_keys = inputs
         own = torch.eye(world.num_uavs, dtype=torch.bool)
         self.register_buffer("_own", own, persistent=False)
-        order = torch.arange(world.num_uavs).repeat(world.num_uavs, 1)
-        if config.own_first:
-            order = (order + order.mT) % world.num_uavs
-        self.register_buffer("_order", order, persistent=False)
+        uav = torch.arange(world.num_uavs)
+        order = world.num_uavs * uav.unsqueeze(-1) + (uav.unsqueeze(-1) + uav) % world.num_uavs
+        self.register_buffer("_order", order.flatten(), persistent=False)
 
     def specs(self, observation: Composite) -> Composite:
         *batch, uavs, features = observation[keys.OBSERVATION].shape
@@ -61,7 +60,8 @@ class Positional(CommModule):
         known = (tensordict.get(keys.HEARS) | self._own).unsqueeze(-1)
         joined = torch.where(known, vectors.unsqueeze(-3), 0.0)
         if self.config.own_first:
-            joined = joined.take_along_dim(self._order.unsqueeze(-1), -2)
+            pairs = joined.flatten(-3, -2).index_select(-2, self._order)
+            joined = pairs.unflatten(-2, joined.shape[-3:-1])
         return tensordict.set(keys.OBSERVATION, joined.flatten(-2))
 
     def bytes_sent(self, tensordict: TensorDictBase) -> Tensor:

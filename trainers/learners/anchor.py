@@ -1,12 +1,34 @@
-"""Draws learned policies towards the policy that they started from."""
+"""Draws learned policies towards the policies that they started from, those of another run."""
 
 import copy
 from typing import Any
 
 import torch
+from pydantic import model_validator
+from pydantic.dataclasses import dataclass
 from torch import Tensor, nn
 
 from emberlink.envs.utils.errors import UserError
+from emberlink.trainers.learners.base import STRICT, LearnerConfig, NotNegative
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class WarmStartConfig(LearnerConfig):
+    """The settings of learners that can begin with the actors of another run."""
+
+    warm_start: str = ""
+    """run folder, or `pretrained:…`, whose actors the run begins with; none if empty"""
+    anchor: NotNegative = 0.0
+    """weight of the distance to the actions of `warm_start`; it falls linearly to 0 at the end"""
+
+    @model_validator(mode="after")
+    def _an_anchor_has_a_start(self) -> "WarmStartConfig":
+        if self.anchor and not self.warm_start:
+            raise UserError(
+                f"anchor={self.anchor:g}: needs warm_start, the run whose actions the actors stay "
+                "near to"
+            )
+        return self
 
 
 class Anchor:
@@ -26,16 +48,7 @@ class Anchor:
 
     @classmethod
     def of(cls, network: nn.Module, config: Any, device: torch.device | str) -> "Anchor | None":
-        """Returns the anchor of a learner with settings `warm_start` and `anchor`; None without.
-
-        Raises:
-            UserError: there is an anchor, but no run whose actors it keeps.
-        """
-        if config.anchor and not config.warm_start:
-            raise UserError(
-                f"learner.anchor={config.anchor:g}: needs learner.warm_start, the run whose "
-                "actions the actors stay near to"
-            )
+        """Returns the anchor of a learner with settings `warm_start` and `anchor`; None without."""
         return cls(network, config.anchor, device) if config.anchor else None
 
     def advance(self, done: float) -> None:

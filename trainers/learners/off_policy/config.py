@@ -7,11 +7,12 @@ from pydantic.dataclasses import dataclass
 
 from emberlink.envs.utils.errors import UserError
 from emberlink.policies.exploration import ExplorationConfig
-from emberlink.trainers.learners.base import STRICT, Count, LearnerConfig, NotNegative, Positive
+from emberlink.trainers.learners.anchor import WarmStartConfig
+from emberlink.trainers.learners.base import STRICT, Count, NotNegative, Positive
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
-class OffPolicyConfig(LearnerConfig):
+class OffPolicyConfig(WarmStartConfig):
     """The settings of learners with a replay buffer and target networks."""
 
     gamma: Annotated[float, Field(ge=0, lt=1)]
@@ -38,10 +39,6 @@ class OffPolicyConfig(LearnerConfig):
     """whether a UAV's critic reads what the UAV observes and does, or what its team does"""
     exploration: ExplorationConfig
     """exploration noise"""
-    warm_start: str = ""
-    """run folder, or `pretrained:…`, whose actors the run begins with; none if empty"""
-    anchor: NotNegative = 0.0
-    """weight of the distance to the actions of `warm_start`; it falls linearly to 0 at the end"""
 
     @model_validator(mode="after")
     def _a_batch_fits(self) -> "OffPolicyConfig":

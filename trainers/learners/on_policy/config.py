@@ -5,11 +5,12 @@ from typing import Annotated
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
-from emberlink.trainers.learners.base import STRICT, Count, LearnerConfig, NotNegative, Positive
+from emberlink.trainers.learners.anchor import WarmStartConfig
+from emberlink.trainers.learners.base import STRICT, Count, NotNegative, Positive
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
-class OnPolicyConfig(LearnerConfig):
+class OnPolicyConfig(WarmStartConfig):
     """The settings of learners from whole episodes."""
 
     share_parameters: bool = True
@@ -32,7 +33,3 @@ class OnPolicyConfig(LearnerConfig):
     """weight of the entropy of the actions in the actors' loss"""
     log_std: Annotated[float, Field(ge=-10, le=2)] = -0.5
     """logarithm of the standard deviation of the actions at the beginning, also of a warm start"""
-    warm_start: str = ""
-    """run folder, or `pretrained:…`, whose actors the run begins with; none if empty"""
-    anchor: NotNegative = 0.0
-    """weight of the distance to the actions of `warm_start`; it falls linearly to 0 at the end"""
