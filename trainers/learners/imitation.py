@@ -6,7 +6,7 @@ from typing import Annotated, Any
 import torch
 from pydantic import Field, model_validator
 from pydantic.dataclasses import dataclass
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torchrl.data import Composite
@@ -32,8 +32,9 @@ from emberlink.trainers.learners.base import (
     Positive,
     generators,
 )
+from emberlink.trainers.learners.demonstrations import Demonstrations, DemonstrationSequences
 from emberlink.trainers.learners.off_policy.learner import OffPolicyLearner
-from emberlink.trainers.learners.off_policy.replay_buffer import ReplayMemory, arrange
+from emberlink.trainers.learners.off_policy.sequences import BEGINS
 from emberlink.trainers.learners.tensors import (
     copy_into,
     group,
@@ -62,9 +63,13 @@ class ImitationConfig(LearnerConfig):
     updates_per_step: Count
     """updates per decision of the batch of environments"""
     samples: Annotated[int, Field(ge=1, le=1_000_000)]
-    """decisions per update and UAV"""
+    """decisions per update and UAV; with a memory, rounded up to whole sequences"""
     buffer_size: Count
     """capacity of a buffer of decisions, in decisions of a UAV"""
+    sequence: Count = 16
+    """successive decisions that networks with a memory learn from"""
+    burn_in: Annotated[int, Field(ge=0, le=1_000_000)] = 16
+    """decisions before them, which prepare the memory and are not learnt from"""
 
     @model_validator(mode="after")
     def _decisions_fit(self) -> "ImitationConfig":
@@ -88,18 +93,13 @@ class Imitation(Learner):
     config_type = ImitationConfig
 
     def __init__(self, config: ImitationConfig, context: LearnerContext):
-        if context.policy.memory != "none":
-            raise UserError(
-                f"policy.memory={context.policy.memory}: learner={config.name} learns from single "
-                "decisions, without a memory"
-            )
         self.config, self.context, self.teams = config, context, len(context.seeds)
         self.guard = context.guard
         specs = context.observation_spec, context.action_spec
         self.actor = self.make_actor(config, *specs, generators(context.seeds), context.policy)
         self.explorer: Any = Mixture(self.actor, context.device)
-        sizes: dict[str, Any] = {"batch_size": config.samples, "buffer_size": config.buffer_size}
-        self.replay = Demonstrations(context, **sizes)
+        self.remembers = context.policy.memory != "none"
+        self.replay = self._make_replay()
         self.learning_starts = self.replay.learning_starts
         network: nn.Module = self.actor.module
         self.parameters = {f"actor.{name}": value for name, value in network.named_parameters()}
@@ -108,6 +108,14 @@ class Imitation(Learner):
         self.optimizer.found_inf = self.guard.bad  # pyright: ignore[reportAttributeAccessIssue]
         self._lr_scale, self._count = 1.0, 0
         self._advance(0)
+
+    def _make_replay(self) -> Demonstrations | DemonstrationSequences:
+        config = self.config
+        sizes: dict[str, Any] = {"batch_size": config.samples, "buffer_size": config.buffer_size}
+        if not self.remembers:
+            return Demonstrations(self.context, **sizes)
+        sizes |= {"sequence": config.sequence, "burn_in": config.burn_in}
+        return DemonstrationSequences(self.context, **sizes)
 
     @classmethod
     def make_actor(
@@ -157,11 +165,31 @@ class Imitation(Learner):
 
     def losses(self, batch: TensorDictBase) -> Losses:
         """Computes the loss with gradients, one number per UAV of all seeds."""
-        acted = self.actor(batch.copy())
-        # The mean of a normal distribution before it is clipped, else the action.
-        action = acted.get(MEAN) if MEAN in self.actor.out_keys else acted.get(keys.ACTION)
+        if self.remembers:
+            action = self._remembered(batch)
+        else:
+            acted = self.actor(batch.copy())
+            # The mean of a normal distribution before it is clipped, else the action.
+            action = acted.get(MEAN) if MEAN in self.actor.out_keys else acted.get(keys.ACTION)
         loss = nn.functional.smooth_l1_loss(action, batch.get(keys.TEACHER), reduction="none")
         return {"imitation": OffPolicyLearner.mean_over_batch(loss.mean(-1), batch)}
+
+    def _remembered(self, batch: TensorDictBase) -> Tensor:
+        """Returns the actions of sequences after their burn-in, [batch, uavs, decisions, 3].
+
+        The memory is empty before the burn-in, and after it where there is none. It has no
+        gradient there.
+        """
+        observed = [batch.get(key) for key in keys.observation_keys(self.context.observation_spec)]
+        burn_in, state, actions = self.config.burn_in, None, []
+        for decision in range(burn_in + self.config.sequence):
+            if decision == burn_in and state is not None:
+                state = state.masked_fill(batch.get(BEGINS).unsqueeze(-1), 0.0)
+            with torch.set_grad_enabled(decision >= burn_in):
+                now = [x[:, :, decision] for x in observed]
+                action, state = self.actor.module.step(now, state)
+            actions.append(action)
+        return torch.stack(actions[burn_in:], 2)
 
     def scale_lr(self, scale: float) -> None:
         self._lr_scale = scale
@@ -228,19 +256,3 @@ class Mixture(TensorDictModuleBase):
         return acted.set(
             keys.ACTION, torch.where(taken.unsqueeze(-1), teacher, acted.get(keys.ACTION))
         )
-
-
-class Demonstrations(ReplayMemory):
-    """Stores what UAVs observed and what the teacher would have done; see `ReplayMemory`."""
-
-    def extend(self, rollout: TensorDictBase) -> None:
-        """Stores the decisions of a rollout, batch size [seeds * environments, decisions]."""
-        kept = [*self._keys, keys.TEACHER, *([keys.ALIVE] if self._failures else [])]
-        rows = {key[-1]: arrange(rollout.get(key), rollout.ndim, self.teams) for key in kept}
-        size = rows[keys.TEACHER[1]].shape[:2]
-        self.extend_rows(TensorDict(rows, batch_size=size, device=rollout.device))
-
-    def sample(self) -> TensorDict:
-        """Samples a batch for each UAV: batch size [batch], with the keys of a rollout."""
-        sample = self._buffer.sample()
-        return TensorDict({keys.AGENTS: sample}, batch_size=sample.shape[:1])

@@ -7,7 +7,16 @@ _REGISTRY = Registry(
     Learner,
     "emberlink.trainers.learners",
     "learner.name",
-    other_files=("anchor", "base", "nan_guard", "off_policy", "on_policy", "registry", "tensors"),
+    other_files=(
+        "anchor",
+        "base",
+        "demonstrations",
+        "nan_guard",
+        "off_policy",
+        "on_policy",
+        "registry",
+        "tensors",
+    ),
     group="emberlink.learners",
 )
 known, find = _REGISTRY.known, _REGISTRY.find

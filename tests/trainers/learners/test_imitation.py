@@ -8,7 +8,6 @@ import pytest
 import torch
 
 from emberlink.envs import keys
-from emberlink.envs.utils.errors import UserError
 from emberlink.policies.scripted.courier import Courier
 from emberlink.policies.scripted.map_greedy import MapGreedy
 from emberlink.trainers.build import build_env
@@ -33,6 +32,7 @@ SHORT = [
     *("comm.pixels=8", "policy.hold=2"),
 ]
 TINY = ["learner.samples=4", "learner.buffer_size=60"]
+MEMORY = ["policy.memory=gru", "policy.units=4", "learner.sequence=3", "learner.burn_in=2"]
 OFF_POLICY = ["learner.batch_size=4", "learner.buffer_size=60", "learner.share_parameters=true"]
 
 
@@ -174,7 +174,7 @@ def test_the_loss_falls_and_is_that_of_smooth_l1():
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["maps", *settings("imitation"), "policy.memory=gru"], "single decisions"),
+        (["maps", *settings("imitation"), "policy.memory=gru"], "learner.sequence=16: an episode"),
         (["maps", *settings("imitation"), "learner.actor_of=imitation"], "no actors of its own"),
         (["maps", *settings("imitation"), "learner.actor_of=none"], "learner.actor_of='none'"),
         (
@@ -313,12 +313,6 @@ def test_pictures_of_other_scales_are_warned_of(imitated, tmp_path):
         prepare()
 
 
-def test_a_memory_has_no_anchor():
-    more = [*OFF_POLICY, "learner.anchor=1", "learner.warm_start=x", "policy.memory=gru"]
-    with pytest.raises(UserError, match=r"needs policy.memory=none"):
-        TrainingSetup(resolve("maps", settings("ddpg", *more, "learner.sequence=2")))
-
-
 def finished(config, stop: int | None):
     trainer = Trainer(config)
     trainer.start()
@@ -330,7 +324,8 @@ def finished(config, stop: int | None):
 
 
 @pytest.mark.parametrize(
-    ("learner", "more"), [("imitation", TINY), ("ippo", []), ("ddpg", OFF_POLICY)]
+    ("learner", "more"),
+    [("imitation", TINY), ("imitation", [*TINY, *MEMORY]), ("ippo", []), ("ddpg", OFF_POLICY)],
 )
 def test_a_resumed_run_is_the_same_bit_for_bit(learner, more, imitated, tmp_path):
     if learner != "imitation":

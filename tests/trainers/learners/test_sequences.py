@@ -31,10 +31,9 @@ def made(learner: str, *more: str, method: str = "consensus") -> TrainingSetup:
     return TrainingSetup(resolve(method, [f"learner={learner}", *SMALL, *more]))
 
 
-def memory(horizon: int, envs: int, decisions: int, **more: Any) -> SequenceMemory:
-    """Returns a memory after some decisions; values are decision, environment and UAV."""
+def context(horizon: int, envs: int) -> LearnerContext:
     spec = Composite({keys.OBSERVATION: Unbounded((envs, UAVS, 3))}, shape=(envs,))
-    context = LearnerContext(
+    return LearnerContext(
         observation_spec=spec,
         action_spec=spec,
         num_uavs=UAVS,
@@ -46,7 +45,11 @@ def memory(horizon: int, envs: int, decisions: int, **more: Any) -> SequenceMemo
         device="cpu",
         horizon=horizon,
     )
-    buffer = SequenceMemory(context, **more)
+
+
+def memory(horizon: int, envs: int, decisions: int, **more: Any) -> SequenceMemory:
+    """Returns a memory after some decisions; values are decision, environment and UAV."""
+    buffer = SequenceMemory(context(horizon, envs), **more)
     for decision in range(decisions):
         where = torch.tensor([[(decision, env, uav) for uav in range(UAVS)] for env in range(envs)])
         agents = {"observation": where[:, None].float(), "action": where[:, None].float()}

@@ -13,7 +13,6 @@ from torchrl.data import Composite
 from torchrl.objectives import LossModule, SoftUpdate, group_optimizers
 
 from emberlink.envs import keys
-from emberlink.envs.utils.errors import UserError
 from emberlink.policies.exploration import OrnsteinUhlenbeck
 from emberlink.policies.gaussian import MemoryActor
 from emberlink.policies.networks import STATE_ACTION_VALUE, Generators, build
@@ -31,7 +30,7 @@ from emberlink.trainers.learners.off_policy.config import OffPolicyConfig
 from emberlink.trainers.learners.off_policy.networks import SequenceActor, with_taken
 from emberlink.trainers.learners.off_policy.networks import critics as make_critics
 from emberlink.trainers.learners.off_policy.replay_buffer import DONE, TERMINATED, ReplayMemory
-from emberlink.trainers.learners.off_policy.sequences import SequenceMemory
+from emberlink.trainers.learners.off_policy.sequences import BEGINS, SequenceMemory
 from emberlink.trainers.learners.tensors import (
     copy_into,
     group,
@@ -51,11 +50,9 @@ class OffPolicyLearner(Learner):
     def __init__(self, config: OffPolicyConfig, context: LearnerContext):
         self.config, self.teams = config, len(context.seeds)
         self._observed: list[Any] = keys.observation_keys(context.observation_spec)
-        self.guard = context.guard
+        self.guard, self._remembers = context.guard, context.policy.memory != "none"
         self.loss = self.make_loss(context, generators(context.seeds))
         self.anchor = Anchor.of(self.actor.module, config, context.device)
-        if self.anchor is not None and context.policy.memory != "none":
-            raise UserError(f"learner.anchor: learner={config.name} needs policy.memory=none")
         self.loss.set_keys(
             state_action_value=STATE_ACTION_VALUE,
             reward=keys.REWARD,
@@ -86,7 +83,7 @@ class OffPolicyLearner(Learner):
             "buffer_size": config.buffer_size,
             "joint": config.critic == "team",
         }
-        if context.policy.memory == "none":
+        if not self._remembers:
             return ReplayMemory(context, **sizes)
         lengths = {"sequence": config.sequence, "burn_in": config.burn_in}
         return SequenceMemory(context, **sizes, **lengths)
@@ -218,11 +215,13 @@ class OffPolicyLearner(Learner):
 
     def _distance(self, anchor: Anchor, batch: TensorDictBase) -> Tensor:
         """Returns the mean distance of each UAV's actions to those of the anchor, [uavs]."""
-        observed = [batch.get(key) for key in self._observed]
+        inputs: list[Any] = [batch.get(key) for key in self._observed]
+        if self._remembers:
+            inputs = [inputs, batch.get(BEGINS), self.config.burn_in, self.config.sequence]
         with torch.no_grad():
-            theirs = anchor.network(*observed)
+            theirs = anchor.network(*inputs)
         network: Any = self.actor.module
-        return self.mean_over_batch(anchor.loss(network(*observed), theirs), batch)
+        return self.mean_over_batch(anchor.loss(network(*inputs), theirs), batch)
 
     def start_from(self, weights: Mapping[str, Tensor]) -> None:
         """Begins with the actors of another run, and target actors like them."""
