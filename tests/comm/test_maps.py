@@ -149,6 +149,27 @@ def test_a_disconnected_uav_learns_nothing_and_in_contact_everything():
         assert (td[keys.BYTES_SENT][0] <= 16 + 5 * (known + 40 * 25)).all()
 
 
+def test_with_losses_and_a_limit_nothing_comes_from_a_uav_out_of_range():
+    """Two UAVs talk; in two worlds, a third one flies elsewhere, over another fire."""
+    pair, steps = [[5.0, 5.0, 3.0], [8.0, 7.0, 3.0]], 30
+    near, talk = burning()[..., :14, :], random_flight(steps, 2, seed=1)
+    flights = []
+    for other, seed in (([25.0, 25.0, 3.0], 2), ([24.0, 20.0, 3.0], 3)):
+        position = torch.tensor([[*pair, other]])
+        actions = torch.cat((talk, random_flight(steps, 1, seed=seed)), 2)
+        actions[..., :2] *= 0.3
+        fire = torch.cat((near, burning(seed)[..., 14:, :]), -2)
+        limited = RadioConfig(range=8.0, loss=0.5, bandwidth=60)
+        flights.append(fly(environment(fire, position, radio=limited), position, actions))
+    for one, two in zip(*flights, strict=True):
+        assert not one[keys.HEARS][0, 2].any()
+        for key in (*OBSERVED, keys.BYTES_SENT):
+            assert one[key][0, :2].equal(two[key][0, :2])
+    heard = torch.stack([td[keys.HEARS][0, 0, 1] for td in flights[0]])
+    assert 0.2 < heard.double().mean() < 0.8
+    assert not flights[0][-1][keys.CROPS][0, 2].equal(flights[1][-1][keys.CROPS][0, 2])
+
+
 def test_without_a_radio_nothing_is_said():
     position = torch.tensor([[[10.0, 10.0, 3.0], [11.0, 10.0, 3.0]]])
     env = environment(burning(), position, radio=RadioConfig(range=0.0))
