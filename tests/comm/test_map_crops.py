@@ -16,9 +16,9 @@ HORIZON = 400
 def draw(grid, known, seen, step, centre, others, base, **more) -> torch.Tensor:
     """Draws the pictures of one UAV."""
     crops = Crops(grid, horizon=HORIZON, **more)
-    points = torch.tensor([[cell for cell, _ in others]]).view(1, -1, 2)
-    heard = torch.tensor([[when for _, when in others]]).view(1, -1)
-    station = torch.tensor([[base]] if base else []).view(1, -1, 2)
+    points = torch.tensor([[cell for cell, _ in others]]).view(1, -1, 2).long()
+    heard = torch.tensor([[when for _, when in others]]).view(1, -1).long()
+    station = torch.tensor([[base]] if base else []).view(1, -1, 2).long()
     given = known[None], seen[None], torch.tensor([step]), torch.tensor([centre])
     return crops.draw(*given, (points, heard, station))[0]
 
@@ -90,9 +90,8 @@ def test_beyond_the_horizon_what_was_never_seen_stays_so():
     known = torch.full((9, 9), -1)
     known[4, 4], known[4, 5], known[4, 6] = 4 * 9 + 1, 4 * 9, 4 * 9 + 2
     form = {"pixels": 8, "scales": (1,), "spread": 0}
-    fire, _, out, _, age, *_ = draw(
-        (9, 9), known, known == 37, 5 * HORIZON, (4, 4), [], None, **form
-    )[0]
+    args = known, known == 37, 5 * HORIZON, (4, 4), [], None
+    fire, _, out, _, age, *_ = draw((9, 9), *args, **form)[0]
     assert fire[4, 4] == out[4, 6] == 255
     assert fire.sum() == out.sum() == 255
     assert age[4, 3] == 255
