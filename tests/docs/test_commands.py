@@ -81,7 +81,8 @@ def place(prepared, finished, tmp_path, monkeypatch) -> Path:
     shutil.copytree(finished, folder / "runs" / "one")
     monkeypatch.chdir(folder)
     monkeypatch.syspath_prepend(str(folder))
-    monkeypatch.setenv("EMBERLINK_CONFIGS", "mine")
+    # The same folder for all commands, so that each choice of files is composed once.
+    monkeypatch.setenv("EMBERLINK_CONFIGS", str(prepared / "mine"))
     monkeypatch.setattr(bootstrap, "RESAMPLES", 200)
     return folder
 
