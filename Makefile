@@ -13,8 +13,10 @@ VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/emberlink-installed
 UNFINISHED := $(VENV)/emberlink-unfinished
-# Python compiles a module when it is first imported; to compile all at once takes half a minute.
-PIP := $(BIN)/python -m pip install -q --no-compile --disable-pip-version-check -c constraints.txt
+PIP := $(BIN)/python -m pip install -q --disable-pip-version-check -c constraints.txt
+# Python keeps compiled modules, also where it is told not to, as in many containers: to compile torch takes each process
+# ten seconds.
+export PYTHONDONTWRITEBYTECODE :=
 
 .DEFAULT_GOAL := help
 .PHONY: help demo test test-slow test-cluster soak bench guard lint typecheck docs install browser clean
