@@ -13,7 +13,8 @@ VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/emberlink-installed
 UNFINISHED := $(VENV)/emberlink-unfinished
-PIP := $(BIN)/python -m pip install -q --disable-pip-version-check -c constraints.txt
+# Python compiles a module when it is first imported; to compile all at once takes a minute.
+PIP := $(BIN)/python -m pip install -q --no-compile --disable-pip-version-check -c constraints.txt
 # Python keeps compiled modules, also where it is told not to, as in many containers: to compile torch takes each process
 # ten seconds.
 export PYTHONDONTWRITEBYTECODE :=
