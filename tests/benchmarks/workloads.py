@@ -17,6 +17,7 @@ from emberlink.envs import keys
 from emberlink.envs.wildfire import WildfireEnv
 from emberlink.trainers import make_env
 from emberlink.trainers.config.compose import resolve
+from emberlink.trainers.rollout.products import fast_products
 from emberlink.trainers.training.setup import TrainingSetup
 
 METHODS = known("method")
@@ -81,6 +82,16 @@ def matrix_product(device: str = "cpu") -> Callable[[], object]:
     """Returns a function with 2048^3 multiply-adds in float32, to measure the machine's peak."""
     a, b = (torch.randn(MATRIX, MATRIX, device=device) for _ in range(2))
     return lambda: a @ b
+
+
+def with_fast_products(work: Callable[[], object]) -> Callable[[], object]:
+    """Returns the function with its products computed as those of a training's updates."""
+
+    def fast() -> None:
+        with fast_products():
+            work()
+
+    return fast
 
 
 MATRIX_FLOPS = 2 * MATRIX**3

@@ -17,6 +17,7 @@ from emberlink.trainers.learners.nan_guard import NonFiniteGuard
 from emberlink.trainers.learners.tensors import copy_into, flatten, group, prefixed, unflatten
 from emberlink.trainers.rollout.allocator import keep_freed_memory
 from emberlink.trainers.rollout.collector import make_collector
+from emberlink.trainers.rollout.products import fast_products
 from emberlink.trainers.training.episode import EpisodeRecord
 
 
@@ -83,7 +84,9 @@ class TrainingSetup:
         self.step += steps
         self.guard.record_rollout(rollout.select(*self._checked), steps)
         transitions = decisions(rollout, self.config.policy.hold)
-        self.record.add(rollout, self.learner.learn(transitions))
+        with fast_products():
+            losses = self.learner.learn(transitions)
+        self.record.add(rollout, losses)
 
     def dry_run(self, steps: int) -> None:
         """Collects and learns for some steps without writing files."""
