@@ -3,6 +3,8 @@
 PYTHON ?= python3
 # number of parallel test processes, with one thread each
 WORKERS ?= 2
+# which tests `make test` runs, as pytest's -m; empty for all
+TESTS ?= not slow
 # threads of the demo: its small networks gain little from a second thread, and two threads are very
 # slow if another process uses a core
 THREADS ?= 1
@@ -30,7 +32,7 @@ demo: $(INSTALLED)  ## train consensus for a few minutes and evaluate it, with f
 
 # Tests of a file run in one process, since they share trainings.
 test: $(INSTALLED)  ## run the tests, without the slow ones (about 5 minutes)
-	@OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n $(WORKERS) --dist loadfile -m "not slow"
+	@OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n $(WORKERS) --dist loadfile -m "$(TESTS)"
 
 test-slow: $(INSTALLED) browser  ## run the slow tests (about 5 minutes)
 	@OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n $(WORKERS) --dist loadfile -m slow
