@@ -39,6 +39,9 @@ class CommModule(Buffers, TensorDictModuleBase):
     """a pydantic dataclass: the settings under `comm` in a method's YAML file"""
     hears: ClassVar[bool] = False
     """whether the module reads `keys.HEARS`"""
+    hold: int = 1
+    """steps from one decision of the policy to the next (`policy.hold`); between them, no policy
+    reads observations"""
 
     def __init__(self, world: WildfireConfig, config: Any, num_envs: int = 1):
         super().__init__()

@@ -42,8 +42,6 @@ class MapsConfig:
     home: Annotated[float, Field(ge=0, le=1)] = 0.0
     """share of the radio's range between places of a chain from the base to the fire; with more
     than 0, a UAV also observes the way to its place, and what it can fly beyond it"""
-    period: Annotated[int, Field(ge=1, le=1_000_000)] = 1
-    """steps from one drawing of the pictures to the next; those of `policy.hold` suffice"""
 
 
 class Maps(CommModule):
@@ -168,7 +166,7 @@ class Maps(CommModule):
     def _draw(self, tensordict: TensorDictBase) -> None:
         """Draws the pictures of the environments in which they are due, and looks for home."""
         step = tensordict.get(keys.STEP)
-        due = step % self.config.period == 0
+        due = step % self.hold == 0
         if due.is_cuda:  # The environments would have to be read from the device.
             env = torch.arange(len(step), device=step.device)
         else:

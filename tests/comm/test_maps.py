@@ -13,11 +13,12 @@ from emberlink.envs.utils.errors import UserError
 from emberlink.envs.wildfire import WildfireEnv
 from emberlink.policies.scripted.map_greedy import MapGreedy
 from emberlink.trainers import make_env
+from emberlink.trainers.config.compose import resolve
 
 OBSERVED = (keys.OBSERVATION, keys.CROPS)
 
 
-def environment(fire, position, *, config=None, **world) -> TransformedEnv:
+def environment(fire, position, *, config=None, hold=1, **world) -> TransformedEnv:
     """Returns an environment and resets it with given positions, [envs, n, 3]."""
     envs, uavs, _ = position.shape
     grid = tuple(fire.shape[-2:])
@@ -25,6 +26,7 @@ def environment(fire, position, *, config=None, **world) -> TransformedEnv:
     world = WildfireConfig(displacement=1.0, measures="all", **more)
     env = WildfireEnv(envs, world, fire, seed=3)
     module = Maps(world, config or MapsConfig(pixels=8, scales=(1, 2)), envs)
+    module.hold = hold
     return TransformedEnv(env, Communication(module))
 
 
@@ -233,11 +235,19 @@ def test_a_batch_equals_single_environments():
 
 def test_pictures_are_drawn_when_they_are_due():
     every = flight_of(range(4))
-    some = flight_of(range(4), config=MapsConfig(pixels=8, scales=(1, 2), period=5))
+    some = flight_of(range(4), hold=5)
     for step, (one, two) in enumerate(zip(every, some, strict=True)):
         drawn = every[step - step % 5]
         assert two[keys.CROPS].equal(drawn[keys.CROPS])
         assert one[keys.OBSERVATION].equal(two[keys.OBSERVATION])
+
+
+def test_pictures_follow_the_hold_of_the_policy():
+    env = make_env("maps", "tuned", **{"policy.hold": 4})
+    assert env.transform.module.hold == 4
+    config = resolve("maps", ["setup=tuned"], hold=3)
+    assert make_env(config).transform.module.hold == 3
+    assert make_env(config, hold=2).transform.module.hold == 2
 
 
 def test_failed_uavs_neither_see_nor_hear():

@@ -183,7 +183,9 @@ class RunConfig:
 def build_comm(config: RunConfig, num_envs: int) -> CommModule:
     """Returns a new communication module for `num_envs` environments."""
     settings = {key: value for key, value in config.comm.items() if key != "name"}
-    return registry.build(config.comm["name"], config.env, settings, num_envs)
+    module = registry.build(config.comm["name"], config.env, settings, num_envs)
+    module.hold = config.policy.hold
+    return module
 
 
 def _completed(key: str, given: dict[str, Any]) -> dict[str, Any]:

@@ -136,8 +136,7 @@ def test_maps_differ_from_the_other_methods_in_listed_settings(setup):
     tuned = {"env.reward.new_fire", "policy.hold", *CORRELATED}
     assert differ == own | (tuned if setup == "tuned" else set())
     assert (maps.comm["name"], maps.replay, maps.env.observation) == ("maps", "shared", "sight")
-    assert maps.comm["period"] == maps.policy.hold == (10 if setup == "tuned" else 1)
-    assert resolve("maps", ["policy.hold=5"]).comm["period"] == 5
+    assert maps.policy.hold == (10 if setup == "tuned" else 1)
 
 
 def test_paper_is_the_default():
