@@ -8,6 +8,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.data import Composite
+from torchrl.envs.utils import ExplorationType, exploration_type
 
 from emberlink.envs import keys
 from emberlink.envs.utils import counter_rng
@@ -62,7 +63,8 @@ class GaussianExplorer(TensorDictModuleBase):
     """Draws actions from the actors' distributions and writes their log-probabilities.
 
     Random numbers come from each environment's random key, as in `OrnsteinUhlenbeck`. Actions are
-    not clipped; the environment does that.
+    not clipped; the environment does that. If exploration is off
+    (`torchrl.envs.set_exploration_type`), the actions are those of the actors.
 
     Args:
         actor: the actors of all UAVs.
@@ -76,7 +78,10 @@ class GaussianExplorer(TensorDictModuleBase):
         self.in_keys, self.out_keys = reads, writes
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        mean = self.actor(tensordict).get(MEAN)
+        self.actor(tensordict)
+        if exploration_type() not in (None, ExplorationType.RANDOM):
+            return tensordict
+        mean = tensordict.get(MEAN)
         step = tensordict.get(keys.STEP)
         key = counter_rng.step_key(tensordict.get(keys.RNG_KEY), step, Use.EXPLORATION_NOISE)
         normal = counter_rng.normal(key, mean.shape[-2] * mean.shape[-1]).view_as(mean)

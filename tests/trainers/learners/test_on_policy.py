@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 import torch
 from torch import Tensor
-from torchrl.envs import check_env_specs
+from torchrl.envs import ExplorationType, check_env_specs, set_exploration_type
 
 from emberlink.envs import keys
 from emberlink.envs.utils.errors import UserError
@@ -32,6 +32,32 @@ SMALL = [
 
 def made(learner: str, *more: str, method: str = "consensus") -> TrainingSetup:
     return TrainingSetup(resolve(method, ["setup=tuned", f"learner={learner}", *SMALL, *more]))
+
+
+@pytest.mark.parametrize(
+    ("learner", "shared", "actor", "critic"),
+    [
+        *[(learner, "true", 22, 22) for learner in LEARNERS],
+        ("ippo", "false", 66, 66),
+        ("mappo", "false", 66, 22),  # one critic per team
+    ],
+)
+def test_a_loss_is_a_mean_over_the_uavs_of_a_network(learner, shared, actor, critic):
+    setup = made(learner, f"learner.share_parameters={shared}", "seeds=[0,1]")
+    loss = torch.tensor([1.0, 2.0, 3.0, 10.0, 20.0, 30.0])
+    trained: Any = setup.learner
+    assert trained._of_networks("actor", loss).item() == actor
+    assert trained._of_networks("critic", loss).item() == critic
+
+
+def test_actions_have_no_noise_if_exploration_is_off():
+    setup = made("ippo")
+    td = setup.env.reset()
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        explored = setup.learner.explorer(td.clone())
+    learner: Any = setup.learner
+    assert explored[keys.ACTION].equal(learner.actor(td.clone())[keys.ACTION])
+    assert not setup.learner.explorer(td.clone())[keys.ACTION].equal(explored[keys.ACTION])
 
 
 def column(*values: float) -> Tensor:

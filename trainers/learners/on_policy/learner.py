@@ -1,5 +1,6 @@
 """Defines the base class of learners from whole episodes (IPPO, MAPPO)."""
 
+import math
 from abc import abstractmethod
 from collections.abc import Iterator, Mapping
 from typing import Any
@@ -66,6 +67,8 @@ class OnPolicyLearner(Learner):
             config, context.observation_spec, context.action_spec, new, context.policy
         )
         self.critic: Any = self.make_critic(context, new)
+        self._critics = len(next(self.critic.module.parameters()))
+        """number of critics of all seeds"""
         self._set_log_std()
         self.explorer = GaussianExplorer(self.actor)
         self.loss = make_loss(
@@ -186,8 +189,7 @@ class OnPolicyLearner(Learner):
         batch = batch.copy().auto_batch_size_(1)
         self.guard.record_batch(batch)
         losses = self.losses(batch)
-        every = torch.stack([*losses.values()]).unflatten(-1, self._of_groups)
-        every.mean(-1).sum().backward()
+        torch.stack([self._of_networks(*item) for item in losses.items()]).sum().backward()
         losses = {name: value.detach() for name, value in losses.items()}
         gradients = {name: v.grad for name, v in self.parameters.items() if v.grad is not None}
         self.guard.check_gradients(losses, gradients)
@@ -200,11 +202,15 @@ class OnPolicyLearner(Learner):
         self.optimizer.zero_grad()
         return losses
 
-    @property
-    def _of_groups(self) -> tuple[int, int]:
-        """Shape that splits the UAVs of all seeds by network: the loss of one is a mean."""
-        teams, networks = self._groups
-        return teams * networks, self.context.num_uavs // networks
+    def _of_networks(self, name: str, loss: Tensor) -> Tensor:
+        """Returns the sum of the losses of all networks, each the mean over its UAVs.
+
+        Args:
+            name: "critic", or another name for a loss of the actors.
+            loss: [seeds * uavs].
+        """
+        networks = self._critics if name == "critic" else math.prod(self._groups)
+        return loss.unflatten(-1, (networks, -1)).mean(-1).sum()
 
     def losses(self, batch: TensorDictBase) -> Losses:
         """Computes the losses with gradients, one number per UAV of all seeds."""
