@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+_UNSET = "none"
 _SIZE = 256
 _TOLERANCE = 1e-5
 """largest error of a float32 product over the largest entry; that of bfloat16 is above 1e-3"""
@@ -20,24 +21,28 @@ def fast_products() -> Iterator[None]:
     By default, torch computes them with MKL, which does not use AVX-512 on processors of AMD;
     oneDNN does. torch hands float32 products to oneDNN only with the permission to round inputs to
     bfloat16. oneDNN rounds them on processors with AMX units, and computes in float32 on others.
-    The permission is given only if an example shows no rounding, and withdrawn after the block.
+    The permission is given only if an example shows no rounding, and withdrawn after the block. A
+    precision that the program has chosen itself (`torch.set_float32_matmul_precision`,
+    `torch.backends.mkldnn`) is kept.
     """
-    if not _stays_float32():
+    if _settings().fp32_precision != _UNSET or not _stays_float32():
         yield
         return
     with _permitted():
         yield
 
 
+def _settings() -> Any:
+    return torch.backends.mkldnn.matmul  # pyright: ignore[reportAttributeAccessIssue]
+
+
 @contextmanager
 def _permitted() -> Iterator[None]:
-    settings: Any = torch.backends.mkldnn.matmul  # pyright: ignore[reportAttributeAccessIssue]
-    before = settings.fp32_precision
-    settings.fp32_precision = "bf16"
+    _settings().fp32_precision = "bf16"
     try:
         yield
     finally:
-        settings.fp32_precision = before
+        _settings().fp32_precision = _UNSET
 
 
 @cache

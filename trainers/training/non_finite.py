@@ -13,6 +13,7 @@ from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.publish import free_name
 from emberlink.trainers.learners.nan_guard import ROLLOUT
 from emberlink.trainers.learners.tensors import flatten, group, prefixed, unflatten
+from emberlink.trainers.rollout.products import fast_products
 from emberlink.trainers.runs import checkpoint_file
 from emberlink.trainers.runs.run_folder import RunFolder
 from emberlink.trainers.runs.versions import versions
@@ -214,5 +215,6 @@ def replay(dump: Path | str, device: str = "cpu") -> NonFiniteReport | None:
     if rollout:
         setup.guard.record_rollout(bad, bad.shape[1])
     else:
-        setup.learner.update(bad)
+        with fast_products():  # as in the training
+            setup.learner.update(bad)
     return report_of(setup) if setup.guard.poll(wait=True) else None
