@@ -12,7 +12,7 @@ from emberlink.envs.config import Number
 
 @dataclass(frozen=True, kw_only=True, config=ConfigDict(extra="forbid", strict=True))
 class HeadingConfig:
-    """The settings of the bonus for flying towards the target; the defaults are the paper's."""
+    """Stores the settings of the bonus for flying to the target; the defaults are the paper's."""
 
     form: Literal["folded_linear", "folded_exponential", "linear", "approach"] = "folded_linear"
     """the formula, a key of `HEADING_FORMS`"""

@@ -26,7 +26,7 @@ RECORD_BYTES = 16
 
 @dataclass(frozen=True, kw_only=True, config=ConfigDict(extra="forbid", strict=True))
 class ConsensusConfig:
-    """The settings of method 4; the defaults are the paper's text."""
+    """Stores the settings of method 4; the defaults are the paper's text."""
 
     discoverer: Literal["new_fire", "any_fire"] = "new_fire"
     """condition for being a discoverer: seeing new fire, or any fire"""

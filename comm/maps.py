@@ -25,7 +25,7 @@ _NEAR = 10.0  # cells; unit of the way home, which is clipped beyond it
 
 @dataclass(frozen=True, kw_only=True, config=ConfigDict(extra="forbid", strict=True))
 class MapsConfig:
-    """The settings under `comm`."""
+    """Stores the settings under `comm`."""
 
     pixels: Annotated[int, Field(ge=8, le=64)] = 24
     """pixels along the side of a picture"""

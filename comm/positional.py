@@ -16,7 +16,7 @@ from emberlink.envs.config import WildfireConfig
 
 @dataclass(frozen=True, kw_only=True, config=ConfigDict(extra="forbid", strict=True))
 class PositionalConfig:
-    """The settings under `comm`."""
+    """Stores the settings under `comm`."""
 
     own_first: bool = False
     """whether the vectors begin with the UAV's own one, and that of UAV 0 follows the last one"""

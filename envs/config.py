@@ -46,7 +46,8 @@ class RadioConfig:
     loss: Annotated[float, Field(ge=0, le=1)] = 0.0
     """probability that a radio does not hear another one in a step, each direction independently"""
     bandwidth: Annotated[int, Field(ge=0, le=1_000_000_000)] | None = None
-    """bytes that a UAV can say in a step, for methods that heed it; None for no limit"""
+    """bytes that a UAV can say to other UAVs in a step, for methods that heed it; None for no
+    limit"""
 
 
 BASE_SIDE = 30

@@ -16,11 +16,20 @@ from emberlink.trainers.training.resume import resume
 from emberlink.trainers.training.trainer import Trainer
 
 HORIZON, EPISODES, EVERY = 20, 4, 3
-SMALL = [
+BASE = [
     *(f"env.horizon={HORIZON}", "env.num_uavs=2", "num_envs=2", f"checkpoint_steps={EVERY}"),
-    *("learner.hidden=[8,8]", "learner.batch_size=16", "learner.buffer_size=60", "fire=paper"),
-    *("evaluation.interval=0", "evaluation.episodes=1", "keep_checkpoints=3"),
+    *("learner.hidden=[8,8]", "fire=paper", "keep_checkpoints=3"),
+    *("evaluation.interval=0", "evaluation.episodes=1"),
 ]
+REPLAY = ["learner.batch_size=16", "learner.buffer_size=60"]
+SMALL = [*BASE, *REPLAY]
+SEQUENCES = [*REPLAY, "policy.memory=gru", "learner.sequence=4", "learner.burn_in=2"]
+LEARNERS = {
+    "ddpg": REPLAY,
+    "td3": SEQUENCES,
+    "ippo": ["policy.memory=gru"],
+    "mappo": ["policy.memory=stack", "policy.hold=2"],
+}
 METHODS = ("independent", "shared_memory", "positional", "consensus")
 
 
@@ -116,8 +125,9 @@ def watch_saves(say: Callable[[str], None], die_at: tuple[str, int] | None) -> N
     Trainer.save = saying
 
 
-def training(method: str, output: Path, die_at: tuple[str, int] | None = None):
+def training(method: str, learner: str, output: Path, die_at: tuple[str, int] | None = None):
     """Starts a run, or resumes an existing one, and trains to the end."""
+    settings = [*BASE, f"learner={learner}", *LEARNERS[learner], f"episodes={EPISODES}"]
 
     def work(say: Callable[[str], None]) -> int:
         watch_saves(say, die_at)
@@ -125,7 +135,7 @@ def training(method: str, output: Path, die_at: tuple[str, int] | None = None):
         if runs:
             trainer = resume(runs[0].parent)
         else:
-            trainer = Trainer(resolve(method, [*SMALL, f"episodes={EPISODES}", f"output={output}"]))
+            trainer = Trainer(resolve(method, [*settings, f"output={output}"]))
             trainer.start()
         say(f"at {trainer.setup.step} {','.join(temporary(output))}")
         trainer.train()
@@ -138,12 +148,13 @@ PARTS = ("save_file", "_digest", "fsync", "replace", "sync", "unlink")
 
 
 def kill_until_finished(
-    method: str, folder: Path, draw: random.Random, kills: int
+    method: str, learner: str, folder: Path, draw: random.Random, kills: int
 ) -> tuple[int, list[str]]:
     """Kills and resumes a training at random times until it has finished.
 
     Args:
         method: name of the method.
+        learner: name of the learner, one of `LEARNERS`.
         folder: an empty folder.
         draw: random numbers for the times.
         kills: maximum number of kills.
@@ -156,7 +167,7 @@ def kill_until_finished(
     while True:
         kind = draw.choice(("time", "save", "part")) if done < kills else "none"
         part = draw.choice(PARTS), draw.randint(1, 12)
-        child = Child(training(method, output, part if kind == "part" else None), folder)
+        child = Child(training(method, learner, output, part if kind == "part" else None), folder)
         if kind == "time":
             child.wait_for(lambda c=child: bool(c.lines()))
             time.sleep(draw.uniform(0, 0.3))
@@ -206,25 +217,32 @@ def outcome(output: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in files}
 
 
-def reference(method: str, folder: Path) -> dict[str, bytes]:
+def reference(method: str, learner: str, folder: Path) -> dict[str, bytes]:
     """Returns the outcome of an uninterrupted run."""
-    child = Child(training(method, folder / "runs"), folder)
+    child = Child(training(method, learner, folder / "runs"), folder)
     assert child.end() == 0, child.text()
     return outcome(folder / "runs")
 
 
 def kill_trials(folder: Path, kills: int, seed: int) -> tuple[int, list[str]]:
-    """Kills runs of all methods `kills` times in total; returns the number and the failures."""
+    """Kills runs of all methods with all learners `kills` times in total.
+
+    The first four runs are of all methods and all learners, the first sixteen of all pairs.
+
+    Returns:
+        The number of kills and the failures.
+    """
     draw, done, failures, number = random.Random(seed), 0, [], 0
-    references: dict[str, dict[str, bytes]] = {}
+    references: dict[tuple[str, str], dict[str, bytes]] = {}
+    most = min(8, max(1, kills // len(LEARNERS)))
     while done < kills:
-        method = METHODS[number % len(METHODS)]
-        if method not in references:
-            references[method] = reference(method, folder / f"reference_{method}")
+        recipe = METHODS[number % 4], [*LEARNERS][(number + number // 4) % 4]
+        if recipe not in references:
+            references[recipe] = reference(*recipe, folder / f"reference_{'_'.join(recipe)}")
         here = folder / f"kill_{number}"
-        killed, new = kill_until_finished(method, here, draw, min(kills - done, 8))
-        if not new and outcome(here / "runs") != references[method]:
-            new = [f"{method}: the outcome differs from that of the uninterrupted run"]
+        killed, new = kill_until_finished(*recipe, here, draw, min(kills - done, most))
+        if not new and outcome(here / "runs") != references[recipe]:
+            new = [f"{recipe}: the outcome differs from that of the uninterrupted run"]
         failures += new
         done, number = done + killed, number + 1
         shutil.rmtree(here)

@@ -84,7 +84,7 @@ def full_disk_trial(folder: Path, draw: random.Random, *, mount: bool = False) -
     method = draw.choice(METHODS)
     undisturbed = folder.parent / f"undisturbed_{method}"
     if not undisturbed.exists():
-        reference(method, undisturbed)
+        reference(method, "ddpg", undisturbed)
     expected = outcome(undisturbed / "runs")
     sizes = sorted(p.stat().st_size for p in undisturbed.rglob("state_*"))
     output, failures = folder / "disk" / "runs", []
@@ -118,7 +118,7 @@ def full_disk_trial(folder: Path, draw: random.Random, *, mount: bool = False) -
             failures.append("half a line")
         if mount:
             subprocess.run(["mount", "-o", "remount,size=100m", str(output)], check=True)
-        again = Child(training(method, output), folder)
+        again = Child(training(method, "ddpg", output), folder)
         if again.end() != 0 or outcome(output) != expected:
             failures.append(f"cannot be resumed: {again.text()}")
     finally:

@@ -2,9 +2,9 @@
 
 import threading
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from copy import deepcopy
-from dataclasses import fields, replace
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -20,13 +20,13 @@ from yaml import YAMLError
 
 from emberlink import configs
 from emberlink.envs.scenarios import fires_of
-from emberlink.envs.utils.config_files import find, place_of, read
+from emberlink.envs.utils.config_files import find, place_of
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import from_plain, plain, shown, unknown
 from emberlink.policies.scripted.registry import SCRIPTED
 from emberlink.trainers.config.overrides import all_keys, flat, full_key, parse, put
+from emberlink.trainers.config.owners import drop_settings_of_others, not_known
 from emberlink.trainers.config.schema import Baseline, RunConfig
-from emberlink.trainers.learners import registry as learners
 
 GROUPS = ("setup", "world", "fire", "learner")
 """groups whose file is chosen by `GROUP=NAME`, besides the method"""
@@ -52,7 +52,7 @@ def resolve(method: str, overrides: Sequence[str] = (), **settings: Any) -> RunC
         key: str(value) for key, value in given if key in GROUPS
     }
     values = _composed(str(method), chosen)
-    _drop_settings_of_other_learners(values["learner"])
+    drop_settings_of_others(values["learner"])
     radio = _radio(values)
     known = list(dict.fromkeys([*GROUPS, *all_keys(values)]))
     for key, value in given:
@@ -60,7 +60,7 @@ def resolve(method: str, overrides: Sequence[str] = (), **settings: Any) -> RunC
             group = key.partition(".")[0]
             raise UserError(f"{key}={shown(value)}: choose it with {group}=NAME")
         if key not in known:
-            raise UserError(_not_known(key, known, method))
+            raise UserError(not_known(key, known, method, values["learner"]["name"]))
         if key not in GROUPS:
             put(values, key, value)
     values = _interpolated(values) | {"method": method, "setup": chosen["setup"]}
@@ -247,25 +247,6 @@ def _changes(before: Mapping[str, Any], after: Mapping[str, Any]) -> dict[str, A
     return {key: value for key, value in after.items() if value != before.get(key)}
 
 
-def _drop_settings_of_other_learners(learner: Any) -> None:
-    """Removes the settings that a setup gives to another learner, such as `critic_lr` for DDPG.
-
-    A setting that no learner has stays, and is an error later.
-    """
-
-    def settings(name: str) -> set[str]:
-        return {field.name for field in fields(learners.find(name).config_type)}
-
-    if not isinstance(learner, dict) or learner.get("name") not in learners.known():
-        return
-    foreign = learner.keys() - settings(learner["name"])
-    for other in learners.known() if foreign else ():
-        # Another package's learner that cannot be imported is an error only where it is chosen.
-        with suppress(UserError):
-            for name in foreign & settings(other) & learner.keys():
-                del learner[name]
-
-
 def _choose_seed(values: dict[str, Any], seed_is_given: bool) -> None:
     """Sets `seed` to the first of `seeds`, if `seeds` is not empty.
 
@@ -277,14 +258,3 @@ def _choose_seed(values: dict[str, Any], seed_is_given: bool) -> None:
         raise UserError(f"seed={values['seed']} and seeds={seeds}: give only one of them")
     if seeds and isinstance(seeds, list):
         values["seed"] = seeds[0]
-
-
-def _not_known(key: str, known: Sequence[str], method: str) -> str:
-    """Returns a message that a method does not have a key, with the methods that have it."""
-    others = []
-    for name in configs.known("method"):
-        with suppress(UserError):  # a file that cannot be read is an error only where it is chosen
-            others += [name] if key in all_keys(read("method", name)) else []
-    if others:
-        return f"key {key!r} is a setting of method {', '.join(others)}, not of {method}"
-    return f"key {unknown(key, known, listed=False)}"

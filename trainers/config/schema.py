@@ -64,7 +64,7 @@ def _check_policies(value: tuple[str, ...]) -> tuple[str, ...]:
 
 @dataclass(frozen=True, kw_only=True, config=_STRICT)
 class EvaluationConfig:
-    """The settings of evaluations of frozen policies on held-out fires."""
+    """Stores the settings of evaluations of frozen policies on held-out fires."""
 
     episodes: Many
     """episodes of the evaluation after training, each on another test fire"""

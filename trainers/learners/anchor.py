@@ -14,7 +14,7 @@ from emberlink.trainers.learners.base import STRICT, LearnerConfig, NotNegative
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class WarmStartConfig(LearnerConfig):
-    """The settings of learners that can begin with the actors of another run."""
+    """Stores the settings of learners that can begin with the actors of another run."""
 
     warm_start: str = ""
     """run folder, or `pretrained:…`, whose actors the run begins with; none if empty"""

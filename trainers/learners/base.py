@@ -37,7 +37,7 @@ ACTOR = "actor_network_params.module."
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class LearnerConfig:
-    """The settings of all learners; the configuration of a learner inherits from it."""
+    """Stores the settings of all learners; the configuration of a learner inherits from it."""
 
     name: Name
     """name of a file in trainers/learners, or of an entry point of `emberlink.learners`"""

@@ -13,7 +13,7 @@ from emberlink.trainers.learners.off_policy import OffPolicyConfig, OffPolicyLea
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class DDPGConfig(OffPolicyConfig):
-    """The settings of DDPG."""
+    """Stores the settings of DDPG."""
 
 
 class DDPG(OffPolicyLearner):

@@ -46,7 +46,7 @@ from emberlink.trainers.learners.tensors import (
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class ImitationConfig(LearnerConfig):
-    """The settings of imitation."""
+    """Stores the settings of imitation."""
 
     share_parameters: bool = True
     """whether all UAVs of a seed use the same weights; if not, each UAV has its own"""

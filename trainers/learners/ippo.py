@@ -15,7 +15,7 @@ from emberlink.trainers.learners.on_policy.proximal import VALUE
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class IPPOConfig(OnPolicyConfig):
-    """The settings of IPPO."""
+    """Stores the settings of IPPO."""
 
 
 class IPPO(OnPolicyLearner):

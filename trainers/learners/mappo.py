@@ -15,7 +15,7 @@ from emberlink.trainers.learners.on_policy.proximal import VALUE
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class MAPPOConfig(OnPolicyConfig):
-    """The settings of MAPPO."""
+    """Stores the settings of MAPPO."""
 
     critic_map: bool = False
     """whether the critic, in training, also reads the true map: fire that a UAV has seen or none"""

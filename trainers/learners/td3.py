@@ -23,7 +23,7 @@ _CRITICS = 2
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class TD3Config(OffPolicyConfig):
-    """The settings of TD3."""
+    """Stores the settings of TD3."""
 
     policy_delay: Count
     """updates of the critics per update of the actors and the target networks"""

@@ -21,7 +21,9 @@ from emberlink.policies.scripted.registry import SCRIPTED
 class KnownMaps:
     """The maps of method `maps`, in the form in which scripted policies read maps.
 
-    A UAV knows the targets of those that it hears at a step: it has their maps and positions.
+    The policy of a UAV also knows the targets of those that it hears at a step. Without a limit of
+    bytes they follow from their maps and positions, which the UAV was told. With one
+    (`env.radio.bandwidth`), the UAV may have been told less.
 
     Args:
         maps: the communication module of the environment.
@@ -55,10 +57,10 @@ class KnownMaps:
 class Teacher(Transform):
     """Writes the actions of a scripted policy under `keys.TEACHER`, made from the maps of the UAVs.
 
-    It stands behind the communication, knows what each UAV knows and nothing else, and does not
-    change the environment. An action leads as far to the target as a UAV flies with it in the steps
-    for which actions are held. New targets are chosen whenever the UAVs decide, and if they decide
-    at each step, as often as the policy chooses them.
+    It stands behind the communication, knows what each UAV knows and the targets of those that it
+    hears (see `KnownMaps`), and does not change the environment. An action leads as far to the
+    target as a UAV flies with it in the steps for which actions are held. New targets are chosen
+    whenever the UAVs decide, and if they decide at each step, as often as the policy chooses them.
 
     Args:
         env: the environment without transforms.
@@ -79,7 +81,10 @@ class Teacher(Transform):
         super().__init__()
         if not isinstance(maps, Maps):
             kind = type(maps).__name__
-            raise UserError(f"the teacher flies by the maps of method maps; {kind} keeps none")
+            raise UserError(
+                f"learner=imitation: the teacher flies by the maps of method maps; {kind} keeps "
+                "none"
+            )
         if torch.device(env.device or "cpu").type != "cpu":
             raise UserError(f"device={env.device}: the teacher needs device=cpu")
         policy = find(name)(env, KnownMaps(maps))

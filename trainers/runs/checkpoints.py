@@ -10,11 +10,17 @@ from torch import Tensor
 
 from emberlink.envs.utils import atomic_io
 from emberlink.envs.utils.errors import UserError
+from emberlink.trainers.config.overrides import flat
 from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.runs import checkpoint_file
 from emberlink.trainers.runs.seal import to_header
 
 _NUMBERED = re.compile(r"(state|step)_\d{9,18}\.safetensors")
+_OF_NETWORKS = (
+    *("comm.", "env.observation", "policy.memory", "policy.units", "policy.decisions"),
+    *("policy.agent_index", "learner.name", "learner.actor_of", "learner.hidden"),
+)
+"""beginnings of the keys of settings on which the names and shapes of weights depend"""
 _PARTIAL = ("*.safetensors.[0-9]*.part", ".tmp*")  # safetensors writes to .tmp*
 
 
@@ -138,16 +144,30 @@ def load_weights(
         _check_header(path, header, config)
     for name, tensor in expected.items():
         if name not in weights:
-            raise UserError(f"{path}: holds no {name}")
+            raise UserError(f"{path}: holds no {name}{_trained_with(header, config)}")
         weight = weights[name]
         if weight.shape != tensor.shape or weight.dtype != tensor.dtype:
             raise UserError(
                 f"{path}: {name} has shape {list(weight.shape)}, {weight.dtype}; this "
                 f"configuration needs {list(tensor.shape)}, {tensor.dtype}"
+                f"{_trained_with(header, config)}"
             )
     chosen = {name: weights[name] for name in expected}
     checkpoint_file.check_finite(path, chosen)
     return chosen
+
+
+def _trained_with(header: Mapping[str, Any], config: RunConfig | None) -> str:
+    """Returns the settings of networks that differ from those of a checkpoint, for a message."""
+    if config is None or not isinstance(header.get("config"), Mapping):
+        return ""
+    before, now = flat(header["config"]), flat(to_header(config))
+    differ = [
+        f"{key}={before[key]}" + (f" (now {now[key]})" if key in now else "")
+        for key in before
+        if key.startswith(_OF_NETWORKS) and before[key] != now.get(key)
+    ]
+    return f"; it was trained with {', '.join(differ)}" if differ else ""
 
 
 def _check_header(path: Path, header: Mapping[str, Any], config: RunConfig) -> None:

@@ -19,6 +19,8 @@ from emberlink.trainers.training.folders import RunFolders
 
 _MAY_DIFFER = ("output", "seeds", *NOT_LEARNT_WITH)
 """first parts of keys that may differ between configurations of the same run"""
+_NAMED = {"setup", "world", "seed", "seeds"}
+"""keys whose values are in the name of every job"""
 
 Identity = tuple[tuple[str, str], ...]
 """keys and values that identify a run"""
@@ -46,6 +48,8 @@ class Job:
         method: the method.
         overrides: `key=value` arguments of a new training.
         configs: the configuration of each seed.
+        swept: those of `overrides` that tell the job from the others of the sweep, besides method,
+            setup, world and seed.
         found: the runs on disk, by seed.
         log: the file with the output of the process.
         failed: the reason if the process failed, else empty.
@@ -55,6 +59,7 @@ class Job:
     method: str
     overrides: list[str]
     configs: list[RunConfig]
+    swept: tuple[str, ...] = ()
     found: dict[int, FoundRun] = field(default_factory=dict)
     log: Path = Path()
     failed: str = ""
@@ -62,9 +67,10 @@ class Job:
 
     @property
     def name(self) -> str:
-        """The method, the setup, the world and the seeds."""
+        """The method, the setup, the world, `swept` and the seeds."""
         seeds = ",".join(str(config.seed) for config in self.configs)
-        return f"{self.method}, {self.configs[0].setup}, {self.configs[0].world}, seed {seeds}"
+        first = self.configs[0]
+        return ", ".join([self.method, first.setup, first.world, *self.swept, f"seed {seeds}"])
 
     @property
     def output(self) -> Path:
@@ -176,6 +182,7 @@ def jobs_of(arguments: Sequence[str]) -> list[Job]:
     """
     methods = [text for text in arguments if "=" not in text] or list(known("method"))
     choices = [_values(text) for text in arguments if "=" in text]
+    several = {key_of(texts[0]) for texts in choices if len(texts) > 1} - _NAMED
     taken: set[tuple[str, Identity]] = set()
     jobs: list[Job] = []
     for method, overrides in product(methods, product(*choices)):
@@ -184,7 +191,8 @@ def jobs_of(arguments: Sequence[str]) -> list[Job]:
         configs = [c for c in wanted if (c.output, identity(c)) not in taken]
         taken |= {(c.output, identity(c)) for c in configs}
         if configs:
-            jobs.append(job_for(configs, overrides))
+            swept = tuple(text for text in overrides if key_of(text) in several)
+            jobs.append(job_for(configs, overrides, swept))
     return jobs
 
 
@@ -207,18 +215,19 @@ def folder_name(config: RunConfig) -> str:
     return f"{name}_{hash_of(identity(config))[:8]}"
 
 
-def job_for(configs: list[RunConfig], overrides: Sequence[str]) -> Job:
+def job_for(configs: list[RunConfig], overrides: Sequence[str], swept: tuple[str, ...] = ()) -> Job:
     """Returns a job that trains several configurations in parallel.
 
     Args:
         configs: configurations that differ only in their seed.
         overrides: `key=value` arguments of the configurations; their seeds are replaced.
+        swept: see `Job`.
     """
     seeds = [config.seed for config in configs]
     if configs[0].seeds and list(configs[0].seeds) != seeds:
         others = [text for text in overrides if key_of(text) not in ("seed", "seeds")]
         overrides = [*others, f"seeds=[{','.join(map(str, seeds))}]"]
-    return Job(configs[0].method, list(overrides), configs)
+    return Job(configs[0].method, list(overrides), configs, swept)
 
 
 def is_finished(folder: RunFolder, config: RunConfig) -> bool:

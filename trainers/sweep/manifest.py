@@ -27,7 +27,7 @@ class Row:
 
     Attributes:
         run: hash of the configuration.
-        name: method, setup, world and seed.
+        name: as `Job.name`.
         folder: name of the run folder.
         state: one of `STATES`.
         episodes: number of episodes of the whole training.
@@ -182,7 +182,7 @@ def _rows(job: Job) -> list[Row]:
         rows.append(
             Row(
                 run=hash_of(identity(config)),
-                name=f"{job.method}, {config.setup}, {config.world}, seed {config.seed}",
+                name=replace(job, configs=[config]).name,
                 folder=found.folder.path.name if found else folder_name(config),
                 state="finished" if finished else "new",
                 episodes=config.episodes,

@@ -31,7 +31,11 @@ def plan(jobs: Sequence[Job], runs: Mapping[Identity, FoundRun]) -> list[Job]:
     for job in jobs:
         job.find_runs(runs)
         for configs in _parts(job):
-            part = job if len(configs) == len(job.configs) else job_for(configs, job.overrides)
+            part = (
+                job
+                if len(configs) == len(job.configs)
+                else job_for(configs, job.overrides, job.swept)
+            )
             part.find_runs(runs)
             stack = _stack(part)
             if stack is not None and stack in stacks:
@@ -73,7 +77,8 @@ def _merged(jobs: Sequence[Job]) -> Job:
     seeds = tuple(job.configs[0].seed for job in jobs)
     others = [text for text in jobs[0].overrides if key_of(text) not in ("seed", "seeds")]
     overrides = [*others, f"seeds=[{','.join(map(str, seeds))}]"]
-    return Job(jobs[0].method, overrides, [replace(job.configs[0], seeds=seeds) for job in jobs])
+    configs = [replace(job.configs[0], seeds=seeds) for job in jobs]
+    return Job(jobs[0].method, overrides, configs, jobs[0].swept)
 
 
 def _parts(job: Job) -> list[list[RunConfig]]:

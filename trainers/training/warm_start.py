@@ -9,7 +9,8 @@ from emberlink.trainers.config.overrides import flat
 from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.learners.base import ACTOR, Learner
 from emberlink.trainers.runs.checkpoints import load_weights
-from emberlink.trainers.runs.pretrained import open_run
+from emberlink.trainers.runs.pretrained import find_one, is_name
+from emberlink.trainers.runs.run_folder import RunFolder
 from emberlink.trainers.runs.seal import check_trained_with
 
 _OBSERVED = ("comm.", "env.observation", "policy.hold")
@@ -32,11 +33,6 @@ def start(learner: Learner, config: RunConfig) -> None:
     name = getattr(config.learner, "warm_start", "")
     if not name:
         return
-    run = open_run(name, config.output)
-    checkpoint = run.checkpoint()
-    theirs = run.config()
-    check_trained_with(checkpoint, theirs)
-    _warn_of_other_observations(name, theirs, config)
     network: Any = learner.actor.module
     teams = len(config.seeds or (config.seed,))
     expected = {
@@ -44,9 +40,13 @@ def start(learner: Learner, config: RunConfig) -> None:
         for key, value in network.state_dict().items()
     }
     try:
+        run = RunFolder(find_one(name) if is_name(name) else name)
+        checkpoint, theirs = run.checkpoint(), run.config()
+        check_trained_with(checkpoint, theirs)
         weights = load_weights(checkpoint, expected, config)
     except UserError as error:
         raise UserError(f"learner.warm_start={name}: {error}") from None
+    _warn_of_other_observations(name, theirs, config)
     learner.start_from(weights)
 
 

@@ -43,6 +43,10 @@ SETUPS = "known: paper, released, strong, tuned"
             ["independent", "comm.jitter=5"],
             ["'comm.jitter'", "a setting of method consensus, not of independent"],
         ),
+        (
+            ["independent", "learner.clip=0.1"],
+            ["'learner.clip'", "a setting of learner ippo, mappo, not of ddpg"],
+        ),
         (["independent", "world=fornt"], ["world 'fornt'", "did you mean front?"]),
         (["independent", "env.base=[30,0]"], ["env.base=[30, 0]", "outside of the map"]),
         (["independent", "env.failures=2.5"], ["env.failures=2.5", "the team has 2 UAVs"]),

@@ -192,7 +192,10 @@ def test_the_loss_falls_and_is_that_of_smooth_l1():
             "learner.teacher: 'curier'",
         ),
         (["maps", *settings("imitation"), "learner.teacher=oracle"], "known: map_greedy, courier"),
-        (["maps", *settings("ippo"), "learner.warm_start=nowhere"], "nowhere"),
+        (
+            ["maps", *settings("ippo"), "learner.warm_start=nowhere"],
+            "learner.warm_start=nowhere: nowhere: holds no checkpoint",
+        ),
     ],
 )
 def test_what_cannot_be_imitated_is_one_line(arguments, said, tmp_path, capsys):
@@ -295,7 +298,17 @@ def test_actors_of_another_network_are_refused(imitated, tmp_path, capsys):
     start = f"learner.warm_start={imitated['ddpg']}"
     arguments = ["train", "maps", *settings("ippo", start), f"output={tmp_path}"]
     assert main.main(arguments) == 2
-    assert "learner.warm_start=" in " ".join(capsys.readouterr().err.split())
+    said = " ".join(capsys.readouterr().err.split())
+    assert "learner.warm_start=" in said
+    assert "learner.name=imitation (now ippo)" in said
+    assert "learner.actor_of=ddpg" in said
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_shipped_policy_that_does_not_fit_leaves_no_copy(tmp_path, capsys):
+    start = "learner.warm_start=pretrained:maps", "comm.pixels=8", f"output={tmp_path}"
+    assert main.main(["train", "maps", *settings("ippo", *start)]) == 2
+    assert "comm.pixels=24 (now 8)" in " ".join(capsys.readouterr().err.split())
     assert not list(tmp_path.iterdir())
 
 

@@ -23,6 +23,7 @@ from emberlink.trainers.sweep import executors, manifest
 from emberlink.trainers.sweep.command import sweep
 from emberlink.trainers.sweep.jobs import folder_name, jobs_of
 from emberlink.trainers.sweep.leases import SWEEP, TRAINING, Leases
+from emberlink.trainers.sweep.plan import plan, stacked
 from emberlink.trainers.sweep.run_index import RunIndex
 from emberlink.trainers.training.folders import SEED_RUNS, find_runs
 
@@ -55,6 +56,15 @@ def test_every_combination_once():
     ]
     assert jobs[3].configs[0].seed == 2
     assert jobs[3].configs[0].setup == "tuned"
+
+
+def test_what_is_swept_is_in_the_name():
+    swept = ["learner=ippo,mappo", "policy.hold=1,2", "seed=0,1", "episodes=3"]
+    jobs = jobs_of(["independent", *swept])
+    first = "independent, paper, paper, learner=ippo, policy.hold=1, seed 0"
+    assert (len(jobs), names(jobs)[0], len(set(names(jobs)))) == (8, first, 8)
+    (job,) = stacked(plan(jobs[:2], {}), 2)
+    assert job.name == first + ",1"
 
 
 def test_worlds_are_combined_too():

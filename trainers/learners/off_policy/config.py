@@ -13,7 +13,7 @@ from emberlink.trainers.learners.base import STRICT, Count, NotNegative, Positiv
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class OffPolicyConfig(WarmStartConfig):
-    """The settings of learners with a replay buffer and target networks."""
+    """Stores the settings of learners with a replay buffer and target networks."""
 
     gamma: Annotated[float, Field(ge=0, lt=1)]
     """discount per decision"""

@@ -11,7 +11,7 @@ from emberlink.trainers.learners.base import STRICT, Count, NotNegative, Positiv
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class OnPolicyConfig(WarmStartConfig):
-    """The settings of learners from whole episodes."""
+    """Stores the settings of learners from whole episodes."""
 
     share_parameters: bool = True
     """whether all UAVs of a seed use the same weights; if not, each UAV has its own"""

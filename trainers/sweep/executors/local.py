@@ -13,7 +13,7 @@ from emberlink.trainers.sweep.executors.base import Executor, Task
 
 @dataclass(frozen=True, kw_only=True, config=ConfigDict(extra="forbid", strict=True))
 class LocalConfig:
-    """The settings of local processes."""
+    """Stores the settings of local processes."""
 
     workers: Annotated[int, Field(ge=1)] | None = None
     """runs at a time; the number of cores if None"""

@@ -38,7 +38,7 @@ Part = Annotated[
 
 @dataclass(frozen=True, kw_only=True, config=ConfigDict(extra="forbid", strict=True))
 class RayConfig:
-    """The settings of Ray tasks."""
+    """Stores the settings of Ray tasks."""
 
     address: str = "auto"
     """address of the cluster, or local"""

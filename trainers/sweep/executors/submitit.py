@@ -48,7 +48,7 @@ CountOrZero = Annotated[int, Field(ge=0)]
 
 @dataclass(frozen=True, kw_only=True, config=ConfigDict(extra="forbid", strict=True))
 class SubmititConfig:
-    """The settings of SLURM jobs."""
+    """Stores the settings of SLURM jobs."""
 
     cluster: Literal["slurm", "local"] = "slurm"
     """slurm, or submitit's local processes for tests"""
