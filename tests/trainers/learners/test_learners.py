@@ -14,11 +14,11 @@ from emberlink.envs.utils.errors import UserError
 from emberlink.policies.settings import PolicyConfig
 from emberlink.trainers.cli import main
 from emberlink.trainers.config.compose import (
-    _drop_settings_of_other_learners,
     from_values,
     resolve,
     to_values,
 )
+from emberlink.trainers.config.owners import drop_settings_of_others
 from emberlink.trainers.learners import registry
 from emberlink.trainers.learners.base import Learner
 from emberlink.trainers.learners.ddpg import DDPG
@@ -137,7 +137,7 @@ def test_another_package_can_add_a_learner(monkeypatch):
 
 def test_a_setup_does_not_give_a_learner_the_settings_of_others():
     values = {"name": "ddpg", "tau": 0.1, "policy_delay": 2, "unheard": 1}
-    _drop_settings_of_other_learners(values)
+    drop_settings_of_others(values)
     assert values == {"name": "ddpg", "tau": 0.1, "unheard": 1}
 
 
