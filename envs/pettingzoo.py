@@ -177,9 +177,7 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
         )
 
     def act(self, policy: Callable[[TensorDictBase], TensorDictBase]) -> dict[str, Array]:
-        """Returns the actions of a policy for `step`; what the policy remembers is kept.
-
-        Call it once a step: each call brings the memory of the policy one decision further.
+        """Returns the actions of a policy for `step`; each call moves its memory one step on.
 
         Args:
             policy: writes ("agents", "action"), such as `emberlink.trainers.load` returns.
