@@ -10,7 +10,7 @@ from pydantic.dataclasses import dataclass
 class PolicyConfig:
     """Stores the settings of a policy's memory and of the interval between its decisions."""
 
-    memory: Annotated[str, Field(min_length=1)] = "none"
+    memory: str = "none"
     """name of a file in policies/networks/memory: none, gru or stack"""
     units: Annotated[int, Field(ge=1, le=8192)] = 64
     """units of the memory `gru`"""

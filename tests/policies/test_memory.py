@@ -39,6 +39,8 @@ def test_memories_are_the_files_on_disk():
     assert memory.known() == ["gru", "none", "stack"]
     with pytest.raises(UserError, match=r"policy.memory='lstm' is not known; known: gru, none"):
         resolve("consensus", ["learner=ippo", "policy.memory=lstm"])
+    with pytest.raises(UserError, match=r"policy.memory='' is not known; known: gru, none"):
+        resolve("consensus", ["learner=ippo", 'policy.memory=""'])
 
 
 @pytest.mark.parametrize("kind", ["none", "gru", "stack"])

@@ -25,8 +25,8 @@ class WarmStartConfig(LearnerConfig):
     def _an_anchor_has_a_start(self) -> "WarmStartConfig":
         if self.anchor and not self.warm_start:
             raise UserError(
-                f"anchor={self.anchor:g}: needs warm_start, the run whose actions the actors stay "
-                "near to"
+                f"learner.anchor={self.anchor:g}: needs learner.warm_start, the run whose actions "
+                "the actors stay near to"
             )
         return self
 

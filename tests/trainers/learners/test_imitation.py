@@ -181,7 +181,10 @@ def test_the_loss_falls_and_is_that_of_smooth_l1():
             ["maps", *settings("imitation"), "learner.samples=9", "learner.buffer_size=8"],
             "samples=9 is larger than buffer_size=8",
         ),
-        (["maps", *settings("ippo"), "learner.anchor=1"], "anchor=1: needs warm_start"),
+        (
+            ["maps", *settings("ippo"), "learner.anchor=1"],
+            "learner.anchor=1: needs learner.warm_start",
+        ),
         (
             ["maps", *settings("ippo"), "env.observation=window"],
             "Maps reads it; it comes from env.observation=sight",
