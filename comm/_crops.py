@@ -35,11 +35,11 @@ class Crops(Buffers):
 
     The channels hold bytes. `fire`, `seen` and `burnt_out` are the shares of the pixel's cells that
     burned at the last look, that were seen while they burned, and that had burnt out at the last
-    look. `near` is the mean chance that a cell burns by now that is at most `spread` cells away
-    from known fire and was without fire at the last look, or never seen. `age` is the mean of
-    `age_byte` over the cells of the grid, 255 for a cell that was never seen. `outside` is the
-    share of cells outside of the grid. `uavs` shows other UAVs as they are known, 255 less
-    `age_byte`, and `base` the base station, 255.
+    look. `near` is the mean chance that a cell burns by now. Only cells at most `spread` cells away
+    from known fire have one: `chance_byte` of the steps since the last look for cells without fire
+    then, 255 for cells never seen. `age` is the mean of `age_byte` over the cells of the grid, 255
+    for a cell that was never seen. `outside` is the share of cells outside of the grid. `uavs`
+    shows other UAVs as they are known, 255 less `age_byte`, and `base` the base station, 255.
 
     The sums over pixels come from one summed-area table of all channels, whose sums are fields of
     an int64; they are exact.

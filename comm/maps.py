@@ -79,8 +79,7 @@ class Maps(CommModule):
         low, high = motion.corners(world.low, world.high)
         self.register_buffer("low", low, persistent=False)
         self.register_buffer("high", high, persistent=False)
-        ceiling = high[2].item()
-        self.sensor = Sensor(world.grid, view_angle=world.view_angle, ceiling=ceiling)
+        self.sensor = Sensor.of(world)
         uavs, area = world.num_uavs, self.sensor.area
         # Steps are stored times 4, plus what was seen.
         last = 4 * world.horizon + 3

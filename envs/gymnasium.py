@@ -27,15 +27,16 @@ class WildfireTeamEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         kwargs: as for `parallel_env`.
 
     Raises:
-        UserError: as `parallel_env`, or an environment with `observation: window`.
+        UserError: as `parallel_env`, or `observation` is not `vector`.
     """
 
     metadata = WildfireParallelEnv.metadata
 
     def __init__(self, **kwargs: Any):
         self._team = parallel_env(**kwargs)
-        if self._team._core.config.observation != "vector":
-            raise UserError("observation=window: the joint view of a team is a vector")
+        observation = self._team._core.config.observation
+        if observation != "vector":
+            raise UserError(f"observation={observation}: the joint view of a team is a vector")
         self.render_mode = self._team.render_mode
         self.observation_space = self._team.state_space
         self.action_space = Box(-1.0, 1.0, (3 * len(self._team.possible_agents),), np.float32)

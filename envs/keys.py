@@ -81,7 +81,7 @@ TRUE_MAP: Final = "true_map"
 """uint8 [num_envs, X, Y]: `WildfireEnv.fire_map`. Only with `true_map=True`; no UAV knows it."""
 
 TEACHER: Final = (AGENTS, "teacher")
-"""float32 [..., 3]: what a teacher would do who knows what the UAV knows; 0 at steps without a
+"""float32 [..., 3]: the action of a teacher that knows what the UAV knows; 0 at steps without a
 decision. Only in trainings with `learner=imitation`."""
 
 FEATURES: Final = ("x", "y", "z", "new_fire", "old_fire", "timestep")

@@ -13,7 +13,7 @@ DONE_NAMES = ("done", "terminated", "truncated")
 def observation_spec(
     envs: int, world: WildfireConfig, window: int, true_map: bool = False
 ) -> Composite:
-    """Returns the spec of all that a reset writes but done, batch size [envs]; see `keys`.
+    """Returns the spec of what a reset writes but the done flags, batch size [envs]; see `keys`.
 
     Args:
         envs: number of environments.

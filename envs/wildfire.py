@@ -38,8 +38,8 @@ class WildfireEnv(Buffers, TeamView):
             [num_envs, X, Y] for one each; or arrival and burn-out times, [1, 2, X, Y] or
             [num_envs, 2, X, Y].
         seed: of all random numbers; the first reset draws a fresh one if None. Environment i's
-            randomness depends on (seed, i) alone. Several seeds share the environments in order,
-            the same number for each, which are what they are with that seed alone.
+            randomness depends on (seed, i) alone. Several seeds get the same number of
+            environments each, in order, as with that seed alone.
         device: where all tensors live.
         agent_done: whether done, terminated and truncated stand under "agents" too, per UAV.
         staggered: whether environments are out of phase: the first episode of environment i after
@@ -100,7 +100,7 @@ class WildfireEnv(Buffers, TeamView):
         low, high = motion.corners(config.low, config.high)
         self.register_buffer("_low", low, persistent=False)
         self.register_buffer("_high", high, persistent=False)
-        sensor = Sensor(config.grid, view_angle=config.view_angle, ceiling=high[2].item())
+        sensor = Sensor.of(config)
         self._side = sensor.side
         fires, self._one_fire_each = load_fires(fire, config, num_envs)
         self._map = CoverageMap(

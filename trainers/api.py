@@ -143,7 +143,8 @@ def train(
         fire: name of a scenario; that of the setup or the world if None.
         seeds: seeds to train in parallel, with a run folder for each, in place of `seed=`.
         progress: called after each step of the environments; an exception in it ends the training.
-        evaluate_after: whether to evaluate at the end, which writes eval.json, figures and a GIF.
+        evaluate_after: whether to evaluate at the end, which writes eval.json, figures, a GIF and a
+            replay.
         settings: other settings, by the last part of their key (`episodes=5`, `horizon=50`) or the
             whole key (`**{"learner.gamma": 0.9}`); `output="runs"` is the folder of run folders.
 
@@ -247,7 +248,7 @@ def load(
 
 
 def compare(paths: Reference | Sequence[Reference], output: Reference | None = None) -> Comparison:
-    """Compares finished runs by setup and method.
+    """Compares finished runs by setup, world, training fire and method.
 
     Args:
         paths: run folders, folders of run folders, or `pretrained:SETUP`.
@@ -255,7 +256,8 @@ def compare(paths: Reference | Sequence[Reference], output: Reference | None = N
             file is written.
 
     Returns:
-        Interquartile means, intervals, rankings and the paper's claims for each setup.
+        Interquartile means, intervals, rankings and the paper's claims for each setup, world and
+        training fire.
 
     Raises:
         UserError: there are no runs, the runs cannot be compared, a file is damaged, or `output` is

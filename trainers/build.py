@@ -49,7 +49,7 @@ def make_env(
             whole key (`**{"env.reward.exit": -10.0}`).
 
     Raises:
-        UserError: a method, setup or setting is not known, or a value is out of range.
+        UserError: a method, setup, world or setting is not known, or a value is out of range.
     """
     check_device(str(device))
     if isinstance(fire, Tensor) and fire.ndim in (2, 3):

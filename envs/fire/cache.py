@@ -35,7 +35,7 @@ def bank_key(
     grid: tuple[int, int],
     horizon: int,
 ) -> str:
-    """Returns a hash of all values on which a bank of arrival times depends."""
+    """Returns a hash of all values on which a bank of fires depends."""
     ranges = dataclasses.asdict(config)
     ranges.pop("burn_time", None)
     parts = [GENERATOR_VERSION, ranges, split, count, *grid, horizon]

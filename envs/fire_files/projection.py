@@ -35,8 +35,8 @@ def library(name: str, what: str = "reading this file") -> Any:
         return importlib.import_module(name)
     except ImportError:
         raise UserError(
-            f"{what} needs the extra geo: pip install '.[geo]' in Emberlink's folder "
-            f"({name} is missing)"
+            f"{what} needs the extra geo: pip install '.[geo]' in the folder of "
+            f"emberlink ({name} is missing)"
         ) from None
 
 

@@ -112,7 +112,8 @@ def chain(
         count: int64, broadcast against [envs, n], UAVs in the team.
 
     Returns:
-        Place, float32 [envs, n, 2], and reach, float32 [envs, n], as in `Rally`.
+        Place, float32 [envs, n, 2], cells, and reach, float32 [envs, n]: the greatest distance from
+        it, cells.
     """
     height = world.altitude[1]
     far = 10.0 * (sum(world.grid) + height)  # as good as any longer range, and finite

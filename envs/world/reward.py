@@ -29,9 +29,9 @@ def step_reward(
 
     Args:
         new, old, none: [...], number of cells of new fire, old fire and no fire in view.
-        told: integers [...], number of burning cells of which the base learns; None for none.
         hit_boundary: bool [..., 3], the axes along which the move would have left the box.
         config: reward per cell of each class, and the penalty.
+        told: integers [...], number of burning cells of which the base learns; None for none.
 
     Returns:
         float32 [...].

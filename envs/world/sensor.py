@@ -5,7 +5,9 @@ import math
 import torch
 from torch import Tensor
 
+from emberlink.envs.config import WildfireConfig
 from emberlink.envs.utils.buffers import Buffers
+from emberlink.envs.world import motion
 
 
 def view_radius(altitude: float, view_angle: float) -> float:
@@ -52,6 +54,12 @@ class Sensor(Buffers):
         # In float64, so that sums over a window of any size are exact.
         weights = torch.stack((i, j, torch.ones_like(i)), -1).flatten(0, 1)
         self.register_buffer("_weights", weights.double(), persistent=False)
+
+    @classmethod
+    def of(cls, world: WildfireConfig) -> "Sensor":
+        """Returns the sensor of the UAVs of a world."""
+        ceiling = motion.corners(world.low, world.high)[1][2].item()
+        return cls(world.grid, view_angle=world.view_angle, ceiling=ceiling)
 
     @property
     def area(self) -> int:

@@ -9,7 +9,7 @@ from torch import Tensor
 from emberlink.envs import keys
 from emberlink.envs.utils.buffers import Buffers
 from emberlink.envs.wildfire import WildfireEnv
-from emberlink.envs.world import motion, radio
+from emberlink.envs.world import radio
 from emberlink.envs.world.sensor import Sensor
 from emberlink.policies.planning.rally import Rally
 from emberlink.policies.planning.targets import HERE, Targets, plan_period
@@ -26,9 +26,10 @@ class Foresight(Buffers):
 
     The value of a target is the number of cells in view from it that nobody has seen burn and that
     burn when the UAV arrives, divided by its distance plus 2 cells. The UAV with the highest value
-    chooses first and claims 7 x 7 cells. With a base, cells count that no flying UAV and not the
-    base has a sighting of, and UAVs have places to be at the end (`radio.chain`), assigned to the
-    nearest UAVs. A UAV that will fail meets another one before.
+    chooses first and claims 7 x 7 cells. With a base, a cell counts if neither a flying UAV nor the
+    base has a sighting of it while it burned. At the end of the episode the UAVs form a chain to
+    the base (`radio.chain`), each place held by the nearest UAV. A UAV that will fail first flies
+    to the nearest UAV that will not.
 
     Args:
         env: the environment; its fire and failures are read.
@@ -42,10 +43,8 @@ class Foresight(Buffers):
         self._env, self._world = (env,), env.config
         self.period = plan_period(_FLOWN, env.config.displacement)
         self._targets = Targets(env, claim=_CLAIM)
-        world = env.config
-        ceiling = motion.corners(world.low, world.high)[1][2].item()
-        self._sensor = Sensor(world.grid, view_angle=world.view_angle, ceiling=ceiling)
-        self.register_buffer("_base", torch.tensor(world.base or (0.0, 0.0)))
+        self._sensor = Sensor.of(env.config)
+        self.register_buffer("_base", torch.tensor(env.config.base or (0.0, 0.0)))
         self.register_buffer("_never", torch.tensor(math.inf))
         self.to(env.device)
 
@@ -59,7 +58,7 @@ class Foresight(Buffers):
         cost, hears = distance + HERE, alive.unsqueeze(-1) & alive.unsqueeze(-2)
         if self._world.base is None:
             return self._targets.choose(ground, weight, cost, hears)[0]
-        rally = self._rally(ground, alive)
+        rally = self._rally(ground)
         late = rally.too_late((self._targets.columns, self._targets.rows), arrives, speed)
         cost.masked_fill_(late, math.inf)
         target, value = self._targets.choose(ground, weight, cost, hears)
@@ -99,7 +98,7 @@ class Foresight(Buffers):
         seen = (env.knowledge.seen_fire & has.unsqueeze(-1)).any(1)
         return ~self._sensor.crop(seen)
 
-    def _rally(self, ground: Tensor, alive: Tensor) -> Rally:
+    def _rally(self, ground: Tensor) -> Rally:
         """Returns where each UAV has to be at the end, or before it fails."""
         (env,) = self._env
         horizon, uavs = self._world.horizon, ground.shape[1]

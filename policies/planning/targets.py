@@ -1,4 +1,4 @@
-"""Assigns cells to UAVs, and how often: weights in view per cost, and claims among UAVs."""
+"""Assigns target cells to UAVs: the highest weight in view per cost that no other UAV claims."""
 
 import torch
 from torch import Tensor

@@ -9,7 +9,7 @@ from torch import Tensor
 from emberlink.envs import keys
 from emberlink.envs.utils.buffers import Buffers
 from emberlink.envs.wildfire import WildfireEnv
-from emberlink.envs.world import motion, radio
+from emberlink.envs.world import radio
 from emberlink.envs.world.coverage_map import View
 from emberlink.envs.world.knowledge import Knowledge
 from emberlink.envs.world.sensor import Sensor
@@ -40,8 +40,7 @@ class TeamMaps(Buffers):
         super().__init__()
         self._env, self._world, self._messages = (env,), env.config, messages
         world, envs = env.config, env.num_envs
-        ceiling = motion.corners(world.low, world.high)[1][2].item()
-        self._sensor = Sensor(world.grid, view_angle=world.view_angle, ceiling=ceiling)
+        self._sensor = Sensor.of(world)
         listens = world.base is not None and messages == "in range"
         self.known = Knowledge(
             envs=envs,

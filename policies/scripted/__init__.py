@@ -6,9 +6,8 @@ from emberlink.envs.utils.lazy import lazy
 
 if TYPE_CHECKING:
     from emberlink.policies.scripted.base import Scripted
-    from emberlink.policies.scripted.registry import SCRIPTED
 
-__all__ = ["ORDER", "SCRIPTED", "Scripted"]
+__all__ = ["ORDER", "Scripted"]
 
 ORDER = (
     *("stationary", "random_actions", "random_waypoints"),
@@ -17,4 +16,4 @@ ORDER = (
 )
 """the names of emberlink's own, in the order of tables"""
 
-__getattr__ = lazy(__name__, {"SCRIPTED": "registry", "Scripted": "base"})
+__getattr__ = lazy(__name__, {"Scripted": "base"})

@@ -22,8 +22,8 @@ class Scripted(TensorDictModuleBase):
     for several steps is written to the TensorDict, which the caller carries to the next step.
 
     Args:
-        env: the environment that it acts in. The policy reads its constants. `Oracle` also reads
-            its fires.
+        env: the environment that it acts in. Policies with maps also read its fire at cells that
+            were seen; `Oracle` reads the whole fire.
     """
 
     recipe: ClassVar[str | None] = None

@@ -24,6 +24,8 @@ class Oracle(Scripted):
     go to the lower index of UAVs and of cells. A UAV without a cell stays at its position. All UAVs
     fly at the maximum altitude.
 
+    Where cells burn out, or with a base, the targets are those of `Foresight` instead.
+
     Args:
         env: the environment that it acts in; its fire is read at every step.
     """

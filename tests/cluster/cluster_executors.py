@@ -27,7 +27,7 @@ def _programs() -> None:
     """Fails if something is not installed: a test that is left out would not be noticed."""
     absent = [name for name in ("submitit", "ray") if find_spec(name) is None]
     if absent:
-        pytest.exit(f"{', '.join(absent)}: not installed; pip install 'emberlink[slurm,ray]'", 2)
+        pytest.exit(f"{', '.join(absent)}: not installed; pip install '.[slurm,ray]'", 2)
     if missing():
         pytest.exit(f"{', '.join(missing())}: not installed; {INSTALL}", 2)
     if os.geteuid() != 0:

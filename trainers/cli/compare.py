@@ -18,10 +18,10 @@ def add_compare(commands: Any) -> None:
         "compare",
         _compare,
         "compare runs: methods, setups, several seeds",
-        "Gathers finished runs by setup and method and prints interquartile means with 95 % "
-        "bootstrap intervals over training seeds, and the paper's claims; writes a new folder "
-        "with compare.html (tables, the paper's figures 5 to 9, timelapses), compare.json and "
-        "the PNGs.",
+        "Gathers finished runs by setup, world, training fire and method and prints interquartile "
+        "means with 95 % bootstrap intervals over training seeds, and the paper's claims; writes "
+        "a new folder with compare.html (tables, the paper's figures 5 to 9, timelapses), "
+        "compare.json and the PNGs.",
         "emberlink compare runs/ --output comparison",
     )
     comparison.add_argument(

@@ -9,8 +9,6 @@ from emberlink.trainers.cli.parser import command
 if TYPE_CHECKING:
     from rich.console import Console
 
-_KINDS = (*KINDS, "policies")
-
 
 def add_list(commands: Any) -> None:
     """Adds the command to the parser."""
@@ -28,7 +26,7 @@ def add_list(commands: Any) -> None:
         completer=kinds,
         nargs="*",
         default=[],
-        help=f"{', '.join(_KINDS)} (default: all)",
+        help=f"{', '.join(kinds())} (default: all)",
     )
 
 
@@ -36,13 +34,13 @@ def _list(options: argparse.Namespace, console: "Console") -> int:
     from emberlink.envs.utils.errors import UserError
 
     for kind in options.kinds:
-        if kind not in _KINDS:
-            raise UserError(f"{kind!r} is not known; known: {', '.join(_KINDS)}")
-    kinds = options.kinds or _KINDS
-    for kind in kinds:
-        if len(kinds) > 1:
+        if kind not in kinds():
+            raise UserError(f"{kind!r} is not known; known: {', '.join(kinds())}")
+    wanted = options.kinds or kinds()
+    for kind in wanted:
+        if len(wanted) > 1:
             console.print(f"{kind}:", style="bold")
-        _print(described(kind), "  " if len(kinds) > 1 else "", console)
+        _print(described(kind), "  " if len(wanted) > 1 else "", console)
     return 0
 
 

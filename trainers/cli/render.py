@@ -54,7 +54,7 @@ def _add_episodes(rendering: Parser) -> None:
         metavar="FIRE",
         completer=completion.fires,
         help="a held-out fire: NAME, INDEX or NAME:INDEX, such as huygens:3 (default: huygens:0, "
-        "or the first of the file that the first run was trained on)",
+        "or the first of the run's own fires if evaluations leave huygens out)",
     )
     add(
         "--checkpoint",

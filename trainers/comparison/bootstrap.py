@@ -5,6 +5,7 @@ Statistical Precipice" (2021), with SciPy: interquartile mean, percentile bootst
 of improvement.
 """
 
+import warnings
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -96,17 +97,15 @@ def paired_interval(statistic: Callable[..., Any], *samples: Values) -> Interval
         samples: [episodes] each; entry i of all samples is drawn together.
 
     Returns:
-        Lower and upper end; None with one episode, or if the statistic is not finite in a resample.
+        Lower and upper end; None with one episode, or if an end is not finite.
     """
     if len(samples[0]) < 2:
         return None
-    generator = np.random.default_rng(BOOTSTRAP_SEED)
-    index = generator.integers(len(samples[0]), size=(RESAMPLES, len(samples[0])))
-    values = statistic(*(np.asarray(sample, float)[index] for sample in samples), axis=-1)
-    if not np.isfinite(values).all():
-        return None
-    tail = (1 - LEVEL) / 2
-    return float(np.quantile(values, tail)), float(np.quantile(values, 1 - tail))
+    values = [np.asarray(sample, float) for sample in samples]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", stats.DegenerateDataWarning)
+        low, high = _bootstrap(statistic, values, -1, RESAMPLES, paired=True)
+    return (float(low), float(high)) if np.isfinite([low, high]).all() else None
 
 
 def band(values: Values) -> tuple[Values, Values] | None:
@@ -115,11 +114,16 @@ def band(values: Values) -> tuple[Values, Values] | None:
 
 
 def _bootstrap(
-    statistic: Callable[..., Any], samples: Sequence[Values], axis: int, resamples: int
+    statistic: Callable[..., Any],
+    samples: Sequence[Values],
+    axis: int,
+    resamples: int,
+    paired: bool = False,
 ) -> Any:
     result = stats.bootstrap(
         samples,
         statistic,
+        paired=paired,
         axis=axis,
         n_resamples=resamples,
         batch=1000,

@@ -1,4 +1,4 @@
-"""Groups runs by setup, fire and method, and labels the groups."""
+"""Groups runs by setup, world, fire and method, and labels the groups."""
 
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -54,10 +54,11 @@ class Group:
 
 @dataclass(frozen=True)
 class Section:
-    """Groups with the same setup and training fire and comparable evaluations.
+    """Groups with the same setup, world and training fire and comparable evaluations.
 
     Attributes:
-        label: the setup, the fire, and settings that distinguish it from other sections of these.
+        label: the setup, the world, the fire, and settings that distinguish it from other sections
+            of these.
         groups: groups sorted by label.
     """
 
@@ -84,7 +85,7 @@ class Section:
 
 
 def gather(runs: Sequence[Run]) -> tuple[list[Section], list[str]]:
-    """Groups runs into sections by setup and training fire, and within sections by method.
+    """Groups runs into sections by setup, world and training fire, and within these by method.
 
     Runs with different horizons, grids, numbers of held-out fires or start positions are in
     different sections. Of several runs of a group with the same seed, the last by name is used.

@@ -19,7 +19,7 @@ class Comparison:
 
     Attributes:
         paths: compared folders, as given.
-        sections: rankings, verdicts and training curves for each setup and training fire.
+        sections: rankings, verdicts and training curves for each setup, world and training fire.
         notes: differences between runs.
         left_out: folders and files that are not compared, with the reason.
     """
@@ -40,7 +40,7 @@ class Comparison:
 
 
 def compare_runs(paths: Sequence[Path]) -> Comparison:
-    """Compares runs by setup, training fire and method.
+    """Compares runs by setup, world, training fire and method.
 
     Args:
         paths: run folders, folders of run folders, or names such as `pretrained:tuned`.

@@ -29,7 +29,7 @@ from emberlink.policies.scripted.registry import to_play
 from emberlink.policies.settings import PolicyConfig
 from emberlink.trainers.config import choice
 from emberlink.trainers.learners import registry as learners
-from emberlink.trainers.learners.base import LearnerConfig
+from emberlink.trainers.learners.base import Count, LearnerConfig
 
 _STRICT = ConfigDict(extra="forbid", strict=True)
 
@@ -40,9 +40,10 @@ NOT_LEARNT_WITH = (
 )
 """keys that do not affect learning: configurations that differ only in them are of the same run"""
 
-Count = Annotated[int, Field(ge=1, le=1_000_000_000)]
+MAX_FIRES = 65_536
+"""maximum number of held-out fires of an evaluation"""
 CountOrZero = Annotated[int, Field(ge=0)]
-Many = Annotated[int, Field(ge=1, le=65_536)]
+Many = Annotated[int, Field(ge=1, le=MAX_FIRES)]
 Seed = Annotated[int, Field(ge=0, lt=2**31)]
 LearnerChoice = Annotated[
     SerializeAsAny[LearnerConfig],

@@ -16,7 +16,7 @@ from emberlink.envs.utils.errors import UserError
 from emberlink.envs.wildfire import WildfireEnv
 from emberlink.policies.scripted.registry import SCRIPTED
 from emberlink.trainers.build import build_env
-from emberlink.trainers.config.schema import RunConfig, build_comm
+from emberlink.trainers.config.schema import MAX_FIRES, RunConfig, build_comm
 from emberlink.trainers.config.transfer import evaluated_with
 from emberlink.trainers.evaluation.actor import load_actor
 from emberlink.trainers.evaluation.evaluate import (
@@ -32,8 +32,6 @@ from emberlink.trainers.replay.record import Recorder
 from emberlink.trainers.runs.pretrained import open_run
 from emberlink.trainers.runs.seal import check_trained_with
 
-FIRES = 65_536
-"""number of held-out fires of a scenario, the maximum of an evaluation"""
 SHARED = ("grid", "num_uavs", "horizon", "altitude")
 """settings that must be equal for all panels; fires and start positions depend on them"""
 _SETTING = re.compile(r"((comm|env)\.[\w.]+|world)=")
@@ -168,9 +166,9 @@ def find_fire(text: str | int | None, run: RunConfig) -> tuple[ScenarioConfig, i
     known = dict.fromkeys([*scenarios(), trained.name])
     if name not in known:
         raise UserError(f"fire {name!r} is not known; known: {', '.join(known)}")
-    if not index.isdecimal() or int(index) >= FIRES:
+    if not index.isdecimal() or int(index) >= MAX_FIRES:
         raise UserError(
-            f"fire {text!r}: there is no held-out fire {index!r}; known: 0 to {FIRES - 1}"
+            f"fire {text!r}: there is no held-out fire {index!r}; known: 0 to {MAX_FIRES - 1}"
         )
     own = name == trained.name and not run.evaluation.huygens
     return trained if own or name not in scenarios() else load_scenario(name), int(index)

@@ -1,7 +1,6 @@
 """Runs `emberlink render`: draws episodes of runs side by side as GIF, MP4 or a replay."""
 
 import dataclasses
-import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -159,14 +158,7 @@ def _free_paths(output: Path | None, run: RunFolder, stem: str) -> list[Path]:
         UserError: the named file exists, or its folder does not.
     """
     if output is not None and not output.is_dir():
-        if output.suffix not in _WRITERS:
-            known = ", ".join([*_WRITERS, REPLAY])
-            raise UserError(f"{output}: there is no such folder, and a file ends in {known}")
-        if os.path.lexists(output):
-            raise UserError(f"{output} exists already; nothing is overwritten")
-        if not output.parent.is_dir():
-            raise UserError(f"{output.parent}: there is no such folder")
-        return [output]
+        return [new_file(output, [*_WRITERS, REPLAY])]
     try:
         folder = run.figures() if output is None else output
     except OSError as error:

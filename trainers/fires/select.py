@@ -16,10 +16,8 @@ from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import shown, unknown
 from emberlink.envs.world.burning import split_times
 from emberlink.trainers.config.compose import resolve
-from emberlink.trainers.config.schema import RunConfig
+from emberlink.trainers.config.schema import MAX_FIRES, RunConfig
 
-MAX_TEST_FIRES = 65_536
-"""maximum number of test fires, as in an evaluation"""
 FILE = "file"
 """name of the scenario of fires that are read from a file"""
 _METHOD = "independent"  # any method; fires do not depend on it
@@ -80,9 +78,9 @@ def find_fire(text: str, overrides: Sequence[str]) -> SelectedFire:
 
 
 def _test_fire(config: RunConfig, text: str, index: str) -> Tensor:
-    if not index.isdecimal() or int(index) >= MAX_TEST_FIRES:
+    if not index.isdecimal() or int(index) >= MAX_FIRES:
         raise UserError(
-            f"{shown(text)}: there is no test fire {index!r}; known: 0 to {MAX_TEST_FIRES - 1}"
+            f"{shown(text)}: there is no test fire {index!r}; known: 0 to {MAX_FIRES - 1}"
         )
     fire = fires_of(config.fire).test_fire(int(index), config.env.grid, config.env.horizon)
     return split_times(fire)[0][0]

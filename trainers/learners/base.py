@@ -116,6 +116,8 @@ class Learner(ABC):
     """decisions of the batch of environments before the first update"""
     updates: int = 0
     """updates made so far"""
+    teams: int
+    """seeds that are trained in parallel"""
 
     @abstractmethod
     def __init__(self, config: Any, context: LearnerContext): ...
@@ -186,6 +188,7 @@ class Learner(ABC):
             weights: the weights of one seed's actors by name, as those of `weights`.
 
         Raises:
+            UserError: the learner has no warm start.
             ValueError: a weight is missing or has another shape.
         """
         raise UserError(f"learner.warm_start: learner={type(self).__name__} has no warm start")
@@ -195,11 +198,18 @@ class Learner(ABC):
         """Sets all learning rates to those of the configuration times a factor."""
 
     @abstractmethod
-    def weights(self, team: int = 0) -> dict[str, Tensor]:
-        """Returns the weights of one seed's networks by name, detached.
+    def networks(self) -> dict[str, Tensor]:
+        """Returns the weights of all seeds' networks by name, not copied: [seeds * k, ...] each.
 
         The names of the actors' weights are `ACTOR` and the name in the network of `make_actor`.
         """
+
+    def weights(self, team: int = 0) -> dict[str, Tensor]:
+        """Returns the weights of one seed's networks by name, detached; [k, ...] each."""
+        return {
+            name: value.detach().unflatten(0, (self.teams, -1))[team]
+            for name, value in self.networks().items()
+        }
 
     @abstractmethod
     def state_dict(self, *, transitions: bool = True) -> dict[str, Tensor]:

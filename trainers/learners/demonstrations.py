@@ -7,9 +7,9 @@ from torch import Tensor
 
 from emberlink.envs import keys
 from emberlink.trainers.learners.off_policy.replay_buffer import ReplayMemory, arrange
-from emberlink.trainers.learners.off_policy.sequences import SequenceMemory
+from emberlink.trainers.learners.off_policy.sequences import BEGINS, SequenceMemory
 
-_TEACHER, _ALIVE, _BEGINS = keys.TEACHER[1], keys.ALIVE[1], "begins"
+_TEACHER, _ALIVE, _BEGINS = keys.TEACHER[1], keys.ALIVE[1], BEGINS[1]
 
 
 class Demonstrations(ReplayMemory):

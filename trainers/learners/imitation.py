@@ -51,7 +51,7 @@ class ImitationConfig(LearnerConfig):
     share_parameters: bool = True
     """whether all UAVs of a seed use the same weights; if not, each UAV has its own"""
     actor_of: Name
-    """learner whose actors are trained: they can start it"""
+    """learner whose actors are trained; its runs can begin with them (`learner.warm_start`)"""
     teacher: Name
     """scripted policy that is imitated: `map_greedy` or another one that plans by the same maps"""
     teacher_range: Annotated[float, Field(gt=0, le=1)]
@@ -196,14 +196,7 @@ class Imitation(Learner):
         self._advance(0)
 
     def networks(self) -> dict[str, Tensor]:
-        """Returns the weights of all seeds' actors by name, not copied."""
         return {ACTOR + name: value for name, value in self.actor.module.state_dict().items()}
-
-    def weights(self, team: int = 0) -> dict[str, Tensor]:
-        return {
-            name: value.detach().unflatten(0, (self.teams, -1))[team]
-            for name, value in self.networks().items()
-        }
 
     def state_dict(self, *, transitions: bool = True) -> dict[str, Tensor]:
         counters = {"updates": torch.tensor(self.updates), "decisions": torch.tensor(self._count)}

@@ -18,7 +18,7 @@ class MAPPOConfig(OnPolicyConfig):
     """Stores the settings of MAPPO."""
 
     critic_map: bool = False
-    """whether the critic, in training, also reads the true map: fire that a UAV has seen or none"""
+    """whether the critic, in training, also reads the true map: burning cells, seen and not seen"""
 
     @property
     def reads_map(self) -> bool:

@@ -6,8 +6,8 @@ from emberlink.envs.utils.lazy import lazy
 
 if TYPE_CHECKING:
     from emberlink.trainers.replay.page import Replay
-    from emberlink.trainers.replay.record import Recorder, Recording
+    from emberlink.trainers.replay.record import Recorder
 
-__all__ = ["Recorder", "Recording", "Replay"]
+__all__ = ["Recorder", "Replay"]
 
-__getattr__ = lazy(__name__, {"Recorder": "record", "Recording": "record", "Replay": "page"})
+__getattr__ = lazy(__name__, {"Recorder": "record", "Replay": "page"})

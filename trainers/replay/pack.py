@@ -66,7 +66,6 @@ def _panel(shown: Shown, arrays: "_Arrays") -> dict[str, Any]:
         "uavs": world.num_uavs,
         "base": None if world.base is None else list(world.base),
         "slope": math.tan(math.radians(world.view_angle)),
-        "range": world.radio.range if math.isfinite(world.radio.range) else None,
         "fails": [int(step) for step in steps["alive"].sum(0)],
         "position": arrays.add(tracks, delta=True),
         "view": arrays.add(_by_time(steps["view"].astype(np.uint8)), delta=True),

@@ -12,7 +12,7 @@ from jinja2 import Environment, StrictUndefined
 
 from emberlink.trainers.replay.pack import Shown, pack
 
-SCRIPTS = ("unpack.js", "knowledge.js", "map.js", "curves.js", "replay.js")
+SCRIPTS = ("unpack.js", "knowledge.js", "palette.js", "map.js", "curves.js", "replay.js")
 """modules of the page, each after those that it imports"""
 _IMPORT = re.compile(r"^import .*?;\n", re.MULTILINE | re.DOTALL)
 _EXPORT = re.compile(r"^export (?=const|function|class|async)", re.MULTILINE)

@@ -12,7 +12,7 @@ from torch import Tensor
 from emberlink.envs import keys
 from emberlink.envs.config import WildfireConfig
 from emberlink.envs.wildfire import WildfireEnv
-from emberlink.envs.world import motion, radio
+from emberlink.envs.world import radio
 from emberlink.envs.world.coverage_map import View
 from emberlink.envs.world.measures import Measures
 from emberlink.envs.world.sensor import Sensor
@@ -106,9 +106,7 @@ class _Observer:
 
     def __init__(self, world: WildfireEnv, member: int):
         self.config = world.config
-        ceiling = motion.corners(self.config.low, self.config.high)[1][2].item()
-        view_angle = self.config.view_angle
-        self._sensor = Sensor(self.config.grid, view_angle=view_angle, ceiling=ceiling)
+        self._sensor = Sensor.of(self.config)
         measured = dataclasses.replace(self.config, measures="all")
         self._measures = Measures(measured, 1, self._sensor.area)
         arrival, burn_out = world.arrival_time[[member]].cpu(), world.burn_out

@@ -57,10 +57,11 @@ class KnownMaps:
 class Teacher(Transform):
     """Writes the actions of a scripted policy under `keys.TEACHER`, made from the maps of the UAVs.
 
-    It stands behind the communication, knows what each UAV knows and the targets of those that it
-    hears (see `KnownMaps`), and does not change the environment. An action leads as far to the
-    target as a UAV flies with it in the steps for which actions are held. New targets are chosen
-    whenever the UAVs decide, and if they decide at each step, as often as the policy chooses them.
+    It is added after the communication. For each UAV it uses what that UAV knows, and the targets
+    of those that it hears (see `KnownMaps`). It does not change the environment. An action flies
+    towards the target at full speed, or reaches it at the end of the steps for which it is held.
+    New targets are chosen whenever the UAVs decide, and if they decide at each step, as often as
+    the policy chooses them.
 
     Args:
         env: the environment without transforms.

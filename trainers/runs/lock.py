@@ -32,8 +32,7 @@ class Lock:
 
     Raises:
         LockedError: another process holds the lock.
-        UserError: `lock` is a link or not a regular file, or the
-            file system has no locks.
+        UserError: `lock` is a link or not a regular file, or the file system has no locks.
     """
 
     def __init__(self, folder: Path, doing: str = "training"):

@@ -3,6 +3,7 @@
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 from rich.table import Table
@@ -40,10 +41,11 @@ def status(arguments: Sequence[str], console: Console) -> int:
     counts: Counter[str] = Counter()
     failed: list[Row] = []
     for row in rows.values():
-        state, where = _state(row, output, leases)
+        lines = _lines(output / row.folder)
+        state, where = _state(row, output, leases, len(lines))
         counts[state] += 1
         failed += [row] if state == "failed" else []
-        table.add_row(row.name, state, *_progress(row, output), where, row.folder)
+        table.add_row(row.name, state, *_progress(row, lines), where, row.folder)
     console.print(table)
     for row in failed:
         console.print(f"{row.name}: {row.note}", soft_wrap=True)
@@ -51,10 +53,9 @@ def status(arguments: Sequence[str], console: Console) -> int:
     return 0
 
 
-def _state(row: Row, output: Path, leases: Leases) -> tuple[str, str]:
-    """Returns the state of a run, and who trains it."""
-    lines, episodes = _lines(row, output)
-    if lines >= episodes and RunFolder(output / row.folder).evaluated():
+def _state(row: Row, output: Path, leases: Leases, episodes: int) -> tuple[str, str]:
+    """Returns the state of a run with a number of finished episodes, and who trains it."""
+    if episodes >= row.episodes and RunFolder(output / row.folder).evaluated():
         return "finished", ""
     holder = leases.newest(row.run)
     if holder is None or not leases.is_held(row.run, holder):
@@ -65,17 +66,15 @@ def _state(row: Row, output: Path, leases: Leases) -> tuple[str, str]:
     return "silent" if since > 2 * PATIENCE else state, f"{holder.holder}, {since:.0f} s ago"
 
 
-def _progress(row: Row, output: Path) -> tuple[str, str]:
+def _progress(row: Row, lines: list[dict[str, Any]]) -> tuple[str, str]:
     """Returns the finished episodes and the last coverage of a run."""
-    lines, episodes = _lines(row, output)
-    if not lines:
-        return f"0/{episodes}", ""
-    last = RunFolder(output / row.folder).lines()[-1]
-    return f"{lines}/{episodes}", f"{last['coverage']:.1f} %" if "coverage" in last else ""
+    coverage = lines[-1].get("coverage") if lines else None
+    return f"{len(lines)}/{row.episodes}", "" if coverage is None else f"{coverage:.1f} %"
 
 
-def _lines(row: Row, output: Path) -> tuple[int, int]:
+def _lines(folder: Path) -> list[dict[str, Any]]:
+    """Returns the metrics of each episode; none while the file is being created or truncated."""
     try:
-        return len(RunFolder(output / row.folder).lines()), row.episodes
-    except (OSError, ValueError):  # the file is being created or truncated
-        return 0, row.episodes
+        return RunFolder(folder).lines()
+    except (OSError, ValueError):
+        return []

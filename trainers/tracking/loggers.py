@@ -191,8 +191,8 @@ def check_installed(config: RunConfig) -> None:
     """
     name = config.logger
     if name in ("wandb", "tensorboard") and find_spec(name) is None:
-        extra = ".[tensorboard]" if name == "tensorboard" else name
-        raise UserError(f"logger={name}: {name} is not installed: pip install '{extra}'")
+        wanted = "'.[tensorboard]' in the folder of emberlink" if name == "tensorboard" else name
+        raise UserError(f"logger={name}: {name} is not installed: pip install {wanted}")
 
 
 def release_wandb() -> None:

@@ -47,7 +47,7 @@ def _geo() -> str:
     try:
         return ", ".join(f"{name} {version(name)}" for name in _GEO)
     except PackageNotFoundError as error:
-        return f"{error.name} is not installed: pip install '.[geo]' in the checkout"
+        return f"{error.name} is not installed: pip install '.[geo]' in the folder of emberlink"
 
 
 def _fire() -> str:

@@ -313,7 +313,6 @@ def test_panels_tell_their_settings(tmp_path):
     page = panels.replay([panel], "paper:1").html
     assert data_of(panels.replay([panel], 1).html)["fire"] == "huygens:1"
     header = data_of(page)
-    assert header["panels"][0]["range"] == 3
     assert header["grid"] == [30, 30]
 
 

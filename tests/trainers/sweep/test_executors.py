@@ -65,8 +65,11 @@ def nothing_installed(monkeypatch):
 @pytest.mark.parametrize(
     ("name", "said"),
     [
-        ("submitit", "submitit is not installed: pip install 'emberlink[slurm]'"),
-        ("ray", "ray is not installed: pip install 'emberlink[ray]'"),
+        (
+            "submitit",
+            "submitit is not installed: pip install '.[slurm]' in the folder of emberlink",
+        ),
+        ("ray", "ray is not installed: pip install '.[ray]' in the folder of emberlink"),
     ],
 )
 def test_a_missing_package_is_named_in_one_line(

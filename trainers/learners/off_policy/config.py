@@ -36,7 +36,7 @@ class OffPolicyConfig(WarmStartConfig):
     burn_in: Annotated[int, Field(ge=0, le=1_000_000)] = 16
     """decisions before them, which prepare the memory and are not learnt from"""
     critic: Literal["own", "team"] = "own"
-    """whether a UAV's critic reads what the UAV observes and does, or what its team does"""
+    """what a critic reads: the observation and action of its UAV (own), or of all UAVs (team)"""
     exploration: ExplorationConfig
     """exploration noise"""
 

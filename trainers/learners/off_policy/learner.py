@@ -272,14 +272,7 @@ class OffPolicyLearner(Learner):
             entry["lr"] = scale * rate
 
     def networks(self) -> dict[str, Tensor]:
-        """Returns the weights of all seeds' networks and target networks by name, not copied."""
         return {name: v for name, v in self.loss.state_dict().items() if "_params." in name}
-
-    def weights(self, team: int = 0) -> dict[str, Tensor]:
-        return {
-            name: value.detach().unflatten(0, (self.teams, -1))[team]
-            for name, value in self.networks().items()
-        }
 
     def state_dict(self, *, transitions: bool = True) -> dict[str, Tensor]:
         return prefixed(

@@ -79,7 +79,7 @@ class SequenceMemory(ReplayMemory):
         """
         drawn: Any = self._buffer.sample(return_info=True)
         sample, info = drawn
-        begins, past = info["begins"], self.burn_in
+        begins, past = info[BEGINS[1]], self.burn_in
 
         def learnt(name: Any) -> Tensor:
             return sample.get(name).transpose(1, 2)[:, :, past:]
@@ -91,9 +91,9 @@ class SequenceMemory(ReplayMemory):
             before = observed[name][:, :, : past + 1]
             following[name] = torch.cat((before, learnt(("next", name))), 2)
         kept = ["action", *(["alive"] if self._failures else [])]
-        agents = {**observed, **{name: learnt(name) for name in kept}, "begins": begins}
+        agents = {**observed, **{name: learnt(name) for name in kept}, BEGINS[1]: begins}
         after = {name: learnt(("next", name)) for name in ("reward", "done", "terminated")}
-        after |= {**following, "begins": begins.clone()}
+        after |= {**following, BEGINS[1]: begins.clone()}
         batch, size = begins.shape, begins.shape[:1]
         return TensorDict(
             {

@@ -253,16 +253,9 @@ class OnPolicyLearner(Learner):
         self._lr_scale = scale
 
     def networks(self) -> dict[str, Tensor]:
-        """Returns the weights of all seeds' networks by name, not copied."""
         actor, critic = self.actor.module.state_dict(), self.critic.module.state_dict()
         return {ACTOR + name: value for name, value in actor.items()} | {
             _CRITIC + name: value for name, value in critic.items()
-        }
-
-    def weights(self, team: int = 0) -> dict[str, Tensor]:
-        return {
-            name: value.detach().unflatten(0, (self.teams, -1))[team]
-            for name, value in self.networks().items()
         }
 
     def state_dict(self, *, transitions: bool = True) -> dict[str, Tensor]:

@@ -1,10 +1,8 @@
 // Draws the measures against the step with uPlot; all charts share a cursor, which is the step.
 
 import { fixed, ratio } from "./unpack.js";
-import { uavStyle } from "./map.js";
+import { panelStyle, uavStyle } from "./palette.js";
 
-const PANEL_COLOURS = ["--panel-0", "--panel-1", "--panel-2", "--panel-3"];
-const DASHES = [[], [8, 4], [2, 3], [8, 3, 2, 3]];
 const MANY_UAVS = 8; // above this number, a chart shows the number of the chosen UAV only
 const HEIGHT = 170;
 
@@ -16,14 +14,6 @@ const MEASURES = [
   ["base_coverage", "Base coverage, %", 1,
     (p, step) => (p.base_seen ? ratio(p.base_seen(step), p.burnt(step)) : null)],
 ];
-
-/** Returns the colour and the dashes of a panel's lines. */
-export function panelStyle(palette, place) {
-  return {
-    stroke: palette.named(PANEL_COLOURS[place % PANEL_COLOURS.length]),
-    dash: DASHES[(place + Math.floor(place / PANEL_COLOURS.length)) % DASHES.length],
-  };
-}
 
 /** The charts below the maps. `seek` is called with a step that was clicked. */
 export class Curves {
@@ -97,7 +87,6 @@ export class Curves {
       height: HEIGHT,
       scales: { x: { time: false } },
       cursor: { sync: { key: "steps" }, drag: { x: false, y: false }, y: false, points: { show: false } },
-      legend: { live: true },
       axes: [axis, { ...axis, size: 58 }],
       series: [{ label: "step" }, ...[...hidden, ...shown].map(({ label, stroke, dash, width, alpha }) => ({
         label, stroke, dash, width, alpha,

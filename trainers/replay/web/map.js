@@ -1,37 +1,16 @@
 // Draws the map of a panel at a step on a canvas.
 
 import { burns } from "./knowledge.js";
+import { uavStyle } from "./palette.js";
 
 const TRAIL = 80; // steps
 const MANY = 16; // UAVs above which links are thin and targets have no lines
-const UAV_COLOURS = ["--uav-0", "--uav-1", "--uav-2", "--uav-3", "--uav-4", "--uav-5"];
-const UAV_DASHES = [[], [9, 5], [2, 4], [12, 4, 2, 4]]; // of lines; with the colours 24 pairs
-const HEAT = ["--heat-0", "--heat-1", "--heat-2", "--heat-3", "--heat-4"];
 const ROLE_COLOURS = ["--discoverer", "--seeker", "--wanderer"];
 const SHAPES = [ // of the roles: corners right and down of the middle
   [[0, -1.75], [1.75, 0], [0, 1.75], [-1.75, 0]],
   [[0, -1.9], [1.8, 1.25], [-1.8, 1.25]],
   [[-1.35, -1.35], [1.35, -1.35], [1.35, 1.35], [-1.35, 1.35]],
 ];
-
-/** Returns the colours of the page's style, which depend on light and dark. */
-export function colours() {
-  const style = getComputedStyle(document.documentElement);
-  const named = (name) => style.getPropertyValue(name).trim();
-  const bytes = (name) => [1, 3, 5].map((at) => parseInt(named(name).slice(at, at + 2), 16));
-  return { named, bytes, heat: HEAT.map(bytes) };
-}
-
-/** Returns the colour and the dashes of a UAV's lines, and the colour of its number. */
-export function uavStyle(palette, uav) {
-  const name = UAV_COLOURS[uav % UAV_COLOURS.length];
-  const [red, green, blue] = palette.bytes(name);
-  return {
-    stroke: palette.named(name),
-    dash: UAV_DASHES[Math.floor(uav / UAV_COLOURS.length) % UAV_DASHES.length],
-    ink: 0.299 * red + 0.587 * green + 0.114 * blue > 140 ? "#000000" : "#ffffff",
-  };
-}
 
 /** Draws one panel: cells in colours, then lines and marks. */
 export class MapView {

@@ -2,8 +2,9 @@
 
 import { fixed, ratio, unpack } from "./unpack.js";
 import { firstSeen, Knowledge } from "./knowledge.js";
-import { colours, MapView } from "./map.js";
-import { Curves, panelStyle } from "./curves.js";
+import { colours, panelStyle } from "./palette.js";
+import { MapView } from "./map.js";
+import { Curves } from "./curves.js";
 
 const find = (name) => document.getElementById(name);
 

@@ -20,7 +20,8 @@ def require(executor: str, package: str, extra: str) -> None:
     """
     if find_spec(package) is None:
         raise UserError(
-            f"executor={executor}: {package} is not installed: pip install 'emberlink[{extra}]'"
+            f"executor={executor}: {package} is not installed: pip install '.[{extra}]' in the "
+            "folder of emberlink"
         )
 
 

@@ -6,9 +6,13 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
+
+from pydantic import Field
 
 from emberlink.envs.utils.errors import UserError
+
+Positive = Annotated[int, Field(ge=1)]
 
 DIED = -9
 """status of a task that ended without a word, such as with its machine"""

@@ -14,7 +14,7 @@ from pydantic.dataclasses import dataclass
 
 from emberlink.envs.utils.errors import UserError
 from emberlink.trainers.sweep.executors import _extras, _process
-from emberlink.trainers.sweep.executors.base import DIED, Executor, QueueFullError, Task
+from emberlink.trainers.sweep.executors.base import DIED, Executor, Positive, QueueFullError, Task
 
 _NAMESPACE = "emberlink"
 _STOPPED = 128 + signal.SIGTERM
@@ -30,7 +30,6 @@ def _whole_above_1(value: float) -> float:
     return value
 
 
-Positive = Annotated[int, Field(ge=1)]
 Part = Annotated[
     float, Field(ge=0, strict=False, allow_inf_nan=False), AfterValidator(_whole_above_1)
 ]

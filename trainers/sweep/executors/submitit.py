@@ -19,7 +19,7 @@ from emberlink.envs.utils.errors import UserError
 from emberlink.trainers.sweep.executors import _extras
 from emberlink.trainers.sweep.executors._slurm_job import STATUS, STOP, Batch, end, file_of
 from emberlink.trainers.sweep.executors._times import minutes
-from emberlink.trainers.sweep.executors.base import DIED, Executor, QueueFullError, Task
+from emberlink.trainers.sweep.executors.base import DIED, Executor, Positive, QueueFullError, Task
 
 _LOOK = 10.0
 """seconds between two looks at SLURM's queue"""
@@ -42,7 +42,6 @@ def _option(value: object) -> str | int:
     return value
 
 
-Positive = Annotated[int, Field(ge=1)]
 CountOrZero = Annotated[int, Field(ge=0)]
 
 
