@@ -114,8 +114,8 @@ def find_runs(folder: Path) -> list[RunFolder]:
     try:
         if not file.exists():
             return [RunFolder(folder)]
-        names = parse_json(read_text(file, MAX_YAML))["folders"]
-        runs = [RunFolder(folder.resolve().parent / Path(name).name) for name in names]
+        names = _named_in(file)
+        runs = [RunFolder(folder.resolve().parent / name) for name in names]
         missing = [run.path for run in runs if not run.path.is_dir()]
         if folder.resolve() not in [run.path for run in runs]:
             raise UserError(folder)
@@ -128,7 +128,31 @@ def find_runs(folder: Path) -> list[RunFolder]:
         raise UserError(f"{path}: cannot be resumed: {file} names it, and it is a link")
     for path in missing:
         raise UserError(f"{path}: is missing; its seed is trained together with {folder}")
+    for path in (run.path for run in runs):
+        if not _names(path / SEED_RUNS, names):
+            raise UserError(f"{path}: {file} names it, and its own {SEED_RUNS} differs")
     return runs
+
+
+def _named_in(file: Path) -> list[str]:
+    """Returns the names of folders in a file `SEED_RUNS`.
+
+    Raises:
+        ValueError: a name is not that of a folder beside the file's.
+        OSError, TypeError, KeyError: the file cannot be read, or holds something else.
+    """
+    names = parse_json(read_text(file, MAX_YAML))["folders"]
+    if any(name in ("", ".", "..") or Path(name).name != name for name in names):
+        raise UserError(f"{file}: names a place outside of its folder")
+    return names
+
+
+def _names(file: Path, names: list[str]) -> bool:
+    """Returns whether a file `SEED_RUNS` names these folders."""
+    try:
+        return _named_in(file) == names
+    except (OSError, ValueError, TypeError, KeyError):
+        return False
 
 
 def check_seeds(runs: Sequence[RunFolder], config: RunConfig) -> None:

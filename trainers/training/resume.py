@@ -43,7 +43,8 @@ def resume(path: Path, method: str | None = None, overrides: Sequence[str] = ())
     folders = RunFolders(runs, [replace(config, seed=seed) for seed in seeds])
     try:
         if chosen is None and not (runs[0].states() or runs[0].networks()):
-            _check_beginning(runs, config)
+            # With the intervals of the run so far; those of now may be shorter.
+            _check_beginning(runs, before)
         trainer = Trainer(config)
         sizes = _restore(trainer, runs, chosen)
         folders.check_lines(sizes, trainer.setup.episode)

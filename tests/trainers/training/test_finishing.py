@@ -1,6 +1,7 @@
 """Tests that a run is finished once its newest checkpoint is evaluated."""
 
 import errno
+import json
 import os
 import re
 import shlex
@@ -12,6 +13,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+import yaml
 from inside import Inside
 from tiny_run import TINY
 
@@ -116,6 +118,27 @@ def test_a_run_with_deleted_checkpoints_is_not_restarted(run, capsys):
     assert error.count("\n") == 1
     assert f"{run.path}: has metrics of 2 episodes and no checkpoint" in error
     assert contents(run.path) == before
+
+
+def test_a_killed_run_begins_again_with_a_shorter_interval(run, capsys):
+    shutil.rmtree(run.checkpoints)
+    (run.path / "eval.json").unlink()
+    config = yaml.safe_load((run.path / "config.yaml").read_text()) | {"checkpoint_interval": 5}
+    (run.path / "config.yaml").write_text(yaml.safe_dump(config))
+    assert trained(capsys, f"resume={run.path}", "checkpoint_interval=1")[0] == 0
+    assert len(run.lines()) == 2
+    assert run.config().checkpoint_interval == 1
+
+
+def test_the_best_networks_are_chosen_anew_by_another_measure(run):
+    more = ["episodes=3", "evaluation.headline=coverage"]
+    same = resume(run.path, overrides=more)
+    same.close()
+    assert same.best == [max(line["coverage"] for line in run.lines())]
+    for text in ("headline=tracking_last", "interval=1", "huygens=false", "interval_episodes=3"):
+        other = resume(run.path, overrides=[*more, f"evaluation.{text}"])
+        other.close()
+        assert other.best == [None], text
 
 
 def test_only_files_of_emberlink_are_removed(run, capsys):
@@ -272,6 +295,24 @@ def test_invalid_lists_of_seed_folders(content, said, run, capsys):
     assert status == 2
     assert error.count("\n") == 1
     assert f"{run.path / 'seed_runs.json'}: {said}" in error
+
+
+@pytest.mark.parametrize("other", ["..", ".", "", "a/../..", "Documents", "copy"])
+def test_a_list_of_seed_folders_leads_to_no_folder_of_the_user(other, run, capsys):
+    """The list may come from a stranger; `resume=` writes into the folders that it names."""
+    (run.path.parent / "Documents").mkdir()
+    copy = run.path.parent / "copy"
+    copy.mkdir()
+    (copy / "seed_runs.json").write_text('{"folders": ["copy"]}')
+    text = yaml.safe_load((run.path / "config.yaml").read_text()) | {"seeds": [0, 1]}
+    (run.path / "config.yaml").write_text(yaml.safe_dump(text))
+    (run.path / "seed_runs.json").write_text(json.dumps({"folders": [run.path.name, other]}))
+    before = contents(run.path.parent.parent)
+    status, _, error = trained(capsys, f"resume={run.path}")
+    assert status == 2
+    assert error.count("\n") == 1
+    assert "seed_runs.json" in error
+    assert contents(run.path.parent.parent) == before
 
 
 def test_a_seed_of_another_training_is_refused(tmp_path, capsys):
