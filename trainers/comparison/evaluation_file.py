@@ -12,7 +12,7 @@ from emberlink.envs.utils.validation import describe
 from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.evaluation.results import CURVES, LEARNED
 from emberlink.trainers.runs.run_folder import RunFolder
-from emberlink.trainers.runs.safe_read import MAX_JSON, read_text
+from emberlink.trainers.runs.safe_read import MAX_JSON, check_parts, read_text
 
 MAX_VALUE = 1e12
 """maximum absolute value of a measure"""
@@ -56,7 +56,9 @@ def read_evaluation(file: Path, config: RunConfig) -> Evaluation:
         UserError: the file is damaged, incomplete, or of another run.
     """
     try:
-        evaluation = TypeAdapter(Evaluation).validate_json(read_text(file, MAX_JSON))
+        text = read_text(file, MAX_JSON)
+        check_parts(text)
+        evaluation = TypeAdapter(Evaluation).validate_json(text)
     except ValidationError as error:
         raise UserError(f"{file}: {' '.join(describe(error).split())[:300]}") from None
     for key in ("method", "setup", "seed"):

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from emberlink.envs.utils.atomic_io import open_regular, replaced
 from emberlink.envs.utils.errors import UserError
+from emberlink.envs.utils.validation import shown
 
 FORMAT = 1
 """version of the file format; files of another version are refused"""
@@ -22,8 +23,8 @@ _KEY = "emberlink"
 _BLANK = "0" * 64
 """stands for the digest while it is computed"""
 _SEAL = re.compile(rb'sha256\\": \\"([0-9a-f]{64})\\"')
-_MAX_HEADER = 100_000_000
-"""bytes"""
+_MAX_HEADER = 4_000_000
+"""bytes; that of a checkpoint with 2,000 tensors has a tenth of it"""
 _MAX_FILE = 2**35
 """bytes; the largest checkpoint measured has 333 MB"""
 
@@ -93,7 +94,9 @@ def read_header(path: Path) -> dict[str, Any]:
             f"{path}: not a readable checkpoint: damaged, or of another program ({reason})"
         ) from None
     if version != FORMAT:
-        raise UserError(f"{path}: a checkpoint of format {version}; this version reads {FORMAT}")
+        raise UserError(
+            f"{path}: a checkpoint of format {shown(version)}; this version reads {FORMAT}"
+        )
     return header
 
 

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from emberlink.envs.utils import atomic_io
 from emberlink.envs.utils.errors import UserError
+from emberlink.envs.utils.validation import shown
 from emberlink.trainers.config.overrides import flat
 from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.runs import checkpoint_file
@@ -177,7 +178,7 @@ def _check_header(path: Path, header: Mapping[str, Any], config: RunConfig) -> N
     for name in ("method",) if any_team else ("method", "uavs"):
         if header.get(name, expected[name]) != expected[name]:
             raise UserError(
-                f"{path}: a checkpoint of {name}={header[name]}; "
+                f"{path}: a checkpoint of {name}={shown(header[name])}; "
                 f"this configuration has {name}={expected[name]}"
             )
 

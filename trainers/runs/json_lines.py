@@ -33,15 +33,9 @@ class JsonLines:
         text = read_text(path, MAX_JSON) if path.exists() else ""
         complete = text[: text.rfind("\n") + 1].splitlines()
         try:
-            values = [parse_json(line) for line in complete]
-            for value in values:
-                if not isinstance(value, dict) or "episode" not in value:
-                    raise UserError("a line is not of the form {episode: ..., ...}")
-                if not all(isinstance(number, int | float) for number in value.values()):
-                    raise UserError("a line holds a value that is not a number")
+            return [_numbers(line) for line in complete]
         except ValueError as error:
             raise UserError(f"{path}: not a file of JSON lines: {error}") from None
-        return values
 
     def append(self, file: str, line: Mapping[str, Any]) -> None:
         """Appends a line to a file, completely or not at all.
@@ -120,3 +114,13 @@ class JsonLines:
             return
         except OSError as error:
             raise UserError(f"{path}: cannot be cut: {error.strerror}") from None
+
+
+def _numbers(line: str) -> dict[str, Any]:
+    """Returns the numbers of a line by name."""
+    value = parse_json(line)
+    if not isinstance(value, dict) or "episode" not in value:
+        raise UserError("a line is not of the form {episode: ..., ...}")
+    if not all(isinstance(number, int | float) for number in value.values()):
+        raise UserError("a line holds a value that is not a number")
+    return value

@@ -125,10 +125,10 @@ def pack(run: RunFolder, into: Path) -> Path:
     Raises:
         UserError: the run is not finished, or the new folder exists.
     """
-    trained = run.config()
+    trained = run.config(device="cpu")
     learner = _without_path(trained.learner)
     config = replace(trained, output="runs", logger="none", device="cpu", learner=learner)
-    if len(run.lines()) < config.episodes or not (run.path / "eval.json").exists():
+    if len(run.lines()) < config.episodes or not run.evaluated():
         raise UserError(f"{run.path}: not finished, or not evaluated")
     target = into / collection(config) / config.method / f"s{config.seed}"
     if target.exists():

@@ -12,8 +12,11 @@ from emberlink.envs.utils.errors import UserError
 
 MAX_YAML = 100_000
 """maximum bytes of a config.yaml; a typical one has 2,000"""
-MAX_JSON = 500_000_000
-"""maximum bytes of eval.json and metrics.jsonl; the largest evaluation has a fifth of it"""
+MAX_JSON = 200_000_000
+"""maximum bytes of eval.json and metrics.jsonl; the largest evaluation has half of it"""
+_MAX_PARTS = 2_000_000
+"""maximum number of lists, mappings and texts in a JSON text; they take up to thirty times their
+bytes in memory"""
 _MAX_DIGITS = 20
 """digits of an integer"""
 
@@ -54,12 +57,25 @@ def read_yaml(path: Path) -> Any:
         raise UserError(f"{path}: cannot be read: {reason}") from None
 
 
+def check_parts(text: str) -> None:
+    """Checks that a JSON text takes little more memory as a value than as a text.
+
+    Raises:
+        UserError: it has too many lists, mappings and texts.
+    """
+    parts = text.count("[") + text.count("{") + text.count('"') // 2
+    if parts > _MAX_PARTS:
+        raise UserError(f"too many lists, mappings and texts: {parts}")
+
+
 def parse_json(text: str) -> Any:
     """Returns the value of a JSON text; integers of more than 20 digits become float.
 
     Raises:
-        ValueError: the text is not JSON, repeats a key, or has too many levels.
+        ValueError: the text is not JSON, repeats a key, or has too many levels, lists, mappings or
+            texts.
     """
+    check_parts(text)
     try:
         return json.loads(text, object_pairs_hook=_once, parse_int=_integer)
     except RecursionError:

@@ -16,11 +16,12 @@ import threading
 import time
 from collections.abc import Callable, Iterable
 from contextlib import suppress
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 
 from emberlink.envs.utils.atomic_io import inner_folder, link_new, sync, temporary, write_bytes
 from emberlink.envs.utils.errors import UserError
+from emberlink.envs.utils.validation import shown
 from emberlink.trainers.runs.safe_read import MAX_YAML, parse_json, read_text
 
 FOLDER = ("logs", "leases")
@@ -268,9 +269,20 @@ def _read(path: Path) -> Record:
         text = read_text(path, MAX_YAML)
         if not text:  # a file system without hard links: its holder is about to write it
             return Record(token="", role=SWEEP, host="", system="", process=0)
-        return Record(**parse_json(text))
+        return _checked(Record(**parse_json(text)))
     except (OSError, ValueError, TypeError) as error:
         raise UserError(f"{path}: not a lease: {error}") from None
+
+
+def _checked(record: Record) -> Record:
+    """Returns a record, after a check of its types and of its role."""
+    for field in fields(Record):
+        value = getattr(record, field.name)
+        if type(value) is not (int if field.name in ("process", "beat") else str):
+            raise UserError(f"{field.name}={shown(value)}")
+    if record.role not in (TRAINING, SWEEP):
+        raise UserError(f"role={shown(record.role)}")
+    return record
 
 
 def _system() -> str:

@@ -1,6 +1,9 @@
 """Counts rollbacks to a checkpoint after a NaN or Inf, and reduces the learning rates."""
 
-from dataclasses import dataclass
+from typing import Annotated
+
+from pydantic import ConfigDict, Field
+from pydantic.dataclasses import dataclass
 
 from emberlink.trainers.training.non_finite import NonFiniteError
 
@@ -12,15 +15,15 @@ FILE = "rollbacks.jsonl"
 """file with a line for each rollback; unlike metrics.jsonl, it is never truncated"""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, config=ConfigDict(strict=True, extra="forbid"))
 class Rollbacks:
     """The rollbacks of a run so far."""
 
-    lr_scale: float = 1.0
+    lr_scale: Annotated[float, Field(gt=0, le=1)] = 1.0
     """factor of the configuration's learning rates"""
-    count: int = 0
+    count: Annotated[int, Field(ge=0, le=MAX_ROLLBACKS)] = 0
     """rollbacks since training last passed `worst_step`"""
-    worst_step: int = 0
+    worst_step: Annotated[int, Field(ge=0)] = 0
     """latest step at which training failed"""
 
     def passed(self, step: int) -> "Rollbacks":

@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -233,7 +233,7 @@ class Trainer:
             sizes=folders.sizes(),
             best=self.best,
             seconds=round(self.elapsed(), 3),
-            rollbacks=asdict(self.rollbacks),
+            rollbacks=self.rollbacks,
             tensors=len(tensors),
             versions=versions(),
         )
@@ -255,7 +255,7 @@ class Trainer:
             UserError: the checkpoint does not fit; the message begins with its path.
         """
         self.rollbacks = checkpoints.restore(path, self.setup, state, tensors)
-        self.best, self.seconds = list(state.best), state.seconds
+        self.best, self.seconds = checkpoints.best(state, self.config), state.seconds
         self.changed_versions = changed(state.versions)
 
     def roll_back(self, error: non_finite.NonFiniteError) -> str:

@@ -41,7 +41,8 @@ def start(learner: Learner, config: RunConfig) -> None:
     }
     try:
         run = RunFolder(find_one(name) if is_name(name) else name)
-        checkpoint, theirs = run.checkpoint(), run.config()
+        # The device of that run may not exist here.
+        checkpoint, theirs = run.checkpoint(), run.config(device=config.device)
         check_trained_with(checkpoint, theirs)
         weights = load_weights(checkpoint, expected, config)
     except UserError as error:

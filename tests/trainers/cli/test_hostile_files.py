@@ -23,8 +23,11 @@ from emberlink.envs.fire.cache import bank_key, fire_bank
 from emberlink.envs.fire.generator import load_scenario
 from emberlink.envs.utils.errors import UserError
 from emberlink.trainers.cli import main
+from emberlink.trainers.comparison.evaluation_file import read_evaluation
 from emberlink.trainers.config.compose import resolve
+from emberlink.trainers.runs import checkpoint_file
 from emberlink.trainers.runs.run_folder import RunFolder
+from emberlink.trainers.runs.safe_read import parse_json
 
 
 class Bomb:
@@ -394,3 +397,21 @@ def test_files_of_the_working_folder_are_not_executed(tmp_path, mark):
     assert (done.returncode, done.stdout, done.stderr) == (2, "", expected)
     assert not mark.exists()
     assert sorted(tmp_path.rglob("*")) == before
+
+
+@pytest.mark.parametrize("part", ["[],", "{},", '"",', '{"":0},'])
+def test_a_text_that_takes_more_memory_as_a_value_is_refused(part, tmp_path):
+    text = f"[{part * 2_100_000}0]"
+    with pytest.raises(UserError, match="too many lists, mappings and texts"):
+        parse_json(text)
+    file = tmp_path / "eval.json"
+    file.write_text(text)
+    with pytest.raises(UserError, match="too many lists, mappings and texts"):
+        read_evaluation(file, resolve("independent"))
+
+
+def test_a_long_header_of_a_checkpoint_is_not_read(tmp_path):
+    file = tmp_path / "step_000000001.safetensors"
+    file.write_bytes(safetensors(b'{"a":[' + b"[]," * 2_000_000 + b"0]}"))
+    with pytest.raises(UserError, match="its header has 6000009 bytes"):
+        checkpoint_file.read_header(file)

@@ -156,6 +156,24 @@ def test_a_header_that_lacks_a_key_is_refused(key, stopped):
     assert reason == f"a checkpoint of another version: it has no '{key}'"
 
 
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        *(("step", value) for value in ("x", None, -1, 0.5, True)),
+        *(("best", value) for value in (None, ["x"], [], [1.0, 2.0], [float("nan")])),
+        *(("seconds", value) for value in ("x", -1.0, float("inf"))),
+        *(("sizes", value) for value in ([], [{}], None, [{"metrics.jsonl": "1"}], [{"a": 0}])),
+        *(("rollbacks", {"lr_scale": value}) for value in ("x", 0.0, 2.0, float("nan"))),
+        *(("rollbacks", value) for value in ([], {"count": -1}, {"more": 1})),
+        *(("folders", value) for value in (3, [], ["a", "b"])),
+        ("versions", []),
+        ("config", "x" * 200_000),
+    ],
+)
+def test_a_header_with_a_wrong_value_is_refused(key, value, stopped):
+    refused(stopped, lambda header, _: header.update({key: value}))
+
+
 @pytest.mark.parametrize("key", ["learner.gamma", "env.horizon", "seed"])
 def test_a_state_of_another_configuration_is_refused(key, stopped):
     def change(header: dict, _) -> None:

@@ -271,3 +271,13 @@ def test_nothing_is_written_through_links(tmp_path):
     with pytest.raises(ValueError, match="link"):
         Leases(tmp_path / "runs").take("a", SWEEP)
     assert not any(outside.iterdir())
+
+
+@pytest.mark.parametrize(
+    "change", [{"role": "x"}, {"role": [1]}, {"process": "../1"}, {"beat": 1.5}, {"token": 3}]
+)
+def test_a_lease_with_a_wrong_value_is_named(change, tmp_path):
+    lease = Leases(tmp_path).take("run", TRAINING)
+    lease.path.write_text(json.dumps(json.loads(lease.path.read_text()) | change))
+    with pytest.raises(ValueError, match=f"not a lease: {next(iter(change))}="):
+        Leases(tmp_path).newest("run")
