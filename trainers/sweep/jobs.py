@@ -2,6 +2,7 @@
 
 import hashlib
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from itertools import product
 from pathlib import Path
@@ -15,6 +16,7 @@ from emberlink.envs.utils.publish import free_name
 from emberlink.trainers.config.compose import flat, resolve, to_values
 from emberlink.trainers.config.schema import NOT_LEARNT_WITH, RunConfig
 from emberlink.trainers.runs.run_folder import RunFolder
+from emberlink.trainers.sweep.executors.base import STATUS, STOP
 from emberlink.trainers.training.folders import RunFolders
 
 _MAY_DIFFER = ("output", "seeds", *NOT_LEARNT_WITH)
@@ -150,19 +152,28 @@ class Job:
         return len(configs)
 
     def open_log(self) -> None:
-        """Sets `log` to the path of a new file.
+        """Creates an empty file for the log, so that no other job takes its name, and sets `log`.
 
         Raises:
-            OSError: the folder of the logs cannot be created.
+            OSError: the file or the folder of the logs cannot be created.
         """
         seeds = "-".join(str(config.seed) for config in self.configs)
         first = self.configs[0]
         stem = f"{first.setup}_{first.world}_{self.method}_s{seeds}"
-        self.log = Path(f"{free_name(inner_folder(self.output, 'logs'), stem, ['.txt'])}.txt")
+        folder = inner_folder(self.output, "logs")
+        while True:
+            self.log = Path(f"{free_name(folder, stem, ['.txt', STATUS, STOP])}.txt")
+            with suppress(FileExistsError):  # another sweep has just taken the name
+                return self.log.open("x").close()
+
+    def drop_log(self) -> None:
+        """Removes the log if nothing was written to it."""
+        if self.log.is_file() and not self.log.stat().st_size:
+            self.log.unlink()
 
     def last_line(self) -> str:
         """Returns the last line of the log, or why there is none."""
-        if not self.log.is_file():  # an executor may fail before its task writes
+        if not self.log.is_file():
             return "there is no log"
         lines = [line.strip() for line in self.log.read_text(errors="replace").splitlines()]
         return next((line for line in reversed(lines) if line), "the log is empty")

@@ -176,9 +176,11 @@ class Scheduler:
         try:
             handle = self._executor.submit(self._task(job, leases))
         except OSError as error:
+            job.drop_log()
             self._heart.release(leases, "not started")
             raise UserError(f"{error.filename or job.output}: {error.strerror or error}") from None
         except UserError as error:
+            job.drop_log()
             self._heart.release(leases, "not started")
             if not (isinstance(error, QueueFullError) and (self._accepted or self._running)):
                 raise

@@ -442,9 +442,33 @@ def test_a_resumed_sweep_equals_an_uninterrupted_one(tmp_path):
 
 def test_a_task_that_failed_before_its_log_is_reported(tmp_path):
     (job,) = jobs_of(["independent", f"output={tmp_path}"])
-    job.open_log()
     assert job.last_line() == "there is no log"
+    job.open_log()
+    assert job.last_line() == "the log is empty"
     job.log.write_text("first\nlast\n\n")
     assert job.last_line() == "last"
     job.log.write_text("\n")
     assert job.last_line() == "the log is empty"
+
+
+def test_every_job_has_a_log_of_its_own(tmp_path):
+    """An executor may write to the logs long after all jobs were submitted."""
+    jobs = jobs_of(["independent", "learner.gamma=0.9,0.95", f"output={tmp_path}"])
+    for job in jobs:
+        job.open_log()
+    first, second = (job.log for job in jobs)
+    assert first != second
+    assert first.exists()
+    assert second.exists()
+    # A job that was cancelled before it wrote leaves these files.
+    first.rename(first.with_suffix(".status"))
+    second.rename(second.with_suffix(".stop"))
+    (job,) = jobs_of(["independent", f"output={tmp_path}"])
+    job.open_log()
+    assert job.log not in (first, second)
+    job.drop_log()
+    assert not job.log.exists()
+    job.open_log()
+    job.log.write_text("a line")
+    job.drop_log()
+    assert job.log.exists()

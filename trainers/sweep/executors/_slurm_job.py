@@ -9,10 +9,8 @@ from typing import Any
 
 from emberlink.envs.utils.atomic_io import write_bytes
 from emberlink.trainers.sweep.executors import _extras, _process
-from emberlink.trainers.sweep.executors.base import Task
+from emberlink.trainers.sweep.executors.base import STATUS, STOP, Task
 
-STATUS, STOP = ".status", ".stop"
-"""suffixes of files beside a log: the exit status of the task; a request to save and end"""
 _SAVED = (128 + signal.SIGTERM, 128 + signal.SIGUSR2, -signal.SIGTERM, -signal.SIGUSR2)
 _GRACE = 120.0
 """seconds for which a job waits for its end after its runs were interrupted"""

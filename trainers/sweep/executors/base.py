@@ -16,6 +16,8 @@ Positive = Annotated[int, Field(ge=1)]
 
 DIED = -9
 """status of a task that ended without a word, such as with its machine"""
+STATUS, STOP = ".status", ".stop"
+"""suffixes of files beside a log: the exit status of the task; a request to save and end"""
 _WORKER = "emberlink.trainers.sweep.worker"
 
 

@@ -17,9 +17,17 @@ from pydantic.dataclasses import dataclass
 from emberlink.envs.utils.atomic_io import inner_folder, write_bytes
 from emberlink.envs.utils.errors import UserError
 from emberlink.trainers.sweep.executors import _extras
-from emberlink.trainers.sweep.executors._slurm_job import STATUS, STOP, Batch, end, file_of
+from emberlink.trainers.sweep.executors._slurm_job import Batch, end, file_of
 from emberlink.trainers.sweep.executors._times import minutes
-from emberlink.trainers.sweep.executors.base import DIED, Executor, Positive, QueueFullError, Task
+from emberlink.trainers.sweep.executors.base import (
+    DIED,
+    STATUS,
+    STOP,
+    Executor,
+    Positive,
+    QueueFullError,
+    Task,
+)
 
 _LOOK = 10.0
 """seconds between two looks at SLURM's queue"""
@@ -262,11 +270,16 @@ def _reason(error: Exception) -> str:
 
 def _explain(handle: _Handle) -> None:
     """Writes the last line of a job's own log to the log of a training that has not begun."""
-    if not handle.task.log.exists() and handle.job.paths.stderr.is_file():
+    if not _written(handle.task.log) and handle.job.paths.stderr.is_file():
         said = handle.job.paths.stderr.read_text(errors="replace").split("\n")
         line = next((line.strip() for line in reversed(said) if line.strip()), "no message")
         text = f"the training has not begun: {line} ({handle.job.paths.stderr})\n"
         write_bytes(handle.task.log, text.encode())
+
+
+def _written(log: Path) -> bool:
+    """Returns whether a log holds text."""
+    return log.is_file() and log.stat().st_size > 0
 
 
 def _slurm(*command: str) -> str | None:
