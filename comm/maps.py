@@ -97,7 +97,7 @@ class Maps(CommModule):
         self.register_buffer("place", torch.zeros(*agents, uavs, 3, dtype=torch.float32))
         drawn = torch.zeros(*agents, *self.pictures.shape, dtype=torch.uint8)
         self.register_buffer("crops", drawn)
-        self.register_buffer("home", torch.zeros(*agents, 3))
+        self.register_buffer("home", torch.zeros(*agents, 3, dtype=torch.float32))
         self.register_buffer("said", torch.zeros(agents, dtype=torch.int64))
         first = torch.arange(num_envs).unsqueeze(-1) * area
         self.register_buffer("_start", first, persistent=False)

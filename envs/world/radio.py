@@ -127,7 +127,7 @@ def chain(
     link = torch.minimum(rank.float(), relays - 1).clamp(min=0)
     along = torch.where(relays > 0, (first + hop * link).minimum(distance), 0.0)
     place = base + way * (along / distance.clamp(min=1e-6)).unsqueeze(-1)
-    reach = torch.where(relays > 0, hop, first)
+    reach = torch.where(relays > 0, hop, first).to(place.dtype)
     return place, torch.where(rank < relays, _RELAY_REACH, reach)
 
 
@@ -139,7 +139,7 @@ def middle(cells: Tensor) -> Tensor:
     count = cells.sum((-2, -1)).clamp(min=1)
     sides = (torch.arange(side, device=cells.device) for side in cells.shape[-2:])
     sums = ((cells.sum(axis) * side).sum(-1) for axis, side in zip((-1, -2), sides, strict=True))
-    return torch.stack([total / count for total in sums], -1)
+    return torch.stack([total.float() / count.float() for total in sums], -1)
 
 
 def chain_to_fire(

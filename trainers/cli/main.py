@@ -25,6 +25,12 @@ INTERRUPTED = 130
 """exit status after Ctrl-C"""
 _BROKEN_PIPE = 141
 """exit status of shells after a closed pipe"""
+_LONGEST = 300
+"""letters of a path in a message"""
+_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EIO)
+"""errors of full or broken disks"""
+_OF_PATHS = (errno.EACCES, errno.EPERM, errno.ENAMETOOLONG, errno.ELOOP, errno.EROFS)
+"""errors of paths that the user gave: without access, too long, links in a circle, read-only"""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -76,10 +82,12 @@ def _run(options: argparse.Namespace) -> int:
             return _BROKEN_PIPE
         if _is_output(error):
             return _unwritable(f"emberlink {options.command}", error)
-        if error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EIO):
+        if error.errno not in (*_FULL, *_OF_PATHS):
             raise
-        name = error.filename or "a file"
-        return _report(options, f"{name}: cannot be written: {error.strerror}")
+        name = os.fspath(error.filename or "a file")
+        name = name if len(name) <= _LONGEST else f"{name[:_LONGEST]}..."
+        what = "cannot be written: " if error.errno in _FULL else ""
+        return _report(options, f"{name}: {what}{error.strerror}")
     except Exception as error:
         message = _message(error)
         if message is None:

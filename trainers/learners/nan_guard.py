@@ -29,15 +29,23 @@ class NonFiniteGuard:
         """1 after a detection, else 0; Adam skips a step if its `found_inf` is 1"""
         self._counts = torch.zeros(3, dtype=torch.int64, device=device)
         self._place, self._steps, self._updates = self._counts.unbind()
-        self.rollout: TensorDictBase | None = None
-        """the first non-finite rollout; before a detection, the newest rollout"""
-        self.batch: TensorDictBase | None = None
-        """the batch of the first non-finite update; before a detection, of the newest update"""
+        self._rollouts = _Newest(self.bad)
+        self._batches = _Newest(self.bad)
         self.losses: dict[str, Tensor] = {}
         """losses of that update, [uavs] each"""
         self.gradients: dict[str, Tensor] = {}
         """norms of its gradients, one per row of the parameter"""
         self._arriving: tuple[Any, Tensor] | None = None
+
+    @property
+    def rollout(self) -> TensorDictBase | None:
+        """The first non-finite rollout; before a detection, the newest rollout."""
+        return self._rollouts.get()
+
+    @property
+    def batch(self) -> TensorDictBase | None:
+        """The batch of the first non-finite update; before a detection, of the newest update."""
+        return self._batches.get()
 
     def start(self, steps: int, updates: int) -> None:
         """Sets the number of steps and updates done so far."""
@@ -50,14 +58,14 @@ class NonFiniteGuard:
 
     def record_rollout(self, rollout: TensorDictBase, steps: int) -> None:
         """Checks and keeps a rollout of the given number of steps."""
-        self.rollout = self._keep(self.rollout, rollout)
+        self._rollouts.keep(rollout)
         values = [value for value in rollout.values(True, True) if value.is_floating_point()]
         self._flag(torch.stack([torch.linalg.vector_norm(value) for value in values]), ROLLOUT)
         self._steps.add_((self.bad == 0) * steps)
 
     def record_batch(self, batch: TensorDictBase) -> None:
         """Keeps the batch of the next update."""
-        self.batch = self._keep(self.batch, batch)
+        self._batches.keep(batch)
 
     def check_gradients(
         self, losses: Mapping[str, Tensor], gradients: Mapping[str, Tensor]
@@ -107,18 +115,40 @@ class NonFiniteGuard:
             event.record()
         return event, arriving
 
-    def _keep(self, place: TensorDictBase | None, value: TensorDictBase) -> TensorDictBase:
-        """Copies a TensorDict into the kept one, unless there was a detection before."""
-        if place is None or place.shape != value.shape:
-            return value.clone()
-        for key, tensor in place.items(True, True):
-            tensor.copy_(torch.where(self.bad > 0, tensor, value.get(key)))
-        return place
-
     def _flag(self, values: Tensor, place: int) -> None:
         wrong = ~values.isfinite().all()
         self._place.masked_fill_(wrong & (self.bad == 0), place)
         self.bad.masked_fill_(wrong, 1.0)
+
+
+class _Newest:
+    """Keeps the newest of several TensorDicts until a detection.
+
+    There is a copy for each batch size, since the minibatches of an epoch may differ in size.
+
+    Args:
+        bad: 1 after a detection, else 0.
+    """
+
+    def __init__(self, bad: Tensor):
+        self._bad = bad
+        self._newest = torch.zeros((), dtype=torch.int64, device=bad.device)
+        self._copies: dict[torch.Size, TensorDictBase] = {}
+
+    def keep(self, value: TensorDictBase) -> None:
+        """Copies a TensorDict, unless there was a detection before."""
+        place = self._copies.get(value.shape)
+        if place is None:
+            self._copies[value.shape] = value.clone()
+        else:
+            for key, tensor in place.items(True, True):
+                tensor.copy_(torch.where(self._bad > 0, tensor, value.get(key)))
+        number = list(self._copies).index(value.shape)
+        self._newest.copy_(torch.where(self._bad > 0, self._newest, number))
+
+    def get(self) -> TensorDictBase | None:
+        """Returns the newest TensorDict before a detection; waits for a GPU."""
+        return list(self._copies.values())[int(self._newest)] if self._copies else None
 
 
 def row_norms(tensors: Sequence[Tensor]) -> list[Tensor]:

@@ -96,7 +96,8 @@ class Teacher(Transform):
         policy.period = hold if hold > 1 else policy.period
         self._hold = hold
         self._policy = (policy,)  # not registered: it has no state but the targets
-        self.register_buffer("target", torch.zeros(env.num_envs, env.n_agents, 2))
+        target = torch.zeros(env.num_envs, env.n_agents, 2, dtype=torch.float32)
+        self.register_buffer("target", target)
 
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase

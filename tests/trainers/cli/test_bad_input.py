@@ -216,3 +216,25 @@ def test_a_batch_that_is_never_filled_gives_a_warning(tmp_path, capsys):
         == 0
     )
     assert "nothing will be learnt" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["eval", "x" * 300],
+        ["render", "x" * 300],
+        ["compare", "x" * 300],
+        ["train", "resume=" + "x" * 300],
+        ["sweep", "independent", "output=" + "x" * 300, "--dry-run"],
+        ["train", "maps", "learner=ippo", "learner.warm_start=" + "x" * 300, "output=runs"],
+    ],
+)
+def test_a_name_that_is_too_long_gives_one_line(arguments, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main.main(arguments) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert error.startswith(f"emberlink {arguments[0]}: ")
+    assert "xxx" in error
+    assert len(error) < 700
+    assert not list(tmp_path.iterdir())

@@ -2,6 +2,7 @@
 
 import json
 import math
+import shutil
 import warnings
 
 import pytest
@@ -295,6 +296,15 @@ def test_the_first_noise_is_that_of_the_configuration(warm, imitated, tmp_path):
     trainer.start()
     noise = trainer.setup.learner.weights()["actor_network_params.module.log_std"]
     assert (noise == -1.5).all()
+
+
+def test_actors_of_a_run_on_a_device_that_is_not_here(imitated, tmp_path):
+    run = shutil.copytree(imitated["ippo"], tmp_path / "run")
+    config = (run / "config.yaml").read_text()
+    assert "device: cpu" in config
+    (run / "config.yaml").write_text(config.replace("device: cpu", "device: cuda:7"))
+    more = [f"learner.warm_start={run}", f"output={tmp_path / 'runs'}"]
+    Trainer(resolve("maps", settings("ippo", *more))).start()
 
 
 def test_actors_of_another_network_are_refused(imitated, tmp_path, capsys):

@@ -30,20 +30,28 @@ def test_a_seed_repeats_its_run_byte_for_byte(method, tmp_path):
         assert weight.equal(same[name]), name
 
 
-@pytest.mark.parametrize("method", [*METHODS, "maps"])
-def test_the_default_dtype_does_not_change_a_training(method, tmp_path):
+ON_POLICY = ["learner=mappo", "comm.home=0.8", "env.base=[0,15]"]
+
+
+@pytest.mark.parametrize(
+    ("method", "more"), [*((method, []) for method in [*METHODS, "maps"]), ("maps", ON_POLICY)]
+)
+def test_the_default_dtype_does_not_change_a_training(method, more, tmp_path):
     """A program that uses emberlink may prefer float64."""
-    usual = until(begun(method, tmp_path / "usual"), 15)
+    step = 20 if more else 15  # on-policy learners learn at the end of an episode
+    usual = until(begun(method, tmp_path / "usual", *more), step)
     torch.set_default_dtype(torch.float64)
     try:
-        other = until(begun(method, tmp_path / "other"), 15)
+        other = until(begun(method, tmp_path / "other", *more), step)
         check_env_specs(make_env(method))
     finally:
         torch.set_default_dtype(torch.float32)
     assert other.setup.learner.updates > 0
     weights = other.setup.learner.actor.state_dict()
     for name, value in usual.setup.learner.actor.state_dict().items():
-        assert weights[name].equal(value), name
+        assert weights[name].dtype == value.dtype
+        # TorchRL's coefficients of PPO and its estimate of advantages round as the default dtype.
+        torch.testing.assert_close(weights[name], value, rtol=0, atol=1e-6 if more else 0)
 
 
 @pytest.mark.parametrize("fire", ["paper", "huygens"])

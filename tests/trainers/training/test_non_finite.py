@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from tensordict import TensorDict
 from test_recipes import METHODS
 from test_resume import assert_same, until
 
@@ -521,3 +522,18 @@ def test_the_update_of_a_sequence_or_a_team_can_be_repeated(more, tmp_path, monk
     assert replay(error.dump) == error.report
     bad.clear()
     assert replay(error.dump) is None
+
+
+def test_the_first_bad_batch_is_kept_whatever_the_size_of_the_next():
+    """The last minibatch of an epoch may be smaller than the others."""
+    guard = NonFiniteGuard("cpu")
+
+    def batch(size: int, value: float) -> TensorDict:
+        return TensorDict({"x": torch.full((size,), value)}, batch_size=[size])
+
+    assert guard.batch is None
+    for size, value, loss in [(2, 1.0, 0.0), (1, 2.0, 0.0), (2, 3.0, torch.nan), (1, 4.0, 0.0)]:
+        guard.record_batch(batch(size, value))
+        guard.check_gradients({"loss": torch.tensor([loss])}, {})
+    assert guard.batch is not None
+    assert guard.batch["x"].tolist() == [3.0, 3.0]

@@ -62,7 +62,7 @@ class Advantages:
         mean, std = self._moments(advantage, flew)
         advantage = self._scaled(self._scaled(advantage, -mean, add=True), 1 / (std + 1e-8))
         _, spread = self._moments(returns, flew)
-        kept = torch.where(self.spread > 0, _KEPT, 0.0)
+        kept = (self.spread > 0).to(self.spread.dtype) * _KEPT
         self.spread.copy_(torch.lerp(spread, self.spread, kept).clamp(min=1e-6))
         return advantage, self._scaled(returns, 1 / self.spread)
 
