@@ -158,7 +158,10 @@ def _free_paths(output: Path | None, run: RunFolder, stem: str) -> list[Path]:
         UserError: the named file exists, or its folder does not.
     """
     if output is not None and not output.is_dir():
-        return [new_file(output, [*_WRITERS, REPLAY])]
+        if output.suffix not in _WRITERS:
+            known = ", ".join([*_WRITERS, REPLAY])
+            raise UserError(f"{output}: there is no such folder, and a file ends in {known}")
+        return [new_file(output, list(_WRITERS))]
     try:
         folder = run.figures() if output is None else output
     except OSError as error:

@@ -16,12 +16,16 @@ import threading
 import time
 from collections.abc import Callable, Iterable
 from contextlib import suppress
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Literal
+
+from pydantic import ConfigDict
+from pydantic.dataclasses import dataclass
 
 from emberlink.envs.utils.atomic_io import inner_folder, link_new, sync, temporary, write_bytes
 from emberlink.envs.utils.errors import UserError
-from emberlink.envs.utils.validation import shown
+from emberlink.envs.utils.validation import from_plain
 from emberlink.trainers.runs.safe_read import MAX_YAML, parse_json, read_text
 
 FOLDER = ("logs", "leases")
@@ -30,11 +34,13 @@ BEAT = 10.0
 """seconds between two signs of life of a holder"""
 PATIENCE = 60.0
 """seconds without a sign of life after which a holder is regarded as dead"""
-TRAINING, SWEEP = "training", "sweep"
+Role = Literal["training", "sweep"]
+TRAINING: Role = "training"
+SWEEP: Role = "sweep"
 """kinds of holders: a training; a sweep that has submitted it"""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, config=ConfigDict(extra="forbid", strict=True))
 class Record:
     """The content of a lease.
 
@@ -49,7 +55,7 @@ class Record:
     """
 
     token: str
-    role: str
+    role: Role
     host: str
     system: str
     process: int
@@ -118,7 +124,7 @@ class Leases:
         self._newest: dict[str, int] = {}
         self._seen: dict[str, tuple[str, int, float]] = {}
 
-    def take(self, run: str, role: str, token: str = "") -> Lease | None:
+    def take(self, run: str, role: Role, token: str = "") -> Lease | None:
         """Takes the lease of a run, or returns None if it is held.
 
         Args:
@@ -156,7 +162,7 @@ class Leases:
         return Lease(path, record)
 
     def take_all(
-        self, runs: Iterable[str], role: str, tokens: dict[str, str] | None = None
+        self, runs: Iterable[str], role: Role, tokens: dict[str, str] | None = None
     ) -> list[Lease] | None:
         """Takes the leases of several runs, or none of them; arguments are those of `take`."""
         taken: list[Lease] = []
@@ -269,20 +275,9 @@ def _read(path: Path) -> Record:
         text = read_text(path, MAX_YAML)
         if not text:  # a file system without hard links: its holder is about to write it
             return Record(token="", role=SWEEP, host="", system="", process=0)
-        return _checked(Record(**parse_json(text)))
+        return from_plain(Record, parse_json(text))
     except (OSError, ValueError, TypeError) as error:
         raise UserError(f"{path}: not a lease: {error}") from None
-
-
-def _checked(record: Record) -> Record:
-    """Returns a record, after a check of its types and of its role."""
-    for field in fields(Record):
-        value = getattr(record, field.name)
-        if type(value) is not (int if field.name in ("process", "beat") else str):
-            raise UserError(f"{field.name}={shown(value)}")
-    if record.role not in (TRAINING, SWEEP):
-        raise UserError(f"role={shown(record.role)}")
-    return record
 
 
 def _system() -> str:

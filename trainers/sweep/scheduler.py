@@ -175,13 +175,12 @@ class Scheduler:
         self._heart.add(leases)
         try:
             handle = self._executor.submit(self._task(job, leases))
-        except OSError as error:
+        except (OSError, UserError) as error:
             job.drop_log()
             self._heart.release(leases, "not started")
-            raise UserError(f"{error.filename or job.output}: {error.strerror or error}") from None
-        except UserError as error:
-            job.drop_log()
-            self._heart.release(leases, "not started")
+            if isinstance(error, OSError):
+                where = error.filename or job.output
+                raise UserError(f"{where}: {error.strerror or error}") from None
             if not (isinstance(error, QueueFullError) and (self._accepted or self._running)):
                 raise
             self._waiting.insert(0, job)
