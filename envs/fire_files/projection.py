@@ -13,7 +13,7 @@ import numpy as np
 
 from emberlink.envs.fire_files.formats import beside
 from emberlink.envs.fire_files.sidecars import read_sidecar
-from emberlink.envs.utils.errors import UserError
+from emberlink.envs.utils.errors import UserError, how_to_install
 
 Bounds = tuple[float, float, float, float]
 """Minimum x, minimum y, maximum x, maximum y."""
@@ -35,8 +35,7 @@ def library(name: str, what: str = "reading this file") -> Any:
         return importlib.import_module(name)
     except ImportError:
         raise UserError(
-            f"{what} needs the extra geo: pip install '.[geo]' in the folder of "
-            f"emberlink ({name} is missing)"
+            f"{what} needs the extra geo: {how_to_install('geo')} ({name} is missing)"
         ) from None
 
 

@@ -7,3 +7,8 @@ class UserError(ValueError):
     The command line prints its message in one line. Any other exception is a defect of the program
     and keeps its traceback.
     """
+
+
+def how_to_install(extra: str) -> str:
+    """Returns the command that installs an extra of emberlink, for messages."""
+    return f"pip install '.[{extra}]' in the folder of emberlink"

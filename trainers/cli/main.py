@@ -25,8 +25,6 @@ INTERRUPTED = 130
 """exit status after Ctrl-C"""
 _BROKEN_PIPE = 141
 """exit status of shells after a closed pipe"""
-_LONGEST = 300
-"""letters of a path in a message"""
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EIO)
 """errors of full or broken disks"""
 _OF_PATHS = (errno.EACCES, errno.EPERM, errno.ENAMETOOLONG, errno.ELOOP, errno.EROFS)
@@ -84,8 +82,7 @@ def _run(options: argparse.Namespace) -> int:
             return _unwritable(f"emberlink {options.command}", error)
         if error.errno not in (*_FULL, *_OF_PATHS):
             raise
-        name = os.fspath(error.filename or "a file")
-        name = name if len(name) <= _LONGEST else f"{name[:_LONGEST]}..."
+        name = error.filename or "a file"
         what = "cannot be written: " if error.errno in _FULL else ""
         return _report(options, f"{name}: {what}{error.strerror}")
     except Exception as error:

@@ -32,7 +32,7 @@ class NonFiniteGuard:
         self._rollouts = _Newest(self.bad)
         self._batches = _Newest(self.bad)
         self.losses: dict[str, Tensor] = {}
-        """losses of that update, [uavs] each"""
+        """losses of the first non-finite update; before a detection, of the newest; [uavs] each"""
         self.gradients: dict[str, Tensor] = {}
         """norms of its gradients, one per row of the parameter"""
         self._arriving: tuple[Any, Tensor] | None = None

@@ -17,7 +17,7 @@ from PIL import Image
 from torchrl.record.loggers import TensorboardLogger, WandbLogger
 
 from emberlink.envs.utils.atomic_io import inner_folder, remove_links
-from emberlink.envs.utils.errors import UserError
+from emberlink.envs.utils.errors import UserError, how_to_install
 from emberlink.trainers.config.compose import to_values
 from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.runs.run_folder import RunFolder
@@ -191,8 +191,8 @@ def check_installed(config: RunConfig) -> None:
     """
     name = config.logger
     if name in ("wandb", "tensorboard") and find_spec(name) is None:
-        wanted = "'.[tensorboard]' in the folder of emberlink" if name == "tensorboard" else name
-        raise UserError(f"logger={name}: {name} is not installed: pip install {wanted}")
+        how = how_to_install(name) if name == "tensorboard" else f"pip install {name}"
+        raise UserError(f"logger={name}: {name} is not installed: {how}")
 
 
 def release_wandb() -> None:

@@ -4,15 +4,15 @@ from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import ConfigDict, Field
+from pydantic import Field
 from pydantic.dataclasses import dataclass
 from torch import Tensor
 
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import from_plain
-from emberlink.trainers.config.schema import RunConfig
+from emberlink.trainers.config.schema import CountOrZero, RunConfig
+from emberlink.trainers.learners.base import STRICT
 from emberlink.trainers.runs import checkpoint_file
-from emberlink.trainers.runs.seal import to_header
 from emberlink.trainers.training.folders import LINES
 from emberlink.trainers.training.non_finite import FIRE_TIMES, first_non_finite
 from emberlink.trainers.training.rollback import Rollbacks
@@ -21,17 +21,17 @@ from emberlink.trainers.training.setup import TrainingSetup
 _Number = Annotated[float, Field(allow_inf_nan=False)]
 
 
-@dataclass(frozen=True, kw_only=True, config=ConfigDict(strict=True, extra="forbid"))
+@dataclass(frozen=True, kw_only=True, config=STRICT)
 class RunState:
     """The part of a training state that is not tensors."""
 
-    step: Annotated[int, Field(ge=0)]
+    step: CountOrZero
     """steps of the batch of environments so far"""
     config: dict[str, Any]
     """configuration of the run, as plain values"""
     folders: list[str]
     """names of the run folders, one per seed"""
-    sizes: list[dict[str, Annotated[int, Field(ge=0)]]]
+    sizes: list[dict[str, CountOrZero]]
     """file -> size in bytes of the .jsonl files of each folder"""
     best: list[_Number | None]
     """best headline measure of each seed so far"""
@@ -99,9 +99,10 @@ def restore(
 
 def best(run: RunState, config: RunConfig) -> list[float | None]:
     """Returns the best headline measure of each seed; None if it is now measured in another way."""
-    before, now = run.config["evaluation"], to_header(config)["evaluation"]
-    same = all(before[key] == now[key] for key in ("headline", "huygens", "interval_episodes"))
-    on_the_same_fires = (before["interval"] > 0) == (now["interval"] > 0)
+    before, now = run.config["evaluation"], config.evaluation
+    compared = ("headline", "huygens", "interval_episodes")
+    same = all(before[key] == getattr(now, key) for key in compared)
+    on_the_same_fires = (before["interval"] > 0) == (now.interval > 0)
     return list(run.best) if same and on_the_same_fires else [None] * len(run.best)
 
 

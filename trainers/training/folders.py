@@ -143,7 +143,7 @@ def _named_in(file: Path) -> list[str]:
     """
     names = parse_json(read_text(file, MAX_YAML))["folders"]
     if any(name in ("", ".", "..") or Path(name).name != name for name in names):
-        raise UserError(f"{file}: names a place outside of its folder")
+        raise ValueError(file)
     return names
 
 

@@ -2,9 +2,11 @@
 
 from typing import Annotated
 
-from pydantic import ConfigDict, Field
+from pydantic import Field
 from pydantic.dataclasses import dataclass
 
+from emberlink.trainers.config.schema import CountOrZero
+from emberlink.trainers.learners.base import STRICT
 from emberlink.trainers.training.non_finite import NonFiniteError
 
 FACTOR = 0.5
@@ -15,7 +17,7 @@ FILE = "rollbacks.jsonl"
 """file with a line for each rollback; unlike metrics.jsonl, it is never truncated"""
 
 
-@dataclass(frozen=True, kw_only=True, config=ConfigDict(strict=True, extra="forbid"))
+@dataclass(frozen=True, kw_only=True, config=STRICT)
 class Rollbacks:
     """The rollbacks of a run so far."""
 
@@ -23,7 +25,7 @@ class Rollbacks:
     """factor of the configuration's learning rates"""
     count: Annotated[int, Field(ge=0, le=MAX_ROLLBACKS)] = 0
     """rollbacks since training last passed `worst_step`"""
-    worst_step: Annotated[int, Field(ge=0)] = 0
+    worst_step: CountOrZero = 0
     """latest step at which training failed"""
 
     def passed(self, step: int) -> "Rollbacks":

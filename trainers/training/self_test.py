@@ -10,6 +10,7 @@ from torchrl.envs.utils import check_env_specs
 
 from emberlink.configs import known
 from emberlink.envs.fire.generator import load_scenario, make_fires
+from emberlink.envs.utils.errors import how_to_install
 from emberlink.trainers.build import make_env
 from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.training.setup import TrainingSetup
@@ -47,7 +48,7 @@ def _geo() -> str:
     try:
         return ", ".join(f"{name} {version(name)}" for name in _GEO)
     except PackageNotFoundError as error:
-        return f"{error.name} is not installed: pip install '.[geo]' in the folder of emberlink"
+        return f"{error.name} is not installed: {how_to_install('geo')}"
 
 
 def _fire() -> str:

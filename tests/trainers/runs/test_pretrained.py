@@ -168,11 +168,13 @@ def test_only_finished_runs_are_packed_without_overwriting(packed, tmp_path, cap
     copy = tmp_path / "copy"
     shutil.copytree(run, copy)
     evaluation = json.loads((copy / "eval.json").read_text())
-    older = json.dumps({**evaluation, "checkpoint": "step_000000001.safetensors"})
-    for spoil in ((copy / "eval.json").write_text, lambda _: (copy / "eval.json").unlink()):
-        spoil(older)
-        assert pretrained.main([str(copy), "--into", str(tmp_path / "new")]) == 2
-        assert "not finished" in capsys.readouterr().err
+    older = {**evaluation, "checkpoint": "step_000000001.safetensors"}
+    (copy / "eval.json").write_text(json.dumps(older))
+    assert pretrained.main([str(copy), "--into", str(tmp_path / "new")]) == 2
+    assert "not finished" in capsys.readouterr().err
+    (copy / "eval.json").unlink()
+    assert pretrained.main([str(copy), "--into", str(tmp_path / "new")]) == 2
+    assert "not finished" in capsys.readouterr().err
     assert not (tmp_path / "new").exists()
 
 

@@ -4,7 +4,7 @@ from importlib import import_module
 from importlib.util import find_spec
 from typing import Any
 
-from emberlink.envs.utils.errors import UserError
+from emberlink.envs.utils.errors import UserError, how_to_install
 
 
 def require(executor: str, package: str, extra: str) -> None:
@@ -19,10 +19,7 @@ def require(executor: str, package: str, extra: str) -> None:
         UserError: it is not installed; the message says how to install it.
     """
     if find_spec(package) is None:
-        raise UserError(
-            f"executor={executor}: {package} is not installed: pip install '.[{extra}]' in the "
-            "folder of emberlink"
-        )
+        raise UserError(f"executor={executor}: {package} is not installed: {how_to_install(extra)}")
 
 
 def load(name: str) -> Any:

@@ -8,7 +8,7 @@ from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
 from emberlink.trainers.sweep.executors import _process
-from emberlink.trainers.sweep.executors.base import Executor, Task
+from emberlink.trainers.sweep.executors.base import CountOrZero, Executor, Task
 
 
 @dataclass(frozen=True, kw_only=True, config=ConfigDict(extra="forbid", strict=True))
@@ -23,7 +23,7 @@ class LocalConfig:
     """seeds of a method that are trained in one process"""
     gpus: Annotated[int, Field(ge=1)] | None = None
     """GPUs that share the runs in turn; if None, `device` alone chooses the GPU"""
-    restarts: Annotated[int, Field(ge=0)] = 3
+    restarts: CountOrZero = 3
     """how often a run is started again after it was killed"""
 
 

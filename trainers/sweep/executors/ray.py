@@ -14,7 +14,14 @@ from pydantic.dataclasses import dataclass
 
 from emberlink.envs.utils.errors import UserError
 from emberlink.trainers.sweep.executors import _extras, _process
-from emberlink.trainers.sweep.executors.base import DIED, Executor, Positive, QueueFullError, Task
+from emberlink.trainers.sweep.executors.base import (
+    DIED,
+    CountOrZero,
+    Executor,
+    Positive,
+    QueueFullError,
+    Task,
+)
 
 _NAMESPACE = "emberlink"
 _STOPPED = 128 + signal.SIGTERM
@@ -51,7 +58,7 @@ class RayConfig:
     """other resources of a run"""
     seeds: Positive = 1
     """seeds of a method that are trained in one process"""
-    restarts: Annotated[int, Field(ge=0)] = 3
+    restarts: CountOrZero = 3
     """how often a run is started again after its node died"""
     workers: Positive | None = None
     """runs at a time; all if None"""

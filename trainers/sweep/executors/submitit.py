@@ -23,6 +23,7 @@ from emberlink.trainers.sweep.executors.base import (
     DIED,
     STATUS,
     STOP,
+    CountOrZero,
     Executor,
     Positive,
     QueueFullError,
@@ -48,9 +49,6 @@ def _option(value: object) -> str | int:
     if isinstance(value, bool) or not isinstance(value, str | int):
         raise UserError("expected text or a whole number")
     return value
-
-
-CountOrZero = Annotated[int, Field(ge=0)]
 
 
 @dataclass(frozen=True, kw_only=True, config=ConfigDict(extra="forbid", strict=True))
