@@ -3,14 +3,14 @@
 from typing import Literal
 
 import torch
-from pydantic import ConfigDict
 from pydantic.dataclasses import dataclass
 from torch import Tensor
 
 from emberlink.envs.config import Number
+from emberlink.envs.utils.validation import STRICT
 
 
-@dataclass(frozen=True, kw_only=True, config=ConfigDict(extra="forbid", strict=True))
+@dataclass(frozen=True, kw_only=True, config=STRICT)
 class HeadingConfig:
     """Stores the settings of the bonus for flying to the target; the defaults are the paper's."""
 

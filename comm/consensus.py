@@ -3,7 +3,7 @@
 from typing import Annotated, Any, ClassVar, Literal
 
 import torch
-from pydantic import ConfigDict, Field
+from pydantic import Field
 from pydantic.dataclasses import dataclass
 from tensordict import TensorDictBase
 from torch import Tensor
@@ -16,6 +16,7 @@ from emberlink.envs import keys
 from emberlink.envs.config import WildfireConfig
 from emberlink.envs.utils import counter_rng
 from emberlink.envs.utils.counter_rng import Use
+from emberlink.envs.utils.validation import STRICT
 from emberlink.envs.world import motion
 from emberlink.envs.world.radio import pairwise_distance
 from emberlink.envs.world.reward import left_box
@@ -24,7 +25,7 @@ RECORD_BYTES = 16
 """position and rank of a discoverer, four float32 numbers"""
 
 
-@dataclass(frozen=True, kw_only=True, config=ConfigDict(extra="forbid", strict=True))
+@dataclass(frozen=True, kw_only=True, config=STRICT)
 class ConsensusConfig:
     """Stores the settings of method 4; the defaults are the paper's text."""
 

@@ -4,7 +4,7 @@ from dataclasses import replace
 from typing import Annotated, Any, ClassVar
 
 import torch
-from pydantic import ConfigDict, Field, Strict
+from pydantic import Field, Strict
 from pydantic.dataclasses import dataclass
 from tensordict import TensorDictBase
 from torch import Tensor
@@ -15,6 +15,7 @@ from emberlink.comm._messages import CellMessages, pass_on_places
 from emberlink.comm.base import CommModule
 from emberlink.envs import keys
 from emberlink.envs.config import WildfireConfig
+from emberlink.envs.utils.validation import STRICT
 from emberlink.envs.world import motion, radio
 from emberlink.envs.world.coverage_map import View
 from emberlink.envs.world.knowledge import Knowledge
@@ -23,7 +24,7 @@ from emberlink.envs.world.sensor import Sensor
 _NEAR = 10.0  # cells; unit of the way home, which is clipped beyond it
 
 
-@dataclass(frozen=True, kw_only=True, config=ConfigDict(extra="forbid", strict=True))
+@dataclass(frozen=True, kw_only=True, config=STRICT)
 class MapsConfig:
     """Stores the settings under `comm`."""
 

@@ -2,14 +2,14 @@
 
 from typing import ClassVar
 
-from pydantic import ConfigDict
 from pydantic.dataclasses import dataclass
 from tensordict import TensorDictBase
 
 from emberlink.comm.base import CommModule
+from emberlink.envs.utils.validation import STRICT
 
 
-@dataclass(frozen=True, kw_only=True, config=ConfigDict(extra="forbid", strict=True))
+@dataclass(frozen=True, kw_only=True, config=STRICT)
 class NoCommConfig:
     """No settings."""
 

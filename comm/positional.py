@@ -3,7 +3,6 @@
 from typing import Any, ClassVar
 
 import torch
-from pydantic import ConfigDict
 from pydantic.dataclasses import dataclass
 from tensordict import TensorDictBase
 from torch import Tensor
@@ -12,9 +11,10 @@ from torchrl.data import Composite, Unbounded
 from emberlink.comm.base import CommModule
 from emberlink.envs import keys
 from emberlink.envs.config import WildfireConfig
+from emberlink.envs.utils.validation import STRICT
 
 
-@dataclass(frozen=True, kw_only=True, config=ConfigDict(extra="forbid", strict=True))
+@dataclass(frozen=True, kw_only=True, config=STRICT)
 class PositionalConfig:
     """Stores the settings under `comm`."""
 

@@ -4,7 +4,6 @@ import math
 from typing import Annotated, Literal
 
 from pydantic import (
-    ConfigDict,
     Field,
     Strict,
     ValidationInfo,
@@ -14,12 +13,13 @@ from pydantic import (
 from pydantic.dataclasses import dataclass
 
 from emberlink.envs.utils.errors import UserError
+from emberlink.envs.utils.validation import STRICT
 
 Number = Annotated[float, Field(ge=-1e12, le=1e12)]
 """bounded so that the square of a sum over a view cannot overflow float32"""
 
 
-@dataclass(frozen=True, kw_only=True, config=ConfigDict(extra="forbid", strict=True))
+@dataclass(frozen=True, kw_only=True, config=STRICT)
 class RewardConfig:
     """The reward of a UAV in one step (paper, section IV.C); the defaults are the paper's."""
 
@@ -37,7 +37,7 @@ class RewardConfig:
     """the axes on which leaving the box is tested"""
 
 
-@dataclass(frozen=True, kw_only=True, config=ConfigDict(extra="forbid", strict=True))
+@dataclass(frozen=True, kw_only=True, config=STRICT)
 class RadioConfig:
     """The radios of the UAVs and of the base station."""
 
@@ -57,7 +57,7 @@ SIDES = (8, 256)
 _Side = Annotated[int, Field(ge=SIDES[0], le=SIDES[1])]
 
 
-@dataclass(frozen=True, kw_only=True, config=ConfigDict(extra="forbid", strict=True))
+@dataclass(frozen=True, kw_only=True, config=STRICT)
 class WildfireConfig:
     """The world and the team; the defaults are the paper's."""
 

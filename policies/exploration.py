@@ -4,7 +4,7 @@ import math
 from typing import Annotated, Any
 
 import torch
-from pydantic import ConfigDict, Field
+from pydantic import Field
 from pydantic.dataclasses import dataclass
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
@@ -13,12 +13,13 @@ from torchrl.envs.utils import ExplorationType, exploration_type
 from emberlink.envs import keys
 from emberlink.envs.utils import counter_rng
 from emberlink.envs.utils.counter_rng import Use
+from emberlink.envs.utils.validation import STRICT
 
 NOISE = (keys.AGENTS, "noise")
 """float32 [..., 3]: the state of the noise process, carried from step to step"""
 
 
-@dataclass(frozen=True, kw_only=True, config=ConfigDict(extra="forbid", strict=True))
+@dataclass(frozen=True, kw_only=True, config=STRICT)
 class ExplorationConfig:
     """Ornstein-Uhlenbeck noise: x += theta * (0 - x) * dt + sigma * sqrt(dt) * N(0, 1)."""
 

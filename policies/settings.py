@@ -2,11 +2,13 @@
 
 from typing import Annotated
 
-from pydantic import ConfigDict, Field
+from pydantic import Field
 from pydantic.dataclasses import dataclass
 
+from emberlink.envs.utils.validation import STRICT
 
-@dataclass(frozen=True, kw_only=True, config=ConfigDict(extra="forbid", strict=True))
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
 class PolicyConfig:
     """Stores the settings of a policy's memory and of the interval between its decisions."""
 

@@ -10,12 +10,14 @@ from collections.abc import Iterable, Mapping
 from typing import Annotated, Any, TypeVar
 
 import numpy as np
-from pydantic import Field, TypeAdapter, ValidationError
+from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 
 from emberlink.envs.utils.errors import UserError
 
 T = TypeVar("T")
 
+STRICT = ConfigDict(extra="forbid", strict=True)
+"""configuration of a pydantic dataclass without unknown keys and without conversions of types"""
 
 TAG = "kind:"
 """prefix of the tags of pydantic's unions, which are not part of a key"""

@@ -6,7 +6,6 @@ from typing import Annotated, Any, Literal
 
 from pydantic import (
     AfterValidator,
-    ConfigDict,
     Field,
     PlainValidator,
     SerializeAsAny,
@@ -23,16 +22,13 @@ from emberlink.envs.config import RadioConfig, WildfireConfig
 from emberlink.envs.scenarios import Scenario
 from emberlink.envs.utils.device import check_device as check_device
 from emberlink.envs.utils.errors import UserError
-from emberlink.envs.utils.validation import Name, unknown
+from emberlink.envs.utils.validation import STRICT, Name, unknown
 from emberlink.policies.networks import memory
 from emberlink.policies.scripted.registry import to_play
 from emberlink.policies.settings import PolicyConfig
 from emberlink.trainers.config import choice
 from emberlink.trainers.learners import registry as learners
 from emberlink.trainers.learners.base import Count, LearnerConfig
-
-_STRICT = ConfigDict(extra="forbid", strict=True)
-
 
 NOT_LEARNT_WITH = (
     *("device", "logger", "on_nan"),
@@ -63,7 +59,7 @@ def _check_policies(value: tuple[str, ...]) -> tuple[str, ...]:
     return value
 
 
-@dataclass(frozen=True, kw_only=True, config=_STRICT)
+@dataclass(frozen=True, kw_only=True, config=STRICT)
 class EvaluationConfig:
     """Stores the settings of evaluations of frozen policies on held-out fires."""
 
@@ -81,7 +77,7 @@ class EvaluationConfig:
     """the measure that chooses the networks of best.safetensors on validation fires"""
 
 
-@dataclass(frozen=True, kw_only=True, config=_STRICT)
+@dataclass(frozen=True, kw_only=True, config=STRICT)
 class Baseline:
     """The communication of a method, for the scripted policies that use it."""
 
@@ -96,7 +92,7 @@ class Baseline:
         return _completed("comm", value)
 
 
-@dataclass(frozen=True, kw_only=True, config=_STRICT)
+@dataclass(frozen=True, kw_only=True, config=STRICT)
 class RunConfig:
     """All settings of a run."""
 
@@ -179,6 +175,22 @@ class RunConfig:
     def _complete_comm(cls, value: dict[str, Any]) -> dict[str, Any]:
         # A run folder keeps them if a later version of the module has other defaults.
         return _completed("comm", value)
+
+    def check_rollouts(self, decisions: int = 1) -> None:
+        """Checks that an episode consists of whole rollouts, which only a training needs.
+
+        Args:
+            decisions: decisions of a rollout.
+
+        Raises:
+            UserError: `env.horizon` is not a multiple of the steps of a rollout.
+        """
+        steps = decisions * self.policy.hold
+        if self.env.horizon % steps:
+            raise UserError(
+                f"env.horizon={self.env.horizon}: must be a multiple of the {steps} steps that the "
+                f"learner takes at once (policy.hold={self.policy.hold})"
+            )
 
 
 def build_comm(config: RunConfig, num_envs: int) -> CommModule:

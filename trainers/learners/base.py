@@ -7,7 +7,7 @@ from dataclasses import field
 from typing import Annotated, Any, ClassVar
 
 import torch
-from pydantic import ConfigDict, Field, Strict
+from pydantic import Field, Strict
 from pydantic.dataclasses import dataclass
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
@@ -16,12 +16,10 @@ from torchrl.data import Composite
 
 from emberlink.envs.config import WildfireConfig
 from emberlink.envs.utils.errors import UserError
-from emberlink.envs.utils.validation import Name
+from emberlink.envs.utils.validation import STRICT, Name
 from emberlink.policies.networks import Generators, make_actor, team_of
 from emberlink.policies.settings import PolicyConfig
 from emberlink.trainers.learners.nan_guard import NonFiniteGuard
-
-STRICT = ConfigDict(extra="forbid", strict=True)
 
 Positive = Annotated[float, Field(gt=0, le=1e30)]
 NotNegative = Annotated[float, Field(ge=0, le=1e30)]

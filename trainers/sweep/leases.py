@@ -20,12 +20,11 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Literal
 
-from pydantic import ConfigDict
 from pydantic.dataclasses import dataclass
 
 from emberlink.envs.utils.atomic_io import inner_folder, link_new, sync, temporary, write_bytes
 from emberlink.envs.utils.errors import UserError
-from emberlink.envs.utils.validation import from_plain
+from emberlink.envs.utils.validation import STRICT, from_plain
 from emberlink.trainers.runs.safe_read import MAX_YAML, parse_json, read_text
 
 FOLDER = ("logs", "leases")
@@ -40,7 +39,7 @@ SWEEP: Role = "sweep"
 """kinds of holders: a training; a sweep that has submitted it"""
 
 
-@dataclass(frozen=True, kw_only=True, config=ConfigDict(extra="forbid", strict=True))
+@dataclass(frozen=True, kw_only=True, config=STRICT)
 class Record:
     """The content of a lease.
 

@@ -9,7 +9,6 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from emberlink.envs import keys
-from emberlink.envs.utils.errors import UserError
 from emberlink.policies.hold import decisions, hold
 from emberlink.trainers.build import build_env, build_learner
 from emberlink.trainers.config.schema import RunConfig
@@ -52,13 +51,13 @@ class TrainingSetup:
             true_map=config.learner.reads_map,
             teacher=config.learner.reads_teacher,
         )
-        self._check_horizon(config.policy.hold)  # learners divide by the decisions of an episode
+        config.check_rollouts()  # learners divide by the decisions of an episode
         self.guard = NonFiniteGuard(config.device)
         self.learner = build_learner(config, self.env, self.guard)
         self.team_actor(0)  # fails before the training, not at its first evaluation
         self.rollout_steps = self.learner.rollout_steps * config.policy.hold
         """steps of the batch of environments in a rollout"""
-        self._check_horizon(self.rollout_steps)
+        config.check_rollouts(self.learner.rollout_steps)
         self.collector = make_collector(
             self.env,
             hold(self.learner.explorer, config.policy.hold),
@@ -96,14 +95,6 @@ class TrainingSetup:
     def seed_config(self, team: int) -> RunConfig:
         """Returns the configuration of one of the seeds."""
         return replace(self.config, seed=self.seeds[team])
-
-    def _check_horizon(self, steps: int) -> None:
-        """Raises UserError if an episode does not consist of whole rollouts of `steps` steps."""
-        if self.horizon % steps:
-            raise UserError(
-                f"env.horizon={self.horizon}: must be a multiple of the {steps} steps that the "
-                f"learner takes at once (policy.hold={self.config.policy.hold})"
-            )
 
     def team_actor(self, team: int) -> Any:
         """Returns the actors of one seed without noise; they share weights with the learner."""

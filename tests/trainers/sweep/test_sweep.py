@@ -102,6 +102,7 @@ def test_all_methods_by_default_and_stacks_of_seeds():
         (["consensus", "seed=0,-1"], "seed"),
         (["consensus", "setup=paper,tunned"], "tunned"),
         (["consensus", "learner.gama=0.9,0.8"], "learner.gama"),
+        (["consensus", "policy.hold=5,7", "env.horizon=20"], "env.horizon=20: must be a multiple"),
         (["consensus", "--jobs", "0"], "--jobs"),
     ],
 )

@@ -4,14 +4,15 @@ import os
 import subprocess
 from typing import Annotated
 
-from pydantic import ConfigDict, Field
+from pydantic import Field
 from pydantic.dataclasses import dataclass
 
+from emberlink.envs.utils.validation import STRICT
 from emberlink.trainers.sweep.executors import _process
 from emberlink.trainers.sweep.executors.base import CountOrZero, Executor, Task
 
 
-@dataclass(frozen=True, kw_only=True, config=ConfigDict(extra="forbid", strict=True))
+@dataclass(frozen=True, kw_only=True, config=STRICT)
 class LocalConfig:
     """Stores the settings of local processes."""
 

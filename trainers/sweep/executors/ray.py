@@ -9,10 +9,11 @@ import time
 import warnings
 from typing import Annotated, Any
 
-from pydantic import AfterValidator, ConfigDict, Field
+from pydantic import AfterValidator, Field
 from pydantic.dataclasses import dataclass
 
 from emberlink.envs.utils.errors import UserError
+from emberlink.envs.utils.validation import STRICT
 from emberlink.trainers.sweep.executors import _extras, _process
 from emberlink.trainers.sweep.executors.base import (
     DIED,
@@ -42,7 +43,7 @@ Part = Annotated[
 ]
 
 
-@dataclass(frozen=True, kw_only=True, config=ConfigDict(extra="forbid", strict=True))
+@dataclass(frozen=True, kw_only=True, config=STRICT)
 class RayConfig:
     """Stores the settings of Ray tasks."""
 

@@ -11,11 +11,12 @@ from io import StringIO
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BeforeValidator, ConfigDict, Field, PlainValidator
+from pydantic import BeforeValidator, Field, PlainValidator
 from pydantic.dataclasses import dataclass
 
 from emberlink.envs.utils.atomic_io import inner_folder, write_bytes
 from emberlink.envs.utils.errors import UserError
+from emberlink.envs.utils.validation import STRICT
 from emberlink.trainers.sweep.executors import _extras
 from emberlink.trainers.sweep.executors._slurm_job import Batch, end, file_of
 from emberlink.trainers.sweep.executors._times import minutes
@@ -51,7 +52,7 @@ def _option(value: object) -> str | int:
     return value
 
 
-@dataclass(frozen=True, kw_only=True, config=ConfigDict(extra="forbid", strict=True))
+@dataclass(frozen=True, kw_only=True, config=STRICT)
 class SubmititConfig:
     """Stores the settings of SLURM jobs."""
 
