@@ -25,39 +25,42 @@ from emberlink.policies.networks.stacked import (
 class _Remembering(StackedNetwork):
     """The common part: it maps sequences of observations, [batch, uavs, decisions, ...]."""
 
-    def recall(self, observations: Sequence[Tensor], begins: Tensor, burn_in: int) -> Tensor:
+    def recall(self, observations: Sequence[Tensor], missing: Tensor, burn_in: int) -> Tensor:
         """Returns the memory's features of the decisions after the burn-in.
 
-        The memory is empty before the burn-in, and after it where there is none. It has no
-        gradient there (Kapturowski et al. 2019, ICLR).
+        The memory is empty before the burn-in, and has no gradient in it (Kapturowski et al. 2019,
+        ICLR).
 
         Args:
             observations: [batch, uavs, decisions, ...] each.
-            begins: bool [batch, uavs], whether a sequence has no burn-in.
+            missing: int64 [batch, uavs], the first decisions of a burn-in that are not part of it.
             burn_in: decisions of the burn-in.
 
         Returns:
             [groups, rows, decisions - burn_in, features].
         """
-        state = None
+        batch = missing.shape
+        following = self._encode([x[:, :, burn_in:] for x in observations], batch)
+        state = self._empty(following)
         if burn_in:
             with torch.no_grad():
-                past = [x[:, :, :burn_in] for x in observations]
-                _, state = self._remember(past, begins.shape, None)
-            forgotten = self.grouping.split(begins, begins.shape).unsqueeze(-1)
-            state = state.masked_fill(forgotten, 0.0)
-        following = [x[:, :, burn_in:] for x in observations]
-        return self._remember(following, begins.shape, state)[0]
+                past = self._encode([x[:, :, :burn_in] for x in observations], batch)
+                state = self._prepare(past, self.grouping.split(missing, batch), state)
+        return self.memory(following, state)[0]
 
-    def _remember(
-        self, observations: Sequence[Tensor], batch: torch.Size, state: Tensor | None
-    ) -> tuple[Tensor, Tensor]:
-        """Maps [*batch, decisions, ...] each to features and the state after the last decision.
+    def _prepare(self, past: Tensor, missing: Tensor, state: Tensor) -> Tensor:
+        """Returns the state after a burn-in, [groups, rows, decisions, features] of the encoder."""
+        for decision, x in enumerate(past.split(1, 2)):
+            _, state = self.memory(x, state)
+            state = state.masked_fill((missing > decision).unsqueeze(-1), 0.0)
+        return state
+
+    def _encode(self, observations: Sequence[Tensor], batch: torch.Size) -> Tensor:
+        """Returns the encoder's features, [groups, rows, decisions, features].
 
         Args:
-            observations: the tensors of the observations.
+            observations: [*batch, decisions, ...] each.
             batch: [..., uavs] or [..., teams * uavs].
-            state: [groups, rows, size]; None for an empty memory.
         """
         dims = len(batch)
         if self._team:
@@ -68,9 +71,10 @@ class _Remembering(StackedNetwork):
         tensors = [self.grouping.split(x, batch) for x in observations]
         rows, decisions = tensors[0].shape[1:3]
         encoded = self.encoder([x.flatten(1, 2) for x in tensors])
-        if state is None:
-            state = encoded.new_zeros(len(encoded), rows, self.memory.size)
-        return self.memory(encoded.unflatten(1, (rows, decisions)), state)
+        return encoded.unflatten(1, (rows, decisions))
+
+    def _empty(self, encoded: Tensor) -> Tensor:
+        return encoded.new_zeros(*encoded.shape[:2], self.memory.size)
 
     def _map(self, function: Callable[..., Tensor], layers: Sequence, x: Tensor) -> list[Tensor]:
         return apply_layers(function, layers, self._parts(x.flatten(1, 2)))
@@ -86,16 +90,16 @@ class RecurrentActor(StackedActor, _Remembering):
     """Maps sequences of observations to actions in [-1, 1]."""
 
     def forward(
-        self, observations: Sequence[Tensor], begins: Tensor, burn_in: int, decisions: int
+        self, observations: Sequence[Tensor], missing: Tensor, burn_in: int, decisions: int
     ) -> Tensor:
         """Returns the actions of the last decisions, [batch, uavs, decisions, actions].
 
         Args:
-            observations, begins, burn_in: see `recall`.
+            observations, missing, burn_in: see `recall`.
             decisions: number of the last decisions.
         """
-        x = self.recall(observations, begins, burn_in)[:, :, -decisions:]
-        return self._act(x, begins.shape)
+        x = self.recall(observations, missing, burn_in)[:, :, -decisions:]
+        return self._act(x, missing.shape)
 
     def step(self, observations: Sequence[Tensor], state: Tensor | None) -> tuple[Tensor, Tensor]:
         """Maps the observations of one decision.
@@ -108,9 +112,9 @@ class RecurrentActor(StackedActor, _Remembering):
             Actions, [*batch, uavs, actions], and the new state, [*batch, uavs, size].
         """
         batch = observations[0].shape[: -self._dims]
-        before = None if state is None else self.grouping.split(state, batch)
-        single = [x.unsqueeze(len(batch)) for x in observations]
-        x, after = self._remember(single, batch, before)
+        encoded = self._encode([x.unsqueeze(len(batch)) for x in observations], batch)
+        before = self._empty(encoded) if state is None else self.grouping.split(state, batch)
+        x, after = self.memory(encoded, before)
         return self._act(x, batch).squeeze(-2), self.grouping.join(after, batch)
 
     def _act(self, x: Tensor, batch: torch.Size) -> Tensor:
@@ -122,18 +126,18 @@ class RecurrentCritic(StackedCritic, _Remembering):
     """Maps sequences of observations, and actions, to values."""
 
     def forward(
-        self, observations: Sequence[Tensor], begins: Tensor, burn_in: int, action: Tensor
+        self, observations: Sequence[Tensor], missing: Tensor, burn_in: int, action: Tensor
     ) -> Tensor:
         """Returns the values of the last decisions, [batch, uavs, decisions, 1].
 
         Args:
-            observations, begins, burn_in: see `recall`.
+            observations, missing, burn_in: see `recall`.
             action: [batch, uavs, decisions, actions], of the last decisions.
         """
-        batch, decisions = begins.shape, action.shape[2]
+        batch, decisions = missing.shape, action.shape[2]
 
         def compute(observations: Sequence[Tensor]) -> list[Tensor]:
-            x = self.recall(observations, begins, burn_in)[:, :, -decisions:]
+            x = self.recall(observations, missing, burn_in)[:, :, -decisions:]
             return self._map(to_features, self._hidden_layers(), x)
 
         first: Any = self.first

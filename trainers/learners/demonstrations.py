@@ -7,9 +7,9 @@ from torch import Tensor
 
 from emberlink.envs import keys
 from emberlink.trainers.learners.off_policy.replay_buffer import ReplayMemory, arrange
-from emberlink.trainers.learners.off_policy.sequences import BEGINS, SequenceMemory
+from emberlink.trainers.learners.off_policy.sequences import MISSING, SequenceMemory
 
-_TEACHER, _ALIVE, _BEGINS = keys.TEACHER[1], keys.ALIVE[1], BEGINS[1]
+_TEACHER, _ALIVE, _MISSING = keys.TEACHER[1], keys.ALIVE[1], MISSING[1]
 
 
 class Demonstrations(ReplayMemory):
@@ -37,16 +37,16 @@ class DemonstrationSequences(SequenceMemory):
         """Samples sequences for each UAV: batch size [batch], [batch, uavs, decisions, ...] each.
 
         Observations are those of the burn-in and of the decisions to learn from, all other tensors
-        those of the decisions to learn from.
+        those of the decisions to learn from; "alive" is that of `SequenceMemory.sample`.
         """
         drawn: Any = self._buffer.sample(return_info=True)
         sample, info = drawn
-        agents: dict[str, Tensor] = {_BEGINS: info[_BEGINS]}
+        agents: dict[str, Tensor] = {_MISSING: info[_MISSING]}
         for _, name in self._keys:
             agents[name] = sample.get(name).transpose(1, 2)
-        for name in (_TEACHER, *([_ALIVE] if self._failures else [])):
-            agents[name] = sample.get(name).transpose(1, 2)[:, :, self.burn_in :]
-        batch = info[_BEGINS].shape
+        agents[_TEACHER] = sample.get(_TEACHER).transpose(1, 2)[:, :, self.burn_in :]
+        agents[_ALIVE] = self._alive(sample, info)
+        batch = info[_MISSING].shape
         return TensorDict({keys.AGENTS: TensorDict(agents, batch)}, batch_size=batch[:1])
 
 

@@ -34,7 +34,7 @@ from emberlink.trainers.learners.base import (
 )
 from emberlink.trainers.learners.demonstrations import Demonstrations, DemonstrationSequences
 from emberlink.trainers.learners.off_policy.learner import OffPolicyLearner
-from emberlink.trainers.learners.off_policy.sequences import BEGINS
+from emberlink.trainers.learners.off_policy.sequences import MISSING
 from emberlink.trainers.learners.tensors import (
     copy_into,
     group,
@@ -177,17 +177,17 @@ class Imitation(Learner):
     def _remembered(self, batch: TensorDictBase) -> Tensor:
         """Returns the actions of sequences after their burn-in, [batch, uavs, decisions, 3].
 
-        The memory is empty before the burn-in, and after it where there is none. It has no
-        gradient there.
+        The memory is empty before the burn-in, and has no gradient in it.
         """
         observed = [batch.get(key) for key in keys.observation_keys(self.context.observation_spec)]
         burn_in, state, actions = self.config.burn_in, None, []
         for decision in range(burn_in + self.config.sequence):
-            if decision == burn_in and state is not None:
-                state = state.masked_fill(batch.get(BEGINS).unsqueeze(-1), 0.0)
             with torch.set_grad_enabled(decision >= burn_in):
                 now = [x[:, :, decision] for x in observed]
                 action, state = self.actor.module.step(now, state)
+            if decision < burn_in:
+                lacks = batch.get(MISSING) > decision
+                state = state.masked_fill(lacks.unsqueeze(-1), 0.0)
             actions.append(action)
         return torch.stack(actions[burn_in:], 2)
 

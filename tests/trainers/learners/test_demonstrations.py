@@ -9,7 +9,7 @@ from test_sequences import UAVS, context
 from emberlink.envs import keys
 from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.learners.demonstrations import DemonstrationSequences
-from emberlink.trainers.learners.off_policy.sequences import BEGINS
+from emberlink.trainers.learners.off_policy.sequences import MISSING
 from emberlink.trainers.training.setup import TrainingSetup
 
 
@@ -30,12 +30,13 @@ def test_the_actions_of_a_sequence_are_those_of_its_decisions():
     assert taught.shape == (14, UAVS, 3, 3)
     assert taught.equal(observed[:, :, 2:])
     steps = observed[..., 0].diff(dim=-1)
-    begins = batch[BEGINS]
-    assert (steps[~begins] == 1).all()
-    assert (steps[begins] == torch.tensor([0.0, 0.0, 1.0, 1.0])).all()
+    missing, alive = batch[MISSING], batch[keys.ALIVE]
+    begin = torch.arange(2) >= missing.unsqueeze(-1)
+    assert steps[..., :2].equal(begin.float())
+    assert (steps[..., 2:][alive[..., 1:]] == 1).all()
+    assert not alive.all()
     assert (observed[..., 2] == torch.arange(UAVS).view(1, -1, 1)).all()
-    assert begins.any()
-    assert not begins.all()
+    assert missing.unique().tolist() == [0, 1, 2]
     assert (taught[..., 0] // horizon == taught[..., :1, 0] // horizon).all()  # one episode
 
 
@@ -51,11 +52,11 @@ def test_a_memory_learns_from_its_teacher(actor_of, memory):
     network, burn_in = learner.actor.module, learner.config.burn_in
     observed = [batch[key] for key in keys.observation_keys(setup.env.observation_spec)]
     total = torch.zeros(3)
-    for row, begins in enumerate(batch[BEGINS]):
+    for row, missing in enumerate(batch[MISSING]):
         for uav in range(3):
             state = None
             for decision in range(observed[0].shape[2]):
-                if begins[uav] and decision < burn_in:
+                if decision < missing[uav]:
                     continue
                 now = [x[row : row + 1, :, decision] for x in observed]
                 action, state = network.step(now, state)
@@ -84,6 +85,6 @@ def test_actors_with_a_memory_stay_near_to_those_they_began_with():
     distance = learner._distance(anchor, batch)
     assert (distance > 0).all()
     with torch.no_grad():
-        inputs = [batch[key] for key in learner._observed], batch[BEGINS], 2, 3
+        inputs = [batch[key] for key in learner._observed], batch[MISSING], 2, 3
         apart = learner.actor.module(*inputs) - anchor.network(*inputs)
     assert distance.detach().allclose(anchor.weight * apart.square().div(2).mean((0, 2, 3)))

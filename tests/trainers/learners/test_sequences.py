@@ -16,7 +16,7 @@ from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.learners.base import LearnerContext
 from emberlink.trainers.learners.nan_guard import NonFiniteGuard
 from emberlink.trainers.learners.off_policy.networks import with_taken
-from emberlink.trainers.learners.off_policy.sequences import BEGINS, SequenceMemory
+from emberlink.trainers.learners.off_policy.sequences import MISSING, SequenceMemory
 from emberlink.trainers.training.setup import TrainingSetup
 
 UAVS = 2
@@ -82,48 +82,59 @@ def test_a_sequence_never_crosses_an_episode(data):
             agents, following = row[keys.AGENTS][uav], row["next", keys.AGENTS][uav]
             observed = agents["observation"].long().tolist()
             first, env, _ = observed[burn_in]
-            learnt = [[first + k, env, uav] for k in range(sequence)]
+            begin, missing = first // horizon * horizon, int(agents["missing"])
+            end = min(begin + horizon, decisions)
+            learnt = [[min(first + k, end - 1), env, uav] for k in range(sequence)]
             assert observed[burn_in:] == agents["action"].long().tolist() == learnt
-            assert {decision // horizon for decision, *_ in learnt} == {first // horizon}
-            assert max(oldest, 0) <= first <= decisions - sequence
+            assert max(oldest, 0) <= first < end
+            alive = agents["alive"].tolist()
+            assert alive == sorted(alive, reverse=True)
+            assert 0 < sum(alive) <= end - first
             after = following["observation"].long().tolist()
-            assert after[burn_in:] == [*learnt, [first + sequence, env, uav]]
-            if agents["begins"]:
-                assert first % horizon == 0
-            else:
-                before = [[first - burn_in + k, env, uav] for k in range(burn_in)]
-                assert observed[:burn_in] == after[:burn_in] == before
-                assert first - burn_in >= max(oldest, first // horizon * horizon)
+            assert after[burn_in:] == [learnt[0], *([k + 1, env, uav] for k, *_ in learnt)]
+            assert missing == max(0, begin + burn_in - first)
+            before = [[max(begin, first - burn_in + k), env, uav] for k in range(burn_in)]
+            assert observed[:burn_in] == after[:burn_in] == before
+            assert first - burn_in + missing >= oldest
 
 
-def test_every_possible_sequence_is_drawn_equally_often():
+def shares(agents: TensorDict, uav: int, decisions: int) -> Tensor:
+    """Returns how often each decision is learnt from, as a share of the sum."""
+    learnt = agents["action"][:, uav, :, 0].long()[agents["alive"][:, uav]]
+    return learnt.bincount(minlength=decisions) / len(learnt)
+
+
+def test_every_decision_is_learnt_from_equally_often():
     """Episodes of 6 decisions; the buffer holds decisions 3 to 13 of two environments.
 
-    Sequences of 2 begin at 5 - 1 = 4 within the first episode, whose beginning is lost, at 6 to 10
-    in the second and at 12 in the third, which is not finished. Those at 6 and at 12 have no
-    burn-in.
+    The beginning of the first episode is lost, so decision 3 is the burn-in of decision 4. The
+    third episode is not finished. The first decisions of episodes, 6 and 12, have no burn-in.
     """
-    lengths = {"sequence": 2, "burn_in": 1}
-    buffer = memory(6, 2, 14, batch_size=40_000, buffer_size=22, **lengths)
+    lengths = {"sequence": 3, "burn_in": 1}
+    buffer = memory(6, 2, 14, batch_size=60_000, buffer_size=22, **lengths)
     agents = buffer.sample()[keys.AGENTS]
     for uav in range(UAVS):
-        first, env, whose = agents["observation"][:, uav, 1].long().unbind(-1)
-        assert (whose == uav).all()
-        starts, counts = (first * 2 + env).unique(return_counts=True)
-        assert starts.tolist() == [
-            2 * start + env for start in (4, 6, 7, 8, 9, 10, 12) for env in (0, 1)
-        ]
-        assert counts.min() > 1250  # 1429 expected
-        assert counts.max() < 1610
-        assert agents["begins"][:, uav].equal((first == 6) | (first == 12))
+        assert (agents["action"][:, uav, :, 2] == uav).all()
+        share = shares(agents, uav, 14)
+        assert not share[:4].any()
+        torch.testing.assert_close(share[4:], torch.full((10,), 0.1), atol=0.006, rtol=0)
+        env = agents["action"][:, uav, 0, 1]
+        assert 0.49 < env.mean() < 0.51
+        first = agents["action"][:, uav, 0, 0]
+        assert (agents["missing"][:, uav] == 1).equal((first == 6) | (first == 12))
 
 
-def test_a_start_within_the_first_burn_in_is_moved_to_the_beginning():
-    """With a burn-in of 3, starts 0, 1 and 2 become 0, and starts 3 and 4 stay."""
-    buffer = memory(6, 1, 6, batch_size=20_000, buffer_size=6 + 10, sequence=2, burn_in=3)
-    first = buffer.sample()[keys.AGENTS]["observation"][:, 0, 3, 0].long()
-    share = first.bincount(minlength=5) / len(first)
-    torch.testing.assert_close(share, torch.tensor([0.6, 0, 0, 0.2, 0.2]), atol=0.02, rtol=0)
+@pytest.mark.parametrize("burn_in", [0, 1, 3, 5])
+def test_a_burn_in_is_shorter_at_the_beginning(burn_in):
+    """Episodes of 6 decisions, and sequences of 2; a sequence may begin before its episode."""
+    lengths = {"sequence": 2, "burn_in": burn_in}
+    buffer = memory(6, 1, 6, batch_size=40_000, buffer_size=20, **lengths)
+    agents = buffer.sample()[keys.AGENTS]
+    torch.testing.assert_close(shares(agents, 0, 6), torch.full((6,), 1 / 6), atol=0.01, rtol=0)
+    first = agents["observation"][:, 0, burn_in, 0].long()
+    assert agents["missing"][:, 0].equal((burn_in - first).clamp(min=0))
+    assert first.unique().tolist() == [0, 1, 2, 3, 4, 5]
+    assert (agents["alive"][:, 0].sum(1) == 1)[first == 5].all()
 
 
 @pytest.mark.parametrize(
@@ -190,7 +201,7 @@ def team_of(x: Tensor, uav: int) -> Tensor:
 def test_the_losses_equal_those_computed_decision_by_decision(team):
     """DDPG with a GRU, in a world with failures."""
     critic = f"learner.critic={'team' if team else 'own'}"
-    setup = made("ddpg", critic, "env.failures=3", "learner.gamma=0.5", "learner.batch_size=16")
+    setup = made("ddpg", critic, "env.failures=3", "learner.gamma=0.5", "learner.batch_size=48")
     setup.dry_run(36)
     learner: Any = setup.learner
     batch, gamma, past, size = learner.sample(), 0.5, 3, 4
@@ -198,14 +209,14 @@ def test_the_losses_equal_those_computed_decision_by_decision(team):
     for name, weight in learner.networks().items():
         kind, _, rest = name.partition("_network_params.module.")
         weights.setdefault(kind, {})[rest] = weight
-    alive, begins = batch[keys.ALIVE], batch[BEGINS]
+    alive, missing = batch[keys.ALIVE], batch[MISSING]
     assert 0 < alive.float().mean() < 1
-    assert 0 < begins.float().mean() < 1
+    assert 0 < ((missing > 0) & (missing < past)).float().mean() < 1, missing
     total = {name: [0.0] * 3 for name in ("actor", "critic")}
     for row in range(len(batch)):
         seen, after = batch[keys.OBSERVATION][row], batch["next", *keys.OBSERVATION][row]
         taken, reward = batch[keys.ACTION][row], batch["next", *keys.REWARD][row]
-        first = [past * int(begins[row, uav]) for uav in range(3)]
+        first = missing[row].tolist()
 
         def states(kind: str, uav: int, x: Tensor, whole: bool, first: int) -> list[Tensor]:
             inputs = [team_of(x[:, t], uav) if whole else x[uav, t] for t in range(x.shape[1])]
@@ -241,21 +252,21 @@ def test_the_losses_equal_those_computed_decision_by_decision(team):
 
 
 @pytest.mark.parametrize("learner", ["ddpg", "td3"])
-def test_the_burn_in_has_no_gradient_and_is_forgotten_at_a_beginning(learner):
+def test_a_burn_in_has_no_gradient_and_does_not_matter_where_it_is_missing(learner):
     setup = made(learner, "learner.share_parameters=true")
     setup.dry_run(24)
     batch = setup.learner.sample()  # pyright: ignore[reportAttributeAccessIssue]
-    begins, changed = batch[BEGINS], batch.clone()
+    missing, changed = batch[MISSING], batch.clone()
     for place in ((), ("next",)):
         changed[(*place, *keys.OBSERVATION)][:, :, :3] += 1
     for uav in range(3):
         for row in range(len(batch)):
             losses = [setup.learner.losses(x[row : row + 1]) for x in (batch, changed)]  # pyright: ignore[reportAttributeAccessIssue]
             for name, loss in losses[0].items():
-                assert loss[uav].equal(losses[1][name][uav]) == bool(begins[row, uav])
+                assert loss[uav].equal(losses[1][name][uav]) == bool(missing[row, uav] == 3)
     network: Any = setup.learner.actor.module
     observed = batch[keys.OBSERVATION].clone().requires_grad_()
-    network([observed], begins, 3, 4).sum().backward()
+    network([observed], missing, 3, 4).sum().backward()
     assert not observed.grad[:, :, :3].any()
     assert observed.grad[:, :, 3:].all()
 
@@ -284,13 +295,13 @@ def test_decision_by_decision_equals_the_whole_sequence(kind, more):
     observed = [
         td[key].transpose(1, 2) for key in keys.observation_keys(setup.env.observation_spec)
     ]
-    begins = torch.zeros(2, 3, dtype=torch.bool)
-    whole = network(observed, begins, 0, 9)
+    missing = torch.zeros(2, 3, dtype=torch.int64)
+    whole = network(observed, missing, 0, 9)
     state = None
     for k in range(9):
         action, state = network.step([x[:, :, k] for x in observed], state)
         torch.testing.assert_close(action, whole[:, :, k], rtol=1e-5, atol=1e-6)
-    torch.testing.assert_close(network(observed, begins, 4, 5), whole[:, :, 4:])
+    torch.testing.assert_close(network(observed, missing, 4, 5), whole[:, :, 4:])
 
 
 @pytest.mark.slow

@@ -30,7 +30,7 @@ from emberlink.trainers.learners.off_policy.config import OffPolicyConfig
 from emberlink.trainers.learners.off_policy.networks import SequenceActor, with_taken
 from emberlink.trainers.learners.off_policy.networks import critics as make_critics
 from emberlink.trainers.learners.off_policy.replay_buffer import DONE, TERMINATED, ReplayMemory
-from emberlink.trainers.learners.off_policy.sequences import BEGINS, SequenceMemory
+from emberlink.trainers.learners.off_policy.sequences import MISSING, SequenceMemory
 from emberlink.trainers.learners.tensors import (
     copy_into,
     group,
@@ -150,7 +150,7 @@ class OffPolicyLearner(Learner):
 
         Args:
             loss: [batch, uavs], or [batch, uavs, decisions].
-            batch: batch size [batch]; without `keys.ALIVE`, UAVs cannot fail.
+            batch: batch size [batch]; without `keys.ALIVE`, it consists of such transitions only.
         """
         alive = batch.get(keys.ALIVE, None)
         if loss.ndim == 3:
@@ -217,7 +217,7 @@ class OffPolicyLearner(Learner):
         """Returns the mean distance of each UAV's actions to those of the anchor, [uavs]."""
         inputs: list[Any] = [batch.get(key) for key in self._observed]
         if self._remembers:
-            inputs = [inputs, batch.get(BEGINS), self.config.burn_in, self.config.sequence]
+            inputs = [inputs, batch.get(MISSING), self.config.burn_in, self.config.sequence]
         with torch.no_grad():
             theirs = anchor.network(*inputs)
         network: Any = self.actor.module

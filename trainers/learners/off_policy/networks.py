@@ -10,7 +10,7 @@ from emberlink.policies.networks import STATE_ACTION_VALUE, Generators, build, m
 from emberlink.policies.networks.recurrent import RecurrentActor, RecurrentCritic
 from emberlink.policies.networks.stacked import StackedCritic
 from emberlink.trainers.learners.base import LearnerContext
-from emberlink.trainers.learners.off_policy.sequences import BEGINS
+from emberlink.trainers.learners.off_policy.sequences import MISSING
 
 TAKEN = (keys.AGENTS, "taken")
 """float32 [batch, uavs, ..., 3]: the actions in the replay buffer, for critics of teams; without
@@ -51,14 +51,14 @@ class SequenceActor(TensorDictModuleBase):
         super().__init__()
         self.module, self.config = network, config
         self._observed = keys.observation_keys(context.observation_spec)
-        reads: list[Any] = [*self._observed, BEGINS]
+        reads: list[Any] = [*self._observed, MISSING]
         writes: list[Any] = [keys.ACTION]
         self.in_keys, self.out_keys = reads, writes
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         observations = [tensordict.get(key) for key in self._observed]
-        begins, config = tensordict.get(BEGINS), self.config
-        action = self.module(observations, begins, config.burn_in, config.sequence)
+        missing, config = tensordict.get(MISSING), self.config
+        action = self.module(observations, missing, config.burn_in, config.sequence)
         return tensordict.set(keys.ACTION, action)
 
 
@@ -80,7 +80,7 @@ class Critic(TensorDictModuleBase):
         self.module, self.config = network, config
         self._observed = keys.observation_keys(context.observation_spec)
         self._remembers, self._team = context.policy.memory != "none", config.critic == "team"
-        own = [BEGINS] if self._remembers else []
+        own = [MISSING] if self._remembers else []
         reads: list[Any] = [*self._observed, *own, *([TAKEN] if self._team else []), keys.ACTION]
         writes: list[Any] = [STATE_ACTION_VALUE]
         self.in_keys, self.out_keys = reads, writes
@@ -91,8 +91,8 @@ class Critic(TensorDictModuleBase):
         if self._team:
             action = self.module.grouping.joint(action, tensordict.get(TAKEN))
         if self._remembers:
-            begins = tensordict.get(BEGINS)
-            value = self.module(observations, begins, self.config.burn_in, action)
+            missing = tensordict.get(MISSING)
+            value = self.module(observations, missing, self.config.burn_in, action)
         else:
             value = self.module(*observations, action)
         return tensordict.set(STATE_ACTION_VALUE, value)

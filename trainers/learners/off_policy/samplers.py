@@ -86,9 +86,10 @@ class SequenceSampler(TeamSampler):
 
     Environments are stored one after another at each decision, and their episodes begin together.
     A sequence has `burn_in` decisions, which only prepare the memory, and `sequence` decisions to
-    learn from. The first of the latter is drawn uniformly from those decisions of all stored
-    episodes at which a whole sequence fits. If it is one of an episode's first `burn_in` decisions,
-    the beginning of the episode is taken in its place: there, the memory is empty.
+    learn from. It is drawn uniformly from all sequences of stored episodes, including those of
+    which only a part is within the episode. So all decisions are learnt from equally often. The
+    burn-in is shorter where the episode has fewer decisions before the sequence; the memory is
+    empty at the beginning of the episode.
 
     TorchRL's SliceSampler draws the same rows for all UAVs, from the global generator.
 
@@ -111,25 +112,33 @@ class SequenceSampler(TeamSampler):
     def sample(self, storage: TensorStorage, batch_size: int) -> tuple[tuple[Tensor, ...], dict]:
         """Returns rows and columns, int64 [sequences, decisions, teams * uavs] each.
 
-        There are as many sequences as have `batch_size` decisions to learn from, rounded up. The
-        rows of a missing burn-in are those of the first decision. "begins", in the dict, tells
-        which sequences have none, bool [sequences, teams * uavs].
+        There are as many sequences as have `batch_size` decisions to learn from, rounded up. In the
+        dict, "missing" counts the decisions that a burn-in lacks, int64 [sequences, teams * uavs],
+        and "within" tells which decisions to learn from are within the episode, bool [sequences,
+        `sequence`, teams * uavs]. Rows of other decisions are those of the nearest decision.
         """
-        first, possible = self._starts()
-        ends = possible.cumsum(0)
-        number, columns = self._draw(-(-batch_size // self.sequence), ends[-1] * self.envs)
+        first, end = self._stored()
+        starts = (end - first + self.sequence - 1) * (end > first)
+        sums = starts.cumsum(0)
+        number, columns = self._draw(-(-batch_size // self.sequence), sums[-1] * self.envs)
         number, env = number // self.envs, number % self.envs
-        place = torch.searchsorted(ends, number, right=True)
-        start = first[place] + number - (ends - possible)[place]
+        place = torch.searchsorted(sums, number, right=True)
+        first, end = first[place], end[place]
+        drawn = first - (self.sequence - 1) + number - (sums - starts)[place]
+        start = torch.maximum(drawn, first)
         began = start // self.horizon * self.horizon
-        begins = start < began + self.burn_in
-        start = torch.where(begins, began, start)
-        decisions = torch.maximum(start.unsqueeze(1) + self._offset, began.unsqueeze(1))
+        last = torch.minimum(drawn + self.sequence, end) - 1
+        decisions = start.unsqueeze(1) + self._offset
+        info = {
+            "missing": (began + self.burn_in - start).clamp(min=0),
+            "within": decisions[:, self.burn_in :] <= last.unsqueeze(1),
+        }
+        decisions = decisions.clamp(began.unsqueeze(1), end.unsqueeze(1) - 1)
         rows = (decisions * self.envs + env.unsqueeze(1)) % self.rows
-        return (rows, columns.unsqueeze(1).expand_as(rows)), {"begins": begins}
+        return (rows, columns.unsqueeze(1).expand_as(rows)), info
 
-    def _starts(self) -> tuple[Tensor, Tensor]:
-        """Returns for each stored episode the first decision that may be drawn, and their number.
+    def _stored(self) -> tuple[Tensor, Tensor]:
+        """Returns for each stored episode the decisions to learn from: the first, and the end.
 
         Decisions are counted from the beginning of the run. An episode whose beginning is
         overwritten has a burn-in before its first one.
@@ -139,4 +148,4 @@ class SequenceSampler(TeamSampler):
         begin = (oldest // self.horizon + self._episode) * self.horizon
         end = torch.minimum(begin + self.horizon, after)
         first = torch.where(begin >= oldest, begin, torch.maximum(begin, oldest) + self.burn_in)
-        return first, (end - self.sequence - first + 1).clamp(min=0)
+        return first, end

@@ -12,8 +12,8 @@ from emberlink.trainers.learners.base import LearnerContext
 from emberlink.trainers.learners.off_policy.replay_buffer import ReplayMemory
 from emberlink.trainers.learners.off_policy.samplers import SequenceSampler, TeamSampler
 
-BEGINS = (keys.AGENTS, "begins")
-"""bool [batch, uavs]: whether a sequence begins with its episode and has no burn-in"""
+MISSING = (keys.AGENTS, "missing")
+"""int64 [batch, uavs]: decisions that a burn-in lacks, because its episode begins after them"""
 
 
 class SequenceMemory(ReplayMemory):
@@ -75,11 +75,12 @@ class SequenceMemory(ReplayMemory):
         """Samples sequences for each UAV: batch size [batch], [batch, uavs, decisions, ...] each.
 
         Observations are those of the burn-in and of the decisions to learn from, and under "next"
-        also the one after. All other tensors are those of the decisions to learn from.
+        also the one after. All other tensors are those of the decisions to learn from. "alive" is
+        false where a UAV had failed, and where a sequence is not within the episode.
         """
         drawn: Any = self._buffer.sample(return_info=True)
         sample, info = drawn
-        begins, past = info[BEGINS[1]], self.burn_in
+        missing, past = info[MISSING[1]], self.burn_in
 
         def learnt(name: Any) -> Tensor:
             return sample.get(name).transpose(1, 2)[:, :, past:]
@@ -90,11 +91,11 @@ class SequenceMemory(ReplayMemory):
             # The transition of a missing burn-in does not lead to the first observation.
             before = observed[name][:, :, : past + 1]
             following[name] = torch.cat((before, learnt(("next", name))), 2)
-        kept = ["action", *(["alive"] if self._failures else [])]
-        agents = {**observed, **{name: learnt(name) for name in kept}, BEGINS[1]: begins}
+        agents = {**observed, "action": learnt("action"), MISSING[1]: missing}
+        agents["alive"] = self._alive(sample, info)
         after = {name: learnt(("next", name)) for name in ("reward", "done", "terminated")}
-        after |= {**following, BEGINS[1]: begins.clone()}
-        batch, size = begins.shape, begins.shape[:1]
+        after |= {**following, MISSING[1]: missing.clone()}
+        batch, size = missing.shape, missing.shape[:1]
         return TensorDict(
             {
                 keys.AGENTS: TensorDict(agents, batch_size=batch),
@@ -102,3 +103,10 @@ class SequenceMemory(ReplayMemory):
             },
             batch_size=size,
         )
+
+    def _alive(self, sample: Any, info: dict[str, Tensor]) -> Tensor:
+        """Returns the decisions to learn from of a sample, bool [batch, uavs, decisions]."""
+        within = info["within"].transpose(1, 2)
+        if not self._failures:
+            return within
+        return within & sample.get("alive").transpose(1, 2)[:, :, self.burn_in :]
