@@ -18,8 +18,9 @@ from emberlink.trainers.runs.seal import to_header
 
 _NUMBERED = re.compile(r"(state|step)_\d{9,18}\.safetensors")
 _OF_NETWORKS = (
-    *("comm.", "env.observation", "policy.memory", "policy.units", "policy.decisions"),
-    *("policy.agent_index", "learner.name", "learner.actor_of", "learner.hidden"),
+    *("comm.", "env.observation", "env.num_uavs"),
+    *("policy.memory", "policy.units", "policy.decisions", "policy.agent_index"),
+    *("learner.name", "learner.actor_of", "learner.hidden"),
 )
 """beginnings of the keys of settings on which the names and shapes of weights depend"""
 _PARTIAL = ("*.safetensors.[0-9]*.part", ".tmp*")  # safetensors writes to .tmp*

@@ -13,8 +13,11 @@ from emberlink.trainers.runs.pretrained import find_one, is_name
 from emberlink.trainers.runs.run_folder import RunFolder
 from emberlink.trainers.runs.seal import check_trained_with
 
-_OBSERVED = ("comm.", "env.observation", "policy.hold")
-"""beginnings of the keys of settings that change what a UAV observes, or for how long it acts"""
+_OBSERVED = (
+    *("comm.", "env.observation", "env.grid", "env.altitude", "env.horizon"),
+    *("env.displacement", "policy.hold"),
+)
+"""beginnings of the keys of settings that change what a UAV observes, or what its action does"""
 
 
 def start(learner: Learner, config: RunConfig) -> None:
@@ -41,8 +44,10 @@ def start(learner: Learner, config: RunConfig) -> None:
     }
     try:
         run = RunFolder(find_one(name) if is_name(name) else name)
+        if run.path.is_file():
+            raise UserError("expected a run folder, found a file")
         # The device of that run may not exist here.
-        checkpoint, theirs = run.checkpoint(), run.config(device=config.device)
+        theirs, checkpoint = run.config(device=config.device), run.checkpoint()
         check_trained_with(checkpoint, theirs)
         weights = load_weights(checkpoint, expected, config)
     except UserError as error:

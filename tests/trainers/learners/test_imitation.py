@@ -318,6 +318,21 @@ def test_actors_of_another_network_are_refused(imitated, tmp_path, capsys):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize(
+    ("path", "said"),
+    [
+        ("none", "there is no such run folder"),
+        ("run/checkpoints/best.safetensors", "expected a run folder, found a file"),
+    ],
+)
+def test_actors_of_no_run_are_an_error(path, said, imitated, tmp_path, capsys):
+    shutil.copytree(imitated["ippo"], tmp_path / "run")
+    start = f"learner.warm_start={tmp_path / path}"
+    assert main.main(["train", "maps", *settings("ippo", start), f"output={tmp_path / 'o'}"]) == 2
+    assert said in " ".join(capsys.readouterr().err.split())
+    assert not (tmp_path / "o").exists()
+
+
 def test_a_shipped_policy_that_does_not_fit_leaves_no_copy(tmp_path, capsys):
     start = "learner.warm_start=pretrained:maps", "comm.pixels=8", f"output={tmp_path}"
     assert main.main(["train", "maps", *settings("ippo", *start)]) == 2
@@ -334,6 +349,10 @@ def test_pictures_of_other_scales_are_warned_of(imitated, tmp_path):
 
     with pytest.warns(UserWarning, match=r"comm.scales=\[1, 5\], this run has \[1, 3\]"):
         prepare("comm.scales=[1,3]")
+    with pytest.warns(UserWarning, match=r"env.displacement=[\d.]+, this run has 0.7"):
+        prepare("env.displacement=0.7")
+    with pytest.warns(UserWarning, match=r"env.altitude=\[1.0, 4.0\], this run has \[1.0, 5.0\]"):
+        prepare("env.altitude=[1.0,5.0]")
     with warnings.catch_warnings():
         warnings.simplefilter("error", UserWarning)
         prepare()

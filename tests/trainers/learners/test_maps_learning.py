@@ -101,6 +101,16 @@ def test_weights_with_an_agent_index_fit_one_team_only(tmp_path, capsys):
     assert "uavs=2; this configuration has uavs=3" in " ".join(capsys.readouterr().err.split())
 
 
+def test_observations_of_positional_fit_one_team_only(tmp_path, capsys):
+    shared = ["learner.share_parameters=true", "learner.hidden=[8,8]", "env.horizon=10"]
+    few = ["env.num_uavs=2", "episodes=1", "evaluation.episodes=1", "evaluation.scripted=[]"]
+    assert main.main(["train", "positional", *shared, *few, f"output={tmp_path}"]) == 0
+    (run,) = tmp_path.iterdir()
+    capsys.readouterr()
+    assert main.main(["eval", str(run), "env.num_uavs=3", "--fires", "1"]) == 2
+    assert "env.num_uavs=2 (now 3)" in " ".join(capsys.readouterr().err.split())
+
+
 def test_what_a_uav_observes_does_not_depend_on_the_team(tmp_path):
     shapes = set()
     for uavs, grid in ((1, "[20,20]"), (3, "[60,50]"), (24, "[128,128]")):
