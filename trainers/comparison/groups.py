@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from emberlink.envs.utils.errors import UserError
-from emberlink.trainers.comparison.runs import Run
+from emberlink.trainers.comparison.runs import Run, settings_of
 from emberlink.trainers.config.compose import flat, resolve, to_values
 from emberlink.trainers.config.schema import NOT_LEARNT_WITH, RunConfig
 
@@ -15,6 +15,7 @@ NOT_COMPARED = ("seed", "seeds", "output", "evaluation", "baselines", *NOT_LEARN
 """first parts of keys that may differ within a group, since they do not affect training"""
 NOT_NOTED = ("seed", "seeds", "output", "baselines")
 """first parts of keys whose differences within a group are not reported in notes"""
+_WARM_START = "learner.warm_start"
 _OF_SECTION = ("env.horizon", "env.grid")
 """settings of the environment that are equal within a section, besides those of the fire"""
 
@@ -195,8 +196,17 @@ def _one_run_per_seed(label: str, runs: Sequence[Run], notes: list[str]) -> tupl
 
 
 def _trained_with(run: Run) -> dict[str, Any]:
-    """Returns the settings that affect training, without the seed."""
-    return {k: v for k, v in run.settings.items() if first_part(k) not in NOT_COMPARED}
+    """Returns the settings that affect training, without the seed.
+
+    If the run began with the actors of another, these are the settings of both, if that run exists.
+    """
+    mine, start = _without_seed(run.settings), run.settings.get(_WARM_START, "")
+    origin = settings_of(start) if start else ""
+    return mine | {_WARM_START: origin if isinstance(origin, str) else _without_seed(origin)}
+
+
+def _without_seed(settings: Mapping[str, Any]) -> dict[str, Any]:
+    return {k: v for k, v in settings.items() if first_part(k) not in NOT_COMPARED}
 
 
 def _split(runs: Iterable[Run], key: Callable[[Run], Any]) -> list[list[Run]]:

@@ -50,6 +50,14 @@ class Run:
         return math.fsum(numbers) / len(numbers)
 
 
+def settings_of(name: str) -> dict[str, Any] | str:
+    """Returns the configuration of a run by dotted key; its name if it cannot be read."""
+    try:
+        return flat(to_values(RunFolder(name).config(device="cpu")))
+    except UserError:
+        return name
+
+
 def read_all(paths: Iterable[Path | str]) -> tuple[list[Run], list[LeftOut]]:
     """Reads the runs of a comparison.
 

@@ -427,6 +427,24 @@ def test_groups_are_named_by_their_settings(tmp_path):
     ]
 
 
+def test_runs_that_began_with_other_seeds_of_the_same_run_are_a_group(tmp_path, monkeypatch):
+    """Three seeds began with seeds of the same settings, one of them by a relative path."""
+    monkeypatch.chdir(tmp_path)
+    for seed in range(3):
+        first = write_run(tmp_path / "first", "consensus", seed, overrides=("learner=ippo",))
+        start = first.relative_to(tmp_path) if seed == 2 else first
+        more = ("learner=ippo", f"learner.warm_start={start}")
+        write_run(tmp_path / "runs", "consensus", seed, overrides=more)
+    other = write_run(tmp_path / "first", overrides=("learner=ippo", "learner.lr=0.5"), name="lr")
+    for name, start in (("other", other), ("lost", tmp_path / "none")):
+        more = ("learner=ippo", f"learner.warm_start={start}")
+        write_run(tmp_path / "runs", name=name, overrides=more)
+    write_run(tmp_path / "runs", name="cold", overrides=("learner=ippo",))
+    (section,), notes = gathered(tmp_path / "runs")
+    assert sorted(group.seeds for group in section.groups) == [[0], [0], [0], [0, 1, 2]]
+    assert any("one group, though learner.warm_start differ" in note for note in notes)
+
+
 def test_groups_of_other_learners_are_named_by_what_chooses_them(tmp_path):
     for seed, setting in enumerate(("learner=td3", "learner=ippo", "learner.critic=team")):
         write_run(tmp_path, "consensus", seed, overrides=(setting,))
