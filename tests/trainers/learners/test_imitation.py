@@ -198,7 +198,7 @@ def test_the_loss_falls_and_is_that_of_smooth_l1():
         (["maps", *settings("imitation"), "learner.teacher=oracle"], "known: map_greedy, courier"),
         (
             ["maps", *settings("ippo"), "learner.warm_start=nowhere"],
-            "learner.warm_start=nowhere: nowhere: holds no checkpoint",
+            "learner.warm_start=nowhere: nowhere: there is no such run folder",
         ),
     ],
 )

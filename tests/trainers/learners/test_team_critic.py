@@ -110,8 +110,8 @@ def test_a_uavs_losses_read_the_team_and_train_its_own_networks_alone(learner, m
     lengths = ["learner.sequence=4", "learner.burn_in=2"]
     of, batch = filled(learner, f"policy.memory={memory}", *lengths)
     changed = batch.clone()
-    changed[keys.OBSERVATION][:, 2] += 1
-    changed["next", *keys.OBSERVATION][:, 2] += 1
+    changed[keys.OBSERVATION][:, 2] += 10
+    changed["next", *keys.OBSERVATION][:, 2] += 10
     losses, other = of.losses(batch), of.losses(changed)
     assert not losses["critic"].detach().isclose(other["critic"].detach()).any()
     assert not losses["actor"].detach().isclose(other["actor"].detach()).any()
