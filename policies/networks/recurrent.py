@@ -49,7 +49,13 @@ class _Remembering(StackedNetwork):
         return self.memory(following, state)[0]
 
     def _prepare(self, past: Tensor, missing: Tensor, state: Tensor) -> Tensor:
-        """Returns the state after a burn-in, [groups, rows, decisions, features] of the encoder."""
+        """Returns the state after a burn-in.
+
+        Args:
+            past: the encoder's features, [groups, rows, decisions, features].
+            missing: see `recall`; [groups, rows].
+            state: of an empty memory, [groups, rows, size].
+        """
         for decision, x in enumerate(past.split(1, 2)):
             _, state = self.memory(x, state)
             state = state.masked_fill((missing > decision).unsqueeze(-1), 0.0)

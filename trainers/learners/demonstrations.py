@@ -44,7 +44,7 @@ class DemonstrationSequences(SequenceMemory):
         agents: dict[str, Tensor] = {_MISSING: info[_MISSING]}
         for _, name in self._keys:
             agents[name] = sample.get(name).transpose(1, 2)
-        agents[_TEACHER] = sample.get(_TEACHER).transpose(1, 2)[:, :, self.burn_in :]
+        agents[_TEACHER] = self._learnt(sample, _TEACHER)
         agents[_ALIVE] = self._alive(sample, info)
         batch = info[_MISSING].shape
         return TensorDict({keys.AGENTS: TensorDict(agents, batch)}, batch_size=batch[:1])

@@ -81,19 +81,16 @@ class SequenceMemory(ReplayMemory):
         drawn: Any = self._buffer.sample(return_info=True)
         sample, info = drawn
         missing, past = info[MISSING[1]], self.burn_in
-
-        def learnt(name: Any) -> Tensor:
-            return sample.get(name).transpose(1, 2)[:, :, past:]
-
         observed, following = {}, {}
         for _, name in self._keys:
             observed[name] = sample.get(name).transpose(1, 2)
             # The transition of a missing burn-in does not lead to the first observation.
             before = observed[name][:, :, : past + 1]
-            following[name] = torch.cat((before, learnt(("next", name))), 2)
-        agents = {**observed, "action": learnt("action"), MISSING[1]: missing}
+            following[name] = torch.cat((before, self._learnt(sample, ("next", name))), 2)
+        agents = {**observed, "action": self._learnt(sample, "action"), MISSING[1]: missing}
         agents["alive"] = self._alive(sample, info)
-        after = {name: learnt(("next", name)) for name in ("reward", "done", "terminated")}
+        outcome = ("reward", "done", "terminated")
+        after = {name: self._learnt(sample, ("next", name)) for name in outcome}
         after |= {**following, MISSING[1]: missing.clone()}
         batch, size = missing.shape, missing.shape[:1]
         return TensorDict(
@@ -104,9 +101,13 @@ class SequenceMemory(ReplayMemory):
             batch_size=size,
         )
 
+    def _learnt(self, sample: Any, name: Any) -> Tensor:
+        """Returns the tensor of the decisions to learn from, [batch, uavs, decisions, ...]."""
+        return sample.get(name).transpose(1, 2)[:, :, self.burn_in :]
+
     def _alive(self, sample: Any, info: dict[str, Tensor]) -> Tensor:
         """Returns the decisions to learn from of a sample, bool [batch, uavs, decisions]."""
         within = info["within"].transpose(1, 2)
         if not self._failures:
             return within
-        return within & sample.get("alive").transpose(1, 2)[:, :, self.burn_in :]
+        return within & self._learnt(sample, "alive")
