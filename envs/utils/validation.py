@@ -25,6 +25,8 @@ TAG = "kind:"
 Name = Annotated[str, Field(pattern=r"^\w[\w.+-]*$", max_length=100)]
 """text that can be part of file names and measures"""
 
+CountOrZero = Annotated[int, Field(ge=0)]
+
 _EXPECTED = {
     "dataclass_type": "expected keys and values",
     "dict_type": "expected keys and values",

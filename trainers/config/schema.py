@@ -22,7 +22,7 @@ from emberlink.envs.config import RadioConfig, WildfireConfig
 from emberlink.envs.scenarios import Scenario
 from emberlink.envs.utils.device import check_device as check_device
 from emberlink.envs.utils.errors import UserError
-from emberlink.envs.utils.validation import STRICT, Name, unknown
+from emberlink.envs.utils.validation import STRICT, CountOrZero, Name, unknown
 from emberlink.policies.networks import memory
 from emberlink.policies.scripted.registry import to_play
 from emberlink.policies.settings import PolicyConfig
@@ -38,7 +38,6 @@ NOT_LEARNT_WITH = (
 
 MAX_FIRES = 65_536
 """maximum number of held-out fires of an evaluation"""
-CountOrZero = Annotated[int, Field(ge=0)]
 Many = Annotated[int, Field(ge=1, le=MAX_FIRES)]
 Seed = Annotated[int, Field(ge=0, lt=2**31)]
 LearnerChoice = Annotated[

@@ -9,8 +9,8 @@ from pydantic.dataclasses import dataclass
 from torch import Tensor
 
 from emberlink.envs.utils.errors import UserError
-from emberlink.envs.utils.validation import STRICT, from_plain
-from emberlink.trainers.config.schema import CountOrZero, RunConfig
+from emberlink.envs.utils.validation import STRICT, CountOrZero, from_plain
+from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.runs import checkpoint_file
 from emberlink.trainers.training.folders import LINES
 from emberlink.trainers.training.non_finite import FIRE_TIMES, first_non_finite

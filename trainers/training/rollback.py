@@ -5,8 +5,7 @@ from typing import Annotated
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
-from emberlink.envs.utils.validation import STRICT
-from emberlink.trainers.config.schema import CountOrZero
+from emberlink.envs.utils.validation import STRICT, CountOrZero
 from emberlink.trainers.training.non_finite import NonFiniteError
 
 FACTOR = 0.5

@@ -13,7 +13,6 @@ from pydantic import Field
 from emberlink.envs.utils.errors import UserError
 
 Positive = Annotated[int, Field(ge=1)]
-CountOrZero = Annotated[int, Field(ge=0)]
 
 DIED = -9
 """status of a task that ended without a word, such as with its machine"""

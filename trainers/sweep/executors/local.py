@@ -7,9 +7,9 @@ from typing import Annotated
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
-from emberlink.envs.utils.validation import STRICT
+from emberlink.envs.utils.validation import STRICT, CountOrZero
 from emberlink.trainers.sweep.executors import _process
-from emberlink.trainers.sweep.executors.base import CountOrZero, Executor, Task
+from emberlink.trainers.sweep.executors.base import Executor, Task
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)

@@ -13,11 +13,10 @@ from pydantic import AfterValidator, Field
 from pydantic.dataclasses import dataclass
 
 from emberlink.envs.utils.errors import UserError
-from emberlink.envs.utils.validation import STRICT
+from emberlink.envs.utils.validation import STRICT, CountOrZero
 from emberlink.trainers.sweep.executors import _extras, _process
 from emberlink.trainers.sweep.executors.base import (
     DIED,
-    CountOrZero,
     Executor,
     Positive,
     QueueFullError,

@@ -16,7 +16,7 @@ from pydantic.dataclasses import dataclass
 
 from emberlink.envs.utils.atomic_io import inner_folder, write_bytes
 from emberlink.envs.utils.errors import UserError
-from emberlink.envs.utils.validation import STRICT
+from emberlink.envs.utils.validation import STRICT, CountOrZero
 from emberlink.trainers.sweep.executors import _extras
 from emberlink.trainers.sweep.executors._slurm_job import Batch, end, file_of
 from emberlink.trainers.sweep.executors._times import minutes
@@ -24,7 +24,6 @@ from emberlink.trainers.sweep.executors.base import (
     DIED,
     STATUS,
     STOP,
-    CountOrZero,
     Executor,
     Positive,
     QueueFullError,
