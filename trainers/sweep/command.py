@@ -10,13 +10,14 @@ from rich.table import Table
 
 from emberlink.envs.utils.errors import UserError
 from emberlink.trainers.sweep import executors
-from emberlink.trainers.sweep.jobs import Job, jobs_of
+from emberlink.trainers.sweep.jobs import Identity, Job, identity, jobs_of
 from emberlink.trainers.sweep.manifest import Manifest
 from emberlink.trainers.sweep.plan import plan, stacked
 from emberlink.trainers.sweep.progress import SweepProgress
 from emberlink.trainers.sweep.run_index import RunIndex
 from emberlink.trainers.sweep.scheduler import Scheduler
 from emberlink.trainers.tracking import loggers
+from emberlink.trainers.training.setup import check_setup
 
 _EXECUTOR = "executor"
 
@@ -54,6 +55,7 @@ def sweep(
     for path, why in index.unreadable.items():
         console.print(f"note: {path} is left out: {why}", style="yellow", soft_wrap=True)
     jobs = stacked(plan(wanted, index.runs), executor.seeds)
+    _check(jobs)
     total = sum(len(job.configs) for job in jobs)
     done = sum(len(job.configs) for job in jobs if job.finished)
     console.print(f"{total} runs, of which {done} are finished -> {output}")
@@ -69,6 +71,25 @@ def sweep(
     _print_table(scheduler.jobs, console)
     _print_end(status, scheduler.left, output, console)
     return status
+
+
+def _check(jobs: Sequence[Job]) -> None:
+    """Checks that new jobs can be trained; those that differ in their seeds only, once.
+
+    Raises:
+        UserError: one cannot.
+    """
+    checked: set[Identity] = set()
+    for job in jobs:
+        config = job.configs[0]
+        name = identity(replace(config, seed=0))
+        if job.state != "new" or name in checked:
+            continue
+        checked.add(name)
+        try:
+            check_setup(config)
+        except UserError as error:
+            raise UserError(f"{job.name}: {error}") from None
 
 
 def _print_end(status: int, left: int, output: Path, console: Console) -> None:

@@ -1,12 +1,13 @@
 """Sets up a training: the environments, the learner and the collector of a configuration."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import islice
 from typing import Any
 
 from tensordict import TensorDictBase
 from torch import Tensor
+from torchrl.envs import TransformedEnv
 
 from emberlink.envs import keys
 from emberlink.policies.hold import decisions, hold
@@ -17,6 +18,7 @@ from emberlink.trainers.learners.tensors import copy_into, flatten, group, prefi
 from emberlink.trainers.rollout.allocator import keep_freed_memory
 from emberlink.trainers.rollout.collector import make_collector
 from emberlink.trainers.rollout.products import fast_products
+from emberlink.trainers.training import warm_start
 from emberlink.trainers.training.episode import EpisodeRecord
 
 
@@ -42,15 +44,7 @@ class TrainingSetup:
         self.total_steps = config.episodes * self.horizon
         self.step = 0
         """steps of the batch of environments so far"""
-        self.env = build_env(
-            config,
-            num_envs=self.teams * config.num_envs,
-            fire=config.fire,
-            seed=self.seeds,
-            device=config.device,
-            true_map=config.learner.reads_map,
-            teacher=config.learner.reads_teacher,
-        )
+        self.env = _make_env(config, self.teams * config.num_envs, self.seeds)
         config.check_rollouts()  # learners divide by the decisions of an episode
         self.guard = NonFiniteGuard(config.device)
         self.learner = build_learner(config, self.env, self.guard)
@@ -133,3 +127,35 @@ class TrainingSetup:
         self.record.load_state_dict(group(state, "episode"), device)
         self.step = step
         self.guard.start(step, self.learner.updates)
+
+
+def check_setup(config: RunConfig) -> None:
+    """Checks that a configuration can be trained, in one environment and without training.
+
+    Args:
+        config: configuration of a run; of several seeds, the first is checked.
+
+    Raises:
+        UserError: the fire, the learner or its warm start does not fit the rest.
+    """
+    config = replace(config, seed=(config.seeds or (config.seed,))[0], seeds=())
+    config.check_rollouts()
+    learner = build_learner(
+        config, _make_env(config, 1, config.seed), NonFiniteGuard(config.device)
+    )
+    learner.team_actor(0, 1)
+    config.check_rollouts(learner.rollout_steps)
+    warm_start.start(learner, config)
+
+
+def _make_env(config: RunConfig, num_envs: int, seed: int | Sequence[int]) -> TransformedEnv:
+    """Returns training environments, with what the learner reads in training only."""
+    return build_env(
+        config,
+        num_envs=num_envs,
+        fire=config.fire,
+        seed=seed,
+        device=config.device,
+        true_map=config.learner.reads_map,
+        teacher=config.learner.reads_teacher,
+    )

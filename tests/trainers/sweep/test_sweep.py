@@ -13,6 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import torch
 from inside import Inside
 from rich.console import Console
 
@@ -103,6 +104,17 @@ def test_all_methods_by_default_and_stacks_of_seeds():
         (["consensus", "setup=paper,tunned"], "tunned"),
         (["consensus", "learner.gama=0.9,0.8"], "learner.gama"),
         (["consensus", "policy.hold=5,7", "env.horizon=20"], "env.horizon=20: must be a multiple"),
+        (
+            ["maps", "independent", "setup=strong", "learner=imitation"],
+            "independent, strong, paper, seed 0: learner=imitation: the teacher flies by the maps",
+        ),
+        (
+            ["consensus", *SMALL, "policy.memory=gru", "learner.sequence=4,41"],
+            "learner.sequence=41, seed 0: learner.sequence=41: an episode has 40 decisions",
+        ),
+        (["consensus", "fire=file", "fire.path=/no/fire"], "/no/fire"),
+        (["maps", "learner=imitation", "policy.hold=7", "env.horizon=20"], "multiple of"),
+        (["consensus", *SMALL, "learner.warm_start=nowhere"], "learner.warm_start=nowhere: "),
         (["consensus", "--jobs", "0"], "--jobs"),
     ],
 )
@@ -333,6 +345,7 @@ def test_two_simultaneous_sweeps_train_every_run_once(tmp_path):
     arguments = [*SMALL, "independent", f"output={tmp_path}", "seed=range(0,4)"]
 
     def work():
+        torch.set_num_threads(1)  # the threads of this process do not exist in its forks
         raise SystemExit(sweep(arguments, Console(quiet=True), executor=Later()))
 
     both = [multiprocessing.get_context("fork").Process(target=work) for _ in range(2)]
