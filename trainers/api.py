@@ -8,8 +8,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, overload
 
-from tensordict.nn import TensorDictModule, TensorDictSequential
-
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import check_whole
 from emberlink.trainers.comparison.report import free_folder, write_report
@@ -17,12 +15,11 @@ from emberlink.trainers.comparison.results import Comparison, compare_runs
 from emberlink.trainers.config.compose import flat, override, resolve, to_values
 from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.config.transfer import in_world
-from emberlink.trainers.evaluation import panels
 from emberlink.trainers.evaluation.actor import load_actor
 from emberlink.trainers.evaluation.evaluate import evaluate as evaluate_policy
+from emberlink.trainers.evaluation.policy import TrainedPolicy
 from emberlink.trainers.evaluation.report import evaluate_run
 from emberlink.trainers.evaluation.results import Results
-from emberlink.trainers.replay.page import Replay
 from emberlink.trainers.runs import pretrained
 from emberlink.trainers.runs.run_folder import RunFolder
 from emberlink.trainers.runs.seal import check_trained_with
@@ -44,59 +41,6 @@ class Run:
     results: Results
     """fire -> policy ("learned", or a scripted one) -> measure -> one number per episode; empty if
     the run was not evaluated"""
-
-
-class TrainedPolicy(TensorDictSequential):
-    """The frozen policy of a run, which maps observations to ("agents", "action").
-
-    `make_env(policy.config)` returns its environment.
-
-    Args:
-        actor: the networks.
-        config: configuration of the run.
-        checkpoint: file of the networks.
-        changes: settings that are not those of the training, such as `env.radio.range=0`.
-    """
-
-    def __init__(
-        self,
-        actor: TensorDictModule,
-        config: RunConfig,
-        checkpoint: Path,
-        changes: Sequence[str] = (),
-    ):
-        modules: Any = [actor]
-        super().__init__(*modules)
-        self.config = config
-        self.checkpoint = checkpoint
-        self.changes = tuple(changes)
-
-    def replay(
-        self,
-        *others: "TrainedPolicy",
-        fire: str | int | None = None,
-        policies: Sequence[str] = (),
-    ) -> Replay:
-        """Returns a page that plays an episode of the evaluation; Jupyter shows it inline.
-
-        Args:
-            others: policies to show beside this one, on the same fire.
-            fire: NAME, INDEX or NAME:INDEX of a held-out fire; `huygens:0`, or the first of the
-                run's own fires, if None.
-            policies: names of scripted policies to show, too.
-
-        Raises:
-            UserError: a name is not known, or the others have another map, team or horizon.
-        """
-        shown = [
-            panels.Panel(
-                panels.title_of(policy.config, *policy.changes),
-                policy.config,
-                lambda _, policy=policy: policy,
-            )
-            for policy in (self, *others)
-        ]
-        return panels.replay([*shown, *panels.scripted(self.config, policies)], fire)
 
 
 @overload

@@ -140,6 +140,33 @@ def test_load_gives_the_trained_policy_and_its_environment(trained):
     assert larger.rollout(1, policy)[keys.ACTION].shape == (1, 1, 2, 3)
 
 
+@pytest.mark.parametrize(
+    ("method", "settings", "given"),
+    [
+        ("independent", {}, "[2, 6]"),
+        ("maps", {}, "[2, 2]"),
+        ("consensus", {"num_uavs": 3}, "[3, 9]"),
+    ],
+)
+def test_a_policy_names_the_observations_that_it_needs(method, settings, given, trained):
+    policy = trainers.load(trained.path)
+    env = trainers.make_env(method, "tuned", **{"num_uavs": 2, "horizon": 4} | settings)
+    said = f"reads {keys.OBSERVATION} with the last sizes [2, 9], the environment gives {given}"
+    with pytest.raises(UserError, match=re.escape(said)):
+        env.rollout(1, policy)
+
+
+def test_a_policy_that_looks_at_maps_names_them_elsewhere():
+    policy = trainers.load("pretrained:maps", num_uavs=3)
+    there = trainers.make_env(policy.config, horizon=4)
+    assert there.rollout(2, policy)[keys.ACTION].shape == (1, 2, 3, 3)
+    without = there.reset().exclude(keys.CROPS)
+    with pytest.raises(UserError, match=r"'crops'.* the environment gives None"):
+        policy(without)
+    with pytest.raises(UserError, match=r"last sizes \[3, .*, the environment gives \[4, "):
+        policy(trainers.make_env(policy.config, num_uavs=4).reset())
+
+
 @pytest.mark.slow
 def test_load_a_shipped_policy(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)

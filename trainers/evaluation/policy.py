@@ -1,0 +1,93 @@
+"""The frozen policy of a run, as Python users have it."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModule, TensorDictSequential, dispatch
+
+from emberlink.envs.utils.errors import UserError
+from emberlink.trainers.config.schema import RunConfig
+from emberlink.trainers.evaluation import panels
+from emberlink.trainers.evaluation.actor import observed
+from emberlink.trainers.replay.page import Replay
+
+
+class TrainedPolicy(TensorDictSequential):
+    """The frozen policy of a run, which maps observations to ("agents", "action").
+
+    `make_env(policy.config)` returns its environment.
+
+    Args:
+        actor: the networks.
+        config: configuration of the run.
+        checkpoint: file of the networks.
+        changes: settings that are not those of the training, such as `env.radio.range=0`.
+    """
+
+    def __init__(
+        self,
+        actor: TensorDictModule,
+        config: RunConfig,
+        checkpoint: Path,
+        changes: Sequence[str] = (),
+    ):
+        modules: Any = [actor]
+        super().__init__(*modules)
+        self._observed = observed(config)
+        self.config = config
+        self.checkpoint = checkpoint
+        self.changes = tuple(changes)
+
+    @dispatch(auto_batch_size=False)
+    def forward(  # pyright: ignore[reportIncompatibleVariableOverride]
+        self, tensordict: TensorDictBase, *args: Any, **kwargs: Any
+    ) -> TensorDictBase:
+        """Writes the actions of all UAVs.
+
+        Raises:
+            UserError: the observations are not those that the policy was trained with.
+        """
+        self._check(tensordict)
+        return super().forward(tensordict, *args, **kwargs)
+
+    def _check(self, tensordict: TensorDictBase) -> None:
+        """Checks the number of UAVs and the shape of what each of them observes."""
+        config = self.config
+        for key, shape in self._observed.items():
+            wanted = [config.env.num_uavs, *shape]
+            given = tensordict.get(key, None)
+            there = None if given is None else list(given.shape[-len(wanted) :])
+            if there != wanted:
+                raise UserError(
+                    f"this policy of {config.method} reads {key} with the last sizes {wanted}, the "
+                    f"environment gives {there}; make_env(policy.config) returns its environment"
+                )
+
+    def replay(
+        self,
+        *others: "TrainedPolicy",
+        fire: str | int | None = None,
+        policies: Sequence[str] = (),
+    ) -> Replay:
+        """Returns a page that plays an episode of the evaluation; Jupyter shows it inline.
+
+        Args:
+            others: policies to show beside this one, on the same fire.
+            fire: NAME, INDEX or NAME:INDEX of a held-out fire; `huygens:0`, or the first of the
+                run's own fires, if None.
+            policies: names of scripted policies to show, too.
+
+        Raises:
+            UserError: a name is not known, or the others have another map, team or horizon.
+        """
+        shown = [
+            panels.Panel(
+                panels.title_of(policy.config, *policy.changes),
+                policy.config,
+                lambda _, policy=policy: policy,
+            )
+            for policy in (self, *others)
+        ]
+        return panels.replay([*shown, *panels.scripted(self.config, policies)], fire)
