@@ -9,13 +9,32 @@ from emberlink.envs.world.knowledge import Knowledge
 
 _COMPARED = 2**11
 """pairs of maps that are compared at a time"""
-CELL_BYTES = 5
-"""index of the cell (2 bytes), step of the last look (2), and what was seen (1)"""
-PLACE_BYTES = 16
-"""a UAV (2 bytes), a step (2), and its position, three float32 numbers"""
 
 
-def pass_on_places(stamp: Tensor, place: Tensor, hears: Tensor, limit: int | None) -> Tensor:
+def cell_bytes(area: int, horizon: int) -> int:
+    """Returns the bytes of a message about a cell.
+
+    They hold the index of the cell, the step of the last look, and what was seen (1 byte).
+    """
+    return bytes_of(area) + bytes_of(horizon + 1) + 1
+
+
+def place_bytes(horizon: int) -> int:
+    """Returns the bytes of a message about a position.
+
+    They hold a UAV (2 bytes), a step, and three float32 numbers.
+    """
+    return 2 + bytes_of(horizon + 1) + 12
+
+
+def bytes_of(count: int) -> int:
+    """Returns the bytes of one of `count` numbers: 2, or 4 if there are more than 65,536."""
+    return 2 if count <= 2**16 else 4
+
+
+def pass_on_places(
+    stamp: Tensor, place: Tensor, hears: Tensor, limit: int | None, size: int
+) -> Tensor:
     """Passes on the positions that UAVs know of each other, in place.
 
     A UAV says a position if one of those that hear it knows an older one or none. With a limit,
@@ -27,6 +46,7 @@ def pass_on_places(stamp: Tensor, place: Tensor, hears: Tensor, limit: int | Non
         place: float32 [envs, n, n, 3], the positions, cells.
         hears: bool [envs, n, n], whether a UAV (row) hears another one (column).
         limit: bytes that a UAV can say; None for no limit.
+        size: bytes of a message about a position.
 
     Returns:
         int64 [envs, n], the bytes that each UAV said.
@@ -37,15 +57,15 @@ def pass_on_places(stamp: Tensor, place: Tensor, hears: Tensor, limit: int | Non
     if limit is not None:
         uavs = stamp.shape[-1]
         worth = stamp * uavs + torch.arange(uavs, device=stamp.device)
-        allowed = torch.full_like(stamp[..., 0], limit // PLACE_BYTES)
-        said = keep_best(said, worth, allowed, limit // PLACE_BYTES)
+        allowed = torch.full_like(stamp[..., 0], limit // size)
+        said = keep_best(said, worth, allowed, limit // size)
         newer &= said.unsqueeze(1)
     told, speaker = torch.where(newer, stamp.unsqueeze(1), -1).max(2)
     better = (told > stamp).unsqueeze(-1)
     theirs = place.gather(1, speaker.unsqueeze(-1).expand(*speaker.shape, 3))
     place.copy_(torch.where(better, theirs, place))
     stamp.copy_(torch.maximum(stamp, told))
-    return PLACE_BYTES * said.sum(-1)
+    return size * said.sum(-1)
 
 
 def keep_best(said: Tensor, worth: Tensor, allowed: Tensor, most: int) -> Tensor:
@@ -82,6 +102,7 @@ class CellMessages(Buffers):
         envs: number of environments.
         uavs: UAVs per environment.
         area: cells of a map.
+        size: bytes of a message about a cell.
     """
 
     fresh: Tensor
@@ -90,8 +111,9 @@ class CellMessages(Buffers):
     """bool [envs, uavs, uavs]: whom each UAV heard at the step before"""
     _shift: Tensor
 
-    def __init__(self, envs: int, uavs: int, area: int):
+    def __init__(self, envs: int, uavs: int, area: int, size: int):
         super().__init__()
+        self.size = size
         self.register_buffer("fresh", torch.zeros(envs, uavs, area, dtype=torch.bool))
         self.register_buffer("heard", torch.zeros(envs, uavs, uavs, dtype=torch.bool))
         # A view's cell of environment e is at e * area; the map of a UAV begins at
@@ -124,18 +146,20 @@ class CellMessages(Buffers):
         """
         last, seen = known.last_seen, known.seen_fire
         assert seen is not None
+        most = None if limit is None else limit // self.size
+        allowed = left.clamp(min=0) // self.size
         if last.is_cuda:
             self.heard.zero_()
-            return CELL_BYTES * _pass_on_dense(last, seen, hears, limit, left)
+            return self.size * _pass_on_dense(last, seen, hears, most, allowed)
         news = self._news(last, seen, hears & self.heard)
         maps = _differences(last, seen, hears & ~self.heard)
         env, speaker, hearer, cell = (torch.cat(parts) for parts in zip(news, maps, strict=True))
         said = torch.zeros_like(seen)
         said[env, speaker, cell] = True
         self.fresh.zero_()
-        if limit is not None:
-            over = said.sum(-1) * CELL_BYTES > left
-            wanted, said[over] = said.clone(), _best(said[over], last[over], limit, left[over])
+        if most is not None:
+            over = said.sum(-1) > allowed
+            wanted, said[over] = said.clone(), _best(said[over], last[over], most, allowed[over])
             self.fresh.copy_(wanted & ~said)
             kept = said[env, speaker, cell]
             env, speaker, hearer, cell = (x[kept] for x in (env, speaker, hearer, cell))
@@ -146,7 +170,7 @@ class CellMessages(Buffers):
         flat.scatter_reduce_(0, place, was_fire.view(torch.uint8), "amax")
         self.fresh.view(-1)[place] = True
         self.heard.copy_(hears)
-        return CELL_BYTES * said.sum(-1)
+        return self.size * said.sum(-1)
 
     def _news(self, last: Tensor, seen: Tensor, hears: Tensor) -> tuple[Tensor, ...]:
         """Returns the fresh cells that are new to others; see `_differences`."""
@@ -179,27 +203,30 @@ def _differences(last: Tensor, seen: Tensor, hears: Tensor) -> tuple[Tensor, ...
     return tuple(torch.cat(every) for every in zip(*parts, strict=True))
 
 
-def _best(said: Tensor, last: Tensor, limit: int, left: Tensor) -> Tensor:
-    """Returns the cells that fit into what a UAV can still say, bool [..., area]."""
-    area, allowed = last.shape[-1], left.clamp(min=0) // CELL_BYTES
+def _best(said: Tensor, last: Tensor, most: int, allowed: Tensor) -> Tensor:
+    """Returns the most useful cells; `most` and `allowed` as in `keep_best`, bool [..., area]."""
+    area = last.shape[-1]
     number = last.long()
     fire = (number & 3 == 1) & (number >= 0)
     worth = (number + fire * 2**32) * area + torch.arange(area, device=last.device)
-    return keep_best(said, worth, allowed, limit // CELL_BYTES)
+    return keep_best(said, worth, allowed, most)
 
 
 def _pass_on_dense(
-    last: Tensor, seen: Tensor, hears: Tensor, limit: int | None, left: Tensor
+    last: Tensor, seen: Tensor, hears: Tensor, most: int | None, allowed: Tensor
 ) -> Tensor:
-    """Compares all maps, never waits for the device, and returns the number of cells said."""
+    """Compares all maps, never waits for the device, and returns the number of cells said.
+
+    `most` and `allowed` are as in `keep_best`; without a limit, `most` is None.
+    """
     before, before_seen, counts = last.clone(), seen.clone(), []
     for number in range(hears.shape[1]):
         told, told_seen = before[:, number : number + 1], before_seen[:, number : number + 1]
         hearing = hears[:, :, number].unsqueeze(-1)
         newer = hearing & ((told > before) | (told_seen > before_seen))
         said = newer.any(1)
-        if limit is not None:
-            said = _best(said, told[:, 0], limit, left[:, number])
+        if most is not None:
+            said = _best(said, told[:, 0], most, allowed[:, number])
         heard = hearing & said.unsqueeze(1)
         torch.maximum(last, torch.where(heard, told, -1), out=last)
         seen |= heard & told_seen

@@ -1,5 +1,6 @@
 """Shared maps: UAVs keep maps of what they know, exchange them by radio, and look at them."""
 
+import math
 from dataclasses import replace
 from typing import Annotated, Any, ClassVar
 
@@ -11,7 +12,7 @@ from torch import Tensor
 from torchrl.data import Composite, Unbounded
 
 from emberlink.comm._crops import LARGEST_SCALE, Crops
-from emberlink.comm._messages import CellMessages, pass_on_places
+from emberlink.comm._messages import CellMessages, cell_bytes, pass_on_places, place_bytes
 from emberlink.comm.base import CommModule
 from emberlink.envs import keys
 from emberlink.envs.config import WildfireConfig
@@ -85,7 +86,8 @@ class Maps(CommModule):
         # Steps are stored times 4, plus what was seen.
         last = 4 * world.horizon + 3
         self.known = Knowledge(envs=num_envs, uavs=uavs, area=area, horizon=last, fires=True)
-        self.messages = CellMessages(num_envs, uavs, area)
+        size = cell_bytes(math.prod(world.grid), world.horizon)
+        self.messages = CellMessages(num_envs, uavs, area, size)
         self.pictures = Crops(
             world.grid,
             pixels=config.pixels,
@@ -129,7 +131,7 @@ class Maps(CommModule):
         return tensordict.set(keys.OBSERVATION, self._vector(tensordict))
 
     def bytes_sent(self, tensordict: TensorDictBase) -> Tensor:
-        """Returns 5 for each cell and 16 for each position that a UAV said, int64 [num_envs, n]."""
+        """Returns the bytes that each UAV said at the last step, int64 [num_envs, n]."""
         return self.said.clone()
 
     def sightings(self) -> tuple[Tensor, Tensor]:
@@ -158,7 +160,8 @@ class Maps(CommModule):
     def _talk(self, tensordict: TensorDictBase) -> None:
         """Passes on what is new to those that hear it, and counts the bytes."""
         hears, limit = tensordict.get(keys.HEARS), self.world.radio.bandwidth
-        places = pass_on_places(self.stamp, self.place, hears, limit)
+        size = place_bytes(self.world.horizon)
+        places = pass_on_places(self.stamp, self.place, hears, limit, size)
         left = (0 if limit is None else limit) - places
         cells = self.messages.pass_on(self.known, hears, limit, left)
         self.said.copy_(places + cells)

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from emberlink.envs import keys
 from emberlink.envs.wildfire import WildfireEnv
+from emberlink.envs.world.knowledge import step_type
 from emberlink.policies.planning import HERE, Messages, Targets, TeamMaps, band, plan_period
 from emberlink.policies.scripted.base import Scripted
 
@@ -69,8 +70,8 @@ class MapGreedy(Scripted):
         self.register_buffer("_area", area)
 
     def bytes_sent(self, tensordict: TensorDictBase) -> Tensor:
-        """Returns the bytes of a map (int16 per cell) and of a target (two float32) per UAV."""
-        size = 2 * math.prod(self.world.grid) + 8
+        """Returns the bytes of a map (a step per cell) and of a target (two float32) per UAV."""
+        size = step_type(self.world.horizon).itemsize * math.prod(self.world.grid) + 8
         return size * tensordict.get(keys.ALIVE).long() * self.maps.sends
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

@@ -5,11 +5,12 @@ import torch
 from scalar_maps import Teller
 
 from emberlink.comm import _messages
-from emberlink.comm._messages import CELL_BYTES, PLACE_BYTES, CellMessages, pass_on_places
+from emberlink.comm._messages import CellMessages, cell_bytes, pass_on_places, place_bytes
 from emberlink.envs.world.coverage_map import View
 from emberlink.envs.world.knowledge import Knowledge
 
 ENVS, UAVS, AREA, STEPS = 3, 5, 40, 25
+CELL_BYTES, PLACE_BYTES = 5, 16
 
 
 def draw(seed: int, *shape: int) -> torch.Tensor:
@@ -33,8 +34,24 @@ def hearing(step: int, density: float) -> torch.Tensor:
     return slow & ~torch.eye(UAVS, dtype=torch.bool) & (draw(step, ENVS, UAVS, UAVS) < 0.9)
 
 
-def dense(*arguments):
-    return _messages._pass_on_dense(*arguments) * CELL_BYTES
+def dense(last, seen, hears, limit, left):
+    most = None if limit is None else limit // CELL_BYTES
+    allowed = left.clamp(min=0) // CELL_BYTES
+    return _messages._pass_on_dense(last, seen, hears, most, allowed) * CELL_BYTES
+
+
+@pytest.mark.parametrize(
+    ("area", "horizon", "cell", "position"),
+    [
+        (900, 1000, 5, 16),
+        (65_536, 65_535, 5, 16),
+        (65_537, 65_535, 7, 16),
+        (65_536, 65_536, 7, 18),
+        (512 * 512, 1_000_000, 9, 18),
+    ],
+)
+def test_numbers_above_65535_take_four_bytes(area, horizon, cell, position):
+    assert (cell_bytes(area, horizon), place_bytes(horizon)) == (cell, position)
 
 
 @pytest.mark.parametrize("function", ["sparse", "dense"])
@@ -42,7 +59,7 @@ def dense(*arguments):
 @pytest.mark.parametrize("density", [0.3, 0.8])
 def test_maps_and_bytes_equal_those_of_dictionaries(function, limit, density):
     known = Knowledge(envs=ENVS, uavs=UAVS, area=AREA, horizon=4 * STEPS + 3, fires=True)
-    messages = CellMessages(ENVS, UAVS, AREA)
+    messages = CellMessages(ENVS, UAVS, AREA, CELL_BYTES)
     tellers = [Teller(UAVS) for _ in range(ENVS)]
     said_any = 0
     for step in range(1, STEPS):
@@ -89,7 +106,7 @@ def test_positions_are_passed_on_a_hop_a_step_and_the_newest_first(limit):
         stamp[0, own, own], place[0, own, own] = step, 10.0 * step + own[:, None].float()
         expected |= {(uav, uav): step for uav in range(uavs)}
         before = dict(expected)
-        sent = pass_on_places(stamp, place, hears, limit)
+        sent = pass_on_places(stamp, place, hears, limit, PLACE_BYTES)
         for speaker in range(uavs):
             hearers = [h for h in (speaker - 1, speaker + 1) if 0 <= h < uavs]
             new = [
