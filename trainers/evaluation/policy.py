@@ -1,4 +1,4 @@
-"""The frozen policy of a run, as Python users have it."""
+"""Defines the frozen policy that `emberlink.trainers.load` returns."""
 
 from collections.abc import Sequence
 from pathlib import Path

@@ -105,7 +105,7 @@ def test_all_methods_by_default_and_stacks_of_seeds():
         (["consensus", "learner.gama=0.9,0.8"], "learner.gama"),
         (["consensus", "policy.hold=5,7", "env.horizon=20"], "env.horizon=20: must be a multiple"),
         (
-            ["maps", "independent", "setup=strong", "learner=imitation"],
+            ["independent", "maps", "setup=strong", "learner=imitation"],
             "independent, strong, paper, seed 0: learner=imitation: the teacher flies by the maps",
         ),
         (
