@@ -4,7 +4,6 @@ The process that starts the others of pytest-xdist reads this file first, so wha
 is imported in the fixtures.
 """
 
-import gc
 import importlib
 import io
 import os
@@ -17,11 +16,6 @@ from types import SimpleNamespace
 
 import pytest
 from tiny_run import train_tiny
-
-
-def pytest_configure() -> None:
-    """Collects garbage less often: environments and networks are many small objects."""
-    gc.set_threshold(20_000, 20, 20)
 
 
 @pytest.fixture(autouse=True, scope="session")
