@@ -15,7 +15,7 @@ from emberlink.trainers.comparison.results import Comparison, compare_runs
 from emberlink.trainers.config.compose import flat, override, resolve, to_values
 from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.config.transfer import in_world
-from emberlink.trainers.evaluation.actor import load_actor
+from emberlink.trainers.evaluation.actor import fireless, load_actor
 from emberlink.trainers.evaluation.evaluate import evaluate as evaluate_policy
 from emberlink.trainers.evaluation.policy import TrainedPolicy
 from emberlink.trainers.evaluation.report import evaluate_run
@@ -188,7 +188,9 @@ def load(
         for key, value in now.items()
         if key.startswith(("world", "env.", "comm.")) and before.get(key) != value
     ]
-    return TrainedPolicy(load_actor(config, file), config, file, changes)
+    env = fireless(config)
+    actor = load_actor(config, file, env)
+    return TrainedPolicy(actor, env.observation_spec, config, file, changes)
 
 
 def compare(paths: Reference | Sequence[Reference], output: Reference | None = None) -> Comparison:

@@ -7,20 +7,26 @@ import torch
 from tensordict.nn import TensorDictModule
 from torchrl.envs import TransformedEnv
 
-from emberlink.envs import keys
 from emberlink.trainers.build import build_actor, build_env
 from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.learners.base import ACTOR
 from emberlink.trainers.runs.checkpoints import load_weights
 
 
-def load_actor(config: RunConfig, checkpoint: Path) -> TensorDictModule:
+def load_actor(
+    config: RunConfig, checkpoint: Path, env: TransformedEnv | None = None
+) -> TensorDictModule:
     """Returns the frozen policy of a checkpoint, which maps observations to ("agents", "action").
+
+    Args:
+        config: configuration of the run.
+        checkpoint: file of the networks.
+        env: the environment whose observations they read; a new one of `fireless` if None.
 
     Raises:
         UserError: the checkpoint cannot be read or does not fit the configuration.
     """
-    actor = build_actor(config, _fireless(config))
+    actor = build_actor(config, fireless(config) if env is None else env)
     network: Any = actor.module
     expected = {ACTOR + name: value for name, value in network.state_dict().items()}
     weights = load_weights(checkpoint, expected, config)
@@ -28,14 +34,7 @@ def load_actor(config: RunConfig, checkpoint: Path) -> TensorDictModule:
     return actor.requires_grad_(False)
 
 
-def observed(config: RunConfig) -> dict[tuple[str, str], torch.Size]:
-    """Returns the keys that the networks of a configuration read, and their shapes per UAV."""
-    spec = _fireless(config).observation_spec
-    shapes = map(torch.Size, keys.observation_shapes(spec))
-    return dict(zip(keys.observation_keys(spec), shapes, strict=True))
-
-
-def _fireless(config: RunConfig) -> TransformedEnv:
+def fireless(config: RunConfig) -> TransformedEnv:
     """Returns one environment without a fire."""
     return build_env(
         config,

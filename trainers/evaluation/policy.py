@@ -6,11 +6,12 @@ from typing import Any
 
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictSequential, dispatch
+from torchrl.data import Composite
 
+from emberlink.envs import keys
 from emberlink.envs.utils.errors import UserError
 from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.evaluation import panels
-from emberlink.trainers.evaluation.actor import observed
 from emberlink.trainers.replay.page import Replay
 
 
@@ -21,6 +22,7 @@ class TrainedPolicy(TensorDictSequential):
 
     Args:
         actor: the networks.
+        observation_spec: of their environment.
         config: configuration of the run.
         checkpoint: file of the networks.
         changes: settings that are not those of the training, such as `env.radio.range=0`.
@@ -29,13 +31,15 @@ class TrainedPolicy(TensorDictSequential):
     def __init__(
         self,
         actor: TensorDictModule,
+        observation_spec: Composite,
         config: RunConfig,
         checkpoint: Path,
         changes: Sequence[str] = (),
     ):
         modules: Any = [actor]
         super().__init__(*modules)
-        self._observed = observed(config)
+        names = keys.observation_keys(observation_spec)
+        self._observed = dict(zip(names, keys.observation_shapes(observation_spec), strict=True))
         self.config = config
         self.checkpoint = checkpoint
         self.changes = tuple(changes)

@@ -198,7 +198,6 @@ def jobs_of(arguments: Sequence[str]) -> list[Job]:
     jobs: list[Job] = []
     for method, overrides in product(methods, product(*choices)):
         config = resolve(method, overrides)
-        config.check_rollouts()
         wanted = [replace(config, seed=seed) for seed in config.seeds or (config.seed,)]
         configs = [c for c in wanted if (c.output, identity(c)) not in taken]
         taken |= {(c.output, identity(c)) for c in configs}

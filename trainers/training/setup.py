@@ -13,6 +13,7 @@ from emberlink.envs import keys
 from emberlink.policies.hold import decisions, hold
 from emberlink.trainers.build import build_env, build_learner
 from emberlink.trainers.config.schema import RunConfig
+from emberlink.trainers.learners.base import Learner
 from emberlink.trainers.learners.nan_guard import NonFiniteGuard
 from emberlink.trainers.learners.tensors import copy_into, flatten, group, prefixed, unflatten
 from emberlink.trainers.rollout.allocator import keep_freed_memory
@@ -45,13 +46,10 @@ class TrainingSetup:
         self.step = 0
         """steps of the batch of environments so far"""
         self.env = _make_env(config, self.teams * config.num_envs, self.seeds)
-        config.check_rollouts()  # learners divide by the decisions of an episode
         self.guard = NonFiniteGuard(config.device)
-        self.learner = build_learner(config, self.env, self.guard)
-        self.team_actor(0)  # fails before the training, not at its first evaluation
+        self.learner = _make_learner(config, self.env, self.guard)
         self.rollout_steps = self.learner.rollout_steps * config.policy.hold
         """steps of the batch of environments in a rollout"""
-        config.check_rollouts(self.learner.rollout_steps)
         self.collector = make_collector(
             self.env,
             hold(self.learner.explorer, config.policy.hold),
@@ -139,12 +137,8 @@ def check_setup(config: RunConfig) -> None:
         UserError: the fire, the learner or its warm start does not fit the rest.
     """
     config = replace(config, seed=(config.seeds or (config.seed,))[0], seeds=())
-    config.check_rollouts()
-    learner = build_learner(
-        config, _make_env(config, 1, config.seed), NonFiniteGuard(config.device)
-    )
-    learner.team_actor(0, 1)
-    config.check_rollouts(learner.rollout_steps)
+    env = _make_env(config, 1, config.seed)
+    learner = _make_learner(config, env, NonFiniteGuard(config.device))
     warm_start.start(learner, config)
 
 
@@ -159,3 +153,12 @@ def _make_env(config: RunConfig, num_envs: int, seed: int | Sequence[int]) -> Tr
         true_map=config.learner.reads_map,
         teacher=config.learner.reads_teacher,
     )
+
+
+def _make_learner(config: RunConfig, env: TransformedEnv, guard: NonFiniteGuard) -> Learner:
+    """Returns a new learner; what does not fit it fails here and not in the training."""
+    config.check_rollouts()  # learners divide by the decisions of an episode
+    learner = build_learner(config, env, guard)
+    learner.team_actor(0, len(config.seeds or (config.seed,)))
+    config.check_rollouts(learner.rollout_steps)
+    return learner
