@@ -2,6 +2,7 @@
 
 import os
 import shutil
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -52,6 +53,16 @@ class Tab:
         self.page.on("dialog", lambda dialog: self.problems.append(dialog.message))
         self.page.on("request", lambda request: self.requests.append(request.url))
         self.page.goto(address)
+
+    def wait_for(self, expression: str, seconds: float = 30.0) -> None:
+        """Waits until an expression is true.
+
+        Playwright's wait_for_function evaluates text within the page, which its policy forbids.
+        """
+        end = time.monotonic() + seconds
+        while not self.page.evaluate(expression):
+            assert time.monotonic() < end, f"still false: {expression}"
+            self.page.wait_for_timeout(20)
 
     def close(self) -> None:
         self._context.close()

@@ -27,7 +27,6 @@ _WORDS = {
     float: "number",
     str: "text",
     bool: "true or false",
-    dict: "names and values",
     type(None): "null",
 }
 _NO_LIMIT = 1e12
@@ -158,7 +157,7 @@ def _meanings(cls: type) -> dict[str, str]:
             documented = ModuleAnalyzer.for_module(base.__module__).find_attr_docs()
             for (owner, name), lines in documented.items():
                 if owner == base.__qualname__:
-                    text = " ".join(lines).strip().replace("|", "\\|")
+                    text = " ".join(lines).strip().rstrip(".").replace("|", "\\|")
                     found[name] = re.sub(r"\bNone\b", "null", text)
     return found
 
@@ -173,6 +172,8 @@ def _type(hint: Any) -> str:
         return ", ".join(f"`{value}`" for value in arguments)
     if origin in (typing.Union, type(int | None)):
         return " or ".join(_type(part) for part in arguments)
+    if origin is dict:
+        return "names and values"
     if origin is tuple:
         if arguments[-1] is Ellipsis:
             return f"list, each {_type(arguments[0])}"

@@ -34,6 +34,7 @@ def write_mp4(path: Path, frames: Iterable[NDArray[np.uint8]], *, fps: int = 20)
         ValueError: there is no frame.
     """
     path.touch()  # raises an error that names the path; ffmpeg's does not
+    path = path.absolute()  # ffmpeg takes `fire:3.mp4` for an address and `-x.mp4` for an option
     written, writer = 0, None
     try:
         for picture in frames:

@@ -14,7 +14,8 @@ from emberlink.trainers.terminal import signals
 from emberlink.trainers.terminal.signals import Interrupted, Interruption
 from emberlink.trainers.training.trainer import Trainer
 
-INT, TERM, USR1, USR2 = signal.SIGINT, signal.SIGTERM, signal.SIGUSR1, signal.SIGUSR2
+INT, TERM, HUP = signal.SIGINT, signal.SIGTERM, signal.SIGHUP
+USR1, USR2 = signal.SIGUSR1, signal.SIGUSR2
 
 
 def send(*numbers) -> Interruption:
@@ -27,7 +28,11 @@ def send(*numbers) -> Interruption:
 
 
 @pytest.mark.parametrize(
-    "numbers", [(TERM,), (USR2,), (USR1, USR1), (TERM, USR2), (TERM, TERM), (USR2, TERM, USR2)]
+    "numbers",
+    [
+        *((TERM,), (USR2,), (USR1, USR1), (TERM, USR2), (TERM, TERM), (USR2, TERM, USR2)),
+        *((TERM, HUP), (HUP, TERM)),
+    ],
 )
 def test_signals_that_a_cluster_sends_together_let_the_training_save(numbers):
     interruption = send(*numbers)
@@ -41,10 +46,11 @@ def test_a_second_signal_of_the_user_ends_at_once(numbers):
         send(*numbers)
 
 
-def test_a_later_sigterm_ends_at_once(monkeypatch):
+@pytest.mark.parametrize("later", [TERM, HUP])
+def test_a_later_signal_of_the_machine_ends_at_once(later, monkeypatch):
     monkeypatch.setattr(signals, "_TOGETHER", 0.0)
     with pytest.raises(Interrupted):
-        send(TERM, TERM)
+        send(TERM, later)
 
 
 def test_a_signal_within_a_context_of_tensordict_is_not_an_error():

@@ -30,7 +30,7 @@ def add_compare(commands: Any) -> None:
         completer=completion.runs,
         nargs="+",
         type=Path,
-        help="run folders, or folders of run folders",
+        help="run folders, folders of run folders, or names such as pretrained:tuned",
     )
     comparison.add_argument(
         "--output", metavar="FOLDER", type=Path, help="a new folder (default: compare)"

@@ -33,7 +33,10 @@ def add_sweep(commands: Any) -> None:
         "executor=local, submitit (SLURM) or ray, and its keys executor.KEY=value",
     )
     sweep.add_argument(
-        "--jobs", metavar="N", type=positive, help="runs at a time (default: one per core)"
+        "--jobs",
+        metavar="N",
+        type=positive,
+        help="runs at a time (default: one per core; on SLURM and Ray, all)",
     )
     sweep.add_argument("--dry-run", action="store_true", help="only print the state of each run")
 

@@ -32,12 +32,14 @@ def compare(paths: Sequence[Path], console: Console, output: Path | None = None)
     folder = free_folder(output)
     comparison = compare_runs(paths)
     for path, why in comparison.left_out:
-        console.print(Text(f"note: {path} is left out: {why}", style="yellow"))
+        console.print(Text(f"note: {path} is left out: {why}", style="yellow"), soft_wrap=True)
     comparison = write_report(
-        comparison, folder, lambda text: console.print(Text(f"  {text}", style="dim"))
+        comparison,
+        folder,
+        lambda text: console.print(Text(f"  {text}", style="dim"), soft_wrap=True),
     )
     for note in comparison.notes:
-        console.print(Text(f"note: {note}", style="yellow"))
+        console.print(Text(f"note: {note}", style="yellow"), soft_wrap=True)
     for numbers in comparison.sections:
         _print_section(console, numbers)
     console.print(Text(str(folder / "compare.html")), soft_wrap=True)

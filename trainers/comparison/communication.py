@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -9,15 +10,20 @@ from numpy.typing import NDArray
 
 from emberlink.trainers.comparison import bootstrap
 from emberlink.trainers.comparison.bootstrap import Interval
-from emberlink.trainers.comparison.groups import Group, Section
+from emberlink.trainers.comparison.groups import Group, Section, trained_with
 from emberlink.trainers.comparison.runs import Run
 from emberlink.trainers.evaluation.results import LEARNED
 
-RANGE, LOSS = "env.radio.range", "env.radio.loss"
 SCRIPTED = ("map_greedy", "courier")
 """scripted policies whose value of communication is computed"""
 _SAME = {"map_greedy": ("map_greedy_alone", "map_greedy_all")}
-"""scripted policy -> those that act, without a base, as it does with the other two radios"""
+"""scripted policy -> those that act, without a base, as it does with the radio off, and without
+limits"""
+_RANGE, _LOSS, _BANDWIDTH = _RADIO = "env.radio.range", "env.radio.loss", "env.radio.bandwidth"
+_Radio = tuple[float, float | None, float | None]
+"""range, loss and bandwidth; None for no loss or no limit, and where they do not matter"""
+_OFF: _Radio = (0.0, None, None)
+_FULL: _Radio = (float("inf"), None, None)
 
 Values = NDArray[np.float64]
 
@@ -28,7 +34,8 @@ class CommunicationValue:
 
     Attributes:
         fire: the fire of the evaluation.
-        policy: label of the group, or name of the scripted policy.
+        policy: label of the group; or name of the scripted policy, with its radio if the section
+            has several.
         measure: the headline measure of the world.
         how: "evaluated" if the same networks were evaluated with other radios, "retrained" if other
             networks were trained with them, "scripted" for a scripted policy.
@@ -61,23 +68,37 @@ def communication_values(section: Section) -> list[CommunicationValue]:
                     if none is not None and full is not None:
                         samples = [_per_fire(g.runs, fire, measure) for g in (none, group, full)]
                         values.append(_value(fire, group.label, measure, how, samples))
-        for policy in SCRIPTED:
-            samples = _scripted(section, fire, policy, measure)
+        limited = _limited(section)
+        for policy, world in product(SCRIPTED, limited):
+            samples = _scripted(section, fire, policy, measure, world)
             if samples is not None:
-                values.append(_value(fire, policy, measure, "scripted", samples))
+                name = policy + (f", {_radio_text(world)}" if len(limited) > 1 else "")
+                values.append(_value(fire, name, measure, "scripted", samples))
     return values
 
 
-def _scripted(section: Section, fire: str, policy: str, measure: str) -> list[Values] | None:
-    """Returns a scripted policy's measure with the radio off, that of the world, and no limits.
+def _limited(section: Section) -> list[Run]:
+    """Returns a run for each radio of trainings that is neither off nor without limits."""
+    first: dict[_Radio, Run] = {}
+    for run in (run for group in section.as_trained for run in group.runs):
+        first.setdefault(_radio(run), run)
+    return [run for radio, run in first.items() if radio not in (_OFF, _FULL)]
+
+
+def _radio_text(run: Run) -> str:
+    """Returns the limits of a run's radio, such as `range 10.0, loss 0.2`."""
+    names = (key.rpartition(".")[2] for key in _RADIO)
+    limits = zip(names, _radio(run), strict=True)
+    return ", ".join(f"{name} {limit}" for name, limit in limits if limit is not None)
+
+
+def _scripted(
+    section: Section, fire: str, policy: str, measure: str, world: Run
+) -> list[Values] | None:
+    """Returns a scripted policy's measure with the radio off, that of a run, and no limits.
 
     None if an evaluation is missing. Without a base no evaluation with another radio is needed.
     """
-    trained = [run for group in section.as_trained for run in group.runs]
-    limited = [run for run in trained if _radio(run) not in (_OFF, _FULL)]
-    if not limited:
-        return None
-    world = limited[0]
     others = [
         next((run for run in section.runs if _radio(run) == radio), None) for radio in (_OFF, _FULL)
     ]
@@ -89,17 +110,14 @@ def _scripted(section: Section, fire: str, policy: str, measure: str) -> list[Va
     return [np.asarray(p[measure]) for p in played if p] if all(played) else None
 
 
-_OFF, _FULL = (0.0, None), (float("inf"), 0.0)
-
-
-def _radio(run: Run) -> tuple[float, float | None]:
-    """Returns range and loss of a run's evaluation; a radio that is off has no loss."""
+def _radio(run: Run) -> _Radio:
+    """Returns the radio of a run's evaluation."""
     settings = {**run.settings, **run.evaluated_with}
-    reach = float(settings[RANGE])
-    return (reach, None) if reach == 0 else (reach, float(settings[LOSS]))
+    reach = float(settings[_RANGE])
+    return _OFF if reach == 0 else (reach, settings[_LOSS] or None, settings[_BANDWIDTH])
 
 
-def _evaluated(section: Section, group: Group, radio: tuple) -> Group | None:
+def _evaluated(section: Section, group: Group, radio: _Radio) -> Group | None:
     """Returns the evaluation of a group's own networks with another radio."""
     paths = {run.path for run in group.runs}
     return next(
@@ -108,31 +126,32 @@ def _evaluated(section: Section, group: Group, radio: tuple) -> Group | None:
             for other in section.groups
             if not other.as_trained
             and {run.path for run in other.runs} == paths
-            and set(other.runs[0].evaluated_with) <= {RANGE, LOSS}
+            and set(other.runs[0].evaluated_with) <= set(_RADIO)
             and _radio(other.runs[0]) == radio
         ),
         None,
     )
 
 
-def _retrained(section: Section, group: Group, radio: tuple) -> Group | None:
+def _retrained(section: Section, group: Group, radio: _Radio) -> Group | None:
     """Returns the group that was trained with another radio and equal settings otherwise."""
-
-    def rest(other: Group) -> dict[str, Any]:
-        ignored = ("evaluation", "seed", "output", "baselines", RANGE, LOSS)
-        settings = other.runs[0].settings.items()
-        return {key: value for key, value in settings if not key.startswith(ignored)}
-
+    wanted = _without_radio(trained_with(group.runs[0]))
     return next(
         (
             other
             for other in section.as_trained
             if other.seeds == group.seeds
             and _radio(other.runs[0]) == radio
-            and rest(other) == rest(group)
+            and _without_radio(trained_with(other.runs[0])) == wanted
         ),
         None,
     )
+
+
+def _without_radio(settings: dict[str, Any]) -> dict[str, Any]:
+    """Returns settings, and those of a warm start within them, without those of the radio."""
+    rest = {key: value for key, value in settings.items() if key not in _RADIO}
+    return {k: _without_radio(v) if isinstance(v, dict) else v for k, v in rest.items()}
 
 
 def _per_fire(runs: Sequence[Run], fire: str, measure: str) -> Values:

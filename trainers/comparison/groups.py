@@ -15,7 +15,7 @@ NOT_COMPARED = ("seed", "seeds", "output", "evaluation", "baselines", *NOT_LEARN
 """first parts of keys that may differ within a group, since they do not affect training"""
 NOT_NOTED = ("seed", "seeds", "output", "baselines")
 """first parts of keys whose differences within a group are not reported in notes"""
-_WARM_START = "learner.warm_start"
+WARM_START = "learner.warm_start"
 _OF_SECTION = ("env.horizon", "env.grid")
 """settings of the environment that are equal within a section, besides those of the fire"""
 
@@ -139,7 +139,7 @@ def _section_name(run: Run, firsts: Sequence[Run]) -> str:
 
 def _groups(section: str, runs: Sequence[Run], notes: list[str]) -> list[Group]:
     """Returns the groups of a section sorted by label, and appends notes about their runs."""
-    parts = _split(runs, lambda run: [run.config.method, _trained_with(run), run.evaluated_with])
+    parts = _split(runs, lambda run: [run.config.method, trained_with(run), run.evaluated_with])
     names = [_group_name(part[0], [other[0] for other in parts]) for part in parts]
     groups = [
         Group(name, _one_run_per_seed(f"{section}, {name}", part, notes))
@@ -154,7 +154,7 @@ def _groups(section: str, runs: Sequence[Run], notes: list[str]) -> list[Group]:
         if first_part(key) not in ("method", "replay", "comm", *NOT_COMPARED):
             having = {g.label: _word(g.settings[key]) for g in trained if key in g.settings}
             if len({*having.values()}) > 1:
-                notes.append(f"{section}: the methods differ in {key}: {by_value(having)}")
+                notes.append(f"{section}: the groups differ in {key}: {by_value(having)}")
     return groups
 
 
@@ -195,14 +195,14 @@ def _one_run_per_seed(label: str, runs: Sequence[Run], notes: list[str]) -> tupl
     return tuple(by_seed[seed] for seed in sorted(by_seed))
 
 
-def _trained_with(run: Run) -> dict[str, Any]:
+def trained_with(run: Run) -> dict[str, Any]:
     """Returns the settings that affect training, without the seed.
 
-    If the run began with the actors of another, these are the settings of both, if that run exists.
+    If the run began with the actors of another that still exists, `WARM_START` holds its settings.
     """
-    mine, start = _without_seed(run.settings), run.settings.get(_WARM_START, "")
+    mine, start = _without_seed(run.settings), run.settings.get(WARM_START, "")
     origin = settings_of(start) if start else ""
-    return mine | {_WARM_START: origin if isinstance(origin, str) else _without_seed(origin)}
+    return mine | {WARM_START: origin if isinstance(origin, str) else _without_seed(origin)}
 
 
 def _without_seed(settings: Mapping[str, Any]) -> dict[str, Any]:

@@ -49,9 +49,9 @@ def compare_runs(paths: Sequence[Path]) -> Comparison:
         UserError: there is no finished run, runs of a section were evaluated on different fires,
             or a file is damaged.
     """
-    runs, left_out = read_all(paths)
     if not paths:
         raise UserError("nothing to compare: expected at least one run folder")
+    runs, left_out = read_all(paths)
     if not runs:
         reasons = "".join(f"; {path}: {why}" for path, why in left_out[:1])
         raise UserError(f"no finished run among {len(left_out)}: nothing to compare{reasons}")

@@ -1,6 +1,7 @@
 """Finds finished runs on disk and reads them."""
 
 import math
+import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -122,12 +123,12 @@ def read(path: Path) -> Run | str:
     try:
         evaluation = read_evaluation(path / "eval.json", config)
     except FileNotFoundError:
-        return f"not evaluated: there is no eval.json (emberlink eval {path})"
+        return f"not evaluated: there is no eval.json (emberlink eval {shlex.quote(str(path))})"
     newest = newest_checkpoint(path)
     if newest is not None and newest.name != evaluation.checkpoint:
         return (
             f"eval.json is of {evaluation.checkpoint}, the newest checkpoint is {newest.name} "
-            f"(emberlink eval {path})"
+            f"(emberlink eval {shlex.quote(str(path))})"
         )
     if newest is not None:
         check_trained_with(newest, config)
@@ -138,14 +139,15 @@ def evaluated_otherwise(run: Run) -> tuple[list[Run], list[LeftOut]]:
     """Reads the evaluations of a run with changed settings, one per eval_*.json.
 
     Returns:
-        The run with each of these evaluations, and the files left out because their checkpoint or
-        fires differ from those of eval.json.
+        The run with each of these evaluations, and the files left out: their checkpoint or fires
+        differ from those of eval.json, or another file has the same settings.
 
     Raises:
         UserError: a file is damaged.
     """
     others: list[Run] = []
     left_out: list[LeftOut] = []
+    names: dict[str, str] = {}
     for file in sorted(run.path.glob("eval_*.json")):
         evaluation = read_evaluation(file, run.config)
         changed = _changed_settings(run, evaluation)
@@ -155,7 +157,11 @@ def evaluated_otherwise(run: Run) -> tuple[list[Run], list[LeftOut]]:
             if getattr(evaluation, name) != getattr(run.evaluation, name)
         ]
         why += [f"{key}={changed[key]}" for key in ("env.horizon", "env.grid") if key in changed]
-        if changed and not why:
+        settings = repr(sorted(changed.items()))
+        if settings in names and not why:
+            left_out.append((str(file), f"has the settings of {names[settings]}"))
+        elif changed and not why:
+            names[settings] = file.name
             others.append(replace(run, evaluation=evaluation, evaluated_with=changed))
         elif changed:
             left_out.append((str(file), f"evaluated otherwise: {', '.join(why)}"))

@@ -58,10 +58,10 @@ def sweep(
     _check(jobs)
     total = sum(len(job.configs) for job in jobs)
     done = sum(len(job.configs) for job in jobs if job.finished)
-    console.print(f"{total} runs, of which {done} are finished -> {output}")
+    console.print(f"{total} runs, of which {done} are finished -> {output}", soft_wrap=True)
     if dry:
         for job in jobs:
-            console.print(f"  {job.name}: {job.state}", highlight=False)
+            console.print(f"  {job.name}: {job.state}", highlight=False, soft_wrap=True)
         return 0
     for job in jobs:
         loggers.check_installed(job.configs[0])

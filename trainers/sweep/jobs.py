@@ -23,6 +23,8 @@ _MAY_DIFFER = ("output", "seeds", *NOT_LEARNT_WITH)
 """first parts of keys that may differ between configurations of the same run"""
 _NAMED = {"setup", "world", "seed", "seeds"}
 """keys whose values are in the name of every job"""
+_SEEDS_NAMED = 8
+"""seeds that the name of a log can hold; for more, it holds the first"""
 
 Identity = tuple[tuple[str, str], ...]
 """keys and values that identify a run"""
@@ -157,8 +159,10 @@ class Job:
         Raises:
             OSError: the file or the folder of the logs cannot be created.
         """
-        seeds = "-".join(str(config.seed) for config in self.configs)
-        first = self.configs[0]
+        first, *others = self.configs
+        few = len(others) < _SEEDS_NAMED
+        rest = [str(other.seed) for other in others] if few else [f"and-{len(others)}-more"]
+        seeds = "-".join([str(first.seed), *rest])
         stem = f"{first.setup}_{first.world}_{self.method}_s{seeds}"
         folder = inner_folder(self.output, "logs")
         while True:

@@ -86,9 +86,9 @@ class Lease:
 
     def beat(self) -> bool:
         """Writes a sign of life, and returns whether the lease is still held."""
-        if self.path.with_name(_next(self.path.name)).exists():
-            return False
         try:
+            if self._is_followed():
+                return False
             self._write(replace(self.record, beat=self.record.beat + 1))
             self._beaten = time.monotonic()
         except OSError:  # a file system may be unavailable for a while
@@ -102,9 +102,17 @@ class Lease:
         Args:
             ended: how the holder has ended; not empty.
         """
-        if not self.path.with_name(_next(self.path.name)).exists():
-            with suppress(OSError):  # the lease expires
+        with suppress(OSError):  # the lease expires
+            if not self._is_followed():
                 self._write(replace(self.record, ended=ended))
+
+    def _is_followed(self) -> bool:
+        """Returns whether another process has taken the run since.
+
+        Raises:
+            OSError: the file system is unavailable.
+        """
+        return self.path.with_name(_next(self.path.name)).exists()
 
     def _write(self, record: Record) -> None:
         write_bytes(self.path, _encode(record), tag=f"-{record.token}")
@@ -198,7 +206,7 @@ class Leases:
         return time.monotonic() - since < PATIENCE
 
     def deaths(self, run: str, token: str) -> int:
-        """Returns how many trainings have ended without a word since the lease with a token.
+        """Returns how many trainings have not released their lease since that with a token.
 
         Only the leases that `newest` has found are counted, not one that was taken since.
         """

@@ -3,10 +3,14 @@
 from typing import Any
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, Progress, ProgressColumn, TaskID, TextColumn, TimeElapsedColumn
+from rich.table import Column
 
 from emberlink.trainers.runs.run_folder import RunFolder
 from emberlink.trainers.sweep.jobs import Job
+
+_WITH_BARS = 100
+"""columns of a terminal that has room for bars beside the names of runs"""
 
 
 class SweepProgress(Progress):
@@ -19,13 +23,16 @@ class SweepProgress(Progress):
     """
 
     def __init__(self, console: Console, total: int, done: int):
+        bars: list[ProgressColumn] = [BarColumn(bar_width=20)]
         super().__init__(
-            TextColumn("{task.description}"),
-            BarColumn(bar_width=20),
-            TextColumn("{task.completed:.0f}/{task.total:.0f} {task.fields[unit]}"),
-            TextColumn("{task.fields[coverage]}"),
+            # Long names are wrapped; numbers and times keep their width.
+            TextColumn("{task.description}", markup=False, table_column=Column(ratio=1)),
+            *(bars if console.width >= _WITH_BARS else []),
+            TextColumn("{task.completed:.0f}/{task.total:.0f} {task.fields[unit]}", markup=False),
+            TextColumn("{task.fields[coverage]}", markup=False),
             TimeElapsedColumn(),
             console=console,
+            expand=True,
         )
         self._all = self.add_task("all", total=total, completed=done, unit="runs", coverage="")
         self._bars: dict[Job, TaskID] = {}
@@ -87,7 +94,8 @@ def _shown(run: RunFolder, episodes: int) -> dict[str, Any]:
         return {}
     if not lines:
         return {}
-    coverage = f"{lines[-1]['coverage']:.1f} %"
+    known = lines[-1].get("coverage")
+    coverage = "" if known is None else f"{known:.1f} %"
     if len(lines) == episodes:
-        coverage += ", being evaluated"
+        coverage += ", evaluation"
     return {"completed": len(lines), "coverage": coverage}

@@ -20,7 +20,7 @@ from emberlink.trainers.terminal.signals import Interruption
 
 _NOTICES = (signal.SIGHUP, signal.SIGTERM, signal.SIGUSR1, signal.SIGUSR2)
 _SAVED = {128 + number for number in _NOTICES}
-"""exit statuses of trainings that have saved because their machine asked for it"""
+"""exit statuses of trainings that saved after a signal from their machine"""
 
 
 @dataclass

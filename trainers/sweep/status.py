@@ -30,7 +30,7 @@ def status(arguments: Sequence[str], console: Console) -> int:
         UserError: there is not one folder, or it holds no sweep.
     """
     if len(arguments) != 1:
-        raise UserError("emberlink sweep status FOLDER: expected one folder")
+        raise UserError("status: expected one output folder, such as emberlink sweep status runs")
     output = Path(arguments[0].removeprefix("output="))
     rows = manifest.read(output)
     if not rows:

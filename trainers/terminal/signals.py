@@ -7,8 +7,10 @@ from types import FrameType
 
 _NOTICES = (signal.SIGUSR1, signal.SIGUSR2)
 """signals that a cluster sends before it ends a process; they may follow another signal"""
+_ENDS = (signal.SIGTERM, signal.SIGHUP)
+"""signals that a machine sends together, in either order, when it ends a process"""
 _TOGETHER = 2.0
-"""seconds in which several SIGTERM are one"""
+"""seconds in which several of `_ENDS` are one"""
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, *_NOTICES)
 
 
@@ -20,8 +22,8 @@ class Interruption:
     """Calls `stop` at the first signal and raises `Interrupted` at the second.
 
     The signals are SIGINT, SIGTERM, SIGHUP, SIGUSR1 and SIGUSR2. Clusters send several of them
-    together. The last two therefore never count as the second, and another SIGTERM does only after
-    `_TOGETHER` seconds.
+    together. SIGUSR1 and SIGUSR2 therefore never count as the second signal. SIGTERM and SIGHUP
+    count only `_TOGETHER` seconds after the first.
 
     Args:
         stop: called at the first signal; requests the end of the training after a step.
@@ -59,7 +61,7 @@ class Interruption:
         self.received = self.received or number
         if first:
             self._since = time.monotonic()
-        again = number == signal.SIGTERM and time.monotonic() - self._since < _TOGETHER
+        again = number in _ENDS and time.monotonic() - self._since < _TOGETHER
         if self.at_once or not (first or again or number in _NOTICES):
             self._raised = True
             raise Interrupted

@@ -105,7 +105,8 @@ def _restore(trainer: Trainer, runs: Sequence[RunFolder], chosen: Path | None) -
         if runs[0].networks():
             raise UserError(
                 f"{runs[0].path}: holds networks alone (checkpoints/state_*.safetensors is "
-                f"missing); they can be evaluated: emberlink eval {runs[0].path}"
+                f"missing); they can be evaluated: emberlink eval "
+                f"{shlex.quote(str(runs[0].path))}"
             )
         warm_start.start(trainer.setup.learner, trainer.config)
         return empty(runs)

@@ -245,6 +245,13 @@ def test_a_video_without_frames_is_an_error(tmp_path):
         video.write_mp4(tmp_path / "a.mp4", [])
 
 
+@pytest.mark.parametrize("name", ["huygens:3.mp4", "-x.mp4"])
+def test_a_name_that_ffmpeg_would_misunderstand(name, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    video.write_mp4(Path(name), [np.zeros((16, 16, 3), np.uint8)] * 2)
+    assert (tmp_path / name).stat().st_size > 0
+
+
 def test_settings_of_starts_and_fires_must_agree():
     """Start positions and fires depend on exactly these settings."""
     base = resolve("independent", SHORT).env

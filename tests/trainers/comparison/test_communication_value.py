@@ -58,6 +58,41 @@ def test_networks_trained_with_other_radios(tmp_path):
     assert value.interval == (0.5, 0.5)
 
 
+def test_settings_without_effect_on_training_do_not_part_the_radios(tmp_path):
+    for override, coverage in ((OFF, 50.0), ("", 60.0), (FULL, 70.0)):
+        more = () if not override else (override, "keep_checkpoints=9", "logger=csv")
+        name = f"run{override}".replace("=", "_")
+        write_run(tmp_path, name=name, overrides=more, learned={"coverage": coverage})
+    (value,) = compare_runs([tmp_path]).sections[0].communication
+    assert (value.how, value.value) == ("retrained", 0.5)
+
+
+def test_a_radio_with_little_bandwidth_has_limits(tmp_path):
+    free, narrow = (FULL,), (FULL, "env.radio.bandwidth=8")
+    for name, overrides, coverage in (
+        ("off", (OFF,), 50.0),
+        ("a", narrow, 60.0),
+        ("b", free, 70.0),
+    ):
+        write_run(tmp_path, name=name, overrides=overrides, learned={"coverage": coverage})
+    (value,) = compare_runs([tmp_path]).sections[0].communication
+    assert (value.how, value.value) == ("retrained", 0.5)
+
+
+def test_scripted_policies_have_a_value_for_each_radio(tmp_path):
+    names = ("map_greedy_alone", "map_greedy", "map_greedy_all")
+    for reach, middle in ((20, 58.0), (5, 52.0)):
+        run = write_run(
+            tmp_path, name=f"r{reach}", scripted=names, overrides=(f"env.radio.range={reach}",)
+        )
+        content = read_evaluation(run)
+        for name, coverage in zip(names, (50.0, middle, 60.0), strict=True):
+            content["results"]["huygens"][name]["coverage"] = [coverage] * 4
+        (run / "eval.json").write_text(json.dumps(content))
+    values = {v.policy: v.value for v in compare_runs([tmp_path]).sections[0].communication}
+    assert values == {"map_greedy, range 20.0": 0.8, "map_greedy, range 5.0": 0.2}
+
+
 def test_nothing_to_gain_has_no_value(tmp_path):
     run = write_run(tmp_path, learned={"coverage": [50.0, 60, 70, 80]})
     evaluate_otherwise(run, 0.0, [40.0, 50, 60, 70])

@@ -4,11 +4,13 @@ import errno
 import html
 import html.parser
 import json
+import os
 import re
 import shutil
 from importlib.resources import files
 from itertools import permutations
-from urllib.parse import unquote
+from pathlib import Path
+from urllib.parse import unquote, unquote_to_bytes
 
 import numpy as np
 import pytest
@@ -214,6 +216,32 @@ def test_invalid_output_folder(runs, tmp_path, capsys):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "link"]
 
 
+def test_an_empty_output_folder_stays_what_it_is(runs, tmp_path, monkeypatch):
+    """A link, the working folder or a mount point is filled, not replaced."""
+    (tmp_path / "real").mkdir()
+    (tmp_path / "link").symlink_to("real")
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    for output in (tmp_path / "link", Path(".")):
+        assert main.main(["compare", str(runs), "--output", str(output)]) == 0
+        assert (output / "compare.html").is_file()
+        assert not list(output.glob(".*"))
+    assert (tmp_path / "link").is_symlink()
+    assert (tmp_path / "real" / "compare.json").is_file()
+
+
+def test_a_folder_whose_name_holds_no_characters_is_compared(tmp_path):
+    folder = tmp_path / os.fsdecode(b"r\xfcns")
+    run = write_run(folder, "consensus", 0)
+    (run / "figures").mkdir(exist_ok=True)
+    (run / "figures" / "replay.html").write_text("a replay")
+    compare([folder], output=tmp_path / "report")
+    page = (tmp_path / "report" / "compare.html").read_text()
+    (address,) = re.findall(r'<a href="([^"]*)">replay</a>', page)
+    assert (tmp_path / "report" / os.fsdecode(unquote_to_bytes(address))).is_file()
+    json.loads((tmp_path / "report" / "compare.json").read_text())
+
+
 def test_a_full_output_is_not_taken_for_the_folder(runs, tmp_path, capsys, monkeypatch):
     def fail(*_):
         raise OutputError(errno.ENOSPC, "No space left on device", "standard output")
@@ -333,7 +361,7 @@ def test_setups_fires_and_configurations_have_separate_sections(tmp_path):
         ("setup tuned, world paper, trained on paper", [("consensus", [0])]),
     ]
     assert [s.trained_on for s in sections] == ["", "huygens", "paper"]
-    assert any("the methods differ in learner.batch_size" in note for note in notes)
+    assert any("the groups differ in learner.batch_size" in note for note in notes)
 
 
 def fewer_fires(content):
@@ -480,10 +508,13 @@ def test_extra_evaluations_are_not_counted_as_runs(tmp_path, capsys):
     }.items():
         write_extra_evaluation(run, name, 10, **about)
     shutil.copy(run / "eval.json", run / "eval_the_same.json")
+    shutil.copy(run / "eval_env.radio.loss=0.5.json", run / "eval_twice.json")
     assert main.main(["compare", str(tmp_path), "--output", str(tmp_path / "out")]) == 0
     said = " ".join(capsys.readouterr().out.split())
     assert "eval_step_7.json is left out: evaluated otherwise: checkpoint is step_7" in said
     assert "eval_fires.json is left out: evaluated otherwise: start_seed is 2" in said
+    assert "eval_twice.json is left out: has the settings of eval_env.radio.loss=0.5.json" in said
+    assert "trained twice" not in said
     (section,) = json.loads((tmp_path / "out" / "compare.json").read_text())["setups"]
     (coverage,) = [r for r in section["fires"]["huygens"] if r["measure"] == "coverage"]
     assert [(r["method"], r["iqm"]) for r in coverage["rows"]] == [

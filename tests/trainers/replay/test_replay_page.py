@@ -64,7 +64,7 @@ def step_of(tab) -> int:
 
 def go_to(tab, step: int) -> None:
     tab.page.evaluate(f"location.hash = '#t={step}'")
-    tab.page.wait_for_function(f"document.getElementById('step').textContent === '{step}'")
+    tab.wait_for(f"document.getElementById('step').textContent === '{step}'")
 
 
 def shown_numbers(tab, place: int) -> dict[str, str]:
@@ -121,7 +121,7 @@ def test_it_plays_pauses_and_steps(tab):
     tab.page.select_option("#speed", "2")  # slow, so that a busy machine does not reach the end
     tab.page.click("#play")
     assert tab.page.get_attribute("#play", "aria-label") == "Pause"
-    tab.page.wait_for_function("Number(document.getElementById('step').textContent) > 0")
+    tab.wait_for("Number(document.getElementById('step').textContent) > 0")
     tab.page.click("#play")
     stopped = step_of(tab)
     tab.page.wait_for_timeout(600)
@@ -140,8 +140,8 @@ def test_it_plays_pauses_and_steps(tab):
     tab.page.select_option("#speed", "60")
     tab.page.locator("h1").click()
     tab.page.keyboard.press("Space")  # at the end it begins again
-    tab.page.wait_for_function(f"Number(document.getElementById('step').textContent) < {STEPS}")
-    tab.page.wait_for_function("document.getElementById('play').ariaLabel === 'Play'")
+    tab.wait_for(f"Number(document.getElementById('step').textContent) < {STEPS}")
+    tab.wait_for("document.getElementById('play').ariaLabel === 'Play'")
     assert step_of(tab) == STEPS
 
 
@@ -153,7 +153,7 @@ def test_the_address_and_a_click_on_a_curve_choose_the_step(browser, file):
     assert step_of(tab) == STEPS // 2
     go_to(tab, 7)
     tab.page.evaluate("location.hash = '#t=999999'")
-    tab.page.wait_for_function(f"document.getElementById('step').textContent === '{STEPS}'")
+    tab.wait_for(f"document.getElementById('step').textContent === '{STEPS}'")
     assert tab.problems == []
     tab.close()
 
@@ -361,7 +361,7 @@ def test_a_file_without_its_end_gives_a_message(browser, replay, tmp_path):
         path = tmp_path / f"{share}.html"
         path.write_text(replay.html[: int(len(replay.html) * share)])
         tab = Tab(browser, f"file://{path}")
-        tab.page.wait_for_function(
+        tab.wait_for(
             "getComputedStyle(document.getElementById('message')).visibility === 'visible'"
         )
         assert "damaged" in tab.page.inner_text("#message")

@@ -176,7 +176,7 @@ def test_every_uav_has_a_number_and_lines_of_its_own(scheme, browser, large):
         tab.page.uncheck(f"#{layer}")
     tab.page.evaluate("lines.clear()")
     tab.page.evaluate("location.hash = '#t=30'")
-    tab.page.wait_for_function(f"Object.keys(numbers).length === {MANY}")
+    tab.wait_for(f"Object.keys(numbers).length === {MANY}")
     names = [f"--uav-{colour}" for colour in range(6)]
     style = "names => names.map(n => getComputedStyle(document.body).getPropertyValue(n).trim())"
     colours = tab.page.evaluate(style, names)

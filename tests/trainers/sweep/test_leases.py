@@ -7,6 +7,7 @@ import os
 import signal
 import time
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
@@ -124,15 +125,17 @@ def test_a_holder_notices_that_it_lost_its_run(tmp_path, clock):
     assert Leases(tmp_path).newest("a") == new.record
 
 
+@pytest.mark.parametrize("place", [(leases, "write_bytes"), (Path, "exists")])
 def test_a_holder_without_a_file_system_gives_up_before_others_take_its_run(
-    tmp_path, clock, monkeypatch
+    place, tmp_path, clock, monkeypatch
 ):
     lease = Leases(tmp_path).take("a", TRAINING)
 
     def fail(*_, **__):
         raise OSError(errno.ESTALE, "stale")
 
-    monkeypatch.setattr(leases, "write_bytes", fail)
+    monkeypatch.setattr(*place, fail)
+    lease.release("finished")  # it expires
     clock.now += PATIENCE / 2 - 1
     assert lease.beat()
     clock.now += 1
@@ -156,7 +159,7 @@ def test_all_runs_of_a_stack_or_none(tmp_path):
     assert len(Leases(tmp_path).take_all(["c", "a", "b"], SWEEP)) == 3
 
 
-def test_trainings_that_ended_without_a_word_are_counted(tmp_path):
+def test_trainings_that_did_not_release_their_lease_are_counted(tmp_path):
     sweep = Leases(tmp_path).take("a", SWEEP)
     token = sweep.record.token
     tokens = {"a": token}

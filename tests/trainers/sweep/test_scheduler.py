@@ -14,6 +14,7 @@ from emberlink.envs.utils.errors import UserError
 from emberlink.trainers.runs.run_folder import RunFolder
 from emberlink.trainers.sweep import executors, manifest, question, slots
 from emberlink.trainers.sweep.command import sweep
+from emberlink.trainers.sweep.jobs import FoundRun, jobs_of
 from emberlink.trainers.sweep.leases import TRAINING, Leases
 from emberlink.trainers.sweep.progress import SweepProgress
 from emberlink.trainers.sweep.worker import HELD
@@ -265,6 +266,40 @@ def test_a_cluster_that_ends_with_the_sweep_cannot_be_left(monkeypatch, may_leav
     assert question.ask(progress, 2, may_leave) == answer
     assert ("[l]eave" in shown.getvalue()) is may_leave
     progress.stop()
+
+
+@pytest.mark.parametrize("width", [72, 80, 120])
+def test_the_progress_shows_whole_names_numbers_and_times(width, tmp_path):
+    """Brackets of a name are no markup."""
+    swept = 'learner.warm_start=a,"b[/c]"', "evaluation.scripted=[oracle],[courier]"
+    first, last = jobs_of(["consensus", "setup=tuned", *swept, f"output={tmp_path}"])[::3]
+    first.create_folders()
+    (folder,) = (FoundRun(RunFolder(file.parent)) for file in tmp_path.glob("*/config.yaml"))
+    first.found = {0: folder}
+    lines = ['{"episode": 14, "coverage": 91.24}\n', '{"episode": 15, "coverage": 96.71}\n']
+    (folder.folder.path / "metrics.jsonl").write_text("".join([lines[0]] * 14 + lines[1:]))
+    shown = io.StringIO()
+    with SweepProgress(Console(file=shown, width=width), 4, 1) as progress:
+        progress.begin(last)
+        progress.follow(first)
+    whole = " ".join(shown.getvalue().split())
+    for part in ("1/4 runs", "15/15 episodes", "96.7 %, evaluation", "0:00:00"):
+        assert part in whole
+    letters = "".join(whole.split())
+    for text in ('"b[/c]"', "evaluation.scripted=[courier]"):
+        assert text in letters or width < 120
+
+
+def test_a_line_without_coverage_is_counted(tmp_path):
+    (job,) = jobs_of(["independent", f"output={tmp_path}"])
+    job.create_folders()
+    (folder,) = (RunFolder(file.parent) for file in tmp_path.glob("*/config.yaml"))
+    (folder.path / "metrics.jsonl").write_text('{"episode": 1}\n')
+    job.found = {0: FoundRun(folder)}
+    shown = io.StringIO()
+    with SweepProgress(Console(file=shown, width=80), 1, 0) as progress:
+        progress.follow(job)
+    assert "1/200 episodes" in " ".join(shown.getvalue().split())
 
 
 def test_ctrl_c_may_be_taken_back(tmp_path, monkeypatch):

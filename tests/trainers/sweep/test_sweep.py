@@ -1,5 +1,6 @@
 """Tests emberlink sweep: every combination is trained once, and repeating it resumes."""
 
+import io
 import json
 import multiprocessing
 import os
@@ -463,6 +464,27 @@ def test_a_task_that_failed_before_its_log_is_reported(tmp_path):
     assert job.last_line() == "last"
     job.log.write_text("\n")
     assert job.last_line() == "the log is empty"
+
+
+def test_the_log_of_many_seeds_has_a_short_name(tmp_path):
+    few, many = ([*range(count)] for count in (8, 100))
+    names = []
+    for seeds in (few, many):
+        (job,) = jobs_of(["independent", f"seeds={seeds}".replace(" ", ""), f"output={tmp_path}"])
+        job.open_log()
+        names.append(job.log.stem)
+    assert names[0] == "paper_paper_independent_s0-1-2-3-4-5-6-7"
+    assert names[1] == "paper_paper_independent_s0-and-99-more"
+
+
+def test_a_dry_run_prints_each_run_on_a_line(tmp_path):
+    shown = io.StringIO()
+    swept = ["learner.hidden=[128,128],[256,256]", "env.radio.range=10,20"]
+    arguments = ["consensus", *SMALL[:3], *swept, f"output={tmp_path / ('x' * 60)}"]
+    assert sweep(arguments, Console(file=shown, width=80), dry=True) == 0
+    first, *lines = shown.getvalue().splitlines()
+    assert first.endswith("x" * 60)
+    assert [line.endswith("seed 0: new") for line in lines] == [True] * 4
 
 
 def test_every_job_has_a_log_of_its_own(tmp_path):

@@ -145,12 +145,9 @@ def ratio(verdict: Verdict) -> tuple[str, str]:
 
 def decision(verdict: Verdict) -> str:
     """Returns the verdict of a claim, with a note if there are too few seeds."""
-    return verdict.verdict + few(verdict.fewest_seeds)
-
-
-def few(seeds: int) -> str:
-    """Returns a note for results of too few seeds, else an empty text."""
-    return "" if seeds >= bootstrap.FEW else f" (only {seeds} seed{'s' if seeds > 1 else ''})"
+    seeds = verdict.fewest_seeds
+    few = "" if seeds >= bootstrap.FEW else f" (only {seeds} seed{'s' if seeds > 1 else ''})"
+    return verdict.verdict + few
 
 
 def worth(value: CommunicationValue) -> tuple[str, ...]:

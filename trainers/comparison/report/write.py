@@ -41,10 +41,19 @@ def _replays(comparison: Comparison, folder: Path) -> dict[Path, str]:
     runs = (run for numbers in comparison.sections for run in numbers.section.runs)
     pages = {run.path: run.path / "figures" / "replay.html" for run in runs}
     return {
-        path: quote(os.path.relpath(page.resolve(), folder.resolve()))
+        path: quote(os.fsencode(os.path.relpath(page.resolve(), folder.resolve())))
         for path, page in pages.items()
         if page.is_file()
     }
+
+
+def _move(made: Path, folder: Path) -> None:
+    """Moves a folder to a new place, or its content into an empty folder."""
+    if folder.is_dir():  # a link, the working folder and a mount point stay what they are
+        for part in made.iterdir():
+            part.replace(folder / part.name)
+    else:
+        made.replace(folder)
 
 
 def write_report(
@@ -54,7 +63,7 @@ def write_report(
 
     Args:
         comparison: result of `compare_runs`.
-        folder: result of `free_folder`; it is created when the report is complete.
+        folder: result of `free_folder`; it is created, or filled, when the report is complete.
         say: called with a line of text before each figure.
 
     Returns:
@@ -65,8 +74,9 @@ def write_report(
     """
     notes = list(comparison.notes)
     try:
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=folder.parent, prefix=".compare-") as partial:
+        beside = folder if folder.is_dir() else folder.parent
+        beside.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=beside, prefix=".compare-") as partial:
             path = Path(partial) / "report"
             path.mkdir()
             drawn = [
@@ -76,9 +86,11 @@ def write_report(
             whole = replace(comparison, notes=tuple(notes))
             replays = _replays(comparison, folder)
             page = html(Report(whole.command, drawn, whole.left_out, notes, replays))
-            (path / "compare.html").write_text(page, encoding="utf-8")
-            (path / "compare.json").write_text(to_json(whole.to_values()), encoding="utf-8")
-            path.replace(folder)
+            numbers = to_json(whole.to_values())
+            for name, text in ("compare.html", page), ("compare.json", numbers):
+                # Names of folders may hold bytes that are no characters.
+                (path / name).write_text(text, encoding="utf-8", errors="backslashreplace")
+            _move(path, folder)
     except OutputError:
         raise
     except OSError as error:

@@ -225,7 +225,8 @@ class Player {
     find("slider").value = step;
     find("slider").setAttribute("aria-valuetext", `step ${step} of ${this.data.horizon}`);
     find("step").textContent = step;
-    document.body.dataset.view = options.heat ? "heat" : options.view;
+    const lacking = options.view === "base" && this.panels.some(({ panel }) => !panel.base);
+    document.body.dataset.view = options.heat ? "heat" : lacking ? "team" : options.view;
     this.curves.show(step);
   }
 }

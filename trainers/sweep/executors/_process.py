@@ -2,6 +2,7 @@
 
 import os
 import subprocess
+from contextlib import suppress
 
 from emberlink.envs.utils.atomic_io import open_in_place
 from emberlink.trainers.sweep.executors.base import Task
@@ -39,6 +40,7 @@ def start(task: Task, threads: int, gpu: int | None = None) -> subprocess.Popen:
 
 def leave(process: subprocess.Popen) -> None:
     """Lets a child go on when this process ends."""
-    if process.stdin is not None and process.poll() is None:
-        process.stdin.write(b"-")
-        process.stdin.close()
+    if process.stdin is not None:
+        with suppress(BrokenPipeError):  # it has ended
+            process.stdin.write(b"-")
+            process.stdin.close()

@@ -15,7 +15,7 @@ from emberlink.envs.utils.errors import UserError
 Positive = Annotated[int, Field(ge=1)]
 
 DIED = -9
-"""status of a task that ended without a word, such as with its machine"""
+"""status of a task that ended without reporting one, for example because its node failed"""
 STATUS, STOP = ".status", ".stop"
 """suffixes of files beside a log: the exit status of the task; a request to save and end"""
 _WORKER = "emberlink.trainers.sweep.worker"
@@ -100,7 +100,7 @@ class Executor(ABC):
     def poll(self, handle: Any) -> int | None:
         """Returns the exit status of a task, or None if it has not ended.
 
-        The status is negative if the task ended without a word, as a process that was killed.
+        The status is negative if the task reported none, as a process that was killed.
         """
 
     @abstractmethod
