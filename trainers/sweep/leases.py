@@ -107,12 +107,9 @@ class Lease:
                 self._write(replace(self.record, ended=ended))
 
     def _is_followed(self) -> bool:
-        """Returns whether another process has taken the run since.
-
-        Raises:
-            OSError: the file system is unavailable.
-        """
-        return self.path.with_name(_next(self.path.name)).exists()
+        """Returns whether another process has taken the run since."""
+        run, _, number = self.path.name.rpartition(".")
+        return self.path.with_name(f"{run}.{int(number) + 1}").exists()
 
     def _write(self, record: Record) -> None:
         write_bytes(self.path, _encode(record), tag=f"-{record.token}")
@@ -266,11 +263,6 @@ class Heart(threading.Thread):
     def close(self) -> None:
         """Ends the thread; the leases are not released."""
         self._closed.set()
-
-
-def _next(name: str) -> str:
-    run, _, number = name.rpartition(".")
-    return f"{run}.{int(number) + 1}"
 
 
 def _encode(record: Record) -> bytes:
