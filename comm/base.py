@@ -80,8 +80,8 @@ class CommModule(Buffers, TensorDictModuleBase):
     def bytes_sent(self, tensordict: TensorDictBase) -> Tensor | None:
         """Returns the bytes that each UAV sends at a step, int64 [num_envs, n]; None for none.
 
-        It is called after `forward`. A message that several UAVs hear counts once. UAVs that have
-        failed, and those with a radio of range 0, send nothing, whatever is returned.
+        It is called after `forward`, with `measures: all` and a range above 0. A message that
+        several UAVs hear counts once. UAVs that have failed send nothing, whatever is returned.
 
         Args:
             tensordict: the time step after `forward`.

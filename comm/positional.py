@@ -19,7 +19,7 @@ class PositionalConfig:
     """Stores the settings under `comm`."""
 
     own_first: bool = False
-    """whether the vectors begin with the UAV's own one, and that of UAV 0 follows the last one"""
+    """whether a UAV's own vector comes first, then those of the next UAVs, 0 after the last"""
 
 
 class Positional(CommModule):

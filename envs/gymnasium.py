@@ -12,6 +12,7 @@ from gymnasium.spaces import Box
 from numpy.typing import NDArray
 
 from emberlink.envs.pettingzoo import WildfireParallelEnv, parallel_env
+from emberlink.envs.spaces import to_action
 from emberlink.envs.utils.errors import UserError
 
 ID = "emberlink/WildfireTeam-v0"
@@ -48,9 +49,13 @@ class WildfireTeamEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         return self._team.state(), _shared(infos)
 
     def step(self, action: NDArray[np.float32]):
-        """Moves all UAVs at once."""
-        rows = np.asarray(action, np.float32).reshape(-1, 3)
+        """Moves all UAVs at once.
+
+        Raises:
+            UserError: the action is not an array of shape [n * 3].
+        """
         every = self._team.possible_agents
+        rows = to_action(action, 3 * len(every)).reshape(-1, 3)
         actions = dict(zip(every, rows, strict=True))
         flying = {agent: actions[agent] for agent in self._team.agents}
         _, rewards, _, truncations, infos = self._team.step(flying)

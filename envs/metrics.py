@@ -138,8 +138,9 @@ def front_age_p95(ages: Tensor) -> Tensor:
 def bytes_per_step(sent: Tensor) -> Tensor:
     """Returns the bytes that a UAV sends in a step, mean over UAVs and steps.
 
-    Of the scripted policies, those of `map_greedy` send their map (2 bytes a cell, 4 if the horizon
-    is above 32,766) and target (8 bytes), the others nothing.
+    Of the scripted policies, `map_greedy`, `map_greedy_all` and `courier` send their map (2 bytes a
+    cell, 4 if the horizon is above 32,766) and target (8 bytes), `follow_target` sends the messages
+    of `consensus`, and the others send nothing.
 
     Args:
         sent: `keys.BYTES_SENT` after each step, int64 [..., T, n].

@@ -1,27 +1,29 @@
 """The environment for PettingZoo: a `ParallelEnv` over `WildfireEnv`."""
 
 import dataclasses
+import inspect
 from collections.abc import Callable
 from typing import Any, ClassVar
 
 import numpy as np
 import torch
-from gymnasium.spaces import Box, Dict, Space
+from gymnasium.spaces import Box, Space
 from numpy.typing import NDArray
 from pettingzoo import AECEnv, ParallelEnv
 from pettingzoo.utils.conversions import parallel_to_aec
+from pydantic import ValidationError
 from tensordict import TensorDictBase
 from torchrl.envs import EnvBase, TransformedEnv, step_mdp
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from emberlink.envs import keys
-from emberlink.envs.config import WildfireConfig
 from emberlink.envs.rendering.window import Window
 from emberlink.envs.scenarios import default_config
+from emberlink.envs.spaces import Array, observation_space, team_spaces, to_action
 from emberlink.envs.utils.errors import UserError
+from emberlink.envs.utils.validation import describe, unknown
 from emberlink.envs.wildfire import WildfireEnv
 
-Array = NDArray[np.float32]
 Observation = Array | dict[str, NDArray[Any]]
 
 _NOT_INFO = {k for _, k in (*keys.NETWORKS_READ, keys.ACTION, keys.REWARD)}
@@ -50,9 +52,15 @@ def parallel_env(
     if env is not None and (kwargs or max_cycles is not None):
         given = sorted([*kwargs, *(["max_cycles"] if max_cycles is not None else [])])
         raise UserError(f"settings cannot be given with an existing environment, got {given}")
+    _, *known = inspect.signature(WildfireEnv.__init__).parameters
+    if wrong := sorted(set(kwargs) - set(known)):
+        raise UserError(f"parallel_env: {unknown(wrong[0], known)}")
     if max_cycles is not None:
         config = kwargs.get("config") or default_config(kwargs.get("fire"))
-        kwargs["config"] = dataclasses.replace(config, horizon=max_cycles)
+        try:
+            kwargs["config"] = dataclasses.replace(config, horizon=max_cycles)
+        except ValidationError as error:
+            raise UserError(f"max_cycles: {describe(error)}") from None
     if env is None:
         env = WildfireEnv(**{"num_envs": 1, **kwargs})
     return WildfireParallelEnv(env, render_mode)
@@ -98,10 +106,10 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
         self._now: TensorDictBase | None = None
         self.possible_agents = core.group_map[keys.AGENTS]
         self.agents: list[str] = []
-        vector, pictures = _spaces(env, core)
+        vector, pictures = team_spaces(env, core.config)
         # One space object per agent, kept: PettingZoo seeds and compares them by identity.
         self.observation_spaces: dict[str, Space] = {
-            agent: _observation_space(vector, pictures) for agent in self.possible_agents
+            agent: observation_space(vector, pictures) for agent in self.possible_agents
         }
         self.action_spaces: dict[str, Space] = {
             agent: Box(-1.0, 1.0, (3,), np.float32) for agent in self.possible_agents
@@ -131,8 +139,8 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
         """
         options = dict(options or {})
         options.pop("options", None)  # PettingZoo's own tests pass {"options": 1}
-        if unknown := sorted(set(options) - {"position"}):
-            raise UserError(f"options: {', '.join(unknown)} not known; known: position")
+        if wrong := sorted(set(options) - {"position"}):
+            raise UserError(f"options: {', '.join(wrong)} not known; known: position")
         if seed is not None:
             self._env.set_seed(seed)
         self._now = self._env.reset(**options)
@@ -236,11 +244,8 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
         if set(actions) != set(self.agents):
             raise UserError(f"got actions for {sorted(actions)}; expected those of {self.agents}")
         hover = np.zeros(3, np.float32)
-        rows = [np.asarray(actions.get(agent, hover), np.float32) for agent in self.possible_agents]
-        for agent, row in zip(self.possible_agents, rows, strict=True):
-            if row.shape != (3,):
-                raise UserError(f"an action is an array of shape (3,), got {row.shape} for {agent}")
-        return np.stack(rows)
+        given = {agent: actions.get(agent, hover) for agent in self.possible_agents}
+        return np.stack([to_action(action, 3, agent) for agent, action in given.items()])
 
     def _observations(self, td: TensorDictBase) -> dict[str, Observation]:
         vectors = td.get(keys.OBSERVATION)[0].cpu().numpy().copy()
@@ -265,35 +270,3 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
             agent: {key: value[i] for key, value in values.items()} | shared
             for i, agent in enumerate(self.possible_agents)
         }
-
-
-def _spaces(env: EnvBase, core: WildfireEnv) -> tuple[Box, dict[str, Box]]:
-    """Returns the spaces of the vector, and of the other tensors of an observation by name."""
-    low, high = _bounds(core.config, env.observation_spec[keys.OBSERVATION].shape[-1])
-    _, *others = keys.observation_keys(env.observation_spec)
-    pictures: dict[str, Box] = {}
-    for key in others:
-        spec = env.observation_spec[key]
-        pictures[key[1]] = Box(0, 1 if spec.dtype == torch.bool else 255, spec.shape[2:], np.uint8)
-    return Box(low, high, dtype=np.float32), pictures
-
-
-def _observation_space(vector: Box, pictures: dict[str, Box]) -> Space:
-    """Returns a new space of one agent's observations."""
-    copied = Box(vector.low, vector.high, dtype=np.float32)
-    if not pictures:
-        return copied
-    other = {name: Box(box.low, box.high, dtype=np.uint8) for name, box in pictures.items()}
-    return Dict({keys.OBSERVATION[1]: copied, **other})
-
-
-def _bounds(config: WildfireConfig, features: int) -> tuple[Array, Array]:
-    """Returns the smallest and largest vector; infinite where communication added numbers."""
-    if features != len(keys.FEATURES):
-        limit = np.full(features, np.inf, np.float32)
-        return -limit, limit
-    if config.observation_scale == "box":
-        low, high = [-1, -1, -1, 0, 0, 0], [1, 1, 1, 1, 1, 1]
-    else:
-        low, high = [*config.low, 0, 0, 0], [*config.high, 1, 1, config.horizon]
-    return np.array(low, np.float32), np.array(high, np.float32)

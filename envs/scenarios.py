@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import torch
-from pydantic import Discriminator, Tag
+from pydantic import Discriminator, Tag, ValidationError
 from torch import Tensor
 
 from emberlink.envs import fire_files
@@ -24,7 +24,7 @@ from emberlink.envs.fire.generator import (
 from emberlink.envs.fire.reaction import ReactionConfig
 from emberlink.envs.fire_files.config import COPY_FILE, FileFireConfig
 from emberlink.envs.utils.errors import UserError
-from emberlink.envs.utils.validation import TAG
+from emberlink.envs.utils.validation import TAG, describe
 from emberlink.envs.world.burning import split_times, with_burn_time
 
 Grid = tuple[int, int]
@@ -177,11 +177,23 @@ def fires_of(scenario: ScenarioConfig) -> FireSource:
     return _KINDS[type(scenario)](scenario)
 
 
+def grid_of(fire: Any) -> tuple[int, int] | None:
+    """Returns the grid of arrival times, a tensor or an array; None for a scenario."""
+    shape = tuple(getattr(fire, "shape", ()))
+    return (int(shape[-2]), int(shape[-1])) if len(shape) in (2, 3, 4) else None
+
+
 def default_config(fire: Any) -> WildfireConfig:
-    """Returns the default config, on the grid of the fire where that is a tensor."""
-    if isinstance(fire, Tensor) and fire.ndim in (2, 3):
-        return WildfireConfig(grid=(fire.shape[-2], fire.shape[-1]))
-    return WildfireConfig()
+    """Returns the default config, on the grid of the fire if that is a tensor or an array.
+
+    Raises:
+        UserError: a grid cannot have this size.
+    """
+    grid = grid_of(fire)
+    try:
+        return WildfireConfig() if grid is None else WildfireConfig(grid=grid)
+    except ValidationError as error:
+        raise UserError(f"fire: {describe(error)}") from None
 
 
 def load_fires(

@@ -38,8 +38,8 @@ class WildfireEnv(Buffers, TeamView):
             [num_envs, X, Y] for one each; or arrival and burn-out times, [1, 2, X, Y] or
             [num_envs, 2, X, Y].
         seed: of all random numbers; the first reset draws a fresh one if None. Environment i's
-            randomness depends on (seed, i) alone. Several seeds get the same number of
-            environments each, in order, as with that seed alone.
+            randomness depends on (seed, i) alone. Several seeds get equal shares of the
+            environments, in order; each is the same as with its seed alone, unless `staggered`.
         device: where all tensors live.
         agent_done: whether done, terminated and truncated stand under "agents" too, per UAV.
         staggered: whether environments are out of phase: the first episode of environment i after
@@ -135,6 +135,7 @@ class WildfireEnv(Buffers, TeamView):
 
     def _set_seed(self, seed: int | None) -> None:
         seed = secrets.randbelow(2**62) if seed is None else seed
+        (seed,) = counter_rng.check_seeds(seed, 1)
         self._seed_key.copy_(counter_rng.seed_keys(seed, self.num_envs, self.device))
         self._episode.zero_()
         self._seeded = True
@@ -193,15 +194,10 @@ class WildfireEnv(Buffers, TeamView):
         if given is None:
             key = counter_rng.fold_in(self._episode_key, Use.START_POSITION)
             return motion.random_points(key, self.n_agents, self._low, self._high)
-        given = torch.as_tensor(given, dtype=torch.float32, device=self.device)
-        outside = (given < self._low) | (given > self._high)
-        if given.shape[-2:] != self._position.shape[-2:] or outside.any() or given.isnan().any():
-            raise UserError(
-                f"position: {tuple(given.shape)} with values {given.min():g} to {given.max():g}; "
-                f"expected [..., {self.n_agents}, 3] inside the box "
-                f"{self.config.low} to {self.config.high}"
-            )
-        return given.expand_as(self._position)
+        points = motion.given_points(given, self.n_agents, self._low, self._high)
+        if points.ndim == 3 and len(points) != self.num_envs:
+            raise UserError(f"position: of {len(points)} environments; there are {self.num_envs}")
+        return points.expand_as(self._position)
 
     def _no_sighting(self) -> Sighting:
         """Returns the sighting at reset: no UAV has looked yet."""

@@ -8,7 +8,7 @@ from torch import Tensor
 from torchrl.envs import TransformedEnv
 
 from emberlink.comm.base import Communication
-from emberlink.envs.scenarios import ScenarioConfig
+from emberlink.envs.scenarios import ScenarioConfig, grid_of
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.wildfire import WildfireEnv
 from emberlink.policies.hold import hold
@@ -52,8 +52,9 @@ def make_env(
         UserError: a method, setup, world or setting is not known, or a value is out of range.
     """
     check_device(str(device))
-    if isinstance(fire, Tensor) and fire.ndim in (2, 3):
-        settings.setdefault("grid", list(fire.shape[-2:]))
+    grid = grid_of(fire)
+    if grid is not None:
+        settings.setdefault("grid", list(grid))
     if "seeds" in settings:
         raise UserError(f"seeds={settings['seeds']}: only for training; an environment takes seed=")
     if isinstance(method, str):

@@ -32,7 +32,7 @@ from emberlink.envs.fire.ranges import (
     unit_draws,
 )
 from emberlink.envs.fire.reaction import ReactionConfig, reaction_fires
-from emberlink.envs.utils.config_files import read
+from emberlink.envs.utils.config_files import find, read
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import Name, describe
 
@@ -140,7 +140,7 @@ def load_scenario(name: str) -> GeneratedConfig:
     try:
         return config_type(**values)
     except ValidationError as error:
-        raise UserError(f"configs/fire/{name}.yaml: {describe(error)}") from None
+        raise UserError(f"{find('fire', name)}: {describe(error)}") from None
 
 
 def fire_seeds(split: Split, count: int) -> Tensor:

@@ -39,7 +39,7 @@ def on_grid(
     times[times > end] = np.inf
     if config.start is None and not in_steps and not (times <= start).any():
         times[times == times.min()] = start  # the first cell burns from step 0
-    if config.ring_width is not None and not (source.whole and in_steps):
+    if config.ring_width is not None and not source.whole:
         times[_burnt_out(times, start, config.ring_width * min(grid) / BASE_SIDE)] = np.inf
     steps = (np.maximum(times, start) - start) / (end - start) * horizon
     burning = steps[np.isfinite(steps)]

@@ -32,7 +32,7 @@ from emberlink.envs.utils.atomic_io import read_sealed, write_sealed
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import printable
 
-READER_VERSION = 5  # increase it if the same file gives another grid
+READER_VERSION = 6  # increase it if the same file gives another grid
 _MAX_COPY = 12 * MAX_CELLS + 1_000_000  # bytes when unpacked: float32 of the cells of all sets
 _EVERY, _VALIDATION, _TEST = 5, 3, 4  # remainders of the numbers of validation and test fires
 

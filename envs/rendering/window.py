@@ -17,7 +17,8 @@ class Window:
         from matplotlib import pyplot  # imported here, since it takes a second
 
         self._pyplot = pyplot
-        self._figure = pyplot.figure(num=title)
+        self._figure = pyplot.figure()  # a title as its name would share it with other windows
+        self._figure.canvas.manager.set_window_title(title)
         self._image: Any = None
 
     def show(self, picture: NDArray[np.uint8]) -> None:

@@ -103,13 +103,13 @@ def check_seeds(seed: int | Sequence[int], num_envs: int) -> list[int]:
     """Returns one or several seeds as a list.
 
     Raises:
-        UserError: a seed is negative or not a whole number, or `num_envs` is not a multiple of the
-            number of seeds.
+        UserError: a seed is not a whole number from 0 to 2^63 - 1, or `num_envs` is not a multiple
+            of the number of seeds.
     """
     given = seed if isinstance(seed, Sequence) and not isinstance(seed, str) else [seed]
     seeds = [check_whole("seed", number) for number in given]
-    if min(seeds, default=-1) < 0:
-        raise UserError(f"seed={seed}: expected a number of at least 0")
+    if not all(0 <= number < 2**63 for number in seeds or [-1]):
+        raise UserError(f"seed={seed}: expected a whole number from 0 to 2^63 - 1")
     if num_envs % len(seeds):
         raise UserError(f"num_envs={num_envs} is not a multiple of the {len(seeds)} seeds")
     return seeds

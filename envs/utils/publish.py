@@ -70,4 +70,4 @@ def free_name(folder: Path, stem: str, suffixes: Sequence[str]) -> Path:
         name = folder / (stem if attempt == 1 else f"{stem}_{attempt}")
         if not any(os.path.lexists(f"{name}{suffix}") for suffix in suffixes):
             return name
-    raise UserError(f"{folder}: {stem} and 9999 more exist already")
+    raise UserError(f"{folder}: {stem} and 9998 more exist already")

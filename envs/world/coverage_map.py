@@ -22,7 +22,8 @@ class Sighting(NamedTuple):
     classes: Tensor
     """bool [..., 3, W * W]: mask of the cells in the UAV's window"""
     burnt_out: Tensor | None = None
-    """bool [..., W * W]: mask of those cells without fire that burned earlier; None for none"""
+    """bool [..., W * W]: mask of those cells without fire that burned earlier; None if cells never
+    burn out"""
 
     def shown(self) -> Tensor:
         """Returns what the camera shows of the window, uint8 [..., W * W]; see `keys.SIGHT`."""

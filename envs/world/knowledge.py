@@ -19,9 +19,9 @@ def step_type(horizon: int) -> torch.dtype:
 class Knowledge(Buffers):
     """Stores a map per UAV of the last step at which each cell was seen, by it or by others.
 
-    At each step, a UAV takes over all that those know whose messages arrive, directly or passed
-    on: the larger step of each cell. Since a fire is a function of time, the step of the last look
-    gives what was seen there.
+    At each step, a UAV merges into its map the maps of all radios whose messages arrive, directly
+    or passed on. The later step of each cell is kept. Since a fire is a function of time, the step
+    of the last look gives what was seen there.
 
     Two UAVs that stay in contact differ only in what they have seen at this step. So whole maps are
     compared only where a message arrives that did not arrive at the step before.

@@ -5,11 +5,14 @@ positions gives the same result.
 """
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from emberlink.envs.utils import counter_rng
+from emberlink.envs.utils.errors import UserError
+from emberlink.envs.utils.validation import shown
 
 
 def corners(low: Sequence[float], high: Sequence[float]) -> tuple[Tensor, Tensor]:
@@ -48,6 +51,26 @@ def random_points(key: Tensor, count: int, low: Tensor, high: Tensor) -> Tensor:
     unit = counter_rng.uniform(key, count * 3).unflatten(-1, (count, 3))
     points = low.float() + unit * (high - low).float()
     return torch.minimum(points, high.float())  # rounding may exceed the upper corner
+
+
+def given_points(given: Any, uavs: int, low: Tensor, high: Tensor) -> Tensor:
+    """Returns given positions as a tensor, float32 [uavs, 3] or [num_envs, uavs, 3].
+
+    Raises:
+        UserError: they are no numbers, have another shape, or lie outside of the box.
+    """
+    expected = f"[{uavs}, 3] or [num_envs, {uavs}, 3] inside the box {low.tolist()} to "
+    expected = f"expected {expected}{high.tolist()}"
+    try:
+        points = torch.as_tensor(given, dtype=torch.float32, device=low.device)
+    except (TypeError, ValueError, RuntimeError):
+        raise UserError(f"position: {shown(given)} is no array of numbers; {expected}") from None
+    if points.ndim not in (2, 3) or points.shape[-2:] != (uavs, 3):
+        raise UserError(f"position: shape {list(points.shape)}; {expected}")
+    if not ((points >= low) & (points <= high)).all():
+        span = f"{points.min():g} to {points.max():g}"
+        raise UserError(f"position: values from {span}; {expected}")
+    return points
 
 
 def next_waypoint(

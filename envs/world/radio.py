@@ -103,6 +103,7 @@ def chain(
 
     UAVs hold places at distances of one radio range from the base to the middle of the fire, as
     many as needed; at least one UAV is left over. The others have to be in range of the last place.
+    All fly at the maximum altitude, which the range has to exceed for the base to hear anything.
 
     Args:
         world: the world and the team.

@@ -27,8 +27,8 @@ class SequenceNetwork(nn.Module):
 
     Args:
         uavs: number of UAVs in a team.
-        observations: shape of each tensor of an observation, per UAV: [features] or
-            [channels, W, W].
+        observations: shape of each tensor of an observation, per UAV: [features],
+            [channels, W, W] or [pictures, channels, S, S].
         outputs: number of outputs per UAV.
         hidden: units of the hidden layers.
         policy: the memory, and whether the index of a UAV is an input.

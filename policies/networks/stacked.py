@@ -34,8 +34,8 @@ class StackedNetwork(nn.Module):
 
     Args:
         uavs: number of UAVs in a team.
-        observations: shape of each tensor of an observation, per UAV: [features] or
-            [channels, W, W].
+        observations: shape of each tensor of an observation, per UAV: [features],
+            [channels, W, W] or [pictures, channels, S, S].
         actions: number of components of an action.
         hidden: units of the hidden layers, 1 to 8 layers. Each is followed by a LayerNorm.
         share_parameters: whether the UAVs of a team share their weights.

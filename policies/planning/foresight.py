@@ -28,8 +28,8 @@ class Foresight(Buffers):
     burn when the UAV arrives, divided by its distance plus 2 cells. The UAV with the highest value
     chooses first and claims 7 x 7 cells. With a base, a cell counts if neither a flying UAV nor the
     base has a sighting of it while it burned. At the end of the episode the UAVs form a chain to
-    the base (`radio.chain`), each place held by the nearest UAV. A UAV that will fail first flies
-    to the nearest UAV that will not.
+    the base (`radio.chain`), each place held by the nearest UAV. Before it fails, a UAV flies to
+    the nearest UAV that will not fail.
 
     Args:
         env: the environment; its fire and failures are read.

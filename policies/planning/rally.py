@@ -9,7 +9,7 @@ _MARGIN = 15  # steps at the meeting place; messages may be lost, and are passed
 
 
 class Rally(NamedTuple):
-    """Says near which place each UAV has to be from which step on."""
+    """Stores where each UAV has to be, and from which step on."""
 
     place: Tensor
     """float32 [envs, n, 2], cells"""

@@ -16,11 +16,11 @@ from emberlink.policies.scripted.base import Scripted
 _FLOWN = 2.0  # cells flown between two plans
 _NEAR = 2  # cells; within this distance of known fire a cell may have ignited
 _SPREAD = 50.0  # steps; time scale at which the chance of ignition near known fire grows
-_FAR = 0.04  # chance of a cell that nobody has seen, far from known fire
+_FAR = 0.04  # chance of a cell of which the UAV knows no sighting, far from known fire
 _AGAIN = 0.02  # the same of a cell that was seen without fire, long ago
 _FORGET = 300.0  # steps; time scale of "long ago"
-_AROUND = 6  # cells; a fire is so large that cells seen without fire speak against fire around them
-_CLAIM = 2.0  # cells; half the side of the square that a UAV claims, about its view
+_AROUND = 6  # cells; within this distance, cells seen without fire make fire less likely
+_CLAIM = 2.0  # cells; half the side of the square that a UAV claims
 _EXACT = 2.0**16  # weights are multiples of its inverse, so that sums do not depend on their order
 
 
@@ -36,8 +36,8 @@ class MapGreedy(Scripted):
     weights in view from it, divided by its distance plus 2 cells.
 
     UAVs choose anew whenever they can have flown 2 cells (every 10 steps at most), the one with
-    the highest value first. A UAV gives no weight to cells in view from the targets of those whose
-    messages it has. All fly at the maximum altitude.
+    the highest value first. A UAV gives no weight to cells within 2 cells (along x and y) of the
+    targets of those whose messages it has. All fly at the maximum altitude.
 
     The targets are carried in the TensorDict under "_map_greedy_target", the maps in the policy.
 

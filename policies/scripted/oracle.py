@@ -21,8 +21,8 @@ class Oracle(Scripted):
     Chebyshev distance from the UAV plus 1000 cells for each step until it burns. So burning cells
     come first, then the cells that burn soonest. The UAV with the lowest cost chooses first and
     reserves all cells in view from its cell at the maximum altitude, so that UAVs spread out. Ties
-    go to the lower index of UAVs and of cells. A UAV without a cell stays at its position. All UAVs
-    fly at the maximum altitude.
+    go to the lower index of UAVs and of cells. A UAV without a cell stays at its position, and one
+    that has failed gets none. All UAVs fly at the maximum altitude.
 
     Where cells burn out, or with a base, the targets are those of `Foresight` instead.
 
@@ -39,8 +39,8 @@ class Oracle(Scripted):
         self._env = (env,)  # in a tuple, so that it is not registered as a submodule
         foresees = env.burn_out is not None or self.world.base is not None
         self._foresight = Foresight(env) if foresees else None
+        self.in_keys.append(keys.ALIVE)
         if foresees:
-            self.in_keys.append(keys.ALIVE)
             self.out_keys.append(self.TARGET)
         self.register_buffer("columns", torch.arange(self.world.grid[0]).double().to(env.device))
         self.register_buffer("rows", torch.arange(self.world.grid[1]).double().to(env.device))
@@ -64,17 +64,17 @@ class Oracle(Scripted):
 
     def _nearest_cells(self, tensordict: TensorDictBase) -> Tensor:
         """Returns the cell that is assigned to each UAV, float64 [num_envs, n, 2]."""
-        position = tensordict.get(keys.POSITION)
-        ground = position[..., :2].double()
+        ground, alive = tensordict.get(keys.POSITION)[..., :2].double(), tensordict.get(keys.ALIVE)
         delay = self._delay(tensordict.get(keys.STEP))
         nearest = torch.stack([self._nearest(delay, xy)[0] for xy in ground.unbind(1)], -1)
+        nearest.masked_fill_(~alive, math.inf)  # the last to choose
         target = ground.clone()
         for turn in torch.sort(nearest, dim=-1, stable=True).indices.unsqueeze(-1).unbind(1):
             uav = turn.unsqueeze(-1).expand(-1, 1, 2)
             xy = ground.gather(1, uav).squeeze(1)
             cost, cell = self._nearest(delay, xy)
-            cell = torch.where(cost.isfinite().unsqueeze(-1), cell, xy)
-            target.scatter_(1, uav, cell.unsqueeze(1))
+            chooses = cost.isfinite().unsqueeze(-1) & alive.gather(1, turn)
+            target.scatter_(1, uav, torch.where(chooses, cell, xy).unsqueeze(1))
             self._reserve(delay, cell)
         return target
 

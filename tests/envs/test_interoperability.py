@@ -13,6 +13,7 @@ from torchrl.envs import ParallelEnv, SerialEnv, check_env_specs
 
 from emberlink.envs import WildfireConfig, WildfireEnv, keys
 from emberlink.envs.metrics import episode_metrics
+from emberlink.envs.utils.errors import UserError
 from emberlink.trainers import make_env
 
 CONFIG = WildfireConfig(grid=(12, 10), num_uavs=3, horizon=10)
@@ -155,5 +156,9 @@ def test_the_team_as_one_agent_of_gymnasium():
         assert reward == pytest.approx(after[keys.REWARD].mean().item())
         assert (terminated, truncated) == (False, step == 10)
         assert info["seen"] == after[keys.SEEN].item()
+    env.reset()
+    for wrong in (np.zeros(10, np.float32), np.zeros((3, 3), np.float32)):
+        with pytest.raises(UserError, match=r"shape \(9,\), got"):
+            env.unwrapped.step(wrong)
     with pytest.raises(ValueError, match="observation=window"):
         gymnasium.make(name, config=WildfireConfig(observation="window"))

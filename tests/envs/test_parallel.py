@@ -19,6 +19,7 @@ from tensordict import TensorDict
 from torchrl.envs import EnvBase, SerialEnv, step_mdp
 
 from emberlink.envs import WildfireConfig, WildfireEnv, keys, parallel_env, pettingzoo
+from emberlink.envs.utils.errors import UserError
 from emberlink.trainers import make_env
 
 pytestmark = pytest.mark.filterwarnings("error")
@@ -242,6 +243,10 @@ def test_bad_input_is_named():
         parallel_env(make_env("independent", num_envs=2))
     with pytest.raises(ValueError, match="seed"):
         parallel_env(recipe("independent"), seed=3)
+    with pytest.raises(UserError, match="'num_env' is not known; did you mean num_envs"):
+        parallel_env(num_env=1)
+    with pytest.raises(UserError, match=r"^max_cycles: horizon=0: [^\n]*$"):
+        parallel_env(max_cycles=0)
     with pytest.raises(ValueError, match="SerialEnv"):
         parallel_env(SerialEnv(1, WildfireEnv))
     env = small()
@@ -255,6 +260,8 @@ def test_bad_input_is_named():
         env.step({"uav_0": null, "uav_1": null})
     with pytest.raises(ValueError, match=r"\(3,\)"):
         env.step(dict.fromkeys(env.agents, np.zeros(2, np.float32)))
+    with pytest.raises(UserError, match="action of uav_0: up is no array"):
+        env.step(dict.fromkeys(env.agents, "up"))
     for _ in range(30):
         env.step(dict.fromkeys(env.agents, null))
     with pytest.raises(ValueError, match=r"reset\(\)"):

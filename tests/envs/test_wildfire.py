@@ -4,6 +4,7 @@ import dataclasses
 import math
 from itertools import product
 
+import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
@@ -260,8 +261,6 @@ def test_other_bad_input_is_named():
     for nothing in (None, b"fire"):
         with pytest.raises(ValueError, match=f"not {type(nothing).__name__}"):
             WildfireEnv(fire=nothing)
-    with pytest.raises(ValueError, match="seed=-1"):
-        WildfireEnv(seed=-1)
     for number in (2.5, "x", True, torch.tensor(2.5)):
         with pytest.raises(UserError, match=r"num_envs=.*expected a whole number"):
             WildfireEnv(number)
@@ -270,11 +269,30 @@ def test_other_bad_input_is_named():
     with pytest.raises(ValueError, match="num_envs=0"):
         WildfireEnv(0)
     for position in ([[5.0, 5, 9]], [[math.nan, 5, 2]], [[5.0, 5, 2], [5, 5, 2]]):
-        with pytest.raises(ValueError, match="position"):
+        with pytest.raises(UserError, match="position"):
             start(world(), *position)
+    point = torch.tensor([5.0, 5, 2])
+    team = point.expand(1, 3)
+    for position in (team.expand(2, 1, 3), team[:, :2], team[None, None], point, "centre", [[]]):
+        with pytest.raises(UserError, match=r"position.*\[num_envs, 1, 3\]|position: of 2 env"):
+            world(num_envs=3).reset(position=position)
+    assert world(num_envs=3).reset(position=team.tolist()).shape == (3,)
+    for seed in (-1, 2**63):
+        with pytest.raises(UserError, match=f"seed={seed}: expected a whole number from 0"):
+            WildfireEnv(seed=seed)
+        with pytest.raises(UserError, match=f"seed={seed}: expected a whole number from 0"):
+            world().set_seed(seed)
     for bad in ({"grid": (7, 30)}, {"num_uavs": 65}, {"altitude": (4.0, 1.0)}, {"horizon": 0}):
         with pytest.raises(ValueError, match=next(iter(bad))):
             WildfireConfig(**bad)
+
+
+@pytest.mark.parametrize("shape", [(20, 24), (3, 20, 24), (1, 2, 20, 24)])
+@pytest.mark.parametrize("kind", [np.asarray, torch.as_tensor])
+def test_the_default_grid_is_that_of_given_times(shape, kind):
+    assert WildfireEnv(3, fire=kind(np.full(shape, 9.0, np.float32))).config.grid == (20, 24)
+    with pytest.raises(UserError, match=r"fire: .*grid"):
+        WildfireEnv(fire=kind(np.zeros((3, 20, 7), np.float32)))
 
 
 def test_an_environment_does_not_depend_on_the_batch_size():

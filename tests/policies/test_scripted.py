@@ -173,6 +173,10 @@ def test_the_oracle_by_hand():
     # UAV 2 is nearest to (4, 4), at 1; UAVs 1 and 3 are at 4 and 3. Then UAVs 3, 0 and 1 choose.
     places = sent(env, Oracle(env), td)
     assert places.mul(1e3).round().tolist() == [[[0, 8e3], [8e3, 8e3], [4e3, 4e3], [8e3, 0]]]
+    # If UAV 2 has failed, it gets and reserves nothing: UAV 3 is the nearest, then 0, then 1.
+    td[keys.ALIVE] = torch.tensor([[True, True, False, True]])
+    places = sent(env, Oracle(env), td)
+    assert places.mul(1e3).round().tolist() == [[[8e3, 0], [0, 8e3], [5e3, 4e3], [4e3, 4e3]]]
 
 
 def test_the_oracle_flies_at_full_altitude_and_stops_at_full_coverage():

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import re
 import warnings
 from functools import cache
 from importlib import resources
@@ -55,6 +56,16 @@ def test_unknown_scenario_lists_the_known_ones():
         load_scenario("papr")
     with pytest.raises(ValueError, match="unknown fire"):
         load_scenario("../fire/paper")
+
+
+def test_a_wrong_value_in_a_file_of_ones_own_names_that_file(tmp_path, monkeypatch):
+    (tmp_path / "fire").mkdir()
+    file = tmp_path / "fire" / "mine.yaml"
+    text = resources.files("emberlink.configs").joinpath("fire", "huygens.yaml").read_text()
+    file.write_text(re.sub("head_ros: .*", "head_ros: [1, 600]", text))
+    monkeypatch.setenv("EMBERLINK_CONFIGS", str(tmp_path))
+    with pytest.raises(ValueError, match=rf"^{re.escape(str(file))}: head_ros"):
+        load_scenario("mine")
 
 
 @pytest.fixture(scope="module")

@@ -257,11 +257,23 @@ def test_a_bank_is_read_unchanged(tmp_path):
     early = read_fires(config, GRID, 500)
     assert torch.equal(early, torch.where(fires <= 500, fires, torch.inf))
     stretched = read_fires(
-        FileFireConfig(path=str(tmp_path / "bank.npy"), start=0.0, end=900.0, ring_width=None),
+        FileFireConfig(path=str(tmp_path / "bank.npy"), start=0.0, end=900.0),
         GRID,
         1800,
     )
     assert torch.allclose(stretched, fires * 2)
+
+
+def test_nothing_of_a_stretched_bank_is_burnt_out(tmp_path):
+    columns, rows = np.meshgrid(np.arange(30), np.arange(30), indexing="ij")
+    far = np.hypot(columns - 15, rows - 15)
+    bank = np.where(far <= 12, np.maximum(far - 6, 0) * 100, np.inf).astype(np.float32)
+    np.save(tmp_path / "bank.npy", bank[None])
+    for keys in ({}, {"end": 1000.0}, {"start": 0.0}):
+        config = FileFireConfig(path=str(tmp_path / "bank.npy"), **keys)
+        (fire,) = read_fires(config, (30, 30), 1000)
+        assert (fire == 0).sum() == (far <= 6).sum()
+        assert fire.isfinite().sum() == (far <= 12).sum()
 
 
 def test_a_bank_on_another_grid_keeps_the_earliest_arrival(tmp_path):

@@ -133,6 +133,11 @@ def test_window_shows_the_last_picture(monkeypatch):
     assert window.show(first) is None
     assert window.show(last) is None
     assert np.array_equal(window._image.get_array(), last)
+    other = Window("test")
+    other.show(first)
+    assert np.array_equal(window._image.get_array(), last)
+    other.close()
+    assert window._pyplot.fignum_exists(window._figure.number)
     window.close()
 
 
