@@ -64,12 +64,13 @@ def describe(group: str, name: str) -> str:
 
 
 def _package(name: str) -> list[Path]:
-    """Returns the folders of a package, without importing it."""
+    """Returns the folders of a package, without importing it; its parents are imported."""
+    spec, why = None, f"there is no package {name}"
     try:
         spec = find_spec(name)
-    except ModuleNotFoundError:
-        spec = None
+    except Exception as error:  # of the parents' code
+        why += f" ({type(error).__name__}: {error})"
     if spec is None or not spec.submodule_search_locations:
-        warnings.warn(f"entry point of {ENTRY_POINTS}: there is no package {name}", stacklevel=4)
+        warnings.warn(f"entry point of {ENTRY_POINTS}: {why}", stacklevel=4)
         return []
     return [Path(folder) for folder in spec.submodule_search_locations]

@@ -13,7 +13,7 @@ from emberlink.envs.utils.validation import check_whole
 from emberlink.trainers.comparison.report import free_folder, write_report
 from emberlink.trainers.comparison.results import Comparison, compare_runs
 from emberlink.trainers.config.compose import flat, override, resolve, to_values
-from emberlink.trainers.config.schema import RunConfig
+from emberlink.trainers.config.schema import MAX_FIRES, RunConfig
 from emberlink.trainers.config.transfer import in_world
 from emberlink.trainers.evaluation.actor import fireless, load_actor
 from emberlink.trainers.evaluation.evaluate import evaluate as evaluate_policy
@@ -50,6 +50,7 @@ def train(
     setup: str = ...,
     world: str = ...,
     fire: str | None = ...,
+    learner: str | None = ...,
     seeds: None = ...,
     progress: Callable[[Progress], None] | None = ...,
     evaluate_after: bool = ...,
@@ -62,6 +63,7 @@ def train(
     setup: str = ...,
     world: str = ...,
     fire: str | None = ...,
+    learner: str | None = ...,
     seeds: Sequence[int],
     progress: Callable[[Progress], None] | None = ...,
     evaluate_after: bool = ...,
@@ -73,6 +75,7 @@ def train(
     setup: str = "paper",
     world: str = "paper",
     fire: str | None = None,
+    learner: str | None = None,
     seeds: Sequence[int] | None = None,
     progress: Callable[[Progress], None] | None = None,
     evaluate_after: bool = True,
@@ -85,8 +88,11 @@ def train(
         setup: paper, released, tuned, strong, or a setup of your own.
         world: paper, front, relay, swarm, blackout, file, or a world of your own.
         fire: name of a scenario; that of the setup or the world if None.
+        learner: ddpg, td3, ippo, mappo, imitation, or a learner of your own; that of the setup if
+            None.
         seeds: seeds to train in parallel, with a run folder for each, in place of `seed=`.
-        progress: called after each step of the environments; an exception in it ends the training.
+        progress: called after each decision of the team (`policy.hold` steps); an exception in it
+            ends the training.
         evaluate_after: whether to evaluate at the end, which writes eval.json, figures, a GIF and a
             replay.
         settings: other settings, by the last part of their key (`episodes=5`, `horizon=50`) or the
@@ -101,7 +107,8 @@ def train(
         NonFiniteError: a number became NaN or infinite, and `on_nan` is "stop" or the rollbacks
             failed.
     """
-    chosen = [f"setup={setup}", f"world={world}", *([] if fire is None else [f"fire={fire}"])]
+    chosen = [f"setup={setup}", f"world={world}"]
+    chosen += [f"{key}={name}" for key, name in (("fire", fire), ("learner", learner)) if name]
     several = {} if seeds is None else {"seeds": seeds}
     trainer = Trainer(resolve(method, chosen, **settings, **several))
     with _quiet():
@@ -147,8 +154,8 @@ def evaluate(
     count = policy.config.evaluation.episodes
     if episodes is not None:
         count = check_whole("episodes", episodes)
-    if count < 1:
-        raise UserError(f"episodes={count}: expected at least 1")
+    if not 1 <= count <= MAX_FIRES:
+        raise UserError(f"episodes={count}: expected 1 to {MAX_FIRES}")
     return evaluate_policy(policy.config, policy, fires=count, scripted=scripted, report=progress)
 
 

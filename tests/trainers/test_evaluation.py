@@ -20,7 +20,7 @@ from emberlink.policies.scripted.registry import SCRIPTED
 from emberlink.trainers.build import build_actor, build_env
 from emberlink.trainers.cli import main
 from emberlink.trainers.config.compose import resolve
-from emberlink.trainers.evaluation import baseline_cache, evaluate, tables
+from emberlink.trainers.evaluation import baseline_cache, evaluate, plots, tables
 from emberlink.trainers.runs.run_folder import RunFolder
 from emberlink.trainers.terminal import SafeConsole
 
@@ -308,6 +308,17 @@ def test_narrow_tables_keep_every_number(columns, monkeypatch, capsys):
     words = " ".join(lines).split()
     for name in metrics.NAMES:
         assert set(name.split("_")) <= set(words), name
+
+
+@pytest.mark.drawn
+def test_curves_of_a_strange_file_are_drawn(tmp_path):
+    """A name is no formula, and absurd numbers are left out."""
+    lines = [
+        {"episode": 1, "mean_reward": 1e308, "$\\frac{$/mean_reward": 1.0, "coverage": 1.0},
+        {"episode": 1e300, "mean_reward": -1e308, "coverage": 2.0},
+    ]
+    plots.training_curves(tmp_path / "curves.png", lines, "title")
+    assert (tmp_path / "curves.png").stat().st_size > 1000
 
 
 def test_several_seeds_make_one_table(monkeypatch, capsys):

@@ -318,9 +318,12 @@ def test_nothing_is_written_through_a_link_or_after_a_damaged_line(swept, tmp_pa
     assert "link" in refused(capsys, "sweep", folder, *SWEPT)
     assert other.read_text() == ""
     (folder / "worlds.jsonl").unlink()
-    (folder / "worlds.jsonl").write_text('{"speed": 1}\n')
-    message = refused(capsys, "sweep", folder, *SWEPT)
-    assert "line 1 is not of a sweep of worlds" in message
+    lines = (swept / "worlds.jsonl").read_text().splitlines()
+    without = {key: value for key, value in json.loads(lines[0]).items() if key != "gain"}
+    for text in ('{"speed": 1}', json.dumps(without), "[1]"):
+        (folder / "worlds.jsonl").write_text(text + "\n")
+        message = refused(capsys, "sweep", folder, *SWEPT)
+        assert "line 1 is not of a sweep of worlds" in message
 
 
 def test_two_sweeps_do_not_share_a_folder(swept, capsys):

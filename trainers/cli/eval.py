@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from emberlink.trainers.cli import completion
-from emberlink.trainers.cli.parser import command, positive
+from emberlink.trainers.cli.parser import MOST_FIRES, between, command
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -42,7 +42,10 @@ def add_eval(commands: Any) -> None:
         "--checkpoint", metavar="FILE", type=Path, help="a checkpoint (default: the newest)"
     )
     evaluation.add_argument(
-        "--fires", metavar="N", type=positive, help="number of episodes (default: the run's)"
+        "--fires",
+        metavar="N",
+        type=between(1, MOST_FIRES),
+        help="number of episodes (default: the run's)",
     )
     evaluation.add_argument("--device", help="cpu, cuda, ... (default: the run's)")
 

@@ -129,6 +129,10 @@ def command_group(commands: Any, name: str, summary: str, description: str, exam
     return group.add_subparsers(dest="action", metavar="ACTION")
 
 
+MOST_FIRES = 65_536
+"""fires of an evaluation at most; `config.schema` has the same number, but imports torch"""
+
+
 def positive(text: str) -> int:
     """Converts an argument to a whole number above 0."""
     if not text.isdecimal() or int(text) < 1:

@@ -6,13 +6,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from emberlink.trainers.cli import completion
-from emberlink.trainers.cli.parser import between, command, command_group
+from emberlink.trainers.cli.parser import MOST_FIRES, between, command, command_group
 
 if TYPE_CHECKING:
     from rich.console import Console
 
 _KEYS = "keys of the world to change, such as fire.burn_time=90 or setup=tuned"
-_MOST_FIRES = 65_536  # as in an evaluation
 
 
 def add_world(commands: Any) -> None:
@@ -46,7 +45,7 @@ def _add_check(actions: Any) -> None:
         nargs="*",
         help="worlds (default: all that evaluate the needed policies); " + _KEYS,
     )
-    number = between(1, _MOST_FIRES)
+    number = between(1, MOST_FIRES)
     check.add_argument(
         "--fires", metavar="N", type=number, default=100, help="number of fires (default: 100)"
     )
@@ -86,7 +85,7 @@ def _add_sweep(actions: Any) -> None:
     _add_axis(sweep, "grids", int, "30,45,60,75", "cells along each side of the map")
     _add_axis(sweep, "teams", int, "2,4,6,8,12", "numbers of UAVs")
     _add_axis(sweep, "ranges", float, "5,10,15,20,40", "ranges of the radio, cells")
-    number = between(2, _MOST_FIRES)
+    number = between(2, MOST_FIRES)
     sweep.add_argument(
         "--fires", metavar="N", type=number, default=8, help="fires per world (default: 8)"
     )

@@ -1,5 +1,6 @@
 """Reads and validates the evaluation and the training curves of a run folder."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -11,6 +12,7 @@ from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import describe
 from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.evaluation.results import CURVES, LEARNED
+from emberlink.trainers.runs.compact_json import infinite
 from emberlink.trainers.runs.run_folder import RunFolder
 from emberlink.trainers.runs.safe_read import MAX_JSON, check_parts, read_text
 
@@ -66,7 +68,8 @@ def read_evaluation(file: Path, config: RunConfig) -> Evaluation:
         if actual != expected:
             raise UserError(f"{file}: {key}={actual}, but the run's config.yaml says {expected}")
     _check_results(file, evaluation)
-    return evaluation
+    settings = ("held_out", "environment", "communication")
+    return replace(evaluation, **{key: infinite(getattr(evaluation, key)) for key in settings})
 
 
 def _check_results(file: Path, evaluation: Evaluation) -> None:

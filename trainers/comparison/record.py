@@ -1,7 +1,6 @@
 """Converts a comparison to plain values and JSON."""
 
 import json
-import math
 from collections.abc import Sequence
 from dataclasses import asdict
 from importlib.metadata import version
@@ -10,6 +9,7 @@ from typing import Any
 from emberlink.trainers.comparison import bootstrap
 from emberlink.trainers.comparison.rankings import Numbers
 from emberlink.trainers.comparison.runs import LeftOut
+from emberlink.trainers.runs.compact_json import finite
 
 
 def settings() -> dict[str, Any]:
@@ -45,7 +45,7 @@ def to_values(
 
 def to_json(values: Any) -> str:
     """Returns values as JSON, with the text "inf" for infinite numbers."""
-    return json.dumps(_without_infinities(values), indent=1, allow_nan=False) + "\n"
+    return json.dumps(finite(values), indent=1, allow_nan=False) + "\n"
 
 
 def _section(numbers: Numbers) -> dict[str, Any]:
@@ -78,11 +78,3 @@ def _section(numbers: Numbers) -> dict[str, Any]:
             for measure, by_method in numbers.curves.items()
         },
     }
-
-
-def _without_infinities(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _without_infinities(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_without_infinities(item) for item in value]
-    return "inf" if isinstance(value, float) and math.isinf(value) else value

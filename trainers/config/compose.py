@@ -106,14 +106,24 @@ def override(config: RunConfig, overrides: Sequence[str] = (), **settings: Any) 
             put(values, key, value)
     _put_settings(values, settings)
     changed = from_values(values)
-    other = _changes(radio, _radio(values))
+    changed = with_radio(replace(changed, baselines=config.baselines), radio)
+    # The run's own fire also holds the path of the run's copy of a fire file.
+    return replace(changed, fire=config.fire) if changed.fire == config.fire else changed
+
+
+def with_radio(config: RunConfig, usual: Mapping[str, Any]) -> RunConfig:
+    """Returns a configuration whose other methods have the run's changes of the radio, too.
+
+    Args:
+        config: configuration of a run.
+        usual: settings of the radio without the changes.
+    """
+    other = _changes(usual, _radio(to_values(config)))
     baselines = {
         method: replace(baseline, radio=replace(baseline.radio, **other))
         for method, baseline in config.baselines.items()
     }
-    changed = replace(changed, baselines=baselines)
-    # The run's own fire also holds the path of the run's copy of a fire file.
-    return replace(changed, fire=config.fire) if changed.fire == config.fire else changed
+    return replace(config, baselines=baselines)
 
 
 def from_values(values: Mapping[str, Any]) -> RunConfig:
@@ -154,7 +164,8 @@ def _composed(method: str, chosen: Mapping[str, str]) -> dict[str, Any]:
     if (name := f"{chosen['setup']}_{method}") in configs.known("setup_method", folders):
         find("setup_method", name, folders)
     files = sorted(file for folder in folders for file in folder.glob("**/*.yaml"))
-    stamps = tuple((file, file.stat().st_mtime_ns) for file in files)
+    # Editors lock a file with a link to nowhere.
+    stamps = tuple((file, file.stat().st_mtime_ns) for file in files if file.is_file())
     values = deepcopy(_compose(tuple(chosen.items()), tuple(folders), stamps))
     for group in ("method", "setup", "world"):
         if group in values:  # without the header, Hydra puts the content under the group

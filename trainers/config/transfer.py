@@ -1,9 +1,9 @@
 """Changes settings of a trained run for an evaluation, also its world."""
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 
-from emberlink.trainers.config.compose import from_values, override, resolve, to_values
+from emberlink.trainers.config.compose import from_values, override, resolve, to_values, with_radio
 from emberlink.trainers.config.overrides import flat, parse, put
 from emberlink.trainers.config.schema import RunConfig
 
@@ -52,4 +52,5 @@ def in_world(config: RunConfig, world: str) -> RunConfig:
         if key.startswith(_OF_A_WORLD) and value != here.get(key):
             put(values, key, value)
     changed = from_values(values | {"world": world})
-    return replace(changed, fire=there.fire, baselines=there.baselines)
+    changed = replace(changed, fire=there.fire, baselines=there.baselines)
+    return with_radio(changed, asdict(there.env.radio))

@@ -22,6 +22,7 @@ from emberlink.trainers.evaluation.actor import load_actor
 from emberlink.trainers.evaluation.evaluate import (
     BLOCK,
     START_SEED,
+    evaluation_scenarios,
     play,
     scripted_config,
     shown_scenario,
@@ -156,22 +157,21 @@ def find_fire(text: str | int | None, run: RunConfig) -> tuple[ScenarioConfig, i
     Raises:
         UserError: there is no such scenario or fire.
     """
-    usual, trained = shown_scenario(run), run.fire
+    usual, evaluated = shown_scenario(run), evaluation_scenarios(run)
     text = usual if text is None else str(text)
     name, _, index = (
         text.rpartition(":")
         if ":" in text
         else ((usual, "", text) if text.lstrip("-").isdecimal() else (text, "", "0"))
     )
-    known = dict.fromkeys([*scenarios(), trained.name])
+    known = dict.fromkeys([*scenarios(), *evaluated])
     if name not in known:
         raise UserError(f"fire {name!r} is not known; known: {', '.join(known)}")
     if not index.isdecimal() or int(index) >= MAX_FIRES:
         raise UserError(
             f"fire {text!r}: there is no held-out fire {index!r}; known: 0 to {MAX_FIRES - 1}"
         )
-    own = name == trained.name and not run.evaluation.huygens
-    return trained if own or name not in scenarios() else load_scenario(name), int(index)
+    return evaluated.get(name) or load_scenario(name), int(index)
 
 
 def follows_advice(config: RunConfig, policy: Any) -> bool:

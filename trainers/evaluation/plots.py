@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
+from numpy.typing import NDArray
 
 from emberlink.trainers.evaluation.results import CURVES, LEARNED, Results
 
@@ -23,19 +24,26 @@ def training_curves(path: Path, lines: Sequence[Mapping[str, Any]], title: str) 
     figure = Figure(figsize=(11, 6), layout="constrained")
     figure.suptitle(title)
     for axes, (name, label) in zip(figure.subplots(2, 3).flat, CURVES.items(), strict=True):
-        episodes = [line["episode"] for line in lines]
-        axes.plot(
-            episodes, [line.get(name, np.nan) for line in lines], color="0.6", label="with noise"
-        )
+        axes.plot(*_points(lines, name), color="0.6", label="with noise")
         for key in sorted({k for line in lines for k in line if k.endswith("/" + name)}):
-            points = [(line["episode"], line[key]) for line in lines if key in line]
             fire = key.split("/")[0]
-            axes.plot(*zip(*points, strict=True), marker="o", ms=3, label=f"without noise, {fire}")
+            axes.plot(*_points(lines, key), marker="o", ms=3, label=f"without noise, {fire}")
         axes.set(xlabel="episode", ylabel=label)
         axes.xaxis.set_major_locator(MaxNLocator(integer=True))
         axes.grid(alpha=0.3)
-    figure.axes[0].legend(fontsize="small")
+    for text in figure.axes[0].legend(fontsize="small").get_texts():
+        text.set_parse_math(False)
     figure.savefig(path, format="png", dpi=120)
+
+
+def _points(lines: Sequence[Mapping[str, Any]], key: str) -> NDArray[np.float32]:
+    """Returns the episodes that have a measure, and its values, float32 [2, episodes].
+
+    float32 makes absurd numbers of a damaged file infinite, which are not drawn.
+    """
+    points = [(line["episode"], line[key]) for line in lines if key in line]
+    with np.errstate(over="ignore"):
+        return np.array(points, np.float64).reshape(-1, 2).T.astype(np.float32)
 
 
 def coverage_bars(path: Path, results: Results) -> None:

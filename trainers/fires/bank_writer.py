@@ -12,6 +12,7 @@ from torch import Tensor
 from emberlink.envs.fire_files.projection import library
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.publish import new_file, published
+from emberlink.trainers.runs.compact_json import finite
 
 SUFFIXES = (".npy", ".tif", ".tiff")
 MAX_BANDS = 4096
@@ -76,7 +77,7 @@ def _write_numpy(
     about = {**facts, "axes": ["fire", "x", "y"], "never": "inf", "fires": list(names)}
     json_path = path.with_suffix(".json")
     with published(json_path) as partial:
-        partial.write_text(json.dumps(about, indent=1) + "\n", encoding="utf-8")
+        partial.write_text(json.dumps(finite(about), indent=1) + "\n", encoding="utf-8")
     try:
         with published(path) as partial, partial.open("wb") as file:
             header = np.lib.format.header_data_from_array_1_0(array)
@@ -108,7 +109,7 @@ def _geotiff(
         ) as raster:
             rows = array.transpose(0, 2, 1)[:, ::-1]
             raster.write(np.where(np.isinf(rows), np.float32(_NODATA), rows))
-            tags = {k: v if isinstance(v, str) else json.dumps(v) for k, v in facts.items()}
+            tags = {k: v if isinstance(v, str) else json.dumps(v) for k, v in finite(facts).items()}
             raster.update_tags(**tags)
             raster.descriptions = tuple(names)
         return memoryview(memory.read())

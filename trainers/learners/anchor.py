@@ -1,4 +1,4 @@
-"""Draws learned policies towards the policies that they started from, those of another run."""
+"""Penalises actions that differ from those of the actors that a run began with."""
 
 import copy
 from typing import Any

@@ -15,9 +15,8 @@ _TEACHER, _ALIVE, _MISSING = keys.TEACHER[1], keys.ALIVE[1], MISSING[1]
 class Demonstrations(ReplayMemory):
     """Samples single decisions, see `ReplayMemory`."""
 
-    def extend(self, rollout: TensorDictBase) -> None:
-        """Stores the decisions of a rollout, batch size [seeds * environments, decisions]."""
-        self.extend_rows(_rows(rollout, self.teams, self._keys, failures=self._failures))
+    def _rows(self, rollout: TensorDictBase) -> TensorDict:
+        return _rows(rollout, self.teams, self._keys, failures=self._failures)
 
     def sample(self) -> TensorDict:
         """Samples a batch for each UAV: batch size [batch], with the keys of a rollout."""
@@ -28,10 +27,8 @@ class Demonstrations(ReplayMemory):
 class DemonstrationSequences(SequenceMemory):
     """Samples sequences of decisions, see `SequenceMemory`."""
 
-    def extend(self, rollout: TensorDictBase) -> None:
-        """Stores a rollout, batch size [seeds * environments, decisions], one after another."""
-        for step in rollout.split(1, 1):
-            self.extend_rows(_rows(step, self.teams, self._keys, failures=self._failures))
+    def _rows(self, rollout: TensorDictBase) -> TensorDict:
+        return _rows(rollout, self.teams, self._keys, failures=self._failures)
 
     def sample(self) -> TensorDict:
         """Samples sequences for each UAV: batch size [batch], [batch, uavs, decisions, ...] each.

@@ -30,13 +30,10 @@ class Checkpoints:
     """The checkpoints of a run: networks (`step_N`), training states (`state_N`) and `best`.
 
     Files with other names, such as `step_mine.safetensors`, are ignored.
-
-    Args:
-        path: the run folder.
     """
 
-    def __init__(self, path: Path | str):
-        self.path = Path(path)
+    path: Path
+    """the run folder"""
 
     @property
     def checkpoints(self) -> Path:

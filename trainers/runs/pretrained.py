@@ -58,7 +58,18 @@ def open_run(text: str, output: Path | str = "runs") -> RunFolder:
             _copy(source, target)
         except OSError as error:
             raise UserError(f"{target}: cannot be created: {error.strerror or error}") from None
+    elif not _is_copy(source, target):
+        raise UserError(
+            f"{target}: holds other networks than {text} of this version of emberlink; move it away"
+        )
     return RunFolder(target)
+
+
+def _is_copy(source: Path, target: Path) -> bool:
+    """Returns whether a run folder has the checkpoint of a policy of the package."""
+    newest = RunFolder(source).checkpoint()
+    mine = target / "checkpoints" / newest.name
+    return not mine.is_file() or mine.read_bytes() == newest.read_bytes()
 
 
 def find(text: str) -> list[Path]:

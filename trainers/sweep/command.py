@@ -79,10 +79,11 @@ def _check(jobs: Sequence[Job]) -> None:
     Raises:
         UserError: one cannot.
     """
-    checked: set[Identity] = set()
+    checked: set[tuple[int, Identity]] = set()
     for job in jobs:
-        config = job.configs[0]
-        name = identity(replace(config, seed=0))
+        seeds = [config.seed for config in job.configs]
+        config = replace(job.configs[0], seeds=tuple(seeds) if len(seeds) > 1 else ())
+        name = len(seeds), identity(replace(config, seed=0))
         if job.state != "new" or name in checked:
             continue
         checked.add(name)

@@ -55,13 +55,13 @@ class RunFolders:
         if len(runs) > 1:
             for run in runs:
                 run.write(SEED_RUNS, {"folders": [other.path.name for other in runs]})
-        for run, config in zip(runs, configs, strict=True):
-            run.write_config(config)
         grid, horizon = configs[0].env.grid, configs[0].env.horizon
         kept = [
             replace(config, fire=fires_of(config.fire).save_copy(run.path, grid, horizon))
             for config, run in zip(configs, runs, strict=True)
         ]
+        for run, config in zip(runs, configs, strict=True):
+            run.write_config(config)
         return cls(runs, kept)
 
     @property

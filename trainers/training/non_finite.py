@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from emberlink.envs import keys
+from emberlink.envs.scenarios import fires_of
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.publish import free_name
 from emberlink.trainers.learners.nan_guard import ROLLOUT
@@ -176,7 +177,9 @@ def _write(setup: TrainingSetup, run: RunFolder, report: NonFiniteReport) -> Pat
     header = {"kind": "divergence", "place": place, "steps": steps, "updates": updates}
     content = prefixed(learner=learner, bad=flatten(bad))
     checkpoint_file.write(folder / _TENSORS, content, header)
-    RunFolder(folder).write_config(setup.config)
+    config = setup.config
+    fires_of(config.fire).save_copy(folder, config.env.grid, config.env.horizon)
+    RunFolder(folder).write_config(config)
     about = {
         "report": asdict(report),
         "message": str(report),

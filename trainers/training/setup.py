@@ -128,16 +128,16 @@ class TrainingSetup:
 
 
 def check_setup(config: RunConfig) -> None:
-    """Checks that a configuration can be trained, in one environment and without training.
+    """Checks that a configuration can be trained, in an environment per seed, without training.
 
     Args:
-        config: configuration of a run; of several seeds, the first is checked.
+        config: configuration of a run.
 
     Raises:
         UserError: the fire, the learner or its warm start does not fit the rest.
     """
-    config = replace(config, seed=(config.seeds or (config.seed,))[0], seeds=())
-    env = _make_env(config, 1, config.seed)
+    seeds = config.seeds or (config.seed,)
+    env = _make_env(config, len(seeds), seeds)
     learner = _make_learner(config, env, NonFiniteGuard(config.device))
     warm_start.start(learner, config)
 

@@ -15,7 +15,7 @@ from emberlink.trainers.runs.seal import check_trained_with
 
 _OBSERVED = (
     *("comm.", "env.observation", "env.grid", "env.altitude", "env.horizon"),
-    *("env.displacement", "policy.hold"),
+    *("env.displacement", "env.view_angle", "policy.hold"),
 )
 """beginnings of the keys of settings that change what a UAV observes, or what its action does"""
 

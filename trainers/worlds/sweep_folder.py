@@ -17,6 +17,7 @@ from emberlink.trainers.runs.safe_read import MAX_JSON, parse_json, read_text
 from emberlink.trainers.worlds.axes import World
 
 Line = dict[str, Any]
+_NEEDED = {*World._fields, "headline", "gain", "gain_all"}
 _SETTINGS, _LINES, FIGURE = "sweep.json", "worlds.jsonl", "sweep.png"
 
 
@@ -84,7 +85,7 @@ class SweepFolder:
         except ValueError as error:
             raise UserError(f"{path}: cannot be read: {error}") from None
         before = flat(stored) if isinstance(stored, dict) else {}
-        now = flat(json.loads(json.dumps(settings)))
+        now = flat(json.loads(compact_json.dumps(dict(settings))))
         other = [key for key in {**now, **before} if now.get(key) != before.get(key)]
         if other:
             raise UserError(
@@ -104,6 +105,8 @@ class SweepFolder:
         for number, content in enumerate(complete.splitlines(), 1):
             try:
                 line = parse_json(content)
+                if not set(line) >= _NEEDED:
+                    raise KeyError(number)
                 lines[World(**{name: line[name] for name in World._fields})] = line
             except (ValueError, KeyError, TypeError):
                 raise UserError(f"{path}: line {number} is not of a sweep of worlds") from None

@@ -12,6 +12,7 @@ from PIL import Image
 from rich.console import Console
 
 from emberlink.configs import known
+from emberlink.envs.fire.generator import load_scenario
 from emberlink.envs.rendering import marks, video
 from emberlink.envs.utils.publish import published
 from emberlink.policies.scripted.registry import SCRIPTED
@@ -238,6 +239,17 @@ def test_a_file_created_meanwhile_is_not_overwritten(tmp_path):
         write()
     assert path.read_text() == "theirs"
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_changed_fire_is_drawn_as_it_was_evaluated():
+    changed = ["fire=oil_slick", "fire.head_ros=[0.01,0.01]"]
+    run = resolve("consensus", ["setup=tuned", *changed])
+    scenario, index = panels.find_fire("oil_slick:3", run)
+    assert (scenario.head_ros, index) == ((0.01, 0.01), 3)
+    run = resolve("consensus", ["setup=tuned", "fire.head_ros=[0.005,0.005]"])
+    own, usual = (panels.find_fire(name, run)[0] for name in ("huygens_as_trained", "huygens"))
+    assert own.head_ros == (0.005, 0.005)
+    assert usual == load_scenario("huygens")
 
 
 def test_a_video_without_frames_is_an_error(tmp_path):

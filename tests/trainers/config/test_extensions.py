@@ -133,7 +133,7 @@ def entry_point(monkeypatch, group: str, name: str, value: str) -> None:
     )
 
 
-def test_an_invalid_entry_point_is_named_in_the_error(monkeypatch):
+def test_an_invalid_entry_point_is_named_in_the_error(monkeypatch, tmp_path):
     for value, message in (
         ("nowhere:Module", "cannot be imported: ModuleNotFoundError: No module named 'nowhere'"),
         ("emberlink.comm.consensus:Nothing", "cannot be imported"),
@@ -159,6 +159,17 @@ def test_an_invalid_entry_point_is_named_in_the_error(monkeypatch):
         entry_point(monkeypatch, "emberlink.configs", "other", value)
         with pytest.warns(UserWarning, match=f"emberlink.configs: there is no package {value}"):
             assert "consensus" in configs.known("method")
+    (tmp_path / "broken").mkdir()
+    (tmp_path / "broken" / "__init__.py").write_text("raise RuntimeError('no licence')")
+    monkeypatch.syspath_prepend(tmp_path)
+    entry_point(monkeypatch, "emberlink.configs", "other", "broken.configs")
+    with pytest.warns(UserWarning, match=r"no package broken.configs \(RuntimeError: no licence"):
+        assert "consensus" in configs.known("method")
+
+
+def test_the_lock_of_an_editor_is_no_configuration(folder):
+    (folder / "setup" / ".#small.yaml").symlink_to("user@host.1234")
+    assert resolve("consensus", ["setup=small"]).env.horizon == 15
 
 
 def test_a_run_folder_does_not_need_its_yaml_files(folder, tmp_path, monkeypatch):

@@ -36,6 +36,14 @@ def test_settings_of_the_run_are_kept_unless_the_worlds_differ_in_them():
     assert in_world(run, "front") is run
 
 
+def test_a_radio_of_the_run_holds_for_the_methods_of_scripted_policies_too():
+    run = resolve("maps", ["setup=tuned", "world=front", "env.radio.loss=0.3"])
+    moved = in_world(run, "paper")
+    expected = resolve("maps", ["setup=tuned", "world=paper", "env.radio.loss=0.3"])
+    assert moved.baselines["consensus"].radio.loss == 0.3
+    assert moved.baselines == expected.baselines
+
+
 def test_settings_after_the_world_change_it():
     run = resolve("maps", ["setup=tuned", "world=front"])
     moved = evaluated_with(run, ["env.radio.range=0", "world=swarm", "env.num_uavs=3"])

@@ -111,6 +111,15 @@ def test_an_existing_copy_is_used_and_kept(shipped, tmp_path):
     assert (tmp_path / run.path / "note.txt").read_text() == "mine"
 
 
+def test_a_copy_of_another_version_is_not_taken_for_this_one(shipped, capsys):
+    run = pretrained.open_run("pretrained:consensus")
+    (networks,) = (run.path / "checkpoints").iterdir()
+    content = networks.read_bytes()
+    networks.write_bytes(content[:-1] + bytes([content[-1] ^ 1]))
+    assert main(["eval", "pretrained:consensus"]) == 2
+    assert f"{run.path}: holds other networks than pretrained" in capsys.readouterr().err
+
+
 def test_names_of_several_policies(shipped):
     def names(text: str) -> list[str]:
         return ["/".join(path.parts[-2:]) for path in pretrained.find(text)]

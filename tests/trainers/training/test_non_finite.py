@@ -8,6 +8,7 @@ from collections import Counter
 from dataclasses import asdict, replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
@@ -19,6 +20,7 @@ from emberlink.envs.utils.errors import UserError
 from emberlink.envs.wildfire import WildfireEnv
 from emberlink.trainers.cli import main
 from emberlink.trainers.config.compose import resolve
+from emberlink.trainers.learners.anchor import Anchor
 from emberlink.trainers.learners.ddpg import DDPG
 from emberlink.trainers.learners.nan_guard import NonFiniteGuard, row_norms
 from emberlink.trainers.learners.off_policy import OffPolicyLearner
@@ -522,6 +524,48 @@ def test_the_update_of_a_sequence_or_a_team_can_be_repeated(more, tmp_path, monk
     assert replay(error.dump) == error.report
     bad.clear()
     assert replay(error.dump) is None
+
+
+@pytest.mark.parametrize("learner", ["ddpg", "ippo"])
+def test_the_loss_of_an_anchor_is_repeated_with_its_weight(learner, tmp_path, monkeypatch):
+    own = [text for text in SMALL if learner == "ddpg" or "batch_size" not in text]
+    config = resolve("independent", [*own, f"learner={learner}", f"output={tmp_path}"])
+    first = Trainer(config)
+    first.start()
+    first.train()
+    start = [f"learner.warm_start={first.run.path}", "learner.anchor=0.5"]
+    config = resolve("independent", [*own, f"learner={learner}", *start])
+    trainer = Trainer(replace(config, output=str(tmp_path / "anchored")))
+    trainer.start()
+    original, weights = Anchor.loss, []
+
+    def poisoned(anchor, *actions):
+        weights.append(anchor.weight.item())
+        return original(anchor, *actions) * (math.nan if len(weights) == 9 else 1)
+
+    monkeypatch.setattr(Anchor, "loss", poisoned)
+    error = diverged(trainer)
+    wanted = weights[8]
+    weights.clear()
+    assert replay(error.dump) is None
+    assert weights == [wanted]
+    assert 0 < wanted < 0.5
+
+
+def test_a_dump_holds_the_fires_of_a_file(tmp_path, monkeypatch):
+    np.save(tmp_path / "bank.npy", np.random.default_rng(0).uniform(0, 30, (3, 30, 30)))
+    fire = "fire=file", f"fire.path={tmp_path / 'bank.npy'}"
+    original = DDPG.losses
+
+    def poisoned(learner, batch, **more):
+        losses = original(learner, batch, **more)
+        losses["critic"] = losses["critic"] * math.nan
+        return losses
+
+    monkeypatch.setattr(DDPG, "losses", poisoned)
+    error = diverged(begun("independent", tmp_path / "runs", *fire))
+    (tmp_path / "bank.npy").unlink()
+    assert replay(error.dump) == error.report
 
 
 def test_the_first_bad_batch_is_kept_whatever_the_size_of_the_next():

@@ -181,17 +181,21 @@ class OffPolicyLearner(Learner):
             return []
         losses = []
         for _ in range(self.config.updates_per_step):
-            if self.anchor is not None:
-                self.anchor.advance(self.updates / self._updates_of_run)
-            self.updates += 1
+            self._count_update()
             update = self._graphs[self.moves_actor(self.updates)]()
             losses.append({name: value.clone() for name, value in update.items()})
         return losses
 
     def update(self, batch: TensorDictBase) -> Losses:
         """Performs one step of the optimizers and of the target networks."""
-        self.updates += 1
+        self._count_update()
         return self._update(batch, self.moves_actor(self.updates))
+
+    def _count_update(self) -> None:
+        """Counts an update; the weight of the anchor depends on the number of those before."""
+        if self.anchor is not None:
+            self.anchor.advance(self.updates / self._updates_of_run)
+        self.updates += 1
 
     def _sample_and_update(self, actor: bool) -> Losses:
         return self._update(self.sample(), actor)

@@ -83,12 +83,16 @@ class ReplayMemory:
 
     def extend(self, rollout: TensorDictBase) -> None:
         """Stores a rollout, batch size [seeds * environments, steps]."""
-        self.extend_rows(to_rows(rollout, self.teams, self._keys, failures=self._failures))
+        self.extend_rows(self._rows(rollout))
 
     def extend_rows(self, rows: TensorDictBase) -> None:
         """Stores rows of `to_rows`."""
         self._buffer.extend(rows)
         self.written += len(rows)
+
+    def _rows(self, rollout: TensorDictBase) -> TensorDict:
+        """Returns what is stored of a rollout, batch size [rows, teams * uavs]."""
+        return to_rows(rollout, self.teams, self._keys, failures=self._failures)
 
     def sample(self) -> TensorDict:
         """Samples a batch for each UAV: batch size [batch], with the keys of a rollout."""

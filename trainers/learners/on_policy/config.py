@@ -20,7 +20,7 @@ class OnPolicyConfig(WarmStartConfig):
     gae_lambda: Annotated[float, Field(ge=0, le=1)]
     """factor of generalised advantage estimation (Schulman et al. 2016), per decision"""
     clip: Annotated[float, Field(gt=0, lt=1)]
-    """largest change of an action's probability in an iteration, as a ratio"""
+    """clip range of the probability ratio, [1 - clip, 1 + clip] (Schulman et al. 2017)"""
     epochs: Count
     """passes over the episodes of an iteration"""
     minibatches: Count

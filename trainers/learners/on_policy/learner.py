@@ -125,6 +125,11 @@ class OnPolicyLearner(Learner):
         """Number of seeds, and of networks of a seed."""
         return self.teams, 1 if self.config.share_parameters else self.context.num_uavs
 
+    @property
+    def _minibatches(self) -> int:
+        """Number of updates of an epoch."""
+        return min(self.config.minibatches, self.context.num_envs)
+
     def learn(self, rollout: TensorDictBase) -> list[Losses]:
         """Stores a rollout, and makes all updates of an iteration at the end of an episode."""
         self._decisions += self._transitions(rollout).split(1, 1)
@@ -135,8 +140,6 @@ class OnPolicyLearner(Learner):
         self._decisions = []
         self._estimate(episode, rollout.get("next")[:, -1:])
         self._set_lr()
-        if self.anchor is not None:
-            self.anchor.advance((self._count - self.context.horizon) / self.context.total_steps)
         return [self.update(batch) for batch in self._batches(episode)]
 
     def _transitions(self, rollout: TensorDictBase) -> TensorDict:
@@ -176,7 +179,7 @@ class OnPolicyLearner(Learner):
         for _ in range(self.config.epochs):
             key = counter_rng.fold_in(self._keys, self.updates)
             order = counter_rng.uniform(key, envs).argsort(dim=-1, stable=True) + first
-            for chosen in order.tensor_split(min(self.config.minibatches, envs), 1):
+            for chosen in order.tensor_split(self._minibatches, 1):
                 yield episode[chosen.flatten()]
 
     def update(self, batch: TensorDictBase) -> Losses:
@@ -185,6 +188,9 @@ class OnPolicyLearner(Learner):
         Args:
             batch: episodes, batch size [seeds * environments] or with a dimension of decisions.
         """
+        if self.anchor is not None:
+            iteration = self.updates // (self.config.epochs * self._minibatches)
+            self.anchor.advance(iteration * self.context.horizon / self.context.total_steps)
         self.updates += 1
         batch = batch.copy().auto_batch_size_(1)
         self.guard.record_batch(batch)

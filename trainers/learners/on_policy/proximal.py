@@ -39,7 +39,7 @@ def make_loss(
     Args:
         actor: actors of all UAVs.
         critic: writes `VALUE`.
-        clip: largest change of an action's probability, as a ratio.
+        clip: clip range of the probability ratio, [1 - clip, 1 + clip].
         entropy: weight of the entropy of the actions.
         device: of the networks.
     """
