@@ -89,9 +89,17 @@ def test_train_writes_the_same_folder_as_the_command(trained):
 
 def test_train_several_seeds_without_an_evaluation(tmp_path):
     runs = trainers.train(
-        "independent", seeds=[3, 4], evaluate_after=False, output=str(tmp_path), **SHORT
+        "independent",
+        learner="td3",
+        seeds=[3, 4],
+        evaluate_after=False,
+        output=str(tmp_path),
+        **SHORT,
     )
     assert [run.config.seed for run in runs] == [3, 4]
+    assert {run.config.learner.name for run in runs} == {"td3"}
+    with pytest.raises(UserError, match="'tdd' is not known; did you mean td3"):
+        trainers.train("independent", learner="tdd")
     assert [run.results for run in runs] == [{}, {}]
     assert not any((run.path / "eval.json").exists() for run in runs)
 
@@ -118,6 +126,9 @@ def test_evaluate_is_the_evaluation_of_the_training(trained):
     alone = trainers.evaluate(str(trained.path), episodes=1, scripted=False, device="cpu")
     assert alone["huygens"].keys() == {"learned"}
     assert alone["huygens"]["learned"]["coverage"] == results["huygens"]["learned"]["coverage"][:1]
+    for number in (0, 65_537):
+        with pytest.raises(UserError, match=f"episodes={number}: expected 1 to 65536"):
+            trainers.evaluate(trained.path, episodes=number)
     deaf = trainers.evaluate(trained.path, scripted=False, **{"env.radio.loss": 1.0})
     assert deaf.keys() == results.keys()
     assert sorted(trained.path.rglob("*")) == before

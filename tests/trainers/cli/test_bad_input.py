@@ -136,6 +136,9 @@ def contents(folder: Path) -> dict[str, bytes]:
 def test_invalid_run_folder(tmp_path, capsys):
     nowhere, empty = tmp_path / "nowhere", tmp_path / "empty"
     empty.mkdir()
+    with pytest.raises(SystemExit):
+        main.main(["eval", str(nowhere), "--fires", "65537"])
+    assert "'65537' is not a whole number 1 to 65536" in capsys.readouterr().err
     refused(["eval", str(nowhere)], capsys, str(nowhere), "no such run folder")
     refused(["eval", str(empty)], capsys, str(empty), "config.yaml is missing")
     assert not nowhere.exists()

@@ -19,6 +19,7 @@ from emberlink.envs.fire_files.config import FileFireConfig
 from emberlink.envs.fire_files.reader import with_checksum
 from emberlink.envs.scenarios import fires_of
 from emberlink.envs.utils.atomic_io import read_sealed, write_sealed
+from emberlink.envs.utils.errors import UserError
 from emberlink.trainers.cli import main
 from emberlink.trainers.config.compose import flat, resolve
 from emberlink.trainers.evaluation.baseline_cache import ScriptedResults
@@ -87,6 +88,18 @@ def test_a_runs_copy_of_its_fires_with_a_changed_bit_is_not_read(tmp_path):
         file.write_bytes(changed)
         with pytest.raises(ValueError, match=r"fire.asc: there is no such file"):
             fires_of(kept).train(*grid)
+
+
+def test_a_folder_without_its_copy_of_the_fires_is_no_run(tmp_path, monkeypatch, capsys):
+    def fail(*_):
+        raise UserError("no space left")
+
+    np.save(tmp_path / "bank.npy", np.random.default_rng(0).uniform(0, 15, (3, 30, 30)))
+    monkeypatch.setattr("emberlink.envs.scenarios.fire_files.save_copy", fail)
+    fire = "fire=file", f"fire.path={tmp_path / 'bank.npy'}", f"output={tmp_path / 'runs'}"
+    assert main.main(["train", "independent", *TINY, *fire]) == 2
+    assert "no space left" in capsys.readouterr().err
+    assert not list((tmp_path / "runs").glob("*/config.yaml"))
 
 
 def test_changed_digits_of_a_configuration(run):

@@ -200,6 +200,15 @@ def swept(arguments, executor=None) -> list[list[str]]:
     return executor.submitted
 
 
+def test_seeds_that_are_trained_as_a_stack_are_checked_as_one(tmp_path, monkeypatch):
+    checked = []
+    check = "emberlink.trainers.sweep.command.check_setup"
+    monkeypatch.setattr(check, lambda config: checked.append(config.seeds))
+    arguments = ["independent", *SMALL, "seed=0,1,2", f"output={tmp_path}", "executor.seeds=2"]
+    assert sweep(arguments, Console(width=200), dry=True) == 0
+    assert checked == [(0, 1), ()]
+
+
 def test_finished_runs_are_skipped(tmp_path, capsys):
     output = f"output={tmp_path}"
     assert swept(["independent", "episodes=1", output, "seed=0"]) == [
