@@ -18,6 +18,14 @@ INT, TERM, HUP = signal.SIGINT, signal.SIGTERM, signal.SIGHUP
 USR1, USR2 = signal.SIGUSR1, signal.SIGUSR2
 
 
+@pytest.fixture(autouse=True)
+def _no_nohup():
+    """Undoes `nohup`, under which SIGHUP is ignored."""
+    before = signal.signal(HUP, signal.SIG_DFL)
+    yield
+    signal.signal(HUP, before)
+
+
 def send(*numbers) -> Interruption:
     """Sends signals to a waiting training and returns what it received."""
     interruption = Interruption(lambda: None)
