@@ -179,8 +179,8 @@ def fires_of(scenario: ScenarioConfig) -> FireSource:
 
 def grid_of(fire: Any) -> tuple[int, int] | None:
     """Returns the grid of arrival times, a tensor or an array; None for a scenario."""
-    shape = tuple(getattr(fire, "shape", ()))
-    return (int(shape[-2]), int(shape[-1])) if len(shape) in (2, 3, 4) else None
+    shape: list[int] = list(getattr(fire, "shape", ()))
+    return (shape[-2], shape[-1]) if len(shape) in (2, 3, 4) else None
 
 
 def default_config(fire: Any) -> WildfireConfig:

@@ -18,7 +18,8 @@ class Window:
 
         self._pyplot = pyplot
         self._figure = pyplot.figure()  # a title as its name would share it with other windows
-        self._figure.canvas.manager.set_window_title(title)
+        manager: Any = self._figure.canvas.manager
+        manager.set_window_title(title)
         self._image: Any = None
 
     def show(self, picture: NDArray[np.uint8]) -> None:
