@@ -24,7 +24,7 @@ def to_action(action: Any, size: int, agent: str = "the team") -> Array:
     """
     try:
         numbers = np.asarray(action, np.float32)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise UserError(f"action of {agent}: {shown(action)} is no array of numbers") from None
     if numbers.shape != (size,):
         got = numbers.shape

@@ -135,7 +135,7 @@ class WildfireEnv(Buffers, TeamView):
 
     def _set_seed(self, seed: int | None) -> None:
         seed = secrets.randbelow(2**62) if seed is None else seed
-        (seed,) = counter_rng.check_seeds(seed, 1)
+        seed = counter_rng.check_seed(seed)
         self._seed_key.copy_(counter_rng.seed_keys(seed, self.num_envs, self.device))
         self._episode.zero_()
         self._seeded = True
@@ -196,7 +196,8 @@ class WildfireEnv(Buffers, TeamView):
             return motion.random_points(key, self.n_agents, self._low, self._high)
         points = motion.given_points(given, self.n_agents, self._low, self._high)
         if points.ndim == 3 and len(points) != self.num_envs:
-            raise UserError(f"position: of {len(points)} environments; there are {self.num_envs}")
+            shape, one = list(points.shape), [self.n_agents, 3]
+            raise UserError(f"position: shape {shape}; expected {one} or {[self.num_envs, *one]}")
         return points.expand_as(self._position)
 
     def _no_sighting(self) -> Sighting:

@@ -108,7 +108,8 @@ def train(
             failed.
     """
     chosen = [f"setup={setup}", f"world={world}"]
-    chosen += [f"{key}={name}" for key, name in (("fire", fire), ("learner", learner)) if name]
+    for key, name in (("fire", fire), ("learner", learner)):
+        chosen += [] if name is None else [f"{key}={name}"]
     several = {} if seeds is None else {"seeds": seeds}
     trainer = Trainer(resolve(method, chosen, **settings, **several))
     with _quiet():

@@ -99,6 +99,18 @@ def seed_keys(seed: int, count: int, device: torch.device | str | None = None) -
     return fold_in(root, torch.arange(count, device=device))
 
 
+def check_seed(seed: int) -> int:
+    """Returns a seed as an int.
+
+    Raises:
+        UserError: it is not a whole number from 0 to 2^63 - 1.
+    """
+    number = check_whole("seed", seed)
+    if not 0 <= number < 2**63:
+        raise UserError(f"seed={seed}: expected a whole number from 0 to 2^63 - 1")
+    return number
+
+
 def check_seeds(seed: int | Sequence[int], num_envs: int) -> list[int]:
     """Returns one or several seeds as a list.
 
@@ -107,9 +119,9 @@ def check_seeds(seed: int | Sequence[int], num_envs: int) -> list[int]:
             of the number of seeds.
     """
     given = seed if isinstance(seed, Sequence) and not isinstance(seed, str) else [seed]
-    seeds = [check_whole("seed", number) for number in given]
-    if not all(0 <= number < 2**63 for number in seeds or [-1]):
-        raise UserError(f"seed={seed}: expected a whole number from 0 to 2^63 - 1")
+    seeds = [check_seed(number) for number in given]
+    if not seeds:
+        raise UserError(f"seed={seed}: expected at least one seed")
     if num_envs % len(seeds):
         raise UserError(f"num_envs={num_envs} is not a multiple of the {len(seeds)} seeds")
     return seeds

@@ -63,7 +63,7 @@ def given_points(given: Any, uavs: int, low: Tensor, high: Tensor) -> Tensor:
     expected = f"expected {expected}{high.tolist()}"
     try:
         points = torch.as_tensor(given, dtype=torch.float32, device=low.device)
-    except (TypeError, ValueError, RuntimeError):
+    except (TypeError, ValueError, RuntimeError, OverflowError):
         raise UserError(f"position: {shown(given)} is no array of numbers; {expected}") from None
     if points.ndim not in (2, 3) or points.shape[-2:] != (uavs, 3):
         raise UserError(f"position: shape {list(points.shape)}; {expected}")

@@ -130,7 +130,7 @@ def command_group(commands: Any, name: str, summary: str, description: str, exam
 
 
 MOST_FIRES = 65_536
-"""fires of an evaluation at most; `config.schema` has the same number, but imports torch"""
+"""largest number of fires of an evaluation; that of `config.schema`, which imports torch"""
 
 
 def positive(text: str) -> int:

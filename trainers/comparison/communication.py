@@ -17,8 +17,8 @@ from emberlink.trainers.evaluation.results import LEARNED
 SCRIPTED = ("map_greedy", "courier")
 """scripted policies whose value of communication is computed"""
 _SAME = {"map_greedy": ("map_greedy_alone", "map_greedy_all")}
-"""scripted policy -> those that act, without a base, as it does with the radio off, and without
-limits"""
+"""scripted policy -> the one that acts like it with the radio off, and the one without limits; in
+worlds without a base"""
 _RANGE, _LOSS, _BANDWIDTH = _RADIO = "env.radio.range", "env.radio.loss", "env.radio.bandwidth"
 _Radio = tuple[float, float | None, float | None]
 """range, loss and bandwidth; None for no loss or no limit, and where they do not matter"""
@@ -78,17 +78,23 @@ def communication_values(section: Section) -> list[CommunicationValue]:
 
 
 def _limited(section: Section) -> list[Run]:
-    """Returns a run for each radio of trainings that is neither off nor without limits."""
+    """Returns a run for each range and loss of trainings between a radio off and no limits."""
     first: dict[_Radio, Run] = {}
     for run in (run for group in section.as_trained for run in group.runs):
-        first.setdefault(_radio(run), run)
+        first.setdefault(_heeded(run), run)
     return [run for radio, run in first.items() if radio not in (_OFF, _FULL)]
 
 
+def _heeded(run: Run) -> _Radio:
+    """Returns the radio of a run's evaluation as far as scripted policies heed it."""
+    reach, loss, _ = _radio(run)
+    return reach, loss, None
+
+
 def _radio_text(run: Run) -> str:
-    """Returns the limits of a run's radio, such as `range 10.0, loss 0.2`."""
+    """Returns the limits of scripted policies' radio, such as `range 10.0, loss 0.2`."""
     names = (key.rpartition(".")[2] for key in _RADIO)
-    limits = zip(names, _radio(run), strict=True)
+    limits = zip(names, _heeded(run), strict=True)
     return ", ".join(f"{name} {limit}" for name, limit in limits if limit is not None)
 
 
@@ -100,7 +106,8 @@ def _scripted(
     None if an evaluation is missing. Without a base no evaluation with another radio is needed.
     """
     others = [
-        next((run for run in section.runs if _radio(run) == radio), None) for radio in (_OFF, _FULL)
+        next((run for run in section.runs if _heeded(run) == radio), None)
+        for radio in (_OFF, _FULL)
     ]
     choices = [(others[0], policy), (world, policy), (others[1], policy)]
     if world.config.env.base is None and policy in _SAME:

@@ -1,10 +1,9 @@
 """Reads and validates the evaluation and the training curves of a run folder."""
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic import AfterValidator, ConfigDict, Field, TypeAdapter, ValidationError
 from pydantic.dataclasses import dataclass
 
 from emberlink.envs import metrics
@@ -20,6 +19,7 @@ MAX_VALUE = 1e12
 """maximum absolute value of a measure"""
 Measured = Annotated[float, Field(ge=-MAX_VALUE, le=MAX_VALUE, allow_inf_nan=False)]
 _MEASURE = TypeAdapter(Measured)
+Settings = Annotated[dict[str, Any], AfterValidator(infinite)]
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="ignore"))
@@ -38,11 +38,11 @@ class Evaluation:
     """episodes per policy and fire"""
     results: dict[str, dict[str, dict[str, list[Measured]]]]
     """fire -> policy -> measure -> one number per episode"""
-    held_out: dict[str, Any] = Field(default_factory=dict)
+    held_out: Settings = Field(default_factory=dict)
     """fire -> description of the held-out fires"""
-    environment: dict[str, Any] = Field(default_factory=dict)
+    environment: Settings = Field(default_factory=dict)
     """settings of the environment"""
-    communication: dict[str, dict[str, Any]] = Field(default_factory=dict)
+    communication: dict[str, Settings] = Field(default_factory=dict)
     """policy -> settings of the communication"""
 
 
@@ -68,8 +68,7 @@ def read_evaluation(file: Path, config: RunConfig) -> Evaluation:
         if actual != expected:
             raise UserError(f"{file}: {key}={actual}, but the run's config.yaml says {expected}")
     _check_results(file, evaluation)
-    settings = ("held_out", "environment", "communication")
-    return replace(evaluation, **{key: infinite(getattr(evaluation, key)) for key in settings})
+    return evaluation
 
 
 def _check_results(file: Path, evaluation: Evaluation) -> None:

@@ -146,13 +146,13 @@ def _plain(value: Any) -> str:
     return str(list(value)) if isinstance(value, tuple) else str(value)
 
 
-def find_fire(text: str | int | None, run: RunConfig) -> tuple[ScenarioConfig, int]:
-    """Returns the scenario and the index of a held-out fire.
+def find_fire(text: str | int | None, run: RunConfig) -> tuple[str, ScenarioConfig, int]:
+    """Returns the name, the scenario and the index of a held-out fire.
 
     Args:
         text: NAME, INDEX or NAME:INDEX. The default name is that of `shown_scenario`, and the
             default index is 0.
-        run: configuration of the run, whose training scenario is known, too.
+        run: configuration of the run; the fires of its evaluation are known, too.
 
     Raises:
         UserError: there is no such scenario or fire.
@@ -171,7 +171,7 @@ def find_fire(text: str | int | None, run: RunConfig) -> tuple[ScenarioConfig, i
         raise UserError(
             f"fire {text!r}: there is no held-out fire {index!r}; known: 0 to {MAX_FIRES - 1}"
         )
-    return evaluated.get(name) or load_scenario(name), int(index)
+    return name, evaluated.get(name) or load_scenario(name), int(index)
 
 
 def follows_advice(config: RunConfig, policy: Any) -> bool:
@@ -197,7 +197,7 @@ def replay(
     """
     check_comparable(panels)
     config = panels[0].config
-    scenario, index = find_fire(fire, config)
+    name, scenario, index = find_fire(fire, config)
     arrival = fires_of(scenario).test_fire(index, config.env.grid, config.env.horizon)
     shown = []
     for panel in panels:
@@ -209,4 +209,4 @@ def replay(
         measured = play(env, policy, recorder.add)
         report(f"  {panel.title}: coverage {measured['coverage'][index % BLOCK]:.1f} %")
         shown.append(Shown(title=panel.title, recording=recorder.recording()))
-    return Replay(shown, f"{scenario.name}:{index}")
+    return Replay(shown, f"{name}:{index}")

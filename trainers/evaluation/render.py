@@ -80,10 +80,10 @@ def render(runs: Sequence[str], console: Console, choices: Choices) -> int:
     check_comparable(panels)
     if choices.output is not None and choices.output.suffix == REPLAY:
         return _write_replay(panels, console, choices, choices.output)
-    scenario, index = find_fire(choices.fire, panels[0].config)
+    fire, scenario, index = find_fire(choices.fire, panels[0].config)
     config = panels[0].config.env
     shown = "episode" if len(panels) == 1 else "side_by_side"
-    stem = "_".join([shown, scenario.name, str(index), *(p.stem for p in choices.checkpoints)])
+    stem = "_".join([shown, fire, str(index), *(p.stem for p in choices.checkpoints)])
     paths = _free_paths(choices.output, open_run(runs[0]), stem)
     steps = _steps(choices, config.horizon, [path.suffix for path in paths])
     arrival = fires_of(scenario).test_fire(index, config.grid, config.horizon)

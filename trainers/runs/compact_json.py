@@ -9,17 +9,19 @@ _WIDTH = 240
 """maximum number of characters of a mapping on one line"""
 
 
-def dumps(value: Any, indent: str = "") -> str:
-    """Returns a value as compact, readable JSON, with texts for numbers that are not finite.
+def dumps(value: Any) -> str:
+    """Returns a value as compact, readable JSON, with the texts "inf" and "-inf" for infinities.
 
     A list of numbers or texts is on one line, however long. A mapping is on one line if that has at
     most 240 characters; otherwise each of its keys begins a line.
 
     Args:
         value: mappings, lists, texts, numbers, bool and None.
-        indent: indentation of the line on which the value begins.
+
+    Raises:
+        ValueError: a number is NaN.
     """
-    return _dumps(finite(value), indent)
+    return _dumps(finite(value), "")
 
 
 def _dumps(value: Any, indent: str) -> str:
@@ -38,12 +40,12 @@ def _dumps(value: Any, indent: str) -> str:
 
 
 def finite(value: Any) -> Any:
-    """Returns a value with texts such as "inf", which JSON has, for numbers that are not finite."""
+    """Returns a value with the texts "inf" and "-inf" for infinite numbers, which JSON lacks."""
     if isinstance(value, Mapping):
         return {key: finite(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
         return [finite(item) for item in value]
-    return str(value) if isinstance(value, float) and not math.isfinite(value) else value
+    return str(value) if isinstance(value, float) and math.isinf(value) else value
 
 
 def infinite(value: Any) -> Any:

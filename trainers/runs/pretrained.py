@@ -66,10 +66,14 @@ def open_run(text: str, output: Path | str = "runs") -> RunFolder:
 
 
 def _is_copy(source: Path, target: Path) -> bool:
-    """Returns whether a run folder has the checkpoint of a policy of the package."""
+    """Returns whether a run folder has no other networks than a policy of the package."""
     newest = RunFolder(source).checkpoint()
-    mine = target / "checkpoints" / newest.name
-    return not mine.is_file() or mine.read_bytes() == newest.read_bytes()
+    for mine in RunFolder(target).networks()[-1:]:
+        try:
+            return mine.name == newest.name and mine.read_bytes() == newest.read_bytes()
+        except OSError as error:
+            raise UserError(f"{mine}: cannot be read: {error.strerror or error}") from None
+    return True
 
 
 def find(text: str) -> list[Path]:

@@ -203,7 +203,7 @@ class Leases:
         return time.monotonic() - since < PATIENCE
 
     def deaths(self, run: str, token: str) -> int:
-        """Returns how many trainings have not released their lease since that with a token.
+        """Returns how many trainings ended without releasing their lease, since that with a token.
 
         Only the leases that `newest` has found are counted, not one that was taken since.
         """

@@ -95,7 +95,6 @@ def _shown(run: RunFolder, episodes: int) -> dict[str, Any]:
     if not lines:
         return {}
     known = lines[-1].get("coverage")
-    coverage = "" if known is None else f"{known:.1f} %"
-    if len(lines) == episodes:
-        coverage += ", evaluation"
-    return {"completed": len(lines), "coverage": coverage}
+    parts = [] if known is None else [f"{known:.1f} %"]
+    parts += ["evaluation"] if len(lines) == episodes else []
+    return {"completed": len(lines), "coverage": ", ".join(parts)}

@@ -178,7 +178,8 @@ def _write(setup: TrainingSetup, run: RunFolder, report: NonFiniteReport) -> Pat
     content = prefixed(learner=learner, bad=flatten(bad))
     checkpoint_file.write(folder / _TENSORS, content, header)
     config = setup.config
-    fires_of(config.fire).save_copy(folder, config.env.grid, config.env.horizon)
+    kept = fires_of(config.fire).load_copy(run.path)  # the file itself may be gone
+    fires_of(kept).save_copy(folder, config.env.grid, config.env.horizon)
     RunFolder(folder).write_config(config)
     about = {
         "report": asdict(report),

@@ -244,10 +244,10 @@ def test_a_file_created_meanwhile_is_not_overwritten(tmp_path):
 def test_a_changed_fire_is_drawn_as_it_was_evaluated():
     changed = ["fire=oil_slick", "fire.head_ros=[0.01,0.01]"]
     run = resolve("consensus", ["setup=tuned", *changed])
-    scenario, index = panels.find_fire("oil_slick:3", run)
-    assert (scenario.head_ros, index) == ((0.01, 0.01), 3)
+    name, scenario, index = panels.find_fire("oil_slick:3", run)
+    assert (name, scenario.head_ros, index) == ("oil_slick", (0.01, 0.01), 3)
     run = resolve("consensus", ["setup=tuned", "fire.head_ros=[0.005,0.005]"])
-    own, usual = (panels.find_fire(name, run)[0] for name in ("huygens_as_trained", "huygens"))
+    own, usual = (panels.find_fire(name, run)[1] for name in ("huygens_as_trained", "huygens"))
     assert own.head_ros == (0.005, 0.005)
     assert usual == load_scenario("huygens")
 

@@ -81,10 +81,11 @@ def test_a_radio_with_little_bandwidth_has_limits(tmp_path):
 
 def test_scripted_policies_have_a_value_for_each_radio(tmp_path):
     names = ("map_greedy_alone", "map_greedy", "map_greedy_all")
-    for reach, middle in ((20, 58.0), (5, 52.0)):
-        run = write_run(
-            tmp_path, name=f"r{reach}", scripted=names, overrides=(f"env.radio.range={reach}",)
-        )
+    more = "env.radio.bandwidth=8"  # which scripted policies ignore
+    for reach, middle, other in ((20, 58.0, ()), (5, 52.0, ()), (5, 52.0, (more,))):
+        overrides = (f"env.radio.range={reach}", *other)
+        name = f"r{reach}{len(other)}"
+        run = write_run(tmp_path, name=name, scripted=names, overrides=overrides)
         content = read_evaluation(run)
         for name, coverage in zip(names, (50.0, middle, 60.0), strict=True):
             content["results"]["huygens"][name]["coverage"] = [coverage] * 4

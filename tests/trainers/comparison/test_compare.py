@@ -21,11 +21,12 @@ from synthetic_runs import read_evaluation, write_evaluation, write_run
 from unpack_replay import data_of
 
 from emberlink.envs import metrics
+from emberlink.envs.utils.errors import UserError
 from emberlink.trainers import compare
 from emberlink.trainers.cli import main
 from emberlink.trainers.comparison.groups import gather
 from emberlink.trainers.comparison.rankings import numbers
-from emberlink.trainers.comparison.report import plots
+from emberlink.trainers.comparison.report import chapters, plots
 from emberlink.trainers.comparison.runs import Run, find, read
 from emberlink.trainers.comparison.scripted import Scripted
 from emberlink.trainers.config.compose import to_values
@@ -228,6 +229,25 @@ def test_an_empty_output_folder_stays_what_it_is(runs, tmp_path, monkeypatch):
         assert not list(output.glob(".*"))
     assert (tmp_path / "link").is_symlink()
     assert (tmp_path / "real" / "compare.json").is_file()
+
+
+@pytest.mark.parametrize("exists", [False, True])
+def test_a_report_that_was_made_meanwhile_is_not_overwritten(exists, runs, tmp_path, monkeypatch):
+    folder, draw = tmp_path / "report", chapters.draw
+    if exists:
+        folder.mkdir()
+
+    def slow(*arguments):
+        folder.mkdir(exist_ok=True)
+        (folder / "compare.html").write_text("theirs")
+        return draw(*arguments)
+
+    monkeypatch.setattr(chapters, "draw", slow)
+    with pytest.raises(UserError, match="there is something by now"):
+        compare([runs], output=folder)
+    assert [file.name for file in folder.iterdir()] == ["compare.html"]
+    assert (folder / "compare.html").read_text() == "theirs"
+    assert [path.name for path in tmp_path.iterdir()] == ["report"]
 
 
 def test_a_folder_whose_name_holds_no_characters_is_compared(tmp_path):

@@ -9,6 +9,7 @@ import torch
 import yaml
 from tiny_run import TINY
 
+from emberlink.envs.utils.errors import UserError
 from emberlink.trainers.cli.main import main
 from emberlink.trainers.config.compose import to_values
 from emberlink.trainers.evaluation.actor import load_actor
@@ -118,6 +119,10 @@ def test_a_copy_of_another_version_is_not_taken_for_this_one(shipped, capsys):
     networks.write_bytes(content[:-1] + bytes([content[-1] ^ 1]))
     assert main(["eval", "pretrained:consensus"]) == 2
     assert f"{run.path}: holds other networks than pretrained" in capsys.readouterr().err
+    networks.write_bytes(content)
+    networks.rename(networks.with_name("step_000000007.safetensors"))
+    with pytest.raises(UserError, match="holds other networks"):
+        pretrained.open_run("pretrained:consensus")
 
 
 def test_names_of_several_policies(shipped):

@@ -563,8 +563,9 @@ def test_a_dump_holds_the_fires_of_a_file(tmp_path, monkeypatch):
         return losses
 
     monkeypatch.setattr(DDPG, "losses", poisoned)
-    error = diverged(begun("independent", tmp_path / "runs", *fire))
+    trainer = begun("independent", tmp_path / "runs", *fire)
     (tmp_path / "bank.npy").unlink()
+    error = diverged(trainer)
     assert replay(error.dump) == error.report
 
 

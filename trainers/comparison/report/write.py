@@ -1,5 +1,6 @@
 """Writes compare.html, compare.json, the figures and the replays of a comparison."""
 
+import errno
 import os
 import tempfile
 from collections.abc import Callable
@@ -47,13 +48,19 @@ def _replays(comparison: Comparison, folder: Path) -> dict[Path, str]:
     }
 
 
-def _move(made: Path, folder: Path) -> None:
-    """Moves a folder to a new place, or its content into an empty folder."""
-    if folder.is_dir():  # a link, the working folder and a mount point stay what they are
+def _move(made: Path, folder: Path, *, fill: bool) -> None:
+    """Moves a folder to a new place, or its content into the empty folder that it is made in.
+
+    Raises:
+        FileExistsError: there is something else in that place by now.
+    """
+    if len(list(folder.iterdir())) > 1 if fill else os.path.lexists(folder):
+        raise FileExistsError(errno.EEXIST, "there is something by now", str(folder))
+    if fill:  # a link, the working folder and a mount point stay what they are
         for part in made.iterdir():
-            part.replace(folder / part.name)
+            part.rename(folder / part.name)
     else:
-        made.replace(folder)
+        made.rename(folder)
 
 
 def write_report(
@@ -74,7 +81,8 @@ def write_report(
     """
     notes = list(comparison.notes)
     try:
-        beside = folder if folder.is_dir() else folder.parent
+        fill = folder.is_dir()
+        beside = folder if fill else folder.parent
         beside.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=beside, prefix=".compare-") as partial:
             path = Path(partial) / "report"
@@ -90,7 +98,7 @@ def write_report(
             for name, text in ("compare.html", page), ("compare.json", numbers):
                 # Names of folders may hold bytes that are no characters.
                 (path / name).write_text(text, encoding="utf-8", errors="backslashreplace")
-            _move(path, folder)
+            _move(path, folder, fill=fill)
     except OutputError:
         raise
     except OSError as error:

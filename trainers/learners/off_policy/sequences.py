@@ -13,7 +13,7 @@ from emberlink.trainers.learners.off_policy.replay_buffer import ReplayMemory
 from emberlink.trainers.learners.off_policy.samplers import SequenceSampler, TeamSampler
 
 MISSING = (keys.AGENTS, "missing")
-"""int64 [batch, uavs]: decisions by which a burn-in is shorter; its episode begins within it"""
+"""int64 [batch, uavs]: decisions that a burn-in lacks, because its episode begins later"""
 
 
 class SequenceMemory(ReplayMemory):
