@@ -8,6 +8,7 @@ are int64 tensors; `fold_in` derives a key from another.
 
 from collections.abc import Sequence
 from enum import IntEnum, unique
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -99,7 +100,7 @@ def seed_keys(seed: int, count: int, device: torch.device | str | None = None) -
     return fold_in(root, torch.arange(count, device=device))
 
 
-def check_seed(seed: int) -> int:
+def check_seed(seed: Any) -> int:
     """Returns a seed as an int.
 
     Raises:
