@@ -88,11 +88,9 @@ def train(
         setup: paper, released, tuned, strong, or a setup of your own.
         world: paper, front, relay, swarm, blackout, file, or a world of your own.
         fire: name of a scenario; that of the setup or the world if None.
-        learner: ddpg, td3, ippo, mappo, imitation, or a learner of your own; that of the setup if
-            None.
+        learner: name of a learner; that of the setup if None.
         seeds: seeds to train in parallel, with a run folder for each, in place of `seed=`.
-        progress: called after each decision of the team (`policy.hold` steps); an exception in it
-            ends the training.
+        progress: called after each decision of the team; an exception in it ends the training.
         evaluate_after: whether to evaluate at the end, which writes eval.json, figures, a GIF and a
             replay.
         settings: other settings, by the last part of their key (`episodes=5`, `horizon=50`) or the
@@ -107,9 +105,8 @@ def train(
         NonFiniteError: a number became NaN or infinite, and `on_nan` is "stop" or the rollbacks
             failed.
     """
-    chosen = [f"setup={setup}", f"world={world}"]
-    for key, name in (("fire", fire), ("learner", learner)):
-        chosen += [] if name is None else [f"{key}={name}"]
+    names = {"setup": setup, "world": world, "fire": fire, "learner": learner}
+    chosen = [f"{key}={name}" for key, name in names.items() if name is not None]
     several = {} if seeds is None else {"seeds": seeds}
     trainer = Trainer(resolve(method, chosen, **settings, **several))
     with _quiet():
