@@ -194,11 +194,7 @@ class WildfireEnv(Buffers, TeamView):
         if given is None:
             key = counter_rng.fold_in(self._episode_key, Use.START_POSITION)
             return motion.random_points(key, self.n_agents, self._low, self._high)
-        points = motion.given_points(given, self.n_agents, self._low, self._high)
-        if points.ndim == 3 and len(points) != self.num_envs:
-            shape, one = list(points.shape), [self.n_agents, 3]
-            raise UserError(f"position: shape {shape}; expected {one} or {[self.num_envs, *one]}")
-        return points.expand_as(self._position)
+        return motion.given_points(given, self._position.shape, self._low, self._high)
 
     def _no_sighting(self) -> Sighting:
         """Returns the sighting at reset: no UAV has looked yet."""

@@ -53,24 +53,30 @@ def random_points(key: Tensor, count: int, low: Tensor, high: Tensor) -> Tensor:
     return torch.minimum(points, high.float())  # rounding may exceed the upper corner
 
 
-def given_points(given: Any, uavs: int, low: Tensor, high: Tensor) -> Tensor:
-    """Returns given positions as a tensor, float32 [uavs, 3] or [num_envs, uavs, 3].
+def given_points(given: Any, shape: Sequence[int], low: Tensor, high: Tensor) -> Tensor:
+    """Returns given positions as a tensor, float32 `shape`.
+
+    Args:
+        given: positions in cells, of this shape, or without the first dimension for all alike.
+        shape: [num_envs, uavs, 3].
+        low, high: [3], the corners of the box, cells.
 
     Raises:
         UserError: they are no numbers, have another shape, or lie outside of the box.
     """
-    expected = f"[{uavs}, 3] or [num_envs, {uavs}, 3] inside the box {low.tolist()} to "
-    expected = f"expected {expected}{high.tolist()}"
+    shapes = [*shape[1:]], [*shape]
+    box = f"{low.tolist()} to {high.tolist()}"
+    expected = f"expected {shapes[0]} or {shapes[1]} inside the box {box}"
     try:
         points = torch.as_tensor(given, dtype=torch.float32, device=low.device)
     except (TypeError, ValueError, RuntimeError, OverflowError):
         raise UserError(f"position: {shown(given)} is no array of numbers; {expected}") from None
-    if points.ndim not in (2, 3) or points.shape[-2:] != (uavs, 3):
+    if [*points.shape] not in shapes:
         raise UserError(f"position: shape {list(points.shape)}; {expected}")
     if not ((points >= low) & (points <= high)).all():
         span = f"{points.min():g} to {points.max():g}"
         raise UserError(f"position: values from {span}; {expected}")
-    return points
+    return points.expand(*shape)
 
 
 def next_waypoint(

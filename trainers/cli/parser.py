@@ -7,6 +7,9 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from typing import Any, NoReturn
 
+MOST_FIRES = 65_536
+"""largest number of fires of an evaluation; that of `config.schema`, which imports torch"""
+
 
 class _Help(argparse.HelpFormatter):
     """Wraps descriptions to the width of the terminal and leaves examples as they are."""
@@ -127,10 +130,6 @@ def command_group(commands: Any, name: str, summary: str, description: str, exam
 
     group = command(commands, name, print_help, summary, description, example)
     return group.add_subparsers(dest="action", metavar="ACTION")
-
-
-MOST_FIRES = 65_536
-"""largest number of fires of an evaluation; that of `config.schema`, which imports torch"""
 
 
 def positive(text: str) -> int:

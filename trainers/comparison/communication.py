@@ -58,7 +58,7 @@ class CommunicationValue:
 
 def communication_values(section: Section) -> list[CommunicationValue]:
     """Returns the value of communication wherever a section has all three evaluations."""
-    measure = section.runs[0].config.evaluation.headline
+    measure, limited = section.runs[0].config.evaluation.headline, _limited(section)
     values: list[CommunicationValue] = []
     for fire in section.runs[0].evaluation.results:
         for group in section.as_trained:
@@ -68,7 +68,6 @@ def communication_values(section: Section) -> list[CommunicationValue]:
                     if none is not None and full is not None:
                         samples = [_per_fire(g.runs, fire, measure) for g in (none, group, full)]
                         values.append(_value(fire, group.label, measure, how, samples))
-        limited = _limited(section)
         for policy, world in product(SCRIPTED, limited):
             samples = _scripted(section, fire, policy, measure, world)
             if samples is not None:
@@ -93,9 +92,8 @@ def _heeded(run: Run) -> _Radio:
 
 def _radio_text(run: Run) -> str:
     """Returns the limits of scripted policies' radio, such as `range 10.0, loss 0.2`."""
-    names = (key.rpartition(".")[2] for key in _RADIO)
-    limits = zip(names, _heeded(run), strict=True)
-    return ", ".join(f"{name} {limit}" for name, limit in limits if limit is not None)
+    reach, loss, _ = _radio(run)
+    return f"range {reach}" + ("" if loss is None else f", loss {loss}")
 
 
 def _scripted(

@@ -15,7 +15,7 @@ NOT_COMPARED = ("seed", "seeds", "output", "evaluation", "baselines", *NOT_LEARN
 """first parts of keys that may differ within a group, since they do not affect training"""
 NOT_NOTED = ("seed", "seeds", "output", "baselines")
 """first parts of keys whose differences within a group are not reported in notes"""
-WARM_START = "learner.warm_start"
+_WARM_START = "learner.warm_start"
 _OF_SECTION = ("env.horizon", "env.grid")
 """settings of the environment that are equal within a section, besides those of the fire"""
 
@@ -198,11 +198,12 @@ def _one_run_per_seed(label: str, runs: Sequence[Run], notes: list[str]) -> tupl
 def trained_with(run: Run) -> dict[str, Any]:
     """Returns the settings that affect training, without the seed.
 
-    If the run began with the actors of another that still exists, `WARM_START` holds its settings.
+    If the run began with the actors of another that still exists, `learner.warm_start` holds its
+    settings.
     """
-    mine, start = _without_seed(run.settings), run.settings.get(WARM_START, "")
+    mine, start = _without_seed(run.settings), run.settings.get(_WARM_START, "")
     origin = settings_of(start) if start else ""
-    return mine | {WARM_START: origin if isinstance(origin, str) else _without_seed(origin)}
+    return mine | {_WARM_START: origin if isinstance(origin, str) else _without_seed(origin)}
 
 
 def _without_seed(settings: Mapping[str, Any]) -> dict[str, Any]:

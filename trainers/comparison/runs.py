@@ -120,15 +120,16 @@ def read(path: Path) -> Run | str:
     lines = read_curves(folder)
     if len(lines) < config.episodes:
         return f"unfinished: {len(lines)} of {config.episodes} episodes"
+    again = f"emberlink eval {shlex.quote(str(path))}"
     try:
         evaluation = read_evaluation(path / "eval.json", config)
     except FileNotFoundError:
-        return f"not evaluated: there is no eval.json (emberlink eval {shlex.quote(str(path))})"
+        return f"not evaluated: there is no eval.json ({again})"
     newest = newest_checkpoint(path)
     if newest is not None and newest.name != evaluation.checkpoint:
         return (
             f"eval.json is of {evaluation.checkpoint}, the newest checkpoint is {newest.name} "
-            f"(emberlink eval {shlex.quote(str(path))})"
+            f"({again})"
         )
     if newest is not None:
         check_trained_with(newest, config)
@@ -151,6 +152,8 @@ def evaluated_otherwise(run: Run) -> tuple[list[Run], list[LeftOut]]:
     for file in sorted(run.path.glob("eval_*.json")):
         evaluation = read_evaluation(file, run.config)
         changed = _changed_settings(run, evaluation)
+        if not changed:
+            continue
         why = [
             f"{name} is {getattr(evaluation, name)}, in eval.json {getattr(run.evaluation, name)}"
             for name in ("world", "checkpoint", "fires", "start_seed")
@@ -158,13 +161,13 @@ def evaluated_otherwise(run: Run) -> tuple[list[Run], list[LeftOut]]:
         ]
         why += [f"{key}={changed[key]}" for key in ("env.horizon", "env.grid") if key in changed]
         settings = repr(sorted(changed.items()))
-        if settings in names and not why:
+        if why:
+            left_out.append((str(file), f"evaluated otherwise: {', '.join(why)}"))
+        elif settings in names:
             left_out.append((str(file), f"has the settings of {names[settings]}"))
-        elif changed and not why:
+        else:
             names[settings] = file.name
             others.append(replace(run, evaluation=evaluation, evaluated_with=changed))
-        elif changed:
-            left_out.append((str(file), f"evaluated otherwise: {', '.join(why)}"))
     return others, left_out
 
 

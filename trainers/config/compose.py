@@ -4,7 +4,7 @@ import threading
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from copy import deepcopy
-from dataclasses import replace
+from dataclasses import asdict, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -118,7 +118,7 @@ def with_radio(config: RunConfig, usual: Mapping[str, Any]) -> RunConfig:
         config: configuration of a run.
         usual: settings of the radio without the changes.
     """
-    other = _changes(usual, _radio(to_values(config)))
+    other = _changes(usual, asdict(config.env.radio))
     baselines = {
         method: replace(baseline, radio=replace(baseline.radio, **other))
         for method, baseline in config.baselines.items()

@@ -12,11 +12,17 @@ from emberlink.trainers.learners.off_policy.sequences import MISSING, SequenceMe
 _TEACHER, _ALIVE, _MISSING = keys.TEACHER[1], keys.ALIVE[1], MISSING[1]
 
 
-class Demonstrations(ReplayMemory):
-    """Samples single decisions, see `ReplayMemory`."""
+class _OfTeacher(ReplayMemory):
+    """Stores observations and what a teacher would have done, in place of transitions."""
 
     def _rows(self, rollout: TensorDictBase) -> TensorDict:
-        return _rows(rollout, self.teams, self._keys, failures=self._failures)
+        kept = [*self._keys, keys.TEACHER, *([keys.ALIVE] if self._failures else [])]
+        rows = {key[-1]: arrange(rollout.get(key), rollout.ndim, self.teams) for key in kept}
+        return TensorDict(rows, batch_size=rows[_TEACHER].shape[:2], device=rollout.device)
+
+
+class Demonstrations(_OfTeacher):
+    """Samples single decisions, see `ReplayMemory`."""
 
     def sample(self) -> TensorDict:
         """Samples a batch for each UAV: batch size [batch], with the keys of a rollout."""
@@ -24,11 +30,8 @@ class Demonstrations(ReplayMemory):
         return TensorDict({keys.AGENTS: sample}, batch_size=sample.shape[:1])
 
 
-class DemonstrationSequences(SequenceMemory):
+class DemonstrationSequences(_OfTeacher, SequenceMemory):
     """Samples sequences of decisions, see `SequenceMemory`."""
-
-    def _rows(self, rollout: TensorDictBase) -> TensorDict:
-        return _rows(rollout, self.teams, self._keys, failures=self._failures)
 
     def sample(self) -> TensorDict:
         """Samples sequences for each UAV: batch size [batch], [batch, uavs, decisions, ...] each.
@@ -45,10 +48,3 @@ class DemonstrationSequences(SequenceMemory):
         agents[_ALIVE] = self._alive(sample, info)
         batch = info[_MISSING].shape
         return TensorDict({keys.AGENTS: TensorDict(agents, batch)}, batch_size=batch[:1])
-
-
-def _rows(rollout: TensorDictBase, teams: int, observations: Any, *, failures: bool) -> TensorDict:
-    """Returns the decisions of a rollout as rows, batch size [rows, teams * uavs]."""
-    kept = [*observations, keys.TEACHER, *([keys.ALIVE] if failures else [])]
-    rows = {key[-1]: arrange(rollout.get(key), rollout.ndim, teams) for key in kept}
-    return TensorDict(rows, batch_size=rows[_TEACHER].shape[:2], device=rollout.device)

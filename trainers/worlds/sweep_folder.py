@@ -1,6 +1,5 @@
 """Reads and writes the folder of a sweep of worlds: settings, results, figure."""
 
-import json
 import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -85,7 +84,7 @@ class SweepFolder:
         except ValueError as error:
             raise UserError(f"{path}: cannot be read: {error}") from None
         before = flat(stored) if isinstance(stored, dict) else {}
-        now = flat(json.loads(compact_json.dumps(dict(settings))))
+        now = flat(compact_json.finite(settings))
         other = [key for key in {**now, **before} if now.get(key) != before.get(key)]
         if other:
             raise UserError(

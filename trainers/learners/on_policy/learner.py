@@ -130,6 +130,12 @@ class OnPolicyLearner(Learner):
         """Number of updates of an epoch."""
         return min(self.config.minibatches, self.context.num_envs)
 
+    @property
+    def _done(self) -> float:
+        """Share of the run before the iteration of the next update."""
+        iteration = self.updates // (self.config.epochs * self._minibatches)
+        return iteration * self.context.horizon / self.context.total_steps
+
     def learn(self, rollout: TensorDictBase) -> list[Losses]:
         """Stores a rollout, and makes all updates of an iteration at the end of an episode."""
         self._decisions += self._transitions(rollout).split(1, 1)
@@ -189,8 +195,7 @@ class OnPolicyLearner(Learner):
             batch: episodes, batch size [seeds * environments] or with a dimension of decisions.
         """
         if self.anchor is not None:
-            iteration = self.updates // (self.config.epochs * self._minibatches)
-            self.anchor.advance(iteration * self.context.horizon / self.context.total_steps)
+            self.anchor.advance(self._done)
         self.updates += 1
         batch = batch.copy().auto_batch_size_(1)
         self.guard.record_batch(batch)
@@ -239,8 +244,7 @@ class OnPolicyLearner(Learner):
 
     def _set_lr(self) -> None:
         """Lowers the learning rate linearly; the last iteration still has a share of it."""
-        done = self._count - self.context.horizon
-        share = max(0.0, 1 - done / self.context.total_steps)
+        share = max(0.0, 1 - self._done)
         for entry in self.optimizer.param_groups:
             entry["lr"] = self.config.lr * self._lr_scale * share
 

@@ -208,6 +208,7 @@ class Player {
   draw() {
     const { step, uav, palette } = this;
     const options = { palette, uav };
+    const views = [];
     for (const layer of this.layers) {
       if (layer.type === "checkbox") options[layer.id] = layer.checked;
       else if (layer.checked) options.view = layer.value;
@@ -215,7 +216,9 @@ class Player {
     for (const { panel, part, knowledge, map } of this.panels) {
       knowledge.seek(step);
       const own = Math.min(uav, panel.uavs - 1);
-      map.draw(step, { ...options, uav: own, view: options.view === "base" && !panel.base ? "team" : options.view });
+      const view = options.view === "base" && !panel.base ? "team" : options.view;
+      views.push(view);
+      map.draw(step, { ...options, uav: own, view });
       list(part("of-team"), "", numbers(panel, step));
       const role = map.role(own);
       const told = role === null || !map.flies(own) ? "" : `, ${this.data.roles[role]}`;
@@ -225,8 +228,8 @@ class Player {
     find("slider").value = step;
     find("slider").setAttribute("aria-valuetext", `step ${step} of ${this.data.horizon}`);
     find("step").textContent = step;
-    const lacking = options.view === "base" && this.panels.some(({ panel }) => !panel.base);
-    document.body.dataset.view = options.heat ? "heat" : lacking ? "team" : options.view;
+    const legend = views.includes("team") ? "team" : options.view; // its entries include those of "base"
+    document.body.dataset.view = options.heat ? "heat" : legend;
     this.curves.show(step);
   }
 }
