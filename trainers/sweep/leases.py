@@ -182,7 +182,8 @@ class Leases:
     def newest(self, run: str) -> Record | None:
         """Returns the newest lease of a run; None if there is none."""
         number = self._newest.get(run, 0)
-        while self._path(run, number + 1).exists():
+        # Unlike Path.exists, this is False if the file system is unavailable. `take` then fails.
+        while os.path.exists(self._path(run, number + 1)):
             number += 1
         self._newest[run] = number
         return _read(self._path(run, number)) if number else None

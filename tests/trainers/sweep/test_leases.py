@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from emberlink.envs.utils.errors import UserError
 from emberlink.trainers.runs.lock import Lock
 from emberlink.trainers.sweep import leases, worker
 from emberlink.trainers.sweep.leases import PATIENCE, SWEEP, TRAINING, Heart, Leases
@@ -284,3 +285,12 @@ def test_a_lease_with_a_wrong_value_is_named(change, tmp_path):
     lease.path.write_text(json.dumps(json.loads(lease.path.read_text()) | change))
     with pytest.raises(ValueError, match=f"not a lease: {next(iter(change))}="):
         Leases(tmp_path).newest("run")
+
+
+def test_a_lease_that_cannot_be_looked_up_cannot_be_taken(tmp_path):
+    name = "r" * 300  # too long for a file system: Path.exists raises OSError
+    found = Leases(tmp_path)
+    assert found.take("run", TRAINING)  # makes the folder of leases
+    assert found.newest(name) is None
+    with pytest.raises(UserError, match="File name too long"):
+        found.take(name, TRAINING)
