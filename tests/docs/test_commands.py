@@ -22,13 +22,17 @@ ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
 VARIABLES = re.compile(r"^(?:[A-Z_]+=\S+ )+")
 SMALL = [*(word for word in TINY if "num_uavs" not in word), "evaluation.scripted=[]"]
-YAML = r"`(?:\w+/)*((?:method|setup|world|learner)/\w+\.yaml)`[^`]*```yaml\n(.*?)```"
+YAML = r"`(?:\w+/)*((?:method|setup|setup_method|world|learner)/\w+\.yaml)`[^`]*```yaml\n(.*?)```"
 ENTRY_POINTS = """[emberlink.comm]
 headcount = extensions_block:Headcount
 visited = communication_block:Visited
 [emberlink.learners]
 slow_actor = learners_block:SlowActor
+[emberlink.scripted]
+gather = extensions_block:Gather
 """
+BLOCKS = {"communication": 1, "extensions": 2, "learners": 1, "worlds": 0}
+"""the number of Python blocks of a page, from its first, that make up a module"""
 
 
 def commands_of(page: Path) -> Iterator[str]:
@@ -61,13 +65,13 @@ def prepared(tmp_path_factory) -> Path:
     days = frame_of(fire, (60, 120, 240)).rename(columns={"Elapsed_Mi": "DateCurrent"})
     days["DateCurrent"] = [f"2020-08-{day}T13:00:00" for day in (18, 19, 20)]
     days.to_file(folder / "perimeters.geojson")
-    for page in ("communication", "extensions", "learners", "worlds"):
+    for page, count in BLOCKS.items():
         text = (ROOT / "docs" / f"{page}.md").read_text()
         for name, content in re.findall(YAML, text, re.DOTALL):
             (folder / "mine" / name).parent.mkdir(parents=True, exist_ok=True)
             (folder / "mine" / name).write_text(content)
-        for block in re.findall(r"```python\n(.*?)```", text, re.DOTALL)[:1]:
-            (folder / f"{page}_block.py").write_text(block)
+        blocks = re.findall(r"```python\n(.*?)```", text, re.DOTALL)[:count]
+        (folder / f"{page}_block.py").write_text("\n".join(blocks))
     (folder / "blocks-1.dist-info").mkdir()
     (folder / "blocks-1.dist-info" / "METADATA").write_text("Name: blocks\nVersion: 1\n")
     (folder / "blocks-1.dist-info" / "entry_points.txt").write_text(ENTRY_POINTS)
