@@ -6,7 +6,9 @@ from pathlib import Path
 from emberlink.envs.utils.config_files import find
 
 PAGE = (Path(__file__).parents[1] / "docs" / "extensions.md").read_text()
-MODULE, METHOD, PROJECT, SETUP_OF_PAGE = re.findall(r"```\w+\n(.*?)```", PAGE, re.DOTALL)
+MODULE, METHOD, PROJECT, _, SETUP_OF_PAGE, CONSENSUS_OF_PAGE = re.findall(
+    r"```\w+\n(.*?)```", PAGE, re.DOTALL
+)
 SETUP = """# @package _global_
 defaults:
   - paper

@@ -113,6 +113,11 @@ def plain(value: Any, key: str = "", deepest: int = 16) -> Any:
     return value
 
 
+def is_index(text: str, end: int) -> bool:
+    """Returns whether a text is a whole number from 0 to `end` - 1."""
+    return text.isdecimal() and len(text) <= len(str(end)) and int(text) < end
+
+
 def shown(value: Any) -> str:
     """Returns a value as text for a message, shortened if it is long, with escaped characters."""
     text = value if isinstance(value, str) else reprlib.repr(value)

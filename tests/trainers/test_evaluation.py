@@ -20,7 +20,7 @@ from emberlink.policies.scripted.registry import SCRIPTED
 from emberlink.trainers.build import build_actor, build_env
 from emberlink.trainers.cli import main
 from emberlink.trainers.config.compose import resolve
-from emberlink.trainers.evaluation import baseline_cache, evaluate, plots, tables
+from emberlink.trainers.evaluation import baseline_cache, command, evaluate, plots, tables
 from emberlink.trainers.runs.run_folder import RunFolder
 from emberlink.trainers.terminal import SafeConsole
 
@@ -319,6 +319,14 @@ def test_curves_of_a_strange_file_are_drawn(tmp_path):
     ]
     plots.training_curves(tmp_path / "curves.png", lines, "title")
     assert (tmp_path / "curves.png").stat().st_size > 1000
+
+
+def test_the_files_of_an_evaluation_with_many_settings_have_short_names():
+    long = [f"_env.reward.base=0.{i:0200d}" for i in (1, 2)]
+    short = {command._shortened(label) for label in long}
+    assert {len(label) for label in short} == {150}
+    assert len(short) == 2
+    assert command._shortened("_env.radio.loss=0.5") == "_env.radio.loss=0.5"
 
 
 def test_several_seeds_make_one_table(monkeypatch, capsys):

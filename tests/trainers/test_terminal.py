@@ -166,6 +166,14 @@ def test_the_remaining_time_is_estimated_from_steps_with_updates():
     assert later.speed == pytest.approx(1, rel=0.05)
 
 
+def test_the_remaining_time_begins_again_after_a_rollback():
+    steps = [(i * 1.0, 100 + i, i) for i in range(1, 51)]
+    after = [(60 + i * 1.0, 2 * i, i) for i in range(1, 11)]
+    left = times(steps + after)
+    assert left.speed == pytest.approx(2)
+    assert left.seconds == pytest.approx((1000 - 20) / 2)
+
+
 class Clock:
     now = 0.0
 

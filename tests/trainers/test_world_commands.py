@@ -319,8 +319,10 @@ def test_nothing_is_written_through_a_link_or_after_a_damaged_line(swept, tmp_pa
     assert other.read_text() == ""
     (folder / "worlds.jsonl").unlink()
     lines = (swept / "worlds.jsonl").read_text().splitlines()
-    without = {key: value for key, value in json.loads(lines[0]).items() if key != "gain"}
-    for text in ('{"speed": 1}', json.dumps(without), "[1]"):
+    line = json.loads(lines[0])
+    without = {key: value for key, value in line.items() if key != "gain"}
+    wrong = [line | {"gain": 5}, line | {"gain": [1, "a"]}, line | {"headline": [1, 2]}]
+    for text in ('{"speed": 1}', *map(json.dumps, [without, *wrong]), "[1]"):
         (folder / "worlds.jsonl").write_text(text + "\n")
         message = refused(capsys, "sweep", folder, *SWEPT)
         assert "line 1 is not of a sweep of worlds" in message

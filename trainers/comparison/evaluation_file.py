@@ -57,12 +57,14 @@ def read_evaluation(file: Path, config: RunConfig) -> Evaluation:
         FileNotFoundError: there is no such file.
         UserError: the file is damaged, incomplete, or of another run.
     """
+    text = read_text(file, MAX_JSON)
     try:
-        text = read_text(file, MAX_JSON)
         check_parts(text)
         evaluation = TypeAdapter(Evaluation).validate_json(text)
     except ValidationError as error:
         raise UserError(f"{file}: {' '.join(describe(error).split())[:300]}") from None
+    except UserError as error:
+        raise UserError(f"{file}: {error}") from None
     for key in ("method", "setup", "seed"):
         actual, expected = getattr(evaluation, key), getattr(config, key)
         if actual != expected:

@@ -2,14 +2,15 @@
 
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
 from emberlink.envs.utils.errors import UserError
 from emberlink.trainers.comparison.runs import Run, settings_of
-from emberlink.trainers.config.compose import flat, resolve, to_values
-from emberlink.trainers.config.schema import NOT_LEARNT_WITH, RunConfig
+from emberlink.trainers.config.compose import to_values
+from emberlink.trainers.config.defaults import defaults_of
+from emberlink.trainers.config.schema import NOT_LEARNT_WITH
+from emberlink.trainers.runs import pretrained
 
 NOT_COMPARED = ("seed", "seeds", "output", "evaluation", "baselines", *NOT_LEARNT_WITH)
 """first parts of keys that may differ within a group, since they do not affect training"""
@@ -183,8 +184,12 @@ def _group_name(run: Run, firsts: Sequence[Run]) -> str:
 
 
 def _one_run_per_seed(label: str, runs: Sequence[Run], notes: list[str]) -> tuple[Run, ...]:
-    """Returns the last run of each seed, sorted by seed, and appends notes about other runs."""
-    by_seed = {run.config.seed: run for run in runs}
+    """Returns the last run of each seed, sorted by seed, and appends notes about other runs.
+
+    A copy of the package's trained policy is chosen only if there is no other run.
+    """
+    copies_first = sorted(runs, key=lambda run: not pretrained.is_copy(run.path))
+    by_seed = {run.config.seed: run for run in copies_first}
     for run in runs:
         taken = by_seed[run.config.seed]
         if run is not taken:
@@ -235,7 +240,7 @@ def _settings_apart(run: Run, others: Sequence[Run], counts: Callable[[str], boo
 
 def changed(run: Run, keys: Sequence[str]) -> dict[str, Any]:
     """Returns the settings among `keys` that are not the default of method, setup and learner."""
-    defaults = _defaults(run.config) if keys else {}
+    defaults = defaults_of(run.config) if keys else {}
     return {
         key: run.settings[key]
         for key in keys
@@ -252,21 +257,6 @@ def _word(value: Any) -> str:
     """Returns a value as on the command line."""
     words = {None: "null", True: "true", False: "false"}
     return words[value] if value is None or isinstance(value, bool) else str(value)
-
-
-def _defaults(config: RunConfig) -> dict[str, Any]:
-    """Returns the default settings of a run's method, setup and learner.
-
-    `learner.name` is that of the setup. Settings of what is not installed are left out.
-    """
-    names = {"setup": config.setup, "world": config.world, "fire": config.fire.name}
-    choices = [f"{group}={name}" for group, name in names.items()]
-    defaults: dict[str, Any] = {}
-    for more in ([f"learner={config.learner.name}"], []):
-        with suppress(UserError):
-            usual = flat(to_values(resolve(config.method, [*choices, *more])))
-            defaults = (defaults or usual) | {"learner.name": usual["learner.name"]}
-    return defaults
 
 
 def differing(runs: Sequence[Run]) -> list[str]:

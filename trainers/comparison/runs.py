@@ -133,7 +133,7 @@ def read(path: Path) -> Run | str:
         )
     if newest is not None:
         check_trained_with(newest, config)
-    return Run(path, config, lines, evaluation)
+    return Run(path, config, lines[: config.episodes], evaluation)
 
 
 def evaluated_otherwise(run: Run) -> tuple[list[Run], list[LeftOut]]:

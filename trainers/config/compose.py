@@ -20,7 +20,7 @@ from yaml import YAMLError
 
 from emberlink import configs
 from emberlink.envs.scenarios import fires_of
-from emberlink.envs.utils.config_files import find, place_of
+from emberlink.envs.utils.config_files import find, place_of, read
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import from_plain, plain, shown, unknown
 from emberlink.policies.scripted.registry import SCRIPTED
@@ -188,6 +188,10 @@ def _compose(
             values: Any = OmegaConf.to_container(composed)
     except (HydraException, OmegaConfBaseException, YAMLError) as error:
         raise UserError(" ".join(str(error).split())[:300]) from None
+    except UnicodeError as error:
+        for group, name in chosen:
+            read(group, name)  # raises an error that names the file
+        raise UserError(str(error)) from None
     return values
 
 

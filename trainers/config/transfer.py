@@ -44,7 +44,8 @@ def in_world(config: RunConfig, world: str) -> RunConfig:
     if world == config.world:
         return config
     setup = f"setup={config.setup}"
-    here = flat(to_values(resolve(config.method, [setup, f"world={config.world}"])))
+    # Of this world, only `env` and `evaluation` are compared; any fire will do.
+    here = flat(to_values(resolve(config.method, [setup, f"world={config.world}", "fire=paper"])))
     there = resolve(config.method, [setup, f"world={world}"])
     values = to_values(config)
     del values["baselines"]

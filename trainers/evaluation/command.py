@@ -1,5 +1,6 @@
 """Runs `emberlink eval`: evaluates a run folder and prints a table."""
 
+import hashlib
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -20,6 +21,8 @@ from emberlink.trainers.runs.seal import check_trained_with
 
 _CHANGEABLE = ("comm.", "env.", "world=")
 """beginnings of the settings that can be changed in an evaluation"""
+_MAX_LABEL = 150
+"""characters; a name of a file can have 255"""
 
 
 def evaluate_folder(
@@ -61,8 +64,16 @@ def evaluate_folder(
         label += "_" + re.sub(r"[^\w.=+-]", "-", text)
     config = evaluated_with(config, overrides)
     actor = load_actor(config, checkpoint)
+    label = _shortened(label)
     evaluate_and_print([(run, config, actor, checkpoint)], console, label=label, fires=fires)
     return 0
+
+
+def _shortened(label: str) -> str:
+    """Returns a suffix of file names that a file system accepts; a hash replaces the end."""
+    if len(label) <= _MAX_LABEL:
+        return label
+    return f"{label[: _MAX_LABEL - 9]}_{hashlib.sha256(label.encode()).hexdigest()[:8]}"
 
 
 def evaluate_and_print(

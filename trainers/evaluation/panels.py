@@ -13,6 +13,7 @@ from torchrl.envs import TransformedEnv
 from emberlink.envs.fire.generator import load_scenario, scenarios
 from emberlink.envs.scenarios import ScenarioConfig, fires_of
 from emberlink.envs.utils.errors import UserError
+from emberlink.envs.utils.validation import is_index, shown
 from emberlink.envs.wildfire import WildfireEnv
 from emberlink.policies.scripted.registry import SCRIPTED
 from emberlink.trainers.build import build_env
@@ -166,10 +167,10 @@ def find_fire(text: str | int | None, run: RunConfig) -> tuple[str, ScenarioConf
     )
     known = dict.fromkeys([*scenarios(), *evaluated])
     if name not in known:
-        raise UserError(f"fire {name!r} is not known; known: {', '.join(known)}")
-    if not index.isdecimal() or int(index) >= MAX_FIRES:
+        raise UserError(f"fire {shown(name)!r} is not known; known: {', '.join(known)}")
+    if not is_index(index, MAX_FIRES):
         raise UserError(
-            f"fire {text!r}: there is no held-out fire {index!r}; known: 0 to {MAX_FIRES - 1}"
+            f"fire {shown(text)!r}: there is no held-out fire; known: 0 to {MAX_FIRES - 1}"
         )
     return name, evaluated.get(name) or load_scenario(name), int(index)
 

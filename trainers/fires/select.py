@@ -13,7 +13,7 @@ from emberlink.envs.fire_files.config import FileFireConfig
 from emberlink.envs.fire_files.reader import read_with_summary
 from emberlink.envs.scenarios import fires_of
 from emberlink.envs.utils.errors import UserError
-from emberlink.envs.utils.validation import shown, unknown
+from emberlink.envs.utils.validation import is_index, shown, unknown
 from emberlink.envs.world.burning import split_times
 from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.config.schema import MAX_FIRES, RunConfig
@@ -65,8 +65,10 @@ def find_fire(text: str, overrides: Sequence[str]) -> SelectedFire:
     path = Path(name)
     config = from_file(path, overrides)
     fires, summary = read(config)
-    if not index.isdecimal() or int(index) >= len(fires):
-        raise UserError(f"{shown(text)}: there is no fire {index!r}; known: 0 to {len(fires) - 1}")
+    if not is_index(index, len(fires)):
+        raise UserError(
+            f"{shown(text)}: there is no fire {shown(index)!r}; known: 0 to {len(fires) - 1}"
+        )
     several, shortened = len(fires) > 1, shown(path.name)
     return SelectedFire(
         title=f"{shortened}, fire {index} of {len(fires)}" if several else shortened,
@@ -78,9 +80,9 @@ def find_fire(text: str, overrides: Sequence[str]) -> SelectedFire:
 
 
 def _test_fire(config: RunConfig, text: str, index: str) -> Tensor:
-    if not index.isdecimal() or int(index) >= MAX_FIRES:
+    if not is_index(index, MAX_FIRES):
         raise UserError(
-            f"{shown(text)}: there is no test fire {index!r}; known: 0 to {MAX_FIRES - 1}"
+            f"{shown(text)}: there is no test fire {shown(index)!r}; known: 0 to {MAX_FIRES - 1}"
         )
     fire = fires_of(config.fire).test_fire(int(index), config.env.grid, config.env.horizon)
     return split_times(fire)[0][0]

@@ -26,6 +26,8 @@ from emberlink.trainers.runs.run_folder import RunFolder
 from emberlink.trainers.runs.seal import check_trained_with, to_header
 
 PREFIX = "pretrained:"
+_COPY = "pretrained"
+"""beginning of the names of copies in an output folder"""
 USUAL_SETUPS = ("tuned", "strong_front")
 """where a method without a setup is looked for, in this order"""
 
@@ -52,7 +54,7 @@ def open_run(text: str, output: Path | str = "runs") -> RunFolder:
     if not is_name(text):
         return RunFolder(text)
     source = find_one(text)
-    target = Path(output) / "_".join(["pretrained", *source.parts[-3:]])
+    target = Path(output) / "_".join([_COPY, *source.parts[-3:]])
     if not target.exists():
         try:
             _copy(source, target)
@@ -63,6 +65,11 @@ def open_run(text: str, output: Path | str = "runs") -> RunFolder:
             f"{target}: holds other networks than {text} of this version of emberlink; move it away"
         )
     return RunFolder(target)
+
+
+def is_copy(folder: Path) -> bool:
+    """Returns whether a run folder has the name of a copy that `open_run` makes."""
+    return folder.name.startswith(f"{_COPY}_")
 
 
 def _is_copy(source: Path, target: Path) -> bool:
@@ -184,9 +191,12 @@ def _copy(source: Path, target: Path) -> None:
     """Copies a folder completely or not at all."""
     target.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=target.parent, prefix=".pretrained") as partial:
-        # Without file modes, since an installed package may be read-only.
-        shutil.copytree(source, Path(partial) / "run", copy_function=shutil.copyfile)
-        (Path(partial) / "run").rename(target)
+        # Without modes, since an installed package may be read-only.
+        for file in (path for path in source.rglob("*") if path.is_file()):
+            copy = Path(partial, "run", file.relative_to(source))
+            copy.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(file, copy)
+        Path(partial, "run").rename(target)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

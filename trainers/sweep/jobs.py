@@ -12,6 +12,7 @@ from hydra.errors import HydraException
 
 from emberlink.configs import known
 from emberlink.envs.utils.atomic_io import inner_folder
+from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.publish import free_name
 from emberlink.trainers.config.compose import flat, resolve, to_values
 from emberlink.trainers.config.schema import NOT_LEARNT_WITH, RunConfig
@@ -148,8 +149,10 @@ class Job:
 
         Each start of the training resumes these runs.
         """
-        config = resolve(self.method, self.overrides)
-        configs = [replace(config, seed=seed) for seed in config.seeds or (config.seed,)]
+        seeds = tuple(config.seed for config in self.configs)
+        stack = seeds if len(seeds) > 1 else ()
+        # Not of the arguments: YAML files may have changed since.
+        configs = [replace(config, seeds=stack) for config in self.configs]
         RunFolders.create(configs, [folder_name(config) for config in configs]).close()
         return len(configs)
 
@@ -208,6 +211,8 @@ def jobs_of(arguments: Sequence[str]) -> list[Job]:
         if configs:
             swept = tuple(text for text in overrides if key_of(text) in several)
             jobs.append(job_for(configs, overrides, swept))
+    if not jobs:
+        raise UserError("no run: a key has no value, as in seed=range(3,3)")
     return jobs
 
 
@@ -265,6 +270,6 @@ def _values(text: str) -> list[str]:
         if parsed.is_sweep_override():
             key = parsed.get_key_element()
             return [f"{key}={value}" for value in parsed.sweep_string_iterator()]
-    except HydraException:
+    except (HydraException, ValueError, RecursionError):
         pass  # `resolve` raises the error
     return [text]

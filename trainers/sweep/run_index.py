@@ -2,8 +2,9 @@
 
 from pathlib import Path
 
+from emberlink.trainers.runs import pretrained
 from emberlink.trainers.runs.run_folder import RunFolder
-from emberlink.trainers.sweep.jobs import FoundRun, Identity, identity
+from emberlink.trainers.sweep.jobs import FoundRun, Identity, identity, is_finished
 
 
 class RunIndex:
@@ -13,7 +14,8 @@ class RunIndex:
         output: folder of the run folders; it may not exist yet.
 
     Attributes:
-        runs: the newest run of each identity.
+        runs: identity -> a finished run, or the last one by name; without copies of the package's
+            trained policies.
         unreadable: path -> reason for each folder whose config.yaml cannot be read.
     """
 
@@ -31,7 +33,7 @@ class RunIndex:
     def update(self) -> None:
         """Reads the configurations of new folders."""
         for file in sorted(self.output.glob("*/config.yaml")):
-            if file.parent not in self._read:
+            if file.parent not in self._read and not pretrained.is_copy(file.parent):
                 self._read.add(file.parent)
                 self._add(RunFolder(file.parent))
 
@@ -42,4 +44,6 @@ class RunIndex:
         except ValueError as error:
             self.unreadable[run.path] = str(error)
             return
-        self.runs[identity(config)] = FoundRun(run, config.seeds)
+        known = self.runs.get(identity(config))
+        if known is None or not is_finished(known.folder, config):
+            self.runs[identity(config)] = FoundRun(run, config.seeds)

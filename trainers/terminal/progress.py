@@ -46,6 +46,9 @@ class TimeLeft:
             step: number of the step.
             updates: number of updates so far.
         """
+        if self._recent and step < self._recent[-1][1]:  # after a rollback
+            self._start = None
+            self._recent.clear()
         if self._start is None and (updates > 0 or not self._learns):
             self._start = now, step
         self._recent.append((now, step))

@@ -83,9 +83,9 @@ def restore(
     Raises:
         UserError: the tensors do not fit the setup, or are not finite.
     """
-    if name := first_non_finite(tensors):
-        raise UserError(f"{path}: {name} holds NaN or infinite numbers")
     try:
+        if name := first_non_finite(tensors):
+            raise UserError(f"{name} holds NaN or infinite numbers")
         _check_teams(setup, run)
         _check_margins(setup, tensors)
         setup.load_state_dict(tensors, run.step)

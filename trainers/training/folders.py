@@ -7,10 +7,12 @@ from typing import Any
 
 from emberlink.envs.scenarios import fires_of
 from emberlink.envs.utils.errors import UserError
+from emberlink.envs.utils.validation import printable
 from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.runs.lock import Lock
 from emberlink.trainers.runs.run_folder import RunFolder
 from emberlink.trainers.runs.safe_read import MAX_YAML, parse_json, read_text
+from emberlink.trainers.runs.seal import MAY_CHANGE
 
 LINES = ("metrics.jsonl", "timing.jsonl")
 """files of a run folder with a line for each episode"""
@@ -66,8 +68,8 @@ class RunFolders:
 
     @property
     def names(self) -> list[str]:
-        """The names of the folders."""
-        return [run.path.name for run in self.runs]
+        """The names of the folders, with escapes for characters that cannot be printed."""
+        return [printable(run.path.name) for run in self.runs]
 
     def sizes(self) -> list[dict[str, int]]:
         """Flushes the files `LINES` of each folder to the disk and returns their sizes."""
@@ -174,7 +176,9 @@ def check_seeds(runs: Sequence[RunFolder], config: RunConfig) -> None:
         if not run.has_config():
             continue
         other = run.config(device=config.device)
-        if replace(other, seed=config.seed) != config:
+        # A resume may have ended after it changed some of the files.
+        free = {key: getattr(config, key) for key in (*MAY_CHANGE, "evaluation")}
+        if replace(other, seed=config.seed, **free) != config:
             raise UserError(f"{run.path / 'config.yaml'}: not of the run of {runs[0].path}")
         if other.seed != seed:
             raise UserError(f"{run.path / 'config.yaml'}: seed={other.seed}, not {seed}")

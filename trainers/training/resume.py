@@ -1,7 +1,8 @@
 """Resumes a stopped run exactly where its newest checkpoint was made."""
 
 import shlex
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -30,7 +31,7 @@ def resume(path: Path, method: str | None = None, overrides: Sequence[str] = ())
         overrides: texts `key=value`, of keys that do not affect learning.
 
     Raises:
-        UserError: the run cannot be resumed; no file has changed.
+        UserError: the run cannot be resumed, and no file has changed; or a file cannot be written.
     """
     chosen = path if path.suffix == ".safetensors" else None
     runs = find_runs(path.absolute().parent.parent if chosen else path)
@@ -46,18 +47,17 @@ def resume(path: Path, method: str | None = None, overrides: Sequence[str] = ())
             # With the intervals of the run so far; those of now may be shorter.
             _check_beginning(runs, before)
         trainer = Trainer(config)
-        sizes = _restore(trainer, runs, chosen)
+        sizes = _restore(trainer, folders, chosen)
         folders.check_lines(sizes, trainer.setup.episode)
         # All checks have passed; files are changed from here on.
         folders.cut_back(sizes, trainer.setup.step)
         for run, run_config in zip(runs, folders.configs, strict=True):
-            if overrides or not run.has_config():
+            # An earlier resume may have ended between the files of two seeds.
+            if overrides or len(runs) > 1 or not run.has_config():
                 run.write_config(run_config)
         trainer.folders = folders
         if trainer.setup.step:
-            trainer.saved = trainer.setup.step
-            # Also removes a checkpoint too many, if the run was killed before the removal.
-            trainer.save_networks()
+            _save(trainer)
     except BaseException:
         folders.close()
         raise
@@ -98,8 +98,9 @@ def _changed(config: RunConfig, method: str | None, overrides: Sequence[str]) ->
     return changed
 
 
-def _restore(trainer: Trainer, runs: Sequence[RunFolder], chosen: Path | None) -> Sequence[Sizes]:
+def _restore(trainer: Trainer, folders: RunFolders, chosen: Path | None) -> Sequence[Sizes]:
     """Restores the training from a checkpoint and returns the file sizes of the checkpoint."""
+    runs = folders.runs
     states = runs[0].states()
     if chosen is None and not states:
         if runs[0].networks():
@@ -111,20 +112,39 @@ def _restore(trainer: Trainer, runs: Sequence[RunFolder], chosen: Path | None) -
         warm_start.start(trainer.setup.learner, trainer.config)
         return empty(runs)
     path = chosen or states[-1]
-    try:
+    with _naming_the_older(states, path):
         state, tensors = checkpoints.read(path)
-        check_same(path, state.config, trainer.config)
-        if state.step > trainer.setup.total_steps:
-            done = state.step / trainer.config.env.horizon
-            raise UserError(f"episodes={trainer.config.episodes}: the run has done {done:g}")
+    check_same(path, state.config, trainer.config)
+    if state.step > trainer.setup.total_steps:
+        done = state.step / trainer.config.env.horizon
+        raise UserError(f"episodes={trainer.config.episodes}: the run has done {done:g}")
+    with _naming_the_older(states, path):
         trainer.restore(path, state, tensors)
+    if len(runs) > 1 and state.folders != folders.names:
+        raise UserError(
+            f"{path}: was saved for other run folders: {shown(', '.join(state.folders))}"
+        )
+    return state.sizes
+
+
+@contextmanager
+def _naming_the_older(states: Sequence[Path], path: Path) -> Iterator[None]:
+    """Adds the checkpoint before `path` to the message that `path` is damaged."""
+    try:
+        yield
     except UserError as error:
         older = [state for state in states if 0 <= step_of(state) < step_of(path)]
         argument = shlex.quote(f"resume={older[-1]}") if older else ""
         hint = f"; the one before it: emberlink train {argument}" if older else ""
         raise UserError(f"{error}{hint}") from None
-    if len(runs) > 1 and state.folders != [run.path.name for run in runs]:
-        raise UserError(
-            f"{path}: was saved for other run folders: {shown(', '.join(state.folders))}"
-        )
-    return state.sizes
+
+
+def _save(trainer: Trainer) -> None:
+    """Writes what is missing of the checkpoint that was restored."""
+    step = trainer.setup.step
+    if trainer.run.state(step).exists():
+        trainer.saved = step
+        # Also removes a checkpoint too many, if the run was killed before the removal.
+        trainer.save_networks()
+    else:  # a state of another name was restored
+        trainer.save()

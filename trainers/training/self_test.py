@@ -23,7 +23,7 @@ _TINY = ("env.horizon=40", "env.num_uavs=3", "episodes=1", "num_envs=2", "learne
 def doctor(console: Console) -> int:
     """Prints versions and devices, runs the self-test, and returns 0 if it passed, else 1."""
     console.print(f"python {platform.python_version()} on {platform.platform()}")
-    console.print(", ".join(f"{name} {version(name)}" for name in _PACKAGES), soft_wrap=True)
+    console.print(", ".join(map(_installed, _PACKAGES)), soft_wrap=True)
     gpus = [torch.cuda.get_device_name(i) for i in range(torch.cuda.device_count())]
     console.print(
         f"devices: cpu ({torch.get_num_threads()} threads), {', '.join(gpus) or 'no GPU'}"
@@ -41,6 +41,14 @@ def doctor(console: Console) -> int:
     seconds = time.monotonic() - began
     console.print(f"self-test: {failures} of {len(checks)} failed, {seconds:.1f} s")
     return int(failures > 0)
+
+
+def _installed(name: str) -> str:
+    """Returns the name and version of a package."""
+    try:
+        return f"{name} {version(name)}"
+    except PackageNotFoundError:
+        return f"{name} not installed"
 
 
 def _geo() -> str:

@@ -104,10 +104,17 @@ class SweepFolder:
         for number, content in enumerate(complete.splitlines(), 1):
             try:
                 line = parse_json(content)
-                if not set(line) >= _NEEDED:
+                if not set(line) >= _NEEDED or not _has_numbers(line):
                     raise KeyError(number)
                 lines[World(**{name: line[name] for name in World._fields})] = line
             except (ValueError, KeyError, TypeError):
                 raise UserError(f"{path}: line {number} is not of a sweep of worlds") from None
         JsonLines(self.path).cut(_LINES, len(complete.encode()))
         return lines
+
+
+def _has_numbers(line: Line) -> bool:
+    """Returns whether a line has its gains with errors, and the means of four policies."""
+    parts = [line[key] for key in ("gain", "gain_all", "headline")]
+    numbers = all(isinstance(number, int | float) for part in parts for number in part)
+    return numbers and [*map(len, parts)] == [2, 2, 4]

@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+from importlib.metadata import PackageNotFoundError
 from pathlib import Path
 
 import pytest
@@ -15,6 +16,7 @@ from tiny_run import PROGRAM, TINY
 from emberlink.trainers.cli import main
 from emberlink.trainers.runs.checkpoints import step_of
 from emberlink.trainers.runs.run_folder import RunFolder
+from emberlink.trainers.training import self_test
 
 ENDLESS = [*TINY, "episodes=100000"]
 
@@ -263,6 +265,18 @@ def test_an_unknown_kind_gives_one_line(capsys):
         "emberlink list: 'method' is not known; known: methods, setups, worlds, fires, learners, "
         "executors, policies\n"
     )
+
+
+def test_doctor_names_a_package_that_is_not_installed(monkeypatch, capsys):
+    def version(name: str) -> str:
+        if name == "wandb":
+            raise PackageNotFoundError(name)
+        return "1.0"
+
+    monkeypatch.setattr(self_test, "version", version)
+    monkeypatch.setattr(self_test, "known", lambda group: [])
+    assert main.main(["doctor"]) == 0
+    assert "pettingzoo 1.0, wandb not installed, hydra-core 1.0" in capsys.readouterr().out
 
 
 def test_windows_gives_a_one_line_error(monkeypatch, capsys):

@@ -107,6 +107,9 @@ CHECKPOINTS = {
     "metadata that is code": lambda _: safetensors(
         {"__metadata__": {"emberlink": "__import__('os').mkdir('mark')"}}
     ),
+    "numbers of eight bits": lambda _: safetensors(
+        {"actor": {"dtype": "F8_E4M3", "shape": [4], "data_offsets": [0, 4]}}, b"\0" * 4
+    ),
     "names that climb": lambda _: safetensors(
         {"../../mark": {"dtype": "F32", "shape": [1], "data_offsets": [0, 4]}}, b"\0" * 4
     ),
@@ -239,6 +242,7 @@ EVALUATIONS = {
     "pickle": lambda mark: pickle.dumps(Bomb(mark)),
     "deep": lambda _: b"[" * 200_000,
     "huge": lambda _: b'{"seed": ' + b"9" * 100_000 + b"}",
+    "many texts": lambda _: b"[" + b'"",' * 2_000_001 + b'""]',
     "nan": lambda _: (
         b'{"method": "x", "setup": "y", "seed": 0, "start_seed": 0, '
         b'"checkpoint": "z", "fires": 1, "results": {"a": {"b": {"coverage": [NaN]}}}}'
@@ -249,7 +253,8 @@ EVALUATIONS = {
 @pytest.mark.parametrize("kind", EVALUATIONS)
 def test_an_evaluation(kind, run, mark, capsys, tmp_path):
     (run / "eval.json").write_bytes(EVALUATIONS[kind](mark))
-    refused(["compare", str(run), "--output", str(tmp_path / "out")], capsys, mark)
+    error = refused(["compare", str(run), "--output", str(tmp_path / "out")], capsys, mark)
+    assert str(run / "eval.json") in error
     assert not (tmp_path / "out").exists()
 
 

@@ -190,6 +190,7 @@ def test_errors_of_render(tmp_path, capsys):
         ),
         ([run, "--fire", "65536"], ["'65536'", "0 to 65535"]),
         ([run, "--fire=-1"], ["'-1'", "0 to 65535"]),
+        ([run, "--fire", "huygens:" + "9" * 5000], ["0 to 65535"]),
         ([run, "--fire", "paper:x"], ["'paper:x'", "0 to 65535"]),
         ([run, "--fire", ""], ["fire ''"]),
         ([run, "--policy", "zzz"], ["policy 'zzz'", "random_waypoints"]),

@@ -38,6 +38,26 @@ def test_claims_compare_groups_in_which_the_same_was_changed(tmp_path):
     assert "consensus (learner.batch_size=8)" in note
 
 
+def test_a_run_of_ones_own_is_compared_before_a_copy_of_the_packages(tmp_path):
+    for name in ("mine", "pretrained_tuned_consensus_s0"):
+        write_run(tmp_path, "consensus", name=name)
+    comparison = compare([tmp_path])
+    (section,) = comparison.sections
+    (group,) = section.section.groups
+    assert [run.path.name for run in group.runs] == ["mine"]
+    (note,) = [note for note in comparison.notes if "trained twice" in note]
+    assert f"{tmp_path}/mine is used" in note
+
+
+def test_lines_after_the_last_episode_are_not_compared(tmp_path):
+    for seed, episodes in enumerate((2, 3)):
+        run = write_run(tmp_path, "consensus", seed, episodes=episodes)
+        config = (run / "config.yaml").read_text()
+        (run / "config.yaml").write_text(config.replace(f"episodes: {episodes}\n", "episodes: 2\n"))
+    (group,) = only(tmp_path).section.groups
+    assert [len(run.lines) for run in group.runs] == [2, 2]
+
+
 def test_claims_do_not_depend_on_settings_of_communication(tmp_path):
     for seed, setting in enumerate(("comm.agree=true", "comm.agree=false", "env.radio.range=5")):
         write_run(tmp_path, "consensus", seed, overrides=(setting,))

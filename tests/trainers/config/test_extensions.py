@@ -10,7 +10,7 @@ from importlib import metadata
 from pathlib import Path
 
 import pytest
-from own_package import METHOD, SETUP, SETUP_OF_PAGE, write, yaml_files
+from own_package import CONSENSUS_OF_PAGE, METHOD, SETUP, SETUP_OF_PAGE, write, yaml_files
 from tiny_run import TINY
 
 from emberlink import configs
@@ -44,7 +44,12 @@ def test_a_folder_adds_a_method_a_setup_and_a_fire(folder):
     write(folder, {"setup/page.yaml": SETUP_OF_PAGE})
     config = resolve("consensus", ["setup=page"])
     assert (config.env.num_uavs, config.fire.name) == (3, "oil_slick")
-    assert config.env.reward == resolve("consensus", ["setup=tuned"]).env.reward
+    tuned = resolve("consensus", ["setup=tuned"])
+    assert config.env.reward == tuned.env.reward
+    assert (config.learner.gamma, tuned.learner.gamma) == (0.97, 0.9)
+    write(folder, {"setup_method/page_consensus.yaml": CONSENSUS_OF_PAGE})
+    config = resolve("consensus", ["setup=page"])
+    assert (config.comm, config.learner) == (tuned.comm, tuned.learner)
     assert "faint" in scenarios()
     assert load_scenario("faint").head_ros == load_scenario("paper").head_ros
     with pytest.raises(UserError, match=r"comm.name='headcount' is not known; known: consensus"):
@@ -59,6 +64,17 @@ def test_a_duplicate_name_is_an_error(folder):
     with pytest.raises(UserError, match="'tuned_independent' is in several folders"):
         resolve("independent", ["setup=tuned"])
     assert resolve("positional", ["setup=tuned"]).setup == "tuned"
+
+
+@pytest.mark.parametrize("group", ["setup", "setup_method"])
+def test_a_file_that_is_not_utf_8(group, folder):
+    name = {"setup": "small", "setup_method": "small_independent"}[group]
+    file = folder / group / f"{name}.yaml"
+    file.parent.mkdir(exist_ok=True)
+    file.write_bytes(b"# @package _global_\nenv:\n  view_angle: 30  # 30\xb0\n")
+    with pytest.raises(UserError, match=r"codec can't decode byte 0xb0") as error:
+        resolve("independent", ["setup=small"])
+    assert group == "setup_method" or f"{file}: " in str(error.value)
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 import json
 from itertools import pairwise
 
+import numpy as np
 import pytest
 from tiny_run import TINY
 
@@ -10,6 +11,7 @@ from emberlink import trainers
 from emberlink.envs.utils.errors import UserError
 from emberlink.trainers.cli.main import main
 from emberlink.trainers.config.compose import flat, resolve, to_values
+from emberlink.trainers.config.defaults import defaults_of
 from emberlink.trainers.config.transfer import evaluated_with, in_world
 
 ROUND = ("paper", "front", "relay", "blackout", "swarm", "paper", "relay", "front", "paper")
@@ -42,6 +44,17 @@ def test_a_radio_of_the_run_holds_for_the_methods_of_scripted_policies_too():
     expected = resolve("maps", ["setup=tuned", "world=paper", "env.radio.loss=0.3"])
     assert moved.baselines["consensus"].radio.loss == 0.3
     assert moved.baselines == expected.baselines
+
+
+def test_a_run_on_a_fire_of_its_own_can_be_moved(tmp_path):
+    np.save(tmp_path / "bank.npy", np.full((4, 60, 60), 5.0, dtype=np.float32))
+    path = f"fire.path={tmp_path}/bank.npy"
+    run = resolve("consensus", ["setup=tuned", "world=file", path, "env.view_angle=40"])
+    moved = in_world(run, "swarm")
+    assert (moved.fire.name, moved.env.num_uavs, moved.env.view_angle) == ("swarm", 24, 40)
+    defaults = defaults_of(run)
+    assert defaults["env.view_angle"] == 30
+    assert not any(key.startswith("fire.") for key in defaults)
 
 
 def test_settings_after_the_world_change_it():

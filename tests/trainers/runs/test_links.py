@@ -7,6 +7,7 @@ outside of the run folder must not change.
 """
 
 import dataclasses
+import errno
 import itertools
 import os
 import re
@@ -208,6 +209,16 @@ def test_only_files_of_a_bounded_size_are_read(tmp_path):
     os.truncate(path, 2**40)  # takes no room
     with pytest.raises(OSError, match="more than 1000 bytes"):
         atomic_io.read_bytes(path, 1000)
+
+
+def test_folders_of_a_file_system_that_cannot_flush_them(tmp_path, monkeypatch):
+    def fsync(handle: int) -> None:
+        if stat.S_ISDIR(os.fstat(handle).st_mode):
+            raise OSError(errno.EINVAL, "Invalid argument")
+
+    monkeypatch.setattr(os, "fsync", fsync)
+    atomic_io.write_bytes(tmp_path / "file", b"content")
+    assert (tmp_path / "file").read_bytes() == b"content"
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -105,6 +105,19 @@ def test_a_name_replaces_a_run_folder(shipped, tmp_path, capsys):
     assert "pretrained_tuned_consensus_s10/figures/side_by_side" in printed.replace("\n", "")
 
 
+def test_a_copy_of_a_read_only_package_can_be_written_to(shipped):
+    source = pretrained.find_one("pretrained:consensus")
+    folders = [source, *(path for path in source.rglob("*") if path.is_dir())]
+    for folder in folders:
+        folder.chmod(0o555)
+    try:
+        run = pretrained.open_run("pretrained:consensus")
+    finally:
+        for folder in folders:
+            folder.chmod(0o755)
+    assert all(path.stat().st_mode & 0o200 for path in (run.path, run.checkpoints))
+
+
 def test_an_existing_copy_is_used_and_kept(shipped, tmp_path):
     run = pretrained.open_run("pretrained:consensus")
     (run.path / "note.txt").write_text("mine")

@@ -116,6 +116,9 @@ def test_all_methods_by_default_and_stacks_of_seeds():
         (["consensus", "fire=file", "fire.path=/no/fire"], "/no/fire"),
         (["maps", "learner=imitation", "policy.hold=7", "env.horizon=20"], "multiple of"),
         (["consensus", *SMALL, "learner.warm_start=nowhere"], "learner.warm_start=nowhere: "),
+        (["consensus", "seed=range(3,3)"], "no run: a key has no value"),
+        (["consensus", "seed=range(0,5,0)"], "seed=range(0,5,0)"),
+        (["consensus", "seed=" + "[" * 600], "'seed="),
         (["consensus", "--jobs", "0"], "--jobs"),
     ],
 )
@@ -220,6 +223,38 @@ def test_finished_runs_are_skipped(tmp_path, capsys):
     assert [run.config().seed for run in runs_in(tmp_path)] == [0, 1]
     assert {file: file.stat().st_mtime_ns for file in first.path.rglob("*")} == before
     assert "2 runs, of which 1 are finished" in capsys.readouterr().out
+
+
+def test_a_finished_run_is_found_beside_an_unfinished_one(tmp_path):
+    settings = ["independent", "episodes=1", f"output={tmp_path}"]
+    (config,) = configs_of([settings[0], *SMALL, *settings[1:]])
+    for name in "abc":
+        run = begin(config)
+        run.path.rename(tmp_path / name)
+    finish(RunFolder(tmp_path / "b"), 1)
+    assert swept(settings) == []
+
+
+def test_a_trained_policy_of_the_package_is_not_the_users_run(tmp_path):
+    settings = ["independent", "episodes=1", f"output={tmp_path}"]
+    (config,) = configs_of([settings[0], *SMALL, *settings[1:]])
+    run = begin(config)
+    finish(run, 1)
+    run.path.rename(tmp_path / "pretrained_tuned_independent_s0")
+    assert swept(settings) == [["new independent 0", "device=cpu"]]
+
+
+def test_yaml_files_that_change_during_a_sweep_do_not_change_its_runs(tmp_path, monkeypatch):
+    file = tmp_path / "mine" / "setup" / "own.yaml"
+    file.parent.mkdir(parents=True)
+    file.write_text("# @package _global_\ndefaults: [tuned]\nlearner: {gamma: 0.5}\n")
+    monkeypatch.setenv("EMBERLINK_CONFIGS", str(tmp_path / "mine"))
+    output = tmp_path / "runs"
+    (job,) = plan(jobs_of(["independent", *SMALL, "setup=own", f"output={output}"]), {})
+    file.write_text("# @package _global_\ndefaults: [tuned]\nlearner: {gamma: 0.6}\n")
+    job.create_folders()
+    (run,) = runs_in(output)
+    assert run.config().learner.gamma == 0.5
 
 
 def test_a_failing_run_does_not_stop_the_others(tmp_path, capsys):
@@ -422,6 +457,8 @@ def test_a_killed_sweep_ends_its_trainings(tmp_path):
         ("executor.cores=2", "'executor.cores' is not known; known: executor.workers"),
         ("executor.workers=0", "executor.workers=0"),
         ("executor.workers=two", "executor.workers=two"),
+        ("executor.workers=2024-13-01", "executor.workers=2024-13-01 is not YAML"),
+        ("executor.workers=" + "9" * 5000, "is not YAML"),
         ("output=a,b", "a sweep has one output folder"),
     ],
 )

@@ -1,7 +1,7 @@
 """Tests that a stopped and resumed run equals the uninterrupted run bit for bit."""
 
 import shutil
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 from weakref import WeakKeyDictionary
@@ -192,6 +192,37 @@ def test_the_folder_of_any_seed_can_be_resumed(tmp_path):
         resume(moved / trainer.run.path.name)
 
 
+def test_a_stack_is_resumed_after_only_one_configuration_was_changed(tmp_path):
+    trainer = until(begun("independent", tmp_path, "seeds=[4,5]"), 25)
+    first, second = trainer.runs
+    first.write_config(replace(first.config(), episodes=5))
+    resume(second.path).close()
+    assert [run.config().episodes for run in trainer.runs] == [5, 5]
+    second.write_config(replace(second.config(), num_envs=3))
+    with pytest.raises(ValueError, match="not of the run of"):
+        resume(first.path)
+
+
+def test_a_folder_with_characters_that_cannot_be_printed_is_resumed_again(paused, tmp_path):
+    folder = paused.rename(tmp_path / "run\u3000one")
+    until(resume(folder), 35)
+    until(resume(folder), 45)
+    for state in RunFolder(folder).states()[:-1]:
+        state.unlink()
+    resume(folder).close()
+
+
+def test_a_state_of_another_name_becomes_a_checkpoint(paused):
+    run = RunFolder(paused)
+    (state,) = run.states()
+    mine = state.rename(state.with_name("state_mine.safetensors"))
+    trainer = resume(mine)
+    trainer.close()
+    assert [path.name for path in run.states()] == ["state_000000030.safetensors"]
+    assert mine.exists()
+    resume(paused).close()
+
+
 def test_metrics_after_the_checkpoint_are_truncated_and_repeated(whole, tmp_path):
     trainer = until(begun("positional", tmp_path, "checkpoint_steps=7"), 45)
     run = trainer.run
@@ -242,11 +273,14 @@ def test_additional_episodes_equal_those_of_a_longer_run(whole, tmp_path):
     ],
 )
 def test_settings_of_the_training_are_kept(overrides, message, paused, capsys):
+    older = RunFolder(paused).states()[0].with_name("state_000000010.safetensors")
+    older.write_bytes(b"")
     before = contents(paused)
     assert main.main(["train", f"resume={paused}", *overrides]) == 2
     error = capsys.readouterr().err
     assert message in error
     assert error.count("\n") == 1
+    assert "the one before it" not in error  # the newest one is not damaged
     assert contents(paused) == before
 
 
@@ -287,6 +321,19 @@ def test_another_version_of_a_package_gives_a_warning(paused, capsys):
     out = " ".join(capsys.readouterr().out.split())
     expected = f"made with torch 1.0 (now {torch.__version__}), vmas 1.4 (now not installed): the"
     assert expected in out
+
+
+def test_a_state_with_numbers_of_eight_bits_is_refused(paused, capsys):
+    def narrow(_, tensors: dict[str, torch.Tensor]) -> None:
+        name = next(name for name, value in tensors.items() if value.is_floating_point())
+        tensors[name] = tensors[name].to(torch.float8_e4m3fn)
+
+    (state,) = RunFolder(paused).states()
+    sealed_again(state, narrow)
+    assert main.main(["train", f"resume={paused}"]) == 2
+    error = capsys.readouterr().err
+    assert f"{state}: does not fit this training: " in error
+    assert error.count("\n") == 1
 
 
 def test_networks_of_an_incomplete_save_are_removed(tmp_path):

@@ -59,5 +59,5 @@ def _value(hint: Any, key: str, text: str) -> Any:
         return text
     try:
         return yaml.safe_load(text)
-    except yaml.YAMLError:
+    except (yaml.YAMLError, ValueError, RecursionError):
         raise UserError(f"executor.{key}={shown(text)} is not YAML") from None
