@@ -43,8 +43,9 @@ class Use(IntEnum):
     SCRIPTED_ACTION = 201
     EXPLORATION_NOISE = 300
     TEACHER = 301
-    # for `fold_in` with a seed; distinct from the indices of environments
+    # for `fold_in` with the seed of a fire
     FIRE_PARAMETER = 0xF12E
+    # for `fold_in` with a seed; distinct from the indices of environments
     REPLAY_SAMPLE = 2**40
     TARGET_NOISE = 2**40 + 1
     MINIBATCH = 2**40 + 2

@@ -355,6 +355,8 @@ def test_pictures_of_other_scales_are_warned_of(imitated, tmp_path):
         prepare("env.altitude=[1.0,5.0]")
     with pytest.warns(UserWarning, match=r"env.view_angle=30.0, this run has 45.0"):
         prepare("env.view_angle=45")
+    with pytest.warns(UserWarning, match=r"env.base=None, this run has \[0.0, 9.0\]"):
+        prepare("env.base=[0,9]")
     with warnings.catch_warnings():
         warnings.simplefilter("error", UserWarning)
         prepare()

@@ -121,7 +121,7 @@ class SequenceSampler(TeamSampler):
         starts = (end - first + self.sequence - 1) * (end > first)
         sums = starts.cumsum(0)
         number, columns = self._draw(-(-batch_size // self.sequence), sums[-1] * self.envs)
-        number, env = number // self.envs, number % self.envs
+        number, env = (number // self.envs).contiguous(), number % self.envs
         place = torch.searchsorted(sums, number, right=True)
         first, end = first[place], end[place]
         drawn = first - (self.sequence - 1) + number - (sums - starts)[place]
@@ -147,5 +147,5 @@ class SequenceSampler(TeamSampler):
         oldest = (self.written - self.rows).clamp(min=0).add(self.envs - 1) // self.envs
         begin = (oldest // self.horizon + self._episode) * self.horizon
         end = torch.minimum(begin + self.horizon, after)
-        first = torch.where(begin >= oldest, begin, torch.maximum(begin, oldest) + self.burn_in)
+        first = torch.where(begin >= oldest, begin, oldest + self.burn_in)
         return first, end
