@@ -49,6 +49,10 @@ def _check_size(size: int) -> None:
         raise UserError(f"{size} bytes; a text file has at most {MAX_BYTES}")
 
 
+class _Link(dict[str, Any]):
+    """An object of JSON whose type is a link."""
+
+
 def _check_json(path: Path) -> None:
     """Parses the whole file, because GDAL returns the features before a damage.
 
@@ -57,14 +61,18 @@ def _check_json(path: Path) -> None:
     _check_length(path)
     links: list[str] = []
 
-    def look(values: dict[str, Any]) -> dict[str, Any]:
-        crs = values.get("crs")
-        if isinstance(crs, dict) and str(crs.get("type")).lower() in ("link", "url"):
-            links.append(str(crs.get("properties"))[:80])
-        return values
+    def look(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        # GDAL does not distinguish upper and lower case. A key may be repeated.
+        links.extend(
+            str(value)[:80]
+            for key, value in pairs
+            if key.lower() == "crs" and isinstance(value, _Link)
+        )
+        kinds = [str(value).lower() for key, value in pairs if key.lower() == "type"]
+        return _Link(pairs) if {*kinds} & {"link", "url"} else dict(pairs)
 
     try:
-        content = json.loads(path.read_bytes().decode("utf-8-sig"), object_hook=look)
+        content = json.loads(path.read_bytes().decode("utf-8-sig"), object_pairs_hook=look)
     except RecursionError:
         raise UserError("too many levels; expected GeoJSON") from None
     except UnicodeDecodeError as error:

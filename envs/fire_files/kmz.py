@@ -1,4 +1,4 @@
-"""Makes the KML in an archive readable for GDAL, which knows its name in lower case only."""
+"""Names files for GDAL, so that it reads them, and reads them as the format that was checked."""
 
 import tempfile
 import zipfile
@@ -31,8 +31,16 @@ def kml_parts(archive: zipfile.ZipFile) -> list[zipfile.ZipInfo]:
 
 
 @contextmanager
-def for_gdal(path: Path) -> Iterator[Path]:
-    """Yields the path of a file, or of a copy of the KML if GDAL would not find it in a KMZ."""
+def for_gdal(path: Path) -> Iterator[Path | str]:
+    """Yields what GDAL is to open.
+
+    This is the path of a file, or that of a copy of the KML if GDAL would not find it in a KMZ, as
+    its suffix is in upper case. GeoJSON gets a prefix: without it, a text in the file could make
+    GDAL take it for another format, such as one that names other files to read.
+    """
+    if path.suffix.lower() in (".geojson", ".json"):
+        yield f"GeoJSON:{path.absolute()}"
+        return
     if path.suffix.lower() == ".kmz":
         with zipfile.ZipFile(path) as archive:
             part = kml_parts(archive)[0]

@@ -201,17 +201,51 @@ def test_the_files_of_a_folder_may_have_different_projections(tmp_path, frame):
 
 
 @pytest.mark.parametrize("place", ["collection", "geometry"])
-@pytest.mark.parametrize("kind", ["link", "Url"])
-def test_a_linked_projection_is_not_fetched(tmp_path, frame, place, kind, monkeypatch):
+@pytest.mark.parametrize("key", ["crs", "CRS"])
+@pytest.mark.parametrize("kind", [("type", "link"), ("type", "Url"), ("Type", "link")])
+def test_a_linked_projection_is_not_fetched(tmp_path, frame, place, kind, key, monkeypatch):
     """The owner of a file would learn who reads it."""
     monkeypatch.setenv("GDAL_HTTP_TIMEOUT", "1")  # so that a fetch would not block
     content = json.loads(frame.to_json())
     with socket.create_server(("127.0.0.1", 0)) as server:
         address = f"http://127.0.0.1:{server.getsockname()[1]}/crs"
         place = content if place == "collection" else content["features"][0]["geometry"]
-        place["crs"] = {"type": kind, "properties": {"href": address, "url": address}}
-        (tmp_path / "fire.geojson").write_text(json.dumps(content))
-        assert "its crs is a link: {'href': 'http" in refused(tmp_path / "fire.geojson")
+        place.pop("crs", None)
+        place[key] = {kind[0]: kind[1], "properties": {"href": address, "url": address}}
+        name = '"crs": {"type": "name", "properties": {"name": "EPSG:4326"}}'
+        text = json.dumps(content)
+        for repeated in ("", f"{name}, ", f", {name}"):
+            start, end = text.index(f'"{key}"'), text.index("}}", text.index(f'"{key}"')) + 2
+            linked = text[start:end]
+            both = linked + repeated if repeated.startswith(",") else repeated + linked
+            (tmp_path / "fire.geojson").write_text(text[:start] + both + text[end:])
+            assert "its crs is a link: {'" in refused(tmp_path / "fire.geojson")
+        server.setblocking(False)
+        with pytest.raises(BlockingIOError):
+            server.accept()
+
+
+VRT = "<OGRVRTDataSource><OGRVRTLayer name='OGRGeoJSON'>{}"
+PDS4 = "<Product_Observational xmlns='http://pds.nasa.gov/pds4/pds/v1'>{}"
+
+
+@pytest.mark.parametrize("text", [VRT, PDS4])
+def test_a_text_does_not_make_geojson_another_format(text, tmp_path, frame, monkeypatch):
+    """A format of GDAL, VRT, names other files and addresses from which features are read."""
+    monkeypatch.setenv("GDAL_HTTP_TIMEOUT", "1")
+    frame.to_file(tmp_path / "plain.geojson")
+    content = json.loads((tmp_path / "plain.geojson").read_text())
+    frame.assign(geometry=frame.buffer(0.1)).to_file(tmp_path / "secret.gpkg", layer="secret")
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        network = f"/vsicurl/http://127.0.0.1:{server.getsockname()[1]}/x.geojson"
+        for source in (str(tmp_path / "secret.gpkg"), network):
+            link = f"<SrcDataSource>{source}</SrcDataSource><SrcLayer>secret</SrcLayer>"
+            layer = text.format(f"{link}</OGRVRTLayer></OGRVRTDataSource>")
+            hostile = {"type": content.pop("type"), "description": layer, **content}
+            content["type"] = hostile["type"]
+            (tmp_path / "fire.geojson").write_text(json.dumps(hostile))
+            fire = read(tmp_path / "fire.geojson")
+            assert fire.equal(read(tmp_path / "plain.geojson"))
         server.setblocking(False)
         with pytest.raises(BlockingIOError):
             server.accept()
