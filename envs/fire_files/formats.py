@@ -1,7 +1,6 @@
 """Finds the format of a file by its name and its first bytes, which must agree."""
 
 import hashlib
-import json
 import os
 import re
 import sqlite3
@@ -15,7 +14,7 @@ from pathlib import Path
 from typing import Any
 from xml.parsers import expat
 
-from emberlink.envs.fire_files.kmz import kml_parts
+from emberlink.envs.fire_files.gdal_files import check_geojson, kml_parts
 from emberlink.envs.fire_files.sidecars import check_sidecars, read_beside
 from emberlink.envs.utils.errors import UserError
 
@@ -49,40 +48,9 @@ def _check_size(size: int) -> None:
         raise UserError(f"{size} bytes; a text file has at most {MAX_BYTES}")
 
 
-class _Link(dict[str, Any]):
-    """An object of JSON whose type is a link."""
-
-
 def _check_json(path: Path) -> None:
-    """Parses the whole file, because GDAL returns the features before a damage.
-
-    A link to a projection is refused, because GDAL would fetch it from the network.
-    """
     _check_length(path)
-    links: list[str] = []
-
-    def look(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-        # GDAL does not distinguish upper and lower case. A key may be repeated.
-        links.extend(
-            str(value)[:80]
-            for key, value in pairs
-            if key.lower() == "crs" and isinstance(value, _Link)
-        )
-        kinds = [str(value).lower() for key, value in pairs if key.lower() == "type"]
-        return _Link(pairs) if {*kinds} & {"link", "url"} else dict(pairs)
-
-    try:
-        content = json.loads(path.read_bytes().decode("utf-8-sig"), object_pairs_hook=look)
-    except RecursionError:
-        raise UserError("too many levels; expected GeoJSON") from None
-    except UnicodeDecodeError as error:
-        raise UserError(f"byte {error.start} is not UTF-8; expected GeoJSON in UTF-8") from None
-    except ValueError as error:
-        raise UserError(f"{error}; expected GeoJSON") from None
-    if links:
-        raise UserError(f"its crs is a link: {links[0]}; expected one with a name, or none")
-    if content.get("type") not in ("FeatureCollection", "Feature"):
-        raise UserError(f"type {str(content.get('type'))[:40]!r}; expected a FeatureCollection")
+    check_geojson(path.read_bytes())
 
 
 def _check_kml(path: Path) -> None:
@@ -126,10 +94,24 @@ def _check_sqlite(path: Path) -> None:
         uri = f"{path.absolute().as_uri()}?mode=ro&immutable=1"
         with closing(sqlite3.connect(uri, uri=True)) as database:
             result = database.execute("PRAGMA integrity_check(1)").fetchone()
+            _check_counts(database)
     except sqlite3.Error as error:
         raise UserError(f"{error}; expected a GeoPackage") from None
     if result != ("ok",):
         raise UserError(f"{str(result[0])[:100]}; expected a whole GeoPackage")
+
+
+def _check_counts(database: sqlite3.Connection) -> None:
+    """Checks the stored numbers of features, because only as many are read."""
+    kinds = "SELECT name FROM sqlite_master WHERE type = 'table'"
+    if ("gpkg_ogr_contents",) not in database.execute(kinds).fetchall():
+        return
+    stored = "SELECT table_name, feature_count FROM gpkg_ogr_contents"
+    for name, count in database.execute(stored).fetchall():
+        quoted = str(name).replace('"', '""')
+        (actual,) = database.execute(f'SELECT count(*) FROM "{quoted}"').fetchone()
+        if count is not None and count != actual:
+            raise UserError(f"layer {str(name)[:60]!r} has {actual} features and says {count}")
 
 
 def _check_shapefile(path: Path) -> None:

@@ -15,7 +15,7 @@ from emberlink.envs.config import SIDES
 from emberlink.envs.fire_files.config import Clock, Units
 from emberlink.envs.fire_files.projection import first_line
 from emberlink.envs.fire_files.raster_source import RasterSource, check_spreads
-from emberlink.envs.fire_files.rasters import clean, open_raster
+from emberlink.envs.fire_files.rasters import check_blocks, clean, open_raster
 from emberlink.envs.utils.errors import UserError
 
 MAX_CELLS = 300_000_000
@@ -74,6 +74,9 @@ def read_geotiff_bank(path: Path) -> Bank | None:
         _check_size(dataset.count, dataset.width, dataset.height)
         if np.dtype(dataset.dtypes[0]).kind not in "iuf":
             raise UserError(f"values of type {dataset.dtypes[0]}; expected numbers")
+        if {*dataset.scales} != {1.0} or {*dataset.offsets} != {0.0}:
+            raise UserError("scaled values; expected a bank without scale and offset")
+        check_blocks(dataset)
         nodata, bands = dataset.nodata, dataset.read()
     fires = bands if nodata is None else [np.where(band == nodata, np.inf, band) for band in bands]
     return Bank(fires, _horizon(tags))
@@ -145,7 +148,7 @@ def _facts(path: Path) -> Any:
 def _horizon(facts: Any) -> int | None:
     try:
         return int(facts["horizon"])
-    except (KeyError, TypeError, ValueError):
+    except (KeyError, TypeError, ValueError, OverflowError):
         return None
 
 

@@ -90,6 +90,19 @@ def doubts_of_growth(times: np.ndarray, cell: tuple[float, float], unit: Units) 
         yield f"the fire would spread by {radius / minutes * 0.06:.3g} km/h on all sides"
 
 
+def begins_at_zero(times: np.ndarray) -> bool:
+    """Returns whether the first cell burns no later than the front takes to cross a cell.
+
+    Args:
+        times: arrival times, [rows, columns], inf for never.
+    """
+    first = times.min()
+    row, column = np.unravel_index(times.argmin(), times.shape)
+    around = times[max(row - 1, 0) : row + 2, max(column - 1, 0) : column + 2]
+    later = around[np.isfinite(around) & (around > first)]
+    return bool(0 <= first <= (later - first).max(initial=0.0))
+
+
 def beginnings(times: np.ndarray) -> int:
     """Returns the number of places that burn before all cells around them.
 

@@ -1,4 +1,4 @@
-"""Imports the libraries of the extra `geo`, and chooses projections onto a plane."""
+"""Imports the libraries of the extra `geo`, and chooses and applies projections onto a plane."""
 
 import importlib
 import logging
@@ -17,6 +17,10 @@ from emberlink.envs.utils.errors import UserError, how_to_install
 
 Bounds = tuple[float, float, float, float]
 """Minimum x, minimum y, maximum x, maximum y."""
+
+Affine = tuple[float, float, float, float, float, float]
+"""(a, b, c, d, e, f): the outer corners of cells are at x = a column + b row + c and
+y = d column + e row + f."""
 
 _LOGGERS = ("rasterio", "pyogrio", "fiona", "shapely", "pyproj")
 _DEGREE_CELL = 0.1  # a cell as large as this is 11 km wide if its side is in degrees
@@ -87,6 +91,8 @@ def projections(
         _refuse_degrees(bounds, cell)
         return None
     source = _parse_crs(crs or wanted)
+    if crs and wanted and not (source.is_projected or source.is_geographic):
+        crs, source = None, _parse_crs(wanted)  # a plane of its own: the user knows which it is
     if source.is_geographic and not _in_degrees(bounds):
         raise UserError(
             f"coordinates from {bounds[:2]} to {bounds[2:]} are not degrees, which "
@@ -94,13 +100,14 @@ def projections(
         )
     if source.is_geographic and not -180 <= bounds[0] <= bounds[2] <= 180:
         raise UserError(
-            f"longitudes from {bounds[0]:g} to {bounds[2]:g}: the fire is across 180 degrees; "
-            "expected a file in metres"
+            f"longitudes from {bounds[0]:g} to {bounds[2]:g}; expected -180 to 180, or a file in "
+            "metres for a fire across 180 degrees"
         )
     if crs and wanted:
         target = _parse_crs(wanted)
-        if target.is_geographic:
-            raise UserError(f"fire.crs={wanted} is in degrees; expected one in metres, as UTM is")
+        if not target.is_projected:
+            what = "in degrees" if target.is_geographic else "not one of a map"
+            raise UserError(f"fire.crs={wanted} is {what}; expected one in metres, as UTM is")
         return source, target
     return (source, _utm(bounds)) if source.is_geographic else None
 
@@ -167,3 +174,47 @@ def read_prj(path: Path) -> Any:
         raise
     except (pyproj.exceptions.CRSError, ValueError):
         return check_projection(path, None)
+
+
+def warped(
+    times: np.ndarray, affine: Affine, chosen: tuple[Any, Any] | None, max_cells: int
+) -> tuple[np.ndarray, Affine]:
+    """Projects times and rotates the raster north up, on cells of half the size.
+
+    Times are interpolated between burnt cells. A point in a cell that never burns stays inf.
+
+    Raises:
+        UserError: the result would have more than `max_cells` cells.
+    """
+    rasterio = library("rasterio")
+    vrt = library("rasterio.vrt").WarpedVRT
+    source, target = chosen or ("EPSG:3857", "EPSG:3857")  # any plane: only rotated
+    about = {
+        "height": times.shape[0],
+        "width": times.shape[1],
+        "transform": rasterio.Affine(*affine),
+    }
+    with rasterio.MemoryFile() as memory:
+        with memory.open(
+            "GTiff", count=1, dtype="float64", crs=source, nodata=math.nan, **about
+        ) as dataset:
+            dataset.write(np.where(np.isfinite(times), times, np.nan), 1)
+        with memory.open() as dataset:
+            with vrt(dataset, crs=target) as view:
+                size = {"width": 2 * view.width, "height": 2 * view.height}
+                if math.prod(size.values()) > max_cells:
+                    raise UserError(
+                        f"{size['width']} x {size['height']} cells after its projection to a "
+                        f"plane; at most {max_cells} are read; expected a part of the file, or "
+                        "one in metres"
+                    )
+                transform = view.transform @ rasterio.Affine.scale(0.5)
+            sampled = []
+            for method in ("nearest", "bilinear"):
+                resampling = rasterio.enums.Resampling[method]
+                with vrt(
+                    dataset, crs=target, transform=transform, resampling=resampling, **size
+                ) as view:
+                    sampled.append(view.read(1))
+    inside, between = (np.where(np.isnan(values), np.inf, values) for values in sampled)
+    return np.where(np.isinf(inside) | np.isinf(between), inside, between), transform[:6]

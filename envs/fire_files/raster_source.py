@@ -53,6 +53,12 @@ class Window:
         x, y = self.x - border[0] * side, self.y - border[1] * side
         return replace(self, x=x, y=y, side=side, grid=grid)
 
+    def contains(self, bounds: Bounds) -> bool:
+        """Returns whether all of an area with some bounds is within the window."""
+        right, upper = self.x + self.grid[0] * self.side, self.y + self.grid[1] * self.side
+        x0, y0, x1, y1 = bounds
+        return self.x <= x0 and self.y <= y0 and x1 <= right and y1 <= upper
+
     def centres(self) -> tuple[np.ndarray, np.ndarray]:
         """Returns x [X] and y [Y] of the cells' centres."""
         columns, rows = (np.arange(count) + 0.5 for count in self.grid)
@@ -114,6 +120,8 @@ class RasterSource:
         whole: as in `Source`.
         name: name of the values in the file, for messages.
         doubts: signs, known already, that these are not arrival times.
+        from_zero: whether the fire began at time 0, before the centre of the first cell burnt, if
+            the times are neither steps nor dates; see `begins_at_zero`.
     """
 
     def __init__(
@@ -125,6 +133,7 @@ class RasterSource:
         whole: bool = False,
         name: str = "",
         doubts: Sequence[str] = (),
+        from_zero: bool = False,
     ):
         rows, columns = times.shape
         x, y = corner
@@ -133,7 +142,8 @@ class RasterSource:
         self._corner, self._cell, self._name, self._doubts = corner, cell, name, doubts
         burning = times[np.isfinite(times)]
         self.first, self.last = float(burning.min()), float(burning.max())
-        self.began = 0.0 if self._from_zero() else self.first
+        from_zero = from_zero and clock.unit != "steps" and clock.origin is None
+        self.began = 0.0 if from_zero else self.first
 
     @property
     def summary(self) -> str:
@@ -188,18 +198,6 @@ class RasterSource:
         if fine:
             times = np.where(times == minimum_filter(times, 3), times, np.inf)
         return np.minimum(samples, self._earliest(times, window))
-
-    def _from_zero(self) -> bool:
-        """Tells whether the fire began at time 0, before the centre of the first cell burnt.
-
-        This is assumed if the first cell burns no later than the front takes to cross a cell.
-        """
-        if self.whole or self.clock.unit == "steps" or self.clock.origin is not None:
-            return False
-        row, column = np.unravel_index(self.times.argmin(), self.times.shape)
-        around = self.times[max(row - 1, 0) : row + 2, max(column - 1, 0) : column + 2]
-        later = around[np.isfinite(around) & (around > self.first)]
-        return bool(0 <= self.first <= (later - self.first).max(initial=0.0))
 
     def _centres(self, rows: np.ndarray, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Returns x and y of cells' centres."""

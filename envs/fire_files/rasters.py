@@ -12,8 +12,15 @@ from typing import Any, TextIO
 import numpy as np
 
 from emberlink.envs.fire_files.config import Clock, Units
-from emberlink.envs.fire_files.plausibility import doubts_of_names, doubts_of_values
-from emberlink.envs.fire_files.projection import first_line, library, projections, read_prj
+from emberlink.envs.fire_files.plausibility import begins_at_zero, doubts_of_names, doubts_of_values
+from emberlink.envs.fire_files.projection import (
+    Affine,
+    first_line,
+    library,
+    projections,
+    read_prj,
+    warped,
+)
 from emberlink.envs.fire_files.raster_source import RasterSource, check_spreads
 from emberlink.envs.utils.errors import UserError
 
@@ -30,13 +37,12 @@ _KEYS |= {"nodata_value": "a number"}
 _NEEDED = (("ncols",), ("nrows",), ("cellsize", "dx"), ("cellsize", "dy"))
 _NEEDED += (("xllcorner", "xllcenter"), ("yllcorner", "yllcenter"))
 _DAMAGE = re.compile(r"IO error|tag ignored|TIFFVSetField|(Null|Incorrect) count|_tiff\w+Proc:")
-Affine = tuple[float, float, float, float, float, float]
-"""(a, b, c, d, e, f): the outer corners of cells are at x = a column + b row + c and
-y = d column + e row + f."""
 
 
 def read_geotiff(path: Path, unit: Units | None, crs: str | None) -> RasterSource:
-    """Reads arrival times from a GeoTIFF with one band. The tag units=steps replaces `unit`.
+    """Reads arrival times from a GeoTIFF with one band.
+
+    `unit` is the unit of the times; if it is None, the tag units=steps tells it.
 
     Raises:
         UserError: the file is damaged, is not a raster of times, or has no geotransform.
@@ -68,7 +74,7 @@ def read_ascii(path: Path, unit: Units | None, crs: str | None) -> RasterSource:
         if math.prod(shape) > MAX_CELLS:
             raise UserError(f"{shape[1]} x {shape[0]} cells; at most {MAX_CELLS} are read")
         try:
-            values = np.loadtxt(file, comments=None, ndmin=2)
+            values = np.loadtxt(file, comments=None, ndmin=2, max_rows=math.prod(shape) + 1)
         except ValueError as error:
             raise UserError(
                 f"after {lines} lines of header: {first_line(error).split(';')[0]}; expected "
@@ -168,11 +174,23 @@ def _check_band(dataset: Any) -> None:
             f"{dataset.width} x {dataset.height} cells; at most {MAX_CELLS} are read; expected a "
             "part, such as gdalwarp -te cuts out"
         )
+    check_blocks(dataset)
     if dataset.transform.is_identity:
         raise UserError(
             "no geotransform, so that the place of the cells is not known; expected one, such as "
             "gdal_translate -a_ullr writes"
         )
+
+
+def check_blocks(dataset: Any) -> None:
+    """Checks the size of the blocks of a GeoTIFF, which may be larger than the raster.
+
+    Raises:
+        UserError: a block is too large to read.
+    """
+    rows, columns = dataset.block_shapes[0]
+    if rows * columns > MAX_CELLS:
+        raise UserError(f"blocks of {columns} x {rows} cells; at most {MAX_CELLS} are read")
 
 
 def _read_header(file: TextIO) -> tuple[dict[str, float], int]:
@@ -246,42 +264,14 @@ def _on_plane(
     corners = [(a * u + b * v + c, d * u + e * v + f) for u in (0, columns) for v in (0, rows)]
     x, y = zip(*corners, strict=True)
     chosen = projections(source_crs or None, crs, (min(x), min(y), max(x), max(y)), math.sqrt(area))
+    clock, from_zero = Clock(unit), begins_at_zero(times)  # by the cells of the file
+    if a < 0 and not (b or d):
+        times, a, c = times[:, ::-1], -a, c + columns * a
+    if e > 0 and not (b or d):
+        times, e, f = times[::-1], -e, f + rows * e
     if chosen or b or d or a < 0 or e > 0:
-        times, affine = _warp(times, (a, b, c, d, e, f), chosen)
+        times, affine = warped(times, (a, b, c, d, e, f), chosen, MAX_CELLS)
         a, b, c, d, e, f = affine
-    return RasterSource(times, (c, f), (a, -e), Clock(unit), name=name, doubts=doubts)
-
-
-def _warp(
-    times: np.ndarray, affine: Affine, chosen: tuple[Any, Any] | None
-) -> tuple[np.ndarray, Affine]:
-    """Projects times and rotates the raster north up, on cells of half the size.
-
-    Times are interpolated between burnt cells. A point in a cell that never burns stays inf.
-    """
-    rasterio = library("rasterio")
-    vrt = library("rasterio.vrt").WarpedVRT
-    source, target = chosen or ("EPSG:3857", "EPSG:3857")  # any plane: only rotated
-    about = {
-        "height": times.shape[0],
-        "width": times.shape[1],
-        "transform": rasterio.Affine(*affine),
-    }
-    with rasterio.MemoryFile() as memory:
-        with memory.open(
-            "GTiff", count=1, dtype="float64", crs=source, nodata=math.nan, **about
-        ) as dataset:
-            dataset.write(np.where(np.isfinite(times), times, np.nan), 1)
-        with memory.open() as dataset:
-            with vrt(dataset, crs=target) as warped:
-                size = {"width": 2 * warped.width, "height": 2 * warped.height}
-                transform = warped.transform @ rasterio.Affine.scale(0.5)
-            sampled = []
-            for method in ("nearest", "bilinear"):
-                resampling = rasterio.enums.Resampling[method]
-                with vrt(
-                    dataset, crs=target, transform=transform, resampling=resampling, **size
-                ) as warped:
-                    sampled.append(warped.read(1))
-    inside, between = (np.where(np.isnan(values), np.inf, values) for values in sampled)
-    return np.where(np.isinf(inside) | np.isinf(between), inside, between), transform[:6]
+        check_spreads(times)
+    about = {"name": name, "doubts": doubts, "from_zero": from_zero}
+    return RasterSource(times, (c, f), (a, -e), clock, **about)

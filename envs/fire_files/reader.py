@@ -99,6 +99,10 @@ def _read(
         source = _read_one(path, kind, config)
         fire = on_grid(source, config, grid, horizon)
         return [fire], source.summary, source.doubts
+    if config.units not in (None, "steps") and config.test is None:  # no other file has units
+        raise UserError(f"fire.units={config.units}: a bank is in steps; expected none")
+    if config.minutes_per_step is not None:
+        raise UserError("fire.minutes_per_step: a bank is in steps; expected none, or fire.end")
     _check_horizon(bank.horizon, config, horizon)
     fires: list[np.ndarray] = []
     for times in bank.fires:
@@ -111,7 +115,7 @@ def _read(
 
 def _check_horizon(written: int | None, config: FileFireConfig, horizon: int) -> None:
     """Checks that a bank whose times stay steps was written for this horizon."""
-    in_steps = config.start is config.end is config.minutes_per_step is None
+    in_steps = config.start is config.end is None
     if in_steps and written not in (None, horizon):
         raise UserError(
             f"its fires are of {written} steps, env.horizon is {horizon}; expected "

@@ -1,4 +1,4 @@
-"""Reads perimeters over time: shapefile, GeoJSON, GeoPackage, KML."""
+"""Makes a fire of perimeters over time, and interpolates the front between them."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -8,32 +8,14 @@ import numpy as np
 from scipy.ndimage import distance_transform_edt
 
 from emberlink.envs.fire_files.config import Clock, FileFireConfig
-from emberlink.envs.fire_files.formats import (
-    GEOJSON,
-    KML,
-    KMZ,
-    PERIMETERS,
-    find_format,
-    perimeter_files,
-)
-from emberlink.envs.fire_files.kmz import for_gdal
 from emberlink.envs.fire_files.perimeters.areas import area_at_zero, enclosed, make_valid, polygons
-from emberlink.envs.fire_files.perimeters.kml_times import with_one_time
-from emberlink.envs.fire_files.perimeters.times import known_columns, perimeter_times
-from emberlink.envs.fire_files.projection import (
-    Bounds,
-    check_projection,
-    first_line,
-    library,
-    projections,
-)
+from emberlink.envs.fire_files.perimeters.tables import read_table
+from emberlink.envs.fire_files.perimeters.times import perimeter_times
+from emberlink.envs.fire_files.projection import Bounds, library, projections
 from emberlink.envs.fire_files.raster_source import Window
 from emberlink.envs.utils.errors import UserError
-from emberlink.envs.utils.validation import as_argument, unknown
 
 MAX_TIMES = 500
-_INCIDENTS = ("poly_incidentname", "attr_incidentname", "incidentname", "incident", "fire_name")
-_INCIDENTS += ("firename", "fire_nm")
 _SHRUNK = 0.75  # minimum share of the burnt area that a perimeter inside it has
 _INSIDE = 0.99  # share of a perimeter inside the burnt area, from which it counts as inside
 
@@ -48,7 +30,7 @@ def read_perimeters(path: Path, config: FileFireConfig) -> "PerimeterSource":
     Raises:
         UserError: a file, a feature or a column is wrong.
     """
-    frame = _choose_incident(_read_tables(path, config), config.incident)
+    frame = read_table(path, config)
     times, clock = perimeter_times(frame, config.time_field, config.units)
     distinct = np.unique(times)
     if len(distinct) > MAX_TIMES:
@@ -58,111 +40,6 @@ def read_perimeters(path: Path, config: FileFireConfig) -> "PerimeterSource":
         part = frame[times == time]
         areas.append(enclosed(part.geometry.tolist(), part.index.tolist()))
     return PerimeterSource(_project(frame, areas, config.crs), distinct, clock)
-
-
-def _read_tables(path: Path, config: FileFireConfig) -> Any:
-    """Reads the features of a file, or of all files in a folder.
-
-    The index of the table names the features in messages.
-    """
-    if not path.is_dir():
-        return _read_table(path, config).rename(index="feature {}".format)
-    names, frames = [], []
-    for part in perimeter_files(path):
-        try:
-            if find_format(part) not in PERIMETERS:
-                raise UserError("expected perimeters")
-            frame = _read_table(part, config).rename(columns=str.lower)
-        except UserError as error:
-            raise UserError(f"{part.name}: {error}") from None
-        names.append(part.name)
-        frames.append(frame.rename(index=f"{part.name}: feature {{}}".format))
-    for name, frame in zip(names, frames, strict=True):
-        if (frame.crs is None) != (frames[0].crs is None):
-            without, other = (name, names[0]) if frame.crs is None else (names[0], name)
-            raise UserError(f"{without}: no projection, which {other} has; expected one in each")
-    return _join(frames)
-
-
-def _join(frames: Sequence[Any]) -> Any:
-    """Joins tables, in the projection of the first."""
-    crs = frames[0].crs
-    same = [frame if frame.crs == crs else frame.to_crs(crs) for frame in frames]
-    return library("pandas").concat(same)
-
-
-def _read_table(path: Path, config: FileFireConfig) -> Any:
-    """Reads the features of a file, each of which has a geometry."""
-    pyogrio = library("pyogrio")
-    library("geopandas")
-    suffix = path.suffix.lower()
-    is_json, is_kml = suffix in GEOJSON.suffixes, suffix in (*KML.suffixes, *KMZ.suffixes)
-    # Dates in GeoJSON as text, because GDAL loses zones that differ.
-    options: dict[str, Any] = {"DATE_AS_STRING": "YES"} if is_json else {}
-    try:
-        with for_gdal(path) as source:
-            layers = _choose_layers(pyogrio.list_layers(source), config.layer, several=is_kml)
-            options["datetime_as_string"] = True
-            parts = [pyogrio.read_dataframe(source, layer=name, **options) for name in layers]
-        frame = _join(parts).reset_index(drop=True)
-    except UserError:
-        raise
-    except Exception as error:  # GDAL, text and geometries raise many types
-        if isinstance(error, pyogrio.errors.CRSError):
-            check_projection(path, None)
-        raise UserError(f"{first_line(error)}; expected perimeters") from None
-    if is_kml:  # without hot spots, and without the columns of KML that are empty
-        frame = frame[frame.geom_type != "Point"].dropna(axis="columns", how="all")
-        frame = with_one_time(frame) if config.time_field is None else frame
-    if not hasattr(frame, "geometry") or len(frame) == 0:
-        raise UserError("no feature with a geometry; expected perimeters")
-    missing = frame.index[frame.geometry.isna() | frame.geometry.is_empty]
-    if len(missing):
-        raise UserError(f"feature {missing[0]} has no geometry; expected a perimeter in each")
-    if not is_json:
-        check_projection(path, frame.crs)
-    elif frame.crs is not None and frame.crs.is_geographic and abs(frame.total_bounds).max() > 360:
-        return frame.set_crs(None, allow_override=True)  # GDAL assumes degrees
-    return frame
-
-
-def _choose_layers(layers: Sequence[Any], wanted: str | None, *, several: bool) -> list[str]:
-    """Returns the layer `wanted`, or the only layer with geometries, or all if `several`."""
-    names = [str(name) for name, kind in layers if kind is not None]
-    if wanted in names:
-        return [str(wanted)]
-    known = ", ".join(names[:30]) or "none"
-    if wanted is not None:
-        raise UserError(f"no layer {wanted!r} (fire.layer); there are {known}")
-    if not names:
-        raise UserError("no feature with a geometry; expected perimeters")
-    if len(names) > 1 and not several:
-        raise UserError(f"{len(names)} layers of perimeters; expected fire.layer, one of {known}")
-    return names
-
-
-def _choose_incident(frame: Any, wanted: str | None) -> Any:
-    """Returns the features of the incident `wanted`, or of the only incident."""
-    known = known_columns({str(name).lower(): str(name) for name in frame.columns}, _INCIDENTS)
-    columns = [name for name in known if frame[name].notna().any()]
-    if wanted == "*" or not (columns or wanted):
-        return frame
-    if not columns:
-        raise UserError(f"fire.incident={wanted}: no column of incidents, such as {_INCIDENTS[0]}")
-    named = frame[columns[0]].dropna().astype(str).str.strip()
-    names = {name.casefold(): name for name in named[::-1]}
-    if wanted is None and len(names) < 2:
-        return frame
-    if wanted is None:
-        several = sorted(names.values())
-        raise UserError(
-            f"perimeters of {len(several)} incidents: {', '.join(several[:30])}; expected "
-            f"{as_argument('fire.incident', several[0])}, or fire.incident=* for all as one fire"
-        )
-    if wanted.casefold() not in names:
-        raise UserError(f"fire.incident={unknown(wanted, sorted(names.values()))}")
-    chosen = named.str.casefold() == wanted.casefold()
-    return frame.loc[chosen.index[chosen]]
 
 
 def _project(frame: Any, areas: Sequence[Any], crs: str | None) -> list[Any]:
@@ -193,7 +70,6 @@ class PerimeterSource:
     """
 
     whole = False
-    doubts: Sequence[str] = ()
 
     def __init__(self, areas: Sequence[Any], times: np.ndarray, clock: Clock):
         if len(times) < 2:
@@ -203,6 +79,11 @@ class PerimeterSource:
         self.clock, self.first, self.last = clock, float(times[0]), float(times[-1])
         span = f"{clock.format(self.first)} to {clock.format(self.last)}"
         self.summary = f"perimeters of {len(times)} times, from {span}"
+        self.doubts: Sequence[str] = ()
+        if clock.origin is None and self.first > self.last - self.first:
+            self.doubts = [
+                f"the fire would begin at time 0 (fire.start={self.first:g}: at the first)"
+            ]
         _check_growth(areas, times, clock)
         if clock.origin is None and times[0] > 0:
             areas, times = [area_at_zero(areas, times), *areas], np.concatenate([[0.0], times])
@@ -244,6 +125,8 @@ class PerimeterSource:
             new = after & ~before
             if new.any() and before.any():
                 from_last, to_next = _depth(~before), _depth(after)
+                if not window.contains(self._areas[k].bounds):
+                    to_next[new] = _to_boundary(self._areas[k], window, new)
                 share = from_last / (from_last + to_next)
                 between = self._times[k - 1] + (self._times[k] - self._times[k - 1]) * share
                 times[new] = between[new]
@@ -275,6 +158,15 @@ def _depth(area: np.ndarray) -> np.ndarray:
     """Returns the distance from each cell's centre to the edge of the area, in cells."""
     distance: Any = distance_transform_edt(area)
     return distance - 0.5
+
+
+def _to_boundary(area: Any, window: Window, cells: np.ndarray) -> np.ndarray:
+    """Returns the distance from the centres of cells to the boundary of an area, in cells."""
+    shapely = library("shapely")
+    x, y = np.meshgrid(*window.centres(), indexing="ij")
+    boundary = area.boundary
+    shapely.prepare(boundary)
+    return shapely.distance(boundary, shapely.points(x[cells], y[cells])) / window.side
 
 
 def _rasterize(area: Any, window: Window) -> np.ndarray:

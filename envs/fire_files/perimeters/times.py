@@ -35,6 +35,7 @@ EDITED = ("poly_datecurrent", "datecurrent")
 _DATES = ("acq_date", "date", "time", "t", "begin")  # columns that may hold a date alone
 _DBF_LENGTH = 10  # maximum length of a column's name in a .dbf
 _MIN_MS = 1e11  # a number from here on is a date: milliseconds since 1970, or digits
+_MIN_S, _MAX_S = 1e9, 1.9e9  # seconds since 1970: from September 2001 to March 2030
 _CENTURIES = ("19", "20")  # the first digits of a year
 _MAX_TIME = 1e12
 _MAX_LENGTH = 40
@@ -109,7 +110,7 @@ def parse_time(text: str) -> datetime:
     else:
         try:
             return parsedate_to_datetime(text) if "," in text else datetime.fromisoformat(text)
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             pass
     for form in forms:
         try:
@@ -165,15 +166,18 @@ def _number(value: Any) -> float | None:
 
 
 def _is_date(number: float) -> bool:
-    """Tells whether a number is a date in digits, or milliseconds since 1970."""
+    """Tells whether a number is a date in digits, or seconds or milliseconds since 1970."""
     digits = f"{number:.0f}"
-    return number >= _MIN_MS or (len(digits) == 8 and digits[:2] in _CENTURIES)
+    in_digits = len(digits) == 8 and digits[:2] in _CENTURIES
+    return number >= _MIN_MS or _MIN_S <= number < _MAX_S or in_digits
 
 
 def _date(value: Any, feature: str, name: str) -> datetime:
-    """Reads a date as text, as a number in digits, or as milliseconds since 1970."""
+    """Reads a date as text, as a number in digits, or as seconds or milliseconds since 1970."""
     text, number = str(value), _number(value)
     try:
+        if number is not None and _MIN_S <= number < _MAX_S:
+            return datetime.fromtimestamp(number, UTC)
         if number is not None and _is_date(number):
             text = f"{number:.0f}"
             if len(text) not in _DIGITS or text[:2] not in _CENTURIES:
@@ -194,7 +198,7 @@ def _elapsed(column: Any, unit: Units | None) -> tuple[np.ndarray, Clock]:
         if number is None or not 0 <= number <= _MAX_TIME:
             raise UserError(f"{feature} has {name}={str(value)[:40]}; expected a time of 0 or more")
         numbers.append(number)
-    known = ELAPSED.get(name.lower())
+    known = _unit_of(name)
     if known and unit and unit != known:
         raise UserError(f"{name} is in {known}; expected fire.units={known}, not {unit}")
     unit = known or unit
@@ -204,6 +208,12 @@ def _elapsed(column: Any, unit: Units | None) -> tuple[np.ndarray, Clock]:
             "or steps"
         )
     return np.array(numbers), Clock(unit)
+
+
+def _unit_of(name: str) -> Units | None:
+    """Returns the unit that the name of a column tells, also in the short form of a .dbf."""
+    short: dict[str, Units] = {known[:_DBF_LENGTH]: unit for known, unit in ELAPSED.items()}
+    return (ELAPSED | short).get(name.lower())
 
 
 def _calendar(

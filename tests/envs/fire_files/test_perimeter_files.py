@@ -90,6 +90,15 @@ def test_kml_and_kmz_equal_geojson(tmp_path, frame, name):
         assert torch.allclose(got, expected, atol=1e-2)
 
 
+def test_points_of_a_multigeometry_are_ignored(tmp_path, frame):
+    (tmp_path / "fire.kml").write_text(kml_of(frame))
+    point = "<Point><coordinates>-117,36</coordinates></Point>"
+    hot = f"<Placemark><name>hot</name><MultiGeometry>{point}{point}</MultiGeometry></Placemark>"
+    text = kml_of(frame).replace("</Document>", f"{hot}</Document>")
+    (tmp_path / "points.kml").write_text(text)
+    assert torch.equal(read(tmp_path / "points.kml"), read(tmp_path / "fire.kml"))
+
+
 STAMP = "<TimeStamp><when>{}</when></TimeStamp>"
 SPAN = "<TimeSpan><begin>{}</begin><end>2021-01-01T00:00:00Z</end></TimeSpan>"
 DATA = "<ExtendedData><Data name='date'><value>{}</value></Data></ExtendedData>"

@@ -1,7 +1,9 @@
 """Tests perimeters in every format, and compares them with the raster of the same fire."""
 
 import datetime
+import sqlite3
 import zipfile
+from contextlib import closing
 
 import geopandas
 import numpy as np
@@ -510,3 +512,86 @@ def test_dates_as_numbers(tmp_path, keys):
     )
     with pytest.raises(ValueError, match=r"feature 2 has date='?20200832'?, which is not a date"):
         read(tmp_path / "wrong.gpkg", **keys)
+
+
+def test_a_front_far_outside_the_map_is_measured_to_its_boundary(tmp_path):
+    """Between circles of 50 and 5000 m, a day apart, the radius after an hour is 256 m.
+
+    A cell burns if one of its samples does, so the burnt cells reach half a cell farther.
+    """
+    circles = [shapely.Point(CORNER).buffer(radius, quad_segs=64) for radius in (50, 5000)]
+    frame = geopandas.GeoDataFrame({"date": DATED[:2]}, geometry=circles, crs=UTM)
+    frame["date"] = ["2020-08-19T13:00", "2020-08-20T13:00"]
+    frame.to_file(tmp_path / "fire.geojson")
+    fire = read(tmp_path / "fire.geojson", end=60.0, units="minutes")
+    radius, side = 50 + 4950 / 24, 2 * (50 + 4950 / 24) / (30 * 0.8)
+    assert fire.isfinite().sum().item() == pytest.approx(
+        np.pi * (radius / side + 0.5) ** 2, rel=0.03
+    )
+    halfway = (fire <= 500).sum().item()
+    assert halfway == pytest.approx(np.pi * ((50 + radius) / 2 / side + 0.5) ** 2, rel=0.1)
+
+
+def test_seconds_since_1970_are_dates(tmp_path):
+    seconds = [1597842000, 1597842000 + 43200, 1597842000 + 86400]
+    squares(200, 300, 400, column="timestamp", values=seconds).to_file(tmp_path / "s.gpkg")
+    squares(200, 300, 400, column="hours", values=[0, 12, 24]).to_file(tmp_path / "e.gpkg")
+    assert torch.equal(read(tmp_path / "s.gpkg"), read(tmp_path / "e.gpkg"))
+
+
+def test_a_first_perimeter_long_after_time_0_gives_a_warning(tmp_path):
+    squares(200, 300, 400, column="DOY", values=[230, 231, 232]).to_file(tmp_path / "doy.gpkg")
+    given = {"time_field": "DOY", "units": "days"}
+    with pytest.warns(UserWarning, match=r"would begin at time 0 \(fire.start=230: at the first\)"):
+        read(tmp_path / "doy.gpkg", **given)
+
+
+@pytest.mark.parametrize("other", [{"Date": 1}, {"Geometry": 1}])
+def test_columns_that_differ_in_case_only(tmp_path, other):
+    folder = tmp_path / "fire"
+    folder.mkdir()
+    frame = squares(200, 300, column="date", values=[20200831, 20200901]).assign(**other)
+    frame.to_file(folder / "a.geojson")
+    name = next(iter(other)).lower()
+    with pytest.raises(ValueError, match=rf"a\.geojson: columns that differ in .*: {name}"):
+        read(folder)
+
+
+def test_elapsed_times_of_a_dbf(tmp_path):
+    """A .dbf cuts `elapsed_hours` to ten letters."""
+    squares(200, 300, 400, column="elapsed_ho", values=[0, 1, 2]).to_file(tmp_path / "e.shp")
+    with pytest.raises(ValueError, match=r"elapsed_ho is in hours; expected fire\.units=hours"):
+        read(tmp_path / "e.shp", units="minutes")
+
+
+def test_an_incident_without_a_name_is_none(tmp_path):
+    frame = squares(200, 300, 400, column="hours", values=[0, 1, 2])
+    frame.assign(IncidentName=["", "Creek", "Creek"]).to_file(tmp_path / "fire.gpkg")
+    frame.to_file(tmp_path / "plain.gpkg")
+    assert torch.equal(read(tmp_path / "fire.gpkg"), read(tmp_path / "plain.gpkg"))
+
+
+def test_a_geopackage_that_says_fewer_features_than_it_has(tmp_path):
+    path = tmp_path / "fire.gpkg"
+    squares(200, 300, 400, column="hours", values=[0, 1, 2]).to_file(path, layer="fire")
+    with closing(sqlite3.connect(path)) as database:
+        database.execute("UPDATE gpkg_ogr_contents SET feature_count = 2")
+        database.commit()
+    with pytest.raises(ValueError, match="layer 'fire' has 3 features and says 2"):
+        read(path)
+
+
+def test_a_plane_of_its_own_gets_the_projection_of_the_user(tmp_path):
+    frame = squares(200, 300, 400, column="hours", values=[0, 1, 2])
+    frame.to_file(tmp_path / "plain.shp")
+    frame.to_file(tmp_path / "local.shp")
+    (tmp_path / "local.prj").write_text('LOCAL_CS["x",UNIT["m",1]]')
+    assert torch.equal(read(tmp_path / "local.shp", crs=UTM), read(tmp_path / "plain.shp"))
+    with pytest.raises(ValueError, match=r"fire\.crs=EPSG:4978 is not one of a map"):
+        read(tmp_path / "plain.shp", crs="EPSG:4978")
+
+
+def test_a_time_after_the_year_9999(tmp_path):
+    squares(200, 300, column="date", values=[20200831, 20200901]).to_file(tmp_path / "fire.gpkg")
+    with pytest.raises(ValueError, match="not a calendar time"):
+        read(tmp_path / "fire.gpkg", start="Fri, 13 Feb 99999999999 10:00:00")

@@ -21,6 +21,7 @@ from emberlink.envs.fire_files import rasters
 from emberlink.envs.fire_files.config import Clock, FileFireConfig
 from emberlink.envs.fire_files.plausibility import beginnings
 from emberlink.envs.fire_files.raster_source import RasterSource, Window
+from emberlink.envs.fire_files.rasters import read_geotiff
 from emberlink.envs.fire_files.reader import read_fires, with_checksum
 from emberlink.envs.utils.errors import UserError
 
@@ -262,7 +263,7 @@ def test_degrees_across_the_antimeridian_are_refused(tmp_path):
         if not refused:
             assert torch.isfinite(read(path, (30, 30))).sum() > 700
             continue
-        with pytest.raises(ValueError, match=r"across 180 degrees; expected a file in metres"):
+        with pytest.raises(ValueError, match=r"longitudes from .*; expected -180 to 180"):
             read(path, (30, 30))
 
 
@@ -533,3 +534,60 @@ def test_a_front_of_many_points_gives_no_warning(tmp_path):
 
 def source_of(times):
     return RasterSource(np.where(times < 0, INF, times), (0, 0), (1, 1), Clock("minutes"))
+
+
+def test_a_raster_from_south_to_north_is_not_resampled(tmp_path):
+    times = np.arange(64.0).reshape(8, 8)
+    x, y = CORNER
+    fires = [
+        read(write_tif(tmp_path / f"{a}_{e}.tif", grid, transform=rasterio.Affine(*affine)), (8, 8))
+        for a, e, grid, affine in (
+            (30, -30, times, (30, 0, x, 0, -30, y)),
+            (30, 30, times[::-1], (30, 0, x, 0, 30, y - 240)),
+            (-30, -30, times[:, ::-1], (-30, 0, x + 240, 0, -30, y)),
+        )
+    ]
+    assert torch.equal(fires[1], fires[0])
+    assert torch.equal(fires[2], fires[0])
+
+
+@pytest.mark.parametrize("crs", ["EPSG:32631", "EPSG:4326"])
+@pytest.mark.parametrize("first", [9.0, 15.0])
+def test_the_projection_does_not_decide_when_a_fire_began(tmp_path, crs, first):
+    """A projected raster has smaller cells, which the front crosses faster."""
+    at = np.arange(20) - 9.5
+    times = first + 10 * (np.hypot(at[:, None] - 0.5, at[None, :] - 0.5))
+    cell = 30.0 if crs == "EPSG:32631" else 30.0 / 111_000
+    place = from_origin(5e5, 4e6, cell, cell) if cell == 30 else from_origin(3.0, 0.1, cell, cell)
+    path = write_tif(tmp_path / "fire.tif", times, transform=place, crs=crs)
+    assert (read_geotiff(path, "minutes", None).began == 0) == (first < 10 * 2**0.5)
+
+
+def test_a_raster_that_is_large_when_projected_is_refused(tmp_path):
+    turned = rasterio.Affine(21, 21, 5e5, -21, 21, 4e6)
+    path = write_tif(tmp_path / "line.tif", np.arange(12_000.0)[None], transform=turned)
+    with pytest.raises(ValueError, match="cells after its projection to a plane; at most"):
+        read(path)
+
+
+def test_blocks_larger_than_a_raster_are_refused(tmp_path):
+    about = {"tiled": True, "blockxsize": 8192, "blockysize": 8192, "compress": "deflate"}
+    path = write_tif(tmp_path / "fire.tif", np.arange(64.0, dtype="f4").reshape(8, 8), **about)
+    with pytest.raises(ValueError, match="blocks of 8192 x 8192 cells"):
+        read(path)
+
+
+def test_a_bank_is_in_steps(tmp_path):
+    fire = np.arange(64, dtype="i2").reshape(8, 8)
+    np.save(tmp_path / "bank.npy", fire)
+    (tmp_path / "bank.json").write_text('{"horizon": Infinity}')
+    with pytest.raises(ValueError, match=r"fire\.units=minutes: a bank is in steps"):
+        read(tmp_path / "bank.npy", horizon=100)
+    with pytest.raises(ValueError, match=r"fire\.minutes_per_step: a bank is in steps"):
+        read(tmp_path / "bank.npy", horizon=100, units=None, minutes_per_step=0.5)
+    assert read(tmp_path / "bank.npy", horizon=100, units=None).max() == 63
+    path = write_tif(tmp_path / "bank.tif", fire, tags={"units": "steps"}, crs=None, nodata=None)
+    with rasterio.open(path, "r+") as dataset:
+        dataset.scales = (0.1,)
+    with pytest.raises(ValueError, match="scaled values; expected a bank without scale"):
+        read(path, horizon=100, units=None)

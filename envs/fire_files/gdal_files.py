@@ -1,14 +1,54 @@
-"""Names files for GDAL, so that it reads them, and reads them as the format that was checked."""
+"""Checks GeoJSON for GDAL, finds the KML in a KMZ, and says what GDAL is to open."""
 
+import json
 import tempfile
 import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from emberlink.envs.utils.errors import UserError
 
 _MAX_NAMES = 5
+
+
+class _Link(dict[str, Any]):
+    """An object of JSON whose type is a link."""
+
+
+def check_geojson(content: bytes) -> None:
+    """Parses the whole file, because GDAL returns the features before a damage.
+
+    A link to a projection is refused, because GDAL would fetch it from the network.
+
+    Raises:
+        UserError: it is not GeoJSON, or its projection is a link.
+    """
+    links: list[str] = []
+
+    def look(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        # GDAL does not distinguish upper and lower case. A key may be repeated.
+        links.extend(
+            str(value)[:80]
+            for key, value in pairs
+            if key.lower() == "crs" and isinstance(value, _Link)
+        )
+        kinds = [str(value).lower() for key, value in pairs if key.lower() == "type"]
+        return _Link(pairs) if {*kinds} & {"link", "url"} else dict(pairs)
+
+    try:
+        whole = json.loads(content.decode("utf-8-sig"), object_pairs_hook=look)
+    except RecursionError:
+        raise UserError("too many levels; expected GeoJSON") from None
+    except UnicodeDecodeError as error:
+        raise UserError(f"byte {error.start} is not UTF-8; expected GeoJSON in UTF-8") from None
+    except ValueError as error:
+        raise UserError(f"{error}; expected GeoJSON") from None
+    if links:
+        raise UserError(f"its crs is a link: {links[0]}; expected one with a name, or none")
+    if whole.get("type") not in ("FeatureCollection", "Feature"):
+        raise UserError(f"type {str(whole.get('type'))[:40]!r}; expected a FeatureCollection")
 
 
 def kml_parts(archive: zipfile.ZipFile) -> list[zipfile.ZipInfo]:
