@@ -31,7 +31,8 @@ def _rewrite(app: Sphinx, page: str, source: list[str]) -> None:
         if target in copied:
             address = Path(os.path.relpath(target, folder)).as_posix()
             return f'<a href="{address}{match["anchor"] or ""}">{match["text"]}</a>'
-        in_site = target.is_relative_to(app.srcdir) and "data" not in target.parts
+        in_site = target.is_relative_to(app.srcdir)
+        in_site = in_site and "data" not in target.relative_to(app.srcdir).parts
         if in_site or not target.exists():
             return match[0]  # a link to nowhere is a warning of Sphinx
         path, text = str(target.relative_to(root)), match["text"].strip("`")

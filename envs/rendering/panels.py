@@ -114,12 +114,16 @@ class Screen:
         draw.text((x, y + LINE / 2), text, fill=INK, font=self._font, anchor="lm")
 
     def _cut(self, text: str, width: float) -> str:
-        """Returns the text, shortened at its end to fit a width in pixels."""
+        """Returns the text, shortened in its middle to fit a width in pixels.
+
+        The end often names the setting in which panels differ.
+        """
         if self._font.getlength(text) <= width:
             return text
-        while text and self._font.getlength(text + "…") > width:
-            text = text[:-1]
-        return text + "…"
+        kept = len(text)
+        while kept and self._font.getlength(_without_middle(text, kept)) > width:
+            kept -= 1
+        return _without_middle(text, kept)
 
     def _wrap(self, words: Sequence[str]) -> tuple[list[tuple[float, float]], int]:
         """Returns the position of each legend entry, and the height of the legend."""
@@ -223,3 +227,9 @@ def _base(draw: ImageDraw.ImageDraw, x: float, y: float) -> None:
 
 def _failed(draw: ImageDraw.ImageDraw, x: float, y: float) -> None:
     draw_cross(draw, (x, y), 6, FAILED)
+
+
+def _without_middle(text: str, kept: int) -> str:
+    """Returns the first and last characters of a text with dots between them."""
+    first, last = -(-kept // 2), kept // 2
+    return f"{text[:first]}…{text[len(text) - last :]}"

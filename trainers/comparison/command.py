@@ -84,10 +84,12 @@ def _communication_table(numbers: Numbers) -> Table:
         title=Text(f"{numbers.section.label}: the value of communication, by {measure}"),
         caption="value: (with radio - off) / (no limits - off); interval over the fires",
     )
-    for column in ("policy", "radios", "off", "with radio", "no limits", "value", "95 % interval"):
-        table.add_column(column, justify="left" if column in ("policy", "radios") else "right")
+    left = ("policy", "on", "radios")
+    for column in (*left, "off", "with radio", "no limits", "value", "95 % interval"):
+        table.add_column(column, justify="left" if column in left else "right")
     for value in numbers.communication:
-        table.add_row(*map(Text, (value.policy.replace("_", " "), value.how, *worth(value))))
+        name = value.policy.replace("_", " ") if value.how == "scripted" else value.policy
+        table.add_row(*map(Text, (name, value.fire, value.how, *worth(value))))
     return table
 
 

@@ -51,8 +51,8 @@ def evaluate_folder(
     if device is not None:
         check_device(device)
     config = run.config(**({} if device is None else {"device": device}))
-    label = f"_{checkpoint.stem}" if checkpoint else ""
-    checkpoint = checkpoint or run.checkpoint()
+    given, checkpoint = checkpoint, checkpoint or run.checkpoint()
+    label = f"_{given.stem}" if given else ""
     check_trained_with(checkpoint, config)
     for text in overrides:
         if "=" not in text:
@@ -64,8 +64,14 @@ def evaluate_folder(
         label += "_" + re.sub(r"[^\w.=+-]", "-", text)
     config = evaluated_with(config, overrides)
     actor = load_actor(config, checkpoint)
-    label = _shortened(label)
-    evaluate_and_print([(run, config, actor, checkpoint)], console, label=label, fires=fires)
+    about = [text for text in overrides if not text.startswith("world=")]  # a title names it anyway
+    evaluate_and_print(
+        [(run, config, actor, checkpoint)],
+        console,
+        label=_shortened(label),
+        about=[*about, *([checkpoint.stem] if given else [])],
+        fires=fires,
+    )
     return 0
 
 
@@ -81,6 +87,7 @@ def evaluate_and_print(
     console: Console,
     *,
     label: str = "",
+    about: Sequence[str] = (),
     fires: int | None = None,
 ) -> list[Results]:
     """Evaluates the frozen policies of several seeds and prints one table and the run folders.
@@ -89,6 +96,7 @@ def evaluate_and_print(
         seeds: run folder, configuration, frozen policy and checkpoint of each seed.
         console: prints the table.
         label: suffix of the file names.
+        about: see `evaluate_run`.
         fires: number of test fires, one episode each; that of the runs if None.
 
     Returns:
@@ -103,6 +111,7 @@ def evaluate_and_print(
             fires=fires or config.evaluation.episodes,
             report=lambda text: console.print(f"  {text}", style="dim", soft_wrap=True),
             label=label,
+            about=about,
         )
         for run, config, actor, checkpoint in seeds
     ]

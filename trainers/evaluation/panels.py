@@ -81,6 +81,7 @@ def learned(arguments: Sequence[str], checkpoints: Sequence[Path]) -> Iterator[P
     runs = [(open_run(name), changes) for name, changes in _with_settings(arguments)]
     if checkpoints and len(checkpoints) != len(runs):
         raise UserError(f"{len(checkpoints)} checkpoints for {len(runs)} runs: one each")
+    titles: set[str] = set()
     for place, (run, changes) in enumerate(runs):
         trained = run.config(device="cpu")
         checkpoint = checkpoints[place] if checkpoints else run.checkpoint()
@@ -89,6 +90,9 @@ def learned(arguments: Sequence[str], checkpoints: Sequence[Path]) -> Iterator[P
         actor = load_actor(config, checkpoint)
         others = [text for text in changes if not text.startswith("world=")]
         title = title_of(config, *others, *([checkpoint.stem] if checkpoints else []))
+        if title in titles:  # runs that were trained with other settings
+            title = f"{title}, {run.path.name}"
+        titles.add(title)
         yield Panel(title, config, lambda env, actor=actor: actor)
 
 

@@ -1,5 +1,6 @@
 """Draws the figures of a run: training curves, coverage, timelapse."""
 
+import textwrap
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -49,7 +50,7 @@ def _points(lines: Sequence[Mapping[str, Any]], key: str) -> NDArray[np.float32]
 def coverage_bars(path: Path, results: Results) -> None:
     """Draws the coverage of each policy on the test fires: a dot per episode, a bar at the mean."""
     most = max(len(by_policy) for by_policy in results.values())
-    size = (1.6 + 0.55 * most) * len(results), 3.9
+    size = max(2.8, 1.6 + 0.55 * most) * len(results), 4.1
     figure = Figure(figsize=size, layout="constrained")
     panels = figure.subplots(1, len(results), squeeze=False, sharey=True)[0]
     for axes, (fire, by_policy) in zip(panels, results.items(), strict=True):
@@ -69,7 +70,7 @@ def coverage_bars(path: Path, results: Results) -> None:
             axes.plot(spread, values, "k.", ms=2, alpha=0.4)
         names = [name.replace("_", " ") for name in by_policy]
         axes.set_xticks(range(len(by_policy)), names, rotation=35, ha="right")
-        axes.set_title(f"test fires: {fire}", pad=18)
+        axes.set_title(f"test fires:\n{fire}", pad=18)
         axes.set_ylim(0, 100)
         axes.grid(axis="y", alpha=0.3)
         axes.set_axisbelow(True)
@@ -95,5 +96,5 @@ def timelapse(
         axes.set_title(f"step {steps[index]}", fontsize="medium")
         axes.set_axis_off()
     if title:
-        figure.suptitle(title, parse_math=False)
+        figure.suptitle(textwrap.fill(title, 24 * len(chosen)), parse_math=False)
     figure.savefig(path, format="png", dpi=120)

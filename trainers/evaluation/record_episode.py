@@ -13,36 +13,42 @@ from torchrl.envs import TransformedEnv
 from emberlink.envs import keys
 from emberlink.envs.config import WildfireConfig
 from emberlink.envs.rendering.marks import ROLES, FrameData
-from emberlink.envs.scenarios import ScenarioConfig
 from emberlink.envs.wildfire import WildfireEnv
 from emberlink.envs.world import radio
-from emberlink.trainers.build import build_env
-from emberlink.trainers.config.schema import RunConfig
-from emberlink.trainers.evaluation.evaluate import START_SEED, Policy, Watch, play
+from emberlink.trainers.evaluation.evaluate import Watch, play
 
 
-def film(
-    config: RunConfig,
-    policy: Policy,
-    *,
-    fire: Tensor | ScenarioConfig,
-    frames: int = 100,
-    watch: Watch | None = None,
-) -> tuple[list[np.ndarray], list[int]]:
-    """Returns frames of test episode 0 on a fire, uint8 [height, width, 3], and their steps."""
-    env = build_env(config, num_envs=1, fire=fire, seed=START_SEED, device=config.device)
-    horizon = config.env.horizon
-    wanted = set(np.linspace(0, horizon, min(frames, horizon + 1)).round().astype(int).tolist())
-    pictures: list[np.ndarray] = []
+class Camera:
+    """Draws the first of several environments at evenly spaced steps; `add` is called at each step.
 
-    def draw(world: WildfireEnv, td: TensorDictBase) -> None:
-        if int(td.get(keys.STEP)[0]) in wanted:
-            pictures.append(world.render())
-        if watch is not None:
-            watch(world, td)
+    Args:
+        horizon: steps of the episode.
+        frames: largest number of pictures.
 
-    play(env, policy, draw)
-    return pictures, sorted(wanted)
+    Attributes:
+        steps: the steps that are drawn.
+        pictures: uint8 [height, width, 3] each.
+    """
+
+    def __init__(self, horizon: int, frames: int = 100):
+        even = np.linspace(0, horizon, min(frames, horizon + 1)).round().astype(int)
+        self.steps: list[int] = sorted({*even.tolist()})
+        self.pictures: list[np.ndarray] = []
+
+    def add(self, world: WildfireEnv, td: TensorDictBase) -> None:
+        """Draws the environments' step if it is one of `steps`; see `Watch`."""
+        if int(td.get(keys.STEP)[0]) in self.steps:
+            self.pictures.append(world.render())
+
+
+def watched_by(*watches: Watch) -> Watch:
+    """Returns a `Watch` that calls others in turn."""
+
+    def watch(world: WildfireEnv, td: TensorDictBase) -> None:
+        for one in watches:
+            one(world, td)
+
+    return watch
 
 
 def record_episode(

@@ -1,6 +1,6 @@
 """Evaluates the frozen policy of a run and writes eval.json, figures, a GIF and a replay."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,7 @@ from emberlink.policies.scripted.registry import to_play
 from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.evaluation import evaluate, plots
 from emberlink.trainers.evaluation.panels import follows_advice, title_of
-from emberlink.trainers.evaluation.record_episode import film
+from emberlink.trainers.evaluation.record_episode import Camera, watched_by
 from emberlink.trainers.evaluation.results import LEARNED, Results
 from emberlink.trainers.replay.pack import Shown
 from emberlink.trainers.replay.page import Replay
@@ -32,6 +32,7 @@ def evaluate_run(
     fires: int,
     report: Callable[[str], None],
     label: str = "",
+    about: Sequence[str] = (),
 ) -> Results:
     """Evaluates a frozen policy and writes eval.json, the figures, a GIF and a replay.
 
@@ -43,45 +44,39 @@ def evaluate_run(
         fires: number of test fires, one episode each.
         report: called with a line of text before each part of the work.
         label: suffix of the file names.
+        about: texts that the title of the replay names, such as changed settings.
 
     Raises:
         UserError: a file cannot be written.
     """
-
-    def say(fire: str, policy: str) -> None:
-        report(f"{policy} on {fires} fires of {fire}")
-
-    changed = changed_evaluation(checkpoint, config)
-    for text in changed:
+    for text in (changed := changed_evaluation(checkpoint, config)):
         report(f"note: {text}")
     try:
         run.figures()  # an unusable folder is an error before the episodes, not after
         recorder = Recorder(advised=follows_advice(config, actor))
-        results = evaluate.evaluate(config, actor, fires=fires, report=say, watch=recorder.add)
-        _draw(run, config, actor, results, report, label)
-        with run.figure(f"replay{label}.html") as path:
-            title = title_of(config, label.strip("_"))
-            shown = Shown(title=title, recording=recorder.recording())
-            Replay([shown], f"{evaluate.shown_scenario(config)}:0").save(path)
+        camera = Camera(config.env.horizon)
+        results = evaluate.evaluate(
+            config,
+            actor,
+            fires=fires,
+            report=lambda fire, policy: report(f"{policy} on {fires} fires of {fire}"),
+            watch=watched_by(recorder.add, camera.add),
+        )
+        shown = Shown(title=title_of(config, *about), recording=recorder.recording())
+        _draw(run, config, results, camera, shown, label)
     except OutputError:
         raise
     except OSError as error:
-        raise UserError(
-            f"{run.path / 'figures'}: cannot be written: {error.strerror or error}"
-        ) from None
+        why = error.strerror or error
+        raise UserError(f"{run.path / 'figures'}: cannot be written: {why}") from None
     # Written last: an evaluation with this file is complete.
-    about = {"checkpoint": checkpoint.name, "fires": fires, "changed": changed}
-    run.write(f"eval{label}.json", record(config, results, **about))
+    content = record(config, results, checkpoint=checkpoint.name, fires=fires, changed=changed)
+    run.write(f"eval{label}.json", content)
     return results
 
 
 def _draw(
-    run: RunFolder,
-    config: RunConfig,
-    actor: evaluate.Policy,
-    results: Results,
-    report: Callable[[str], None],
-    label: str,
+    run: RunFolder, config: RunConfig, results: Results, camera: Camera, shown: Shown, label: str
 ) -> None:
     with run.figure(f"coverage{label}.png") as path:
         plots.coverage_bars(path, results)
@@ -90,13 +85,13 @@ def _draw(
         title = f"{config.method}, setup {config.setup}, fire {config.fire.name}"
         with run.figure("training.png") as path:
             plots.training_curves(path, lines, title)
-    report("one episode for the animation")
-    name, arrival = evaluate.shown_fire(config)
-    pictures, steps = film(config, actor, fire=arrival)
+    name = evaluate.shown_scenario(config)
     with run.figure(f"episode_{name}{label}.gif") as path:
-        write_gif(path, pictures)
+        write_gif(path, camera.pictures)
     with run.figure(f"timelapse_{name}{label}.png") as path:
-        plots.timelapse(path, pictures, steps)
+        plots.timelapse(path, camera.pictures, camera.steps)
+    with run.figure(f"replay{label}.html") as path:
+        Replay([shown], f"{name}:0").save(path)
 
 
 def record(config: RunConfig, results: Results, **about: Any) -> dict[str, Any]:

@@ -13,6 +13,8 @@ BETWEEN_LINES = 60.0
 """seconds between lines about the progress within an episode, without a bar"""
 FIRST_LINE = 10.0
 """seconds before the first of these lines"""
+_PERCENT = ("coverage", "coverage_auc", "base_coverage")
+"""measures in %"""
 _BETWEEN_REFRESHES = 0.2
 """seconds between updates of the bar"""
 
@@ -163,7 +165,7 @@ class TrainingProgress:
             f"episode {episode}/{self._episodes}: coverage {means['coverage']:.1f} %, "
             f"mean reward {means['mean_reward']:.2f}, {self._pace(means['updates'])}"
         )
-        end, unit = f"/{self._headline}", " %" if "coverage" in self._headline else ""
+        end, unit = f"/{self._headline}", " %" if self._headline in _PERCENT else ""
         evaluated = [name.removesuffix(end) for name in means if name.endswith(end)]
         if evaluated:
             shown = ", ".join(f"{fire} {means[fire + end]:.1f}{unit}" for fire in evaluated)

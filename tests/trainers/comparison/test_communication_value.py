@@ -41,8 +41,10 @@ def test_networks_evaluated_with_other_radios(tmp_path, capsys):
     said = " ".join(capsys.readouterr().out.split())
     assert "the value of communication, by coverage" in said
     assert "0.40" in said
+    assert "huygens" in said.partition("the value of communication")[2]
     page = (tmp_path / "out" / "compare.html").read_text()
-    assert "The value of communication" in page
+    table = page.partition("The value of communication")[2].partition("</table>")[0]
+    assert "<td>huygens</td></tr>" in table
     (section,) = json.loads((tmp_path / "out" / "compare.json").read_text())["setups"]
     assert section["communication"][0]["value"] == pytest.approx(0.4)
 

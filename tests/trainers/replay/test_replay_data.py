@@ -21,7 +21,7 @@ from unpack_replay import bit, data_of
 from emberlink.envs import WildfireConfig, keys
 from emberlink.trainers import load
 from emberlink.trainers.cli import main
-from emberlink.trainers.evaluation import panels
+from emberlink.trainers.evaluation import evaluate, panels
 from emberlink.trainers.replay.pack import Shown
 from emberlink.trainers.replay.page import Replay, page_of, script
 from emberlink.trainers.replay.record import Recording
@@ -285,6 +285,23 @@ def test_the_last_numbers_are_those_of_the_evaluation(tmp_path):
     assert covered.item() == pytest.approx(evaluated["coverage"][0], abs=0)
     rewards = np.array(panel["reward"])[:, 1:]
     assert rewards.mean() == pytest.approx(evaluated["mean_reward"][0], rel=1e-6)
+
+
+def test_a_report_plays_as_many_environments_as_an_evaluation(finished, tmp_path, monkeypatch):
+    """The last bit of a product of matrices depends on the number of rows."""
+    played, play = [], evaluate.play
+    monkeypatch.setattr(
+        evaluate, "play", lambda env, *rest: (played.append(env.batch_size), play(env, *rest))[1]
+    )
+    assert main.main(["compare", str(finished), "--output", str(tmp_path / "report")]) == 0
+    assert played == [torch.Size([evaluate.BLOCK])]
+    assert (tmp_path / "report" / "1_paper_replay.html").is_file()
+
+
+def test_panels_of_runs_with_the_same_name_differ_in_their_title(tmp_path):
+    runs = [make_run(tmp_path / name, "consensus", "learner.gamma=0.5") for name in "ab"]
+    first, second = panels.learned(list(map(str, runs)), [])
+    assert second.title == f"{first.title}, {runs[1].name}"
 
 
 def test_nothing_is_written_through_a_link(tmp_path, episode):

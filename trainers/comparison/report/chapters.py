@@ -11,9 +11,9 @@ from emberlink.trainers.comparison.report.page import Chapter, Picture, ReplayFi
 from emberlink.trainers.comparison.runs import newest_checkpoint
 from emberlink.trainers.evaluation import evaluate
 from emberlink.trainers.evaluation.actor import load_actor
-from emberlink.trainers.evaluation.panels import follows_advice
+from emberlink.trainers.evaluation.panels import Panel, follows_advice
 from emberlink.trainers.evaluation.plots import timelapse
-from emberlink.trainers.evaluation.record_episode import film
+from emberlink.trainers.evaluation.record_episode import Camera, watched_by
 from emberlink.trainers.replay import Recorder, Replay
 from emberlink.trainers.replay.pack import Shown
 
@@ -103,18 +103,19 @@ def _films(
             without.append(str(run.path))
             continue
         say(f"timelapse of {group.label}")
-        actor = load_actor(run.config, newest)
+        title, actor = f"{group.label}, seed {run.config.seed}", load_actor(run.config, newest)
         fire, arrival = evaluate.shown_fire(run.config)
+        env = Panel(title, run.config, lambda _, actor=actor: actor).env(arrival, 0)
+        camera = Camera(run.config.env.horizon, FRAMES)
         recorder = Recorder(advised=follows_advice(run.config, actor))
-        pictures, steps = film(run.config, actor, fire=arrival, frames=FRAMES, watch=recorder.add)
+        evaluate.play(env, actor, watched_by(camera.add, recorder.add))
         path = folder / f"{stem}_timelapse_{place}.png"
-        timelapse(path, pictures, steps, group.label)
+        timelapse(path, camera.pictures, camera.steps, group.label)
         caption = (
-            f"{group.label}, seed {run.config.seed}: the frozen policy of {newest.name} on the "
-            f"first held-out fire of {fire}, from the same start positions as every other method. "
-            "Fire white, field of view yellow, UAVs blue."
+            f"{title}: the frozen policy of {newest.name} on the first held-out fire of {fire}. "
+            "Teams of the same size and altitudes have the same start positions. Fire white, field "
+            "of view yellow, UAVs blue."
         )
-        title = f"{group.label}, seed {run.config.seed}"
         shown = Shown(title=title, recording=recorder.recording())
         yield _Film(Picture(path, caption), fire, shown)
     if without:

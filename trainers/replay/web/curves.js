@@ -3,7 +3,7 @@
 import { fixed, ratio } from "./unpack.js";
 import { panelStyle, uavStyle } from "./palette.js";
 
-const MANY_UAVS = 8; // above this number, a chart shows the number of the chosen UAV only
+const MANY_UAVS = 8; // above this number, a chart of rewards shows the number of the chosen UAV only
 const HEIGHT = 170;
 
 /** The charts of a page: title, digits, and for each line its name and numbers by step. */
@@ -20,8 +20,9 @@ export class Curves {
   constructor(parent, data, seek) {
     Object.assign(this, { parent, data, seek, hovered: false });
     this.steps = Float64Array.from({ length: data.horizon + 1 }, (_, step) => step);
-    parent.addEventListener("mouseenter", () => { this.hovered = true; });
-    parent.addEventListener("mouseleave", () => {
+    // A tap of a finger is no hovering: it would not end.
+    parent.addEventListener("pointerenter", (event) => { this.hovered = event.pointerType === "mouse"; });
+    parent.addEventListener("pointerleave", () => {
       this.hovered = false;
       this.show(this.step);
     });
@@ -62,7 +63,8 @@ export class Curves {
       alpha: number === uav ? 1 : 0.55,
     }));
     lines.push(lines.splice(uav, 1)[0]); // the chosen one on top
-    return { name: `reward-${place}`, title: `Reward per UAV: ${panel.title}`, digits: 2, lines };
+    const many = panel.uavs > MANY_UAVS;
+    return { name: `reward-${place}`, title: `Reward per UAV: ${panel.title}`, digits: 2, lines, many };
   }
 
   box(name, title) {
@@ -74,26 +76,26 @@ export class Curves {
     return box;
   }
 
-  chart(palette, { digits, lines }, box) {
+  chart(palette, { digits, lines, many }, box) {
     const axis = {
       stroke: palette.named("--ink"),
       grid: { stroke: palette.named("--grid"), width: 1 },
       ticks: { stroke: palette.named("--grid"), width: 1 },
     };
-    const shown = lines.length <= MANY_UAVS ? lines : lines.slice(-1);
-    const hidden = lines.filter((line) => !shown.includes(line));
+    const hidden = many ? lines.slice(0, -1) : [];
     const chart = new uPlot({
       width: box.clientWidth,
       height: HEIGHT,
       scales: { x: { time: false } },
       cursor: { sync: { key: "steps" }, drag: { x: false, y: false }, y: false, points: { show: false } },
       axes: [axis, { ...axis, size: 58 }],
-      series: [{ label: "step" }, ...[...hidden, ...shown].map(({ label, stroke, dash, width, alpha }) => ({
+      legend: { markers: { dash: (_chart, place) => lines[place - 1]?.marker ?? "solid" } },
+      series: [{ label: "step" }, ...lines.map(({ label, stroke, dash, width, alpha }) => ({
         label, stroke, dash, width, alpha,
         points: { show: false },
         value: (_chart, number) => (number === null ? "\u2013" : fixed(number, digits)),
       }))],
-    }, [this.steps, ...[...hidden, ...shown].map((line) => line.values)], box);
+    }, [this.steps, ...lines.map((line) => line.values)], box);
     const rows = box.querySelectorAll(".u-series");
     hidden.forEach((_, place) => { rows[place + 1].hidden = true; });
     chart.over.addEventListener("click", () => this.seek(chart.cursor.idx));

@@ -7,6 +7,8 @@ import { MapView } from "./map.js";
 import { Curves } from "./curves.js";
 
 const find = (name) => document.getElementById(name);
+const ADDRESS = 250; // milliseconds after which a step is written into the address
+const counted = (number, word) => `${number} ${word}${number === 1 ? "" : "s"}`;
 
 /** What a panel says about a step: name, text before the number, number, digits, text after. */
 function numbers(panel, step) {
@@ -59,10 +61,14 @@ class Player {
     this.curves = new Curves(find("curves"), data, (step) => this.seek(step));
     const most = Math.max(...data.panels.map((panel) => panel.uavs));
     find("uav").replaceChildren(...Array.from({ length: most }, (_, uav) => new Option(`UAV ${uav}`, uav)));
-    find("about").textContent = `${data.columns} \u00d7 ${data.rows} cells, ${most} UAVs, ${data.horizon} steps`;
+    const teams = [...new Set(data.panels.map((panel) => panel.uavs))].sort((a, b) => a - b);
+    const uavs = [...teams.slice(0, -1), counted(most, "UAV")].join(" or ");
+    find("about").textContent = `${data.columns} \u00d7 ${data.rows} cells, ${uavs}, ${counted(data.horizon, "step")}`;
     find("slider").max = data.horizon;
     find("last").textContent = data.horizon;
-    find("oldest").textContent = this.panels[0].map.oldest;
+    const { oldest } = this.panels[0].map;
+    find("oldest").textContent = oldest;
+    find("middle").textContent = Math.round(oldest / 4); // colours follow the square root of the age
     this.offer();
     this.listen();
     this.restyle();
@@ -124,13 +130,14 @@ class Player {
   /** Handles the keys of the page, except where a control has its own use for them. */
   key(event) {
     const { target, key } = event;
-    if (event.altKey || event.ctrlKey || event.metaKey || target.closest?.("select, #curves a")) return;
+    if (event.altKey || event.ctrlKey || event.metaKey || target.closest?.("select")) return;
     const slider = target.id === "slider";
     const choice = target.type === "radio";
     const pressed = target.closest?.("button, summary, input") && !slider;
     const jump = { Home: 0, End: this.data.horizon, ArrowLeft: this.step - 1, ArrowRight: this.step + 1 }[key];
-    if (key === " " && !pressed) this.play(!this.playing);
-    else if (jump !== undefined && !(choice && key.startsWith("Arrow"))) this.seek(jump);
+    if (key === " " && !pressed && !event.shiftKey) {
+      if (!event.repeat) this.play(!this.playing);
+    } else if (jump !== undefined && !(choice && key.startsWith("Arrow"))) this.seek(jump);
     else return;
     event.preventDefault();
   }
@@ -189,8 +196,11 @@ class Player {
     this.panels.forEach(({ canvas }, place) => {
       canvas.setAttribute("aria-label", `Map at step ${this.step}. ${covered[place]}`);
     });
-    // A frame without an address of its own, as in Jupyter, would change that of its page.
-    if (location.protocol !== "about:") history.replaceState(null, "", `#t=${this.step}`);
+    // Browsers limit how often the address changes. A frame without an address of its own, as in Jupyter, would
+    // change that of its page.
+    clearTimeout(this.later);
+    if (location.protocol === "about:") return;
+    this.later = setTimeout(() => history.replaceState(null, "", `#t=${this.step}`), ADDRESS);
   }
 
   /** Reads the colours of the style again: light and dark differ. */
