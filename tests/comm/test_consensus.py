@@ -353,3 +353,35 @@ def test_the_result_does_not_depend_on_the_order_of_uavs():
     roles = plain[keys.FOLLOWS]
     assert (roles < 0).any()
     assert ((roles >= 0) & (roles != torch.arange(9))).any()
+
+
+@pytest.mark.parametrize(
+    ("more", "limit", "sent"),
+    [
+        ({}, 10.0, [16, 16, 32, 0, 32, 16]),
+        ({"agree": False}, 10.0, [0, 16, 0, 0, 0, 16]),
+        ({}, 0.0, [0] * 6),
+    ],
+)
+def test_bytes_by_hand(more, limit, sent):
+    """UAVs 1 and 5 discover. UAV 3 has failed, so 2 and 4 pass on what both sides say."""
+    world = dataclasses.replace(WORLD, measures="all", radio=RadioConfig(range=limit))
+    now = time_step(in_a_row(6), [0, 1, 0, 0, 0, 9])
+    now[keys.ALIVE] = torch.tensor([[True, True, True, False, True, True]])
+    after = communication(now, ConsensusConfig(**more), world)._reset(now, now)
+    assert after[keys.BYTES_SENT][0].tolist() == sent
+
+
+def test_absolute_targets_are_scaled_to_the_box():
+    world = WildfireConfig(grid=(21, 11), observation_scale="box")
+    where = [[3.0, 4.0, 2.5], [8.0, 4.0, 1.5]]
+    seen = after_consensus(where, [2, 0], centre=[[3.25, 4.5], [0.0, 0.0]], world=world)
+    expected = torch.tensor([[-0.675, -0.1, 0.0], [-0.7, -0.2, 0.0]])
+    torch.testing.assert_close(seen[keys.OBSERVATION][0, :, 6:], expected)
+
+
+def test_targets_with_noise_stay_in_the_box():
+    near = torch.tensor([[0.2, 0.2, 2.0]]).expand(500, 1, 3)
+    about = {"position": near, "new": [9], "centre": [[0.3, 0.3]]}
+    target = after_consensus(config=ConsensusConfig(jitter=0.75), **about)[keys.TARGET]
+    assert target.min() == 0

@@ -128,3 +128,8 @@ def test_positions_are_passed_on_a_hop_a_step_and_the_newest_first(limit):
                     assert (place[0, uav, other] == 10.0 * known + other).all()
     if limit is None:
         assert stamp[0, 0].tolist() == [11, 11, 10, 9]
+
+
+def test_pairs_are_compared_in_parts(monkeypatch):
+    monkeypatch.setattr(_messages, "_COMPARED", 3)
+    test_maps_and_bytes_equal_those_of_dictionaries("sparse", None, 0.8)

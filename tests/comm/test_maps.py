@@ -285,3 +285,31 @@ def test_sightings_are_those_of_the_scripted_search():
     assert (what == 2).equal(burnt_out)
     assert burnt_out.any()
     assert (ignited & ~burnt_out).any()
+
+
+def test_a_new_episode_begins_with_empty_maps():
+    position = torch.tensor([[[12.0, 15.0, 3.0], [18.0, 15.0, 3.0]]])
+    actions = random_flight(20, 2, seed=1)
+    env = environment(burning(), position)
+    fly(env, position, random_flight(40, 2))
+    again = fly(env, position, actions)
+    fresh = fly(environment(burning(), position), position, actions)
+    for one, two in zip(again, fresh, strict=True):
+        for key in (*OBSERVED, keys.BYTES_SENT):
+            assert one[key].equal(two[key])
+
+
+def test_environments_out_of_phase_have_pictures_of_their_own():
+    """Pictures are drawn at decisions, which differ if one environment was reset between them."""
+    fire = torch.cat([burning(seed, 20) for seed in range(2)])
+    position = torch.tensor([[[8.0, 8, 3], [12, 12, 3]]]).repeat(2, 1, 1)
+    actions, flights = random_flight(20, 2, 2), []
+    for hold in (1, 5):
+        env = environment(fire, position, hold=hold)
+        td = fly(env, position, actions[:3])[-1]
+        env.reset(td.set("_reset", torch.tensor([[True], [False]])), position=position)
+        later = [TensorDict({keys.ACTION: action}, [2]) for action in actions[3:]]
+        flights.append([env.step(step)["next"] for step in later])
+    for every, held in zip(*flights, strict=True):
+        due = every[keys.STEP] % 5 == 0
+        assert held[keys.CROPS][due].equal(every[keys.CROPS][due])

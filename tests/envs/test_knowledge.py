@@ -277,3 +277,10 @@ def test_measures_that_are_not_asked_for_are_not_made():
     assert env.knowledge is None
     base = dataclasses.replace(env.config, base=(0.0, 0.0))
     assert keys.BASE_SEEN in WildfireEnv(1, base, "paper", seed=0).reset().keys()  # noqa: SIM118
+
+
+def test_a_uav_that_was_not_heard_of_for_150_steps_is_believed_to_have_failed():
+    world = WildfireConfig(num_uavs=2, failures=1.0)
+    heard = torch.tensor([[[200, 50], [51, 200]]])
+    flies = radio.believed_to_fly(world, torch.tensor([200]), heard)
+    assert flies.tolist() == [[[True, False], [True, True]]]

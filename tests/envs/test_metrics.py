@@ -148,3 +148,7 @@ def test_only_step_keys_are_read():
     steps = env.rollout(5)["next"]
     few = metrics.episode_metrics(steps.select(*metrics.STEP_KEYS, strict=False))
     assert few == metrics.episode_metrics(steps)
+
+
+def test_bytes_per_step_by_hand():
+    assert metrics.bytes_per_step(torch.tensor([[[16, 0], [32, 16]]])).tolist() == [16]

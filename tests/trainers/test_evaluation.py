@@ -342,3 +342,20 @@ def test_several_seeds_make_one_table(monkeypatch, capsys):
     assert rows["consensus"] == ["2.000", *["2.0"] * 7]  # the mean
     assert rows["std. dev."] == ["1.000", *["1.0"] * 7]
     assert text.count("test fires: huygens") == text.count("oracle") == 1
+
+
+def test_validation_has_fires_and_starts_of_its_own(cache, monkeypatch):
+    config, given = small("independent", "fire=paper", "evaluation.interval_episodes=3"), []
+
+    def play(config, policy, arrival, *, start_seed, block):
+        given.append((arrival, start_seed, block))
+        return {name: [1.0] for name in metrics.NAMES}
+
+    monkeypatch.setattr(evaluate, "play_blocks", play)
+    evaluate.validate(config, lambda td: td)
+    seeds = fire_seeds("validation", 3)
+    assert seeds.tolist() == [2_000_000, 2_000_001, 2_000_002]
+    for (arrival, start, block), scenario in zip(given, ("huygens", "paper"), strict=True):
+        assert arrival.equal(make_fires(load_scenario(scenario), seeds, (12, 10), 12))
+        assert (start, block) == (20_350_923, 3)
+    assert (evaluate.START_SEED, evaluate.BLOCK) == (20_250_923, 50)

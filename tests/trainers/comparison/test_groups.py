@@ -4,6 +4,7 @@ import pytest
 from synthetic_runs import write_run
 
 from emberlink.trainers import compare
+from emberlink.trainers.comparison.claims import CLAIMS
 from emberlink.trainers.comparison.groups import by_value
 from emberlink.trainers.comparison.rankings import Numbers, Ranking
 from emberlink.trainers.comparison.report.page import lines
@@ -13,6 +14,15 @@ from emberlink.trainers.comparison.scripted import Scripted
 def only(folder) -> Numbers:
     (section,) = compare([folder]).sections
     return section
+
+
+def test_the_factors_are_those_of_the_paper():
+    assert [(claim.measure, claim.factor) for claim in CLAIMS] == [
+        ("coverage", 1.3),
+        ("tracking_first", 1.4),
+        ("tracking_last", 1.4),
+        ("boundary_exits", 2.0),
+    ]
 
 
 def test_claims_compare_groups_in_which_the_same_was_changed(tmp_path):

@@ -149,11 +149,3 @@ def test_band_equals_the_interval_at_every_episode(monkeypatch):
         expected = plain_interval(lambda chosen: plain_iqm(chosen), column)
         assert got == pytest.approx(expected, abs=0.06 * (max(column) - min(column)))
     assert band(values[:1]) is None
-
-
-def test_coverage_of_the_median_with_few_seeds():
-    draws = np.random.default_rng(0).standard_normal((20_000, 4))
-    for seeds, share in ((2, 0.5), (3, 0.75), (4, 0.875)):
-        some = draws[:, :seeds]
-        held = (some.min(1) < 0) & (some.max(1) > 0)
-        assert held.mean() == pytest.approx(share, abs=0.01)

@@ -7,6 +7,9 @@ import warnings
 
 import pytest
 import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModuleBase
+from torch import nn
 
 from emberlink.envs import keys
 from emberlink.policies.scripted.courier import Courier
@@ -14,7 +17,9 @@ from emberlink.policies.scripted.map_greedy import MapGreedy
 from emberlink.trainers.build import build_env
 from emberlink.trainers.cli import main
 from emberlink.trainers.config.compose import resolve
+from emberlink.trainers.learners.anchor import Anchor
 from emberlink.trainers.learners.base import ACTOR
+from emberlink.trainers.learners.imitation import Mixture
 from emberlink.trainers.training.non_finite import NonFiniteError, NonFiniteReport
 from emberlink.trainers.training.resume import resume
 from emberlink.trainers.training.setup import TrainingSetup
@@ -143,11 +148,11 @@ def test_held_actions_end_at_the_target():
 def test_the_share_of_the_teacher_falls_and_is_taken():
     setup = TrainingSetup(resolve("maps", settings("imitation", *TINY, "episodes=20")))
     explorer, td = setup.learner.explorer, setup.env.reset()
-    for share in (1.0, 0.0, 0.5):
+    for share in (1.0, 0.0):
         explorer.share.fill_(share)
         acted = explorer(td.clone())
         taken = (acted[keys.ACTION] == td[keys.TEACHER]).all(-1)
-        assert share == 0.5 or (taken == bool(share)).all()
+        assert (taken == bool(share)).all()
     setup.learner._advance(0)
     shares = []
     for _ in range(3):
@@ -389,3 +394,32 @@ def test_a_resumed_run_is_the_same_bit_for_bit(learner, more, imitated, tmp_path
     for name, value in states[0].items():
         assert value.nan_to_num(7).equal(states[1][name].nan_to_num(7)), name
     assert lines[0] == lines[1]
+
+
+class Still(TensorDictModuleBase):
+    """A student that does not move."""
+
+    in_keys, out_keys = [keys.TEACHER], [keys.ACTION]
+
+    def forward(self, tensordict):
+        return tensordict.set(keys.ACTION, torch.zeros_like(tensordict[keys.TEACHER]))
+
+
+def test_each_uav_takes_the_action_of_the_teacher_with_the_same_probability():
+    mixture, envs = Mixture(Still(), "cpu"), 8000
+    mixture.share.fill_(0.3)
+    td = TensorDict(
+        {keys.TEACHER: torch.ones(envs, 3, 3), keys.RNG_KEY: torch.arange(envs)}, [envs]
+    )
+    td[keys.STEP] = torch.zeros(envs, dtype=torch.int64)
+    taken = mixture(td)[keys.ACTION].mean(-1)
+    assert taken.unique().tolist() == [0, 1]
+    assert taken.mean().item() == pytest.approx(0.3, abs=0.02)
+    assert (torch.corrcoef(taken.T) - torch.eye(3)).abs().max() < 0.05
+
+
+def test_the_weight_of_an_anchor_falls_linearly_to_0():
+    anchor = Anchor(nn.Linear(2, 2), 0.4, "cpu")
+    for done, weight in ((0.0, 0.4), (0.25, 0.3), (0.75, 0.1), (1.0, 0.0)):
+        anchor.advance(done)
+        assert anchor.weight.item() == pytest.approx(weight)

@@ -221,3 +221,18 @@ def test_td3s_target_is_the_lower_of_two_critics_at_the_smoothed_action():
     computed = learner.losses(batch)["critic"].detach()
     assert rows == 8
     torch.testing.assert_close(computed, wanted.mean(0)[:, 0], rtol=1e-4, atol=1e-4)
+
+
+def test_td3s_actors_follow_the_value_of_their_actions():
+    setup = made("td3", "learner.gamma=0.5")
+    setup.dry_run(12)
+    learner: Any = setup.learner
+    batch, loss = learner.sample(), learner.loss
+    observation = batch["agents", "observation"]
+    with torch.no_grad():
+        with loss.actor_network_params.to_module(loss.actor_network):
+            action = loss.actor_network.actor.module(observation)
+        with loss.qvalue_network_params[0].to_module(loss.qvalue_network):
+            value = loss.qvalue_network.module(observation, action)
+    actual = learner.losses(batch)["actor"].detach()
+    torch.testing.assert_close(actual, -value.mean(0)[:, 0], rtol=1e-4, atol=1e-4)

@@ -1,5 +1,6 @@
 """Tests the learners from whole episodes: IPPO and MAPPO."""
 
+import math
 from itertools import islice
 from typing import Any
 
@@ -13,6 +14,7 @@ from emberlink.envs.utils.errors import UserError
 from emberlink.policies.gaussian import LOG_PROB
 from emberlink.trainers import make_env
 from emberlink.trainers.config.compose import resolve
+from emberlink.trainers.learners.nan_guard import row_norms
 from emberlink.trainers.learners.on_policy.advantages import Advantages
 from emberlink.trainers.learners.on_policy.proximal import (
     ADVANTAGE,
@@ -275,3 +277,47 @@ def test_settings_out_of_range(setting, message):
     with pytest.raises(UserError) as error:
         resolve("independent", ["learner=ippo", setting])
     assert message in str(error.value)
+
+
+@pytest.mark.parametrize("learner", LEARNERS)
+def test_the_losses_are_those_of_ppo(learner):
+    setup = made(learner, "learner.clip=0.1", "learner.entropy=0.01")
+    batch, trained = first_batches(setup)[0], setup.learner
+    draw = torch.Generator().manual_seed(0)
+    shift = 0.6 * torch.rand(batch[LOG_PROB].shape, generator=draw) - 0.3
+    batch[LOG_PROB] += shift
+    losses, ratio, gain = trained.losses(batch), (-shift).exp(), batch[ADVANTAGE][..., 0]
+    surrogate = torch.minimum(ratio * gain, ratio.clamp(0.9, 1.1) * gain)
+    torch.testing.assert_close(losses["actor"], -surrogate.mean((0, 1)), rtol=1e-3, atol=1e-3)
+    error = (trained.critic(batch.copy())[VALUE] - batch[RETURN]).square()
+    torch.testing.assert_close(losses["critic"], error.mean((0, 1))[:, 0])
+    entropy = 3 * (0.5 * math.log(2 * math.pi * math.e) - 0.5)  # log_std = -0.5
+    assert losses["entropy"].tolist() == pytest.approx([-0.01 * entropy] * 3, rel=1e-4)
+
+
+@pytest.mark.parametrize("learner", LEARNERS)
+def test_the_gradients_of_an_update_have_a_largest_norm(learner, monkeypatch):
+    setup = made(learner, "learner.gradient_norm=0.001")
+    (batch, *_), trained, seen = first_batches(setup), setup.learner, {}
+
+    def step() -> None:
+        seen.update({name: value.grad.clone() for name, value in trained.parameters.items()})
+
+    monkeypatch.setattr(trained.optimizer, "step", step)
+    type(trained).update(trained, batch)  # `first_batches` replaces that of the object
+    for network in ("actor.", "critic."):
+        norms = row_norms([value for name, value in seen.items() if name.startswith(network)])
+        total = torch.stack(norms).square().sum(0).sqrt()
+        torch.testing.assert_close(total, torch.full_like(total, 0.001), rtol=1e-2, atol=0)
+
+
+def test_a_critic_distinguishes_the_kinds_of_cells_of_the_true_map():
+    """No fire, fire, and fire that was seen."""
+    setup = made("mappo", "learner.critic_map=true")
+    batch, critic, values = first_batches(setup)[0], setup.learner.critic, []
+    for kind in (0, 1, 2):
+        changed = batch.clone()
+        changed[keys.TRUE_MAP][:, 2] = kind
+        values.append(critic(changed)[VALUE][:, 2])
+    pairs = ((0, 1), (0, 2), (1, 2))
+    assert not any(values[a].isclose(values[b]).any() for a, b in pairs)

@@ -214,17 +214,21 @@ def test_a_queue_that_takes_nothing_is_an_error(tmp_path):
         swept(tmp_path, Full(0), "seed=0,1")
 
 
+def interrupt_when_submitted(executor) -> None:
+    """Sends SIGINT to this process when a training was submitted."""
+    deadline = time.monotonic() + 60
+    while not executor.submitted and time.monotonic() < deadline:
+        time.sleep(0.01)
+    if executor.submitted:
+        os.kill(os.getpid(), signal.SIGINT)
+
+
 def interrupted(executor, answer, monkeypatch, folder) -> int:
     """Sends SIGINT to a sweep with a running training and answers the question."""
     answers = [answer]
     monkeypatch.setattr(question, "ask", lambda *_: answers.pop(0))
 
-    def interrupt():
-        while not executor.submitted:
-            time.sleep(0.01)
-        os.kill(os.getpid(), signal.SIGINT)
-
-    thread = threading.Thread(target=interrupt)
+    thread = threading.Thread(target=interrupt_when_submitted, args=(executor,), daemon=True)
     thread.start()
     try:
         return swept(folder, executor)
@@ -312,7 +316,7 @@ def test_ctrl_c_may_be_taken_back(tmp_path, monkeypatch):
 
 def test_without_a_terminal_ctrl_c_stops(tmp_path):
     executor = Scripted(None)
-    thread = threading.Timer(1, os.kill, (os.getpid(), signal.SIGINT))
+    thread = threading.Thread(target=interrupt_when_submitted, args=(executor,), daemon=True)
     thread.start()
     assert swept(tmp_path, executor) == 130
     assert executor.cancelled

@@ -408,3 +408,12 @@ def test_wandb_keeps_the_name_of_the_run(tmp_path, monkeypatch):
     until(resume(trainer.run.path), None)
     folders = sorted((trainer.run.path / "wandb").glob("offline-run-*"))
     assert len({folder.name.rpartition("-")[2] for folder in folders}) == 1
+
+
+def test_the_best_networks_have_the_least_of_a_measure_of_which_less_is_better(tmp_path):
+    more = ["evaluation.headline=tracking_last", "evaluation.interval=1"]
+    trainer = begun("independent", tmp_path, *more)
+    for measured in (30.0, 20.0, 25.0):
+        trainer._keep_best(0, {"huygens/tracking_last": measured, "paper/tracking_last": measured})
+    assert trainer.best == [20.0]
+    trainer.close()
