@@ -61,7 +61,7 @@ class Player {
     this.curves = new Curves(find("curves"), data, (step) => this.seek(step));
     const most = Math.max(...data.panels.map((panel) => panel.uavs));
     find("uav").replaceChildren(...Array.from({ length: most }, (_, uav) => new Option(`UAV ${uav}`, uav)));
-    const teams = [...new Set(data.panels.map((panel) => panel.uavs))].sort((a, b) => a - b);
+    const teams = [...new Set(data.panels.map((panel) => panel.uavs))].toSorted((a, b) => a - b);
     const uavs = [...teams.slice(0, -1), counted(most, "UAV")].join(" or ");
     find("about").textContent = `${data.columns} \u00d7 ${data.rows} cells, ${uavs}, ${counted(data.horizon, "step")}`;
     find("slider").max = data.horizon;
