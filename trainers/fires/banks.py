@@ -17,6 +17,7 @@ from torch import Tensor
 from emberlink.envs.config import WildfireConfig
 from emberlink.envs.fire.cache import GENERATOR_VERSION
 from emberlink.envs.fire.generator import GeneratedConfig, Split, fire_seeds, make_fires
+from emberlink.envs.scenarios import ScenarioConfig
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.publish import free_name
 from emberlink.envs.world.burning import split_times
@@ -89,13 +90,18 @@ def _make(fire: GeneratedConfig, seeds: Tensor, world: WildfireConfig, console: 
     )
     made = torch.cat([make_fires(fire, part, world.grid, world.horizon) for part in parts])
     arrival, burn_out = split_times(made)
+    _warn_of_burn_out(fire, burn_out)
+    return arrival
+
+
+def _warn_of_burn_out(fire: ScenarioConfig, burn_out: Tensor | None) -> None:
+    """Warns that a file of fires will not hold the times at which cells burn out, if they do."""
     if burn_out is not None or math.isfinite(getattr(fire, "burn_time", math.inf)):
         warnings.warn(
             "a file of fires holds arrival times only, without the times at which cells burn out; "
             "fire.burn_time=STEPS gives one for all cells when the file is read",
-            stacklevel=2,
+            stacklevel=3,
         )
-    return arrival
 
 
 def import_files(arguments: Sequence[str], console: Console, output: Path) -> int:
@@ -120,6 +126,7 @@ def import_files(arguments: Sequence[str], console: Console, output: Path) -> in
     for path, config in zip(paths, configs, strict=True):
         fires.append(read(config)[0])
         names += list(_names(path, len(fires[-1])))
+    _warn_of_burn_out(configs[0].fire, None)
     facts = _facts(configs[0])
     del facts["fire"]["path"], facts["fire"]["sha256"]  # they hold for the first file only
     digests = [to_values(config)["fire"]["sha256"] for config in configs]

@@ -301,6 +301,8 @@ def test_import_of_several_files(capsys, tmp_path):
     assert lines[0] == "both.tif, fire 1 of 2: 25 x 20 cells, 200 steps, setup paper"
     assert numbers(lines)["burning at the end"] == np.isfinite(np.load("second.npy")).sum()
     assert lines[-1] == "fire_both_1.png"
+    with pytest.warns(UserWarning, match="without the times at which cells burn out"):
+        ran(capsys, "import", first, *keys, "fire.burn_time=50", "--output", "burnt.npy")
 
 
 def test_a_file_named_like_a_scenario_is_read_by_its_path(capsys, tmp_path):

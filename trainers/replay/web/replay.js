@@ -7,7 +7,7 @@ import { MapView } from "./map.js";
 import { Curves } from "./curves.js";
 
 const find = (name) => document.getElementById(name);
-const ADDRESS = 250; // milliseconds after which a step is written into the address
+const ADDRESS = 350; // milliseconds between two changes of the address
 const counted = (number, word) => `${number} ${word}${number === 1 ? "" : "s"}`;
 
 /** What a panel says about a step: name, text before the number, number, digits, text after. */
@@ -55,7 +55,7 @@ function list(box, text, rows) {
 
 class Player {
   constructor(data) {
-    Object.assign(this, { data, step: 0, playing: false });
+    Object.assign(this, { data, step: 0, playing: false, written: -Infinity });
     this.layers = [...document.querySelectorAll("#layers input")];
     this.panels = data.panels.map((panel, place) => this.makePanel(panel, place));
     this.curves = new Curves(find("curves"), data, (step) => this.seek(step));
@@ -200,7 +200,13 @@ class Player {
     // change that of its page.
     clearTimeout(this.later);
     if (location.protocol === "about:") return;
-    this.later = setTimeout(() => history.replaceState(null, "", `#t=${this.step}`), ADDRESS);
+    const write = () => {
+      this.written = performance.now();
+      history.replaceState(null, "", `#t=${this.step}`);
+    };
+    const wait = this.written + ADDRESS - performance.now();
+    if (wait > 0) this.later = setTimeout(write, wait);
+    else write();
   }
 
   /** Reads the colours of the style again: light and dark differ. */
