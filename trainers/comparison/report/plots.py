@@ -31,9 +31,9 @@ COLOURS = (
 yellow), and the same lighter"""
 DASHES = (
     *((0, (7, 3)), (0, (7, 2, 1, 2)), (0, (3, 2)), (0, (7, 2, 1, 2, 1, 2)), (0, (12, 4))),
-    *((0, (3, 2, 1, 2)), (0, (12, 2, 3, 2)), (0, (1, 1))),
+    *((0, (3, 2, 1, 2)), (0, (12, 2, 3, 2)), (0, (1, 1)), (0, (1, 4)), (0, (12, 2, 1, 2, 1, 2))),
 )
-"""line styles of scripted policies"""
+"""line styles of scripted policies, one for each that comes with emberlink"""
 FROZEN = ("coverage", "tracking_first", "tracking_last", "boundary_exits")
 """measures of the figure of frozen policies; rows are sorted by the first"""
 LOGARITHMIC = {"tracking_first": 1.0, "boundary_exits": 0.1}
