@@ -269,7 +269,7 @@ def _on_plane(
         times, a, c = times[:, ::-1], -a, c + columns * a
     if e > 0 and not (b or d):
         times, e, f = times[::-1], -e, f + rows * e
-    if chosen or b or d or a < 0 or e > 0:
+    if chosen or b or d:
         times, affine = warped(times, (a, b, c, d, e, f), chosen, MAX_CELLS)
         a, b, c, d, e, f = affine
         check_spreads(times)

@@ -44,6 +44,7 @@ class RunIndex:
         except ValueError as error:
             self.unreadable[run.path] = str(error)
             return
-        known = self.runs.get(identity(config))
+        name = identity(config)
+        known = self.runs.get(name)
         if known is None or not is_finished(known.folder, config):
-            self.runs[identity(config)] = FoundRun(run, config.seeds)
+            self.runs[name] = FoundRun(run, config.seeds)

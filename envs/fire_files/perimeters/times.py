@@ -169,14 +169,19 @@ def _is_date(number: float) -> bool:
     """Tells whether a number is a date in digits, or seconds or milliseconds since 1970."""
     digits = f"{number:.0f}"
     in_digits = len(digits) == 8 and digits[:2] in _CENTURIES
-    return number >= _MIN_MS or _MIN_S <= number < _MAX_S or in_digits
+    return number >= _MIN_MS or _in_seconds(number) or in_digits
+
+
+def _in_seconds(number: float) -> bool:
+    """Tells whether a number is seconds since 1970."""
+    return _MIN_S <= number < _MAX_S
 
 
 def _date(value: Any, feature: str, name: str) -> datetime:
     """Reads a date as text, as a number in digits, or as seconds or milliseconds since 1970."""
     text, number = str(value), _number(value)
     try:
-        if number is not None and _MIN_S <= number < _MAX_S:
+        if number is not None and _in_seconds(number):
             return datetime.fromtimestamp(number, UTC)
         if number is not None and _is_date(number):
             text = f"{number:.0f}"
