@@ -22,7 +22,7 @@ from tiny_run import train_tiny
 def _environment(tmp_path_factory):
     """Gives the tests and their subprocesses a temporary cache and no terminal."""
     with pytest.MonkeyPatch.context() as patch:
-        for name in ("COLUMNS", "FORCE_COLOR", "NO_COLOR"):
+        for name in ("COLUMNS", "EMBERLINK_CONFIGS", "FORCE_COLOR", "NO_COLOR"):
             patch.delenv(name, raising=False)
         patch.setenv("EMBERLINK_CACHE", str(_cache(tmp_path_factory)))
         yield

@@ -1,14 +1,17 @@
-"""Prints torch's profile of an update and of environment steps.
+"""Prints torch's profile of updates and of environment steps.
 
 python tests/benchmarks/profiles.py
 """
 
+import time
 from collections.abc import Callable
+from typing import Any
 
 from torch.profiler import profile
 from workloads import batch_of, flying, make
 
 from emberlink.trainers.config.compose import resolve
+from emberlink.trainers.rollout.products import fast_products
 from emberlink.trainers.training.setup import TrainingSetup
 
 KINDS = {
@@ -43,7 +46,49 @@ def show(title: str, work: Callable[[], object], units: int, calls: int = 10) ->
         print(f"| {kind} | {time:.3f} | {count:.0f} |")
 
 
+def iteration(num_envs: int) -> None:
+    """Prints the share of CPU time of each part of an iteration of `ippo` with a memory."""
+    options = ["setup=strong", "learner=ippo", "episodes=2", f"num_envs={num_envs}"]
+    setup = TrainingSetup(resolve("independent", options))
+    spent = dict.fromkeys(("steps of the environments", "communication", "actors", "updates"), 0.0)
+    batches: list[Any] = []
+    base, learner = setup.env.base_env, setup.learner
+    _time(base, "_step", "steps of the environments", spent)
+    _time(setup.env.transform, "_step", "communication", spent)
+    _time(learner.explorer, "forward", "actors", spent)
+    _time(learner, "update", "updates", spent, batches)
+    setup.dry_run(setup.horizon)
+    spent.update(dict.fromkeys(spent, 0.0))
+    began = time.process_time()
+    setup.dry_run(setup.horizon)
+    whole = time.process_time() - began
+    print(f"\nan iteration of ippo, {num_envs} environments: {whole:.2f} CPU s")
+    for part, seconds in [*spent.items(), ("the rest", whole - sum(spent.values()))]:
+        print(f"| {part} | {100 * seconds / whole:.0f} % |")
+    with fast_products():
+        show("an update of ippo", lambda: learner.update(batches[-1]), 1)
+
+
+def _time(
+    owner: Any, name: str, part: str, spent: dict[str, float], kept: list[Any] | None = None
+) -> None:
+    """Adds the CPU time of an object's method to `spent[part]`, and keeps its first arguments."""
+    method = getattr(owner, name)
+
+    def timed(*args: Any, **more: Any) -> Any:
+        if kept is not None:
+            kept[:] = args
+        began = time.process_time()
+        result = method(*args, **more)
+        spent[part] += time.process_time() - began
+        return result
+
+    object.__setattr__(owner, name, timed)
+
+
 def main() -> None:
+    for envs in (16, 64, 256, 1024):
+        iteration(envs)
     setup = TrainingSetup(resolve("shared_memory", ["env.horizon=1000", "episodes=1"]))
     batch = batch_of(setup)
     show("an update, paper's networks", lambda: setup.learner.update(batch), 1)
