@@ -41,16 +41,17 @@ def show(title: str, work: Callable[[], object], units: int, calls: int = 10) ->
         entry = table.setdefault(kind_of(event.key), [0.0, 0.0])
         entry[0] += event.self_cpu_time_total / calls / units / 1000
         entry[1] += event.count / calls / units
-    print(f"\n{title}: {sum(time for time, _ in table.values()):.3f} ms")
-    for kind, (time, count) in sorted(table.items(), key=lambda item: -item[1][0]):
-        print(f"| {kind} | {time:.3f} | {count:.0f} |")
+    print(f"\n{title}: {sum(spent for spent, _ in table.values()):.3f} ms")
+    for kind, (spent, count) in sorted(table.items(), key=lambda item: -item[1][0]):
+        print(f"| {kind} | {spent:.3f} | {count:.0f} |")
 
 
 def iteration(num_envs: int) -> None:
     """Prints the share of CPU time of each part of an iteration of `ippo` with a memory."""
     options = ["setup=strong", "learner=ippo", "episodes=2", f"num_envs={num_envs}"]
     setup = TrainingSetup(resolve("independent", options))
-    spent = dict.fromkeys(("steps of the environments", "communication", "actors", "updates"), 0.0)
+    parts = "steps of the environments", "communication", "actors", "updates"
+    spent: dict[str, float] = dict.fromkeys(parts, 0.0)
     batches: list[Any] = []
     base, learner = setup.env.base_env, setup.learner
     _time(base, "_step", "steps of the environments", spent)
@@ -58,7 +59,7 @@ def iteration(num_envs: int) -> None:
     _time(learner.explorer, "forward", "actors", spent)
     _time(learner, "update", "updates", spent, batches)
     setup.dry_run(setup.horizon)
-    spent.update(dict.fromkeys(spent, 0.0))
+    spent.update(dict.fromkeys(parts, 0.0))
     began = time.process_time()
     setup.dry_run(setup.horizon)
     whole = time.process_time() - began
