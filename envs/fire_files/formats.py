@@ -20,6 +20,8 @@ from emberlink.envs.utils.errors import UserError
 
 MAX_BYTES = 300_000_000
 """Bytes of a text file."""
+MAX_JSON = 100_000_000
+"""Bytes of GeoJSON, which takes up to 17 times as much memory while it is checked."""
 MAX_FILES = 500
 """Files of perimeters in a folder."""
 _SAFE_NAME = re.compile(r"\w[\w.:+-]*")  # part of a shell's command as it is
@@ -43,13 +45,13 @@ def _check_length(path: Path) -> None:
     _check_size(path.stat().st_size)
 
 
-def _check_size(size: int) -> None:
-    if size > MAX_BYTES:
-        raise UserError(f"{size} bytes; a text file has at most {MAX_BYTES}")
+def _check_size(size: int, most: int = MAX_BYTES, kind: str = "a text file") -> None:
+    if size > most:
+        raise UserError(f"{size} bytes; {kind} has at most {most}")
 
 
 def _check_json(path: Path) -> None:
-    _check_length(path)
+    _check_size(path.stat().st_size, MAX_JSON, "GeoJSON")
     check_geojson(path.read_bytes())
 
 

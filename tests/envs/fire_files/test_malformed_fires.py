@@ -91,3 +91,15 @@ def test_valid_files_are_read(tmp_path):
         assert fires.dtype == torch.float32
         assert fires.shape[1:] == GRID
         assert 4 < torch.isfinite(fires[0]).sum() <= np.prod(GRID)
+
+
+@pytest.mark.parametrize(
+    ("name", "most"), [("fire.geojson", 100_000_000), ("fire.kml", 300_000_000)]
+)
+def test_text_that_is_too_long_is_not_read(tmp_path, name, most):
+    path = tmp_path / name
+    path.write_bytes(b"{" if name.endswith("json") else b"<")
+    with path.open("r+b") as file:
+        file.truncate(most + 1)  # a hole, which takes no space
+    with pytest.raises(ValueError, match=f"{most + 1} bytes; .* has at most {most}"):
+        read(path)
