@@ -1,12 +1,15 @@
 """Measures UAV-steps per second of the environment, and of VMAS in the same run."""
 
+import time
 from dataclasses import replace
+from itertools import islice
 
 import pytest
 from workloads import flying, in_turns, make, steps_for, vmas_flying
 
 from emberlink.envs.wildfire import WildfireEnv
 from emberlink.trainers.config.compose import resolve
+from emberlink.trainers.training.setup import TrainingSetup
 
 GOALS = {None: 1_000_000, "consensus": 300_000}
 
@@ -44,6 +47,21 @@ def test_knowledge_maps(tell, num_envs):
     tell(
         f"{num_envs:5} environments: {alone:9,.0f} UAV-steps/s, with knowledge maps "
         f"{maps:9,.0f}, {maps / 100_000:.2f} x the goal; maps and all measures {measured:9,.0f}"
+    )
+
+
+@pytest.mark.parametrize("hold", [1, 10])
+def test_maps_with_its_network(tell, hold):
+    """Collects an episode of `front`: 60 x 60 cells, six UAVs, 64 environments."""
+    options = ["setup=strong", "world=front", "num_envs=64", f"policy.hold={hold}"]
+    setup = TrainingSetup(resolve("maps", options))
+    began = time.perf_counter()
+    for _ in islice(setup.collector, setup.horizon // setup.rollout_steps):
+        pass
+    rate = 6 * 64 * setup.horizon / (time.perf_counter() - began)
+    tell(
+        f"maps, its network at every {hold} steps: {rate:9,.0f} UAV-steps/s, "
+        f"{rate / 20_000:.2f} x the goal"
     )
 
 
