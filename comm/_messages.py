@@ -33,7 +33,7 @@ def bytes_of(count: int) -> int:
 
 
 def pass_on_places(
-    stamp: Tensor, place: Tensor, hears: Tensor, limit: int | None, size: int
+    stamp: Tensor, place: Tensor, hears: Tensor, left: Tensor | None, size: int
 ) -> Tensor:
     """Passes on the positions that UAVs know of each other, in place.
 
@@ -45,7 +45,7 @@ def pass_on_places(
             (column), -1 for never.
         place: float32 [envs, n, n, 3], the positions, cells.
         hears: bool [envs, n, n], whether a UAV (row) hears another one (column).
-        limit: bytes that a UAV can say; None for no limit.
+        left: int64 [envs, n], the bytes that each UAV can still say; None for no limit.
         size: bytes of a message about a position.
 
     Returns:
@@ -54,11 +54,10 @@ def pass_on_places(
     # [envs, hearers, speakers, known]
     newer = hears.unsqueeze(-1) & (stamp.unsqueeze(1) > stamp.unsqueeze(2))
     said = newer.any(1)
-    if limit is not None:
+    if left is not None:
         uavs = stamp.shape[-1]
         worth = stamp * uavs + torch.arange(uavs, device=stamp.device)
-        allowed = torch.full_like(stamp[..., 0], limit // size)
-        said = keep_best(said, worth, allowed, limit // size)
+        said = keep_best(said, worth, left // size, uavs)
         newer &= said.unsqueeze(1)
     told, speaker = torch.where(newer, stamp.unsqueeze(1), -1).max(2)
     better = (told > stamp).unsqueeze(-1)
@@ -132,14 +131,13 @@ class CellMessages(Buffers):
         flat = self.fresh.view(-1).view(torch.uint8)
         flat.scatter_reduce_(0, index, view.in_view.flatten().view(torch.uint8), "amax")
 
-    def pass_on(self, known: Knowledge, hears: Tensor, limit: int | None, left: Tensor) -> Tensor:
+    def pass_on(self, known: Knowledge, hears: Tensor, limit: int | None) -> Tensor:
         """Changes the maps of those that hear others.
 
         Args:
             known: the maps.
             hears: bool [envs, n, n], whether a UAV (row) hears another one (column).
             limit: bytes that a UAV can say in a step; None for no limit.
-            left: int64 [envs, n], bytes that each UAV can still say.
 
         Returns:
             int64 [envs, n], the bytes that each UAV said.
@@ -147,10 +145,9 @@ class CellMessages(Buffers):
         last, seen = known.last_seen, known.seen_fire
         assert seen is not None
         most = None if limit is None else limit // self.size
-        allowed = left.clamp(min=0) // self.size
         if last.is_cuda:
             self.heard.zero_()
-            return self.size * _pass_on_dense(last, seen, hears, most, allowed)
+            return self.size * _pass_on_dense(last, seen, hears, most)
         news = self._news(last, seen, hears & self.heard)
         maps = _differences(last, seen, hears & ~self.heard)
         env, speaker, hearer, cell = (torch.cat(parts) for parts in zip(news, maps, strict=True))
@@ -158,8 +155,8 @@ class CellMessages(Buffers):
         said[env, speaker, cell] = True
         self.fresh.zero_()
         if most is not None:
-            over = said.sum(-1) > allowed
-            wanted, said[over] = said.clone(), _best(said[over], last[over], most, allowed[over])
+            over = said.sum(-1) > most
+            wanted, said[over] = said.clone(), _best(said[over], last[over], most)
             self.fresh.copy_(wanted & ~said)
             kept = said[env, speaker, cell]
             env, speaker, hearer, cell = (x[kept] for x in (env, speaker, hearer, cell))
@@ -203,21 +200,19 @@ def _differences(last: Tensor, seen: Tensor, hears: Tensor) -> tuple[Tensor, ...
     return tuple(torch.cat(every) for every in zip(*parts, strict=True))
 
 
-def _best(said: Tensor, last: Tensor, most: int, allowed: Tensor) -> Tensor:
-    """Returns the most useful cells; `most` and `allowed` as in `keep_best`, bool [..., area]."""
+def _best(said: Tensor, last: Tensor, most: int) -> Tensor:
+    """Returns the `most` most useful cells of `said`, bool [..., area]."""
     area = last.shape[-1]
     number = last.long()
     fire = (number & 3 == 1) & (number >= 0)
     worth = (number + fire * 2**32) * area + torch.arange(area, device=last.device)
-    return keep_best(said, worth, allowed, most)
+    return keep_best(said, worth, torch.full_like(number[..., 0], most), most)
 
 
-def _pass_on_dense(
-    last: Tensor, seen: Tensor, hears: Tensor, most: int | None, allowed: Tensor
-) -> Tensor:
+def _pass_on_dense(last: Tensor, seen: Tensor, hears: Tensor, most: int | None) -> Tensor:
     """Compares all maps, never waits for the device, and returns the number of cells said.
 
-    `most` and `allowed` are as in `keep_best`; without a limit, `most` is None.
+    A UAV says at most `most` cells; None is no limit.
     """
     before, before_seen, counts = last.clone(), seen.clone(), []
     for number in range(hears.shape[1]):
@@ -226,7 +221,7 @@ def _pass_on_dense(
         newer = hearing & ((told > before) | (told_seen > before_seen))
         said = newer.any(1)
         if most is not None:
-            said = _best(said, told[:, 0], most, allowed[:, number])
+            said = _best(said, told[:, 0], most)
         heard = hearing & said.unsqueeze(1)
         torch.maximum(last, torch.where(heard, told, -1), out=last)
         seen |= heard & told_seen

@@ -160,11 +160,10 @@ class Maps(CommModule):
     def _talk(self, tensordict: TensorDictBase) -> None:
         """Passes on what is new to those that hear it, and counts the bytes."""
         hears, limit = tensordict.get(keys.HEARS), self.world.radio.bandwidth
+        cells = self.messages.pass_on(self.known, hears, limit)
+        left = None if limit is None else limit - cells
         size = place_bytes(self.world.horizon)
-        places = pass_on_places(self.stamp, self.place, hears, limit, size)
-        left = (0 if limit is None else limit) - places
-        cells = self.messages.pass_on(self.known, hears, limit, left)
-        self.said.copy_(places + cells)
+        self.said.copy_(cells + pass_on_places(self.stamp, self.place, hears, left, size))
 
     def _draw(self, tensordict: TensorDictBase) -> None:
         """Draws the pictures of the environments in which they are due, and looks for home."""

@@ -170,15 +170,18 @@ def unknown(value: str, known: Iterable[str], *, listed: bool = True) -> str:
 
     Args:
         value: the name.
-        known: all known names; the last part of a dotted key is compared too.
+        known: all known names. One whose last part is that of a dotted key is the most similar.
         listed: whether to append all known names. If not, names without dots are appended only if
             no name is similar.
     """
     names = list(known)
     last_parts = {name.rsplit(".", 1)[-1]: name for name in names}
-    near = difflib.get_close_matches(value, names, n=1) or [
-        last_parts[part] for part in difflib.get_close_matches(value, last_parts, n=1)
-    ]
+    same = [name for name in names if "." in value and name.endswith(value[value.rfind(".") :])]
+    near = (
+        difflib.get_close_matches(value, same, n=1, cutoff=0.0)
+        or difflib.get_close_matches(value, names, n=1)
+        or [last_parts[part] for part in difflib.get_close_matches(value, last_parts, n=1)]
+    )
     hint = f"; did you mean {near[0]}?" if near else ""
     if listed:
         hint += f"{'' if hint else ';'} known: {', '.join(names)}"

@@ -194,6 +194,21 @@ def test_a_limit_is_kept_and_less_becomes_known():
     assert known[None] >= known[400] > known[100] > known[7]
 
 
+@pytest.mark.parametrize(("uavs", "reach"), [(2, 40.0), (24, 40.0), (24, 5.0)])
+def test_more_bytes_make_more_cells_known(uavs, reach):
+    """Positions, 16 bytes each and new at every step, do not take the place of cells."""
+    position = torch.full((1, uavs, 3), 4.0)
+    position[0, :, 0] = torch.linspace(2, 27, uavs)  # a chain with a radio of 5 cells
+    position[0, :, 1] = 15.0
+    known = []
+    for limit in (0, 5, 15, 16, 20, 21, 64, 100, None):
+        env = environment(burning(), position, radio=RadioConfig(range=reach, bandwidth=limit))
+        fly(env, position, random_flight(20, uavs))
+        known.append((env.transform.module.known.last_seen >= 0).sum().item())
+    assert known == sorted(known)
+    assert known[0] < known[2] < known[-1]
+
+
 @pytest.mark.parametrize("aside", [0.0, 0.2])  # 32.3 + 0.2 is between two cells
 def test_moving_the_world_does_not_change_the_pictures(aside):
     """The pictures reach 14 cells far and do not touch the edge."""

@@ -83,6 +83,9 @@ SETUPS = "known: paper, released, strong, tuned"
         (["consensus", "logger=mlflow"], ["logger=mlflow", "'wandb', 'tensorboard', 'csv'"]),
         (["consensus", "replay=both"], ["replay=both", "'per_agent' or 'shared'"]),
         (["consensus", "env.radio.rnge=3"], ["'env.radio.rnge'", "did you mean env.radio.range?"]),
+        (["maps", "comm.range=0"], ["'comm.range'", "did you mean env.radio.range?"]),
+        (["maps", "comm.bandwidth=9"], ["'comm.bandwidth'", "did you mean env.radio.bandwidth?"]),
+        (["maps", "setup.memory=gru"], ["'setup.memory'", "did you mean policy.memory?"]),
         (["consensus", "env.radio.range=-1"], ["env.radio.range=-1", "greater than or equal to 0"]),
         (["consensus", "comm.heading.form=cubic"], ["comm.heading.form=cubic", "'folded_linear'"]),
         (
