@@ -4,6 +4,7 @@ from typing import Any
 
 import pytest
 import torch
+from test_recipes import METHODS
 
 from emberlink.envs import keys
 from emberlink.policies.networks.grouping import Grouping
@@ -128,9 +129,11 @@ def test_a_uavs_losses_read_the_team_and_train_its_own_networks_alone(learner, m
 
 
 @pytest.mark.parametrize("learner", ["ddpg", "td3"])
-@pytest.mark.parametrize("method", ["independent", "shared_memory"])
+@pytest.mark.parametrize("method", [*METHODS, "maps"])
 def test_every_network_is_trained(learner, method):
-    more = ["env.observation=window", "env.failures=2", "seeds=[1,2]", "policy.agent_index=true"]
+    more = ["env.failures=2", "seeds=[1,2]", "policy.agent_index=true"]
+    maps = ["comm.pixels=8", "policy.hold=1"]
+    more += maps if method == "maps" else ["env.observation=window"]
     setup = made(learner, *more, "env.num_uavs=2", method=method)
     before = {name: value.clone() for name, value in setup.learner.weights(1).items()}
     setup.dry_run(14)
