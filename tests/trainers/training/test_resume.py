@@ -35,6 +35,7 @@ def replay(trainer: Trainer) -> ReplayMemory:
 
 # A replay buffer of 60 rows is full after 30 of the 80 steps.
 REPLAY = ["learner.batch_size=16", "learner.buffer_size=60"]
+SEQUENCES = ["learner.sequence=4", "learner.burn_in=3"]
 ON_POLICY = ["policy.memory=gru", "policy.units=6"]
 
 
@@ -134,10 +135,18 @@ def test_a_resumed_run_equals_the_uninterrupted_run(method, steps, learner, whol
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("method", "learner"), [("consensus", "ddpg"), ("positional", "td3"), ("independent", "ippo")]
+    ("method", "more"),
+    [
+        ("consensus", ["learner=ddpg"]),
+        ("positional", ["learner=td3"]),
+        ("independent", ["learner=ippo"]),
+        ("shared_memory", ["learner=mappo", "learner.critic_map=true"]),
+        ("consensus", ["learner=ddpg", "policy.memory=stack", *SEQUENCES, "learner.critic=team"]),
+        ("independent", ["learner=td3", "policy.memory=gru", *SEQUENCES]),
+    ],
 )
-def test_seeds_side_by_side_are_resumed_together(method, learner, whole, tmp_path):
-    more = "seeds=[0,1,2]", f"learner={learner}"
+def test_seeds_side_by_side_are_resumed_together(method, more, whole, tmp_path):
+    more = "seeds=[0,1,2]", *more
     stopped = stopped_at([27, 60], method, tmp_path, *more)
     assert len(stopped.runs) == 3
     assert_same(whole(method, *more), stopped)
@@ -148,9 +157,11 @@ def test_seeds_side_by_side_are_resumed_together(method, learner, whole, tmp_pat
     "more",
     [
         ["learner=ippo"],
+        ["learner=ippo", "learner.share_parameters=false"],
         ["learner=mappo", "policy.memory=stack", "learner.critic_map=true"],
         ["learner=ddpg"],
-        ["learner=ddpg", "policy.memory=gru", "learner.sequence=4", "learner.burn_in=3"],
+        ["learner=ddpg", "learner.critic=team"],
+        ["learner=ddpg", "policy.memory=gru", *SEQUENCES],
         [
             *("learner=td3", "policy.memory=stack", "learner.sequence=3", "learner.burn_in=4"),
             "learner.critic=team",
