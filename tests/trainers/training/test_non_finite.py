@@ -18,6 +18,7 @@ from test_resume import assert_same, until
 from emberlink.envs import keys
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.wildfire import WildfireEnv
+from emberlink.policies.gaussian import MemoryActor
 from emberlink.trainers.cli import main
 from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.learners.anchor import Anchor
@@ -41,14 +42,18 @@ SMALL = [
     *("evaluation.interval=0", "evaluation.episodes=1"),
 ]
 PLACES = ["observation", "reward", "gradient", "weight"]
-LEARNERS = {"ddpg": DDPG, "td3": TD3}
+LEARNERS = {"ddpg": DDPG, "td3": TD3, "ippo": OnPolicyLearner, "mappo": OnPolicyLearner}
+SEQUENCES = ["learner.sequence=4", "learner.burn_in=2"]
+GRU, STACK = ["policy.memory=gru"], ["policy.memory=stack"]
 
 
 resolved = functools.cache(resolve)
 
 
 def begun(method: str, output: Path, *more: str) -> Trainer:
-    config = resolved(method, (*SMALL, *more))
+    whole_episodes = {"learner=ippo", "learner=mappo"} & {*more}
+    own = [text for text in SMALL if not (whole_episodes and "batch_size" in text)]
+    config = resolved(method, (*own, *more))
     trainer = Trainer(replace(config, output=str(output)))
     trainer.start()
     return trainer
@@ -98,6 +103,18 @@ class Poison:
             return after
 
         self.monkeypatch.setattr(WildfireEnv, "_step", poisoned)
+
+    def memory(self) -> None:
+        """Changes the state of a memory before the decision of the step."""
+        state = MemoryActor._state
+
+        def poisoned(actor, tensordict):
+            before = state(actor, tensordict)
+            if self.is_due(actor, tensordict[keys.STEP] + 1):
+                before[self.env, self.uav, 2] = math.nan
+            return before
+
+        self.monkeypatch.setattr(MemoryActor, "_state", poisoned)
 
     def gradient(self) -> None:
         """Adds a term of value 0 to the critic's loss, whose derivative is NaN."""
@@ -150,6 +167,7 @@ class Poison:
 EXPECTED = {
     "observation": {"tensor": "observation", "environment": ENV, "value": "nan"},
     "reward": {"tensor": "reward", "environment": ENV, "value": "-inf"},
+    "memory": {"tensor": "action", "environment": ENV, "value": "nan"},
     "gradient": {"tensor": "gradient of critic.second.weight", "value": "nan"},
     "loss": {"tensor": "critic's loss", "value": "nan"},
     "weight": {"tensor": "action", "environment": 0, "value": "nan"},
@@ -185,15 +203,16 @@ def clean(tmp_path_factory):
     """Returns a function that gives the state of an undisturbed run just before `STEP`."""
     states = {}
 
-    def of(method: str, learner: str = "ddpg") -> dict:
-        if (method, learner) not in states:
+    def of(method: str, learner: str = "ddpg", *more: str) -> dict:
+        key = method, learner, *more
+        if key not in states:
             folder = tmp_path_factory.mktemp("clean")
-            trainer = begun(method, folder, f"learner={learner}")
+            trainer = begun(method, folder, f"learner={learner}", *more)
             until(trainer, STEP - 1)
             header, state = checkpoint_file.read(trainer.run.states()[-1])
             assert header["step"] == STEP - 1
-            states[method, learner] = state
-        return states[method, learner]
+            states[key] = state
+        return states[key]
 
     return of
 
@@ -208,18 +227,26 @@ def check_weights(dump: Path, wanted: dict) -> None:
 
 
 CASES = [
-    *(("consensus", "ddpg", place) for place in PLACES),
-    *((method, "ddpg", "observation") for method in METHODS if method != "consensus"),
-    *(("consensus", "td3", place) for place in ("gradient", "loss")),
+    *(("consensus", "ddpg", place, []) for place in PLACES),
+    *((method, "ddpg", "observation", []) for method in METHODS if method != "consensus"),
+    *(("consensus", "td3", place, []) for place in ("gradient", "loss")),
+    ("consensus", "ddpg", "memory", [*GRU, *SEQUENCES]),
+    ("independent", "td3", "memory", [*STACK, *SEQUENCES]),
+    ("consensus", "ippo", "observation", GRU),
+    ("independent", "ippo", "memory", [*GRU, "learner.share_parameters=false"]),
+    ("shared_memory", "mappo", "reward", ["learner.critic_map=true"]),
+    ("consensus", "mappo", "memory", STACK),
 ]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("method", "learner", "place"), CASES)
-def test_training_stops_and_names_the_value(method, learner, place, clean, tmp_path, monkeypatch):
-    before = clean(method, learner)
+@pytest.mark.parametrize(("method", "learner", "place", "more"), CASES)
+def test_training_stops_and_names_the_value(
+    method, learner, place, more, clean, tmp_path, monkeypatch
+):
+    before = clean(method, learner, *more)
     poison = Poison(monkeypatch, place, method, learner=learner)
-    trainer = begun(method, tmp_path, f"learner={learner}")
+    trainer = begun(method, tmp_path, f"learner={learner}", *more)
     error = diverged(trainer)
     report, wanted = error.report, expected(place, method, learner)
     check_report(report, wanted)
@@ -272,7 +299,7 @@ def test_the_seed_of_the_value_is_named(place, tmp_path, monkeypatch):
 @pytest.mark.parametrize("place", ["observation", "gradient", "loss"])
 def test_a_late_poll_reports_the_same_value(place, clean, tmp_path, monkeypatch):
     """On a GPU the flags arrive some steps later. No update happens in between."""
-    late = 3
+    late, before = 3, clean("consensus")
     Poison(monkeypatch, place)
     seen: list[bool] = []
 
@@ -285,7 +312,7 @@ def test_a_late_poll_reports_the_same_value(place, clean, tmp_path, monkeypatch)
     error = diverged(trainer)
     check_report(error.report, expected(place))
     assert trainer.setup.step == error.report.step + late
-    check_weights(error.dump, clean("consensus"))
+    check_weights(error.dump, before)
 
 
 def test_no_checkpoint_contains_the_value(tmp_path, monkeypatch):
@@ -353,20 +380,20 @@ def test_a_failed_dump_keeps_the_message(tmp_path, monkeypatch):
     assert error.dump is None
 
 
-def diverging_above(monkeypatch, share: float) -> None:
-    """Makes a gradient NaN at the 20th update while the learning rates are above a share."""
-    original = DDPG.losses
+def diverging_above(monkeypatch, kind: type, update: int, share: float) -> None:
+    """Makes a gradient NaN at an update while the learning rate is above a share of the first."""
+    original, rates = kind.losses, []
 
-    def poisoned(learner, batch, *, actor=True):
-        losses = original(learner, batch, actor=actor)
-        group = learner.optimizer.param_groups[0]
-        weight = group["params"][0]
-        done = int(learner.optimizer.state[weight].get("step", 0))
-        if done == 20 and group["lr"] > share * 1e-4:
-            losses["critic"] = losses["critic"] + (0 * weight[UAV]).sum().sqrt()
+    def poisoned(learner, *given, **named):
+        losses = original(learner, *given, **named)
+        if learner.updates == update:
+            rates.append(learner.optimizer.param_groups[0]["lr"])
+            if rates[-1] > share * rates[0]:
+                weight = next(iter(learner.parameters.values()))
+                losses["critic"] = losses["critic"] + (0 * weight).sum().sqrt()
         return losses
 
-    monkeypatch.setattr(DDPG, "losses", poisoned)
+    monkeypatch.setattr(kind, "losses", poisoned)
 
 
 def progress_of(trainer: Trainer) -> tuple[float, int, int]:
@@ -378,10 +405,21 @@ ROLLBACK = ["on_nan=rollback", "setup=paper"]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seeds", [[], ["seeds=[0,4]"]])
-def test_a_rollback_resumes_bit_for_bit(seeds, tmp_path, monkeypatch):
-    diverging_above(monkeypatch, 0.3)
-    trainer = begun("consensus", tmp_path / "a", *ROLLBACK, *seeds)
+@pytest.mark.parametrize(
+    ("learner", "more", "update", "to"),
+    [
+        ("ddpg", [], 21, 20),
+        ("ddpg", ["seeds=[0,4]"], 21, 20),
+        ("td3", [*GRU, *SEQUENCES], 21, 20),
+        # Eight updates follow each episode, after its last step and before its checkpoint.
+        ("ippo", [*GRU, "seeds=[0,4]"], 11, 30),
+        ("mappo", ["learner.critic_map=true"], 11, 30),
+    ],
+)
+def test_a_rollback_resumes_bit_for_bit(learner, more, update, to, tmp_path, monkeypatch):
+    diverging_above(monkeypatch, LEARNERS[learner], update, 0.3)
+    trainer = begun("consensus", tmp_path / "a", *ROLLBACK, f"learner={learner}", *more)
+    rates = [group["lr"] for group in trainer.setup.learner.optimizer.param_groups]
     copy = tmp_path / "b"
     notes = []
 
@@ -396,28 +434,27 @@ def test_a_rollback_resumes_bit_for_bit(seeds, tmp_path, monkeypatch):
     monkeypatch.setattr(trainer, "train", lambda report: train(lambda p: (watch(p), report(p))))
     until(trainer, None)
     assert progress_of(trainer) == (0.25, 0, 60)
-    assert [group["lr"] for group in trainer.setup.learner.optimizer.param_groups] == [
-        2.5e-5,
-        2.5e-4,
-    ]
+    lowered = [group["lr"] for group in trainer.setup.learner.optimizer.param_groups]
+    whole_episodes = learner in ("ippo", "mappo")  # the last of three has a third of the rate
+    assert lowered == pytest.approx([rate / (12 if whole_episodes else 4) for rate in rates])
     assert len(notes) == 2
-    assert "rollback 2 of 5: on from step 20 with learning rates x 0.25" in notes[1]
+    assert f"rollback 2 of 5: on from step {to} with learning rates x 0.25" in notes[1]
     for run in trainer.runs:
         lines = (run.path / "rollbacks.jsonl").read_text().splitlines()
         assert [(json.loads(text)["to"], json.loads(text)["lr_scale"]) for text in lines] == [
-            (20, 0.5),
-            (20, 0.25),
+            (to, 0.5),
+            (to, 0.25),
         ]
         assert [line["episode"] for line in run.lines()] == [1, 2, 3]
         assert [line["episode"] for line in run.lines("timing.jsonl")] == [1, 2, 3]
     assert len(list(trainer.run.path.glob("divergence_step_*"))) == 2
     # Killed after the first rollback, and stopped after the second.
     resumed = resume(copy / trainer.run.path.name)
-    assert progress_of(resumed) == (0.5, 1, 20)
-    until(resumed, 37)
+    assert progress_of(resumed) == (0.5, 1, to)
+    until(resumed, 47)
     again = resume(resumed.run.path)
-    # The checkpoint of step 30 is after the failing step, so the count restarts.
-    assert progress_of(again) == (0.25, 0, 37)
+    # This checkpoint is after the failing step, so the count restarts.
+    assert progress_of(again) == (0.25, 0, 47)
     assert_same(trainer, until(again, None))
 
 
@@ -468,31 +505,37 @@ def test_gradient_norms_are_per_uav():
     torch.testing.assert_close(torch.stack(row_norms(tensors)), torch.tensor(wanted))
 
 
-@pytest.mark.parametrize(("learner", "weight"), [("ippo", "output"), ("mappo", "network.output")])
+@pytest.mark.parametrize(
+    ("learner", "more", "weight"),
+    [
+        ("ippo", GRU, "output"),
+        ("mappo", GRU, "network.output"),
+        ("mappo", [*STACK, "learner.critic_map=true"], "network.output"),
+    ],
+)
 def test_learners_from_whole_episodes_stop_and_name_the_value(
-    learner, weight, tmp_path, monkeypatch
+    learner, more, weight, tmp_path, monkeypatch
 ):
     """The third of the eight updates after the second episode has a gradient that is NaN."""
-    original, bad = OnPolicyLearner.losses, [11]
+    original, bad, computed = OnPolicyLearner.losses, [11], []
 
     def poisoned(learner, batch):
         losses = original(learner, batch)
         if learner.updates in bad:
+            computed.append(losses["critic"].detach())
             values = learner.parameters[f"critic.{weight}.weight"]
             losses["critic"] = losses["critic"] + (0 * values).sum().sqrt()
         return losses
 
     monkeypatch.setattr(OnPolicyLearner, "losses", poisoned)
-    settings = [text for text in SMALL if "batch_size" not in text]
-    memory = [f"learner={learner}", "policy.memory=gru", "policy.hold=2"]
-    trainer = Trainer(resolve("consensus", [*settings, *memory, f"output={tmp_path}"]))
-    trainer.start()
+    trainer = begun("consensus", tmp_path, f"learner={learner}", *more, "policy.hold=2")
     error = diverged(trainer)
     wanted = {"tensor": f"gradient of critic.{weight}.weight", "uav": None, "seed": 0}
     wanted |= {"environment": None, "step": 40, "update": 11, "value": "nan"}
     check_report(error.report, wanted)
     assert error.dump is not None
     assert replay(error.dump) == error.report
+    torch.testing.assert_close(computed[0], computed[1])
     bad.clear()
     assert replay(error.dump) is None
     for value in trainer.setup.learner.weights().values():
@@ -502,41 +545,40 @@ def test_learners_from_whole_episodes_stop_and_name_the_value(
     again.close()
 
 
-@pytest.mark.parametrize("more", [["policy.memory=gru"], ["learner.critic=team"]])
-def test_the_update_of_a_sequence_or_a_team_can_be_repeated(more, tmp_path, monkeypatch):
+@pytest.mark.parametrize("learner", ["ddpg", "td3"])
+@pytest.mark.parametrize("more", [GRU, STACK, ["learner.critic=team"]])
+def test_the_update_of_a_sequence_or_a_team_can_be_repeated(learner, more, tmp_path, monkeypatch):
     """The gradient of UAV 1's critic is NaN in the ninth update."""
-    original, bad = DDPG.losses, [9]
+    kind, bad, computed = LEARNERS[learner], [9], []
+    original = kind.losses
 
     def poisoned(learner, batch, **more):
         losses = original(learner, batch, **more)
         if learner.updates in bad:
+            computed.append(losses["critic"].detach())
             values = learner.parameters["critic.value.weight"]
-            losses["critic"] = losses["critic"] + (0 * values[1]).sum().sqrt()
+            losses["critic"] = losses["critic"] + (0 * values[..., 1, :, :]).sum().sqrt()
         return losses
 
-    monkeypatch.setattr(DDPG, "losses", poisoned)
-    more = [*more, "learner.sequence=4", "learner.burn_in=2"]
-    trainer = begun("independent", tmp_path, *more)
+    monkeypatch.setattr(kind, "losses", poisoned)
+    trainer = begun("independent", tmp_path, f"learner={learner}", *more, *SEQUENCES)
     error = diverged(trainer)
-    assert error.report.tensor == "gradient of critic.value.weight"
+    critic = "critic_1" if learner == "td3" else "critic"
+    assert error.report.tensor == f"gradient of {critic}.value.weight"
     assert (error.report.uav, error.report.update) == (1, 9)
     assert error.dump is not None
     assert replay(error.dump) == error.report
+    torch.testing.assert_close(computed[0], computed[1])
     bad.clear()
     assert replay(error.dump) is None
 
 
 @pytest.mark.parametrize("learner", ["ddpg", "ippo"])
 def test_the_loss_of_an_anchor_is_repeated_with_its_weight(learner, tmp_path, monkeypatch):
-    own = [text for text in SMALL if learner == "ddpg" or "batch_size" not in text]
-    config = resolve("independent", [*own, f"learner={learner}", f"output={tmp_path}"])
-    first = Trainer(config)
-    first.start()
+    first = begun("independent", tmp_path / "first", f"learner={learner}")
     first.train()
     start = [f"learner.warm_start={first.run.path}", "learner.anchor=0.5"]
-    config = resolve("independent", [*own, f"learner={learner}", *start])
-    trainer = Trainer(replace(config, output=str(tmp_path / "anchored")))
-    trainer.start()
+    trainer = begun("independent", tmp_path / "anchored", f"learner={learner}", *start)
     original, weights = Anchor.loss, []
 
     def poisoned(anchor, *actions):
