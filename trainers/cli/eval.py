@@ -35,7 +35,8 @@ def add_eval(commands: Any) -> None:
         completer=completion.settings,
         nargs="*",
         default=[],
-        help="keys of comm. or env. to change, such as env.radio.loss=0.5, or world=NAME; "
+        help="keys of comm. or env. to change, such as env.radio.loss=0.5, world=NAME, or "
+        "evaluation.scripted=[] for the frozen policies alone; "
         "the names of the files contain them",
     )
     evaluation.add_argument(

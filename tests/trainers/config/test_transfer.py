@@ -103,11 +103,28 @@ def test_a_replay_in_another_world(run, tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
+    ("scripted", "names"), [("[]", ["learned"]), ("[stationary]", ["learned", "stationary"])]
+)
+def test_scripted_policies_can_be_chosen(scripted, names, run, capsys):
+    before = (run / "eval.json").read_bytes()
+    assert main(["eval", str(run), f"evaluation.scripted={scripted}", "--fires", "1"]) == 0
+    (file,) = run.glob("eval_evaluation.scripted*.json")
+    content = json.loads(file.read_text())
+    assert all(list(played) == names for played in content["results"].values())
+    assert content["changed"][0].startswith(f"evaluation.scripted is {names[1:]} here")
+    assert (run / "eval.json").read_bytes() == before
+    file.unlink()
+
+
+@pytest.mark.parametrize(
     ("setting", "said"),
     [
         ("world=moon", "known: blackout, file, front, paper, relay, swarm"),
         ("world=file", "fire.path"),
-        ("fire=front", "can change the world and keys of comm. and env. only"),
+        (
+            "fire=front",
+            "can change the world, evaluation.scripted, and keys of comm. and env. only",
+        ),
         ("world=swarm", "a checkpoint of uavs=2; this configuration has uavs=24"),
     ],
 )
