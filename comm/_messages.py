@@ -33,18 +33,18 @@ def bytes_of(count: int) -> int:
 
 
 def pass_on_places(
-    stamp: Tensor, place: Tensor, hears: Tensor, left: Tensor | None, size: int
+    stamp: Tensor, place: Tensor, near: Tensor, hears: Tensor, left: Tensor | None, size: int
 ) -> Tensor:
     """Passes on the positions that UAVs know of each other, in place.
 
-    A UAV says a position if one of those that hear it knows an older one or none. With a limit,
-    the newest are said first.
+    A UAV says a position if one of those in range knows an older one or none. With a limit, the
+    newest are said first.
 
     Args:
         stamp: int64 [envs, n, n], the step at which a UAV (row) knows the position of another one
             (column), -1 for never.
         place: float32 [envs, n, n, 3], the positions, cells.
-        hears: bool [envs, n, n], whether a UAV (row) hears another one (column).
+        near, hears: see `CellMessages.pass_on`.
         left: int64 [envs, n], the bytes that each UAV can still say; None for no limit.
         size: bytes of a message about a position.
 
@@ -52,13 +52,13 @@ def pass_on_places(
         int64 [envs, n], the bytes that each UAV said.
     """
     # [envs, hearers, speakers, known]
-    newer = hears.unsqueeze(-1) & (stamp.unsqueeze(1) > stamp.unsqueeze(2))
+    newer = near.unsqueeze(-1) & (stamp.unsqueeze(1) > stamp.unsqueeze(2))
     said = newer.any(1)
     if left is not None:
         uavs = stamp.shape[-1]
         worth = stamp * uavs + torch.arange(uavs, device=stamp.device)
         said = keep_best(said, worth, left // size, uavs)
-        newer &= said.unsqueeze(1)
+    newer &= hears.unsqueeze(-1) & said.unsqueeze(1)
     told, speaker = torch.where(newer, stamp.unsqueeze(1), -1).max(2)
     better = (told > stamp).unsqueeze(-1)
     theirs = place.gather(1, speaker.unsqueeze(-1).expand(*speaker.shape, 3))
@@ -88,14 +88,14 @@ def keep_best(said: Tensor, worth: Tensor, allowed: Tensor, most: int) -> Tensor
 class CellMessages(Buffers):
     """Passes on the cells of maps.
 
-    A UAV says a cell if one of those that hear it has an older look at it or none, or does not know
+    A UAV says a cell if one of those in range has an older look at it or none, or does not know
     that it was seen while it burned. With a limit, cells with fire are said first, then the others;
     of each, the newest look first. A map holds 4 times the step of the last look plus what was seen
     (1 for fire), -1 for never.
 
     Between UAVs in contact, only cells can be new that a UAV saw at this step, was told at the step
-    before, or had no time to say. So whole maps are compared only where a UAV did not hear another
-    one at the step before.
+    before, had no time to say, or said in vain. So whole maps are compared only where a UAV was not
+    in range of another one at the step before.
 
     Args:
         envs: number of environments.
@@ -105,9 +105,9 @@ class CellMessages(Buffers):
     """
 
     fresh: Tensor
-    """bool [envs, uavs, area]: cells that may be new to those who heard the UAV the step before"""
+    """bool [envs, uavs, area]: cells that may be new to UAVs in range at the step before"""
     heard: Tensor
-    """bool [envs, uavs, uavs]: whom each UAV heard at the step before"""
+    """bool [envs, uavs, uavs]: whom each UAV was in range of at the step before"""
     _shift: Tensor
 
     def __init__(self, envs: int, uavs: int, area: int, size: int):
@@ -131,12 +131,13 @@ class CellMessages(Buffers):
         flat = self.fresh.view(-1).view(torch.uint8)
         flat.scatter_reduce_(0, index, view.in_view.flatten().view(torch.uint8), "amax")
 
-    def pass_on(self, known: Knowledge, hears: Tensor, limit: int | None) -> Tensor:
+    def pass_on(self, known: Knowledge, near: Tensor, hears: Tensor, limit: int | None) -> Tensor:
         """Changes the maps of those that hear others.
 
         Args:
             known: the maps.
-            hears: bool [envs, n, n], whether a UAV (row) hears another one (column).
+            near: bool [envs, n, n], whether a UAV (row) is in range of another one (column).
+            hears: bool [envs, n, n], of these, who hears the other one: no message is lost.
             limit: bytes that a UAV can say in a step; None for no limit.
 
         Returns:
@@ -147,9 +148,9 @@ class CellMessages(Buffers):
         most = None if limit is None else limit // self.size
         if last.is_cuda:
             self.heard.zero_()
-            return self.size * _pass_on_dense(last, seen, hears, most)
-        news = self._news(last, seen, hears & self.heard)
-        maps = _differences(last, seen, hears & ~self.heard)
+            return self.size * _pass_on_dense(last, seen, near, hears, most)
+        news = self._news(last, seen, near & self.heard)
+        maps = _differences(last, seen, near & ~self.heard)
         env, speaker, hearer, cell = (torch.cat(parts) for parts in zip(news, maps, strict=True))
         said = torch.zeros_like(seen)
         said[env, speaker, cell] = True
@@ -160,19 +161,23 @@ class CellMessages(Buffers):
             self.fresh.copy_(wanted & ~said)
             kept = said[env, speaker, cell]
             env, speaker, hearer, cell = (x[kept] for x in (env, speaker, hearer, cell))
+        if near is not hears:
+            arrives = hears[env, hearer, speaker]
+            self.fresh[env[~arrives], speaker[~arrives], cell[~arrives]] = True
+            env, speaker, hearer, cell = (x[arrives] for x in (env, speaker, hearer, cell))
         number, was_fire = last[env, speaker, cell], seen[env, speaker, cell]
         place = (env * last.shape[1] + hearer) * last.shape[2] + cell
         last.view(-1).scatter_reduce_(0, place, number, "amax")
         flat = seen.view(-1).view(torch.uint8)
         flat.scatter_reduce_(0, place, was_fire.view(torch.uint8), "amax")
         self.fresh.view(-1)[place] = True
-        self.heard.copy_(hears)
+        self.heard.copy_(near)
         return self.size * said.sum(-1)
 
-    def _news(self, last: Tensor, seen: Tensor, hears: Tensor) -> tuple[Tensor, ...]:
+    def _news(self, last: Tensor, seen: Tensor, near: Tensor) -> tuple[Tensor, ...]:
         """Returns the fresh cells that are new to others; see `_differences`."""
         env, speaker, cell = self.fresh.nonzero(as_tuple=True)
-        linked = hears.transpose(1, 2)[env, speaker]
+        linked = near.transpose(1, 2)[env, speaker]
         rows = linked.any(-1)
         env, speaker, cell = env[rows], speaker[rows], cell[rows]
         newer = last[env, speaker, cell].unsqueeze(-1) > last[env, :, cell]
@@ -181,17 +186,17 @@ class CellMessages(Buffers):
         return env[entry], speaker[entry], hearer, cell[entry]
 
 
-def _differences(last: Tensor, seen: Tensor, hears: Tensor) -> tuple[Tensor, ...]:
+def _differences(last: Tensor, seen: Tensor, near: Tensor) -> tuple[Tensor, ...]:
     """Returns environment, speaker, hearer and cell, int64 [k] each, of all cells new to a hearer.
 
     Args:
         last: integers [envs, n, area].
         seen: bool [envs, n, area].
-        hears: bool [envs, n, n], whose maps are compared.
+        near: bool [envs, n, n], whose maps are compared.
     """
     parts = []
     for env, hearer, speaker in zip(
-        *(x.split(_COMPARED) for x in hears.nonzero(as_tuple=True)), strict=True
+        *(x.split(_COMPARED) for x in near.nonzero(as_tuple=True)), strict=True
     ):
         newer = last[env, speaker] > last[env, hearer]
         newer |= seen[env, speaker] > seen[env, hearer]
@@ -209,7 +214,9 @@ def _best(said: Tensor, last: Tensor, most: int) -> Tensor:
     return keep_best(said, worth, torch.full_like(number[..., 0], most), most)
 
 
-def _pass_on_dense(last: Tensor, seen: Tensor, hears: Tensor, most: int | None) -> Tensor:
+def _pass_on_dense(
+    last: Tensor, seen: Tensor, near: Tensor, hears: Tensor, most: int | None
+) -> Tensor:
     """Compares all maps, never waits for the device, and returns the number of cells said.
 
     A UAV says at most `most` cells; None is no limit.
@@ -217,12 +224,11 @@ def _pass_on_dense(last: Tensor, seen: Tensor, hears: Tensor, most: int | None) 
     before, before_seen, counts = last.clone(), seen.clone(), []
     for number in range(hears.shape[1]):
         told, told_seen = before[:, number : number + 1], before_seen[:, number : number + 1]
-        hearing = hears[:, :, number].unsqueeze(-1)
-        newer = hearing & ((told > before) | (told_seen > before_seen))
+        newer = near[:, :, number].unsqueeze(-1) & ((told > before) | (told_seen > before_seen))
         said = newer.any(1)
         if most is not None:
             said = _best(said, told[:, 0], most)
-        heard = hearing & said.unsqueeze(1)
+        heard = hears[:, :, number].unsqueeze(-1) & said.unsqueeze(1)
         torch.maximum(last, torch.where(heard, told, -1), out=last)
         seen |= heard & told_seen
         counts.append(said.sum(-1))

@@ -49,10 +49,11 @@ class MapsConfig:
 class Maps(CommModule):
     """Keeps a map per UAV of what it saw and was told, and shows it to the UAV as pictures.
 
-    At each step, a UAV says to those that hear it what is new to one of them: cells, and positions
-    of UAVs. What it hears it can pass on at the next step. A UAV observes its altitude, the time
-    and pictures of its own map (`Crops`); with `home`, also the way to its place in a chain of
-    radios from the base to the fire that it knows. It observes nothing else.
+    At each step, a UAV says to those in range what is new to one of them: cells, and positions of
+    UAVs. What it hears it can pass on at the next step. A UAV observes its altitude, the time and
+    pictures of its own map (`Crops`); with `home`, also the way to its place in a chain of radios
+    from the base to the fire that it knows. With a limit of bytes, which cells it receives may
+    depend on what another UAV in range of the sender knows.
     """
 
     config_type: ClassVar[type] = MapsConfig
@@ -158,12 +159,16 @@ class Maps(CommModule):
         self.place.diagonal(dim1=1, dim2=2).copy_(position.mT)
 
     def _talk(self, tensordict: TensorDictBase) -> None:
-        """Passes on what is new to those that hear it, and counts the bytes."""
-        hears, limit = tensordict.get(keys.HEARS), self.world.radio.bandwidth
-        cells = self.messages.pass_on(self.known, hears, limit)
+        """Passes on what is new to those in range, and counts the bytes."""
+        near = hears = tensordict.get(keys.HEARS)
+        settings, limit = self.world.radio, self.world.radio.bandwidth
+        if settings.loss:
+            place, alive = tensordict.get(keys.POSITION), tensordict.get(keys.ALIVE)
+            near = radio.in_range(settings, place, alive)
+        cells = self.messages.pass_on(self.known, near, hears, limit)
         left = None if limit is None else limit - cells
         size = place_bytes(self.world.horizon)
-        self.said.copy_(cells + pass_on_places(self.stamp, self.place, hears, left, size))
+        self.said.copy_(cells + pass_on_places(self.stamp, self.place, near, hears, left, size))
 
     def _draw(self, tensordict: TensorDictBase) -> None:
         """Draws the pictures of the environments in which they are due, and looks for home."""

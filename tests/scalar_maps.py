@@ -81,19 +81,23 @@ class Teller:
             if code == 1:
                 self.fires[uav].add(cell)
 
-    def talk(self, hears, budget=None) -> list[int]:
-        """Passes on what is new, and returns the number of cells that each UAV said."""
+    def talk(self, near, hears, budget=None) -> list[int]:
+        """Passes on what is new, and returns the number of cells that each UAV said.
+
+        What is said depends on the UAVs in range, what is received on those that hear.
+        """
         looks, fires = [dict(m) for m in self.looks], [set(m) for m in self.fires]
         counts = []
         for speaker, mine in enumerate(looks):
             hearers = [uav for uav in range(len(looks)) if hears[uav][speaker]]
+            in_range = [uav for uav in range(len(looks)) if near[uav][speaker]]
             new = [
                 cell
                 for cell in mine
                 if any(
                     mine[cell] > looks[uav].get(cell, (-1, 0))
                     or (cell in fires[speaker] and cell not in fires[uav])
-                    for uav in hearers
+                    for uav in in_range
                 )
             ]
             # Fire first, then the newest; among equal ones the cell of the larger index.

@@ -28,20 +28,31 @@ def links(
 
     Args:
         config: range and probability of loss.
-        position: float [..., n, 3], cells.
+        position, alive: see `in_range`.
         rng_key: int64 [...], `keys.RNG_KEY`.
         step: int64 [...], steps since the episode began.
-        alive: bool [..., n]; a radio that is not neither hears nor is heard. All are alive if None.
         use: purpose of the random numbers.
     """
-    linked = neighbours(position, config.range)
-    if alive is not None:
-        linked &= alive.unsqueeze(-1) & alive.unsqueeze(-2)
+    linked = in_range(config, position, alive)
     if config.loss:
         radios = linked.shape[-1]
         key = counter_rng.step_key(rng_key, step, use)
         unit = counter_rng.uniform(key, radios * radios).unflatten(-1, (radios, radios))
         linked &= unit >= config.loss
+    return linked
+
+
+def in_range(config: RadioConfig, position: Tensor, alive: Tensor | None = None) -> Tensor:
+    """Returns the links of a step if no message is lost, bool [..., n, n].
+
+    Args:
+        config: the range.
+        position: float [..., n, 3], cells.
+        alive: bool [..., n]; a radio that is not neither hears nor is heard. All are alive if None.
+    """
+    linked = neighbours(position, config.range)
+    if alive is not None:
+        linked &= alive.unsqueeze(-1) & alive.unsqueeze(-2)
     return linked
 
 

@@ -28,15 +28,17 @@ def looks(step: int) -> tuple[View, torch.Tensor]:
     return View(cells + start, in_view, in_view & (code == 1)), code
 
 
-def hearing(step: int, density: float) -> torch.Tensor:
-    """Returns links that mostly last for some steps."""
+def links(step: int, density: float, loss: float) -> tuple[torch.Tensor, torch.Tensor]:
+    """Returns who is in range, which mostly lasts for some steps, and who hears."""
     slow = draw(step // 4, ENVS, UAVS, UAVS) < density
-    return slow & ~torch.eye(UAVS, dtype=torch.bool) & (draw(step, ENVS, UAVS, UAVS) < 0.9)
+    near = slow & ~torch.eye(UAVS, dtype=torch.bool) & (draw(step, ENVS, UAVS, UAVS) < 0.9)
+    return near, near & (draw(step + 900, ENVS, UAVS, UAVS) >= loss) if loss else near
 
 
-def dense(last, seen, hears, limit):
+def dense(known, near, hears, limit):
     most = None if limit is None else limit // CELL_BYTES
-    return _messages._pass_on_dense(last, seen, hears, most) * CELL_BYTES
+    given = known.last_seen, known.seen_fire, near, hears, most
+    return _messages._pass_on_dense(*given) * CELL_BYTES
 
 
 @pytest.mark.parametrize(
@@ -55,8 +57,8 @@ def test_numbers_above_65535_take_four_bytes(area, horizon, cell, position):
 
 @pytest.mark.parametrize("function", ["sparse", "dense"])
 @pytest.mark.parametrize("limit", [None, 0, 23, 60])
-@pytest.mark.parametrize("density", [0.3, 0.8])
-def test_maps_and_bytes_equal_those_of_dictionaries(function, limit, density):
+@pytest.mark.parametrize(("density", "loss"), [(0.3, 0.0), (0.8, 0.0), (0.8, 0.4)])
+def test_maps_and_bytes_equal_those_of_dictionaries(function, limit, density, loss):
     known = Knowledge(envs=ENVS, uavs=UAVS, area=AREA, horizon=4 * STEPS + 3, fires=True)
     messages = CellMessages(ENVS, UAVS, AREA, CELL_BYTES)
     tellers = [Teller(UAVS) for _ in range(ENVS)]
@@ -65,9 +67,9 @@ def test_maps_and_bytes_equal_those_of_dictionaries(function, limit, density):
         view, code = looks(step)
         known.see(view, 4 * step + code)
         messages.saw(view)
-        hears = hearing(step, density)
-        given = known.last_seen, known.seen_fire, hears, limit
-        sent = dense(*given) if function == "dense" else messages.pass_on(known, *given[2:])
+        near, hears = links(step, density, loss)
+        pass_on = dense if function == "dense" else messages.pass_on
+        sent = pass_on(known, near, hears, limit)
         for env, teller in enumerate(tellers):
             for uav in range(UAVS):
                 seen = view.in_view[env, uav]
@@ -75,7 +77,7 @@ def test_maps_and_bytes_equal_those_of_dictionaries(function, limit, density):
                 codes = code[env, uav][seen].tolist()
                 teller.see(uav, dict(zip(cells, codes, strict=True)), step)
             budget = None if limit is None else [limit // CELL_BYTES] * UAVS
-            counts = teller.talk(hears[env].tolist(), budget)
+            counts = teller.talk(near[env].tolist(), hears[env].tolist(), budget)
             assert sent[env].tolist() == [CELL_BYTES * count for count in counts], (step, env)
             said_any += sum(counts)
             for uav in range(UAVS):
@@ -90,13 +92,14 @@ def test_maps_and_bytes_equal_those_of_dictionaries(function, limit, density):
     assert (said_any > 0) == (limit != 0)
 
 
+@pytest.mark.parametrize("lost", [False, True])
 @pytest.mark.parametrize("limit", [None, 2 * PLACE_BYTES])
-def test_positions_are_passed_on_a_hop_a_step_and_the_newest_first(limit):
+def test_positions_are_passed_on_a_hop_a_step_and_the_newest_first(limit, lost):
     uavs = 4
     stamp, place = torch.full((1, uavs, uavs), -1), torch.zeros(1, uavs, uavs, 3)
-    hears = torch.zeros(1, uavs, uavs, dtype=torch.bool)
+    near = torch.zeros(1, uavs, uavs, dtype=torch.bool)
     for uav in range(uavs - 1):  # a chain
-        hears[0, uav, uav + 1] = hears[0, uav + 1, uav] = True
+        near[0, uav, uav + 1] = near[0, uav + 1, uav] = True
     expected = {(uav, uav): 0 for uav in range(uavs)}
     for step in range(12):
         own = torch.arange(uavs)
@@ -104,18 +107,19 @@ def test_positions_are_passed_on_a_hop_a_step_and_the_newest_first(limit):
         expected |= {(uav, uav): step for uav in range(uavs)}
         before = dict(expected)
         left = None if limit is None else limit - 8 * (own.unsqueeze(0) % 2)  # 2 or 1 positions
-        sent = pass_on_places(stamp, place, hears, left, PLACE_BYTES)
+        hears = near & (draw(step, uavs, uavs) < 0.6) if lost else near
+        sent = pass_on_places(stamp, place, near, hears, left, PLACE_BYTES)
         for speaker in range(uavs):
-            hearers = [h for h in (speaker - 1, speaker + 1) if 0 <= h < uavs]
+            in_range = [h for h in (speaker - 1, speaker + 1) if 0 <= h < uavs]
             new = [
                 k
                 for k in range(uavs)
-                if any(before.get((speaker, k), -1) > before.get((h, k), -1) for h in hearers)
+                if any(before.get((speaker, k), -1) > before.get((h, k), -1) for h in in_range)
             ]
             new.sort(key=lambda k, s=speaker: (before[s, k], k), reverse=True)
             said = new if left is None else new[: left[0, speaker] // PLACE_BYTES]
             assert sent[0, speaker] == PLACE_BYTES * len(said)
-            for hearer in hearers:
+            for hearer in (h for h in in_range if hears[0, h, speaker]):
                 for k in said:
                     expected[hearer, k] = max(expected.get((hearer, k), -1), before[speaker, k])
         for uav in range(uavs):
@@ -124,10 +128,10 @@ def test_positions_are_passed_on_a_hop_a_step_and_the_newest_first(limit):
                 assert stamp[0, uav, other] == known
                 if known >= 0:
                     assert (place[0, uav, other] == 10.0 * known + other).all()
-    if limit is None:
+    if limit is None and not lost:
         assert stamp[0, 0].tolist() == [11, 11, 10, 9]
 
 
 def test_pairs_are_compared_in_parts(monkeypatch):
     monkeypatch.setattr(_messages, "_COMPARED", 3)
-    test_maps_and_bytes_equal_those_of_dictionaries("sparse", None, 0.8)
+    test_maps_and_bytes_equal_those_of_dictionaries("sparse", None, 0.8, 0.0)

@@ -172,6 +172,20 @@ def test_with_losses_and_a_limit_nothing_comes_from_a_uav_out_of_range():
     assert not flights[0][-1][keys.CROPS][0, 2].equal(flights[1][-1][keys.CROPS][0, 2])
 
 
+def test_lost_messages_are_counted_and_said_again():
+    """A UAV sees 25 cells at each step, of which it leaves 5 behind; the other one hovers."""
+    position = torch.tensor([[[4.0, 4.0, 3.5], [20.0, 15.0, 3.5]]])
+    lossy = RadioConfig(range=60.0, loss=0.5)
+    env = environment(torch.full((1, 50, 20), torch.inf), position, radio=lossy)
+    ahead = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, 0.0]]).expand(40, 1, 2, 3)
+    lost, most = 0, 0
+    for td in fly(env, position, ahead)[1:]:
+        assert td[keys.BYTES_SENT].tolist() == [[16 + 5 * (25 + 5 * lost), 16 + 5 * 25]]
+        lost = 0 if td[keys.HEARS][0, 1, 0] else lost + 1
+        most = max(most, lost)
+    assert 1 < most < 40
+
+
 def test_without_a_radio_nothing_is_said():
     position = torch.tensor([[[10.0, 10.0, 3.0], [11.0, 10.0, 3.0]]])
     env = environment(burning(), position, radio=RadioConfig(range=0.0))
