@@ -1,5 +1,6 @@
 """Loads the frozen policy of a run."""
 
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ from torchrl.envs import TransformedEnv
 from emberlink.trainers.build import build_actor, build_env
 from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.learners.base import ACTOR
+from emberlink.trainers.runs import checkpoint_file
 from emberlink.trainers.runs.checkpoints import load_weights
 
 
@@ -17,6 +19,8 @@ def load_actor(
     config: RunConfig, checkpoint: Path, env: TransformedEnv | None = None
 ) -> TensorDictModule:
     """Returns the frozen policy of a checkpoint, which maps observations to ("agents", "action").
+
+    It warns if the networks see a base here and saw none in training.
 
     Args:
         config: configuration of the run.
@@ -30,6 +34,13 @@ def load_actor(
     network: Any = actor.module
     expected = {ACTOR + name: value for name, value in network.state_dict().items()}
     weights = load_weights(checkpoint, expected, config)
+    trained = checkpoint_file.read_header(checkpoint)["config"]
+    if config.env.observation == "sight" and config.env.base and not trained["env"]["base"]:
+        warnings.warn(
+            f"env.base={list(config.env.base)}: the networks were trained without a base, so the "
+            "weights of the pixels that show one keep their initial values",
+            stacklevel=2,
+        )
     network.load_state_dict({name.removeprefix(ACTOR): v for name, v in weights.items()})
     return actor.requires_grad_(False)
 

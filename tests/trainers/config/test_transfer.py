@@ -1,6 +1,7 @@
 """Tests evaluations of a run in another world than that of its training."""
 
 import json
+import warnings
 from itertools import pairwise
 
 import numpy as np
@@ -134,6 +135,14 @@ def test_worlds_that_a_run_cannot_be_evaluated_in(setting, said, run, capsys):
     error = capsys.readouterr().err
     assert said in " ".join(error.split())
     assert sorted(run.rglob("*")) == files
+
+
+def test_networks_that_never_saw_a_base_are_warned_of():
+    with pytest.warns(UserWarning, match=r"^env\.base=\[0\.0, 30\.0\]: the networks were trained"):
+        trainers.load("pretrained:maps", world="relay")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", UserWarning)
+        trainers.load("pretrained:maps", world="swarm")
 
 
 def test_the_api_names_what_can_be_changed(run):
