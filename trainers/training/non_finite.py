@@ -99,7 +99,7 @@ def report_of(setup: TrainingSetup) -> NonFiniteReport:
 def _in_rollout(setup: TrainingSetup, steps: int) -> NonFiniteReport:
     """Returns a report about the first non-finite number of a rollout.
 
-    Tensors are searched in causal order: observation, action, position, reward.
+    Tensors are searched in causal order: observation, teacher, action, position, reward.
     """
     assert setup.guard.rollout is not None, "a rollout was recorded"
     tensors = {
@@ -107,7 +107,7 @@ def _in_rollout(setup: TrainingSetup, steps: int) -> NonFiniteReport:
         for name, value in flatten(setup.guard.rollout).items()
         if value.is_floating_point()
     }
-    order = ("observation", "action", "next.position", "next.reward")
+    order = ("observation", "teacher", "action", "next.position", "next.reward")
     for name in sorted(tensors, key=lambda name: order.index(name) if name in order else 9):
         wrong = ~tensors[name].isfinite()
         if not wrong.any():

@@ -62,7 +62,8 @@ class TrainingSetup:
         # Pictures are bytes: they are always finite, and copying them would take a fifth of a step.
         observed = [key for key in keys.observation_keys(spec) if spec[key].dtype.is_floating_point]
         following = [keys.POSITION, keys.REWARD, *observed]
-        self._checked = [*observed, keys.ACTION, *(("next", *key) for key in following)]
+        taught = [keys.TEACHER] if config.learner.reads_teacher else []
+        self._checked = [*observed, *taught, keys.ACTION, *(("next", *key) for key in following)]
 
     @property
     def episode(self) -> int:

@@ -11,6 +11,7 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
+from emberlink.comm.maps import Maps
 from emberlink.envs import keys
 from emberlink.policies.scripted.courier import Courier
 from emberlink.policies.scripted.map_greedy import MapGreedy
@@ -19,8 +20,9 @@ from emberlink.trainers.cli import main
 from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.learners.anchor import Anchor
 from emberlink.trainers.learners.base import ACTOR
-from emberlink.trainers.learners.imitation import Mixture
-from emberlink.trainers.training.non_finite import NonFiniteError, NonFiniteReport
+from emberlink.trainers.learners.imitation import Imitation, Mixture
+from emberlink.trainers.rollout.teacher import Teacher
+from emberlink.trainers.training.non_finite import NonFiniteError, NonFiniteReport, replay
 from emberlink.trainers.training.resume import resume
 from emberlink.trainers.training.setup import TrainingSetup
 from emberlink.trainers.training.trainer import Trainer
@@ -394,6 +396,59 @@ def test_a_resumed_run_is_the_same_bit_for_bit(learner, more, imitated, tmp_path
     for name, value in states[0].items():
         assert value.nan_to_num(7).equal(states[1][name].nan_to_num(7)), name
     assert lines[0] == lines[1]
+
+
+def poison(place: str, monkeypatch) -> None:
+    """Makes a number NaN: of environment 1 and UAV 2 at step 10, or of the fifth update."""
+    owner, name = {
+        "observation": (Maps, "_vector"),
+        "teacher": (Teacher, "_teach"),
+        "gradient": (Imitation, "losses"),
+    }[place]
+    original = getattr(owner, name)
+
+    def poisoned(self, tensordict, *more):
+        result = original(self, tensordict, *more)
+        if place == "gradient":
+            weight = self.parameters["actor.output.weight"]
+            if self.updates == 5:
+                result["imitation"] = result["imitation"] + (0 * weight).sum().sqrt()
+        elif tensordict[keys.STEP][1] == 10:
+            values = result if place == "observation" else result[keys.TEACHER]
+            values[1, 2] = math.nan
+        return result
+
+    monkeypatch.setattr(owner, name, poisoned)
+
+
+EXPECTED = {
+    "observation": ("observation", 2, 1, 10, None),
+    "teacher": ("teacher", 2, 1, 11, None),
+    "gradient": ("gradient of actor.output.weight", None, None, 10, 5),
+}
+
+
+@pytest.mark.parametrize("more", [[], MEMORY])
+@pytest.mark.parametrize("place", [*EXPECTED])
+def test_a_value_that_is_not_finite_stops_an_imitation(place, more, tmp_path, monkeypatch):
+    poison(place, monkeypatch)
+    own = [*TINY, *more, "learner.teacher_share=1", f"output={tmp_path}"]
+    trainer = Trainer(resolve("maps", settings("imitation", *own)))
+    trainer.start()
+    with pytest.raises(NonFiniteError) as caught:
+        trainer.train()
+    report, dump = caught.value.report, caught.value.dump
+    tensor, uav, env, step, update = EXPECTED[place]
+    step += 4 if update and more else 0  # the first sequence is complete later
+    assert report == NonFiniteReport(tensor, uav, 0, env, step, update, "nan")
+    assert dump is not None
+    assert replay(dump) == report
+    assert all(value.isfinite().all() for value in trainer.setup.learner.weights().values())
+    monkeypatch.undo()
+    assert place != "gradient" or replay(dump) is None
+    again = resume(trainer.run.path)
+    assert again.setup.step == step - step % 4
+    again.close()
 
 
 class Still(TensorDictModuleBase):
