@@ -7,6 +7,8 @@ import warnings
 
 import pytest
 import torch
+from inside import Inside
+from rich.console import Console
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase
 from torch import nn
@@ -22,6 +24,8 @@ from emberlink.trainers.learners.anchor import Anchor
 from emberlink.trainers.learners.base import ACTOR
 from emberlink.trainers.learners.imitation import Imitation, Mixture
 from emberlink.trainers.rollout.teacher import Teacher
+from emberlink.trainers.runs.run_folder import RunFolder
+from emberlink.trainers.sweep.command import sweep
 from emberlink.trainers.training.non_finite import NonFiniteError, NonFiniteReport, replay
 from emberlink.trainers.training.resume import resume
 from emberlink.trainers.training.setup import TrainingSetup
@@ -235,6 +239,19 @@ def test_an_imitation_is_recorded_and_evaluated(imitated):
     assert all(0 < line["loss_imitation"] < 2 for line in lines[1:])
     assert json.loads((imitated["ippo"] / "eval.json").read_text())
     assert main.main(["eval", str(imitated["ippo"]), "env.num_uavs=5", "--fires", "1"]) == 0
+
+
+def test_a_sweep_of_imitations_trains_each_once(tmp_path):
+    arguments = ["maps", *settings("imitation", *TINY, "learner.teacher_share=0,1")]
+    arguments += ["env.horizon=12", "episodes=1", f"output={tmp_path}"]
+    for _ in range(2):
+        assert sweep(arguments, Console(quiet=True), executor=Inside()) == 0
+        runs = [RunFolder(file.parent) for file in tmp_path.glob("*/config.yaml")]
+        share = [run.config().learner.teacher_share for run in runs]
+        assert sorted(share) == [0, 1]
+        (first,), (second,) = (run.lines() for run in runs)
+        assert first["loss_imitation"] != second["loss_imitation"]
+        assert all((run.path / "eval.json").exists() for run in runs)
 
 
 def test_a_run_without_a_checkpoint_begins_with_these_actors_again(imitated, tmp_path):

@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from emberlink.envs import keys
+from emberlink.trainers import load, make_env
 from emberlink.trainers.cli import main
 from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.training.setup import TrainingSetup
@@ -85,6 +86,25 @@ def test_a_trained_policy_flies_in_other_teams_and_maps(changes, tmp_path):
     assert main.main(["eval", str(run), *changes, "--fires", "1"]) == 0
     (file,) = [path for path in run.glob("eval_*.json") if "env." in path.name]
     assert json.loads(file.read_text())
+
+
+@pytest.mark.parametrize("uavs", [1, 3, 24, 64])
+@pytest.mark.parametrize("grid", [[20, 20], [128, 128], [20, 128]])
+def test_a_policy_of_six_uavs_acts_in_every_team_and_map(uavs, grid):
+    """A UAV acts as it would with the same observation if it were alone."""
+    policy = load("pretrained:maps", num_uavs=uavs, grid=grid)
+    burning = torch.full(grid, torch.inf)
+    burning[5:15, 5:15] = 1.0
+    env = make_env(policy.config, num_envs=2, fire=burning, seed=1)
+    flight = env.rollout(12, policy)
+    assert flight[keys.ACTION].shape == (2, 12, uavs, 3)
+    assert flight[keys.ACTION].isfinite().all()
+    furthest = torch.tensor([*grid, policy.config.env.altitude[1] + 1]) - 1
+    assert (flight["next", *keys.POSITION] <= furthest).all()
+    decision = flight[:, 10].exclude(keys.ACTION)
+    decision[keys.AGENTS] = decision[keys.AGENTS][:, -1:]
+    alone = load("pretrained:maps", num_uavs=1)(decision)[keys.ACTION]
+    torch.testing.assert_close(alone[:, 0], flight[keys.ACTION][:, 10, -1])
 
 
 def test_weights_of_each_uav_fit_one_team_only(tmp_path, capsys):
