@@ -9,6 +9,7 @@ import torch
 from inside import Inside
 from rich.console import Console
 from torchrl.envs import ExplorationType, set_exploration_type, step_mdp
+from unpack_replay import data_of
 
 from emberlink.envs import keys, parallel_env
 from emberlink.policies.gaussian import MEMORY
@@ -34,10 +35,12 @@ CASES = {
         *("learner=ddpg", "policy.memory=gru", "policy.hold=2", "learner.batch_size=8"),
         *("learner.sequence=4", "learner.burn_in=3"),
     ],
+    "ddpg-team": ["learner=ddpg", "learner.critic=team", "learner.batch_size=8"],
     "td3-team": [
         *("learner=td3", "policy.memory=stack", "learner.critic=team", "learner.batch_size=8"),
         *("learner.sequence=4", "learner.burn_in=3", "learner.share_parameters=true"),
     ],
+    "mappo-gru": ["learner=mappo", "policy.memory=gru", "policy.hold=10"],
     "mappo-map": ["learner=mappo", "learner.critic_map=true", "policy.hold=4"],
     "ippo-own": ["learner=ippo", "policy.memory=gru", "learner.share_parameters=false"],
 }
@@ -99,7 +102,7 @@ def test_a_loaded_policy_needs_no_further_code(case, trained):
     assert not pettingzoo.agents
 
 
-@pytest.mark.parametrize("case", ["ippo", "mappo", "ddpg-gru", "td3-team"])
+@pytest.mark.parametrize("case", ["ippo", "mappo", "mappo-gru", "ddpg-gru", "td3-team"])
 def test_an_episode_that_begins_again_forgets_the_one_before(case, trained):
     """Environment 0 begins again after 8 steps; environment 1 goes on."""
     policy = load(trained(case))
@@ -118,33 +121,44 @@ def test_an_episode_that_begins_again_forgets_the_one_before(case, trained):
     assert acted[MEMORY].any()
 
 
-def test_runs_of_all_learners_are_rendered_and_compared(trained, tmp_path, capsys):
-    runs = [trained(case) for case in ("ddpg", "td3", "ippo", "mappo")]
-    output = tmp_path / "film.gif"
-    assert main.main(["render", *map(str, runs), "--output", str(output)]) == 0
-    assert output.stat().st_size > 1000
+@pytest.mark.parametrize("cases", [["ddpg", "td3", "ippo", "mappo"], ["ddpg-gru", "ippo"]])
+def test_runs_of_all_learners_are_rendered_and_compared(cases, trained, tmp_path, capsys):
+    """A page shows the first episode of the evaluation."""
+    runs = [trained(case) for case in cases]
+    film, page = tmp_path / "film.gif", tmp_path / "page.html"
+    for output in (film, page):
+        assert main.main(["render", *map(str, runs), "--output", str(output)]) == 0
+    assert film.stat().st_size > 1000
+    for run, panel in zip(runs, data_of(page.read_text())["panels"], strict=True):
+        evaluated = json.loads((run / "eval.json").read_text())["results"]["huygens"]["learned"]
+        covered = 100 * panel["seen"][0][-1] / panel["burnt"][0][-1]
+        assert covered == pytest.approx(evaluated["coverage"][0], rel=1e-6)
+        rewards = [sum(uav[1:]) / HORIZON for uav in panel["reward"]]
+        assert sum(rewards) / 3 == pytest.approx(evaluated["mean_reward"][0], rel=1e-5)
     comparison = compare(runs)
     (section,) = comparison.sections
-    assert len(section.section.groups) == 4
+    assert len(section.section.groups) == len(cases)
     capsys.readouterr()
 
 
-def test_a_sweep_over_learners(tmp_path, capsys):
-    settings = [*SMALL, "learner=ippo,mappo", "seed=0,1", "evaluation.episodes=1"]
-    arguments = ["independent", *settings, f"output={tmp_path}"]
+@pytest.mark.parametrize("learners", [["ippo", "mappo"], ["td3"]])
+def test_a_sweep_over_learners(learners, tmp_path, capsys):
+    own = [] if "ippo" in learners else ["learner.batch_size=8"]
+    swept = [f"learner={','.join(learners)}", "seed=0,1", "evaluation.episodes=1"]
+    arguments = ["independent", *SMALL, *own, *swept, f"output={tmp_path}"]
     assert sweep(arguments, Console(quiet=True), executor=Inside()) == 0
     runs = [RunFolder(path.parent) for path in tmp_path.glob("*/config.yaml")]
     assert sorted((run.config().learner.name, run.config().seed) for run in runs) == [
-        ("ippo", 0),
-        ("ippo", 1),
-        ("mappo", 0),
-        ("mappo", 1),
+        (learner, seed) for learner in learners for seed in (0, 1)
     ]
     assert all(run.evaluated() for run in runs)
     capsys.readouterr()
 
 
-@pytest.mark.parametrize("case", ["ippo", "mappo", "ippo-own", "ddpg-gru", "td3-team"])
+SIDE_BY_SIDE = [case for case in CASES if case != "ddpg"]  # that of ddpg is in test_seeds.py
+
+
+@pytest.mark.parametrize("case", SIDE_BY_SIDE)
 def test_seeds_side_by_side_learn_the_same_as_alone(case, tmp_path):
     settings = ["train", "independent", *SMALL, *CASES[case], "evaluation.interval=0"]
     assert main.main([*settings, "seeds=[3,11]", f"output={tmp_path / 'both'}"]) == 0
