@@ -63,12 +63,20 @@ def test_learners_are_the_files_on_disk():
         registry.find("sac")
 
 
+STRONG = ["setup=strong", "env.horizon=20"]
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("learner", ["td3", "ippo", "mappo"])
-@pytest.mark.parametrize("method", METHODS)
-def test_a_short_run_learns_and_evaluates(method, learner, tmp_path, capsys):
+@pytest.mark.parametrize(
+    ("method", "settings"),
+    [
+        *((method, LEARNERS[name]) for name in ("td3", "ippo", "mappo") for method in METHODS),
+        *((method, STRONG) for method in [*METHODS, "maps"]),
+    ],
+)
+def test_a_short_run_learns_and_evaluates(method, settings, tmp_path, capsys):
     """The same for ddpg is in test_recipes and test_cli."""
-    arguments = ["train", method, *LEARNERS[learner], *SMALL, f"output={tmp_path}"]
+    arguments = ["train", method, *SMALL, *settings, f"output={tmp_path}"]
     assert main.main(arguments) == 0
     (run,) = tmp_path.iterdir()
     lines = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
