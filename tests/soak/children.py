@@ -1,5 +1,6 @@
 """Runs trainings in processes that are forked after the imports, and kills them."""
 
+import math
 import os
 import random
 import shutil
@@ -25,10 +26,12 @@ REPLAY = ["learner.batch_size=16", "learner.buffer_size=60"]
 SMALL = [*BASE, *REPLAY]
 SEQUENCES = [*REPLAY, "policy.memory=gru", "learner.sequence=4", "learner.burn_in=2"]
 LEARNERS = {
-    "ddpg": REPLAY,
-    "td3": SEQUENCES,
-    "ippo": ["policy.memory=gru"],
-    "mappo": ["policy.memory=stack", "policy.hold=2"],
+    "ddpg": ["learner=ddpg", *REPLAY],
+    "ddpg-gru": ["learner=ddpg", *SEQUENCES],
+    "td3-team": ["learner=td3", *SEQUENCES, "learner.critic=team"],
+    "ippo-own": ["learner=ippo", "policy.memory=gru", "learner.share_parameters=false"],
+    "mappo": ["learner=mappo", "policy.memory=stack", "policy.hold=2"],
+    "mappo-map": ["learner=mappo", "policy.memory=gru", "learner.critic_map=true"],
 }
 METHODS = ("independent", "shared_memory", "positional", "consensus")
 
@@ -127,7 +130,7 @@ def watch_saves(say: Callable[[str], None], die_at: tuple[str, int] | None) -> N
 
 def training(method: str, learner: str, output: Path, die_at: tuple[str, int] | None = None):
     """Starts a run, or resumes an existing one, and trains to the end."""
-    settings = [*BASE, f"learner={learner}", *LEARNERS[learner], f"episodes={EPISODES}"]
+    settings = [*BASE, *LEARNERS[learner], f"episodes={EPISODES}"]
 
     def work(say: Callable[[str], None]) -> int:
         watch_saves(say, die_at)
@@ -227,7 +230,7 @@ def reference(method: str, learner: str, folder: Path) -> dict[str, bytes]:
 def kill_trials(folder: Path, kills: int, seed: int) -> tuple[int, list[str]]:
     """Kills runs of all methods with all learners `kills` times in total.
 
-    The first four runs are of all methods and all learners, the first sixteen of all pairs.
+    The first six runs are of all methods and all learners, the first 24 of all pairs.
 
     Returns:
         The number of kills and the failures.
@@ -235,8 +238,9 @@ def kill_trials(folder: Path, kills: int, seed: int) -> tuple[int, list[str]]:
     draw, done, failures, number = random.Random(seed), 0, [], 0
     references: dict[tuple[str, str], dict[str, bytes]] = {}
     most = min(8, max(1, kills // len(LEARNERS)))
+    names, cycle = [*LEARNERS], math.lcm(len(METHODS), len(LEARNERS))
     while done < kills:
-        recipe = METHODS[number % 4], [*LEARNERS][(number + number // 4) % 4]
+        recipe = METHODS[number % len(METHODS)], names[(number + number // cycle) % len(names)]
         if recipe not in references:
             references[recipe] = reference(*recipe, folder / f"reference_{'_'.join(recipe)}")
         here = folder / f"kill_{number}"
