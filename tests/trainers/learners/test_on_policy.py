@@ -174,6 +174,16 @@ def test_a_pass_uses_every_episode_once_in_an_order_of_the_seed():
 
 
 @pytest.mark.parametrize("learner", LEARNERS)
+def test_returns_do_not_depend_on_the_number_of_minibatches(learner):
+    whole, parts = (
+        torch.cat([batch[RETURN] for batch in first_batches(made(learner, "num_envs=5", *more))])
+        for more in (["learner.minibatches=1"], ["learner.minibatches=3"])
+    )
+    assert whole.shape[0] == 5 * 4  # a row for each environment and epoch
+    torch.testing.assert_close(parts[:5], whole[:5])
+
+
+@pytest.mark.parametrize("learner", LEARNERS)
 def test_the_learning_rate_falls_to_zero_and_can_be_scaled(learner):
     setup = made(learner, "learner.lr=0.5")
     (entry,) = setup.learner.optimizer.param_groups  # pyright: ignore[reportAttributeAccessIssue]

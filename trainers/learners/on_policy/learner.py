@@ -89,6 +89,9 @@ class OnPolicyLearner(Learner):
         """decisions so far, in the whole run"""
         seeds = torch.tensor(context.seeds, device=self.device)
         self._keys = counter_rng.fold_in(seeds, Use.MINIBATCH)
+        rows = torch.arange(self.teams * context.num_envs, device=self.device)
+        self._rows = rows.view(self.teams, -1)
+        """the environments of each seed, [seeds, environments]"""
 
     @classmethod
     def make_actor(
@@ -164,13 +167,16 @@ class OnPolicyLearner(Learner):
             episode: batch size [seeds * environments, decisions].
             last: the time step after the last decision, batch size [seeds * environments, 1].
         """
-        observed = self.critic.in_keys
-        whole: Any = torch.cat([episode.select(*observed), last.select(*observed)], 1)  # pyright: ignore[reportArgumentType]
-        with torch.no_grad():
-            value = self.critic(whole).get(VALUE)
-        advantage, returns = self.advantages.estimate(
-            value, episode.get(keys.REWARD), episode.get(keys.ALIVE, None)
-        )
+        read = [part.select(*self.critic.in_keys) for part in (episode, last)]
+        rewards = episode.get(keys.REWARD)
+        value = rewards.new_empty(rewards.shape[0], rewards.shape[1] + 1, *rewards.shape[2:])
+        # The environments of a minibatch at a time, to save memory.
+        for rows in self._rows.tensor_split(self._minibatches, 1):
+            rows = rows.flatten()
+            whole: Any = torch.cat([part[rows] for part in read], 1)  # pyright: ignore[reportArgumentType]
+            with torch.no_grad():
+                value[rows] = self.critic(whole).get(VALUE)
+        advantage, returns = self.advantages.estimate(value, rewards, episode.get(keys.ALIVE, None))
         episode.set(ADVANTAGE, advantage).set(RETURN, returns)
         del episode[keys.REWARD]
 
@@ -180,11 +186,10 @@ class OnPolicyLearner(Learner):
         The environments are permuted for each epoch; a seed's permutation does not depend on the
         other seeds.
         """
-        envs = self.context.num_envs
-        first = torch.arange(self.teams, device=self.device)[:, None] * envs
         for _ in range(self.config.epochs):
             key = counter_rng.fold_in(self._keys, self.updates)
-            order = counter_rng.uniform(key, envs).argsort(dim=-1, stable=True) + first
+            draws = counter_rng.uniform(key, self.context.num_envs)
+            order = self._rows.gather(1, draws.argsort(dim=-1, stable=True))
             for chosen in order.tensor_split(self._minibatches, 1):
                 yield episode[chosen.flatten()]
 
