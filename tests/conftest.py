@@ -47,7 +47,7 @@ def _torchrl_is_imported() -> None:
 
 @pytest.fixture(autouse=True)
 def _blank_figures(request, monkeypatch) -> None:
-    """Saves a blank picture for each figure and GIF, except in tests marked `drawn`.
+    """Saves a blank picture for each figure, except in tests marked `drawn`, which look at it.
 
     Drawing takes half of the time of a short training.
     """
@@ -55,14 +55,12 @@ def _blank_figures(request, monkeypatch) -> None:
         return
     from matplotlib.figure import Figure
 
-    from emberlink.trainers.evaluation import plots, report
+    from emberlink.trainers.evaluation import plots
 
     blank = _blank()
-    for name in ("coverage_bars", "timelapse", "training_curves"):
+    for name in ("coverage_bars", "timelapse"):
         monkeypatch.setattr(plots, name, lambda path, *_: path.write_bytes(blank))
     monkeypatch.setattr(Figure, "savefig", lambda _, path, **__: path.write_bytes(blank))
-    monkeypatch.setattr(report, "write_gif", lambda path, *_: path.write_bytes(blank))
-    monkeypatch.setattr(report.Camera, "add", lambda *_: None)
 
 
 @cache

@@ -145,21 +145,6 @@ def test_networks_that_never_saw_a_base_are_warned_of():
         trainers.load("pretrained:maps", world="swarm")
 
 
-def test_another_map_is_warned_of_where_positions_are_observed(run):
-    with pytest.warns(UserWarning, match=r"^env\.grid=\[40, 40\]: the networks observe positions"):
-        trainers.load(run, grid=[40, 40])
-    with warnings.catch_warnings():
-        warnings.simplefilter("error", UserWarning)
-        trainers.load("pretrained:maps", grid=[40, 40])
-
-
-def test_a_training_state_is_not_evaluated(run, capsys):
-    state = next(run.glob("checkpoints/state_*"))
-    assert main(["eval", str(run), "--checkpoint", str(state)]) == 2
-    said = " ".join(capsys.readouterr().err.split())
-    assert f"{state.name}: a state of a training; expected networks, such as step_" in said
-
-
 def test_the_api_names_what_can_be_changed(run):
     with pytest.raises(UserError, match="only world and keys of env and comm"):
         trainers.load(run, world="front", seed=2)

@@ -342,13 +342,6 @@ def test_actors_of_another_network_are_refused(imitated, tmp_path, capsys):
     assert not list(tmp_path.iterdir())
 
 
-def test_weights_of_each_uav_are_refused_where_they_are_shared(imitated, tmp_path, capsys):
-    start = f"learner.warm_start={imitated['ippo']}", "learner.share_parameters=false"
-    assert main.main(["train", "maps", *settings("ippo", *start), f"output={tmp_path}"]) == 2
-    said = " ".join(capsys.readouterr().err.split())
-    assert "it was trained with learner.share_parameters=True (now False), learner." in said
-
-
 @pytest.mark.parametrize(
     ("path", "said"),
     [
@@ -388,8 +381,6 @@ def test_pictures_of_other_scales_are_warned_of(imitated, tmp_path):
         prepare("env.view_angle=45")
     with pytest.warns(UserWarning, match=r"env.base=None, this run has \[0.0, 9.0\]"):
         prepare("env.base=[0,9]")
-    with pytest.warns(UserWarning, match=r"env.radio.range=10.0, this run has 0.0"):
-        prepare("env.radio.range=0.0")
     with warnings.catch_warnings():
         warnings.simplefilter("error", UserWarning)
         prepare()
