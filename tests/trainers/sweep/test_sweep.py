@@ -476,11 +476,12 @@ def test_every_executor_has_a_file_and_settings():
 
 
 @pytest.mark.slow
-def test_a_resumed_sweep_equals_an_uninterrupted_one(tmp_path):
+@pytest.mark.parametrize("learner", ["ddpg", "mappo"])
+def test_a_resumed_sweep_equals_an_uninterrupted_one(learner, tmp_path):
     broken, whole = tmp_path / "broken", tmp_path / "whole"
     # Long enough to be interrupted during the training.
-    own = [text for text in SMALL if "batch_size" not in text]
-    own += ["learner=mappo", "policy.memory=gru"]
+    own = [text for text in SMALL if learner == "ddpg" or "batch_size" not in text]
+    own += [f"learner={learner}", *([] if learner == "ddpg" else ["policy.memory=gru"])]
     arguments = ["consensus", *own, "episodes=12", "checkpoint_steps=20", "seed=5"]
 
     def stop() -> None:
