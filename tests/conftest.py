@@ -13,6 +13,7 @@ import warnings
 from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from tiny_run import train_tiny
@@ -47,7 +48,7 @@ def _torchrl_is_imported() -> None:
 
 @pytest.fixture(autouse=True)
 def _blank_figures(request, monkeypatch) -> None:
-    """Saves a blank picture for each figure, except in tests marked `drawn`, which look at it.
+    """Saves a blank picture for each figure and GIF, except in tests marked `drawn`.
 
     Drawing takes half of the time of a short training.
     """
@@ -55,12 +56,23 @@ def _blank_figures(request, monkeypatch) -> None:
         return
     from matplotlib.figure import Figure
 
-    from emberlink.trainers.evaluation import plots
+    from emberlink.trainers.evaluation import plots, report
 
     blank = _blank()
-    for name in ("coverage_bars", "timelapse"):
+    for name in ("coverage_bars", "timelapse", "training_curves"):
         monkeypatch.setattr(plots, name, lambda path, *_: path.write_bytes(blank))
     monkeypatch.setattr(Figure, "savefig", lambda _, path, **__: path.write_bytes(blank))
+    monkeypatch.setattr(report, "write_gif", lambda path, *_: path.write_bytes(blank))
+    monkeypatch.setattr(report, "Camera", _NoCamera)
+
+
+class _NoCamera:
+    """Draws no pictures; takes the place of `Camera`."""
+
+    def __init__(self, _horizon: int):
+        self.steps, self.pictures = [], []
+
+    def add(self, *_: Any) -> None: ...
 
 
 @cache

@@ -3,7 +3,9 @@
 import importlib
 from collections.abc import Collection
 from dataclasses import dataclass
+from functools import cache
 from importlib.metadata import EntryPoint
+from pathlib import Path
 from pkgutil import iter_modules
 from typing import Any, Generic, TypeVar
 
@@ -78,8 +80,9 @@ class Registry(Generic[T]):
         return registered(self.group or self.package)
 
     def _files(self) -> set[str]:
-        folders = importlib.import_module(self.package).__path__
-        files = {module.name for module in iter_modules(folders)}
+        paths = map(Path, importlib.import_module(self.package).__path__)
+        # setuptools adds the name of a hook that is no folder.
+        files = _modules(tuple((str(p), p.stat().st_mtime_ns) for p in paths if p.exists()))
         return {name for name in files if not name.startswith("_")} - set(self.other_files)
 
     def _class_in(self, name: str) -> type[T]:
@@ -108,3 +111,9 @@ class Registry(Generic[T]):
 
     def _fits(self, item: Any) -> bool:
         return isinstance(item, type) and issubclass(item, self.base)
+
+
+@cache
+def _modules(folders: tuple[tuple[str, int], ...]) -> frozenset[str]:
+    """Returns the names of the modules in folders that were last changed at the given times."""
+    return frozenset(module.name for module in iter_modules([path for path, _ in folders]))

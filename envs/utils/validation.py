@@ -7,6 +7,7 @@ import re
 import reprlib
 import shlex
 from collections.abc import Iterable, Mapping
+from pathlib import PurePath
 from typing import Annotated, Any, TypeVar
 
 import numpy as np
@@ -77,10 +78,10 @@ def check_whole(name: str, number: Any) -> int:
 
 
 def plain(value: Any, key: str = "", deepest: int = 16) -> Any:
-    """Returns a value with types that JSON has; ranges and NumPy arrays become lists.
+    """Returns a value with types that JSON has: of ranges and NumPy arrays lists, of a path text.
 
     Args:
-        value: mappings, lists and tuples of text, numbers, bool and None.
+        value: mappings, lists and tuples of text, numbers, bool, None and paths.
         key: key of the value, for messages.
         deepest: maximum number of nested levels.
 
@@ -89,6 +90,8 @@ def plain(value: Any, key: str = "", deepest: int = 16) -> Any:
     """
     if isinstance(value, np.generic | np.ndarray):
         value = value.tolist()
+    if isinstance(value, PurePath):
+        value = str(value)
     if isinstance(value, range):
         value = list(value)
     if isinstance(value, Mapping | list | tuple) and deepest == 0:
@@ -118,9 +121,14 @@ def is_index(text: str, end: int) -> bool:
     return text.isdecimal() and len(text) <= len(str(end)) and int(text) < end
 
 
+_LIKE_A_NUMBER = re.compile(r"[-+.]?\d.*|[-+]?\.?inf|\.?nan|true|false|null", re.I)
+_AS_YAML = {"None": "null", "True": "true", "False": "false"}
+"""values that YAML writes in another way, by what Python writes"""
+
+
 def shown(value: Any) -> str:
     """Returns a value as text for a message, shortened if it is long, with escaped characters."""
-    text = value if isinstance(value, str) else reprlib.repr(value)
+    text = value if isinstance(value, str) else _AS_YAML.get(repr(value)) or reprlib.repr(value)
     return printable(text if len(text) <= 100 else f"{text[:60]}...{text[-20:]}")
 
 
@@ -161,7 +169,10 @@ def describe(error: ValidationError, prefix: str = "") -> str:
         return f"key {shown(key)!r} is {wrong}"
     if not key or message.startswith((f"{key}=", f"{key}.", f"{key}: ", f"key '{key}.")):
         return message
-    value = "" if isinstance(first["input"], dict) else f"={shown(first['input'])}"
+    given = first["input"]
+    if isinstance(given, str) and _LIKE_A_NUMBER.fullmatch(given):
+        given = json.dumps(given)  # in quotes: why the text is not the number that it looks like
+    value = "" if isinstance(given, dict) else f"={shown(given)}"
     return f"{key}{value}: {message}"
 
 

@@ -1,7 +1,7 @@
 """A scripted policy that searches as map_greedy and brings what it knows to the base."""
 
 import math
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -24,6 +24,8 @@ class Courier(MapGreedy):
     Until then UAVs search, and choose only cells from which they still come to their place in time,
     15 steps before the end. Without a base they search as `MapGreedy`.
     """
+
+    informs_base: ClassVar[bool] = True
 
     _base: Tensor
 

@@ -48,6 +48,8 @@ class MapGreedy(Scripted):
 
     hears: ClassVar[bool] = True
     messages: ClassVar[Messages] = "in range"
+    informs_base: ClassVar[bool] = False
+    """whether it needs a base station to do more than `map_greedy`"""
     TARGET = "_map_greedy_target"
 
     _near_x: Tensor

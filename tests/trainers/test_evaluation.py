@@ -12,10 +12,11 @@ from pathlib import Path
 import pytest
 import torch
 
-from emberlink.envs import metrics
+from emberlink.envs import keys, metrics
 from emberlink.envs.fire.cache import cache_folder
 from emberlink.envs.fire.generator import fire_seeds, load_scenario, make_fires
 from emberlink.envs.utils.atomic_io import read_sealed, write_sealed
+from emberlink.envs.utils.errors import UserError
 from emberlink.policies.scripted.registry import SCRIPTED
 from emberlink.trainers.build import build_actor, build_env
 from emberlink.trainers.cli import main
@@ -73,6 +74,21 @@ def test_an_episode_does_not_depend_on_the_others(method, cache):
         assert few[fire][policy][name] == numbers[:1]
         assert more[fire][policy][name] == numbers[:3]
     assert len(set(many["huygens"]["learned"]["coverage_auc"])) > 25
+
+
+@pytest.mark.parametrize(("number", "said"), [(torch.nan, "nan"), (-torch.inf, "-inf")])
+def test_an_action_that_is_not_finite_is_an_error(number, said):
+    config = resolve("independent", ["env.num_uavs=3", "env.horizon=5"])
+    env = build_env(config, num_envs=2, fire="paper", seed=0, device="cpu")
+
+    def policy(td):
+        action = torch.zeros(2, 3, 3)
+        action[1, 2, 0] = number if td[keys.STEP][0] == 3 else 0
+        return td.set(keys.ACTION, action)
+
+    message = rf"action is {said} for UAV 2 of environment 1 at step 4; expected finite numbers"
+    with pytest.raises(UserError, match=message):
+        evaluate.play(env, policy)
 
 
 def test_all_policies_have_the_same_fires_and_starts(cache, monkeypatch):

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import asdict, replace
 
+from emberlink.envs.utils.validation import shown
 from emberlink.trainers.config.compose import from_values, override, resolve, to_values, with_radio
 from emberlink.trainers.config.overrides import flat, parse, put
 from emberlink.trainers.config.schema import RunConfig
@@ -28,6 +29,33 @@ def evaluated_with(config: RunConfig, overrides: Sequence[str]) -> RunConfig:
     return override(config, others) if others else config
 
 
+def kept(config: RunConfig, overrides: Sequence[str]) -> list[str]:
+    """Returns settings of `env`, as `key=value`, that a run keeps in the world of an evaluation.
+
+    These are the settings in which the evaluation differs from a run of its setup in that world,
+    apart from those that are changed. There are none without `world=NAME`.
+
+    Args:
+        config: configuration of the run.
+        overrides: as for `evaluated_with`.
+    """
+    changed = dict(map(parse, overrides))
+    if "world" not in changed:
+        return []
+    moved = in_world(config, str(changed["world"]))
+    usual, own = flat(to_values(_usual(moved))), flat(to_values(moved))
+    return [
+        f"{key}={shown(value)}"
+        for key, value in own.items()
+        if key.startswith("env.") and key not in changed and value != usual[key]
+    ]
+
+
+def _usual(config: RunConfig) -> RunConfig:
+    """Returns the configuration of a run's method, setup and world; any fire will do."""
+    return resolve(config.method, [f"setup={config.setup}", f"world={config.world}", "fire=paper"])
+
+
 def in_world(config: RunConfig, world: str) -> RunConfig:
     """Returns a run's configuration in another world.
 
@@ -43,10 +71,8 @@ def in_world(config: RunConfig, world: str) -> RunConfig:
     """
     if world == config.world:
         return config
-    setup = f"setup={config.setup}"
-    # Of this world, only `env` and `evaluation` are compared; any fire will do.
-    here = flat(to_values(resolve(config.method, [setup, f"world={config.world}", "fire=paper"])))
-    there = resolve(config.method, [setup, f"world={world}"])
+    here = flat(to_values(_usual(config)))
+    there = resolve(config.method, [f"setup={config.setup}", f"world={world}"])
     values = to_values(config)
     del values["baselines"]
     for key, value in flat(to_values(there)).items():

@@ -1,6 +1,7 @@
 """Loads the frozen policy of a run."""
 
 import warnings
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,8 @@ def load_actor(
 ) -> TensorDictModule:
     """Returns the frozen policy of a checkpoint, which maps observations to ("agents", "action").
 
-    It warns if the networks see a base here and saw none in training.
+    It warns if the networks see a base here and saw none in training, or observe positions in
+    another map.
 
     Args:
         config: configuration of the run.
@@ -41,8 +43,21 @@ def load_actor(
             "weights of the pixels that show one keep their initial values",
             stacklevel=2,
         )
+    _warn_of_another_map(config, trained["env"])
     network.load_state_dict({name.removeprefix(ACTOR): v for name, v in weights.items()})
     return actor.requires_grad_(False)
+
+
+def _warn_of_another_map(config: RunConfig, trained: Mapping[str, Any]) -> None:
+    """Warns of a map or altitudes in which observed positions mean something else."""
+    by_map = config.env.observation != "sight" or config.comm.get("position", False)
+    for key in ("grid", "altitude") if by_map else ("altitude",):
+        here, before = list(getattr(config.env, key)), list(trained[key])
+        if here != before:
+            warnings.warn(
+                f"env.{key}={here}: the networks observe positions, and were trained with {before}",
+                stacklevel=3,
+            )
 
 
 def fireless(config: RunConfig) -> TransformedEnv:

@@ -9,7 +9,7 @@ from rich.console import Console
 
 from emberlink.envs.utils.errors import UserError
 from emberlink.trainers.config.schema import RunConfig, check_device
-from emberlink.trainers.config.transfer import evaluated_with
+from emberlink.trainers.config.transfer import evaluated_with, kept
 from emberlink.trainers.evaluation.actor import load_actor
 from emberlink.trainers.evaluation.evaluate import Policy
 from emberlink.trainers.evaluation.report import evaluate_run
@@ -63,6 +63,8 @@ def evaluate_folder(
                 "comm. and env. only"
             )
         label += "_" + re.sub(r"[^\w.=+-]", "-", text)
+    if own := kept(config, overrides):
+        console.print(f"note: the run keeps its own {', '.join(own)}", soft_wrap=True)
     config = evaluated_with(config, overrides)
     actor = load_actor(config, checkpoint)
     about = [text for text in overrides if not text.startswith("world=")]  # a title names it anyway

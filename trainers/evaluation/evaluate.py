@@ -14,6 +14,7 @@ from emberlink.envs import keys, metrics
 from emberlink.envs.fire.generator import load_scenario
 from emberlink.envs.fire_files.config import FileFireConfig
 from emberlink.envs.scenarios import ScenarioConfig, fires_of
+from emberlink.envs.utils.errors import UserError
 from emberlink.envs.wildfire import WildfireEnv
 from emberlink.policies.scripted.base import Scripted
 from emberlink.policies.scripted.registry import SCRIPTED, to_play
@@ -52,6 +53,9 @@ def play(
 
     Returns:
         The measures of `metrics.names`, float32 [num_envs] each.
+
+    Raises:
+        UserError: an action is NaN or infinite.
     """
     world: Any = env.base_env
     horizon: int = world.config.horizon
@@ -60,8 +64,10 @@ def play(
         td = env.reset()
         if watch is not None:
             watch(world, td)
-        for _ in range(horizon):
-            td = env.step(policy(td))
+        for step in range(1, horizon + 1):
+            acted = policy(td)
+            _check_action(acted.get(keys.ACTION), step)
+            td = env.step(acted)
             _count_messages(policy, td.get("next"))
             if watch is not None:
                 watch(world, td.get("next"))
@@ -69,6 +75,17 @@ def play(
             td = step_mdp(td, keep_other=True)
     episode: Any = torch.stack(cast(Any, steps), dim=1)
     return metrics.episode_metrics(episode)
+
+
+def _check_action(action: Tensor, step: int) -> None:
+    """Checks that all actions, [num_envs, n, 3], are finite."""
+    wrong = ~action.isfinite()
+    if wrong.any():
+        env, uav, axis = wrong.nonzero()[0].tolist()
+        raise UserError(
+            f"the policy's action is {action[env, uav, axis].item():g} for UAV {uav} of "
+            f"environment {env} at step {step}; expected finite numbers"
+        )
 
 
 def _count_messages(policy: Policy, td: TensorDictBase) -> None:

@@ -10,6 +10,7 @@ from torchrl.data import Composite
 
 from emberlink.envs import keys
 from emberlink.envs.utils.errors import UserError
+from emberlink.envs.utils.validation import shown
 from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.evaluation import panels
 from emberlink.trainers.replay.page import Replay
@@ -84,9 +85,15 @@ class TrainedPolicy(TensorDictSequential):
             policies: names of scripted policies to show, too.
 
         Raises:
-            UserError: a name is not known, or the others have another map, team or horizon.
+            UserError: a name is not known, or the others are no policies, or have another map, team
+                or horizon.
         """
-        shown = [
+        for other in others:
+            if not isinstance(other, TrainedPolicy):
+                raise UserError(
+                    f"replay: {shown(other)} is not a policy of load(...); fire=0 chooses a fire"
+                )
+        own = [
             panels.Panel(
                 panels.title_of(policy.config, *policy.changes),
                 policy.config,
@@ -94,4 +101,4 @@ class TrainedPolicy(TensorDictSequential):
             )
             for policy in (self, *others)
         ]
-        return panels.replay([*shown, *panels.scripted(self.config, policies)], fire)
+        return panels.replay([*own, *panels.scripted(self.config, policies)], fire)

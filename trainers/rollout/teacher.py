@@ -71,8 +71,8 @@ class Teacher(Transform):
         hold: steps for which an action is held.
 
     Raises:
-        UserError: the module keeps no maps, the policy plans by other maps, or the environment is
-            on a GPU.
+        UserError: the module keeps no maps, the policy plans by other maps or needs a base that the
+            world lacks, or the environment is on a GPU.
     """
 
     target: Tensor
@@ -89,6 +89,11 @@ class Teacher(Transform):
         if torch.device(env.device or "cpu").type != "cpu":
             raise UserError(f"device={env.device}: the teacher needs device=cpu")
         policy = find(name)(env, KnownMaps(maps))
+        if policy.informs_base and env.config.base is None:
+            raise UserError(
+                f"learner.teacher={name}: it informs a base station, and env.base is null; "
+                "world=relay has one"
+            )
         radio = policy.world.radio
         planned = replace(radio, range=share * radio.range)
         policy.world = replace(policy.world, radio=planned)
@@ -138,5 +143,5 @@ def find(name: str) -> type[MapGreedy]:
         if issubclass(policy, MapGreedy) and policy.messages == "in range"
     }
     if name not in known:
-        raise UserError(f"learner.teacher: {unknown(name, known)}")
+        raise UserError(f"learner.teacher={unknown(name, known)}")
     return known[name]

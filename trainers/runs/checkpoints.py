@@ -18,11 +18,11 @@ from emberlink.trainers.runs.seal import to_header
 
 _NUMBERED = re.compile(r"(state|step)_\d{9,18}\.safetensors")
 _OF_NETWORKS = (
-    *("comm.", "env.observation", "env.num_uavs"),
-    *("policy.memory", "policy.units", "policy.decisions", "policy.agent_index"),
-    *("learner.name", "learner.actor_of", "learner.hidden"),
+    *("policy.agent_index", "policy.memory", "policy.units", "policy.decisions"),
+    *("learner.share_parameters", "learner.hidden", "learner.actor_of", "learner.name"),
+    *("env.observation", "env.num_uavs"),
 )
-"""beginnings of the keys of settings on which the names and shapes of weights depend"""
+"""keys of settings on which the names and shapes of weights depend, besides those of `comm`"""
 _PARTIAL = ("*.safetensors.[0-9]*.part", ".tmp*")  # safetensors writes to .tmp*
 
 
@@ -161,24 +161,33 @@ def _trained_with(header: Mapping[str, Any], config: RunConfig | None) -> str:
     if config is None or not isinstance(header.get("config"), Mapping):
         return ""
     before, now = flat(header["config"]), flat(to_header(config))
+    keys = [*_OF_NETWORKS, *(key for key in before if key.startswith("comm."))]
+    if _flies_in_any_team(config):
+        keys.remove("env.num_uavs")
     differ = [
-        f"{key}={before[key]}" + (f" (now {now[key]})" if key in now else "")
-        for key in before
-        if key.startswith(_OF_NETWORKS) and before[key] != now.get(key)
+        f"{key}={shown(before[key])}" + (f" (now {shown(now[key])})" if key in now else "")
+        for key in keys
+        if key in before and before[key] != now.get(key)
     ]
     return f"; it was trained with {', '.join(differ)}" if differ else ""
 
 
 def _check_header(path: Path, header: Mapping[str, Any], config: RunConfig) -> None:
     expected = _network_header(config, 0)
-    # Shared weights fly in a team of any size, if what a UAV observes does not depend on it.
-    any_team = config.learner.share_parameters and not config.policy.agent_index
-    for name in ("method",) if any_team else ("method", "uavs"):
+    if header.get("kind") == "state":
+        name = path.name.replace("state", "step", 1)
+        raise UserError(f"{path}: a state of a training; expected networks, such as {name}")
+    for name in ("method",) if _flies_in_any_team(config) else ("method", "uavs"):
         if header.get(name, expected[name]) != expected[name]:
             raise UserError(
                 f"{path}: a checkpoint of {name}={shown(header[name])}; "
                 f"this configuration has {name}={expected[name]}"
             )
+
+
+def _flies_in_any_team(config: RunConfig) -> bool:
+    """Returns whether the weights do not depend on the number of UAVs, apart from observations."""
+    return config.learner.share_parameters and not config.policy.agent_index
 
 
 def _network_header(config: RunConfig, step: int) -> dict[str, Any]:

@@ -215,9 +215,12 @@ def _resume_hint(trainer: Trainer, error: Exception | None = None) -> str:
     """Returns text about the newest checkpoint and how to resume from it, after an error."""
     config: RunConfig = trainer.config
     # Without a rollback, the run would end at the same step again.
-    diverged = isinstance(error, NonFiniteError) and config.on_nan == "stop"
+    diverged = isinstance(error, NonFiniteError)
     command = _resume_command(trainer) + (" on_nan=rollback" if diverged else "")
     states = trainer.run.states()
+    if diverged and config.on_nan == "rollback":
+        last = f"the last checkpoint is {states[-1]}; " if states else ""
+        return f"{last}to resume would repeat this: train a new run with smaller learning rates"
     if not states:
         return f"there is no checkpoint; begin again with: {command}"
     return f"the last good checkpoint is {states[-1]}, resume with: {command}"

@@ -141,6 +141,26 @@ def first_non_finite(state: Mapping[str, Tensor]) -> str | None:
     return None
 
 
+def check(setup: TrainingSetup, run: RunFolder, *, wait: bool) -> None:
+    """Checks what the guard has detected, and before something is written also the weights.
+
+    Args:
+        setup: the training.
+        run: folder of a dump.
+        wait: whether to wait for a GPU, and to check that the squares of weights are finite.
+
+    Raises:
+        NonFiniteError: a number is NaN or infinite.
+    """
+    if setup.guard.poll(wait=wait):
+        raise error_of(setup, run)
+    for name, value in setup.learner.networks().items() if wait else ():
+        if not torch.linalg.vector_norm(value.detach()).isfinite():
+            largest = f"{float(value.detach().abs().amax()):g}"  # NaN if one is
+            report = NonFiniteReport(f"weight {name}", None, None, None, setup.step, None, largest)
+            raise NonFiniteError(f"{report}; nothing was saved", report, None)
+
+
 def check_state(setup: TrainingSetup, state: Mapping[str, Tensor]) -> None:
     """Checks that a state is finite before it is saved.
 

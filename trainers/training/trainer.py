@@ -144,7 +144,7 @@ class Trainer:
         try:
             self._loop(trackers, report)
             if self.saved != self.setup.step:
-                self._check_finite(wait=True)
+                non_finite.check(self.setup, self.run, wait=True)
                 self.save()
         finally:
             trackers.close()
@@ -157,7 +157,7 @@ class Trainer:
             before = setup.step
             setup.learn(rollout)
             ends, due = setup.step % setup.horizon == 0, self._is_due(before, setup.step)
-            self._check_finite(wait=ends or due)
+            non_finite.check(setup, self.run, wait=ends or due)
             if ends:
                 lines = self._finish_episode(trackers)
             if due:
@@ -175,11 +175,6 @@ class Trainer:
         config = self.config
         intervals = config.checkpoint_interval * config.env.horizon, config.checkpoint_steps
         return any(after // steps > before // steps for steps in intervals if steps)
-
-    def _check_finite(self, *, wait: bool) -> None:
-        """Raises an error if the guard has detected a NaN or Inf."""
-        if self.setup.guard.poll(wait=wait):
-            raise non_finite.error_of(self.setup, self.run)
 
     def _finish_episode(self, trackers: Trackers) -> list[dict[str, Any]]:
         """Measures an episode, evaluates if it is due, and writes and returns the lines."""

@@ -3,7 +3,9 @@
 import warnings
 from typing import Any
 
+from emberlink.comm import registry
 from emberlink.envs.utils.errors import UserError
+from emberlink.envs.utils.validation import shown
 from emberlink.trainers.config.compose import to_values
 from emberlink.trainers.config.overrides import flat
 from emberlink.trainers.config.schema import RunConfig
@@ -59,11 +61,12 @@ def start(learner: Learner, config: RunConfig) -> None:
 def _warn_of_other_observations(name: str, theirs: RunConfig, mine: RunConfig) -> None:
     """Warns of settings that give the same observations another meaning."""
     before, now = flat(to_values(theirs)), flat(to_values(mine))
-    of_maps = ("env.base",) if mine.env.observation == "sight" else ()  # maps show the base
-    for key in (key for key in now if key.startswith(_OBSERVED + of_maps) and key in before):
+    more = ("env.base",) if mine.env.observation == "sight" else ()  # maps show the base
+    more += ("env.radio.",) if registry.find(mine.comm["name"]).hears else ()
+    for key in (key for key in now if key.startswith(_OBSERVED + more) and key in before):
         if before[key] != now[key]:
             warnings.warn(
-                f"learner.warm_start={name}: its actors were trained with {key}={before[key]}, "
-                f"this run has {now[key]}",
+                f"learner.warm_start={name}: its actors were trained with {key}="
+                f"{shown(before[key])}, this run has {shown(now[key])}",
                 stacklevel=3,
             )

@@ -73,6 +73,7 @@ def check_evaluation(folder: Path, out: str, *, episodes: int = 2) -> None:
     assert animation.read_bytes()[:6] == b"GIF89a"
 
 
+@pytest.mark.drawn
 def test_eval_repeats_the_evaluation_of_train(run, capsys):
     trained = json.loads((run / "eval.json").read_text())["results"]
     shutil.rmtree(run / "figures")

@@ -8,6 +8,7 @@ import functools
 import math
 import re
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -382,9 +383,10 @@ def test_every_key_of_every_group_is_fuzzed():
         ({"seed": np.int64(7)}, 7),
         ({"env.grid": np.array([12, 9])}, [12, 9]),
         ({"learner.gamma": np.float64(0.5)}, 0.5),
+        ({"output": Path("my/runs")}, "my/runs"),
     ],
 )
-def test_numpys_numbers_are_numbers(given, plain):
+def test_numpys_numbers_are_numbers_and_paths_are_text(given, plain):
     ((key, _),) = given.items()
     values = to_values(resolve("consensus", **given))
     for part in key.split("."):

@@ -13,7 +13,7 @@ from emberlink.envs.utils.errors import UserError
 from emberlink.trainers.cli.main import main
 from emberlink.trainers.config.compose import flat, resolve, to_values
 from emberlink.trainers.config.defaults import defaults_of
-from emberlink.trainers.config.transfer import evaluated_with, in_world
+from emberlink.trainers.config.transfer import evaluated_with, in_world, kept
 
 ROUND = ("paper", "front", "relay", "blackout", "swarm", "paper", "relay", "front", "paper")
 
@@ -76,9 +76,14 @@ def run(tmp_path_factory):
     return path
 
 
+OTHER_MAP = pytest.mark.filterwarnings("ignore:env.grid=|env.altitude=:UserWarning")
+
+
+@OTHER_MAP
 def test_an_evaluation_in_another_world(run, tmp_path, capsys):
     assert main(["eval", str(run), "world=relay"]) == 0
     printed = " ".join(capsys.readouterr().out.split())
+    assert "note: the run keeps its own env.num_uavs=2, env.horizon=15 note: world" in printed
     assert "note: world is relay here, paper in training" in printed
     assert "huygens" not in printed
     written = json.loads((run / "eval_world=relay.json").read_text())
@@ -94,6 +99,19 @@ def test_an_evaluation_in_another_world(run, tmp_path, capsys):
     assert "is left out: evaluated otherwise: world is relay, in eval.json paper" in said
 
 
+def test_what_a_run_keeps_in_another_world():
+    run = resolve("consensus", ["setup=tuned", "env.radio.range=0", "env.reward.exit=-2"])
+    both = ["env.radio.range=0.0", "env.reward.exit=-2.0"]
+    assert sorted(kept(run, ["world=front"])) == sorted(kept(run, ["world=paper"])) == both
+    assert kept(run, ["world=front", "env.radio.range=5"]) == both[1:]
+    assert kept(run, ["env.num_uavs=3"]) == []
+    assert kept(resolve("maps", ["setup=strong", "world=relay"]), ["world=swarm"]) == []
+    team = resolve("consensus", ["setup=tuned", "world=front", "env.num_uavs=4"])
+    assert kept(team, ["world=relay"]) == ["env.num_uavs=4"]
+    assert kept(team, ["world=swarm"]) == []  # swarm has 24 UAVs, so 4 are not kept
+
+
+@OTHER_MAP
 def test_a_replay_in_another_world(run, tmp_path, capsys):
     page = tmp_path / "replay.html"
     settings = ["world=relay", "env.radio.range=0"]
@@ -143,6 +161,21 @@ def test_networks_that_never_saw_a_base_are_warned_of():
     with warnings.catch_warnings():
         warnings.simplefilter("error", UserWarning)
         trainers.load("pretrained:maps", world="swarm")
+
+
+def test_another_map_is_warned_of_where_positions_are_observed(run):
+    with pytest.warns(UserWarning, match=r"^env\.grid=\[40, 40\]: the networks observe positions"):
+        trainers.load(run, grid=[40, 40])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", UserWarning)
+        trainers.load("pretrained:maps", grid=[40, 40])
+
+
+def test_a_training_state_is_not_evaluated(run, capsys):
+    state = next(run.glob("checkpoints/state_*"))
+    assert main(["eval", str(run), "--checkpoint", str(state)]) == 2
+    said = " ".join(capsys.readouterr().err.split())
+    assert f"{state.name}: a state of a training; expected networks, such as step_" in said
 
 
 def test_the_api_names_what_can_be_changed(run):

@@ -204,9 +204,13 @@ def test_the_loss_falls_and_is_that_of_smooth_l1():
         (["consensus", "learner=imitation"], "Consensus keeps none"),
         (
             ["maps", *settings("imitation"), "learner.teacher=curier"],
-            "learner.teacher: 'curier'",
+            "learner.teacher='curier' is not known",
         ),
         (["maps", *settings("imitation"), "learner.teacher=oracle"], "known: map_greedy, courier"),
+        (
+            ["maps", *settings("imitation"), "learner.teacher=courier"],
+            "learner.teacher=courier: it informs a base station, and env.base is null",
+        ),
         (
             ["maps", *settings("ippo"), "learner.warm_start=nowhere"],
             "learner.warm_start=nowhere: nowhere: there is no such run folder",
@@ -342,6 +346,13 @@ def test_actors_of_another_network_are_refused(imitated, tmp_path, capsys):
     assert not list(tmp_path.iterdir())
 
 
+def test_weights_of_each_uav_are_refused_where_they_are_shared(imitated, tmp_path, capsys):
+    start = f"learner.warm_start={imitated['ippo']}", "learner.share_parameters=false"
+    assert main.main(["train", "maps", *settings("ippo", *start), f"output={tmp_path}"]) == 2
+    said = " ".join(capsys.readouterr().err.split())
+    assert "it was trained with learner.share_parameters=true (now false), learner." in said
+
+
 @pytest.mark.parametrize(
     ("path", "said"),
     [
@@ -379,8 +390,10 @@ def test_pictures_of_other_scales_are_warned_of(imitated, tmp_path):
         prepare("env.altitude=[1.0,5.0]")
     with pytest.warns(UserWarning, match=r"env.view_angle=30.0, this run has 45.0"):
         prepare("env.view_angle=45")
-    with pytest.warns(UserWarning, match=r"env.base=None, this run has \[0.0, 9.0\]"):
+    with pytest.warns(UserWarning, match=r"env.base=null, this run has \[0.0, 9.0\]"):
         prepare("env.base=[0,9]")
+    with pytest.warns(UserWarning, match=r"env.radio.range=10.0, this run has 0.0"):
+        prepare("env.radio.range=0.0")
     with warnings.catch_warnings():
         warnings.simplefilter("error", UserWarning)
         prepare()

@@ -9,6 +9,7 @@ import os
 import re
 from html.parser import HTMLParser
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from test_render_command import make_run, refused, rendered
 from unpack_replay import bit, data_of
 
 from emberlink.envs import WildfireConfig, keys
+from emberlink.envs.utils.errors import UserError
 from emberlink.trainers import load
 from emberlink.trainers.cli import main
 from emberlink.trainers.evaluation import evaluate, panels
@@ -321,6 +323,9 @@ def test_replay_from_python_equals_that_of_the_command(tmp_path, capsys):
     shown = load(run).replay(deaf)
     assert shown.html == out.read_text()
     assert shown._repr_html_().startswith('<iframe srcdoc="&lt;!DOCTYPE html&gt;')
+    number: Any = 3
+    with pytest.raises(UserError, match=r"^replay: 3 is not a policy of load\(\.\.\.\); fire=0"):
+        deaf.replay(number)
 
 
 def test_panels_tell_their_settings(tmp_path):

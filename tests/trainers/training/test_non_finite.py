@@ -3,6 +3,7 @@
 import functools
 import json
 import math
+import re
 import shutil
 from collections import Counter
 from dataclasses import asdict, replace
@@ -458,6 +459,21 @@ def test_a_rollback_resumes_bit_for_bit(learner, more, update, to, tmp_path, mon
     assert_same(trainer, until(again, None))
 
 
+def test_weights_are_checked_before_they_are_saved_and_evaluated(tmp_path, capsys):
+    """The only update of the run makes weights whose squares are infinite."""
+    tiny = ["env.horizon=20", "num_envs=2", "env.num_uavs=2", "episodes=1", "policy.hold=10"]
+    own = ["learner=mappo", "learner.epochs=1", "learner.minibatches=1", "learner.lr=1e30"]
+    command = ["train", "independent", *tiny, *own, "evaluation.interval=1", f"output={tmp_path}"]
+    assert main.main(command) == 2
+    err = capsys.readouterr().err
+    assert err.count("\n") == 1
+    assert re.search(r"weight actor\S+ is \d\S*e\+\d\d at step 20; nothing was saved", err)
+    assert "on_nan=rollback" in err
+    (folder,) = tmp_path.iterdir()
+    assert not [*folder.rglob("*.safetensors"), *folder.glob("eval*")]
+    assert not (folder / "metrics.jsonl").exists() or not (folder / "metrics.jsonl").read_text()
+
+
 def test_rollbacks_without_progress_end_the_training(tmp_path, monkeypatch, capsys):
     """The environment gives NaN before the first checkpoint."""
     step = WildfireEnv._step
@@ -474,6 +490,7 @@ def test_rollbacks_without_progress_end_the_training(tmp_path, monkeypatch, caps
     out, err = capsys.readouterr()
     assert err.count("\n") == 1
     assert "given up after 5 rollbacks, learning rates x 0.03125" in err
+    assert "train a new run with smaller learning rates" in err
     assert "on_nan" not in err
     assert "rollback 1 of 5: on from step 0 with learning rates x 0.5" in out
     (folder,) = tmp_path.iterdir()
