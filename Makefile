@@ -4,7 +4,7 @@ PYTHON ?= python3
 # number of parallel test processes, with one thread each
 WORKERS ?= 2
 # which tests `make test` runs, as pytest's -m; empty for all
-TESTS ?= not slow
+TESTS ?= not slow and not heavy
 # threads of the demo: its small networks gain little from a second thread, and two threads are very
 # slow if another process uses a core
 THREADS ?= 1
@@ -34,8 +34,8 @@ demo: $(INSTALLED)  ## train consensus for a few minutes and evaluate it, with f
 test: $(INSTALLED)  ## run the tests, without the slow ones (about 5 minutes)
 	@OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n $(WORKERS) --dist loadfile -m "$(TESTS)"
 
-test-slow: $(INSTALLED) browser  ## run the slow tests (about 5 minutes)
-	@OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n $(WORKERS) --dist loadfile -m slow
+test-slow: $(INSTALLED) browser  ## run the slow tests (5 to 20 minutes)
+	@OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n $(WORKERS) --dist loadfile -m "slow or heavy"
 
 # Replays are tested in Chromium, which Debian's package installs.
 browser:  ## install Chromium for test-slow if it is missing (on Debian and as root only)

@@ -185,7 +185,7 @@ def test_console_script_starts(installed: Path, elsewhere):
     assert list(cwd.iterdir()) == []
 
 
-@pytest.mark.slow
+@pytest.mark.heavy
 def test_an_extension_package_adds_a_method_a_setup_and_a_fire(installed: Path, elsewhere):
     """Also tests that the console script of the wheel trains."""
     cwd, env = elsewhere

@@ -183,8 +183,23 @@ def different(commands: list[str]) -> list[str]:
     return list({tuple(shortened(shlex.split(c)[1:])): c for c in reversed(commands)}.values())
 
 
+LONG = (
+    "emberlink compare docs/data",
+    "emberlink compare pretrained",
+    "emberlink world check",
+    "emberlink eval pretrained:maps world",
+)
+"""beginnings of commands that take more than five seconds"""
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("command", different(COMMANDS))
+@pytest.mark.parametrize(
+    "command",
+    [
+        pytest.param(command, marks=pytest.mark.heavy if command.startswith(LONG) else ())
+        for command in different(COMMANDS)
+    ],
+)
 def test_a_command_of_the_documentation_runs(command, place):
     if "=BANK" in command:
         assert main(["fire", "import", "ArrivalTime.asc", "fire.units=minutes", *BANK]) == 0

@@ -54,7 +54,7 @@ def test_a_loaded_state_keeps_its_seed():
     assert starts(new).equal(starts(old))
 
 
-@pytest.mark.slow
+@pytest.mark.heavy
 def test_the_workers_of_a_parallel_environment_differ():
     workers = ParallelEnv(2, make)
     try:

@@ -187,7 +187,7 @@ def sweep(steps: int, first: int = 0) -> int:
     return taken
 
 
-@pytest.mark.slow
+@pytest.mark.heavy
 @pytest.mark.parametrize("part", range(4))
 def test_the_invariants_hold(part):
     assert sweep(STEPS // 4, first=1_000_000 * part) >= STEPS // 4

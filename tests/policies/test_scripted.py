@@ -309,7 +309,7 @@ def test_every_policy_in_every_world(name, place):
     assert actions([6], both[1:])[:, 0].equal(batch[:, 1])
 
 
-@pytest.mark.slow
+@pytest.mark.heavy
 def test_coverage_of_each_policy():
     """The bounds are wide; docs/evaluation.md has the measured values."""
     config = resolve("consensus", ["setup=tuned"])

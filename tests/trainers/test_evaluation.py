@@ -132,7 +132,7 @@ def test_follow_target_uses_the_consensus_of_the_setup():
                 assert evaluate.scripted_config(config, name) is config
 
 
-@pytest.mark.slow
+@pytest.mark.heavy
 def test_eval_json_is_reproducible_to_the_byte(run, cache, played):
     assert main.main(["eval", str(run), "--fires", "3"]) == 0
     first = (run / "eval.json").read_bytes()

@@ -277,7 +277,7 @@ def test_configurations_are_resolved_in_several_threads():
     assert resolved == {(m, s): trainers.resolve(m, [f"setup={s}"]) for m, s in pairs}
 
 
-@pytest.mark.slow
+@pytest.mark.heavy
 def test_the_examples_of_the_documentation_run(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     page = (ROOT / "docs" / "python.md").read_text()

@@ -64,7 +64,7 @@ def test_rows_say_who_was_alive_after_a_step():
     assert "alive" not in to_rows(rollout, 1, [keys.OBSERVATION])
 
 
-@pytest.mark.slow
+@pytest.mark.heavy
 def test_a_run_in_a_world_is_trained_resumed_and_evaluated(tmp_path, capsys):
     output = f"output={tmp_path / 'runs'}"
     assert main.main(["train", "consensus", *TINY, "world=blackout", output]) == 0

@@ -60,31 +60,33 @@ def play(
     world: Any = env.base_env
     horizon: int = world.config.horizon
     steps: list[TensorDictBase] = []
+    actions: list[Tensor] = []
     with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
         td = env.reset()
         if watch is not None:
             watch(world, td)
-        for step in range(1, horizon + 1):
-            acted = policy(td)
-            _check_action(acted.get(keys.ACTION), step)
-            td = env.step(acted)
+        for _ in range(horizon):
+            td = env.step(policy(td))
+            actions.append(td.get(keys.ACTION))
             _count_messages(policy, td.get("next"))
             if watch is not None:
                 watch(world, td.get("next"))
             steps.append(td.get("next").select(*metrics.STEP_KEYS, strict=False))
             td = step_mdp(td, keep_other=True)
+    _check_finite(torch.stack(actions))
     episode: Any = torch.stack(cast(Any, steps), dim=1)
     return metrics.episode_metrics(episode)
 
 
-def _check_action(action: Tensor, step: int) -> None:
-    """Checks that all actions, [num_envs, n, 3], are finite."""
-    wrong = ~action.isfinite()
+def _check_finite(actions: Tensor) -> None:
+    """Checks that the actions of an episode, [horizon, num_envs, n, 3], are finite."""
+    wrong = ~actions.isfinite()
     if wrong.any():
-        env, uav, axis = wrong.nonzero()[0].tolist()
+        place = wrong.nonzero()[0].tolist()
+        step, env, uav, _ = place
         raise UserError(
-            f"the policy's action is {action[env, uav, axis].item():g} for UAV {uav} of "
-            f"environment {env} at step {step}; expected finite numbers"
+            f"the policy's action is {actions[tuple(place)].item():g} for UAV {uav} of environment "
+            f"{env} at step {step + 1}; expected finite numbers"
         )
 
 

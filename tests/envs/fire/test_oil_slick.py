@@ -286,7 +286,7 @@ def test_fires() -> Tensor:
     return make_fires(load_scenario("oil_slick"), fire_seeds("test", 100), GRID, HORIZON)
 
 
-@pytest.mark.slow
+@pytest.mark.heavy
 def test_slicks_are_of_the_size_of_the_fires(test_fires: Tensor):
     count = burning_cells(test_fires, HORIZON)
     assert ((count[:, 0] >= 55) & (count[:, 0] <= 90)).all()

@@ -128,7 +128,7 @@ def test_a_run_describes_its_fires(trained):
             assert np.array_equal(kept[split], expected.numpy())
 
 
-@pytest.mark.slow
+@pytest.mark.heavy
 def test_a_run_is_evaluated_rendered_and_resumed_without_its_file(run, trained, tmp_path, capfd):
     gone = trained / "fire.asc"
     gone.rename(trained / "elsewhere.asc")

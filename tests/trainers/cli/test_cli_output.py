@@ -50,7 +50,7 @@ def check_saved(output: Path) -> None:
     assert not (folder / "lock").exists()
 
 
-@pytest.mark.slow
+@pytest.mark.heavy
 def test_a_closed_pipe_ends_the_training_with_a_checkpoint(tmp_path):
     process = started(["train", "independent", *ENDLESS, f"output={tmp_path}"], subprocess.PIPE)
     try:
@@ -66,7 +66,7 @@ def test_a_closed_pipe_ends_the_training_with_a_checkpoint(tmp_path):
     check_saved(tmp_path)
 
 
-@pytest.mark.slow
+@pytest.mark.heavy
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs Linux's /dev/full")
 def test_a_full_output_is_an_error_and_unlocks_the_folder(tmp_path):
     with open("/dev/full", "w") as full:
@@ -159,7 +159,7 @@ def test_a_warning_of_a_command_can_be_recorded(monkeypatch):
     assert [warning.category for warning in caught] == [UserWarning, UserWarning, RuntimeWarning]
 
 
-@pytest.mark.slow
+@pytest.mark.heavy
 def test_a_lost_terminal_ends_the_training_with_a_checkpoint(tmp_path, capsys):
     """The run can then be evaluated."""
     process = started(["train", "independent", *ENDLESS, f"output={tmp_path}"], subprocess.PIPE)

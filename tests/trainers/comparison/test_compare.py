@@ -321,7 +321,7 @@ def test_intervals_ignore_the_spread_within_a_run(tmp_path):
     assert calm.interval == wild.interval == (20, 40)
 
 
-@pytest.mark.slow
+@pytest.mark.heavy
 @pytest.mark.drawn
 def test_results_do_not_depend_on_the_order_of_runs(runs, tmp_path):
     folders = find([runs])
@@ -422,7 +422,7 @@ def test_numbers_without_printing(runs, tmp_path, capsys, monkeypatch):
         compare([tmp_path / "missing"])
 
 
-@pytest.mark.slow
+@pytest.mark.heavy
 def test_different_rewards_are_not_ranked(tmp_path, capsys):
     """Rewards differ by their settings or by the reward of a scripted policy."""
     for seed in range(2):

@@ -236,14 +236,14 @@ def stepped(values: dict) -> None:
         assert td[key].isfinite().all(), key
 
 
-@pytest.mark.slow
+@pytest.mark.heavy
 @FUZZ
 @given(valid_values())
 def test_valid_values_are_built_and_stepped(values):
     stepped(values)
 
 
-@pytest.mark.slow
+@pytest.mark.heavy
 @settings(FUZZ, max_examples=max(15, EXAMPLES // 50))
 @given(valid_values())
 def test_valid_values_collect_and_learn(values):

@@ -141,6 +141,7 @@ def test_runs_of_all_learners_are_rendered_and_compared(cases, trained, tmp_path
     capsys.readouterr()
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("learners", [["ippo", "mappo"], ["td3"]])
 def test_a_sweep_over_learners(learners, tmp_path, capsys):
     own = [] if "ippo" in learners else ["learner.batch_size=8"]
@@ -158,6 +159,7 @@ def test_a_sweep_over_learners(learners, tmp_path, capsys):
 SIDE_BY_SIDE = [case for case in CASES if case != "ddpg"]  # that of ddpg is in test_seeds.py
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("case", SIDE_BY_SIDE)
 def test_seeds_side_by_side_learn_the_same_as_alone(case, tmp_path):
     settings = ["train", "independent", *SMALL, *CASES[case], "evaluation.interval=0"]

@@ -283,8 +283,8 @@ def test_a_run_without_a_checkpoint_begins_with_these_actors_again(imitated, tmp
 LEARNERS = [
     ("ippo", "ippo", ["learner.minibatches=2", "seeds=[3,4]"]),
     ("ddpg", "ddpg", OFF_POLICY),
-    pytest.param("mappo", "ippo", [], marks=pytest.mark.slow),
-    pytest.param("td3", "ddpg", OFF_POLICY, marks=pytest.mark.slow),
+    pytest.param("mappo", "ippo", [], marks=pytest.mark.heavy),
+    pytest.param("td3", "ddpg", OFF_POLICY, marks=pytest.mark.heavy),
 ]
 
 

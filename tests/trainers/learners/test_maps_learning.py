@@ -76,9 +76,9 @@ def trained(tmp_path, *more: str):
     [
         ["env.num_uavs=1", "env.grid=[20,20]"],
         ["env.num_uavs=24", "env.grid=[128,100]"],
-        pytest.param(["env.num_uavs=3"], marks=pytest.mark.slow),
-        pytest.param(["env.num_uavs=64", "env.grid=[60,60]"], marks=pytest.mark.slow),
-        pytest.param(["env.grid=[128,128]"], marks=pytest.mark.slow),
+        pytest.param(["env.num_uavs=3"], marks=pytest.mark.heavy),
+        pytest.param(["env.num_uavs=64", "env.grid=[60,60]"], marks=pytest.mark.heavy),
+        pytest.param(["env.grid=[128,128]"], marks=pytest.mark.heavy),
     ],
 )
 def test_a_trained_policy_flies_in_other_teams_and_maps(changes, tmp_path):

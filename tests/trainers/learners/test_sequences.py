@@ -304,7 +304,7 @@ def test_decision_by_decision_equals_the_whole_sequence(kind, more):
     torch.testing.assert_close(network(observed, missing, 4, 5), whole[:, :, 4:])
 
 
-@pytest.mark.slow
+@pytest.mark.heavy
 @pytest.mark.parametrize(("kind", "learnt"), [("none", False), ("stack", True), ("gru", True)])
 def test_what_needs_a_memory_is_learnt_with_one(kind, learnt):
     """The best action is 0.8 times the observation before, which is random."""

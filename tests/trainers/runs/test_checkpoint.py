@@ -110,7 +110,7 @@ def refused(path: Path, change: Callable[[dict, dict[str, torch.Tensor]], object
     return text.partition("; the one before it")[0].removeprefix(f"{path}: ")
 
 
-@pytest.mark.slow
+@pytest.mark.heavy
 def test_nan_in_any_tensor_is_refused(stopped):
     _, content = checkpoint_file.read(stopped)
     floating = [name for name, value in content.items() if value.is_floating_point()]

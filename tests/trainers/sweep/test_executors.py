@@ -309,7 +309,7 @@ def test_a_process_sees_its_share_of_threads_and_gpus(monkeypatch, tmp_path):
 LONG = [*(word for word in TINY if word != "episodes=2"), "episodes=4000", "checkpoint_steps=50"]
 
 
-@pytest.mark.slow
+@pytest.mark.heavy
 def test_ctrl_c_at_a_terminal_leaves_a_local_training_running(tmp_path):
     """`sweep status` sees it, the same sweep waits for it, and SIGTERM saves it."""
     sweep = [sys.executable, "-m", "emberlink.trainers.cli", "sweep"]

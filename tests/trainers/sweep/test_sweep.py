@@ -475,7 +475,7 @@ def test_every_executor_has_a_file_and_settings():
     assert (executor.slots(9), executor.slots(2)) == (3, 2)
 
 
-@pytest.mark.slow
+@pytest.mark.heavy
 @pytest.mark.parametrize("learner", ["ddpg", "mappo"])
 def test_a_resumed_sweep_equals_an_uninterrupted_one(learner, tmp_path):
     broken, whole = tmp_path / "broken", tmp_path / "whole"

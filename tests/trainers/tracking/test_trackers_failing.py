@@ -213,7 +213,7 @@ def test_the_process_of_wandb_is_killed_or_stopped(how, tmp_path):
                 os.kill(process, signal.SIGKILL)
 
 
-@pytest.mark.slow
+@pytest.mark.heavy
 def test_a_program_exits_normally_if_wandb_was_killed(tmp_path):
     """Errors of wandb at the end of the program are not printed."""
     program = (

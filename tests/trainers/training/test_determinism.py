@@ -12,7 +12,7 @@ from emberlink.envs.wildfire import WildfireEnv
 from emberlink.trainers import make_env
 
 
-@pytest.mark.slow
+@pytest.mark.heavy
 @pytest.mark.parametrize("method", [*METHODS, "maps"])
 def test_a_seed_repeats_its_run_byte_for_byte(method, tmp_path):
     def run(folder: str, seed: int) -> tuple[bytes, dict[str, torch.Tensor]]:

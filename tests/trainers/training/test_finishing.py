@@ -240,7 +240,7 @@ for call in (3, 4):
 """
 
 
-@pytest.mark.slow
+@pytest.mark.heavy
 def test_a_kill_during_the_creation_of_the_folders_of_seeds(tmp_path, capsys):
     """Either no folder looks like a run, or the run can be resumed with all its seeds."""
     arguments = ["independent", *TINY, "seeds=[0,1]"]
@@ -340,7 +340,7 @@ def test_folders_named_like_temporary_files_are_kept(run, capsys):
     assert (run.path / "divergence_step_3.part").read_text() == "mine"
 
 
-@pytest.mark.slow
+@pytest.mark.heavy
 def test_an_infinite_range_round_trips(tmp_path, capsys):
     arguments = ["consensus", *TINY, "env.radio.range=inf", f"output={tmp_path / 'runs'}"]
     assert trained(capsys, *arguments)[0] == 0

@@ -347,7 +347,7 @@ def test_a_learning_rate_that_diverges(tmp_path):
     assert replay(error.dump) == error.report
 
 
-@pytest.mark.slow
+@pytest.mark.heavy
 def test_the_command_prints_one_line(tmp_path, monkeypatch, capsys):
     Poison(monkeypatch, "reward")
     assert main.main(["train", "consensus", *SMALL, f"output={tmp_path}"]) == 2
@@ -405,7 +405,7 @@ def progress_of(trainer: Trainer) -> tuple[float, int, int]:
 ROLLBACK = ["on_nan=rollback", "setup=paper"]
 
 
-@pytest.mark.slow
+@pytest.mark.heavy
 @pytest.mark.parametrize(
     ("learner", "more", "update", "to"),
     [

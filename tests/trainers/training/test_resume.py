@@ -124,7 +124,7 @@ def whole(tmp_path_factory):
     ("method", "steps"),
     [
         *zip(METHODS, [[1, 33], [40], [41, 42, 79], [33, 40, 79]], strict=True),
-        ("maps", [1, 33, 40, 79]),
+        pytest.param("maps", [1, 33, 40, 79], marks=pytest.mark.heavy),
     ],
 )
 def test_a_resumed_run_equals_the_uninterrupted_run(method, steps, learner, whole, tmp_path):
@@ -174,14 +174,14 @@ def test_held_actions_and_memories_are_resumed(more, whole, tmp_path):
     assert_same(whole("consensus", *held), stopped_at([10, 26, 40], "consensus", tmp_path, *held))
 
 
-@pytest.mark.slow
+@pytest.mark.heavy
 def test_a_run_can_be_stopped_at_any_step(whole, tmp_path):
     """Stops a run every 5 steps, so within, at and after the end of every episode."""
     steps, evaluated = list(range(5, HORIZON * EPISODES, 5)), "evaluation.interval=2"
     assert_same(whole("consensus", evaluated), stopped_at(steps, "consensus", tmp_path, evaluated))
 
 
-@pytest.mark.slow
+@pytest.mark.heavy
 def test_several_updates_a_step_and_the_released_setup(whole, tmp_path):
     more = ["setup=released", "learner.updates_per_step=3"]
     assert_same(whole("consensus", *more), stopped_at([9, 50], "consensus", tmp_path, *more))

@@ -21,7 +21,7 @@ from emberlink.trainers.training.setup import TrainingSetup
 SEEDS = [3, 11]
 
 
-@pytest.mark.slow
+@pytest.mark.heavy
 @pytest.mark.parametrize(
     ("method", "setup"), [*zip(METHODS, ["released", "paper"] * 2, strict=True)]
 )
@@ -45,7 +45,7 @@ def test_a_seed_of_a_stack_learns_the_same_as_alone(method, setup, tmp_path):
             assert line == pytest.approx(single, rel=1e-3, abs=1e-3)
 
 
-@pytest.mark.slow
+@pytest.mark.heavy
 def test_a_stack_of_networks_equals_single_networks_in_float64(tmp_path):
     """Compares 300 updates in float64 at tuned's learning rates, from recorded transitions.
 

@@ -33,7 +33,7 @@ def table(tmp_path_factory) -> dict[str, list[str]]:
     return results
 
 
-@pytest.mark.slow
+@pytest.mark.heavy
 @pytest.mark.parametrize("kind", COUNTS)
 def test_every_trial_succeeds(kind, table):
     _, done, failures, _ = table[kind]
