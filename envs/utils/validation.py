@@ -121,7 +121,9 @@ def is_index(text: str, end: int) -> bool:
     return text.isdecimal() and len(text) <= len(str(end)) and int(text) < end
 
 
-_LIKE_A_NUMBER = re.compile(r"[-+.]?\d.*|[-+]?\.?inf|\.?nan|true|false|null", re.I)
+_LIKE_A_NUMBER = re.compile(
+    r"[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?|[-+]?\.?inf|\.?nan|true|false|null", re.IGNORECASE
+)
 _AS_YAML = {"None": "null", "True": "true", "False": "false"}
 """values that YAML writes in another way, by what Python writes"""
 

@@ -188,6 +188,7 @@ LONG = (
     "emberlink compare pretrained",
     "emberlink world check",
     "emberlink eval pretrained:maps world",
+    "emberlink doctor",
 )
 """beginnings of commands that take more than five seconds"""
 

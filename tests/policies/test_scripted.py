@@ -240,7 +240,7 @@ def fires(shape, count: int):
     return arrival.where(arrival < 30, NEVER)
 
 
-@pytest.mark.slow
+@pytest.mark.heavy
 @pytest.mark.parametrize("shape", SHAPES, ids=str)
 @pytest.mark.parametrize("method", known("method"))
 @pytest.mark.parametrize("name", SCRIPTED)

@@ -97,7 +97,7 @@ def test_the_suite_is_the_worlds_that_evaluate_the_needed_policies(capsys):
     names = check.suite(Console(width=300))
     assert names == ["blackout", "front", "relay", "swarm"]
     notes = capsys.readouterr().out
-    assert "note: world file is left out: fire.path=None: a file is needed" in notes
+    assert "note: world file is left out: fire.path=null: a file is needed" in notes
     assert "note: world paper is left out: evaluation.scripted lacks map_greedy_alone" in notes
 
 
@@ -271,7 +271,7 @@ def refused(capsys, *arguments) -> str:
         (["paper"], "evaluation.scripted lacks map_greedy_alone, map_greedy_all"),
         (["front", "evaluation.headline=front_age"], "front_age is not a share in %; known: cov"),
         (["world=front"], "the worlds are given without a key"),
-        (["file"], "fire.path=None: a file is needed"),
+        (["file"], "fire.path=null: a file is needed"),
         (["front", "--fires", "0"], "'0' is not a whole number"),
         (["front", "--json", "out.txt"], "must end in .json"),
     ],

@@ -55,13 +55,7 @@ def evaluate_folder(
     label = f"_{given.stem}" if given else ""
     check_trained_with(checkpoint, config)
     for text in overrides:
-        if "=" not in text:
-            raise UserError(f"{text!r}: one run is evaluated at a time; compare takes several runs")
-        if not text.startswith(_CHANGEABLE):
-            raise UserError(
-                f"{text!r}: an evaluation can change the world, evaluation.scripted, and keys of "
-                "comm. and env. only"
-            )
+        _check_changeable(text)
         label += "_" + re.sub(r"[^\w.=+-]", "-", text)
     if own := kept(config, overrides):
         console.print(f"note: the run keeps its own {', '.join(own)}", soft_wrap=True)
@@ -76,6 +70,17 @@ def evaluate_folder(
         fires=fires,
     )
     return 0
+
+
+def _check_changeable(text: str) -> None:
+    """Checks that a text is `key=value` with a key that can be changed in an evaluation."""
+    if "=" not in text:
+        raise UserError(f"{text!r}: one run is evaluated at a time; compare takes several runs")
+    if not text.startswith(_CHANGEABLE):
+        raise UserError(
+            f"{text!r}: an evaluation can change the world, evaluation.scripted, and keys of comm. "
+            "and env. only"
+        )
 
 
 def _shortened(label: str) -> str:

@@ -162,14 +162,14 @@ def _trained_with(header: Mapping[str, Any], config: RunConfig | None) -> str:
         return ""
     before, now = flat(header["config"]), flat(to_header(config))
     keys = [*_OF_NETWORKS, *(key for key in before if key.startswith("comm."))]
-    if _flies_in_any_team(config):
-        keys.remove("env.num_uavs")
-    differ = [
-        f"{key}={shown(before[key])}" + (f" (now {shown(now[key])})" if key in now else "")
+    differ = {
+        key: f"{key}={shown(before[key])}" + (f" (now {shown(now[key])})" if key in now else "")
         for key in keys
         if key in before and before[key] != now.get(key)
-    ]
-    return f"; it was trained with {', '.join(differ)}" if differ else ""
+    }
+    if len(differ) > 1 and _flies_in_any_team(config):
+        differ.pop("env.num_uavs", None)  # it is hardly the reason
+    return f"; it was trained with {', '.join(differ.values())}" if differ else ""
 
 
 def _check_header(path: Path, header: Mapping[str, Any], config: RunConfig) -> None:

@@ -238,7 +238,7 @@ BAD = [
     ({"wind_speed": [0.0, 11.0]}, "wind_speed.1=11.0"),
     ({"heating": 0.0}, "heating=0.0: should be greater"),
     ({"heating": math.nan}, "heating=nan"),
-    ({"diffusivity": "1"}, "diffusivity=1: expected a number"),
+    ({"diffusivity": "1"}, 'diffusivity="1": expected a number'),
     ({"head_ros": 1.0}, "'head_ros' is not known"),
     ({"kind": "fire"}, "kind=fire"),
 ]

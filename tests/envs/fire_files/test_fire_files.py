@@ -105,7 +105,7 @@ def test_keys_in_any_order_override_the_setup(source):
 
 def test_a_missing_path_or_file_gives_one_line(capfd, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert "fire.path=None: a file is needed" in fails(["train", "consensus", "fire=file"], capfd)
+    assert "fire.path=null: a file is needed" in fails(["train", "consensus", "fire=file"], capfd)
     for path in ("none.asc", "3mph120deg7hr.asc", "2020.tif", ".", "a folder/x.shp"):
         line = fails(["train", "consensus", "fire=file", f"fire.path={path}"], capfd)
         assert Path(path).name in line

@@ -411,7 +411,12 @@ def finished(config, stop: int | None):
 
 @pytest.mark.parametrize(
     ("learner", "more"),
-    [("imitation", TINY), ("imitation", [*TINY, *MEMORY]), ("ippo", []), ("ddpg", OFF_POLICY)],
+    [
+        ("imitation", TINY),
+        ("ippo", []),
+        pytest.param("imitation", [*TINY, *MEMORY], marks=pytest.mark.heavy),
+        pytest.param("ddpg", OFF_POLICY, marks=pytest.mark.heavy),
+    ],
 )
 def test_a_resumed_run_is_the_same_bit_for_bit(learner, more, imitated, tmp_path):
     if learner != "imitation":

@@ -66,7 +66,7 @@ def test_learners_are_the_files_on_disk():
 STRONG = ["setup=strong", "env.horizon=20"]
 
 
-@pytest.mark.slow
+@pytest.mark.heavy
 @pytest.mark.parametrize(
     ("method", "settings"),
     [

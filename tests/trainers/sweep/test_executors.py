@@ -98,7 +98,7 @@ def test_a_machine_without_slurm_is_named(tmp_path, capsys, monkeypatch):
         (["executor=submitit", "executor.time=4:00:00:00"], "executor.time=4:00:00:00"),
         (["executor=submitit", "executor.cluster=debug"], "executor.cluster=debug"),
         (["executor=submitit", "executor.address=auto"], "'executor.address' is not known"),
-        (["executor=submitit", "executor.time=null"], "executor.time=None: expected minutes"),
+        (["executor=submitit", "executor.time=null"], "executor.time=null: expected minutes"),
         (["executor=submitit", "executor.time=2"], "executor.notice=90: executor.time=2 must be"),
         (["executor=submitit", "executor.options={qos: low"], "executor.options={qos: low"),
         (["executor=submitit", "executor.options={qos: [1]}"], "options.qos=[1]: expected text"),

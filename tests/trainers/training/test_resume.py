@@ -116,15 +116,25 @@ def whole(tmp_path_factory):
     return of
 
 
-@pytest.mark.slow
 # Before the first update; within, at and after the end of an episode; before the last step. At
 # step 33 of 80 the replay buffer has just wrapped around.
-@pytest.mark.parametrize("learner", ["ddpg", "td3", "ippo", "mappo"])
+STOPS = dict(
+    zip(METHODS, [[1, 33], [40], [41, 42, 79], [33, 40, 79]], strict=True), maps=[1, 33, 40, 79]
+)
+IN_CI = {(method, "ddpg") for method in METHODS}
+IN_CI |= {("consensus", learner) for learner in ("td3", "ippo", "mappo")}
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize(
-    ("method", "steps"),
+    ("method", "steps", "learner"),
     [
-        *zip(METHODS, [[1, 33], [40], [41, 42, 79], [33, 40, 79]], strict=True),
-        pytest.param("maps", [1, 33, 40, 79], marks=pytest.mark.heavy),
+        pytest.param(
+            *(method, steps, learner),
+            marks=() if (method, learner) in IN_CI else pytest.mark.heavy,
+        )
+        for method, steps in STOPS.items()
+        for learner in ("ddpg", "td3", "ippo", "mappo")
     ],
 )
 def test_a_resumed_run_equals_the_uninterrupted_run(method, steps, learner, whole, tmp_path):
@@ -138,11 +148,15 @@ def test_a_resumed_run_equals_the_uninterrupted_run(method, steps, learner, whol
     ("method", "more"),
     [
         ("consensus", ["learner=ddpg"]),
-        ("positional", ["learner=td3"]),
+        pytest.param("positional", ["learner=td3"], marks=pytest.mark.heavy),
         ("independent", ["learner=ippo"]),
-        ("shared_memory", ["learner=mappo", "learner.critic_map=true"]),
+        pytest.param(
+            "shared_memory", ["learner=mappo", "learner.critic_map=true"], marks=pytest.mark.heavy
+        ),
         ("consensus", ["learner=ddpg", "policy.memory=stack", *SEQUENCES, "learner.critic=team"]),
-        ("independent", ["learner=td3", "policy.memory=gru", *SEQUENCES]),
+        pytest.param(
+            "independent", ["learner=td3", "policy.memory=gru", *SEQUENCES], marks=pytest.mark.heavy
+        ),
     ],
 )
 def test_seeds_side_by_side_are_resumed_together(method, more, whole, tmp_path):
