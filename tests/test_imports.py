@@ -90,6 +90,14 @@ def test_the_command_line_starts_without_torch(module):
     assert done.stdout.split() == []
 
 
+def test_names_are_listed_without_torch():
+    code = "from emberlink.trainers.cli.main import main; main(['list', 'methods', 'worlds'])"
+    code += "; import sys; print('torch' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert "consensus" in done.stdout
+    assert done.stdout.endswith("False\n")
+
+
 EFFECTS = """
 import random, sys, threading, numpy, rich.style, torch
 import torchrl.envs, torchrl.collectors, torchrl.objectives

@@ -1,7 +1,9 @@
 """Finds and reads YAML files of configuration groups."""
 
+import copy
 import re
 from collections.abc import Collection, Mapping, Sequence
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -76,10 +78,17 @@ def read(group: str, name: str) -> dict[str, Any]:
     """
     file = find(group, name)
     try:
-        values: Any = OmegaConf.to_container(OmegaConf.create(file.read_text(encoding="utf-8")))
+        about = file.stat()
+        values = copy.deepcopy(_parsed(file, about.st_mtime_ns, about.st_size))
     except (OSError, UnicodeError, YAMLError, OmegaConfBaseException) as error:
         reason = " ".join(str(error).split())[:200]
         raise UserError(f"{file}: cannot be read: {reason}") from None
     if not isinstance(values, dict):
         raise UserError(f"{file}: expected keys and values")
     return values
+
+
+@lru_cache(maxsize=256)
+def _parsed(file: Path, _changed: int, _size: int) -> Any:
+    """Returns the content of a file, which is parsed again if its time or its size changes."""
+    return OmegaConf.to_container(OmegaConf.create(file.read_text(encoding="utf-8")))

@@ -49,10 +49,11 @@ def described(kind: str) -> list[tuple[str, str]]:
     import inspect
 
     from emberlink.configs import describe, known
-    from emberlink.policies.scripted.registry import SCRIPTED
 
     if kind != "policies":
         return [(name, describe(KINDS[kind], name)) for name in known(KINDS[kind])]
+    from emberlink.policies.scripted.registry import SCRIPTED  # imports torch
+
     texts = {name: inspect.getdoc(policy) or "" for name, policy in SCRIPTED.items()}
     return [(name, " ".join(text.split("\n\n")[0].split())) for name, text in texts.items()]
 
