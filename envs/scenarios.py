@@ -177,6 +177,16 @@ def fires_of(scenario: ScenarioConfig) -> FireSource:
     return _KINDS[type(scenario)](scenario)
 
 
+def same_tests(one: ScenarioConfig, other: ScenarioConfig) -> bool:
+    """Returns whether two scenarios have the same test fires.
+
+    The number of training fires makes no difference to them.
+    """
+    if not (isinstance(one, GeneratedConfig) and isinstance(other, GeneratedConfig)):
+        return one == other
+    return dataclasses.replace(one, num_train_fires=other.num_train_fires) == other
+
+
 def grid_of(fire: Any) -> tuple[int, int] | None:
     """Returns the grid of arrival times, a tensor or an array; None for a scenario."""
     shape: list[int] = list(getattr(fire, "shape", ()))

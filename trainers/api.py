@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, overload
 
 from emberlink.envs.utils.errors import UserError
-from emberlink.envs.utils.validation import check_whole
+from emberlink.envs.utils.validation import check_whole, shown
 from emberlink.trainers.comparison.report import free_folder, write_report
 from emberlink.trainers.comparison.results import Comparison, compare_runs
 from emberlink.trainers.config.compose import flat, override, resolve, to_values
@@ -139,8 +139,8 @@ def evaluate(
         checkpoint: file of networks; the newest of the run if None.
         device: device of the episodes; that of the run if None.
         progress: called with the names of the fire and the policy before each evaluation.
-        settings: `world`, or settings of `env` or `comm` to change, as for `train`; the networks
-            must fit.
+        settings: `world`, settings of its fire (`"fire.path"`), `headline`, or settings of `env` or
+            `comm` to change, as for `train`; the networks must fit.
 
     Returns:
         fire -> policy ("learned", or a scripted one) -> measure -> one number per episode.
@@ -170,26 +170,31 @@ def load(
         run: a run folder, or `pretrained:METHOD`.
         checkpoint: file of networks; the newest of the run if None.
         device: device of the networks; that of the run if None.
-        settings: `world`, or settings of `env` or `comm` to change, as for `train`; the networks
-            must fit.
+        settings: `world`, settings of its fire (`"fire.path"`), `headline`, or settings of `env` or
+            `comm` to change, as for `train`; the networks must fit.
 
     Raises:
         UserError: there is no such run, a file in it is damaged, or a setting does not fit.
     """
+    if not isinstance(run, str | os.PathLike):
+        raise UserError(f"load: {shown(run)} is not the path of a run folder")
     folder = RunFolder(pretrained.find_one(str(run)) if pretrained.is_name(str(run)) else Path(run))
     trained = folder.config(**({} if device is None else {"device": device}))
     file = folder.checkpoint() if checkpoint is None else Path(checkpoint)
     check_trained_with(file, trained)
-    there = in_world(trained, str(settings.pop("world", trained.world)))
+    fire = {key: settings.pop(key) for key in [*settings] if key.startswith("fire.")}
+    there = in_world(trained, str(settings.pop("world", trained.world)), **fire)
     config = override(there, **settings)
     changed = {key: getattr(config, key) for key in ("env", "comm", "baselines")}
-    if replace(there, **changed) != config:
+    evaluation = replace(there.evaluation, headline=config.evaluation.headline)
+    if replace(there, evaluation=evaluation, **changed) != config:
         raise UserError(
-            f"{', '.join(settings)}: only world and keys of env and comm can be changed"
+            f"{', '.join(settings)}: only world, fire, headline and keys of env and comm can be "
+            "changed"
         )
     before, now = (flat(to_values(each)) for each in (trained, config))
     changes = [
-        f"{key}={value}"
+        f"{key}={shown(value)}"
         for key, value in now.items()
         if key.startswith(("world", "env.", "comm.")) and before.get(key) != value
     ]

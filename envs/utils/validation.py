@@ -74,7 +74,8 @@ def check_whole(name: str, number: Any) -> int:
             return operator.index(number)
     except TypeError:
         pass
-    raise UserError(f"{name}={shown(number)}: expected a whole number")
+    given = json.dumps(number) if isinstance(number, str) else number
+    raise UserError(f"{name}={shown(given)}: expected a whole number")
 
 
 def plain(value: Any, key: str = "", deepest: int = 16) -> Any:

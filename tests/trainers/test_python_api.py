@@ -221,7 +221,8 @@ def test_compare_writes_the_report_of_the_command(trained, tmp_path):
         (lambda run: trainers.train("consensus", device="cuda:99"), "device=cuda:99"),
         (lambda run: trainers.evaluate("nowhere"), "there is no such run folder"),
         (lambda run: trainers.evaluate(run, episodes=0), "episodes=0"),
-        (lambda run: trainers.evaluate(run, episodes="3"), "episodes=3: expected a whole number"),
+        (lambda run: trainers.evaluate(run, episodes="3"), 'episodes="3": expected a whole number'),
+        (lambda run: trainers.load(None), "load: null is not the path of a run folder"),
         (lambda run: trainers.evaluate(run, episodes=1.5), "episodes=1.5: expected a whole number"),
         (lambda run: trainers.train("consensus", seeds=3), "seeds=3: expected a list"),
         (lambda run: trainers.make_env("consensus", env=3), "env=3: expected keys and values"),
@@ -229,7 +230,7 @@ def test_compare_writes_the_report_of_the_command(trained, tmp_path):
         (lambda run: trainers.compare([]), "expected at least one run folder"),
         (
             lambda run: trainers.evaluate(run, gamma=0.5),
-            "gamma: only world and keys of env and comm",
+            "gamma: only world, fire, headline and keys of env and comm",
         ),
         (lambda run: trainers.evaluate(run, num_uavs=3), "this configuration"),
         (lambda run: trainers.load("pretrained:nothing"), "no such trained policy; known: "),

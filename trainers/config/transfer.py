@@ -2,7 +2,9 @@
 
 from collections.abc import Sequence
 from dataclasses import asdict, replace
+from typing import Any
 
+from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import shown
 from emberlink.trainers.config.compose import from_values, override, resolve, to_values, with_radio
 from emberlink.trainers.config.overrides import flat, parse, put
@@ -17,16 +19,24 @@ def evaluated_with(config: RunConfig, overrides: Sequence[str]) -> RunConfig:
 
     Args:
         config: configuration of the run.
-        overrides: texts `key=value`, as on the command line. `world=NAME` is applied first.
+        overrides: texts `key=value`, as on the command line. `world=NAME` is applied first, with
+            keys of `fire`.
 
     Raises:
         UserError: a key or a value is wrong.
     """
     worlds = [str(value) for key, value in map(parse, overrides) if key == "world"]
-    others = [text for text in overrides if parse(text)[0] != "world"]
+    fire = _of_the_fire(overrides)
+    others = [text for text in overrides if parse(text)[0] != "world" and text not in fire]
+    if fire and not worlds:
+        raise UserError(f"{shown(fire[0])}: an evaluation on another fire needs world=NAME, too")
     for world in worlds:
-        config = in_world(config, world)
+        config = in_world(config, world, fire)
     return override(config, others) if others else config
+
+
+def _of_the_fire(overrides: Sequence[str]) -> list[str]:
+    return [text for text in overrides if text.startswith("fire.")]
 
 
 def kept(config: RunConfig, overrides: Sequence[str]) -> list[str]:
@@ -42,7 +52,7 @@ def kept(config: RunConfig, overrides: Sequence[str]) -> list[str]:
     changed = dict(map(parse, overrides))
     if "world" not in changed:
         return []
-    moved = in_world(config, str(changed["world"]))
+    moved = in_world(config, str(changed["world"]), _of_the_fire(overrides))
     usual, own = flat(to_values(_usual(moved))), flat(to_values(moved))
     return [
         f"{key}={shown(value)}"
@@ -56,7 +66,7 @@ def _usual(config: RunConfig) -> RunConfig:
     return resolve(config.method, [f"setup={config.setup}", f"world={config.world}", "fire=paper"])
 
 
-def in_world(config: RunConfig, world: str) -> RunConfig:
+def in_world(config: RunConfig, world: str, fire: Sequence[str] = (), **settings: Any) -> RunConfig:
     """Returns a run's configuration in another world.
 
     The fire is that of the world. Of `env` and `evaluation`, the keys in which the two worlds
@@ -65,14 +75,17 @@ def in_world(config: RunConfig, world: str) -> RunConfig:
     Args:
         config: configuration of the run.
         world: name of a file in configs/world.
+        fire: texts `key=value` of the world's fire, such as `fire.path=ArrivalTime.asc`.
+        settings: the same as keyword arguments.
 
     Raises:
         UserError: the world is not known, or needs other settings.
     """
-    if world == config.world:
+    if world == config.world and not (fire or settings):
         return config
     here = flat(to_values(_usual(config)))
-    there = resolve(config.method, [f"setup={config.setup}", f"world={world}"])
+    chosen = [f"setup={config.setup}", f"world={world}"]
+    there = resolve(config.method, [*chosen, *fire], **settings)
     values = to_values(config)
     del values["baselines"]
     for key, value in flat(to_values(there)).items():

@@ -9,7 +9,9 @@ import torch
 from tensordict.nn import TensorDictModule
 from torchrl.envs import TransformedEnv
 
+from emberlink.envs.utils.validation import shown
 from emberlink.trainers.build import build_actor, build_env
+from emberlink.trainers.config.compose import to_values
 from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.learners.base import ACTOR
 from emberlink.trainers.runs import checkpoint_file
@@ -21,8 +23,8 @@ def load_actor(
 ) -> TensorDictModule:
     """Returns the frozen policy of a checkpoint, which maps observations to ("agents", "action").
 
-    It warns if the networks see a base here and saw none in training, or observe positions in
-    another map.
+    It warns if the networks see a base here and saw none in training, or if the map, the altitudes,
+    the horizon, the speed, the view or the units of observations are not those of the training.
 
     Args:
         config: configuration of the run.
@@ -43,21 +45,26 @@ def load_actor(
             "weights of the pixels that show one keep their initial values",
             stacklevel=2,
         )
-    _warn_of_another_map(config, trained["env"])
+    _warn_of_other_units(config, trained["env"])
     network.load_state_dict({name.removeprefix(ACTOR): v for name, v in weights.items()})
     return actor.requires_grad_(False)
 
 
-def _warn_of_another_map(config: RunConfig, trained: Mapping[str, Any]) -> None:
-    """Warns of a map or altitudes in which observed positions mean something else."""
+def _warn_of_other_units(config: RunConfig, trained: Mapping[str, Any]) -> None:
+    """Warns of settings with which observed and flown distances mean something else."""
     by_map = config.env.observation != "sight" or config.comm.get("position", False)
-    for key in ("grid", "altitude") if by_map else ("altitude",):
-        here, before = list(getattr(config.env, key)), list(trained[key])
-        if here != before:
-            warnings.warn(
-                f"env.{key}={here}: the networks observe positions, and were trained with {before}",
-                stacklevel=3,
-            )
+    keys = ("grid", "altitude", "horizon", "displacement", "view_angle", "observation_scale")
+    here = to_values(config)["env"]
+    differ = [
+        f"env.{key}={shown(here[key])} (in training {shown(trained[key])})"
+        for key in keys
+        if here[key] != trained.get(key, here[key]) and (by_map or key != "grid")
+    ]
+    if differ:
+        warnings.warn(
+            f"{', '.join(differ)}: what the networks observe and do means something else here",
+            stacklevel=3,
+        )
 
 
 def fireless(config: RunConfig) -> TransformedEnv:

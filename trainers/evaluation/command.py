@@ -19,7 +19,7 @@ from emberlink.trainers.runs.pretrained import open_run
 from emberlink.trainers.runs.run_folder import RunFolder
 from emberlink.trainers.runs.seal import check_trained_with
 
-_CHANGEABLE = ("comm.", "env.", "world=", "evaluation.scripted=")
+_CHANGEABLE = ("comm.", "env.", "world=", "fire.", "evaluation.scripted=", "evaluation.headline=")
 """beginnings of the settings that can be changed in an evaluation"""
 _MAX_LABEL = 150
 """characters; a name of a file can have 255"""
@@ -78,8 +78,8 @@ def _check_changeable(text: str) -> None:
         raise UserError(f"{text!r}: one run is evaluated at a time; compare takes several runs")
     if not text.startswith(_CHANGEABLE):
         raise UserError(
-            f"{text!r}: an evaluation can change the world, evaluation.scripted, and keys of comm. "
-            "and env. only"
+            f"{text!r}: an evaluation can change the world and its fire, evaluation.scripted, "
+            "evaluation.headline, and keys of comm. and env. only"
         )
 
 

@@ -13,8 +13,7 @@ from torchrl.envs.utils import ExplorationType
 from emberlink.envs import keys, metrics
 from emberlink.envs.fire.generator import load_scenario
 from emberlink.envs.fire_files.config import FileFireConfig
-from emberlink.envs.scenarios import ScenarioConfig, fires_of
-from emberlink.envs.utils.errors import UserError
+from emberlink.envs.scenarios import ScenarioConfig, fires_of, same_tests
 from emberlink.envs.wildfire import WildfireEnv
 from emberlink.policies.scripted.base import Scripted
 from emberlink.policies.scripted.registry import SCRIPTED, to_play
@@ -23,6 +22,7 @@ from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.evaluation.baseline_cache import ScriptedResults
 from emberlink.trainers.evaluation.results import LEARNED, Measured, Results, means
+from emberlink.trainers.rollout.finite_actions import check_finite
 
 HELD_OUT_SCENARIO = "huygens"
 """the scenario of evaluations with `evaluation.huygens`, besides that of the training"""
@@ -55,7 +55,7 @@ def play(
         The measures of `metrics.names`, float32 [num_envs] each.
 
     Raises:
-        UserError: an action is NaN or infinite.
+        NonFiniteActionError: an action is NaN or infinite.
     """
     world: Any = env.base_env
     horizon: int = world.config.horizon
@@ -73,21 +73,9 @@ def play(
                 watch(world, td.get("next"))
             steps.append(td.get("next").select(*metrics.STEP_KEYS, strict=False))
             td = step_mdp(td, keep_other=True)
-    _check_finite(torch.stack(actions))
+    check_finite(torch.stack(actions))
     episode: Any = torch.stack(cast(Any, steps), dim=1)
     return metrics.episode_metrics(episode)
-
-
-def _check_finite(actions: Tensor) -> None:
-    """Checks that the actions of an episode, [horizon, num_envs, n, 3], are finite."""
-    wrong = ~actions.isfinite()
-    if wrong.any():
-        place = wrong.nonzero()[0].tolist()
-        step, env, uav, _ = place
-        raise UserError(
-            f"the policy's action is {actions[tuple(place)].item():g} for UAV {uav} of environment "
-            f"{env} at step {step + 1}; expected finite numbers"
-        )
 
 
 def _count_messages(policy: Policy, td: TensorDictBase) -> None:
@@ -109,7 +97,7 @@ def evaluation_scenarios(config: RunConfig) -> dict[str, ScenarioConfig]:
     scenarios: dict[str, ScenarioConfig] = {}
     if config.evaluation.huygens:
         scenarios[HELD_OUT_SCENARIO] = load_scenario(HELD_OUT_SCENARIO)
-    if config.fire not in scenarios.values():
+    if not any(same_tests(config.fire, scenario) for scenario in scenarios.values()):
         changed = config.fire.name in scenarios
         scenarios[config.fire.name + ("_as_trained" if changed else "")] = config.fire
     return scenarios

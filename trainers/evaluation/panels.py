@@ -36,7 +36,7 @@ from emberlink.trainers.runs.seal import check_trained_with
 
 SHARED = ("grid", "num_uavs", "horizon", "altitude")
 """settings that must be equal for all panels; fires and start positions depend on them"""
-_SETTING = re.compile(r"((comm|env)\.[\w.]+|world)=")
+_SETTING = re.compile(r"((comm|env|fire)\.[\w.]+|world)=")
 _KEY = re.compile(r"[\w.]+")
 
 
@@ -123,7 +123,7 @@ def title_of(config: RunConfig, *more: str) -> str:
 
 def scripted(config: RunConfig, names: Sequence[str]) -> Iterator[Panel]:
     """Yields a panel for each scripted policy, in the environment of a configuration."""
-    for name in names:
+    for name in [names] if isinstance(names, str) else names:
         if name not in SCRIPTED:
             raise UserError(f"policy {name!r} is not known; known: {', '.join(SCRIPTED)}")
         title = f"{name.replace('_', ' ')} (scripted)"

@@ -60,8 +60,8 @@ def check_same(path: Path, sealed: Mapping[str, Any], config: RunConfig) -> None
         if key.startswith(("env.", "comm.")):
             hint = f"; to evaluate with another value: emberlink eval RUN {key}=VALUE"
         raise UserError(
-            f"{path}: made with {key}={shown(str(before))}; the run has {key}={shown(str(now))}: "
-            f"put {shown(str(before))} back into config.yaml{hint}"
+            f"{path}: made with {key}={shown(before)}; the run has {key}={shown(now)}: "
+            f"put {shown(before)} back into config.yaml{hint}"
         )
 
 
@@ -82,7 +82,7 @@ def changed_evaluation(path: Path, config: RunConfig) -> list[str]:
     before = trained.get("evaluation", {})
     now = to_values(config)["evaluation"]
     return [
-        f"evaluation.{key} is {value} here, {shown(str(before.get(key)))} in {path.name}"
+        f"evaluation.{key} is {shown(value)} here, {shown(before.get(key))} in {path.name}"
         for key, value in now.items()
         if value != before.get(key)
     ]

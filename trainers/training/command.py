@@ -13,6 +13,7 @@ from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.evaluation.command import evaluate_and_print
 from emberlink.trainers.evaluation.results import learned_means
+from emberlink.trainers.rollout.finite_actions import NonFiniteActionError
 from emberlink.trainers.runs.run_folder import RunFolder
 from emberlink.trainers.terminal import OutputError, TrainingProgress
 from emberlink.trainers.terminal.signals import Interrupted, Interruption
@@ -43,7 +44,7 @@ def train(method: str | None, overrides: Sequence[str], console: Console) -> int
     trainer = _trainer(method, overrides)
     interruption = Interruption(trainer.stop)
     try:
-        _announce(trainer, console)
+        _announce(trainer, overrides, console)
         with interruption:
             _train(trainer, console)
             # The run folders are locked during the evaluation, too.
@@ -85,7 +86,7 @@ def _trainer(method: str | None, overrides: Sequence[str]) -> Trainer:
     return resume(Path(folders[0]), method, others)
 
 
-def _announce(trainer: Trainer, console: Console) -> None:
+def _announce(trainer: Trainer, overrides: Sequence[str], console: Console) -> None:
     """Prints the method, the run folders, and notes about the training."""
     config = trainer.config
     setup, scale = trainer.setup, trainer.rollbacks.lr_scale
@@ -108,6 +109,12 @@ def _announce(trainer: Trainer, console: Console) -> None:
             f"More: {_resume_command(trainer)} episodes={2 * config.episodes}",
             soft_wrap=True,
         )
+        if any(text.startswith("evaluation.") for text in overrides):
+            console.print(
+                "note: eval.json is that of the earlier settings of evaluations; for another one: "
+                f"emberlink eval {shlex.quote(str(trainer.run.path))}",
+                soft_wrap=True,
+            )
     elif not _learns(trainer):
         console.print(
             "note: a first batch needs more transitions than this run collects: "
@@ -218,6 +225,8 @@ def _resume_hint(trainer: Trainer, error: Exception | None = None) -> str:
     diverged = isinstance(error, NonFiniteError)
     command = _resume_command(trainer) + (" on_nan=rollback" if diverged else "")
     states = trainer.run.states()
+    if isinstance(error, NonFiniteActionError):  # in the last evaluation
+        return "the training has diverged: train a new run with smaller learning rates"
     if diverged and config.on_nan == "rollback":
         last = f"the last checkpoint is {states[-1]}; " if states else ""
         return f"{last}to resume would repeat this: train a new run with smaller learning rates"

@@ -1,9 +1,12 @@
 """Reports the first NaN or Inf in training and writes a dump that reproduces it."""
 
+import math
 import platform
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import NoReturn
 
 import torch
 from torch import Tensor
@@ -14,6 +17,7 @@ from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.publish import free_name
 from emberlink.trainers.learners.nan_guard import ROLLOUT
 from emberlink.trainers.learners.tensors import flatten, group, prefixed, unflatten
+from emberlink.trainers.rollout.finite_actions import NonFiniteActionError
 from emberlink.trainers.rollout.products import fast_products
 from emberlink.trainers.runs import checkpoint_file
 from emberlink.trainers.runs.run_folder import RunFolder
@@ -77,17 +81,15 @@ def report_of(setup: TrainingSetup) -> NonFiniteReport:
     # From the last layer to the first, as gradients are computed.
     gradients = list(setup.guard.gradients.items())[::-1]
     named |= {f"gradient of {name}": value for name, value in gradients}
-    uavs = setup.config.env.num_uavs
     for name, value in named.items():
         if value.isfinite().all():
             continue
         row = int((~value.isfinite()).nonzero()[0])
-        of_uavs, of_seeds = len(value) == uavs * setup.teams, len(value) == setup.teams
-        team = row // uavs if of_uavs else row
+        uav, seed = _owner(setup, row, len(value))
         return NonFiniteReport(
             tensor=name,
-            uav=row % uavs if of_uavs else None,
-            seed=setup.seeds[team] if of_uavs or of_seeds else None,
+            uav=uav,
+            seed=seed,
             environment=None,
             step=steps,
             update=updates + 1,
@@ -155,10 +157,47 @@ def check(setup: TrainingSetup, run: RunFolder, *, wait: bool) -> None:
     if setup.guard.poll(wait=wait):
         raise error_of(setup, run)
     for name, value in setup.learner.networks().items() if wait else ():
-        if not torch.linalg.vector_norm(value.detach()).isfinite():
-            largest = f"{float(value.detach().abs().amax()):g}"  # NaN if one is
-            report = NonFiniteReport(f"weight {name}", None, None, None, setup.step, None, largest)
-            raise NonFiniteError(f"{report}; nothing was saved", report, None)
+        largest = value.detach().abs().amax()  # NaN if one is
+        if not largest.square().isfinite():
+            _refuse(setup, name, value.detach())
+
+
+def _refuse(setup: TrainingSetup, name: str, weight: Tensor) -> NoReturn:
+    """Raises an error about the first number of a weight whose square is not finite."""
+    row, value = next(
+        (row, float(numbers[~numbers.square().isfinite()][0]))
+        for row, numbers in enumerate(weight.reshape(len(weight) if weight.ndim else 1, -1))
+        if not numbers.square().isfinite().all()
+    )
+    uav, seed = _owner(setup, row, len(weight) if weight.ndim else 1)
+    report = NonFiniteReport(f"weight {name}", uav, seed, None, setup.step, None, f"{value:g}")
+    reason = "; its square is infinite" if math.isfinite(value) else ""
+    raise NonFiniteError(f"{report}{reason}; nothing was saved", report, None)
+
+
+def _owner(setup: TrainingSetup, row: int, rows: int) -> tuple[int | None, int | None]:
+    """Returns the UAV and the seed of a row of stacked networks or losses, where it has one."""
+    uavs = setup.config.env.num_uavs
+    of_uavs, of_seeds = rows == uavs * setup.teams, rows == setup.teams
+    team = row // uavs if of_uavs else row
+    return (row % uavs if of_uavs else None, setup.seeds[team] if of_uavs or of_seeds else None)
+
+
+@contextmanager
+def in_validation(setup: TrainingSetup, seed: int) -> Iterator[None]:
+    """Reports an action of a validation that is not finite as an error of the training.
+
+    Raises:
+        NonFiniteError: the networks give an action that is NaN or infinite.
+    """
+    try:
+        yield
+    except NonFiniteActionError as error:
+        report = NonFiniteReport(
+            *("action in the validation", error.uav, seed, error.environment),
+            *(setup.step, None, error.value),
+        )
+        raise NonFiniteError(f"{report}; nothing was saved", report, None) from None
 
 
 def check_state(setup: TrainingSetup, state: Mapping[str, Tensor]) -> None:

@@ -94,7 +94,9 @@ def _changed(config: RunConfig, method: str | None, overrides: Sequence[str]) ->
     changed = override(config, overrides)
     for key, (new, old) in differences(changed, config).items():
         if key not in MAY_CHANGE and not key.startswith("evaluation."):
-            raise UserError(f"{key}={new}: the run has {key}={old}; a resumed run keeps it")
+            raise UserError(
+                f"{key}={shown(new)}: the run has {key}={shown(old)}; a resumed run keeps it"
+            )
     return changed
 
 

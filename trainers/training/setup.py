@@ -10,9 +10,10 @@ from torch import Tensor
 from torchrl.envs import TransformedEnv
 
 from emberlink.envs import keys
+from emberlink.envs.utils.errors import UserError
 from emberlink.policies.hold import decisions, hold
 from emberlink.trainers.build import build_env, build_learner
-from emberlink.trainers.config.schema import RunConfig
+from emberlink.trainers.config.schema import RunConfig, build_comm
 from emberlink.trainers.learners.base import Learner
 from emberlink.trainers.learners.nan_guard import NonFiniteGuard
 from emberlink.trainers.learners.tensors import copy_into, flatten, group, prefixed, unflatten
@@ -144,7 +145,16 @@ def check_setup(config: RunConfig) -> None:
 
 
 def _make_env(config: RunConfig, num_envs: int, seed: int | Sequence[int]) -> TransformedEnv:
-    """Returns training environments, with what the learner reads in training only."""
+    """Returns training environments, with what the learner reads in training only.
+
+    Raises:
+        UserError: the environment shows what cameras see, and the communication does not read it.
+    """
+    if config.env.observation == "sight" and keys.SIGHT not in build_comm(config, 1).in_keys:
+        raise UserError(
+            f"env.observation=sight: comm.name={config.comm['name']} does not read what cameras "
+            "see; method maps does"
+        )
     return build_env(
         config,
         num_envs=num_envs,

@@ -184,7 +184,8 @@ class Trainer:
         setup.record.clear()
         if interval and setup.episode % interval == 0:
             for team, line in enumerate(lines):
-                line |= evaluate.validate(self.configs[team], setup.team_actor(team))
+                with non_finite.in_validation(setup, setup.seeds[team]):
+                    line |= evaluate.validate(self.configs[team], setup.team_actor(team))
         seconds = round(self.elapsed(), 3)
         for team, (line, run) in enumerate(zip(lines, self.runs, strict=True)):
             self._keep_best(team, line)

@@ -61,6 +61,10 @@ SETUPS = "known: paper, released, strong, tuned"
             ["consensus", 'env.radio.range="10"'],
             ['env.radio.range="10": expected a number'],
         ),
+        (
+            ["consensus", "env.observation=sight"],
+            ["comm.name=consensus does not read", "maps does"],
+        ),
         (["consensus", "env.radio.range=null"], ["env.radio.range=null: expected a number"]),
         (["consensus", "learner.hidden=true"], ["learner.hidden=true: expected a list"]),
         (["consensus", "zzz=1"], ["'zzz'", "known: setup, world, fire, learner, env", "num_envs"]),

@@ -3,17 +3,21 @@
 import json
 import warnings
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import pytest
+from fire_files import Ellipses, raster_of, write_asc
 from tiny_run import TINY
 
 from emberlink import trainers
+from emberlink.envs import FileFireConfig
 from emberlink.envs.utils.errors import UserError
 from emberlink.trainers.cli.main import main
 from emberlink.trainers.config.compose import flat, resolve, to_values
 from emberlink.trainers.config.defaults import defaults_of
 from emberlink.trainers.config.transfer import evaluated_with, in_world, kept
+from emberlink.trainers.evaluation.evaluate import evaluation_scenarios
 
 ROUND = ("paper", "front", "relay", "blackout", "swarm", "paper", "relay", "front", "paper")
 
@@ -76,7 +80,7 @@ def run(tmp_path_factory):
     return path
 
 
-OTHER_MAP = pytest.mark.filterwarnings("ignore:env.grid=|env.altitude=:UserWarning")
+OTHER_MAP = pytest.mark.filterwarnings("ignore:env.*means something else here:UserWarning")
 
 
 @OTHER_MAP
@@ -141,8 +145,12 @@ def test_scripted_policies_can_be_chosen(scripted, names, run, capsys):
         ("world=moon", "known: blackout, file, front, paper, relay, swarm"),
         ("world=file", "fire.path"),
         (
+            "fire.burn_time=5",
+            "fire.burn_time=5: an evaluation on another fire needs world=NAME, too",
+        ),
+        (
             "fire=front",
-            "can change the world, evaluation.scripted, and keys of comm. and env. only",
+            "can change the world and its fire, evaluation.scripted, evaluation.headline, and keys",
         ),
         ("world=swarm", "a checkpoint of uavs=2; this configuration has uavs=24"),
     ],
@@ -164,8 +172,9 @@ def test_networks_that_never_saw_a_base_are_warned_of():
 
 
 def test_another_map_is_warned_of_where_positions_are_observed(run):
-    with pytest.warns(UserWarning, match=r"^env\.grid=\[40, 40\]: the networks observe positions"):
-        trainers.load(run, grid=[40, 40])
+    said = r"^env\.grid=\[40, 40\] \(in training \[\d+, \d+\]\), env\.observation_scale=raw \(in "
+    with pytest.warns(UserWarning, match=said):
+        trainers.load(run, grid=[40, 40], observation_scale="raw")
     with warnings.catch_warnings():
         warnings.simplefilter("error", UserWarning)
         trainers.load("pretrained:maps", grid=[40, 40])
@@ -179,5 +188,43 @@ def test_a_training_state_is_not_evaluated(run, capsys):
 
 
 def test_the_api_names_what_can_be_changed(run):
-    with pytest.raises(UserError, match="only world and keys of env and comm"):
+    with pytest.raises(UserError, match="only world, fire, headline and keys of env and comm"):
         trainers.load(run, world="front", seed=2)
+
+
+def test_a_run_is_evaluated_on_a_fire_of_a_file(run, tmp_path):
+    write_asc(tmp_path / "fire.asc", raster_of(Ellipses(), 240))
+    fire = f"fire.path={tmp_path / 'fire.asc'}", "fire.units=minutes"
+    with pytest.warns(UserWarning, match="means something else here"):
+        assert (
+            main(["eval", str(run), "world=file", *fire, "env.grid=[30,30]", "--fires", "1"]) == 0
+        )
+    (file,) = run.glob("eval_world=file*.json")
+    written = json.loads(file.read_text())
+    assert written["environment"]["grid"] == [30, 30]
+    (held_out,) = written["held_out"].values()
+    assert "fire.asc" in json.dumps(held_out)
+    file.unlink()
+    path: dict[str, Any] = {"fire.path": tmp_path / "fire.asc", "fire.units": "minutes"}
+    with pytest.warns(UserWarning, match="means something else here"):
+        policy = trainers.load(run, world="file", grid=[30, 30], **path)
+    assert isinstance(policy.config.fire, FileFireConfig)
+    assert policy.config.fire.path == str(tmp_path / "fire.asc")
+
+
+@OTHER_MAP
+def test_a_base_is_taken_away_with_the_headline(run, capsys):
+    arguments = ["eval", str(run), "world=relay", "env.base=null", "--fires", "1"]
+    assert main(arguments) == 2
+    said = " ".join(capsys.readouterr().err.split())
+    assert "evaluation.headline=base_coverage is not measured in this world" in said
+    assert main([*arguments, "evaluation.headline=coverage"]) == 0
+    without: dict[str, Any] = {"env.base": None, "headline": "coverage"}
+    assert trainers.load(run, world="relay", **without).config.env.base is None
+
+
+def test_the_number_of_training_fires_does_not_change_the_test_fires():
+    run = resolve("independent", ["setup=tuned", "fire.num_train_fires=2"])
+    assert list(evaluation_scenarios(run)) == ["huygens"]
+    other = resolve("independent", ["setup=tuned", "fire.burn_time=50"])
+    assert list(evaluation_scenarios(other)) == ["huygens", "huygens_as_trained"]

@@ -8,6 +8,7 @@ import shutil
 from collections import Counter
 from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -22,12 +23,14 @@ from emberlink.envs.wildfire import WildfireEnv
 from emberlink.policies.gaussian import MemoryActor
 from emberlink.trainers.cli import main
 from emberlink.trainers.config.compose import resolve
+from emberlink.trainers.evaluation import evaluate
 from emberlink.trainers.learners.anchor import Anchor
 from emberlink.trainers.learners.ddpg import DDPG
 from emberlink.trainers.learners.nan_guard import NonFiniteGuard, row_norms
 from emberlink.trainers.learners.off_policy import OffPolicyLearner
 from emberlink.trainers.learners.on_policy import OnPolicyLearner
 from emberlink.trainers.learners.td3 import TD3
+from emberlink.trainers.rollout.finite_actions import NonFiniteActionError
 from emberlink.trainers.runs import checkpoint_file
 from emberlink.trainers.runs.run_folder import RunFolder
 from emberlink.trainers.training import non_finite
@@ -467,11 +470,61 @@ def test_weights_are_checked_before_they_are_saved_and_evaluated(tmp_path, capsy
     assert main.main(command) == 2
     err = capsys.readouterr().err
     assert err.count("\n") == 1
-    assert re.search(r"weight actor\S+ is \d\S*e\+\d\d at step 20; nothing was saved", err)
+    assert re.search(
+        r"weight actor\S+, seed 0, is \d\S*e\+\d\d at step 20; its square is infinite", err
+    )
     assert "on_nan=rollback" in err
     (folder,) = tmp_path.iterdir()
     assert not [*folder.rglob("*.safetensors"), *folder.glob("eval*")]
     assert not (folder / "metrics.jsonl").exists() or not (folder / "metrics.jsonl").read_text()
+
+
+@pytest.mark.parametrize("on_nan", ["stop", "rollback"])
+def test_an_action_of_a_validation_that_is_not_finite_ends_the_training(
+    on_nan, tmp_path, monkeypatch
+):
+    def validate(*_: Any) -> dict:
+        raise NonFiniteActionError("nan", 1, 0, 3)
+
+    monkeypatch.setattr(evaluate, "validate", validate)
+    more = ["evaluation.interval=1", "seeds=[4,5]", f"on_nan={on_nan}", "checkpoint_steps=0"]
+    trainer = begun("independent", tmp_path, *more)
+    with pytest.raises(NonFiniteError, match="; nothing was saved") as caught:
+        trainer.train()
+    said = str(caught.value)
+    where = "action in the validation of UAV 1, seed 4, environment 0, is nan at step 20"
+    assert said.startswith(where)
+    assert ("given up after 5 rollbacks" in said) == (on_nan == "rollback")
+    assert not any(run.lines() for run in trainer.runs)
+    assert not [*tmp_path.rglob("*_000000020.safetensors")]
+
+
+def test_an_action_of_the_last_evaluation_that_is_not_finite(tmp_path, monkeypatch, capsys):
+    def fail(*_: Any, **__: Any) -> None:
+        raise NonFiniteActionError("nan", 1, 0, 3)
+
+    monkeypatch.setattr(evaluate, "evaluate", fail)
+    assert main.main(["train", "independent", *SMALL, f"output={tmp_path}"]) == 2
+    err = capsys.readouterr().err
+    assert err.endswith(
+        "action is nan for UAV 1 of environment 0 at step 3; expected finite numbers; the training "
+        "has diverged: train a new run with smaller learning rates\n"
+    )
+
+
+def test_a_weight_with_an_infinite_square_is_named_with_its_seed_and_uav(tmp_path):
+    trainer = begun("independent", tmp_path, "seeds=[4,5]")
+    networks = trainer.setup.learner.networks()
+    name = next(name for name, value in networks.items() if value.shape[:2] == (2 * UAVS, 6))
+    with torch.no_grad():
+        networks[name][4, 2] = 1e19
+        non_finite.check(trainer.setup, trainer.run, wait=True)
+        networks[name][4, 2, 1] = -2e19
+    with pytest.raises(NonFiniteError) as caught:
+        non_finite.check(trainer.setup, trainer.run, wait=True)
+    where = f"weight {name} of UAV 1, seed 5, is -2e+19 at step 0"
+    assert str(caught.value) == f"{where}; its square is infinite; nothing was saved"
+    trainer.close()
 
 
 def test_rollbacks_without_progress_end_the_training(tmp_path, monkeypatch, capsys):

@@ -335,8 +335,13 @@ def test_the_command_resumes_and_reports_a_finished_run(paused, whole, capsys):
     assert len(RunFolder(paused).networks()) == 2
     before = contents(paused)
     assert main.main(["train", f"resume={paused}"]) == 0
-    assert "is finished" in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert "is finished" in out
+    assert "note: " not in out
     assert contents(paused) == before
+    assert main.main(["train", f"resume={paused}", "evaluation.episodes=1"]) == 0
+    note = "note: eval.json is that of the earlier settings of evaluations; for another one: "
+    assert f"{note}emberlink eval {paused}\n" in capsys.readouterr().out
 
 
 def test_another_version_of_a_package_gives_a_warning(paused, capsys):

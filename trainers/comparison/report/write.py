@@ -29,11 +29,11 @@ def free_folder(output: Path | None) -> Path:
         dangling = output.is_symlink() and not output.exists()
         taken = output.exists() and (not output.is_dir() or any(output.iterdir()))
     except OSError as error:
-        raise UserError(f"--output {output}: cannot be written: {error.strerror}") from None
+        raise UserError(f"output {output}: cannot be written: {error.strerror}") from None
     if dangling:
-        raise UserError(f"--output {output}: a link to a missing folder; name a new folder")
+        raise UserError(f"output {output}: a link to a missing folder; name a new folder")
     if taken:
-        raise UserError(f"--output {output}: exists and is not an empty folder; name a new one")
+        raise UserError(f"output {output}: exists and is not an empty folder; name a new one")
     return output
 
 
@@ -102,7 +102,5 @@ def write_report(
     except OutputError:
         raise
     except OSError as error:
-        raise UserError(
-            f"--output {folder}: cannot be written: {error.strerror or error}"
-        ) from None
+        raise UserError(f"output {folder}: cannot be written: {error.strerror or error}") from None
     return whole
