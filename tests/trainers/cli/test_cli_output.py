@@ -160,6 +160,7 @@ def test_a_warning_of_a_command_can_be_recorded(monkeypatch):
 
 
 @pytest.mark.heavy
+@pytest.mark.drawn
 def test_a_lost_terminal_ends_the_training_with_a_checkpoint(tmp_path, capsys):
     """The run can then be evaluated."""
     process = started(["train", "independent", *ENDLESS, f"output={tmp_path}"], subprocess.PIPE)
