@@ -46,14 +46,13 @@ def kept(config: RunConfig, overrides: Sequence[str]) -> list[str]:
     apart from those that are changed. There are none without `world=NAME`.
 
     Args:
-        config: configuration of the run.
-        overrides: as for `evaluated_with`.
+        config: result of `evaluated_with`.
+        overrides: its overrides.
     """
-    changed = dict(map(parse, overrides))
+    changed = [parse(text)[0] for text in overrides]
     if "world" not in changed:
         return []
-    moved = in_world(config, str(changed["world"]), _of_the_fire(overrides))
-    usual, own = flat(to_values(_usual(moved))), flat(to_values(moved))
+    usual, own = flat(to_values(_usual(config))), flat(to_values(config))
     return [
         f"{key}={shown(value)}"
         for key, value in own.items()

@@ -17,6 +17,9 @@ from emberlink.trainers.learners.base import ACTOR
 from emberlink.trainers.runs import checkpoint_file
 from emberlink.trainers.runs.checkpoints import load_weights
 
+UNITS = ("grid", "altitude", "horizon", "displacement", "view_angle", "observation_scale")
+"""keys of `env` that change what the numbers in observations and actions mean"""
+
 
 def load_actor(
     config: RunConfig, checkpoint: Path, env: TransformedEnv | None = None
@@ -53,11 +56,10 @@ def load_actor(
 def _warn_of_other_units(config: RunConfig, trained: Mapping[str, Any]) -> None:
     """Warns of settings with which observed and flown distances mean something else."""
     by_map = config.env.observation != "sight" or config.comm.get("position", False)
-    keys = ("grid", "altitude", "horizon", "displacement", "view_angle", "observation_scale")
     here = to_values(config)["env"]
     differ = [
         f"env.{key}={shown(here[key])} (in training {shown(trained[key])})"
-        for key in keys
+        for key in UNITS
         if here[key] != trained.get(key, here[key]) and (by_map or key != "grid")
     ]
     if differ:

@@ -57,9 +57,9 @@ def evaluate_folder(
     for text in overrides:
         _check_changeable(text)
         label += "_" + re.sub(r"[^\w.=+-]", "-", text)
+    config = evaluated_with(config, overrides)
     if own := kept(config, overrides):
         console.print(f"note: the run keeps its own {', '.join(own)}", soft_wrap=True)
-    config = evaluated_with(config, overrides)
     actor = load_actor(config, checkpoint)
     about = [text for text in overrides if not text.startswith("world=")]  # a title names it anyway
     evaluate_and_print(

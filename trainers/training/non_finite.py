@@ -157,19 +157,15 @@ def check(setup: TrainingSetup, run: RunFolder, *, wait: bool) -> None:
     if setup.guard.poll(wait=wait):
         raise error_of(setup, run)
     for name, value in setup.learner.networks().items() if wait else ():
-        largest = value.detach().abs().amax()  # NaN if one is
-        if not largest.square().isfinite():
-            _refuse(setup, name, value.detach())
+        if not value.square().isfinite().all():
+            _refuse(setup, name, torch.atleast_1d(value.detach()))
 
 
 def _refuse(setup: TrainingSetup, name: str, weight: Tensor) -> NoReturn:
     """Raises an error about the first number of a weight whose square is not finite."""
-    row, value = next(
-        (row, float(numbers[~numbers.square().isfinite()][0]))
-        for row, numbers in enumerate(weight.reshape(len(weight) if weight.ndim else 1, -1))
-        if not numbers.square().isfinite().all()
-    )
-    uav, seed = _owner(setup, row, len(weight) if weight.ndim else 1)
+    place = tuple((~weight.square().isfinite()).nonzero()[0].tolist())
+    value = float(weight[place])
+    uav, seed = _owner(setup, place[0], len(weight))
     report = NonFiniteReport(f"weight {name}", uav, seed, None, setup.step, None, f"{value:g}")
     reason = "; its square is infinite" if math.isfinite(value) else ""
     raise NonFiniteError(f"{report}{reason}; nothing was saved", report, None)

@@ -9,6 +9,7 @@ from emberlink.envs.utils.validation import shown
 from emberlink.trainers.config.compose import to_values
 from emberlink.trainers.config.overrides import flat
 from emberlink.trainers.config.schema import RunConfig
+from emberlink.trainers.evaluation.actor import UNITS
 from emberlink.trainers.learners.base import ACTOR, Learner
 from emberlink.trainers.runs.checkpoints import load_weights
 from emberlink.trainers.runs.pretrained import find_one, is_name
@@ -16,8 +17,8 @@ from emberlink.trainers.runs.run_folder import RunFolder
 from emberlink.trainers.runs.seal import check_trained_with
 
 _OBSERVED = (
-    *("comm.", "env.observation", "env.grid", "env.altitude", "env.horizon"),
-    *("env.displacement", "env.view_angle", "policy.hold"),
+    *("comm.", "env.observation", "policy.hold"),
+    *(f"env.{key}" for key in UNITS),
 )
 """beginnings of the keys of settings that change what a UAV observes, or what its action does"""
 

@@ -16,6 +16,7 @@ from emberlink.envs.utils.errors import UserError
 from emberlink.trainers.cli.main import main
 from emberlink.trainers.config.compose import flat, resolve, to_values
 from emberlink.trainers.config.defaults import defaults_of
+from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.config.transfer import evaluated_with, in_world, kept
 from emberlink.trainers.evaluation.evaluate import evaluation_scenarios
 
@@ -103,16 +104,20 @@ def test_an_evaluation_in_another_world(run, tmp_path, capsys):
     assert "is left out: evaluated otherwise: world is relay, in eval.json paper" in said
 
 
+def keeps(run: RunConfig, overrides: list[str]) -> list[str]:
+    return kept(evaluated_with(run, overrides), overrides)
+
+
 def test_what_a_run_keeps_in_another_world():
     run = resolve("consensus", ["setup=tuned", "env.radio.range=0", "env.reward.exit=-2"])
     both = ["env.radio.range=0.0", "env.reward.exit=-2.0"]
-    assert sorted(kept(run, ["world=front"])) == sorted(kept(run, ["world=paper"])) == both
-    assert kept(run, ["world=front", "env.radio.range=5"]) == both[1:]
-    assert kept(run, ["env.num_uavs=3"]) == []
-    assert kept(resolve("maps", ["setup=strong", "world=relay"]), ["world=swarm"]) == []
+    assert sorted(keeps(run, ["world=front"])) == sorted(keeps(run, ["world=paper"])) == both
+    assert keeps(run, ["world=front", "env.radio.range=5"]) == both[1:]
+    assert keeps(run, ["env.num_uavs=3"]) == []
+    assert keeps(resolve("maps", ["setup=strong", "world=relay"]), ["world=swarm"]) == []
     team = resolve("consensus", ["setup=tuned", "world=front", "env.num_uavs=4"])
-    assert kept(team, ["world=relay"]) == ["env.num_uavs=4"]
-    assert kept(team, ["world=swarm"]) == []  # swarm has 24 UAVs, so 4 are not kept
+    assert keeps(team, ["world=relay"]) == ["env.num_uavs=4"]
+    assert keeps(team, ["world=swarm"]) == []  # swarm has 24 UAVs, so 4 are not kept
 
 
 @OTHER_MAP
