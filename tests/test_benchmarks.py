@@ -76,7 +76,7 @@ def test_the_guard_fails_at_a_loss_of_30_percent(taken, kept, calls, capsys):
     assert ("has lost more than 30%" in capsys.readouterr().out) is not kept
 
 
-@pytest.mark.slow
+@pytest.mark.heavy
 def test_the_guard_has_a_record_of_every_workload():
     recorded = guard.json.loads(guard.BASELINE.read_text())
     assert recorded.keys() == guard.works().keys()

@@ -183,21 +183,18 @@ def different(commands: list[str]) -> list[str]:
     return list({tuple(shortened(shlex.split(c)[1:])): c for c in reversed(commands)}.values())
 
 
-LONG = (
-    "emberlink compare docs/data",
-    "emberlink compare pretrained",
-    "emberlink world check",
-    "emberlink eval pretrained:maps world",
-    "emberlink doctor",
+LONG = re.compile(
+    "emberlink (compare (docs/data|pretrained)|world check|eval pretrained:maps world|doctor"
+    "|.*setup=strong|train .*(seeds=|learner=imitation))"
 )
-"""beginnings of commands that take more than five seconds"""
+"""beginnings of commands that take long"""
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "command",
     [
-        pytest.param(command, marks=pytest.mark.heavy if command.startswith(LONG) else ())
+        pytest.param(command, marks=pytest.mark.heavy if LONG.match(command) else ())
         for command in different(COMMANDS)
     ],
 )

@@ -199,7 +199,7 @@ def test_td3_of_torchrl_trains_these_networks(window, shared, vmap):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("shared", [False, True])
+@pytest.mark.parametrize("shared", [False, pytest.param(True, marks=pytest.mark.heavy)])
 def test_ddpg_of_torchrl_fits_a_reward_seen_in_the_window(shared):
     torch.manual_seed(0)
     observation, action = specs(1, window=True)

@@ -87,6 +87,7 @@ def test_more_uavs_than_stops_and_fewer_than_strips():
     assert mower.period.tolist() == [16] * 4
 
 
+@pytest.mark.heavy
 @settings(max_examples=40, deadline=None)
 @given(
     grid=st.tuples(st.integers(8, 21), st.integers(8, 21)),

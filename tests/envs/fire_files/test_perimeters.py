@@ -514,6 +514,7 @@ def test_dates_as_numbers(tmp_path, keys):
         read(tmp_path / "wrong.gpkg", **keys)
 
 
+@pytest.mark.heavy
 def test_a_front_far_outside_the_map_is_measured_to_its_boundary(tmp_path):
     """Between circles of 50 and 5000 m, a day apart, the radius after an hour is 256 m.
 

@@ -167,6 +167,7 @@ def test_the_base_is_drawn():
     assert BASE not in all_of(drawn(frame()))
 
 
+@pytest.mark.heavy
 def test_the_environment_draws_failed_uavs_and_the_base():
     env = make_env("consensus", "tuned", world="blackout", seed=1)
     env.reset()

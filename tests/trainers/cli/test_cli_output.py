@@ -114,6 +114,7 @@ def test_a_wrong_argument_has_status_2_also_if_it_cannot_be_said():
     assert ended.returncode == 2
 
 
+@pytest.mark.heavy
 def test_a_closed_output_is_one_line():
     ended = subprocess.run(
         [sys.executable, "-m", "emberlink.trainers.cli", "list", "methods"],

@@ -336,7 +336,7 @@ def test_results_do_not_depend_on_the_order_of_runs(runs, tmp_path):
     assert sum(name.endswith(".png") for name in whole[0]) == 6
 
 
-@pytest.mark.slow
+@pytest.mark.heavy
 @settings(
     deadline=None, max_examples=6, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )

@@ -90,7 +90,7 @@ def test_a_map_of_another_package_is_restored_bit_for_bit(installed, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("shared", [False, True])
+@pytest.mark.parametrize("shared", [False, pytest.param(True, marks=pytest.mark.heavy)])
 def test_consensus_on_windows_trains_and_resumes(shared, tmp_path):
     more = ["env.observation=window", f"learner.share_parameters={shared}", "episodes=2"]
     trainer = Trainer(resolve("consensus", [*SMALL, *REPLAY, *more, f"output={tmp_path}"]))

@@ -44,6 +44,8 @@ CASES = {
     "mappo-map": ["learner=mappo", "learner.critic_map=true", "policy.hold=4"],
     "ippo-own": ["learner=ippo", "policy.memory=gru", "learner.share_parameters=false"],
 }
+IN_CI = {"ddpg", "td3", "ippo", "mappo", "ddpg-gru", "mappo-gru"}
+EACH = [case if case in IN_CI else pytest.param(case, marks=pytest.mark.heavy) for case in CASES]
 
 
 @pytest.fixture(scope="module")
@@ -63,7 +65,7 @@ def trained(tmp_path_factory):
 pytestmark = pytest.mark.slow
 
 
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("case", EACH)
 def test_a_run_trains_and_its_evaluation_can_be_repeated(case, trained, capsys):
     run = trained(case)
     lines = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
@@ -76,7 +78,7 @@ def test_a_run_trains_and_its_evaluation_can_be_repeated(case, trained, capsys):
     capsys.readouterr()
 
 
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("case", EACH)
 def test_a_loaded_policy_needs_no_further_code(case, trained):
     """TorchRL's rollout, PettingZoo and the evaluation give the same episode."""
     policy = load(trained(case))
@@ -102,7 +104,10 @@ def test_a_loaded_policy_needs_no_further_code(case, trained):
     assert not pettingzoo.agents
 
 
-@pytest.mark.parametrize("case", ["ippo", "mappo", "mappo-gru", "ddpg-gru", "td3-team"])
+@pytest.mark.parametrize(
+    "case",
+    ["ippo", "mappo", "mappo-gru", "ddpg-gru", pytest.param("td3-team", marks=pytest.mark.heavy)],
+)
 def test_an_episode_that_begins_again_forgets_the_one_before(case, trained):
     """Environment 0 begins again after 8 steps; environment 1 goes on."""
     policy = load(trained(case))
@@ -121,7 +126,10 @@ def test_an_episode_that_begins_again_forgets_the_one_before(case, trained):
     assert acted[MEMORY].any()
 
 
-@pytest.mark.parametrize("cases", [["ddpg", "td3", "ippo", "mappo"], ["ddpg-gru", "ippo"]])
+FOUR = pytest.param(["ddpg", "td3", "ippo", "mappo"], marks=pytest.mark.heavy)
+
+
+@pytest.mark.parametrize("cases", [FOUR, ["ddpg-gru", "ippo"]])
 def test_runs_of_all_learners_are_rendered_and_compared(cases, trained, tmp_path, capsys):
     """A page shows the first episode of the evaluation."""
     runs = [trained(case) for case in cases]

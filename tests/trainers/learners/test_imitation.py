@@ -88,6 +88,7 @@ def test_a_courier_teaches_to_come_to_the_base_in_time(failures):
     assert differs or failures
 
 
+@pytest.mark.heavy
 def test_a_taught_team_tells_the_base_what_it_knows():
     hold = 5
     more = ["world=relay", "env.base=[0,15]", "env.radio.range=4.5", "env.grid=[30,30]"]
@@ -151,6 +152,7 @@ def test_held_actions_end_at_the_target():
         assert (moved[~near].abs().amax(-1) - 2).abs().max() < 1e-4
 
 
+@pytest.mark.heavy
 def test_the_share_of_the_teacher_falls_and_is_taken():
     setup = TrainingSetup(resolve("maps", settings("imitation", *TINY, "episodes=20")))
     explorer, td = setup.learner.explorer, setup.env.reset()
@@ -245,6 +247,7 @@ def test_an_imitation_is_recorded_and_evaluated(imitated):
     assert main.main(["eval", str(imitated["ippo"]), "env.num_uavs=5", "--fires", "1"]) == 0
 
 
+@pytest.mark.heavy
 def test_a_sweep_of_imitations_trains_each_once(tmp_path):
     arguments = ["maps", *settings("imitation", *TINY, "learner.teacher_share=0,1")]
     arguments += ["env.horizon=12", "episodes=1", f"output={tmp_path}"]

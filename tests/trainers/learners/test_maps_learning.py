@@ -75,8 +75,8 @@ def trained(tmp_path, *more: str):
     "changes",
     [
         ["env.num_uavs=1", "env.grid=[20,20]"],
-        ["env.num_uavs=24", "env.grid=[128,100]"],
-        pytest.param(["env.num_uavs=3"], marks=pytest.mark.heavy),
+        pytest.param(["env.num_uavs=24", "env.grid=[128,100]"], marks=pytest.mark.heavy),
+        ["env.num_uavs=3"],
         pytest.param(["env.num_uavs=64", "env.grid=[60,60]"], marks=pytest.mark.heavy),
         pytest.param(["env.grid=[128,128]"], marks=pytest.mark.heavy),
     ],

@@ -57,7 +57,10 @@ def test_a_change_of_any_byte_is_detected(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize(
+    "method",
+    ["consensus", *(pytest.param(m, marks=pytest.mark.heavy) for m in METHODS if m != "consensus")],
+)
 def test_damaged_and_foreign_checkpoints_are_refused(method, tmp_path):
     files = readable(tmp_path, method)
     done, failures = damage_trials(files, 28, METHODS.index(method))

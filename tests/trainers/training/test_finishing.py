@@ -100,6 +100,7 @@ def test_an_interrupt_during_the_evaluation_of_the_second_seed(tmp_path, capsys,
     assert (first.path / "eval.json").stat().st_mtime_ns == before
 
 
+@pytest.mark.heavy
 def test_an_evaluation_of_an_earlier_checkpoint_does_not_finish_a_run(run, capsys):
     assert trained(capsys, f"resume={run.path}", "episodes=3")[0] == 0
     assert run.evaluated()

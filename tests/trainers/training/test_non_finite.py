@@ -234,8 +234,8 @@ CASES = [
     *(("consensus", "ddpg", place, []) for place in PLACES),
     *((method, "ddpg", "observation", []) for method in METHODS if method != "consensus"),
     *(("consensus", "td3", place, []) for place in ("gradient", "loss")),
-    ("consensus", "ddpg", "memory", [*GRU, *SEQUENCES]),
-    ("independent", "td3", "memory", [*STACK, *SEQUENCES]),
+    pytest.param("consensus", "ddpg", "memory", [*GRU, *SEQUENCES], marks=pytest.mark.heavy),
+    pytest.param("independent", "td3", "memory", [*STACK, *SEQUENCES], marks=pytest.mark.heavy),
     ("consensus", "ippo", "observation", GRU),
     ("independent", "ippo", "memory", [*GRU, "learner.share_parameters=false"]),
     ("shared_memory", "mappo", "reward", ["learner.critic_map=true"]),
@@ -527,6 +527,7 @@ def test_a_weight_with_an_infinite_square_is_named_with_its_seed_and_uav(tmp_pat
     trainer.close()
 
 
+@pytest.mark.heavy
 def test_rollbacks_without_progress_end_the_training(tmp_path, monkeypatch, capsys):
     """The environment gives NaN before the first checkpoint."""
     step = WildfireEnv._step

@@ -36,10 +36,20 @@ def trained(config) -> Trainer:
     return trainer
 
 
+def _marks(method: str, setup: str) -> list[pytest.MarkDecorator]:
+    """Returns heavy for `maps`, whose convolutions take long, in all setups but `tuned`."""
+    slow = [pytest.mark.slow] if setup != "paper" else []
+    return [pytest.mark.heavy] if method == "maps" and setup != "tuned" else slow
+
+
 @pytest.mark.parametrize(
-    "setup", ["paper", *(pytest.param(s, marks=pytest.mark.slow) for s in SETUPS[1:])]
+    ("method", "setup"),
+    [
+        pytest.param(method, setup, marks=_marks(method, setup))
+        for setup in SETUPS
+        for method in [*METHODS, "maps"]
+    ],
 )
-@pytest.mark.parametrize("method", [*METHODS, "maps"])
 def test_a_recipe_trains(method, setup, tmp_path):
     pixels = ["comm.pixels=8"] if method == "maps" else []
     config = short(method, tmp_path, "policy.hold=1", *pixels, setup=setup)

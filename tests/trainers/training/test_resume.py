@@ -153,7 +153,13 @@ def test_a_resumed_run_equals_the_uninterrupted_run(method, steps, learner, whol
         pytest.param(
             "shared_memory", ["learner=mappo", "learner.critic_map=true"], marks=pytest.mark.heavy
         ),
-        ("consensus", ["learner=ddpg", "policy.memory=stack", *SEQUENCES, "learner.critic=team"]),
+        pytest.param(
+            *(
+                "consensus",
+                ["learner=ddpg", "policy.memory=stack", *SEQUENCES, "learner.critic=team"],
+            ),
+            marks=pytest.mark.heavy,
+        ),
         pytest.param(
             "independent", ["learner=td3", "policy.memory=gru", *SEQUENCES], marks=pytest.mark.heavy
         ),
@@ -171,15 +177,18 @@ def test_seeds_side_by_side_are_resumed_together(method, more, whole, tmp_path):
     "more",
     [
         ["learner=ippo"],
-        ["learner=ippo", "learner.share_parameters=false"],
+        pytest.param(["learner=ippo", "learner.share_parameters=false"], marks=pytest.mark.heavy),
         ["learner=mappo", "policy.memory=stack", "learner.critic_map=true"],
         ["learner=ddpg"],
-        ["learner=ddpg", "learner.critic=team"],
+        pytest.param(["learner=ddpg", "learner.critic=team"], marks=pytest.mark.heavy),
         ["learner=ddpg", "policy.memory=gru", *SEQUENCES],
-        [
-            *("learner=td3", "policy.memory=stack", "learner.sequence=3", "learner.burn_in=4"),
-            "learner.critic=team",
-        ],
+        pytest.param(
+            [
+                *("learner=td3", "policy.memory=stack", "learner.sequence=3", "learner.burn_in=4"),
+                "learner.critic=team",
+            ],
+            marks=pytest.mark.heavy,
+        ),
     ],
 )
 def test_held_actions_and_memories_are_resumed(more, whole, tmp_path):
@@ -396,6 +405,7 @@ def test_folders_that_cannot_be_resumed(paused, tmp_path, capsys):
     refused(paused, "holds networks alone", "emberlink eval")
 
 
+@pytest.mark.heavy
 def test_a_tracker_continues_from_the_checkpoint(tmp_path):
     def table(trainer: Trainer) -> str:
         return (trainer.run.path / "metrics.csv").read_text()
@@ -420,6 +430,7 @@ def test_old_checkpoints_are_removed_except_the_best(tmp_path):
     assert header["step"] == HORIZON * (1 + held_out.index(max(held_out)))
 
 
+@pytest.mark.heavy
 def test_tensorboard_replaces_repeated_episodes(tmp_path):
     """A run killed before its first checkpoint repeats all four episodes."""
     trainer = until(begun("independent", tmp_path, "logger=tensorboard"), 70)
@@ -431,6 +442,7 @@ def test_tensorboard_replaces_repeated_episodes(tmp_path):
     assert [event.step for event in events.Scalars("mean_reward")] == [1, 2, 3, 4]
 
 
+@pytest.mark.heavy
 def test_wandb_keeps_the_name_of_the_run(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("WANDB_MODE", "offline")

@@ -129,6 +129,7 @@ def test_environments_not_divisible_by_seeds(seeds):
         WildfireEnv(3, seed=seeds)
 
 
+@pytest.mark.heavy
 def test_every_seed_has_a_run_folder_that_can_be_evaluated(tmp_path, capsys):
     small = [
         *("episodes=2", "env.horizon=15", "env.num_uavs=2", "learner.hidden=[8,8]"),
