@@ -19,6 +19,8 @@ from emberlink.trainers.comparison.groups import (
 )
 from emberlink.trainers.evaluation.results import LEARNED
 
+ROUNDING = 1e-6
+"""relative error of a ratio of measures, which are float32"""
 _NOT_OF_LEARNING = ("method", "comm", "replay", *NOT_COMPARED)
 """first parts of keys in which compared methods may differ"""
 
@@ -127,8 +129,10 @@ def _verdict(group: Group, others: Sequence[Group], fire: str, claim: Claim) -> 
 
 
 def _decision(interval: Interval | None, factor: float) -> str:
-    if interval is not None and interval[0] >= factor:
+    """Returns the verdict of an interval; an end `ROUNDING` below the factor is at the factor."""
+    least = factor * (1 - ROUNDING)
+    if interval is not None and interval[0] >= least:
         return "holds"
-    if interval is not None and interval[1] < factor:
+    if interval is not None and interval[1] < least:
         return "does not hold"
     return "undecided"

@@ -24,6 +24,7 @@ from emberlink.envs import metrics
 from emberlink.envs.utils.errors import UserError
 from emberlink.trainers import compare
 from emberlink.trainers.cli import main
+from emberlink.trainers.comparison import claims
 from emberlink.trainers.comparison.groups import gather
 from emberlink.trainers.comparison.rankings import numbers
 from emberlink.trainers.comparison.report import chapters, plots
@@ -110,6 +111,21 @@ def test_verdicts(tmp_path):
             write_run(tmp_path / verdict, "positional", seed, learned={"coverage": other - shift})
         got = [v for v in only(tmp_path / verdict).verdicts if v.measure == "coverage"]
         assert [v.verdict for v in got] == [verdict]
+
+
+@pytest.mark.parametrize(
+    ("interval", "verdict"),
+    [
+        ((2.0, 3.0), "holds"),
+        ((1.99999994, 3.0), "holds"),  # 2 in float32, rounded
+        ((0.0, 1.99999996), "undecided"),
+        ((0.0, 1.99), "does not hold"),
+        ((1.99, 3.0), "undecided"),
+        (None, "undecided"),
+    ],
+)
+def test_rounding_does_not_decide_a_claim(interval, verdict):
+    assert claims._decision(interval, 2.0) == verdict
 
 
 def test_a_method_is_compared_with_the_best_other(tmp_path):
