@@ -110,7 +110,7 @@ class PictureEncoder(nn.Module):
         for layers, picture in zip(every, x.unbind(2), strict=True):
             # Bytes with the channels last: the convolutions are then a quarter faster on a CPU.
             y = picture.transpose(0, 1).flatten(1, 2).contiguous(memory_format=torch.channels_last)
-            y = y.to(layers[0].weight.dtype).div_(255)
+            y = y.to(layers[0].weight.dtype, copy=True).div_(255)
             for layer in layers:
                 y = layer(y).relu_()
             encoded.append(y.unflatten(1, (groups, -1)).transpose(0, 1).flatten(2))

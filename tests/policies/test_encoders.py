@@ -247,6 +247,12 @@ def test_pictures_pass_three_convolutions_with_weights_of_their_group():
         assert mine[0].double().equal(stacked[1])
 
 
+def test_pictures_of_floats_are_not_written_to():
+    pictures = torch.ones(1, 2, 1, 1, 8, 8)
+    PictureEncoder(1, [1, 1, 8, 8], generator=torch.Generator().manual_seed(0))(pictures)
+    assert pictures.eq(1).all()
+
+
 def test_pictures_take_about_a_million_multiplications():
     multiplications, side, inputs = 0, 24, 8
     for outputs in PICTURE_CHANNELS:

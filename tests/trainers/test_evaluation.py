@@ -197,7 +197,7 @@ def test_a_scripted_policy_is_evaluated_once(cache, played):
     "change",
     [
         *("env.displacement=0.7", "env.reward.no_fire=-1.5", "env.num_uavs=3", "env.horizon=13"),
-        *("env.radio.range=4", "comm.heading.weight=2"),
+        *("env.radio.range=4", "comm.heading.weight=2", "policy.hold=3"),
     ],
 )
 def test_the_file_name_depends_on_the_settings(change, cache, played):

@@ -58,6 +58,7 @@ class ScriptedResults:
             "policy": policy,
             "env": asdict(config.env),
             "comm": config.comm,
+            "hold": config.policy.hold,
             "fires": hashlib.sha256(arrival.cpu().contiguous().numpy().tobytes()).hexdigest(),
             "protocol": dict(protocol),
             "torch": torch.__version__,

@@ -111,7 +111,11 @@ class Imitation(Learner):
 
     def _make_replay(self) -> Demonstrations | DemonstrationSequences:
         config = self.config
-        sizes: dict[str, Any] = {"batch_size": config.samples, "buffer_size": config.buffer_size}
+        sizes: dict[str, Any] = {
+            "batch_size": config.samples,
+            "buffer_size": config.buffer_size,
+            "mixed": not self.context.policy.agent_index,  # the input is the index of a column
+        }
         if not self.remembers:
             return Demonstrations(self.context, **sizes)
         sizes |= {"sequence": config.sequence, "burn_in": config.burn_in}

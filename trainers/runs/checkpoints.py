@@ -13,6 +13,7 @@ from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import shown
 from emberlink.trainers.config.overrides import flat
 from emberlink.trainers.config.schema import RunConfig
+from emberlink.trainers.learners.base import ACTOR
 from emberlink.trainers.runs import checkpoint_file
 from emberlink.trainers.runs.seal import to_header
 
@@ -127,7 +128,7 @@ def load_weights(
 
     Args:
         path: a checkpoint file.
-        expected: tensors with the expected names, shapes and types.
+        expected: tensors with the expected names, shapes and types: those of actors.
         config: configuration with the expected method, and the number of UAVs if each has its own
             weights; not checked if None.
 
@@ -136,7 +137,7 @@ def load_weights(
 
     Raises:
         UserError: the file cannot be read or is damaged, a tensor is missing, of another shape or
-            type, or not finite.
+            type, or not finite, or the actors have more tensors.
     """
     header, weights = checkpoint_file.read(path)
     if config is not None:
@@ -151,6 +152,10 @@ def load_weights(
                 f"configuration needs {list(tensor.shape)}, {tensor.dtype}"
                 f"{_trained_with(header, config)}"
             )
+    more = [name for name in weights if name.startswith(ACTOR) and name not in expected]
+    if more:
+        reason = f"{more[0]}, which this configuration does not have"
+        raise UserError(f"{path}: holds {reason}{_trained_with(header, config)}")
     chosen = {name: weights[name] for name in expected}
     checkpoint_file.check_finite(path, chosen)
     return chosen

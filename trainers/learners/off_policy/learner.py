@@ -82,6 +82,8 @@ class OffPolicyLearner(Learner):
             "batch_size": config.batch_size,
             "buffer_size": config.buffer_size,
             "joint": config.critic == "team",
+            # A shared network learns from all UAVs anyway, and its input is the index of a column.
+            "mixed": not (config.share_parameters and context.policy.agent_index),
         }
         if not self._remembers:
             return ReplayMemory(context, **sizes)

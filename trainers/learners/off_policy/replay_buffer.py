@@ -30,10 +30,17 @@ class ReplayMemory:
         buffer_size: capacity in transitions of a UAV. A shared buffer has this capacity for all
             UAVs together.
         joint: whether the UAVs of a team sample the same rows, see `TeamSampler`.
+        mixed: whether a UAV samples transitions of other UAVs, too, if the buffer is shared.
     """
 
     def __init__(
-        self, context: LearnerContext, *, batch_size: int, buffer_size: int, joint: bool = False
+        self,
+        context: LearnerContext,
+        *,
+        batch_size: int,
+        buffer_size: int,
+        joint: bool = False,
+        mixed: bool = True,
     ):
         uavs, shared = context.num_uavs, context.shared_replay
         self.teams, self.device = len(context.seeds), context.device
@@ -51,7 +58,7 @@ class ReplayMemory:
         """rows written so far, including overwritten ones"""
         self._sampler = self._make_sampler(
             uavs,
-            shared=shared,
+            shared=shared and mixed,
             joint=joint,
             rows=self.capacity,
             seeds=context.seeds,
