@@ -42,7 +42,7 @@ class MapsConfig:
     position: bool = False
     """whether a UAV also observes its own x and y"""
     home: Annotated[float, Field(ge=0, le=1)] = 0.0
-    """share of the radio's range between places of a chain from the base to the fire; with more
+    """share of the radio's range that a chain from the base to the fire is planned with; with more
     than 0, a UAV also observes the way to its place, and what it can fly beyond it"""
 
 

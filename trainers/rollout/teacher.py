@@ -21,9 +21,9 @@ from emberlink.policies.scripted.registry import SCRIPTED
 class KnownMaps:
     """The maps of method `maps`, in the form in which scripted policies read maps.
 
-    The policy of a UAV also knows the targets of those that it hears at a step. Without a limit of
-    bytes they follow from their maps and positions, which the UAV was told. With one
-    (`env.radio.bandwidth`), the UAV may have been told less.
+    The policy of a UAV also knows the targets of those that it hears at a step. Such a target may
+    follow from a map that reaches the UAV one step later, or not at all with
+    `env.radio.bandwidth`.
 
     Args:
         maps: the communication module of the environment.
