@@ -7,7 +7,7 @@ import sys
 import threading
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from contextlib import suppress
 from pathlib import Path
 
@@ -175,19 +175,27 @@ def test_wandb_cannot_reach_its_server(tmp_path, monkeypatch):
     only(train("wandb", tmp_path), "logger=wandb")
 
 
-def service() -> int:
-    """Returns the service process that wandb has started."""
-    end = time.monotonic() + 20
-    while time.monotonic() < end:
-        for folder in Path("/proc").iterdir():
-            try:
-                about = (folder / "stat").read_text().rsplit(")", 1)[-1].split()
-                if int(about[1]) == os.getpid() and about[0] != "Z":
-                    command = (folder / "cmdline").read_bytes()
-                    if b"wandb-core" in command:
-                        return int(folder.name)
-            except (OSError, IndexError, ValueError):
-                continue
+def services() -> set[int]:
+    """Returns the service processes of wandb that this process has started and that still run."""
+    found: set[int] = set()
+    for folder in Path("/proc").iterdir():
+        try:
+            about = (folder / "stat").read_text().rsplit(")", 1)[-1].split()
+            command = (folder / "cmdline").read_bytes()
+            if int(about[1]) == os.getpid() and about[0] != "Z" and b"wandb-core" in command:
+                found.add(int(folder.name))
+        except (OSError, IndexError, ValueError):
+            continue
+    return found
+
+
+def service(others: Collection[int] = ()) -> int:
+    """Returns the service process that wandb has started, or one of the others that it reuses."""
+    began = time.monotonic()
+    while (waited := time.monotonic() - began) < 20:
+        running = services()
+        if found := running - set(others) or (running if waited > 5 else None):
+            return found.pop()
         time.sleep(0.02)
     raise AssertionError("wandb has started no process")
 
@@ -197,11 +205,12 @@ def service() -> int:
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGSTOP])
 def test_the_process_of_wandb_is_killed_or_stopped(how, tmp_path):
     struck: list[int] = []
+    before = services()  # that of an earlier test may still be ending
 
     def strike(progress: Progress) -> None:
         if progress.step == 10:
             time.sleep(1)  # it may still be starting
-            struck.append(service())
+            struck.append(service(before))
             os.kill(struck[0], how)
             time.sleep(0.3)
 
