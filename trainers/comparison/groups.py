@@ -1,6 +1,7 @@
 """Groups runs by setup, world, fire and method, and labels the groups."""
 
 import json
+import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -17,6 +18,8 @@ NOT_COMPARED = ("seed", "seeds", "output", "evaluation", "baselines", *NOT_LEARN
 NOT_NOTED = ("seed", "seeds", "output", "baselines")
 """first parts of keys whose differences within a group are not reported in notes"""
 _WARM_START = "learner.warm_start"
+_OF_RUN = re.compile(r"\d{4}(?:-\d\d){2}_(?:\d\d-?){3}_([^/]+)_s\d+/?$")
+"""the name of a run's folder"""
 _OF_SECTION = ("env.horizon", "env.grid")
 """settings of the environment that are equal within a section, besides those of the fire"""
 
@@ -203,12 +206,13 @@ def _one_run_per_seed(label: str, runs: Sequence[Run], notes: list[str]) -> tupl
 def trained_with(run: Run) -> dict[str, Any]:
     """Returns the settings that affect training, without the seed.
 
-    If the run began with the actors of another that still exists, `learner.warm_start` holds its
-    settings.
+    If the run began with the actors of another, `learner.warm_start` holds the settings of that
+    run, or its path without the time and the seed if it no longer exists.
     """
     mine, start = _without_seed(run.settings), run.settings.get(_WARM_START, "")
     origin = settings_of(start) if start else ""
-    return mine | {_WARM_START: origin if isinstance(origin, str) else _without_seed(origin)}
+    known = not isinstance(origin, str)
+    return mine | {_WARM_START: _without_seed(origin) if known else _OF_RUN.sub(r"\1", origin)}
 
 
 def _without_seed(settings: Mapping[str, Any]) -> dict[str, Any]:

@@ -510,6 +510,15 @@ def test_runs_that_began_with_other_seeds_of_the_same_run_are_a_group(tmp_path, 
     assert any("one group, though learner.warm_start differ" in note for note in notes)
 
 
+def test_runs_that_began_with_seeds_of_a_lost_run_are_a_group(tmp_path):
+    starts = [f"runs/2026-11-2{s}_01-36-35_consensus_tuned_front_s{s}" for s in range(3)]
+    for seed, start in enumerate([*starts, "runs/2026-11-23_01-36-35_consensus_tuned_paper_s3"]):
+        more = ("learner=ippo", f"learner.warm_start={start}")
+        write_run(tmp_path / "runs", "consensus", seed, overrides=more)
+    (section,), _ = gathered(tmp_path / "runs")
+    assert [group.seeds for group in section.groups] == [[0, 1, 2], [3]]
+
+
 def test_groups_of_other_learners_are_named_by_what_chooses_them(tmp_path):
     for seed, setting in enumerate(("learner=td3", "learner=ippo", "learner.critic=team")):
         write_run(tmp_path, "consensus", seed, overrides=(setting,))
