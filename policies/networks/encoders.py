@@ -108,7 +108,8 @@ class PictureEncoder(nn.Module):
         """Maps uint8 [groups, rows, pictures, channels, S, S] to [groups, rows, features]."""
         groups, encoded, every = len(x), [], list[Any](self.pictures)
         for layers, picture in zip(every, x.unbind(2), strict=True):
-            # Bytes with the channels last: the convolutions are then a quarter faster on a CPU.
+            # Bytes with the channels last: the convolutions are then a quarter faster on a CPU. A
+            # picture of floats is copied, as it is the caller's.
             y = picture.transpose(0, 1).flatten(1, 2).contiguous(memory_format=torch.channels_last)
             y = y.to(layers[0].weight.dtype, copy=True).div_(255)
             for layer in layers:

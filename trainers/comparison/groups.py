@@ -1,7 +1,6 @@
 """Groups runs by setup, world, fire and method, and labels the groups."""
 
 import json
-import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -12,14 +11,13 @@ from emberlink.trainers.config.compose import to_values
 from emberlink.trainers.config.defaults import defaults_of
 from emberlink.trainers.config.schema import NOT_LEARNT_WITH
 from emberlink.trainers.runs import pretrained
+from emberlink.trainers.runs.run_folder import without_time_and_seed
 
 NOT_COMPARED = ("seed", "seeds", "output", "evaluation", "baselines", *NOT_LEARNT_WITH)
 """first parts of keys that may differ within a group, since they do not affect training"""
 NOT_NOTED = ("seed", "seeds", "output", "baselines")
 """first parts of keys whose differences within a group are not reported in notes"""
 _WARM_START = "learner.warm_start"
-_OF_RUN = re.compile(r"\d{4}(?:-\d\d){2}_(?:\d\d-?){3}_([^/]+)_s\d+/?$")
-"""the name of a run's folder"""
 _OF_SECTION = ("env.horizon", "env.grid")
 """settings of the environment that are equal within a section, besides those of the fire"""
 
@@ -211,8 +209,8 @@ def trained_with(run: Run) -> dict[str, Any]:
     """
     mine, start = _without_seed(run.settings), run.settings.get(_WARM_START, "")
     origin = settings_of(start) if start else ""
-    known = not isinstance(origin, str)
-    return mine | {_WARM_START: _without_seed(origin) if known else _OF_RUN.sub(r"\1", origin)}
+    alike = without_time_and_seed(origin) if isinstance(origin, str) else _without_seed(origin)
+    return mine | {_WARM_START: alike}
 
 
 def _without_seed(settings: Mapping[str, Any]) -> dict[str, Any]:

@@ -1,6 +1,7 @@
 """Reads and writes run folders: config.yaml, metrics.jsonl, checkpoints, evaluation, figures."""
 
 import errno
+import re
 import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -173,6 +174,12 @@ def _check_complete(values: Mapping[str, Any], config: RunConfig) -> None:
     for key in flat(world):
         if key not in written:
             raise UserError(f"key {key!r} is missing")
+
+
+def without_time_and_seed(path: str) -> str:
+    """Returns the path of a run without the time and the seed in a name that `create` has made."""
+    made = re.fullmatch(r"\d{4}-\d\d-\d\d_\d\d-\d\d-\d\d_(.+)_s\d+(_\d+)?", Path(path).name)
+    return str(Path(path).with_name(made[1])) if made else path
 
 
 def _new_folder(path: Path) -> Path:

@@ -30,8 +30,8 @@ from emberlink.trainers.comparison.rankings import numbers
 from emberlink.trainers.comparison.report import chapters, plots
 from emberlink.trainers.comparison.runs import Run, find, read
 from emberlink.trainers.comparison.scripted import Scripted
-from emberlink.trainers.config.compose import to_values
-from emberlink.trainers.runs.run_folder import RunFolder
+from emberlink.trainers.config.compose import resolve, to_values
+from emberlink.trainers.runs.run_folder import RunFolder, without_time_and_seed
 from emberlink.trainers.terminal import OutputError
 
 METHODS = ("consensus", "independent", "positional", "shared_memory")
@@ -508,6 +508,15 @@ def test_runs_that_began_with_other_seeds_of_the_same_run_are_a_group(tmp_path, 
     (section,), notes = gathered(tmp_path / "runs")
     assert sorted(group.seeds for group in section.groups) == [[0], [0], [0], [0, 1, 2]]
     assert any("one group, though learner.warm_start differ" in note for note in notes)
+
+
+def test_names_of_run_folders_lose_their_time_and_seed(tmp_path):
+    configs = [resolve("consensus", [f"seed={seed}", f"output={tmp_path}"]) for seed in (3, 3, 12)]
+    made = [str(RunFolder.create(config).path) for config in configs]
+    assert len(set(made)) == 3
+    assert {*map(without_time_and_seed, made)} == {str(tmp_path / "consensus_paper_paper")}
+    named = str(RunFolder.create(configs[0], "mine_s3").path)
+    assert without_time_and_seed(named) == named
 
 
 def test_runs_that_began_with_seeds_of_a_lost_run_are_a_group(tmp_path):

@@ -37,9 +37,10 @@ def trained(config) -> Trainer:
 
 
 def _marks(method: str, setup: str) -> list[pytest.MarkDecorator]:
-    """Returns heavy for `maps`, whose convolutions take long, in all setups but `tuned`."""
-    slow = [pytest.mark.slow] if setup != "paper" else []
-    return [pytest.mark.heavy] if method == "maps" and setup != "tuned" else slow
+    """Returns the marks of a recipe: the convolutions of `maps` take long."""
+    if method == "maps" and setup != "tuned":
+        return [pytest.mark.heavy]
+    return [pytest.mark.slow] if setup != "paper" else []
 
 
 @pytest.mark.parametrize(

@@ -154,10 +154,8 @@ def test_a_resumed_run_equals_the_uninterrupted_run(method, steps, learner, whol
             "shared_memory", ["learner=mappo", "learner.critic_map=true"], marks=pytest.mark.heavy
         ),
         pytest.param(
-            *(
-                "consensus",
-                ["learner=ddpg", "policy.memory=stack", *SEQUENCES, "learner.critic=team"],
-            ),
+            "consensus",
+            ["learner=ddpg", "policy.memory=stack", *SEQUENCES, "learner.critic=team"],
             marks=pytest.mark.heavy,
         ),
         pytest.param(
