@@ -9,7 +9,7 @@ from emberlink.envs.utils.counter_rng import Use
 from emberlink.envs.world import motion
 
 _NEARER = 0.97  # of the range, so that rounding and small errors of position break no link
-_RELAY_REACH = 0.2  # cells; distance at which a relay is at its place
+_AT_PLACE = 0.01  # of the range over the ground; distance at which a relay is at its place
 _SILENT = 150  # steps; a UAV not heard of for so long counts as lost where UAVs fail
 
 
@@ -131,7 +131,8 @@ def chain(
     far = 10.0 * (sum(world.grid) + height)  # as good as any longer range, and finite
     heard = min(world.radio.range, far)
     hop = _NEARER * heard
-    first = _NEARER * max(heard**2 - height**2, 0.0) ** 0.5
+    over_ground = max(heard**2 - height**2, 0.0) ** 0.5  # the base's range at that altitude
+    first = _NEARER * over_ground
     way = centre - base
     distance = torch.linalg.vector_norm(way, dim=-1)
     needed = ((distance - first) / max(hop, 1e-6)).ceil()
@@ -140,7 +141,7 @@ def chain(
     along = torch.where(relays > 0, (first + hop * link).minimum(distance), 0.0)
     place = base + way * (along / distance.clamp(min=1e-6)).unsqueeze(-1)
     reach = torch.where(relays > 0, hop, first).to(place.dtype)
-    return place, torch.where(rank < relays, _RELAY_REACH, reach)
+    return place, torch.where(rank < relays, _AT_PLACE * over_ground, reach)
 
 
 def middle(cells: Tensor) -> Tensor:

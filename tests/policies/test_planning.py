@@ -4,6 +4,8 @@ import math
 
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 from torchrl.envs import step_mdp
 
 from emberlink.envs import WildfireConfig, WildfireEnv, keys
@@ -58,7 +60,8 @@ def test_a_chain_by_hand():
     along = [first, first + 9.7, first + 19.4, first + 29.1, first + 29.1, first + 29.1]
     assert place[0, :, 0].tolist() == pytest.approx(along)
     assert place[0, :, 1].tolist() == [30] * 6
-    assert reach[0].tolist() == pytest.approx([0.2] * 4 + [9.7] * 2)
+    at_place = 0.01 * math.sqrt(84)
+    assert reach[0].tolist() == pytest.approx([at_place] * 4 + [9.7] * 2)
     points = torch.cat(
         (torch.tensor([[0.0, 30, 0]]), torch.nn.functional.pad(place[0], (0, 1), value=4))
     )
@@ -66,10 +69,26 @@ def test_a_chain_by_hand():
     # Two UAVs: one holds a place, the other is in its range. No fire known: within the base's.
     place, reach = radio.chain(config, BASE, centre[:, :2], rank[:, :2], torch.tensor(2))
     assert place[0, :, 0].tolist() == pytest.approx([first] * 2)
-    assert reach[0].tolist() == pytest.approx([0.2, 9.7])
+    assert reach[0].tolist() == pytest.approx([at_place, 9.7])
     place, reach = radio.chain(config, BASE, BASE.expand(1, 2, 2), rank[:, :2], torch.tensor(2))
     assert place.tolist() == [[[0, 30], [0, 30]]]
     assert reach[0].tolist() == pytest.approx([first] * 2)
+
+
+@given(st.floats(1.5, 40), st.floats(0.1, 0.99), st.floats(20, 59))
+def test_a_chain_holds_if_each_uav_is_within_its_reach(heard, height, along):
+    top = height * heard
+    world = WildfireConfig(
+        grid=(60, 60), num_uavs=6, altitude=(top, top), radio=RadioConfig(range=heard)
+    )
+    centre = torch.tensor([along, 30.0]).expand(1, 6, 2)
+    place, reach = radio.chain(world, BASE, centre, torch.arange(6)[None], torch.tensor(6))
+    relays = int((reach[0] < reach[0, -1]).sum())
+    along, reach = place[0, : relays + 1, 0].double(), reach[0, : relays + 1].double()
+    # The greatest distances from the base on the ground, and between neighbours in the chain. The
+    # last of these is that of a UAV without a place of its own to the UAV at the last place.
+    assert math.hypot(along[0] + reach[0], top) < heard
+    assert (along.diff() + reach[1:] + reach[:-1] < heard).all()
 
 
 def test_who_is_late_by_hand():

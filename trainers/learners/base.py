@@ -200,15 +200,25 @@ class Learner(ABC):
     def networks(self) -> dict[str, Tensor]:
         """Returns the weights of all seeds' networks by name, not copied: [seeds * k, ...] each.
 
-        The names of the actors' weights are `ACTOR` and the name in the network of `make_actor`.
+        In some, the dimension of seeds and UAVs is another one, see `stack_dim`. The names of the
+        actors' weights are `ACTOR` and the name in the network of `make_actor`.
         """
 
+    def stack_dim(self, name: str) -> int:
+        """Returns the dimension of a weight of `networks` that stacks the seeds and their UAVs."""
+        return 0
+
     def weights(self, team: int = 0) -> dict[str, Tensor]:
-        """Returns the weights of one seed's networks by name, detached; [k, ...] each."""
-        return {
-            name: value.detach().unflatten(0, (self.teams, -1))[team]
-            for name, value in self.networks().items()
-        }
+        """Returns the weights of one seed's networks by name, detached.
+
+        They have the shapes of `networks`, with k instead of seeds * k.
+        """
+        weights: dict[str, Tensor] = {}
+        for name, value in self.networks().items():
+            dim = self.stack_dim(name)
+            stacked = value.detach().unflatten(dim, (self.teams, -1))
+            weights[name] = stacked.select(dim, team)
+        return weights
 
     @abstractmethod
     def state_dict(self, *, transitions: bool = True) -> dict[str, Tensor]:

@@ -97,14 +97,16 @@ class TD3(OffPolicyLearner):
                 gradients |= {f"critic_{k}.{rest}": part for k, part in enumerate(value)}
         return gradients
 
+    def stack_dim(self, name: str) -> int:
+        """Returns 1 for critics, whose weights have the critic as the first dimension, else 0."""
+        return int("qvalue" in name)
+
     def weights(self, team: int = 0) -> dict[str, Tensor]:
-        """Returns one seed's weights; the first dimension of a critic's weight is the critic."""
-        weights: dict[str, Tensor] = {}
-        for name, value in self.networks().items():
-            dim = int("qvalue" in name)
-            weight = value.detach().unflatten(dim, (self.teams, -1)).select(dim, team)
-            weights[name.replace("params.actor.module.", "params.module.")] = weight
-        return weights
+        weights = super().weights(team)
+        return {
+            name.replace("params.actor.module.", "params.module."): weight
+            for name, weight in weights.items()
+        }
 
 
 class _SmoothedActor(TensorDictModuleBase):

@@ -165,7 +165,8 @@ def _refuse(setup: TrainingSetup, name: str, weight: Tensor) -> NoReturn:
     """Raises an error about the first number of a weight whose square is not finite."""
     place = tuple((~weight.square().isfinite()).nonzero()[0].tolist())
     value = float(weight[place])
-    uav, seed = _owner(setup, place[0], len(weight))
+    stack = setup.learner.stack_dim(name)
+    uav, seed = _owner(setup, place[stack], weight.shape[stack])
     report = NonFiniteReport(f"weight {name}", uav, seed, None, setup.step, None, f"{value:g}")
     reason = "; its square is infinite" if math.isfinite(value) else ""
     raise NonFiniteError(f"{report}{reason}; nothing was saved", report, None)

@@ -527,6 +527,17 @@ def test_a_weight_with_an_infinite_square_is_named_with_its_seed_and_uav(tmp_pat
     trainer.close()
 
 
+def test_a_weight_of_a_second_critic_is_named_with_its_seed_and_uav(tmp_path):
+    trainer = begun("independent", tmp_path, "seeds=[4,5]", "learner=td3")
+    networks = trainer.setup.learner.networks()
+    name = next(name for name, value in networks.items() if value.shape[:2] == (2, 2 * UAVS))
+    with torch.no_grad():
+        networks[name][1, 4] = torch.inf
+    with pytest.raises(NonFiniteError, match=re.escape(f"weight {name} of UAV 1, seed 5, is inf")):
+        non_finite.check(trainer.setup, trainer.run, wait=True)
+    trainer.close()
+
+
 @pytest.mark.heavy
 def test_rollbacks_without_progress_end_the_training(tmp_path, monkeypatch, capsys):
     """The environment gives NaN before the first checkpoint."""
