@@ -77,6 +77,20 @@ class CommModule(Buffers, TensorDictModuleBase):
         """
         return None
 
+    def steer(self, tensordict: TensorDictBase) -> Tensor | None:
+        """Returns the actions that the UAVs perform, float32 [num_envs, n, 3].
+
+        It is called before each step, with the state of the last `forward`. The learner learns from
+        the action of the policy, which does not change.
+
+        Args:
+            tensordict: has ("agents", "action"), and not always the rest of the time step.
+
+        Returns:
+            The actions; None for those of the policy.
+        """
+        return None
+
     def bytes_sent(self, tensordict: TensorDictBase) -> Tensor | None:
         """Returns the bytes that each UAV sends at a step, int64 [num_envs, n]; None for none.
 
@@ -135,6 +149,10 @@ class Communication(Transform):
             began = mask.view(-1, *[1] * (buffer.ndim - 1))
             buffer.copy_(torch.where(began, buffer, before[name]))
         return result
+
+    def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
+        action = self.module.steer(tensordict)
+        return tensordict if action is None else tensordict.set(keys.ACTION, action)
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         self._listen(next_tensordict)

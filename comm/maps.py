@@ -1,7 +1,6 @@
 """Shared maps: UAVs keep maps of what they know, exchange them by radio, and look at them."""
 
 import math
-from dataclasses import replace
 from typing import Annotated, Any, ClassVar
 
 import torch
@@ -11,6 +10,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import Composite, Unbounded
 
+from emberlink.comm import _home
 from emberlink.comm._crops import LARGEST_SCALE, Crops
 from emberlink.comm._messages import CellMessages, cell_bytes, pass_on_places, place_bytes
 from emberlink.comm.base import CommModule
@@ -21,8 +21,6 @@ from emberlink.envs.world import motion, radio
 from emberlink.envs.world.coverage_map import View
 from emberlink.envs.world.knowledge import Knowledge
 from emberlink.envs.world.sensor import Sensor
-
-_NEAR = 10.0  # cells; unit of the way home, which is clipped beyond it
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
@@ -41,9 +39,9 @@ class MapsConfig:
     """cells around known fire that may burn by now, along x and y; 0 for none"""
     position: bool = False
     """whether a UAV also observes its own x and y"""
-    home: Annotated[float, Field(ge=0, le=1)] = 0.0
-    """share of the radio's range that a chain from the base to the fire is planned with; with more
-    than 0, a UAV also observes the way to its place, and what it can fly beyond it"""
+    home: bool = True
+    """whether UAVs fly to a chain of radios to the base in time, whatever the policy does; without
+    a base, and without a radio that reaches it, they do not"""
 
 
 class Maps(CommModule):
@@ -51,9 +49,11 @@ class Maps(CommModule):
 
     At each step, a UAV says to those in range what is new to one of them: cells, and positions of
     UAVs. What it hears it can pass on at the next step. A UAV observes its altitude, the time and
-    pictures of its own map (`Crops`); with `home`, also the way to its place in a chain of radios
-    from the base to the fire that it knows. With a limit of bytes, which cells it receives may
-    depend on what another UAV in range of the sender knows.
+    pictures of its own map (`Crops`). With a limit of bytes, which cells it receives may depend on
+    what another UAV in range of the sender knows.
+
+    With `home` and a base, a UAV leaves for its place in a chain of radios from the base to the
+    fire that it knows when it would otherwise come too late (`steer`).
     """
 
     config_type: ClassVar[type] = MapsConfig
@@ -108,10 +108,11 @@ class Maps(CommModule):
         base = torch.tensor([] if world.base is None else [world.base]).view(-1, 2)
         self.register_buffer("_base", _nearest(base), persistent=False)
         self.register_buffer("_place", base.float(), persistent=False)
+        self._brings_home = config.home and _home.is_needed(world)
 
     def specs(self, observation: Composite) -> Composite:
         shape, device = observation[keys.AGENTS].shape, observation.device
-        features = 2 + 2 * self.config.position + 3 * (self.config.home > 0)
+        features = 2 + 2 * self.config.position
         vector = Unbounded(torch.Size((*shape, features)), device=device, dtype=torch.float32)
         pictures = torch.Size((*shape, *self.pictures.shape))
         observation[keys.OBSERVATION] = vector
@@ -130,6 +131,13 @@ class Maps(CommModule):
         self._draw(tensordict)
         tensordict.set(keys.CROPS, self.crops.clone())
         return tensordict.set(keys.OBSERVATION, self._vector(tensordict))
+
+    def steer(self, tensordict: TensorDictBase) -> Tensor | None:
+        if not self._brings_home:
+            return None
+        action = tensordict.get(keys.ACTION)
+        position, step = self.place.diagonal(dim1=1, dim2=2).mT, self.stamp.diagonal(dim1=1, dim2=2)
+        return _home.steer(self.world, action, self.home, position, step)
 
     def bytes_sent(self, tensordict: TensorDictBase) -> Tensor:
         """Returns the bytes that each UAV said at the last step, int64 [num_envs, n]."""
@@ -181,7 +189,7 @@ class Maps(CommModule):
         if not len(env):
             return
         stores = [(self.crops, self._pictures(tensordict, env))]
-        if self.config.home and self.world.base is not None:
+        if self._brings_home:
             stores.append((self.home, self._find_home(tensordict, env)))
         for store, new in stores:
             if due.is_cuda:
@@ -210,43 +218,21 @@ class Maps(CommModule):
 
     def _find_home(self, tensordict: TensorDictBase, env: Tensor) -> Tensor:
         """Returns the place and reach of UAVs in a chain to the fire, float32 [len(env), n, 3]."""
-        radio_range = self.config.home * self.world.radio.range
-        world = replace(self.world, radio=replace(self.world.radio, range=radio_range))
-        heard = self.stamp[env].clamp(min=0)
-        flies = radio.believed_to_fly(world, tensordict.get(keys.STEP)[env], heard)
         known = self.sensor.crop(self.known.last_seen[env])
         burning = (known >= 0) & (known & 3 == 1)
-        place, reach = radio.chain_to_fire(world, self._place[0], burning, flies)
-        return torch.cat((place, reach.unsqueeze(-1)), -1)
-
-    def _way_home(self, tensordict: TensorDictBase) -> list[Tensor]:
-        """Returns the way home and what can be flown beyond it, see `_vector`.
-
-        Home is the edge of the circle around a UAV's place in the chain in which it has to be. The
-        way is 0 inside of it, and without a base.
-        """
-        place, reach = self.home[..., :2], self.home[..., 2:]
-        way = place - tensordict.get(keys.POSITION)[..., :2].float()
-        distance = torch.linalg.vector_norm(way, dim=-1, keepdim=True)
-        way = way * (1 - reach / distance.clamp(min=1e-6)).clamp(min=0)
-        way = torch.zeros_like(way) if self.world.base is None else way
-        steps = self.world.horizon - tensordict.get(keys.STEP).float().view(-1, 1, 1)
-        spare = steps * self.world.displacement - way.abs().amax(-1, keepdim=True)
-        return [(part / _NEAR).clamp(-1, 1) for part in (way, spare)]
+        step, heard = tensordict.get(keys.STEP)[env], self.stamp[env]
+        return _home.find(self.world, self._place[0], burning, step, heard)
 
     def _vector(self, tensordict: TensorDictBase) -> Tensor:
         """Returns altitude, time, and what else is wanted, float32 [num_envs, n, k].
 
-        The box is scaled to [-1, 1], the horizon to [0, 1]. The way home along x and y, and what
-        can be flown beyond it, are in units of 10 cells, and clipped to [-1, 1].
+        The box is scaled to [-1, 1], the horizon to [0, 1].
         """
         scaled = motion.scale_to_box(tensordict.get(keys.POSITION), self.low, self.high)
         clock = tensordict.get(keys.STEP).float().view(-1, 1, 1) / self.world.horizon
         parts = [scaled[..., 2:], clock.expand(-1, scaled.shape[1], 1)]
         if self.config.position:
             parts.append(scaled[..., :2])
-        if self.config.home:
-            parts += self._way_home(tensordict)
         return torch.cat(parts, -1)
 
 

@@ -76,7 +76,7 @@ def build_env(
     seed: int | Sequence[int] | None,
     device: torch.device | str,
     true_map: bool = False,
-    teacher: tuple[str, float] | None = None,
+    teacher: str | None = None,
 ) -> TransformedEnv:
     """Returns the environment and communication of a configuration; see `WildfireEnv`.
 
@@ -86,7 +86,7 @@ def build_env(
     module = build_comm(config, num_envs).to(world.device)
     env = TransformedEnv(world, Communication(module))
     if teacher is not None:
-        env.append_transform(Teacher(world, module, *teacher, config.policy.hold))
+        env.append_transform(Teacher(world, module, teacher, config.policy.hold))
     return env
 
 

@@ -49,7 +49,7 @@ class MapGreedy(Scripted):
     hears: ClassVar[bool] = True
     messages: ClassVar[Messages] = "in range"
     informs_base: ClassVar[bool] = False
-    """whether it needs a base station to do more than `map_greedy`"""
+    """whether it brings what the UAVs know to a base"""
     TARGET = "_map_greedy_target"
 
     _near_x: Tensor

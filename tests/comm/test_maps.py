@@ -5,6 +5,7 @@ import torch
 from tensordict import TensorDict
 from torchrl.envs import TransformedEnv, check_env_specs
 
+from emberlink.comm import _home
 from emberlink.comm.base import Communication
 from emberlink.comm.maps import Maps, MapsConfig
 from emberlink.envs import keys
@@ -62,29 +63,69 @@ def test_specs_and_shapes():
     assert more.observation_spec[keys.OBSERVATION].shape == (1, 6, 4)
 
 
-def test_a_uav_observes_the_way_home_and_what_it_can_fly_beyond():
-    """The fire burns in one cell 20 cells from the base; two radios of 9 cells reach it."""
+def test_uavs_are_home_in_time_whatever_the_policy_does():
+    """The fire burns in one cell 20 cells from the base; two radios of 10 cells reach it."""
     fire = torch.full((1, 30, 30), torch.inf)
     fire[0, 20, 15] = 1.0
     position = torch.tensor([[[20.0, 15, 3], [21, 15, 3], [20, 16, 3], [29.0, 15, 3]]])
-    config = MapsConfig(pixels=8, home=0.9)
-    hop, first = 0.97 * 9, 0.97 * (81 - 16) ** 0.5
-    reached = [(first, 0.2), (first + hop, 0.2), (first + hop, hop), (first + hop, hop)]
-    for base, heard in (((0.0, 15.0), 10.0), ((0.0, 15.0), torch.inf), (None, 10.0)):
-        more = {"base": base, "radio": RadioConfig(range=heard)}
-        env = environment(fire, position, config=config, **more)
-        steps = fly(env, position, torch.zeros(30, 1, 4, 3))
-        assert env.observation_spec[keys.OBSERVATION].shape == (1, 4, 5)
-        for step in (0, 10, 30):  # of 60, at one cell a step
-            observed = steps[step][keys.OBSERVATION][0]
-            for uav, (along, reach) in enumerate(reached):
-                if step == 0:  # no fire is known
-                    along, reach = 0.0, first
-                way = torch.tensor([along, 15.0]) - position[0, uav, :2]
-                way *= max(0.0, 1 - reach / way.norm()) if base and heard == 10 else 0.0
-                spare = (60 - step - way.abs().max()) / 10
-                expected = torch.stack((*(way / 10), spare)).clamp(-1, 1)
-                torch.testing.assert_close(observed[uav, 2:], expected)
+    hop, first = 9.7, 0.97 * 84**0.5
+    away = torch.tensor([1.0, 0.5, -1.0]).expand(60, 1, 4, 3)
+    for home, base, heard in (
+        *((True, (0.0, 15.0), 10.0), (False, (0.0, 15.0), 10.0)),
+        *((True, None, 10.0), (True, (0.0, 15.0), 4.0)),  # no base, or none that hears the ceiling
+    ):
+        config = MapsConfig(pixels=8, home=home)
+        env = environment(fire, position, config=config, base=base, radio=RadioConfig(range=heard))
+        end = fly(env, position, away)[-1]
+        if home and base and heard == 10:
+            x, y, z = end[keys.POSITION][0].unbind(-1)
+            assert x[:2].tolist() == pytest.approx([first, first + hop], abs=1e-3)
+            assert y[:2].tolist() == pytest.approx([15, 15], abs=1e-3)
+            assert (torch.hypot(x[2:] - first - hop, y[2:] - 15) < hop).all()
+            assert z.tolist() == pytest.approx([4] * 4, abs=1e-3)
+            assert end[keys.BASE_SEEN].item() == end[keys.SEEN].item() == 1
+        else:
+            assert (end[keys.POSITION][0] == torch.tensor([29.0, 29, 1])).all()
+            assert not base or end[keys.BASE_SEEN].item() == 0
+
+
+def test_a_uav_leaves_at_the_last_moment_by_hand():
+    world = WildfireConfig(horizon=100, displacement=0.5, altitude=(1.0, 4.0))
+    home = torch.tensor([[[10.0, 10, 2.0]] * 3])
+    # 12 cells along x less 2 of reach, and 0.71 for one more step, are 21.4 steps. It has to be
+    # there at step 85, so it leaves at step 63. The last UAV is within its reach, in spite of
+    # another step.
+    position = torch.tensor([[[22.0, 10, 4], [10.0, 22, 3], [10, 11, 4]]])
+    action = torch.full((1, 3, 3), 0.25)
+    for step, leaves in ((62, False), (63, True), (99, True)):
+        now = torch.full((1, 3), step)
+        steered = _home.steer(world, action, home, position, now)
+        assert steered[0, 2].equal(action[0, 2])
+        if not leaves:
+            assert steered.equal(action)
+            continue
+        expected = torch.tensor([[-1.0, 0, 0], [0, -1, 1 / 12]])
+        torch.testing.assert_close(steered[0, :2], expected)
+        assert (steered.abs() < 1).all()
+    # Within its reach, but 2 cells below the ceiling: with another one down, it climbs for 5 steps.
+    low = position[:, 2:] - torch.tensor([0.0, 0, 2])
+    for step, climbs in ((79, False), (80, True)):
+        steered = _home.steer(world, action[:, 2:], home[:, 2:], low, torch.full((1, 1), step))
+        assert steered[0, 0, 2].item() == pytest.approx(1.0 if climbs else 0.25)
+    near = torch.tensor([[[10.0, 10.2, 3.9]]])
+    there = home[:, :1] * torch.tensor([1, 1, 0])
+    steered = _home.steer(world, action[:, :1], there, near, now[:, :1])
+    torch.testing.assert_close(steered, torch.tensor([[[0.0, -0.4, 0.2]]]))
+
+
+def test_the_learner_learns_from_the_action_of_the_policy():
+    fire = torch.full((1, 30, 30), torch.inf)
+    position = torch.full((1, 2, 3), 20.0).clamp(max=torch.tensor([29.0, 29, 4]))
+    env = environment(fire, position, base=(0.0, 15.0), horizon=20)
+    td = env.reset(position=position).set(keys.ACTION, torch.ones(1, 2, 3))
+    stepped = env.step(td)
+    assert (stepped[keys.ACTION] == 1).all()
+    assert (stepped["next"][keys.POSITION][..., 0] < 20).all()  # home to the base
 
 
 def test_what_a_uav_sees_is_what_is_there():
@@ -122,7 +163,7 @@ def test_a_disconnected_uav_learns_nothing_and_in_contact_everything():
         actions = torch.cat((own, random_flight(steps, 1, seed=seed)), 2)
         actions[..., :2] *= 0.4  # so that they stay apart
         fire = torch.cat((near, burning(seed)[..., 14:, :]), -2)
-        config = MapsConfig(pixels=8, scales=(1, 4), home=0.9)
+        config = MapsConfig(pixels=8, scales=(1, 4))
         more = {"base": (0.0, 15.0), "radio": RadioConfig(range=10.0)}
         env = environment(fire, position, config=config, **more)
         flights.append(fly(env, position, actions))
@@ -195,7 +236,7 @@ def test_without_a_radio_nothing_is_said():
 
 
 def test_a_limit_is_kept_and_less_becomes_known():
-    position = torch.rand(1, 6, 3) * 12 + torch.tensor([8.0, 8.0, 0.0])
+    position = random_flight(1, 6)[0] * 6 + torch.tensor([14.0, 14.0, 0.0])
     position[..., 2] = 4.0
     known = {}
     for limit in (None, 400, 100, 7):

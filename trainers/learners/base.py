@@ -50,11 +50,8 @@ class LearnerConfig:
         return False
 
     @property
-    def reads_teacher(self) -> tuple[str, float] | None:
-        """The teacher whose actions, `keys.TEACHER`, it learns from; None for none.
-
-        It is the name of a scripted policy, and the share of the radio's range that it plans with.
-        """
+    def reads_teacher(self) -> str | None:
+        """The scripted policy whose actions, `keys.TEACHER`, it learns from; None for none."""
         return None
 
 

@@ -54,8 +54,6 @@ class ImitationConfig(LearnerConfig):
     """learner whose actors are trained; its runs can begin with them (`learner.warm_start`)"""
     teacher: Name
     """scripted policy that is imitated: `map_greedy` or another one that plans by the same maps"""
-    teacher_range: Annotated[float, Field(gt=0, le=1)]
-    """range of the radio that the teacher plans with, as a share of the true one"""
     teacher_share: Annotated[float, Field(ge=0, le=1)]
     """share of decisions that the teacher takes at the beginning; it falls linearly to 0"""
     lr: Positive
@@ -78,8 +76,8 @@ class ImitationConfig(LearnerConfig):
         return self
 
     @property
-    def reads_teacher(self) -> tuple[str, float]:
-        return self.teacher, self.teacher_range
+    def reads_teacher(self) -> str:
+        return self.teacher
 
 
 class Imitation(Learner):

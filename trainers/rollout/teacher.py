@@ -1,6 +1,5 @@
 """Adds the actions of a scripted teacher, made from what each UAV knows, to an environment."""
 
-from dataclasses import replace
 from typing import Any
 
 import torch
@@ -39,11 +38,6 @@ class KnownMaps:
         """Reads the links of a time step; the module has updated the maps."""
         self.reach = tensordict.get(keys.HEARS)
 
-    @property
-    def heard(self) -> Tensor:
-        """The last step at which each UAV (row) knows of another one, float32 [envs, n, n]."""
-        return self._maps.stamp.clamp(min=0).float()
-
     def last_seen(self) -> Tensor:
         """Returns the last step at which each UAV knows each cell seen, float [envs, n, X, Y]."""
         return self._maps.sightings()[0].float()
@@ -66,19 +60,18 @@ class Teacher(Transform):
     Args:
         env: the environment without transforms.
         maps: its communication module.
-        name: `map_greedy`, or a policy that inherits from it, such as `courier`.
-        share: share of the range of the radio that the policy plans with.
+        name: `map_greedy`, or a policy that inherits from it.
         hold: steps for which an action is held.
 
     Raises:
-        UserError: the module keeps no maps, the policy plans by other maps or needs a base that the
-            world lacks, or the environment is on a GPU.
+        UserError: the module keeps no maps, there is no such teacher, or the environment is on a
+            GPU.
     """
 
     target: Tensor
     """float32 [num_envs, n, 2]: targets of the UAVs, cells"""
 
-    def __init__(self, env: WildfireEnv, maps: Any, name: str, share: float, hold: int):
+    def __init__(self, env: WildfireEnv, maps: Any, name: str, hold: int):
         super().__init__()
         if not isinstance(maps, Maps):
             kind = type(maps).__name__
@@ -89,14 +82,6 @@ class Teacher(Transform):
         if torch.device(env.device or "cpu").type != "cpu":
             raise UserError(f"device={env.device}: the teacher needs device=cpu")
         policy = find(name)(env, KnownMaps(maps))
-        if policy.informs_base and env.config.base is None:
-            raise UserError(
-                f"learner.teacher={name}: it informs a base station, and env.base is null; "
-                "world=relay has one"
-            )
-        radio = policy.world.radio
-        planned = replace(radio, range=share * radio.range)
-        policy.world = replace(policy.world, radio=planned)
         policy.stride *= hold
         policy.period = hold if hold > 1 else policy.period
         self._hold = hold
@@ -134,13 +119,17 @@ class Teacher(Transform):
 def find(name: str) -> type[MapGreedy]:
     """Returns the scripted policy of a name, which plans by the maps that UAVs share in range.
 
+    A policy that informs a base is none: UAVs of `maps` come home by themselves.
+
     Raises:
         UserError: there is none of this name; the message lists those that there are.
     """
     known = {
         other: policy
         for other, policy in SCRIPTED.items()
-        if issubclass(policy, MapGreedy) and policy.messages == "in range"
+        if issubclass(policy, MapGreedy)
+        and policy.messages == "in range"
+        and not policy.informs_base
     }
     if name not in known:
         raise UserError(f"learner.teacher={unknown(name, known)}")
