@@ -42,7 +42,8 @@ def steer(
 ) -> Tensor:
     """Returns the actions of a step: home, if a UAV that flies on would come too late.
 
-    A UAV has to be home 15 steps before the end, at the ceiling.
+    A UAV has to be home, and at the ceiling, 15 steps before the end and from then on. The two are
+    decided apart from each other: the action along x and y, and that along z.
 
     Args:
         world: the world and the team.
@@ -55,10 +56,11 @@ def steer(
     way, up = home[..., :2] - position[..., :2], world.altitude[1] - position[..., 2:]
     # If it flies on, it may be farther away after this step, and has the steps that are left then.
     apart = torch.linalg.vector_norm(way, dim=-1) - home[..., 2] + _DIAGONAL * speed
-    below = torch.where(up > 0, up + speed, 0.0).squeeze(-1)
-    distance = torch.maximum(apart, below)
     left = world.horizon - _MARGIN - (step + 1)
-    leaves = (distance > 0) & (distance / speed > left)
-    needed = torch.cat((way, up), -1) / speed
-    needed = _BELOW_ONE * needed / needed.abs().amax(-1, keepdim=True).clamp(min=1)
-    return torch.where(leaves.unsqueeze(-1), needed.to(action.dtype), action)
+    leaves = (apart > 0) & (apart / speed > left)
+    climbs = (up.squeeze(-1) + speed) / speed > left
+    along = way / speed
+    along = along / along.abs().amax(-1, keepdim=True).clamp(min=1)
+    needed = _BELOW_ONE * torch.cat((along, (up / speed).clamp(max=1)), -1)
+    performed = torch.stack((leaves, leaves, climbs), -1)
+    return torch.where(performed, needed.to(action.dtype), action)

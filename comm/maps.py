@@ -58,6 +58,7 @@ class Maps(CommModule):
 
     config_type: ClassVar[type] = MapsConfig
     hears: ClassVar[bool] = True
+    steers: ClassVar[bool] = True
     stamp: Tensor
     """int64 [num_envs, n, n]: steps at which UAVs know positions of UAVs, -1 for never"""
     place: Tensor
@@ -72,7 +73,7 @@ class Maps(CommModule):
     high: Tensor
     _start: Tensor
     _base: Tensor
-    _place: Tensor
+    _base_place: Tensor
 
     def __init__(self, world: WildfireConfig, config: MapsConfig, num_envs: int = 1):
         super().__init__(world, config, num_envs)
@@ -107,7 +108,7 @@ class Maps(CommModule):
         self.register_buffer("_start", first, persistent=False)
         base = torch.tensor([] if world.base is None else [world.base]).view(-1, 2)
         self.register_buffer("_base", _nearest(base), persistent=False)
-        self.register_buffer("_place", base.float(), persistent=False)
+        self.register_buffer("_base_place", base.float(), persistent=False)
         self._brings_home = config.home and _home.is_needed(world)
 
     def specs(self, observation: Composite) -> Composite:
@@ -221,7 +222,7 @@ class Maps(CommModule):
         known = self.sensor.crop(self.known.last_seen[env])
         burning = (known >= 0) & (known & 3 == 1)
         step, heard = tensordict.get(keys.STEP)[env], self.stamp[env]
-        return _home.find(self.world, self._place[0], burning, step, heard)
+        return _home.find(self.world, self._base_place[0], burning, step, heard)
 
     def _vector(self, tensordict: TensorDictBase) -> Tensor:
         """Returns altitude, time, and what else is wanted, float32 [num_envs, n, k].

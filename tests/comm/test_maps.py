@@ -95,27 +95,25 @@ def test_a_uav_leaves_at_the_last_moment_by_hand():
     # 12 cells along x less 2 of reach, and 0.71 for one more step, are 21.4 steps. It has to be
     # there at step 85, so it leaves at step 63. The last UAV is within its reach, in spite of
     # another step.
-    position = torch.tensor([[[22.0, 10, 4], [10.0, 22, 3], [10, 11, 4]]])
+    position = torch.tensor([[[22.0, 10, 4], [10.0, 22, 2], [10, 11, 4]]])
     action = torch.full((1, 3, 3), 0.25)
-    for step, leaves in ((62, False), (63, True), (99, True)):
-        now = torch.full((1, 3), step)
-        steered = _home.steer(world, action, home, position, now)
-        assert steered[0, 2].equal(action[0, 2])
-        if not leaves:
-            assert steered.equal(action)
-            continue
-        expected = torch.tensor([[-1.0, 0, 0], [0, -1, 1 / 12]])
-        torch.testing.assert_close(steered[0, :2], expected)
-        assert (steered.abs() < 1).all()
-    # Within its reach, but 2 cells below the ceiling: with another one down, it climbs for 5 steps.
-    low = position[:, 2:] - torch.tensor([0.0, 0, 2])
-    for step, climbs in ((79, False), (80, True)):
-        steered = _home.steer(world, action[:, 2:], home[:, 2:], low, torch.full((1, 1), step))
-        assert steered[0, 0, 2].item() == pytest.approx(1.0 if climbs else 0.25)
-    near = torch.tensor([[[10.0, 10.2, 3.9]]])
-    there = home[:, :1] * torch.tensor([1, 1, 0])
-    steered = _home.steer(world, action[:, :1], there, near, now[:, :1])
-    torch.testing.assert_close(steered, torch.tensor([[[0.0, -0.4, 0.2]]]))
+
+    def steered(step: int) -> list:
+        performed = _home.steer(world, action, home, position, torch.full((1, 3), step))
+        assert (performed.abs() < 1).all()
+        return [pytest.approx(uav, abs=1e-5) for uav in performed[0].tolist()]
+
+    assert steered(62) == action[0].tolist()
+    assert steered(63) == [[-1, 0, 0.25], [0, -1, 0.25], [0.25] * 3]
+    # 2 cells below the ceiling, and another one down, are 5 steps: it climbs from step 80 on. At
+    # the ceiling a UAV stays there, when it could not come back otherwise.
+    assert steered(79) == [[-1, 0, 0.25], [0, -1, 0.25], [0.25] * 3]
+    assert steered(80) == [[-1, 0, 0.25], [0, -1, 1], [0.25] * 3]
+    assert steered(84) == [[-1, 0, 0], [0, -1, 1], [0.25, 0.25, 0]]
+    place = home * torch.tensor([1, 1, 0])  # no reach
+    near = torch.tensor([[[10.0, 10.2, 3.9]] * 3])
+    performed = _home.steer(world, action, place, near, torch.full((1, 3), 99))
+    torch.testing.assert_close(performed, torch.tensor([[[0.0, -0.4, 0.2]] * 3]))
 
 
 def test_the_learner_learns_from_the_action_of_the_policy():

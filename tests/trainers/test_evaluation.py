@@ -132,6 +132,18 @@ def test_follow_target_uses_the_consensus_of_the_setup():
                 assert evaluate.scripted_config(config, name) is config
 
 
+@pytest.mark.parametrize("name", ["random_waypoints", "map_greedy"])
+def test_no_rule_of_a_method_changes_the_flight_of_a_scripted_policy(name, cache):
+    """In `maps`, UAVs would fly home."""
+    measured = []
+    for method in ("maps", "independent"):
+        more = ["env.horizon=60", "fire.num_train_fires=2", "evaluation.episodes=2"]
+        config = resolve(method, ["world=relay", "setup=tuned", *more])
+        arrival = evaluate.evaluation_fires(config, 2)["front"]
+        measured.append(evaluate.play_scripted(config, name, arrival, block=2))
+    assert measured[0] == measured[1]
+
+
 @pytest.mark.heavy
 def test_eval_json_is_reproducible_to_the_byte(run, cache, played):
     assert main.main(["eval", str(run), "--fires", "3"]) == 0

@@ -10,6 +10,7 @@ from torch import Tensor
 from torchrl.envs import TransformedEnv, set_exploration_type, step_mdp
 from torchrl.envs.utils import ExplorationType
 
+from emberlink.comm import registry
 from emberlink.envs import keys, metrics
 from emberlink.envs.fire.generator import load_scenario
 from emberlink.envs.fire_files.config import FileFireConfig
@@ -231,11 +232,13 @@ def scripted_config(config: RunConfig, name: str) -> RunConfig:
     """Returns the configuration of the environment of a scripted policy.
 
     It is that of the run. If the policy needs the communication of another method, its settings in
-    the run's setup replace those of the run.
+    the run's setup replace those of the run. Where the run's communication would replace actions of
+    the policy, there is none.
     """
     recipe = SCRIPTED[name].recipe
     if recipe is None:
-        return config
+        steers = registry.find(config.comm["name"]).steers
+        return replace(config, comm={"name": "no_comm"}) if steers else config
     if recipe not in config.baselines:
         # The policy is of a package that was not installed at the time of the training.
         choices = [f"setup={config.setup}", f"world={config.world}"]
