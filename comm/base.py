@@ -39,8 +39,6 @@ class CommModule(Buffers, TensorDictModuleBase):
     """a pydantic dataclass: the settings under `comm` in a method's YAML file"""
     hears: ClassVar[bool] = False
     """whether the module reads `keys.HEARS`"""
-    steers: ClassVar[bool] = False
-    """whether `steer` may replace actions; scripted policies then fly without the module"""
     hold: int = 1
     """steps from one decision of the policy to the next (`policy.hold`); between them, no policy
     reads observations"""
@@ -82,8 +80,9 @@ class CommModule(Buffers, TensorDictModuleBase):
     def steer(self, tensordict: TensorDictBase) -> Tensor | None:
         """Returns the actions that the UAVs perform, float32 [num_envs, n, 3].
 
-        It is called before each step if `steers` is true, with the state of the last `forward`. The
-        learner learns from the action of the policy, which does not change.
+        It is called before each step, with the state of the last `forward`. The learner learns from
+        the action of the policy, which does not change. Scripted policies are evaluated without a
+        module that defines it.
 
         Args:
             tensordict: has ("agents", "action"), and not always the rest of the time step.
@@ -153,7 +152,7 @@ class Communication(Transform):
         return result
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
-        action = self.module.steer(tensordict) if self.module.steers else None
+        action = self.module.steer(tensordict)
         return tensordict if action is None else tensordict.set(keys.ACTION, action)
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:

@@ -58,7 +58,6 @@ class Maps(CommModule):
 
     config_type: ClassVar[type] = MapsConfig
     hears: ClassVar[bool] = True
-    steers: ClassVar[bool] = True
     stamp: Tensor
     """int64 [num_envs, n, n]: steps at which UAVs know positions of UAVs, -1 for never"""
     place: Tensor
@@ -221,8 +220,10 @@ class Maps(CommModule):
         """Returns the place and reach of UAVs in a chain to the fire, float32 [len(env), n, 3]."""
         known = self.sensor.crop(self.known.last_seen[env])
         burning = (known >= 0) & (known & 3 == 1)
-        step, heard = tensordict.get(keys.STEP)[env], self.stamp[env]
-        return _home.find(self.world, self._base_place[0], burning, step, heard)
+        step, heard = tensordict.get(keys.STEP)[env], self.stamp[env].clamp(min=0)
+        base = self._base_place[0]
+        place, reach = radio.chain_to_fire(self.world, base, burning, step, heard)
+        return torch.cat((place, reach.unsqueeze(-1)), -1)
 
     def _vector(self, tensordict: TensorDictBase) -> Tensor:
         """Returns altitude, time, and what else is wanted, float32 [num_envs, n, k].

@@ -14,6 +14,8 @@ from emberlink.envs.utils import counter_rng
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import shown
 
+_BELOW_ONE = 1 - 2**-22  # so that rounding does not carry a UAV across the edge of the box
+
 
 def corners(low: Sequence[float], high: Sequence[float]) -> tuple[Tensor, Tensor]:
     """Returns two corners of the box, float64 [3] each, rounded to float32.
@@ -44,6 +46,20 @@ def move(
     wanted = torch.add(position.double(), clipped, alpha=displacement)
     inside = wanted.clamp(low, high)
     return inside.float(), inside != wanted
+
+
+def towards(way: Tensor, stride: float) -> Tensor:
+    """Returns the action that flies straight along a way at full speed and stops at its end.
+
+    Args:
+        way: float [..., k], cells along each axis.
+        stride: cells that a component of 1 leads.
+
+    Returns:
+        float32 [..., k].
+    """
+    step = way / stride
+    return (step / step.abs().amax(-1, keepdim=True).clamp(min=1)).float() * _BELOW_ONE
 
 
 def random_points(key: Tensor, count: int, low: Tensor, high: Tensor) -> Tensor:

@@ -8,6 +8,7 @@ from emberlink.envs.utils import counter_rng
 from emberlink.envs.utils.counter_rng import Use
 from emberlink.envs.world import motion
 
+PASSING = 15  # steps that a chain has to pass on what is known: over one link per step, with losses
 _NEARER = 0.97  # of the range, so that rounding and small errors of position break no link
 _AT_PLACE = 0.01  # of the range over the ground; distance at which a relay is at its place
 _SILENT = 150  # steps; a UAV not heard of for so long counts as lost where UAVs fail
@@ -156,7 +157,7 @@ def middle(cells: Tensor) -> Tensor:
 
 
 def chain_to_fire(
-    world: WildfireConfig, base: Tensor, burning: Tensor, flies: Tensor
+    world: WildfireConfig, base: Tensor, burning: Tensor, step: Tensor, heard: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Returns the place of each UAV in a `chain` to the middle of the fire that it knows.
 
@@ -166,12 +167,13 @@ def chain_to_fire(
         world: the world and the team.
         base: float32 [2], cells.
         burning: bool [envs, n, X, Y], the cells that each UAV knows to burn.
-        flies: bool [envs, n, n], the UAVs of which each UAV (row) believes that they fly.
+        step, heard: see `believed_to_fly`; UAVs that do not fly have no place.
 
     Returns:
         Place, float32 [envs, n, 2], cells, and reach, float32 [envs, n]: the greatest distance from
         it, cells.
     """
+    flies = believed_to_fly(world, step, heard)
     known = burning.flatten(2).any(-1, keepdim=True)
     centre = torch.where(known, middle(burning), base)
     rank = flies.tril(-1).sum(-1)

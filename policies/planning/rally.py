@@ -5,7 +5,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-_MARGIN = 15  # steps at the meeting place; messages may be lost, and are passed on step by step
+from emberlink.envs.world.radio import PASSING
 
 
 class Rally(NamedTuple):
@@ -30,7 +30,7 @@ class Rally(NamedTuple):
         along_y = (self.place[..., 1:] - cells[1]).unsqueeze(-2)
         apart = torch.hypot(along_x, along_y) - self.reach[..., None, None]
         outside = apart > 0
-        needs = (apart.clamp(min=0) / speed + _MARGIN) * outside
+        needs = (apart.clamp(min=0) / speed + PASSING) * outside
         return arrives + needs > self.step[..., None, None]
 
     def leaves(self, ground: Tensor, step: Tensor, speed: float, period: int) -> Tensor:
@@ -43,5 +43,5 @@ class Rally(NamedTuple):
             period: steps between plans.
         """
         apart = torch.linalg.vector_norm(self.place - ground, dim=-1) - self.reach
-        needs = apart.clamp(min=0) / speed + _MARGIN + period
+        needs = apart.clamp(min=0) / speed + PASSING + period
         return (apart > 0) & (step.unsqueeze(-1) + needs >= self.step)

@@ -12,8 +12,6 @@ from emberlink.envs.wildfire import WildfireEnv
 from emberlink.envs.world import motion
 from emberlink.envs.world.sensor import view_radius
 
-_BELOW_ONE = 1 - 2**-22  # so that rounding does not carry a UAV across the edge of the box
-
 
 class Scripted(TensorDictModuleBase):
     """Maps observations to actions without learning.
@@ -78,9 +76,8 @@ class Scripted(TensorDictModuleBase):
         Returns:
             The same TensorDict.
         """
-        step = (target - tensordict.get(keys.POSITION)) / self.stride
-        action = (step / step.abs().amax(-1, keepdim=True).clamp(min=1)).float()
-        return tensordict.set(keys.ACTION, action * _BELOW_ONE)
+        way = target - tensordict.get(keys.POSITION)
+        return tensordict.set(keys.ACTION, motion.towards(way, self.stride))
 
     def carried(self, tensordict: TensorDictBase, key: str, initial: torch.Tensor) -> torch.Tensor:
         """Returns the tensor under `key`, or `initial` at the first step of an episode.

@@ -52,6 +52,6 @@ class Courier(MapGreedy):
 
     def _rally(self, step: Tensor, burning: Tensor) -> Rally:
         """Returns where each UAV has to be at the end, given the fire and the UAVs it knows."""
-        flies = radio.believed_to_fly(self.world, step, self.maps.heard)
-        place, reach = radio.chain_to_fire(self.world, self._base, burning, flies)
+        heard = self.maps.heard
+        place, reach = radio.chain_to_fire(self.world, self._base, burning, step, heard)
         return Rally(place, reach, torch.full_like(reach, self.world.horizon))

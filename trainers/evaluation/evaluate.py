@@ -11,6 +11,7 @@ from torchrl.envs import TransformedEnv, set_exploration_type, step_mdp
 from torchrl.envs.utils import ExplorationType
 
 from emberlink.comm import registry
+from emberlink.comm.base import CommModule
 from emberlink.envs import keys, metrics
 from emberlink.envs.fire.generator import load_scenario
 from emberlink.envs.fire_files.config import FileFireConfig
@@ -237,7 +238,7 @@ def scripted_config(config: RunConfig, name: str) -> RunConfig:
     """
     recipe = SCRIPTED[name].recipe
     if recipe is None:
-        steers = registry.find(config.comm["name"]).steers
+        steers = registry.find(config.comm["name"]).steer is not CommModule.steer
         return replace(config, comm={"name": "no_comm"}) if steers else config
     if recipe not in config.baselines:
         # The policy is of a package that was not installed at the time of the training.
