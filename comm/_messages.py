@@ -10,6 +10,9 @@ from emberlink.envs.world.knowledge import Knowledge
 _COMPARED = 2**11
 """pairs of maps that are compared at a time"""
 
+News = tuple[Tensor, ...]
+"""environment, speaker, hearer and cell, int64 [k] each, of what is new to a UAV in range"""
+
 
 def cell_bytes(area: int, horizon: int) -> int:
     """Returns the bytes of a message about a cell.
@@ -32,20 +35,33 @@ def bytes_of(count: int) -> int:
     return 2 if count <= 2**16 else 4
 
 
+def worth_of_places(stamp: Tensor, near: Tensor) -> Tensor:
+    """Returns what it is worth to say positions: the steps by which they get newer.
+
+    Args:
+        stamp, near: see `pass_on_places`.
+
+    Returns:
+        int64 [envs, n, n], summed over the UAVs in range of the speaker (row).
+    """
+    # [envs, hearers, speakers, known]
+    gained = (stamp.unsqueeze(1) - stamp.unsqueeze(2)).clamp(min=0)
+    return (gained * near.unsqueeze(-1)).sum(1)
+
+
 def pass_on_places(
-    stamp: Tensor, place: Tensor, near: Tensor, hears: Tensor, left: Tensor | None, size: int
+    stamp: Tensor, place: Tensor, near: Tensor, hears: Tensor, chosen: Tensor | None, size: int
 ) -> Tensor:
     """Passes on the positions that UAVs know of each other, in place.
 
-    A UAV says a position if one of those in range knows an older one or none. With a limit, the
-    newest are said first.
+    A UAV says a position if one of those in range knows an older one or none.
 
     Args:
         stamp: int64 [envs, n, n], the step at which a UAV (row) knows the position of another one
             (column), -1 for never.
         place: float32 [envs, n, n, 3], the positions, cells.
         near, hears: see `CellMessages.pass_on`.
-        left: int64 [envs, n], the bytes that each UAV can still say; None for no limit.
+        chosen: bool [envs, n, n], which of the new positions a UAV (row) says; None for all.
         size: bytes of a message about a position.
 
     Returns:
@@ -53,11 +69,7 @@ def pass_on_places(
     """
     # [envs, hearers, speakers, known]
     newer = near.unsqueeze(-1) & (stamp.unsqueeze(1) > stamp.unsqueeze(2))
-    said = newer.any(1)
-    if left is not None:
-        uavs = stamp.shape[-1]
-        worth = stamp * uavs + torch.arange(uavs, device=stamp.device)
-        said = keep_best(said, worth, left // size, uavs)
+    said = newer.any(1) if chosen is None else chosen
     newer &= hears.unsqueeze(-1) & said.unsqueeze(1)
     told, speaker = torch.where(newer, stamp.unsqueeze(1), -1).max(2)
     better = (told > stamp).unsqueeze(-1)
@@ -67,31 +79,12 @@ def pass_on_places(
     return size * said.sum(-1)
 
 
-def keep_best(said: Tensor, worth: Tensor, allowed: Tensor, most: int) -> Tensor:
-    """Returns the most useful entries of a mask, bool [..., entries].
-
-    Args:
-        said: bool [..., entries].
-        worth: int64 [..., entries], at least 0 where `said` is true; no two are equal.
-        allowed: int64 [...], number of entries to keep.
-        most: the largest number in `allowed`, or a larger one.
-    """
-    most = min(most, said.shape[-1])
-    if not most:
-        return torch.zeros_like(said)
-    best, place = torch.where(said, worth, -1).topk(most, -1)
-    rank = torch.arange(most, device=said.device)
-    kept = (best >= 0) & (rank < allowed.unsqueeze(-1))
-    return torch.zeros_like(said).scatter_(-1, place, kept)
-
-
 class CellMessages(Buffers):
     """Passes on the cells of maps.
 
     A UAV says a cell if one of those in range has an older look at it or none, or does not know
-    that it was seen while it burned. With a limit, cells with fire are said first, then the others;
-    of each, the newest look first. A map holds 4 times the step of the last look plus what was seen
-    (1 for fire), -1 for never.
+    that it was seen while it burned. A map holds 4 times the step of the last look plus what was
+    seen (1 for fire), -1 for never.
 
     Between UAVs in contact, only cells can be new that a UAV saw at this step, was told at the step
     before, had no time to say, or said in vain. So whole maps are compared only where a UAV was not
@@ -131,35 +124,84 @@ class CellMessages(Buffers):
         flat = self.fresh.view(-1).view(torch.uint8)
         flat.scatter_reduce_(0, index, view.in_view.flatten().view(torch.uint8), "amax")
 
-    def pass_on(self, known: Knowledge, near: Tensor, hears: Tensor, limit: int | None) -> Tensor:
+    def compare(self, known: Knowledge, near: Tensor) -> News | None:
+        """Returns what is new to UAVs in range; None on a GPU, which would have to wait for it.
+
+        Args:
+            known: the maps.
+            near: bool [envs, n, n], whether a UAV (row) is in range of another one (column).
+        """
+        last, seen = known.last_seen, known.seen_fire
+        assert seen is not None
+        if last.is_cuda:
+            return None
+        news = self._news(last, seen, near & self.heard)
+        maps = _differences(last, seen, near & ~self.heard)
+        return tuple(torch.cat(parts) for parts in zip(news, maps, strict=True))
+
+    def worth(self, known: Knowledge, near: Tensor, news: News | None) -> tuple[Tensor, Tensor]:
+        """Returns what it is worth to say cells: the steps by which the last looks get newer.
+
+        It is at least 1 for each UAV to which something is new, and summed over those in range of
+        the speaker.
+
+        Args:
+            known, near: see `pass_on`.
+            news: what `compare` returned.
+
+        Returns:
+            The worth, 0 for nothing new, and the indices of the cells, int64 [envs, n, k] each.
+        """
+        last, seen = known.last_seen, known.seen_fire
+        assert seen is not None
+        if news is None:
+            return _worth_dense(last, seen, near)
+        env, speaker, hearer, cell = news
+        shape = envs, uavs, area = last.shape
+        entry = (env * uavs + speaker) * area + cell
+        entry, number = entry.unique(return_inverse=True)
+        gained = _gained(last[env, speaker, cell], last[env, hearer, cell])
+        worth = torch.zeros_like(entry).index_add_(0, number, gained)
+        row = entry // area
+        count = row.bincount(minlength=envs * uavs)
+        place = torch.arange(len(entry)) - (count.cumsum(0) - count)[row]
+        columns = torch.zeros(2, envs * uavs, int(count.max()), dtype=torch.int64)
+        columns[0, row, place], columns[1, row, place] = worth, entry % area
+        columns = columns.view(2, *shape[:2], -1)
+        return columns[0], columns[1]
+
+    def pass_on(
+        self,
+        known: Knowledge,
+        near: Tensor,
+        hears: Tensor,
+        news: News | None,
+        chosen: Tensor | None = None,
+    ) -> Tensor:
         """Changes the maps of those that hear others.
 
         Args:
             known: the maps.
             near: bool [envs, n, n], whether a UAV (row) is in range of another one (column).
             hears: bool [envs, n, n], of these, who hears the other one: no message is lost.
-            limit: bytes that a UAV can say in a step; None for no limit.
+            news: what `compare` returned.
+            chosen: bool [envs, n, area], which of the new cells a UAV says; None for all.
 
         Returns:
             int64 [envs, n], the bytes that each UAV said.
         """
         last, seen = known.last_seen, known.seen_fire
         assert seen is not None
-        most = None if limit is None else limit // self.size
-        if last.is_cuda:
+        if news is None:
             self.heard.zero_()
-            return self.size * _pass_on_dense(last, seen, near, hears, most)
-        news = self._news(last, seen, near & self.heard)
-        maps = _differences(last, seen, near & ~self.heard)
-        env, speaker, hearer, cell = (torch.cat(parts) for parts in zip(news, maps, strict=True))
+            return self.size * _pass_on_dense(last, seen, near, hears, chosen)
+        env, speaker, hearer, cell = news
         said = torch.zeros_like(seen)
         said[env, speaker, cell] = True
         self.fresh.zero_()
-        if most is not None:
-            over = said.sum(-1) > most
-            wanted, said[over] = said.clone(), _best(said[over], last[over], most)
-            self.fresh.copy_(wanted & ~said)
-            kept = said[env, speaker, cell]
+        if chosen is not None:
+            self.fresh.copy_(said & ~chosen)
+            said, kept = chosen, chosen[env, speaker, cell]
             env, speaker, hearer, cell = (x[kept] for x in (env, speaker, hearer, cell))
         if near is not hears:
             arrives = hears[env, hearer, speaker]
@@ -174,7 +216,7 @@ class CellMessages(Buffers):
         self.heard.copy_(near)
         return self.size * said.sum(-1)
 
-    def _news(self, last: Tensor, seen: Tensor, near: Tensor) -> tuple[Tensor, ...]:
+    def _news(self, last: Tensor, seen: Tensor, near: Tensor) -> News:
         """Returns the fresh cells that are new to others; see `_differences`."""
         env, speaker, cell = self.fresh.nonzero(as_tuple=True)
         linked = near.transpose(1, 2)[env, speaker]
@@ -186,7 +228,7 @@ class CellMessages(Buffers):
         return env[entry], speaker[entry], hearer, cell[entry]
 
 
-def _differences(last: Tensor, seen: Tensor, near: Tensor) -> tuple[Tensor, ...]:
+def _differences(last: Tensor, seen: Tensor, near: Tensor) -> News:
     """Returns environment, speaker, hearer and cell, int64 [k] each, of all cells new to a hearer.
 
     Args:
@@ -205,30 +247,37 @@ def _differences(last: Tensor, seen: Tensor, near: Tensor) -> tuple[Tensor, ...]
     return tuple(torch.cat(every) for every in zip(*parts, strict=True))
 
 
-def _best(said: Tensor, last: Tensor, most: int) -> Tensor:
-    """Returns the `most` most useful cells of `said`, bool [..., area]."""
-    area = last.shape[-1]
-    number = last.long()
-    fire = (number & 3 == 1) & (number >= 0)
-    worth = (number + fire * 2**32) * area + torch.arange(area, device=last.device)
-    return keep_best(said, worth, torch.full_like(number[..., 0], most), most)
+def _gained(told: Tensor, before: Tensor) -> Tensor:
+    """Returns the steps by which looks are newer than before, int64, at least 1."""
+    return ((told >> 2).long() - (before >> 2).long()).clamp(min=1)
+
+
+def _newer(last: Tensor, seen: Tensor, near: Tensor, speaker: int) -> Tensor:
+    """Returns what a UAV could tell the others in range, bool [envs, n, area]."""
+    told, told_seen = last[:, speaker : speaker + 1], seen[:, speaker : speaker + 1]
+    return near[:, :, speaker].unsqueeze(-1) & ((told > last) | (told_seen > seen))
+
+
+def _worth_dense(last: Tensor, seen: Tensor, near: Tensor) -> tuple[Tensor, Tensor]:
+    """Computes `CellMessages.worth` from all maps, and never waits for the device."""
+    uavs = range(near.shape[1])
+    every = (
+        (_gained(last[:, uav : uav + 1], last) * _newer(last, seen, near, uav)).sum(1)
+        for uav in uavs
+    )
+    worth = torch.stack(list(every), 1)
+    return worth, torch.arange(last.shape[-1], device=last.device).expand_as(worth)
 
 
 def _pass_on_dense(
-    last: Tensor, seen: Tensor, near: Tensor, hears: Tensor, most: int | None
+    last: Tensor, seen: Tensor, near: Tensor, hears: Tensor, chosen: Tensor | None
 ) -> Tensor:
-    """Compares all maps, never waits for the device, and returns the number of cells said.
-
-    A UAV says at most `most` cells; None is no limit.
-    """
+    """Compares all maps, never waits for the device, and returns the number of cells said."""
     before, before_seen, counts = last.clone(), seen.clone(), []
-    for number in range(hears.shape[1]):
-        told, told_seen = before[:, number : number + 1], before_seen[:, number : number + 1]
-        newer = near[:, :, number].unsqueeze(-1) & ((told > before) | (told_seen > before_seen))
-        said = newer.any(1)
-        if most is not None:
-            said = _best(said, told[:, 0], most)
-        heard = hears[:, :, number].unsqueeze(-1) & said.unsqueeze(1)
+    for uav in range(hears.shape[1]):
+        said = _newer(before, before_seen, near, uav).any(1) if chosen is None else chosen[:, uav]
+        heard = hears[:, :, uav].unsqueeze(-1) & said.unsqueeze(1)
+        told, told_seen = before[:, uav : uav + 1], before_seen[:, uav : uav + 1]
         torch.maximum(last, torch.where(heard, told, -1), out=last)
         seen |= heard & told_seen
         counts.append(said.sum(-1))

@@ -11,8 +11,15 @@ from torch import Tensor
 from torchrl.data import Composite, Unbounded
 
 from emberlink.comm import _home
+from emberlink.comm._bandwidth import said_within
 from emberlink.comm._crops import LARGEST_SCALE, Crops
-from emberlink.comm._messages import CellMessages, cell_bytes, pass_on_places, place_bytes
+from emberlink.comm._messages import (
+    CellMessages,
+    cell_bytes,
+    pass_on_places,
+    place_bytes,
+    worth_of_places,
+)
 from emberlink.comm.base import CommModule
 from emberlink.envs import keys
 from emberlink.envs.config import WildfireConfig
@@ -173,10 +180,14 @@ class Maps(CommModule):
         if settings.loss:
             place, alive = tensordict.get(keys.POSITION), tensordict.get(keys.ALIVE)
             near = radio.in_range(settings, place, alive)
-        cells = self.messages.pass_on(self.known, near, hears, limit)
-        left = None if limit is None else limit - cells
-        size = place_bytes(self.world.horizon)
-        self.said.copy_(cells + pass_on_places(self.stamp, self.place, near, hears, left, size))
+        news, cells, places = self.messages.compare(self.known, near), None, None
+        sizes = self.messages.size, place_bytes(self.world.horizon)
+        if limit is not None:
+            worth = self.messages.worth(self.known, near, news), worth_of_places(self.stamp, near)
+            cells, places = said_within(limit, *worth, self.sensor.area, sizes)
+        spoken = self.messages.pass_on(self.known, near, hears, news, cells)
+        spoken += pass_on_places(self.stamp, self.place, near, hears, places, sizes[1])
+        self.said.copy_(spoken)
 
     def _draw(self, tensordict: TensorDictBase) -> None:
         """Draws the pictures of the environments in which they are due, and looks for home."""

@@ -69,45 +69,64 @@ class Teller:
     """The maps of a team and their messages, with dictionaries.
 
     A map holds cell -> (step, code) with code 0, 1 (fire) or 2, and a set of cells seen burning.
+    `places` holds UAV -> step of the last known position.
     """
 
     def __init__(self, uavs: int):
         self.looks = [{} for _ in range(uavs)]
         self.fires = [set() for _ in range(uavs)]
+        self.places = [{} for _ in range(uavs)]
 
     def see(self, uav: int, cells: dict, step: int) -> None:
+        self.places[uav][uav] = step
         for cell, code in cells.items():
             self.looks[uav][cell] = (step, code)
             if code == 1:
                 self.fires[uav].add(cell)
 
-    def talk(self, near, hears, budget=None) -> list[int]:
-        """Passes on what is new, and returns the number of cells that each UAV said.
+    def talk(self, near, hears, limit=None, sizes=(5, 16)) -> list[tuple[int, int]]:
+        """Passes on what is new, and returns the numbers of cells and positions of each UAV.
 
         What is said depends on the UAVs in range, what is received on those that hear.
         """
         looks, fires = [dict(m) for m in self.looks], [set(m) for m in self.fires]
-        counts = []
+        places, counts = [dict(m) for m in self.places], []
         for speaker, mine in enumerate(looks):
-            hearers = [uav for uav in range(len(looks)) if hears[uav][speaker]]
-            in_range = [uav for uav in range(len(looks)) if near[uav][speaker]]
-            new = [
-                cell
-                for cell in mine
-                if any(
-                    mine[cell] > looks[uav].get(cell, (-1, 0))
-                    or (cell in fires[speaker] and cell not in fires[uav])
-                    for uav in in_range
-                )
-            ]
-            # Fire first, then the newest; among equal ones the cell of the larger index.
-            new.sort(key=lambda cell: (mine[cell][1] == 1, mine[cell], cell), reverse=True)
-            said = new if budget is None else new[: max(0, budget[speaker])]
-            counts.append(len(said))
-            for uav in hearers:
-                for cell in said:
-                    other = self.looks[uav].get(cell, (-1, 0))
-                    self.looks[uav][cell] = max(other, mine[cell])
-                    if cell in fires[speaker]:
-                        self.fires[uav].add(cell)
+            worth = {}
+            for uav in (k for k in range(len(looks)) if near[k][speaker]):
+                for cell, look in mine.items():
+                    theirs = looks[uav].get(cell, (-1, -1))
+                    if look > theirs or (cell in fires[speaker] and cell not in fires[uav]):
+                        gained = max(1, look[0] - theirs[0])
+                        worth["cell", cell] = worth.get(("cell", cell), 0) + gained
+                for other, step in places[speaker].items():
+                    gained = step - places[uav].get(other, -1)
+                    if gained > 0:
+                        worth["place", other] = worth.get(("place", other), 0) + gained
+            said = set(worth) if limit is None else within(limit, worth, sizes)
+            counts.append(tuple(sum(k == kind for k, _ in said) for kind in ("cell", "place")))
+            for uav in (k for k in range(len(looks)) if hears[k][speaker]):
+                for kind, what in said:
+                    if kind == "place":
+                        step = self.places[uav].get(what, -1)
+                        self.places[uav][what] = max(step, places[speaker][what])
+                    else:
+                        look = self.looks[uav].get(what, (-1, -1))
+                        self.looks[uav][what] = max(look, mine[what])
+                        if what in fires[speaker]:
+                            self.fires[uav].add(what)
         return counts
+
+
+def within(limit: int, worth: dict, sizes: tuple[int, int]) -> set:
+    """Returns what is said: the best that fit together, and then cells."""
+    size = {"cell": sizes[0], "place": sizes[1]}
+    ranked = sorted(worth, key=lambda k: (worth[k], k[0] == "place", k[1]), reverse=True)
+    said, left = set(), limit
+    for number, item in enumerate(ranked):
+        if size[item[0]] > left:
+            more = [k for k in ranked[number:] if k[0] == "cell"]
+            return said | set(more[: left // sizes[0]])
+        said.add(item)
+        left -= size[item[0]]
+    return said

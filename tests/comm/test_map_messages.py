@@ -2,10 +2,19 @@
 
 import pytest
 import torch
-from scalar_maps import Teller
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scalar_maps import Teller, within
 
 from emberlink.comm import _messages
-from emberlink.comm._messages import CellMessages, cell_bytes, pass_on_places, place_bytes
+from emberlink.comm._bandwidth import said_within
+from emberlink.comm._messages import (
+    CellMessages,
+    cell_bytes,
+    pass_on_places,
+    place_bytes,
+    worth_of_places,
+)
 from emberlink.envs.world.coverage_map import View
 from emberlink.envs.world.knowledge import Knowledge
 
@@ -35,12 +44,6 @@ def links(step: int, density: float, loss: float) -> tuple[torch.Tensor, torch.T
     return near, near & (draw(step + 900, ENVS, UAVS, UAVS) >= loss) if loss else near
 
 
-def dense(known, near, hears, limit):
-    most = None if limit is None else limit // CELL_BYTES
-    given = known.last_seen, known.seen_fire, near, hears, most
-    return _messages._pass_on_dense(*given) * CELL_BYTES
-
-
 @pytest.mark.parametrize(
     ("area", "horizon", "cell", "position"),
     [
@@ -55,83 +58,131 @@ def test_numbers_above_65535_take_four_bytes(area, horizon, cell, position):
     assert (cell_bytes(area, horizon), place_bytes(horizon)) == (cell, position)
 
 
+def talk(messages, known, places, links, limit, *, dense=False) -> list:
+    """Lets all UAVs talk, and returns the bytes of cells and of positions, [envs, n] each."""
+    near, hears = links
+    stamp, place = places
+    news, cells, chosen = None if dense else messages.compare(known, near), None, None
+    if limit is not None:
+        worth = messages.worth(known, near, news), worth_of_places(stamp, near)
+        cells, chosen = said_within(limit, *worth, AREA, (CELL_BYTES, PLACE_BYTES))
+    return [
+        messages.pass_on(known, near, hears, news, cells),
+        pass_on_places(stamp, place, near, hears, chosen, PLACE_BYTES),
+    ]
+
+
 @pytest.mark.parametrize("function", ["sparse", "dense"])
-@pytest.mark.parametrize("limit", [None, 0, 23, 60])
+@pytest.mark.parametrize("limit", [None, 0, 15, 23, 60, 10**9])
 @pytest.mark.parametrize(("density", "loss"), [(0.3, 0.0), (0.8, 0.0), (0.8, 0.4)])
-def test_maps_and_bytes_equal_those_of_dictionaries(function, limit, density, loss):
+def test_what_is_known_and_bytes_equal_those_of_dictionaries(function, limit, density, loss):
     known = Knowledge(envs=ENVS, uavs=UAVS, area=AREA, horizon=4 * STEPS + 3, fires=True)
     messages = CellMessages(ENVS, UAVS, AREA, CELL_BYTES)
+    stamp, place = torch.full((ENVS, UAVS, UAVS), -1), torch.zeros(ENVS, UAVS, UAVS, 3)
+    own = torch.arange(UAVS)
     tellers = [Teller(UAVS) for _ in range(ENVS)]
-    said_any = 0
+    said_any = torch.zeros(2)
     for step in range(1, STEPS):
         view, code = looks(step)
         known.see(view, 4 * step + code)
         messages.saw(view)
-        near, hears = links(step, density, loss)
-        pass_on = dense if function == "dense" else messages.pass_on
-        sent = pass_on(known, near, hears, limit)
+        stamp[:, own, own], place[:, own, own] = step, 10.0 * step + own[:, None].float()
+        linked = links(step, density, loss)
+        sent = talk(messages, known, (stamp, place), linked, limit, dense=function == "dense")
         for env, teller in enumerate(tellers):
             for uav in range(UAVS):
                 seen = view.in_view[env, uav]
                 cells = (view.cells[env, uav][seen] - env * AREA).tolist()
                 codes = code[env, uav][seen].tolist()
                 teller.see(uav, dict(zip(cells, codes, strict=True)), step)
-            budget = None if limit is None else [limit // CELL_BYTES] * UAVS
-            counts = teller.talk(near[env].tolist(), hears[env].tolist(), budget)
-            assert sent[env].tolist() == [CELL_BYTES * count for count in counts], (step, env)
-            said_any += sum(counts)
-            for uav in range(UAVS):
-                last = {
-                    cell: (number // 4, number % 4)
-                    for cell, number in enumerate(known.last_seen[env, uav].tolist())
-                    if number >= 0
-                }
-                assert last == teller.looks[uav], (step, env, uav)
-                burnt = set(known.seen_fire[env, uav].nonzero().flatten().tolist())
-                assert burnt == teller.fires[uav]
-    assert (said_any > 0) == (limit != 0)
+            counts = teller.talk(*(x[env].tolist() for x in linked), limit)
+            expected = torch.tensor(counts).T * torch.tensor([[CELL_BYTES], [PLACE_BYTES]])
+            assert torch.stack([x[env] for x in sent]).equal(expected), (step, env)
+            said_any += expected.sum(1)
+            check_knowledge(teller, known, stamp, place, env)
+    assert (said_any > 0).tolist() == [limit != 0, limit is None or limit >= PLACE_BYTES]
+
+
+def check_knowledge(teller, known, stamp, place, env) -> None:
+    """Checks that UAVs of an environment know what those of the teller know."""
+    for uav in range(UAVS):
+        last = {
+            cell: (number // 4, number % 4)
+            for cell, number in enumerate(known.last_seen[env, uav].tolist())
+            if number >= 0
+        }
+        assert last == teller.looks[uav]
+        assert set(known.seen_fire[env, uav].nonzero().flatten().tolist()) == teller.fires[uav]
+        for other in range(UAVS):
+            step = teller.places[uav].get(other, -1)
+            assert stamp[env, uav, other] == step
+            if step >= 0:
+                assert (place[env, uav, other] == 10.0 * step + other).all()
 
 
 @pytest.mark.parametrize("lost", [False, True])
-@pytest.mark.parametrize("limit", [None, 2 * PLACE_BYTES])
-def test_positions_are_passed_on_a_hop_a_step_and_the_newest_first(limit, lost):
+def test_positions_are_passed_on_a_hop_a_step(lost):
     uavs = 4
     stamp, place = torch.full((1, uavs, uavs), -1), torch.zeros(1, uavs, uavs, 3)
     near = torch.zeros(1, uavs, uavs, dtype=torch.bool)
     for uav in range(uavs - 1):  # a chain
         near[0, uav, uav + 1] = near[0, uav + 1, uav] = True
-    expected = {(uav, uav): 0 for uav in range(uavs)}
+    own = torch.arange(uavs)
     for step in range(12):
-        own = torch.arange(uavs)
         stamp[0, own, own], place[0, own, own] = step, 10.0 * step + own[:, None].float()
-        expected |= {(uav, uav): step for uav in range(uavs)}
-        before = dict(expected)
-        left = None if limit is None else limit - 8 * (own.unsqueeze(0) % 2)  # 2 or 1 positions
+        before = stamp.clone()
         hears = near & (draw(step, uavs, uavs) < 0.6) if lost else near
-        sent = pass_on_places(stamp, place, near, hears, left, PLACE_BYTES)
-        for speaker in range(uavs):
-            in_range = [h for h in (speaker - 1, speaker + 1) if 0 <= h < uavs]
-            new = [
-                k
-                for k in range(uavs)
-                if any(before.get((speaker, k), -1) > before.get((h, k), -1) for h in in_range)
-            ]
-            new.sort(key=lambda k, s=speaker: (before[s, k], k), reverse=True)
-            said = new if left is None else new[: left[0, speaker] // PLACE_BYTES]
-            assert sent[0, speaker] == PLACE_BYTES * len(said)
-            for hearer in (h for h in in_range if hears[0, h, speaker]):
-                for k in said:
-                    expected[hearer, k] = max(expected.get((hearer, k), -1), before[speaker, k])
-        for uav in range(uavs):
-            for other in range(uavs):
-                known = expected.get((uav, other), -1)
-                assert stamp[0, uav, other] == known
-                if known >= 0:
-                    assert (place[0, uav, other] == 10.0 * known + other).all()
-    if limit is None and not lost:
+        pass_on_places(stamp, place, near, hears, None, PLACE_BYTES)
+        for hearer in range(uavs):
+            told = [before[0, k] for k in range(uavs) if k == hearer or hears[0, hearer, k]]
+            assert stamp[0, hearer].equal(torch.stack(told).amax(0))
+    if not lost:
         assert stamp[0, 0].tolist() == [11, 11, 10, 9]
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.data())
+def test_what_fits_equals_a_greedy_choice(data):
+    worths = st.integers(0, 9)
+    cells = data.draw(st.lists(st.lists(worths, min_size=7, max_size=7), min_size=2, max_size=2))
+    places = data.draw(st.lists(st.lists(worths, min_size=2, max_size=2), min_size=2, max_size=2))
+    limit, sizes = data.draw(st.integers(0, 90)), data.draw(st.sampled_from([(5, 16), (7, 18)]))
+    index = torch.tensor([4, 0, 8, 2, 1, 7, 3])  # of 9 cells
+    given = torch.tensor([cells]), index.expand(1, 2, -1)
+    said_cells, said_places = said_within(limit, given, torch.tensor([places]), 9, sizes)
+    for uav in range(2):
+        worth = {("cell", k): x for k, x in zip(index.tolist(), cells[uav], strict=True) if x}
+        worth |= {("place", k): x for k, x in enumerate(places[uav]) if x}
+        said = {("cell", k) for k in said_cells[0, uav].nonzero().flatten().tolist()}
+        said |= {("place", k) for k in said_places[0, uav].nonzero().flatten().tolist()}
+        assert said == within(limit, worth, sizes)
+
+
+def test_the_oldest_knowledge_is_renewed_first():
+    """A UAV tells another one of four cells; 16 bytes are three cells or a position."""
+    known = Knowledge(envs=1, uavs=2, area=4, horizon=403, fires=True)
+    known.last_seen[0, 0] = torch.tensor([4 * 90, 4 * 80, 4 * 70 + 1, 4 * 60 + 2])
+    known.last_seen[0, 1] = torch.tensor([4 * 89, 4 * 50, 4 * 20 + 1, -1])
+    near = torch.tensor([[[False, False], [True, False]]])
+    stamp = torch.tensor([[[90, -1], [55, 90]]])
+    messages = CellMessages(1, 2, 4, CELL_BYTES)
+    news = messages.compare(known, near)
+    worth = messages.worth(known, near, news), worth_of_places(stamp, near)
+    assert torch.stack(worth[0])[:, 0, 0].tolist() == [[1, 30, 50, 61], [0, 1, 2, 3]]
+    assert worth[1][0, 0].tolist() == [35, 0]
+    for limit, cells, place in (
+        (4, [], False),
+        (5, [3], False),
+        (15, [1, 2, 3], False),  # the position is next and does not fit; a cell does
+        (26, [2, 3], True),
+        (31, [1, 2, 3], True),
+        (36, [0, 1, 2, 3], True),
+    ):
+        said = said_within(limit, *worth, 4, (CELL_BYTES, PLACE_BYTES))
+        assert said[0][0, 0].nonzero().flatten().tolist() == cells
+        assert said[1][0, 0].tolist() == [place, False]
 
 
 def test_pairs_are_compared_in_parts(monkeypatch):
     monkeypatch.setattr(_messages, "_COMPARED", 3)
-    test_maps_and_bytes_equal_those_of_dictionaries("sparse", None, 0.8, 0.0)
+    test_what_is_known_and_bytes_equal_those_of_dictionaries("sparse", None, 0.8, 0.0)

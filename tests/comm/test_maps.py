@@ -247,19 +247,35 @@ def test_a_limit_is_kept_and_less_becomes_known():
     assert known[None] >= known[400] > known[100] > known[7]
 
 
+def chain(uavs: int, reach: float, limit: int | None):
+    """Returns what UAVs of a chain with a radio of `reach` cells know after 20 steps."""
+    position = torch.full((1, uavs, 3), 4.0)
+    position[0, :, 0] = torch.linspace(2, 27, uavs)
+    position[0, :, 1] = 15.0
+    env = environment(burning(), position, radio=RadioConfig(range=reach, bandwidth=limit))
+    fly(env, position, random_flight(20, uavs))
+    return env.transform.module
+
+
 @pytest.mark.parametrize(("uavs", "reach"), [(2, 40.0), (24, 40.0), (24, 5.0)])
 def test_more_bytes_make_more_cells_known(uavs, reach):
-    """Positions, 16 bytes each and new at every step, do not take the place of cells."""
-    position = torch.full((1, uavs, 3), 4.0)
-    position[0, :, 0] = torch.linspace(2, 27, uavs)  # a chain with a radio of 5 cells
-    position[0, :, 1] = 15.0
-    known = []
-    for limit in (0, 5, 15, 16, 20, 21, 64, 100, None):
-        env = environment(burning(), position, radio=RadioConfig(range=reach, bandwidth=limit))
-        fly(env, position, random_flight(20, uavs))
-        known.append((env.transform.module.known.last_seen >= 0).sum().item())
+    limits = (0, 5, 15, 64, 100, None)
+    known = [(chain(uavs, reach, limit).known.last_seen >= 0).sum().item() for limit in limits]
     assert known == sorted(known)
     assert known[0] < known[2] < known[-1]
+
+
+@pytest.mark.parametrize(("uavs", "reach"), [(2, 40.0), (24, 40.0), (24, 5.0)])
+def test_positions_are_said_once_they_fit(uavs, reach):
+    """A position has 16 bytes, and new cells would fill any of these limits at every step."""
+    apart = ~torch.eye(uavs, dtype=torch.bool)
+    heard = [chain(uavs, reach, limit).stamp[0][apart] for limit in (15, 16, 64, 200, None)]
+    assert not (heard[0] >= 0).any()
+    known = [(stamps >= 0).sum().item() for stamps in heard]
+    ages = [20 - stamps.clamp(min=0).double().mean().item() for stamps in heard]
+    assert known[1] > 0
+    assert known == sorted(known)
+    assert ages == sorted(ages, reverse=True)
 
 
 @pytest.mark.parametrize("aside", [0.0, 0.2])  # 32.3 + 0.2 is between two cells
