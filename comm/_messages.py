@@ -1,5 +1,7 @@
 """Passes on maps and positions: what UAVs say, what it costs, and who knows it afterwards."""
 
+from typing import NamedTuple
+
 import torch
 from torch import Tensor
 
@@ -10,8 +12,18 @@ from emberlink.envs.world.knowledge import Knowledge
 _COMPARED = 2**11
 """pairs of maps that are compared at a time"""
 
-News = tuple[Tensor, ...]
-"""environment, speaker, hearer and cell, int64 [k] each, of what is new to a UAV in range"""
+
+class News(NamedTuple):
+    """The cells that are new to a UAV in range of the speaker."""
+
+    env: Tensor
+    """int64 [k]"""
+    speaker: Tensor
+    """int64 [k]"""
+    cell: Tensor
+    """int64 [k]"""
+    new_to: Tensor
+    """bool [k, n], to which UAVs in range the cell is new"""
 
 
 def cell_bytes(area: int, horizon: int) -> int:
@@ -33,20 +45,6 @@ def place_bytes(horizon: int) -> int:
 def bytes_of(count: int) -> int:
     """Returns the bytes of one of `count` numbers: 2, or 4 if there are more than 65,536."""
     return 2 if count <= 2**16 else 4
-
-
-def worth_of_places(stamp: Tensor, near: Tensor) -> Tensor:
-    """Returns what it is worth to say positions: the steps by which they get newer.
-
-    Args:
-        stamp, near: see `pass_on_places`.
-
-    Returns:
-        int64 [envs, n, n], summed over the UAVs in range of the speaker (row).
-    """
-    # [envs, hearers, speakers, known]
-    gained = (stamp.unsqueeze(1) - stamp.unsqueeze(2)).clamp(min=0)
-    return (gained * near.unsqueeze(-1)).sum(1)
 
 
 def pass_on_places(
@@ -87,8 +85,8 @@ class CellMessages(Buffers):
     seen (1 for fire), -1 for never.
 
     Between UAVs in contact, only cells can be new that a UAV saw at this step, was told at the step
-    before, had no time to say, or said in vain. So whole maps are compared only where a UAV was not
-    in range of another one at the step before.
+    before, had no bytes left to say, or said without being heard. So whole maps are compared only
+    where a UAV was not in range of another one at the step before.
 
     Args:
         envs: number of environments.
@@ -98,7 +96,7 @@ class CellMessages(Buffers):
     """
 
     fresh: Tensor
-    """bool [envs, uavs, area]: cells that may be new to UAVs in range at the step before"""
+    """bool [envs, uavs, area]: cells that may be new to UAVs in range; not read on a GPU"""
     heard: Tensor
     """bool [envs, uavs, uavs]: whom each UAV was in range of at the step before"""
     _shift: Tensor
@@ -117,6 +115,7 @@ class CellMessages(Buffers):
     def start_episodes(self, mask: Tensor) -> None:
         """Forgets the contacts in the environments of a mask, bool [envs]."""
         self.heard.masked_fill_(mask[:, None, None], False)
+        self.fresh.masked_fill_(mask[:, None, None], False)
 
     def saw(self, view: View) -> None:
         """Notes the cells that UAVs see at this step."""
@@ -135,40 +134,26 @@ class CellMessages(Buffers):
         assert seen is not None
         if last.is_cuda:
             return None
-        news = self._news(last, seen, near & self.heard)
-        maps = _differences(last, seen, near & ~self.heard)
-        return tuple(torch.cat(parts) for parts in zip(news, maps, strict=True))
+        self._meet(last, seen, near & ~self.heard)
+        env, speaker, cell = self.fresh.nonzero(as_tuple=True)
+        linked = near.transpose(1, 2)[env, speaker]
+        rows = linked.any(-1)
+        env, speaker, cell = env[rows], speaker[rows], cell[rows]
+        newer = last[env, speaker, cell].unsqueeze(-1) > last[env, :, cell]
+        newer |= seen[env, speaker, cell].unsqueeze(-1) > seen[env, :, cell]
+        new_to = newer & linked[rows]
+        news = new_to.any(-1)
+        return News(env[news], speaker[news], cell[news], new_to[news])
 
-    def worth(self, known: Knowledge, near: Tensor, news: News | None) -> tuple[Tensor, Tensor]:
-        """Returns what it is worth to say cells: the steps by which the last looks get newer.
-
-        It is at least 1 for each UAV to which something is new, and summed over those in range of
-        the speaker.
-
-        Args:
-            known, near: see `pass_on`.
-            news: what `compare` returned.
-
-        Returns:
-            The worth, 0 for nothing new, and the indices of the cells, int64 [envs, n, k] each.
-        """
-        last, seen = known.last_seen, known.seen_fire
-        assert seen is not None
-        if news is None:
-            return _worth_dense(last, seen, near)
-        env, speaker, hearer, cell = news
-        shape = envs, uavs, area = last.shape
-        entry = (env * uavs + speaker) * area + cell
-        entry, number = entry.unique(return_inverse=True)
-        gained = _gained(last[env, speaker, cell], last[env, hearer, cell])
-        worth = torch.zeros_like(entry).index_add_(0, number, gained)
-        row = entry // area
-        count = row.bincount(minlength=envs * uavs)
-        place = torch.arange(len(entry)) - (count.cumsum(0) - count)[row]
-        columns = torch.zeros(2, envs * uavs, int(count.max()), dtype=torch.int64)
-        columns[0, row, place], columns[1, row, place] = worth, entry % area
-        columns = columns.view(2, *shape[:2], -1)
-        return columns[0], columns[1]
+    def _meet(self, last: Tensor, seen: Tensor, met: Tensor) -> None:
+        """Notes the cells that are new to a UAV (row) which comes in range of another one."""
+        for env, hearer, speaker in zip(
+            *(x.split(_COMPARED) for x in met.nonzero(as_tuple=True)), strict=True
+        ):
+            newer = last[env, speaker] > last[env, hearer]
+            newer |= seen[env, speaker] > seen[env, hearer]
+            pair, cell = newer.nonzero(as_tuple=True)
+            self.fresh[env[pair], speaker[pair], cell] = True
 
     def pass_on(
         self,
@@ -195,18 +180,21 @@ class CellMessages(Buffers):
         if news is None:
             self.heard.zero_()
             return self.size * _pass_on_dense(last, seen, near, hears, chosen)
-        env, speaker, hearer, cell = news
-        said = torch.zeros_like(seen)
-        said[env, speaker, cell] = True
+        env, speaker, cell, new_to = news
         self.fresh.zero_()
         if chosen is not None:
-            self.fresh.copy_(said & ~chosen)
-            said, kept = chosen, chosen[env, speaker, cell]
-            env, speaker, hearer, cell = (x[kept] for x in (env, speaker, hearer, cell))
+            said = chosen[env, speaker, cell]
+            self.fresh[env[~said], speaker[~said], cell[~said]] = True
+            env, speaker, cell, new_to = (x[said] for x in news)
+        count = torch.zeros(near.shape[:2], dtype=torch.int64)
+        count.index_put_((env, speaker), torch.ones_like(env), accumulate=True)
         if near is not hears:
-            arrives = hears[env, hearer, speaker]
-            self.fresh[env[~arrives], speaker[~arrives], cell[~arrives]] = True
-            env, speaker, hearer, cell = (x[arrives] for x in (env, speaker, hearer, cell))
+            arrives = hears.transpose(1, 2)[env, speaker]
+            lost = (new_to & ~arrives).any(-1)
+            self.fresh[env[lost], speaker[lost], cell[lost]] = True
+            new_to = new_to & arrives
+        entry, hearer = new_to.nonzero(as_tuple=True)
+        env, speaker, cell = env[entry], speaker[entry], cell[entry]
         number, was_fire = last[env, speaker, cell], seen[env, speaker, cell]
         place = (env * last.shape[1] + hearer) * last.shape[2] + cell
         last.view(-1).scatter_reduce_(0, place, number, "amax")
@@ -214,59 +202,13 @@ class CellMessages(Buffers):
         flat.scatter_reduce_(0, place, was_fire.view(torch.uint8), "amax")
         self.fresh.view(-1)[place] = True
         self.heard.copy_(near)
-        return self.size * said.sum(-1)
-
-    def _news(self, last: Tensor, seen: Tensor, near: Tensor) -> News:
-        """Returns the fresh cells that are new to others; see `_differences`."""
-        env, speaker, cell = self.fresh.nonzero(as_tuple=True)
-        linked = near.transpose(1, 2)[env, speaker]
-        rows = linked.any(-1)
-        env, speaker, cell = env[rows], speaker[rows], cell[rows]
-        newer = last[env, speaker, cell].unsqueeze(-1) > last[env, :, cell]
-        newer |= seen[env, speaker, cell].unsqueeze(-1) > seen[env, :, cell]
-        entry, hearer = (newer & linked[rows]).nonzero(as_tuple=True)
-        return env[entry], speaker[entry], hearer, cell[entry]
+        return self.size * count
 
 
-def _differences(last: Tensor, seen: Tensor, near: Tensor) -> News:
-    """Returns environment, speaker, hearer and cell, int64 [k] each, of all cells new to a hearer.
-
-    Args:
-        last: integers [envs, n, area].
-        seen: bool [envs, n, area].
-        near: bool [envs, n, n], whose maps are compared.
-    """
-    parts = []
-    for env, hearer, speaker in zip(
-        *(x.split(_COMPARED) for x in near.nonzero(as_tuple=True)), strict=True
-    ):
-        newer = last[env, speaker] > last[env, hearer]
-        newer |= seen[env, speaker] > seen[env, hearer]
-        pair, cell = newer.nonzero(as_tuple=True)
-        parts.append((env[pair], speaker[pair], hearer[pair], cell))
-    return tuple(torch.cat(every) for every in zip(*parts, strict=True))
-
-
-def _gained(told: Tensor, before: Tensor) -> Tensor:
-    """Returns the steps by which looks are newer than before, int64, at least 1."""
-    return ((told >> 2).long() - (before >> 2).long()).clamp(min=1)
-
-
-def _newer(last: Tensor, seen: Tensor, near: Tensor, speaker: int) -> Tensor:
+def could_tell(last: Tensor, seen: Tensor, near: Tensor, speaker: int) -> Tensor:
     """Returns what a UAV could tell the others in range, bool [envs, n, area]."""
     told, told_seen = last[:, speaker : speaker + 1], seen[:, speaker : speaker + 1]
     return near[:, :, speaker].unsqueeze(-1) & ((told > last) | (told_seen > seen))
-
-
-def _worth_dense(last: Tensor, seen: Tensor, near: Tensor) -> tuple[Tensor, Tensor]:
-    """Computes `CellMessages.worth` from all maps, and never waits for the device."""
-    uavs = range(near.shape[1])
-    every = (
-        (_gained(last[:, uav : uav + 1], last) * _newer(last, seen, near, uav)).sum(1)
-        for uav in uavs
-    )
-    worth = torch.stack(list(every), 1)
-    return worth, torch.arange(last.shape[-1], device=last.device).expand_as(worth)
 
 
 def _pass_on_dense(
@@ -275,7 +217,9 @@ def _pass_on_dense(
     """Compares all maps, never waits for the device, and returns the number of cells said."""
     before, before_seen, counts = last.clone(), seen.clone(), []
     for uav in range(hears.shape[1]):
-        said = _newer(before, before_seen, near, uav).any(1) if chosen is None else chosen[:, uav]
+        said = (
+            could_tell(before, before_seen, near, uav).any(1) if chosen is None else chosen[:, uav]
+        )
         heard = hears[:, :, uav].unsqueeze(-1) & said.unsqueeze(1)
         told, told_seen = before[:, uav : uav + 1], before_seen[:, uav : uav + 1]
         torch.maximum(last, torch.where(heard, told, -1), out=last)

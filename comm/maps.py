@@ -11,14 +11,13 @@ from torch import Tensor
 from torchrl.data import Composite, Unbounded
 
 from emberlink.comm import _home
-from emberlink.comm._bandwidth import said_within
+from emberlink.comm._bandwidth import offers, said_within, worth_of_places
 from emberlink.comm._crops import LARGEST_SCALE, Crops
 from emberlink.comm._messages import (
     CellMessages,
     cell_bytes,
     pass_on_places,
     place_bytes,
-    worth_of_places,
 )
 from emberlink.comm.base import CommModule
 from emberlink.envs import keys
@@ -55,9 +54,9 @@ class Maps(CommModule):
     """Keeps a map per UAV of what it saw and was told, and shows it to the UAV as pictures.
 
     At each step, a UAV says to those in range what is new to one of them: cells, and positions of
-    UAVs. What it hears it can pass on at the next step. A UAV observes its altitude, the time and
-    pictures of its own map (`Crops`). With a limit of bytes, which cells it receives may depend on
-    what another UAV in range of the sender knows.
+    UAVs; with a limit of bytes, what is worth most of it. What it hears it can pass on at the next
+    step. A UAV observes its altitude, the time and pictures of its own map (`Crops`). With a limit,
+    what it receives may depend on what another UAV in range of the sender knows.
 
     With `home` and a base, a UAV leaves for its place in a chain of radios from the base to the
     fire that it knows when it would otherwise come too late (`steer`).
@@ -180,13 +179,17 @@ class Maps(CommModule):
         if settings.loss:
             place, alive = tensordict.get(keys.POSITION), tensordict.get(keys.ALIVE)
             near = radio.in_range(settings, place, alive)
-        news, cells, places = self.messages.compare(self.known, near), None, None
+        news = self.messages.compare(self.known, near)
+        said_cells = said_places = None
         sizes = self.messages.size, place_bytes(self.world.horizon)
         if limit is not None:
-            worth = self.messages.worth(self.known, near, news), worth_of_places(self.stamp, near)
-            cells, places = said_within(limit, *worth, self.sensor.area, sizes)
-        spoken = self.messages.pass_on(self.known, near, hears, news, cells)
-        spoken += pass_on_places(self.stamp, self.place, near, hears, places, sizes[1])
+            cells = offers(self.known, near, news, limit // sizes[0])
+            places = worth_of_places(self.stamp, near)
+            said = said_within(limit, cells, places, self.sensor.area, sizes)
+            said_cells, said_places = said
+        spoken = self.messages.pass_on(self.known, near, hears, news, said_cells)
+        links = near, hears
+        spoken += pass_on_places(self.stamp, self.place, *links, said_places, sizes[1])
         self.said.copy_(spoken)
 
     def _draw(self, tensordict: TensorDictBase) -> None:

@@ -4,6 +4,7 @@ import math
 from fractions import Fraction
 
 FULL = 255
+OLD = 100
 
 
 def rounded(value) -> int:
@@ -84,10 +85,11 @@ class Teller:
             if code == 1:
                 self.fires[uav].add(cell)
 
-    def talk(self, near, hears, limit=None, sizes=(5, 16)) -> list[tuple[int, int]]:
+    def talk(self, near, hears, limit=None, sizes=(5, 16), area=0) -> list[tuple[int, int]]:
         """Passes on what is new, and returns the numbers of cells and positions of each UAV.
 
-        What is said depends on the UAVs in range, what is received on those that hear.
+        What is said depends on the UAVs in range, what is received on those that hear. With a
+        limit, `area` is the number of cells of the map.
         """
         looks, fires = [dict(m) for m in self.looks], [set(m) for m in self.fires]
         places, counts = [dict(m) for m in self.places], []
@@ -96,14 +98,16 @@ class Teller:
             for uav in (k for k in range(len(looks)) if near[k][speaker]):
                 for cell, look in mine.items():
                     theirs = looks[uav].get(cell, (-1, -1))
-                    if look > theirs or (cell in fires[speaker] and cell not in fires[uav]):
-                        gained = max(1, look[0] - theirs[0])
+                    fire_is_new = cell in fires[speaker] and cell not in fires[uav]
+                    if look > theirs or fire_is_new:
+                        gained = min(OLD, look[0] - (-1 if fire_is_new else theirs[0]))
                         worth["cell", cell] = worth.get(("cell", cell), 0) + gained
                 for other, step in places[speaker].items():
                     gained = step - places[uav].get(other, -1)
                     if gained > 0:
                         worth["place", other] = worth.get(("place", other), 0) + gained
-            said = set(worth) if limit is None else within(limit, worth, sizes)
+            turn = speaker * (area // len(looks))
+            said = set(worth) if limit is None else within(limit, worth, sizes, turn, area)
             counts.append(tuple(sum(k == kind for k, _ in said) for kind in ("cell", "place")))
             for uav in (k for k in range(len(looks)) if hears[k][speaker]):
                 for kind, what in said:
@@ -118,10 +122,18 @@ class Teller:
         return counts
 
 
-def within(limit: int, worth: dict, sizes: tuple[int, int]) -> set:
-    """Returns what is said: the best that fit together, and then cells."""
+def within(limit: int, worth: dict, sizes: tuple[int, int], turn: int, area: int) -> set:
+    """Returns what is said: the best that fit together, and then cells.
+
+    Of equal worth, cells come first, in the order of their indices plus `turn`, modulo `area`.
+    """
     size = {"cell": sizes[0], "place": sizes[1]}
-    ranked = sorted(worth, key=lambda k: (worth[k], k[0] == "place", k[1]), reverse=True)
+
+    def rank(item) -> tuple:
+        kind, number = item
+        return -worth[item], kind == "place", (number + turn) % area if kind == "cell" else number
+
+    ranked = sorted(worth, key=rank)
     said, left = set(), limit
     for number, item in enumerate(ranked):
         if size[item[0]] > left:

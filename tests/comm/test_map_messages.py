@@ -7,14 +7,8 @@ from hypothesis import strategies as st
 from scalar_maps import Teller, within
 
 from emberlink.comm import _messages
-from emberlink.comm._bandwidth import said_within
-from emberlink.comm._messages import (
-    CellMessages,
-    cell_bytes,
-    pass_on_places,
-    place_bytes,
-    worth_of_places,
-)
+from emberlink.comm._bandwidth import Offers, offers, said_within, worth_of_places
+from emberlink.comm._messages import CellMessages, cell_bytes, pass_on_places, place_bytes
 from emberlink.envs.world.coverage_map import View
 from emberlink.envs.world.knowledge import Knowledge
 
@@ -64,8 +58,9 @@ def talk(messages, known, places, links, limit, *, dense=False) -> list:
     stamp, place = places
     news, cells, chosen = None if dense else messages.compare(known, near), None, None
     if limit is not None:
-        worth = messages.worth(known, near, news), worth_of_places(stamp, near)
-        cells, chosen = said_within(limit, *worth, AREA, (CELL_BYTES, PLACE_BYTES))
+        offered = offers(known, near, news, limit // CELL_BYTES), worth_of_places(stamp, near)
+        area = known.last_seen.shape[-1]
+        cells, chosen = said_within(limit, *offered, area, (CELL_BYTES, PLACE_BYTES))
     return [
         messages.pass_on(known, near, hears, news, cells),
         pass_on_places(stamp, place, near, hears, chosen, PLACE_BYTES),
@@ -73,7 +68,7 @@ def talk(messages, known, places, links, limit, *, dense=False) -> list:
 
 
 @pytest.mark.parametrize("function", ["sparse", "dense"])
-@pytest.mark.parametrize("limit", [None, 0, 15, 23, 60, 10**9])
+@pytest.mark.parametrize("limit", [None, 0, 4, 5, 16, 20, 23, 60, 10**9])
 @pytest.mark.parametrize(("density", "loss"), [(0.3, 0.0), (0.8, 0.0), (0.8, 0.4)])
 def test_what_is_known_and_bytes_equal_those_of_dictionaries(function, limit, density, loss):
     known = Knowledge(envs=ENVS, uavs=UAVS, area=AREA, horizon=4 * STEPS + 3, fires=True)
@@ -95,12 +90,13 @@ def test_what_is_known_and_bytes_equal_those_of_dictionaries(function, limit, de
                 cells = (view.cells[env, uav][seen] - env * AREA).tolist()
                 codes = code[env, uav][seen].tolist()
                 teller.see(uav, dict(zip(cells, codes, strict=True)), step)
-            counts = teller.talk(*(x[env].tolist() for x in linked), limit)
+            counts = teller.talk(*(x[env].tolist() for x in linked), limit, area=AREA)
             expected = torch.tensor(counts).T * torch.tensor([[CELL_BYTES], [PLACE_BYTES]])
             assert torch.stack([x[env] for x in sent]).equal(expected), (step, env)
             said_any += expected.sum(1)
             check_knowledge(teller, known, stamp, place, env)
-    assert (said_any > 0).tolist() == [limit != 0, limit is None or limit >= PLACE_BYTES]
+    bytes_left = 10**9 if limit is None else limit
+    assert (said_any > 0).tolist() == [bytes_left >= CELL_BYTES, bytes_left >= PLACE_BYTES]
 
 
 def check_knowledge(teller, known, stamp, place, env) -> None:
@@ -143,44 +139,85 @@ def test_positions_are_passed_on_a_hop_a_step(lost):
 @settings(max_examples=200, deadline=None)
 @given(st.data())
 def test_what_fits_equals_a_greedy_choice(data):
-    worths = st.integers(0, 9)
-    cells = data.draw(st.lists(st.lists(worths, min_size=7, max_size=7), min_size=2, max_size=2))
-    places = data.draw(st.lists(st.lists(worths, min_size=2, max_size=2), min_size=2, max_size=2))
-    limit, sizes = data.draw(st.integers(0, 90)), data.draw(st.sampled_from([(5, 16), (7, 18)]))
-    index = torch.tensor([4, 0, 8, 2, 1, 7, 3])  # of 9 cells
-    given = torch.tensor([cells]), index.expand(1, 2, -1)
-    said_cells, said_places = said_within(limit, given, torch.tensor([places]), 9, sizes)
-    for uav in range(2):
-        worth = {("cell", k): x for k, x in zip(index.tolist(), cells[uav], strict=True) if x}
-        worth |= {("place", k): x for k, x in enumerate(places[uav]) if x}
-        said = {("cell", k) for k in said_cells[0, uav].nonzero().flatten().tolist()}
-        said |= {("place", k) for k in said_places[0, uav].nonzero().flatten().tolist()}
-        assert said == within(limit, worth, sizes)
+    area, sizes = 7, data.draw(st.sampled_from([(5, 16), (7, 18), (9, 18)]))
+    limit = data.draw(st.integers(0, 90))
+    cells = data.draw(st.lists(st.integers(0, 9), min_size=area, max_size=area))
+    places = data.draw(st.lists(st.integers(0, 9), min_size=2, max_size=2))
+    more = data.draw(st.integers(0, 3))
+    order = sorted(range(area), key=lambda k: (-cells[k], k))[: limit // sizes[0] + more]
+    offered = Offers(torch.tensor([[[cells[k] for k in order]]]), torch.tensor([[order]]))
+    offered = Offers(*(x.long() for x in offered))
+    said = said_within(limit, offered, torch.tensor([[places]]), area, sizes)
+    worth = {("cell", k): x for k, x in enumerate(cells) if x}
+    worth |= {("place", k): x for k, x in enumerate(places) if x}
+    result = {
+        (kind, k)
+        for kind, mask in zip(("cell", "place"), said, strict=True)
+        for k in mask[0, 0].nonzero().flatten().tolist()
+    }
+    assert result == within(limit, worth, sizes, 0, area)
+
+
+def two_uavs(known: list, theirs: list, stamp: list) -> tuple:
+    """Returns the maps of two UAVs, of which the second one is in range of the first one."""
+    area = len(known)
+    maps = Knowledge(envs=1, uavs=2, area=area, horizon=1203, fires=True)
+    maps.last_seen[0] = torch.tensor([known, theirs])
+    near = torch.tensor([[[False, False], [True, False]]])
+    return CellMessages(1, 2, area, CELL_BYTES), maps, near, torch.tensor([stamp])
 
 
 def test_the_oldest_knowledge_is_renewed_first():
-    """A UAV tells another one of four cells; 16 bytes are three cells or a position."""
-    known = Knowledge(envs=1, uavs=2, area=4, horizon=403, fires=True)
-    known.last_seen[0, 0] = torch.tensor([4 * 90, 4 * 80, 4 * 70 + 1, 4 * 60 + 2])
-    known.last_seen[0, 1] = torch.tensor([4 * 89, 4 * 50, 4 * 20 + 1, -1])
-    near = torch.tensor([[[False, False], [True, False]]])
-    stamp = torch.tensor([[[90, -1], [55, 90]]])
-    messages = CellMessages(1, 2, 4, CELL_BYTES)
-    news = messages.compare(known, near)
-    worth = messages.worth(known, near, news), worth_of_places(stamp, near)
-    assert torch.stack(worth[0])[:, 0, 0].tolist() == [[1, 30, 50, 61], [0, 1, 2, 3]]
-    assert worth[1][0, 0].tolist() == [35, 0]
+    """A UAV tells another one of five cells; 16 bytes are three cells or a position."""
+    known, theirs = [360, 320, 281, 242, 1200], [356, 200, 81, -1, 400]
+    messages, maps, near, stamp = two_uavs(known, theirs, [[90, -1], [55, 90]])
+    news = messages.compare(maps, near)
     for limit, cells, place in (
         (4, [], False),
-        (5, [3], False),
-        (15, [1, 2, 3], False),  # the position is next and does not fit; a cell does
-        (26, [2, 3], True),
-        (31, [1, 2, 3], True),
-        (36, [0, 1, 2, 3], True),
+        (5, [4], False),
+        (10, [3, 4], False),
+        (20, [1, 2, 3, 4], False),  # the position is next and does not fit; a cell does
+        (31, [2, 3, 4], True),
+        (36, [1, 2, 3, 4], True),
+        (41, [0, 1, 2, 3, 4], True),
     ):
-        said = said_within(limit, *worth, 4, (CELL_BYTES, PLACE_BYTES))
+        cells_offered = offers(maps, near, news, limit // CELL_BYTES)
+        worth = worth_of_places(stamp, near)
+        said = said_within(limit, cells_offered, worth, 5, (CELL_BYTES, PLACE_BYTES))
         assert said[0][0, 0].nonzero().flatten().tolist() == cells
         assert said[1][0, 0].tolist() == [place, False]
+    assert worth.tolist() == [[[35, 0], [0, 0]]]
+    cells_offered = offers(maps, near, news, 9)
+    assert cells_offered.cell[0, 0].tolist() == [4, 3, 2, 1, 0]
+    # 300 to 100 is 200, of which 100 count.
+    assert cells_offered.worth[0].tolist() == [[100, 61, 50, 30, 1], [0, 0, 0, 0, 0]]
+
+
+@pytest.mark.parametrize("limit", [5, 16, 20])
+def test_all_is_said_in_the_end(limit):
+    """One UAV knows old cells of never seen fire; it goes on, and its position changes."""
+    area = 30
+    messages, maps, near, stamp = two_uavs([4 * 9 + 1] * area, [4 * 10 + 1] * area, [[9, -1]] * 2)
+    maps.seen_fire[0, 0] = True
+    place = torch.zeros(1, 2, 2, 3)
+    for step in range(10, 200):
+        stamp[0, 0, 0] = step
+        talk(messages, maps, (stamp, place), (near, near), limit)
+        if limit >= PLACE_BYTES and step > 60:
+            assert step - stamp[0, 1, 0] < 60
+    assert maps.seen_fire[0, 1].all()
+
+
+def test_uavs_with_the_same_news_offer_different_cells():
+    uavs, area = 4, 40
+    maps = Knowledge(envs=1, uavs=uavs, area=area, horizon=403, fires=True)
+    maps.last_seen[0, :-1] = 80
+    near = torch.zeros(1, uavs, uavs, dtype=torch.bool)
+    near[0, -1, :-1] = True
+    messages = CellMessages(1, uavs, area, CELL_BYTES)
+    for news in (messages.compare(maps, near), None):
+        offered = offers(maps, near, news, 10).cell[0, :-1]
+        assert offered.tolist() == [[*range(10)], [*range(30, 40)], [*range(20, 30)]]
 
 
 def test_pairs_are_compared_in_parts(monkeypatch):
