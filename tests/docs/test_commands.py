@@ -119,7 +119,8 @@ def _train(rest: list[str]) -> list[str]:
 
 def _small(rest: list[str]) -> list[str]:
     """Returns the settings of a small training, which the chosen learner has."""
-    no_batch = {"learner=ippo", "learner=imitation", "setup=strong"} & {*rest}
+    first = {word.split(",")[0] for word in rest}
+    no_batch = {"learner=ippo", "learner=imitation", "setup=strong"} & first
     small = [word for word in SMALL if not no_batch or "batch_size" not in word]
     held = {"policy.hold=10", "setup=strong", "maps"} & {*rest}
     return [*small, "env.horizon=20"] if held else small
