@@ -115,7 +115,6 @@ class CellMessages(Buffers):
     def start_episodes(self, mask: Tensor) -> None:
         """Forgets the contacts in the environments of a mask, bool [envs]."""
         self.heard.masked_fill_(mask[:, None, None], False)
-        self.fresh.masked_fill_(mask[:, None, None], False)
 
     def saw(self, view: View) -> None:
         """Notes the cells that UAVs see at this step."""
@@ -139,9 +138,8 @@ class CellMessages(Buffers):
         linked = near.transpose(1, 2)[env, speaker]
         rows = linked.any(-1)
         env, speaker, cell = env[rows], speaker[rows], cell[rows]
-        newer = last[env, speaker, cell].unsqueeze(-1) > last[env, :, cell]
-        newer |= seen[env, speaker, cell].unsqueeze(-1) > seen[env, :, cell]
-        new_to = newer & linked[rows]
+        told = last[env, speaker, cell, None], seen[env, speaker, cell, None]
+        new_to = _is_new(told, (last[env, :, cell], seen[env, :, cell])) & linked[rows]
         news = new_to.any(-1)
         return News(env[news], speaker[news], cell[news], new_to[news])
 
@@ -150,9 +148,9 @@ class CellMessages(Buffers):
         for env, hearer, speaker in zip(
             *(x.split(_COMPARED) for x in met.nonzero(as_tuple=True)), strict=True
         ):
-            newer = last[env, speaker] > last[env, hearer]
-            newer |= seen[env, speaker] > seen[env, hearer]
-            pair, cell = newer.nonzero(as_tuple=True)
+            told = last[env, speaker], seen[env, speaker]
+            theirs = last[env, hearer], seen[env, hearer]
+            pair, cell = _is_new(told, theirs).nonzero(as_tuple=True)
             self.fresh[env[pair], speaker[pair], cell] = True
 
     def pass_on(
@@ -205,10 +203,19 @@ class CellMessages(Buffers):
         return self.size * count
 
 
+def _is_new(told: tuple[Tensor, Tensor], theirs: tuple[Tensor, Tensor]) -> Tensor:
+    """Returns whether looks are newer than theirs, or tell of fire that they do not know of, bool.
+
+    Args:
+        told, theirs: a map, integers, and whether cells were seen while they burned, bool.
+    """
+    return (told[0] > theirs[0]) | (told[1] > theirs[1])
+
+
 def could_tell(last: Tensor, seen: Tensor, near: Tensor, speaker: int) -> Tensor:
     """Returns what a UAV could tell the others in range, bool [envs, n, area]."""
-    told, told_seen = last[:, speaker : speaker + 1], seen[:, speaker : speaker + 1]
-    return near[:, :, speaker].unsqueeze(-1) & ((told > last) | (told_seen > seen))
+    told = last[:, speaker : speaker + 1], seen[:, speaker : speaker + 1]
+    return near[:, :, speaker].unsqueeze(-1) & _is_new(told, (last, seen))
 
 
 def _pass_on_dense(

@@ -13,12 +13,7 @@ from torchrl.data import Composite, Unbounded
 from emberlink.comm import _home
 from emberlink.comm._bandwidth import offers, said_within, worth_of_places
 from emberlink.comm._crops import LARGEST_SCALE, Crops
-from emberlink.comm._messages import (
-    CellMessages,
-    cell_bytes,
-    pass_on_places,
-    place_bytes,
-)
+from emberlink.comm._messages import CellMessages, cell_bytes, pass_on_places, place_bytes
 from emberlink.comm.base import CommModule
 from emberlink.envs import keys
 from emberlink.envs.config import WildfireConfig
@@ -185,11 +180,10 @@ class Maps(CommModule):
         if limit is not None:
             cells = offers(self.known, near, news, limit // sizes[0])
             places = worth_of_places(self.stamp, near)
-            said = said_within(limit, cells, places, self.sensor.area, sizes)
-            said_cells, said_places = said
+            area = self.sensor.area
+            said_cells, said_places = said_within(limit, cells, places, area, sizes)
         spoken = self.messages.pass_on(self.known, near, hears, news, said_cells)
-        links = near, hears
-        spoken += pass_on_places(self.stamp, self.place, *links, said_places, sizes[1])
+        spoken += pass_on_places(self.stamp, self.place, near, hears, said_places, sizes[1])
         self.said.copy_(spoken)
 
     def _draw(self, tensordict: TensorDictBase) -> None:

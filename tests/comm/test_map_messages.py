@@ -145,8 +145,8 @@ def test_what_fits_equals_a_greedy_choice(data):
     places = data.draw(st.lists(st.integers(0, 9), min_size=2, max_size=2))
     more = data.draw(st.integers(0, 3))
     order = sorted(range(area), key=lambda k: (-cells[k], k))[: limit // sizes[0] + more]
-    offered = Offers(torch.tensor([[[cells[k] for k in order]]]), torch.tensor([[order]]))
-    offered = Offers(*(x.long() for x in offered))
+    worths = [cells[k] for k in order]
+    offered = Offers(*torch.tensor([[[worths]], [[order]]], dtype=torch.int64))
     said = said_within(limit, offered, torch.tensor([[places]]), area, sizes)
     worth = {("cell", k): x for k, x in enumerate(cells) if x}
     worth |= {("place", k): x for k, x in enumerate(places) if x}

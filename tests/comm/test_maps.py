@@ -259,7 +259,7 @@ def chain(uavs: int, reach: float, limit: int | None):
 
 @pytest.mark.parametrize(("uavs", "reach"), [(2, 40.0), (24, 40.0), (24, 5.0)])
 def test_more_bytes_make_more_cells_known(uavs, reach):
-    limits = (0, 5, 15, 64, 100, None)
+    limits = (0, 5, 15, 20, 21, 64, 100, None)
     known = [(chain(uavs, reach, limit).known.last_seen >= 0).sum().item() for limit in limits]
     assert known == sorted(known)
     assert known[0] < known[1] < known[-1]  # 15 bytes are enough for two UAVs

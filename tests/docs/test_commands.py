@@ -122,7 +122,7 @@ def _small(rest: list[str]) -> list[str]:
     first = {word.split(",")[0] for word in rest}
     no_batch = {"learner=ippo", "learner=imitation", "setup=strong"} & first
     small = [word for word in SMALL if not no_batch or "batch_size" not in word]
-    held = {"policy.hold=10", "setup=strong", "maps"} & {*rest}
+    held = {"policy.hold=10", "setup=strong", "maps"} & first
     return [*small, "env.horizon=20"] if held else small
 
 
