@@ -7,6 +7,8 @@ from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
 from torchrl.collectors import Collector
 
+from emberlink.configs import known
+from emberlink.envs import keys
 from emberlink.trainers.build import build_env
 from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.rollout.collector import LockstepCollector
@@ -123,6 +125,38 @@ def test_no_step_leaves_the_device(method, setup, learner, watch, seeds):
             training.learn(next(rollouts))
     assert training.learner.updates > 4
     assert watched.found == []
+
+
+class OnGpu(TorchFunctionMode):
+    """Lets tensors on the CPU take the code paths of GPUs."""
+
+    def __torch_function__(self, func, types, args=(), kwargs=None):
+        if func == torch.Tensor.is_cuda.__get__:
+            return True
+        return func(*args, **(kwargs or {}))
+
+
+@pytest.mark.parametrize("limit", ["null", "40"])
+@pytest.mark.parametrize("world", [world for world in known("world") if world != "file"])
+def test_maps_on_the_paths_of_gpus(world, limit):
+    """No step of `maps` leaves the device, and all of it equals the paths of CPUs."""
+    settings = ["setup=tuned", f"world={world}", "env.horizon=25", "env.num_uavs=6"]
+    radio = ["env.measures=all", "env.radio.range=30", f"env.radio.bandwidth={limit}"]
+    config = resolve("maps", [*settings, *radio, "num_envs=2"])
+    about = {"num_envs": 2, "seed": 1, "fire": config.fire, "device": "cpu"}
+    ours, theirs = build_env(config, **about), build_env(config, **about)
+    one, two = ours.reset(), theirs.reset()
+    generator = torch.Generator().manual_seed(0)
+    for _ in range(20):
+        action = torch.rand(one[keys.POSITION].shape, generator=generator) * 2 - 1
+        one[keys.ACTION] = two[keys.ACTION] = action
+        with Waiting() as waiting, Elsewhere() as elsewhere, OnGpu():
+            one = ours.step(one)
+        two = theirs.step(two)
+        assert not waiting.found + elsewhere.found
+        assert (one == two).all()
+        one, two = ours.step_mdp(one), theirs.step_mdp(two)
+    assert two[keys.BYTES_SENT].sum() > 0
 
 
 def test_tensors_on_the_cpu_are_recorded():
