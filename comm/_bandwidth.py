@@ -38,21 +38,21 @@ def offers(known: Knowledge, near: Tensor, news: News | None, most: int) -> Offe
     assert seen is not None
     if news is None:
         return _offers_dense(last, seen, near, most)
-    env, speaker, cell, new_to = news
-    told, was_fire = last[env, speaker, cell, None], seen[env, speaker, cell, None]
-    gained = _gained(told, last[env, :, cell], was_fire & ~seen[env, :, cell])
-    worth = (gained * new_to).sum(-1)
+    told, entry, theirs = news
     envs, uavs, area = last.shape
-    row, most_worth = env * uavs + speaker, uavs * OLD
-    turned = _turned(cell, speaker, uavs, area)
+    was_fire = seen.take(told)[entry] & ~seen.take(theirs)
+    gained = _gained(last.take(told)[entry], last.take(theirs), was_fire)
+    worth = torch.zeros_like(told).index_add_(0, entry, gained)
+    row, cell, most_worth = told // area, told % area, uavs * OLD
+    turned = _turned(cell, row % uavs, uavs, area)
     order = ((row * most_worth + most_worth - worth) * area + turned).argsort()
     count = row.bincount(minlength=envs * uavs)  # the rows ascend, and sorting does not move them
     rank = torch.arange(len(row)) - (count.cumsum(0) - count)[row]
     best = rank < most
-    place, first = (env[best], speaker[best], rank[best]), order[best]
-    result = Offers(*torch.zeros(2, envs, uavs, min(most, int(count.max())), dtype=torch.int64))
+    place, first = (row[best], rank[best]), order[best]
+    result = Offers(*torch.zeros(2, envs * uavs, min(most, int(count.max())), dtype=torch.int64))
     result.worth[place], result.cell[place] = worth[first], cell[first]
-    return result
+    return Offers(*(x.unflatten(0, (envs, uavs)) for x in result))
 
 
 def worth_of_places(stamp: Tensor, near: Tensor) -> Tensor:

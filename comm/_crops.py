@@ -68,13 +68,13 @@ class Crops(Buffers):
         super().__init__()
         self.grid, self.pixels, self.scales, self.spread = grid, pixels, tuple(scales), spread
         fields = []
-        for age in range(horizon + 2):
+        ages = range(min(horizon, int(_OLD)) + 2)  # the bytes of older ones are those of the last
+        for age in ages:
             old, chance = age_byte(age) << _AGE, chance_byte(age) << _NEAR
             never = (_FULL << _AGE) + (_FULL << _NEAR)
             fields += [never, (1 << _BURNT_OUT) + old, (1 << _FIRE) + old, chance + old]
         self.register_buffer("_fields", torch.tensor(fields), persistent=False)
-        ages = torch.tensor([age_byte(age) for age in range(horizon + 2)])
-        self.register_buffer("_ages", ages, persistent=False)
+        self.register_buffer("_ages", torch.tensor([*map(age_byte, ages)]), persistent=False)
         edges = [
             [(pixel - pixels // 2) * scale - scale // 2 for pixel in range(pixels + 1)]
             for scale in scales

@@ -14,24 +14,26 @@ _COMPARED = 2**11
 
 
 class News(NamedTuple):
-    """The cells that are new to a UAV in range of the speaker."""
+    """The cells that are new to UAVs in range of the speaker.
 
-    env: Tensor
-    """int64 [k]"""
-    speaker: Tensor
-    """int64 [k]"""
-    cell: Tensor
-    """int64 [k]"""
-    new_to: Tensor
-    """bool [k, n], to which UAVs in range the cell is new"""
+    Entries of maps, [envs, n, area], are given by their index in the flat array.
+    """
+
+    told: Tensor
+    """int64 [k], the entries of the speakers; ascend"""
+    row: Tensor
+    """int64 [m], which of these is new to a UAV in range; ascends"""
+    theirs: Tensor
+    """int64 [m], the entry of the UAV to which it is new"""
 
 
-def cell_bytes(area: int, horizon: int) -> int:
+def cell_bytes(horizon: int) -> int:
     """Returns the bytes of a message about a cell.
 
-    They hold the index of the cell, the step of the last look, and what was seen (1 byte).
+    They hold the index of the cell (2 bytes), the step of the last look, and what was seen (1
+    byte).
     """
-    return bytes_of(area) + bytes_of(horizon + 1) + 1
+    return 2 + _bytes_of_step(horizon) + 1
 
 
 def place_bytes(horizon: int) -> int:
@@ -39,12 +41,11 @@ def place_bytes(horizon: int) -> int:
 
     They hold a UAV (2 bytes), a step, and three float32 numbers.
     """
-    return 2 + bytes_of(horizon + 1) + 12
+    return 2 + _bytes_of_step(horizon) + 12
 
 
-def bytes_of(count: int) -> int:
-    """Returns the bytes of one of `count` numbers: 2, or 4 if there are more than 65,536."""
-    return 2 if count <= 2**16 else 4
+def _bytes_of_step(horizon: int) -> int:
+    return 2 if horizon < 2**16 else 4
 
 
 def pass_on_places(
@@ -134,14 +135,13 @@ class CellMessages(Buffers):
         if last.is_cuda:
             return None
         self._meet(last, seen, near & ~self.heard)
-        env, speaker, cell = self.fresh.nonzero(as_tuple=True)
-        linked = near.transpose(1, 2)[env, speaker]
-        rows = linked.any(-1)
-        env, speaker, cell = env[rows], speaker[rows], cell[rows]
-        told = last[env, speaker, cell, None], seen[env, speaker, cell, None]
-        new_to = _is_new(told, (last[env, :, cell], seen[env, :, cell])) & linked[rows]
-        news = new_to.any(-1)
-        return News(env[news], speaker[news], cell[news], new_to[news])
+        told = self.fresh.view(-1).nonzero().squeeze(-1)
+        row, theirs = _heard_by(near, told, last.shape[2])
+        new = _is_new(
+            (last.take(told)[row], seen.take(told)[row]), (last.take(theirs), seen.take(theirs))
+        )
+        rows, row = row[new].unique_consecutive(return_inverse=True)
+        return News(told[rows], row, theirs[new])
 
     def _meet(self, last: Tensor, seen: Tensor, met: Tensor) -> None:
         """Notes the cells that are new to a UAV (row) which comes in range of another one."""
@@ -178,29 +178,47 @@ class CellMessages(Buffers):
         if news is None:
             self.heard.zero_()
             return self.size * _pass_on_dense(last, seen, near, hears, chosen)
-        env, speaker, cell, new_to = news
-        self.fresh.zero_()
+        told, row, theirs = news
+        area, fresh = last.shape[2], self.fresh.view(-1)
+        speaker = told // area
+        fresh.zero_()
+        said = speaker
         if chosen is not None:
-            said = chosen[env, speaker, cell]
-            self.fresh[env[~said], speaker[~said], cell[~said]] = True
-            env, speaker, cell, new_to = (x[said] for x in news)
-        count = torch.zeros(near.shape[:2], dtype=torch.int64)
-        count.index_put_((env, speaker), torch.ones_like(env), accumulate=True)
+            says = chosen.take(told)
+            fresh[told[~says]] = True
+            goes, said = says[row], speaker[says]
+            row, theirs = row[goes], theirs[goes]
         if near is not hears:
-            arrives = hears.transpose(1, 2)[env, speaker]
-            lost = (new_to & ~arrives).any(-1)
-            self.fresh[env[lost], speaker[lost], cell[lost]] = True
-            new_to = new_to & arrives
-        entry, hearer = new_to.nonzero(as_tuple=True)
-        env, speaker, cell = env[entry], speaker[entry], cell[entry]
-        number, was_fire = last[env, speaker, cell], seen[env, speaker, cell]
-        place = (env * last.shape[1] + hearer) * last.shape[2] + cell
-        last.view(-1).scatter_reduce_(0, place, number, "amax")
-        flat = seen.view(-1).view(torch.uint8)
-        flat.scatter_reduce_(0, place, was_fire.view(torch.uint8), "amax")
-        self.fresh.view(-1)[place] = True
+            uavs = near.shape[1]
+            arrives = hears.take(theirs // area * uavs + (speaker % uavs)[row])
+            fresh[told[row[~arrives]]] = True
+            row, theirs = row[arrives], theirs[arrives]
+        last.view(-1).scatter_reduce_(0, theirs, last.take(told)[row], "amax")
+        was_fire, flat = seen.take(told).view(torch.uint8)[row], seen.view(-1).view(torch.uint8)
+        flat.scatter_reduce_(0, theirs, was_fire, "amax")
+        fresh[theirs] = True
         self.heard.copy_(near)
-        return self.size * count
+        return self.size * said.bincount(minlength=near.shape[:2].numel()).view(near.shape[:2])
+
+
+def _heard_by(near: Tensor, told: Tensor, area: int) -> tuple[Tensor, Tensor]:
+    """Returns the entries of UAVs that are in range of speakers.
+
+    Args:
+        near: bool [envs, n, n], whether a UAV (row) is in range of another one (column).
+        told: int64 [k], entries of the speakers, see `News`.
+        area: cells of a map.
+
+    Returns:
+        For each UAV in range, which of the k entries it can hear, and its entry, int64 [m] each.
+    """
+    _, speaker, hearer = near.transpose(1, 2).nonzero(as_tuple=True)
+    shift = (hearer - speaker) * area
+    count = near.sum(1).view(-1)
+    first, count = ((x.take(told // area)) for x in (count.cumsum(0) - count, count))
+    row = torch.arange(len(told)).repeat_interleave(count)
+    link = torch.arange(len(row)) - (count.cumsum(0) - count - first).take(row)
+    return row, told.take(row) + shift.take(link)
 
 
 def _is_new(told: tuple[Tensor, Tensor], theirs: tuple[Tensor, Tensor]) -> Tensor:

@@ -1,6 +1,5 @@
 """Shared maps: UAVs keep maps of what they know, exchange them by radio, and look at them."""
 
-import math
 from typing import Annotated, Any, ClassVar
 
 import torch
@@ -88,7 +87,7 @@ class Maps(CommModule):
         # Steps are stored times 4, plus what was seen.
         last = 4 * world.horizon + 3
         self.known = Knowledge(envs=num_envs, uavs=uavs, area=area, horizon=last, fires=True)
-        size = cell_bytes(math.prod(world.grid), world.horizon)
+        size = cell_bytes(world.horizon)
         self.messages = CellMessages(num_envs, uavs, area, size)
         self.pictures = Crops(
             world.grid,

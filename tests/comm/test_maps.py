@@ -172,6 +172,7 @@ def test_a_disconnected_uav_learns_nothing_and_in_contact_everything():
         assert one[keys.SIGHT][0, 0].equal(two[keys.SIGHT][0, 0])
         for key in OBSERVED:
             assert one[key][0, 0].equal(two[key][0, 0])
+    met = []
     for env, last in observed:
         maps = env.transform.module
         assert maps.known.seen_fire[0, 1].any()
@@ -180,7 +181,9 @@ def test_a_disconnected_uav_learns_nothing_and_in_contact_everything():
         td = last
         while not td[keys.HEARS].all(-1).any() and not td[keys.HEARS].any():
             td = env.step(TensorDict({keys.ACTION: towards}, [1]))["next"]
+        met.append(td[keys.CROPS][0, 0])
         assert maps.known.last_seen[0, 0].equal(maps.known.last_seen[0, 1])
+        assert maps.known.seen_fire[0, 0].equal(maps.known.seen_fire[0, 1])
         assert (maps.known.last_seen[0, 0] >= alone.amax(1)[0]).all()
         assert maps.stamp[0, 0, 1] == td[keys.STEP]
         assert maps.place[0, 0, 1].equal(td[keys.POSITION][0, 1])
@@ -188,6 +191,7 @@ def test_a_disconnected_uav_learns_nothing_and_in_contact_everything():
         known = (alone >= 0).sum(-1)[0]
         assert td[keys.BYTES_SENT].min() > 16
         assert (td[keys.BYTES_SENT][0] <= 16 + 5 * (known + 40 * 25)).all()
+    assert not met[0].equal(met[1])
 
 
 def test_with_losses_and_a_limit_nothing_comes_from_a_uav_out_of_range():
