@@ -4,7 +4,7 @@ import logging
 import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, overload
 
@@ -28,6 +28,7 @@ from emberlink.trainers.training.trainer import Progress, Trainer
 Reference = str | os.PathLike[str]
 """a run folder, or a trained policy of emberlink: `pretrained:METHOD`, `pretrained:SETUP/METHOD` or
 `pretrained:SETUP/METHOD/SEED`"""
+_CHANGEABLE = ("env.", "comm.", "baselines", "evaluation.headline")
 
 
 @dataclass(frozen=True)
@@ -185,14 +186,14 @@ def load(
     fire = {key: settings.pop(key) for key in [*settings] if key.startswith("fire.")}
     there = in_world(trained, str(settings.pop("world", trained.world)), **fire)
     config = override(there, **settings)
-    changed = {key: getattr(config, key) for key in ("env", "comm", "baselines")}
-    evaluation = replace(there.evaluation, headline=config.evaluation.headline)
-    if replace(there, evaluation=evaluation, **changed) != config:
+    before, now = (flat(to_values(each)) for each in (there, config))
+    fixed = [key for key in now if not key.startswith(_CHANGEABLE) and before.get(key) != now[key]]
+    if fixed:
         raise UserError(
-            f"{', '.join(settings)}: only world, fire, headline and keys of env and comm can be "
+            f"{', '.join(fixed)}: only world, fire, headline and keys of env and comm can be "
             "changed"
         )
-    before, now = (flat(to_values(each)) for each in (trained, config))
+    before = flat(to_values(trained))
     changes = [
         f"{key}={shown(value)}"
         for key, value in now.items()

@@ -53,9 +53,14 @@ def load_actor(
     return actor.requires_grad_(False)
 
 
+def observes_place(config: RunConfig) -> bool:
+    """Returns whether a UAV observes where in the box it is; if not, the grid scales nothing."""
+    return config.env.observation != "sight" or config.comm.get("position", False)
+
+
 def _warn_of_other_units(config: RunConfig, trained: Mapping[str, Any]) -> None:
     """Warns of settings with which observed and flown distances mean something else."""
-    by_map = config.env.observation != "sight" or config.comm.get("position", False)
+    by_map = observes_place(config)
     here = to_values(config)["env"]
     differ = [
         f"env.{key}={shown(here[key])} (in training {shown(trained[key])})"

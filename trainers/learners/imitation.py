@@ -34,7 +34,7 @@ from emberlink.trainers.learners.base import (
 )
 from emberlink.trainers.learners.demonstrations import Demonstrations, DemonstrationSequences
 from emberlink.trainers.learners.off_policy.learner import OffPolicyLearner
-from emberlink.trainers.learners.off_policy.sequences import MISSING
+from emberlink.trainers.learners.off_policy.sequences import MISSING, fit_burn_in
 from emberlink.trainers.learners.tensors import (
     copy_into,
     group,
@@ -91,6 +91,7 @@ class Imitation(Learner):
     config_type = ImitationConfig
 
     def __init__(self, config: ImitationConfig, context: LearnerContext):
+        config = fit_burn_in(config, context.horizon)
         self.config, self.context, self.teams = config, context, len(context.seeds)
         self.guard = context.guard
         specs = context.observation_spec, context.action_spec
@@ -131,7 +132,10 @@ class Imitation(Learner):
         """Returns new actors of the learner `actor_of`."""
         learner = registry.find(config.actor_of, "learner.actor_of")
         if issubclass(learner, cls):
-            raise UserError(f"learner.actor_of={config.actor_of}: has no actors of its own")
+            others = ", ".join(name for name in registry.known() if name != config.actor_of)
+            raise UserError(
+                f"learner.actor_of={config.actor_of}: has no actors of its own; known: {others}"
+            )
         return learner.make_actor(config, observation_spec, action_spec, generator, policy)
 
     def _advance(self, decisions: int) -> None:

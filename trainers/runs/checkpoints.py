@@ -3,6 +3,7 @@
 import re
 from collections.abc import Mapping
 from contextlib import suppress
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ from torch import Tensor
 from emberlink.envs.utils import atomic_io
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import shown
+from emberlink.policies.settings import PolicyConfig
 from emberlink.trainers.config.overrides import flat
 from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.learners.base import ACTOR
@@ -165,7 +167,9 @@ def _trained_with(header: Mapping[str, Any], config: RunConfig | None) -> str:
     """Returns the settings of networks that differ from those of a checkpoint, for a message."""
     if config is None or not isinstance(header.get("config"), Mapping):
         return ""
-    before, now = flat(header["config"]), flat(to_header(config))
+    # Checkpoints before the memories have no settings of the policy; they have those of today.
+    before = flat({"policy": asdict(PolicyConfig())}) | flat(header["config"])
+    now = flat(to_header(config))
     keys = [*_OF_NETWORKS, *(key for key in before if key.startswith("comm."))]
     differ = {
         key: f"{key}={shown(before[key])}" + (f" (now {shown(now[key])})" if key in now else "")
@@ -184,15 +188,22 @@ def _check_header(path: Path, header: Mapping[str, Any], config: RunConfig) -> N
         raise UserError(f"{path}: a state of a training; expected networks, such as {name}")
     for name in ("method",) if _flies_in_any_team(config) else ("method", "uavs"):
         if header.get(name, expected[name]) != expected[name]:
+            reason = "" if name == "method" else _why_not_any_team(config)
             raise UserError(
                 f"{path}: a checkpoint of {name}={shown(header[name])}; "
-                f"this configuration has {name}={expected[name]}"
+                f"this configuration has {name}={expected[name]}{reason}"
             )
 
 
 def _flies_in_any_team(config: RunConfig) -> bool:
     """Returns whether the weights do not depend on the number of UAVs, apart from observations."""
     return config.learner.share_parameters and not config.policy.agent_index
+
+
+def _why_not_any_team(config: RunConfig) -> str:
+    if config.policy.agent_index:
+        return " (env.num_uavs), and its networks read the index of a UAV (policy.agent_index)"
+    return " (env.num_uavs), and each UAV has networks of its own (learner.share_parameters=false)"
 
 
 def _network_header(config: RunConfig, step: int) -> dict[str, Any]:

@@ -1,7 +1,7 @@
 """Runs `emberlink train`: trains, shows the progress, evaluates."""
 
 import shlex
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
 
@@ -115,12 +115,29 @@ def _announce(trainer: Trainer, overrides: Sequence[str], console: Console) -> N
                 f"emberlink eval {shlex.quote(str(trainer.run.path))}",
                 soft_wrap=True,
             )
-    elif not _learns(trainer):
-        console.print(
-            "note: a first batch needs more transitions than this run collects: "
-            "nothing will be learnt",
-            style="yellow",
-            soft_wrap=True,
+    else:
+        for note in _notes(trainer):
+            console.print(f"note: {note}", style="yellow", soft_wrap=True)
+
+
+def _notes(trainer: Trainer) -> Iterator[str]:
+    """Yields what a user might not expect of a training."""
+    config = trainer.config
+    learner, world = config.learner, config.env
+    if not _learns(trainer):
+        yield (
+            "a first batch needs more transitions than this run collects: nothing will be learnt"
+        )
+    if config.replay == "shared" and config.comm["name"] == "no_comm" and not learner.replays:
+        yield (
+            f"learner={learner.name} has no replay buffer to share: {config.method} trains as "
+            "independent does"
+        )
+    squashes = config.policy.memory != "none" or not learner.replays
+    if squashes and world.observation_scale == "raw" and world.observation != "sight":
+        yield (
+            "env.observation_scale=raw: the first layer of these networks has a tanh, which "
+            "saturates with numbers of cells and steps; env.observation_scale=box scales them"
         )
 
 

@@ -9,7 +9,7 @@ from emberlink.envs.utils.validation import shown
 from emberlink.trainers.config.compose import to_values
 from emberlink.trainers.config.overrides import flat
 from emberlink.trainers.config.schema import RunConfig
-from emberlink.trainers.evaluation.actor import UNITS
+from emberlink.trainers.evaluation.actor import UNITS, observes_place
 from emberlink.trainers.learners.base import ACTOR, Learner
 from emberlink.trainers.runs.checkpoints import load_weights
 from emberlink.trainers.runs.pretrained import find_one, is_name
@@ -62,10 +62,11 @@ def start(learner: Learner, config: RunConfig) -> None:
 def _warn_of_other_observations(name: str, theirs: RunConfig, mine: RunConfig) -> None:
     """Warns of settings that give the same observations another meaning."""
     before, now = flat(to_values(theirs)), flat(to_values(mine))
+    kept = () if observes_place(mine) else ("env.grid",)
     more = ("env.base",) if mine.env.observation == "sight" else ()  # maps show the base
     more += ("env.radio.",) if registry.find(mine.comm["name"]).hears else ()
     for key in (key for key in now if key.startswith(_OBSERVED + more) and key in before):
-        if before[key] != now[key]:
+        if before[key] != now[key] and key not in kept:
             warnings.warn(
                 f"learner.warm_start={name}: its actors were trained with {key}="
                 f"{shown(before[key])}, this run has {shown(now[key])}",

@@ -235,6 +235,32 @@ def test_a_batch_that_is_never_filled_gives_a_warning(tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
+    ("method", "setup", "more", "notes"),
+    [
+        ("shared_memory", "tuned", ["learner=mappo"], ["learner=mappo has no replay buffer"]),
+        ("shared_memory", "paper", ["learner=ippo"], ["learner=ippo has", "scale=raw"]),
+        ("independent", "paper", ["learner=ippo"], ["env.observation_scale=raw: the first layer"]),
+        ("consensus", "released", ["policy.memory=gru"], ["env.observation_scale=raw: the"]),
+        ("consensus", "paper", ["learner=ippo", "env.observation_scale=box"], []),
+        ("shared_memory", "paper", [], []),
+        ("consensus", "tuned", ["learner=mappo"], []),
+        ("maps", "paper", ["learner=mappo"], []),
+    ],
+)
+def test_notes_of_a_training(method, setup, more, notes, tmp_path, capsys):
+    small = [text for text in TINY if not text.startswith(("setup=", "learner."))]
+    small += [f"setup={setup}", "learner.hidden=[8]", f"output={tmp_path}"]
+    replays = not any("ppo" in text for text in more)
+    small += (
+        ["learner.batch_size=4", "learner.sequence=4"] if replays else ["learner.minibatches=1"]
+    )
+    assert main.main(["train", method, *small, *more]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert said.count("note: ") == len(notes), said
+    assert all(note in said for note in notes)
+
+
+@pytest.mark.parametrize(
     "arguments",
     [
         ["eval", "x" * 300],

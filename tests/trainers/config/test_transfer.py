@@ -157,7 +157,11 @@ def test_scripted_policies_can_be_chosen(scripted, names, run, capsys):
             "fire=front",
             "can change the world and its fire, evaluation.scripted, evaluation.headline, and keys",
         ),
-        ("world=swarm", "a checkpoint of uavs=2; this configuration has uavs=24"),
+        (
+            "world=swarm",
+            "a checkpoint of uavs=2; this configuration has uavs=24 (env.num_uavs), and each UAV "
+            "has networks of its own (learner.share_parameters=false)",
+        ),
     ],
 )
 def test_worlds_that_a_run_cannot_be_evaluated_in(setting, said, run, capsys):
@@ -193,8 +197,9 @@ def test_a_training_state_is_not_evaluated(run, capsys):
 
 
 def test_the_api_names_what_can_be_changed(run):
-    with pytest.raises(UserError, match="only world, fire, headline and keys of env and comm"):
-        trainers.load(run, world="front", seed=2)
+    said = r"^seed, policy\.hold: only world, fire, headline and keys of env and comm"
+    with pytest.raises(UserError, match=said):
+        trainers.load(run, world="front", seed=2, horizon=20, **{"policy.hold": 2})
 
 
 def test_a_run_is_evaluated_on_a_fire_of_a_file(run, tmp_path):

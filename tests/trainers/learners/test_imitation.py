@@ -285,6 +285,22 @@ def test_actors_of_a_run_on_a_device_that_is_not_here(imitated, tmp_path):
     Trainer(resolve("maps", settings("ippo", *more))).start()
 
 
+def test_another_grid_is_warned_of_where_positions_are_observed(imitated, tmp_path):
+    start = [f"learner.warm_start={imitated['ippo']}", "env.grid=[40,40]"]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", UserWarning)
+        Trainer(resolve("maps", settings("ippo", *start, f"output={tmp_path}"))).start()
+
+
+def test_an_old_checkpoint_has_no_memory(tmp_path, capsys):
+    """The networks of `tuned` were written before there were settings of the policy."""
+    start = ["learner.warm_start=pretrained:tuned/independent/s0", "policy.memory=gru"]
+    arguments = ["train", "independent", "setup=tuned", *start, f"output={tmp_path}"]
+    assert main.main(arguments) == 2
+    said = " ".join(capsys.readouterr().err.split())
+    assert "it was trained with policy.memory=none (now gru)" in said
+
+
 def test_actors_of_another_network_are_refused(imitated, tmp_path, capsys):
     start = f"learner.warm_start={imitated['ddpg']}"
     arguments = ["train", "maps", *settings("ippo", start), f"output={tmp_path}"]

@@ -118,7 +118,8 @@ def test_weights_with_an_agent_index_fit_one_team_only(tmp_path, capsys):
     run = trained(tmp_path, "policy.agent_index=true")
     capsys.readouterr()
     assert main.main(["eval", str(run), "env.num_uavs=3", "--fires", "1"]) == 2
-    assert "uavs=2; this configuration has uavs=3" in " ".join(capsys.readouterr().err.split())
+    error = " ".join(capsys.readouterr().err.split())
+    assert "this configuration has uavs=3 (env.num_uavs), and its networks read the index" in error
 
 
 def test_observations_of_positional_fit_one_team_only(tmp_path, capsys):

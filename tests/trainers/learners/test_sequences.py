@@ -137,6 +137,19 @@ def test_a_burn_in_is_shorter_at_the_beginning(burn_in):
     assert (agents["alive"][:, 0].sum(1) == 1)[first == 5].all()
 
 
+@pytest.mark.parametrize("learner", ["ddpg", "imitation"])
+def test_no_burn_in_is_longer_than_an_episode(learner):
+    """Decisions before the beginning of an episode of 12 decisions are not computed."""
+    method = "maps" if learner == "imitation" else "consensus"
+    more = ["learner.samples=8", "policy.hold=1"] if method == "maps" else []
+    given = [text for text in SMALL if method != "maps" or "batch_size" not in text]
+    settings = [f"learner={learner}", *given, "learner.burn_in=1000000", *more]
+    setup = TrainingSetup(resolve(method, settings))
+    setup.dry_run(24)
+    assert setup.learner.updates > 0
+    assert setup.learner.replay.burn_in == setup.learner.config.burn_in == 11
+
+
 @pytest.mark.parametrize(
     ("given", "message"),
     [

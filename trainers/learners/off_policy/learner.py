@@ -30,7 +30,7 @@ from emberlink.trainers.learners.off_policy.config import OffPolicyConfig
 from emberlink.trainers.learners.off_policy.networks import SequenceActor, with_taken
 from emberlink.trainers.learners.off_policy.networks import critics as make_critics
 from emberlink.trainers.learners.off_policy.replay_buffer import DONE, TERMINATED, ReplayMemory
-from emberlink.trainers.learners.off_policy.sequences import MISSING, SequenceMemory
+from emberlink.trainers.learners.off_policy.sequences import MISSING, SequenceMemory, fit_burn_in
 from emberlink.trainers.learners.tensors import (
     copy_into,
     group,
@@ -48,6 +48,7 @@ class OffPolicyLearner(Learner):
     """name of the critic in TorchRL's loss: "value" or "qvalue\""""
 
     def __init__(self, config: OffPolicyConfig, context: LearnerContext):
+        config = fit_burn_in(config, context.horizon)
         self.config, self.teams = config, len(context.seeds)
         self._observed: list[Any] = keys.observation_keys(context.observation_spec)
         self.guard, self._remembers = context.guard, context.policy.memory != "none"

@@ -1,5 +1,6 @@
 """Samples sequences of decisions, from which networks with a memory learn."""
 
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -14,6 +15,14 @@ from emberlink.trainers.learners.off_policy.samplers import SequenceSampler, Tea
 
 MISSING = (keys.AGENTS, "missing")
 """int64 [batch, uavs]: decisions that a burn-in lacks, because its episode begins later"""
+
+
+def fit_burn_in(config: Any, horizon: int) -> Any:
+    """Returns a learner's configuration with a burn-in of fewer decisions than an episode has.
+
+    Decisions before the beginning of an episode would be computed and have no effect.
+    """
+    return replace(config, burn_in=min(config.burn_in, horizon - 1))
 
 
 class SequenceMemory(ReplayMemory):

@@ -33,3 +33,7 @@ class OnPolicyConfig(WarmStartConfig):
     """weight of the entropy of the actions in the actors' loss"""
     log_std: Annotated[float, Field(ge=-10, le=2)] = -0.5
     """logarithm of the standard deviation of the actions at the beginning, also of a warm start"""
+
+    @property
+    def replays(self) -> bool:
+        return False
