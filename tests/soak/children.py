@@ -33,6 +33,7 @@ LEARNERS = {
     "mappo": ["learner=mappo", "policy.memory=stack", "policy.hold=2"],
     "mappo-map": ["learner=mappo", "policy.memory=gru", "learner.critic_map=true"],
 }
+IMITATION = ["learner=imitation", "learner.samples=8", "learner.buffer_size=60"]
 METHODS = ("independent", "shared_memory", "positional", "consensus")
 
 
@@ -130,7 +131,7 @@ def watch_saves(say: Callable[[str], None], die_at: tuple[str, int] | None) -> N
 
 def training(method: str, learner: str, output: Path, die_at: tuple[str, int] | None = None):
     """Starts a run, or resumes an existing one, and trains to the end."""
-    settings = [*BASE, *LEARNERS[learner], f"episodes={EPISODES}"]
+    settings = [*BASE, *(LEARNERS.get(learner) or IMITATION), f"episodes={EPISODES}"]
 
     def work(say: Callable[[str], None]) -> int:
         watch_saves(say, die_at)
@@ -157,7 +158,7 @@ def kill_until_finished(
 
     Args:
         method: name of the method.
-        learner: name of the learner, one of `LEARNERS`.
+        learner: name of the learner, one of `LEARNERS` or "imitation".
         folder: an empty folder.
         draw: random numbers for the times.
         kills: maximum number of kills.
@@ -230,7 +231,8 @@ def reference(method: str, learner: str, folder: Path) -> dict[str, bytes]:
 def kill_trials(folder: Path, kills: int, seed: int) -> tuple[int, list[str]]:
     """Kills runs of all methods with all learners `kills` times in total.
 
-    The first six runs are of all methods and all learners, the first 24 of all pairs.
+    The first six runs are of all methods and all learners, the seventh is an imitation; the first
+    25 are of all pairs and an imitation.
 
     Returns:
         The number of kills and the failures.
@@ -239,8 +241,13 @@ def kill_trials(folder: Path, kills: int, seed: int) -> tuple[int, list[str]]:
     references: dict[tuple[str, str], dict[str, bytes]] = {}
     most = min(8, max(1, kills // len(LEARNERS)))
     names, cycle = [*LEARNERS], math.lcm(len(METHODS), len(LEARNERS))
+    recipes = [
+        (METHODS[n % len(METHODS)], names[(n + n // cycle) % len(names)])
+        for n in range(len(METHODS) * len(LEARNERS))
+    ]
+    recipes.insert(len(LEARNERS), ("maps", "imitation"))
     while done < kills:
-        recipe = METHODS[number % len(METHODS)], names[(number + number // cycle) % len(names)]
+        recipe = recipes[number % len(recipes)]
         if recipe not in references:
             references[recipe] = reference(*recipe, folder / f"reference_{'_'.join(recipe)}")
         here = folder / f"kill_{number}"
