@@ -83,7 +83,7 @@ class Crops(Buffers):
 
     @property
     def shape(self) -> tuple[int, int, int, int]:
-        """Scales, channels, and pixels along both sides."""
+        """The shape of pictures: scales, channels, and pixels along both sides."""
         return len(self.scales), len(CHANNELS), self.pixels, self.pixels
 
     def draw(

@@ -85,9 +85,9 @@ class CellMessages(Buffers):
     that it was seen while it burned. A map holds 4 times the step of the last look plus what was
     seen (1 for fire), -1 for never.
 
-    Between UAVs in contact, only cells can be new that a UAV saw at this step, was told at the step
-    before, had no bytes left to say, or said without being heard. So whole maps are compared only
-    where a UAV was not in range of another one at the step before.
+    Between UAVs in contact, a cell can be new only if a UAV saw it at this step, was told it at the
+    step before, had no bytes left to say it, or said it without being heard. So whole maps are
+    compared only where a UAV was not in range of another one at the step before.
 
     Args:
         envs: number of environments.
@@ -222,10 +222,11 @@ def _heard_by(near: Tensor, told: Tensor, area: int) -> tuple[Tensor, Tensor]:
 
 
 def _is_new(told: tuple[Tensor, Tensor], theirs: tuple[Tensor, Tensor]) -> Tensor:
-    """Returns whether looks are newer than theirs, or tell of fire that they do not know of, bool.
+    """Returns whether what is told is newer than what others know, or tells of fire new to them.
 
     Args:
-        told, theirs: a map, integers, and whether cells were seen while they burned, bool.
+        told, theirs: maps of the speakers and of the others, integers, and whether cells were seen
+            while they burned, bool.
     """
     return (told[0] > theirs[0]) | (told[1] > theirs[1])
 

@@ -1,4 +1,4 @@
-"""Shared maps: UAVs keep maps of what they know, exchange them by radio, and look at them."""
+"""Keeps maps of what UAVs know, which they exchange by radio and look at."""
 
 from typing import Annotated, Any, ClassVar
 
@@ -47,10 +47,11 @@ class MapsConfig:
 class Maps(CommModule):
     """Keeps a map per UAV of what it saw and was told, and shows it to the UAV as pictures.
 
-    At each step, a UAV says to those in range what is new to one of them: cells, and positions of
-    UAVs; with a limit of bytes, what is worth most of it. What it hears it can pass on at the next
-    step. A UAV observes its altitude, the time and pictures of its own map (`Crops`). With a limit,
-    what it receives may depend on what another UAV in range of the sender knows.
+    At each step, a UAV says to those in range the cells, and the positions of UAVs, that are new to
+    one of them. With a limit of bytes, it says what is worth most first. It can pass on what it
+    hears at the next step. A UAV observes its altitude, the time and pictures of its own map
+    (`Crops`). With a limit, what it receives may depend on what another UAV in range of the sender
+    knows.
 
     With `home` and a base, a UAV leaves for its place in a chain of radios from the base to the
     fire that it knows when it would otherwise come too late (`steer`).

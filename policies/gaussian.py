@@ -27,7 +27,7 @@ LOG_PROB = (keys.AGENTS, "action_log_prob")
 class MemoryActor(TensorDictModuleBase):
     """Writes the mean action of each UAV, clipped to [-1, 1], and the new state of its memory.
 
-    The memory is empty at step 0 of an episode, and without a state in the TensorDict.
+    The memory is empty at step 0 of an episode, and if the TensorDict holds no state of it.
 
     Args:
         network: the actors of all UAVs; its `step` gives mean actions and the memory's state.

@@ -32,7 +32,7 @@ class WarmStartConfig(LearnerConfig):
 
 
 class Anchor:
-    """Keeps a frozen copy of actors, whose actions the learned actors may leave at a cost.
+    """Keeps a frozen copy of actors, and adds a loss where the learned actors act differently.
 
     Args:
         network: the actors of all seeds.

@@ -18,7 +18,7 @@ from emberlink.policies.scripted.registry import SCRIPTED
 
 
 class KnownMaps:
-    """The maps of method `maps`, in the form in which scripted policies read maps.
+    """Shows the maps of method `maps` in the form that scripted policies read.
 
     The policy of a UAV also knows the targets of those that it hears at a step. Such a target may
     follow from a map that reaches the UAV one step later, or not at all with

@@ -93,7 +93,7 @@ class SequenceMemory(ReplayMemory):
         observed, following = {}, {}
         for _, name in self._keys:
             observed[name] = sample.get(name).transpose(1, 2)
-            # The transition of a missing burn-in does not lead to the first observation.
+            # "next" of a decision that the burn-in lacks is not the first observation.
             before = observed[name][:, :, : past + 1]
             following[name] = torch.cat((before, self._learnt(sample, ("next", name))), 2)
         agents = {**observed, "action": self._learnt(sample, "action"), MISSING[1]: missing}

@@ -13,9 +13,9 @@ _KEPT = 0.9
 class Advantages:
     """Estimates advantages (GAE, Schulman et al. 2016), and scales them and the returns.
 
-    The horizon truncates an episode, and does not end the world: the value of the last observation
-    stands for what would follow. The same holds for a UAV that fails: its last decision before is
-    followed by the value of what it then observed.
+    The horizon truncates an episode and does not end the world: the value of the last observation
+    stands for what would follow. The episode of a UAV that fails is truncated there, too: the value
+    of the observation after its last decision stands for what would follow.
 
     Args:
         gamma: discount per decision.
