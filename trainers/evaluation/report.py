@@ -59,7 +59,9 @@ def evaluate_run(
             config,
             actor,
             fires=fires,
-            report=lambda fire, policy: report(f"{policy} on {fires} fires of {fire}"),
+            report=lambda fire, policy: report(
+                f"{policy} on {fires} fire{'s' * (fires > 1)} of {fire}"
+            ),
             watch=watched_by(recorder.add, camera.add),
         )
         shown = Shown(title=title_of(config, *about), recording=recorder.recording())

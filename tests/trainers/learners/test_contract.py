@@ -43,9 +43,19 @@ CASES = {
     "mappo-gru": ["learner=mappo", "policy.memory=gru", "policy.hold=10"],
     "mappo-map": ["learner=mappo", "learner.critic_map=true", "policy.hold=4"],
     "ippo-own": ["learner=ippo", "policy.memory=gru", "learner.share_parameters=false"],
+    "imitation": ["learner=imitation", "policy.hold=5", "learner.samples=8"],
+    "imitation-gru": [
+        *("learner=imitation", "policy.memory=gru", "policy.hold=2", "learner.samples=8"),
+        *("learner.sequence=4", "learner.burn_in=3"),
+    ],
 }
-IN_CI = {"ddpg", "td3", "ippo", "mappo", "ddpg-gru", "mappo-gru"}
+IN_CI = {"ddpg", "td3", "ippo", "mappo", "ddpg-gru", "mappo-gru", "imitation-gru"}
 EACH = [case if case in IN_CI else pytest.param(case, marks=pytest.mark.heavy) for case in CASES]
+
+
+def method_of(case: str, method: str = "consensus") -> str:
+    """Returns the method of a case: imitation has a teacher for `maps` only."""
+    return "maps" if case.startswith("imitation") else method
 
 
 @pytest.fixture(scope="module")
@@ -55,7 +65,8 @@ def trained(tmp_path_factory):
     @cache
     def of(case: str) -> Path:
         folder = tmp_path_factory.mktemp(case)
-        assert main.main(["train", "consensus", *SMALL, *CASES[case], f"output={folder}"]) == 0
+        arguments = [method_of(case), *SMALL, *CASES[case], f"output={folder}"]
+        assert main.main(["train", *arguments]) == 0
         (run,) = folder.iterdir()
         return run
 
@@ -71,7 +82,10 @@ def test_a_run_trains_and_its_evaluation_can_be_repeated(case, trained, capsys):
     lines = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
     assert len(lines) == 2
     for line in lines:
-        assert line.keys() >= {"loss_actor", "loss_critic", "coverage", "huygens/coverage"}
+        losses = {key for key in line if key.startswith("loss_")}
+        imitates = case.startswith("imitation")
+        assert losses >= ({"loss_imitation"} if imitates else {"loss_actor", "loss_critic"})
+        assert line.keys() >= {"coverage", "huygens/coverage"}
     before = json.loads((run / "eval.json").read_text())["results"]
     assert main.main(["eval", str(run)]) == 0
     assert json.loads((run / "eval.json").read_text())["results"] == before
@@ -126,10 +140,10 @@ def test_an_episode_that_begins_again_forgets_the_one_before(case, trained):
     assert acted[MEMORY].any()
 
 
-FOUR = pytest.param(["ddpg", "td3", "ippo", "mappo"], marks=pytest.mark.heavy)
+ALL = pytest.param(["ddpg", "td3", "ippo", "mappo", "imitation"], marks=pytest.mark.heavy)
 
 
-@pytest.mark.parametrize("cases", [FOUR, ["ddpg-gru", "ippo"]])
+@pytest.mark.parametrize("cases", [ALL, ["ddpg-gru", "ippo"]])
 def test_runs_of_all_learners_are_rendered_and_compared(cases, trained, tmp_path, capsys):
     """A page shows the first episode of the evaluation."""
     runs = [trained(case) for case in cases]
@@ -170,7 +184,8 @@ SIDE_BY_SIDE = [case for case in CASES if case != "ddpg"]  # that of ddpg is in 
 @pytest.mark.heavy
 @pytest.mark.parametrize("case", SIDE_BY_SIDE)
 def test_seeds_side_by_side_learn_the_same_as_alone(case, tmp_path):
-    settings = ["train", "independent", *SMALL, *CASES[case], "evaluation.interval=0"]
+    method = method_of(case, "independent")
+    settings = ["train", method, *SMALL, *CASES[case], "evaluation.interval=0"]
     assert main.main([*settings, "seeds=[3,11]", f"output={tmp_path / 'both'}"]) == 0
     both = sorted((tmp_path / "both").iterdir(), key=lambda run: RunFolder(run).config().seed)
     for seed, run in zip((3, 11), both, strict=True):
