@@ -155,7 +155,10 @@ def test_no_burn_in_is_longer_than_an_episode(learner):
     [
         (["learner.sequence=13"], "learner.sequence=13: an episode has 12 decisions"),
         (["policy.hold=4"], "learner.sequence=4: an episode has 3 decisions"),
-        (["learner.buffer_size=19"], "learner.buffer_size=19: holds 3 decisions of 2 environments"),
+        (
+            ["learner.buffer_size=19"],
+            "learner.buffer_size=19: shared by 3 UAVs, holds 3 decisions of 2 environments",
+        ),
         (["learner.critic=both"], "learner.critic=both: should be 'own' or 'team'"),
     ],
 )

@@ -53,8 +53,9 @@ class SequenceMemory(ReplayMemory):
         # At least one sequence fits while the buffer is full, whatever decision is overwritten.
         wanted = burn_in + 2 * sequence - 1
         if held < min(wanted, context.total_steps):
+            shared = f"shared by {context.num_uavs} UAVs, " if context.shared_replay else ""
             raise UserError(
-                f"learner.buffer_size={more['buffer_size']}: holds {held} decisions of "
+                f"learner.buffer_size={more['buffer_size']}: {shared}holds {held} decisions of "
                 f"{context.num_envs} environments; {wanted} are needed for learner.burn_in="
                 f"{burn_in} and learner.sequence={sequence}"
             )
