@@ -39,6 +39,11 @@ def iqm(values: Values, axis: int = -1) -> Any:
     return stats.trim_mean(values, 0.25, axis=axis)
 
 
+def iqm_difference(first: Values, second: Values, axis: int = -1) -> Any:
+    """Returns the interquartile mean of `first` minus that of `second`."""
+    return iqm(first, axis) - iqm(second, axis)
+
+
 def probability_of_improvement(first: Values, second: Values, axis: int = -1) -> Any:
     """Returns the probability that a value of `first` is above one of `second`; ties count half.
 

@@ -1,11 +1,15 @@
 """Computes the numbers of a section: rankings by measure, verdicts and training curves."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from itertools import zip_longest
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
 from emberlink.envs import metrics
+from emberlink.envs.utils.errors import UserError
+from emberlink.envs.utils.validation import unknown
 from emberlink.trainers.comparison import bootstrap
 from emberlink.trainers.comparison.bootstrap import Interval
 from emberlink.trainers.comparison.claims import Verdict, verdicts
@@ -14,6 +18,8 @@ from emberlink.trainers.comparison.groups import Group, Section
 from emberlink.trainers.comparison.scripted import REWARD, Scripted, different_rewards, scripted
 from emberlink.trainers.evaluation.evaluate import HELD_OUT_SCENARIO
 from emberlink.trainers.evaluation.results import CURVES, LEARNED
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -62,6 +68,18 @@ class Ranking:
     not_ranked: str = ""
 
 
+class Difference(NamedTuple):
+    """The difference between the IQMs of two groups, first minus second.
+
+    Attributes:
+        value: the difference.
+        interval: its interval; None if a group has only one seed.
+    """
+
+    value: float
+    interval: Interval | None
+
+
 @dataclass(frozen=True)
 class Curve:
     """A measure of the exploring policy at every episode of training.
@@ -101,6 +119,34 @@ class Numbers:
         """The rankings on the training fire; empty if it was not evaluated."""
         return self.fires.get(self.section.trained_on, [])
 
+    def difference(self, first: str, second: str, measure: str, fire: str) -> Difference:
+        """Returns by how much the IQM of a group is above that of another, with its interval.
+
+        Args:
+            first, second: labels of the groups; the second is subtracted.
+            measure: a name in `metrics.ALL`.
+            fire: fire of the evaluation.
+
+        Raises:
+            UserError: a name is not known, the measure is not ranked, or both groups are
+                evaluations of the same runs, which are not independent samples.
+        """
+        rankings = _known("fire", fire, self.fires)
+        ranking = _known("measure", measure, {r.measure: r for r in rankings})
+        if ranking.not_ranked:
+            raise UserError(f"{measure} has no differences: {ranking.not_ranked}")
+        groups = {group.label: group for group in self.section.groups}
+        pair = [_known("method", label, groups) for label in (first, second)]
+        if _same_trainings(*pair):
+            raise UserError(f"{first!r} and {second!r} are evaluations of the same runs")
+        rows = {row.method: row for row in ranking.rows}
+        a, b = rows[first], rows[second]
+        if a.iqm < b.iqm:  # The resamples depend on the order, so the higher is always the first.
+            value, ends = self.difference(second, first, measure, fire)
+            return Difference(-value, ends and (-ends[1], -ends[0]))
+        ends = bootstrap.interval(bootstrap.iqm_difference, a.values, b.values)
+        return Difference(a.iqm - b.iqm, ends)
+
 
 def numbers(section: Section) -> Numbers:
     """Computes the rankings, verdicts and curves of a section."""
@@ -132,6 +178,13 @@ def measures(section: Section, fire: str) -> list[str]:
         if all(name in run.evaluation.results[fire][LEARNED] for run in section.runs)
     ]
     return sorted(known, key=lambda name: (name == REWARD, name != headline))
+
+
+def _known(what: str, name: str, known: Mapping[str, T]) -> T:
+    """Returns the entry with a name; raises a UserError if there is none."""
+    if name not in known:
+        raise UserError(f"{what} {unknown(name, known)}")
+    return known[name]
 
 
 def _ranking(section: Section, fire: str, measure: str, notes: list[str]) -> Ranking:

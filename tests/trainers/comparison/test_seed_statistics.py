@@ -13,6 +13,7 @@ from emberlink.trainers.comparison.bootstrap import (
     band,
     interval,
     iqm,
+    iqm_difference,
     iqm_ratio_share,
     probability_of_improvement,
 )
@@ -66,6 +67,14 @@ def test_probability_of_improvement_by_hand(sample, reference, expected):
         probability_of_improvement(np.asarray(sample, float), np.asarray(reference, float))
         == expected
     )
+
+
+def test_difference_of_iqms_by_hand():
+    # Of 5 and 4 values, the lowest and the highest are left out.
+    first, second = np.array([9.0, 0, 4, 5, 100]), np.array([[9.0], [2], [1], [-50]])
+    assert iqm_difference(first, second[:, 0]) == 6 - 1.5
+    assert iqm_difference(second[:, 0], first) == 1.5 - 6
+    np.testing.assert_array_equal(iqm_difference(first[:, None], second, axis=0), [4.5])
 
 
 @settings(deadline=None)
@@ -123,6 +132,18 @@ def test_interval_resamples_within_each_method():
     # Resampling both together would give the ends 0 and 1.
     apart = interval(probability_of_improvement, [1.0, 2.0, 3.0], [7.0, 8.0, 9.0])
     assert apart == (0, 0)
+
+
+def test_interval_of_a_difference_is_over_the_seeds_of_both():
+    first, second = [1.0, 3.0, 8.0], [2.0, 6.0]
+    got = interval(iqm_difference, first, second)
+    # There are 27 means of the first and 4 of the second. Of the 108 differences, the least are -5,
+    # once, and 5/3 - 6, three times. These 4 are 3.7 % of all, so that the 2.5 % end at the latter.
+    assert got == pytest.approx((5 / 3 - 6, 19 / 3 - 2), abs=1e-9)
+    expected = plain_interval(lambda a, b: plain_iqm(a) - plain_iqm(b), first, second)
+    assert got == pytest.approx(expected, abs=1e-9)
+    assert interval(iqm_difference, first, second) == got
+    assert interval(iqm_difference, first, [2.0]) is None
 
 
 @settings(deadline=None, max_examples=25)
