@@ -160,7 +160,9 @@ class Maps(CommModule):
         sight = tensordict.get(keys.SIGHT).flatten(-2)
         cells = self.sensor.look(position.double(), self._start)[1]
         view = View(cells, sight > 0, sight == 2)
-        self.known.see(view, 4 * step.view(-1, 1, 1) + sight - 1)
+        # Beyond the horizon, a step that does not fit into the map counts as the last that does.
+        latest = torch.iinfo(self.known.last_seen.dtype).max >> 2
+        self.known.see(view, 4 * step.clamp(max=latest).view(-1, 1, 1) + sight - 1)
         self.messages.saw(view)
         alive = tensordict.get(keys.ALIVE)
         own = self.stamp.diagonal(dim1=1, dim2=2)

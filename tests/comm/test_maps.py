@@ -389,6 +389,19 @@ def test_a_new_episode_begins_with_empty_maps():
             assert one[key].equal(two[key])
 
 
+def test_a_look_long_after_the_horizon_is_kept():
+    """A number of 16 bits holds looks until step 8191."""
+    position = torch.tensor([[[12.0, 15.0, 3.0], [18.0, 15.0, 3.0]]])
+    env = environment(burning(), position)
+    td, maps = fly(env, position, random_flight(1, 2))[-1], env.transform.module
+    for step in (8191, 8192, 20_000):
+        maps.known.start_episodes(torch.ones(1, dtype=torch.bool))
+        maps(td.set(keys.STEP, torch.tensor([step])))
+        when, what = maps.sightings()
+        assert set(when.unique().tolist()) == {-1, 8191}
+        assert set(what[when > 0].unique().tolist()) <= {0, 1, 2}
+
+
 def test_environments_out_of_phase_have_pictures_of_their_own():
     """Pictures are drawn at decisions, which differ if one environment was reset between them."""
     fire = torch.cat([burning(seed, 20) for seed in range(2)])
