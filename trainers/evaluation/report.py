@@ -59,9 +59,7 @@ def evaluate_run(
             config,
             actor,
             fires=fires,
-            report=lambda fire, policy: report(
-                f"{policy} on {fires} fire{'s' * (fires > 1)} of {fire}"
-            ),
+            report=lambda fire, policy: report(f"{policy} on {fires} fires of {fire}"),
             watch=watched_by(recorder.add, camera.add),
         )
         shown = Shown(title=title_of(config, *about), recording=recorder.recording())

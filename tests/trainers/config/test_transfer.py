@@ -197,7 +197,7 @@ def test_a_training_state_is_not_evaluated(run, capsys):
 
 
 def test_the_api_names_what_can_be_changed(run):
-    said = r"^seed, policy\.hold: only world, fire, headline and keys of env and comm"
+    said = r"^policy\.hold, seed: only world, fire, headline and keys of env and comm"
     with pytest.raises(UserError, match=said):
         trainers.load(run, world="front", seed=2, horizon=20, **{"policy.hold": 2})
 
