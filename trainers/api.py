@@ -22,7 +22,7 @@ from emberlink.trainers.evaluation.report import evaluate_run
 from emberlink.trainers.evaluation.results import Results
 from emberlink.trainers.runs import pretrained
 from emberlink.trainers.runs.run_folder import RunFolder
-from emberlink.trainers.runs.seal import check_trained_with
+from emberlink.trainers.runs.seal import check_trained_with, differences
 from emberlink.trainers.training.trainer import Progress, Trainer
 
 Reference = str | os.PathLike[str]
@@ -186,14 +186,13 @@ def load(
     fire = {key: settings.pop(key) for key in [*settings] if key.startswith("fire.")}
     there = in_world(trained, str(settings.pop("world", trained.world)), **fire)
     config = override(there, **settings)
-    before, now = (flat(to_values(each)) for each in (there, config))
-    fixed = [key for key in now if not key.startswith(_CHANGEABLE) and before.get(key) != now[key]]
+    fixed = [key for key in differences(there, config) if not key.startswith(_CHANGEABLE)]
     if fixed:
         raise UserError(
             f"{', '.join(fixed)}: only world, fire, headline and keys of env and comm can be "
             "changed"
         )
-    before = flat(to_values(trained))
+    before, now = (flat(to_values(each)) for each in (trained, config))
     changes = [
         f"{key}={shown(value)}"
         for key, value in now.items()

@@ -34,6 +34,7 @@ LEARNERS = {
     "mappo-map": ["learner=mappo", "policy.memory=gru", "learner.critic_map=true"],
 }
 IMITATION = ["learner=imitation", "learner.samples=8", "learner.buffer_size=60"]
+SETTINGS = {**LEARNERS, "imitation": IMITATION}
 METHODS = ("independent", "shared_memory", "positional", "consensus")
 
 
@@ -131,7 +132,7 @@ def watch_saves(say: Callable[[str], None], die_at: tuple[str, int] | None) -> N
 
 def training(method: str, learner: str, output: Path, die_at: tuple[str, int] | None = None):
     """Starts a run, or resumes an existing one, and trains to the end."""
-    settings = [*BASE, *(LEARNERS.get(learner) or IMITATION), f"episodes={EPISODES}"]
+    settings = [*BASE, *SETTINGS[learner], f"episodes={EPISODES}"]
 
     def work(say: Callable[[str], None]) -> int:
         watch_saves(say, die_at)
@@ -158,7 +159,7 @@ def kill_until_finished(
 
     Args:
         method: name of the method.
-        learner: name of the learner, one of `LEARNERS` or "imitation".
+        learner: name of the learner, one of `SETTINGS`.
         folder: an empty folder.
         draw: random numbers for the times.
         kills: maximum number of kills.

@@ -17,8 +17,7 @@ from emberlink.trainers.learners.base import ACTOR
 from emberlink.trainers.runs import checkpoint_file
 from emberlink.trainers.runs.checkpoints import load_weights
 
-UNITS = ("grid", "altitude", "horizon", "displacement", "view_angle", "observation_scale")
-"""keys of `env` that change what the numbers in observations and actions mean"""
+_UNITS = ("altitude", "horizon", "displacement", "view_angle", "observation_scale")
 
 
 def load_actor(
@@ -53,19 +52,22 @@ def load_actor(
     return actor.requires_grad_(False)
 
 
-def observes_place(config: RunConfig) -> bool:
-    """Returns whether a UAV observes where in the box it is; if not, the grid scales nothing."""
-    return config.env.observation != "sight" or config.comm.get("position", False)
+def units(config: RunConfig) -> tuple[str, ...]:
+    """Returns the keys of `env` that change what the numbers in observations and actions mean.
+
+    The grid is among them if a UAV observes where in the box it is.
+    """
+    by_map = config.env.observation != "sight" or config.comm.get("position", False)
+    return ("grid", *_UNITS) if by_map else _UNITS
 
 
 def _warn_of_other_units(config: RunConfig, trained: Mapping[str, Any]) -> None:
     """Warns of settings with which observed and flown distances mean something else."""
-    by_map = observes_place(config)
     here = to_values(config)["env"]
     differ = [
         f"env.{key}={shown(here[key])} (in training {shown(trained[key])})"
-        for key in UNITS
-        if here[key] != trained.get(key, here[key]) and (by_map or key != "grid")
+        for key in units(config)
+        if here[key] != trained.get(key, here[key])
     ]
     if differ:
         warnings.warn(

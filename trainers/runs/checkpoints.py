@@ -3,7 +3,6 @@
 import re
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -12,12 +11,11 @@ from torch import Tensor
 from emberlink.envs.utils import atomic_io
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import shown
-from emberlink.policies.settings import PolicyConfig
 from emberlink.trainers.config.overrides import flat
 from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.learners.base import ACTOR
 from emberlink.trainers.runs import checkpoint_file
-from emberlink.trainers.runs.seal import to_header
+from emberlink.trainers.runs.seal import to_header, unsealed
 
 _NUMBERED = re.compile(r"(state|step)_\d{9,18}\.safetensors")
 _OF_NETWORKS = (
@@ -146,30 +144,32 @@ def load_weights(
         _check_header(path, header, config)
     for name, tensor in expected.items():
         if name not in weights:
-            raise UserError(f"{path}: holds no {name}{_trained_with(header, config)}")
+            raise UserError(f"{path}: holds no {name}{_trained_with(path, header, config)}")
         weight = weights[name]
         if weight.shape != tensor.shape or weight.dtype != tensor.dtype:
             raise UserError(
                 f"{path}: {name} has shape {list(weight.shape)}, {weight.dtype}; this "
                 f"configuration needs {list(tensor.shape)}, {tensor.dtype}"
-                f"{_trained_with(header, config)}"
+                f"{_trained_with(path, header, config)}"
             )
     more = [name for name in weights if name.startswith(ACTOR) and name not in expected]
     if more:
         reason = f"{more[0]}, which this configuration does not have"
-        raise UserError(f"{path}: holds {reason}{_trained_with(header, config)}")
+        raise UserError(f"{path}: holds {reason}{_trained_with(path, header, config)}")
     chosen = {name: weights[name] for name in expected}
     checkpoint_file.check_finite(path, chosen)
     return chosen
 
 
-def _trained_with(header: Mapping[str, Any], config: RunConfig | None) -> str:
+def _trained_with(path: Path, header: Mapping[str, Any], config: RunConfig | None) -> str:
     """Returns the settings of networks that differ from those of a checkpoint, for a message."""
     if config is None or not isinstance(header.get("config"), Mapping):
         return ""
-    # Checkpoints before the memories have no settings of the policy; they have those of today.
-    before = flat({"policy": asdict(PolicyConfig())}) | flat(header["config"])
-    now = flat(to_header(config))
+    try:
+        trained = unsealed(path, header["config"], config)
+    except UserError:  # the message is about the weights
+        return ""
+    before, now = flat(to_header(trained)), flat(to_header(config))
     keys = [*_OF_NETWORKS, *(key for key in before if key.startswith("comm."))]
     differ = {
         key: f"{key}={shown(before[key])}" + (f" (now {shown(now[key])})" if key in now else "")

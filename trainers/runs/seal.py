@@ -50,11 +50,7 @@ def check_same(path: Path, sealed: Mapping[str, Any], config: RunConfig) -> None
         UserError: they differ; see `check_trained_with`.
     """
     free = {key: getattr(config, key) for key in _FREE}
-    try:
-        here = {"device": config.device, "output": config.output}
-        trained = from_values({**sealed, **here})
-    except (ValueError, TypeError) as error:
-        raise UserError(f"{path}: its configuration cannot be read: {error}") from None
+    trained = unsealed(path, sealed, config)
     for key, (before, now) in differences(replace(trained, **free), config).items():
         hint = ""
         if key.startswith(("env.", "comm.")):
@@ -63,6 +59,24 @@ def check_same(path: Path, sealed: Mapping[str, Any], config: RunConfig) -> None
             f"{path}: made with {key}={shown(before)}; the run has {key}={shown(now)}: "
             f"put {shown(before)} back into config.yaml{hint}"
         )
+
+
+def unsealed(path: Path, sealed: Mapping[str, Any], config: RunConfig) -> RunConfig:
+    """Returns the configuration in a checkpoint's header; what an old one lacks is the default.
+
+    Args:
+        path: path of the checkpoint, for the message.
+        sealed: configuration in its header, as plain values.
+        config: configuration whose device and output it gets.
+
+    Raises:
+        UserError: it cannot be read.
+    """
+    here = {"device": config.device, "output": config.output}
+    try:
+        return from_values({**sealed, **here})
+    except (ValueError, TypeError) as error:
+        raise UserError(f"{path}: its configuration cannot be read: {error}") from None
 
 
 def changed_evaluation(path: Path, config: RunConfig) -> list[str]:

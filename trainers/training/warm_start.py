@@ -9,18 +9,16 @@ from emberlink.envs.utils.validation import shown
 from emberlink.trainers.config.compose import to_values
 from emberlink.trainers.config.overrides import flat
 from emberlink.trainers.config.schema import RunConfig
-from emberlink.trainers.evaluation.actor import UNITS, observes_place
+from emberlink.trainers.evaluation.actor import units
 from emberlink.trainers.learners.base import ACTOR, Learner
 from emberlink.trainers.runs.checkpoints import load_weights
 from emberlink.trainers.runs.pretrained import find_one, is_name
 from emberlink.trainers.runs.run_folder import RunFolder
 from emberlink.trainers.runs.seal import check_trained_with
 
-_OBSERVED = (
-    *("comm.", "env.observation", "policy.hold"),
-    *(f"env.{key}" for key in UNITS),
-)
-"""beginnings of the keys of settings that change what a UAV observes, or what its action does"""
+_OBSERVED = ("comm.", "env.observation", "policy.hold")
+"""beginnings of the keys of settings that change what a UAV observes, or what its action does,
+besides `units`"""
 
 
 def start(learner: Learner, config: RunConfig) -> None:
@@ -62,11 +60,11 @@ def start(learner: Learner, config: RunConfig) -> None:
 def _warn_of_other_observations(name: str, theirs: RunConfig, mine: RunConfig) -> None:
     """Warns of settings that give the same observations another meaning."""
     before, now = flat(to_values(theirs)), flat(to_values(mine))
-    kept = () if observes_place(mine) else ("env.grid",)
-    more = ("env.base",) if mine.env.observation == "sight" else ()  # maps show the base
+    more = tuple(f"env.{key}" for key in units(mine))
+    more += ("env.base",) if mine.env.observation == "sight" else ()  # maps show the base
     more += ("env.radio.",) if registry.find(mine.comm["name"]).hears else ()
     for key in (key for key in now if key.startswith(_OBSERVED + more) and key in before):
-        if before[key] != now[key] and key not in kept:
+        if before[key] != now[key]:
             warnings.warn(
                 f"learner.warm_start={name}: its actors were trained with {key}="
                 f"{shown(before[key])}, this run has {shown(now[key])}",
