@@ -229,14 +229,18 @@ def _settings_apart(run: Run, others: Sequence[Run], counts: Callable[[str], boo
     """Returns the settings that distinguish a run from others with the same name, in brackets.
 
     Settings with the default of the run's method, setup and learner are left out, and those that
-    its learner does not have. The text can be empty.
+    its learner does not have. So is the path of a warm start if the other settings distinguish the
+    run. The text can be empty.
 
     Args:
         run: the run.
         others: all runs with the same name, including `run`.
         counts: whether a key may be part of the text.
     """
-    apart = changed(run, [key for key in differing(others) if counts(key)])
+    keys = [key for key in differing(others) if counts(key)]
+    rest = [key for key in keys if key != _WARM_START]
+    mine, unlike = changed(run, rest), [o for o in others if trained_with(o) != trained_with(run)]
+    apart = changed(run, keys) if mine in [changed(other, rest) for other in unlike] else mine
     return f" ({', '.join(_typed(*item) for item in apart.items())})" if apart else ""
 
 
@@ -258,7 +262,7 @@ def _typed(key: str, value: Any) -> str:
 def _word(value: Any) -> str:
     """Returns a value as on the command line."""
     words = {None: "null", True: "true", False: "false"}
-    return words[value] if value is None or isinstance(value, bool) else str(value)
+    return words[value] if value is None or isinstance(value, bool) else str(value) or "''"
 
 
 def differing(runs: Sequence[Run]) -> list[str]:

@@ -528,6 +528,23 @@ def test_runs_that_began_with_seeds_of_a_lost_run_are_a_group(tmp_path):
     assert [group.seeds for group in section.groups] == [[0, 1, 2], [3]]
 
 
+def test_a_warm_start_is_part_of_a_name_only_if_nothing_else_tells_groups_apart(tmp_path):
+    """A lost run's path stands in a label where two groups differ in nothing else."""
+    starts = {"a": "runs/lost_a", "b": "runs/lost_b", "c": "runs/lost_c"}
+    more = {"a": (), "b": (), "c": ("env.radio.range=0",)}
+    for name, start in starts.items():
+        settings = ("learner=ippo", f"learner.warm_start={start}", *more[name])
+        write_run(tmp_path, "consensus", 0, overrides=settings, name=name)
+    (section,), notes = gathered(tmp_path)
+    assert [group.label for group in section.groups] == [
+        "consensus (env.radio.range=0.0)",
+        "consensus (learner.warm_start=runs/lost_a)",
+        "consensus (learner.warm_start=runs/lost_b)",
+    ]
+    (note,) = (note for note in notes if "differ in learner.warm_start:" in note)
+    assert "runs/lost_c for consensus (env.radio.range=0.0)" in note
+
+
 def test_groups_of_other_learners_are_named_by_what_chooses_them(tmp_path):
     for seed, setting in enumerate(("learner=td3", "learner=ippo", "learner.critic=team")):
         write_run(tmp_path, "consensus", seed, overrides=(setting,))
