@@ -32,9 +32,12 @@ class RewardConfig:
     base: Number = 0.0
     """per cell of which the base learns that it burned, to each UAV whose messages arrive there"""
     exit: Number = -100.0
-    """replaces the whole reward of a step whose move would have left the box"""
+    """replaces this reward in a step whose move would have left the box"""
     exit_axes: Literal["xyz", "xy"] = "xyz"
     """the axes on which leaving the box is tested"""
+    unseen: Number = 0.0
+    """times log(1 + n), added in every step, where n is the number of burning cells that no UAV has
+    seen while they burned; negative, a price of late finds"""
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)

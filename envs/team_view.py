@@ -68,6 +68,11 @@ class TeamView(EnvBase):
         return fire
 
     @property
+    def unseen_fire(self) -> Tensor:
+        """The number of burning cells that no UAV has seen while they burned, int64 [num_envs]."""
+        return (self.fire_map == 2).sum((-1, -2))
+
+    @property
     def arrival_time(self) -> Tensor:
         """The fire of each environment: arrival times in steps, float32 [num_envs, X, Y]."""
         return self._map.arrival_time

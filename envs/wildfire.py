@@ -212,7 +212,9 @@ class WildfireEnv(Buffers, TeamView):
             self._measures.update(view, self._position, self._step_key, self._time, alive)
         new, old, none = sighting.counts.unbind(-1)
         told = None if self._measures is None else self._measures.told
-        reward = step_reward(new, old, none, hit_boundary, self.config.reward, told)
+        flies = self._all_alive if alive is None else alive
+        unseen = self.unseen_fire.unsqueeze(-1) * flies if self.config.reward.unseen else None
+        reward = step_reward(new, old, none, hit_boundary, self.config.reward, told, unseen)
         self._seen.add_(new.sum(-1).long())
         return self._snapshot(position, sighting, hit_boundary, reward)
 

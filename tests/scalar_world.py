@@ -61,6 +61,13 @@ class ScalarWorld:
         news = self.base_seen() - before
         self.told = [news if uav in arrives else 0 for uav in range(self.uavs)]
 
+    def unseen(self, step: int) -> int:
+        """Returns how many cells burn that no UAV has seen while they burned."""
+        return sum(
+            self.burns(cell, step) and not any(self.burns(cell, look) for look in looks)
+            for cell, looks in self.seen.items()
+        )
+
     def burning(self, step: int) -> int:
         return sum(self.burns(cell, step) for cell in self.cells)
 

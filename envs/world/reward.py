@@ -24,14 +24,18 @@ def step_reward(
     hit_boundary: Tensor,
     config: RewardConfig,
     told: Tensor | None = None,
+    unseen: Tensor | None = None,
 ) -> Tensor:
     """Returns the reward for the cells in view and for news, or the penalty for leaving the box.
+
+    The reward for burning cells that no UAV has seen is added to either.
 
     Args:
         new, old, none: [...], number of cells of new fire, old fire and no fire in view.
         hit_boundary: bool [..., 3], the axes along which the move would have left the box.
         config: reward per cell of each class, and the penalty.
         told: integers [...], number of burning cells of which the base learns; None for none.
+        unseen: integers [...], number of burning cells that no UAV has seen; None for none.
 
     Returns:
         float32 [...].
@@ -40,4 +44,7 @@ def step_reward(
     reward.add_(old, alpha=config.old_fire).add_(none, alpha=config.no_fire)
     if told is not None:
         reward.add_(told, alpha=config.base)
-    return reward.masked_fill_(left_box(hit_boundary, config.exit_axes), config.exit).float()
+    reward = reward.masked_fill_(left_box(hit_boundary, config.exit_axes), config.exit).float()
+    if unseen is not None:
+        reward.add_(unseen.float().log1p(), alpha=config.unseen)
+    return reward

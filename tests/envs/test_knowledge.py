@@ -35,8 +35,9 @@ def action(generator: torch.Generator, uavs: int) -> torch.Tensor:
     loss=st.sampled_from([0.0, 0.5]),
     failures=st.sampled_from([0.0, 0.7]),
     burn_time=st.sampled_from([1.0, 4.5, math.inf]),
+    unseen=st.sampled_from([0.0, -0.1]),
 )
-def test_every_step_equals_plain_python(seed, uavs, limit, loss, failures, burn_time):
+def test_every_step_equals_plain_python(seed, uavs, limit, loss, failures, burn_time, unseen):
     world = WildfireConfig(
         grid=(9, 8),
         num_uavs=uavs,
@@ -46,7 +47,7 @@ def test_every_step_equals_plain_python(seed, uavs, limit, loss, failures, burn_
         base=(0.0, 4.0),
         failures=failures,
         measures="all",
-        reward=RewardConfig(base=0.5),
+        reward=RewardConfig(base=0.5, unseen=unseen),
     )
     generator = torch.Generator().manual_seed(seed)
     arrival = torch.rand(ENVS, 9, 8, generator=generator) * 24 - 2
@@ -88,7 +89,9 @@ def test_every_step_equals_plain_python(seed, uavs, limit, loss, failures, burn_
                 new, old, none = (now[key][e, uav].item() for key in COUNTS)
                 inside = new - 4 * old - 10 * none + 0.5 * told
                 left = now[keys.HIT_BOUNDARY][e, uav].any()
-                assert now[keys.REWARD][e, uav].item() == (-100 if left else inside)
+                late = unseen * math.log(1 + scalar.unseen(step)) * alive[e, uav].item()
+                expected = late + (-100 if left else inside)
+                assert now[keys.REWARD][e, uav].item() == pytest.approx(expected, rel=1e-6)
     maps = env._map._sensor.crop(env.knowledge.last_seen)
     for e, scalar in enumerate(scalars):
         for node in range(uavs + 1):

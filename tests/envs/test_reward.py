@@ -43,6 +43,17 @@ def test_reward_for_what_the_base_learns(told, left, expected):
     assert step_reward(*counts, out, config, torch.tensor(told)) == expected
 
 
+@pytest.mark.parametrize(
+    ("unseen", "left", "expected"),
+    [(0, 0, 7), (1, 0, 7 - 0.5 * math.log(2)), (9, 1, -100 - 0.5 * math.log(10))],
+)
+def test_reward_for_fire_that_no_uav_has_seen(unseen, left, expected):
+    config = RewardConfig(new_fire=1.0, old_fire=0.0, no_fire=0.0, unseen=-0.5)
+    counts, out = torch.tensor([7, 2, 3]), torch.tensor([bool(left), False, False])
+    reward = step_reward(*counts, out, config, None, torch.tensor(unseen))
+    assert reward.item() == pytest.approx(expected, rel=1e-6)
+
+
 def test_step_reward_is_elementwise():
     new, old, none = torch.randint(0, 9, (3, 5, 4))
     hit_boundary = torch.rand(5, 4, 3) < 0.3
