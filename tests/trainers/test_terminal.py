@@ -166,6 +166,17 @@ def test_the_remaining_time_is_estimated_from_steps_with_updates():
     assert later.speed == pytest.approx(1, rel=0.05)
 
 
+def test_the_speed_is_averaged_over_an_episode_whose_updates_take_long():
+    """An episode has ten decisions of ten steps in a second; the last one waits a minute."""
+    left, now = TimeLeft(1000, span=100), 0.0
+    left.add(now, 0, 0)
+    for step in range(10, 301, 10):
+        now += 61 if step % 100 == 0 else 1
+        left.add(now, step, step // 100)
+        if step > 100:
+            assert left.speed == pytest.approx(100 / 70, rel=0.01)
+
+
 def test_the_remaining_time_begins_again_after_a_rollback():
     steps = [(i * 1.0, 100 + i, i) for i in range(1, 51)]
     after = [(60 + i * 1.0, 2 * i, i) for i in range(1, 11)]

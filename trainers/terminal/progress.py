@@ -28,15 +28,17 @@ class TimeLeft:
     Args:
         steps: number of steps of the whole training.
         learns: whether there will be any updates.
+        span: least number of steps over which the speed is averaged. Learners that make their
+            updates at the end of an episode need a whole one.
     """
 
     ENOUGH = 3.0
     """seconds with updates before the first estimate"""
     WINDOW = 30.0
-    """seconds over which the speed is averaged"""
+    """least number of seconds over which the speed is averaged"""
 
-    def __init__(self, steps: int, *, learns: bool = True):
-        self._steps, self._learns = steps, learns
+    def __init__(self, steps: int, *, learns: bool = True, span: int = 0):
+        self._steps, self._learns, self._span = steps, learns, span
         self._start: tuple[float, int] | None = None
         self._recent: deque[tuple[float, int]] = deque()
 
@@ -54,12 +56,16 @@ class TimeLeft:
         if self._start is None and (updates > 0 or not self._learns):
             self._start = now, step
         self._recent.append((now, step))
-        while len(self._recent) > 2 and now - self._recent[1][0] > self.WINDOW:
+        while len(self._recent) > 2 and self._covers(*self._recent[1], now, step):
             self._recent.popleft()
+
+    def _covers(self, before: float, first: int, now: float, last: int) -> bool:
+        """Returns whether the speed can be averaged from an earlier step and time."""
+        return now - before > self.WINDOW and last - first >= self._span
 
     @property
     def speed(self) -> float | None:
-        """Steps per second in the last `WINDOW` seconds; None before the second step."""
+        """Steps per second in the last `WINDOW` seconds and `span` steps; None before two steps."""
         if not self._recent:
             return None
         (before, first), (now, last) = self._recent[0], self._recent[-1]
@@ -105,7 +111,7 @@ class TrainingProgress:
     ):
         self._console, self._clock, self._headline = console, clock, headline
         self._steps, self._episodes, self._learns = steps, episodes, learns
-        self._left = TimeLeft(steps, learns=learns)
+        self._left = TimeLeft(steps, learns=learns, span=steps // episodes)
         self._left.add(clock(), step, 0)
         self._next_line = clock() + FIRST_LINE
         self._next_refresh = 0.0
