@@ -115,7 +115,7 @@ class Elsewhere(TorchFunctionMode):
 @pytest.mark.parametrize("method", METHODS)
 def test_no_step_leaves_the_device(method, setup, learner, watch, seeds):
     """A step has environment, communication, noise, replay buffer and update, within an episode."""
-    settings = [f"setup={setup}", f"learner={learner}", *SMALL, seeds]
+    settings = [f"setup={setup}", f"learner={learner}", *SMALL, seeds, "env.reward.unseen=-0.1"]
     training = TrainingSetup(resolve(method, settings))
     rollouts = iter(training.collector)
     for _ in range(6):
@@ -142,6 +142,7 @@ def test_maps_on_the_paths_of_gpus(world, limit):
     """No step of `maps` leaves the device, and all of it equals the paths of CPUs."""
     settings = ["setup=tuned", f"world={world}", "env.horizon=25", "env.num_uavs=6"]
     radio = ["env.measures=all", "env.radio.range=30", f"env.radio.bandwidth={limit}"]
+    radio += ["env.reward.unseen=-0.1"]
     config = resolve("maps", [*settings, *radio, "num_envs=2"])
     about = {"num_envs": 2, "seed": 1, "fire": config.fire, "device": "cpu"}
     ours, theirs = build_env(config, **about), build_env(config, **about)
