@@ -238,9 +238,12 @@ def _settings_apart(run: Run, others: Sequence[Run], counts: Callable[[str], boo
         counts: whether a key may be part of the text.
     """
     keys = [key for key in differing(others) if counts(key)]
-    rest = [key for key in keys if key != _WARM_START]
-    mine, unlike = changed(run, rest), [o for o in others if trained_with(o) != trained_with(run)]
-    apart = changed(run, keys) if mine in [changed(other, rest) for other in unlike] else mine
+    apart = changed(run, keys)
+    if _WARM_START in apart:
+        rest = {*keys} - {_WARM_START}
+        alike = [other for other in others if rest.isdisjoint(differing([run, other]))]
+        if len(_split(alike, trained_with)) == 1:
+            del apart[_WARM_START]
     return f" ({', '.join(_typed(*item) for item in apart.items())})" if apart else ""
 
 
