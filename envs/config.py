@@ -32,7 +32,7 @@ class RewardConfig:
     base: Number = 0.0
     """per cell of which the base learns that it burned, to each UAV whose messages arrive there"""
     exit: Number = -100.0
-    """replaces this reward in a step whose move would have left the box"""
+    """replaces the reward for cells and news in a step whose move would have left the box"""
     exit_axes: Literal["xyz", "xy"] = "xyz"
     """the axes on which leaving the box is tested"""
     unseen: Number = 0.0

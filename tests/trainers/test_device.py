@@ -141,9 +141,9 @@ class OnGpu(TorchFunctionMode):
 def test_maps_on_the_paths_of_gpus(world, limit):
     """No step of `maps` leaves the device, and all of it equals the paths of CPUs."""
     settings = ["setup=tuned", f"world={world}", "env.horizon=25", "env.num_uavs=6"]
+    settings += ["env.reward.unseen=-0.1", "num_envs=2"]
     radio = ["env.measures=all", "env.radio.range=30", f"env.radio.bandwidth={limit}"]
-    radio += ["env.reward.unseen=-0.1"]
-    config = resolve("maps", [*settings, *radio, "num_envs=2"])
+    config = resolve("maps", [*settings, *radio])
     about = {"num_envs": 2, "seed": 1, "fire": config.fire, "device": "cpu"}
     ours, theirs = build_env(config, **about), build_env(config, **about)
     one, two = ours.reset(), theirs.reset()

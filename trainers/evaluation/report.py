@@ -59,7 +59,7 @@ def evaluate_run(
             config,
             actor,
             fires=fires,
-            report=lambda fire, policy: report(f"{policy} on {fires} fires of {fire}"),
+            report=lambda fire, policy: report(f"{policy} on {_fires(fires)} of {fire}"),
             watch=watched_by(recorder.add, camera.add),
         )
         shown = Shown(title=title_of(config, *about), recording=recorder.recording())
@@ -73,6 +73,10 @@ def evaluate_run(
     content = record(config, results, checkpoint=checkpoint.name, fires=fires, changed=changed)
     run.write(f"eval{label}.json", content)
     return results
+
+
+def _fires(count: int) -> str:
+    return f"{count} fire{'s' * (count > 1)}"
 
 
 def _draw(

@@ -140,6 +140,7 @@ def test_scripted_policies_can_be_chosen(scripted, names, run, capsys):
     content = json.loads(file.read_text())
     assert all(list(played) == names for played in content["results"].values())
     assert content["changed"][0].startswith(f"evaluation.scripted is {names[1:]} here")
+    assert "learned on 1 fire of huygens" in capsys.readouterr().out
     assert (run / "eval.json").read_bytes() == before
     file.unlink()
 
