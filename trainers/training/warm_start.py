@@ -20,6 +20,9 @@ _OBSERVED = ("comm.", "env.observation", "policy.hold")
 """beginnings of the keys of settings that change what a UAV observes, or what its action does,
 besides `units`"""
 
+_REWARD = "comm.heading."
+"""beginning of the keys of `comm` that change rewards only"""
+
 
 def start(learner: Learner, config: RunConfig) -> None:
     """Copies the actors of the run `learner.warm_start` to all seeds of a learner.
@@ -52,7 +55,7 @@ def start(learner: Learner, config: RunConfig) -> None:
         check_trained_with(checkpoint, theirs)
         weights = load_weights(checkpoint, expected, config)
     except UserError as error:
-        raise UserError(f"learner.warm_start={name}: {error}") from None
+        raise UserError(f"learner.warm_start={name}: {str(error).removeprefix(f'{name}: ')}") from None
     _warn_of_other_observations(name, theirs, config)
     learner.start_from(weights)
 
@@ -63,8 +66,9 @@ def _warn_of_other_observations(name: str, theirs: RunConfig, mine: RunConfig) -
     more = tuple(f"env.{key}" for key in units(mine))
     more += ("env.base",) if mine.env.observation == "sight" else ()  # maps show the base
     more += ("env.radio.",) if registry.find(mine.comm["name"]).hears else ()
-    for key in (key for key in now if key.startswith(_OBSERVED + more) and key in before):
-        if before[key] != now[key]:
+    observed = (key for key in now if key.startswith(_OBSERVED + more) and key in before)
+    for key in observed:
+        if before[key] != now[key] and not key.startswith(_REWARD):
             warnings.warn(
                 f"learner.warm_start={name}: its actors were trained with {key}="
                 f"{shown(before[key])}, this run has {shown(now[key])}",

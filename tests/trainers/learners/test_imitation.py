@@ -162,7 +162,7 @@ def test_the_loss_falls_and_is_that_of_smooth_l1():
         (["maps", *settings("imitation"), "learner.teacher=courier"], "known: map_greedy"),
         (
             ["maps", *settings("ippo"), "learner.warm_start=nowhere"],
-            "learner.warm_start=nowhere: nowhere: there is no such run folder",
+            "learner.warm_start=nowhere: there is no such run folder",
         ),
     ],
 )
@@ -290,6 +290,14 @@ def test_another_grid_is_warned_of_where_positions_are_observed(imitated, tmp_pa
     with warnings.catch_warnings():
         warnings.simplefilter("error", UserWarning)
         Trainer(resolve("maps", settings("ippo", *start, f"output={tmp_path}"))).start()
+
+
+def test_another_reward_is_not_warned_of(tmp_path):
+    start = "learner.warm_start=pretrained:tuned/consensus/s0", f"output={tmp_path}"
+    config = resolve("consensus", ["setup=tuned", *start, "comm.heading.weight=0"])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", UserWarning)
+        Trainer(config).start()
 
 
 def test_an_old_checkpoint_has_no_memory(tmp_path, capsys):
