@@ -81,8 +81,8 @@ def pass_on_places(
 class CellMessages(Buffers):
     """Passes on the cells of maps.
 
-    A UAV says a cell if one of those in range has an older look at it or none, or does not know
-    that it was seen while it burned. A map holds 4 times the step of the last look plus what was
+    A UAV says a cell if a UAV in range has no look at it, has an older one, or does not know that
+    it was seen while it burned. A map holds 4 times the step of the last look plus what was
     seen (1 for fire), -1 for never.
 
     Between UAVs in contact, a cell can be new only if a UAV saw it at this step, was told it at the

@@ -50,8 +50,8 @@ class Maps(CommModule):
     At each step, a UAV says to those in range the cells, and the positions of UAVs, that are new to
     one of them. With a limit of bytes, it says what is worth most first. It can pass on what it
     hears at the next step. A UAV observes its altitude, the time and pictures of its own map
-    (`Crops`). With a limit, what it receives may depend on what another UAV in range of the sender
-    knows.
+    (`Crops`). With a limit, a sender chooses by the maps of all UAVs in range, so what one of them
+    receives may depend on the maps of the others.
 
     With `home` and a base, a UAV leaves for its place in a chain of radios from the base to the
     fire that it knows when it would otherwise come too late (`steer`).

@@ -37,7 +37,7 @@ class RewardConfig:
     """the axes on which leaving the box is tested"""
     unseen: Number = 0.0
     """times log(1 + n), added in every step, where n is the number of burning cells that no UAV has
-    seen while they burned; negative, a price of late finds"""
+    seen while they burned; a negative value penalises late finds"""
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)

@@ -67,7 +67,7 @@ def coverage_auc(seen: Tensor, burnt: Tensor) -> Tensor:
 def time_to_full_coverage(seen: Tensor, burnt: Tensor) -> Tensor:
     """Returns the first step at which every burnt cell has been seen while it burned.
 
-    The horizon if there is none.
+    The horizon if there is none; 1 if nothing burns at the first step.
 
     Args:
         seen, burnt: as for `coverage`.
@@ -85,7 +85,9 @@ def tracking_first(on_fire: Tensor) -> Tensor:
 
 
 def tracking_last(on_fire: Tensor) -> Tensor:
-    """Returns the first step by which every UAV has seen fire; the horizon if none (figure 7).
+    """Returns the first step by which every UAV has seen fire (figure 7).
+
+    The horizon if a UAV never sees fire, also because it failed before.
 
     Args:
         on_fire: as for `tracking_first`.
@@ -104,6 +106,8 @@ def boundary_exits(left: Tensor) -> Tensor:
 
 def fire_losses(on_fire: Tensor) -> Tensor:
     """Returns how often a UAV lost sight of fire, mean over UAVs (figure 9).
+
+    A UAV that fails while it sees fire loses it, too.
 
     Args:
         on_fire: as for `tracking_first`.

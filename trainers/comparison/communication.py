@@ -20,6 +20,8 @@ _SAME = {"map_greedy": ("map_greedy_alone", "map_greedy_all")}
 """scripted policy -> the one that acts like it with the radio off, and the one without limits; in
 worlds without a base"""
 _RANGE, _LOSS, _BANDWIDTH = _RADIO = "env.radio.range", "env.radio.loss", "env.radio.bandwidth"
+_OF_LEARNERS = ("env.reward.", "env.observation", "env.measures")
+"""beginnings of the keys of `env` that do not change what scripted policies do"""
 _Radio = tuple[float, float | None, float | None]
 """range, loss and bandwidth; None for no loss or no limit, and where they do not matter"""
 _OFF: _Radio = (0.0, None, None)
@@ -58,10 +60,11 @@ class CommunicationValue:
 
 def communication_values(section: Section) -> list[CommunicationValue]:
     """Returns the value of communication wherever a section has all three evaluations."""
-    measure, limited = section.runs[0].config.evaluation.headline, _limited(section)
+    limited = _limited(section)
     values: list[CommunicationValue] = []
     for fire in section.runs[0].evaluation.results:
         for group in section.as_trained:
+            measure = group.runs[0].config.evaluation.headline
             if _radio(group.runs[0]) not in (_OFF, _FULL):
                 for how, others in (("evaluated", _evaluated), ("retrained", _retrained)):
                     none, full = (others(section, group, radio) for radio in (_OFF, _FULL))
@@ -69,6 +72,7 @@ def communication_values(section: Section) -> list[CommunicationValue]:
                         samples = [_per_fire(g.runs, fire, measure) for g in (none, group, full)]
                         values.append(_value(fire, group.label, measure, how, samples))
         for policy, world in product(SCRIPTED, limited):
+            measure = world.config.evaluation.headline
             samples = _scripted(section, fire, policy, measure, world)
             if samples is not None:
                 name = policy + (f", {_radio_text(world)}" if len(limited) > 1 else "")
@@ -77,7 +81,7 @@ def communication_values(section: Section) -> list[CommunicationValue]:
 
 
 def _limited(section: Section) -> list[Run]:
-    """Returns a run for each range and loss of trainings between a radio off and no limits."""
+    """Returns one run as trained for each range and loss, without those off or without limits."""
     first: dict[_Radio, Run] = {}
     for run in (run for group in section.as_trained for run in group.runs):
         first.setdefault(_heeded(run), run)
@@ -103,16 +107,24 @@ def _scripted(
 
     None if an evaluation is missing. Without a base no evaluation with another radio is needed.
     """
-    others = [
-        next((run for run in section.runs if _heeded(run) == radio), None)
-        for radio in (_OFF, _FULL)
-    ]
+    alike = [run for run in section.runs if _world(run) == _world(world)]
+    others = [next((r for r in alike if _heeded(r) == radio), None) for radio in (_OFF, _FULL)]
     choices = [(others[0], policy), (world, policy), (others[1], policy)]
     if world.config.env.base is None and policy in _SAME:
         none, full = _SAME[policy]
         choices = [(world, none), (world, policy), (world, full)]
     played = [run and run.evaluation.results[fire].get(name) for run, name in choices]
-    return [np.asarray(p[measure]) for p in played if p] if all(played) else None
+    measured = [np.asarray(p[measure]) for p in played if p and measure in p]
+    return measured if len(measured) == len(played) else None
+
+
+def _world(run: Run) -> dict[str, Any]:
+    """Returns the settings of an evaluation that scripted policies heed, without the radio."""
+    return {
+        key: value
+        for key, value in {**run.settings, **run.evaluated_with}.items()
+        if key.startswith("env.") and not key.startswith((*_RADIO, *_OF_LEARNERS))
+    }
 
 
 def _radio(run: Run) -> _Radio:
@@ -183,7 +195,6 @@ def _value(
 
 
 def _share(none: Values, with_radio: Values, full: Values, axis: int = -1) -> Any:
-    """Returns (with_radio - none) / (full - none) of the means along an axis."""
-    gained = with_radio.mean(axis) - none.mean(axis)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        return gained / (full.mean(axis) - none.mean(axis))
+    """Returns (with_radio - none) / (full - none) of the means along an axis; NaN for x / 0."""
+    gained, most = (m.mean(axis) - none.mean(axis) for m in (with_radio, full))
+    return np.divide(gained, most, out=np.full_like(gained, np.nan), where=most != 0)

@@ -89,8 +89,8 @@ class LearnerContext:
     horizon: int = 1000
     """decisions of an episode; steps if actions are not held"""
     failures: bool = False
-    """whether UAVs can fail; nothing is learnt from those that have failed, and nothing that needs
-    a reward from the decision in which they fail"""
+    """whether UAVs can fail; losses leave out decisions after a failure, and those that use rewards
+    also the decision during which it happens"""
 
 
 class Learner(ABC):

@@ -21,8 +21,7 @@ class KnownMaps:
     """Shows the maps of method `maps` in the form that scripted policies read.
 
     The policy of a UAV also knows the targets of those that it hears at a step. Such a target may
-    follow from a map that reaches the UAV one step later, or not at all with
-    `env.radio.bandwidth`.
+    depend on cells that the UAV receives one step later, or never with `env.radio.bandwidth`.
 
     Args:
         maps: the communication module of the environment.
@@ -54,8 +53,8 @@ class Teacher(Transform):
     It is added after the communication. For each UAV it uses what that UAV knows, and the targets
     of those that it hears (see `KnownMaps`). It does not change the environment. An action flies
     towards the target at full speed, or reaches it at the end of the steps for which it is held.
-    New targets are chosen whenever the UAVs decide, and if they decide at each step, as often as
-    the policy chooses them.
+    With held actions, targets are chosen at each decision, else as often as the policy chooses
+    them.
 
     Args:
         env: the environment without transforms.

@@ -55,7 +55,8 @@ def start(learner: Learner, config: RunConfig) -> None:
         check_trained_with(checkpoint, theirs)
         weights = load_weights(checkpoint, expected, config)
     except UserError as error:
-        raise UserError(f"learner.warm_start={name}: {str(error).removeprefix(f'{name}: ')}") from None
+        said = str(error).removeprefix(f"{name}: ")
+        raise UserError(f"learner.warm_start={name}: {said}") from None
     _warn_of_other_observations(name, theirs, config)
     learner.start_from(weights)
 

@@ -1,6 +1,7 @@
 """Tests the value of communication on numbers that were computed by hand."""
 
 import json
+import warnings
 
 import numpy as np
 import pytest
@@ -145,6 +146,38 @@ def test_with_a_base_scripted_policies_need_the_other_radios(tmp_path):
         ("courier", 45.0, 85.0, 95.0, 0.8),
     ]
     assert not [note for note in compared.notes if "does not have the same" in note]
+
+
+def test_the_other_radios_of_scripted_policies_are_those_of_the_same_team(tmp_path):
+    own = {"map_greedy": 80.0, "courier": 85.0}
+    scripted_run(tmp_path, [0, 0], {"eval.json": own})
+    for reach, name in (("0", "off"), ("inf", "full")):
+        overrides = ("env.base=[0,0]", f"env.radio.range={reach}", "env.num_uavs=3")
+        write_run(tmp_path, name=name, scripted=tuple(own), overrides=overrides)
+    assert compare_runs([tmp_path]).sections[0].communication == []
+
+
+def test_groups_with_other_headlines_are_compared(tmp_path):
+    ages = ("env.measures=all", "evaluation.headline=front_age")
+    learned = {"front_age": 30.0, "front_age_p95": 60.0, "bytes_per_step": 9.0}
+    write_run(tmp_path, overrides=ages, learned=learned)
+    for override, coverage in ((OFF, 50.0), ("env.radio.range=10", 60.0), (FULL, 70.0)):
+        name = f"run{override}".replace("=", "_")
+        more = {"learned": {"coverage": coverage}, "overrides": (override,)}
+        write_run(tmp_path, "independent", name=name, **more)
+    (value,) = compare_runs([tmp_path]).sections[0].communication
+    assert (value.policy, value.measure, value.value) == ("independent", "coverage", 0.5)
+
+
+def test_a_resample_without_anything_to_gain_leaves_no_interval(tmp_path):
+    """On the first of four fires there is none; one resample in 256 draws only this fire."""
+    run = write_run(tmp_path, learned={"coverage": [55.0, 60.0, 60.0, 60.0]})
+    evaluate_otherwise(run, 0.0, [50.0, 50.0, 50.0, 50.0])
+    evaluate_otherwise(run, float("inf"), [50.0, 70.0, 70.0, 70.0])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        (value,) = compare_runs([tmp_path]).sections[0].communication
+    assert (value.value, value.interval) == (35 / 60, None)
 
 
 def test_without_a_base_map_greedy_plays_as_alone_and_as_all_with_the_other_radios():

@@ -86,10 +86,10 @@ class SequenceSampler(TeamSampler):
 
     Environments are stored one after another at each decision, and their episodes begin together.
     A sequence has `burn_in` decisions, which only prepare the memory, and `sequence` decisions to
-    learn from. It is drawn uniformly from all sequences of stored episodes, including those of
-    which only a part is within the episode. So all decisions are learnt from equally often. The
-    burn-in is shorter where the episode has fewer decisions before the sequence; the memory is
-    empty at the beginning of the episode.
+    learn from. It is drawn uniformly from all sequences of stored episodes. Sequences may extend
+    beyond either end of an episode, so that each decision is drawn equally often. The burn-in is
+    shorter where the episode has fewer decisions before the sequence; the memory is empty at the
+    beginning of the episode.
 
     TorchRL's SliceSampler draws the same rows for all UAVs, from the global generator.
 

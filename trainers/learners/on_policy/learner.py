@@ -134,7 +134,7 @@ class OnPolicyLearner(Learner):
         return min(self.config.minibatches, self.context.num_envs)
 
     @property
-    def _done(self) -> float:
+    def _progress(self) -> float:
         """Share of the run before the iteration of the next update."""
         iteration = self.updates // (self.config.epochs * self._minibatches)
         return iteration * self.context.horizon / self.context.total_steps
@@ -200,7 +200,7 @@ class OnPolicyLearner(Learner):
             batch: episodes, batch size [seeds * environments] or with a dimension of decisions.
         """
         if self.anchor is not None:
-            self.anchor.advance(self._done)
+            self.anchor.advance(self._progress)
         self.updates += 1
         batch = batch.copy().auto_batch_size_(1)
         self.guard.record_batch(batch)
@@ -249,7 +249,7 @@ class OnPolicyLearner(Learner):
 
     def _set_lr(self) -> None:
         """Lowers the learning rate linearly; the last iteration still has a share of it."""
-        share = max(0.0, 1 - self._done)
+        share = max(0.0, 1 - self._progress)
         for entry in self.optimizer.param_groups:
             entry["lr"] = self.config.lr * self._lr_scale * share
 
