@@ -41,6 +41,8 @@ class ConsensusConfig:
     """the known discoverer that a UAV follows: the one of highest rank, or the nearest"""
     wander: bool = True
     """whether wanderers get random targets; if not, a wanderer's target is its own position"""
+    redraw: Annotated[int, Field(ge=1, le=1_000_000)] | None = None
+    """steps after which random targets are drawn again, even if not reached; None for never"""
     heading: HeadingConfig = HeadingConfig()
     """the bonus for flying towards the target"""
 
@@ -185,6 +187,10 @@ class Consensus(CommModule):
         wanders = (follows < 0).unsqueeze(-1)
         key = self._redraw_key(tensordict)
         other = motion.next_waypoint(self.waypoint, position, key, self.low, self.high)
+        if self.config.redraw:
+            points = motion.random_points(key, self.world.num_uavs, self.low, self.high)
+            due = tensordict.get(keys.STEP) % self.config.redraw == 0
+            other = torch.where(due[:, None, None], points, other)
         self.waypoint.copy_(torch.where(wanders, other, self.waypoint))
         new = (tensordict.get(keys.NEW_FIRE) > 0).unsqueeze(-1)
         centre = torch.where(new, tensordict.get(keys.NEW_CENTRE), tensordict.get(keys.OLD_CENTRE))

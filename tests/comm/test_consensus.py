@@ -256,6 +256,20 @@ def test_a_waypoint_is_redrawn_only_by_a_wanderer_closer_than_one():
     assert now[keys.TARGET][0, :2].equal(talk.module.waypoint[0, :2])
 
 
+@pytest.mark.parametrize(("step", "redrawn"), [(1, False), (49, False), (50, True), (100, True)])
+def test_waypoints_that_are_not_reached_are_drawn_again_in_time(step, redrawn):
+    # 0 and 1 wander far from their waypoints, 2 is a discoverer.
+    position = [[5.0, 5.0, 2.0], [30.0, 5.0, 2.0], [50.0, 50.0, 2.0]]
+    waypoint = torch.tensor([[[5.0, 40.0, 2.0], [30.0, 40.0, 2.0], [50.0, 5.0, 2.0]]])
+    now = time_step(position, [0, 0, 1], step=step)
+    talk = communication(now, ConsensusConfig(redraw=50))
+    talk.module.waypoint.copy_(waypoint)
+    now = talk._step(now, now)
+    changed = (talk.module.waypoint != waypoint).any(-1)
+    assert changed.tolist() == [[redrawn, redrawn, False]]
+    assert now[keys.TARGET][0, :2].equal(talk.module.waypoint[0, :2])
+
+
 def test_a_first_waypoint_closer_than_one_is_drawn_again():
     # Each UAV starts at its first waypoint, drawn as the module draws it from this key.
     first = time_step([[32.0, 32.0, 2.0]] * 6, [0] * 6)

@@ -62,6 +62,7 @@ def random_settings(rng: np.random.Generator) -> dict:
             "agree": bool(rng.integers(2)),
             "follow": str(rng.choice(["best", "nearest"])),
             "wander": bool(rng.integers(2)),
+            "redraw": [None, 1, 7][rng.integers(3)],
             "heading": {
                 "form": str(rng.choice(heading)),
                 "weight": float(rng.normal(0, 3)),
