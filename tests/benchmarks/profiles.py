@@ -48,7 +48,8 @@ def show(title: str, work: Callable[[], object], units: int, calls: int = 10) ->
 
 def iteration(num_envs: int) -> None:
     """Prints the share of CPU time of each part of an iteration of `ippo` with a memory."""
-    options = ["setup=strong", "learner=ippo", "episodes=2", f"num_envs={num_envs}"]
+    options = ["setup=strong", "learner=ippo", "learner.minibatches=16", "episodes=2"]
+    options += [f"num_envs={num_envs}"]
     setup = TrainingSetup(resolve("independent", options))
     parts = "steps of the environments", "communication", "actors", "updates"
     spent: dict[str, float] = dict.fromkeys(parts, 0.0)
