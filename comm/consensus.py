@@ -186,11 +186,9 @@ class Consensus(CommModule):
         position = tensordict.get(keys.POSITION)
         wanders = (follows < 0).unsqueeze(-1)
         key = self._redraw_key(tensordict)
-        other = motion.next_waypoint(self.waypoint, position, key, self.low, self.high)
-        if self.config.redraw:
-            points = motion.random_points(key, self.world.num_uavs, self.low, self.high)
-            due = tensordict.get(keys.STEP) % self.config.redraw == 0
-            other = torch.where(due[:, None, None], points, other)
+        every = self.config.redraw
+        due = tensordict.get(keys.STEP) % every == 0 if every else None
+        other = motion.next_waypoint(self.waypoint, position, key, self.low, self.high, due)
         self.waypoint.copy_(torch.where(wanders, other, self.waypoint))
         new = (tensordict.get(keys.NEW_FIRE) > 0).unsqueeze(-1)
         centre = torch.where(new, tensordict.get(keys.NEW_CENTRE), tensordict.get(keys.OLD_CENTRE))

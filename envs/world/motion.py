@@ -96,7 +96,12 @@ def given_points(given: Any, shape: Sequence[int], low: Tensor, high: Tensor) ->
 
 
 def next_waypoint(
-    waypoint: Tensor, position: Tensor, key: Tensor, low: Tensor, high: Tensor
+    waypoint: Tensor,
+    position: Tensor,
+    key: Tensor,
+    low: Tensor,
+    high: Tensor,
+    due: Tensor | None = None,
 ) -> Tensor:
     """Returns the waypoints, with a new random one for each UAV closer than 1 cell to its own.
 
@@ -104,9 +109,13 @@ def next_waypoint(
         waypoint, position: float32 [..., n, 3], cells.
         key: int64 [...], a random key for this purpose alone.
         low, high: [3], the corners of the box, cells.
+        due: bool [...], where all UAVs get a new one.
     """
-    reached = (distance(position, waypoint) < 1).unsqueeze(-1)
-    return torch.where(reached, random_points(key, position.shape[-2], low, high), waypoint)
+    redraws = distance(position, waypoint) < 1
+    if due is not None:
+        redraws = redraws | due.unsqueeze(-1)
+    points = random_points(key, position.shape[-2], low, high)
+    return torch.where(redraws.unsqueeze(-1), points, waypoint)
 
 
 def distance(first: Tensor, second: Tensor) -> Tensor:

@@ -107,7 +107,8 @@ def _scripted(
 
     None if an evaluation is missing. Without a base no evaluation with another radio is needed.
     """
-    alike = [run for run in section.runs if _world(run) == _world(world)]
+    wanted = _world(world)
+    alike = [run for run in section.runs if _world(run) == wanted]
     others = [next((r for r in alike if _heeded(r) == radio), None) for radio in (_OFF, _FULL)]
     choices = [(others[0], policy), (world, policy), (others[1], policy)]
     if world.config.env.base is None and policy in _SAME:
