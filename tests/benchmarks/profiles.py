@@ -29,8 +29,8 @@ def kind_of(name: str) -> str:
     return next((kind for kind, names in KINDS.items() if plain in names), "everything else")
 
 
-def show(title: str, work: Callable[[], object], units: int, calls: int = 10) -> None:
-    """Prints milliseconds and operations per unit, by kind."""
+def show(title: str, work: Callable[[], object], units: int, calls: int = 10) -> dict[str, float]:
+    """Prints milliseconds and operations per unit by kind, and returns each kind's share."""
     for _ in range(3):
         work()
     with profile() as recorded:
@@ -41,15 +41,16 @@ def show(title: str, work: Callable[[], object], units: int, calls: int = 10) ->
         entry = table.setdefault(kind_of(event.key), [0.0, 0.0])
         entry[0] += event.self_cpu_time_total / calls / units / 1000
         entry[1] += event.count / calls / units
-    print(f"\n{title}: {sum(spent for spent, _ in table.values()):.3f} ms")
+    whole = sum(spent for spent, _ in table.values())
+    print(f"\n{title}: {whole:.3f} ms")
     for kind, (spent, count) in sorted(table.items(), key=lambda item: -item[1][0]):
         print(f"| {kind} | {spent:.3f} | {count:.0f} |")
+    return {kind: spent / whole for kind, (spent, _) in table.items()}
 
 
 def iteration(num_envs: int) -> None:
     """Prints the share of CPU time of each part of an iteration of `ippo` with a memory."""
-    options = ["setup=strong", "learner=ippo", "learner.minibatches=16", "episodes=2"]
-    options += [f"num_envs={num_envs}"]
+    options = ["setup=strong", "learner=ippo", "episodes=2", f"num_envs={num_envs}"]
     setup = TrainingSetup(resolve("independent", options))
     parts = "steps of the environments", "communication", "actors", "updates"
     spent: dict[str, float] = dict.fromkeys(parts, 0.0)
@@ -67,8 +68,11 @@ def iteration(num_envs: int) -> None:
     print(f"\nan iteration of ippo, {num_envs} environments: {whole:.2f} CPU s")
     for part, seconds in [*spent.items(), ("the rest", whole - sum(spent.values()))]:
         print(f"| {part} | {100 * seconds / whole:.0f} % |")
+    environments, updates = spent[parts[0]], spent[parts[3]]
     with fast_products():
-        show("an update of ippo", lambda: learner.update(batches[-1]), 1)
+        shares = show("an update of ippo", lambda: learner.update(batches[-1]), 1)
+    counted = environments + shares["matrix products"] * updates
+    print(f"\nmatrix products of updates and steps of environments: {100 * counted / whole:.0f} %")
 
 
 def _time(
