@@ -2,6 +2,7 @@
 
 import difflib
 import json
+import math
 import operator
 import re
 import reprlib
@@ -40,6 +41,7 @@ _EXPECTED = {
     "string_type": "expected text",
 }
 """type of a pydantic error -> its message; the others keep pydantic's"""
+_BOUNDS = ("less_than", "less_than_equal", "greater_than", "greater_than_equal")
 
 
 def from_plain(config_type: type[T], values: Mapping[str, Any], key: str = "") -> T:
@@ -167,12 +169,14 @@ def describe(error: ValidationError, prefix: str = "") -> str:
     usual = first["msg"].removeprefix("Value error, ").replace("Input should", "should", 1)
     expected = _EXPECTED.get(first["type"])
     message = usual if expected is None else expected.format(**first.get("ctx", {}))
+    given = first["input"]
+    if first["type"] in _BOUNDS and isinstance(given, float) and not given < math.inf:
+        message = "expected a finite number"
     if first["type"] in ("missing", "unexpected_keyword_argument"):
         wrong = "missing" if first["type"] == "missing" else "not known"
         return f"key {shown(key)!r} is {wrong}"
     if not key or message.startswith((f"{key}=", f"{key}.", f"{key}: ", f"key '{key}.")):
         return message
-    given = first["input"]
     if isinstance(given, str) and _LIKE_A_NUMBER.fullmatch(given):
         given = json.dumps(given)  # in quotes: why the text is not the number that it looks like
     value = "" if isinstance(given, dict) else f"={shown(given)}"

@@ -47,6 +47,8 @@ def evaluate_folder(
     Raises:
         UserError: a file cannot be read or written, or an argument does not fit.
     """
+    for text in overrides:
+        _check_changeable(text)
     run = open_run(name)
     if device is not None:
         check_device(device)
@@ -55,7 +57,6 @@ def evaluate_folder(
     label = f"_{given.stem}" if given else ""
     check_trained_with(checkpoint, config)
     for text in overrides:
-        _check_changeable(text)
         label += "_" + re.sub(r"[^\w.=+-]", "-", text)
     config = evaluated_with(config, overrides)
     if own := kept(config, overrides):

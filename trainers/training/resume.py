@@ -35,6 +35,8 @@ def resume(path: Path, method: str | None = None, overrides: Sequence[str] = ())
     """
     chosen = path if path.suffix == ".safetensors" else None
     runs = find_runs(path.absolute().parent.parent if chosen else path)
+    if chosen is None:
+        _check_state(runs[0])
     # The device of the run may not exist here, so it is replaced before it is checked.
     devices = [text.partition("=")[2] for text in overrides if text.startswith("device=")]
     before = runs[0].config(**({"device": devices[-1]} if devices else {}))
@@ -83,6 +85,15 @@ def _check_beginning(runs: Sequence[RunFolder], config: RunConfig) -> None:
         run.own_checkpoints()
 
 
+def _check_state(run: RunFolder) -> None:
+    """Checks that a run has not networks alone, as trained policies of the package have."""
+    if run.networks() and not run.states():
+        raise UserError(
+            f"{run.path}: holds networks alone (checkpoints/state_*.safetensors is missing); they "
+            f"can be evaluated: emberlink eval {shlex.quote(str(run.path))}"
+        )
+
+
 def _changed(config: RunConfig, method: str | None, overrides: Sequence[str]) -> RunConfig:
     """Returns the configuration with the overrides.
 
@@ -105,12 +116,6 @@ def _restore(trainer: Trainer, folders: RunFolders, chosen: Path | None) -> Sequ
     runs = folders.runs
     states = runs[0].states()
     if chosen is None and not states:
-        if runs[0].networks():
-            raise UserError(
-                f"{runs[0].path}: holds networks alone (checkpoints/state_*.safetensors is "
-                f"missing); they can be evaluated: emberlink eval "
-                f"{shlex.quote(str(runs[0].path))}"
-            )
         warm_start.start(trainer.setup.learner, trainer.config)
         return empty(runs)
     path = chosen or states[-1]

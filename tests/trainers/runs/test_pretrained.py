@@ -118,6 +118,21 @@ def test_a_copy_of_a_read_only_package_can_be_written_to(shipped):
     assert all(path.stat().st_mode & 0o200 for path in (run.path, run.checkpoints))
 
 
+def test_a_copy_cannot_be_resumed(shipped, capsys):
+    run = pretrained.open_run("pretrained:tuned/consensus/s3")
+    config = run.path / "config.yaml"
+    of_two = yaml.safe_load(config.read_text()) | {"seeds": [3, 4]}
+    config.write_text(yaml.safe_dump(of_two, sort_keys=False))
+    assert main(["train", f"resume={run.path}"]) == 2
+    assert f"{run.path}: holds networks alone" in capsys.readouterr().err
+
+
+def test_an_evaluation_that_is_refused_leaves_no_copy(shipped, tmp_path, capsys):
+    assert main(["eval", "pretrained:tuned/consensus/s3", "policy.hold=5"]) == 2
+    assert "'policy.hold=5': an evaluation can change" in capsys.readouterr().err
+    assert not (tmp_path / "runs").exists()
+
+
 def test_an_existing_copy_is_used_and_kept(shipped, tmp_path):
     run = pretrained.open_run("pretrained:consensus")
     (run.path / "note.txt").write_text("mine")
