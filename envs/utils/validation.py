@@ -41,7 +41,7 @@ _EXPECTED = {
     "string_type": "expected text",
 }
 """type of a pydantic error -> its message; the others keep pydantic's"""
-_BOUNDS = ("less_than", "less_than_equal", "greater_than", "greater_than_equal")
+_UPPER_BOUNDS = ("less_than", "less_than_equal")
 
 
 def from_plain(config_type: type[T], values: Mapping[str, Any], key: str = "") -> T:
@@ -170,7 +170,7 @@ def describe(error: ValidationError, prefix: str = "") -> str:
     expected = _EXPECTED.get(first["type"])
     message = usual if expected is None else expected.format(**first.get("ctx", {}))
     given = first["input"]
-    if first["type"] in _BOUNDS and isinstance(given, float) and not given < math.inf:
+    if first["type"] in _UPPER_BOUNDS and isinstance(given, float) and not given < math.inf:
         message = "expected a finite number"
     if first["type"] in ("missing", "unexpected_keyword_argument"):
         wrong = "missing" if first["type"] == "missing" else "not known"

@@ -68,7 +68,7 @@ def iteration(num_envs: int) -> None:
     print(f"\nan iteration of ippo, {num_envs} environments: {whole:.2f} CPU s")
     for part, seconds in [*spent.items(), ("the rest", whole - sum(spent.values()))]:
         print(f"| {part} | {100 * seconds / whole:.0f} % |")
-    environments, updates = spent[parts[0]], spent[parts[3]]
+    environments, updates = spent["steps of the environments"], spent["updates"]
     with fast_products():
         shares = show("an update of ippo", lambda: learner.update(batches[-1]), 1)
     counted = environments + shares["matrix products"] * updates

@@ -45,7 +45,7 @@ def resume(path: Path, method: str | None = None, overrides: Sequence[str] = ())
     seeds = config.seeds or (config.seed,)
     folders = RunFolders(runs, [replace(config, seed=seed) for seed in seeds])
     try:
-        if chosen is None and not (runs[0].states() or runs[0].networks()):
+        if chosen is None and not runs[0].states():
             # With the intervals of the run so far; those of now may be shorter.
             _check_beginning(runs, before)
         trainer = Trainer(config)

@@ -67,9 +67,9 @@ def _warn_of_other_observations(name: str, theirs: RunConfig, mine: RunConfig) -
     more = tuple(f"env.{key}" for key in units(mine))
     more += ("env.base",) if mine.env.observation == "sight" else ()  # maps show the base
     more += ("env.radio.",) if registry.find(mine.comm["name"]).hears else ()
-    observed = (key for key in now if key.startswith(_OBSERVED + more))
-    for key in (key for key in observed if key in before and not key.startswith(_REWARD)):
-        if before[key] != now[key]:
+    observed = (key for key in now if key.startswith(_OBSERVED + more) and key in before)
+    for key in observed:
+        if before[key] != now[key] and not key.startswith(_REWARD):
             warnings.warn(
                 f"learner.warm_start={name}: its actors were trained with {key}="
                 f"{shown(before[key])}, this run has {shown(now[key])}",

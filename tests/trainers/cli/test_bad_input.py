@@ -97,6 +97,7 @@ SETUPS = "known: paper, released, strong, tuned"
         (["maps", "comm.range=0"], ["'comm.range'", "did you mean env.radio.range?"]),
         (["maps", "comm.bandwidth=9"], ["'comm.bandwidth'", "did you mean env.radio.bandwidth?"]),
         (["maps", "setup.memory=gru"], ["'setup.memory'", "did you mean policy.memory?"]),
+        (["consensus", "env.radio.range=nan"], ["env.radio.range=nan: should be greater"]),
         (["consensus", "env.radio.range=-1"], ["env.radio.range=-1", "greater than or equal to 0"]),
         (["consensus", "comm.heading.form=cubic"], ["comm.heading.form=cubic", "'folded_linear'"]),
         (
