@@ -15,7 +15,7 @@ from emberlink.trainers.evaluation.evaluate import Policy
 from emberlink.trainers.evaluation.report import evaluate_run
 from emberlink.trainers.evaluation.results import Results
 from emberlink.trainers.evaluation.tables import print_results
-from emberlink.trainers.runs.pretrained import open_run
+from emberlink.trainers.runs.pretrained import open_run, read_run
 from emberlink.trainers.runs.run_folder import RunFolder
 from emberlink.trainers.runs.seal import check_trained_with
 
@@ -49,7 +49,7 @@ def evaluate_folder(
     """
     for text in overrides:
         _check_changeable(text)
-    run = open_run(name)
+    run = read_run(name)
     if device is not None:
         check_device(device)
     config = run.config(**({} if device is None else {"device": device}))
@@ -62,6 +62,7 @@ def evaluate_folder(
     if own := kept(config, overrides):
         console.print(f"note: the run keeps its own {', '.join(own)}", soft_wrap=True)
     actor = load_actor(config, checkpoint)
+    run = open_run(name)  # copies a trained policy of the package once all is checked
     about = [text for text in overrides if not text.startswith("world=")]  # a title names it anyway
     evaluate_and_print(
         [(run, config, actor, checkpoint)],

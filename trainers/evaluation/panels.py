@@ -31,7 +31,7 @@ from emberlink.trainers.evaluation.evaluate import (
 from emberlink.trainers.replay.pack import Shown
 from emberlink.trainers.replay.page import Replay
 from emberlink.trainers.replay.record import Recorder
-from emberlink.trainers.runs.pretrained import open_run
+from emberlink.trainers.runs.pretrained import read_run
 from emberlink.trainers.runs.seal import check_trained_with
 
 SHARED = ("grid", "num_uavs", "horizon", "altitude")
@@ -78,7 +78,7 @@ def learned(arguments: Sequence[str], checkpoints: Sequence[Path]) -> Iterator[P
     Raises:
         UserError: there is no such run, or a setting does not fit.
     """
-    runs = [(open_run(name), changes) for name, changes in _with_settings(arguments)]
+    runs = [(read_run(name), changes) for name, changes in _with_settings(arguments)]
     if checkpoints and len(checkpoints) != len(runs):
         raise UserError(f"{len(checkpoints)} checkpoints for {len(runs)} runs: one each")
     titles: set[str] = set()

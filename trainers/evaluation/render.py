@@ -84,9 +84,9 @@ def render(runs: Sequence[str], console: Console, choices: Choices) -> int:
     config = panels[0].config.env
     shown = "episode" if len(panels) == 1 else "side_by_side"
     stem = "_".join([shown, fire, str(index), *(p.stem for p in choices.checkpoints)])
-    paths = _free_paths(choices.output, open_run(runs[0]), stem)
-    steps = _steps(choices, config.horizon, [path.suffix for path in paths])
+    steps = _steps(choices, config.horizon, _suffixes(choices.output))
     arrival = fires_of(scenario).test_fire(index, config.grid, config.horizon)
+    paths = _free_paths(choices.output, runs[0], stem)
     episodes = [_play(panel, arrival, index, steps, console) for panel in panels]
     least, most = _ALONE if len(panels) == 1 else _BESIDE
     size = min(max(_CELL * max(config.grid), least), most)
@@ -151,21 +151,37 @@ def _png(path: Path, screen: Screen, count: int, fps: int) -> None:
 _WRITERS = {".gif": _gif, ".mp4": _mp4, ".png": _png}
 
 
-def _free_paths(output: Path | None, run: RunFolder, stem: str) -> list[Path]:
-    """Returns the paths of the new files.
+def _suffixes(output: Path | None) -> list[str]:
+    """Returns the endings of the files to write.
+
+    Raises:
+        UserError: the output is neither a folder nor a file of a known kind.
+    """
+    if output is None or output.is_dir():
+        return [".gif", ".mp4"]
+    if output.suffix not in _WRITERS:
+        known = ", ".join([*_WRITERS, REPLAY])
+        raise UserError(f"{output}: there is no such folder, and a file ends in {known}")
+    return [output.suffix]
+
+
+def _free_paths(output: Path | None, name: str, stem: str) -> list[Path]:
+    """Returns the paths of the new files, in the folder of the run with a name if `output` is None.
 
     Raises:
         UserError: the named file exists, or its folder does not.
     """
     if output is not None and not output.is_dir():
-        if output.suffix not in _WRITERS:
-            known = ", ".join([*_WRITERS, REPLAY])
-            raise UserError(f"{output}: there is no such folder, and a file ends in {known}")
         return [new_file(output, list(_WRITERS))]
+    folder = _figures(open_run(name)) if output is None else output
+    suffixes = _suffixes(output)
+    path = free_name(folder, stem, suffixes)
+    return [path.with_name(f"{path.name}{suffix}") for suffix in suffixes]
+
+
+def _figures(run: RunFolder) -> Path:
+    """Returns the folder of a run's figures."""
     try:
-        folder = run.figures() if output is None else output
+        return run.figures()
     except OSError as error:
         raise UserError(f"{run.path}: {error.strerror or error}") from None
-    suffixes = (".gif", ".mp4")
-    name = free_name(folder, stem, suffixes)
-    return [name.with_name(f"{name.name}{suffix}") for suffix in suffixes]

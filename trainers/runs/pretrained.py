@@ -51,20 +51,47 @@ def open_run(text: str, output: Path | str = "runs") -> RunFolder:
     Raises:
         UserError: there is no such policy, or several; the message lists the known ones.
     """
+    run = read_run(text, output)
     if not is_name(text):
-        return RunFolder(text)
-    source = find_one(text)
-    target = Path(output) / "_".join([_COPY, *source.parts[-3:]])
-    if not target.exists():
+        return run
+    source, target = run.path, _copy_of(find_one(text), output)
+    if source != target:
         try:
             _copy(source, target)
         except OSError as error:
             raise UserError(f"{target}: cannot be created: {error.strerror or error}") from None
-    elif not _is_copy(source, target):
+    return RunFolder(target)
+
+
+def read_run(text: str, output: Path | str = "runs") -> RunFolder:
+    """Returns the run that an argument of the command line names, to be read.
+
+    Nothing is written: a trained policy of the package is its copy in `output`, or the installed
+    folder if there is no copy.
+
+    Args:
+        text: see `open_run`.
+        output: folder of run folders.
+
+    Raises:
+        UserError: there is no such policy, or several; or the copy holds other networks.
+    """
+    if not is_name(text):
+        return RunFolder(text)
+    source = find_one(text)
+    target = _copy_of(source, output)
+    if not target.exists():
+        return RunFolder(source)
+    if not _is_copy(source, target):
         raise UserError(
             f"{target}: holds other networks than {text} of this version of emberlink; move it away"
         )
     return RunFolder(target)
+
+
+def _copy_of(source: Path, output: Path | str) -> Path:
+    """Returns the folder of the copy of a trained policy of the package."""
+    return Path(output) / "_".join([_COPY, *source.parts[-3:]])
 
 
 def is_copy(folder: Path) -> bool:

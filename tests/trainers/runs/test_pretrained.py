@@ -127,9 +127,24 @@ def test_a_copy_cannot_be_resumed(shipped, capsys):
     assert f"{run.path}: holds networks alone" in capsys.readouterr().err
 
 
-def test_an_evaluation_that_is_refused_leaves_no_copy(shipped, tmp_path, capsys):
-    assert main(["eval", "pretrained:tuned/consensus/s3", "policy.hold=5"]) == 2
-    assert "'policy.hold=5': an evaluation can change" in capsys.readouterr().err
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["eval", "{}", "policy.hold=5"], "'policy.hold=5': an evaluation can change"),
+        (["eval", "{}", "env.num_uavs=0"], "env.num_uavs=0"),
+        (["eval", "{}", "world=moon"], "world 'moon'"),
+        (["eval", "{}", "evaluation.scripted=[nobody]"], "nobody"),
+        (["eval", "{}", "--checkpoint", "missing.safetensors"], "missing.safetensors"),
+        (["eval", "{}", "--device", "nowhere"], "nowhere"),
+        (["render", "{}", "env.num_uavs=0"], "env.num_uavs=0"),
+        (["render", "{}", "{}", "env.num_uavs=5"], "uavs=5 (env.num_uavs)"),
+        (["render", "{}", "--fire", "moon"], "moon"),
+        (["render", "{}", "--step", "3"], "step=3"),
+    ],
+)
+def test_what_is_refused_leaves_no_copy(shipped, tmp_path, capsys, arguments, message):
+    assert main([text.format("pretrained:tuned/consensus/s3") for text in arguments]) == 2
+    assert message in capsys.readouterr().err.replace("\n", " ")
     assert not (tmp_path / "runs").exists()
 
 
