@@ -24,7 +24,8 @@ STRICT = ConfigDict(extra="forbid", strict=True)
 TAG = "kind:"
 """prefix of the tags of pydantic's unions, which are not part of a key"""
 
-Name = Annotated[str, Field(pattern=r"^\w[\w.+-]*$", max_length=100)]
+_NAME = r"^\w[\w.+-]*$"
+Name = Annotated[str, Field(pattern=_NAME, max_length=100)]
 """text that can be part of file names and measures"""
 
 CountOrZero = Annotated[int, Field(ge=0)]
@@ -170,6 +171,8 @@ def describe(error: ValidationError, prefix: str = "") -> str:
     expected = _EXPECTED.get(first["type"])
     message = usual if expected is None else expected.format(**first.get("ctx", {}))
     given = first["input"]
+    if first.get("ctx", {}).get("pattern") == _NAME:
+        message = "expected a name of letters, digits and _ . + -"
     if first["type"] in _UPPER_BOUNDS and isinstance(given, float) and not given < math.inf:
         message = "expected a finite number"
     if first["type"] in ("missing", "unexpected_keyword_argument"):

@@ -15,6 +15,7 @@ from torch import nn
 
 from emberlink.comm.maps import Maps
 from emberlink.envs import keys
+from emberlink.envs.utils.errors import UserError
 from emberlink.policies.scripted.map_greedy import MapGreedy
 from emberlink.trainers.build import build_env
 from emberlink.trainers.cli import main
@@ -274,6 +275,12 @@ def test_the_first_noise_is_that_of_the_configuration(warm, imitated, tmp_path):
     trainer.start()
     noise = trainer.setup.learner.weights()["actor_network_params.module.log_std"]
     assert (noise == -1.5).all()
+
+
+@pytest.mark.parametrize("name", ["", "map greedy", "../map_greedy"])
+def test_a_teacher_has_a_name(name):
+    with pytest.raises(UserError, match=r"learner\.teacher=.*: expected a name of letters, digits"):
+        resolve("maps", settings("imitation", f"learner.teacher={name}"))
 
 
 def test_actors_of_a_run_on_a_device_that_is_not_here(imitated, tmp_path):
