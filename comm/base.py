@@ -39,6 +39,9 @@ class CommModule(Buffers, TensorDictModuleBase):
     """a pydantic dataclass: the settings under `comm` in a method's YAML file"""
     hears: ClassVar[bool] = False
     """whether the module reads `keys.HEARS`"""
+    units: ClassVar[tuple[str, ...]] = ()
+    """settings that change what the numbers of an observation mean; if they are not those of the
+    training, an evaluation warns"""
     hold: int = 1
     """steps from one decision of the policy to the next (`policy.hold`); between them, no policy
     reads observations"""

@@ -56,6 +56,7 @@ class Consensus(CommModule):
 
     config_type: ClassVar[type] = ConsensusConfig
     hears: ClassVar[bool] = True
+    units: ClassVar[tuple[str, ...]] = ("target",)
     low: Tensor
     high: Tensor
     waypoint: Tensor

@@ -32,6 +32,7 @@ class Positional(CommModule):
 
     config_type: ClassVar[type] = PositionalConfig
     hears: ClassVar[bool] = True
+    units: ClassVar[tuple[str, ...]] = ("own_first",)
 
     _own: Tensor
     _order: Tensor

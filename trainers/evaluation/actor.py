@@ -9,9 +9,11 @@ import torch
 from tensordict.nn import TensorDictModule
 from torchrl.envs import TransformedEnv
 
+from emberlink.comm import registry
 from emberlink.envs.utils.validation import shown
 from emberlink.trainers.build import build_actor, build_env
 from emberlink.trainers.config.compose import to_values
+from emberlink.trainers.config.overrides import flat
 from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.learners.base import ACTOR
 from emberlink.trainers.runs import checkpoint_file
@@ -26,7 +28,8 @@ def load_actor(
     """Returns the frozen policy of a checkpoint, which maps observations to ("agents", "action").
 
     It warns if the networks see a base here and saw none in training, or if the map, the altitudes,
-    the horizon, the speed, the view or the units of observations are not those of the training.
+    the horizon, the speed, the view or the units of observations, also those of the communication,
+    are not those of the training.
 
     Args:
         config: configuration of the run.
@@ -47,27 +50,29 @@ def load_actor(
             "weights of the pixels that show one keep their initial values",
             stacklevel=2,
         )
-    _warn_of_other_units(config, trained["env"])
+    _warn_of_other_units(config, trained)
     network.load_state_dict({name.removeprefix(ACTOR): v for name, v in weights.items()})
     return actor.requires_grad_(False)
 
 
 def units(config: RunConfig) -> tuple[str, ...]:
-    """Returns the keys of `env` that change what the numbers in observations and actions mean.
+    """Returns the keys that change what the numbers in observations and actions mean.
 
     The grid is among them if a UAV observes where in the box it is.
     """
     by_map = config.env.observation != "sight" or config.comm.get("position", False)
-    return ("grid", *_UNITS) if by_map else _UNITS
+    world = ("grid", *_UNITS) if by_map else _UNITS
+    said = registry.find(config.comm["name"]).units
+    return (*(f"env.{key}" for key in world), *(f"comm.{key}" for key in said))
 
 
 def _warn_of_other_units(config: RunConfig, trained: Mapping[str, Any]) -> None:
     """Warns of settings with which observed and flown distances mean something else."""
-    here = to_values(config)["env"]
+    here, there = flat(to_values(config)), flat(trained)
     differ = [
-        f"env.{key}={shown(here[key])} (in training {shown(trained[key])})"
+        f"{key}={shown(here[key])} (in training {shown(there[key])})"
         for key in units(config)
-        if here[key] != trained.get(key, here[key])
+        if here[key] != there.get(key, here[key])
     ]
     if differ:
         warnings.warn(

@@ -64,7 +64,7 @@ def start(learner: Learner, config: RunConfig) -> None:
 def _warn_of_other_observations(name: str, theirs: RunConfig, mine: RunConfig) -> None:
     """Warns of settings that give the same observations another meaning."""
     before, now = flat(to_values(theirs)), flat(to_values(mine))
-    more = tuple(f"env.{key}" for key in units(mine))
+    more = units(mine)
     more += ("env.base",) if mine.env.observation == "sight" else ()  # maps show the base
     more += ("env.radio.",) if registry.find(mine.comm["name"]).hears else ()
     observed = (key for key in now if key.startswith(_OBSERVED + more) and key in before)

@@ -1,6 +1,7 @@
 """Tests evaluations of a run in another world than that of its training."""
 
 import json
+import re
 import warnings
 from itertools import pairwise
 from typing import Any
@@ -188,6 +189,26 @@ def test_another_map_is_warned_of_where_positions_are_observed(run):
     with warnings.catch_warnings():
         warnings.simplefilter("error", UserWarning)
         trainers.load("pretrained:maps", grid=[40, 40])
+
+
+@pytest.mark.parametrize(
+    ("name", "setting", "said"),
+    [
+        ("maps", {"scales": [5, 1]}, r"^comm\.scales=\[5, 1\] \(in training \[1, 5\]\): what"),
+        ("maps", {"spread": 0}, r"^comm\.spread=0 \(in training 2\): what"),
+        ("maps", {"home": False}, None),
+        ("consensus", {"target": "absolute"}, r"^comm\.target=absolute \(in training relative\)"),
+        ("consensus", {"redraw": 50}, None),
+        ("strong/positional", {"own_first": False}, r"^comm\.own_first=false \(in training true\)"),
+    ],
+)
+def test_other_units_of_the_communication_are_warned_of(name, setting, said):
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", UserWarning)
+        trainers.load(f"pretrained:{name}", **setting)
+    messages = [str(warning.message) for warning in caught]
+    assert len(messages) == (said is not None)
+    assert said is None or re.match(said, messages[0]), messages
 
 
 def test_a_training_state_is_not_evaluated(run, capsys):
