@@ -84,9 +84,10 @@ def render(runs: Sequence[str], console: Console, choices: Choices) -> int:
     config = panels[0].config.env
     shown = "episode" if len(panels) == 1 else "side_by_side"
     stem = "_".join([shown, fire, str(index), *(p.stem for p in choices.checkpoints)])
-    steps = _steps(choices, config.horizon, _suffixes(choices.output))
+    suffixes = _suffixes(choices.output)
+    steps = _steps(choices, config.horizon, suffixes)
     arrival = fires_of(scenario).test_fire(index, config.grid, config.horizon)
-    paths = _free_paths(choices.output, runs[0], stem)
+    paths = _free_paths(choices.output, runs[0], stem, suffixes)
     episodes = [_play(panel, arrival, index, steps, console) for panel in panels]
     least, most = _ALONE if len(panels) == 1 else _BESIDE
     size = min(max(_CELL * max(config.grid), least), most)
@@ -165,7 +166,7 @@ def _suffixes(output: Path | None) -> list[str]:
     return [output.suffix]
 
 
-def _free_paths(output: Path | None, name: str, stem: str) -> list[Path]:
+def _free_paths(output: Path | None, name: str, stem: str, suffixes: Sequence[str]) -> list[Path]:
     """Returns the paths of the new files, in the folder of the run with a name if `output` is None.
 
     Raises:
@@ -174,7 +175,6 @@ def _free_paths(output: Path | None, name: str, stem: str) -> list[Path]:
     if output is not None and not output.is_dir():
         return [new_file(output, list(_WRITERS))]
     folder = _figures(open_run(name)) if output is None else output
-    suffixes = _suffixes(output)
     path = free_name(folder, stem, suffixes)
     return [path.with_name(f"{path.name}{suffix}") for suffix in suffixes]
 

@@ -52,14 +52,13 @@ def open_run(text: str, output: Path | str = "runs") -> RunFolder:
         UserError: there is no such policy, or several; the message lists the known ones.
     """
     run = read_run(text, output)
-    if not is_name(text):
+    if not is_name(text) or is_copy(run.path):
         return run
-    source, target = run.path, _copy_of(find_one(text), output)
-    if source != target:
-        try:
-            _copy(source, target)
-        except OSError as error:
-            raise UserError(f"{target}: cannot be created: {error.strerror or error}") from None
+    target = _copy_of(run.path, output)
+    try:
+        _copy(run.path, target)
+    except OSError as error:
+        raise UserError(f"{target}: cannot be created: {error.strerror or error}") from None
     return RunFolder(target)
 
 
