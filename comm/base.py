@@ -39,6 +39,8 @@ class CommModule(Buffers, TensorDictModuleBase):
     """a pydantic dataclass: the settings under `comm` in a method's YAML file"""
     hears: ClassVar[bool] = False
     """whether the module reads `keys.HEARS`"""
+    heeds_bandwidth: ClassVar[bool] = False
+    """whether UAVs say no more than `env.radio.bandwidth`; if not, a limit causes a warning"""
     units: ClassVar[tuple[str, ...]] = ()
     """settings that change what the numbers of an observation mean; if they are not those of the
     training, an evaluation warns"""

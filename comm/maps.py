@@ -59,6 +59,7 @@ class Maps(CommModule):
 
     config_type: ClassVar[type] = MapsConfig
     hears: ClassVar[bool] = True
+    heeds_bandwidth: ClassVar[bool] = True
     units: ClassVar[tuple[str, ...]] = "scales", "spread"
     stamp: Tensor
     """int64 [num_envs, n, n]: steps at which UAVs know positions of UAVs, -1 for never"""

@@ -1,5 +1,6 @@
 """Finds communication modules by name: files of this folder, and entry points of other packages."""
 
+import warnings
 from collections.abc import Mapping
 from typing import Any
 
@@ -17,6 +18,8 @@ def build(
 ) -> CommModule:
     """Returns a new communication module.
 
+    It warns if the world limits the bytes of messages and the module does not heed the limit.
+
     Args:
         name: name of the communication method.
         world: the environment's constants.
@@ -26,5 +29,10 @@ def build(
     Raises:
         UserError: the name or a setting is not known, or a value is out of range.
     """
-    module = find(name)
+    module, limit = find(name), world.radio.bandwidth
+    if limit is not None and module.hears and not module.heeds_bandwidth:
+        warnings.warn(
+            f"env.radio.bandwidth={limit}: the messages of comm.name={name} are not limited",
+            stacklevel=2,
+        )
     return module(world, from_plain(module.config_type, settings, "comm"), num_envs)

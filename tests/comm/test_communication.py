@@ -1,5 +1,6 @@
 """Tests the outputs and the discovery of the communication modules."""
 
+import warnings
 from pathlib import Path
 
 import pytest
@@ -95,6 +96,20 @@ def test_every_recipe_names_a_module():
     assert recipes == sorted(EVERY)
     used = {resolve(method).comm["name"] for method in recipes}
     assert used == set(registry.known())
+
+
+@pytest.mark.parametrize("method", ["positional", "consensus"])
+def test_a_limit_that_a_method_does_not_heed_causes_a_warning(method):
+    message = rf"^env\.radio\.bandwidth=20: the messages of comm\.name={method} are not limited$"
+    with pytest.warns(UserWarning, match=message):
+        recipe(method, **{"env.radio.bandwidth": 20})
+
+
+@pytest.mark.parametrize("method", ["independent", "shared_memory", "maps"])
+def test_a_limit_causes_no_warning_without_messages_or_if_it_is_heeded(method):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", UserWarning)
+        recipe(method, **{"env.radio.bandwidth": 20})
 
 
 @pytest.mark.parametrize("name", ["consensu", "", "base", "../no_comm"])
