@@ -78,18 +78,20 @@ def _claims_table(numbers: Numbers) -> Table:
 
 
 def _communication_table(numbers: Numbers) -> Table:
-    """Returns a table of the values of communication."""
+    """Returns a table of the values of communication, with a section for each fire."""
     measure = numbers.communication[0].measure
     table = Table(
         title=Text(f"{numbers.section.label}: the value of communication, by {measure}"),
-        caption="value: (with radio - off) / (no limits - off); interval over the fires",
+        caption="gain: with radio - off; value: gain / (no limits - off); intervals over the fires",
     )
-    left = ("policy", "on", "radios")
-    for column in (*left, "off", "with radio", "no limits", "value", "95 % interval"):
+    left, ends = ("policy", "radios"), "95 %\ninterval"
+    for column in (*left, "off", "with\nradio", "no\nlimits", "gain", ends, "value", ends):
         table.add_column(column, justify="left" if column in left else "right")
-    for value in numbers.communication:
-        name = value.policy.replace("_", " ") if value.how == "scripted" else value.policy
-        table.add_row(*map(Text, (name, value.fire, value.how, *worth(value))))
+    for fire, values in groupby(numbers.communication, lambda value: value.fire):
+        table.add_row(Text(fire, style="bold"))
+        for value in values:
+            name = value.policy.replace("_", " ") if value.how == "scripted" else value.policy
+            table.add_row(*map(Text, (name, value.how, *worth(value))))
     return table
 
 

@@ -43,6 +43,8 @@ class CommunicationValue:
             networks were trained with them, "scripted" for a scripted policy.
         none, with_radio, full: mean of the measure with the radio off, with the radio of the world,
             and with a radio without limits.
+        gain: with_radio - none, in units of the measure.
+        gain_interval: 95 % bootstrap interval of `gain` over fires, paired; None with one fire.
         value: (with_radio - none) / (full - none); None if `none` and `full` do not differ.
         interval: 95 % bootstrap interval over fires, paired; None if it is not finite.
     """
@@ -54,6 +56,8 @@ class CommunicationValue:
     none: float
     with_radio: float
     full: float
+    gain: float
+    gain_interval: Interval | None
     value: float | None
     interval: Interval | None
 
@@ -190,12 +194,19 @@ def _value(
         none=none,
         with_radio=with_radio,
         full=full,
+        gain=with_radio - none,
+        gain_interval=bootstrap.paired_interval(_gain, *samples[:2]),
         value=value,
         interval=bootstrap.paired_interval(_share, *samples),
     )
 
 
+def _gain(none: Values, with_radio: Values, axis: int = -1) -> Any:
+    """Returns with_radio - none of the means along an axis."""
+    return with_radio.mean(axis) - none.mean(axis)
+
+
 def _share(none: Values, with_radio: Values, full: Values, axis: int = -1) -> Any:
     """Returns (with_radio - none) / (full - none) of the means along an axis; NaN for x / 0."""
-    gained, most = (m.mean(axis) - none.mean(axis) for m in (with_radio, full))
+    gained, most = (_gain(none, m, axis) for m in (with_radio, full))
     return np.divide(gained, most, out=np.full_like(gained, np.nan), where=most != 0)

@@ -33,6 +33,7 @@ def test_networks_evaluated_with_other_radios(tmp_path, capsys):
     (value,) = compare_runs([tmp_path]).sections[0].communication
     assert (value.policy, value.measure, value.how) == ("consensus", "coverage", "evaluated")
     assert (value.none, value.with_radio, value.full) == (55.25, 65.25, 80.25)
+    assert (value.gain, value.gain_interval) == (10.0, (10.0, 10.0))  # 10 on each fire
     assert value.value == pytest.approx(10 / 25)
     assert value.interval is not None
     low, high = value.interval
@@ -41,13 +42,23 @@ def test_networks_evaluated_with_other_radios(tmp_path, capsys):
     assert main.main(["compare", str(tmp_path), "--output", str(tmp_path / "out")]) == 0
     said = " ".join(capsys.readouterr().out.split())
     assert "the value of communication, by coverage" in said
-    assert "0.40" in said
+    assert "consensus evaluated 55.2 65.2 80.2 10.00 [10.00, 10.00] 0.40 [" in said
     assert "huygens" in said.partition("the value of communication")[2]
     page = (tmp_path / "out" / "compare.html").read_text()
     table = page.partition("The value of communication")[2].partition("</table>")[0]
     assert "<td>huygens</td></tr>" in table
     (section,) = json.loads((tmp_path / "out" / "compare.json").read_text())["setups"]
     assert section["communication"][0]["value"] == pytest.approx(0.4)
+    assert section["communication"][0]["gain"] == 10.0
+
+
+def test_the_gain_is_paired_by_fire(tmp_path):
+    run = write_run(tmp_path, learned={"coverage": [50.0, 60, 70, 80]})
+    evaluate_otherwise(run, 0.0, [49.0, 59, 69, 79.0])  # fires differ by 10, the radios by 1
+    evaluate_otherwise(run, float("inf"), [49.0, 59, 69, 79.0])
+    (value,) = compare_runs([tmp_path]).sections[0].communication
+    assert (value.gain, value.gain_interval) == (1.0, (1.0, 1.0))
+    assert (value.value, value.interval) == (None, None)
 
 
 def test_networks_trained_with_other_radios(tmp_path):

@@ -151,11 +151,15 @@ def decision(verdict: Verdict) -> str:
 
 
 def worth(value: CommunicationValue) -> tuple[str, ...]:
-    """Returns the cells of a value of communication: three means, the value and its interval."""
+    """Returns the cells of a value of communication.
+
+    Three means, the gain and its interval, the value and its interval.
+    """
     digits = DIGITS.get(value.measure, 1)
-    means = (f"{mean:.{digits}f}" for mean in (value.none, value.with_radio, value.full))
     return (
-        *means,
+        *(_number(mean, digits) for mean in (value.none, value.with_radio, value.full)),
+        _number(value.gain, digits + 1),
+        _interval(value.gain_interval, digits + 1),
         NONE if value.value is None else f"{value.value:.2f}",
         _interval(value.interval, 2),
     )
