@@ -200,6 +200,7 @@ def unknown(value: str, known: Iterable[str], *, listed: bool = True) -> str:
     same = [name for name in names if "." in value and name.endswith(value[value.rfind(".") :])]
     near = (
         difflib.get_close_matches(value, same, n=1, cutoff=0.0)
+        or [last_parts[part] for part in [value] if part in last_parts]
         or difflib.get_close_matches(value, names, n=1)
         or [last_parts[part] for part in difflib.get_close_matches(value, last_parts, n=1)]
     )

@@ -94,12 +94,12 @@ def test_learners_receive_decisions(learner):
 
 def test_the_horizon_is_a_multiple_of_the_held_steps():
     config = resolve("independent", ["policy.hold=7", "env.horizon=20"])
-    with pytest.raises(UserError, match=r"env.horizon=20: must be a multiple of the 7 steps"):
+    with pytest.raises(UserError, match=r"env.horizon=20: must be a multiple of 7, the steps"):
         TrainingSetup(config)
 
 
 @pytest.mark.parametrize("learner", ["ddpg", "mappo", "imitation"])
 def test_an_episode_has_a_decision_at_least(learner):
     config = resolve("maps", ["world=front", f"learner={learner}", "setup=tuned", "env.horizon=8"])
-    with pytest.raises(UserError, match=r"env.horizon=8: must be a multiple of the 10 steps"):
+    with pytest.raises(UserError, match=r"env.horizon=8: must be a multiple of 10, the steps"):
         TrainingSetup(config)

@@ -187,8 +187,9 @@ class RunConfig:
         steps = decisions * self.policy.hold
         if self.env.horizon % steps:
             raise UserError(
-                f"env.horizon={self.env.horizon}: must be a multiple of the {steps} steps that the "
-                f"learner takes at once (policy.hold={self.policy.hold})"
+                f"env.horizon={self.env.horizon}: must be a multiple of {steps}, the steps of "
+                f"{'a decision' if decisions == 1 else f'{decisions} decisions'} "
+                f"(policy.hold={self.policy.hold})"
             )
 
 

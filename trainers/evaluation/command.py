@@ -81,7 +81,8 @@ def _check_changeable(text: str) -> None:
     if not text.startswith(_CHANGEABLE):
         raise UserError(
             f"{text!r}: an evaluation can change the world and its fire, evaluation.scripted, "
-            "evaluation.headline, and keys of comm. and env. only"
+            "evaluation.headline, and keys of comm. and env. only; "
+            "--fires N chooses the number of fires"
         )
 
 

@@ -73,10 +73,9 @@ class Teacher(Transform):
     def __init__(self, env: WildfireEnv, maps: Any, name: str, hold: int):
         super().__init__()
         if not isinstance(maps, Maps):
-            kind = type(maps).__name__
             raise UserError(
-                f"learner=imitation: the teacher flies by the maps of method maps; {kind} keeps "
-                "none"
+                "learner=imitation: the teacher flies by the maps of the UAVs, which only method "
+                "maps keeps"
             )
         if torch.device(env.device or "cpu").type != "cpu":
             raise UserError(f"device={env.device}: the teacher needs device=cpu")

@@ -9,6 +9,7 @@ from rich.console import Console
 
 from emberlink.configs import known
 from emberlink.envs.utils.errors import UserError
+from emberlink.policies.networks import memory
 from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.evaluation.command import evaluate_and_print
@@ -116,7 +117,7 @@ def _announce(trainer: Trainer, overrides: Sequence[str], console: Console) -> N
                 soft_wrap=True,
             )
     else:
-        for note in _notes(trainer):
+        for note in [*_notes(trainer), *_without_effect(config, overrides)]:
             console.print(f"note: {note}", style="yellow", soft_wrap=True)
 
 
@@ -139,6 +140,17 @@ def _notes(trainer: Trainer) -> Iterator[str]:
             "env.observation_scale=raw: the first layer of these networks has a tanh, which "
             "saturates with numbers of cells and steps; env.observation_scale=box scales them"
         )
+
+
+def _without_effect(config: RunConfig, overrides: Sequence[str]) -> Iterator[str]:
+    """Yields the given settings that do not matter with the chosen memory."""
+    chosen, others = config.policy.memory, set[str]()
+    for name in memory.known():
+        with suppress(UserError):  # a memory of another package that cannot be imported
+            others.update(memory.find(name).settings)
+    for text in overrides:
+        if text.partition("=")[0] in others.difference(memory.find(chosen).settings):
+            yield f"{text} has no effect with policy.memory={chosen}"
 
 
 def _is_finished(trainer: Trainer) -> bool:

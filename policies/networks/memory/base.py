@@ -1,6 +1,7 @@
 """Defines the base class of memories."""
 
 from abc import abstractmethod
+from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -23,6 +24,11 @@ class Memory(nn.Module):
         generator: of the initial weights.
     """
 
+    settings: ClassVar[tuple[str, ...]] = (
+        *("policy.units", "policy.decisions"),
+        *("learner.sequence", "learner.burn_in"),
+    )
+    """the keys among these that matter with this memory; others that are given cause a note"""
     features: int
     """number of features of the output"""
     size: int

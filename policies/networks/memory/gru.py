@@ -1,5 +1,7 @@
 """A gated recurrent unit (Cho et al. 2014, EMNLP)."""
 
+from typing import ClassVar
+
 import torch
 from torch import Tensor
 
@@ -14,6 +16,8 @@ class GRU(Memory):
     A GRU of torch has the weights of one group. Several groups are computed together, one decision
     after another; on a CPU, this takes less than half of the time of one group after another.
     """
+
+    settings: ClassVar[tuple[str, ...]] = "policy.units", "learner.sequence", "learner.burn_in"
 
     def __init__(
         self,

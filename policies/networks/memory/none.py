@@ -1,5 +1,7 @@
 """No memory: a decision depends on its observation alone."""
 
+from typing import ClassVar
+
 import torch
 from torch import Tensor
 
@@ -10,6 +12,8 @@ from emberlink.policies.settings import PolicyConfig
 
 class NoMemory(Memory):
     """Returns its input."""
+
+    settings: ClassVar[tuple[str, ...]] = ()
 
     def __init__(
         self,

@@ -1,5 +1,7 @@
 """Remembers the inputs of the last decisions."""
 
+from typing import ClassVar
+
 import torch
 from torch import Tensor
 
@@ -13,6 +15,8 @@ class Stack(Memory):
 
     Inputs before the beginning of the episode are 0.
     """
+
+    settings: ClassVar[tuple[str, ...]] = "policy.decisions", "learner.sequence", "learner.burn_in"
 
     def __init__(
         self,

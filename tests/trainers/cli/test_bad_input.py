@@ -96,6 +96,7 @@ SETUPS = "known: paper, released, strong, tuned"
         (["consensus", "env.radio.rnge=3"], ["'env.radio.rnge'", "did you mean env.radio.range?"]),
         (["maps", "comm.range=0"], ["'comm.range'", "did you mean env.radio.range?"]),
         (["maps", "comm.bandwidth=9"], ["'comm.bandwidth'", "did you mean env.radio.bandwidth?"]),
+        (["maps", "hold=9"], ["'hold'", "did you mean policy.hold?"]),
         (["maps", "setup.memory=gru"], ["'setup.memory'", "did you mean policy.memory?"]),
         (["consensus", "env.radio.range=nan"], ["env.radio.range=nan: should be greater"]),
         (["consensus", "env.radio.range=-1"], ["env.radio.range=-1", "greater than or equal to 0"]),
@@ -247,15 +248,30 @@ def test_a_batch_that_is_never_filled_gives_a_warning(tmp_path, capsys):
         ("shared_memory", "paper", [], []),
         ("consensus", "tuned", ["learner=mappo"], []),
         ("maps", "paper", ["learner=mappo"], []),
+        (
+            "consensus",
+            "tuned",
+            ["policy.units=8"],
+            ["policy.units=8 has no effect with policy.memory=none"],
+        ),
+        ("consensus", "tuned", ["learner.burn_in=2"], ["learner.burn_in=2 has no effect with"]),
+        (
+            "consensus",
+            "tuned",
+            ["policy.memory=gru", "policy.decisions=4"],
+            ["policy.decisions=4 has"],
+        ),
+        ("consensus", "tuned", ["policy.memory=stack", "policy.units=8"], ["policy.units=8 has"]),
+        ("consensus", "tuned", ["policy.memory=gru", "policy.units=8"], []),
+        ("consensus", "tuned", ["policy.memory=stack", "policy.decisions=4"], []),
     ],
 )
 def test_notes_of_a_training(method, setup, more, notes, tmp_path, capsys):
     small = [text for text in TINY if not text.startswith(("setup=", "learner."))]
     small += [f"setup={setup}", "learner.hidden=[8]", f"output={tmp_path}"]
     replays = not any("ppo" in text for text in more)
-    small += (
-        ["learner.batch_size=4", "learner.sequence=4"] if replays else ["learner.minibatches=1"]
-    )
+    small += ["learner.batch_size=4"] if replays else ["learner.minibatches=1"]
+    small += ["learner.sequence=4"] if any("policy.memory=" in text for text in more) else []
     assert main.main(["train", method, *small, *more]) == 0
     said = " ".join(capsys.readouterr().out.split())
     assert said.count("note: ") == len(notes), said

@@ -155,7 +155,7 @@ def test_the_loss_falls_and_is_that_of_smooth_l1():
             ["maps", *settings("ippo"), "env.observation=window"],
             "Maps reads it; it comes from env.observation=sight",
         ),
-        (["consensus", "learner=imitation"], "Consensus keeps none"),
+        (["consensus", "learner=imitation"], "which only method maps keeps"),
         (
             ["maps", *settings("imitation"), "learner.teacher=curier"],
             "learner.teacher='curier' is not known",

@@ -56,8 +56,8 @@ class SequenceMemory(ReplayMemory):
             shared = f"shared by {context.num_uavs} UAVs, " if context.shared_replay else ""
             raise UserError(
                 f"learner.buffer_size={more['buffer_size']}: {shared}holds {held} decisions of "
-                f"{context.num_envs} environments; {wanted} are needed for learner.burn_in="
-                f"{burn_in} and learner.sequence={sequence}"
+                f"{context.num_envs} environments; {wanted} are needed for a burn-in of {burn_in} "
+                f"(learner.burn_in, at most an episode) and learner.sequence={sequence}"
             )
         self.learning_starts = max(self.learning_starts, sequence)
 
