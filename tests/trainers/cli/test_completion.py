@@ -16,7 +16,7 @@ from emberlink.trainers.cli.completion import SHELLS
 RADIO = [f"env.radio.{name}=" for name in ("range", "loss", "bandwidth")]
 SETUPS = [f"setup={name}" for name in ("paper", "released", "strong", "tuned")]
 METHODS = ["consensus", "independent", "positional", "shared_memory"]
-PRETRAINED = sorted([*METHODS, "maps", "strong/", "strong_front/", "tuned/", "tuned_front/"])
+PRETRAINED = sorted([*METHODS, "maps", "strong/", "strong_front/", "tuned/"])
 """the methods with trained policies"""
 
 
