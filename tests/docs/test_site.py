@@ -59,6 +59,12 @@ def test_keys_and_measures_are_tabulated_in_the_reference_only():
     assert [page.name for page in PAGES if re.search(tables, page.read_text(), re.M)] == []
 
 
+def test_no_line_is_a_comment():
+    """MyST leaves out a line of text that begins with a percent sign, such as a wrapped `98 %`."""
+    comment = re.compile(r"^\s*%.*", re.M)
+    assert [line for page in PAGES for line in comment.findall(page.read_text())] == []
+
+
 def test_a_figure_stands_on_one_page():
     shown = Counter(name for page in PAGES for name in FIGURE.findall(page.read_text()))
     assert [name for name, count in shown.items() if count > 1] == []
