@@ -191,16 +191,15 @@ def unknown(value: str, known: Iterable[str], *, listed: bool = True) -> str:
 
     Args:
         value: the name.
-        known: all known names. One whose last part is that of a dotted key is the most similar.
+        known: all known names. One with the same last part is the most similar.
         listed: whether to append all known names. If not, names without dots are appended only if
             no name is similar.
     """
     names = list(known)
     last_parts = {name.rsplit(".", 1)[-1]: name for name in names}
-    same = [name for name in names if "." in value and name.endswith(value[value.rfind(".") :])]
+    same = [name for name in names if name.endswith(f".{value.rpartition('.')[2]}")]
     near = (
         difflib.get_close_matches(value, same, n=1, cutoff=0.0)
-        or [last_parts[part] for part in [value] if part in last_parts]
         or difflib.get_close_matches(value, names, n=1)
         or [last_parts[part] for part in difflib.get_close_matches(value, last_parts, n=1)]
     )

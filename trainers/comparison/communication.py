@@ -185,7 +185,8 @@ def _value(
     fire: str, policy: str, measure: str, how: str, samples: Sequence[Values]
 ) -> CommunicationValue:
     none, with_radio, full = (float(sample.mean()) for sample in samples)
-    value = (with_radio - none) / (full - none) if full != none else None
+    gain = with_radio - none
+    value = gain / (full - none) if full != none else None
     return CommunicationValue(
         fire=fire,
         policy=policy,
@@ -194,7 +195,7 @@ def _value(
         none=none,
         with_radio=with_radio,
         full=full,
-        gain=with_radio - none,
+        gain=gain,
         gain_interval=bootstrap.paired_interval(_gain, *samples[:2]),
         value=value,
         interval=bootstrap.paired_interval(_share, *samples),

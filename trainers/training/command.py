@@ -117,11 +117,11 @@ def _announce(trainer: Trainer, overrides: Sequence[str], console: Console) -> N
                 soft_wrap=True,
             )
     else:
-        for note in [*_notes(trainer), *_without_effect(config, overrides)]:
+        for note in _notes(trainer, overrides):
             console.print(f"note: {note}", style="yellow", soft_wrap=True)
 
 
-def _notes(trainer: Trainer) -> Iterator[str]:
+def _notes(trainer: Trainer, overrides: Sequence[str]) -> Iterator[str]:
     """Yields what a user might not expect of a training."""
     config = trainer.config
     learner, world = config.learner, config.env
@@ -140,16 +140,10 @@ def _notes(trainer: Trainer) -> Iterator[str]:
             "env.observation_scale=raw: the first layer of these networks has a tanh, which "
             "saturates with numbers of cells and steps; env.observation_scale=box scales them"
         )
-
-
-def _without_effect(config: RunConfig, overrides: Sequence[str]) -> Iterator[str]:
-    """Yields the given settings that do not matter with the chosen memory."""
-    chosen, others = config.policy.memory, set[str]()
-    for name in memory.known():
-        with suppress(UserError):  # a memory of another package that cannot be imported
-            others.update(memory.find(name).settings)
+    chosen = config.policy.memory
+    unread = set(memory.Memory.settings).difference(memory.find(chosen).settings)
     for text in overrides:
-        if text.partition("=")[0] in others.difference(memory.find(chosen).settings):
+        if text.partition("=")[0] in unread:
             yield f"{text} has no effect with policy.memory={chosen}"
 
 

@@ -25,8 +25,10 @@ class Memory(nn.Module):
     """
 
     settings: ClassVar[tuple[str, ...]] = (
-        *("policy.units", "policy.decisions"),
-        *("learner.sequence", "learner.burn_in"),
+        "policy.units",
+        "policy.decisions",
+        "learner.sequence",
+        "learner.burn_in",
     )
     """the keys among these that matter with this memory; others that are given cause a note"""
     features: int
