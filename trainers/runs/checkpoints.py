@@ -142,27 +142,34 @@ def load_weights(
     header, weights = checkpoint_file.read(path)
     if config is not None:
         _check_header(path, header, config)
-    for name, tensor in expected.items():
-        if name not in weights:
-            raise UserError(f"{path}: holds no {name}{_trained_with(path, header, config)}")
-        weight = weights[name]
-        if weight.shape != tensor.shape or weight.dtype != tensor.dtype:
-            raise UserError(
-                f"{path}: {name} has shape {list(weight.shape)}, {weight.dtype}; this "
-                f"configuration needs {list(tensor.shape)}, {tensor.dtype}"
-                f"{_trained_with(path, header, config)}"
-            )
-    more = [name for name in weights if name.startswith(ACTOR) and name not in expected]
-    if more:
-        reason = f"{more[0]}, which this configuration does not have"
-        raise UserError(f"{path}: holds {reason}{_trained_with(path, header, config)}")
+    reason = _misfit(weights, expected)
+    if reason:
+        raise UserError(f"{path}: {_trained_with(path, header, config)}{reason}")
     chosen = {name: weights[name] for name in expected}
     checkpoint_file.check_finite(path, chosen)
     return chosen
 
 
+def _misfit(weights: Mapping[str, Tensor], expected: Mapping[str, Tensor]) -> str:
+    """Returns how the weights of a checkpoint differ from the expected ones; "" if they fit."""
+    for name, tensor in expected.items():
+        if name not in weights:
+            return f"holds no {name}"
+        weight = weights[name]
+        if weight.shape != tensor.shape or weight.dtype != tensor.dtype:
+            return (
+                f"{name} has shape {list(weight.shape)}, {weight.dtype}; this configuration needs "
+                f"{list(tensor.shape)}, {tensor.dtype}"
+            )
+    more = [name for name in weights if name.startswith(ACTOR) and name not in expected]
+    return f"holds {more[0]}, which this configuration does not have" if more else ""
+
+
 def _trained_with(path: Path, header: Mapping[str, Any], config: RunConfig | None) -> str:
-    """Returns the settings of networks that differ from those of a checkpoint, for a message."""
+    """Returns the settings of networks that differ from those of a checkpoint.
+
+    They begin a message: "it was trained with KEY=VALUE (now VALUE): ".
+    """
     if config is None or not isinstance(header.get("config"), Mapping):
         return ""
     try:
@@ -178,7 +185,7 @@ def _trained_with(path: Path, header: Mapping[str, Any], config: RunConfig | Non
     }
     if len(differ) > 1 and _flies_in_any_team(config):
         differ.pop("env.num_uavs", None)  # it is hardly the reason
-    return f"; it was trained with {', '.join(differ.values())}" if differ else ""
+    return f"it was trained with {', '.join(differ.values())}: " if differ else ""
 
 
 def _check_header(path: Path, header: Mapping[str, Any], config: RunConfig) -> None:
