@@ -141,7 +141,15 @@ def _notes(trainer: Trainer, overrides: Sequence[str]) -> Iterator[str]:
             "saturates with numbers of cells and steps; env.observation_scale=box scales them"
         )
     chosen = config.policy.memory
-    unread = set(memory.Memory.settings).difference(memory.find(chosen).settings)
+    kind = memory.find(chosen)
+    filled = min(kind.burn_in(config.policy), world.horizon // config.policy.hold - 1)
+    burn_in: int = getattr(learner, "burn_in", filled)
+    if burn_in < filled:
+        yield (
+            f"learner.burn_in={burn_in}: in the middle of an episode, sequences begin with "
+            f"zeros in the memory; learner.burn_in={filled} fills it"
+        )
+    unread = set(memory.Memory.settings).difference(kind.settings)
     for text in overrides:
         if text.partition("=")[0] in unread:
             yield f"{text} has no effect with policy.memory={chosen}"

@@ -48,6 +48,14 @@ class Memory(nn.Module):
     ):
         super().__init__()
 
+    @classmethod
+    def burn_in(cls, config: PolicyConfig) -> int:
+        """Returns the decisions after which a state no longer depends on earlier ones.
+
+        0 if it always depends on them.
+        """
+        return 0
+
     @abstractmethod
     def forward(self, x: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
         """Maps the inputs of a sequence of decisions to features.

@@ -31,6 +31,10 @@ class Stack(Memory):
         self.decisions = config.decisions
         self.features, self.size = config.decisions * inputs, (config.decisions - 1) * inputs
 
+    @classmethod
+    def burn_in(cls, config: PolicyConfig) -> int:
+        return config.decisions - 1
+
     def forward(self, x: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
         before = state.unflatten(-1, (self.decisions - 1, -1))
         every = torch.cat((before, x), 2)

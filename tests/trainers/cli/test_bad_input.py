@@ -264,6 +264,23 @@ def test_a_batch_that_is_never_filled_gives_a_warning(tmp_path, capsys):
         ("consensus", "tuned", ["policy.memory=stack", "policy.units=8"], ["policy.units=8 has"]),
         ("consensus", "tuned", ["policy.memory=gru", "policy.units=8"], []),
         ("consensus", "tuned", ["policy.memory=stack", "policy.decisions=4"], []),
+        (
+            "consensus",
+            "tuned",
+            ["policy.memory=stack", "policy.decisions=5", "learner.burn_in=3"],
+            [
+                "learner.burn_in=3: in the middle of an episode, sequences begin with zeros in the "
+                "memory; learner.burn_in=4 fills it"
+            ],
+        ),
+        (
+            "consensus",
+            "tuned",
+            ["policy.memory=stack", "policy.decisions=5", "learner.burn_in=4"],
+            [],
+        ),
+        ("consensus", "tuned", ["policy.memory=gru", "learner.burn_in=0"], []),
+        ("consensus", "tuned", ["learner=ippo", "policy.memory=stack"], []),
     ],
 )
 def test_notes_of_a_training(method, setup, more, notes, tmp_path, capsys):
@@ -271,7 +288,8 @@ def test_notes_of_a_training(method, setup, more, notes, tmp_path, capsys):
     small += [f"setup={setup}", "learner.hidden=[8]", f"output={tmp_path}"]
     replays = not any("ppo" in text for text in more)
     small += ["learner.batch_size=4"] if replays else ["learner.minibatches=1"]
-    small += ["learner.sequence=4"] if any("policy.memory=" in text for text in more) else []
+    remembers = any("policy.memory=" in text for text in more)
+    small += ["learner.sequence=4"] if replays and remembers else []
     assert main.main(["train", method, *small, *more]) == 0
     said = " ".join(capsys.readouterr().out.split())
     assert said.count("note: ") == len(notes), said
