@@ -42,10 +42,10 @@ class CommunicationValue:
         how: "evaluated" if the same networks were evaluated with other radios, "retrained" if other
             networks were trained with them, "scripted" for a scripted policy.
         none, with_radio, full: mean of the measure with the radio off, with the radio of the world,
-            and with a radio without limits.
+            and with a radio without limits; `full` is None if that was not evaluated.
         gain: with_radio - none, in units of the measure.
         gain_interval: 95 % bootstrap interval of `gain` over fires, paired; None with one fire.
-        value: (with_radio - none) / (full - none); None if `none` and `full` do not differ.
+        value: (with_radio - none) / (full - none); None if there is no `full`, or it equals `none`.
         interval: 95 % bootstrap interval over fires, paired; None if it is not finite.
     """
 
@@ -55,7 +55,7 @@ class CommunicationValue:
     how: str
     none: float
     with_radio: float
-    full: float
+    full: float | None
     gain: float
     gain_interval: Interval | None
     value: float | None
@@ -63,7 +63,7 @@ class CommunicationValue:
 
 
 def communication_values(section: Section) -> list[CommunicationValue]:
-    """Returns the value of communication wherever a section has all three evaluations."""
+    """Returns the value of communication wherever there is an evaluation with the radio off."""
     limited = _limited(section)
     values: list[CommunicationValue] = []
     for fire in section.runs[0].evaluation.results:
@@ -72,8 +72,12 @@ def communication_values(section: Section) -> list[CommunicationValue]:
             if _radio(group.runs[0]) not in (_OFF, _FULL):
                 for how, others in (("evaluated", _evaluated), ("retrained", _retrained)):
                     none, full = (others(section, group, radio) for radio in (_OFF, _FULL))
-                    if none is not None and full is not None:
-                        samples = [_per_fire(g.runs, fire, measure) for g in (none, group, full)]
+                    if none is not None:
+                        samples = [
+                            _per_fire(g.runs, fire, measure)
+                            for g in (none, group, full)
+                            if g is not None
+                        ]
                         values.append(_value(fire, group.label, measure, how, samples))
         for policy, world in product(SCRIPTED, limited):
             measure = world.config.evaluation.headline
@@ -184,9 +188,10 @@ def _per_fire(runs: Sequence[Run], fire: str, measure: str) -> Values:
 def _value(
     fire: str, policy: str, measure: str, how: str, samples: Sequence[Values]
 ) -> CommunicationValue:
-    none, with_radio, full = (float(sample.mean()) for sample in samples)
-    gain = with_radio - none
-    value = gain / (full - none) if full != none else None
+    """Returns the value of samples with the radio off, that of the world and, maybe, no limits."""
+    none, with_radio, *rest = (float(sample.mean()) for sample in samples)
+    gain, full = with_radio - none, rest[0] if rest else None
+    value = None if full is None or full == none else gain / (full - none)
     return CommunicationValue(
         fire=fire,
         policy=policy,
@@ -198,7 +203,7 @@ def _value(
         gain=gain,
         gain_interval=bootstrap.paired_interval(_gain, *samples[:2]),
         value=value,
-        interval=bootstrap.paired_interval(_share, *samples),
+        interval=None if full is None else bootstrap.paired_interval(_share, *samples),
     )
 
 

@@ -61,6 +61,25 @@ def test_the_gain_is_paired_by_fire(tmp_path):
     assert (value.value, value.interval) == (None, None)
 
 
+def test_without_an_evaluation_without_limits_there_is_a_gain_and_no_value(tmp_path, capsys):
+    run = write_run(tmp_path, learned={"coverage": [50.0, 60, 70, 80]})
+    assert not compare_runs([tmp_path]).sections[0].communication
+    evaluate_otherwise(run, 0.0, [48.0, 58, 68, 78])
+    write_run(tmp_path, name="off", overrides=(OFF,), learned={"coverage": [49.0, 59, 69, 79]})
+    retrained, evaluated = sorted(
+        compare_runs([tmp_path]).sections[0].communication, key=lambda value: value.gain
+    )
+    for value, how, none in ((retrained, "retrained", 64.0), (evaluated, "evaluated", 63.0)):
+        assert (value.how, value.none, value.with_radio, value.full) == (how, none, 65.0, None)
+        assert value.gain_interval == (65.0 - none, 65.0 - none)
+        assert (value.value, value.interval) == (None, None)
+    assert main.main(["compare", str(tmp_path), "--output", str(tmp_path / "out")]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "consensus evaluated 63.0 65.0 - 2.00 [2.00, 2.00] - -" in said
+    (section,) = json.loads((tmp_path / "out" / "compare.json").read_text())["setups"]
+    assert [worth["full"] for worth in section["communication"]] == [None, None]
+
+
 def test_networks_trained_with_other_radios(tmp_path):
     for override, coverage in (("", 60.0), (OFF, 50.0), (FULL, 70.0)):
         overrides = (override,) if override else ()

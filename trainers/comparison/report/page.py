@@ -157,7 +157,8 @@ def worth(value: CommunicationValue) -> tuple[str, ...]:
     """
     digits = DIGITS.get(value.measure, 1)
     return (
-        *(_number(mean, digits) for mean in (value.none, value.with_radio, value.full)),
+        *(_number(mean, digits) for mean in (value.none, value.with_radio)),
+        NONE if value.full is None else _number(value.full, digits),
         _number(value.gain, digits + 1),
         _interval(value.gain_interval, digits + 1),
         NONE if value.value is None else f"{value.value:.2f}",
