@@ -69,16 +69,14 @@ def communication_values(section: Section) -> list[CommunicationValue]:
     for fire in section.runs[0].evaluation.results:
         for group in section.as_trained:
             measure = group.runs[0].config.evaluation.headline
-            if _radio(group.runs[0]) not in (_OFF, _FULL):
-                for how, others in (("evaluated", _evaluated), ("retrained", _retrained)):
-                    none, full = (others(section, group, radio) for radio in (_OFF, _FULL))
-                    if none is not None:
-                        samples = [
-                            _per_fire(g.runs, fire, measure)
-                            for g in (none, group, full)
-                            if g is not None
-                        ]
-                        values.append(_value(fire, group.label, measure, how, samples))
+            if _radio(group.runs[0]) in (_OFF, _FULL):
+                continue
+            for how, others in (("evaluated", _evaluated), ("retrained", _retrained)):
+                none, full = (others(section, group, radio) for radio in (_OFF, _FULL))
+                if none is not None:
+                    groups = [none, group] if full is None else [none, group, full]
+                    samples = [_per_fire(g.runs, fire, measure) for g in groups]
+                    values.append(_value(fire, group.label, measure, how, samples))
         for policy, world in product(SCRIPTED, limited):
             measure = world.config.evaluation.headline
             samples = _scripted(section, fire, policy, measure, world)

@@ -157,11 +157,10 @@ def worth(value: CommunicationValue) -> tuple[str, ...]:
     """
     digits = DIGITS.get(value.measure, 1)
     return (
-        *(_number(mean, digits) for mean in (value.none, value.with_radio)),
-        NONE if value.full is None else _number(value.full, digits),
+        *(_number(mean, digits) for mean in (value.none, value.with_radio, value.full)),
         _number(value.gain, digits + 1),
         _interval(value.gain_interval, digits + 1),
-        NONE if value.value is None else f"{value.value:.2f}",
+        _number(value.value, 2),
         _interval(value.interval, 2),
     )
 
@@ -188,7 +187,9 @@ def html(report: Report) -> str:
     return environment.from_string(source).render(report=report, settings=settings())
 
 
-def _number(value: float, digits: int) -> str:
+def _number(value: float | None, digits: int) -> str:
+    if value is None:
+        return NONE
     return "∞" if math.isinf(value) else f"{value:.{digits}f}"
 
 
