@@ -5,7 +5,7 @@ Rates are measured over calls of the public interface: an environment's step is 
 """
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from statistics import median
 from typing import Any
 
@@ -92,46 +92,6 @@ def with_fast_products(work: Callable[[], object]) -> Callable[[], object]:
             work()
 
     return fast
-
-
-MATRIX_FLOPS = 2 * MATRIX**3
-
-
-def update_flops(
-    members: int,
-    features: int,
-    actions: int,
-    hidden: Sequence[int],
-    batch: int,
-    *,
-    shared: bool = False,
-) -> int:
-    """Counts the floating-point operations of a DDPG update of `members` networks, by layer sizes.
-
-    Only matrix products are counted. A multiply-add is two operations. Forward: actor and critic in
-    the actors' loss, critic, target actor and target critic in the critics'. Backward: for each
-    trained layer the product for its weights, and for each input with a gradient the product for
-    that input.
-
-    Args:
-        shared: whether the critics' trunk is computed once for both losses, as in our learner, or
-            as often as in DDPG.
-    """
-    first, second = hidden
-    trunk = features * first + first * second
-    actor = trunk + second * actions
-    critic = trunk + actions * second + second
-    forward = 2 * actor + 3 * critic - (trunk if shared else 0)
-    weights = actor + critic
-    inputs = (
-        second * actions
-        + first * second  # the actors' own layers but the first
-        + second
-        + second * actions  # through the critic to the action, without its trunk
-        + second
-        + first * second  # the critics' layers but the first and the action's
-    )
-    return 2 * batch * members * (forward + weights + inputs)
 
 
 def batch_of(setup: TrainingSetup) -> TensorDict:
