@@ -12,9 +12,8 @@ from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import check_whole, shown
 from emberlink.trainers.comparison.report import free_folder, write_report
 from emberlink.trainers.comparison.results import Comparison, compare_runs
-from emberlink.trainers.config.compose import flat, override, resolve, to_values
+from emberlink.trainers.config.compose import flat, in_world, override, resolve, to_values
 from emberlink.trainers.config.schema import MAX_FIRES, RunConfig
-from emberlink.trainers.config.transfer import in_world
 from emberlink.trainers.evaluation.actor import fireless, load_actor
 from emberlink.trainers.evaluation.evaluate import evaluate as evaluate_policy
 from emberlink.trainers.evaluation.policy import TrainedPolicy
@@ -28,7 +27,7 @@ from emberlink.trainers.training.trainer import Progress, Trainer
 Reference = str | os.PathLike[str]
 """a run folder, or a trained policy of emberlink: `pretrained:METHOD`, `pretrained:SETUP/METHOD` or
 `pretrained:SETUP/METHOD/SEED`"""
-_CHANGEABLE = ("env.", "comm.", "baselines", "evaluation.headline")
+_CHANGEABLE = ("env.", "comm.", "evaluation.headline")
 
 
 @dataclass(frozen=True)

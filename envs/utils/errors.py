@@ -1,4 +1,9 @@
-"""Defines the error for mistakes of the user."""
+"""Defines the error for mistakes of the user, and texts for its messages."""
+
+import difflib
+import reprlib
+from collections.abc import Iterable
+from typing import Any
 
 
 class UserError(ValueError):
@@ -12,3 +17,24 @@ class UserError(ValueError):
 def how_to_install(extra: str) -> str:
     """Returns the command that installs an extra of emberlink, for messages."""
     return f"pip install '.[{extra}]' in the folder of emberlink"
+
+
+def shown(value: Any) -> str:
+    """Returns a value as text for a message, as YAML writes it, shortened if it is long."""
+    words = {"None": "null", "True": "true", "False": "false"}
+    text = value if isinstance(value, str) else reprlib.repr(value)
+    text = text if isinstance(value, str) else words.get(text, text)
+    return printable(text if len(text) <= 100 else f"{text[:60]}...{text[-20:]}")
+
+
+def printable(text: str) -> str:
+    """Returns the text on one line, with escapes for characters that cannot be printed."""
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
+
+
+def unknown(value: str, known: Iterable[str]) -> str:
+    """Returns a message that a name is not known, with the most similar and all known names."""
+    names = list(known)
+    near = difflib.get_close_matches(value, names, n=1)
+    hint = f"; did you mean {near[0]}?" if near else ";"
+    return f"{shown(value)!r} is not known{hint} known: {', '.join(names)}"

@@ -13,9 +13,9 @@ from emberlink.trainers.config.schema import NOT_LEARNT_WITH
 from emberlink.trainers.runs import pretrained
 from emberlink.trainers.runs.run_folder import without_time_and_seed
 
-NOT_COMPARED = ("seed", "seeds", "output", "evaluation", "baselines", *NOT_LEARNT_WITH)
+NOT_COMPARED = ("seed", "seeds", "output", "evaluation", *NOT_LEARNT_WITH)
 """first parts of keys that may differ within a group, since they do not affect training"""
-NOT_NOTED = ("seed", "seeds", "output", "baselines")
+NOT_NOTED = ("seed", "seeds", "output")
 """first parts of keys whose differences within a group are not reported in notes"""
 _WARM_START = "learner.warm_start"
 _OF_SECTION = ("env.horizon", "env.grid")

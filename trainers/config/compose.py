@@ -1,36 +1,30 @@
-"""Composes a run's configuration from YAML files and the user's settings."""
+"""Composes and changes the configuration of a run."""
 
-import threading
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from copy import deepcopy
-from dataclasses import asdict, replace
-from functools import lru_cache
-from pathlib import Path
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import fields, replace
 from typing import Any
 
-from hydra import compose, initialize_config_module
-from hydra.core.global_hydra import GlobalHydra
-from hydra.errors import HydraException
-from hydra.version import VersionBase
-from omegaconf import OmegaConf
-from omegaconf.errors import OmegaConfBaseException
 from pydantic import TypeAdapter
-from yaml import YAMLError
 
 from emberlink import configs
 from emberlink.envs.scenarios import fires_of
-from emberlink.envs.utils.config_files import find, place_of, read
+from emberlink.envs.utils.config_files import read
 from emberlink.envs.utils.errors import UserError
-from emberlink.envs.utils.validation import from_plain, plain, shown, unknown
-from emberlink.policies.scripted.registry import SCRIPTED
-from emberlink.trainers.config.overrides import all_keys, flat, full_key, parse, put
-from emberlink.trainers.config.owners import drop_settings_of_others, not_known
-from emberlink.trainers.config.schema import Baseline, RunConfig
+from emberlink.envs.utils.validation import from_plain, shown
+from emberlink.trainers.config.schema import RunConfig
+from emberlink.trainers.config.values import (
+    GROUPS,
+    change,
+    check_not_removed,
+    composed,
+    flat,
+    parse,
+    put,
+)
+from emberlink.trainers.learners import registry as learners
 
-GROUPS = ("setup", "world", "fire", "learner")
-"""groups whose file is chosen by `GROUP=NAME`, besides the method"""
-_HYDRA = threading.RLock()
+__all__ = ["evaluated_with", "flat", "from_values", "in_world", "override", "resolve", "to_values"]
 
 
 def resolve(method: str, overrides: Sequence[str] = (), **settings: Any) -> RunConfig:
@@ -45,38 +39,12 @@ def resolve(method: str, overrides: Sequence[str] = (), **settings: Any) -> RunC
     Raises:
         UserError: the method, a key or a value is wrong; the message names it and what is known.
     """
-    if isinstance(overrides, str):
-        raise UserError(f"{shown(overrides)!r}: expected a list of texts key=value")
-    given = [parse(text) for text in overrides]
-    chosen = {"setup": "paper", "world": "paper"} | {
-        key: str(value) for key, value in given if key in GROUPS
-    }
-    values = _composed(str(method), chosen)
-    drop_settings_of_others(values["learner"])
-    radio = _radio(values)
-    known = list(dict.fromkeys([*GROUPS, *all_keys(values)]))
-    for key, value in given:
-        if key in (*(f"{group}.name" for group in GROUPS), "fire.kind"):
-            group = key.partition(".")[0]
-            raise UserError(f"{key}={shown(value)}: choose it with {group}=NAME")
-        if key not in known:
-            raise UserError(not_known(key, known, method, values["learner"]["name"]))
-        if key not in GROUPS:
-            put(values, key, value)
-    values = _interpolated(values) | {"method": method, "setup": chosen["setup"]}
-    values["world"] = chosen["world"]
-    _put_settings(values, settings)
-    _choose_seed(values, any(key == "seed" for key in [*dict(given), *settings]))
-    try:
-        config = from_values(values)
-    except UserError as error:
-        given_keys = {key for key, _ in given} | settings.keys()
-        own = f"{chosen['setup']}_{method}"
-        files = {"setup_method": own} if own in configs.known("setup_method") else {}
-        files |= {"method": method, **chosen}
-        raise UserError(place_of(error, files, given_keys)) from None
-    baselines = _baselines(chosen, _changes(radio, _radio(values)))
-    return replace(config, baselines=baselines, fire=fires_of(config.fire).with_checksum())
+    values = composed(method, overrides, **settings)
+    given = {text.partition("=")[0] for text in overrides}
+    _drop_settings_of_others(values["learner"], given | settings.keys())
+    _choose_seed(values, "seed" in given | settings.keys())
+    config = from_values(values)
+    return replace(config, fire=fires_of(config.fire).with_checksum())
 
 
 def override(config: RunConfig, overrides: Sequence[str] = (), **settings: Any) -> RunConfig:
@@ -91,39 +59,67 @@ def override(config: RunConfig, overrides: Sequence[str] = (), **settings: Any) 
     Raises:
         UserError: a key is not known, or a value does not fit.
     """
-    values = to_values(config)
-    del values["baselines"]
-    radio = _radio(values)
-    known = list(flat(values))
-    for key, value in map(parse, overrides):
-        if key in GROUPS:
-            name = values[key]["name"] if isinstance(values[key], dict) else values[key]
-            if str(value) != name:
-                raise UserError(f"{key}={shown(value)}: the run has {key}={name}")
-        elif key not in known:
-            raise UserError(f"key {unknown(key, known, listed=False)}")
-        else:
-            put(values, key, value)
-    _put_settings(values, settings)
+    values, texts = to_values(config), []
+    for text in overrides:
+        key, _, name = text.partition("=")
+        has = values.get(key)
+        has = has["name"] if isinstance(has, dict) else has
+        if key in GROUPS and name != has:
+            raise UserError(f"{shown(text)}: the run has {key}={has}")
+        texts += [] if key in GROUPS else [text]
+    change(values, texts, settings)
     changed = from_values(values)
-    changed = with_radio(replace(changed, baselines=config.baselines), radio)
     # The run's own fire also holds the path of the run's copy of a fire file.
     return replace(changed, fire=config.fire) if changed.fire == config.fire else changed
 
 
-def with_radio(config: RunConfig, usual: Mapping[str, Any]) -> RunConfig:
-    """Returns a configuration whose other methods have the run's changes of the radio, too.
+def evaluated_with(config: RunConfig, overrides: Sequence[str]) -> RunConfig:
+    """Returns the configuration of an evaluation with other settings than those of the training.
 
     Args:
-        config: configuration of a run.
-        usual: settings of the radio without the changes.
+        config: configuration of the run.
+        overrides: texts `key=value`, as on the command line. `world=NAME` is applied first, with
+            keys of `fire`.
+
+    Raises:
+        UserError: a key or a value is wrong.
     """
-    other = _changes(usual, asdict(config.env.radio))
-    baselines = {
-        method: replace(baseline, radio=replace(baseline.radio, **other))
-        for method, baseline in config.baselines.items()
-    }
-    return replace(config, baselines=baselines)
+    given = [(text, text.partition("=")[0]) for text in overrides]
+    worlds = [str(parse(text)[1]) for text, key in given if key == "world"]
+    fire = [text for text, key in given if key.startswith("fire.")]
+    others = [text for text, key in given if key != "world" and text not in fire]
+    if fire and not worlds:
+        raise UserError(f"{shown(fire[0])}: an evaluation on another fire needs world=NAME, too")
+    for world in worlds:
+        config = in_world(config, world, fire)
+    return override(config, others) if others else config
+
+
+def in_world(config: RunConfig, world: str, fire: Sequence[str] = (), **settings: Any) -> RunConfig:
+    """Returns a run's configuration in another world.
+
+    The fire is that of the world. Of `env` and `evaluation`, the keys in which the two worlds
+    differ have the values of the other world; the run keeps the rest.
+
+    Args:
+        config: configuration of the run.
+        world: name of a file in configs/world.
+        fire: texts `key=value` of the world's fire, such as `fire.path=ArrivalTime.asc`.
+        settings: the same as keyword arguments.
+
+    Raises:
+        UserError: the world is not known, or needs other settings.
+    """
+    if world == config.world and not (fire or settings):
+        return config
+    setup = f"setup={config.setup}"
+    here = flat(to_values(resolve(config.method, [setup, f"world={config.world}", "fire=paper"])))
+    there = resolve(config.method, [setup, f"world={world}", *fire], **settings)
+    values = to_values(config)
+    for key, value in flat(to_values(there)).items():
+        if key.startswith(("env.", "evaluation.")) and value != here.get(key):
+            put(values, key, value)
+    return replace(from_values(values | {"world": world}), fire=there.fire)
 
 
 def from_values(values: Mapping[str, Any]) -> RunConfig:
@@ -132,6 +128,10 @@ def from_values(values: Mapping[str, Any]) -> RunConfig:
     Raises:
         UserError: a key or a value is wrong; the message names the first one and the reason.
     """
+    if isinstance(values, Mapping):
+        values = {key: value for key, value in values.items() if key != "baselines"}
+        for key, value in flat(values).items():
+            check_not_removed(key, value)
     return from_plain(RunConfig, values)
 
 
@@ -147,119 +147,19 @@ def _lists(value: Any) -> Any:
     return [_lists(item) for item in value] if isinstance(value, list | tuple) else value
 
 
-def _composed(method: str, chosen: Mapping[str, str]) -> dict[str, Any]:
-    """Returns the values that Hydra composes from the chosen files, without resolving `${...}`.
+def _drop_settings_of_others(learner: Any, given: set[str]) -> None:
+    """Removes settings of other learners that a setup holds, such as `critic_lr` for PPO.
 
-    Args:
-        method: name of a file in configs/method.
-        chosen: group -> name of the chosen file, for the setup and other `GROUPS`.
-
-    Raises:
-        UserError: a file is not known or not a configuration.
+    What the user gave or no learner's file holds stays, and is an error later.
     """
-    folders = configs.folders()
-    chosen = {"method": method, **chosen}
-    for group, name in chosen.items():
-        find(group, name, folders)
-    if (name := f"{chosen['setup']}_{method}") in configs.known("setup_method", folders):
-        find("setup_method", name, folders)
-    files = sorted(file for folder in folders for file in folder.glob("**/*.yaml"))
-    # Editors lock a file with a link to nowhere.
-    stamps = tuple((file, file.stat().st_mtime_ns) for file in files if file.is_file())
-    values = deepcopy(_compose(tuple(chosen.items()), tuple(folders), stamps))
-    for group in ("method", "setup", "world"):
-        if group in values:  # without the header, Hydra puts the content under the group
-            file = find(group, chosen[group])
-            raise UserError(f"{file} must begin with '# @package _global_'")
-    return values
-
-
-@lru_cache(maxsize=256)
-def _compose(
-    chosen: tuple[tuple[str, str], ...], folders: tuple[Path, ...], stamps: tuple
-) -> dict[str, Any]:
-    """Calls Hydra; results are cached by the choices and the modification times of all files."""
-    # The last folder is emberlink's own, which Hydra searches anyway.
-    paths = ["'file://" + str(folder).replace("'", "\\'") + "'" for folder in folders[:-1]]
-    overrides = [f"{group}={name}" for group, name in chosen]
-    try:
-        with _own_hydra():
-            composed = compose("base", [*overrides, f"hydra.searchpath=[{','.join(paths)}]"])
-            values: Any = OmegaConf.to_container(composed)
-    except (HydraException, OmegaConfBaseException, YAMLError) as error:
-        raise UserError(" ".join(str(error).split())[:300]) from None
-    except UnicodeError as error:
-        for group, name in chosen:
-            read(group, name)  # raises an error that names the file
-        raise UserError(str(error)) from None
-    return values
-
-
-@contextmanager
-def _own_hydra() -> Iterator[None]:
-    """Initialises Hydra for one composition, then restores the caller's state of Hydra."""
-    with _HYDRA:
-        callers, version = GlobalHydra.instance().hydra, VersionBase.instance().getbase()
-        GlobalHydra.instance().clear()
-        try:
-            with initialize_config_module(config_module="emberlink.configs", version_base="1.3"):
-                yield
-        finally:
-            GlobalHydra.instance().hydra = callers
-            VersionBase.instance().version_base = version
-
-
-def _interpolated(values: dict[str, Any]) -> dict[str, Any]:
-    """Returns the values with each `${key}` replaced by the value of the key."""
-    if not any(mark in str(values) for mark in ("${", "???")):
-        return values  # OmegaConf takes several milliseconds.
-    try:
-        whole: Any = OmegaConf.to_container(
-            OmegaConf.create(values), resolve=True, throw_on_missing=True
-        )
-    except OmegaConfBaseException as error:
-        raise UserError(" ".join(str(error).split())[:300]) from None
-    return whole
-
-
-def _put_settings(values: dict[str, Any], settings: Mapping[str, Any]) -> None:
-    """Sets the values of keyword arguments."""
-    for key, value in settings.items():
-        if key in ("method", *GROUPS):
-            raise UserError(f"{key}={shown(value)}: names a file, so it is not a setting")
-        put(values, full_key(values, key), plain(value, key))
-
-
-def _baselines(chosen: Mapping[str, str], radio: Mapping[str, Any]) -> dict[str, Baseline]:
-    """Returns the settings of the methods whose communication scripted policies use.
-
-    Args:
-        chosen: group -> name of the chosen file.
-        radio: settings of the radio that the user changed; they hold for all methods.
-
-    Returns:
-        method -> its communication.
-    """
-    methods = {policy.recipe for policy in SCRIPTED.values() if policy.recipe}
-    groups = {group: chosen[group] for group in ("setup", "world")}
-    baselines = {}
-    for method in sorted(methods):
-        values = _interpolated(_composed(method, groups))
-        settings = {"comm": values["comm"], "radio": values["env"]["radio"] | radio}
-        baselines[method] = from_plain(Baseline, settings, f"baselines.{method}")
-    return baselines
-
-
-def _radio(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Returns a copy of the settings of the radio; empty if a user has replaced them by a value."""
-    env = values["env"]
-    radio = env.get("radio") if isinstance(env, Mapping) else None
-    return dict(radio) if isinstance(radio, Mapping) else {}
-
-
-def _changes(before: Mapping[str, Any], after: Mapping[str, Any]) -> dict[str, Any]:
-    """Returns the values of `after` that differ from those of `before`."""
-    return {key: value for key, value in after.items() if value != before.get(key)}
+    own = {field.name for field in fields(learners.find(learner["name"]).config_type)}
+    foreign = {key for key in learner.keys() - own if not given & {key, f"learner.{key}"}}
+    of_files: set[str] = set()
+    for name in configs.known("learner") if foreign else ():
+        with suppress(UserError):  # another package's file that cannot be read
+            of_files |= read("learner", name).keys()
+    for key in foreign & of_files:
+        del learner[key]
 
 
 def _choose_seed(values: dict[str, Any], seed_is_given: bool) -> None:

@@ -6,8 +6,8 @@ from typing import Any
 from emberlink.envs.fire_files.config import FileFireConfig
 from emberlink.envs.utils.errors import UserError
 from emberlink.trainers.config.compose import resolve, to_values
-from emberlink.trainers.config.overrides import flat
 from emberlink.trainers.config.schema import RunConfig
+from emberlink.trainers.config.values import flat
 
 
 def defaults_of(config: RunConfig) -> dict[str, Any]:

@@ -1,7 +1,7 @@
 """Defines the schema of a run's configuration."""
 
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, fields, is_dataclass
 from typing import Annotated, Any, Literal
 
 from pydantic import (
@@ -18,15 +18,14 @@ from pydantic.dataclasses import dataclass
 from emberlink.comm import registry
 from emberlink.comm.base import CommModule
 from emberlink.envs import metrics
-from emberlink.envs.config import RadioConfig, WildfireConfig
+from emberlink.envs.config import WildfireConfig
 from emberlink.envs.scenarios import Scenario
 from emberlink.envs.utils.device import check_device as check_device
 from emberlink.envs.utils.errors import UserError
-from emberlink.envs.utils.validation import STRICT, CountOrZero, Name, unknown
+from emberlink.envs.utils.validation import STRICT, CountOrZero, Name, from_plain, shown, unknown
 from emberlink.policies.networks import memory
 from emberlink.policies.scripted.registry import to_play
 from emberlink.policies.settings import PolicyConfig
-from emberlink.trainers.config import choice
 from emberlink.trainers.learners import registry as learners
 from emberlink.trainers.learners.base import Count, LearnerConfig
 
@@ -40,9 +39,35 @@ MAX_FIRES = 65_536
 """maximum number of held-out fires of an evaluation"""
 Many = Annotated[int, Field(ge=1, le=MAX_FIRES)]
 Seed = Annotated[int, Field(ge=0, lt=2**31)]
+
+
+def _settings(key: str, values: Any, registry: Any) -> Any:
+    """Returns name and settings as an instance of the `config_type` of the named class.
+
+    Args:
+        key: `comm` or `learner`, for messages.
+        values: name and settings as plain values, or an instance of a `config_type`.
+        registry: module with `known()` and `find(name)`.
+    """
+    if is_dataclass(values):
+        return values
+    if not isinstance(values, Mapping):
+        raise UserError(f"{key}={shown(values)}: expected keys and values")
+    if not isinstance(name := values.get("name"), str):
+        raise UserError(f"{key}.name is missing; known: {', '.join(registry.known())}")
+    config_type = registry.find(name).config_type
+    known = [field.name for field in fields(config_type)]
+    # A type may have the name among its fields.
+    given = {name: value for name, value in values.items() if name != "name" or name in known}
+    for setting in given.keys() - set(known):
+        listed = ", ".join(known) or "none"
+        raise UserError(f"{key}.{setting} is not a setting of {name}; known: {listed}")
+    return from_plain(config_type, given, key)
+
+
 LearnerChoice = Annotated[
     SerializeAsAny[LearnerConfig],
-    PlainValidator(lambda values: choice.settings("learner", values, learners)),
+    PlainValidator(lambda values: _settings("learner", values, learners)),
 ]
 """settings of the learner `learner.name`"""
 
@@ -77,21 +102,6 @@ class EvaluationConfig:
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
-class Baseline:
-    """The communication of a method, for the scripted policies that use it."""
-
-    comm: dict[str, Any]
-    """name and settings of the communication module"""
-    radio: RadioConfig
-    """settings of the radio with this method in the run's world"""
-
-    @field_validator("comm")
-    @classmethod
-    def _complete_comm(cls, value: dict[str, Any]) -> dict[str, Any]:
-        return _completed("comm", value)
-
-
-@dataclass(frozen=True, kw_only=True, config=STRICT)
 class RunConfig:
     """All settings of a run."""
 
@@ -107,8 +117,6 @@ class RunConfig:
     """name and settings of the communication module"""
     env: WildfireConfig
     """settings of the environment"""
-    baselines: dict[str, Baseline] = Field(default_factory=dict)
-    """method -> settings of the methods whose communication scripted policies use"""
     fire: Scenario
     """training fires"""
     learner: LearnerChoice
@@ -203,7 +211,7 @@ def build_comm(config: RunConfig, num_envs: int) -> CommModule:
 
 def _completed(key: str, given: dict[str, Any]) -> dict[str, Any]:
     """Returns the settings of a communication module, followed by those left to their defaults."""
-    return _filled(given, asdict(choice.settings(key, given, registry)))
+    return _filled(given, asdict(_settings(key, given, registry)))
 
 
 def _filled(given: Mapping[str, Any], complete: Mapping[str, Any]) -> dict[str, Any]:

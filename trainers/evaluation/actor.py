@@ -13,8 +13,8 @@ from emberlink.comm import registry
 from emberlink.envs.utils.validation import shown
 from emberlink.trainers.build import build_actor, build_env
 from emberlink.trainers.config.compose import to_values
-from emberlink.trainers.config.overrides import flat
 from emberlink.trainers.config.schema import RunConfig
+from emberlink.trainers.config.values import flat
 from emberlink.trainers.learners.base import ACTOR
 from emberlink.trainers.runs import checkpoint_file
 from emberlink.trainers.runs.checkpoints import load_weights

@@ -8,8 +8,8 @@ from pathlib import Path
 from rich.console import Console
 
 from emberlink.envs.utils.errors import UserError
+from emberlink.trainers.config.compose import evaluated_with
 from emberlink.trainers.config.schema import RunConfig, check_device
-from emberlink.trainers.config.transfer import evaluated_with, kept
 from emberlink.trainers.evaluation.actor import load_actor
 from emberlink.trainers.evaluation.evaluate import Policy
 from emberlink.trainers.evaluation.report import evaluate_run
@@ -59,8 +59,6 @@ def evaluate_folder(
     for text in overrides:
         label += "_" + re.sub(r"[^\w.=+-]", "-", text)
     config = evaluated_with(config, overrides)
-    if own := kept(config, overrides):
-        console.print(f"note: the run keeps its own {', '.join(own)}", soft_wrap=True)
     actor = load_actor(config, checkpoint)
     run = open_run(name)  # copies a trained policy of the package once all is checked
     about = [text for text in overrides if not text.startswith("world=")]  # a title names it anyway

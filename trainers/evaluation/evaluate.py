@@ -1,7 +1,7 @@
 """Evaluates frozen policies on test fires and, during training, on validation fires."""
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import Any, cast
 
 import torch
@@ -16,6 +16,7 @@ from emberlink.envs import keys, metrics
 from emberlink.envs.fire.generator import load_scenario
 from emberlink.envs.fire_files.config import FileFireConfig
 from emberlink.envs.scenarios import ScenarioConfig, fires_of, same_tests
+from emberlink.envs.utils.errors import UserError
 from emberlink.envs.wildfire import WildfireEnv
 from emberlink.policies.scripted.base import Scripted
 from emberlink.policies.scripted.registry import SCRIPTED, to_play
@@ -240,14 +241,22 @@ def scripted_config(config: RunConfig, name: str) -> RunConfig:
     if recipe is None:
         steers = registry.find(config.comm["name"]).steer is not CommModule.steer
         return replace(config, comm={"name": "no_comm"}) if steers else config
-    if recipe not in config.baselines:
-        # The policy is of a package that was not installed at the time of the training.
-        choices = [f"setup={config.setup}", f"world={config.world}"]
-        config = replace(config, baselines=resolve(recipe, choices).baselines)
-    baseline = config.baselines[recipe]
-    if baseline.comm["name"] == config.comm["name"]:
+    if recipe == config.method:
         return config
-    return replace(config, comm=baseline.comm, env=replace(config.env, radio=baseline.radio))
+    choices = [f"setup={config.setup}", f"world={config.world}", "fire=paper"]
+    try:
+        usual, other = (resolve(method, choices) for method in (config.method, recipe))
+    except UserError as error:
+        raise UserError(
+            f"{name} flies with the communication of {recipe}: {error}; evaluation.scripted=[] "
+            "leaves scripted policies out"
+        ) from None
+    if other.comm["name"] == config.comm["name"]:
+        return config
+    usually = asdict(usual.env.radio)
+    changed = {k: v for k, v in asdict(config.env.radio).items() if v != usually[k]}
+    radio = replace(other.env.radio, **changed)
+    return replace(config, comm=other.comm, env=replace(config.env, radio=radio))
 
 
 def play_blocks(

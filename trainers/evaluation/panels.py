@@ -17,8 +17,8 @@ from emberlink.envs.utils.validation import is_index, shown
 from emberlink.envs.wildfire import WildfireEnv
 from emberlink.policies.scripted.registry import SCRIPTED
 from emberlink.trainers.build import build_env
+from emberlink.trainers.config.compose import evaluated_with
 from emberlink.trainers.config.schema import MAX_FIRES, RunConfig, build_comm
-from emberlink.trainers.config.transfer import evaluated_with
 from emberlink.trainers.evaluation.actor import load_actor
 from emberlink.trainers.evaluation.evaluate import (
     BLOCK,

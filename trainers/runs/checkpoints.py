@@ -11,8 +11,8 @@ from torch import Tensor
 from emberlink.envs.utils import atomic_io
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import shown
-from emberlink.trainers.config.overrides import flat
 from emberlink.trainers.config.schema import RunConfig
+from emberlink.trainers.config.values import flat
 from emberlink.trainers.learners.base import ACTOR
 from emberlink.trainers.runs import checkpoint_file
 from emberlink.trainers.runs.seal import to_header, unsealed

@@ -7,8 +7,8 @@ from emberlink.comm import registry
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import shown
 from emberlink.trainers.config.compose import to_values
-from emberlink.trainers.config.overrides import flat
 from emberlink.trainers.config.schema import RunConfig
+from emberlink.trainers.config.values import flat
 from emberlink.trainers.evaluation.actor import units
 from emberlink.trainers.learners.base import ACTOR, Learner
 from emberlink.trainers.runs.checkpoints import load_weights

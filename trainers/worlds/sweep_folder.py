@@ -8,7 +8,7 @@ from typing import Any
 
 from emberlink.envs.utils import atomic_io
 from emberlink.envs.utils.errors import UserError
-from emberlink.trainers.config.overrides import flat
+from emberlink.trainers.config.values import flat
 from emberlink.trainers.runs import compact_json
 from emberlink.trainers.runs.json_lines import JsonLines
 from emberlink.trainers.runs.lock import Lock

@@ -16,7 +16,7 @@ from fire_files import UTM, Ellipses, frame_of
 from emberlink.envs.fire_files.config import FileFireConfig
 from emberlink.envs.fire_files.reader import read_fires, with_checksum
 from emberlink.envs.utils.errors import UserError
-from emberlink.trainers.config.overrides import parse
+from emberlink.trainers.config.values import parse
 
 HOURS = (60.0, 120.0, 180.0)
 DATES = [f"2020-08-19T{hour}:00:00Z" for hour in (22, 23)] + ["2020-08-19T17:00:00-07:00"]

@@ -83,7 +83,7 @@ def leaves(schema: dict, root: dict, prefix: str = "") -> Iterator[tuple[str, di
         below = entered(below, root)
         if "properties" in below:
             yield from leaves(below, root, f"{prefix}{name}.")
-        elif prefix + name not in ("comm", "baselines", "learner"):
+        elif prefix + name not in ("comm", "learner"):
             yield prefix + name, below
 
 
@@ -371,7 +371,7 @@ def test_every_key_of_every_group_is_fuzzed():
     chosen += [("consensus", f"fire={fire}") for fire in scenarios()]
     for method, choice in chosen:
         config = resolve(method, [choice, "learner=ddpg"])
-        present |= {key for key in flat(to_values(config)) if "baselines" not in key}
+        present |= set(flat(to_values(config)))
     assert present == fuzzed
     assert set(CAPS) | set(FIXED) <= fuzzed  # every listed key still exists
 

@@ -18,7 +18,6 @@ from emberlink.trainers.config.compose import (
     resolve,
     to_values,
 )
-from emberlink.trainers.config.owners import drop_settings_of_others
 from emberlink.trainers.learners import registry
 from emberlink.trainers.learners.base import Learner
 from emberlink.trainers.learners.ddpg import DDPG
@@ -141,12 +140,6 @@ def test_another_package_can_add_a_learner(monkeypatch):
     monkeypatch.setattr(plugins, "registered", lambda of: {"mine": point} if of == group else {})
     assert registry.known() == ["ddpg", "imitation", "ippo", "mappo", "mine", "td3"]
     assert registry.find("mine") is TD3
-
-
-def test_a_setup_does_not_give_a_learner_the_settings_of_others():
-    values = {"name": "ddpg", "tau": 0.1, "policy_delay": 2, "unheard": 1}
-    drop_settings_of_others(values)
-    assert values == {"name": "ddpg", "tau": 0.1, "unheard": 1}
 
 
 def test_networks_of_seeds_that_cannot_be_told_apart_are_refused():

@@ -15,11 +15,8 @@ from emberlink import trainers
 from emberlink.envs import FileFireConfig
 from emberlink.envs.utils.errors import UserError
 from emberlink.trainers.cli.main import main
-from emberlink.trainers.config.compose import flat, resolve, to_values
-from emberlink.trainers.config.defaults import defaults_of
-from emberlink.trainers.config.schema import RunConfig
-from emberlink.trainers.config.transfer import evaluated_with, in_world, kept
-from emberlink.trainers.evaluation.evaluate import evaluation_scenarios
+from emberlink.trainers.config.compose import evaluated_with, flat, in_world, resolve, to_values
+from emberlink.trainers.evaluation.evaluate import evaluation_scenarios, scripted_config
 
 ROUND = ("paper", "front", "relay", "blackout", "swarm", "paper", "relay", "front", "paper")
 
@@ -47,10 +44,13 @@ def test_settings_of_the_run_are_kept_unless_the_worlds_differ_in_them():
 
 def test_a_radio_of_the_run_holds_for_the_methods_of_scripted_policies_too():
     run = resolve("maps", ["setup=tuned", "world=front", "env.radio.loss=0.3"])
-    moved = in_world(run, "paper")
-    expected = resolve("maps", ["setup=tuned", "world=paper", "env.radio.loss=0.3"])
-    assert moved.baselines["consensus"].radio.loss == 0.3
-    assert moved.baselines == expected.baselines
+    consensus = resolve("consensus", ["setup=tuned", "world=paper", "env.radio.loss=0.3"])
+    played = scripted_config(in_world(run, "paper"), "follow_target")
+    assert (played.comm, played.env.radio) == (consensus.comm, consensus.env.radio)
+    own = resolve("positional", ["setup=tuned"])  # its radio has no limit
+    assert scripted_config(own, "follow_target").env.radio == resolve("consensus").env.radio
+    off = evaluated_with(own, ["env.radio.range=0"])
+    assert scripted_config(off, "follow_target").env.radio.range == 0
 
 
 def test_a_run_on_a_fire_of_its_own_can_be_moved(tmp_path):
@@ -59,9 +59,6 @@ def test_a_run_on_a_fire_of_its_own_can_be_moved(tmp_path):
     run = resolve("consensus", ["setup=tuned", "world=file", path, "env.view_angle=40"])
     moved = in_world(run, "swarm")
     assert (moved.fire.name, moved.env.num_uavs, moved.env.view_angle) == ("swarm", 24, 40)
-    defaults = defaults_of(run)
-    assert defaults["env.view_angle"] == 30
-    assert not any(key.startswith("fire.") for key in defaults)
 
 
 def test_settings_after_the_world_change_it():
@@ -89,7 +86,6 @@ OTHER_MAP = pytest.mark.filterwarnings("ignore:env.*means something else here:Us
 def test_an_evaluation_in_another_world(run, tmp_path, capsys):
     assert main(["eval", str(run), "world=relay"]) == 0
     printed = " ".join(capsys.readouterr().out.split())
-    assert "note: the run keeps its own env.num_uavs=2, env.horizon=15 note: world" in printed
     assert "note: world is relay here, paper in training" in printed
     assert "huygens" not in printed
     written = json.loads((run / "eval_world=relay.json").read_text())
@@ -103,22 +99,6 @@ def test_an_evaluation_in_another_world(run, tmp_path, capsys):
     assert main(["compare", str(run), "--output", str(tmp_path / "compared")]) == 0
     said = " ".join(capsys.readouterr().out.split())
     assert "is left out: evaluated otherwise: world is relay, in eval.json paper" in said
-
-
-def keeps(run: RunConfig, overrides: list[str]) -> list[str]:
-    return kept(evaluated_with(run, overrides), overrides)
-
-
-def test_what_a_run_keeps_in_another_world():
-    run = resolve("consensus", ["setup=tuned", "env.radio.range=0", "env.reward.exit=-2"])
-    both = ["env.radio.range=0.0", "env.reward.exit=-2.0"]
-    assert sorted(keeps(run, ["world=front"])) == sorted(keeps(run, ["world=paper"])) == both
-    assert keeps(run, ["world=front", "env.radio.range=5"]) == both[1:]
-    assert keeps(run, ["env.num_uavs=3"]) == []
-    assert keeps(resolve("maps", ["setup=strong", "world=relay"]), ["world=swarm"]) == []
-    team = resolve("consensus", ["setup=tuned", "world=front", "env.num_uavs=4"])
-    assert keeps(team, ["world=relay"]) == ["env.num_uavs=4"]
-    assert keeps(team, ["world=swarm"]) == []  # swarm has 24 UAVs, so 4 are not kept
 
 
 @OTHER_MAP

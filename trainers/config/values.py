@@ -1,0 +1,258 @@
+"""Composes a run's values from YAML files and `key=value` texts.
+
+Imports no torch, so that a wrong name or key is reported at once.
+"""
+
+import difflib
+import threading
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from copy import deepcopy
+from functools import lru_cache, reduce
+from operator import getitem
+from pathlib import Path
+from typing import Any
+
+from hydra import compose, initialize_config_module
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.errors import HydraException
+from hydra.version import VersionBase
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+from yaml import YAMLError
+
+from emberlink import configs
+from emberlink.envs.utils.config_files import find
+from emberlink.envs.utils.errors import UserError
+from emberlink.envs.utils.validation import plain, shown
+from emberlink.trainers.config.removed import REMOVED
+
+GROUPS = ("setup", "world", "fire", "learner")
+"""groups whose file is chosen by `GROUP=NAME`, besides the method"""
+_HYDRA = threading.RLock()
+
+
+def composed(method: str, overrides: Sequence[str] = (), **settings: Any) -> dict[str, Any]:
+    """Returns the values of a method's run, whose types and ranges are not checked.
+
+    Args:
+        method: name of a file in configs/method.
+        overrides: texts `key=value`, as on the command line.
+        settings: other keys and their values; see `full_key`.
+
+    Raises:
+        UserError: a name or a key is not known, or a text is of another form.
+    """
+    if isinstance(overrides, str):
+        raise UserError(f"{shown(overrides)!r}: expected a list of texts key=value")
+    names = {"method": str(method), "setup": "paper", "world": "paper"}
+    for text in overrides:
+        key, equals, _ = text.partition("=")
+        if equals and key in GROUPS:
+            names[key] = str(parse(text)[1])
+    values = _from_files(names)
+    changed = [text for text in overrides if text.partition("=")[0] not in GROUPS]
+    change(values, changed, settings)
+    values = _interpolated(values)
+    return values | {group: names[group] for group in ("method", "setup", "world")}
+
+
+def change(
+    values: dict[str, Any], overrides: Sequence[str] = (), settings: Mapping[str, Any] | None = None
+) -> None:
+    """Sets values by texts `key=value` and by keyword arguments.
+
+    Raises:
+        UserError: a key is not known or names a file, or a text is of another form.
+    """
+    known = list(all_keys(values))
+    given = [parse(text, values) for text in overrides]
+    for name, value in (settings or {}).items():
+        check_not_removed(name, value)
+        if name in ("method", *GROUPS):
+            raise UserError(f"{name}={shown(value)}: names a file, so it is not a setting")
+        given.append((full_key(known, name), plain(value)))
+    for key, value in given:
+        check_not_removed(key, value)
+        group, _, last = key.partition(".")
+        if group in GROUPS and last in ("", "name", "kind"):
+            raise UserError(f"{key}={shown(value)}: choose it with {group}=NAME")
+        if key not in known:
+            raise UserError(unknown_key(key, known))
+        put(values, key, value)
+
+
+def parse(text: str, values: Mapping[str, Any] | None = None) -> tuple[str, Any]:
+    """Returns the key and the value of `key=value` by Hydra's grammar.
+
+    A value that the grammar cannot read, as in `output=Läufe`, is a text.
+
+    Args:
+        text: the text.
+        values: values that it changes, for the message if it gives several.
+
+    Raises:
+        UserError: the text is of another form, or gives several values.
+    """
+    key, equals, value = text.partition("=")
+    if not equals or not key.strip():
+        raise UserError(f"{shown(text)!r} is not of the form key=value")
+    try:
+        parsed = OverridesParser.create().parse_override(text)
+    except (HydraException, ValueError, RecursionError):
+        return key, value
+    if parsed.is_sweep_override():
+        hint = "several runs are a sweep, see emberlink sweep --help"
+        if isinstance(flat(values or {}).get(key), list) and parsed.is_choice_sweep():
+            hint = f"a list is written {key}=[{value}]"
+        raise UserError(f"{shown(text)!r}: only one value is possible here; {hint}")
+    if parsed.is_delete():
+        raise UserError(f"{shown(text)!r}: a key cannot be removed")
+    return parsed.get_key_element(), _with_infinity(parsed.value())
+
+
+def _with_infinity(value: Any) -> Any:
+    """Reads `.inf` as the files do; Hydra's grammar knows `inf` only."""
+    if isinstance(value, list):
+        return [_with_infinity(item) for item in value]
+    return float(value.replace(".", "")) if value in (".inf", "+.inf", "-.inf") else value
+
+
+def put(values: dict[str, Any], key: str, value: Any) -> None:
+    """Sets the value of a dotted key.
+
+    A mapping changes only the keys that it holds. If it has another `name`, as in `comm`, it
+    replaces the whole mapping.
+    """
+    *path, last = key.split(".")
+    parent = reduce(getitem, path, values)
+    old = parent.get(last)
+    both = isinstance(old, dict) and isinstance(value, Mapping)
+    same = both and old.get("name") == value.get("name", old.get("name"))  # pyright: ignore
+    if not same:
+        parent[last] = value
+        return
+    for name, item in value.items():
+        put(values, f"{key}.{name}", item)
+
+
+def full_key(known: Sequence[str], key: str) -> str:
+    """Returns the known key that equals `key`, or else the only one that ends with it.
+
+    Raises:
+        UserError: there is no such key, or several.
+    """
+    if key in known:
+        return key
+    matching = [name for name in known if name.endswith(f".{key}")]
+    if len(matching) > 1:
+        raise UserError(f"key {key!r} is ambiguous: {', '.join(matching)}")
+    if not matching:
+        raise UserError(unknown_key(key, known))
+    return matching[0]
+
+
+def check_not_removed(key: str, value: Any = None) -> None:
+    """Raises a UserError that names what replaces a key of an earlier version."""
+    for name in (key, f"{key}={value}"):
+        if name in REMOVED:
+            raise UserError(f"{name} is no longer a setting: {REMOVED[name]}")
+
+
+def unknown_key(key: str, known: Iterable[str]) -> str:
+    """Returns a message that a key is not known, with similar keys or those beside it."""
+    names = list(known)
+    parent, _, last = key.rpartition(".")
+    lasts = {name.rpartition(".")[2]: name for name in names}
+    near = (
+        [name for name in names if name.endswith((f".{last}", f"_{last}"))]
+        or difflib.get_close_matches(key, names, n=1)
+        or [lasts[name] for name in difflib.get_close_matches(last, lasts, n=1)]
+    )
+    parent = parent if parent in names else ""
+    beside = [name for name in names if name.rpartition(".")[0] == parent]
+    hint = f"did you mean {' or '.join(near[:4])}?" if near else f"known: {', '.join(beside)}"
+    return f"key {shown(key)!r} is not known; {hint}"
+
+
+def all_keys(values: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
+    """Yields the dotted keys of nested mappings, including those of inner mappings."""
+    for key, value in values.items():
+        yield f"{prefix}{key}"
+        if isinstance(value, Mapping):
+            yield from all_keys(value, f"{prefix}{key}.")
+
+
+def flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Returns the values of nested mappings by dotted key."""
+    result: dict[str, Any] = {}
+    for key, value in values.items():
+        below = flat(value, f"{prefix}{key}.") if isinstance(value, Mapping) else None
+        result |= {f"{prefix}{key}": value} if below is None else below
+    return result
+
+
+def _from_files(names: Mapping[str, str]) -> dict[str, Any]:
+    """Returns the values that Hydra composes from the files of groups, with `${...}` in them.
+
+    Raises:
+        UserError: a file is not known or not a configuration.
+    """
+    own = f"{names['setup']}_{names['method']}"
+    more = {"setup_method": own} if own in configs.known("setup_method") else {}
+    for group, name in {**names, **more}.items():
+        find(group, name)
+    folders = configs.folders()
+    files = sorted(file for folder in folders for file in folder.glob("**/*.yaml"))
+    # Editors lock a file with a link to nowhere.
+    stamps = tuple((file, file.stat().st_mtime_ns) for file in files if file.is_file())
+    values = deepcopy(_compose(tuple(names.items()), tuple(folders), stamps))
+    for group in ("method", "setup", "world"):
+        if group in values:  # without the header, Hydra puts the content under the group
+            raise UserError(f"{find(group, names[group])} must begin with '# @package _global_'")
+    return values
+
+
+@lru_cache(maxsize=256)
+def _compose(
+    names: tuple[tuple[str, str], ...], folders: tuple[Path, ...], stamps: tuple
+) -> dict[str, Any]:
+    """Calls Hydra, which takes 0.2 s, if a name or the modification time of a file is new."""
+    # The last folder is emberlink's own, which Hydra searches anyway.
+    paths = ["'file://" + str(folder).replace("'", "\\'") + "'" for folder in folders[:-1]]
+    overrides = [f"{group}={name}" for group, name in names]
+    try:
+        with _own_hydra():
+            whole = compose("base", [*overrides, f"hydra.searchpath=[{','.join(paths)}]"])
+            values: Any = OmegaConf.to_container(whole)
+    except (HydraException, OmegaConfBaseException, YAMLError, UnicodeError) as error:
+        raise UserError(" ".join(str(error).split())[:300]) from None
+    return values
+
+
+@contextmanager
+def _own_hydra() -> Iterator[None]:
+    """Initialises Hydra for one composition, then restores the caller's state of Hydra."""
+    with _HYDRA:
+        callers, version = GlobalHydra.instance().hydra, VersionBase.instance().getbase()
+        GlobalHydra.instance().clear()
+        try:
+            with initialize_config_module(config_module="emberlink.configs", version_base="1.3"):
+                yield
+        finally:
+            GlobalHydra.instance().hydra = callers
+            VersionBase.instance().version_base = version
+
+
+def _interpolated(values: dict[str, Any]) -> dict[str, Any]:
+    """Returns the values with each `${key}` replaced by the value of the key."""
+    if not any(mark in str(values) for mark in ("${", "???")):
+        return values  # OmegaConf takes several milliseconds.
+    try:
+        whole: Any = OmegaConf.to_container(
+            OmegaConf.create(values), resolve=True, throw_on_missing=True
+        )
+    except OmegaConfBaseException as error:
+        raise UserError(" ".join(str(error).split())[:300]) from None
+    return whole
