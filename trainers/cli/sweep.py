@@ -1,6 +1,7 @@
 """Defines the arguments of `emberlink sweep`."""
 
 import argparse
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from emberlink.trainers.cli import completion
@@ -32,19 +33,15 @@ def add_sweep(commands: Any) -> None:
         help="methods (default: all); keys as for train, with one value or several; "
         "executor=local, submitit (SLURM) or ray, and its keys executor.KEY=value",
     )
-    sweep.add_argument(
-        "--jobs",
-        metavar="N",
-        type=positive,
-        help="runs at a time (default: one per core; on SLURM and Ray, all)",
-    )
+    sweep.add_argument("--jobs", metavar="N", type=positive, help="the same as executor.workers=N")
     sweep.add_argument("--dry-run", action="store_true", help="only print the state of each run")
 
 
 def _sweep(options: argparse.Namespace, console: "Console") -> int:
-    from emberlink.trainers.sweep.command import sweep
-    from emberlink.trainers.sweep.status import status
+    from emberlink.trainers.sweep.command import status, sweep
 
-    if options.arguments[0] == "status":
-        return status(options.arguments[1:], console)
-    return sweep(options.arguments, console, at_a_time=options.jobs, dry=options.dry_run)
+    first, *others = options.arguments
+    if first == "status" and len(others) == 1:
+        return status(Path(others[0]), console)
+    jobs = [f"executor.workers={options.jobs}"] if options.jobs else []
+    return sweep([*options.arguments, *jobs], console, dry=options.dry_run)

@@ -1,41 +1,49 @@
-"""Runs `emberlink sweep`: trains every combination, and resumes stopped runs."""
+"""Runs `emberlink sweep`: trains every combination that is not finished."""
 
 import shlex
+import time
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 from emberlink.envs.utils.errors import UserError
-from emberlink.trainers.sweep import executors
-from emberlink.trainers.sweep.jobs import Identity, Job, identity, jobs_of
-from emberlink.trainers.sweep.manifest import Manifest
-from emberlink.trainers.sweep.plan import plan, stacked
-from emberlink.trainers.sweep.progress import SweepProgress
-from emberlink.trainers.sweep.run_index import RunIndex
-from emberlink.trainers.sweep.scheduler import Scheduler
+from emberlink.trainers.runs.lock import Lock, LockedError
+from emberlink.trainers.runs.run_folder import RunFolder
+from emberlink.trainers.sweep.combinations import (
+    Combination,
+    combinations,
+    find_folders,
+    lines_of,
+    without_seed,
+)
+from emberlink.trainers.sweep.executors.base import Executor
+from emberlink.trainers.sweep.executors.registry import make
+from emberlink.trainers.terminal.signals import Interruption
 from emberlink.trainers.tracking import loggers
 from emberlink.trainers.training.setup import check_setup
 
-_EXECUTOR = "executor"
+_INTERVAL = 0.5
+"""seconds between two looks at the runs"""
+_AGAIN = 60.0
+"""seconds after which runs that a cluster did not take are submitted again"""
 
 
 def sweep(
     arguments: Sequence[str],
     console: Console,
     *,
-    at_a_time: int | None = None,
     dry: bool = False,
-    executor: executors.Executor | None = None,
+    executor: Executor | None = None,
 ) -> int:
     """Trains and evaluates the runs that are not finished.
 
     Args:
-        arguments: see `jobs_of`; and `executor=NAME`, `executor.KEY=VALUE`.
+        arguments: see `combinations`; and `executor=NAME`, `executor.KEY=VALUE`.
         console: shows the progress and a table at the end.
-        at_a_time: number of runs in parallel; replaces `executor.workers`.
         dry: whether to print the state of each run and do nothing else.
         executor: runs the trainings; replaces the executor of the arguments.
 
@@ -45,103 +53,190 @@ def sweep(
     Raises:
         UserError: an argument is wrong, or the output folder cannot be written.
     """
-    name, executor = _executor(arguments, at_a_time) if executor is None else ("", executor)
-    wanted = jobs_of([a for a in arguments if not _is_executor(a)])
-    outputs = {job.output: RunIndex(job.output) for job in wanted}
-    if len(outputs) > 1:
-        raise UserError(f"output={','.join(map(str, outputs))}: a sweep has one output folder")
-    (output, index), *_ = outputs.items()
-    index.update()
-    for path, why in index.unreadable.items():
-        console.print(f"note: {path} is left out: {why}", style="yellow", soft_wrap=True)
-    jobs = stacked(plan(wanted, index.runs), executor.seeds)
-    _check(jobs)
-    total = sum(len(job.configs) for job in jobs)
-    done = sum(len(job.configs) for job in jobs if job.finished)
-    console.print(f"{total} runs, of which {done} are finished -> {output}", soft_wrap=True)
+    chosen = [text for text in arguments if text.startswith(("executor=", "executor."))]
+    runs = combinations([text for text in arguments if text not in chosen])
+    executor = executor or make(chosen)
+    output = Path(runs[0].config.output)
+    for note in find_folders(runs, output):
+        console.print(f"note: {note}", style="yellow", soft_wrap=True)
+    _check([run for run in runs if run.folder is None])
+    waiting = [run for run in runs if not run.finished]
+    done = len(runs) - len(waiting)
+    console.print(f"{len(runs)} runs, of which {done} are finished -> {output}", soft_wrap=True)
     if dry:
-        for job in jobs:
-            console.print(f"  {job.name}: {job.state}", highlight=False, soft_wrap=True)
+        for run in runs:
+            console.print(f"  {run.name}: {run.state}", highlight=False, soft_wrap=True)
         return 0
-    for job in jobs:
-        loggers.check_installed(job.configs[0])
-    progress = SweepProgress(console, total, done)
-    scheduler = Scheduler(jobs, index, executor, progress, Manifest(output, name))
-    status = scheduler.work()
-    _print_table(scheduler.jobs, console)
-    _print_end(status, scheduler.left, output, console)
+    status = _Sweep(executor, runs, waiting, console).work()
+    _print_table(runs, console)
+    if status == 0:
+        again = f"emberlink compare {shlex.quote(str(output))}"
+        console.print(f"compare them with: {again}", soft_wrap=True)
+    else:
+        console.print("the same command trains what is left")
     return status
 
 
-def _check(jobs: Sequence[Job]) -> None:
-    """Checks that new jobs can be trained; those that differ in their seeds only, once.
+def _check(runs: Sequence[Combination]) -> None:
+    """Checks that new runs can be trained; those that differ in their seed only, once.
 
     Raises:
         UserError: one cannot.
     """
-    checked: set[tuple[int, Identity]] = set()
-    for job in jobs:
-        seeds = [config.seed for config in job.configs]
-        config = replace(job.configs[0], seeds=tuple(seeds) if len(seeds) > 1 else ())
-        name = len(seeds), identity(replace(config, seed=0))
-        if job.state != "new" or name in checked:
-            continue
-        checked.add(name)
+    for run in {without_seed(run.config): run for run in reversed(runs)}.values():
+        loggers.check_installed(run.config)
         try:
-            check_setup(config)
+            check_setup(run.config)
         except UserError as error:
-            raise UserError(f"{job.name}: {error}") from None
+            raise UserError(f"{run.name}: {error}") from None
 
 
-def _print_end(status: int, left: int, output: Path, console: Console) -> None:
-    """Prints the command that follows a sweep.
+class _Sweep:
+    """Submits runs, shows their progress, and cancels them at the first signal."""
 
-    Args:
-        status: as of `sweep`.
-        left: number of trainings that still run or wait.
-        output: folder of the runs.
-        console: prints the text.
-    """
-    where = shlex.quote(str(output))
-    if status == 0:
-        console.print(f"compare them with: emberlink compare {where}", soft_wrap=True)
-    elif left:
-        console.print(
-            f"{left} trainings are left running or queued; "
-            f"show their states with: emberlink sweep status {where}",
-            soft_wrap=True,
+    def __init__(
+        self,
+        executor: Executor,
+        runs: Sequence[Combination],
+        waiting: list[Combination],
+        console: Console,
+    ):
+        self._executor, self._waiting = executor, waiting
+        self._running: dict[Combination, Any] = {}
+        self._stopped = False
+        self._submit_at = 0.0
+        self._progress = _RunProgress(console, len(runs), len(runs) - len(waiting))
+
+    def work(self) -> int:
+        """Trains all runs and returns the exit status of the sweep."""
+        interruption = Interruption(self._stop)
+        failed = 0
+        with interruption, self._progress:
+            try:
+                while self._running or self._waiting:
+                    self._submit()
+                    failed += self._look()
+                    if self._running:
+                        time.sleep(_INTERVAL)
+            finally:  # after a second signal or an error, the trainings end, too
+                self._stop()
+                while self._running:
+                    self._look()
+                    time.sleep(_INTERVAL / 5)
+        return interruption.status if interruption.received else int(failed > 0)
+
+    def _submit(self) -> None:
+        """Submits as many of the waiting runs as the executor takes.
+
+        Raises:
+            UserError: it takes none, and no run is left to wait for.
+        """
+        room = (self._executor.workers or len(self._waiting)) - len(self._running)
+        if room <= 0 or not self._waiting or time.monotonic() < self._submit_at:
+            return
+        batch, self._waiting = self._waiting[:room], self._waiting[room:]
+        try:
+            handles = self._executor.submit([run.task() for run in batch])
+        except UserError as error:
+            if not self._running:
+                raise
+            self._waiting = batch + self._waiting
+            self._submit_at = time.monotonic() + _AGAIN
+            self._progress.say(str(error))
+            return
+        self._running |= zip(batch, handles, strict=True)
+        if self._stopped:  # the signal came meanwhile
+            self._stop()
+
+    def _look(self) -> int:
+        """Updates the progress and returns the number of runs that have failed since."""
+        failed = 0
+        for run, handle in list(self._running.items()):
+            status = self._executor.poll(handle)
+            if status is None:
+                self._progress.follow(run)
+                continue
+            del self._running[run]
+            if not run.finished and not self._stopped:
+                said = lines_of(run.log)
+                run.failed = said[-1].strip() if said else f"exit status {status}"
+                failed += 1
+            state = "failed" if run.failed else "finished" if run.finished else "stopped"
+            self._progress.end(run, state)
+        return failed
+
+    def _stop(self) -> None:
+        self._stopped, self._waiting = True, []
+        for handle in list(self._running.values()):
+            self._executor.cancel(handle)
+
+
+class _RunProgress(Progress):
+    """Shows a bar for all runs and one for each run that has begun, and prints those that end."""
+
+    def __init__(self, console: Console, total: int, done: int):
+        super().__init__(
+            TextColumn("{task.description}", markup=False),
+            BarColumn(bar_width=20),
+            TextColumn("{task.completed:.0f}/{task.total:.0f}"),
+            TimeElapsedColumn(),
+            console=console,
         )
-    elif status > 1:
-        console.print("stopped; the same command resumes the runs")
+        self._all = self.add_task("runs", total=total, completed=done)
+        self._bars: dict[Combination, TaskID] = {}
+
+    def follow(self, run: Combination) -> None:
+        """Shows the episodes of a run as soon as it has one."""
+        if episodes := run.episodes:
+            if run not in self._bars:
+                self._bars[run] = self.add_task(run.name, total=run.config.episodes)
+            self.update(self._bars[run], completed=episodes)
+
+    def end(self, run: Combination, state: str) -> None:
+        """Prints how a run ended and removes its bar."""
+        if run in self._bars:
+            self.remove_task(self._bars.pop(run))
+        self.advance(self._all)
+        self.say(f"{run.name}: {state}")
+
+    def say(self, text: str) -> None:
+        """Prints a line above the bars."""
+        self.console.print(f"  {text}", highlight=False, soft_wrap=True)
 
 
-def _is_executor(text: str) -> bool:
-    return text.partition("=")[0].split(".")[0] == _EXECUTOR and "=" in text
-
-
-def _executor(arguments: Sequence[str], workers: int | None) -> tuple[str, executors.Executor]:
-    """Returns the name and the executor of `executor=NAME` and `executor.KEY=VALUE`."""
-    name = "local"
-    texts: dict[str, str] = {} if workers is None else {"workers": str(workers)}
-    for text in filter(_is_executor, arguments):
-        key, _, value = text.partition("=")
-        if key == _EXECUTOR:
-            name = value
-        else:
-            texts[key.partition(".")[2]] = value
-    return name, executors.from_texts(name, texts)
-
-
-def _print_table(jobs: Sequence[Job], console: Console) -> None:
-    """Prints the state and the folder of each run, and why jobs failed."""
+def _print_table(runs: Sequence[Combination], console: Console) -> None:
+    """Prints the state and the folder of each run, and the last line of those that failed."""
     table = Table("run", "state", "folder")
-    for job in jobs:
-        state = "failed" if job.failed else "finished" if job.finished else "not finished"
-        for config in job.configs:
-            run = job.found.get(config.seed)
-            name = replace(job, configs=[config]).name
-            table.add_row(name, state, run.folder.path.name if run else "-")
+    for run in runs:
+        state = "failed" if run.failed else run.state
+        table.add_row(run.name, state, run.folder.path.name if run.folder else "-")
     console.print(table)
-    for job in jobs:
-        if job.failed:
-            console.print(f"{job.name}: {job.failed}", soft_wrap=True)
+    for run in runs:
+        if run.failed:
+            console.print(f"{run.name}: {run.failed} (log: {run.log})", soft_wrap=True)
+
+
+def status(output: Path, console: Console) -> int:
+    """Prints the state and the episodes of each run in an output folder.
+
+    Raises:
+        UserError: there is none.
+    """
+    table = Table("run", "state", "episodes")
+    for file in sorted(output.glob("*/config.yaml")):
+        folder = RunFolder(file.parent)
+        run = Combination("", folder.config(device="cpu"), (), folder)
+        table.add_row(folder.path.name, _state(run), f"{run.episodes}/{run.config.episodes}")
+    if not table.row_count:
+        raise UserError(f"{output}: holds no run")
+    console.print(table)
+    return 0
+
+
+def _state(run: Combination) -> str:
+    try:
+        if run.folder and (run.folder.path / "lock").exists():  # also after SIGKILL
+            Lock(run.folder.path).release()
+    except LockedError:
+        return "running"
+    return run.state

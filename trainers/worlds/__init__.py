@@ -1,1 +1,1 @@
-"""Calibrates worlds: tests that a world is worth learning in, and compares many worlds."""
+"""Tests that a world is worth learning in, by means of scripted policies."""

@@ -1,8 +1,9 @@
-"""Runs `emberlink world check`: measures scripted policies and tests the conditions of a world."""
+"""Runs `emberlink world check`: plays scripted policies and tests the conditions of a world."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from rich.console import Console
 from rich.table import Table
@@ -10,14 +11,119 @@ from rich.text import Text
 
 from emberlink.configs import known
 from emberlink.envs import metrics
+from emberlink.envs.scenarios import fires_of
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.publish import new_file, published
 from emberlink.policies.scripted.registry import to_play
+from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.config.schema import RunConfig
-from emberlink.trainers.evaluation.results import means
+from emberlink.trainers.evaluation.evaluate import BLOCK, VALIDATION_START_SEED, play_scripted
+from emberlink.trainers.evaluation.results import Measured, means
 from emberlink.trainers.runs import compact_json
-from emberlink.trainers.worlds.conditions import Condition, Means, conditions, missing
-from emberlink.trainers.worlds.play import Split, played, world_config
+
+Split = Literal["test", "validation"]
+Means = Mapping[str, Mapping[str, float]]
+"""policy -> measure -> mean over episodes"""
+RANDOM, ALONE, ALL, ORACLE = "random_waypoints", "map_greedy_alone", "map_greedy_all", "oracle"
+"""the scripted policies on which the conditions depend"""
+SHARES = ("coverage", "coverage_auc", "base_coverage")
+"""measures in %, of which more is better: the possible headlines of a calibrated world"""
+MOST_AT_RANDOM = 50.0
+"""%; random waypoints may reach at most this much of the headline"""
+LEAST_OF_ORACLE = 90.0
+"""%; the oracle has to reach at least this much of the headline"""
+LEAST_GAIN = 10.0
+"""what merging all maps has to add to merging none: points of the headline, or % of `front_age`"""
+_METHOD = "independent"  # any method; scripted policies do not depend on it
+
+
+@dataclass(frozen=True)
+class Condition:
+    """A bound on one figure or several of a world, of which one suffices."""
+
+    name: str
+    """the policies that are measured"""
+    figures: Mapping[str, float]
+    """what is measured, with its unit -> number"""
+    bound: float
+    at_most: bool = False
+    """whether the bound is an upper one"""
+
+    @property
+    def passes(self) -> bool:
+        """Whether at least one of the figures keeps the bound."""
+        if self.at_most:
+            return any(number <= self.bound for number in self.figures.values())
+        return any(number >= self.bound for number in self.figures.values())
+
+    def __str__(self) -> str:
+        figures = "; ".join(f"{name} {number:.1f}" for name, number in self.figures.items())
+        kind = "at most" if self.at_most else "at least"
+        one = "one of them " if len(self.figures) > 1 else ""
+        verdict = "pass" if self.passes else "FAIL"
+        return f"{verdict}: {self.name}: {figures}; {one}{kind} {self.bound:g}"
+
+
+def conditions(means: Means, headline: str) -> list[Condition]:
+    """Returns the conditions of a world.
+
+    Args:
+        means: the measures of at least the four needed policies.
+        headline: the world's headline measure, in %.
+    """
+    none, merged = means[ALONE], means[ALL]
+    gains = {f"{headline}, points": merged[headline] - none[headline]}
+    if none.get("front_age"):
+        saved = none["front_age"] - merged["front_age"]
+        gains["front_age, % less"] = 100 * saved / none["front_age"]
+    share = f"{headline}, %"
+    return [
+        Condition(RANDOM, {share: means[RANDOM][headline]}, MOST_AT_RANDOM, at_most=True),
+        Condition(ORACLE, {share: means[ORACLE][headline]}, LEAST_OF_ORACLE),
+        Condition(f"{ALL} against {ALONE}", gains, LEAST_GAIN),
+    ]
+
+
+def world_config(overrides: Sequence[str]) -> RunConfig:
+    """Returns the configuration of a world: `world=NAME` and other `key=value`.
+
+    Raises:
+        UserError: a key or value is wrong, or the headline is not a share.
+    """
+    config = resolve(_METHOD, overrides)
+    headline = config.evaluation.headline
+    if headline not in SHARES:
+        raise UserError(
+            f"world {config.world}: evaluation.headline={headline} is not a share in %; "
+            f"known: {', '.join(SHARES)}"
+        )
+    return config
+
+
+def played(
+    config: RunConfig,
+    policy: str,
+    *,
+    fires: int,
+    split: Split,
+    report: Callable[[str], None] = lambda _: None,
+) -> Measured:
+    """Returns the measures of a scripted policy, from the cache if they are in it.
+
+    Args:
+        config: configuration of the world.
+        policy: a name in `SCRIPTED`.
+        fires: number of fires, one episode each.
+        split: test fires as in an evaluation, or validation fires as during a training.
+        report: called with the name if the policy is played.
+    """
+    scenario, world = fires_of(config.fire), config.env
+    if split == "test":
+        arrival = scenario.test(fires, world.grid, world.horizon)
+        return play_scripted(config, policy, arrival, report=report)
+    arrival = scenario.validation(fires, world.grid, world.horizon)
+    start, block = VALIDATION_START_SEED, min(fires, BLOCK)
+    return play_scripted(config, policy, arrival, start_seed=start, block=block, report=report)
 
 
 def check(
@@ -46,29 +152,36 @@ def check(
     if output is not None:
         new_file(output, [".json"])
     overrides = [text for text in arguments if "=" in text]
-    if any(text.partition("=")[0] == "world" for text in overrides):
+    if any(text.startswith("world=") for text in overrides):
         raise UserError("world=NAME: the worlds are given without a key here")
     names = [text for text in arguments if text not in overrides] or suite(console)
     configs = [world_config([f"world={name}", *overrides]) for name in dict.fromkeys(names)]
     for config in configs:
-        if lacking := missing(config.evaluation.scripted):
-            raise UserError(f"world {config.world}: {_lacks(lacking)}")
+        if lacking := _lacking(config.evaluation.scripted):
+            raise UserError(f"world {config.world}: {lacking}")
     record = {}
     for config in configs:
-        measured = _measure(config, console, fires, split)
+
+        def say(policy: str, world: str = config.world) -> None:
+            console.print(f"  {world}: {policy} plays", style="dim")
+
+        measured = {
+            policy: means(played(config, policy, fires=fires, split=split, report=say))
+            for policy in to_play(config.evaluation.scripted)
+        }
         found = conditions(measured, config.evaluation.headline)
-        console.print(_table(config, measured, fires, split))
+        console.print(_table(config, measured, f"{fires} {split} fires"))
         for condition in found:
-            style = "" if condition.passes else "red"
-            console.print(_line(condition), style=style, soft_wrap=True)
+            console.print(str(condition), style="" if condition.passes else "red", soft_wrap=True)
         console.print()
-        record[config.world] = _record(config, measured, found, fires, split)
+        numbers = {"fires": fires, "split": split, "headline": config.evaluation.headline}
+        record[config.world] = numbers | _record(measured, found)
     if output is not None:
         with published(output) as partial:
             partial.write_text(compact_json.dumps(record) + "\n", encoding="utf-8")
-    passing = [name for name, world in record.items() if world["passes"]]
-    console.print(f"{len(passing)} of {len(record)} worlds pass")
-    return int(len(passing) < len(record))
+    passing = sum(world["passes"] for world in record.values())
+    console.print(f"{passing} of {len(record)} worlds pass")
+    return int(passing < len(record))
 
 
 def suite(console: Console) -> list[str]:
@@ -76,36 +189,25 @@ def suite(console: Console) -> list[str]:
     names = []
     for name in known("world"):
         try:
-            lacking = missing(world_config([f"world={name}"]).evaluation.scripted)
+            lacking = _lacking(world_config([f"world={name}"]).evaluation.scripted)
         except UserError as error:
-            console.print(f"note: world {name} is left out: {error}", soft_wrap=True)
-            continue
+            lacking = str(error)
         if lacking:
-            console.print(f"note: world {name} is left out: {_lacks(lacking)}", soft_wrap=True)
+            console.print(f"note: world {name} is left out: {lacking}", soft_wrap=True)
         else:
             names.append(name)
     return names
 
 
-def _lacks(policies: Sequence[str]) -> str:
-    return f"evaluation.scripted lacks {', '.join(policies)}"
+def _lacking(policies: Collection[str]) -> str:
+    """Returns which of the needed policies a world does not evaluate; empty if none."""
+    lacking = [name for name in (RANDOM, ALONE, ALL, ORACLE) if name not in policies]
+    return f"evaluation.scripted lacks {', '.join(lacking)}" if lacking else ""
 
 
-def _measure(config: RunConfig, console: Console, fires: int, split: Split) -> Means:
-    """Returns the means of the scripted policies of a world."""
-
-    def say(policy: str) -> None:
-        console.print(f"  {config.world}: {policy} plays", style="dim")
-
-    return {
-        policy: means(played(config, policy, fires=fires, split=split, report=say))
-        for policy in to_play(config.evaluation.scripted)
-    }
-
-
-def _table(config: RunConfig, measured: Means, fires: int, split: Split) -> Table:
+def _table(config: RunConfig, measured: Means, fires: str) -> Table:
     """Returns a table with a row per policy and a column per measure, the headline first."""
-    table = Table(title=Text(f"world {config.world}: means of {fires} {split} fires"))
+    table = Table(title=Text(f"world {config.world}: means of {fires}"))
     table.add_column()
     order = sorted(metrics.names(config.env), key=lambda name: name != config.evaluation.headline)
     for name in order:
@@ -115,35 +217,22 @@ def _table(config: RunConfig, measured: Means, fires: int, split: Split) -> Tabl
     return table
 
 
-def _line(condition: Condition) -> str:
-    """Returns a condition as a line of text."""
-    figures = "; ".join(f"{name} {number:.1f}" for name, number in condition.figures.items())
-    kind = "at most" if condition.at_most else "at least"
-    one = "one of them " if len(condition.figures) > 1 else ""
-    verdict = "pass" if condition.passes else "FAIL"
-    return f"{verdict}: {condition.name}: {figures}; {one}{kind} {condition.bound:g}"
+def _record(measured: Means, found: Sequence[Condition]) -> dict[str, Any]:
+    """Returns the conditions and means of a world for JSON."""
 
+    def rounded(figures: Mapping[str, float]) -> dict[str, float]:
+        return {name: round(number, 3) for name, number in figures.items()}
 
-def _record(
-    config: RunConfig, measured: Means, found: Sequence[Condition], fires: int, split: Split
-) -> dict[str, Any]:
-    """Returns the numbers of a world for JSON."""
     return {
-        "fires": fires,
-        "split": split,
-        "headline": config.evaluation.headline,
         "passes": all(condition.passes for condition in found),
         "conditions": [
             {
                 "policies": condition.name,
-                "figures": {name: round(number, 3) for name, number in condition.figures.items()},
+                "figures": rounded(condition.figures),
                 "at_most" if condition.at_most else "at_least": condition.bound,
                 "passes": condition.passes,
             }
             for condition in found
         ],
-        "means": {
-            policy: {name: round(number, 3) for name, number in of_policy.items()}
-            for policy, of_policy in measured.items()
-        },
+        "means": {policy: rounded(of_policy) for policy, of_policy in measured.items()},
     }

@@ -1,28 +1,22 @@
 """Defines the base class of executors, which run the trainings of a sweep."""
 
-import json
+import os
+import subprocess
 import sys
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
 
 from pydantic import Field
 
-from emberlink.envs.utils.errors import UserError
+from emberlink.envs.utils.errors import UserError, how_to_install
 
 Positive = Annotated[int, Field(ge=1)]
-
 DIED = -9
 """status of a task that ended without reporting one, for example because its node failed"""
-STATUS, STOP = ".status", ".stop"
-"""suffixes of files beside a log: the exit status of the task; a request to save and end"""
-_WORKER = "emberlink.trainers.sweep.worker"
-
-
-class QueueFullError(UserError):
-    """Reports that a cluster takes no task now; those that it has taken go on."""
 
 
 @dataclass(frozen=True)
@@ -30,35 +24,48 @@ class Task:
     """A training to run. The same task may be run again: it resumes the run.
 
     Attributes:
-        arguments: arguments of `emberlink train`.
-        log: file for the output; an absolute path.
-        leases: run -> token of the lease that the sweep holds; see trainers/sweep/leases.py.
-        output: folder of the run folders; an absolute path.
-        restarts: how often the run may be started again after it ended without saving.
-        place: working directory, to which paths in the arguments are relative.
+        run: the run folder; an absolute path.
+        overrides: `key=value` of keys that a resumed training may change.
+        log: file to which the output is appended; an absolute path.
+        place: working directory, to which paths in the configuration are relative.
     """
 
-    arguments: Sequence[str]
+    run: Path
+    overrides: Sequence[str]
     log: Path
-    leases: Mapping[str, str] = field(default_factory=dict)
-    output: Path = Path()
-    restarts: int = 3
     place: Path = field(default_factory=Path.cwd)
 
-    @property
-    def command(self) -> list[str]:
-        """The command that runs the training while it holds the leases of its runs."""
-        settings = {
-            "output": str(self.output),
-            "leases": dict(self.leases),
-            "restarts": self.restarts,
-        }
+    def start(self, threads: int, gpu: int | None = None) -> subprocess.Popen:
+        """Starts the training as a child process; it saves and ends when this process ends.
+
+        Args:
+            threads: threads of the training; `OMP_NUM_THREADS` overrides it.
+            gpu: the only GPU that the training sees; None for all.
+
+        Raises:
+            OSError: the log cannot be written.
+        """
+        settings = {"OMP_NUM_THREADS": str(threads), **os.environ, "COLUMNS": "120"}
+        if gpu is not None:
+            seen = os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",")
+            settings["CUDA_VISIBLE_DEVICES"] = seen[gpu] if gpu < len(seen) > 1 else str(gpu)
         # -P: modules of the working directory are not imported.
-        return [sys.executable, "-P", "-m", _WORKER, json.dumps(settings), *self.arguments]
+        worker = [sys.executable, "-P", "-m", "emberlink.trainers.sweep.worker"]
+        with self.log.open("ab") as log:
+            # In a new session, so that Ctrl-C reaches only the sweep, which cancels its tasks.
+            return subprocess.Popen(
+                [*worker, str(self.run), *self.overrides],
+                stdin=subprocess.PIPE,
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                env=settings,
+                cwd=self.place,
+                start_new_session=True,
+            )
 
 
 class Executor(ABC):
-    """Runs trainings, several at a time.
+    """Runs trainings.
 
     Args:
         config: an instance of `config_type`.
@@ -66,55 +73,34 @@ class Executor(ABC):
 
     config_type: ClassVar[type]
     """a dataclass; its fields are the keys of configs/executor/NAME.yaml without `name`"""
-    interval: ClassVar[float] = 0.5
-    """seconds between two polls"""
-    restarts: int = 3
-    """how often a run may be started again after it ended without saving"""
-    seeds: int = 1
-    """seeds of a method that are trained in one process"""
-
-    may_leave: bool = True
-    """whether tasks can go on when this process ends"""
+    workers: int | None = None
+    """tasks that are submitted at a time; all if None"""
 
     @abstractmethod
     def __init__(self, config: Any): ...
 
     @abstractmethod
-    def slots(self, tasks: int) -> int:
-        """Returns the number of tasks to run at a time.
-
-        Args:
-            tasks: number of all tasks.
-        """
-
-    @abstractmethod
-    def submit(self, task: Task) -> Any:
-        """Starts a task without waiting for it and returns a handle.
+    def submit(self, tasks: Sequence[Task]) -> Sequence[Any]:
+        """Starts or queues tasks without waiting for them and returns a handle of each.
 
         Raises:
-            OSError: the task cannot be started, for example because the log cannot be written.
-            QueueFullError: the cluster takes no task now.
+            UserError: the cluster does not take them.
         """
 
     @abstractmethod
     def poll(self, handle: Any) -> int | None:
-        """Returns the exit status of a task, or None if it has not ended.
-
-        The status is negative if the task reported none, as a process that was killed.
-        """
+        """Returns the exit status of a task, or None if it has not ended."""
 
     @abstractmethod
     def cancel(self, handle: Any) -> None:
         """Requests that a task saves and ends, without waiting; has no effect if it has ended."""
 
-    def leave(self, handle: Any) -> None:
-        """Lets a task go on when this process ends; has no effect if tasks do so anyway."""
-        return
 
-    def name_of(self, handle: Any) -> str:
-        """Returns a name by which `find` finds a task from another process; may be empty."""
-        return ""
+def require(executor: str, package: str, extra: str) -> None:
+    """Checks that the package of an executor is installed.
 
-    def find(self, name: str) -> Any:
-        """Returns the handle of a task that was left, or None if it has ended or is not known."""
-        return None
+    Raises:
+        UserError: it is not; the message says how to install emberlink's extra.
+    """
+    if find_spec(package) is None:
+        raise UserError(f"executor={executor}: {package} is not installed: {how_to_install(extra)}")

@@ -1,43 +1,62 @@
-"""Runs trainings as SLURM jobs, through submitit."""
+"""Runs trainings as SLURM jobs, through submitit: an array for the tasks of each call."""
 
+import hashlib
+import os
+import re
 import shutil
 import signal
 import subprocess
 import time
-import warnings
+from collections.abc import Sequence
 from contextlib import redirect_stderr, suppress
-from dataclasses import dataclass as plain_dataclass
+from importlib import import_module
 from io import StringIO
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BeforeValidator, Field, PlainValidator
+from pydantic import BeforeValidator, Field
 from pydantic.dataclasses import dataclass
 
-from emberlink.envs.utils.atomic_io import inner_folder, write_bytes
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import STRICT, CountOrZero
-from emberlink.trainers.sweep.executors import _extras
-from emberlink.trainers.sweep.executors._slurm_job import Batch, end, file_of
-from emberlink.trainers.sweep.executors._times import minutes
-from emberlink.trainers.sweep.executors.base import (
-    DIED,
-    STATUS,
-    STOP,
-    Executor,
-    Positive,
-    QueueFullError,
-    Task,
-)
+from emberlink.trainers.sweep.executors.base import DIED, Executor, Positive, Task, require
 
-_LOOK = 10.0
+_MOST = 1000
+"""jobs of an array in SLURM's default configuration (MaxArraySize)"""
+_LOOK = 5.0
 """seconds between two looks at SLURM's queue"""
-_RETRY = 60.0
-"""seconds after which a job that SLURM did not accept is submitted again"""
+_GRACE = 30.0
+"""seconds for which a job may be missing in the queue, such as while it is requeued"""
+_UNTIL_KILLED = 120.0
+"""seconds for which a job whose training was asked to save waits for its requeue or end"""
+_SAVED = (128 + signal.SIGTERM, 128 + signal.SIGUSR2, -signal.SIGTERM, -signal.SIGUSR2)
+_TIME = re.compile(r"(?:(\d+)-)?(\d+)(?::(\d+))?(?::(\d+))?")
 _FOR_SBATCH = ("partition", "account", "time", "cpus", "gpus", "memory", "options")
 """settings that become options of sbatch"""
-_USUAL = ("None", "Priority", "Resources", "BeginTime", "Cleaning", "Prolog")
-"""reasons for which every job may wait in SLURM's queue"""
+
+
+def minutes(text: str) -> int:
+    """Returns the minutes of a time in one of the forms of sbatch, at least 1.
+
+    Raises:
+        UserError: it has another form, or is 0, which SLURM reads as no limit.
+    """
+    found = _TIME.fullmatch(text)
+    if not found or not any(int(part or 0) for part in found.groups()):
+        raise UserError("expected minutes, or H:MM:SS, or D-HH:MM:SS")
+    days, first, second, third = found.groups()
+    if days is not None:
+        parts = [int(days) * 24 + int(first), int(second or 0), int(third or 0)]
+    elif third is not None:
+        parts = [int(first), int(second), int(third)]
+    else:
+        parts = [0, int(first), int(second or 0)]
+    return parts[0] * 60 + parts[1] + (parts[2] > 0)
+
+
+def _text(value: object) -> object:
+    """Returns a number as text: accounts and times may look like numbers."""
+    return str(value) if isinstance(value, int) and not isinstance(value, bool) else value
 
 
 def _time(value: object) -> str:
@@ -45,10 +64,7 @@ def _time(value: object) -> str:
     return str(value)
 
 
-def _option(value: object) -> str | int:
-    if isinstance(value, bool) or not isinstance(value, str | int):
-        raise UserError("expected text or a whole number")
-    return value
+Text = Annotated[str, BeforeValidator(_text)]
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
@@ -57,9 +73,9 @@ class SubmititConfig:
 
     cluster: Literal["slurm", "local"] = "slurm"
     """slurm, or submitit's local processes for tests"""
-    partition: str | None = None
+    partition: Text | None = None
     """partition; SLURM's default if None"""
-    account: str | None = None
+    account: Text | None = None
     """account; SLURM's default if None"""
     time: Annotated[str, BeforeValidator(_time)] = "60"
     """time of a job: minutes, or as in sbatch"""
@@ -67,21 +83,15 @@ class SubmititConfig:
     """cores of a job"""
     gpus: CountOrZero = 0
     """GPUs of a job"""
-    memory: str | None = None
+    memory: Text | None = None
     """memory of a job, such as 4G"""
-    share: Positive = 1
-    """runs of a job, which share its cores and GPUs"""
-    seeds: Positive = 1
-    """seeds of a method that are trained in one process"""
     notice: Positive = 90
     """seconds before the end of the time at which SLURM asks a run to save"""
     requeues: CountOrZero = 100
     """how often a job is requeued because its time is over"""
-    restarts: CountOrZero = 3
-    """how often a run is started again after its job ended without saving"""
     workers: Positive | None = None
-    """runs at a time; all if None"""
-    options: dict[str, Annotated[str | int, PlainValidator(_option)]] = Field(default_factory=dict)
+    """jobs in the queue at a time; as many as an array may have if None"""
+    options: dict[str, str | int] = Field(default_factory=dict)
     """other options of sbatch"""
 
     def __post_init__(self) -> None:
@@ -93,125 +103,113 @@ class SubmititConfig:
             )
 
 
-@plain_dataclass(eq=False)
-class _Handle:
-    """A submitted task; `job` is None until its job is submitted."""
+class _Training:
+    """A training in a job of submitit.
 
-    task: Task
-    job: Any = None
-    seen: float = 0.0
+    Args:
+        task: the training.
+        threads: its threads.
+        until_killed: seconds for which the job waits after the training was asked to save.
+    """
+
+    def __init__(self, task: Task, threads: int, until_killed: float):
+        self._arguments = task, threads, until_killed
+        self._process: subprocess.Popen | None = None
+
+    def __call__(self) -> int:
+        """Trains, and returns the exit status of the training."""
+        task, threads, until_killed = self._arguments
+        # SLURM sends SIGTERM before it preempts a job. submitit would ignore it.
+        signal.signal(signal.SIGTERM, lambda *_: self._ask_to_save())
+        self._process = task.start(threads)
+        while (status := self._process.poll()) is None:
+            time.sleep(0.2)
+        if status in _SAVED:
+            time.sleep(until_killed)  # SLURM requeues the job, or ends it
+        return status
+
+    def checkpoint(self) -> Any:
+        """Waits until the training has saved; submitit calls it at SIGUSR2 and requeues the job."""
+        self._ask_to_save()
+        with suppress(ChildProcessError):
+            # Not Popen.wait: this handler may interrupt Popen.poll, which holds a lock.
+            os.waitid(os.P_PID, self._process.pid if self._process else 0, os.WEXITED | os.WNOWAIT)
+        return import_module("submitit").helpers.DelayedSubmission(_Training(*self._arguments))
+
+    def _ask_to_save(self) -> None:
+        if self._process:
+            # Never counts as a second signal, so that the training saves in any case.
+            self._process.send_signal(signal.SIGUSR2)
+
+
+class _Handle:
+    """A submitted task."""
+
+    def __init__(self, task: Task, job: Any):
+        self.task, self.job = task, job
+        self.seen, self.cancelled = time.monotonic(), False
 
 
 class SubmititExecutor(Executor):
-    """Runs each task, or several together, as a SLURM job, which is requeued if preempted."""
+    """Runs each task as a job of an array, which SLURM requeues if it is preempted."""
 
     config_type = SubmititConfig
-    interval = 2.0
 
     def __init__(self, config: SubmititConfig):
-        _extras.require("submitit", "submitit", "slurm")
-        self._config = config
-        self.seeds, self.restarts = config.seeds, config.restarts
-        self._waiting: list[_Handle] = []
-        self._accepted, self._refused = False, -_RETRY
-        self._queue: dict[str, str] | None = None
-        self._looked = -_LOOK
-        self._said: set[str] = set()
-
-    def slots(self, tasks: int) -> int:
-        if self._config.cluster == "slurm" and shutil.which("sbatch") is None:
+        require("submitit", "submitit", "slurm")
+        if config.cluster == "slurm" and shutil.which("sbatch") is None:
             raise UserError(
                 "executor=submitit: there is no sbatch here; SLURM's login nodes have it"
             )
-        return self._config.workers or max(tasks, 1)
+        # submitit starts Python with -m, which would import a random.py of the working directory.
+        os.environ.setdefault("PYTHONSAFEPATH", "1")
+        self.workers = min(config.workers or _MOST, _MOST)
+        self._config = config
+        self._queue: set[str] | None = None
+        self._looked = -_LOOK
 
-    def submit(self, task: Task) -> _Handle:
-        handle = _Handle(task)
-        self._waiting.append(handle)
-        if len(self._waiting) >= self._config.share:
-            try:
-                self._submit()
-            except UserError:
-                self._waiting.remove(handle)
-                raise
-        return handle
+    def submit(self, tasks: Sequence[Task]) -> Sequence[_Handle]:
+        folder = _without_patterns(tasks[0].log.parent / "submitit")
+        wait = _UNTIL_KILLED if self._config.cluster == "slurm" else 0.0
+        trainings = [_Training(task, self._config.cpus, wait) for task in tasks]
+        try:
+            executor = self._make(folder)
+            # submitit prints sbatch's messages, too.
+            with redirect_stderr(StringIO()), executor.batch():
+                jobs = [executor.submit(training) for training in trainings]
+        except (RuntimeError, OSError, ValueError, subprocess.CalledProcessError) as error:
+            values = {key: getattr(self._config, key) for key in _FOR_SBATCH}
+            given = "".join(f" executor.{key}={value}" for key, value in values.items() if value)
+            lines = [line.removeprefix("sbatch: error: ") for line in str(error).splitlines()]
+            raise UserError(f"executor=submitit{given}: {'; '.join(lines)[-300:]}") from None
+        return [_Handle(task, job) for task, job in zip(tasks, jobs, strict=True)]
 
     def poll(self, handle: _Handle) -> int | None:
-        self._submit_rest()
-        try:
-            return int(file_of(handle.task, STATUS).read_text())
-        except (OSError, ValueError):
-            pass
-        now = time.monotonic()
-        if handle.job is None or self._is_known(handle.job):
+        job, now = handle.job, time.monotonic()
+        if job.paths.result_pickle.exists():
+            try:
+                return job.result()
+            except Exception as error:  # whatever the training's process has raised
+                return _explain(handle, str(error))
+        if self._is_known(job):
             handle.seen = now
             return None
-        # Another machine may show the status a little later.
-        if now - handle.seen <= 3 * _LOOK and self._config.cluster == "slurm":
+        # Another machine may show the result a little later.
+        if self._config.cluster == "slurm" and not handle.cancelled and now - handle.seen < _GRACE:
             return None
-        _explain(handle)
-        return DIED
+        return _explain(handle, job.stderr() or "")
 
     def cancel(self, handle: _Handle) -> None:
-        write_bytes(file_of(handle.task, STOP), b"")
-        if handle.job is None:
-            self._waiting = [other for other in self._waiting if other is not handle]
-            end(handle.task.log, 128 + signal.SIGTERM)
-        elif self._config.cluster == "slurm":
-            _slurm("scancel", "--state=PENDING", handle.job.job_id)
-
-    def name_of(self, handle: _Handle) -> str:
-        return f"{handle.job.job_id} {handle.task.log.absolute()}" if handle.job else ""
-
-    def find(self, name: str) -> _Handle | None:
-        number, _, log = name.partition(" ")
-        task = Task((), Path(log))
-        # The folder of an output that was moved is missing; a job of this number is another one.
-        gone = not task.log.parent.is_dir() or file_of(task, STATUS).exists()
-        if gone or self._config.cluster == "local":
-            return None
-        job = _extras.load("submitit").SlurmJob(folder=task.log.parent / "submitit", job_id=number)
-        return _Handle(task, job, time.monotonic()) if self._is_known(job) else None
-
-    def _submit_rest(self) -> None:
-        """Submits the tasks that wait although no others have followed."""
-        if not self._waiting or time.monotonic() - self._refused < _RETRY:
-            return
-        with suppress(QueueFullError):
-            self._submit()
-
-    def _submit(self) -> None:
-        """Submits one job for the waiting tasks.
-
-        Raises:
-            QueueFullError: SLURM does not accept the job now.
-            UserError: SLURM has never accepted a job.
-        """
-        tasks = [handle.task for handle in self._waiting]
-        folder = inner_folder(tasks[0].output, "logs", "submitit")
-        threads = max(self._config.cpus // self._config.share, 1)
-        try:
-            # submitit prints sbatch's messages, too.
-            with redirect_stderr(StringIO()):
-                job = self._make(folder).submit(Batch(tasks, threads))
-        except (RuntimeError, OSError, ValueError, subprocess.CalledProcessError) as error:
-            self._refused = time.monotonic()
-            wrong = QueueFullError if self._accepted else UserError
-            raise wrong(f"executor=submitit{self._given()}: {_reason(error)}") from None
-        self._accepted = True
-        for handle in self._waiting:
-            handle.job, handle.seen = job, time.monotonic()
-        self._waiting = []
-
-    def _given(self) -> str:
-        """Returns the settings that sbatch gets, for messages."""
-        values = {key: getattr(self._config, key) for key in _FOR_SBATCH}
-        return "".join(f" executor.{key}={value}" for key, value in values.items() if value)
+        handle.cancelled = True
+        if self._config.cluster == "slurm":
+            _slurm("scancel", handle.job.job_id)
+        else:  # the number of the process that submitit has started
+            with suppress(ProcessLookupError):
+                os.kill(int(handle.job.job_id), signal.SIGTERM)
 
     def _make(self, folder: Path) -> Any:
-        submitit = _extras.load("submitit")
+        submitit = import_module("submitit")
         config, wall = self._config, minutes(self._config.time)
-        # %j is replaced by the number of the job.
         if config.cluster == "local":
             local = submitit.LocalExecutor(folder, max_num_timeout=config.requeues)
             local.update_parameters(
@@ -230,6 +228,7 @@ class SubmititExecutor(Executor):
             cpus_per_task=config.cpus,
             job_name="emberlink",
             signal_delay_s=config.notice,
+            array_parallelism=_MOST,
             additional_parameters={"requeue": True, **config.options},
             **{key: value for key, value in options.items() if value is not None},
         )
@@ -241,43 +240,29 @@ class SubmititExecutor(Executor):
             return not job.done()
         if time.monotonic() - self._looked > _LOOK:
             self._looked = time.monotonic()
-            listed = _slurm("squeue", "--me", "--noheader", "--format=%A %r")
-            self._queue = (
-                None
-                if listed is None
-                else dict(line.split(maxsplit=1) for line in listed.splitlines())
-            )
-        if self._queue is None:
-            return True
-        self._warn(self._queue.get(job.job_id, "None"))
-        return job.job_id in self._queue
-
-    def _warn(self, reason: str) -> None:
-        """Warns once of each unusual reason for which jobs wait, such as too long a time."""
-        if reason not in (*_USUAL, *self._said):
-            self._said.add(reason)
-            message = f"jobs wait in SLURM's queue: {reason} (executor=submitit{self._given()})"
-            warnings.warn(message, stacklevel=2)
+            listed = _slurm("squeue", "--me", "--noheader", "--array", "--format=%F_%K %A")
+            self._queue = None if listed is None else {*listed.split()}
+        return self._queue is None or job.job_id in self._queue
 
 
-def _reason(error: Exception) -> str:
-    """Returns the message of sbatch in one line."""
-    lines = [line.strip().removeprefix("sbatch: error: ") for line in str(error).splitlines()]
-    return "; ".join(filter(None, lines))[-300:]
+def _without_patterns(folder: Path) -> Path:
+    """Returns the folder, or a link to it if submitit and SLURM would replace parts of its path."""
+    folder.mkdir(exist_ok=True)
+    if "%" not in str(folder):
+        return folder
+    name = hashlib.sha256(str(folder).encode()).hexdigest()[:16]
+    link = Path.home() / ".cache" / "emberlink" / "submitit" / name
+    link.parent.mkdir(parents=True, exist_ok=True)
+    with suppress(FileExistsError):
+        link.symlink_to(folder)
+    return link
 
 
-def _explain(handle: _Handle) -> None:
-    """Writes the last line of a job's own log to the log of a training that has not begun."""
-    if not _written(handle.task.log) and handle.job.paths.stderr.is_file():
-        said = handle.job.paths.stderr.read_text(errors="replace").split("\n")
-        line = next((line.strip() for line in reversed(said) if line.strip()), "no message")
-        text = f"the training has not begun: {line} ({handle.job.paths.stderr})\n"
-        write_bytes(handle.task.log, text.encode())
-
-
-def _written(log: Path) -> bool:
-    """Returns whether a log holds text."""
-    return log.is_file() and log.stat().st_size > 0
+def _explain(handle: _Handle, said: str) -> int:
+    """Appends what the job has said last to the log of its training, and returns `DIED`."""
+    with handle.task.log.open("a") as log:
+        log.write(f"{next(filter(str.strip, said.splitlines()[::-1]), 'the job has ended')}\n")
+    return DIED
 
 
 def _slurm(*command: str) -> str | None:

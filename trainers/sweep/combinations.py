@@ -1,0 +1,174 @@
+"""Lists the runs of a sweep, one for each combination of values, and finds them on disk."""
+
+import hashlib
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+from pathlib import Path
+
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.errors import HydraException
+
+from emberlink.configs import known
+from emberlink.envs.utils.errors import UserError
+from emberlink.trainers.config.compose import flat, resolve, to_values
+from emberlink.trainers.config.schema import NOT_LEARNT_WITH, RunConfig
+from emberlink.trainers.runs import pretrained
+from emberlink.trainers.runs.run_folder import RunFolder
+from emberlink.trainers.sweep.executors.base import Task
+from emberlink.trainers.training.folders import RunFolders
+
+_IGNORED = ("output", *NOT_LEARNT_WITH)
+"""first parts of keys that do not tell runs apart"""
+_NAMED = ("setup", "world", "seed")
+"""keys whose values are in every name"""
+
+Identity = tuple[tuple[str, str], ...]
+"""keys and values that tell a run from others"""
+
+
+@dataclass(eq=False)
+class Combination:
+    """A run of a sweep.
+
+    Attributes:
+        name: the method, the setup, the world, the other keys with several values, the seed.
+        config: the configuration.
+        overrides: given `key=value` of keys that do not affect learning; a resumed run gets them.
+        folder: the run folder; None if there is none yet.
+        failed: the last line of the log if the training has failed, else empty.
+    """
+
+    name: str
+    config: RunConfig
+    overrides: tuple[str, ...]
+    folder: RunFolder | None = None
+    failed: str = ""
+
+    @property
+    def finished(self) -> bool:
+        """Whether the run has all episodes and an evaluation of its newest checkpoint."""
+        return (
+            self.folder is not None
+            and self.episodes >= self.config.episodes
+            and self.folder.evaluated()
+        )
+
+    @property
+    def state(self) -> str:
+        """The state: "finished", "unfinished" or "new"."""
+        return "finished" if self.finished else "unfinished" if self.folder else "new"
+
+    @property
+    def episodes(self) -> int:
+        """Number of finished episodes."""
+        return len(lines_of(self.folder.path / "metrics.jsonl")) if self.folder else 0
+
+    @property
+    def log(self) -> Path:
+        """The file with the output of the trainings."""
+        assert self.folder is not None
+        path = self.folder.path.absolute()
+        return path.parent / "logs" / f"{path.name}.txt"
+
+    def task(self) -> Task:
+        """Creates the run folder if there is none, and returns the task that trains the run."""
+        if self.folder is None:
+            # From the configuration and not the arguments: YAML files may have changed since.
+            folders = RunFolders.create([self.config], [_folder_name(self.config)])
+            folders.close()
+            (self.folder,) = folders.runs
+        self.log.parent.mkdir(exist_ok=True)
+        overrides = (f"device={self.config.device}", *self.overrides)
+        return Task(self.folder.path.absolute(), overrides, self.log)
+
+
+def combinations(arguments: Sequence[str]) -> list[Combination]:
+    """Returns each combination of methods and values once.
+
+    Args:
+        arguments: names of methods (all methods if there are none), and `key=value` or, in Hydra's
+            syntax for several values, `seed=0,1,2` or `seed=range(0,5)`.
+
+    Raises:
+        UserError: a key or a value is wrong; the message names it.
+    """
+    methods = [text for text in arguments if "=" not in text] or list(known("method"))
+    choices = [_values(text) for text in arguments if "=" in text]
+    several = {_key(texts[0]) for texts in choices if len(texts) > 1} - {*_NAMED}
+    found: dict[Identity, Combination] = {}
+    outputs: set[str] = set()
+    for method, overrides in product(methods, product(*choices)):
+        config = resolve(method, overrides)
+        outputs.add(config.output)
+        swept = [text for text in overrides if _key(text) in several]
+        parts = [method, config.setup, config.world, *swept, f"seed {config.seed}"]
+        free = tuple(text for text in overrides if _key(text) in NOT_LEARNT_WITH)
+        found.setdefault(_identity(config), Combination(", ".join(parts), config, free))
+    if not found:
+        raise UserError("no run: a key has no value, as in seed=range(3,3)")
+    if len(outputs) > 1:
+        raise UserError(f"output={','.join(sorted(outputs))}: a sweep has one output folder")
+    return list(found.values())
+
+
+def find_folders(wanted: Sequence[Combination], output: Path) -> Iterator[str]:
+    """Sets the folder of each run that is in the output folder; yields what cannot be read.
+
+    A folder belongs to a combination if its config.yaml has the same values, apart from the keys
+    that do not affect learning; its name does not matter. A finished one goes before others.
+    """
+    by_identity = {_identity(run.config): run for run in wanted}
+    for file in sorted(output.glob("*/config.yaml")):
+        if pretrained.is_copy(file.parent):
+            continue
+        folder = RunFolder(file.parent)
+        try:
+            # The device of the run may not exist on this machine.
+            config = folder.config(device="cpu")
+        except ValueError as error:
+            yield f"{folder.path} is left out: {error}"
+            continue
+        run = by_identity.get(_identity(config))
+        if run is not None and not run.finished:
+            run.folder = folder
+
+
+def lines_of(file: Path) -> list[str]:
+    """Returns the lines of a text file that are not empty; none if it cannot be read."""
+    try:
+        return [line for line in file.read_text(errors="replace").splitlines() if line.strip()]
+    except OSError:
+        return []
+
+
+def without_seed(config: RunConfig) -> Identity:
+    """Returns what the configurations of several seeds have in common."""
+    return _identity(replace(config, seed=0))
+
+
+def _identity(config: RunConfig) -> Identity:
+    values = flat(to_values(config))
+    return tuple(sorted((k, str(v)) for k, v in values.items() if k.split(".")[0] not in _IGNORED))
+
+
+def _folder_name(config: RunConfig) -> str:
+    """Returns the name of a new folder: it ends with a hash of the configuration."""
+    digest = hashlib.sha256(repr(_identity(config)).encode()).hexdigest()[:8]
+    return f"{config.method}_{config.setup}_{config.world}_s{config.seed}_{digest}"
+
+
+def _key(text: str) -> str:
+    return text.partition("=")[0]
+
+
+def _values(text: str) -> list[str]:
+    """Splits `key=1,2` into `key=1` and `key=2` by Hydra's grammar; other texts are unchanged."""
+    try:
+        parsed = OverridesParser.create().parse_override(text)
+        if parsed.is_sweep_override():
+            key = parsed.get_key_element()
+            return [f"{key}={value}" for value in parsed.sweep_string_iterator()]
+    except (HydraException, ValueError, RecursionError):
+        pass  # `resolve` raises the error
+    return [text]
