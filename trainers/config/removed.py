@@ -1,4 +1,8 @@
 """Names what replaces the keys of earlier versions."""
 
-REMOVED: dict[str, str] = {}
+REMOVED: dict[str, str] = {
+    "executor.seeds": "each seed is a run: seed=0,1,2",
+    "executor.share": "each run is a job; executor.gpus=0.25 of executor=ray shares a GPU",
+    "executor.restarts": "a killed run is listed at the end; the same command resumes it",
+}
 """key, or key=value -> a sentence about what to use instead"""

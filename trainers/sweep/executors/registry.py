@@ -7,7 +7,7 @@ from emberlink.envs.utils.config_files import read
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.plugins import Registry
 from emberlink.envs.utils.validation import from_plain, unknown
-from emberlink.trainers.config.overrides import parse
+from emberlink.trainers.config.values import check_not_removed, parse
 from emberlink.trainers.sweep.executors.base import Executor
 
 _REGISTRY = Registry(
@@ -34,6 +34,7 @@ def make(arguments: Sequence[str]) -> Executor:
         elif not rest and first in values:
             values[first] = value
         else:
+            check_not_removed(key, value)
             raise UserError(f"key {unknown(key, [f'executor.{known}' for known in values])}")
     config: Any = from_plain(executor.config_type, values, "executor")
     return executor(config)
