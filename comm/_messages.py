@@ -1,4 +1,4 @@
-"""Passes on maps and positions: what UAVs say, what it costs, and who knows it afterwards."""
+"""Passes on maps and positions: what UAVs say, within a limit of bytes, and who knows it then."""
 
 from typing import NamedTuple
 
@@ -9,6 +9,8 @@ from emberlink.envs.utils.buffers import Buffers
 from emberlink.envs.world.coverage_map import View
 from emberlink.envs.world.knowledge import Knowledge
 
+OLD = 100
+"""steps; a look that is newer by more is not worth more"""
 _COMPARED = 2**11
 """pairs of maps that are compared at a time"""
 
@@ -97,7 +99,7 @@ class CellMessages(Buffers):
     """
 
     fresh: Tensor
-    """bool [envs, uavs, area]: cells that may be new to UAVs in range; not read on a GPU"""
+    """bool [envs, uavs, area]: cells that may be new to UAVs in range"""
     heard: Tensor
     """bool [envs, uavs, uavs]: whom each UAV was in range of at the step before"""
     _shift: Tensor
@@ -123,8 +125,8 @@ class CellMessages(Buffers):
         flat = self.fresh.view(-1).view(torch.uint8)
         flat.scatter_reduce_(0, index, view.in_view.flatten().view(torch.uint8), "amax")
 
-    def compare(self, known: Knowledge, near: Tensor) -> News | None:
-        """Returns what is new to UAVs in range; None on a GPU, which would have to wait for it.
+    def compare(self, known: Knowledge, near: Tensor) -> News:
+        """Returns what is new to UAVs in range.
 
         Args:
             known: the maps.
@@ -132,8 +134,6 @@ class CellMessages(Buffers):
         """
         last, seen = known.last_seen, known.seen_fire
         assert seen is not None
-        if last.is_cuda:
-            return None
         self._meet(last, seen, near & ~self.heard)
         told = self.fresh.view(-1).nonzero().squeeze(-1)
         row, theirs = _heard_by(near, told, last.shape[2])
@@ -158,7 +158,7 @@ class CellMessages(Buffers):
         known: Knowledge,
         near: Tensor,
         hears: Tensor,
-        news: News | None,
+        news: News,
         chosen: Tensor | None = None,
     ) -> Tensor:
         """Changes the maps of those that hear others.
@@ -175,9 +175,6 @@ class CellMessages(Buffers):
         """
         last, seen = known.last_seen, known.seen_fire
         assert seen is not None
-        if news is None:
-            self.heard.zero_()
-            return self.size * _pass_on_dense(last, seen, near, hears, chosen)
         told, row, theirs = news
         area, fresh = last.shape[2], self.fresh.view(-1)
         speaker = told // area
@@ -216,8 +213,8 @@ def _heard_by(near: Tensor, told: Tensor, area: int) -> tuple[Tensor, Tensor]:
     shift = (hearer - speaker) * area
     count = near.sum(1).view(-1)
     first, count = ((x.take(told // area)) for x in (count.cumsum(0) - count, count))
-    row = torch.arange(len(told)).repeat_interleave(count)
-    link = torch.arange(len(row)) - (count.cumsum(0) - count - first).take(row)
+    row = torch.arange(len(told), device=told.device).repeat_interleave(count)
+    link = torch.arange(len(row), device=row.device) - (count.cumsum(0) - count - first).take(row)
     return row, told.take(row) + shift.take(link)
 
 
@@ -231,24 +228,92 @@ def _is_new(told: tuple[Tensor, Tensor], theirs: tuple[Tensor, Tensor]) -> Tenso
     return (told[0] > theirs[0]) | (told[1] > theirs[1])
 
 
-def could_tell(last: Tensor, seen: Tensor, near: Tensor, speaker: int) -> Tensor:
-    """Returns what a UAV could tell the others in range, bool [envs, n, area]."""
-    told = last[:, speaker : speaker + 1], seen[:, speaker : speaker + 1]
-    return near[:, :, speaker].unsqueeze(-1) & _is_new(told, (last, seen))
+class Offers(NamedTuple):
+    """The new cells of UAVs, those of the highest gain first: int64 [envs, n, k] each."""
+
+    gain: Tensor
+    """steps by which the looks of those in range get newer; 0 behind the last cell"""
+    cell: Tensor
 
 
-def _pass_on_dense(
-    last: Tensor, seen: Tensor, near: Tensor, hears: Tensor, chosen: Tensor | None
-) -> Tensor:
-    """Compares all maps, never waits for the device, and returns the number of cells said."""
-    before, before_seen, counts = last.clone(), seen.clone(), []
-    for uav in range(hears.shape[1]):
-        said = (
-            could_tell(before, before_seen, near, uav).any(1) if chosen is None else chosen[:, uav]
-        )
-        heard = hears[:, :, uav].unsqueeze(-1) & said.unsqueeze(1)
-        told, told_seen = before[:, uav : uav + 1], before_seen[:, uav : uav + 1]
-        torch.maximum(last, torch.where(heard, told, -1), out=last)
-        seen |= heard & told_seen
-        counts.append(said.sum(-1))
-    return torch.stack(counts, -1)
+def offers(known: Knowledge, news: News, most: int) -> Offers:
+    """Returns the new cells of the highest gain, at most `most` for each UAV.
+
+    The gain of a cell is the sum, over the UAVs in range, of the steps by which their last look
+    gets newer, at most `OLD` each. A UAV that has not looked, or that does not know that the cell
+    was seen while it burned, counts as one that looked at step -1. Of equal gain, the cells that a
+    UAV offers first depend on its number, so that UAVs offer different ones.
+
+    Args:
+        known: the maps.
+        news: what `CellMessages.compare` returned.
+        most: number of cells.
+    """
+    last, seen = known.last_seen, known.seen_fire
+    assert seen is not None
+    told, entry, theirs = news
+    envs, uavs, area = last.shape
+    fire_is_new = seen.take(told)[entry] & ~seen.take(theirs)
+    before = torch.where(fire_is_new, -1, last.take(theirs).long() >> 2)
+    newer = ((last.take(told)[entry].long() >> 2) - before).clamp(max=OLD)
+    gain = torch.zeros_like(told).index_add_(0, entry, newer)
+    row, cell, highest = told // area, told % area, uavs * OLD
+    turned = (cell + row % uavs * (area // uavs)) % area
+    order = ((row * highest + highest - gain) * area + turned).argsort()
+    count = row.bincount(minlength=envs * uavs)  # the rows ascend, and sorting does not move them
+    rank = torch.arange(len(row), device=row.device) - (count.cumsum(0) - count)[row]
+    best = rank < most
+    place, first = (row[best], rank[best]), order[best]
+    result = Offers(*told.new_zeros(2, envs * uavs, min(most, int(count.max()))))
+    result.gain[place], result.cell[place] = gain[first], cell[first]
+    return Offers(*(x.unflatten(0, (envs, uavs)) for x in result))
+
+
+def place_gain(stamp: Tensor, near: Tensor) -> Tensor:
+    """Returns the steps by which positions get newer, int64 [envs, n, n].
+
+    They are summed over the UAVs in range of the speaker (row).
+
+    Args:
+        stamp: int64 [envs, n, n], the step at which a UAV (row) knows the position of another one
+            (column), -1 for never.
+        near: bool [envs, n, n], whether a UAV (row) is in range of another one (column).
+    """
+    # [envs, hearers, speakers, known]
+    newer = (stamp.unsqueeze(1) - stamp.unsqueeze(2)).clamp(min=0)
+    return (newer * near.unsqueeze(-1)).sum(1)
+
+
+def said_within(
+    limit: int, cells: Offers, places: Tensor, area: int, sizes: tuple[int, int]
+) -> tuple[Tensor, Tensor]:
+    """Returns which cells and positions UAVs say in a step.
+
+    The highest gain is said first, until the next one does not fit. If that is a position, cells
+    fill the bytes that are left. Of equal gain, cells come before positions.
+
+    Args:
+        limit: bytes of a UAV.
+        cells: the new cells; those that fit if there are no positions, or more.
+        places: int64 [envs, n, n], from `place_gain`, 0 for a position that is not new.
+        area: number of cells.
+        sizes: bytes of a cell and of a position.
+
+    Returns:
+        Masks of what is said, bool [envs, n, area] and [envs, n, n].
+    """
+    cell, place = sizes
+    uavs = torch.arange(area, area + places.shape[-1], device=places.device)
+    index = torch.cat((cells.cell, uavs.expand_as(places)), -1)
+    gain, order = torch.cat((cells.gain, places), -1).sort(stable=True, descending=True)
+    index = index.gather(-1, order)
+    is_place, is_cell = (gain > 0) & (index >= area), (gain > 0) & (index < area)
+    is_place &= (place * is_place + cell * is_cell).cumsum(-1) <= limit
+    left = limit - place * is_place.sum(-1, keepdim=True)
+    is_cell &= cell * is_cell.cumsum(-1) <= left
+    # What is not said is written behind the last entry.
+    entries = area + len(uavs)
+    index = torch.where(is_place | is_cell, index, entries)
+    shape = *gain.shape[:2], entries + 1
+    said = torch.zeros(shape, dtype=torch.bool, device=gain.device).scatter_(-1, index, True)
+    return said[..., :area], said[..., area:entries]

@@ -9,20 +9,30 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import Bounded, Composite, Unbounded
 
-from emberlink.comm._agreement import choose_leader, known_discoverers
-from emberlink.comm._heading import HeadingConfig, circling, heading_reward
 from emberlink.comm.base import CommModule
 from emberlink.envs import keys
-from emberlink.envs.config import WildfireConfig
+from emberlink.envs.config import Number, WildfireConfig
 from emberlink.envs.utils import counter_rng
 from emberlink.envs.utils.counter_rng import Use
 from emberlink.envs.utils.validation import STRICT
 from emberlink.envs.world import motion
-from emberlink.envs.world.radio import pairwise_distance
+from emberlink.envs.world.radio import pairwise_distance, reachable
 from emberlink.envs.world.reward import left_box
 
 RECORD_BYTES = 16
 """position and rank of a discoverer, four float32 numbers"""
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class HeadingConfig:
+    """Stores the settings of the bonus for flying to the target; the defaults are the paper's."""
+
+    form: Literal["folded_linear", "folded_exponential", "linear", "approach"] = "folded_linear"
+    """the formula, a key of `HEADING_FORMS`"""
+    weight: Number = 1.0
+    """factor of the term"""
+    circle: Number = 0.0
+    """factor of `circling`, which replaces the term of a UAV that sees old fire only; 0 for none"""
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
@@ -225,3 +235,112 @@ class Consensus(CommModule):
         if self.config.target == "relative":
             return shown / ((self.high - self.low) / 2).clamp(min=1e-6).float()
         return motion.scale_to_box(shown, self.low, self.high)
+
+
+def known_discoverers(hears: Tensor, discovers: Tensor, *, agree: bool = True) -> Tensor:
+    """Returns the discoverers that each UAV knows after the exchange, bool [..., n, n].
+
+    A non-discoverer hears the discoverers among its neighbours. Non-discoverers in the same
+    connected sub-network of non-discoverers then share the discoverers that any of them hears.
+
+    Args:
+        hears: bool [..., n, n], whether a UAV (row) hears another one (column).
+        discovers: bool [..., n], whether a UAV is a discoverer.
+        agree: whether non-discoverers share the discoverers that they hear.
+    """
+    known = hears & discovers.unsqueeze(-2)
+    if not agree:
+        return known
+    others = ~discovers
+    within = reachable(hears & others.unsqueeze(-1) & others.unsqueeze(-2)).float()
+    return (within @ known.float()) > 0
+
+
+def choose_leader(known: Tensor, cost: Tensor, discovers: Tensor) -> Tensor:
+    """Returns the index of the discoverer that each UAV follows, int64 [..., n].
+
+    A discoverer follows itself. The index is -1 for a UAV that knows no discoverer.
+
+    Args:
+        known: bool [..., n, n], the discoverers that a UAV (row) knows of.
+        cost: [..., n or 1, n], of following a UAV (column). Each UAV chooses the discoverer of
+            lowest cost, and of equal costs the lower index.
+        discovers: bool [..., n], whether a UAV is a discoverer.
+    """
+    uavs = discovers.shape[-1]
+    # Ranks have no ties, so the minimum is the same on every device.
+    order = torch.sort(cost, dim=-1, stable=True).indices.argsort(-1)
+    best, leader = order.masked_fill(~known, uavs).min(-1)
+    leader = torch.where(best < uavs, leader, -1)
+    return torch.where(discovers, torch.arange(uavs, device=leader.device), leader)
+
+
+def _degrees(vector: Tensor) -> Tensor:
+    """Returns the angles of vectors [..., 2 or 3] in the x-y plane, [...], in (-180, 180]."""
+    return torch.rad2deg(torch.atan2(vector[..., 1], vector[..., 0]))
+
+
+def _folded_difference(target: Tensor, moved: Tensor) -> Tensor:
+    """Returns | |A_target| - |A_moved| |, degrees; as in the paper, it ignores the signs."""
+    return (_degrees(target).abs() - _degrees(moved).abs()).abs()
+
+
+def _folded_linear(target: Tensor, moved: Tensor) -> Tensor:
+    return (180 - _folded_difference(target, moved)) / 10
+
+
+def _folded_exponential(target: Tensor, moved: Tensor) -> Tensor:
+    return 20 * 0.94 ** _folded_difference(target, moved)
+
+
+def _linear(target: Tensor, moved: Tensor) -> Tensor:
+    """Returns (90 - D) / 90 for an angle D between the vectors; 0 for a UAV that did not move."""
+    difference = (_degrees(target) - _degrees(moved) + 180).remainder(360) - 180
+    return torch.where((moved[..., :2] == 0).all(-1), 0.0, (90 - difference.abs()) / 90)
+
+
+def _approach(target: Tensor, moved: Tensor) -> Tensor:
+    """Returns the cells by which the 3-D distance to the target has decreased."""
+    return torch.linalg.vector_norm(target, dim=-1) - torch.linalg.vector_norm(
+        target - moved, dim=-1
+    )
+
+
+HEADING_FORMS = {
+    "folded_linear": _folded_linear,
+    "folded_exponential": _folded_exponential,
+    "linear": _linear,
+    "approach": _approach,
+}
+"""the formula of each form, of the vector to the target and the vector of the move, [..., 3]"""
+
+
+def heading_reward(before: Tensor, after: Tensor, target: Tensor, config: HeadingConfig) -> Tensor:
+    """Computes the heading term, float32 [...].
+
+    Angles are measured in the x-y plane, in degrees, from the position before the move. They are
+    computed in float64: a move of 0.1 cells is a difference of nearly equal float32 numbers.
+
+    Args:
+        before, after: float32 [..., 3], positions before and after the move, cells.
+        target: float32 [..., 3], the target that the UAV had before the move, cells.
+        config: form and weight.
+    """
+    before = before.double()
+    term = HEADING_FORMS[config.form](target.double() - before, after.double() - before)
+    return (config.weight * term).float()
+
+
+def circling(before: Tensor, after: Tensor, target: Tensor) -> Tensor:
+    """Computes the cells flown around the target counterclockwise, float32 [...].
+
+    The term is the component of the move perpendicular to the vector to the target, times
+    2 d / (1 + d^2), where d is the horizontal distance to the target in cells. This factor is 1 at
+    a distance of 1 and smaller both nearer to the target and further away.
+
+    Args:
+        before, after, target: as of `heading_reward`.
+    """
+    offset, moved = (end[..., :2].double() - before[..., :2].double() for end in (target, after))
+    arm = 2 * offset / (1 + offset.square().sum(-1, keepdim=True))
+    return (moved[..., 0] * arm[..., 1] - moved[..., 1] * arm[..., 0]).float()

@@ -9,10 +9,16 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import Composite, Unbounded
 
-from emberlink.comm import _home
-from emberlink.comm._bandwidth import offers, said_within, worth_of_places
 from emberlink.comm._crops import LARGEST_SCALE, Crops
-from emberlink.comm._messages import CellMessages, cell_bytes, pass_on_places, place_bytes
+from emberlink.comm._messages import (
+    CellMessages,
+    cell_bytes,
+    offers,
+    pass_on_places,
+    place_bytes,
+    place_gain,
+    said_within,
+)
 from emberlink.comm.base import CommModule
 from emberlink.envs import keys
 from emberlink.envs.config import WildfireConfig
@@ -21,6 +27,8 @@ from emberlink.envs.world import motion, radio
 from emberlink.envs.world.coverage_map import View
 from emberlink.envs.world.knowledge import Knowledge
 from emberlink.envs.world.sensor import Sensor
+
+_DIAGONAL = 2**0.5  # greatest distance over the ground that a unit of action leads
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
@@ -111,7 +119,7 @@ class Maps(CommModule):
         base = torch.tensor([] if world.base is None else [world.base]).view(-1, 2)
         self.register_buffer("_base", _nearest(base), persistent=False)
         self.register_buffer("_base_place", base.float(), persistent=False)
-        self._brings_home = config.home and _home.is_needed(world)
+        self._brings_home = config.home and hears_home(world)
 
     def specs(self, observation: Composite) -> Composite:
         shape, device = observation[keys.AGENTS].shape, observation.device
@@ -140,7 +148,7 @@ class Maps(CommModule):
             return None
         action = tensordict.get(keys.ACTION)
         position, step = self.place.diagonal(dim1=1, dim2=2).mT, self.stamp.diagonal(dim1=1, dim2=2)
-        return _home.steer(self.world, action, self.home, position, step)
+        return steer_home(self.world, action, self.home, position, step)
 
     def bytes_sent(self, tensordict: TensorDictBase) -> Tensor:
         """Returns the bytes that each UAV said at the last step, int64 [num_envs, n]."""
@@ -182,8 +190,8 @@ class Maps(CommModule):
         said_cells = said_places = None
         sizes = self.messages.size, place_bytes(self.world.horizon)
         if limit is not None:
-            cells = offers(self.known, near, news, limit // sizes[0])
-            places = worth_of_places(self.stamp, near)
+            cells = offers(self.known, news, limit // sizes[0])
+            places = place_gain(self.stamp, near)
             area = self.sensor.area
             said_cells, said_places = said_within(limit, cells, places, area, sizes)
         spoken = self.messages.pass_on(self.known, near, hears, news, said_cells)
@@ -193,21 +201,12 @@ class Maps(CommModule):
     def _draw(self, tensordict: TensorDictBase) -> None:
         """Draws the pictures of the environments in which they are due, and looks for home."""
         step = tensordict.get(keys.STEP)
-        due = step % self.hold == 0
-        if due.is_cuda:  # The environments would have to be read from the device.
-            env = torch.arange(len(step), device=step.device)
-        else:
-            env = due.nonzero().squeeze(-1)
+        env = (step % self.hold == 0).nonzero().squeeze(-1)
         if not len(env):
             return
-        stores = [(self.crops, self._pictures(tensordict, env))]
+        self.crops[env] = self._pictures(tensordict, env)
         if self._brings_home:
-            stores.append((self.home, self._find_home(tensordict, env)))
-        for store, new in stores:
-            if due.is_cuda:
-                store.copy_(torch.where(due.view(-1, *[1] * (new.ndim - 1)), new, store))
-            else:
-                store[env] = new
+            self.home[env] = self._find_home(tensordict, env)
 
     def _pictures(self, tensordict: TensorDictBase, env: Tensor) -> Tensor:
         """Returns the pictures of some environments, uint8 [len(env), n, ...]."""
@@ -253,3 +252,35 @@ class Maps(CommModule):
 def _nearest(place: Tensor) -> Tensor:
     """Returns the nearest cells, int64; halves are rounded up, wherever they are in the grid."""
     return (place + 0.5).floor().long()
+
+
+def hears_home(world: WildfireConfig) -> bool:
+    """Returns whether there is a base that hears UAVs at the ceiling."""
+    return world.base is not None and world.radio.range > world.altitude[1]
+
+
+def steer_home(
+    world: WildfireConfig, action: Tensor, home: Tensor, position: Tensor, step: Tensor
+) -> Tensor:
+    """Returns the actions of a step: home, if a UAV that flies on would come too late.
+
+    A UAV has to be home, and at the ceiling, 15 steps before the end and from then on. The two are
+    decided apart from each other: the action along x and y, and that along z.
+
+    Args:
+        world: the world and the team.
+        action: float32 [envs, n, 3], the actions of the policy.
+        home: float32 [envs, n, 3], each UAV's place along x and y, and the greatest distance from
+            it, cells.
+        position: float32 [envs, n, 3], cells.
+        step: int64 [envs, n], steps since the episode began.
+    """
+    speed = world.displacement
+    way, up = home[..., :2] - position[..., :2], world.altitude[1] - position[..., 2:]
+    # If it flies on, it may be farther away after this step, and has the steps that are left then.
+    apart = torch.linalg.vector_norm(way, dim=-1) - home[..., 2] + _DIAGONAL * speed
+    left = world.horizon - radio.PASSING - (step + 1)
+    leaves = (apart > 0) & (apart / speed > left)
+    climbs = (up.squeeze(-1) + speed) / speed > left
+    needed = torch.cat((motion.towards(way, speed), motion.towards(up, speed)), -1)
+    return torch.where(torch.stack((leaves, leaves, climbs), -1), needed, action)

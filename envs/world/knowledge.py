@@ -110,17 +110,10 @@ class Knowledge(Buffers):
             fire = (knows & view.burning.unsqueeze(1)).flatten()
             flat = self.seen_fire.view(-1).view(torch.uint8)
             flat.scatter_reduce_(0, index.view(-1), fire.view(torch.uint8), "amax")
-        new = reach & ~self.reach
-        if new.is_cuda:
-            self._merge_dense(new)
-        else:
-            self._merge_sparse(new)
+        self._merge(reach & ~self.reach)
         self.reach.copy_(reach)
 
-    def _maps(self) -> list[Tensor]:
-        return [self.last_seen] if self.seen_fire is None else [self.last_seen, self.seen_fire]
-
-    def _merge_sparse(self, new: Tensor) -> None:
+    def _merge(self, new: Tensor) -> None:
         """Takes over the maps of radios whose messages arrive for the first time.
 
         Args:
@@ -130,13 +123,6 @@ class Knowledge(Buffers):
         for number in source.unique().tolist():
             rows = source == number
             where = env[rows], taker[rows]
-            for known in self._maps():
-                known[where] = torch.maximum(known[where], known[env[rows], number])
-
-    def _merge_dense(self, new: Tensor) -> None:
-        """Does the same as `_merge_sparse` and never waits for the device."""
-        for number in range(new.shape[-1]):
-            takes = new[..., number].unsqueeze(-1)
-            for known in self._maps():
-                other = known[:, number : number + 1]
-                torch.maximum(known, torch.where(takes, other, known), out=known)
+            for known in (self.last_seen, self.seen_fire):
+                if known is not None:
+                    known[where] = torch.maximum(known[where], known[env[rows], number])

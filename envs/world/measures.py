@@ -136,14 +136,10 @@ class Measures(Buffers):
         """Adds the ages of the burning cells of all environments, from int [envs, area]."""
         ignition = self.times.ignition
         burning = self.times.burning(step.to(ignition.dtype).unsqueeze(-1)).flatten()
-        if burning.is_cuda:  # The number of burning cells would have to be read from the device.
-            cell, weight = torch.arange(len(burning), device=burning.device), burning.long()
-        else:
-            cell = burning.nonzero().squeeze(-1)
-            weight = torch.ones_like(cell)
+        cell = burning.nonzero().squeeze(-1)
         env = cell // ignition.shape[1]
         age = cell_ages(step.take(env), last_seen.take(cell), ignition.take(cell))
-        ages.add(age.clamp(min=0), env, weight)
+        ages.add(age.clamp(min=0), env)
 
     def hears(
         self, position: Tensor, rng_key: Tensor, step: Tensor, alive: Tensor | None

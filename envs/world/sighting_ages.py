@@ -91,18 +91,18 @@ class SightingAges(Buffers):
         self.count.masked_fill_(mask, 0)
         self.histogram.masked_fill_(mask[:, None], 0)
 
-    def add(self, ages: Tensor, env: Tensor, weight: Tensor) -> None:
+    def add(self, ages: Tensor, env: Tensor) -> None:
         """Adds the ages of one step.
 
         Args:
             ages: int64 [cells], at least 0.
             env: int64 [cells], the environment of each cell.
-            weight: int64 [cells], 1, or 0 for a cell that does not count.
         """
-        self.total.scatter_add_(0, env, ages * weight)
-        self.count.scatter_add_(0, env, weight)
+        one = torch.ones_like(env)
+        self.total.scatter_add_(0, env, ages)
+        self.count.scatter_add_(0, env, one)
         place = self._class.take(ages).add_(env, alpha=len(self._limits))
-        self.histogram.view(-1).scatter_add_(0, place, weight)
+        self.histogram.view(-1).scatter_add_(0, place, one)
 
     def mean(self) -> Tensor:
         """Returns the mean age, float32 [envs]; 0 without any ages."""

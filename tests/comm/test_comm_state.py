@@ -16,9 +16,8 @@ from torchrl.envs import (
 )
 from visited_map import VisitedMap, VisitedMapConfig
 
-from emberlink.comm._heading import HeadingConfig
 from emberlink.comm.base import CommModule, Communication
-from emberlink.comm.consensus import Consensus, ConsensusConfig
+from emberlink.comm.consensus import Consensus, ConsensusConfig, HeadingConfig
 from emberlink.comm.positional import Positional, PositionalConfig
 from emberlink.envs import keys
 from emberlink.envs.config import RadioConfig, WildfireConfig

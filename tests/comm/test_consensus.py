@@ -9,9 +9,13 @@ from tensordict import TensorDict
 from time_steps import WORLD, communication, time_step
 from torch import Tensor
 
-from emberlink.comm._agreement import choose_leader, known_discoverers
-from emberlink.comm._heading import HeadingConfig
-from emberlink.comm.consensus import Consensus, ConsensusConfig
+from emberlink.comm.consensus import (
+    Consensus,
+    ConsensusConfig,
+    HeadingConfig,
+    choose_leader,
+    known_discoverers,
+)
 from emberlink.envs import keys
 from emberlink.envs.config import RadioConfig, WildfireConfig
 from emberlink.envs.world import radio

@@ -9,9 +9,8 @@ from tensordict import TensorDict
 from time_steps import communication, time_step
 from torch import Tensor
 
-from emberlink.comm._heading import HeadingConfig
 from emberlink.comm.base import Communication
-from emberlink.comm.consensus import Consensus, ConsensusConfig
+from emberlink.comm.consensus import Consensus, ConsensusConfig, HeadingConfig
 from emberlink.envs import keys
 from emberlink.envs.config import RadioConfig, WildfireConfig
 from emberlink.envs.utils import counter_rng

@@ -7,7 +7,7 @@ import torch
 from time_steps import communication, time_step
 from torch import Tensor
 
-from emberlink.comm._heading import HeadingConfig, heading_reward
+from emberlink.comm.consensus import HeadingConfig, heading_reward
 from emberlink.envs import keys
 from emberlink.envs.config import RewardConfig, WildfireConfig
 

@@ -7,8 +7,16 @@ from hypothesis import strategies as st
 from scalar_maps import Teller, within
 
 from emberlink.comm import _messages
-from emberlink.comm._bandwidth import Offers, offers, said_within, worth_of_places
-from emberlink.comm._messages import CellMessages, cell_bytes, pass_on_places, place_bytes
+from emberlink.comm._messages import (
+    CellMessages,
+    Offers,
+    cell_bytes,
+    offers,
+    pass_on_places,
+    place_bytes,
+    place_gain,
+    said_within,
+)
 from emberlink.envs.config import SIDES
 from emberlink.envs.world.coverage_map import View
 from emberlink.envs.world.knowledge import Knowledge
@@ -50,13 +58,13 @@ def test_the_index_of_a_cell_fits_into_two_bytes():
     assert SIDES[1] ** 2 <= 2**16
 
 
-def talk(messages, known, places, links, limit, *, dense=False) -> list:
+def talk(messages, known, places, links, limit) -> list:
     """Lets all UAVs talk, and returns the bytes of cells and of positions, [envs, n] each."""
     near, hears = links
     stamp, place = places
-    news, cells, chosen = None if dense else messages.compare(known, near), None, None
+    news, cells, chosen = messages.compare(known, near), None, None
     if limit is not None:
-        offered = offers(known, near, news, limit // CELL_BYTES), worth_of_places(stamp, near)
+        offered = offers(known, news, limit // CELL_BYTES), place_gain(stamp, near)
         area = known.last_seen.shape[-1]
         cells, chosen = said_within(limit, *offered, area, (CELL_BYTES, PLACE_BYTES))
     return [
@@ -65,10 +73,9 @@ def talk(messages, known, places, links, limit, *, dense=False) -> list:
     ]
 
 
-@pytest.mark.parametrize("function", ["sparse", "dense"])
-@pytest.mark.parametrize("limit", [None, 0, 4, 5, 16, 20, 23, 60, 10**9])
-@pytest.mark.parametrize(("density", "loss"), [(0.3, 0.0), (0.8, 0.0), (0.8, 0.4)])
-def test_what_is_known_and_bytes_equal_those_of_dictionaries(function, limit, density, loss):
+@pytest.mark.parametrize("limit", [None, 4, 5, 16, 23, 60])
+@pytest.mark.parametrize(("density", "loss"), [(0.3, 0.0), (0.8, 0.4)])
+def test_exchange_matches_reference(limit, density, loss):
     known = Knowledge(envs=ENVS, uavs=UAVS, area=AREA, horizon=4 * STEPS + 3, fires=True)
     messages = CellMessages(ENVS, UAVS, AREA, CELL_BYTES)
     stamp, place = torch.full((ENVS, UAVS, UAVS), -1), torch.zeros(ENVS, UAVS, UAVS, 3)
@@ -81,7 +88,7 @@ def test_what_is_known_and_bytes_equal_those_of_dictionaries(function, limit, de
         messages.saw(view)
         stamp[:, own, own], place[:, own, own] = step, 10.0 * step + own[:, None].float()
         linked = links(step, density, loss)
-        sent = talk(messages, known, (stamp, place), linked, limit, dense=function == "dense")
+        sent = talk(messages, known, (stamp, place), linked, limit)
         for env, teller in enumerate(tellers):
             for uav in range(UAVS):
                 seen = view.in_view[env, uav]
@@ -179,16 +186,16 @@ def test_the_oldest_knowledge_is_renewed_first():
         (36, [1, 2, 3, 4], True),
         (41, [0, 1, 2, 3, 4], True),
     ):
-        cells_offered = offers(maps, near, news, limit // CELL_BYTES)
-        worth = worth_of_places(stamp, near)
-        said = said_within(limit, cells_offered, worth, 5, (CELL_BYTES, PLACE_BYTES))
+        cells_offered = offers(maps, news, limit // CELL_BYTES)
+        gain = place_gain(stamp, near)
+        said = said_within(limit, cells_offered, gain, 5, (CELL_BYTES, PLACE_BYTES))
         assert said[0][0, 0].nonzero().flatten().tolist() == cells
         assert said[1][0, 0].tolist() == [place, False]
-    assert worth.tolist() == [[[35, 0], [0, 0]]]
-    cells_offered = offers(maps, near, news, 9)
+    assert gain.tolist() == [[[35, 0], [0, 0]]]
+    cells_offered = offers(maps, news, 9)
     assert cells_offered.cell[0, 0].tolist() == [4, 3, 2, 1, 0]
     # 300 to 100 is 200, of which 100 count.
-    assert cells_offered.worth[0].tolist() == [[100, 61, 50, 30, 1], [0, 0, 0, 0, 0]]
+    assert cells_offered.gain[0].tolist() == [[100, 61, 50, 30, 1], [0, 0, 0, 0, 0]]
 
 
 @pytest.mark.parametrize("limit", [5, 16, 20])
@@ -213,11 +220,10 @@ def test_uavs_with_the_same_news_offer_different_cells():
     near = torch.zeros(1, uavs, uavs, dtype=torch.bool)
     near[0, -1, :-1] = True
     messages = CellMessages(1, uavs, area, CELL_BYTES)
-    for news in (messages.compare(maps, near), None):
-        offered = offers(maps, near, news, 10).cell[0, :-1]
-        assert offered.tolist() == [[*range(10)], [*range(30, 40)], [*range(20, 30)]]
+    offered = offers(maps, messages.compare(maps, near), 10).cell[0, :-1]
+    assert offered.tolist() == [[*range(10)], [*range(30, 40)], [*range(20, 30)]]
 
 
 def test_pairs_are_compared_in_parts(monkeypatch):
     monkeypatch.setattr(_messages, "_COMPARED", 3)
-    test_what_is_known_and_bytes_equal_those_of_dictionaries("sparse", None, 0.8, 0.0)
+    test_exchange_matches_reference(None, 0.8, 0.0)

@@ -5,9 +5,8 @@ import torch
 from tensordict import TensorDict
 from torchrl.envs import TransformedEnv, check_env_specs
 
-from emberlink.comm import _home
 from emberlink.comm.base import Communication
-from emberlink.comm.maps import Maps, MapsConfig
+from emberlink.comm.maps import Maps, MapsConfig, steer_home
 from emberlink.envs import keys
 from emberlink.envs.config import RadioConfig, WildfireConfig
 from emberlink.envs.utils.errors import UserError
@@ -99,7 +98,7 @@ def test_a_uav_leaves_at_the_last_moment_by_hand():
     action = torch.full((1, 3, 3), 0.25)
 
     def steered(step: int) -> list:
-        performed = _home.steer(world, action, home, position, torch.full((1, 3), step))
+        performed = steer_home(world, action, home, position, torch.full((1, 3), step))
         assert (performed.abs() < 1).all()
         return [pytest.approx(uav, abs=1e-5) for uav in performed[0].tolist()]
 
@@ -112,7 +111,7 @@ def test_a_uav_leaves_at_the_last_moment_by_hand():
     assert steered(84) == [[-1, 0, 0], [0, -1, 1], [0.25, 0.25, 0]]
     place = home * torch.tensor([1, 1, 0])  # no reach
     near = torch.tensor([[[10.0, 10.2, 3.9]] * 3])
-    performed = _home.steer(world, action, place, near, torch.full((1, 3), 99))
+    performed = steer_home(world, action, place, near, torch.full((1, 3), 99))
     torch.testing.assert_close(performed, torch.tensor([[[0.0, -0.4, 0.2]] * 3]))
 
 

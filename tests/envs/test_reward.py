@@ -7,7 +7,7 @@ import pytest
 import torch
 from pydantic import ValidationError
 
-from emberlink.comm._heading import HEADING_FORMS, HeadingConfig, heading_reward
+from emberlink.comm.consensus import HEADING_FORMS, HeadingConfig, heading_reward
 from emberlink.envs.config import RewardConfig
 from emberlink.envs.world.reward import left_box, step_reward
 

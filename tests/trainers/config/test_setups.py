@@ -5,8 +5,7 @@ import math
 
 import pytest
 
-from emberlink.comm._heading import HeadingConfig
-from emberlink.comm.consensus import ConsensusConfig
+from emberlink.comm.consensus import ConsensusConfig, HeadingConfig
 from emberlink.configs import known
 from emberlink.envs.config import RewardConfig, WildfireConfig
 from emberlink.envs.fire.generator import scenarios
