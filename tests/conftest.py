@@ -13,7 +13,6 @@ import warnings
 from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import pytest
 from tiny_run import train_tiny
@@ -63,16 +62,6 @@ def _blank_figures(request, monkeypatch) -> None:
         monkeypatch.setattr(plots, name, lambda path, *_: path.write_bytes(blank))
     monkeypatch.setattr(Figure, "savefig", lambda _, path, **__: path.write_bytes(blank))
     monkeypatch.setattr(report, "write_gif", lambda path, *_: path.write_bytes(blank))
-    monkeypatch.setattr(report, "Camera", _NoCamera)
-
-
-class _NoCamera:
-    """Draws no pictures; takes the place of `Camera`."""
-
-    def __init__(self, _horizon: int):
-        self.steps, self.pictures = [], []
-
-    def add(self, *_: Any) -> None: ...
 
 
 @cache

@@ -11,7 +11,7 @@ from emberlink.envs.world import radio
 from emberlink.envs.world.burning import with_burn_time
 from emberlink.trainers.build import build_env
 from emberlink.trainers.config.compose import resolve
-from emberlink.trainers.replay.record import Recorder, Recording
+from emberlink.trainers.replay.recording import Recorder, Recording
 
 SIDES = 12, 10
 STEPS = 40

@@ -1,7 +1,6 @@
-"""Draws frames of an episode in the paper's colours (section IV.A) and writes animations."""
+"""Draws a map with fields of view and UAVs in the paper's colours (section IV.A)."""
 
-from collections.abc import Iterable, Sequence
-from pathlib import Path
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,8 +18,8 @@ MISSED = (150, 60, 0)
 """colour of a burnt-out cell that was not seen while it burned"""
 FAILED = (150, 150, 150)
 BASE = (230, 0, 230)
-MAX_COLOURS = 256
-"""colours in the palette of a GIF"""
+
+Colour = tuple[int, int, int]
 
 
 class Chart:
@@ -43,18 +42,18 @@ class Chart:
         *,
         view_angle: float,
         scale: int,
-        seen_fire: tuple[int, int, int] = FIRE,
+        seen_fire: Colour = FIRE,
         alive: NDArray[np.bool_] | None = None,
         base: Sequence[float] | None = None,
     ):
         self.scale = scale
         self._rows = fire_map.shape[1]
         self.image = Image.new("RGB", (fire_map.shape[0] * scale, self._rows * scale), NO_FIRE)
-        self.draw = ImageDraw.Draw(self.image)
+        self.pen = ImageDraw.Draw(self.image)
         flying = position if alive is None else position[alive]
         views = [self.square(x, y, view_radius(z, view_angle)) for x, y, z in flying.tolist()]
         for box in views:
-            self.draw.rectangle(box, fill=FIELD_OF_VIEW)
+            self.pen.rectangle(box, fill=FIELD_OF_VIEW)
         for value, colour in ((1, seen_fire), (2, FIRE), (3, BURNT_OUT), (4, MISSED)):
             cells = Image.fromarray(np.uint8(255) * (fire_map.T[::-1] == value))
             mask = cells.resize(self.image.size, Image.Resampling.NEAREST)
@@ -62,11 +61,11 @@ class Chart:
         line = max(2, scale // 6)
         for left, top, right, bottom in views:
             # The black line keeps the edge visible over fire and over other views.
-            self.draw.rectangle((left - 1, top - 1, right + 1, bottom + 1), outline=NO_FIRE)
-            self.draw.rectangle((left, top, right, bottom), outline=FIELD_OF_VIEW, width=line)
+            self.pen.rectangle((left - 1, top - 1, right + 1, bottom + 1), outline=NO_FIRE)
+            self.pen.rectangle((left, top, right, bottom), outline=FIELD_OF_VIEW, width=line)
         if base is not None:
             x, y = base
-            draw_base(self.draw, self.point(x, y), max(0.6 * scale, 6.0))
+            draw_base(self.pen, self.point(x, y), max(0.6 * scale, 6.0))
 
     def point(self, x: float, y: float) -> tuple[float, float]:
         """Returns the pixel of a point in cells; x grows to the right and y upwards."""
@@ -77,33 +76,33 @@ class Chart:
         (across, down), reach = self.point(x, y), max(half * self.scale, 0.5)
         return across - reach, down - reach, across + reach - 1, down + reach - 1
 
-    def uav(self, x: float, y: float, *, alive: bool = True) -> None:
+    def draw_uav(self, x: float, y: float, *, alive: bool = True) -> None:
         """Draws a UAV as a blue disc, or as a grey cross if it has failed."""
         half = max(0.45, 4 / self.scale)
         if alive:
-            self.draw.ellipse(self.square(x, y, half), fill=UAV)
+            self.pen.ellipse(self.square(x, y, half), fill=UAV)
         else:
-            draw_cross(self.draw, self.point(x, y), half * self.scale, FAILED)
+            draw_cross(self.pen, self.point(x, y), half * self.scale, FAILED)
 
 
-def draw_base(draw: ImageDraw.ImageDraw, place: tuple[float, float], half: float) -> None:
+def draw_base(pen: ImageDraw.ImageDraw, place: tuple[float, float], half: float) -> None:
     """Draws the base station as a magenta square with a white edge, 2 * half pixels wide."""
     x, y = place
-    draw.rectangle((x - half, y - half, x + half, y + half), fill=BASE, outline=FIRE, width=2)
+    pen.rectangle((x - half, y - half, x + half, y + half), fill=BASE, outline=FIRE, width=2)
 
 
 def draw_cross(
-    draw: ImageDraw.ImageDraw,
+    pen: ImageDraw.ImageDraw,
     place: tuple[float, float],
     half: float,
-    colour: tuple[int, int, int],
+    colour: Colour,
 ) -> None:
     """Draws a diagonal cross with dark edges, 2 * half pixels wide."""
     x, y = place
     for width, fill in ((4, NO_FIRE), (2, colour)):
         for turn in (1, -1):
             ends = (x - half, y - turn * half), (x + half, y + turn * half)
-            draw.line(ends, fill=fill, width=width)
+            pen.line(ends, fill=fill, width=width)
 
 
 def frame(
@@ -130,50 +129,5 @@ def frame(
     scale = max(2, size // max(fire_map.shape))
     chart = Chart(fire_map, position, view_angle=view_angle, scale=scale, alive=alive, base=base)
     for index, (x, y, _) in enumerate(position.tolist()):
-        chart.uav(x, y, alive=alive is None or bool(alive[index]))
+        chart.draw_uav(x, y, alive=alive is None or bool(alive[index]))
     return np.asarray(chart.image)
-
-
-def write_gif(path: Path, frames: Iterable[NDArray[np.uint8]], *, fps: int = 20) -> None:
-    """Writes frames, uint8 [height, width, 3] each, as a GIF that repeats.
-
-    Raises:
-        ValueError: there is no frame.
-    """
-    images = [Image.fromarray(picture).quantize(MAX_COLOURS) for picture in frames]
-    if not images:
-        raise ValueError(f"{path}: an animation needs at least one frame")
-    images = _share_palette(images)
-    duration = round(1000 / fps)
-    images[0].save(
-        path,
-        "GIF",
-        save_all=True,
-        append_images=images[1:],
-        duration=duration,
-        loop=0,
-        optimize=False,
-    )
-
-
-def _share_palette(images: list[Image.Image]) -> list[Image.Image]:
-    """Converts images to a common palette if all their colours fit into it.
-
-    Pixels that do not change between frames then take almost no space in the file.
-    """
-    colours: dict[bytes, int] = {}
-    tables: list[list[int]] = []
-    for image in images:
-        palette = bytes(image.getpalette() or ())
-        entries = (palette[i : i + 3] for i in range(0, len(palette), 3))
-        tables.append([colours.setdefault(entry, len(colours)) for entry in entries])
-    # One entry must be free for pixels that do not change.
-    if len(colours) >= MAX_COLOURS:
-        return images
-    shared = []
-    for image, table in zip(images, tables, strict=True):
-        numbers = np.array(table, np.uint8)[np.asarray(image)]
-        renumbered = Image.fromarray(numbers, "P")
-        renumbered.putpalette(b"".join(colours))
-        shared.append(renumbered)
-    return shared

@@ -1,7 +1,13 @@
 """Evaluates frozen policies on test fires and, during training, on validation fires."""
 
-from collections.abc import Callable
+import hashlib
+import inspect
+import json
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import asdict, replace
+from functools import cache
+from pathlib import Path
 from typing import Any, cast
 
 import torch
@@ -13,9 +19,11 @@ from torchrl.envs.utils import ExplorationType
 from emberlink.comm import registry
 from emberlink.comm.base import CommModule
 from emberlink.envs import keys, metrics
+from emberlink.envs.fire.cache import cache_folder
 from emberlink.envs.fire.generator import load_scenario
 from emberlink.envs.fire_files.config import FileFireConfig
 from emberlink.envs.scenarios import ScenarioConfig, fires_of, same_tests
+from emberlink.envs.utils.atomic_io import write_bytes
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.wildfire import WildfireEnv
 from emberlink.policies.scripted.base import Scripted
@@ -23,7 +31,6 @@ from emberlink.policies.scripted.registry import SCRIPTED, to_play
 from emberlink.trainers.build import build_env
 from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.config.schema import RunConfig
-from emberlink.trainers.evaluation.baseline_cache import ScriptedResults
 from emberlink.trainers.evaluation.results import LEARNED, Measured, Results, means
 from emberlink.trainers.rollout.finite_actions import check_finite
 
@@ -210,7 +217,9 @@ def play_scripted(
     block: int = BLOCK,
     report: Callable[[str], None] = lambda _: None,
 ) -> Measured:
-    """Returns the measures of a scripted policy, from the cache if they are in it.
+    """Returns the measures of a scripted policy.
+
+    They are the same for all runs in an environment, so they are kept in a file.
 
     Args:
         config: configuration of the run.
@@ -219,15 +228,41 @@ def play_scripted(
         start_seed, block: as in `play_blocks`.
         report: called with the name if the policy is evaluated.
     """
-    world = scripted_config(config, name)
-    protocol = {"start_seed": start_seed, "block": block}
-    cache = ScriptedResults(name, world, arrival, protocol)
-    measured = cache.read()
-    if measured is None:
-        report(name)
-        measured = play_blocks(world, SCRIPTED[name], arrival, start_seed=start_seed, block=block)
-        cache.write(measured)
+    world, policy = scripted_config(config, name), SCRIPTED[name]
+    settings = asdict(world.env), world.comm, world.policy.hold, world.device, start_seed, block
+    file = _kept_file(policy, settings, arrival)
+    if file is not None and file.exists():
+        with suppress(OSError, ValueError):
+            return json.loads(file.read_text())
+    report(name)
+    measured = play_blocks(world, policy, arrival, start_seed=start_seed, block=block)
+    if file is not None:
+        with suppress(OSError):  # the next evaluation plays it again
+            file.parent.mkdir(parents=True, exist_ok=True)
+            write_bytes(file, json.dumps(measured).encode())
     return measured
+
+
+def _kept_file(policy: type[Scripted], settings: Sequence[Any], arrival: Tensor) -> Path | None:
+    """Returns the file of a policy's results; None if another package defines the policy."""
+    if not policy.__module__.startswith("emberlink."):
+        return None
+    fires = hashlib.sha256(arrival.cpu().contiguous().numpy().tobytes()).hexdigest()
+    parts = policy.__name__, settings, fires, torch.__version__, source_digest()
+    key = hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
+    return cache_folder() / f"scripted-{key[:32]}.json"
+
+
+@cache
+def source_digest() -> str:
+    """Returns a hash of the source files on which an episode of a scripted policy depends."""
+    digest = hashlib.sha256()
+    environment, comm = (Path(inspect.getfile(one)).parent for one in (WildfireEnv, CommModule))
+    policies = Path(inspect.getfile(Scripted)).parents[1]
+    for folder in (environment, comm, policies):
+        for file in sorted(folder.rglob("*.py")):
+            digest.update(file.read_bytes())
+    return digest.hexdigest()
 
 
 def scripted_config(config: RunConfig, name: str) -> RunConfig:

@@ -10,7 +10,10 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
+from emberlink.envs.rendering.frame import frame
 from emberlink.trainers.evaluation.results import CURVES, LEARNED, Results
+from emberlink.trainers.replay.recording import Recording
+from emberlink.trainers.replay.screen import even_steps
 
 
 def training_curves(path: Path, lines: Sequence[Mapping[str, Any]], title: str) -> None:
@@ -78,23 +81,27 @@ def coverage_bars(path: Path, results: Results) -> None:
     figure.savefig(path, format="png", dpi=120)
 
 
-def timelapse(
-    path: Path, pictures: Sequence[np.ndarray], steps: Sequence[int], title: str = ""
-) -> None:
-    """Draws a row of up to five frames of one episode, as in the paper's figure 3.
+def timelapse(path: Path, episode: Recording, title: str = "") -> None:
+    """Draws a row of up to five steps of an episode, as in the paper's figure 3.
 
     Args:
         path: a .png file.
-        pictures: frames, uint8 [height, width, 3].
-        steps: step of each frame.
+        episode: the episode.
         title: title of the figure; none if empty.
     """
-    chosen = np.linspace(0, len(pictures) - 1, min(5, len(pictures))).round().astype(int)
-    figure = Figure(figsize=(2.4 * len(chosen), 2.7), layout="constrained")
-    for axes, index in zip(figure.subplots(1, len(chosen), squeeze=False)[0], chosen, strict=True):
-        axes.imshow(pictures[index], interpolation="nearest")
-        axes.set_title(f"step {steps[index]}", fontsize="medium")
+    steps = even_steps(episode.horizon, 5)
+    figure = Figure(figsize=(2.4 * len(steps), 2.7), layout="constrained")
+    for axes, step in zip(figure.subplots(1, len(steps), squeeze=False)[0], steps, strict=True):
+        picture = frame(
+            episode.fire_map(step),
+            episode.steps["position"][step],
+            view_angle=episode.world.view_angle,
+            alive=episode.steps["alive"][step],
+            base=episode.world.base,
+        )
+        axes.imshow(picture, interpolation="nearest")
+        axes.set_title(f"step {step}", fontsize="medium")
         axes.set_axis_off()
     if title:
-        figure.suptitle(textwrap.fill(title, 24 * len(chosen)), parse_math=False)
+        figure.suptitle(textwrap.fill(title, 24 * len(steps)), parse_math=False)
     figure.savefig(path, format="png", dpi=120)

@@ -12,7 +12,7 @@ from emberlink.envs import keys
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import shown
 from emberlink.trainers.config.schema import RunConfig
-from emberlink.trainers.evaluation import panels
+from emberlink.trainers.evaluation import episodes
 from emberlink.trainers.replay.page import Replay
 
 
@@ -94,11 +94,11 @@ class TrainedPolicy(TensorDictSequential):
                     f"replay: {shown(other)} is not a policy of load(...); fire=0 chooses a fire"
                 )
         own = [
-            panels.Panel(
-                panels.title_of(policy.config, *policy.changes),
+            episodes.Panel(
+                episodes.title_of(policy.config, *policy.changes),
                 policy.config,
                 lambda _, policy=policy: policy,
             )
             for policy in (self, *others)
         ]
-        return panels.replay([*own, *panels.scripted(self.config, policies)], fire)
+        return episodes.replay([*own, *episodes.scripted(self.config, policies)], fire)

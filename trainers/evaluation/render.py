@@ -1,45 +1,26 @@
-"""Runs `emberlink render`: draws episodes of runs side by side as GIF, MP4 or a replay."""
+"""Runs `emberlink render`: draws episodes side by side as GIF, MP4, picture or page."""
 
-import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 from PIL import Image
 from rich.console import Console
-from torch import Tensor
 
-from emberlink.envs.rendering.frame import write_gif
-from emberlink.envs.rendering.panels import Episode, Screen
-from emberlink.envs.rendering.video import write_mp4
-from emberlink.envs.scenarios import fires_of
+from emberlink.envs.rendering.film import write_gif, write_mp4
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.publish import free_name, new_file, published
-from emberlink.trainers.evaluation.evaluate import BLOCK
-from emberlink.trainers.evaluation.panels import (
-    Panel,
-    check_comparable,
-    find_fire,
-    follows_advice,
-    learned,
-    replay,
-    scripted,
-)
-from emberlink.trainers.evaluation.record_episode import record_episode
+from emberlink.trainers.evaluation import episodes
+from emberlink.trainers.replay.page import Replay
+from emberlink.trainers.replay.screen import Screen, even_steps
 from emberlink.trainers.runs.pretrained import open_run
-from emberlink.trainers.runs.run_folder import RunFolder
 
 _ALONE, _BESIDE = (480, 800), (360, 600)  # minimum and maximum pixels of a map's longer side
 _CELL = 8  # pixels of a cell, within those limits
-
-REPLAY = ".html"
-"""suffix of a replay"""
-
-Write = Callable[[Path, Screen, int], None]
+_SUFFIXES = (".gif", ".mp4", ".png", ".html")
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True)
 class Choices:
     """The options of the command, with the defaults of the command line."""
 
@@ -75,113 +56,61 @@ def render(runs: Sequence[str], console: Console, choices: Choices) -> int:
     Raises:
         UserError: a run, fire or output is wrong.
     """
-    panels = [*learned(runs, choices.checkpoints)]
-    panels += scripted(panels[0].config, choices.policies)
-    check_comparable(panels)
-    if choices.output is not None and choices.output.suffix == REPLAY:
-        return _write_replay(panels, console, choices, choices.output)
-    fire, scenario, index = find_fire(choices.fire, panels[0].config)
-    config = panels[0].config.env
+    panels = [*episodes.learned(runs, choices.checkpoints)]
+    panels += episodes.scripted(panels[0].config, choices.policies)
+    fire, _, index = episodes.find_fire(choices.fire, panels[0].config)
     shown = "episode" if len(panels) == 1 else "side_by_side"
-    stem = "_".join([shown, fire, str(index), *(p.stem for p in choices.checkpoints)])
-    suffixes = _suffixes(choices.output)
-    steps = _steps(choices, config.horizon, suffixes)
-    arrival = fires_of(scenario).test_fire(index, config.grid, config.horizon)
-    paths = _free_paths(choices.output, runs[0], stem, suffixes)
-    episodes = [_play(panel, arrival, index, steps, console) for panel in panels]
+    stem = "_".join([shown, fire, str(index), *(path.stem for path in choices.checkpoints)])
+    paths = _free_paths(choices.output, runs[0], stem)
+    steps = _steps(choices, panels[0].config.env.horizon, paths[0])
+    name, played = episodes.play_side_by_side(
+        panels, f"{fire}:{index}", lambda text: console.print(text, style="dim", highlight=False)
+    )
     least, most = _ALONE if len(panels) == 1 else _BESIDE
-    size = min(max(_CELL * max(config.grid), least), most)
-    screen = Screen(episodes, size=choices.size or size, grey_seen=choices.seen)
+    size = choices.size or min(max(_CELL * max(panels[0].config.env.grid), least), most)
+    screen = Screen(played, size=size, grey_seen=choices.seen)
     for path in paths:
         with published(path) as partial:
-            _WRITERS[path.suffix](partial, screen, len(steps), choices.fps)
+            if path.suffix == ".html":
+                Replay(played, name).save(partial)
+            elif path.suffix == ".png":
+                image = Image.fromarray(screen.picture(steps[0])).quantize(256)
+                image.save(partial, "PNG", optimize=True)
+            else:
+                write = write_gif if path.suffix == ".gif" else write_mp4
+                write(partial, map(screen.picture, steps), fps=choices.fps)
         console.print(str(path), soft_wrap=True, highlight=False)
     return 0
 
 
-def _write_replay(panels: Sequence[Panel], console: Console, choices: Choices, output: Path) -> int:
-    """Writes a page of HTML and returns the exit status 0."""
-    if choices.step is not None:
-        raise UserError(f"step={choices.step}: a replay opens at a step with {output.name}#t=STEP")
-    path = new_file(output, (REPLAY,))
-    page = replay(panels, choices.fire, lambda text: console.print(text, style="dim"))
-    with published(path) as partial:
-        page.save(partial)
-    console.print(str(path), soft_wrap=True, highlight=False)
-    return 0
-
-
-def _steps(choices: Choices, horizon: int, suffixes: Sequence[str]) -> list[int]:
+def _steps(choices: Choices, horizon: int, path: Path) -> list[int]:
     """Returns the steps to draw."""
-    if suffixes != [".png"]:
-        if choices.step is not None:
-            raise UserError(f"step={choices.step}: needs a picture as output, --output FILE.png")
-        frames = min(choices.frames, horizon + 1)
-        return np.linspace(0, horizon, frames).round().astype(int).tolist()
-    step = horizon if choices.step is None else choices.step
-    if step > horizon:
-        raise UserError(f"step={step}: the episode has the steps 0 to {horizon}")
-    return [step]
+    if path.suffix == ".png":
+        step = horizon if choices.step is None else choices.step
+        if step > horizon:
+            raise UserError(f"step={step}: the episode has the steps 0 to {horizon}")
+        return [step]
+    if choices.step is not None:
+        other = f"a page opens at a step with {path.name}#t=STEP"
+        needs = other if path.suffix == ".html" else "needs a picture, --output FILE.png"
+        raise UserError(f"step={choices.step}: {needs}")
+    return even_steps(horizon, choices.frames)
 
 
-def _play(
-    panel: Panel, arrival: Tensor, index: int, steps: Sequence[int], console: Console
-) -> Episode:
-    """Plays episode `index` of the evaluation and returns its frames."""
-    config, env = panel.config, panel.env(arrival, index)
-    world: Any = env.base_env
-    policy = panel.policy(world)
-    advised = follows_advice(config, policy)
-    frames = record_episode(env, policy, steps=set(steps), advised=advised, member=index % BLOCK)
-    console.print(f"  {panel.title}: coverage {frames[-1].coverage:.1f} %", style="dim")
-    return Episode(title=panel.title, view_angle=config.env.view_angle, frames=frames)
-
-
-def _gif(path: Path, screen: Screen, count: int, fps: int) -> None:
-    write_gif(path, map(screen.picture, range(count)), fps=fps)
-
-
-def _mp4(path: Path, screen: Screen, count: int, fps: int) -> None:
-    write_mp4(path, map(screen.picture, range(count)), fps=fps)
-
-
-def _png(path: Path, screen: Screen, count: int, fps: int) -> None:
-    Image.fromarray(screen.picture(0)).quantize(256).save(path, "PNG", optimize=True)
-
-
-_WRITERS = {".gif": _gif, ".mp4": _mp4, ".png": _png}
-
-
-def _suffixes(output: Path | None) -> list[str]:
-    """Returns the endings of the files to write.
+def _free_paths(output: Path | None, run: str, stem: str) -> list[Path]:
+    """Returns the paths of the new files: a GIF and an MP4, or the file that the user named.
 
     Raises:
-        UserError: the output is neither a folder nor a file of a known kind.
-    """
-    if output is None or output.is_dir():
-        return [".gif", ".mp4"]
-    if output.suffix not in _WRITERS:
-        known = ", ".join([*_WRITERS, REPLAY])
-        raise UserError(f"{output}: there is no such folder, and a file ends in {known}")
-    return [output.suffix]
-
-
-def _free_paths(output: Path | None, name: str, stem: str, suffixes: Sequence[str]) -> list[Path]:
-    """Returns the paths of the new files, in the folder of the run with a name if `output` is None.
-
-    Raises:
-        UserError: the named file exists, or its folder does not.
+        UserError: the named file exists or is of an unknown kind, or its folder does not exist.
     """
     if output is not None and not output.is_dir():
-        return [new_file(output, list(_WRITERS))]
-    folder = _figures(open_run(name)) if output is None else output
-    path = free_name(folder, stem, suffixes)
-    return [path.with_name(f"{path.name}{suffix}") for suffix in suffixes]
-
-
-def _figures(run: RunFolder) -> Path:
-    """Returns the folder of a run's figures."""
+        if output.suffix not in _SUFFIXES:
+            known = ", ".join(_SUFFIXES)
+            raise UserError(f"{output}: there is no such folder, and a file ends in {known}")
+        return [new_file(output, _SUFFIXES)]
     try:
-        return run.figures()
+        folder = open_run(run).figures() if output is None else output
     except OSError as error:
-        raise UserError(f"{run.path}: {error.strerror or error}") from None
+        raise UserError(f"{run}: {error.strerror or error}") from None
+    path = free_name(folder, stem, [".gif", ".mp4"])
+    return [path.with_name(f"{path.name}{suffix}") for suffix in (".gif", ".mp4")]

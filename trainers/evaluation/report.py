@@ -5,18 +5,17 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from emberlink.envs.rendering.frame import write_gif
+from emberlink.envs.rendering.film import write_gif
 from emberlink.envs.scenarios import fires_of
 from emberlink.envs.utils.errors import UserError
 from emberlink.policies.scripted.registry import to_play
 from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.evaluation import evaluate, plots
-from emberlink.trainers.evaluation.panels import follows_advice, title_of
-from emberlink.trainers.evaluation.record_episode import Camera, watched_by
+from emberlink.trainers.evaluation.episodes import recorder_of, title_of
 from emberlink.trainers.evaluation.results import LEARNED, Results
-from emberlink.trainers.replay.pack import Shown
 from emberlink.trainers.replay.page import Replay
-from emberlink.trainers.replay.record import Recorder
+from emberlink.trainers.replay.recording import Episode
+from emberlink.trainers.replay.screen import Screen, even_steps
 from emberlink.trainers.runs.run_folder import RunFolder
 from emberlink.trainers.runs.seal import changed_evaluation
 from emberlink.trainers.runs.versions import versions
@@ -53,17 +52,16 @@ def evaluate_run(
         report(f"note: {text}")
     try:
         run.figures()  # an unusable folder is an error before the episodes, not after
-        recorder = Recorder(advised=follows_advice(config, actor))
-        camera = Camera(config.env.horizon)
+        recorder = recorder_of(config, actor)
         results = evaluate.evaluate(
             config,
             actor,
             fires=fires,
             report=lambda fire, policy: report(f"{policy} on {_fires(fires)} of {fire}"),
-            watch=watched_by(recorder.add, camera.add),
+            watch=recorder.add,
         )
-        shown = Shown(title=title_of(config, *about), recording=recorder.recording())
-        _draw(run, config, results, camera, shown, label)
+        shown = Episode(title=title_of(config, *about), recording=recorder.recording())
+        _draw(run, config, results, shown, label)
     except OutputError:
         raise
     except OSError as error:
@@ -80,7 +78,7 @@ def _fires(count: int) -> str:
 
 
 def _draw(
-    run: RunFolder, config: RunConfig, results: Results, camera: Camera, shown: Shown, label: str
+    run: RunFolder, config: RunConfig, results: Results, episode: Episode, label: str
 ) -> None:
     with run.figure(f"coverage{label}.png") as path:
         plots.coverage_bars(path, results)
@@ -91,11 +89,12 @@ def _draw(
             plots.training_curves(path, lines, title)
     name = evaluate.shown_scenario(config)
     with run.figure(f"episode_{name}{label}.gif") as path:
-        write_gif(path, camera.pictures)
+        screen = Screen([episode], size=480)
+        write_gif(path, map(screen.picture, even_steps(config.env.horizon, 100)))
     with run.figure(f"timelapse_{name}{label}.png") as path:
-        plots.timelapse(path, camera.pictures, camera.steps)
+        plots.timelapse(path, episode.recording)
     with run.figure(f"replay{label}.html") as path:
-        Replay([shown], f"{name}:0").save(path)
+        Replay([episode], f"{name}:0").save(path)
 
 
 def record(config: RunConfig, results: Results, **about: Any) -> dict[str, Any]:

@@ -16,7 +16,7 @@ from emberlink.policies.gaussian import MEMORY
 from emberlink.trainers import compare, load, make_env
 from emberlink.trainers.cli import main
 from emberlink.trainers.evaluation.evaluate import play
-from emberlink.trainers.evaluation.record_episode import record_episode
+from emberlink.trainers.replay.recording import Recorder
 from emberlink.trainers.runs.run_folder import RunFolder
 from emberlink.trainers.sweep.command import sweep
 
@@ -106,9 +106,9 @@ def test_a_loaded_policy_needs_no_further_code(case, trained):
     assert flight.shape == (HORIZON, 3, 3)
     measured = play(env(), policy)
     assert measured["coverage"].isfinite().all()
-    world = env()
-    frames = record_episode(world, policy, steps=[HORIZON], advised=False)
-    assert frames[0].position.tolist() == flight[-1].tolist()
+    recorder = Recorder()
+    play(env(), policy, recorder.add)
+    assert recorder.recording().steps["position"][-1].tolist() == flight[-1].tolist()
     pettingzoo = parallel_env(env())
     pettingzoo.reset()
     for step in range(HORIZON):

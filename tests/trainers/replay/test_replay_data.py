@@ -23,10 +23,9 @@ from emberlink.envs import WildfireConfig, keys
 from emberlink.envs.utils.errors import UserError
 from emberlink.trainers import load
 from emberlink.trainers.cli import main
-from emberlink.trainers.evaluation import evaluate, panels
-from emberlink.trainers.replay.pack import Shown
-from emberlink.trainers.replay.page import Replay, page_of, script
-from emberlink.trainers.replay.record import Recording
+from emberlink.trainers.evaluation import episodes
+from emberlink.trainers.replay.page import Replay, script
+from emberlink.trainers.replay.recording import Episode
 
 HOSTILE = "</script><script>alert(1)</script><img src=x onerror=alert(2)>{{ 7*7 }}\"'&amp;"
 
@@ -38,7 +37,7 @@ def episode():
 
 @pytest.fixture(scope="module")
 def data(episode):
-    return data_of(Replay([Shown(title="one", recording=episode.recording)], "small:0").html)
+    return data_of(Replay([Episode(title="one", recording=episode.recording)], "small:0").html)
 
 
 def test_numbers_of_every_step_are_those_of_the_environment(episode, data):
@@ -170,18 +169,18 @@ def test_worlds_without_a_base_or_measures_are_recorded_with_ages():
     assert keys.FRONT_AGE not in plain.steps[-1].keys()  # noqa: SIM118
     expected = [now[keys.FRONT_AGE].item() for now in recorded.steps]
     assert second["front_age"].tolist() == expected
-    (panel,) = data_of(Replay([Shown(title="", recording=plain.recording)], "x:0").html)["panels"]
+    (panel,) = data_of(Replay([Episode(title="", recording=plain.recording)], "x:0").html)["panels"]
     assert panel["base"] is None
     assert "lost" not in panel
     assert panel["fails"] == [STEPS + 1] * 3
 
 
 def test_a_hostile_name_is_text(episode):
-    page = Replay([Shown(title=HOSTILE, recording=episode.recording)], HOSTILE).html
-    plain = Replay([Shown(title="one", recording=episode.recording)], "x:0").html
+    page = Replay([Episode(title=HOSTILE, recording=episode.recording)], HOSTILE).html
+    plain = Replay([Episode(title="one", recording=episode.recording)], "x:0").html
     assert data_of(page)["panels"][0]["title"] == HOSTILE
     assert _tags(page) == _tags(plain)
-    frame = Replay([Shown(title=HOSTILE, recording=episode.recording)], HOSTILE)._repr_html_()
+    frame = Replay([Episode(title=HOSTILE, recording=episode.recording)], HOSTILE)._repr_html_()
     assert [tag for tag, _ in _tags(frame)] == ["iframe"]
 
 
@@ -198,48 +197,12 @@ def _tags(page: str) -> list:
 
 
 def test_the_page_needs_nothing_else(episode):
-    page = Replay([Shown(title="one", recording=episode.recording)], "x:0").html
+    page = Replay([Episode(title="one", recording=episode.recording)], "x:0").html
     for name in ("src", "href"):
         linked = re.findall(rf'<\w+[^>]* {name}="([^"]*)"', page)
         assert all(address.startswith("data:") for address in linked)
     assert "default-src 'none'" in page
     assert not re.search(r"^(import|export) ", script(), re.MULTILINE)
-
-
-def test_the_same_episode_gives_the_same_bytes(episode):
-    shown = [Shown(title="one", recording=episode.recording)]
-    assert Replay(shown, "x:0").html == Replay(shown, "x:0").html
-
-
-def synthetic(uavs: int, side: int, *, loss: float) -> Recording:
-    """Returns 1000 steps of random flights, which compress worse than those of any policy."""
-    draw = np.random.default_rng(0)
-    moves = draw.uniform(-1, 1, (1001, uavs, 3)).astype(np.float32)
-    position = np.abs(moves.cumsum(0) * 3) % (side - 1)
-    cells = position[..., :2].astype(np.int16)
-    view = np.stack((cells[..., 0], cells[..., 0] + 4, cells[..., 1], cells[..., 1] + 4), -1).clip(
-        0, side - 1
-    )
-    near = draw.random((1, uavs, uavs)) < 0.3
-    hears = near & (draw.random((1001, uavs, uavs)) >= loss)
-    counts = {name: draw.integers(0, 5, 1001).cumsum() for name in ("seen", "burning", "burnt")}
-    steps = {
-        **{"position": position, "view": view, "hears": hears, "lost": near & ~hears},
-        **{"alive": np.ones((1001, uavs), bool), **counts},
-        "reward": draw.normal(size=(1001, uavs)).astype(np.float32),
-        **{name: draw.random(1001).astype(np.float32) for name in ("front_age", "front_age_p95")},
-        "follows": draw.integers(-1, uavs, (1001, uavs)),
-        "target": position[:, ::-1],
-    }
-    ignition = draw.integers(0, 1002, (side, side))
-    world = WildfireConfig(grid=(side, side), num_uavs=uavs)
-    return Recording(world=world, ignition=ignition, end=ignition + 150, steps=steps)
-
-
-@pytest.mark.parametrize(("uavs", "side", "limit"), [(6, 60, 500_000), (24, 100, 2_000_000)])
-def test_a_page_is_small(uavs, side, limit):
-    worst = synthetic(uavs, side, loss=0.5)
-    assert len(Replay([Shown(title="worst", recording=worst)], "x:0").html.encode()) < limit
 
 
 def test_render_writes_a_page_of_several_runs(tmp_path, capsys):
@@ -289,32 +252,6 @@ def test_the_last_numbers_are_those_of_the_evaluation(tmp_path):
     assert rewards.mean() == pytest.approx(evaluated["mean_reward"][0], rel=1e-6)
 
 
-def test_a_report_plays_as_many_environments_as_an_evaluation(finished, tmp_path, monkeypatch):
-    """The last bit of a product of matrices depends on the number of rows."""
-    played, play = [], evaluate.play
-    monkeypatch.setattr(
-        evaluate, "play", lambda env, *rest: (played.append(env.batch_size), play(env, *rest))[1]
-    )
-    assert main.main(["compare", str(finished), "--output", str(tmp_path / "report")]) == 0
-    assert played == [torch.Size([evaluate.BLOCK])]
-    assert (tmp_path / "report" / "1_paper_replay.html").is_file()
-
-
-def test_panels_of_runs_with_the_same_name_differ_in_their_title(tmp_path):
-    runs = [make_run(tmp_path / name, "consensus", "learner.gamma=0.5") for name in "ab"]
-    first, second = panels.learned(list(map(str, runs)), [])
-    assert second.title == f"{first.title}, {runs[1].name}"
-
-
-def test_nothing_is_written_through_a_link(tmp_path, episode):
-    (tmp_path / "mine").write_text("mine")
-    target = tmp_path / "replay.html"
-    os.symlink(tmp_path / "mine", target)
-    run = make_run(tmp_path)
-    assert main.main(["render", str(run), "--output", str(target)]) == 2
-    assert (tmp_path / "mine").read_text() == "mine"
-
-
 def test_replay_from_python_equals_that_of_the_command(tmp_path, capsys):
     run = make_run(tmp_path)
     out = tmp_path / "replay.html"
@@ -326,43 +263,3 @@ def test_replay_from_python_equals_that_of_the_command(tmp_path, capsys):
     number: Any = 3
     with pytest.raises(UserError, match=r"^replay: 3 is not a policy of load\(\.\.\.\); fire=0"):
         deaf.replay(number)
-
-
-def test_panels_tell_their_settings(tmp_path):
-    run = str(make_run(tmp_path))
-    (panel,) = panels.learned([run, "env.radio.range=3"], [])
-    assert panel.config.env.radio.range == 3
-    page = panels.replay([panel], "paper:1").html
-    assert data_of(panels.replay([panel], 1).html)["fire"] == "huygens:1"
-    header = data_of(page)
-    assert header["grid"] == [30, 30]
-
-
-def test_damage_is_found_by_the_checksum(episode):
-    page = Replay([Shown(title="one", recording=episode.recording)], "x:0").html
-    (text,) = re.findall(r'id="data">([^<]*)<', page)
-    packed = bytearray(base64.b64decode(text))
-    packed[len(packed) // 2] ^= 1
-    with pytest.raises((OSError, EOFError, gzip.zlib.error)):
-        gzip.decompress(bytes(packed))
-
-
-def test_long_episodes_use_wider_integers(episode):
-    steps = {
-        name: np.concatenate([values[:1], np.repeat(values[1:2], 70_000, 0)])
-        for name, values in episode.recording.steps.items()
-    }
-    ignition = np.full(SIDES, 69_000)
-    long = dataclasses.replace(
-        episode.recording, steps=steps, ignition=ignition, end=ignition + 900
-    )
-    data = data_of(Replay([Shown(title="", recording=long)], "x:0").html)
-    assert data["horizon"] == 70_000
-    assert set(data["ignition"][0]) == {69_000}
-    assert set(data["end"][0]) == {69_900}
-
-
-def test_the_page_of_the_documentation_has_the_current_code():
-    page = (Path(__file__).parents[3] / "docs" / "replay.html").read_text()
-    (text,) = re.findall(r'id="data">([^<]*)<', page)
-    assert page == page_of(base64.b64decode(text), data_of(page)["fire"])

@@ -22,7 +22,6 @@ from emberlink.envs.utils.atomic_io import read_sealed, write_sealed
 from emberlink.envs.utils.errors import UserError
 from emberlink.trainers.cli import main
 from emberlink.trainers.config.compose import flat, resolve
-from emberlink.trainers.evaluation.baseline_cache import ScriptedResults
 from emberlink.trainers.runs.run_folder import RunFolder
 from emberlink.trainers.runs.seal import check_trained_with
 
@@ -59,18 +58,6 @@ def test_a_cached_bank_with_a_changed_bit_is_computed_again(tmp_path, monkeypatc
         file.write_bytes(changed)
         assert torch.equal(fire_bank(*arguments), right)
         assert file.read_bytes() == whole
-
-
-def test_cached_results_with_a_changed_bit_are_not_read(tmp_path, monkeypatch):
-    monkeypatch.setenv("EMBERLINK_CACHE", str(tmp_path))
-    results = ScriptedResults("oracle", resolve("independent", TINY), torch.ones(2, 9, 9), {})
-    measured = {name: [1.5, 2.25] for name in metrics.NAMES}
-    results.write(measured)
-    assert results.read() == measured
-    (file,) = tmp_path.iterdir()
-    for changed in list(flips(file.read_bytes()))[::37]:
-        file.write_bytes(changed)
-        assert results.read() is None
 
 
 def test_a_runs_copy_of_its_fires_with_a_changed_bit_is_not_read(tmp_path):

@@ -11,23 +11,19 @@ from emberlink.trainers.comparison.report.page import Chapter, Picture, ReplayFi
 from emberlink.trainers.comparison.runs import newest_checkpoint
 from emberlink.trainers.evaluation import evaluate
 from emberlink.trainers.evaluation.actor import load_actor
-from emberlink.trainers.evaluation.panels import Panel, follows_advice
+from emberlink.trainers.evaluation.episodes import Panel
 from emberlink.trainers.evaluation.plots import timelapse
-from emberlink.trainers.evaluation.record_episode import Camera, watched_by
-from emberlink.trainers.replay import Recorder, Replay
-from emberlink.trainers.replay.pack import Shown
-
-FRAMES = 5
-"""frames of a timelapse"""
+from emberlink.trainers.replay.page import Replay
+from emberlink.trainers.replay.recording import Episode
 
 
 @dataclass(frozen=True)
 class _Film:
-    """An episode: its timelapse, the name of its fire, and what a replay shows of it."""
+    """An episode, its timelapse, and the name of its fire."""
 
     timelapse: Picture
     fire: str
-    shown: Shown
+    episode: Episode
 
 
 def draw(
@@ -105,19 +101,15 @@ def _films(
         say(f"timelapse of {group.label}")
         title, actor = f"{group.label}, seed {run.config.seed}", load_actor(run.config, newest)
         fire, arrival = evaluate.shown_fire(run.config)
-        env = Panel(title, run.config, lambda _, actor=actor: actor).env(arrival, 0)
-        camera = Camera(run.config.env.horizon, FRAMES)
-        recorder = Recorder(advised=follows_advice(run.config, actor))
-        evaluate.play(env, actor, watched_by(camera.add, recorder.add))
+        episode = Panel(title, run.config, lambda _, actor=actor: actor).play(arrival)
         path = folder / f"{stem}_timelapse_{place}.png"
-        timelapse(path, camera.pictures, camera.steps, group.label)
+        timelapse(path, episode.recording, group.label)
         caption = (
             f"{title}: the frozen policy of {newest.name} on the first held-out fire of {fire}. "
             "Teams of the same size and altitudes have the same start positions. Fire white, field "
             "of view yellow, UAVs blue."
         )
-        shown = Shown(title=title, recording=recorder.recording())
-        yield _Film(Picture(path, caption), fire, shown)
+        yield _Film(Picture(path, caption), fire, episode)
     if without:
         notes.append(
             f"no timelapse or replay, because there is no checkpoint: {', '.join(without)}"
@@ -127,7 +119,7 @@ def _films(
 def _replays(folder: Path, stem: str, films: Sequence[_Film]) -> Iterator[ReplayFile]:
     """Writes a page for each fire that plays the methods side by side."""
     for place, fire in enumerate(dict.fromkeys(one.fire for one in films)):
-        shown = [one.shown for one in films if one.fire == fire]
+        shown = [one.episode for one in films if one.fire == fire]
         path = folder / f"{stem}_replay{f'_{place + 1}' if place else ''}.html"
         Replay(shown, f"{fire}:0").save(path)
         yield ReplayFile(path, fire, len(shown))

@@ -1,4 +1,4 @@
-// Reads the data of the page, which replay/pack.py wrote.
+// Reads the data of the page, which replay/page.py wrote.
 
 const TYPES = {
   u1: Uint8Array, i1: Int8Array, u2: Uint16Array, i2: Int16Array,

@@ -1,4 +1,4 @@
-"""Writes MP4 videos with ffmpeg."""
+"""Writes frames as a GIF, or with ffmpeg as an MP4 video."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -7,9 +7,11 @@ from typing import Any, cast
 import imageio_ffmpeg
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
 from emberlink.envs.utils.errors import UserError
 
+_PALETTE = 256  # colours of a GIF
 _COLOURS = (
     "scale=out_color_matrix=bt709:out_range=tv,"
     "setparams=color_primaries=bt709:color_trc=bt709:colorspace=bt709:range=tv"
@@ -23,6 +25,51 @@ _OPTIONS = [
     *("-vf", _COLOURS),
     *("-threads", "1", "-movflags", "+faststart", "-f", "mp4"),
 ]
+
+
+def write_gif(path: Path, frames: Iterable[NDArray[np.uint8]], *, fps: int = 20) -> None:
+    """Writes frames, uint8 [height, width, 3] each, as a GIF that repeats.
+
+    Raises:
+        ValueError: there is no frame.
+    """
+    images = [Image.fromarray(picture).quantize(_PALETTE) for picture in frames]
+    if not images:
+        raise ValueError(f"{path}: an animation needs at least one frame")
+    images = _share_palette(images)
+    duration = round(1000 / fps)
+    images[0].save(
+        path,
+        "GIF",
+        save_all=True,
+        append_images=images[1:],
+        duration=duration,
+        loop=0,
+        optimize=False,
+    )
+
+
+def _share_palette(images: list[Image.Image]) -> list[Image.Image]:
+    """Converts images to a common palette if all their colours fit into it.
+
+    Pixels that do not change between frames then take almost no space in the file.
+    """
+    colours: dict[bytes, int] = {}
+    tables: list[list[int]] = []
+    for image in images:
+        palette = bytes(image.getpalette() or ())
+        entries = (palette[i : i + 3] for i in range(0, len(palette), 3))
+        tables.append([colours.setdefault(entry, len(colours)) for entry in entries])
+    # One entry must be free for pixels that do not change.
+    if len(colours) >= _PALETTE:
+        return images
+    shared = []
+    for image, table in zip(images, tables, strict=True):
+        numbers = np.array(table, np.uint8)[np.asarray(image)]
+        renumbered = Image.fromarray(numbers, "P")
+        renumbered.putpalette(b"".join(colours))
+        shared.append(renumbered)
+    return shared
 
 
 def write_mp4(path: Path, frames: Iterable[NDArray[np.uint8]], *, fps: int = 20) -> None:

@@ -1,13 +1,19 @@
-"""Tests pictures: colours, orientation, size, animation, window."""
+"""Tests pictures of an environment: colours, orientation, size, GIF, video, window."""
 
+from pathlib import Path
+
+import imageio_ffmpeg
 import numpy as np
 import pytest
 import torch
 from PIL import Image
 
 from emberlink.envs import WildfireConfig, WildfireEnv
-from emberlink.envs.rendering import frame
+from emberlink.envs.rendering import film
+from emberlink.envs.rendering.frame import BASE, FAILED, FIELD_OF_VIEW, UAV, frame
 from emberlink.envs.rendering.window import Window
+from emberlink.envs.utils.errors import UserError
+from emberlink.trainers import make_env
 
 BLACK, WHITE, YELLOW, BLUE = (0, 0, 0), (255, 255, 255), (255, 255, 0), (0, 0, 255)
 
@@ -17,7 +23,7 @@ def picture(fire=(), positions=(), grid=(30, 20), **options) -> np.ndarray:
     for i, j in fire:
         fire_map[i, j] = 2
     position = np.array(positions, np.float32).reshape(-1, 3)
-    return frame.frame(fire_map, position, **{"view_angle": 30.0, **options})
+    return frame(fire_map, position, **{"view_angle": 30.0, **options})
 
 
 def colour(image: np.ndarray, x: float, y: float, grid=(30, 20)) -> tuple[int, ...]:
@@ -29,6 +35,7 @@ def colour(image: np.ndarray, x: float, y: float, grid=(30, 20)) -> tuple[int, .
 
 def test_colours():
     image = picture(fire=[(10, 5), (11, 5), (20, 15)], positions=[(10, 6, 4)])
+    assert {tuple(c) for c in image.reshape(-1, 3).tolist()} == {BLACK, WHITE, YELLOW, BLUE}
     assert colour(image, 10, 6) == BLUE
     assert colour(image, 10, 5) == WHITE  # fire in view
     assert colour(image, 20, 15) == WHITE
@@ -37,19 +44,6 @@ def test_colours():
     assert colour(image, 13, 9) == BLACK  # 3 > 4 tan 30
     assert colour(image, 25, 2) == BLACK
     assert colour(image, 10 + 2.2, 6) == YELLOW  # the view ends 2.309 away
-
-
-def test_pictures_have_four_colours_only():
-    positions = [(10, 6, 4), (11, 7, 3), (0, 0, 1), (29, 19, 4)]
-    image = picture(fire=[(i, 6) for i in range(30)], positions=positions)
-    assert {tuple(c) for c in image.reshape(-1, 3).tolist()} == {BLACK, WHITE, YELLOW, BLUE}
-
-
-def test_seen_and_unseen_fire_look_the_same():
-    seen, unseen = np.zeros((2, 9, 9), np.uint8)
-    seen[3, 4], unseen[3, 4] = 1, 2
-    nobody = np.zeros((0, 3), np.float32)
-    assert np.array_equal(*(frame.frame(m, nobody, view_angle=30.0) for m in (seen, unseen)))
 
 
 def test_x_points_to_the_right_and_y_upwards():
@@ -75,25 +69,14 @@ def test_a_cell_fills_its_square():
     [((30, 30), (360, 360, 3)), ((8, 16), (352, 176, 3)), ((256, 100), (200, 512, 3))],
 )
 def test_size(grid, shape):
-    image = picture(grid=grid)
+    image = picture(grid=grid, positions=[(5, 5, 0)])
     assert image.shape == shape
     assert image.dtype == np.uint8
+    assert colour(image, 5, 5, grid) == BLUE
+    assert (image == BLUE).all(-1).sum() >= 30  # visible on the largest map
 
 
-def test_a_uav_is_visible_on_the_largest_grid():
-    image = picture(grid=(256, 256), positions=[(100, 100, 1)])
-    assert (image == BLUE).all(-1).sum() >= 30
-
-
-def test_the_width_of_the_view_follows_from_the_angle():
-    for angle in (15.0, 30.0, 60.0):
-        image = picture(positions=[(15, 10, 3)], view_angle=angle)
-        width = 2 * 3 * np.tan(np.radians(angle)) * 12
-        yellow = np.nonzero((image == YELLOW).all(-1))[1]
-        assert np.ptp(yellow) == pytest.approx(min(width, 359), abs=2)
-
-
-def test_the_environment_renders_one_of_its_members():
+def test_the_environment_draws_one_of_its_members():
     fire = torch.full((2, 12, 12), torch.inf)
     fire[1, 2, 3] = 0
     env = WildfireEnv(2, WildfireConfig(grid=(12, 12), num_uavs=1), fire)
@@ -102,27 +85,43 @@ def test_the_environment_renders_one_of_its_members():
     assert colour(empty, 2, 3, (12, 12)) == BLACK
     assert colour(burning, 2, 3, (12, 12)) == WHITE
     assert colour(burning, 9, 9, (12, 12)) == BLUE
-    with pytest.raises(ValueError, match=r"'ansi'.*'rgb_array'"):
+    with pytest.raises(UserError, match="ansi"):
         env.render("ansi")
 
 
-def test_animation(tmp_path):
+@pytest.mark.heavy
+def test_the_environment_draws_failed_uavs_and_the_base():
+    env = make_env("consensus", "tuned", world="blackout", seed=1)
+    env.reset()
+    env.base_env._fail_step.fill_(0)
+    shown = {tuple(c) for c in env.base_env.render().reshape(-1, 3).tolist()}
+    assert {BASE, FAILED} <= shown
+    assert not shown & {UAV, FIELD_OF_VIEW}
+
+
+def test_a_gif_has_every_frame(tmp_path):
     frames = [picture(fire=[(3 + t, 5)], positions=[(2 * t, 6, 4)]) for t in range(7)]
+    frames[5][0, 0] = (1, 2, 250)  # a colour that earlier frames lack
     path = tmp_path / "episode.gif"
-    frame.write_gif(path, iter(frames), fps=10)
-    with Image.open(path) as film:
-        assert film.n_frames == 7
-        assert film.info["duration"] == 100
-        assert film.info["loop"] == 0
+    film.write_gif(path, iter(frames), fps=10)
+    with Image.open(path) as shown:
+        assert shown.n_frames == 7
+        assert shown.info["duration"] == 100
+        assert shown.info["loop"] == 0
         for index, expected in enumerate(frames):
-            film.seek(index)
-            assert np.array_equal(np.asarray(film.convert("RGB")), expected)
+            shown.seek(index)
+            assert np.array_equal(np.asarray(shown.convert("RGB")), expected)
 
 
-def test_an_animation_without_frames_is_an_error(tmp_path):
-    with pytest.raises(ValueError, match=r"none\.gif"):
-        frame.write_gif(tmp_path / "none.gif", [])
-    assert not list(tmp_path.iterdir())
+@pytest.mark.parametrize("name", ["huygens:3.mp4", "-x.mp4"])
+def test_a_video_has_every_frame(name, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    frames = [np.zeros((16, 16, 3), np.uint8)] * 3
+    film.write_mp4(Path(name), frames)
+    assert imageio_ffmpeg.count_frames_and_secs(tmp_path / name)[0] == 3
+    monkeypatch.setattr(imageio_ffmpeg, "count_frames_and_secs", lambda _: (2, 1.0))
+    with pytest.raises(UserError, match="not all 3 frames"):
+        film.write_mp4(Path("part.mp4"), frames)
 
 
 @pytest.mark.filterwarnings("error")
@@ -130,8 +129,8 @@ def test_window_shows_the_last_picture(monkeypatch):
     monkeypatch.setenv("MPLBACKEND", "agg")
     window = Window("test")
     first, last = picture(positions=[(3, 3, 4)]), picture(positions=[(9, 9, 4)])
-    assert window.show(first) is None
-    assert window.show(last) is None
+    window.show(first)
+    window.show(last)
     assert np.array_equal(window._image.get_array(), last)
     other = Window("test")
     other.show(first)
@@ -139,18 +138,3 @@ def test_window_shows_the_last_picture(monkeypatch):
     other.close()
     assert window._pyplot.fignum_exists(window._figure.number)
     window.close()
-
-
-@pytest.mark.parametrize("altitude", [0.0, 1e-3, 0.1])
-def test_a_view_smaller_than_a_pixel(altitude):
-    assert colour(picture(positions=[(5, 5, altitude)]), 5, 5) == BLUE
-
-
-def test_an_animation_keeps_colours_of_later_frames():
-    frames = [np.full((4, 6, 3), shade, np.uint8) for shade in range(0, 250, 5)]
-    frames[7][0, 0] = (1, 2, 250)
-    images = [Image.fromarray(original).quantize(256) for original in frames]
-    shared = frame._share_palette(images)
-    assert len({bytes(image.getpalette()) for image in shared}) == 1
-    for image, original in zip(shared, frames, strict=True):
-        assert np.array_equal(np.asarray(image.convert("RGB")), original)

@@ -1,19 +1,18 @@
-"""Chooses the episodes that are shown side by side: runs, changed settings, scripted policies."""
+"""Chooses and plays the episodes that are shown side by side."""
 
-import dataclasses
 import re
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
-from torchrl.envs import TransformedEnv
 
 from emberlink.envs.fire.generator import load_scenario, scenarios
 from emberlink.envs.scenarios import ScenarioConfig, fires_of
 from emberlink.envs.utils.errors import UserError
-from emberlink.envs.utils.validation import is_index, shown
+from emberlink.envs.utils.validation import is_index, shown, unknown
 from emberlink.envs.wildfire import WildfireEnv
 from emberlink.policies.scripted.registry import SCRIPTED
 from emberlink.trainers.build import build_env
@@ -28,46 +27,57 @@ from emberlink.trainers.evaluation.evaluate import (
     scripted_config,
     shown_scenario,
 )
-from emberlink.trainers.replay.pack import Shown
 from emberlink.trainers.replay.page import Replay
-from emberlink.trainers.replay.record import Recorder
+from emberlink.trainers.replay.recording import Episode, Recorder
 from emberlink.trainers.runs.pretrained import read_run
 from emberlink.trainers.runs.seal import check_trained_with
 
 SHARED = ("grid", "num_uavs", "horizon", "altitude")
-"""settings that must be equal for all panels; fires and start positions depend on them"""
-_SETTING = re.compile(r"((comm|env|fire)\.[\w.]+|world)=")
-_KEY = re.compile(r"[\w.]+")
+"""keys of `env` on which fires and start positions depend"""
+_SETTING = re.compile(r"(comm|env|fire|world)(\.[\w.]+)?=")
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclass(frozen=True)
 class Panel:
-    """The title, configuration and policy of a panel."""
+    """A policy that plays an episode of the evaluation, and the title of that episode."""
 
     title: str
     config: RunConfig
     policy: Callable[[WildfireEnv], TensorDictModuleBase]
     """returns the policy for an environment"""
 
-    def env(self, arrival: Tensor, index: int) -> TransformedEnv:
-        """Returns the environments of episode `index` of the evaluation, at `index % BLOCK`.
+    def play(self, arrival: Tensor, index: int = 0) -> Episode:
+        """Plays and records episode `index` of the evaluation.
 
-        They are as many as in an evaluation, so that the episode is bit-identical.
+        As many environments are stepped as in an evaluation, so that the numbers are the same to
+        the last bit.
 
         Args:
             arrival: the fire, for one environment.
             index: number of the episode.
         """
-        return build_env(
+        env = build_env(
             self.config,
             num_envs=BLOCK,
             fire=arrival.expand(BLOCK, *arrival.shape[1:]),
             seed=[START_SEED + index] * BLOCK,
             device=self.config.device,
         )
+        world: Any = env.base_env
+        policy = self.policy(world)
+        recorder = recorder_of(self.config, policy, index % BLOCK)
+        play(env, policy, recorder.add)
+        return Episode(title=self.title, recording=recorder.recording())
 
 
-def learned(arguments: Sequence[str], checkpoints: Sequence[Path]) -> Iterator[Panel]:
+def recorder_of(config: RunConfig, policy: Any, member: int = 0) -> Recorder:
+    """Returns a recorder of what a policy does in environment `member`."""
+    written = build_comm(config, 1).out_keys
+    advised = any(key in written for key in getattr(policy, "in_keys", ()))
+    return Recorder(member=member, advised=advised, hears=getattr(policy, "hears", False))
+
+
+def learned(arguments: Sequence[str], checkpoints: Sequence[Path] = ()) -> Iterator[Panel]:
     """Yields a panel for each run.
 
     Args:
@@ -78,54 +88,45 @@ def learned(arguments: Sequence[str], checkpoints: Sequence[Path]) -> Iterator[P
     Raises:
         UserError: there is no such run, or a setting does not fit.
     """
-    runs = [(read_run(name), changes) for name, changes in _with_settings(arguments)]
+    runs: list[tuple[str, list[str]]] = []
+    for text in arguments:
+        if not _SETTING.match(text):
+            runs.append((text, []))
+        elif runs:
+            runs[-1][1].append(text)
+        else:
+            raise UserError(f"{text!r}: a setting stands after the run that it changes")
     if checkpoints and len(checkpoints) != len(runs):
         raise UserError(f"{len(checkpoints)} checkpoints for {len(runs)} runs: one each")
     titles: set[str] = set()
-    for place, (run, changes) in enumerate(runs):
+    for place, (name, changes) in enumerate(runs):
+        run = read_run(name)
         trained = run.config(device="cpu")
         checkpoint = checkpoints[place] if checkpoints else run.checkpoint()
         check_trained_with(checkpoint, trained)
         config = evaluated_with(trained, changes)
         actor = load_actor(config, checkpoint)
-        others = [text for text in changes if not text.startswith("world=")]
-        title = title_of(config, *others, *([checkpoint.stem] if checkpoints else []))
+        title = title_of(config, *changes, *([checkpoint.stem] if checkpoints else []))
         if title in titles:  # runs that were trained with other settings
             title = f"{title}, {run.path.name}"
         titles.add(title)
         yield Panel(title, config, lambda env, actor=actor: actor)
 
 
-def _with_settings(arguments: Sequence[str]) -> list[tuple[str, list[str]]]:
-    """Returns each run with the settings that follow it."""
-    runs: list[tuple[str, list[str]]] = []
-    for text in arguments:
-        key = text.partition("=")[0]
-        if not _SETTING.match(text):
-            if _KEY.fullmatch(key) and key != text and not Path(text).exists():
-                raise UserError(
-                    f"{text!r}: only the world and keys under env and comm can be changed here"
-                )
-            runs.append((text, []))
-        elif runs:
-            runs[-1][1].append(text)
-        else:
-            raise UserError(f"{text!r}: a setting stands after the run that it changes")
-    return runs
-
-
 def title_of(config: RunConfig, *more: str) -> str:
-    """Returns the title of a run."""
+    """Returns the title of a run, with changed settings; the world is named anyway."""
     world = [] if config.world == "paper" else [f"world {config.world}"]
-    parts = [config.method, f"setup {config.setup}", *world, f"seed {config.seed}", *more]
-    return ", ".join(part for part in parts if part)
+    changes = [text for text in more if not text.startswith("world=")]
+    return ", ".join(
+        [config.method, f"setup {config.setup}", *world, f"seed {config.seed}", *changes]
+    )
 
 
 def scripted(config: RunConfig, names: Sequence[str]) -> Iterator[Panel]:
     """Yields a panel for each scripted policy, in the environment of a configuration."""
     for name in [names] if isinstance(names, str) else names:
         if name not in SCRIPTED:
-            raise UserError(f"policy {name!r} is not known; known: {', '.join(SCRIPTED)}")
+            raise UserError(f"policy {unknown(name, SCRIPTED)}")
         title = f"{name.replace('_', ' ')} (scripted)"
         yield Panel(title, scripted_config(config, name), SCRIPTED[name])
 
@@ -142,13 +143,9 @@ def check_comparable(panels: Sequence[Panel]) -> None:
             expected, actual = (getattr(panel.config.env, name) for panel in (first, other))
             if actual != expected:
                 raise UserError(
-                    f"{other.title} has env.{name}={_plain(actual)}, {first.title} has "
-                    f"{_plain(expected)}: side by side, {', '.join(SHARED)} must be the same"
+                    f"{other.title} has env.{name}={shown(actual)}, {first.title} has "
+                    f"{shown(expected)}: side by side, {', '.join(SHARED)} must be the same"
                 )
-
-
-def _plain(value: Any) -> str:
-    return str(list(value)) if isinstance(value, tuple) else str(value)
 
 
 def find_fire(text: str | int | None, run: RunConfig) -> tuple[str, ScenarioConfig, int]:
@@ -164,11 +161,10 @@ def find_fire(text: str | int | None, run: RunConfig) -> tuple[str, ScenarioConf
     """
     usual, evaluated = shown_scenario(run), evaluation_scenarios(run)
     text = usual if text is None else str(text)
-    name, _, index = (
-        text.rpartition(":")
-        if ":" in text
-        else ((usual, "", text) if text.lstrip("-").isdecimal() else (text, "", "0"))
-    )
+    name, colon, index = text.rpartition(":")
+    if not colon:
+        is_number = text.lstrip("-").isdecimal()
+        name, index = (usual, text) if is_number else (text, "0")
     known = dict.fromkeys([*scenarios(), *evaluated])
     if name not in known:
         raise UserError(f"fire {shown(name)!r} is not known; known: {', '.join(known)}")
@@ -179,18 +175,12 @@ def find_fire(text: str | int | None, run: RunConfig) -> tuple[str, ScenarioConf
     return name, evaluated.get(name) or load_scenario(name), int(index)
 
 
-def follows_advice(config: RunConfig, policy: Any) -> bool:
-    """Returns whether a policy reads an output of the communication."""
-    written = build_comm(config, 1).out_keys
-    return any(key in written for key in getattr(policy, "in_keys", ()))
-
-
-def replay(
+def play_side_by_side(
     panels: Sequence[Panel],
     fire: str | int | None,
     report: Callable[[str], None] = lambda _: None,
-) -> Replay:
-    """Plays the same episode of each panel and returns a page of them.
+) -> tuple[str, list[Episode]]:
+    """Plays the same episode of each panel and returns the name of the fire and the episodes.
 
     Args:
         panels: what is shown side by side.
@@ -201,17 +191,19 @@ def replay(
         UserError: there is no such fire, or the panels cannot be compared.
     """
     check_comparable(panels)
-    config = panels[0].config
-    name, scenario, index = find_fire(fire, config)
-    arrival = fires_of(scenario).test_fire(index, config.env.grid, config.env.horizon)
-    shown = []
+    world = panels[0].config.env
+    name, scenario, index = find_fire(fire, panels[0].config)
+    arrival = fires_of(scenario).test_fire(index, world.grid, world.horizon)
+    episodes = []
     for panel in panels:
-        env = panel.env(arrival, index)
-        world: Any = env.base_env
-        policy = panel.policy(world)
-        advised = follows_advice(panel.config, policy)
-        recorder = Recorder(member=index % BLOCK, advised=advised)
-        measured = play(env, policy, recorder.add)
-        report(f"  {panel.title}: coverage {measured['coverage'][index % BLOCK]:.1f} %")
-        shown.append(Shown(title=panel.title, recording=recorder.recording()))
-    return Replay(shown, f"{name}:{index}")
+        episode = panel.play(arrival, index)
+        covered = episode.recording.coverage(episode.recording.horizon)
+        report(f"  {panel.title}: coverage {covered:.1f} %")
+        episodes.append(episode)
+    return f"{name}:{index}", episodes
+
+
+def replay(panels: Sequence[Panel], fire: str | int | None) -> Replay:
+    """Returns a page that plays the same episode of each panel; see `play_side_by_side`."""
+    name, episodes = play_side_by_side(panels, fire)
+    return Replay(episodes, name)

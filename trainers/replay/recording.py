@@ -1,6 +1,7 @@
-"""Records an episode for the replay: fire, tracks, fields of view, links and measures."""
+"""Records an episode, so that it can be drawn: fire, tracks, fields of view, links, measures."""
 
 import dataclasses
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -22,6 +23,8 @@ AGES = {"front_age": keys.FRONT_AGE, "front_age_p95": keys.FRONT_AGE_P95}
 OF_BASE = {"base_seen": keys.BASE_SEEN, "base_age": keys.BASE_AGE}
 ADVICE = {"follows": keys.FOLLOWS, "target": keys.TARGET}
 """what a communication module tells the UAVs"""
+ROLES = ("discoverer", "seeker", "wanderer")
+"""the roles of UAVs in a consensus network (paper, section IV.F)"""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -29,6 +32,8 @@ class Recording:
     """One episode: T steps, n UAVs, r radios (the UAVs, and the base last if there is one)."""
 
     world: WildfireConfig
+    listens: bool
+    """whether the policy or a base station receives messages"""
     ignition: NDArray[Any]
     """[X, Y]: the first step at which each cell burns, T + 1 for never"""
     end: NDArray[Any]
@@ -48,6 +53,42 @@ class Recording:
         """The number of steps, T."""
         return len(self.steps["position"]) - 1
 
+    @cached_property
+    def first_seen(self) -> NDArray[Any]:
+        """The first step at which a UAV saw each cell while it burned, T + 1 for never, [X, Y]."""
+        first = np.full_like(self.ignition, self.horizon + 1)
+        for step in range(self.horizon, 0, -1):
+            for left, right, low, high in self.steps["view"][step].tolist():
+                seen = np.s_[left : right + 1, low : high + 1]
+                burns = (self.ignition[seen] <= step) & (step < self.end[seen])
+                first[seen][burns] = step
+        return first
+
+    def fire_map(self, step: int) -> NDArray[np.uint8]:
+        """Returns `WildfireEnv.fire_map` at a step, uint8 [X, Y]."""
+        fire = (self.ignition <= step).astype(np.uint8) * (2 - (self.first_seen <= step))
+        return (fire + 2 * (self.end <= step)).astype(np.uint8)
+
+    def coverage(self, step: int) -> float:
+        """Returns cells seen / cells burnt up to a step, in %; 100 where nothing has burnt."""
+        seen, burnt = (int(self.steps[name][step]) for name in ("seen", "burnt"))
+        return 100 * seen / burnt if burnt else 100.0
+
+    def roles(self, step: int) -> list[int | None]:
+        """Returns the role of each UAV at a step, an index in `ROLES`; None without roles."""
+        if "follows" not in self.steps:
+            return [None] * self.world.num_uavs
+        followed = enumerate(self.steps["follows"][step].tolist())
+        return [2 if other < 0 else int(other != uav) for uav, other in followed]
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Episode:
+    """An episode and the title that it is shown with."""
+
+    title: str
+    recording: Recording
+
 
 class Recorder:
     """Records the episode of one environment; `add` is called at each step.
@@ -57,10 +98,11 @@ class Recorder:
     Args:
         member: index of the environment.
         advised: whether the policy reads what the communication tells it.
+        hears: whether the policy receives messages of its own.
     """
 
-    def __init__(self, *, member: int = 0, advised: bool = True):
-        self._member, self._advised = member, advised
+    def __init__(self, *, member: int = 0, advised: bool = True, hears: bool = False):
+        self._member, self._advised, self._hears = member, advised, hears
         self._steps: dict[str, list[NDArray[Any]]] = {}
         self._observer: _Observer | None = None
 
@@ -93,7 +135,9 @@ class Recorder:
         assert self._observer is not None, "no step was recorded"
         ignition, end = self._observer.fire
         steps = {name: np.stack(values) for name, values in self._steps.items()}
-        return Recording(world=self._observer.config, ignition=ignition, end=end, steps=steps)
+        world = self._observer.config
+        listens = self._advised or self._hears or world.base is not None
+        return Recording(world=world, listens=listens, ignition=ignition, end=end, steps=steps)
 
 
 class _Observer:
