@@ -143,8 +143,8 @@ def check_comparable(panels: Sequence[Panel]) -> None:
             expected, actual = (getattr(panel.config.env, name) for panel in (first, other))
             if actual != expected:
                 raise UserError(
-                    f"{other.title} has env.{name}={shown(actual)}, {first.title} has "
-                    f"{shown(expected)}: side by side, {', '.join(SHARED)} must be the same"
+                    f"{other.title} has env.{name}={actual}, {first.title} has {expected}: side by "
+                    f"side, {', '.join(SHARED)} must be the same"
                 )
 
 

@@ -126,6 +126,7 @@ class Recorder:
         reward = now.get(keys.REWARD, None)
         told["reward"] = torch.zeros(1, len(told["alive"][0])) if reward is None else reward[..., 0]
         if self._advised:
+            self._hears |= now.get(keys.HEARS, None) is not None
             advice = {name: now.get(key, None) for name, key in ADVICE.items()}
             told |= {name: value for name, value in advice.items() if value is not None}
         return told
@@ -136,7 +137,7 @@ class Recorder:
         ignition, end = self._observer.fire
         steps = {name: np.stack(values) for name, values in self._steps.items()}
         world = self._observer.config
-        listens = self._advised or self._hears or world.base is not None
+        listens = self._hears or world.base is not None
         return Recording(world=world, listens=listens, ignition=ignition, end=end, steps=steps)
 
 

@@ -101,6 +101,7 @@ def test_the_environment_draws_failed_uavs_and_the_base():
 
 def test_a_gif_has_every_frame(tmp_path):
     frames = [picture(fire=[(3 + t, 5)], positions=[(2 * t, 6, 4)]) for t in range(7)]
+    frames[5] = frames[5].copy()
     frames[5][0, 0] = (1, 2, 250)  # a colour that earlier frames lack
     path = tmp_path / "episode.gif"
     film.write_gif(path, iter(frames), fps=10)

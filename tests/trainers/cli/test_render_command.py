@@ -9,17 +9,15 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from rich.console import Console
 
 from emberlink.configs import known
 from emberlink.envs.fire.generator import load_scenario
-from emberlink.envs.rendering import marks, video
-from emberlink.envs.utils.publish import published
 from emberlink.policies.scripted.registry import SCRIPTED
 from emberlink.trainers.build import build_actor, build_env
 from emberlink.trainers.cli import main
 from emberlink.trainers.config.compose import resolve
-from emberlink.trainers.evaluation import evaluate, panels, render
+from emberlink.trainers.evaluation import episodes, evaluate
+from emberlink.trainers.replay.screen import LINK
 from emberlink.trainers.runs.run_folder import RunFolder
 
 SHORT = ("setup=tuned", "learner.hidden=[8,8]", "env.horizon=12", "env.num_uavs=3")
@@ -89,61 +87,40 @@ def test_a_second_rendering_takes_another_name(tmp_path, capsys):
     assert [len(gif_frames(path)) for path in (first[0], second[0])] == [2, 3]
 
 
-def panels_of(runs, choices, monkeypatch):
-    """Returns the episodes that a command shows, without writing files."""
-    caught = []
-
-    class Caught(Exception):
-        pass
-
-    def catch(episodes, **_):
-        caught.extend(episodes)
-        raise Caught
-
-    monkeypatch.setattr(render, "Screen", catch)
-    with pytest.raises(Caught):
-        render.render([str(run) for run in runs], Console(quiet=True), choices)
-    monkeypatch.undo()
-    return caught
-
-
-def test_panels_have_the_same_fire_and_the_same_starts(tmp_path, monkeypatch):
+def test_episodes_side_by_side_have_the_same_fire_and_starts(tmp_path):
     methods = known("method")
-    runs = [make_run(tmp_path, method) for method in methods]
-    choices = render.Choices(fire="paper:3", policies=list(SCRIPTED))
-    episodes = panels_of(runs, choices, monkeypatch)
-    assert len(episodes) == len(methods) + len(SCRIPTED)
-    first, *others = episodes
+    runs = [str(make_run(tmp_path, method)) for method in methods]
+    panels = [*episodes.learned(runs)]
+    panels += episodes.scripted(panels[0].config, list(SCRIPTED))
+    name, shown = episodes.play_side_by_side(panels, "paper:3")
+    assert name == "paper:3"
+    first, *others = (episode.recording for episode in shown)
     for other in others:
-        assert np.array_equal(other.frames[0].position, first.frames[0].position)
-        for frame, other_frame in zip(first.frames, other.frames, strict=True):
-            assert frame.step == other_frame.step
-            assert np.array_equal(frame.fire_map > 0, other_frame.fire_map > 0)
-    assert any(
-        not np.array_equal(other.frames[-1].position, first.frames[-1].position) for other in others
-    )
-    for method, episode in zip(methods, episodes, strict=False):
+        assert np.array_equal(other.steps["position"][0], first.steps["position"][0])
+        assert np.array_equal(other.ignition, first.ignition)
+    ends = {other.steps["position"][-1].tobytes() for other in others}
+    assert len(ends) > len(methods)
+    for method, episode in zip(methods, shown, strict=False):
         assert episode.title == f"{method}, setup tuned, seed 0"
-        now = episode.frames[-1]
-        assert (now.links is not None) == (method in ("consensus", "maps", "positional"))
-        assert (now.roles is not None) == (now.target is not None) == (method == "consensus")
-    for name, episode in zip(SCRIPTED, episodes[len(methods) :], strict=True):
-        now = episode.frames[-1]
-        assert (now.links is not None) == SCRIPTED[name].hears
-        assert (now.roles is not None) == (SCRIPTED[name].recipe is not None)
+        record = episode.recording
+        assert record.listens == (method in ("consensus", "maps", "positional"))
+        assert ("follows" in record.steps) == ("target" in record.steps) == (method == "consensus")
+    for name, episode in zip(SCRIPTED, shown[len(methods) :], strict=True):
+        follows = SCRIPTED[name].recipe is not None
+        assert ("follows" in episode.recording.steps) == follows
+        assert episode.recording.listens == (follows or SCRIPTED[name].hears)
 
 
-def test_an_episode_equals_that_of_the_evaluation(tmp_path, monkeypatch):
+def test_an_episode_equals_that_of_the_evaluation(tmp_path):
     run = RunFolder(make_run(tmp_path))
-    config = run.config()
-    actor = panels.load_actor(config, run.checkpoint())
-    results = evaluate.evaluate(config, actor, fires=3, scripted=False)["huygens"]
+    (panel,) = episodes.learned([str(run.path)])
+    actor = panel.policy(None)
+    results = evaluate.evaluate(panel.config, actor, fires=3, scripted=False)["huygens"]
     covered = results[evaluate.LEARNED]["coverage"]
     assert len(set(covered)) > 1
     for index in range(3):
-        choices = render.Choices(fire=str(index))
-        (episode,) = panels_of([run.path], choices, monkeypatch)
-        assert episode.frames[-1].coverage == pytest.approx(covered[index], rel=1e-6)
+        _, (episode,) = episodes.play_side_by_side([panel], index)
+        assert episode.recording.coverage(12) == pytest.approx(covered[index], rel=1e-6)
 
 
 @pytest.mark.parametrize("horizon", [1, 2, 12])
@@ -161,7 +138,7 @@ def test_other_grids(grid, tmp_path, capsys):
     out = tmp_path / "shot.png"
     assert rendered(capsys, run, "--output", out, "--step", 5, "--size", 200)[-1] == str(out)
     with Image.open(out) as picture:
-        assert tuple(marks.LINK) in {colour for _, colour in picture.convert("RGB").getcolors(256)}
+        assert tuple(LINK) in {colour for _, colour in picture.convert("RGB").getcolors(256)}
 
 
 def refused(arguments, capsys, *words: str) -> None:
@@ -183,10 +160,10 @@ def test_errors_of_render(tmp_path, capsys):
     cases = [
         ([tmp_path / "none"], ["no such run folder"]),
         ([run, "world=moon"], ["world 'moon'", "known: blackout, "]),
-        ([run, "seed=1"], ["'seed=1'", "only the world and keys under env and comm"]),
+        ([run, "seed=1"], ["seed=1", "no such run folder"]),
         (
             [run, "--fire", "zzz"],
-            ["fire 'zzz'", "known: front, huygens, oil_slick, paper, reaction, swarm"],
+            ["fire 'zzz'", "known: "],
         ),
         ([run, "--fire", "65536"], ["'65536'", "0 to 65535"]),
         ([run, "--fire=-1"], ["'-1'", "0 to 65535"]),
@@ -194,7 +171,7 @@ def test_errors_of_render(tmp_path, capsys):
         ([run, "--fire", "paper:x"], ["'paper:x'", "0 to 65535"]),
         ([run, "--fire", ""], ["fire ''"]),
         ([run, "--policy", "zzz"], ["policy 'zzz'", "random_waypoints"]),
-        ([run, wide], ["env.grid=[40, 30]", "[30, 30]"]),
+        ([run, wide], ["env.grid=(40, 30)", "(30, 30)"]),
         ([run, team], ["env.num_uavs=4", "has 3"]),
         ([run, "--output", there], ["there.gif exists already"]),
         ([run, "--output", tmp_path / "no" / "a.gif"], [str(tmp_path / "no"), "no such folder"]),
@@ -212,13 +189,6 @@ def test_errors_of_render(tmp_path, capsys):
     assert not [*tmp_path.rglob("*.mp4"), *tmp_path.rglob("*.png")]
 
 
-@pytest.mark.parametrize("option", ["--fps=0", "--fps=51", "--frames=0", "--size=1", "--step=-1"])
-def test_numbers_out_of_range(option, capsys):
-    with pytest.raises(SystemExit):
-        main.main(["render", "x", option])
-    assert capsys.readouterr().err.count("\n") == 1
-
-
 def test_a_failing_ffmpeg_gives_one_line(tmp_path, capsys, monkeypatch):
     run = make_run(tmp_path)
     for program in ("false", "true"):
@@ -228,41 +198,15 @@ def test_a_failing_ffmpeg_gives_one_line(tmp_path, capsys, monkeypatch):
     assert not list(tmp_path.glob(".*"))
 
 
-def test_a_file_created_meanwhile_is_not_overwritten(tmp_path):
-    path = tmp_path / "a.gif"
-
-    def write():
-        with published(path) as partial:
-            partial.write_text("ours")
-            path.write_text("theirs")
-
-    with pytest.raises(ValueError, match="already"):
-        write()
-    assert path.read_text() == "theirs"
-    assert list(tmp_path.iterdir()) == [path]
-
-
 def test_a_changed_fire_is_drawn_as_it_was_evaluated():
     changed = ["fire=oil_slick", "fire.head_ros=[0.01,0.01]"]
     run = resolve("consensus", ["setup=tuned", *changed])
-    name, scenario, index = panels.find_fire("oil_slick:3", run)
+    name, scenario, index = episodes.find_fire("oil_slick:3", run)
     assert (name, scenario.head_ros, index) == ("oil_slick", (0.01, 0.01), 3)
     run = resolve("consensus", ["setup=tuned", "fire.head_ros=[0.005,0.005]"])
-    own, usual = (panels.find_fire(name, run)[1] for name in ("huygens_as_trained", "huygens"))
+    own, usual = (episodes.find_fire(name, run)[1] for name in ("huygens_as_trained", "huygens"))
     assert own.head_ros == (0.005, 0.005)
     assert usual == load_scenario("huygens")
-
-
-def test_a_video_without_frames_is_an_error(tmp_path):
-    with pytest.raises(ValueError, match="at least one frame"):
-        video.write_mp4(tmp_path / "a.mp4", [])
-
-
-@pytest.mark.parametrize("name", ["huygens:3.mp4", "-x.mp4"])
-def test_a_name_that_ffmpeg_would_misunderstand(name, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    video.write_mp4(Path(name), [np.zeros((16, 16, 3), np.uint8)] * 2)
-    assert (tmp_path / name).stat().st_size > 0
 
 
 def test_settings_of_starts_and_fires_must_agree():
@@ -270,12 +214,4 @@ def test_settings_of_starts_and_fires_must_agree():
     base = resolve("independent", SHORT).env
     other = {"reward", "observation", "observation_scale", "displacement", "view_angle"}
     other |= {"radio", "base", "failures", "measures"}
-    assert {field.name for field in dataclasses.fields(base)} == other | set(panels.SHARED)
-
-
-def test_an_incomplete_video_is_an_error(tmp_path, monkeypatch):
-    frames = [np.zeros((16, 16, 3), np.uint8)] * 3
-    video.write_mp4(tmp_path / "whole.mp4", frames)
-    monkeypatch.setattr(imageio_ffmpeg, "count_frames_and_secs", lambda _: (2, 1.0))
-    with pytest.raises(ValueError, match="not all 3 frames"):
-        video.write_mp4(tmp_path / "part.mp4", frames)
+    assert {field.name for field in dataclasses.fields(base)} == other | set(episodes.SHARED)

@@ -1,14 +1,9 @@
 """Tests what a replay holds: its numbers, its size, its text and its files."""
 
-import base64
-import dataclasses
-import gzip
 import json
 import math
-import os
 import re
 from html.parser import HTMLParser
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,11 +14,10 @@ from small_episode import SIDES, STEPS, play_small
 from test_render_command import make_run, refused, rendered
 from unpack_replay import bit, data_of
 
-from emberlink.envs import WildfireConfig, keys
+from emberlink.envs import keys
 from emberlink.envs.utils.errors import UserError
 from emberlink.trainers import load
 from emberlink.trainers.cli import main
-from emberlink.trainers.evaluation import episodes
 from emberlink.trainers.replay.page import Replay, script
 from emberlink.trainers.replay.recording import Episode
 

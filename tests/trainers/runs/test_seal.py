@@ -12,7 +12,6 @@ from fire_files import Ellipses, raster_of, write_asc
 from safetensors.torch import load_file, save_file
 from tiny_run import TINY
 
-from emberlink.envs import metrics
 from emberlink.envs.fire.cache import fire_bank
 from emberlink.envs.fire.generator import load_scenario
 from emberlink.envs.fire_files.config import FileFireConfig
@@ -21,7 +20,7 @@ from emberlink.envs.scenarios import fires_of
 from emberlink.envs.utils.atomic_io import read_sealed, write_sealed
 from emberlink.envs.utils.errors import UserError
 from emberlink.trainers.cli import main
-from emberlink.trainers.config.compose import flat, resolve
+from emberlink.trainers.config.compose import flat
 from emberlink.trainers.runs.run_folder import RunFolder
 from emberlink.trainers.runs.seal import check_trained_with
 
