@@ -6,7 +6,7 @@ from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.lazy import lazy
 
 if TYPE_CHECKING:
-    from emberlink.trainers.api import Run, TrainedPolicy, compare, evaluate, load, train
+    from emberlink.trainers.api import Run, TrainedPolicy, compare, evaluate, load, resume, train
     from emberlink.trainers.build import make_env
     from emberlink.trainers.config.compose import resolve
     from emberlink.trainers.config.schema import RunConfig
@@ -23,6 +23,7 @@ __all__ = [
     "load",
     "make_env",
     "resolve",
+    "resume",
     "train",
 ]
 
@@ -38,6 +39,7 @@ __getattr__ = lazy(
         "load": "api",
         "make_env": "build",
         "resolve": "config.compose",
+        "resume": "api",
         "train": "api",
     },
 )

@@ -2,11 +2,13 @@
 
 import logging
 import os
+import signal
+import threading
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, overload
+from typing import Any
 
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import check_whole, shown
@@ -17,12 +19,13 @@ from emberlink.trainers.config.schema import MAX_FIRES, RunConfig
 from emberlink.trainers.evaluation.actor import fireless, load_actor
 from emberlink.trainers.evaluation.evaluate import evaluate as evaluate_policy
 from emberlink.trainers.evaluation.policy import TrainedPolicy
-from emberlink.trainers.evaluation.report import evaluate_run
 from emberlink.trainers.evaluation.results import Results
 from emberlink.trainers.runs import pretrained
 from emberlink.trainers.runs.run_folder import RunFolder
-from emberlink.trainers.runs.seal import check_trained_with, differences
-from emberlink.trainers.training.trainer import Progress, Trainer
+from emberlink.trainers.terminal.signals import Interruption
+from emberlink.trainers.training.resume import differences
+from emberlink.trainers.training.resume import resume as resumed
+from emberlink.trainers.training.trainer import ONE_AT_A_TIME, Progress, Trainer
 
 Reference = str | os.PathLike[str]
 """a run folder, or a trained policy of emberlink: `pretrained:METHOD`, `pretrained:SETUP/METHOD` or
@@ -43,32 +46,6 @@ class Run:
     the run was not evaluated"""
 
 
-@overload
-def train(
-    method: str,
-    *,
-    setup: str = ...,
-    world: str = ...,
-    fire: str | None = ...,
-    learner: str | None = ...,
-    seeds: None = ...,
-    progress: Callable[[Progress], None] | None = ...,
-    evaluate_after: bool = ...,
-    **settings: Any,
-) -> Run: ...
-@overload
-def train(
-    method: str,
-    *,
-    setup: str = ...,
-    world: str = ...,
-    fire: str | None = ...,
-    learner: str | None = ...,
-    seeds: Sequence[int],
-    progress: Callable[[Progress], None] | None = ...,
-    evaluate_after: bool = ...,
-    **settings: Any,
-) -> list[Run]: ...
 def train(
     method: str,
     *,
@@ -76,12 +53,14 @@ def train(
     world: str = "paper",
     fire: str | None = None,
     learner: str | None = None,
-    seeds: Sequence[int] | None = None,
     progress: Callable[[Progress], None] | None = None,
     evaluate_after: bool = True,
     **settings: Any,
-) -> Run | list[Run]:
+) -> Run:
     """Trains a method, evaluates its frozen policy, and writes a run folder.
+
+    Ctrl-C ends it after the current step, with a checkpoint; `resume` continues. Of several threads
+    that call it, one trains at a time: processes train at the same time.
 
     Args:
         method: independent, shared_memory, positional, consensus, maps, or a method of your own.
@@ -89,34 +68,47 @@ def train(
         world: paper, front, relay, swarm, blackout, file, or a world of your own.
         fire: name of a scenario; that of the setup or the world if None.
         learner: name of a learner; that of the setup if None.
-        seeds: seeds to train in parallel, with a run folder for each, in place of `seed=`.
         progress: called after each decision of the team; an exception in it ends the training.
         evaluate_after: whether to evaluate at the end, which writes eval.json, figures, a GIF and a
             replay.
         settings: other settings, by the last part of their key (`episodes=5`, `horizon=50`) or the
             whole key (`**{"learner.gamma": 0.9}`); `output="runs"` is the folder of run folders.
 
-    Returns:
-        The run, or with `seeds` a list of runs in the order of the seeds.
-
     Raises:
         UserError: a name or setting is not known, a value is out of range, or a file cannot be
             written.
-        NonFiniteError: a number became NaN or infinite, and `on_nan` is "stop" or the rollbacks
-            failed.
+        NonFiniteError: a number became NaN or infinite.
     """
     names = {"setup": setup, "world": world, "fire": fire, "learner": learner}
     chosen = [f"{key}={name}" for key, name in names.items() if name is not None]
-    several = {} if seeds is None else {"seeds": seeds}
-    trainer = Trainer(resolve(method, chosen, **settings, **several))
+    trainer = Trainer(resolve(method, chosen, **settings))
     with _quiet():
         trainer.start()
-        try:
-            trainer.train(progress or (lambda _: None), hold=True)
-            runs = [_finished(trainer, team, evaluate_after) for team in range(trainer.setup.teams)]
-        finally:
-            trainer.close()
-    return runs[0] if seeds is None else runs
+        return _finish(trainer, progress, evaluate_after)
+
+
+def resume(
+    run: Reference,
+    *,
+    progress: Callable[[Progress], None] | None = None,
+    evaluate_after: bool = True,
+    **settings: Any,
+) -> Run:
+    """Resumes a stopped training exactly where its newest checkpoint was made.
+
+    Args:
+        run: a run folder.
+        progress: see `train`.
+        evaluate_after: see `train`.
+        settings: settings that do not affect learning: `episodes`, `device`, `logger`,
+            `checkpoint_interval`, `checkpoint_steps`, and those of `evaluation`.
+
+    Raises:
+        UserError: the run cannot be resumed, or a file cannot be written.
+        NonFiniteError: a number became NaN or infinite.
+    """
+    with _quiet():
+        return _finish(resumed(Path(run), **settings), progress, evaluate_after)
 
 
 def evaluate(
@@ -179,9 +171,8 @@ def load(
     if not isinstance(run, str | os.PathLike):
         raise UserError(f"load: {shown(run)} is not the path of a run folder")
     folder = RunFolder(pretrained.find_one(str(run)) if pretrained.is_name(str(run)) else Path(run))
-    trained = folder.config(**({} if device is None else {"device": device}))
     file = folder.checkpoint() if checkpoint is None else Path(checkpoint)
-    check_trained_with(file, trained)
+    trained = folder.config(file, **({} if device is None else {"device": device}))
     fire = {key: settings.pop(key) for key in [*settings] if key.startswith("fire.")}
     there = in_world(trained, str(settings.pop("world", trained.world)), **fire)
     config = override(there, **settings)
@@ -224,19 +215,24 @@ def compare(paths: Reference | Sequence[Reference], output: Reference | None = N
     return comparison if folder is None else write_report(comparison, folder)
 
 
-def _finished(trainer: Trainer, team: int, evaluate_after: bool) -> Run:
-    """Evaluates one seed of a finished training if asked to, and returns its run."""
-    run, config, results = trainer.runs[team], trainer.configs[team], {}
-    if evaluate_after:
-        results = evaluate_run(
-            run,
-            config,
-            trainer.setup.team_actor(team),
-            checkpoint=run.checkpoint(),
-            fires=config.evaluation.episodes,
-            report=lambda _: None,
-        )
-    return Run(run.path, config, results)
+def _finish(
+    trainer: Trainer, progress: Callable[[Progress], None] | None, evaluate_after: bool
+) -> Run:
+    """Trains to the end, evaluates if asked to, and returns the run."""
+    stopping = Interruption(trainer.stop, (signal.SIGINT,))
+    in_main_thread = threading.current_thread() is threading.main_thread()
+    results: Results = {}
+    try:
+        with stopping if in_main_thread else nullcontext(), ONE_AT_A_TIME:
+            trainer.train(progress or (lambda _: None))
+            stopping.at_once = True
+            if stopping.received:
+                raise KeyboardInterrupt
+            if evaluate_after:
+                results = trainer.evaluate()
+    finally:
+        trainer.close()
+    return Run(trainer.run.path, trainer.config, results)
 
 
 @contextmanager

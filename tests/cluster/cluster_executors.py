@@ -117,8 +117,8 @@ def test_slurm_requeues_a_run_at_the_end_of_its_time_and_when_its_node_dies(tmp_
         process = sweeps.start(folder, *keys, "episodes=9999", env=env, methods=["independent"])
         sweeps.wait_for(lambda: sweeps.resumed(folder) == 1, process)
         (run,) = sweeps.runs_in(folder)
-        before = len(run.lines())
-        sweeps.wait_for(lambda: len(run.lines()) > before + 5, process)
+        before = len(run.metrics())
+        sweeps.wait_for(lambda: len(run.metrics()) > before + 5, process)
         kill_node(daemons)
         listed = ["squeue", "--noheader", "--format=%t"]
         sweeps.wait_for(lambda: subprocess.check_output(listed, env=env) == b"PD\n", process)
@@ -129,7 +129,7 @@ def test_slurm_requeues_a_run_at_the_end_of_its_time_and_when_its_node_dies(tmp_
             assert process.wait(sweeps.PATIENCE) == 128 + signal.SIGTERM
     said = "".join(log.read_text() for log in (folder / "runs/logs/submitit").glob("*.out"))
     assert "Requeued job" in said
-    episodes = [line["episode"] for line in run.lines()]
+    episodes = [line["episode"] for line in run.metrics()]
     assert episodes == list(range(1, len(episodes) + 1))
     assert len(episodes) >= before
 

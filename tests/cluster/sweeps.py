@@ -54,7 +54,7 @@ def runs_in(folder: Path) -> list[RunFolder]:
 
 def training(folder: Path) -> list[RunFolder]:
     """Returns the runs that have saved a checkpoint and are not near their end."""
-    return [run for run in runs_in(folder) if 4 <= len(run.lines()) <= 11]
+    return [run for run in runs_in(folder) if 4 <= len(run.metrics()) <= 11]
 
 
 def finished(folder: Path) -> int:

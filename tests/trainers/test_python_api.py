@@ -73,7 +73,7 @@ def test_train_writes_the_same_folder_as_the_command(trained):
     assert trained.config.setup == "tuned"
     assert trained.config.fire.name == "paper"
     assert RunFolder(trained.path).config() == trained.config
-    assert len(RunFolder(trained.path).lines()) == 2
+    assert len(RunFolder(trained.path).metrics()) == 2
     written = json.loads((trained.path / "eval.json").read_text())
     assert written["results"] == trained.results
     assert list(trained.results) == ["huygens", "paper"]

@@ -99,7 +99,7 @@ def read_curves(folder: RunFolder) -> list[dict[str, Any]]:
     """
     file = folder.path / "metrics.jsonl"
     try:
-        lines = folder.lines()
+        lines = folder.metrics()
     except (OSError, UnicodeDecodeError) as error:
         raise UserError(f"{file}: cannot be read: {error}") from None
     for number, line in enumerate(lines, 1):

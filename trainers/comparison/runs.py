@@ -15,7 +15,6 @@ from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.evaluation.results import LEARNED
 from emberlink.trainers.runs import pretrained
 from emberlink.trainers.runs.run_folder import RunFolder
-from emberlink.trainers.runs.seal import check_trained_with
 
 LeftOut = tuple[str, str]
 """a folder or file that is not compared, and the reason"""
@@ -125,14 +124,8 @@ def read(path: Path) -> Run | str:
         evaluation = read_evaluation(path / "eval.json", config)
     except FileNotFoundError:
         return f"not evaluated: there is no eval.json ({again})"
-    newest = newest_checkpoint(path)
-    if newest is not None and newest.name != evaluation.checkpoint:
-        return (
-            f"eval.json is of {evaluation.checkpoint}, the newest checkpoint is {newest.name} "
-            f"({again})"
-        )
-    if newest is not None:
-        check_trained_with(newest, config)
+    if folder.newest.exists() and not folder.evaluated():
+        return f"eval.json is not of the newest checkpoint ({again})"
     return Run(path, config, lines[: config.episodes], evaluation)
 
 
@@ -176,11 +169,3 @@ def _changed_settings(run: Run, evaluation: Evaluation) -> dict[str, Any]:
     learned = evaluation.communication.get(LEARNED, {})
     settings = flat({"world": evaluation.world, "env": evaluation.environment, "comm": learned})
     return {key: value for key, value in settings.items() if run.settings.get(key) != value}
-
-
-def newest_checkpoint(path: Path) -> Path | None:
-    """Returns the newest checkpoint of a run folder, or None if there is none."""
-    try:
-        return RunFolder(path).checkpoint()
-    except UserError:
-        return None

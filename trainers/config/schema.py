@@ -29,10 +29,7 @@ from emberlink.policies.settings import PolicyConfig
 from emberlink.trainers.learners import registry as learners
 from emberlink.trainers.learners.base import Count, LearnerConfig
 
-NOT_LEARNT_WITH = (
-    *("device", "logger", "on_nan"),
-    *("checkpoint_interval", "checkpoint_steps", "keep_checkpoints"),
-)
+NOT_LEARNT_WITH = (*("device", "logger", "checkpoint_interval", "checkpoint_steps"),)
 """keys that do not affect learning: configurations that differ only in them are of the same run"""
 
 MAX_FIRES = 65_536
@@ -143,11 +140,6 @@ class RunConfig:
     """episodes between checkpoints"""
     checkpoint_steps: CountOrZero = 0
     """steps between additional checkpoints; 0 for none"""
-    keep_checkpoints: Count = 5
-    """checkpoints whose networks are kept; training can be resumed from the two newest"""
-    on_nan: Literal["stop", "rollback"] = "stop"
-    """reaction to NaN or Inf: stop, or return to the last checkpoint and continue with smaller
-    learning rates"""
 
     @model_validator(mode="after")
     def _check_headline(self) -> "RunConfig":

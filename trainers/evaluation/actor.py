@@ -16,8 +16,7 @@ from emberlink.trainers.config.compose import to_values
 from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.config.values import flat
 from emberlink.trainers.learners.base import ACTOR
-from emberlink.trainers.runs import checkpoint_file
-from emberlink.trainers.runs.checkpoints import load_weights
+from emberlink.trainers.runs.checkpoint import load_weights, read_header
 
 _UNITS = ("altitude", "horizon", "displacement", "view_angle", "observation_scale")
 
@@ -43,7 +42,7 @@ def load_actor(
     network: Any = actor.module
     expected = {ACTOR + name: value for name, value in network.state_dict().items()}
     weights = load_weights(checkpoint, expected, config)
-    trained = checkpoint_file.read_header(checkpoint)["config"]
+    trained = read_header(checkpoint).config
     if config.env.observation == "sight" and config.env.base and not trained["env"]["base"]:
         warnings.warn(
             f"env.base={list(config.env.base)}: the networks were trained without a base, so the "

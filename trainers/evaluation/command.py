@@ -17,7 +17,6 @@ from emberlink.trainers.evaluation.results import Results
 from emberlink.trainers.evaluation.tables import print_results
 from emberlink.trainers.runs.pretrained import open_run, read_run
 from emberlink.trainers.runs.run_folder import RunFolder
-from emberlink.trainers.runs.seal import check_trained_with
 
 _CHANGEABLE = ("comm.", "env.", "world=", "fire.", "evaluation.scripted=", "evaluation.headline=")
 """beginnings of the settings that can be changed in an evaluation"""
@@ -52,10 +51,9 @@ def evaluate_folder(
     run = read_run(name)
     if device is not None:
         check_device(device)
-    config = run.config(**({} if device is None else {"device": device}))
     given, checkpoint = checkpoint, checkpoint or run.checkpoint()
+    config = run.config(checkpoint, **({} if device is None else {"device": device}))
     label = f"_{given.stem}" if given else ""
-    check_trained_with(checkpoint, config)
     for text in overrides:
         label += "_" + re.sub(r"[^\w.=+-]", "-", text)
     config = evaluated_with(config, overrides)

@@ -30,7 +30,6 @@ from emberlink.trainers.evaluation.evaluate import (
 from emberlink.trainers.replay.page import Replay
 from emberlink.trainers.replay.recording import Episode, Recorder
 from emberlink.trainers.runs.pretrained import read_run
-from emberlink.trainers.runs.seal import check_trained_with
 
 SHARED = ("grid", "num_uavs", "horizon", "altitude")
 """keys of `env` on which fires and start positions depend"""
@@ -101,9 +100,8 @@ def learned(arguments: Sequence[str], checkpoints: Sequence[Path] = ()) -> Itera
     titles: set[str] = set()
     for place, (name, changes) in enumerate(runs):
         run = read_run(name)
-        trained = run.config(device="cpu")
         checkpoint = checkpoints[place] if checkpoints else run.checkpoint()
-        check_trained_with(checkpoint, trained)
+        trained = run.config(checkpoint, device="cpu")
         config = evaluated_with(trained, changes)
         actor = load_actor(config, checkpoint)
         title = title_of(config, *changes, *([checkpoint.stem] if checkpoints else []))

@@ -16,8 +16,8 @@ from emberlink.trainers.evaluation.results import LEARNED, Results
 from emberlink.trainers.replay.page import Replay
 from emberlink.trainers.replay.recording import Episode
 from emberlink.trainers.replay.screen import Screen, even_steps
+from emberlink.trainers.runs.checkpoint import read_header
 from emberlink.trainers.runs.run_folder import RunFolder
-from emberlink.trainers.runs.seal import changed_evaluation
 from emberlink.trainers.runs.versions import versions
 from emberlink.trainers.terminal import OutputError
 
@@ -48,8 +48,6 @@ def evaluate_run(
     Raises:
         UserError: a file cannot be written.
     """
-    for text in (changed := changed_evaluation(checkpoint, config)):
-        report(f"note: {text}")
     try:
         run.figures()  # an unusable folder is an error before the episodes, not after
         recorder = recorder_of(config, actor)
@@ -68,7 +66,8 @@ def evaluate_run(
         why = error.strerror or error
         raise UserError(f"{run.path / 'figures'}: cannot be written: {why}") from None
     # Written last: an evaluation with this file is complete.
-    content = record(config, results, checkpoint=checkpoint.name, fires=fires, changed=changed)
+    step = read_header(checkpoint).step
+    content = record(config, results, checkpoint=checkpoint.name, step=step, fires=fires)
     run.write(f"eval{label}.json", content)
     return results
 
@@ -82,7 +81,7 @@ def _draw(
 ) -> None:
     with run.figure(f"coverage{label}.png") as path:
         plots.coverage_bars(path, results)
-    lines = run.lines()
+    lines = run.metrics()
     if lines:
         title = f"{config.method}, setup {config.setup}, fire {config.fire.name}"
         with run.figure("training.png") as path:

@@ -21,9 +21,8 @@ from emberlink.envs.fire_files.config import COPY_FILE
 from emberlink.envs.utils.errors import UserError
 from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.learners.base import ACTOR
-from emberlink.trainers.runs import checkpoint_file
+from emberlink.trainers.runs import checkpoint
 from emberlink.trainers.runs.run_folder import RunFolder
-from emberlink.trainers.runs.seal import check_trained_with, to_header
 
 PREFIX = "pretrained:"
 _COPY = "pretrained"
@@ -100,13 +99,11 @@ def is_copy(folder: Path) -> bool:
 
 def _is_copy(source: Path, target: Path) -> bool:
     """Returns whether a run folder has no other networks than a policy of the package."""
-    newest = RunFolder(source).checkpoint()
-    for mine in RunFolder(target).networks()[-1:]:
-        try:
-            return mine.name == newest.name and mine.read_bytes() == newest.read_bytes()
-        except OSError as error:
-            raise UserError(f"{mine}: cannot be read: {error.strerror or error}") from None
-    return True
+    mine, theirs = RunFolder(target).newest, RunFolder(source).newest
+    try:
+        return not mine.exists() or mine.read_bytes() == theirs.read_bytes()
+    except OSError as error:
+        raise UserError(f"{mine}: cannot be read: {error.strerror or error}") from None
 
 
 def find(text: str) -> list[Path]:
@@ -176,19 +173,18 @@ def pack(run: RunFolder, into: Path) -> Path:
     trained = run.config(device="cpu")
     learner = _without_path(trained.learner)
     config = replace(trained, output="runs", logger="none", device="cpu", learner=learner)
-    if len(run.lines()) < config.episodes or not run.evaluated():
+    if len(run.metrics()) < config.episodes or not run.evaluated():
         raise UserError(f"{run.path}: not finished, or not evaluated")
     target = into / collection(config) / config.method / f"s{config.seed}"
     if target.exists():
         raise UserError(f"{target}: exists already")
-    newest = run.checkpoint()
-    check_trained_with(newest, trained)
-    header, weights = checkpoint_file.read(newest)
-    actors = {name: value for name, value in weights.items() if name.startswith(ACTOR)}
-    about = {k: v for k, v in header.items() if k not in ("sha256", "format")}
-    about["config"] = to_header(config)
-    (target / "checkpoints").mkdir(parents=True)
-    checkpoint_file.write(target / "checkpoints" / newest.name, actors, about)
+    actors = checkpoint.read_tensors(run.newest, f"{checkpoint.WEIGHTS}{ACTOR}")
+    target.mkdir(parents=True)
+    checkpoint.write(
+        target / run.newest.name,
+        checkpoint.header_of(config, run.step()),
+        {f"{checkpoint.WEIGHTS}{ACTOR}{name}": value for name, value in actors.items()},
+    )
     RunFolder(target).write_config(config)
     for file in ("metrics.jsonl", "eval.json", COPY_FILE):
         if (run.path / file).is_file():

@@ -1,13 +1,14 @@
-"""Reads and writes run folders: config.yaml, metrics.jsonl, checkpoints, evaluation, figures."""
+"""Reads and writes run folders: configuration, metrics, checkpoints, evaluation, figures."""
 
 import errno
+import json
+import os
 import re
-import shutil
+import stat
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from datetime import datetime
-from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -16,28 +17,51 @@ import yaml
 from emberlink.envs.scenarios import fires_of
 from emberlink.envs.utils import atomic_io
 from emberlink.envs.utils.errors import UserError
-from emberlink.trainers.config.compose import flat, from_values, to_values
+from emberlink.trainers.config.compose import from_values, to_values
 from emberlink.trainers.config.schema import RunConfig
-from emberlink.trainers.runs import compact_json
-from emberlink.trainers.runs.checkpoints import Checkpoints
-from emberlink.trainers.runs.json_lines import JsonLines
+from emberlink.trainers.runs import checkpoint, compact_json
 from emberlink.trainers.runs.safe_read import MAX_JSON, parse_json, read_text, read_yaml
 
-_PARTIAL = ("config.yaml", "metrics.csv", "*.json", "*.jsonl", "fires.npz")
-_PARTIAL_FIGURES = tuple(f"*.{kind}.[0-9]*.part" for kind in ("png", "gif", "html"))
-_PARTIAL_DUMPS = "divergence_step_*.part"
+NEWEST = "checkpoint.safetensors"
+"""file of the newest networks and the training state"""
+BEST = "best.safetensors"
+"""file of the networks with the best headline measure"""
+METRICS = "metrics.jsonl"
+"""file with a line for each episode"""
 
 
-class RunFolder(JsonLines, Checkpoints):
+class RunFolder:
     """The files of one training run.
 
+    A folder from somebody else may hold links, pipes or devices, through which a later command
+    would read or write elsewhere. It is refused here, where every command opens it.
+
     Args:
-        path: the folder.
+        path: the folder; it may itself be a link.
+
+    Raises:
+        UserError: it holds something other than folders and regular files.
     """
+
+    def __init__(self, path: Path | str):
+        self.path = Path(path)
+        for place, folders, files in os.walk(self.path):
+            # wandb makes links in its folder, which it replaces and nobody reads.
+            of_wandb = Path(place) == self.path / "wandb"
+            for name in (*folders, *files):
+                with suppress(FileNotFoundError):  # a training has just removed it
+                    mode = os.lstat(os.path.join(place, name)).st_mode
+                    if stat.S_ISDIR(mode) or stat.S_ISREG(mode):
+                        continue
+                    if not (of_wandb and stat.S_ISLNK(mode)):
+                        raise UserError(
+                            f"{os.path.join(place, name)}: a link, a pipe or a device; a run "
+                            "folder holds only folders and files"
+                        )
 
     @classmethod
     def create(cls, config: RunConfig, name: str = "") -> "RunFolder":
-        """Creates a new run folder in `config.output`, without config.yaml.
+        """Creates a new run folder in `config.output`, with config.yaml and the fires of files.
 
         Args:
             config: configuration of the run.
@@ -50,11 +74,13 @@ class RunFolder(JsonLines, Checkpoints):
         name = name or f"{stamp}_{config.method}_{config.setup}_{config.world}_s{config.seed}"
         try:
             path = _new_folder(Path(config.output) / name)
-            (path / "checkpoints").mkdir()
             (path / "figures").mkdir()
         except OSError as error:
             raise UserError(f"output={config.output}: {error.strerror or error}") from None
-        return cls(path)
+        run = cls(path)
+        fires_of(config.fire).save_copy(path, config.env.grid, config.env.horizon)
+        run.write_config(config)
+        return run
 
     def write_config(self, config: RunConfig) -> None:
         """Writes config.yaml completely, or leaves the earlier one.
@@ -66,19 +92,11 @@ class RunFolder(JsonLines, Checkpoints):
         text = yaml.safe_dump(values, sort_keys=False, default_flow_style=None, width=100)
         self.write_text("config.yaml", text)
 
-    def has_config(self) -> bool:
-        """Returns whether config.yaml exists; it is the last file of a new folder to be written."""
-        return (self.path / "config.yaml").exists()
-
-    def config(self, **changes: Any) -> RunConfig:
-        """Reads the run's configuration.
-
-        Args:
-            changes: keys and values to change, such as `device="cpu"`.
+    def values(self) -> dict[str, Any]:
+        """Returns the configuration of config.yaml as plain values, without checking them.
 
         Raises:
-            UserError: the folder or its config.yaml does not exist, or a key or value in it is
-                missing or wrong.
+            UserError: the folder or its config.yaml does not exist, or is not readable.
         """
         file = self.path / "config.yaml"
         if not self.path.is_dir():
@@ -89,12 +107,144 @@ class RunFolder(JsonLines, Checkpoints):
             raise UserError(f"{self.path}: not a run folder, config.yaml is missing") from None
         if not isinstance(values, dict):
             raise UserError(f"{file}: expected keys and values, found {type(values).__name__}")
-        try:
-            config = from_values({**values, **changes})
-            _check_complete(values, config)
-        except ValueError as error:
-            raise UserError(f"{file}: {error}") from None
+        return values
+
+    def config(self, file: Path | None = None, **changes: Any) -> RunConfig:
+        """Returns the configuration that a checkpoint was trained with.
+
+        Args:
+            file: the checkpoint; the newest if None or, before there is one, config.yaml.
+            changes: keys and values to change, such as `device="cpu"`.
+
+        Raises:
+            UserError: there is no such folder, or a key or value is missing or wrong.
+        """
+        values: dict[str, Any] = {"output": str(self.path.parent), **changes}
+        if file is not None or self.newest.exists():
+            config = checkpoint.read_config(file or self.newest, **values)
+        else:
+            try:
+                config = from_values(self.values() | values)
+            except UserError as error:
+                text = str(error)
+                where = "" if str(self.path) in text else f"{self.path / 'config.yaml'}: "
+                raise UserError(f"{where}{text}") from None
+        return self.with_fires(config)
+
+    def with_fires(self, config: RunConfig) -> RunConfig:
+        """Returns a configuration that reads the fires of files from the run's copy."""
         return replace(config, fire=fires_of(config.fire).load_copy(self.path))
+
+    @property
+    def newest(self) -> Path:
+        """The path of the newest checkpoint, which may not exist yet."""
+        return self.path / NEWEST
+
+    def checkpoint(self, name: str = NEWEST) -> Path:
+        """Returns the path of a checkpoint: the newest, or `BEST`.
+
+        Raises:
+            UserError: there is no such file.
+        """
+        path = self.path / name
+        if not path.is_file():
+            raise UserError(f"{self.path}: holds no {name}")
+        return path
+
+    def metrics(self) -> list[dict[str, Any]]:
+        """Returns the lines of metrics.jsonl; an empty list if there is no such file.
+
+        An incomplete last line, which a killed process left, is ignored.
+
+        Raises:
+            UserError: a line is not of the form {"episode": 1, NAME: NUMBER, ...}.
+        """
+        path = self.path / METRICS
+        text = read_text(path, MAX_JSON) if path.exists() else ""
+        complete = text[: text.rfind("\n") + 1].splitlines()
+        try:
+            return [_numbers(line) for line in complete]
+        except ValueError as error:
+            raise UserError(f"{path}: not a file of JSON lines: {error}") from None
+
+    def append(self, line: Mapping[str, Any]) -> None:
+        """Appends a line to metrics.jsonl, completely or not at all.
+
+        Raises:
+            UserError: it cannot be written, such as to a full disk.
+        """
+        path = self.path / METRICS
+        try:
+            with path.open("ab", buffering=0) as file:
+                before = file.seek(0, os.SEEK_END)
+                left = (json.dumps(line) + "\n").encode()
+                try:
+                    while left:
+                        left = left[file.write(left) :]
+                except OSError:
+                    file.truncate(before)
+                    raise
+        except OSError as error:
+            raise UserError(f"{path}: cannot be written: {error.strerror}") from None
+
+    def sync_metrics(self) -> None:
+        """Flushes metrics.jsonl to the disk; a checkpoint must not be newer than its lines."""
+        if (self.path / METRICS).exists():
+            atomic_io.sync(self.path / METRICS)
+
+    def return_to(self, episode: int) -> None:
+        """Removes the lines of later episodes and the incomplete files of a killed process.
+
+        Raises:
+            UserError: lines of earlier episodes are missing, or a file cannot be written.
+        """
+        lines = [line for line in self.metrics() if line["episode"] <= episode]
+        if [line["episode"] for line in lines] != list(range(1, episode + 1)):
+            raise UserError(
+                f"{self.path / METRICS}: does not hold a line for each of the {episode} episodes "
+                "of the checkpoint"
+            )
+        self.write_text(METRICS, "".join(f"{json.dumps(line)}\n" for line in lines))
+        for pattern in (
+            "*.[0-9]*.part",
+            ".tmp*",
+            "figures/*.[0-9]*.part",
+        ):  # safetensors writes to .tmp*
+            for path in self.path.glob(pattern):
+                path.unlink(missing_ok=True)
+
+    def evaluation(self) -> dict[str, Any] | None:
+        """Returns the content of eval.json, or None if there is no such file.
+
+        Raises:
+            UserError: it cannot be read.
+        """
+        path = self.path / "eval.json"
+        try:
+            content = parse_json(read_text(path, MAX_JSON))
+        except FileNotFoundError:
+            return None
+        except ValueError as error:
+            text = str(error)
+            raise UserError(text if str(path) in text else f"{path}: {text}") from None
+        if not isinstance(content, dict):
+            raise UserError(f"{path}: not an evaluation")
+        return content
+
+    def evaluated(self) -> bool:
+        """Returns whether eval.json is an evaluation of the newest checkpoint."""
+        with suppress(UserError):
+            evaluation = self.evaluation()
+            return evaluation is not None and evaluation.get("step") == self.step()
+        return False
+
+    def step(self) -> int:
+        """Returns the step of the newest checkpoint.
+
+        Raises:
+            UserError: there is none.
+        """
+        return checkpoint.read_header(self.checkpoint()).step
 
     def write(self, file: str, content: Mapping[str, Any]) -> None:
         """Writes a JSON file completely, or leaves the earlier one.
@@ -120,60 +270,21 @@ class RunFolder(JsonLines, Checkpoints):
         """Creates the folder of the figures if it is missing, and returns it.
 
         Raises:
-            OSError: it is a link or not a folder, or cannot be created.
+            OSError: it cannot be created.
         """
-        return atomic_io.inner_folder(self.path, "figures")
+        folder = self.path / "figures"
+        folder.mkdir(exist_ok=True)
+        return folder
 
     @contextmanager
     def figure(self, file: str) -> Iterator[Path]:
         """Yields a path for a figure, which is renamed to figures/FILE at the end.
 
         Raises:
-            OSError: it cannot be written, or the folder is a link.
+            OSError: it cannot be written.
         """
         with atomic_io.replaced(self.figures() / file) as partial:
             yield partial
-
-    def evaluated(self) -> bool:
-        """Returns whether eval.json is an evaluation of the newest checkpoint."""
-        try:
-            evaluation = parse_json(read_text(self.path / "eval.json", MAX_JSON))
-            return evaluation["checkpoint"] == self.checkpoint().name
-        except (OSError, ValueError, KeyError, TypeError):
-            return False
-
-    def take_away_after(self, step: int) -> None:
-        """Removes the checkpoints after a step and all incomplete files.
-
-        Raises:
-            UserError: a file cannot be removed.
-        """
-        partial = [self.path.glob(f"{name}.[0-9]*.part") for name in _PARTIAL]
-        try:
-            partial += [self.figures().glob(pattern) for pattern in _PARTIAL_FIGURES]
-            for path in chain(self.checkpoints_after(step), self.partial_checkpoints(), *partial):
-                if path.is_file() or path.is_symlink():  # a folder with such a name is not ours
-                    atomic_io.remove(path)
-            for path in self.path.glob(_PARTIAL_DUMPS):
-                if path.is_dir() and not path.is_symlink():
-                    shutil.rmtree(path)
-        except OSError as error:
-            raise UserError(f"{error.filename}: cannot be removed: {error.strerror}") from None
-
-
-def _check_complete(values: Mapping[str, Any], config: RunConfig) -> None:
-    """Checks that all settings of the environment, fire and communication are in the file.
-
-    A missing setting would get a default, which may not be the value of the run.
-
-    Raises:
-        UserError: a key is missing.
-    """
-    written, complete = flat(values), to_values(config)
-    world = {key: complete[key] for key in ("env", "fire", "comm")}
-    for key in flat(world):
-        if key not in written:
-            raise UserError(f"key {key!r} is missing")
 
 
 def without_time_and_seed(path: str) -> str:
@@ -182,14 +293,22 @@ def without_time_and_seed(path: str) -> str:
     return str(Path(path).with_name(made[1])) if made else path
 
 
+def _numbers(line: str) -> dict[str, Any]:
+    """Returns the numbers of a line by name."""
+    value = parse_json(line)
+    if not isinstance(value, dict) or "episode" not in value:
+        raise UserError("a line is not of the form {episode: ..., ...}")
+    if not all(isinstance(number, int | float) for number in value.values()):
+        raise UserError("a line holds a value that is not a number")
+    return value
+
+
 def _new_folder(path: Path) -> Path:
     """Creates `path`, or `path_2` and so on if it exists, and returns the new folder."""
     path.parent.mkdir(parents=True, exist_ok=True)
     for attempt in range(1, 1000):
         candidate = path if attempt == 1 else path.with_name(f"{path.name}_{attempt}")
-        try:
+        with suppress(FileExistsError):
             candidate.mkdir()
-        except FileExistsError:
-            continue
-        return candidate
+            return candidate
     raise FileExistsError(errno.EEXIST, f"{path} and 998 more exist already")

@@ -16,7 +16,6 @@ from emberlink.trainers.config.schema import NOT_LEARNT_WITH, RunConfig
 from emberlink.trainers.runs import pretrained
 from emberlink.trainers.runs.run_folder import RunFolder
 from emberlink.trainers.sweep.executors.base import Task
-from emberlink.trainers.training.folders import RunFolders
 
 _IGNORED = ("output", *NOT_LEARNT_WITH)
 """first parts of keys that do not tell runs apart"""
@@ -75,9 +74,7 @@ class Combination:
         """Creates the run folder if there is none, and returns the task that trains the run."""
         if self.folder is None:
             # From the configuration and not the arguments: YAML files may have changed since.
-            folders = RunFolders.create([self.config], [_folder_name(self.config)])
-            folders.close()
-            (self.folder,) = folders.runs
+            self.folder = RunFolder.create(self.config, _folder_name(self.config))
         self.log.parent.mkdir(exist_ok=True)
         overrides = (f"device={self.config.device}", *self.overrides)
         return Task(self.folder.path.absolute(), overrides, self.log)
@@ -122,12 +119,12 @@ def find_folders(wanted: Sequence[Combination], output: Path) -> Iterator[str]:
     for file in sorted(output.glob("*/config.yaml")):
         if pretrained.is_copy(file.parent):
             continue
-        folder = RunFolder(file.parent)
         try:
+            folder = RunFolder(file.parent)
             # The device of the run may not exist on this machine.
             config = folder.config(device="cpu")
         except ValueError as error:
-            yield f"{folder.path} is left out: {error}"
+            yield f"{file.parent} is left out: {error}"
             continue
         run = by_identity.get(_identity(config))
         if run is not None and not run.finished:

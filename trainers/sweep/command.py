@@ -23,7 +23,7 @@ from emberlink.trainers.sweep.combinations import (
 from emberlink.trainers.sweep.executors.base import Executor
 from emberlink.trainers.sweep.executors.registry import make
 from emberlink.trainers.terminal.signals import Interruption
-from emberlink.trainers.tracking import loggers
+from emberlink.trainers.tracking import check_installed
 from emberlink.trainers.training.setup import check_setup
 
 _INTERVAL = 0.5
@@ -84,7 +84,7 @@ def _check(runs: Sequence[Combination]) -> None:
         UserError: one cannot.
     """
     for run in {without_seed(run.config): run for run in reversed(runs)}.values():
-        loggers.check_installed(run.config)
+        check_installed(run.config.logger)
         try:
             check_setup(run.config)
         except UserError as error:

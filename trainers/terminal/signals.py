@@ -2,7 +2,7 @@
 
 import signal
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from types import FrameType
 
 _NOTICES = (signal.SIGUSR1, signal.SIGUSR2)
@@ -11,7 +11,7 @@ _ENDS = (signal.SIGTERM, signal.SIGHUP)
 """signals that a machine sends together, in either order, when it ends a process"""
 _TOGETHER = 2.0
 """seconds in which several of `_ENDS` are one"""
-_SIGNALS = (signal.SIGINT, signal.SIGTERM, *_NOTICES)
+_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, *_NOTICES)
 
 
 class Interrupted(KeyboardInterrupt):
@@ -27,9 +27,15 @@ class Interruption:
 
     Args:
         stop: called at the first signal; requests the end of the training after a step.
+        signals: the signals to handle.
     """
 
-    def __init__(self, stop: Callable[[], None]):
+    def __init__(
+        self,
+        stop: Callable[[], None],
+        signals: Sequence[signal.Signals] = (*_SIGNALS, signal.SIGHUP),
+    ):
+        self._signals = signals
         self._stop, self._since, self._raised = stop, 0.0, False
         self._before: dict[signal.Signals, signal._HANDLER] = {}
         self.received: int | None = None
@@ -38,10 +44,9 @@ class Interruption:
         """whether the first signal raises `Interrupted`, too"""
 
     def __enter__(self) -> "Interruption":
-        signals = [*_SIGNALS]
-        if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # nohup ignores it
-            signals.append(signal.SIGHUP)
-        self._before = {number: signal.signal(number, self._handle) for number in signals}
+        for number in self._signals:
+            if number != signal.SIGHUP or signal.getsignal(number) is not signal.SIG_IGN:  # nohup
+                self._before[number] = signal.signal(number, self._handle)
         return self
 
     def __exit__(self, _: object, error: BaseException | None, __: object) -> None:

@@ -14,7 +14,7 @@ from emberlink.envs.utils.errors import UserError
 from emberlink.policies.hold import decisions, hold
 from emberlink.trainers.build import build_env, build_learner
 from emberlink.trainers.config.schema import RunConfig, build_comm
-from emberlink.trainers.learners.base import Learner
+from emberlink.trainers.learners.base import Learner, Losses
 from emberlink.trainers.learners.nan_guard import NonFiniteGuard
 from emberlink.trainers.learners.tensors import copy_into, flatten, group, prefixed, unflatten
 from emberlink.trainers.rollout.allocator import keep_freed_memory
@@ -42,6 +42,8 @@ class TrainingSetup:
         keep_freed_memory()
         self.config, self.horizon = config, config.env.horizon
         self.seeds = config.seeds or (config.seed,)
+        if len(self.seeds) > 1:
+            raise UserError("a run trains one seed; several: emberlink sweep METHOD seed=0,1,2")
         self.teams = len(self.seeds)
         self.total_steps = config.episodes * self.horizon
         self.step = 0
@@ -71,8 +73,8 @@ class TrainingSetup:
         """The number of finished episodes."""
         return self.step // self.horizon
 
-    def learn(self, rollout: TensorDictBase) -> None:
-        """Checks a rollout, learns from it and records it."""
+    def learn(self, rollout: TensorDictBase) -> list[Losses]:
+        """Learns from a rollout, records it and returns the losses of each update."""
         steps = rollout.shape[1]
         self.step += steps
         self.guard.record_rollout(rollout.select(*self._checked), steps)
@@ -80,6 +82,7 @@ class TrainingSetup:
         with fast_products():
             losses = self.learner.learn(transitions)
         self.record.add(rollout, losses)
+        return losses
 
     def dry_run(self, steps: int) -> None:
         """Collects and learns for some steps without writing files."""

@@ -1,24 +1,33 @@
 """Runs the training loop: collects, learns, measures, evaluates and saves."""
 
-import time
-from collections.abc import Callable
-from dataclasses import dataclass, field, replace
-from pathlib import Path
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 from torch import Tensor
 
 from emberlink.envs import metrics
+from emberlink.envs.utils.errors import UserError
 from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.evaluation import evaluate
-from emberlink.trainers.runs.run_folder import RunFolder
-from emberlink.trainers.runs.seal import to_header
-from emberlink.trainers.runs.versions import changed, versions
-from emberlink.trainers.tracking.trackers import Trackers
-from emberlink.trainers.training import checkpoints, non_finite, rollback, warm_start
-from emberlink.trainers.training.folders import RunFolders, empty
-from emberlink.trainers.training.rollback import Rollbacks
+from emberlink.trainers.evaluation.report import evaluate_run
+from emberlink.trainers.evaluation.results import Results, learned_means
+from emberlink.trainers.learners.base import Losses
+from emberlink.trainers.rollout.finite_actions import NonFiniteActionError
+from emberlink.trainers.runs import checkpoint
+from emberlink.trainers.runs.lock import Lock
+from emberlink.trainers.runs.run_folder import BEST, RunFolder
+from emberlink.trainers.tracking import Tracker
+from emberlink.trainers.training import warm_start
 from emberlink.trainers.training.setup import TrainingSetup
+
+ONE_AT_A_TIME = threading.RLock()
+"""held while a training runs: TorchRL's exploration type is one variable for all threads"""
+
+
+class NonFiniteError(UserError):
+    """Reports that a number of a training became NaN or infinite."""
 
 
 @dataclass
@@ -33,169 +42,180 @@ class Progress:
     """finished episodes"""
     episodes: int
     """episodes of the whole training"""
-    lines: list[dict[str, Any]] = field(default_factory=list)
-    """line of metrics.jsonl of the last finished episode, for each seed"""
-    note: str = ""
-    """message for the user about a rollback, or empty"""
+    line: dict[str, Any]
+    """line of metrics.jsonl of the last finished episode; empty before"""
 
 
 class Trainer:
-    """Trains all seeds of a configuration and writes their run folders.
+    """Trains a configuration in a run folder.
 
-    The setup is built before a folder is created, so that an error leaves no files.
+    The setup is built before the folder is created, so that an error leaves no files.
 
     Args:
         config: configuration of the run.
     """
 
+    run: RunFolder
+    """the run folder, after `start` or `resume`"""
+
     def __init__(self, config: RunConfig):
         self.config = config
         self.setup = TrainingSetup(config)
-        self.rollbacks = Rollbacks()
-        self.seconds = 0.0
-        """seconds of training before `train` was called"""
-        self.best: list[float | None] = [None] * self.setup.teams
-        """best headline measure of each seed; that of best.safetensors"""
+        self.best: float | None = None
+        """best headline measure, that of best.safetensors"""
         self.saved: int | None = None
         """step of the newest checkpoint"""
         self.changed_versions = ""
         """packages whose version is not that of the checkpoint that was resumed"""
-        self.folders: RunFolders | None = None
-        self._began = time.monotonic()
-        self._stopping = self._untracked = False
-
-    @property
-    def runs(self) -> list[RunFolder]:
-        """The run folders, one per seed; `start` creates them."""
-        assert self.folders is not None, "start() comes first"
-        return self.folders.runs
-
-    @property
-    def configs(self) -> list[RunConfig]:
-        """The configurations of all seeds."""
-        assert self.folders is not None, "start() comes first"
-        return self.folders.configs
-
-    @property
-    def run(self) -> RunFolder:
-        """The first seed's run folder."""
-        return self.runs[0]
+        self._lock: Lock | None = None
+        self._tracker: Tracker | None = None
+        self._stopping = False
 
     def start(self) -> RunFolder:
-        """Creates the run folders, one per seed, and returns the first."""
+        """Creates the run folder, locks it and returns it."""
         warm_start.start(self.setup.learner, self.config)  # before there are files
-        teams = range(self.setup.teams)
-        self.folders = RunFolders.create([self.setup.seed_config(team) for team in teams])
-        self.config = replace(self.config, fire=self.configs[0].fire)
-        return self.run
+        run = RunFolder.create(self.config)
+        self.open(run, Lock(run.path))
+        return run
+
+    def open(self, run: RunFolder, lock: Lock) -> None:
+        """Continues in a run folder, which stays locked until `close`."""
+        self.run, self._lock = run, lock
+        self.config = run.with_fires(self.config)
 
     def stop(self) -> None:
         """Ends the training after the current rollout; may be called from a signal handler."""
         self._stopping = True
 
     def close(self) -> None:
-        """Unlocks the run folders."""
-        if self.folders is not None:
-            self.folders.close()
+        """Closes the tracker and unlocks the run folder."""
+        if self._tracker is not None:
+            self._tracker.close()
+        if self._lock is not None:
+            self._lock.release()
 
-    def elapsed(self) -> float:
-        """Returns the seconds of training so far."""
-        return self.seconds + time.monotonic() - self._began
-
-    def train(
-        self, report: Callable[[Progress], None] = lambda _: None, *, hold: bool = False
-    ) -> bool:
+    def train(self, report: Callable[[Progress], None] = lambda _: None) -> bool:
         """Trains to the end, or until `stop`, and saves.
 
-        After an exception, nothing is saved: a setup is consistent only between rollouts.
+        After an exception, nothing is saved: a setup is consistent only between rollouts. A second
+        training in another thread of the process waits for the first one.
 
         Args:
             report: called after each rollout.
-            hold: whether the run folders stay locked until `close`.
 
         Returns:
             True at the end of the run, False after `stop`.
 
         Raises:
-            NonFiniteError: a number is NaN or infinite, and `on_nan` is "stop" or the rollbacks
-                failed.
+            NonFiniteError: a number is NaN or infinite.
             UserError: a file cannot be written, such as to a full disk.
         """
-        try:
-            while True:
-                try:
-                    self._train(report)
-                    return self.setup.step == self.setup.total_steps
-                except non_finite.NonFiniteError as error:
-                    if self.config.on_nan != "rollback":
-                        raise
-                    note = self.roll_back(error)
-                report(self._progress(note=note))
-        finally:
-            if not hold:
-                self.close()
-
-    def _train(self, report: Callable[[Progress], None]) -> None:
-        """Trains to the end, or until `stop` or a NaN or Inf."""
-        # A failed tracker is not started again after a rollback.
-        quiet = [replace(config, logger="none") for config in self.configs]
-        configs = quiet if self._untracked else self.configs
-        trackers = Trackers(configs, self.runs, episode=self.setup.episode)
-        try:
-            self._loop(trackers, report)
-            if self.saved != self.setup.step:
-                non_finite.check(self.setup, self.run, wait=True)
+        setup, line = self.setup, {}
+        with ONE_AT_A_TIME:
+            self._tracker = self._tracker or Tracker(self.config, self.run)
+            for rollout in setup.collector:
+                before = setup.step
+                self._check(setup.learn(rollout))
+                if setup.step % setup.horizon == 0:
+                    line = self._finish_episode()
+                if self._is_due(before, setup.step):
+                    self.save()
+                report(
+                    Progress(
+                        *(setup.step, setup.total_steps),
+                        *(setup.episode, self.config.episodes, line),
+                    )
+                )
+                if self._stopping:
+                    break
+            if self.saved != setup.step:
                 self.save()
-        finally:
-            trackers.close()
-            self._untracked = self._untracked or trackers.given_up
+        return setup.step == setup.total_steps
 
-    def _loop(self, trackers: Trackers, report: Callable[[Progress], None]) -> None:
-        setup, lines = self.setup, []
-        self._began = time.monotonic()
-        for rollout in setup.collector:
-            before = setup.step
-            setup.learn(rollout)
-            ends, due = setup.step % setup.horizon == 0, self._is_due(before, setup.step)
-            non_finite.check(setup, self.run, wait=ends or due)
-            if ends:
-                lines = self._finish_episode(trackers)
-            if due:
-                self.save()
-            report(self._progress(lines=lines))
-            if self._stopping:
-                return
+    def evaluate(self, report: Callable[[str], None] = lambda _: None) -> Results:
+        """Evaluates the frozen policy, writes eval.json and figures, and tells the tracker.
 
-    def _progress(self, **more: Any) -> Progress:
-        setup = self.setup
-        return Progress(setup.step, setup.total_steps, setup.episode, self.config.episodes, **more)
+        Args:
+            report: called with a line of text before each part of the work.
 
-    def _is_due(self, before: int, after: int) -> bool:
-        """Returns whether a checkpoint is due between two steps."""
-        config = self.config
-        intervals = config.checkpoint_interval * config.env.horizon, config.checkpoint_steps
-        return any(after // steps > before // steps for steps in intervals if steps)
+        Raises:
+            UserError: a file cannot be written.
+        """
+        config, run = self.config, self.run
+        with ONE_AT_A_TIME:
+            results = evaluate_run(
+                run,
+                config,
+                self.setup.team_actor(0),
+                checkpoint=run.checkpoint(),
+                fires=config.evaluation.episodes,
+                report=report,
+            )
+        self._tracker = self._tracker or Tracker(config, run)
+        figures = sorted((run.path / "figures").glob("*.png"))
+        self._tracker.log_evaluation(learned_means(results), figures)
+        return results
 
-    def _finish_episode(self, trackers: Trackers) -> list[dict[str, Any]]:
-        """Measures an episode, evaluates if it is due, and writes and returns the lines."""
+    def save(self) -> None:
+        """Writes a checkpoint.
+
+        Raises:
+            NonFiniteError: a tensor in it is not finite.
+            UserError: the file cannot be written; the earlier checkpoint is unchanged.
+        """
+        state = self.setup.state_dict()
+        # Times of fires are infinite where nothing burns.
+        checked = {k: v for k, v in state.items() if not k.startswith("environments/")}
+        if name := checkpoint.first_non_finite(checked):
+            raise self._non_finite(name)
+        self.run.sync_metrics()
+        about = checkpoint.header_of(self.config, self.setup.step, best=self.best, resumable=True)
+        checkpoint.write(self.run.newest, about, state | self._weights())
+        self.saved = self.setup.step
+
+    def restore(self) -> None:
+        """Restores a new setup from the newest checkpoint of the run folder.
+
+        Raises:
+            UserError: the checkpoint cannot be read, or does not fit.
+        """
+        path = self.run.newest
+        header = checkpoint.read_header(path)
+        if not header.resumable:
+            raise UserError(f"{path}: holds networks alone; nothing can be resumed from it")
+        if header.step > self.setup.total_steps:
+            done = header.step / self.config.env.horizon
+            raise UserError(f"episodes={self.config.episodes}: the run has done {done:g}")
+        try:
+            self.setup.load_state_dict(checkpoint.read_tensors(path), header.step)
+        except (ValueError, KeyError, RuntimeError, TypeError, IndexError) as error:
+            reason = " ".join(str(error).split())[:200]
+            raise UserError(f"{path}: does not fit this training: {reason}") from None
+        self.saved = header.step
+        before, now = header.config["evaluation"], self.config.evaluation
+        compared = ("headline", "huygens", "interval_episodes", "interval")
+        if all(before.get(key) == getattr(now, key) for key in compared):
+            self.best = header.best
+
+    def _finish_episode(self) -> dict[str, Any]:
+        """Measures an episode, evaluates if it is due, and writes and returns the line."""
         setup, interval = self.setup, self.config.evaluation.interval
-        counted = {"episode": setup.episode, "updates": setup.learner.updates}
-        lines = [counted | measures for measures in setup.record.measures()]
+        (measures,) = setup.record.measures()
+        line = {"episode": setup.episode, "updates": setup.learner.updates} | measures
         setup.record.clear()
         if interval and setup.episode % interval == 0:
-            for team, line in enumerate(lines):
-                with non_finite.in_validation(setup, setup.seeds[team]):
-                    line |= evaluate.validate(self.configs[team], setup.team_actor(team))
-        seconds = round(self.elapsed(), 3)
-        for team, (line, run) in enumerate(zip(lines, self.runs, strict=True)):
-            self._keep_best(team, line)
-            run.append("metrics.jsonl", line)
-            run.append("timing.jsonl", {"episode": setup.episode, "seconds": seconds})
-        trackers.log(lines, setup.episode)
-        return lines
+            try:
+                line |= evaluate.validate(self.config, setup.team_actor(0))
+            except NonFiniteActionError as error:
+                raise self._non_finite("an action of the validation", error.value) from None
+        self._keep_best(line)
+        self.run.append(line)
+        if self._tracker is not None:
+            self._tracker.log(line)
+        return line
 
-    def _keep_best(self, team: int, line: dict[str, Any]) -> None:
-        """Writes the networks of a seed if their headline measure is the best so far.
+    def _keep_best(self, line: Mapping[str, Any]) -> None:
+        """Writes best.safetensors if the headline measure is the best so far.
 
         It is measured on validation fires or, without evaluations during training, in the episode.
         """
@@ -204,93 +224,36 @@ class Trainer:
         if self.config.evaluation.interval and not evaluated:
             return
         measured = sum(evaluated) / len(evaluated) if evaluated else line[headline]
-        best, higher = self.best[team], headline in metrics.HIGHER_IS_BETTER
-        if best is None or (measured > best if higher else measured < best):
-            self.best[team] = measured
-            weights = self.setup.learner.weights(team)
-            self.runs[team].save_best(weights, self.configs[team], self.setup.step)
+        higher = headline in metrics.HIGHER_IS_BETTER
+        if self.best is None or (measured > self.best if higher else measured < self.best):
+            self.best = measured
+            header = checkpoint.header_of(self.config, self.setup.step, best=measured)
+            checkpoint.write(self.run.path / BEST, header, self._weights())
 
-    def save(self) -> None:
-        """Writes a checkpoint: the training state, then the networks of each seed.
+    def _weights(self) -> dict[str, Tensor]:
+        weights = self.setup.learner.weights()
+        return {f"{checkpoint.WEIGHTS}{name}": value for name, value in weights.items()}
 
-        Raises:
-            NonFiniteError: a tensor in the state is not finite.
-            UserError: a file cannot be written; earlier checkpoints are unchanged.
-        """
-        setup, folders = self.setup, self.folders
-        assert folders is not None, "start() comes first"
-        tensors = setup.state_dict()
-        non_finite.check_state(setup, tensors)
-        self.rollbacks = self.rollbacks.passed(setup.step)
-        state = checkpoints.RunState(
-            step=setup.step,
-            config=to_header(self.config),
-            folders=folders.names,
-            sizes=folders.sizes(),
-            best=self.best,
-            seconds=round(self.elapsed(), 3),
-            rollbacks=self.rollbacks,
-            tensors=len(tensors),
-            versions=versions(),
-        )
-        checkpoints.write(self.run.state(setup.step), state, tensors)
-        self.save_networks()
-        self.saved = setup.step
+    def _is_due(self, before: int, after: int) -> bool:
+        """Returns whether a checkpoint is due between two steps."""
+        config = self.config
+        intervals = config.checkpoint_interval * config.env.horizon, config.checkpoint_steps
+        return any(after // steps > before // steps for steps in intervals if steps)
 
-    def save_networks(self) -> None:
-        """Writes the networks of each seed, then removes older checkpoints."""
-        for team, (config, run) in enumerate(zip(self.configs, self.runs, strict=True)):
-            run.save(self.setup.learner.weights(team), config, self.setup.step)
-        for run in self.runs:
-            run.rotate(self.config.keep_checkpoints, states=2)
-
-    def restore(self, path: Path, state: checkpoints.RunState, tensors: dict[str, Tensor]) -> None:
-        """Restores a new setup from a training state.
+    def _check(self, updates: Sequence[Losses]) -> None:
+        """Checks that all losses are finite.
 
         Raises:
-            UserError: the checkpoint does not fit; the message begins with its path.
+            NonFiniteError: one is not.
         """
-        self.rollbacks = checkpoints.restore(path, self.setup, state, tensors)
-        self.best, self.seconds = checkpoints.best(state, self.config), state.seconds
-        self.changed_versions = changed(state.versions)
+        for losses in updates:
+            for name, value in losses.items():
+                if not value.isfinite().all():
+                    raise self._non_finite(f"loss {name}", f"{value[~value.isfinite()][0]:g}")
 
-    def roll_back(self, error: non_finite.NonFiniteError) -> str:
-        """Returns to the newest checkpoint, or to the beginning, with smaller learning rates.
-
-        A checkpoint with these rates is written at once, so that a resumed run has them, too. The
-        best networks are kept.
-
-        Returns:
-            A message for the user.
-
-        Raises:
-            NonFiniteError: there were too many rollbacks without progress.
-            UserError: a file cannot be read or written.
-        """
-        assert self.folders is not None, "start() comes first"
-        rollbacks, seconds, best = self.rollbacks.after(error), self.elapsed(), self.best
-        self.setup, sizes = TrainingSetup(self.config), empty(self.runs)
-        states = self.run.states()
-        if states:
-            state, tensors = checkpoints.read(states[-1])
-            self.restore(states[-1], state, tensors)
-            sizes = state.sizes
-        else:
-            warm_start.start(self.setup.learner, self.config)
-        self.rollbacks, self.seconds, self.best = rollbacks, seconds, best
-        self.setup.learner.scale_lr(rollbacks.lr_scale)
-        self._began = time.monotonic()
-        self.folders.cut_back(sizes, self.setup.step)
-        line = {
-            "step": error.report.step,
-            "to": self.setup.step,
-            "lr_scale": rollbacks.lr_scale,
-            "report": str(error.report),
-            "dump": error.dump.name if error.dump else None,
-        }
-        self.folders.append(rollback.FILE, line)
-        self.save()
-        return (
-            f"{error}; rollback {rollbacks.count} of {rollback.MAX_ROLLBACKS}: on from step "
-            f"{self.setup.step} with learning rates x {rollbacks.lr_scale:g}"
-        )
+    def _non_finite(self, name: str, value: str = "NaN or infinite") -> NonFiniteError:
+        """Returns the error that ends the training; nothing has been saved since."""
+        last = "there is no checkpoint"
+        if self.saved is not None:
+            last = f"the last good checkpoint is {self.run.newest}, of step {self.saved}"
+        return NonFiniteError(f"{name} is {value} at step {self.setup.step}; {last}")

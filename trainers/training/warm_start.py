@@ -1,5 +1,6 @@
 """Begins a run with the actors of another run (`learner.warm_start`)."""
 
+import os
 import warnings
 from typing import Any
 
@@ -11,10 +12,9 @@ from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.config.values import flat
 from emberlink.trainers.evaluation.actor import units
 from emberlink.trainers.learners.base import ACTOR, Learner
-from emberlink.trainers.runs.checkpoints import load_weights
+from emberlink.trainers.runs.checkpoint import load_weights
 from emberlink.trainers.runs.pretrained import find_one, is_name
 from emberlink.trainers.runs.run_folder import RunFolder
-from emberlink.trainers.runs.seal import check_trained_with
 
 _OBSERVED = ("comm.", "env.observation", "policy.hold")
 """beginnings of the keys of settings that change what a UAV observes, or what its action does,
@@ -25,10 +25,7 @@ _REWARD = "comm.heading."
 
 
 def start(learner: Learner, config: RunConfig) -> None:
-    """Copies the actors of the run `learner.warm_start` to all seeds of a learner.
-
-    Their checkpoint is the newest of the run. Its checksum, the configuration that it was trained
-    with, and the names, shapes and values of its weights are checked.
+    """Copies the actors of the run `learner.warm_start`, of its newest checkpoint, to a learner.
 
     Args:
         learner: a new learner.
@@ -41,19 +38,12 @@ def start(learner: Learner, config: RunConfig) -> None:
     if not name:
         return
     network: Any = learner.actor.module
-    teams = len(config.seeds or (config.seed,))
-    expected = {
-        ACTOR + key: value.unflatten(0, (teams, -1))[0]
-        for key, value in network.state_dict().items()
-    }
+    expected = {ACTOR + key: value for key, value in network.state_dict().items()}
     try:
-        run = RunFolder(find_one(name) if is_name(name) else name)
-        if run.path.is_file():
-            raise UserError("expected a run folder, found a file")
+        run = RunFolder(find_one(name) if is_name(name) else os.path.expanduser(name))
         # The device of that run may not exist here.
-        theirs, checkpoint = run.config(device=config.device), run.checkpoint()
-        check_trained_with(checkpoint, theirs)
-        weights = load_weights(checkpoint, expected, config)
+        theirs = run.config(device=config.device)
+        weights = load_weights(run.checkpoint(), expected, config)
     except UserError as error:
         said = str(error).removeprefix(f"{name}: ")
         raise UserError(f"learner.warm_start={name}: {said}") from None

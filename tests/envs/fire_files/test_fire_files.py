@@ -141,7 +141,7 @@ def test_a_run_is_evaluated_rendered_and_resumed_without_its_file(run, trained, 
         assert main.main(["render", str(run), "--fire", "file:3", "--output", str(picture)]) == 0
         assert picture.stat().st_size > 1000
         assert main.main(["train", f"resume={run}", "episodes=3"]) == 0
-        assert len(RunFolder(run).lines()) == 3
+        assert len(RunFolder(run).metrics()) == 3
         # Another grid needs the file.
         line = fails(["eval", run, "env.horizon=9"], capfd)
         assert line.endswith("fire.asc: there is no such file")

@@ -220,13 +220,13 @@ def test_too_little_memory_gives_one_line(capsys, monkeypatch):
 
 
 def test_an_unfinished_line_is_ignored(run):
-    lines = RunFolder(run).lines()
+    lines = RunFolder(run).metrics()
     with (run / "metrics.jsonl").open("a") as out:
         out.write('{"epi')
-    assert RunFolder(run).lines() == lines
+    assert RunFolder(run).metrics() == lines
     (run / "metrics.jsonl").write_text("{}\nnothing\n")
     with pytest.raises(ValueError, match=r"metrics\.jsonl: not a file of JSON lines"):
-        RunFolder(run).lines()
+        RunFolder(run).metrics()
 
 
 def test_a_batch_that_is_never_filled_gives_a_warning(tmp_path, capsys):

@@ -235,7 +235,7 @@ def test_huge_numbers_in_a_run(run, capsys):
         f'{{"episode": 2, "mean_reward": {many}}}\n'
     )
     assert main.main(["eval", str(run), "--fires", "1"]) == 0
-    assert RunFolder(run).lines()[1]["mean_reward"] == float("inf")
+    assert RunFolder(run).metrics()[1]["mean_reward"] == float("inf")
 
 
 EVALUATIONS = {

@@ -191,7 +191,7 @@ def test_seeds_side_by_side_learn_the_same_as_alone(case, tmp_path):
     for seed, run in zip((3, 11), both, strict=True):
         assert main.main([*settings, f"seed={seed}", f"output={tmp_path / str(seed)}"]) == 0
         (alone,) = (tmp_path / str(seed)).iterdir()
-        lines = zip(RunFolder(run).lines(), RunFolder(alone).lines(), strict=True)
+        lines = zip(RunFolder(run).metrics(), RunFolder(alone).metrics(), strict=True)
         for line, single in lines:
             assert line == pytest.approx(single, rel=1e-3, abs=1e-3)
         together, own = load(run).module[0], load(alone).module[0]

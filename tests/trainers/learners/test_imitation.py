@@ -204,7 +204,7 @@ def test_a_sweep_of_imitations_trains_each_once(tmp_path):
         runs = [RunFolder(file.parent) for file in tmp_path.glob("*/config.yaml")]
         share = [run.config().learner.teacher_share for run in runs]
         assert sorted(share) == [0, 1]
-        (first,), (second,) = (run.lines() for run in runs)
+        (first,), (second,) = (run.metrics() for run in runs)
         assert first["loss_imitation"] != second["loss_imitation"]
         assert all((run.path / "eval.json").exists() for run in runs)
 
@@ -259,7 +259,7 @@ def test_a_run_begins_with_the_actors_of_another(learner, actor_of, more, imitat
             target = name.replace(ACTOR, "target_" + ACTOR)
             assert target not in weights or weights[target].equal(value)
     trainer.train()
-    assert all("loss_anchor" in line for line in trainer.run.lines()[1:])
+    assert all("loss_anchor" in line for line in trainer.run.metrics()[1:])
     assert mine.anchor.weight < 0.3
     assert any(not mine.weights()[name].equal(value) for name, value in expected.items())
     frozen = mine.anchor.network.state_dict()
@@ -416,7 +416,7 @@ def test_a_resumed_run_is_the_same_bit_for_bit(learner, more, imitated, tmp_path
         config = resolve("maps", [*settings(learner, *more), f"output={tmp_path / str(stop)}"])
         trainer = finished(config, stop)
         states.append(trainer.setup.state_dict())
-        lines.append(trainer.run.lines())
+        lines.append(trainer.run.metrics())
     assert states[0].keys() == states[1].keys()
     for name, value in states[0].items():
         assert value.nan_to_num(7).equal(states[1][name].nan_to_num(7)), name

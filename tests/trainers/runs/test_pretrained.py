@@ -255,7 +255,7 @@ def test_every_shipped_policy_loads():
         check_trained_with(run.checkpoint(), config)
         actor = load_actor(config, run.checkpoint())
         assert all(torch.isfinite(weight).all() for weight in actor.parameters())
-        assert len(run.lines()) == config.episodes
+        assert len(run.metrics()) == config.episodes
         evaluation = json.loads((folder / "eval.json").read_text())
         assert evaluation["checkpoint"] == run.checkpoint().name
         assert evaluation["fires"] >= 100

@@ -97,7 +97,7 @@ def test_errors_are_one_line_before_training(arguments, said, capsys, tmp_path, 
 
 def finish(run: RunFolder) -> None:
     """Adds the files of a training and its evaluation."""
-    for episode in range(len(run.lines()) + 1, run.config().episodes + 1):
+    for episode in range(len(run.metrics()) + 1, run.config().episodes + 1):
         run.append("metrics.jsonl", {"episode": episode, "coverage": 50.0})
     (run.checkpoints / "step_000000040.safetensors").touch()
     run.write("eval.json", {"checkpoint": "step_000000040.safetensors"})
@@ -184,7 +184,7 @@ def test_a_config_that_cannot_be_read_is_named(tmp_path, capsys):
 def test_a_failing_run_does_not_stop_the_others(tmp_path, capsys):
     arguments = ["independent", *SMALL, f"output={tmp_path}", "seed=0,1,2"]
     assert sweep(arguments, Console(width=300), executor=Instant(fails=[0])) == 1
-    assert [len(run.lines()) for run in folders_in(tmp_path)] == [0, 15, 15]
+    assert [len(run.metrics()) for run in folders_in(tmp_path)] == [0, 15, 15]
     said = capsys.readouterr().out
     assert "seed 0: emberlink train: no such thing (log: " in said
     assert "compare them with" not in said
@@ -243,7 +243,7 @@ def test_a_stopped_sweep_saves_and_the_same_command_completes_it(tmp_path):
     def stop() -> None:
         deadline = time.monotonic() + 120
         while time.monotonic() < deadline:
-            if any(1 <= len(run.lines()) < 5 for run in folders_in(tmp_path / "a")):
+            if any(1 <= len(run.metrics()) < 5 for run in folders_in(tmp_path / "a")):
                 os.kill(os.getpid(), signal.SIGINT)
                 break
             time.sleep(0.02)
@@ -252,7 +252,7 @@ def test_a_stopped_sweep_saves_and_the_same_command_completes_it(tmp_path):
     thread.start()
     assert sweep([*arguments, f"output={tmp_path / 'a'}"], Console()) == 130
     thread.join()
-    assert 1 <= len(folders_in(tmp_path / "a")[0].lines()) < 6
+    assert 1 <= len(folders_in(tmp_path / "a")[0].metrics()) < 6
     for name in "ab":
         assert sweep([*arguments, f"output={tmp_path / name}"], Console()) == 0
     (resumed,), (whole,) = folders_in(tmp_path / "a"), folders_in(tmp_path / "b")
@@ -267,7 +267,7 @@ def test_a_killed_sweep_ends_its_trainings(tmp_path):
     command = [sys.executable, "-m", "emberlink.trainers.cli", "sweep", "independent", *TRAINED]
     process = subprocess.Popen([*command, "episodes=9999", "output=runs"], cwd=tmp_path)
     deadline = time.monotonic() + 120
-    while not any(run.lines() for run in folders_in(tmp_path / "runs")):
+    while not any(run.metrics() for run in folders_in(tmp_path / "runs")):
         assert time.monotonic() < deadline
         time.sleep(0.1)
     process.kill()

@@ -38,7 +38,7 @@ def train(logger: str, folder: Path, watch: Callable[[Progress], None] = lambda 
         assert trainer.train(watch)
     assert time.monotonic() - began < 30
     for run in trainer.runs:
-        assert [line["episode"] for line in run.lines()] == list(range(1, EPISODES + 1))
+        assert [line["episode"] for line in run.metrics()] == list(range(1, EPISODES + 1))
         assert run.checkpoint().name == f"step_{EPISODES * 8:09d}.safetensors"
     return [str(warning.message) for warning in caught if "logger=" in str(warning.message)]
 
@@ -151,7 +151,7 @@ def test_a_tracker_whose_files_cannot_be_created(logger, name, tmp_path):
     with pytest.warns(UserWarning, match=f"logger={logger} has stopped") as caught:
         assert trainer.train()
     assert len([warning for warning in caught if "logger=" in str(warning.message)]) == 1
-    assert len(run.lines()) == EPISODES
+    assert len(run.metrics()) == EPISODES
     assert logger == "csv" or (run.path / name).read_text() == "in the way"
 
 

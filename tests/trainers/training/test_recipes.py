@@ -9,7 +9,8 @@ import yaml
 from emberlink.envs import keys, metrics
 from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.evaluation.actor import load_actor
-from emberlink.trainers.runs.run_folder import RunFolder
+from emberlink.trainers.runs.checkpoint import read_header
+from emberlink.trainers.runs.run_folder import BEST, RunFolder
 from emberlink.trainers.training.trainer import Trainer
 
 METHODS = ["independent", "shared_memory", "positional", "consensus"]
@@ -64,6 +65,7 @@ def test_a_recipe_trains(method, setup, tmp_path):
     run = trainer.run
     assert list(tmp_path.iterdir()) == [run.path]
     assert RunFolder(run.path).config() == config
+    assert run.values()["seed"] == config.seed
     check_lines(run, config)
     networks = trainer.setup.learner.weights()
     pictures = 12 if method == "maps" else 0  # two pictures, three convolutions each
@@ -94,9 +96,8 @@ def check_lines(run: RunFolder, config) -> None:
 
 def check_actor(run: RunFolder, config, trainer: Trainer) -> None:
     """Checks that the checkpoint's actor equals the trained actor."""
-    checkpoint = run.checkpoint()
-    assert checkpoint.name == f"step_{EPISODES * HORIZON:09d}.safetensors"
-    loaded = load_actor(config, checkpoint)
+    assert run.step() == EPISODES * HORIZON
+    loaded = load_actor(config, run.checkpoint())
     rollout = trainer.setup.env.rollout(5, trainer.setup.learner.actor)
     for step in range(5):
         observed = keys.observation_keys(trainer.setup.env.observation_spec)
@@ -105,7 +106,9 @@ def check_actor(run: RunFolder, config, trainer: Trainer) -> None:
     assert rollout[keys.ACTION].abs().max() > 0
 
 
-def test_evaluations_and_checkpoints_follow_their_intervals(tmp_path):
+def test_evaluations_and_checkpoints_follow_their_intervals(tmp_path, monkeypatch):
+    saved, save = [], Trainer.save
+    monkeypatch.setattr(Trainer, "save", lambda self: saved.append(self.setup.step) or save(self))
     config = short(
         "consensus",
         tmp_path,
@@ -114,12 +117,20 @@ def test_evaluations_and_checkpoints_follow_their_intervals(tmp_path):
     )
     run = trained(config).run
     frozen = {f"{fire}/{name}" for fire in ("huygens", "paper") for name in metrics.NAMES}
-    for line in run.lines():
+    for line in run.metrics():
         assert line.keys() & frozen == (frozen if line["episode"] in (2, 4) else set())
-    saved = [path.name for path in run.networks()]
-    assert saved == [f"step_{20 * episode:09d}.safetensors" for episode in (2, 4, 5)]
-    assert run.checkpoint().name == saved[-1]
-    assert len(run.lines("timing.jsonl")) == 5
+    assert saved == [40, 80, 100]
+    held_out = {episode: run.metrics()[episode - 1] for episode in (2, 4)}
+    coverage = {
+        episode: (line["huygens/coverage"] + line["paper/coverage"]) / 2
+        for episode, line in held_out.items()
+    }
+    best = read_header(run.path / BEST)
+    assert best.best == max(coverage.values())
+    assert best.step == 20 * max(coverage, key=lambda episode: coverage[episode])
+    assert {path.name for path in run.path.iterdir()} == {
+        *("config.yaml", "metrics.jsonl", "checkpoint.safetensors", BEST, "figures", "lock"),
+    }
 
 
 def test_several_updates_a_step(tmp_path):

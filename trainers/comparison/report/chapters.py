@@ -8,13 +8,13 @@ from pathlib import Path
 from emberlink.trainers.comparison.rankings import Numbers
 from emberlink.trainers.comparison.report import plots
 from emberlink.trainers.comparison.report.page import Chapter, Picture, ReplayFile
-from emberlink.trainers.comparison.runs import newest_checkpoint
 from emberlink.trainers.evaluation import evaluate
 from emberlink.trainers.evaluation.actor import load_actor
 from emberlink.trainers.evaluation.episodes import Panel
 from emberlink.trainers.evaluation.plots import timelapse
 from emberlink.trainers.replay.page import Replay
 from emberlink.trainers.replay.recording import Episode
+from emberlink.trainers.runs.run_folder import RunFolder
 
 
 @dataclass(frozen=True)
@@ -94,8 +94,8 @@ def _films(
     without: list[str] = []
     for place, group in enumerate(numbers.section.as_trained, 1):
         run = group.runs[0]
-        newest = newest_checkpoint(run.path)
-        if newest is None:
+        newest = RunFolder(run.path).newest
+        if not newest.exists():
             without.append(str(run.path))
             continue
         say(f"timelapse of {group.label}")

@@ -1,1 +1,0 @@
-"""Sends a run's numbers and figures to trackers: wandb, TensorBoard, CSV."""
