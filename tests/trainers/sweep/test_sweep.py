@@ -12,6 +12,7 @@ import pytest
 from rich.console import Console
 
 from emberlink.trainers.cli.main import main
+from emberlink.trainers.runs import checkpoint
 from emberlink.trainers.runs.lock import Lock
 from emberlink.trainers.runs.run_folder import RunFolder
 from emberlink.trainers.sweep.combinations import combinations
@@ -98,9 +99,9 @@ def test_errors_are_one_line_before_training(arguments, said, capsys, tmp_path, 
 def finish(run: RunFolder) -> None:
     """Adds the files of a training and its evaluation."""
     for episode in range(len(run.metrics()) + 1, run.config().episodes + 1):
-        run.append("metrics.jsonl", {"episode": episode, "coverage": 50.0})
-    (run.checkpoints / "step_000000040.safetensors").touch()
-    run.write("eval.json", {"checkpoint": "step_000000040.safetensors"})
+        run.append({"episode": episode, "coverage": 50.0})
+    checkpoint.write(run.newest, checkpoint.header_of(run.config(), 40), {})
+    run.write("eval.json", {"step": 40})
 
 
 class Instant(Executor):
