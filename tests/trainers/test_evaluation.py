@@ -18,7 +18,7 @@ from emberlink.trainers.cli import main
 from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.evaluation import command, evaluate, plots, tables
 from emberlink.trainers.runs.run_folder import RunFolder
-from emberlink.trainers.terminal import SafeConsole
+from emberlink.trainers.terminal.console import SafeConsole
 
 SMALL = ["env.horizon=12", "env.num_uavs=2", "learner.hidden=[8,8]", "env.grid=[12,10]"]
 

@@ -4,7 +4,6 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from emberlink.trainers.cli import completion
 from emberlink.trainers.cli.parser import command
 
 if TYPE_CHECKING:
@@ -27,7 +26,6 @@ def add_compare(commands: Any) -> None:
     comparison.add_argument(
         "folders",
         metavar="RUN",
-        completer=completion.runs,
         nargs="+",
         type=Path,
         help="run folders, folders of run folders, or names such as pretrained:tuned",

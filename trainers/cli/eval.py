@@ -4,7 +4,6 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from emberlink.trainers.cli import completion
 from emberlink.trainers.cli.parser import MOST_FIRES, between, command
 
 if TYPE_CHECKING:
@@ -26,13 +25,11 @@ def add_eval(commands: Any) -> None:
     evaluation.add_argument(
         "folder",
         metavar="RUN",
-        completer=completion.runs,
         help="a run folder, or pretrained:METHOD, pretrained:SETUP/METHOD",
     )
     evaluation.add_argument(
         "overrides",
         metavar="key=value",
-        completer=completion.settings,
         nargs="*",
         default=[],
         help="keys of comm. or env. to change, such as env.radio.loss=0.5, world=NAME, or "

@@ -4,7 +4,6 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from emberlink.trainers.cli import completion
 from emberlink.trainers.cli.parser import command, command_group, positive
 
 if TYPE_CHECKING:
@@ -42,14 +41,12 @@ def _add_preview(actions: Any) -> None:
     preview.add_argument(
         "source",
         metavar="SOURCE",
-        completer=completion.fires_and_files,
         help="a scenario (huygens, or huygens:3 for its test fire 3) or a file "
         "(or bank.tif:3 for fire 3 in it)",
     )
     preview.add_argument(
         "overrides",
         metavar="key=value",
-        completer=completion.settings,
         nargs="*",
         help=_KEYS,
     )
@@ -72,13 +69,11 @@ def _add_make(actions: Any) -> None:
     make.add_argument(
         "scenario",
         metavar="SCENARIO",
-        completer=completion.fires,
         help="a file in configs/fire: huygens, ...",
     )
     make.add_argument(
         "overrides",
         metavar="key=value",
-        completer=completion.settings,
         nargs="*",
         help=_KEYS,
     )
@@ -116,7 +111,6 @@ def _add_import(actions: Any) -> None:
     imported.add_argument(
         "arguments",
         metavar="FILE | key=value",
-        completer=completion.files_and_settings,
         nargs="+",
         help="files with one fire or more; " + _KEYS,
     )

@@ -1,13 +1,18 @@
-"""Defines the arguments of `emberlink list`."""
+"""Defines the arguments of `emberlink list` and prints the names."""
 
 import argparse
+import ast
 from typing import TYPE_CHECKING, Any
 
-from emberlink.trainers.cli.completion import KINDS, kinds
+from emberlink.configs import describe, entry_points, known
+from emberlink.envs.utils.errors import UserError, unknown
+from emberlink.policies import scripted
 from emberlink.trainers.cli.parser import command
 
 if TYPE_CHECKING:
     from rich.console import Console
+
+KINDS = ("methods", "setups", "worlds", "fires", "learners", "executors", "policies")
 
 
 def add_list(commands: Any) -> None:
@@ -21,51 +26,44 @@ def add_list(commands: Any) -> None:
         "emberlink list worlds",
     )
     listing.add_argument(
-        "kinds",
-        metavar="KIND",
-        completer=kinds,
-        nargs="*",
-        default=[],
-        help=f"{', '.join(kinds())} (default: all)",
+        "kinds", metavar="KIND", nargs="*", default=[], help=f"{', '.join(KINDS)} (default: all)"
     )
 
 
 def _list(options: argparse.Namespace, console: "Console") -> int:
-    from emberlink.envs.utils.errors import UserError
+    from rich.table import Table
 
     for kind in options.kinds:
-        if kind not in kinds():
-            raise UserError(f"{kind!r} is not known; known: {', '.join(kinds())}")
-    wanted = options.kinds or kinds()
+        if kind not in KINDS:
+            raise UserError(unknown(kind, KINDS))
+    wanted = options.kinds or KINDS
     for kind in wanted:
+        table = Table(box=None, show_header=False, padding=(0, 2, 0, 0), pad_edge=False)
+        table.add_column(no_wrap=True)
         if len(wanted) > 1:
-            console.print(f"{kind}:", style="bold")
-        _print(described(kind), "  " if len(wanted) > 1 else "", console)
+            table.title, table.title_justify, table.title_style = f"{kind}:", "left", "bold"
+        for name, text in described(kind):
+            table.add_row(name, text)
+        console.print(table)
     return 0
 
 
 def described(kind: str) -> list[tuple[str, str]]:
-    """Returns the names of a kind and a sentence about each, "" where there is none."""
-    import inspect
+    """Returns the names of a kind and a sentence about each, "" where there is none.
 
-    from emberlink.configs import describe, known
-
+    Nothing is imported for it: classes of policies are described by their source.
+    """
     if kind != "policies":
-        return [(name, describe(KINDS[kind], name)) for name in known(KINDS[kind])]
-    from emberlink.policies.scripted.registry import SCRIPTED  # imports torch
-
-    texts = {name: inspect.getdoc(policy) or "" for name, policy in SCRIPTED.items()}
-    return [(name, " ".join(text.split("\n\n")[0].split())) for name, text in texts.items()]
-
-
-def _print(rows: list[tuple[str, str]], indent: str, console: "Console") -> None:
-    """Prints names and descriptions in two columns; on a terminal, descriptions are wrapped."""
-    import textwrap
-
-    column = max((len(name) for name, _ in rows), default=0) + 2
-    width = console.width - len(indent) - column if console.is_terminal else 10_000
-    for name, text in rows:
-        first, *rest = textwrap.wrap(text, max(width, 20)) or [""]
-        console.print(f"{indent}{name:{column}}{first}".rstrip(), soft_wrap=True, highlight=False)
-        for line in rest:
-            console.print(" " * (len(indent) + column) + line, soft_wrap=True, highlight=False)
+        group = kind.removesuffix("s")
+        return [(name, describe(group, name)) for name in known(group)]
+    (folder,) = scripted.__path__
+    rows = []
+    for name in scripted.ORDER:
+        with open(f"{folder}/{name}.py", encoding="utf-8") as file:
+            classes = [
+                node for node in ast.parse(file.read()).body if isinstance(node, ast.ClassDef)
+            ]
+        text = ast.get_docstring(classes[-1]) or ""
+        rows.append((name, " ".join(text.split("\n\n")[0].split())))
+    points = entry_points.read("emberlink.scripted")
+    return [*rows, *sorted((point.name, f"of the package {point.module}") for point in points)]

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from typing import Any
 
+from emberlink.envs.utils.errors import UserError, unknown
 from emberlink.trainers.cli.compare import add_compare
 from emberlink.trainers.cli.completion import SHELLS, PrintScript, answer
 from emberlink.trainers.cli.doctor import add_doctor
@@ -38,95 +39,62 @@ def main(arguments: Sequence[str] | None = None) -> int:
     traceback.
     """
     if sys.platform == "win32":
-        print("emberlink: runs on Linux and macOS; on Windows, use WSL", file=sys.stderr)
-        return 2
+        return _report("emberlink", "runs on Linux and macOS; on Windows, use WSL")
+    words = list(sys.argv[1:] if arguments is None else arguments)
     try:
         with one_line_warnings():
-            status = _parse_and_run(arguments)
+            return _flush(_run(words))
     except SystemExit as ended:  # of argparse, after a help or an error
         raise SystemExit(_flush(int(ended.code or 0))) from None
-    except BaseException:
-        _flush(1)
-        raise
-    return _flush(status)
 
 
-def _parse_and_run(arguments: Sequence[str] | None) -> int:
-    parser = _parser()
+def _run(words: list[str]) -> int:
+    parser, names = _parser()
     if "_ARGCOMPLETE" in os.environ:  # of the script that --completion prints
         answer(parser)
-    try:
-        options = parser.parse_args(arguments)
-        if options.command is None:
-            parser.print_help()
-            return 0
-    except OSError as error:  # of a help or the version
-        return _unwritable("emberlink", error)
-    return _run(options)
-
-
-def _run(options: argparse.Namespace) -> int:
+    if not words:
+        parser.print_help()
+        return 0
+    if not words[0].startswith("-") and words[0] not in names:
+        parser.error(f"command {unknown(words[0], names)}")
+    options = parser.parse_args(words)
+    program = f"emberlink {options.command}"
     # torchrl's messages of level INFO would disturb the progress bar.
     os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")
     try:
-        # Imported here, since Ctrl-C during the import must end in one line, too.
-        from emberlink.trainers.terminal import SafeConsole
+        from emberlink.trainers.terminal.console import SafeConsole
 
         return options.run(options, SafeConsole())
     except KeyboardInterrupt:
-        return _report(options, "stopped", INTERRUPTED)
+        return _report(program, "stopped", INTERRUPTED)
+    except UserError as error:
+        return _report(program, str(error))
     except OSError as error:
-        if error.errno == errno.EPIPE:
-            return _BROKEN_PIPE
-        if _is_output(error):
-            return _unwritable(f"emberlink {options.command}", error)
-        if error.errno not in (*_FULL, *_OF_PATHS):
-            raise
-        name = error.filename or "a file"
-        what = "cannot be written: " if error.errno in _FULL else ""
-        return _report(options, f"{name}: {what}{error.strerror}")
-    except Exception as error:
-        message = _message(error)
-        if message is None:
-            raise
-        return _report(options, message)
+        return _of_system(program, error)
+    except RuntimeError as error:
+        # PyTorch has no error of its own for memory of the CPU.
+        if "DefaultCPUAllocator" in str(error) or type(error).__name__ == "OutOfMemoryError":
+            return _report(program, f"not enough memory: {str(error).splitlines()[0]}")
+        raise
 
 
-def _message(error: Exception) -> str | None:
-    """Returns the message of a user's mistake; None for a defect of the program."""
-    from emberlink.envs.utils.errors import UserError
-
-    if isinstance(error, UserError):
-        return str(error)
-    # PyTorch has no error of its own for memory of the CPU.
-    allocator = "DefaultCPUAllocator" in str(error) or type(error).__name__ == "OutOfMemoryError"
-    if isinstance(error, RuntimeError) and allocator:
-        return f"not enough memory: {str(error).splitlines()[0]}"
-    return None
+def _of_system(program: str, error: OSError) -> int:
+    """Reports an error of the output, of a full disk or of a path; others are defects."""
+    if error.errno == errno.EPIPE:
+        return _BROKEN_PIPE
+    if error.errno not in (*_FULL, *_OF_PATHS, errno.EBADF):
+        raise error
+    status = 1 if error.filename == "standard output" else 2
+    written = "cannot be written: " if error.errno in _FULL or status == 1 else ""
+    return _report(program, f"{error.filename or 'a file'}: {written}{error.strerror}", status)
 
 
-def _is_output(error: OSError) -> bool:
-    from emberlink.trainers.terminal import OutputError
-
-    return isinstance(error, OutputError)
-
-
-def _report(options: argparse.Namespace, message: str, status: int = 2) -> int:
+def _report(program: str, message: str, status: int = 2) -> int:
     """Prints a message on one line and returns the exit status."""
     line = "".join(c if c.isprintable() else " " for c in " ".join(message.split()))
     with suppress(OSError):  # the terminal may be gone
-        print(f"emberlink {options.command}: {line}", file=sys.stderr)
+        print(f"{program}: {line}", file=sys.stderr)
     return status
-
-
-def _unwritable(program: str, error: OSError) -> int:
-    """Reports that standard output cannot be written and returns the exit status."""
-    if error.errno == errno.EPIPE:
-        return _BROKEN_PIPE
-    with suppress(OSError):
-        reason = error.strerror or error
-        print(f"{program}: standard output: cannot be written: {reason}", file=sys.stderr)
-    return 1
 
 
 def _flush(status: int) -> int:
@@ -134,19 +102,20 @@ def _flush(status: int) -> int:
 
     An output that cannot be flushed is discarded, so that Python does not report it at its end.
     """
-    if sys.stdout is None:  # closed by the shell: >&-
-        return status
     try:
-        sys.stdout.flush()
+        if sys.stdout is not None:  # closed by the shell: >&-
+            sys.stdout.flush()
     except OSError as error:
         null = os.open(os.devnull, os.O_WRONLY)
         os.dup2(null, sys.stdout.fileno())
         os.close(null)
-        return status or _unwritable("emberlink", error)
+        error.filename = "standard output"
+        return status or _of_system("emberlink", error)
     return status
 
 
-def _parser() -> Parser:
+def _parser() -> tuple[Parser, list[str]]:
+    """Returns the parser and the names of the commands."""
     parser = Parser(
         prog="emberlink",
         description="Teams of UAVs that learn to find and cover a spreading wildfire.",
@@ -159,13 +128,13 @@ def _parser() -> Parser:
         choices=SHELLS,
         help="print a completion script, which the shell evaluates, and exit",
     )
-    commands = parser.add_subparsers(dest="command", metavar="COMMAND")
+    commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
     for add in (
         *(add_train, add_eval, add_compare, add_render),
         *(add_sweep, add_fire, add_world, add_list, add_doctor),
     ):
         add(commands)
-    return parser
+    return parser, list(commands.choices)
 
 
 class _Version(argparse.Action):
@@ -174,5 +143,5 @@ class _Version(argparse.Action):
     def __call__(self, parser: Any, *_: object) -> None:
         from importlib.metadata import version
 
-        parser._print_message(f"emberlink {version('emberlink')}\n", sys.stdout)
+        print(f"emberlink {version('emberlink')}")
         parser.exit()

@@ -1,9 +1,9 @@
-"""Defines the parser of the command line, its usage errors, and functions shared by commands."""
+"""Defines the parser of the command line, its one-line errors, and functions shared by commands."""
 
 import argparse
 import difflib
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import suppress
 from typing import Any, NoReturn
 
@@ -26,13 +26,6 @@ class Parser(argparse.ArgumentParser):
 
     _is_intermixed = False
 
-    def add_argument(self, *names: str, completer: Any = None, **options: Any) -> argparse.Action:
-        """Adds an argument, with a function of `completion` that returns its words."""
-        argument = super().add_argument(*names, **options)
-        if completer is not None:
-            argument.completer = completer  # pyright: ignore[reportAttributeAccessIssue]
-        return argument
-
     def parse_known_args(self, args=None, namespace=None):  # pyright: ignore
         """Parses as argparse does; unknown options are errors."""
         if self._is_intermixed or self._subparsers is not None:
@@ -44,18 +37,8 @@ class Parser(argparse.ArgumentParser):
             self._is_intermixed = False
         for text in unknown:
             if text.startswith("-"):
-                self.error(self._unknown_option(text, list(args or ())))
+                self.error(f"option {text} is not known{self._hint(text)}")
         return parsed, unknown
-
-    def _print_message(self, message: str, file: Any = None) -> None:
-        """Writes a message to a file, or to standard error if it is None.
-
-        Raises:
-            OSError: it cannot be written. argparse itself would not report this.
-        """
-        stream = file or sys.stderr
-        if stream is not None:
-            stream.write(message)
 
     def error(self, message: str) -> NoReturn:
         """Prints the message and exits with status 2."""
@@ -64,23 +47,14 @@ class Parser(argparse.ArgumentParser):
             print(f"{self.prog}: {text} (see {self.prog} --help)", file=sys.stderr)
         raise SystemExit(2)
 
-    def _unknown_option(self, text: str, arguments: Sequence[str]) -> str:
-        """Returns a message with the most similar option, or with key=value."""
-        name, _, value = text.partition("=")
+    def _hint(self, text: str) -> str:
+        """Returns the most similar option, or that settings are given as key=value."""
         options = [option for action in self._actions for option in action.option_strings]
-        near = difflib.get_close_matches(name, options, n=1)
-        message = f"option {name} is not known"
+        near = difflib.get_close_matches(text.partition("=")[0], options, n=1)
         if near:
-            return f"{message}; did you mean {near[0]}?"
-        if self._takes_keys() and name.startswith("--"):
-            after = arguments[arguments.index(text) + 1 :] if text in arguments else []
-            value = value or next((word for word in after[:1] if "=" not in word), "VALUE")
-            key = name.removeprefix("--").replace("-", "_")
-            return f"{message}; keys are given as {key}={value}"
-        return message
-
-    def _takes_keys(self) -> bool:
-        return any("key=value" in str(action.metavar) for action in self._actions)
+            return f"; did you mean {near[0]}?"
+        keys = any("key=value" in str(action.metavar) for action in self._actions)
+        return "; settings are given as key=value" if keys else ""
 
 
 def command(
@@ -116,12 +90,9 @@ def command(
 
 
 def command_group(commands: Any, name: str, summary: str, description: str, example: str) -> Any:
-    """Adds a command with subcommands, which alone prints its help.
+    """Adds a command with subcommands, which alone prints its help; returns their group.
 
     Arguments are those of `command`.
-
-    Returns:
-        The object to which `command` adds the subcommands.
     """
 
     def print_help(_: argparse.Namespace, console: Any) -> int:

@@ -4,7 +4,6 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from emberlink.trainers.cli import completion
 from emberlink.trainers.cli.parser import Parser, between, command, positive
 
 if TYPE_CHECKING:
@@ -36,7 +35,6 @@ def _add_episodes(rendering: Parser) -> None:
     add(
         "runs",
         metavar="RUN",
-        completer=completion.runs,
         nargs="+",
         help="a run folder, or pretrained:METHOD; after it KEY=VALUE, such as env.radio.range=0, "
         "for other settings of env and comm, or world=NAME",
@@ -44,7 +42,6 @@ def _add_episodes(rendering: Parser) -> None:
     add(
         "--policy",
         metavar="NAME",
-        completer=completion.policies,
         action="append",
         default=[],
         help="a scripted policy to draw, too; may be given several times",
@@ -52,7 +49,6 @@ def _add_episodes(rendering: Parser) -> None:
     add(
         "--fire",
         metavar="FIRE",
-        completer=completion.fires,
         help="a held-out fire: NAME, INDEX or NAME:INDEX, such as huygens:3 (default: huygens:0, "
         "or the first of the run's own fires if evaluations leave huygens out)",
     )

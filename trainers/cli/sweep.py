@@ -4,7 +4,6 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from emberlink.trainers.cli import completion
 from emberlink.trainers.cli.parser import command, positive
 
 if TYPE_CHECKING:
@@ -28,7 +27,6 @@ def add_sweep(commands: Any) -> None:
     sweep.add_argument(
         "arguments",
         metavar="METHOD | key=value,value",
-        completer=completion.sweep_arguments,
         nargs="+",
         help="methods (default: all); keys as for train, with one value or several; "
         "executor=local, submitit (SLURM) or ray, and its keys executor.KEY=value",

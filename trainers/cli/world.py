@@ -4,7 +4,6 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from emberlink.trainers.cli import completion
 from emberlink.trainers.cli.parser import MOST_FIRES, between, command, command_group
 
 if TYPE_CHECKING:
@@ -33,7 +32,6 @@ def add_world(commands: Any) -> None:
     check.add_argument(
         "arguments",
         metavar="NAME | key=value",
-        completer=completion.worlds_and_settings,
         nargs="*",
         help="worlds (default: all that evaluate the needed policies); keys of the world to "
         "change, such as fire.burn_time=90 or setup=tuned",

@@ -19,7 +19,7 @@ from emberlink.trainers.replay.screen import Screen, even_steps
 from emberlink.trainers.runs.checkpoint import read_header
 from emberlink.trainers.runs.run_folder import RunFolder
 from emberlink.trainers.runs.versions import versions
-from emberlink.trainers.terminal import OutputError
+from emberlink.trainers.terminal.console import OutputError
 
 
 def evaluate_run(

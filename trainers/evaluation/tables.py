@@ -10,7 +10,7 @@ from rich.text import Text
 from emberlink.envs import metrics
 from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.evaluation.results import LEARNED, Results, means
-from emberlink.trainers.terminal import print_table
+from emberlink.trainers.terminal.table import print_table
 
 
 def print_results(

@@ -1,6 +1,5 @@
-"""Defines a rich console that supports any encoding, width and text."""
+"""Defines the console of the command line."""
 
-import errno
 import os
 import sys
 from collections.abc import Iterator
@@ -19,11 +18,8 @@ _CONTROL_CODES = (
     *range(0x2066, 0x206A),
 )
 _NO_CONTROL = dict.fromkeys(_CONTROL_CODES, "?")
-_PLAIN = {
-    **{"→": "->", "←": "<-", "↑": "^", "↓": "v", "…": "...", "±": "+/-", "\u00d7": "x"},
-    **{"≥": ">=", "≤": "<=", "≈": "~", "°": " deg"},
-    **dict.fromkeys("\u2212\u2013\u2014", "-"),  # minus sign and dashes
-}
+_WITHOUT_TERMINAL = 1000
+"""columns of a pipe or a file"""
 
 
 class OutputError(OSError):
@@ -33,28 +29,19 @@ class OutputError(OSError):
 class SafeConsole(Console):
     """A console on standard output.
 
-    Differences from rich's console:
-
-    - Characters that the output's encoding lacks are replaced, so no print fails on them.
-    - Control characters in the text, such as escape sequences in a file's name, are replaced.
-    - Brackets and colons in the text are printed as they are.
-    - A width of 0 (`COLUMNS=0`) is ignored.
-    - A table that is wider than the output is printed in parts, see `print_table`.
-    - An output that cannot be written to raises `OutputError`.
+    Differences from rich's console: control characters in names, such as escape sequences, are
+    replaced, as are characters that the encoding lacks; tables have the style of `print_table`;
+    lines of pipes and files are as long as the text; an output that cannot be written to raises
+    `OutputError`.
     """
 
     def __init__(self) -> None:
-        environ = dict(os.environ)
-        if environ.get("COLUMNS", "").isdigit() and int(environ["COLUMNS"]) == 0:
-            del environ["COLUMNS"]
-        output: Any = _StandardOutput()
-        super().__init__(markup=False, emoji=False, highlight=False, file=output, _environ=environ)
-        self._is_limited = self.is_terminal or environ.get("COLUMNS", "").isdigit()
-
-    @property
-    def line_width(self) -> int | None:
-        """The width of a line in columns; None for a pipe or a file without `COLUMNS`."""
-        return self.width if self._is_limited else None
+        output: Any = _Output()
+        super().__init__(markup=False, emoji=False, highlight=False, file=output)
+        if not self.is_terminal and not os.environ.get("COLUMNS", "").isdigit():
+            self.width = _WITHOUT_TERMINAL
+        elif self.width < 1:  # COLUMNS=0
+            self.width = 80
 
     def print(self, *objects: Any, **options: Any) -> None:
         """Prints as rich does, but tables with `print_table`."""
@@ -67,51 +54,29 @@ class SafeConsole(Console):
         self, renderable: RenderableType, options: ConsoleOptions | None = None
     ) -> Iterator[Segment]:
         """Renders as rich does, with control characters in the text replaced."""
-        for segment in super().render(renderable, options):
-            text, style, control = segment
-            yield segment if control else Segment(text.translate(_NO_CONTROL), style)
+        for text, style, control in super().render(renderable, options):
+            yield Segment(text if control else text.translate(_NO_CONTROL), style, control)
 
 
-class _StandardOutput:
-    """Forwards to the current `sys.stdout` at each write; see `SafeConsole`."""
+class _Output:
+    """Forwards to the current `sys.stdout`."""
 
     def write(self, text: str) -> int:
-        stream = _stdout()
-        if stream is None:  # `>&-` in a shell
-            raise OutputError(errno.EBADF, "it is closed", "standard output")
         try:
-            return stream.write(_encodable(text, getattr(stream, "encoding", None) or "utf-8"))
+            encoding = sys.stdout.encoding or "utf-8"
+            return sys.stdout.write(text.encode(encoding, "replace").decode(encoding))
         except OSError as error:
-            raise _output_error(error) from None
+            raise _named(error) from None
 
     def flush(self) -> None:
         try:
-            if (stream := _stdout()) is not None:
-                stream.flush()
+            sys.stdout.flush()
         except OSError as error:
-            raise _output_error(error) from None
+            raise _named(error) from None
 
     def __getattr__(self, name: str) -> Any:
-        return getattr(_stdout(), name)
+        return getattr(sys.stdout, name)
 
 
-def _stdout() -> Any:
-    # While rich shows a progress bar, it replaces sys.stdout.
-    return getattr(sys.stdout, "rich_proxied_file", sys.stdout)
-
-
-def _output_error(error: OSError) -> OutputError:
+def _named(error: OSError) -> OutputError:
     return OutputError(error.errno, error.strerror or str(error), "standard output")
-
-
-def _encodable(text: str, encoding: str) -> str:
-    """Replaces characters that cannot be encoded by similar ASCII or a question mark."""
-
-    def fits(characters: str) -> bool:
-        try:
-            characters.encode(encoding)
-        except UnicodeEncodeError:
-            return False
-        return True
-
-    return text if fits(text) else "".join(c if fits(c) else _PLAIN.get(c, "?") for c in text)

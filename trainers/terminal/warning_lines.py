@@ -7,28 +7,20 @@ from contextlib import contextmanager
 
 @contextmanager
 def one_line_warnings() -> Iterator[None]:
-    """Prints each `UserWarning` as `emberlink: warning: ...`, until the end of the context.
+    """Prints each `UserWarning` once as `emberlink: warning: ...`, until the end of the context.
 
-    The same text is printed once, also if several parts of the program warn of it. Other categories
-    are not meant for users and keep their place. Only what is printed changes: warnings can still
-    be recorded, ignored, or turned into errors.
+    Other categories are not meant for users and keep their place. Only what is printed changes:
+    warnings can still be recorded, ignored, or turned into errors.
     """
     before, printed = warnings.formatwarning, set[str]()
 
-    def formatted(
-        message: Warning | str,
-        category: type[Warning],
-        filename: str,
-        lineno: int,
-        line: str | None = None,
-    ) -> str:
+    def formatted(message, category, *place) -> str:
         if not issubclass(category, UserWarning):
-            return before(message, category, filename, lineno, line)
-        text = " ".join(str(message).split())
-        if text in printed:
-            return ""
+            return before(message, category, *place)
+        text = "".join(c if c.isprintable() else "?" for c in " ".join(str(message).split()))
+        line = "" if text in printed else f"emberlink: warning: {text}\n"
         printed.add(text)
-        return f"emberlink: warning: {''.join(c if c.isprintable() else '?' for c in text)}\n"
+        return line
 
     warnings.formatwarning = formatted
     try:

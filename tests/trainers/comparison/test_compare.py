@@ -32,7 +32,7 @@ from emberlink.trainers.comparison.runs import Run, find, read
 from emberlink.trainers.comparison.scripted import Scripted
 from emberlink.trainers.config.compose import resolve, to_values
 from emberlink.trainers.runs.run_folder import RunFolder, without_time_and_seed
-from emberlink.trainers.terminal import OutputError
+from emberlink.trainers.terminal.console import OutputError
 
 METHODS = ("consensus", "independent", "positional", "shared_memory")
 

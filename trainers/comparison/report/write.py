@@ -13,7 +13,7 @@ from emberlink.trainers.comparison.record import to_json
 from emberlink.trainers.comparison.report import chapters
 from emberlink.trainers.comparison.report.page import Report, html
 from emberlink.trainers.comparison.results import Comparison
-from emberlink.trainers.terminal import OutputError
+from emberlink.trainers.terminal.console import OutputError
 
 
 def free_folder(output: Path | None) -> Path:
