@@ -46,6 +46,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return _flush(_run(words))
     except SystemExit as ended:  # of argparse, after a help or an error
         raise SystemExit(_flush(int(ended.code or 0))) from None
+    except OSError as error:  # of a help or the version
+        error.filename = error.filename or "standard output"
+        return _of_system("emberlink", error)
 
 
 def _run(words: list[str]) -> int:

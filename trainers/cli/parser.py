@@ -40,6 +40,11 @@ class Parser(argparse.ArgumentParser):
                 self.error(f"option {text} is not known{self._hint(text)}")
         return parsed, unknown
 
+    def _print_message(self, message: str, file: Any = None) -> None:
+        """Writes a message; argparse itself would not report that it cannot be written."""
+        if stream := file or sys.stderr:
+            stream.write(message)
+
     def error(self, message: str) -> NoReturn:
         """Prints the message and exits with status 2."""
         text = "".join(c if c.isprintable() else "?" for c in message)

@@ -10,18 +10,9 @@ from emberlink.configs import known
 from emberlink.envs.utils.errors import UserError
 from emberlink.policies.networks import memory
 from emberlink.trainers.config.compose import resolve
-<<<<<<< HEAD
 from emberlink.trainers.evaluation.tables import print_results
-from emberlink.trainers.terminal import OutputError, TrainingProgress
-=======
-from emberlink.trainers.config.schema import RunConfig
-from emberlink.trainers.evaluation.command import evaluate_and_print
-from emberlink.trainers.evaluation.results import learned_means
-from emberlink.trainers.rollout.finite_actions import NonFiniteActionError
-from emberlink.trainers.runs.run_folder import RunFolder
 from emberlink.trainers.terminal.console import OutputError
 from emberlink.trainers.terminal.progress import TrainingProgress
->>>>>>> 167c253d (Command line: names are checked before torch is imported; rich prints tables and progress; completion of names alone)
 from emberlink.trainers.terminal.signals import Interrupted, Interruption
 from emberlink.trainers.tracking import check_installed
 from emberlink.trainers.training.resume import resume
@@ -180,9 +171,9 @@ def _train(trainer: Trainer, console: Console) -> None:
         if failures:
             return
         try:
-            progress.step(state.step, state.episode, setup.learner.updates)
+            progress.step(state.step)
             if state.line and state.step % trainer.config.env.horizon == 0:
-                progress.episode(state.episode, [state.line])
+                progress.episode(state.episode, state.line)
         except OutputError as error:
             failures.append(error)
             trainer.stop()
@@ -193,17 +184,6 @@ def _train(trainer: Trainer, console: Console) -> None:
         raise failures[0]
 
 
-<<<<<<< HEAD
-=======
-def _show(progress: TrainingProgress, state: Progress, trainer: Trainer) -> None:
-    if state.note:
-        progress.note(state.note, "yellow")
-    progress.step(state.step)
-    if state.lines and state.step % trainer.config.env.horizon == 0:
-        progress.episode(state.episode, state.lines[0])
-
-
->>>>>>> 167c253d (Command line: names are checked before torch is imported; rich prints tables and progress; completion of names alone)
 def _evaluate(trainer: Trainer, console: Console) -> None:
     """Evaluates the trained policy and prints the results."""
     results = trainer.evaluate(lambda text: console.print(f"  {text}", style="dim", soft_wrap=True))
