@@ -193,25 +193,28 @@ def load(
     return TrainedPolicy(actor, env.observation_spec, config, file, changes)
 
 
-def compare(paths: Reference | Sequence[Reference], output: Reference | None = None) -> Comparison:
+def compare(
+    paths: Reference | Sequence[Reference],
+    output: Reference | None = None,
+    labels: Sequence[str] = (),
+) -> Comparison:
     """Compares finished runs by setup, world, training fire and method.
 
     Args:
         paths: run folders, folders of run folders, or `pretrained:SETUP`.
-        output: a new or empty folder for compare.html, compare.json and the figures; if None, no
-            file is written.
+        output: a new or empty folder for compare.html and compare.json; if None, no file is
+            written.
+        labels: a name for the runs of each path, in place of their method.
 
     Returns:
-        Interquartile means, intervals, rankings and the paper's claims for each setup, world and
-        training fire.
+        Tables of the runs, rankings with intervals, the gain of messages and the paper's claims.
 
     Raises:
-        UserError: there are no runs, the runs cannot be compared, a file is damaged, or `output` is
-            not empty.
+        UserError: there are no runs, or `output` is not empty.
     """
     folder = None if output is None else free_folder(Path(output))
     several = [paths] if isinstance(paths, str | os.PathLike) else paths
-    comparison = compare_runs([Path(path) for path in several])
+    comparison = compare_runs([Path(path) for path in several], labels)
     return comparison if folder is None else write_report(comparison, folder)
 
 

@@ -9,6 +9,17 @@ from emberlink.trainers.cli.parser import command
 if TYPE_CHECKING:
     from rich.console import Console
 
+EXTRAS = {
+    "csv": "compare.csv, one row per run, fire and measure",
+    "latex": "compare.tex, the rankings by the world's headline measure",
+    "marl-eval": "marl_eval.json, training and held-out fires in the format of MARL-eval",
+    "replay": "a page that plays the methods side by side, for each section and fire",
+    "png": "the figures as PNG",
+    "pdf": "the figures as PDF",
+    "svg": "the figures as SVG",
+}
+"""what can be written beside the page -> its help"""
+
 
 def add_compare(commands: Any) -> None:
     """Adds the command to the parser."""
@@ -18,9 +29,9 @@ def add_compare(commands: Any) -> None:
         _compare,
         "compare runs: methods, setups, several seeds",
         "Gathers finished runs by setup, world, training fire and method and prints interquartile "
-        "means with 95 % bootstrap intervals over training seeds, and the paper's claims; writes "
-        "a new folder with compare.html (tables, the paper's figures 5 to 9, timelapses), "
-        "compare.json and the PNGs.",
+        "means with 95 % bootstrap intervals over seeds, the gain of messages, and the paper's "
+        "claims; writes a new folder with compare.html, one page with all tables and figures, and "
+        "compare.json.",
         "emberlink compare runs/ --output comparison",
     )
     comparison.add_argument(
@@ -33,9 +44,25 @@ def add_compare(commands: Any) -> None:
     comparison.add_argument(
         "--output", metavar="FOLDER", type=Path, help="a new folder (default: compare)"
     )
+    comparison.add_argument(
+        "--label",
+        metavar="NAME",
+        action="append",
+        default=[],
+        help="name of the runs of the first RUN, of the second, and so on (default: their method)",
+    )
+    for name, what in EXTRAS.items():
+        comparison.add_argument(
+            f"--{name}",
+            action="append_const",
+            const=name,
+            dest="extras",
+            default=[],
+            help=f"also write {what}",
+        )
 
 
 def _compare(options: argparse.Namespace, console: "Console") -> int:
     from emberlink.trainers.comparison.command import compare
 
-    return compare(options.folders, console, options.output)
+    return compare(options.folders, console, options.output, options.label, options.extras)

@@ -1,4 +1,4 @@
-"""Computes statistics over training seeds; each run contributes one number.
+"""Computes statistics over training seeds and their bootstrap intervals.
 
 The statistics are those of Agarwal et al., "Deep Reinforcement Learning at the Edge of the
 Statistical Precipice" (2021), with SciPy: interquartile mean, percentile bootstrap, and probability
@@ -45,18 +45,15 @@ def iqm_difference(first: Values, second: Values, axis: int = -1) -> Any:
 
 
 def probability_of_improvement(first: Values, second: Values, axis: int = -1) -> Any:
-    """Returns the probability that a value of `first` is above one of `second`; ties count half.
-
-    This is the Mann-Whitney statistic divided by the number of pairs, as in rliable.
-    """
-    pairs = first.shape[axis] * second.shape[axis]
-    return stats.mannwhitneyu(first, second, axis=axis, method="asymptotic").statistic / pairs
+    """Returns the probability that a value of `first` is above one of `second`; ties count half."""
+    a, b = np.moveaxis(first, axis, -1)[..., :, None], np.moveaxis(second, axis, -1)[..., None, :]
+    return ((a > b) + 0.5 * (a == b)).mean((-2, -1))
 
 
 def iqm_ratio_share(sample: Values, *others: Values, higher: bool, axis: int = -1) -> Any:
-    """Returns r / (1 + r) for the ratio r of an IQM to the best IQM of others; above 0.5 is better.
+    """Returns the IQM share, x / (x + best of the others); above 0.5 is better.
 
-    Unlike the ratio, the share is finite: it is 1 for a ratio to 0, and 0.5 for 0 to 0.
+    Unlike the ratio x / best, the share is finite: 1 for a ratio to 0, and 0.5 for 0 to 0.
 
     Args:
         sample, others: non-negative numbers, one per run.
@@ -72,7 +69,7 @@ def iqm_ratio_share(sample: Values, *others: Values, higher: bool, axis: int = -
 
 
 def as_ratio(share: float) -> float:
-    """Returns r for r / (1 + r); infinite for 1."""
+    """Returns the ratio x / y of a share x / (x + y); infinite for 1."""
     return share / (1 - share) if share < 1 else float("inf")
 
 
@@ -110,6 +107,34 @@ def paired_interval(statistic: Callable[..., Any], *samples: Values) -> Interval
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", stats.DegenerateDataWarning)
         low, high = _bootstrap(statistic, values, -1, RESAMPLES, paired=True)
+    return (float(low), float(high)) if np.isfinite([low, high]).all() else None
+
+
+def crossed_interval(statistic: Callable[..., Any], *samples: Values) -> Interval | None:
+    """Returns the 95 % interval of a statistic of trainings, over their seeds and the fires.
+
+    Each resample draws fires, the same for all trainings, and seeds within each training. A run's
+    number is its mean over the drawn fires. Where fires alone are drawn, an interval describes the
+    networks at hand; this one describes another training on other fires.
+
+    Args:
+        statistic: a function of arrays with the keyword `axis`; one number per run.
+        samples: [seeds, fires] for each training; the fires are the same.
+
+    Returns:
+        Lower and upper end; None if a training has only one seed, or an end is not finite.
+    """
+    if min(map(len, samples)) < 2:
+        return None
+    generator = np.random.default_rng(BOOTSTRAP_SEED)
+    fires = samples[0].shape[1]
+    share = generator.multinomial(fires, [1 / fires] * fires, RESAMPLES).T / fires
+    drawn: list[Values] = []
+    for sample in samples:
+        seeds = generator.integers(len(sample), size=(len(sample), RESAMPLES))
+        drawn.append(np.take_along_axis(sample @ share, seeds, axis=0))
+    tail = (1 - LEVEL) / 2
+    low, high = np.quantile(statistic(*drawn, axis=0), [tail, 1 - tail])
     return (float(low), float(high)) if np.isfinite([low, high]).all() else None
 
 

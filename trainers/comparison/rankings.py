@@ -1,231 +1,179 @@
-"""Computes the numbers of a section: rankings by measure, verdicts and training curves."""
+"""Computes the rankings by measure, the results of scripted policies and the training curves."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
 from itertools import zip_longest
-from typing import NamedTuple, TypeVar
+from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from emberlink.envs import metrics
-from emberlink.envs.utils.errors import UserError
-from emberlink.envs.utils.validation import unknown
 from emberlink.trainers.comparison import bootstrap
-from emberlink.trainers.comparison.bootstrap import Interval
-from emberlink.trainers.comparison.claims import Verdict, verdicts
-from emberlink.trainers.comparison.communication import CommunicationValue, communication_values
-from emberlink.trainers.comparison.groups import Group, Section
-from emberlink.trainers.comparison.scripted import REWARD, Scripted, different_rewards, scripted
-from emberlink.trainers.evaluation.evaluate import HELD_OUT_SCENARIO
+from emberlink.trainers.comparison.tables import Frame, learned
 from emberlink.trainers.evaluation.results import CURVES, LEARNED
 
-T = TypeVar("T")
+REWARD = "mean_reward"
+"""the measure that depends on a method's own reward"""
+TOLERANCE = 1e-5
+"""relative difference that is possible between devices for a scripted policy on the same fires"""
+RANKING = (
+    *("section", "fires", "measure", "label", "policy", "seeds", "values", "iqm", "low", "high"),
+    *("next", "probability", "probability_low", "probability_high", "not_ranked"),
+)
+"""columns of `rank`: `values` are the runs' means, `iqm` their interquartile mean with the ends of
+its interval, `probability` that a run is better than a run of the label in `next`"""
 
 
-@dataclass(frozen=True)
-class Row:
-    """The result of a group for one measure.
+def trained_on(runs: Frame) -> str:
+    """Returns the evaluated set of fires that a section was trained on; empty if there is none."""
+    first = runs.iloc[0]
+    names = f"{first['trained_on']}_as_trained", first["trained_on"]
+    return next((name for name in names if name in first["object"].evaluation.results), "")
 
-    Attributes:
-        method: label of the group.
-        seeds: training seeds of the group.
-        values: mean over the episodes of the run of each seed.
-        iqm: interquartile mean over seeds.
-        interval: interval of the IQM; None with one seed.
-        next: label of the next group in the ranking; None for the last group, and if the measure is
-            not ranked.
-        probability_of_improvement: probability that a run is better than a run of the next group;
-            None without a next group, and if both groups are evaluations of the same runs.
-        probability_interval: interval of this probability; None with one seed.
+
+def rank(runs: Frame, means: Frame) -> Frame:
+    """Returns the rankings of a section: by set of fires, measure and rank.
+
+    The fires trained on are first, and the headline of the world; the reward is last, since methods
+    may have different ones. Scripted policies follow the trained ones; their `seeds` are empty and
+    `iqm` is the mean over fires.
     """
+    known = [name for name in metrics.ALL if _everywhere(name, learned(means))]
+    known.sort(key=lambda name: (name == REWARD, name != runs["object"].iloc[0].headline))
+    first = trained_on(runs)
+    rows: list[dict[str, Any]] = []
+    for fires in sorted(means["fires"].unique(), key=lambda name: (name != first, name)):
+        on_fires = means[means["fires"] == fires]
+        scripted = {name: _scripted(on_fires, name) for name in known}
+        for measure in known:
+            about = {"section": runs["section"].iloc[0], "fires": fires, "measure": measure}
+            why = different_rewards(runs, scripted) if measure == REWARD else ""
+            part = learned(on_fires)[learned(on_fires)["measure"] == measure]
+            ranked = _rows(part, measure in metrics.HIGHER_IS_BETTER, bool(why))
+            rows += [{**about, "not_ranked": why, **row} for row in [*ranked, *scripted[measure]]]
+    return pd.DataFrame(rows, columns=list(RANKING))
 
-    method: str
-    seeds: list[int]
-    values: list[float]
-    iqm: float
-    interval: Interval | None
-    next: str | None
-    probability_of_improvement: float | None
-    probability_interval: Interval | None
+
+def _everywhere(measure: str, means: Frame) -> bool:
+    """Returns whether all runs have a measure."""
+    cells = ["run", "evaluated_with", "fires"]
+    having = means[means["measure"] == measure]
+    return len(having) == len(means.drop_duplicates(cells))
 
 
-@dataclass(frozen=True)
-class Ranking:
-    """The ranking of groups by one measure on one fire.
+def _rows(means: Frame, higher: bool, unranked: bool) -> list[dict[str, Any]]:
+    """Returns the rows of the trained policies of one measure, best first."""
+    groups = dict(iter(means.groupby("label")))
+    values = {label: part["value"].to_numpy(float) for label, part in groups.items()}
+    iqms = {label: float(bootstrap.iqm(sample)) for label, sample in values.items()}
+    order = list(groups)
+    if not unranked:
+        order.sort(key=lambda label: -iqms[label] if higher else iqms[label])
+    rows: list[dict[str, Any]] = []
+    for label, other in zip_longest(order, [] if unranked else order[1:]):
+        low, high = bootstrap.interval(bootstrap.iqm, values[label]) or (None, None)
+        row = {"label": label, "policy": LEARNED, "seeds": groups[label]["seed"].tolist()}
+        row |= {"values": values[label].tolist(), "iqm": iqms[label], "low": low, "high": high}
+        row |= {"next": other or ""}
+        if other is not None and not same_trainings(groups[label], groups[other]):
+            pair = (values[label], values[other])[:: 1 if higher else -1]
+            if ends := bootstrap.interval(bootstrap.probability_of_improvement, *pair):
+                row["probability"] = float(bootstrap.probability_of_improvement(*pair))
+                row["probability_low"], row["probability_high"] = ends
+        rows.append(row)
+    return rows
 
-    Attributes:
-        measure: a name in `metrics.NAMES`.
-        higher_is_better: whether more is better.
-        rows: rows of the groups, best first; sorted by label if the measure is not ranked.
-        scripted: results of each scripted policy.
-        not_ranked: reason why the measure is not ranked, else empty.
+
+def same_trainings(first: Frame, second: Frame) -> bool:
+    """Returns whether two labels are evaluations of the same runs."""
+    return not set(first["run"]).isdisjoint(second["run"])
+
+
+def _scripted(means: Frame, measure: str) -> list[dict[str, Any]]:
+    """Returns the rows of the scripted policies: one each, or several if labels have other values.
+
+    A policy that heeds messages depends on the communication of the runs it was played for.
     """
-
-    measure: str
-    higher_is_better: bool
-    rows: list[Row]
-    scripted: dict[str, list[Scripted]]
-    not_ranked: str = ""
-
-
-class Difference(NamedTuple):
-    """The difference between the IQMs of two groups, first minus second.
-
-    Attributes:
-        value: the difference.
-        interval: its interval; None if a group has only one seed.
-    """
-
-    value: float
-    interval: Interval | None
-
-
-@dataclass(frozen=True)
-class Curve:
-    """A measure of the exploring policy at every episode of training.
-
-    Attributes:
-        iqm: interquartile mean over seeds.
-        low, high: ends of its interval; None with one seed.
-    """
-
-    iqm: list[float]
-    low: list[float] | None
-    high: list[float] | None
-
-
-@dataclass(frozen=True)
-class Numbers:
-    """The numbers of a section.
-
-    Attributes:
-        section: the section.
-        fires: fire of the evaluation -> ranking of each measure.
-        verdicts: verdicts of the paper's claims.
-        curves: measure -> label of the group -> curve.
-        communication: the value of communication, where all evaluations that it needs are present.
-        notes: differences between runs.
-    """
-
-    section: Section
-    fires: dict[str, list[Ranking]]
-    verdicts: list[Verdict]
-    curves: dict[str, dict[str, Curve]]
-    communication: list[CommunicationValue]
-    notes: list[str] = field(default_factory=list)
-
-    @property
-    def on_trained(self) -> list[Ranking]:
-        """The rankings on the training fire; empty if it was not evaluated."""
-        return self.fires.get(self.section.trained_on, [])
-
-    def difference(self, first: str, second: str, measure: str, fire: str) -> Difference:
-        """Returns by how much the IQM of a group is above that of another, with its interval.
-
-        Args:
-            first, second: labels of the groups; the second is subtracted.
-            measure: a name in `metrics.ALL`.
-            fire: fire of the evaluation.
-
-        Raises:
-            UserError: a name is not known, the measure is not ranked, or both groups are
-                evaluations of the same runs, which are not independent samples.
-        """
-        rankings = _known("fire", fire, self.fires)
-        ranking = _known("measure", measure, {r.measure: r for r in rankings})
-        if ranking.not_ranked:
-            raise UserError(f"{measure} has no differences: {ranking.not_ranked}")
-        groups = {group.label: group for group in self.section.groups}
-        pair = [_known("method", label, groups) for label in (first, second)]
-        if _same_trainings(*pair):
-            raise UserError(f"{first!r} and {second!r} are evaluations of the same runs")
-        rows = {row.method: row for row in ranking.rows}
-        a, b = rows[first], rows[second]
-        if a.iqm < b.iqm:  # The resamples depend on the order, so the higher is always the first.
-            value, ends = self.difference(second, first, measure, fire)
-            return Difference(-value, ends and (-ends[1], -ends[0]))
-        ends = bootstrap.interval(bootstrap.iqm_difference, a.values, b.values)
-        return Difference(a.iqm - b.iqm, ends)
-
-
-def numbers(section: Section) -> Numbers:
-    """Computes the rankings, verdicts and curves of a section."""
-    fires = sorted(
-        section.runs[0].evaluation.results, key=lambda name: (name != HELD_OUT_SCENARIO, name)
-    )
-    notes: list[str] = []
-    rankings = {
-        fire: [_ranking(section, fire, name, notes) for name in measures(section, fire)]
-        for fire in fires
-    }
-    curves = {
-        name: {group.label: _curve(group, name) for group in section.as_trained} for name in CURVES
-    }
-    told = verdicts(section, fires, notes)
-    unique = list(dict.fromkeys(notes))
-    return Numbers(section, rankings, told, curves, communication_values(section), unique)
-
-
-def measures(section: Section, fire: str) -> list[str]:
-    """Returns the measures of all runs of a section on a fire.
-
-    The headline of the world is first, and the reward last, since methods may have different ones.
-    """
-    headline = section.runs[0].config.evaluation.headline
-    known = [
-        name
-        for name in metrics.ALL
-        if all(name in run.evaluation.results[fire][LEARNED] for run in section.runs)
-    ]
-    return sorted(known, key=lambda name: (name == REWARD, name != headline))
-
-
-def _known(what: str, name: str, known: Mapping[str, T]) -> T:
-    """Returns the entry with a name; raises a UserError if there is none."""
-    if name not in known:
-        raise UserError(f"{what} {unknown(name, known)}")
-    return known[name]
-
-
-def _ranking(section: Section, fire: str, measure: str, notes: list[str]) -> Ranking:
-    higher = measure in metrics.HIGHER_IS_BETTER
-    values = {g.label: [run.mean(fire, LEARNED, measure) for run in g.runs] for g in section.groups}
-    means = {label: float(bootstrap.iqm(np.asarray(v))) for label, v in values.items()}
-    why = different_rewards(section, fire) if measure == REWARD else ""
-    order = list(section.groups)
-    if not why:
-        order.sort(key=lambda g: -means[g.label] if higher else means[g.label])
-    rows: list[Row] = []
-    for group, other in zip_longest(order, [] if why else order[1:]):
-        sample = values[group.label]
-        probability = ends = None
-        if other is not None and not _same_trainings(group, other):
-            pair = (sample, values[other.label]) if higher else (values[other.label], sample)
-            better, worse = map(np.asarray, pair)
-            probability = float(bootstrap.probability_of_improvement(better, worse))
-            ends = bootstrap.interval(bootstrap.probability_of_improvement, *pair)
-        rows.append(
-            Row(
-                method=group.label,
-                seeds=group.seeds,
-                values=sample,
-                iqm=means[group.label],
-                interval=bootstrap.interval(bootstrap.iqm, sample),
-                next=other and other.label,
-                probability_of_improvement=probability,
-                probability_interval=ends,
+    played = means[(means["policy"] != LEARNED) & (means["measure"] == measure)]
+    rows: list[dict[str, Any]] = []
+    for policy, part in played.groupby("policy"):
+        of_labels = part.groupby("label")["value"].first()
+        distinct: list[float] = []
+        for value in of_labels:
+            distinct += [] if any(_same(value, other) for other in distinct) else [value]
+        labels = [[n for n, v in of_labels.items() if _same(v, value)] for value in distinct]
+        most = max(map(len, labels))
+        for value, names in zip(distinct, labels, strict=True):
+            whose = "all others" if len(names) == most > 2 else ", ".join(map(str, names))
+            name = str(policy).replace("_", " ") + (f" ({whose})" if len(distinct) > 1 else "")
+            rows.append(
+                {"label": name, "policy": policy, "seeds": [], "values": names, "iqm": value}
             )
-        )
-    return Ranking(measure, higher, rows, scripted(section, fire, measure, notes), why)
+    return rows
 
 
-def _same_trainings(first: Group, second: Group) -> bool:
-    """Returns whether two groups are evaluations of the same runs."""
-    return not {run.path for run in first.runs}.isdisjoint(run.path for run in second.runs)
+def _same(first: float, second: float) -> bool:
+    return abs(first - second) <= TOLERANCE * max(1.0, abs(first), abs(second))
 
 
-def _curve(group: Group, measure: str) -> Curve:
-    values = np.asarray([[line[measure] for line in run.lines] for run in group.runs], float)
-    ends = bootstrap.band(values)
-    low, high = (None, None) if ends is None else (ends[0].tolist(), ends[1].tolist())
-    return Curve(bootstrap.iqm(values, 0).tolist(), low, high)
+def different_rewards(runs: Frame, scripted: Mapping[str, Sequence[Mapping[str, Any]]]) -> str:
+    """Returns why the rewards of a section cannot be compared; an empty text if they can.
+
+    Args:
+        runs: the runs of the section.
+        scripted: measure -> rows of the scripted policies.
+    """
+    settings: Frame = pd.DataFrame(list(runs["settings"])).filter(regex=r"^env\.reward\.")
+    for key in settings.columns:
+        if settings[key].nunique(dropna=False) > 1:
+            return f"the methods' rewards differ in {key}"
+    for policy in dict.fromkeys(row["policy"] for row in scripted[REWARD]):
+        several = {
+            name: sum(row["policy"] == policy for row in rows) for name, rows in scripted.items()
+        }
+        if several.pop(REWARD) > 1 and set(several.values()) == {1}:
+            return f"the methods' rewards differ: {policy} acts alike and earns differently"
+    return ""
+
+
+def differing(runs: Frame) -> Frame:
+    """Returns the settings in which the labels of a section differ, besides communication."""
+    first = runs[runs["as_trained"]].drop_duplicates("label").set_index("label")
+    settings: Frame = pd.DataFrame(list(first["settings"]), first.index).fillna("")
+    return settings[
+        [
+            key
+            for key in settings
+            if not key.startswith(("method", "comm.", "replay")) and settings[key].nunique() > 1
+        ]
+    ]
+
+
+def unequal_scripted(means: Frame) -> list[str]:
+    """Returns notes about scripted policies that differ between the runs of a label."""
+    played = means[means["policy"] != LEARNED].groupby(["policy", "fires", "measure", "label"])
+    ends = played["value"].agg(["min", "max"])
+    apart = ends[~np.isclose(ends["min"], ends["max"], rtol=TOLERANCE, atol=TOLERANCE)]
+    return [
+        f"{policy} does not have the same {measure} on {fires} in all runs of {label} "
+        f"({row['min']:.6g} to {row['max']:.6g}): other fires, starts or another version"
+        for (policy, fires, measure, label), row in apart.iterrows()
+    ]
+
+
+def curves(runs: Frame) -> Frame:
+    """Returns the training curves of a section.
+
+    Columns: section, label, measure, episode, and the interquartile mean over seeds, `iqm`, with
+    the ends of its interval.
+    """
+    parts: list[Frame] = []
+    for label, group in runs[runs["as_trained"]].groupby("label"):
+        for measure in CURVES:
+            values = np.array([[line[measure] for line in r.lines] for r in group["object"]], float)
+            low, high = bootstrap.band(values) or (np.nan, np.nan)
+            about = {"section": group["section"].iloc[0], "label": label, "measure": measure}
+            numbers = {"iqm": bootstrap.iqm(values, 0), "low": low, "high": high}
+            episode = np.arange(1, values.shape[1] + 1)
+            parts.append(pd.DataFrame({**about, "episode": episode, **numbers}))
+    return pd.concat(parts, ignore_index=True)

@@ -1,61 +1,211 @@
-"""Compares runs and holds the results."""
+"""Compares runs and holds the results as tables."""
 
+import json
 import shlex
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
+
+import numpy as np
+import pandas as pd
 
 from emberlink.envs.utils.errors import UserError
-from emberlink.trainers.comparison.groups import gather
-from emberlink.trainers.comparison.rankings import Numbers, numbers
-from emberlink.trainers.comparison.record import to_values
+from emberlink.envs.utils.validation import unknown
+from emberlink.trainers.comparison import bootstrap, rankings, tables
+from emberlink.trainers.comparison.bootstrap import Interval
+from emberlink.trainers.comparison.claims import verdicts
+from emberlink.trainers.comparison.communication import communication_values
 from emberlink.trainers.comparison.runs import LeftOut, read_all
+from emberlink.trainers.comparison.tables import Frame
+from emberlink.trainers.evaluation.results import LEARNED
+from emberlink.trainers.runs.compact_json import finite
 
 
-@dataclass(frozen=True)
+class Difference(NamedTuple):
+    """The difference between the interquartile means of two labels, first minus second.
+
+    Attributes:
+        value: the difference.
+        interval: its interval over seeds and fires; None if a label has only one seed.
+    """
+
+    value: float
+    interval: Interval | None
+
+
+@dataclass(frozen=True, repr=False)
 class Comparison:
-    """The results of a comparison.
+    """The results of a comparison, as pandas tables.
 
     Attributes:
         paths: compared folders, as given.
-        sections: rankings, verdicts and training curves for each setup, world and training fire.
-        notes: differences between runs.
+        runs: one row per evaluation of a run.
+        means: one row per run, set of fires, policy and measure.
+        ranking: one row per set of fires, measure and label, best first; see `rankings.RANKING`.
+        claims: verdicts of the paper's claims; see `claims.COLUMNS`.
+        communication: gain of messages and value of communication; see `communication.COLUMNS`.
+        curves: one row per label, measure and training episode.
+        notes: what a reader should know.
         left_out: folders and files that are not compared, with the reason.
     """
 
     paths: tuple[Path, ...]
-    sections: tuple[Numbers, ...]
-    notes: tuple[str, ...]
-    left_out: tuple[LeftOut, ...]
+    runs: Frame
+    means: Frame
+    ranking: Frame
+    claims: Frame
+    communication: Frame
+    curves: Frame
+    notes: list[str] = field(default_factory=list)
+    left_out: list[LeftOut] = field(default_factory=list)
+
+    def __repr__(self) -> str:
+        lines = [f"Comparison of {self.runs['run'].nunique()} runs"]
+        for section, part in self.runs.groupby("section"):
+            seeds = part.groupby("label")["seed"].size()
+            lines.append(f"{section}: " + ", ".join(f"{k} ({v} seeds)" for k, v in seeds.items()))
+        return "\n".join(lines)
+
+    @property
+    def table(self) -> Frame:
+        """One row per run, policy, fire and measure: section, label, run, method, ..., value."""
+        return tables.tidy(self.means)
+
+    @property
+    def sections(self) -> list[str]:
+        """The names of the sections."""
+        return list(self.runs["section"].unique())
 
     @property
     def command(self) -> str:
         """The command line of the comparison."""
         return shlex.join(["emberlink", "compare", *sorted(map(str, self.paths))])
 
+    def difference(
+        self, first: str, second: str, measure: str, fires: str = "", section: str = ""
+    ) -> Difference:
+        """Returns by how much the interquartile mean of a label is above that of another.
+
+        Args:
+            first, second: labels; the second is subtracted.
+            measure: a measure.
+            fires: set of fires; may be empty if there is only one.
+            section: a section; may be empty if there is only one.
+
+        Raises:
+            UserError: a name is not known, the measure is not ranked, or both labels are
+                evaluations of the same runs, which are not independent samples.
+        """
+        ranking, means = self.ranking, tables.learned(self.means)
+        trained = ranking[ranking["policy"] == LEARNED]
+        for column, name in (("section", section), ("fires", fires), ("measure", measure)):
+            name = _one(column, name, trained[column].unique())
+            trained, means = (part[part[column] == name] for part in (trained, means))
+        if why := trained["not_ranked"].iloc[0]:
+            raise UserError(f"{measure} has no differences: {why}")
+        known = trained["label"].unique()
+        parts = [means[means["label"] == _one("label", label, known)] for label in (first, second)]
+        if rankings.same_trainings(*parts):
+            raise UserError(f"{first!r} and {second!r} are evaluations of the same runs")
+        iqms = [float(bootstrap.iqm(part["value"].to_numpy(float))) for part in parts]
+        samples = [np.array(part["values"].tolist(), float) for part in parts]
+        ends = bootstrap.crossed_interval(bootstrap.iqm_difference, *samples)
+        return Difference(iqms[0] - iqms[1], ends)
+
     def to_values(self) -> dict[str, Any]:
         """Returns all results as plain values, the content of compare.json."""
-        return to_values(self.command, self.sections, self.left_out, self.notes)
+        of_label = self.curves.groupby(["section", "label", "measure"], sort=False)
+        return {
+            "settings": about(),
+            "command": self.command,
+            "left_out": [{"run": path, "why": why} for path, why in self.left_out],
+            "notes": self.notes,
+            "runs": _records(self.runs.drop(columns=["object", "settings"])),
+            "ranking": _records(self.ranking),
+            "claims": _records(self.claims),
+            "communication": _records(self.communication),
+            "curves": _records(of_label[["iqm", "low", "high"]].agg(list).reset_index()),
+        }
+
+    def to_json(self) -> str:
+        """Returns all results as JSON, with the text "inf" for infinite numbers."""
+        return json.dumps(self.to_values(), indent=1, allow_nan=False) + "\n"
 
 
-def compare_runs(paths: Sequence[Path]) -> Comparison:
-    """Compares runs by setup, world, training fire and method.
+def _records(table: Frame) -> list[dict[str, Any]]:
+    """Returns the rows of a table as plain values, with None for missing numbers."""
+    return [{k: _plain(v) for k, v in row.items()} for row in table.to_dict("records")]
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, list):
+        return [_plain(item) for item in value]
+    return None if isinstance(value, float) and np.isnan(value) else finite(value)
+
+
+def _one(what: str, name: str, known: Sequence[str]) -> str:
+    """Returns a name if it is known, or the only known one for an empty name."""
+    if not name and len(known) == 1:
+        return known[0]
+    if name not in known:
+        raise UserError(f"{what} {unknown(name, list(known))}")
+    return name
+
+
+def about() -> dict[str, Any]:
+    """Returns the settings of the statistics and the versions of the libraries."""
+    return {
+        "emberlink": version("emberlink"),
+        "scipy": version("scipy"),
+        "level": bootstrap.LEVEL,
+        "resamples": bootstrap.RESAMPLES,
+        "curve_resamples": bootstrap.BAND_RESAMPLES,
+        "bootstrap_seed": bootstrap.BOOTSTRAP_SEED,
+        "few_seeds": bootstrap.FEW,
+    }
+
+
+def compare_runs(paths: Sequence[Path], labels: Sequence[str] = ()) -> Comparison:
+    """Compares runs by setup, world, training fire and label.
 
     Args:
         paths: run folders, folders of run folders, or names such as `pretrained:tuned`.
+        labels: a name for the runs of each path, in place of their method.
 
     Raises:
-        UserError: there is no finished run, runs of a section were evaluated on different fires,
-            or a file is damaged.
+        UserError: there is no finished run.
     """
     if not paths:
         raise UserError("nothing to compare: expected at least one run folder")
-    runs, left_out = read_all(paths)
-    if not runs:
+    read, left_out = read_all(paths, labels)
+    if not read:
         reasons = "".join(f"; {path}: {why}" for path, why in left_out[:1])
         raise UserError(f"no finished run among {len(left_out)}: nothing to compare{reasons}")
-    sections, notes = gather(runs)
-    results = [numbers(section) for section in sections]
-    notes += [note for result in results for note in result.notes]
-    return Comparison(tuple(paths), tuple(results), tuple(notes), tuple(left_out))
+    runs, others = tables.runs_table(read)
+    means = tables.means_table(runs)
+    notes: list[str] = []
+    parts: list[tuple[Frame, ...]] = []
+    for section, part in runs.groupby("section"):
+        of_section = means[means["section"] == section]
+        found: list[str] = []
+        parts.append(
+            (
+                rankings.rank(part, of_section),
+                verdicts(part, of_section, found),
+                communication_values(part),
+                rankings.curves(part),
+            )
+        )
+        if apart := list(rankings.differing(part)):
+            found.append(f"the rows differ in {', '.join(apart)}")
+        found += rankings.unequal_scripted(of_section)
+        notes += [f"{section}: {note}" for note in found]
+    ranking, claims, communication, curves = (
+        pd.concat([table for table in column if len(table)] or column[:1], ignore_index=True)
+        for column in zip(*parts, strict=True)
+    )
+    return Comparison(
+        tuple(paths), runs, means, ranking, claims, communication, curves, notes, left_out + others
+    )

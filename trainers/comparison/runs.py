@@ -1,23 +1,59 @@
-"""Finds finished runs on disk and reads them."""
+"""Finds finished runs on disk and reads them.
 
-import math
+A configuration is read as plain values and not checked, so that runs of earlier versions stay
+readable.
+"""
+
 import shlex
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+import numpy as np
+from pydantic import AfterValidator, ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic.dataclasses import dataclass as checked
 
 from emberlink.envs.utils.errors import UserError
-from emberlink.trainers.comparison.evaluation_file import Evaluation, read_curves, read_evaluation
-from emberlink.trainers.config.compose import flat, to_values
-from emberlink.trainers.config.schema import RunConfig
-from emberlink.trainers.evaluation.results import LEARNED
+from emberlink.envs.utils.validation import describe
+from emberlink.trainers.config.values import flat
+from emberlink.trainers.evaluation.results import CURVES, LEARNED
 from emberlink.trainers.runs import pretrained
+from emberlink.trainers.runs.compact_json import infinite
 from emberlink.trainers.runs.run_folder import RunFolder
+from emberlink.trainers.runs.safe_read import MAX_JSON, check_parts, read_text
 
 LeftOut = tuple[str, str]
 """a folder or file that is not compared, and the reason"""
+Settings = Annotated[dict[str, Any], AfterValidator(infinite)]
+_Measured = Annotated[float, Field(ge=-1e12, le=1e12, allow_inf_nan=False)]
+
+
+@checked(frozen=True, config=ConfigDict(extra="ignore"))
+class Evaluation:
+    """The content of eval.json."""
+
+    method: str
+    setup: str
+    seed: int
+    start_seed: int
+    """seed of the start positions"""
+    checkpoint: str
+    """file name of the checkpoint that was evaluated"""
+    fires: Annotated[int, Field(ge=1)]
+    """episodes per policy and fire"""
+    results: Annotated[dict[str, dict[str, dict[str, list[_Measured]]]], Field(min_length=1)]
+    """fire -> policy -> measure -> one number per episode"""
+    step: int = 0
+    """step of training of the checkpoint; 0 in files that have only its name"""
+    world: str = "paper"
+    held_out: Settings = Field(default_factory=dict)
+    """fire -> description of the held-out fires"""
+    environment: Settings = Field(default_factory=dict)
+    """settings of the environment"""
+    communication: dict[str, Settings] = Field(default_factory=dict)
+    """policy -> settings of the communication"""
 
 
 @dataclass(frozen=True)
@@ -26,7 +62,8 @@ class Run:
 
     Attributes:
         path: the run folder.
-        config: configuration of the training.
+        name: the method, or the label that the user gave.
+        settings: configuration of the training by dotted key.
         lines: lines of metrics.jsonl, one per training episode.
         evaluation: content of eval.json or of an eval_*.json.
         evaluated_with: dotted key -> value of each setting of the evaluation that differs from the
@@ -34,132 +71,180 @@ class Run:
     """
 
     path: Path
-    config: RunConfig
+    name: str
+    settings: Mapping[str, Any]
     lines: Sequence[Mapping[str, Any]]
     evaluation: Evaluation
     evaluated_with: Mapping[str, Any] = field(default_factory=dict)
 
-    @cached_property
-    def settings(self) -> dict[str, Any]:
-        """The configuration by dotted key."""
-        return flat(to_values(self.config))
+    @property
+    def now(self) -> dict[str, Any]:
+        """The settings of the evaluation by dotted key."""
+        return {**self.settings, **self.evaluated_with}
 
-    def mean(self, fire: str, policy: str, measure: str) -> float:
-        """Returns the mean over the episodes of a policy on a fire."""
-        numbers = self.evaluation.results[fire][policy][measure]
-        return math.fsum(numbers) / len(numbers)
-
-
-def settings_of(name: str) -> dict[str, Any] | str:
-    """Returns the configuration of a run by dotted key; its name if it cannot be read."""
-    try:
-        return flat(to_values(RunFolder(name).config(device="cpu")))
-    except UserError:
-        return name
+    @property
+    def headline(self) -> str:
+        """The headline measure of the run's world."""
+        return self.settings.get("evaluation.headline", "coverage")
 
 
-def read_all(paths: Iterable[Path | str]) -> tuple[list[Run], list[LeftOut]]:
+def read_all(
+    paths: Sequence[Path | str], labels: Sequence[str] = ()
+) -> tuple[list[Run], list[LeftOut]]:
     """Reads the runs of a comparison.
 
     Args:
         paths: run folders, folders of run folders, or names such as `pretrained:tuned`.
+        labels: a name for the runs of each path, in place of their method.
 
     Returns:
         The finished runs, one entry per evaluation, and the folders and files left out.
 
     Raises:
-        UserError: a path holds no run, or a file is damaged.
+        UserError: a path holds no run, or the labels are not as many as the paths.
     """
+    if labels and len(labels) != len(paths):
+        raise UserError(f"{len(labels)} labels for {len(paths)} paths: one each")
+    folders: dict[Path, tuple[Path, str]] = {}
+    for path, label in zip(paths, labels or [""] * len(paths), strict=True):
+        for folder in find(path):
+            folders.setdefault(folder.resolve(), (folder, label))
     runs: list[Run] = []
     left_out: list[LeftOut] = []
-    for path in find(paths):
-        run = read(path)
-        if isinstance(run, Run):
-            others, why = evaluated_otherwise(run)
-            runs += [run, *others]
-            left_out += why
-        else:
-            left_out.append((str(path), run))
+    for folder, label in sorted(folders.values()):
+        try:
+            run = read(folder)
+        except (UserError, OSError) as error:
+            left_out.append((str(folder), str(error)))
+            continue
+        run = replace(run, name=label or run.name)
+        others, why = evaluated_otherwise(run)
+        runs += [run, *others]
+        left_out += why
     return runs, left_out
 
 
-def find(paths: Iterable[Path | str]) -> list[Path]:
-    """Returns the run folders among `paths` and directly within them, sorted and unique.
+def find(path: Path | str) -> list[Path]:
+    """Returns the run folder of a path, or those directly within it.
 
     Raises:
-        UserError: a path is not a run folder and does not hold any.
+        UserError: there is none.
     """
-    unique: dict[Path, Path] = {}
-    for name in paths:
-        path = Path(name)
-        if pretrained.is_name(str(name)):
-            folders = pretrained.find(str(name))
-        elif (path / "config.yaml").is_file():
-            folders = [path]
-        elif path.is_dir():
-            folders = [folder.parent for folder in path.glob("*/config.yaml")]
-        else:
-            raise UserError(f"{path}: there is no such run folder")
-        if not folders:
-            raise UserError(f"{path}: neither a run folder nor a folder that holds runs")
-        for folder in sorted(folders):
-            known = unique.setdefault(folder.resolve(), folder)
-            unique[folder.resolve()] = min(known, folder)
-    return sorted(unique.values())
+    folder = Path(path)
+    if pretrained.is_name(str(path)):
+        return pretrained.find(str(path))
+    if (folder / "config.yaml").is_file():
+        return [folder]
+    if not folder.is_dir():
+        raise UserError(f"{folder}: there is no such run folder")
+    if not (found := [file.parent for file in folder.glob("*/config.yaml")]):
+        raise UserError(f"{folder}: neither a run folder nor a folder that holds runs")
+    return found
 
 
-def read(path: Path) -> Run | str:
-    """Returns a run, or the reason why it cannot be compared.
+def read(path: Path) -> Run:
+    """Returns a run.
 
     Raises:
-        UserError: a file of the run is damaged.
+        UserError: it is not finished, or not evaluated, or a file is damaged.
     """
-    folder = RunFolder(path)
-    config = folder.config(device="cpu")
-    lines = read_curves(folder)
-    if len(lines) < config.episodes:
-        return f"unfinished: {len(lines)} of {config.episodes} episodes"
+    folder, why = RunFolder(path), ""
+    settings = flat(folder.values())
+    for key in ("method", "setup", "seed", "episodes"):
+        if key not in settings:
+            raise UserError(f"{path / 'config.yaml'}: key {key!r} is missing")
+    settings.setdefault("world", "paper")
+    lines = _curves(path, int(settings["episodes"]))
     again = f"emberlink eval {shlex.quote(str(path))}"
     try:
-        evaluation = read_evaluation(path / "eval.json", config)
+        evaluation = read_evaluation(path / "eval.json", settings)
     except FileNotFoundError:
-        return f"not evaluated: there is no eval.json ({again})"
-    if folder.newest.exists() and not folder.evaluated():
-        return f"eval.json is not of the newest checkpoint ({again})"
-    return Run(path, config, lines[: config.episodes], evaluation)
+        raise UserError(f"not evaluated: there is no eval.json ({again})") from None
+    with suppress(UserError):  # no checkpoint, or a damaged one: the numbers can be compared
+        if evaluation.step != (step := folder.step()):
+            why = (
+                f"eval.json is of step {evaluation.step}, the newest checkpoint of {step} ({again})"
+            )
+    if why:
+        raise UserError(why)
+    return Run(path, settings["method"], settings, lines, evaluation)
+
+
+def read_evaluation(file: Path, settings: Mapping[str, Any]) -> Evaluation:
+    """Returns the content of an eval.json.
+
+    Args:
+        file: path of the file.
+        settings: configuration of its run, by dotted key.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        UserError: the file is damaged, incomplete, or of another run.
+    """
+    text = read_text(file, MAX_JSON)
+    try:
+        check_parts(text)
+        evaluation = TypeAdapter(Evaluation).validate_json(text)
+    except ValidationError as error:
+        raise UserError(f"{file}: {' '.join(describe(error).split())[:300]}") from None
+    except UserError as error:
+        raise UserError(f"{file}: {error}") from None
+    for key in ("method", "setup", "seed"):
+        actual, expected = getattr(evaluation, key), settings[key]
+        if actual != expected:
+            raise UserError(f"{file}: {key}={actual}, but the run's config.yaml says {expected}")
+    for fire, policies in evaluation.results.items():
+        if LEARNED not in policies:
+            raise UserError(f"{file}: results.{fire} has no policy {LEARNED!r}")
+        for policy, measured in policies.items():
+            for name, values in measured.items():
+                if len(values) != evaluation.fires:
+                    raise UserError(
+                        f"{file}: results.{fire}.{policy}.{name} has {len(values)} episodes; "
+                        f"fires={evaluation.fires}"
+                    )
+    return evaluation
+
+
+def _curves(path: Path, episodes: int) -> list[dict[str, Any]]:
+    """Returns the lines of metrics.jsonl, one per episode of a finished training."""
+    lines = RunFolder(path).metrics()[:episodes]
+    if len(lines) < episodes:
+        raise UserError(f"unfinished: {len(lines)} of {episodes} episodes")
+    for number, line in enumerate(lines, 1):
+        values = [line.get(name, np.nan) for name in CURVES]
+        if line["episode"] != number or not np.isfinite(np.array(values, float)).all():
+            raise UserError(f"{path / 'metrics.jsonl'}: line {number} is not of episode {number}")
+    return lines
 
 
 def evaluated_otherwise(run: Run) -> tuple[list[Run], list[LeftOut]]:
     """Reads the evaluations of a run with changed settings, one per eval_*.json.
 
     Returns:
-        The run with each of these evaluations, and the files left out: their checkpoint or fires
-        differ from those of eval.json, or another file has the same settings.
-
-    Raises:
-        UserError: a file is damaged.
+        The run with each of these evaluations, and the files left out: damaged ones, those whose
+        checkpoint or fires differ from those of eval.json, and a second one with equal settings.
     """
     others: list[Run] = []
     left_out: list[LeftOut] = []
-    names: dict[str, str] = {}
     for file in sorted(run.path.glob("eval_*.json")):
-        evaluation = read_evaluation(file, run.config)
-        changed = _changed_settings(run, evaluation)
-        if not changed:
+        try:
+            evaluation = read_evaluation(file, run.settings)
+        except (UserError, OSError) as error:
+            left_out.append((str(file), str(error)))
             continue
+        changed = _changed_settings(run, evaluation)
         why = [
             f"{name} is {getattr(evaluation, name)}, in eval.json {getattr(run.evaluation, name)}"
-            for name in ("world", "checkpoint", "fires", "start_seed")
+            for name in ("world", "checkpoint", "step", "fires", "start_seed")
             if getattr(evaluation, name) != getattr(run.evaluation, name)
         ]
         why += [f"{key}={changed[key]}" for key in ("env.horizon", "env.grid") if key in changed]
-        settings = repr(sorted(changed.items()))
-        if why:
+        if changed and why:
             left_out.append((str(file), f"evaluated otherwise: {', '.join(why)}"))
-        elif settings in names:
-            left_out.append((str(file), f"has the settings of {names[settings]}"))
-        else:
-            names[settings] = file.name
+        elif any(other.evaluated_with == changed for other in others):
+            left_out.append((str(file), "another file has the same settings"))
+        elif changed:
             others.append(replace(run, evaluation=evaluation, evaluated_with=changed))
     return others, left_out
 

@@ -23,7 +23,7 @@ from emberlink.envs.fire.cache import bank_key, fire_bank
 from emberlink.envs.fire.generator import load_scenario
 from emberlink.envs.utils.errors import UserError
 from emberlink.trainers.cli import main
-from emberlink.trainers.comparison.evaluation_file import read_evaluation
+from emberlink.trainers.comparison.runs import read_evaluation
 from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.runs import checkpoint_file
 from emberlink.trainers.runs.run_folder import RunFolder
@@ -412,7 +412,7 @@ def test_a_text_that_takes_more_memory_as_a_value_is_refused(part, tmp_path):
     file = tmp_path / "eval.json"
     file.write_text(text)
     with pytest.raises(UserError, match="too many lists, mappings and texts"):
-        read_evaluation(file, resolve("independent"))
+        read_evaluation(file, {})
 
 
 def test_a_long_header_of_a_checkpoint_is_not_read(tmp_path):

@@ -1,0 +1,165 @@
+"""Draws the paper's figures 5 to 9 and the results of frozen policies."""
+
+import textwrap
+from collections.abc import Iterator, Mapping, Sequence
+
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import MaxNLocator, StrMethodFormatter
+
+from emberlink.envs import metrics
+from emberlink.trainers.comparison.tables import Frame
+from emberlink.trainers.evaluation.results import CURVES, LEARNED
+
+FIGURES = {
+    5: (("mean_reward",), "Averaged rewards collected by all UAVs at each episode."),
+    6: (("coverage",), "The share of the fire region that was seen, of all that burns."),
+    7: (
+        ("tracking_first", "tracking_last"),
+        "The fastest (solid) and slowest (dotted) time taken by the UAVs to track the fire.",
+    ),
+    8: (("boundary_exits",), "Attempted moves out of the box, mean over UAVs."),
+    9: (("fire_losses",), "Times a UAV fell out of the fire region, mean over UAVs."),
+}
+"""number of the figure in the paper -> measure of each panel, and the caption"""
+COLOURS = (
+    *("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#D55E00", "#56B4E9", "#8C6D00", "#000000"),
+    *("#8CBFDD", "#F4D28C", "#8CD2BE", "#E8C1D7", "#ECB48C", "#AFDCF5", "#CBBB8C", "#999999"),
+)
+"""colours of labels, distinguishable with colour blindness (Okabe and Ito, 2008, with a darker
+yellow), and the same lighter"""
+DASHES = (
+    *((0, (7, 3)), (0, (7, 2, 1, 2)), (0, (3, 2)), (0, (7, 2, 1, 2, 1, 2)), (0, (12, 4))),
+    *((0, (3, 2, 1, 2)), (0, (12, 2, 3, 2)), (0, (1, 1)), (0, (1, 4)), (0, (12, 2, 1, 2, 1, 2))),
+)
+"""line styles of scripted policies"""
+FROZEN = ("coverage", "tracking_first", "tracking_last", "boundary_exits")
+"""measures of the figure of frozen policies, besides the world's headline"""
+LOGARITHMIC = {"tracking_first": 1.0, "boundary_exits": 0.1}
+"""measure with a logarithmic axis in that figure -> value below which the axis is linear"""
+DOTTED = "tracking_last"
+"""measure with dotted lines, as in the paper's figure 7"""
+FROZEN_CAPTION = (
+    "frozen policies. Small dots: each seed's mean over the fires. Large dot: interquartile mean "
+    "over seeds; line: 95 % bootstrap interval, none with one seed. Dashed: scripted policies, in "
+    "the rows of the runs that they were played with. The first UAV's step and exits are on a "
+    "logarithmic scale, linear near 0."
+)
+CURVES_CAPTION = (
+    "The exploring policy in each episode of training, mean over its environments. Line: "
+    "interquartile mean over seeds; band: 95 % bootstrap interval, none with one seed. Dashed: "
+    "scripted policies, mean over held-out fires of the scenario trained on."
+)
+
+
+def training(curves: Frame, scripted: Frame, measures: Sequence[str]) -> Figure:
+    """Returns training curves: the interquartile mean over seeds and its interval for each label.
+
+    Args:
+        curves: the training curves of a section.
+        scripted: results of scripted policies on the fires trained on.
+        measures: measure of each panel.
+    """
+    colours = _colours(list(curves["label"].unique()))
+    dashes = _dashes(scripted)
+    lines = len(dashes) + sum(1 + _wrapped(name).count("\n") for name in colours)
+    figure = Figure(figsize=(10.8, max(3.8, 0.4 + 0.2 * lines)), layout="constrained")
+    panels = figure.subplots(1, len(measures), squeeze=False)[0]
+    for axes, measure in zip(panels, measures, strict=True):
+        for row in scripted[scripted["measure"] == measure].to_dict("records"):
+            shown = [name for name in row["values"] if name in colours]
+            colour = colours[shown[0]] if len(shown) == 1 < len(colours) else "0.3"
+            axes.axhline(row["iqm"], color=colour, ls=dashes[row["policy"]], lw=1.3, zorder=1)
+        for label, curve in curves[curves["measure"] == measure].groupby("label"):
+            style = {"color": colours[label], "ls": ":" if measure == DOTTED else "-"}
+            marker = "o" if len(curve) == 1 else ""
+            axes.plot(curve["episode"], curve["iqm"], lw=2, marker=marker, **style)
+            if curve["low"].notna().all():
+                ends = curve["low"], curve["high"]
+                axes.fill_between(curve["episode"], *ends, color=colours[label], alpha=0.18, lw=0)
+        axes.set(xlabel="episode of training", ylabel=CURVES[measure])
+        axes.xaxis.set_major_locator(MaxNLocator(nbins=6, integer=True))
+        axes.grid(alpha=0.3)
+    return _with_legend(figure, colours, dashes)
+
+
+def frozen(ranking: Frame, labels: Sequence[str]) -> Figure:
+    """Returns the results of frozen policies: a row per label, a panel per measure.
+
+    Args:
+        ranking: the ranking on one set of fires; rows are sorted by its first measure.
+        labels: the labels as trained, which have colours.
+    """
+    is_learned = ranking["policy"] == LEARNED
+    learned, scripted = ranking[is_learned], ranking[~is_learned]
+    first = ranking["measure"].iloc[0]
+    order = list(learned[learned["measure"] == first]["label"])[::-1]
+    colours, dashes = _colours(labels), _dashes(scripted)
+    names = [_wrapped(name) for name in order]
+    tall = sum(0.14 + 0.2 * (1 + name.count("\n")) for name in names)
+    measures = [m for m in dict.fromkeys([first, *FROZEN]) if m in set(ranking["measure"])]
+    size = 3.4 * len(measures), 1.5 + max(tall, 1.4)
+    figure = Figure(figsize=size, layout="constrained")
+    panels = figure.subplots(1, len(measures), sharey=True, squeeze=False)[0]
+    for axes, measure in zip(panels, measures, strict=True):
+        for row in learned[learned["measure"] == measure].to_dict("records"):
+            y, style = order.index(row["label"]), {"color": colours.get(row["label"], "0.45")}
+            axes.plot(row["values"], [y] * len(row["values"]), "o", ms=3, alpha=0.5, **style)
+            axes.plot([row["iqm"]], [y], "o", ms=6, **style)
+            axes.plot([row["low"], row["high"]], [y, y], "|-", lw=2, ms=9, mew=1.5, **style)
+        for row in scripted[scripted["measure"] == measure].to_dict("records"):
+            for low, high in stretches([order.index(label) for label in row["values"]]):
+                style = {"color": "0.3", "ls": dashes[row["policy"]], "lw": 1.3}
+                axes.plot([row["iqm"]] * 2, [low - 0.5, high + 0.5], zorder=1, **style)
+        if measure in LOGARITHMIC:
+            axes.set_xscale("symlog", linthresh=LOGARITHMIC[measure])
+            axes.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+            axes.set_xlim(left=0)
+        better = "more" if measure in metrics.HIGHER_IS_BETTER else "less"
+        axes.set(xlabel=f"{CURVES.get(measure, measure)}\n({better} is better)")
+        axes.set_ylim(-0.5, len(order) - 0.5)
+        axes.grid(alpha=0.3, axis="x")
+    panels[0].set_yticks(range(len(order)), names, parse_math=False)
+    return _with_legend(figure, {}, dashes)
+
+
+def stretches(places: Sequence[int]) -> Iterator[tuple[int, int]]:
+    """Yields the first and the last of each run of consecutive rows."""
+    ordered = sorted(places)
+    starts = [i for i in ordered if i - 1 not in ordered]
+    ends = [i for i in ordered if i + 1 not in ordered]
+    yield from zip(starts, ends, strict=True)
+
+
+def _wrapped(label: str) -> str:
+    return textwrap.fill(label, 34, break_on_hyphens=False)
+
+
+def _colours(labels: Sequence[str]) -> dict[str, str]:
+    """Returns the colour of each label."""
+    return {label: COLOURS[i % len(COLOURS)] for i, label in enumerate(labels)}
+
+
+def _dashes(scripted: Frame) -> dict[str, tuple[int, tuple[int, ...]]]:
+    """Returns the line style of each scripted policy."""
+    names = sorted(scripted["policy"].unique())
+    return {name: DASHES[i % len(DASHES)] for i, name in enumerate(names)}
+
+
+def _with_legend(
+    figure: Figure,
+    colours: Mapping[str, str],
+    dashes: Mapping[str, tuple[int, tuple[int, ...]]],
+) -> Figure:
+    handles = [
+        Line2D([], [], color=colour, lw=2, label=_wrapped(name)) for name, colour in colours.items()
+    ]
+    handles += [
+        Line2D([], [], color="0.3", ls=dash, lw=1.3, label=f"scripted: {name.replace('_', ' ')}")
+        for name, dash in dashes.items()
+    ]
+    if handles:
+        place = {"loc": "outside right upper", "frameon": False, "handlelength": 3}
+        for text in figure.legend(handles=handles, **place).get_texts():
+            text.set_parse_math(False)  # names are not formulas
+    return figure

@@ -1,0 +1,218 @@
+"""Puts runs into tables: one row per run, one per mean, one per fire and measure.
+
+A *section* holds runs that can be compared: one setup, world, training fire, horizon, grid and set
+of held-out fires. A *row* of a ranking is a label: trainings that differ in the seed alone.
+"""
+
+import json
+import math
+import re
+from collections.abc import Hashable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from emberlink.trainers.comparison.runs import LeftOut, Run
+from emberlink.trainers.config.values import flat
+from emberlink.trainers.evaluation.results import LEARNED
+from emberlink.trainers.runs import pretrained
+
+NOT_COMPARED = (
+    *("seed", "seeds", "output", "evaluation", "baselines", "device", "logger", "on_nan"),
+    *("checkpoint_interval", "checkpoint_steps", "keep_checkpoints"),
+)
+"""first parts of keys that do not affect training"""
+WARM_START = "learner.warm_start"
+RADIO = "env.radio.range", "env.radio.loss", "env.radio.bandwidth"
+_FIRST = ("learner.name", "policy.memory")
+"""keys that name a group before all others, which often follow from them"""
+_OF_SECTION = ("setup", "world", "env.horizon", "env.grid", "fires", "start_seed")
+
+Frame = Any
+"""a pandas table; the types that pandas infers for its parts are too wide to be checked"""
+Settings = Frame
+"""one row per run, one column per key; values as on the command line, "" for a missing key"""
+
+
+def runs_table(runs: Sequence[Run]) -> tuple[Frame, list[LeftOut]]:
+    """Returns one row per evaluation of a run, sorted by section, label and seed.
+
+    Columns: section, label, run, method, setup, world, trained_on, radio, evaluated_with, seed,
+    `settings` (those that affect training, as text by key), `as_trained` and `object`, the run.
+
+    Of several runs of a label with one seed, the last by name is used, and a copy of the package's
+    policy only if there is no other. Runs that were evaluated on other fires than the first of
+    their section are left out.
+    """
+    runs = sorted(runs, key=lambda r: (r.settings["seed"], r.path.name, r.path))
+    runs.sort(key=lambda run: not pretrained.is_copy(run.path))
+    of_section = _settings([_of_section(run) for run in runs])
+    trained = [trained_with(run) for run in runs]
+    fire = of_section["fire.name"]
+    table: Frame = pd.DataFrame(
+        {
+            "section": "setup "
+            + of_section["setup"]
+            + ", world "
+            + of_section["world"]
+            + ", trained on "
+            + fire,
+            "label": [run.name for run in runs],
+            "run": [str(run.path) for run in runs],
+            "method": [run.settings["method"] for run in runs],
+            "setup": of_section["setup"],
+            "world": of_section["world"],
+            "trained_on": fire,
+            "radio": [radio_text(run.now) for run in runs],
+            "evaluated_with": [_typed(run.evaluated_with) for run in runs],
+            "seed": [run.settings["seed"] for run in runs],
+            "settings": trained,
+            "as_trained": [not run.evaluated_with for run in runs],
+            "object": runs,
+        }
+    )
+    apart = of_section.drop(columns=["setup", "world"])
+    table["section"] = named(table["section"], apart)
+    labels = pd.Series("", table.index)
+    for _, part in table.groupby("section"):
+        labels[part.index] = named(part["label"], _settings(part["settings"]))
+    other = table["evaluated_with"].map(lambda text: text and f", evaluated with {text}")
+    table["label"] = labels + other
+    twice = table.duplicated(["section", "label", "seed"], keep="last")
+    left_out = [
+        (row.run, f"seed {row.seed} of {row.label} is there twice")
+        for row in table[twice].itertuples()
+    ]
+    table, other_fires = _same_fires(table[~twice])
+    return table.sort_values(
+        ["section", "label", "seed"], ignore_index=True
+    ), left_out + other_fires
+
+
+def _of_section(run: Run) -> dict[str, Any]:
+    """Returns the settings that are the same for all runs of a section."""
+    about = {**run.settings, "fires": run.evaluation.fires, "start_seed": run.evaluation.start_seed}
+    return {k: v for k, v in about.items() if k in _OF_SECTION or k.startswith("fire.")}
+
+
+def trained_with(run: Run) -> dict[str, str]:
+    """Returns the settings that affect training, as on the command line, without the seed.
+
+    The path of a warm start loses its time and seed, since each seed has a start of its own.
+    """
+    settings = {k: word(v) for k, v in run.settings.items() if k.split(".")[0] not in NOT_COMPARED}
+    if start := settings.get(WARM_START):
+        name = re.sub(r"^\d{4}-\d\d-\d\d_\d\d-\d\d-\d\d_|_s\d+(_\d+)?$", "", Path(start).name)
+        settings[WARM_START] = str(Path(start).with_name(name))
+    return settings
+
+
+def word(value: Any) -> str:
+    """Returns a value as on the command line."""
+    if isinstance(value, float):
+        return str(int(value) if value.is_integer() else value)
+    return value if isinstance(value, str) else json.dumps(value)
+
+
+def _typed(settings: Mapping[str, Any]) -> str:
+    return ", ".join(f"{key}={word(value)}" for key, value in settings.items())
+
+
+def _settings(rows: Sequence[Mapping[str, Any]] | pd.Series) -> Settings:
+    """Returns settings as a table of text."""
+    index = rows.index if isinstance(rows, pd.Series) else None
+    words = [{key: word(value) for key, value in row.items()} for row in rows]
+    return pd.DataFrame(words, index, dtype=object).fillna("")
+
+
+def named(names: Frame, settings: Settings) -> Frame:
+    """Adds to each name, in brackets, the settings that tell it from others of the same name.
+
+    The value that more than half of the distinct settings have is not named.
+    """
+    distinct = settings.drop_duplicates()
+    result = names.copy()
+    for _, rows in settings.groupby(names):
+        keys = telling_apart(rows)
+        shares = {k: distinct[k][distinct[k] != ""].value_counts(normalize=True) for k in keys}
+        for place, row in rows[keys].iterrows():
+            told = ", ".join(
+                f"{key.replace('learner.name', 'learner')}={value}"
+                for key, value in row.items()
+                if value != "" and shares[key][value] <= 0.5
+            )
+            result[place] += f" ({told})" if told else ""
+    return result
+
+
+def telling_apart(settings: Settings) -> list[str]:
+    """Returns keys that tell distinct rows apart; none that follows from those before it."""
+    keys: list[str] = []
+    parts = 1
+    for key in sorted(settings.columns, key=lambda key: (key not in _FIRST, key == WARM_START)):
+        if (more := len(settings[[*keys, key]].drop_duplicates())) > parts:
+            keys, parts = [*keys, key], more
+    return keys
+
+
+def radio_text(settings: Mapping[str, Any], *, bandwidth: bool = True) -> str:
+    """Returns the radio of an evaluation, such as "off", "no limits" or "range 10, loss 0.2"."""
+    reach, loss, most = (settings.get(key) for key in RADIO)
+    if reach is not None and float(reach) == 0:
+        return "off"
+    parts = [] if reach is None or math.isinf(float(reach)) else [f"range {word(float(reach))}"]
+    parts += [f"loss {word(loss)}"] if loss else []
+    parts += [f"{word(most)} bytes"] if bandwidth and most is not None else []
+    return ", ".join(parts) or "no limits"
+
+
+def _same_fires(table: Frame) -> tuple[Frame, list[LeftOut]]:
+    """Leaves out the runs of each section that were evaluated on other fires than the first."""
+    left_out: list[LeftOut] = []
+    others: list[Hashable] = []
+    for _, part in table.sort_values(["section", "label", "seed"]).groupby("section", sort=False):
+        first = part.iloc[0]
+        for place, row in part.iterrows():
+            if not _alike(first["object"], row["object"]):
+                others.append(place)
+                why = f"not evaluated on the fires of {first['run']} (emberlink eval RUN)"
+                left_out.append((row["run"], why))
+    return table.drop(index=others), left_out
+
+
+def _alike(first: Run, other: Run) -> bool:
+    """Returns whether two evaluations are of the same fires, as far as both describe them."""
+    one, two = (flat(run.evaluation.held_out) for run in (first, other))
+    same = all(two[key] == value for key, value in one.items() if key in two)
+    return same and first.evaluation.results.keys() == other.evaluation.results.keys()
+
+
+def means_table(runs: Frame) -> Frame:
+    """Returns one row per run, set of fires, policy and measure.
+
+    Columns: those of `runs_table` from section to seed, policy, fires, measure, `values` (one per
+    fire) and `value`, their mean.
+    """
+    columns = list(runs.columns[: runs.columns.get_loc("seed") + 1])
+    rows = [
+        (*row[: len(columns)], policy, fires, measure, values, math.fsum(values) / len(values))
+        for row in runs.itertuples(index=False)
+        for fires, policies in row.object.evaluation.results.items()
+        for policy, measured in policies.items()
+        for measure, values in measured.items()
+    ]
+    return pd.DataFrame(rows, columns=[*columns, "policy", "fires", "measure", "values", "value"])
+
+
+def tidy(means: Frame) -> Frame:
+    """Returns one row per run, policy, fire and measure; `fire` counts from 0 in its set."""
+    table = means.drop(columns="value").rename(columns={"values": "value"}).explode("value")
+    fire = table.groupby(level=0).cumcount()
+    table.insert(table.columns.get_loc("measure"), "fire", fire)
+    return table.astype({"value": float}).reset_index(drop=True)
+
+
+def learned(means: Frame) -> Frame:
+    """Returns the rows of trained policies."""
+    return means[means["policy"] == LEARNED]
