@@ -1,25 +1,31 @@
 """Tests sweeps on submitit, SLURM and Ray, with interruptions; `make test-cluster` runs them.
 
-Each sweep trains 12 runs, whose files must be those of the local executor, byte for byte.
+Each sweep trains three runs, whose files must be those of the local executor, byte for byte.
 """
 
 import os
 import signal
 import subprocess
-import threading
+import sys
+import time
+from collections.abc import Callable
 from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
-import sweeps
-from rich.console import Console
-from slurm import INSTALL, cluster, kill_node, missing, node
+from slurm import INSTALL, cluster, missing
 
-from emberlink.trainers.sweep import executors
-from emberlink.trainers.sweep.command import sweep
-from emberlink.trainers.sweep.executors.submitit import SubmititExecutor
+from emberlink.trainers.runs.run_folder import RunFolder
 
 pytestmark = pytest.mark.cluster
+COMMAND = [
+    *(sys.executable, "-m", "emberlink.trainers.cli", "sweep", "consensus", "seed=0,1,2"),
+    *("output=runs", "episodes=40", "env.horizon=15", "env.num_uavs=2", "num_envs=2"),
+    *("learner.hidden=[8,8]", "learner.batch_size=8", "checkpoint_steps=30"),
+    *("evaluation.episodes=2", "evaluation.interval=0", "evaluation.scripted=[]"),
+    *("evaluation.huygens=false", "fire.num_train_fires=2"),
+]
+PATIENCE = 900.0
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -34,156 +40,122 @@ def _programs() -> None:
         pytest.exit("SLURM's daemons are started as root", 2)
 
 
+def start(folder: Path, *more: str, env: dict[str, str] | None = None) -> subprocess.Popen:
+    """Starts the sweep in a folder with a random.py, which nothing may import."""
+    (folder / "random.py").write_text("raise RuntimeError('wrong module')\n")
+    with (folder / "out.txt").open("ab") as out, (folder / "err.txt").open("ab") as err:
+        # -P: the sweep itself is started as the installed command is.
+        command = [COMMAND[0], "-P", *COMMAND[1:], *more]
+        return subprocess.Popen(command, cwd=folder, env=env, stdout=out, stderr=err)
+
+
+def finish(process: subprocess.Popen, folder: Path) -> None:
+    """Waits for a sweep, which must succeed and print nothing to standard error."""
+    assert process.wait(PATIENCE) == 0, (folder / "out.txt").read_text()
+    assert (folder / "err.txt").read_text() == ""
+
+
+def runs_in(folder: Path) -> list[RunFolder]:
+    return [RunFolder(file.parent) for file in sorted(folder.glob("runs/*/config.yaml"))]
+
+
+def training(folder: Path) -> int:
+    """Returns the number of runs that have a checkpoint and are not near their end."""
+    return sum(4 <= len(run.metrics()) <= 30 for run in runs_in(folder))
+
+
+def resumed(folder: Path) -> int:
+    """Returns how often a training was resumed in its middle."""
+    logs = folder.glob("runs/logs/*.txt")
+    return sum(log.read_text().count("resumed at step") for log in logs)
+
+
+def wait_for(condition: Callable[[], object], process: subprocess.Popen) -> None:
+    deadline = time.monotonic() + PATIENCE
+    while not condition():
+        assert time.monotonic() < deadline
+        assert process.poll() is None, "the sweep has ended"
+        time.sleep(0.1)
+
+
+def results(folder: Path) -> dict[str, bytes]:
+    """Returns the files that must not depend on where and how often a run was started."""
+    files = [run.path / name for run in runs_in(folder) for name in ("metrics.jsonl", "eval.json")]
+    files += [run.checkpoint() for run in runs_in(folder)]
+    return {str(file.relative_to(folder)): file.read_bytes() for file in files}
+
+
 @pytest.fixture(scope="session")
-def local(tmp_path_factory) -> dict[str, dict[str, bytes]]:
+def local(tmp_path_factory) -> dict[str, bytes]:
     """Returns the results of the local executor."""
     folder = tmp_path_factory.mktemp("local")
-    sweeps.finish(sweeps.start(folder), folder)
-    return sweeps.results(folder)
+    finish(start(folder, "executor.threads=1"), folder)
+    assert len(runs_in(folder)) == 3
+    return results(folder)
 
 
-class _Watched(SubmititExecutor):
-    """Keeps the handles of its tasks."""
-
-    def submit(self, task):
-        self.handles = [*getattr(self, "handles", []), super().submit(task)]
-        return self.handles[-1]
-
-
-def test_submitit_requeues_an_interrupted_run(local, tmp_path, monkeypatch):
-    """One run gets submitit's signal; the controller of another one is killed."""
-    monkeypatch.chdir(tmp_path)
-    made = executors.make("submitit", {"cluster": "local", "workers": 2})
-    executor = _Watched(made._config)
-    trained: list[str] = []
-
-    def interrupt() -> None:
-        sweeps.wait_for(lambda: sweeps.training(tmp_path))
-        controller = _controller_of(executor, sweeps.training(tmp_path)[0].path.name)
-        (task,) = _children(controller._process.pid)
-        os.kill(task, signal.SIGUSR2)
-        trained.append("requeued")
-        sweeps.wait_for(lambda: sweeps.resumed(tmp_path))
-        sweeps.wait_for(lambda: sweeps.training(tmp_path))
-        # This ends submitit's controller (1.5.4), and the training goes on without it.
-        _controller_of(executor, sweeps.training(tmp_path)[-1].path.name)._interrupt()
-        trained.append("orphaned")
-
-    thread = threading.Thread(target=interrupt)
-    thread.start()
-    assert sweep(sweeps.ARGUMENTS, Console(), executor=executor) == 0
-    thread.join()
-    assert trained == ["requeued", "orphaned"]
-    logs = (tmp_path / "runs" / "logs" / "submitit").glob("*.out")
-    assert sum(log.read_text().count("Requeued job") for log in logs) == 1
-    assert sweeps.results(tmp_path) == local
+def test_submitit_requeues_a_run_at_the_end_of_its_time(local, tmp_path):
+    folder = tmp_path / "a%j b"
+    folder.mkdir()
+    process = start(folder, "executor=submitit", "executor.cluster=local", "executor.workers=2")
+    wait_for(lambda: training(folder), process)
+    jobs = subprocess.check_output(["pgrep", "-f", "submitit.core._submit"], text=True).split()
+    os.kill(int(jobs[0]), signal.SIGUSR2)  # as submitit and SLURM do
+    wait_for(lambda: resumed(folder), process)
+    finish(process, folder)
+    assert results(folder) == local
+    assert [file.name for file in tmp_path.iterdir()] == ["a%j b"]
 
 
-def _controller_of(executor: _Watched, folder: str):
-    """Returns submitit's job of the run in a folder."""
-    (job,) = {h.job for h in executor.handles if h.task.arguments[0].endswith(folder)}
-    return job
+@pytest.fixture
+def slurm(tmp_path):
+    (tmp_path / "slurm").mkdir()
+    with cluster(tmp_path / "slurm") as env:
+        yield env
 
 
-def _children(process: int) -> list[int]:
-    listed = Path(f"/proc/{process}/task/{process}/children").read_text()
-    return [int(number) for number in listed.split()]
-
-
-def test_slurm_runs_come_back_after_a_preemption(local, tmp_path):
+def test_slurm_requeues_a_preempted_run(local, tmp_path, slurm):
     """A job of a partition with precedence takes both cores."""
-    folder, daemons = tmp_path / "sweep", tmp_path / "slurm"
-    folder.mkdir()
-    daemons.mkdir()
-    with cluster(daemons) as env:
-        keys = ("executor=submitit", "executor.partition=low", "executor.time=20")
-        process = sweeps.start(folder, *keys, env=env)
-        sweeps.wait_for(lambda: len(sweeps.training(folder)) == 2, process)
-        command = ["sbatch", "--partition=high", "--ntasks=2", "--output=/dev/null"]
-        subprocess.run([*command, "--wrap=sleep 1"], env=env, check=True)
-        sweeps.wait_for(lambda: sweeps.resumed(folder), process)
-        sweeps.finish(process, folder)
-    assert "DUE TO PREEMPTION" in _errors(folder)
-    assert sweeps.results(folder) == local
+    process = start(
+        tmp_path, "executor=submitit", "executor.partition=low", "executor.time=20", env=slurm
+    )
+    wait_for(lambda: training(tmp_path) == 2, process)
+    command = ["sbatch", "--partition=high", "--ntasks=2", "--output=/dev/null"]
+    subprocess.run([*command, "--wrap=sleep 1"], env=slurm, check=True)
+    wait_for(lambda: resumed(tmp_path), process)
+    finish(process, tmp_path)
+    said = [log.read_text() for log in (tmp_path / "runs/logs/submitit").glob("*.err")]
+    assert any("DUE TO PREEMPTION" in text for text in said)
+    assert results(tmp_path) == local
 
 
-def test_slurm_requeues_a_run_at_the_end_of_its_time_and_when_its_node_dies(tmp_path):
-    """The time is two minutes and the notice 50 s, so SLURM interrupts it after 10 to 70 s."""
-    folder, daemons = tmp_path / "sweep of läufe", tmp_path / "slurm"
-    folder.mkdir()
-    daemons.mkdir()
-    keys = ("executor=submitit", "executor.time=2", "executor.notice=50", "seed=0")
-    with cluster(daemons) as env:
-        process = sweeps.start(folder, *keys, "episodes=9999", env=env, methods=["independent"])
-        sweeps.wait_for(lambda: sweeps.resumed(folder) == 1, process)
-        (run,) = sweeps.runs_in(folder)
-        before = len(run.metrics())
-        sweeps.wait_for(lambda: len(run.metrics()) > before + 5, process)
-        kill_node(daemons)
-        listed = ["squeue", "--noheader", "--format=%t"]
-        sweeps.wait_for(lambda: subprocess.check_output(listed, env=env) == b"PD\n", process)
-        with node(daemons, env):
-            seen = sweeps.resumed(folder)
-            sweeps.wait_for(lambda: sweeps.resumed(folder) > seen, process)
-            process.terminate()
-            assert process.wait(sweeps.PATIENCE) == 128 + signal.SIGTERM
-    said = "".join(log.read_text() for log in (folder / "runs/logs/submitit").glob("*.out"))
-    assert "Requeued job" in said
-    episodes = [line["episode"] for line in run.metrics()]
-    assert episodes == list(range(1, len(episodes) + 1))
-    assert len(episodes) >= before
+def test_a_stopped_sweep_on_slurm_saves_and_is_completed_elsewhere(local, tmp_path, slurm):
+    process = start(tmp_path, "executor=submitit", env=slurm)
+    wait_for(lambda: training(tmp_path) == 2, process)
+    process.send_signal(signal.SIGINT)
+    assert process.wait(PATIENCE) == 128 + signal.SIGINT
+    assert subprocess.check_output(["squeue", "--noheader"], env=slurm) == b""
+    finish(start(tmp_path, "executor.threads=1"), tmp_path)
+    assert resumed(tmp_path) == 2
+    assert results(tmp_path) == local
 
 
-def test_slurm_runs_come_back_after_a_signal(local, tmp_path):
-    """SLURM's notice arrives in the middle; the sweep is killed; another executor does the rest."""
-    folder, daemons = tmp_path / "sweep", tmp_path / "slurm"
-    folder.mkdir()
-    daemons.mkdir()
-    with cluster(daemons) as env:
-        process = sweeps.start(folder, "executor=submitit", "executor.share=2", env=env)
-        sweeps.wait_for(lambda: len(sweeps.training(folder)) == 2, process)
-        subprocess.run(["scancel", "--signal=USR2", "1"], env=env, check=True)
-        sweeps.wait_for(lambda: sweeps.resumed(folder), process)
-        jobs = sorted((folder / "runs/logs/submitit").glob("*_submitted.pkl"))
-        process.kill()
-        process.wait()
-        said = sweeps.finished(folder)
-        process = sweeps.start(folder, "executor=submitit", "executor.share=2", env=env)
-        sweeps.wait_for(lambda: sweeps.finished(folder) > said + 1, process)
-        process.terminate()
-        assert process.wait(sweeps.PATIENCE) == 128 + signal.SIGTERM
-        assert subprocess.check_output(["squeue", "--noheader"], env=env) == b""
-    # The second sweep has followed the jobs of the first.
-    assert jobs == sorted((folder / "runs/logs/submitit").glob("*_submitted.pkl"))
-    done = [run for run in sweeps.runs_in(folder) if run.evaluated()]
-    before = {run.path: (run.path / "eval.json").stat().st_mtime_ns for run in done}
-    sweeps.finish(sweeps.start(folder), folder)
-    assert before == {path: (path / "eval.json").stat().st_mtime_ns for path in before}
-    assert sweeps.results(folder) == local
-
-
-def _errors(folder: Path) -> str:
-    return "".join(log.read_text() for log in (folder / "runs/logs/submitit").glob("*.err"))
-
-
-def test_ray_runs_go_on_after_a_node_was_killed(local, tmp_path):
+def test_ray_starts_a_run_again_when_its_node_dies(local, tmp_path):
     import psutil
     from ray.cluster_utils import Cluster
 
     nodes = Cluster(initialize_head=True, head_node_args={"num_cpus": 1})
-    others = [nodes.add_node(num_cpus=1) for _ in range(2)]
+    other = nodes.add_node(num_cpus=1)
     nodes.wait_for_nodes()
     try:
-        keys = ("executor=ray", f"executor.address={nodes.address}")
-        process = sweeps.start(tmp_path, *keys)
-        sweeps.wait_for(lambda: len(sweeps.training(tmp_path)) == 3, process)
-        raylet = others[0].all_processes["raylet"][0].process.pid
-        victims = psutil.Process(raylet).children(recursive=True)
-        for victim in victims:
+        process = start(tmp_path, "executor=ray", f"executor.address={nodes.address}")
+        wait_for(lambda: training(tmp_path) == 2, process)
+        raylet = other.all_processes["raylet"][0].process.pid
+        for victim in psutil.Process(raylet).children(recursive=True):
             victim.kill()
-        nodes.remove_node(others[0], allow_graceful=False)
-        sweeps.finish(process, tmp_path)
+        nodes.remove_node(other, allow_graceful=False)
+        finish(process, tmp_path)
     finally:
         nodes.shutdown()
-    assert sweeps.resumed(tmp_path) >= 1
-    assert sweeps.results(tmp_path) == local
+    assert resumed(tmp_path) >= 1
+    assert results(tmp_path) == local

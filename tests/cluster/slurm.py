@@ -1,25 +1,20 @@
 """Starts SLURM with one node on this machine, for tests.
 
-    python tests/cluster/slurm.py FOLDER COMMAND...
-
-runs a command with the cluster, and stops the cluster when the command has ended. It needs root and
-Debian's packages slurmctld, slurmd and munge. All files are in FOLDER: a configuration, keys, logs.
+It needs root and Debian's packages slurmctld, slurmd, slurm-client and munge.
 """
 
 import os
 import secrets
 import shutil
-import signal
 import socket
 import subprocess
-import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 
 PROGRAMS = ("slurmctld", "slurmd", "munged", "sbatch", "squeue")
-INSTALL = "apt-get install slurmctld slurmd munge"
+INSTALL = "apt-get install slurmctld slurmd slurm-client munge"
 CORES = 2
 HOST = socket.gethostname().split(".")[0]
 CONFIG = """\
@@ -60,10 +55,12 @@ PartitionName=high Nodes={host} MaxTime=INFINITE PriorityTier=10 PreemptMode=OFF
 """
 
 
+PATH = f"{os.environ.get('PATH', '')}:/usr/sbin:/sbin"
+
+
 def missing() -> list[str]:
     """Returns the programs that are not installed."""
-    path = f"{os.environ.get('PATH', '')}:/usr/sbin:/sbin"
-    return [program for program in PROGRAMS if shutil.which(program, path=path) is None]
+    return [program for program in PROGRAMS if shutil.which(program, path=PATH) is None]
 
 
 @contextmanager
@@ -74,10 +71,8 @@ def cluster(folder: Path) -> Iterator[dict[str, str]]:
         folder: an empty folder for the files of the cluster.
 
     Raises:
-        RuntimeError: a program is missing or the node does not become idle.
+        RuntimeError: the node does not become idle.
     """
-    if absent := missing():
-        raise RuntimeError(f"{', '.join(absent)}: not installed; install with: {INSTALL}")
     folder.chmod(0o755)
     (folder / "state").mkdir()
     (folder / "spool").mkdir()
@@ -88,8 +83,7 @@ def cluster(folder: Path) -> Iterator[dict[str, str]]:
     ports = [_free_port(), _free_port()]
     numbers = {"port": ports[0], "node_port": ports[1], "cores": CORES}
     config.write_text(CONFIG.format(folder=folder, host=HOST, **numbers))
-    path = f"{os.environ.get('PATH', '')}:/usr/sbin:/sbin"
-    environment = {**os.environ, "PATH": path, "SLURM_CONF": str(config)}
+    environment = {**os.environ, "PATH": PATH, "SLURM_CONF": str(config)}
     munge = [f"--key-file={key}", f"--socket={folder}/munge.socket"]
     munge += [f"--{name}-file={folder}/munge.{name}" for name in ("pid", "log", "seed")]
     started: list[subprocess.Popen] = []
@@ -118,32 +112,6 @@ def cluster(folder: Path) -> Iterator[dict[str, str]]:
                 process.kill()
 
 
-def kill_node(folder: Path) -> None:
-    """Kills slurmd and all that it has started, as if the machine had lost its power."""
-    listed = subprocess.check_output(["ps", "-e", "-o", "pid,ppid,args"], text=True)
-    rows = [line.split(maxsplit=2) for line in listed.splitlines()[1:]]
-    steps = [int(pid) for pid, _, text in rows if text.startswith("slurmstepd: [")]
-    dying = [int((folder / "slurmd.pid").read_text()), *steps]
-    for process in dying:  # grows
-        dying += [int(pid) for pid, parent, _ in rows if int(parent) == process]
-    for process in {*dying}:
-        with suppress(ProcessLookupError):
-            os.kill(process, signal.SIGKILL)
-
-
-@contextmanager
-def node(folder: Path, environment: dict[str, str]) -> Iterator[None]:
-    """Runs slurmd again after `kill_node`."""
-    command = ["slurmd", "-D", "-f", str(folder / "slurm.conf"), "-N", HOST]
-    with (folder / "slurmd.out").open("ab") as log:
-        process = subprocess.Popen(command, env=environment, stdout=log, stderr=log)
-    try:
-        yield
-    finally:
-        process.terminate()
-        process.wait(30)
-
-
 def _wait_until_idle(environment: dict[str, str], folder: Path) -> None:
     deadline = time.monotonic() + 60
     while time.monotonic() < deadline:
@@ -160,8 +128,3 @@ def _free_port() -> int:
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         return free.getsockname()[1]
-
-
-if __name__ == "__main__":
-    with cluster(Path(sys.argv[1])) as variables:
-        sys.exit(subprocess.run(sys.argv[2:], env=variables).returncode)

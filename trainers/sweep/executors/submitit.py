@@ -2,7 +2,6 @@
 
 import hashlib
 import os
-import re
 import shutil
 import signal
 import subprocess
@@ -30,33 +29,26 @@ _GRACE = 30.0
 _UNTIL_KILLED = 120.0
 """seconds for which a job whose training was asked to save waits for its requeue or end"""
 _SAVED = (128 + signal.SIGTERM, 128 + signal.SIGUSR2, -signal.SIGTERM, -signal.SIGUSR2)
-_TIME = re.compile(r"(?:(\d+)-)?(\d+)(?::(\d+))?(?::(\d+))?")
 _FOR_SBATCH = ("partition", "account", "time", "cpus", "gpus", "memory", "options")
 """settings that become options of sbatch"""
 
 
 def minutes(text: str) -> int:
-    """Returns the minutes of a time in one of the forms of sbatch, at least 1.
+    """Returns the minutes of a time in one of the forms of sbatch, such as 90 or 1-12:00:00.
 
     Raises:
         UserError: it has another form, or is 0, which SLURM reads as no limit.
     """
-    found = _TIME.fullmatch(text)
-    if not found or not any(int(part or 0) for part in found.groups()):
-        raise UserError("expected minutes, or H:MM:SS, or D-HH:MM:SS")
-    days, first, second, third = found.groups()
-    if days is not None:
-        parts = [int(days) * 24 + int(first), int(second or 0), int(third or 0)]
-    elif third is not None:
-        parts = [int(first), int(second), int(third)]
-    else:
-        parts = [0, int(first), int(second or 0)]
-    return parts[0] * 60 + parts[1] + (parts[2] > 0)
-
-
-def _text(value: object) -> object:
-    """Returns a number as text: accounts and times may look like numbers."""
-    return str(value) if isinstance(value, int) and not isinstance(value, bool) else value
+    days, _, rest = text.rpartition("-")
+    parts = rest.split(":")
+    if len(parts) <= 3 and all(part.isdecimal() for part in [*parts, days or "0"]):
+        numbers = [int(part) for part in parts]
+        if not days and len(parts) < 3:
+            numbers = [0, *numbers]
+        hours, whole, seconds = [*numbers, 0, 0][:3]
+        if total := (24 * int(days or 0) + hours) * 60 + whole + (seconds > 0):
+            return total
+    raise UserError("expected minutes, or H:MM:SS, or D-HH:MM:SS")
 
 
 def _time(value: object) -> str:
@@ -64,7 +56,8 @@ def _time(value: object) -> str:
     return str(value)
 
 
-Text = Annotated[str, BeforeValidator(_text)]
+Text = Annotated[str, BeforeValidator(lambda value: str(value) if type(value) is int else value)]
+"""text that may look like a number, such as an account"""
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
