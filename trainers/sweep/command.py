@@ -92,7 +92,7 @@ def _check(runs: Sequence[Combination]) -> None:
 
 
 class _Sweep:
-    """Submits runs, shows their progress, and cancels them at the first signal."""
+    """Submits runs, follows them, and cancels them after a signal."""
 
     def __init__(
         self,
@@ -109,12 +109,15 @@ class _Sweep:
 
     def work(self) -> int:
         """Trains all runs and returns the exit status of the sweep."""
-        interruption = Interruption(self._stop)
+        interruption = Interruption(lambda: None)
         failed = 0
         with interruption, self._progress:
             try:
-                while self._running or self._waiting:
-                    self._submit()
+                while self._running or (self._waiting and not self._stopped):
+                    if not interruption.received:
+                        self._submit()
+                    elif not self._stopped:
+                        self._stop()
                     failed += self._look()
                     if self._running:
                         time.sleep(_INTERVAL)
@@ -131,7 +134,8 @@ class _Sweep:
         Raises:
             UserError: it takes none, and no run is left to wait for.
         """
-        room = (self._executor.workers or len(self._waiting)) - len(self._running)
+        workers = self._executor.workers
+        room = len(self._waiting) if workers is None else workers - len(self._running)
         if room <= 0 or not self._waiting or time.monotonic() < self._submit_at:
             return
         batch, self._waiting = self._waiting[:room], self._waiting[room:]
@@ -145,8 +149,6 @@ class _Sweep:
             self._progress.say(str(error))
             return
         self._running |= zip(batch, handles, strict=True)
-        if self._stopped:  # the signal came meanwhile
-            self._stop()
 
     def _look(self) -> int:
         """Updates the progress and returns the number of runs that have failed since."""
@@ -166,8 +168,8 @@ class _Sweep:
         return failed
 
     def _stop(self) -> None:
-        self._stopped, self._waiting = True, []
-        for handle in list(self._running.values()):
+        self._stopped = True
+        for handle in self._running.values():
             self._executor.cancel(handle)
 
 
