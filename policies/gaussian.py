@@ -5,16 +5,12 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.data import Composite
-from torchrl.envs.utils import ExplorationType, exploration_type
 
 from emberlink.envs import keys
-from emberlink.envs.utils import counter_rng
-from emberlink.envs.utils.counter_rng import Use
-from emberlink.policies.networks.recurrent import RecurrentActor
 from emberlink.policies.networks.sequence import GaussianNetwork
+from emberlink.policies.state import Stateful, written
 
 MEAN = (keys.AGENTS, "mean")
 """float32 [..., 3]: means of the actions"""
@@ -24,67 +20,55 @@ LOG_PROB = (keys.AGENTS, "action_log_prob")
 """float32 [...]: logarithm of the probability density of the drawn action"""
 
 
-class MemoryActor(TensorDictModuleBase):
+class GaussianActor(Stateful):
     """Writes the mean action of each UAV, clipped to [-1, 1], and the new state of its memory.
-
-    The memory is empty at step 0 of an episode, and if the TensorDict holds no state of it.
 
     Args:
         network: the actors of all UAVs; its `step` gives mean actions and the memory's state.
         observation_spec: of the environment.
     """
 
-    def __init__(self, network: GaussianNetwork | RecurrentActor, observation_spec: Composite):
+    def __init__(self, network: GaussianNetwork, observation_spec: Composite):
         super().__init__()
         self.module: Any = network
-        self._observed = keys.observation_keys(observation_spec)
-        remembers = network.memory.size > 0
-        reads: list[Any] = [*self._observed, *([keys.STEP] if remembers else [])]
-        writes: list[Any] = [keys.ACTION, MEAN, *([MEMORY] if remembers else [])]
+        self.observed = keys.observation_keys(observation_spec)
+        size = network.memory.size
+        self.uavs, self.carries = network.grouping.uavs, {MEMORY: size} if size else {}
+        reads: list[Any] = [*self.observed, *([keys.STEP, MEMORY] if size else [])]
+        writes: list[Any] = [keys.ACTION, *([written(MEMORY)] if size else [])]
         self.in_keys, self.out_keys = reads, writes
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        observations = [tensordict.get(key) for key in self._observed]
-        mean, after = self.module.step(observations, self._state(tensordict))
-        tensordict.set(MEAN, mean)
-        if after.shape[-1]:
-            tensordict.set(MEMORY, after)
-        return tensordict.set(keys.ACTION, mean.clamp(-1, 1))
+        return tensordict.set(keys.ACTION, self.mean(tensordict).clamp(-1, 1))
 
-    def _state(self, tensordict: TensorDictBase) -> Tensor | None:
-        state = tensordict.get(MEMORY, None)
-        if state is None or MEMORY not in self.out_keys:
-            return None
-        began = tensordict.get(keys.STEP) == 0
-        return state.masked_fill(began[..., None, None], 0.0)
+    def mean(self, tensordict: TensorDictBase) -> Tensor:
+        """Returns the means of the actions, not clipped, and writes the new state."""
+        state = self.state(tensordict, MEMORY) if self.carries else None
+        mean, after = self.module.step([tensordict.get(key) for key in self.observed], state)
+        if self.carries:
+            tensordict.set(written(MEMORY), after)
+        return mean
 
 
-class GaussianExplorer(TensorDictModuleBase):
+class GaussianExplorer(Stateful):
     """Draws actions from the actors' distributions and writes their log-probabilities.
 
-    Random numbers come from each environment's random key, as in `OrnsteinUhlenbeck`. Actions are
-    not clipped; the environment does that. If exploration is off
-    (`torchrl.envs.set_exploration_type`), the actions are those of the actors.
+    Actions are not clipped; the environment does that. TorchRL's ProbabilisticActor draws from the
+    global generator.
 
     Args:
         actor: the actors of all UAVs.
+        generator: of the actions, on their device.
     """
 
-    def __init__(self, actor: MemoryActor):
+    def __init__(self, actor: GaussianActor, generator: torch.Generator):
         super().__init__()
-        self.actor = actor
-        reads: list[Any] = list(dict.fromkeys([*actor.in_keys, keys.RNG_KEY, keys.STEP]))
-        writes: list[Any] = [*actor.out_keys, LOG_PROB]
-        self.in_keys, self.out_keys = reads, writes
+        self.actor, self.generator, self.uavs, self.carries = actor, generator, actor.uavs, {}
+        self.in_keys, self.out_keys = actor.in_keys, [*actor.out_keys, LOG_PROB]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        self.actor(tensordict)
-        if exploration_type() not in (None, ExplorationType.RANDOM):
-            return tensordict
-        mean = tensordict.get(MEAN)
-        step = tensordict.get(keys.STEP)
-        key = counter_rng.step_key(tensordict.get(keys.RNG_KEY), step, Use.EXPLORATION_NOISE)
-        normal = counter_rng.normal(key, mean.shape[-2] * mean.shape[-1]).view_as(mean)
+        mean = self.actor.mean(tensordict)
+        normal = torch.empty_like(mean).normal_(generator=self.generator)
         std = self.actor.module.std(mean.shape[:-1])
         density = -0.5 * (normal.square() + math.log(2 * math.pi)) - std.log()
         tensordict.set(LOG_PROB, density.sum(-1))

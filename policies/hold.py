@@ -8,12 +8,13 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
 from emberlink.envs import keys
+from emberlink.policies.state import Stateful, written
 
 HELD = (keys.AGENTS, "held")
 """float32 [..., 3]: the action of the last decision, carried from step to step"""
 
 
-class Held(TensorDictModuleBase):
+class Held(Stateful):
     """Lets a policy decide at every k-th step of an episode and repeats its actions in between.
 
     State that the policy carries, such as a memory or noise, changes only at decisions.
@@ -22,40 +23,45 @@ class Held(TensorDictModuleBase):
     Args:
         policy: writes ("agents", "action").
         steps: steps for which an action is held.
+        uavs: number of UAVs.
     """
 
-    def __init__(self, policy: TensorDictModuleBase, steps: int):
+    def __init__(self, policy: Any, steps: int, uavs: int):
         super().__init__()
-        self.policy, self.steps = policy, steps
-        reads: list[Any] = list(dict.fromkeys([*policy.in_keys, keys.STEP]))
-        writes: list[Any] = [*policy.out_keys, HELD]
+        self.policy, self.steps, self.uavs, self.carries = policy, steps, uavs, {HELD: 3}
+        reads: list[Any] = list(dict.fromkeys([*policy.in_keys, keys.STEP, HELD]))
+        writes: list[Any] = [*policy.out_keys, written(HELD)]
         self.in_keys, self.out_keys = reads, writes
+        self._inner: list[Any] = [key[1:] for key in policy.out_keys if key[0] == "next"]
 
     @property
     def module(self) -> nn.Module:
         """The networks of the policy."""
-        module: Any = self.policy
-        return module.module
+        return self.policy.module
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         decides = tensordict.get(keys.STEP) % self.steps == 0
-        held = tensordict.get(HELD, None)
-        if held is None:
-            decides = torch.ones_like(decides)
-        elif not decides.is_cuda and not decides.any():  # on a GPU, the question would wait for it
-            return tensordict.set(keys.ACTION, held)
-        carried = {key: tensordict.get(key, None) for key in self.out_keys if key != keys.ACTION}
+        if torch.compiler.is_compiling() or decides.any():  # nobody decides: no networks
+            return self._decide(tensordict, decides)
+        for key in self._inner:
+            tensordict.set(written(key), tensordict.get(key))
+        held = self.state(tensordict, HELD)
+        return tensordict.set(written(HELD), held).set(keys.ACTION, held)
+
+    def _decide(self, tensordict: TensorDictBase, decides: Tensor) -> TensorDictBase:
+        before = {key: tensordict.get(key, None) for key in self._inner}
+        held = self.state(tensordict, HELD)
         acted = self.policy(tensordict)
-        acted.set(HELD, acted.get(keys.ACTION))
-        for key, before in carried.items():
-            if before is not None:
-                acted.set(key, _choose(decides, acted.get(key), before))
-        return acted.set(keys.ACTION, acted.get(HELD))
+        for key, old in before.items():
+            if old is not None:
+                acted.set(written(key), _choose(decides, acted.get(written(key)), old))
+        action = _choose(decides, acted.get(keys.ACTION), held)
+        return acted.set(written(HELD), action).set(keys.ACTION, action)
 
 
-def hold(policy: TensorDictModuleBase, steps: int) -> Any:
+def hold(policy: TensorDictModuleBase, steps: int, uavs: int) -> Any:
     """Returns a policy whose actions are held for a number of steps; itself for one step."""
-    return policy if steps == 1 else Held(policy, steps)
+    return policy if steps == 1 else Held(policy, steps, uavs)
 
 
 def decisions(rollout: TensorDictBase, steps: int) -> TensorDictBase:

@@ -13,11 +13,9 @@ class PolicyConfig:
     """Stores the settings of a policy's memory and of the interval between its decisions."""
 
     memory: str = "none"
-    """name of a file in policies/networks/memory: none, gru or stack"""
+    """name of a file in policies/networks/memory: none or gru"""
     units: Annotated[int, Field(ge=1, le=8192)] = 64
     """units of the memory `gru`"""
-    decisions: Annotated[int, Field(ge=2, le=1000)] = 8
-    """decisions whose observations the memory `stack` holds, the current one included"""
     hold: Annotated[int, Field(ge=1, le=1_000_000)] = 1
     """steps for which an action is held; divides the horizon"""
     agent_index: bool = False

@@ -1,6 +1,5 @@
 """Builds environments, networks and learners from a configuration."""
 
-from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -12,12 +11,11 @@ from emberlink.envs.scenarios import ScenarioConfig, grid_of
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.wildfire import WildfireEnv
 from emberlink.policies.hold import hold
-from emberlink.policies.networks.layers import Generators
+from emberlink.policies.state import primer_of
 from emberlink.trainers.config.compose import override, resolve
 from emberlink.trainers.config.schema import RunConfig, build_comm, check_device
 from emberlink.trainers.learners import registry
 from emberlink.trainers.learners.base import Learner, LearnerContext
-from emberlink.trainers.learners.nan_guard import NonFiniteGuard
 from emberlink.trainers.rollout.teacher import Teacher
 
 
@@ -55,8 +53,6 @@ def make_env(
     grid = grid_of(fire)
     if grid is not None:
         settings.setdefault("grid", list(grid))
-    if "seeds" in settings:
-        raise UserError(f"seeds={settings['seeds']}: only for training; an environment takes seed=")
     if isinstance(method, str):
         choices = [f"setup={setup or 'paper'}", f"world={world or 'paper'}"]
         config = resolve(method, choices, **settings)
@@ -65,7 +61,11 @@ def make_env(
     else:
         raise UserError("expected a method, a setup and a world, or a RunConfig alone")
     fire = config.fire if fire is None else fire
-    return build_env(config, num_envs=num_envs, fire=fire, seed=seed, device=device)
+    env = build_env(config, num_envs=num_envs, fire=fire, seed=seed, device=device)
+    if config.policy.memory != "none" or config.policy.hold > 1:
+        # What the policies of this configuration carry from step to step.
+        env.append_transform(primer_of(build_actor(config, env)))
+    return env
 
 
 def build_env(
@@ -73,7 +73,7 @@ def build_env(
     *,
     num_envs: int,
     fire: str | ScenarioConfig | Tensor,
-    seed: int | Sequence[int] | None,
+    seed: int | None,
     device: torch.device | str,
     true_map: bool = False,
     teacher: str | None = None,
@@ -90,7 +90,9 @@ def build_env(
     return env
 
 
-def build_actor(config: RunConfig, env: TransformedEnv, generator: Generators = None) -> Any:
+def build_actor(
+    config: RunConfig, env: TransformedEnv, generator: torch.Generator | None = None
+) -> Any:
     """Returns new actors of a configuration's learner for an environment.
 
     They are a TensorDict module with the networks in `module`.
@@ -98,29 +100,22 @@ def build_actor(config: RunConfig, env: TransformedEnv, generator: Generators = 
     learner = registry.find(config.learner.name)
     specs = env.observation_spec, env.full_action_spec
     actor = learner.make_actor(config.learner, *specs, generator, config.policy)
-    return hold(actor, config.policy.hold)
+    return hold(actor, config.policy.hold, config.env.num_uavs)
 
 
-def build_learner(config: RunConfig, env: TransformedEnv, guard: NonFiniteGuard) -> Learner:
-    """Returns a new learner of a configuration, for all its seeds.
-
-    Args:
-        config: configuration of the run.
-        env: the environments of all seeds in one batch.
-        guard: checks losses and gradients for NaN and Inf.
-    """
+def build_learner(config: RunConfig, env: TransformedEnv) -> Learner:
+    """Returns a new learner of a configuration for its environments."""
     context = LearnerContext(
         observation_spec=env.observation_spec,
         action_spec=env.full_action_spec,
         num_uavs=config.env.num_uavs,
         num_envs=config.num_envs,
-        seeds=config.seeds or (config.seed,),
+        seed=config.seed,
         shared_replay=config.replay == "shared",
         total_steps=config.episodes * config.env.horizon // config.policy.hold,
         policy=config.policy,
         world=config.env,
         horizon=config.env.horizon // config.policy.hold,
-        guard=guard,
         device=config.device,
         failures=config.env.failures > 0,
     )

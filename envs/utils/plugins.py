@@ -1,8 +1,8 @@
 """Finds classes by name: in the files of a package, and among entry points of other packages."""
 
 import importlib
-from collections.abc import Collection
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field
 from functools import cache
 from importlib.metadata import EntryPoint
 from pathlib import Path
@@ -43,6 +43,8 @@ class Registry(Generic[T]):
         other_files: files of the package without a subclass, besides those with a leading
             underscore.
         group: group of the entry points; the package's name if empty.
+        shared: name -> file, of subclasses that share a file; their names are those of the classes
+            in lower case.
     """
 
     base: type[T]
@@ -50,6 +52,7 @@ class Registry(Generic[T]):
     key: str
     other_files: Collection[str] = ("base", "registry")
     group: str = ""
+    shared: Mapping[str, str] = field(default_factory=dict)
 
     def known(self) -> list[str]:
         """Returns the names in alphabetical order."""
@@ -83,14 +86,17 @@ class Registry(Generic[T]):
         paths = map(Path, importlib.import_module(self.package).__path__)
         # setuptools adds the name of a hook that is no folder.
         files = _modules(tuple((str(p), p.stat().st_mtime_ns) for p in paths if p.exists()))
-        return {name for name in files if not name.startswith("_")} - set(self.other_files)
+        return {name for name in files if not name.startswith("_")} - set(self.other_files) | set(
+            self.shared
+        )
 
     def _class_in(self, name: str) -> type[T]:
-        file = importlib.import_module(f"{self.package}.{name}")
+        file = importlib.import_module(f"{self.package}.{self.shared.get(name, name)}")
         classes = [
             item
             for item in vars(file).values()
             if getattr(item, "__module__", "") == file.__name__ and self._fits(item)
+            and (name not in self.shared or item.__name__.lower() == name)
         ]
         if len(classes) != 1:
             kind = self.base.__name__

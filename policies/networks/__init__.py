@@ -2,11 +2,9 @@
 
 from emberlink.policies.networks.actor_critic import (
     STATE_ACTION_VALUE,
-    build,
+    TAKEN,
     make_actor,
     make_critic,
-    team_of,
 )
-from emberlink.policies.networks.layers import Generators
 
-__all__ = ["STATE_ACTION_VALUE", "Generators", "build", "make_actor", "make_critic", "team_of"]
+__all__ = ["STATE_ACTION_VALUE", "TAKEN", "make_actor", "make_critic"]

@@ -1,101 +1,172 @@
-"""Actors and critics as TensorDict modules, built from an environment's specs."""
+"""The actor and critic of the paper (section III.C), with weights per UAV or shared."""
 
-import copy
 from collections.abc import Sequence
-from typing import Any, TypeVar
+from typing import Any
 
+import torch
 from tensordict.nn import TensorDictModule
+from torch import Tensor, nn
 from torchrl.data import Composite
-from torchrl.modules import ValueOperator
 
 from emberlink.envs import keys
+from emberlink.policies.networks.encoders import ObservationEncoder
 from emberlink.policies.networks.grouping import Grouping
-from emberlink.policies.networks.layers import Generators
-from emberlink.policies.networks.stacked import StackedActor, StackedCritic, StackedNetwork
-from emberlink.policies.settings import PolicyConfig
-
-Network = TypeVar("Network", bound=StackedNetwork)
+from emberlink.policies.networks.layers import StackedLayerNorm, StackedLinear
 
 STATE_ACTION_VALUE = (keys.AGENTS, "state_action_value")
 """float32 [..., uavs, 1]: the critics' output"""
+TAKEN = (keys.AGENTS, "taken")
+"""float32 [..., uavs, 3]: actions of the replay buffer, for critics of the team; missing where all
+UAVs take the actions of their (target) actors"""
+LAYER_NAMES = ("first", "second", "third", "fourth", "fifth", "sixth", "seventh", "eighth")
+"""names of the hidden layers"""
+FINAL_BOUND = 3e-3
+"""bound of the initial weights of the last layer (Lillicrap et al. 2016, section 7)"""
+
+
+class _Stacked(nn.Module):
+    """The common part of actors and critics: an encoder and hidden layers with a LayerNorm each.
+
+    Args:
+        uavs: number of UAVs in a team.
+        observations: shape of each tensor of an observation, per UAV: [features],
+            [channels, W, W] or [pictures, channels, S, S].
+        actions: number of components of an action.
+        hidden: units of the hidden layers, 1 to 8 layers.
+        share_parameters: whether the UAVs share their weights.
+        agent_index: whether the index of the UAV is an input, too.
+        team: whether the inputs of a UAV are the observations and actions of its whole team.
+        start: see `layers.Start`.
+
+    Raises:
+        ValueError: there are no hidden layers or more than 8, or an observation has an unsupported
+            shape.
+    """
+
+    def __init__(
+        self,
+        uavs: int,
+        observations: Sequence[Sequence[int]],
+        actions: int,
+        hidden: Sequence[int],
+        *,
+        share_parameters: bool = False,
+        agent_index: bool = False,
+        team: bool = False,
+        **start: Any,
+    ):
+        super().__init__()
+        if not 1 <= len(hidden) <= len(LAYER_NAMES):
+            raise ValueError(f"hidden={list(hidden)}: 1 to {len(LAYER_NAMES)} layers are possible")
+        self.grouping = Grouping(uavs, shared=share_parameters)
+        self.names = LAYER_NAMES[: len(hidden)]
+        self._dims, self._indexed, self._team = len(observations[0]), agent_index, team
+        if team:
+            observations = [(n * uavs, *sides) for n, *sides in observations]
+            actions *= uavs
+        if agent_index:
+            observations = [(observations[0][0] + uavs,), *observations[1:]]
+        groups = self.grouping.groups
+        self.encoder = ObservationEncoder(groups, observations, **start)
+        inputs = self.encoder.features
+        for name, units in zip(self.names, hidden, strict=True):
+            self.add_module(name, StackedLinear(groups, inputs, units, **start))
+            norm = StackedLayerNorm(groups, units, device=start.get("device"))
+            self.add_module(f"{name}_norm", norm)
+            inputs = units
+        self._add_output(groups, actions, inputs, **start)
+
+    def _add_output(self, groups: int, actions: int, inputs: int, **start: Any) -> None:
+        raise NotImplementedError
+
+    def _features(self, observations: Sequence[Tensor], batch: torch.Size) -> Tensor:
+        """Returns the last hidden layer before its ReLU, [groups, rows, units]."""
+        if self._team:
+            observations = [self.grouping.of_team(x, len(batch)) for x in observations]
+        if self._indexed:
+            observations = [self.grouping.with_index(observations[0]), *observations[1:]]
+        x = self.encoder([self.grouping.split(x, batch) for x in observations])
+        for name in self.names:
+            x = x if name == self.names[0] else x.relu_()
+            x = getattr(self, f"{name}_norm")(getattr(self, name)(x))
+        return x
+
+
+class StackedActor(_Stacked):
+    """Maps observations to actions in [-1, 1], with a tanh behind the last layer."""
+
+    def _add_output(self, groups: int, actions: int, inputs: int, **start: Any) -> None:
+        self.action = StackedLinear(groups, inputs, actions, bound=FINAL_BOUND, **start)
+
+    def forward(self, *observations: Tensor) -> Tensor:
+        """Maps the tensors of an observation, [*batch, uavs, ...], to [*batch, uavs, actions]."""
+        batch = observations[0].shape[: -self._dims]
+        x = self.action(self._features(observations, batch).relu_()).tanh_()
+        return self.grouping.join(x, batch)
+
+
+class StackedCritic(_Stacked):
+    """Maps observations and actions to values.
+
+    A linear map of the action is added to the normalised last hidden layer before its ReLU.
+
+    The critic of a UAV with `team` reads the observations and actions of all UAVs (MADDPG, Lowe et
+    al. 2017, NeurIPS). For the actors' losses, a UAV's own action is that of its actor, and those
+    of the others are from the replay buffer.
+    """
+
+    def _add_output(self, groups: int, actions: int, inputs: int, **start: Any) -> None:
+        self.action = StackedLinear(groups, actions, inputs, **start)
+        self.value = StackedLinear(groups, inputs, 1, bound=FINAL_BOUND, **start)
+
+    def forward(self, action: Tensor, taken: Tensor | None, *observations: Tensor) -> Tensor:
+        """Maps an observation and actions to float32 [*batch, uavs, 1].
+
+        Args:
+            action: [*batch, uavs, actions].
+            taken: the actions of the other UAVs, for `team`; those of `action` if None.
+            observations: the tensors of an observation, [*batch, uavs, ...].
+        """
+        batch = action.shape[:-1]
+        if self._team:
+            others = self.grouping.of_team(action if taken is None else taken, len(batch))
+            action = torch.cat((action, others[..., action.shape[-1] :]), -1)
+        features = self._features(observations, batch)
+        x = features + self.action(self.grouping.split(action, batch))
+        return self.grouping.join(self.value(x.relu_()), batch)
 
 
 def make_actor(
-    observation_spec: Composite,
-    action_spec: Composite,
-    hidden: Sequence[int],
-    *,
-    share_parameters: bool = False,
-    policy: PolicyConfig | None = None,
-    generator: Generators = None,
+    observation_spec: Composite, action_spec: Composite, hidden: Sequence[int], **more: Any
 ) -> TensorDictModule:
     """Returns the actors of all UAVs, which map the observation to ("agents", "action").
 
     Args:
         observation_spec, action_spec: of the environment, batch size [num_envs].
         hidden: units of the hidden layers, 1 to 8 layers.
-        share_parameters: whether all UAVs of a team use the same weights.
-        policy: whether the networks also read which of the UAVs they act for; without a memory.
-        generator: of the initial weights. Several generators create the same number of teams,
-            which share no weights; see `Grouping`.
+        more: `share_parameters` and `agent_index`, see `StackedActor`; `generator`.
 
     Raises:
         ValueError: the number of layers or the shape of an observation is not supported.
     """
-    specs = observation_spec, action_spec
-    more = {"share_parameters": share_parameters, "policy": policy, "generator": generator}
-    network = build(StackedActor, *specs, hidden, **more)
-    in_keys: list[Any] = keys.observation_keys(observation_spec)
-    return TensorDictModule(network, in_keys=in_keys, out_keys=[keys.ACTION])
+    network = _build(StackedActor, observation_spec, action_spec, hidden, **more)
+    observed: Any = keys.observation_keys(observation_spec)
+    return TensorDictModule(network, in_keys=observed, out_keys=[keys.ACTION])
 
 
 def make_critic(
-    observation_spec: Composite,
-    action_spec: Composite,
-    hidden: Sequence[int],
-    *,
-    share_parameters: bool = False,
-    policy: PolicyConfig | None = None,
-    generator: Generators = None,
-) -> ValueOperator:
-    """Returns the critics of all UAVs, which map observation and action to `STATE_ACTION_VALUE`.
+    observation_spec: Composite, action_spec: Composite, hidden: Sequence[int], **more: Any
+) -> TensorDictModule:
+    """Returns the critics of all UAVs, which write `STATE_ACTION_VALUE`.
 
-    Arguments and errors are those of `make_actor`.
+    Arguments and errors are those of `make_actor`; `team` makes critics of the team.
     """
-    specs = observation_spec, action_spec
-    more = {"share_parameters": share_parameters, "policy": policy, "generator": generator}
-    network = build(StackedCritic, *specs, hidden, **more)
-    in_keys: list[Any] = [*keys.observation_keys(observation_spec), keys.ACTION]
-    return ValueOperator(network, in_keys=in_keys, out_keys=[STATE_ACTION_VALUE])
+    network = _build(StackedCritic, observation_spec, action_spec, hidden, **more)
+    reads: Any = [keys.ACTION, TAKEN, *keys.observation_keys(observation_spec)]
+    return TensorDictModule(network, in_keys=reads, out_keys=[STATE_ACTION_VALUE])
 
 
-def build(
-    network: type[Network],
-    observation: Composite,
-    action: Composite,
-    hidden: Sequence[int],
-    **more: Any,
-) -> Network:
-    """Returns a new network with the sizes of an environment's specs.
-
-    Args:
-        network: its type.
-        observation, action: specs of the environment, batch size [num_envs].
-        hidden: units of the hidden layers.
-        more: other arguments of the network.
-    """
-    *batch, actions = action[keys.ACTION].shape
-    shapes, device = keys.observation_shapes(observation), {"device": observation.device}
-    return network(batch[-1], shapes, actions, hidden, **device, **more)
-
-
-def team_of(network: Any, team: int, teams: int) -> Any:
-    """Returns the networks of one of several teams; their weights share memory with `network`."""
-    if teams == 1:
-        return network
-    single = copy.deepcopy(network)
-    for part, stacked in zip(single.parameters(), network.parameters(), strict=True):
-        part.data = stacked.data.unflatten(0, (teams, -1))[team]
-    stack: Any = single.module
-    stack.grouping = Grouping(stack.grouping.uavs, shared=stack.grouping.shared)
-    return single
+def _build(kind: Any, observation: Composite, action: Composite, hidden: Any, **more: Any) -> Any:
+    *_, uavs, actions = action[keys.ACTION].shape
+    shapes = keys.observation_shapes(observation)
+    return kind(uavs, shapes, actions, hidden, device=observation.device, **more)

@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from emberlink.policies.networks.layers import Generators, StackedConv2d
+from emberlink.policies.networks.layers import StackedConv2d
 
 CHANNELS = 16
 """channels of the convolutions"""
@@ -40,24 +40,20 @@ class WindowEncoder(nn.Module):
     Args:
         groups: number of groups of weights.
         shape: [channels, W, W] of the window, or [channels, X, Y] of a map.
-        device: of the weights.
-        generator: of the initial weights.
+        start: see `layers.Start`.
     """
 
     def __init__(
         self,
         groups: int,
         shape: Sequence[int],
-        *,
-        device: torch.device | str | None = None,
-        generator: Generators = None,
+        **start: Any,
     ):
         super().__init__()
         channels, *sides = shape
         self.pool = -(-max(sides) // MAX_SIDE)
-        more = {"device": device, "generator": generator}
-        self.first = StackedConv2d(groups, channels, CHANNELS, **more)
-        self.second = StackedConv2d(groups, CHANNELS, CHANNELS, stride=2, **more)
+        self.first = StackedConv2d(groups, channels, CHANNELS, **start)
+        self.second = StackedConv2d(groups, CHANNELS, CHANNELS, stride=2, **start)
         self.features = CHANNELS * math.prod((-(-side // self.pool) + 1) // 2 for side in sides)
 
     def forward(self, x: Tensor) -> Tensor:
@@ -79,26 +75,22 @@ class PictureEncoder(nn.Module):
     Args:
         groups: number of groups of weights.
         shape: [pictures, channels, S, S]; bytes, which are scaled to [0, 1].
-        device: of the weights.
-        generator: of the initial weights.
+        start: see `layers.Start`.
     """
 
     def __init__(
         self,
         groups: int,
         shape: Sequence[int],
-        *,
-        device: torch.device | str | None = None,
-        generator: Generators = None,
+        **start: Any,
     ):
         super().__init__()
         pictures, channels, *sides = shape
-        more = {"stride": 2, "device": device, "generator": generator}
         self.pictures = nn.ModuleList()
         for _ in range(pictures):
             layers, inputs = nn.ModuleList(), channels
             for outputs in PICTURE_CHANNELS:
-                layers.append(StackedConv2d(groups, inputs, outputs, **more))
+                layers.append(StackedConv2d(groups, inputs, outputs, stride=2, **start))
                 inputs = outputs
             self.pictures.append(layers)
         pixels = math.prod(-(-side // 2 ** len(PICTURE_CHANNELS)) for side in sides)
@@ -106,8 +98,9 @@ class PictureEncoder(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """Maps uint8 [groups, rows, pictures, channels, S, S] to [groups, rows, features]."""
-        groups, encoded, every = len(x), [], list[Any](self.pictures)
-        for layers, picture in zip(every, x.unbind(2), strict=True):
+        groups, encoded = len(x), []
+        pictures: Any = self.pictures
+        for layers, picture in zip(pictures, x.unbind(2), strict=True):
             # Bytes with the channels last: the convolutions are then a quarter faster on a CPU. A
             # picture of floats is copied, as it is the caller's.
             y = picture.transpose(0, 1).flatten(1, 2).contiguous(memory_format=torch.channels_last)
@@ -129,8 +122,7 @@ class ObservationEncoder(nn.Module):
         groups: number of groups of weights.
         shapes: shape of each tensor, per UAV: [features], [channels, W, W] or
             [pictures, channels, S, S].
-        device: of the weights.
-        generator: of the initial weights.
+        start: see `layers.Start`.
 
     Raises:
         ValueError: there is no encoder for the shape of a tensor.
@@ -140,17 +132,14 @@ class ObservationEncoder(nn.Module):
         self,
         groups: int,
         shapes: Sequence[Sequence[int]],
-        *,
-        device: torch.device | str | None = None,
-        generator: Generators = None,
+        **start: Any,
     ):
         super().__init__()
         for shape in shapes:
             if len(shape) not in ENCODERS:
                 raise ValueError(f"no encoder for an observation of shape {list(shape)} per UAV")
         self.parts = nn.ModuleList(
-            ENCODERS[len(shape)](groups, shape, device=device, generator=generator)
-            for shape in shapes
+            ENCODERS[len(shape)](groups, shape, **start) for shape in shapes
         )
         self.features: int = sum(part.features for part in self.parts)  # pyright: ignore[reportArgumentType, reportCallIssue]
 

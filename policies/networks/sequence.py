@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from emberlink.policies.networks.encoders import ObservationEncoder
 from emberlink.policies.networks.grouping import Grouping
-from emberlink.policies.networks.layers import Generators, StackedLinear, team_generators
+from emberlink.policies.networks.layers import StackedLinear
 from emberlink.policies.networks.memory.registry import find
 from emberlink.policies.settings import PolicyConfig
 
@@ -26,16 +26,15 @@ class SequenceNetwork(nn.Module):
     Weights are orthogonal at the beginning, those of the last map are scaled by `gain`.
 
     Args:
-        uavs: number of UAVs in a team.
+        uavs: number of UAVs.
         observations: shape of each tensor of an observation, per UAV: [features],
             [channels, W, W] or [pictures, channels, S, S].
         outputs: number of outputs per UAV.
         hidden: units of the hidden layers.
         policy: the memory, and whether the index of a UAV is an input.
         gain: factor of the weights of the last map.
-        share_parameters: whether the UAVs of a team share their weights.
-        device: of the weights.
-        generator: of the initial weights; several generators create the same number of teams.
+        share_parameters: whether the UAVs share their weights.
+        start: see `layers.Start`.
     """
 
     def __init__(
@@ -48,15 +47,14 @@ class SequenceNetwork(nn.Module):
         policy: PolicyConfig,
         gain: float,
         share_parameters: bool = True,
-        device: torch.device | str | None = None,
-        generator: Generators = None,
+        **start: Any,
     ):
         super().__init__()
-        self.grouping = Grouping(uavs, len(team_generators(generator)), shared=share_parameters)
+        self.grouping = Grouping(uavs, shared=share_parameters)
         self.agent_index = policy.agent_index
         first, *others = observations
         shapes = [(first[0] + uavs * policy.agent_index,), *others]
-        groups, start = self.grouping.groups, {"device": device, "generator": generator}
+        groups = self.grouping.groups
         self.encoder = ObservationEncoder(groups, shapes, **start)
         self.memory = find(policy.memory)(groups, self.encoder.features, policy, **start)
         inputs, self.hidden = self.memory.features, nn.ModuleList()
@@ -146,7 +144,7 @@ class TeamNetwork(nn.Module):
     """Maps what all UAVs of a team observe, and the true map, to an output for each of them.
 
     Args:
-        uavs: number of UAVs in a team.
+        uavs: number of UAVs.
         observations: shape of each tensor of an observation, per UAV.
         low, high: corners of the box, cells.
         grid: cells of the map along x and y; None without a map.

@@ -42,7 +42,6 @@ def resolve(method: str, overrides: Sequence[str] = (), **settings: Any) -> RunC
     values = composed(method, overrides, **settings)
     given = {text.partition("=")[0] for text in overrides}
     _drop_settings_of_others(values["learner"], given | settings.keys())
-    _choose_seed(values, "seed" in given | settings.keys())
     config = from_values(values)
     return replace(config, fire=fires_of(config.fire).with_checksum())
 
@@ -160,16 +159,3 @@ def _drop_settings_of_others(learner: Any, given: set[str]) -> None:
             of_files |= read("learner", name).keys()
     for key in foreign & of_files:
         del learner[key]
-
-
-def _choose_seed(values: dict[str, Any], seed_is_given: bool) -> None:
-    """Sets `seed` to the first of `seeds`, if `seeds` is not empty.
-
-    Raises:
-        UserError: the user gave both.
-    """
-    seeds = values["seeds"]
-    if seeds and seed_is_given:
-        raise UserError(f"seed={values['seed']} and seeds={seeds}: give only one of them")
-    if seeds and isinstance(seeds, list):
-        values["seed"] = seeds[0]

@@ -125,11 +125,9 @@ class RunConfig:
     episodes: Count
     """training episodes of each environment"""
     num_envs: Many
-    """environments per seed, stepped in one batch"""
-    seeds: Annotated[tuple[Seed, ...], Strict(False)] = ()
-    """seeds to train in parallel, each with its own run folder; if empty, only `seed` is trained"""
+    """environments, stepped in one batch"""
     seed: Seed
-    """seed of all random numbers; with `seeds`, the seed of this run folder"""
+    """seed of all random numbers"""
     device: str
     """device of the environment, the replay buffer and the networks"""
     logger: Literal["wandb", "tensorboard", "csv", "none"]
@@ -155,13 +153,6 @@ class RunConfig:
     @classmethod
     def _check_device(cls, value: str) -> str:
         return check_device(value)
-
-    @field_validator("seeds")
-    @classmethod
-    def _check_seeds(cls, value: tuple[int, ...]) -> tuple[int, ...]:
-        if len(set(value)) < len(value):
-            raise UserError(f"seeds={list(value)}: a seed is repeated")
-        return value
 
     @field_validator("policy")
     @classmethod

@@ -7,10 +7,12 @@ from typing import Any
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictSequential, dispatch
 from torchrl.data import Composite
+from torchrl.envs import TensorDictPrimer
 
 from emberlink.envs import keys
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import shown
+from emberlink.policies.state import primer_of
 from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.evaluation import episodes
 from emberlink.trainers.replay.page import Replay
@@ -19,7 +21,9 @@ from emberlink.trainers.replay.page import Replay
 class TrainedPolicy(TensorDictSequential):
     """The frozen policy of a run, which maps observations to ("agents", "action").
 
-    `make_env(policy.config)` returns its environment.
+    `make_env(policy.config)` returns its environment. A memory and held actions are read from the
+    TensorDict and written under "next", as TorchRL's GRUModule does; `in_keys` and `out_keys` name
+    them.
 
     Args:
         actor: the networks.
@@ -69,6 +73,13 @@ class TrainedPolicy(TensorDictSequential):
                     f"this policy of {config.method} reads {key} with the last sizes {wanted}, the "
                     f"environment gives {there}; make_env(policy.config) returns its environment"
                 )
+
+    def make_tensordict_primer(self) -> TensorDictPrimer:
+        """Returns a transform that adds the policy's state to an environment.
+
+        `make_env` has added it already.
+        """
+        return primer_of(self)
 
     def replay(
         self,

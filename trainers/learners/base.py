@@ -13,13 +13,20 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.data import Composite
+from torchrl.objectives import LossModule
 
 from emberlink.envs.config import WildfireConfig
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import STRICT, Name
-from emberlink.policies.networks import Generators, make_actor, team_of
+from emberlink.policies.networks import make_actor
 from emberlink.policies.settings import PolicyConfig
-from emberlink.trainers.learners.nan_guard import NonFiniteGuard
+from emberlink.trainers.learners.tensors import (
+    copy_into,
+    group,
+    load_optimizer,
+    optimizer_tensors,
+    prefixed,
+)
 
 Positive = Annotated[float, Field(gt=0, le=1e30)]
 NotNegative = Annotated[float, Field(ge=0, le=1e30)]
@@ -27,7 +34,7 @@ Count = Annotated[int, Field(ge=1, le=1_000_000_000)]
 Units = Annotated[int, Field(ge=1, le=8192)]
 
 Losses = dict[str, Tensor]
-"""losses of an update by name, detached, one number per UAV of all seeds"""
+"""losses of an update by name, detached, one number per UAV"""
 
 ACTOR = "actor_network_params.module."
 """prefix of the names of the actors' weights in `Learner.weights`"""
@@ -38,11 +45,11 @@ class LearnerConfig:
     """Stores the settings of all learners; the configuration of a learner inherits from it."""
 
     name: Name
-    """name of a file in trainers/learners, or of an entry point of `emberlink.learners`"""
+    """name of a learner of trainers/learners, or of an entry point of `emberlink.learners`"""
     hidden: Annotated[tuple[Units, ...], Field(min_length=1, max_length=8), Strict(False)]
     """units of the hidden layers, 1 to 8 layers"""
     share_parameters: bool = False
-    """whether all UAVs of a seed use the same weights; if not, each UAV has its own"""
+    """whether all UAVs use the same weights; if not, each UAV has its own"""
 
     @property
     def replays(self) -> bool:
@@ -65,21 +72,19 @@ class LearnerContext:
     """The environment and the run that a learner is built for."""
 
     observation_spec: Composite
-    """observation spec of the environments, batch size [seeds * num_envs]"""
+    """observation spec of the environments, batch size [num_envs]"""
     action_spec: Composite
-    """action spec of the environments, batch size [seeds * num_envs]"""
+    """action spec of the environments, batch size [num_envs]"""
     num_uavs: int
     """UAVs per environment"""
     num_envs: int
-    """environments per seed; those of the first seed come first"""
-    seeds: tuple[int, ...]
-    """seeds that are trained in parallel; they share no weights and no transitions"""
+    """environments"""
+    seed: int
+    """seed of initial weights, exploration and batches"""
     shared_replay: bool
     """whether UAVs of a team learn from each other's transitions"""
     total_steps: int
     """decisions of the batch of environments in the whole run; steps if actions are not held"""
-    guard: NonFiniteGuard
-    """checks the batch, losses and gradients of each update"""
     device: str
     """device of networks and transitions"""
     policy: PolicyConfig = field(default_factory=PolicyConfig)
@@ -94,11 +99,12 @@ class LearnerContext:
 
 
 class Learner(ABC):
-    """Trains the networks of all UAVs, for one seed or several in parallel.
+    """Trains the networks of all UAVs.
 
-    A subclass in its own file, `trainers/learners/<name>.py`, is a new learner; its defaults are in
-    `configs/learner/<name>.yaml`. It owns the networks, their updates, the transitions that it
-    learns from, and the exploration policy.
+    A learner owns the networks, their updates, the transitions that it learns from, and the
+    exploration policy. A subclass sets `actor`, `loss`, `optimizer`, and a `generator` if it draws
+    random numbers after `__init__`; these are saved. What else learning changes, `state_dict` and
+    `load_state_dict` of the subclass add.
 
     Args:
         config: an instance of `config_type`.
@@ -111,14 +117,18 @@ class Learner(ABC):
     `module`"""
     explorer: TensorDictModuleBase
     """the policy that collects transitions"""
+    loss: LossModule | torch.nn.Module
+    """holds all networks; its parameters and buffers are saved"""
+    optimizer: torch.optim.Optimizer
+    """of all parameters that are trained"""
+    generator: torch.Generator | None = None
+    """draws exploration, batches and everything else after `__init__`"""
     rollout_steps: int = 1
     """decisions of the batch of environments per call of `learn`; must divide the horizon"""
     learning_starts: int = 0
     """decisions of the batch of environments before the first update"""
     updates: int = 0
     """updates made so far"""
-    teams: int
-    """seeds that are trained in parallel"""
 
     @abstractmethod
     def __init__(self, config: Any, context: LearnerContext): ...
@@ -129,10 +139,10 @@ class Learner(ABC):
         config: Any,
         observation_spec: Composite,
         action_spec: Composite,
-        generator: Generators = None,
+        generator: torch.Generator | None = None,
         policy: PolicyConfig | None = None,
     ) -> Any:
-        """Returns new actors for as many seeds as there are generators.
+        """Returns new actors.
 
         Raises:
             UserError: the policy has a memory, and the networks have none.
@@ -140,36 +150,21 @@ class Learner(ABC):
         policy = policy or PolicyConfig()
         if policy.memory != "none":
             raise UserError(
-                f"policy.memory={policy.memory}: the networks of learner={config.name} have none"
+                f"policy.memory={policy.memory}: the networks of learner={config.name} have none; "
+                "those of ippo and mappo have"
             )
         return make_actor(
             observation_spec,
             action_spec,
             config.hidden,
             share_parameters=config.share_parameters,
-            policy=policy,
+            agent_index=policy.agent_index,
             generator=generator,
         )
 
-    def team_actor(self, team: int, teams: int) -> Any:
-        """Returns the actors of one of several seeds without noise; they share memory with `actor`.
-
-        A learner with networks that `make_actor` does not make overrides it to train several seeds
-        in parallel.
-
-        Raises:
-            UserError: the networks of a seed cannot be told apart.
-        """
-        if teams > 1 and not hasattr(self.actor.module, "grouping"):
-            raise UserError(
-                f"seeds: {type(self).__name__} trains one seed at a time; its networks are not "
-                "those of make_actor, and it has no team_actor of its own"
-            )
-        return team_of(self.actor, team, teams)
-
     @abstractmethod
     def learn(self, rollout: TensorDictBase) -> list[Losses]:
-        """Learns from a rollout, batch size [seeds * num_envs, rollout_steps].
+        """Learns from a rollout, batch size [num_envs, rollout_steps].
 
         Where actions are held for several steps, a transition leads from one decision to the next
         (`policies.hold.decisions`).
@@ -178,74 +173,64 @@ class Learner(ABC):
             The losses of each update; an empty list if there was no update.
         """
 
-    @abstractmethod
-    def update(self, batch: TensorDictBase) -> Losses:
-        """Performs one update with a batch that the guard recorded."""
-
     def start_from(self, weights: Mapping[str, Tensor]) -> None:
-        """Begins the run with the actors of another run, in all seeds.
+        """Begins the run with the actors of another run.
 
         Args:
-            weights: the weights of one seed's actors by name, as those of `weights`.
+            weights: the weights of its actors by name, as those of `weights`.
 
         Raises:
             UserError: the learner has no warm start.
-            ValueError: a weight is missing or has another shape.
         """
         raise UserError(f"learner.warm_start: learner={type(self).__name__} has no warm start")
 
-    @abstractmethod
-    def scale_lr(self, scale: float) -> None:
-        """Sets all learning rates to those of the configuration times a factor."""
+    def copy_actor(self, weights: Mapping[str, Tensor]) -> None:
+        """Copies weights as those of `weights` into the actors."""
+        network = self.actor.module
+        copy_into(network.state_dict(), {k: weights[ACTOR + k] for k in network.state_dict()})
 
-    @abstractmethod
-    def networks(self) -> dict[str, Tensor]:
-        """Returns the weights of all seeds' networks by name, not copied: [seeds * k, ...] each.
+    def weights(self) -> dict[str, Tensor]:
+        """Returns the actors' weights by name, detached: `ACTOR` and the name in the network."""
+        return {ACTOR + name: value for name, value in self.actor.module.state_dict().items()}
 
-        In some, the dimension of seeds and UAVs is another one, see `stack_dim`. The names of the
-        actors' weights are `ACTOR` and the name in the network of `make_actor`.
-        """
+    def state_dict(self) -> dict[str, Tensor]:
+        """Returns the state that learning changes, by name."""
+        generator = {} if self.generator is None else {"state": self.generator.get_state()}
+        return prefixed(
+            networks=self._networks(),
+            optimizer=optimizer_tensors(self.optimizer),
+            counters={"updates": torch.tensor(self.updates)},
+            generator=generator,
+        )
 
-    def stack_dim(self, name: str) -> int:
-        """Returns the dimension of a weight of `networks` that stacks the seeds and their UAVs."""
-        return 0
-
-    def weights(self, team: int = 0) -> dict[str, Tensor]:
-        """Returns the weights of one seed's networks by name, detached.
-
-        They have the shapes of `networks`, with k instead of seeds * k.
-        """
-        weights: dict[str, Tensor] = {}
-        for name, value in self.networks().items():
-            dim = self.stack_dim(name)
-            stacked = value.detach().unflatten(dim, (self.teams, -1))
-            weights[name] = stacked.select(dim, team)
-        return weights
-
-    @abstractmethod
-    def state_dict(self, *, transitions: bool = True) -> dict[str, Tensor]:
-        """Returns the state that learning changes, by name.
-
-        Args:
-            transitions: whether to include the replay buffer's transitions.
-        """
-
-    @abstractmethod
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
-        """Restores the state of `state_dict`, with or without transitions.
+        """Restores the state of `state_dict`.
 
         Raises:
             ValueError: the state does not fit this configuration.
         """
+        copy_into(self._networks(), group(state, "networks"))
+        load_optimizer(self.optimizer, group(state, "optimizer"))
+        self.updates = int(state["counters/updates"])
+        if self.generator is not None:
+            self.generator.set_state(state["generator/state"].cpu())
+
+    def _networks(self) -> dict[str, Tensor]:
+        state = self.loss.state_dict()
+        return {name: value for name, value in state.items() if isinstance(value, Tensor)}
 
 
-def copy_to_seeds(network: torch.nn.Module, weights: Mapping[str, Tensor], teams: int) -> None:
-    """Copies the actors of one seed, as in `Learner.weights`, to all seeds of a network."""
-    with torch.no_grad():
-        for name, place in network.state_dict().items():
-            place.unflatten(0, (teams, -1)).copy_(weights[ACTOR + name])
+def mean_over_batch(loss: Tensor, alive: Tensor | None) -> Tensor:
+    """Returns the mean loss of each UAV, [uavs], over the decisions in which it flew.
 
+    It is not averaged over UAVs: gradients would shrink with their number.
 
-def generators(seeds: tuple[int, ...]) -> list[torch.Generator]:
-    """Returns a generator of initial weights for each seed."""
-    return [torch.Generator().manual_seed(seed) for seed in seeds]
+    Args:
+        loss: [..., uavs].
+        alive: bool of the same shape; None if UAVs do not fail.
+    """
+    loss = loss.flatten(0, -2)
+    if alive is None:
+        return loss.mean(0)
+    weight = alive.flatten(0, -2).to(loss.dtype)
+    return (loss * weight).sum(0) / weight.sum(0).clamp(min=1)

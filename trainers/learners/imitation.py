@@ -6,23 +6,18 @@ from typing import Annotated, Any
 import torch
 from pydantic import Field, model_validator
 from pydantic.dataclasses import dataclass
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torchrl.data import Composite
-from torchrl.envs.utils import ExplorationType, exploration_type
 
 from emberlink.envs import keys
-from emberlink.envs.utils import counter_rng
-from emberlink.envs.utils.counter_rng import Use
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import Name
-from emberlink.policies.gaussian import MEAN
-from emberlink.policies.networks import Generators
+from emberlink.policies.gaussian import MEMORY, GaussianActor
 from emberlink.policies.settings import PolicyConfig
 from emberlink.trainers.learners import registry
 from emberlink.trainers.learners.base import (
-    ACTOR,
     STRICT,
     Count,
     Learner,
@@ -30,18 +25,10 @@ from emberlink.trainers.learners.base import (
     LearnerContext,
     Losses,
     Positive,
-    generators,
+    mean_over_batch,
 )
-from emberlink.trainers.learners.demonstrations import Demonstrations, DemonstrationSequences
-from emberlink.trainers.learners.off_policy.learner import OffPolicyLearner
-from emberlink.trainers.learners.off_policy.sequences import MISSING, fit_burn_in
-from emberlink.trainers.learners.tensors import (
-    copy_into,
-    group,
-    load_optimizer,
-    optimizer_tensors,
-    prefixed,
-)
+from emberlink.trainers.learners.replay import TeamReplay
+from emberlink.trainers.learners.tensors import flatten, group, prefixed, unflatten
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
@@ -49,7 +36,7 @@ class ImitationConfig(LearnerConfig):
     """Stores the settings of imitation."""
 
     share_parameters: bool = True
-    """whether all UAVs of a seed use the same weights; if not, each UAV has its own"""
+    """whether all UAVs use the same weights; if not, each UAV has its own"""
     actor_of: Name
     """learner whose actors are trained; its runs can begin with them (`learner.warm_start`)"""
     teacher: Name
@@ -60,14 +47,12 @@ class ImitationConfig(LearnerConfig):
     """learning rate of Adam at the beginning; it falls linearly to 0 at the end of the run"""
     updates_per_step: Count
     """updates per decision of the batch of environments"""
-    samples: Annotated[int, Field(ge=1, le=1_000_000)]
+    samples: Count
     """decisions per update and UAV; with a memory, rounded up to whole sequences"""
     buffer_size: Count
-    """capacity of a buffer of decisions, in decisions of a UAV"""
+    """capacity of the buffer, in decisions of a UAV"""
     sequence: Count = 16
-    """successive decisions that networks with a memory learn from"""
-    burn_in: Annotated[int, Field(ge=0, le=1_000_000)] = 16
-    """decisions before them, which prepare the memory and are not learnt from"""
+    """successive decisions that a memory learns from at once"""
 
     @model_validator(mode="after")
     def _decisions_fit(self) -> "ImitationConfig":
@@ -86,39 +71,40 @@ class Imitation(Learner):
     Each UAV's decision is the teacher's with a probability that falls to 0. What the UAV observed
     and what the teacher would have done is kept in a buffer. An update draws from it; the loss is
     the smooth L1 distance to the teacher's action.
+
+    With a memory, the buffer holds sequences of decisions, with the state of the memory before the
+    first one (Kapturowski et al. 2019, ICLR).
     """
 
     config_type = ImitationConfig
 
     def __init__(self, config: ImitationConfig, context: LearnerContext):
-        config = fit_burn_in(config, context.horizon)
-        self.config, self.context, self.teams = config, context, len(context.seeds)
-        self.guard = context.guard
+        self.config, self.context = config, context
         specs = context.observation_spec, context.action_spec
-        self.actor = self.make_actor(config, *specs, generators(context.seeds), context.policy)
-        self.explorer: Any = Mixture(self.actor, context.device)
+        initial = torch.Generator().manual_seed(context.seed)
+        self.actor = self.make_actor(config, *specs, initial, context.policy)
+        self.loss: nn.Module = self.actor.module
+        self.generator = torch.Generator(context.device).manual_seed(context.seed)
+        self.explorer: Any = Mixture(self.actor, self.generator)
+        self.observed = keys.observation_keys(context.observation_spec)
         self.remembers = context.policy.memory != "none"
-        self.replay = self._make_replay()
+        self.sequence = min(config.sequence, context.horizon) if self.remembers else 1
+        """decisions of a row of the buffer"""
+        self.replay = TeamReplay(
+            context,
+            self.generator,
+            batch_size=-(-config.samples // self.sequence),
+            buffer_size=-(-config.buffer_size // self.sequence),
+            mixed=not context.policy.agent_index,  # the input is the index of a column
+            decisions=self.sequence,
+        )
         self.learning_starts = self.replay.learning_starts
-        network: nn.Module = self.actor.module
-        self.parameters = {f"actor.{name}": value for name, value in network.named_parameters()}
-        values = list(self.parameters.values())
-        self.optimizer = torch.optim.Adam(values, lr=config.lr, fused=True)
-        self.optimizer.found_inf = self.guard.bad  # pyright: ignore[reportAttributeAccessIssue]
-        self._lr_scale, self._count = 1.0, 0
-        self._advance(0)
-
-    def _make_replay(self) -> Demonstrations | DemonstrationSequences:
-        config = self.config
-        sizes: dict[str, Any] = {
-            "batch_size": config.samples,
-            "buffer_size": config.buffer_size,
-            "mixed": not self.context.policy.agent_index,  # the input is the index of a column
-        }
-        if not self.remembers:
-            return Demonstrations(self.context, **sizes)
-        sizes |= {"sequence": config.sequence, "burn_in": config.burn_in}
-        return DemonstrationSequences(self.context, **sizes)
+        self.optimizer = torch.optim.Adam(self.loss.parameters(), lr=config.lr, fused=True)
+        self.decisions = 0
+        """decisions so far, in the whole run"""
+        self._recent: list[TensorDictBase] = []
+        """decisions that do not fill a row yet, batch size [environments, 1] each"""
+        self._schedule()
 
     @classmethod
     def make_actor(
@@ -126,7 +112,7 @@ class Imitation(Learner):
         config: Any,
         observation_spec: Composite,
         action_spec: Composite,
-        generator: Generators = None,
+        generator: torch.Generator | None = None,
         policy: PolicyConfig | None = None,
     ) -> Any:
         """Returns new actors of the learner `actor_of`."""
@@ -138,120 +124,110 @@ class Imitation(Learner):
             )
         return learner.make_actor(config, observation_spec, action_spec, generator, policy)
 
-    def _advance(self, decisions: int) -> None:
-        """Counts decisions, and lowers the teacher's share and the learning rate."""
-        self._count += decisions
-        left = max(0.0, 1 - self._count / self.context.total_steps)
-        self.explorer.share.fill_(self.config.teacher_share * left)
+    def _schedule(self) -> None:
+        """Lowers the teacher's share and the learning rate linearly."""
+        left = max(0.0, 1 - self.decisions / self.context.total_steps)
+        self.explorer.share = self.config.teacher_share * left
         for entry in self.optimizer.param_groups:
-            entry["lr"] = self.config.lr * self._lr_scale * left
+            entry["lr"] = self.config.lr * left
 
     def learn(self, rollout: TensorDictBase) -> list[Losses]:
-        self.replay.extend(rollout)
-        losses = []
-        if self.replay.ready:
-            updates = range(self.config.updates_per_step)
-            losses = [self.update(self.replay.sample()) for _ in updates]
-        self._advance(rollout.shape[1])
+        """Stores a rollout, and performs updates if there is a full batch."""
+        self._store(rollout)
+        updates = range(self.config.updates_per_step if self.replay.ready else 0)
+        losses = [self.update(self.replay.sample()) for _ in updates]
+        self._schedule()
         return losses
+
+    def _store(self, rollout: TensorDictBase) -> None:
+        """Stores the decisions of a rollout as rows of `sequence` decisions of an episode.
+
+        The last row of an episode is padded with decisions that are not learnt from.
+        """
+        kept: list[Any] = [*self.observed, keys.TEACHER]
+        kept += [keys.ALIVE] if self.context.failures else []
+        kept += [MEMORY] if self.remembers else []
+        for decision in rollout.select(*kept).split(1, 1):
+            self._recent.append(decision.clone())
+            self.decisions += 1
+            missing = self.sequence - len(self._recent)
+            if missing and self.decisions % self.context.horizon:
+                continue
+            agents: Any = torch.cat([*self._recent, *[decision] * missing], 1).get(keys.AGENTS)  # pyright: ignore[reportArgumentType]
+            alive = agents.get("alive", torch.ones(agents.shape, dtype=torch.bool)).clone()
+            alive[:, len(self._recent) :] = False
+            rows = {name: value.transpose(1, 2) for name, value in agents.items()}
+            if self.remembers:
+                rows["memory"] = rows["memory"][:, :, 0]
+            rows["alive"] = alive.transpose(1, 2).to(agents.device)
+            size = rollout.shape[0], self.context.num_uavs
+            self.replay.extend(TensorDict(rows, size, device=rollout.device))
+            self._recent = []
 
     def update(self, batch: TensorDictBase) -> Losses:
-        """Performs one step of the optimizer; after a detection of the guard, no weight changes."""
-        self.updates += 1
-        self.guard.record_batch(batch)
+        """Performs one step of the optimizer.
+
+        Args:
+            batch: rows of the buffer for each UAV, batch size [batch, uavs].
+        """
         losses = self.losses(batch)
-        networks = self.teams if self.config.share_parameters else len(losses["imitation"])
+        networks = 1 if self.config.share_parameters else self.context.num_uavs
         losses["imitation"].unflatten(0, (networks, -1)).mean(1).sum().backward()
-        losses = {name: value.detach() for name, value in losses.items()}
-        gradients = {name: v.grad for name, v in self.parameters.items() if v.grad is not None}
-        self.guard.check_gradients(losses, gradients)
         self.optimizer.step()
         self.optimizer.zero_grad()
-        return losses
+        self.updates += 1
+        return {name: value.detach() for name, value in losses.items()}
 
     def losses(self, batch: TensorDictBase) -> Losses:
-        """Computes the loss with gradients, one number per UAV of all seeds."""
-        if self.remembers:
-            action = self._remembered(batch)
-        else:
-            acted = self.actor(batch.copy())
-            # The mean of a normal distribution before it is clipped, else the action.
-            action = acted.get(MEAN) if MEAN in self.actor.out_keys else acted.get(keys.ACTION)
-        loss = nn.functional.smooth_l1_loss(action, batch.get(keys.TEACHER), reduction="none")
-        return {"imitation": OffPolicyLearner.mean_over_batch(loss.mean(-1), batch)}
-
-    def _remembered(self, batch: TensorDictBase) -> Tensor:
-        """Returns the actions of sequences after their burn-in, [batch, uavs, decisions, 3].
-
-        The memory is empty before the burn-in, and has no gradient in it.
-        """
-        observed = [batch.get(key) for key in keys.observation_keys(self.context.observation_spec)]
-        burn_in, state, actions = self.config.burn_in, None, []
-        for decision in range(burn_in + self.config.sequence):
-            with torch.set_grad_enabled(decision >= burn_in):
-                now = [x[:, :, decision] for x in observed]
+        """Computes the loss with gradients, one number per UAV."""
+        state, actions = batch.get("memory", None), []
+        for decision in range(self.sequence):
+            now = [batch.get(name)[:, :, decision] for _, name in self.observed]
+            if isinstance(self.actor, GaussianActor):  # the mean before it is clipped
                 action, state = self.actor.module.step(now, state)
-            if decision < burn_in:
-                lacks = batch.get(MISSING) > decision
-                state = state.masked_fill(lacks.unsqueeze(-1), 0.0)
+            else:
+                action = self.actor.module(*now)
             actions.append(action)
-        return torch.stack(actions[burn_in:], 2)
+        action, teacher = torch.stack(actions, 1), batch.get(keys.TEACHER[1]).transpose(1, 2)
+        loss = nn.functional.smooth_l1_loss(action, teacher, reduction="none").mean(-1)
+        return {"imitation": mean_over_batch(loss, batch.get("alive").transpose(1, 2))}
 
-    def scale_lr(self, scale: float) -> None:
-        self._lr_scale = scale
-        self._advance(0)
-
-    def networks(self) -> dict[str, Tensor]:
-        return {ACTOR + name: value for name, value in self.actor.module.state_dict().items()}
-
-    def state_dict(self, *, transitions: bool = True) -> dict[str, Tensor]:
-        counters = {"updates": torch.tensor(self.updates), "decisions": torch.tensor(self._count)}
-        return prefixed(
-            networks=self.networks(),
-            optimizer=optimizer_tensors(self.optimizer),
-            counters=counters,
-            replay=self.replay.state_dict(transitions=transitions),
+    def state_dict(self) -> dict[str, Tensor]:
+        recent: Any = torch.cat(self._recent, 1) if self._recent else TensorDict({})  # pyright: ignore[reportArgumentType]
+        return super().state_dict() | prefixed(
+            replay=self.replay.state_dict(),
+            recent=flatten(recent) | {"decisions": torch.tensor(self.decisions)},
         )
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
-        copy_into(self.networks(), group(state, "networks"))
-        load_optimizer(self.optimizer, group(state, "optimizer"))
-        self.updates = int(state["counters/updates"])
-        self._count = int(state["counters/decisions"])
+        super().load_state_dict(state)
         self.replay.load_state_dict(group(state, "replay"))
-        self._advance(0)
+        recent = group(state, "recent")
+        self.decisions = int(recent.pop("decisions"))
+        whole: Any = unflatten(recent, 2, self.context.device) if recent else None
+        self._recent = [] if whole is None else [part.clone() for part in whole.split(1, 1)]
+        self._schedule()
 
 
 class Mixture(TensorDictModuleBase):
     """Takes the teacher's action with a probability, for each UAV and decision, else the actor's.
 
-    Random numbers come from each environment's random key. With exploration off, and without a
-    teacher, all actions are the actor's.
-
     Args:
         actor: the actors of all UAVs.
-        device: of the share.
+        generator: on the device of the actions.
     """
 
-    share: Tensor
-    """float32 []: the probability"""
+    share = 0.0
+    """the probability"""
 
-    def __init__(self, actor: Any, device: torch.device | str):
+    def __init__(self, actor: Any, generator: torch.Generator):
         super().__init__()
-        self.actor = actor
-        self.register_buffer("share", torch.zeros((), device=device))
-        reads: list[Any] = list(dict.fromkeys([*actor.in_keys, keys.RNG_KEY, keys.STEP]))
-        writes: list[Any] = list(actor.out_keys)
-        self.in_keys, self.out_keys = reads, writes
+        self.actor, self.generator = actor, generator
+        reads: list[Any] = [*actor.in_keys, keys.TEACHER]
+        self.in_keys, self.out_keys = reads, list(actor.out_keys)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        acted = self.actor(tensordict)
-        teacher = tensordict.get(keys.TEACHER, None)
-        if teacher is None or exploration_type() not in (None, ExplorationType.RANDOM):
-            return acted
-        step = tensordict.get(keys.STEP)
-        key = counter_rng.step_key(tensordict.get(keys.RNG_KEY), step, Use.TEACHER)
-        taken = counter_rng.uniform(key, teacher.shape[-2]) < self.share
-        return acted.set(
-            keys.ACTION, torch.where(taken.unsqueeze(-1), teacher, acted.get(keys.ACTION))
-        )
+        acted, teacher = self.actor(tensordict), tensordict.get(keys.TEACHER)
+        draws = torch.empty_like(teacher[..., :1]).uniform_(generator=self.generator)
+        action = torch.where(draws < self.share, teacher, acted.get(keys.ACTION))
+        return acted.set(keys.ACTION, action)

@@ -7,17 +7,9 @@ _REGISTRY = Registry(
     Learner,
     "emberlink.trainers.learners",
     "learner.name",
-    other_files=(
-        "anchor",
-        "base",
-        "demonstrations",
-        "nan_guard",
-        "off_policy",
-        "on_policy",
-        "registry",
-        "tensors",
-    ),
+    other_files=("base", "ppo", "registry", "replay", "tensors"),
     group="emberlink.learners",
+    shared={"ippo": "ppo", "mappo": "ppo"},
 )
 known, find = _REGISTRY.known, _REGISTRY.find
 

@@ -1,28 +1,38 @@
 """TD3 for all UAVs (Fujimoto, van Hoof and Meger 2018, ICML)."""
 
+from collections.abc import Mapping
 from typing import Annotated, Any
 
 import torch
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase
+from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torch import Tensor
-from torchrl.objectives import TD3Loss
+from torchrl.objectives import SoftUpdate, TD3Loss, group_optimizers
 
 from emberlink.envs import keys
-from emberlink.envs.utils import counter_rng
-from emberlink.envs.utils.counter_rng import Use
-from emberlink.trainers.learners.base import STRICT, Count, LearnerContext, Losses, NotNegative
-from emberlink.trainers.learners.off_policy import OffPolicyConfig, OffPolicyLearner
+from emberlink.policies.exploration import OrnsteinUhlenbeck
+from emberlink.policies.networks import STATE_ACTION_VALUE, TAKEN, make_critic
+from emberlink.trainers.learners.base import (
+    STRICT,
+    Count,
+    Learner,
+    LearnerContext,
+    Losses,
+    NotNegative,
+    mean_over_batch,
+)
+from emberlink.trainers.learners.ddpg import DDPGConfig
+from emberlink.trainers.learners.replay import DONE, TERMINATED, TeamReplay, to_batch, to_rows
+from emberlink.trainers.learners.tensors import group, prefixed
 
 _TARGET_NOISE = (keys.AGENTS, "target_noise")
 """float32 [batch, uavs, 3], under "next": noise on the target actors' actions"""
-_CRITICS = 2
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
-class TD3Config(OffPolicyConfig):
+class TD3Config(DDPGConfig):
     """Stores the settings of TD3."""
 
     policy_delay: Count
@@ -33,83 +43,121 @@ class TD3Config(OffPolicyConfig):
     """maximum absolute value of that noise; actions are in [-1, 1]"""
 
 
-class TD3(OffPolicyLearner):
+class TD3(Learner):
     """Updates the actor and two critics of each UAV, with target smoothing and delayed actors."""
 
     config_type = TD3Config
-    critic_name = "qvalue"
-    config: TD3Config
+    loss: TD3Loss
 
     def __init__(self, config: TD3Config, context: LearnerContext):
-        super().__init__(config, context)
-        seeds = torch.tensor(context.seeds, device=context.device)
-        self._keys = counter_rng.fold_in(seeds, Use.TARGET_NOISE)
-
-    def make_loss(self, context: LearnerContext, generators: list[torch.Generator]) -> TD3Loss:
-        actor, critics = self.make_networks(context, generators, _CRITICS)
-        smoothed: Any = _SmoothedActor(actor, critics[0])
+        self.config, self.context = config, context
+        # Networks: those of all UAVs are stacked, with weights per UAV or shared.
+        specs, policy = (context.observation_spec, context.action_spec), context.policy
+        initial = torch.Generator().manual_seed(context.seed)
+        self.actor = self.make_actor(config, *specs, initial, policy)
+        shape: dict[str, Any] = {
+            "share_parameters": config.share_parameters,
+            "agent_index": policy.agent_index,
+            "team": config.critic == "team",
+        }
+        critics = [make_critic(*specs, config.hidden, **shape, generator=initial) for _ in range(2)]
+        # Exploration.
+        self.generator = torch.Generator(context.device).manual_seed(context.seed)
+        noise = OrnsteinUhlenbeck(config.exploration, context.num_uavs, self.generator)
+        self.explorer = TensorDictSequential(self.actor, noise)
+        # Losses and target networks. A list of critics, or TorchRL draws weights itself.
         bounds: Any = (-1.0, 1.0)
         loss = TD3Loss(
-            smoothed,
-            critics,  # a list, so that TorchRL does not draw weights itself
+            SmoothedActor(self.actor, critics[0]),  # pyright: ignore[reportArgumentType]
+            critics,
             bounds=bounds,
-            policy_noise=0.0,  # `sample` draws the noise
+            policy_noise=0.0,  # TorchRL's noise is of the global generator; `update` draws it
             noise_clip=0.0,
             loss_function="l2",
             reduction="none",
             deactivate_vmap=True,
         )
-        loss.set_keys(action=keys.ACTION)
-        return loss
+        loss.set_keys(
+            action=keys.ACTION,
+            state_action_value=STATE_ACTION_VALUE,
+            reward=keys.REWARD,
+            done=DONE,
+            terminated=TERMINATED,
+        )
+        loss.make_value_estimator(gamma=config.gamma)
+        self.loss, self.targets = loss, SoftUpdate(loss, tau=config.tau)
+        # Optimizer.
+        actor_weights = list(loss.actor_network_params.values(True, True))
+        critic_weights = list(loss.qvalue_network_params.values(True, True))
+        decay = config.critic_weight_decay
+        self.optimizer = group_optimizers(
+            torch.optim.Adam(actor_weights, lr=config.actor_lr, fused=True),
+            torch.optim.Adam(critic_weights, lr=config.critic_lr, weight_decay=decay, fused=True),
+        )
+        # Replay buffer.
+        self.replay = TeamReplay(
+            context,
+            self.generator,
+            batch_size=config.batch_size,
+            buffer_size=config.buffer_size,
+            joint=config.critic == "team",
+            # A shared network learns from all UAVs anyway, and its input is the index of a column.
+            mixed=not (config.share_parameters and policy.agent_index),
+        )
+        self.learning_starts = self.replay.learning_starts
 
-    def moves_actor(self, update: int) -> bool:
-        return update % self.config.policy_delay == 0
+    def learn(self, rollout: TensorDictBase) -> list[Losses]:
+        """Stores a rollout, and performs updates if there is a full batch."""
+        self.replay.extend(to_rows(rollout, self.context))
+        if not self.replay.ready:
+            return []
+        updates = range(self.config.updates_per_step)
+        return [self.update(to_batch(self.replay.sample())) for _ in updates]
 
-    def sample(self) -> TensorDictBase:
-        """Draws a batch and the noise on the target actors' actions."""
-        batch, config = self.replay.sample(), self.config
-        action = batch.get(keys.ACTION)
-        key = counter_rng.fold_in(self._keys, self.replay.draws)
-        normal = counter_rng.normal(key, action.numel() // self.teams)
-        by_team = normal.view(self.teams, len(action), -1, *action.shape[2:])
-        noise = by_team.transpose(0, 1).reshape(action.shape)
+    def update(self, batch: TensorDictBase) -> Losses:
+        """Updates the critics, and with every `policy_delay`-th update actors and targets.
+
+        Args:
+            batch: transitions for each UAV, batch size [batch].
+        """
+        config = self.config
+        self.updates += 1
+        moves_actor = self.updates % config.policy_delay == 0
+        normal = torch.empty_like(batch.get(keys.ACTION)).normal_(generator=self.generator)
         clip = config.target_noise_clip
-        batch.set(("next", *_TARGET_NOISE), (noise * config.target_noise).clamp(-clip, clip))
-        return batch
+        noise = (normal * config.target_noise).clamp(-clip, clip)
+        losses = self.losses(batch.copy().set(("next", *_TARGET_NOISE), noise), actor=moves_actor)
+        torch.stack([*losses.values()]).sum().backward()
+        self.optimizer.step()
+        self.optimizer.zero_grad()
+        if moves_actor:
+            self.targets.step()
+        return {name: value.detach() for name, value in losses.items()}
 
     def losses(self, batch: TensorDictBase, *, actor: bool = True) -> Losses:
-        loss: Any = self.loss
-        critic_loss, _ = loss.value_loss(batch)
-        losses = {"critic": self.mean_over_batch(critic_loss, batch)}
+        """Computes the losses with gradients, one number per UAV; the actors' if asked for."""
+        if self.config.critic == "team":
+            batch = batch.copy().set(TAKEN, batch.get(keys.ACTION))
+        alive = batch.get(keys.ALIVE, None)
+        losses = {"critic": mean_over_batch(self.loss.value_loss(batch)[0], alive)}
         if actor:
-            actor_loss, _ = loss.actor_loss(batch)
-            losses["actor"] = self.mean_over_batch(actor_loss, batch)
+            losses["actor"] = mean_over_batch(self.loss.actor_loss(batch)[0], alive)
         return losses
 
-    def gradients(self) -> dict[str, Tensor]:
-        """Returns the gradients by parameter, with separate entries for the two critics."""
-        gradients: dict[str, Tensor] = {}
-        for name, value in super().gradients().items():
-            network, _, rest = name.partition(".")
-            if network == "actor":
-                gradients[name] = value
-            else:
-                gradients |= {f"critic_{k}.{rest}": part for k, part in enumerate(value)}
-        return gradients
+    def start_from(self, weights: Mapping[str, Tensor]) -> None:
+        """Begins with the actors of another run, and target actors like them."""
+        self.copy_actor(weights)
+        self.targets = SoftUpdate(self.loss, tau=self.config.tau)
 
-    def stack_dim(self, name: str) -> int:
-        """Returns 1 for critics, whose weights have the critic as the first dimension, else 0."""
-        return int("qvalue" in name)
+    def state_dict(self) -> dict[str, Tensor]:
+        return super().state_dict() | prefixed(replay=self.replay.state_dict())
 
-    def weights(self, team: int = 0) -> dict[str, Tensor]:
-        weights = super().weights(team)
-        return {
-            name.replace("params.actor.module.", "params.module."): weight
-            for name, weight in weights.items()
-        }
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        super().load_state_dict(state)
+        self.replay.load_state_dict(group(state, "replay"))
 
 
-class _SmoothedActor(TensorDictModuleBase):
+class SmoothedActor(TensorDictModuleBase):
     """Adds the noise in a batch, if there is any, to the actors' actions and clips them.
 
     It passes on what the critics read.

@@ -8,7 +8,6 @@ from rich.console import Console
 
 from emberlink.configs import known
 from emberlink.envs.utils.errors import UserError
-from emberlink.policies.networks import memory
 from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.evaluation.tables import print_results
 from emberlink.trainers.terminal.console import OutputError
@@ -128,19 +127,10 @@ def _notes(trainer: Trainer, overrides: Sequence[str]) -> Iterator[str]:
             "env.observation_scale=raw: the first layer of these networks has a tanh, which "
             "saturates with numbers of cells and steps; env.observation_scale=box scales them"
         )
-    chosen = config.policy.memory
-    kind = memory.find(chosen)
-    filled = min(kind.burn_in(config.policy), world.horizon // config.policy.hold - 1)
-    burn_in: int = getattr(learner, "burn_in", filled)
-    if burn_in < filled:
-        yield (
-            f"learner.burn_in={burn_in}: in the middle of an episode, sequences begin with "
-            f"zeros in the memory; learner.burn_in={filled} fills it"
-        )
-    unread = set(memory.Memory.settings).difference(kind.settings)
-    for text in overrides:
-        if text.partition("=")[0] in unread:
-            yield f"{text} has no effect with policy.memory={chosen}"
+    if config.policy.memory == "none":
+        for text in overrides:
+            if text.startswith(("policy.units=", "learner.sequence=")):
+                yield f"{text} has no effect without a memory (policy.memory)"
 
 
 def _learns(trainer: Trainer) -> bool:

@@ -13,18 +13,13 @@ from emberlink.trainers.learners.tensors import flatten, group, prefixed, unflat
 
 
 class EpisodeRecord:
-    """Records the measures and losses of an episode for all seeds.
+    """Records the measures and losses of an episode."""
 
-    Args:
-        teams: number of seeds that are trained in parallel.
-    """
-
-    def __init__(self, teams: int):
-        self.teams = teams
+    def __init__(self):
         self.steps: list[TensorDictBase] = []
         """measured tensors of each rollout, batch size [environments, steps]"""
         self.losses: dict[str, list[Tensor]] = {}
-        """losses of each update by name, [seeds * uavs]"""
+        """losses of each update by name, [uavs]"""
 
     def add(self, rollout: TensorDictBase, losses: list[Losses]) -> None:
         """Adds a rollout and the losses of the updates that followed it."""
@@ -37,28 +32,15 @@ class EpisodeRecord:
         """Removes all records, at the beginning of an episode."""
         self.steps, self.losses = [], {}
 
-    def measures(self) -> list[dict[str, float]]:
-        """Returns the episode's measures and mean losses by name, for each seed."""
+    def measures(self) -> dict[str, float]:
+        """Returns the episode's measures and mean losses by name."""
         episode: Any = torch.cat(cast(Any, self.steps), dim=1)
         table = {
-            name: value.unflatten(0, (self.teams, -1)).mean(1)
-            for name, value in metrics.episode_metrics(episode).items()
+            name: value.mean().item() for name, value in metrics.episode_metrics(episode).items()
         }
-        values = {name: column.tolist() for name, column in (table | self._mean_losses()).items()}
-        return [
-            {name: column[team] for name, column in values.items()} for team in range(self.teams)
-        ]
-
-    def _mean_losses(self) -> dict[str, Tensor]:
-        """Returns the means of losses over updates and UAVs, [teams] each."""
-        means: dict[str, Tensor] = {}
-        for count in dict.fromkeys(len(values) for values in self.losses.values()):
-            # Losses with equal numbers of updates share one sum: its order affects the last digit.
-            names = sorted(name for name, v in self.losses.items() if len(v) == count)
-            stacked = torch.stack([torch.stack(self.losses[name]) for name in names], dim=1)
-            of_uavs = stacked.mean(0).unflatten(1, (self.teams, -1))
-            means |= {f"loss_{name}": of_uavs.mean(2)[k] for k, name in enumerate(names)}
-        return dict(sorted(means.items()))
+        # Means over updates and UAVs.
+        losses = {name: torch.stack(self.losses[name]).mean() for name in sorted(self.losses)}
+        return table | {f"loss_{name}": value.item() for name, value in losses.items()}
 
     def state_dict(self) -> dict[str, Tensor]:
         """Returns all records by name."""

@@ -1,7 +1,6 @@
 """Sets up a training: the environments, the learner and the collector of a configuration."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Mapping
 from itertools import islice
 from typing import Any
 
@@ -15,21 +14,14 @@ from emberlink.policies.hold import decisions, hold
 from emberlink.trainers.build import build_env, build_learner
 from emberlink.trainers.config.schema import RunConfig, build_comm
 from emberlink.trainers.learners.base import Learner, Losses
-from emberlink.trainers.learners.nan_guard import NonFiniteGuard
 from emberlink.trainers.learners.tensors import copy_into, flatten, group, prefixed, unflatten
-from emberlink.trainers.rollout.allocator import keep_freed_memory
-from emberlink.trainers.rollout.collector import make_collector
-from emberlink.trainers.rollout.products import fast_products
+from emberlink.trainers.rollout.collector import RolloutLoop
 from emberlink.trainers.training import warm_start
 from emberlink.trainers.training.episode import EpisodeRecord
 
 
 class TrainingSetup:
     """Holds all objects that training changes, and accesses no files.
-
-    The environments of several seeds are one batch, and their networks are stacked. Seeds do not
-    share transitions or weights. Creating a setup changes the memory allocator of the process, see
-    `keep_freed_memory`.
 
     Args:
         config: configuration of the run.
@@ -39,34 +31,21 @@ class TrainingSetup:
     """
 
     def __init__(self, config: RunConfig):
-        keep_freed_memory()
         self.config, self.horizon = config, config.env.horizon
-        self.seeds = config.seeds or (config.seed,)
-        if len(self.seeds) > 1:
-            raise UserError("a run trains one seed; several: emberlink sweep METHOD seed=0,1,2")
-        self.teams = len(self.seeds)
         self.total_steps = config.episodes * self.horizon
         self.step = 0
         """steps of the batch of environments so far"""
-        self.env = _make_env(config, self.teams * config.num_envs, self.seeds)
-        self.guard = NonFiniteGuard(config.device)
-        self.learner = _make_learner(config, self.env, self.guard)
+        self.env = _make_env(config, config.num_envs)
+        self.learner = _make_learner(config, self.env)
         self.rollout_steps = self.learner.rollout_steps * config.policy.hold
         """steps of the batch of environments in a rollout"""
-        self.collector = make_collector(
+        self.collector = RolloutLoop(
             self.env,
-            hold(self.learner.explorer, config.policy.hold),
-            horizon=self.horizon,
+            hold(self.learner.explorer, config.policy.hold, config.env.num_uavs),
             total_steps=self.total_steps,
             rollout_steps=self.rollout_steps,
         )
-        self.record = EpisodeRecord(self.teams)
-        spec = self.env.observation_spec
-        # Pictures are bytes: they are always finite, and copying them would take a fifth of a step.
-        observed = [key for key in keys.observation_keys(spec) if spec[key].dtype.is_floating_point]
-        following = [keys.POSITION, keys.REWARD, *observed]
-        taught = [keys.TEACHER] if config.learner.reads_teacher else []
-        self._checked = [*observed, *taught, keys.ACTION, *(("next", *key) for key in following)]
+        self.record = EpisodeRecord()
 
     @property
     def episode(self) -> int:
@@ -75,12 +54,8 @@ class TrainingSetup:
 
     def learn(self, rollout: TensorDictBase) -> list[Losses]:
         """Learns from a rollout, records it and returns the losses of each update."""
-        steps = rollout.shape[1]
-        self.step += steps
-        self.guard.record_rollout(rollout.select(*self._checked), steps)
-        transitions = decisions(rollout, self.config.policy.hold)
-        with fast_products():
-            losses = self.learner.learn(transitions)
+        self.step += rollout.shape[1]
+        losses = self.learner.learn(decisions(rollout, self.config.policy.hold))
         self.record.add(rollout, losses)
         return losses
 
@@ -89,19 +64,16 @@ class TrainingSetup:
         for rollout in islice(self.collector, -(-steps // self.rollout_steps)):
             self.learn(rollout)
 
-    def seed_config(self, team: int) -> RunConfig:
-        """Returns the configuration of one of the seeds."""
-        return replace(self.config, seed=self.seeds[team])
-
-    def team_actor(self, team: int) -> Any:
-        """Returns the actors of one seed without noise; they share weights with the learner."""
-        return hold(self.learner.team_actor(team, self.teams), self.config.policy.hold)
+    @property
+    def actor(self) -> Any:
+        """The actors without noise; they share weights with the learner."""
+        return hold(self.learner.actor, self.config.policy.hold, self.config.env.num_uavs)
 
     def state_dict(self) -> dict[str, Tensor]:
         """Returns the state of the training, "group/name" -> tensor.
 
         Tensors are copied, except the transitions. The state does not contain fires, which follow
-        from the configuration, or random states: random numbers are hashes of seeds and counters.
+        from the configuration. Random numbers of the environments are hashes of seeds and counters.
         """
         state = prefixed(
             learner=self.learner.state_dict(),
@@ -129,11 +101,10 @@ class TrainingSetup:
         self.collector.restore(unflatten(carried, 1, device), step)
         self.record.load_state_dict(group(state, "episode"), device)
         self.step = step
-        self.guard.start(step, self.learner.updates)
 
 
 def check_setup(config: RunConfig) -> None:
-    """Checks that a configuration can be trained, in an environment per seed, without training.
+    """Checks that a configuration can be trained, in one environment, without training.
 
     Args:
         config: configuration of a run.
@@ -141,13 +112,10 @@ def check_setup(config: RunConfig) -> None:
     Raises:
         UserError: the fire, the learner or its warm start does not fit the rest.
     """
-    seeds = config.seeds or (config.seed,)
-    env = _make_env(config, len(seeds), seeds)
-    learner = _make_learner(config, env, NonFiniteGuard(config.device))
-    warm_start.start(learner, config)
+    warm_start.start(_make_learner(config, _make_env(config, 1)), config)
 
 
-def _make_env(config: RunConfig, num_envs: int, seed: int | Sequence[int]) -> TransformedEnv:
+def _make_env(config: RunConfig, num_envs: int) -> TransformedEnv:
     """Returns training environments, with what the learner reads in training only.
 
     Raises:
@@ -162,17 +130,16 @@ def _make_env(config: RunConfig, num_envs: int, seed: int | Sequence[int]) -> Tr
         config,
         num_envs=num_envs,
         fire=config.fire,
-        seed=seed,
+        seed=config.seed,
         device=config.device,
         true_map=config.learner.reads_map,
         teacher=config.learner.reads_teacher,
     )
 
 
-def _make_learner(config: RunConfig, env: TransformedEnv, guard: NonFiniteGuard) -> Learner:
+def _make_learner(config: RunConfig, env: TransformedEnv) -> Learner:
     """Returns a new learner; what does not fit it fails here and not in the training."""
     config.check_rollouts()  # learners divide by the decisions of an episode
-    learner = build_learner(config, env, guard)
-    learner.team_actor(0, len(config.seeds or (config.seed,)))
+    learner = build_learner(config, env)
     config.check_rollouts(learner.rollout_steps)
     return learner

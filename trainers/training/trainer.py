@@ -146,7 +146,7 @@ class Trainer:
             results = evaluate_run(
                 run,
                 config,
-                self.setup.team_actor(0),
+                self.setup.actor,
                 checkpoint=run.checkpoint(),
                 fires=config.evaluation.episodes,
                 report=report,
@@ -200,12 +200,12 @@ class Trainer:
     def _finish_episode(self) -> dict[str, Any]:
         """Measures an episode, evaluates if it is due, and writes and returns the line."""
         setup, interval = self.setup, self.config.evaluation.interval
-        (measures,) = setup.record.measures()
+        measures = setup.record.measures()
         line = {"episode": setup.episode, "updates": setup.learner.updates} | measures
         setup.record.clear()
         if interval and setup.episode % interval == 0:
             try:
-                line |= evaluate.validate(self.config, setup.team_actor(0))
+                line |= evaluate.validate(self.config, setup.actor)
             except NonFiniteActionError as error:
                 raise self._non_finite("an action of the validation", error.value) from None
         self._keep_best(line)

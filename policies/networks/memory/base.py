@@ -1,12 +1,10 @@
 """Defines the base class of memories."""
 
 from abc import abstractmethod
-from typing import ClassVar
+from typing import Any
 
-import torch
 from torch import Tensor, nn
 
-from emberlink.policies.networks.layers import Generators
 from emberlink.policies.settings import PolicyConfig
 
 
@@ -20,41 +18,17 @@ class Memory(nn.Module):
         groups: number of groups of weights.
         inputs: number of features of an input.
         config: settings of the policy.
-        device: of the weights.
-        generator: of the initial weights.
+        start: `device` of the weights and `generator` of their initial values.
     """
 
-    settings: ClassVar[tuple[str, ...]] = (
-        "policy.units",
-        "policy.decisions",
-        "learner.sequence",
-        "learner.burn_in",
-    )
-    """the keys among these that matter with this memory; others that are given cause a note"""
     features: int
     """number of features of the output"""
     size: int
     """numbers per UAV that are carried from decision to decision; they are 0 before the first"""
 
     @abstractmethod
-    def __init__(
-        self,
-        groups: int,
-        inputs: int,
-        config: PolicyConfig,
-        *,
-        device: torch.device | str | None = None,
-        generator: Generators = None,
-    ):
+    def __init__(self, groups: int, inputs: int, config: PolicyConfig, **start: Any):
         super().__init__()
-
-    @classmethod
-    def burn_in(cls, config: PolicyConfig) -> int:
-        """Returns the decisions after which a state no longer depends on earlier ones.
-
-        0 if it always depends on them.
-        """
-        return 0
 
     @abstractmethod
     def forward(self, x: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:

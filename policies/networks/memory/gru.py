@@ -1,11 +1,11 @@
 """A gated recurrent unit (Cho et al. 2014, EMNLP)."""
 
-from typing import ClassVar
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from emberlink.policies.networks.layers import Generators, StackedLinear, orthogonal_weights
+from emberlink.policies.networks.layers import StackedLinear, orthogonal_weights
 from emberlink.policies.networks.memory.base import Memory
 from emberlink.policies.settings import PolicyConfig
 
@@ -17,26 +17,14 @@ class GRU(Memory):
     after another; on a CPU, this takes less than half of the time of one group after another.
     """
 
-    settings: ClassVar[tuple[str, ...]] = "policy.units", "learner.sequence", "learner.burn_in"
-
-    def __init__(
-        self,
-        groups: int,
-        inputs: int,
-        config: PolicyConfig,
-        *,
-        device: torch.device | str | None = None,
-        generator: Generators = None,
-    ):
+    def __init__(self, groups: int, inputs: int, config: PolicyConfig, **start: Any):
         super().__init__(groups, inputs, config)
         units = self.features = self.size = config.units
-        start = {"gain": 1.0, "device": device, "generator": generator}
-        self.input = StackedLinear(groups, inputs, units, **start)
-        self.input_weight = orthogonal_weights(groups, 3 * units, units, **start)
-        self.state_weight = orthogonal_weights(groups, 3 * units, units, **start)
-        zeros = torch.zeros(groups, 3 * units, dtype=torch.float32, device=device)
-        self.input_bias = torch.nn.Parameter(zeros)
-        self.state_bias = torch.nn.Parameter(zeros.clone())
+        self.input = StackedLinear(groups, inputs, units, gain=1.0, **start)
+        self.input_weight = orthogonal_weights(groups, 3 * units, units, gain=1.0, **start)
+        self.state_weight = orthogonal_weights(groups, 3 * units, units, gain=1.0, **start)
+        self.input_bias = torch.nn.Parameter(torch.zeros_like(self.input_weight[:, :, 0]))
+        self.state_bias = torch.nn.Parameter(torch.zeros_like(self.input_bias))
 
     def forward(self, x: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
         x = self.input(x.flatten(1, 2)).unflatten(1, x.shape[1:3]).tanh()

@@ -1,0 +1,171 @@
+"""Tests that the memory and held actions of a policy survive in somebody else's loop."""
+
+import warnings
+from functools import partial
+from pathlib import Path
+
+import pytest
+import torch
+from torchrl.collectors import Collector, MultiSyncCollector
+from torchrl.envs import ParallelEnv, SerialEnv, TransformedEnv
+from torchrl.envs.utils import check_env_specs, step_mdp
+
+from emberlink.envs import keys
+from emberlink.envs.utils.errors import UserError
+from emberlink.policies.gaussian import MEMORY
+from emberlink.policies.hold import HELD
+from emberlink.trainers.build import build_actor, build_env, make_env
+from emberlink.trainers.config.compose import resolve
+from emberlink.trainers.evaluation.policy import TrainedPolicy
+
+HORIZON, STEPS = 12, 24
+"""two episodes"""
+CONFIGS = {
+    "gru": ("independent", ["learner=ippo", "policy.memory=gru", "policy.units=8", "gamma=0.9"]),
+    "maps": ("maps", ["setup=tuned"]),
+}
+
+
+def config_of(name):
+    method, given = CONFIGS[name]
+    given = [text for text in given if text != "gamma=0.9"]
+    short = {"policy.hold": 3, "env.horizon": HORIZON, "env.num_uavs": 3}
+    return resolve(method, given, **short)
+
+
+def policy_of(name):
+    """Returns actors with random weights that move the UAVs, frozen."""
+    config = config_of(name)
+    actor = build_actor(config, make_env(config, seed=0), torch.Generator().manual_seed(0))
+    with torch.no_grad():
+        for value in actor.module.parameters():
+            value.mul_(3)
+    spec = make_env(config, seed=0).observation_spec
+    return TrainedPolicy(actor, spec, config, Path()).requires_grad_(False)
+
+
+def make(config, seed):
+    return make_env(config, num_envs=1, seed=seed)
+
+
+def alone(policy):
+    """Returns the actions of two environments, each in a rollout of its own."""
+    runs = [
+        make(policy.config, seed).rollout(STEPS, policy, break_when_any_done=False)
+        for seed in (3, 4)
+    ]
+    return torch.stack([run[keys.ACTION][0] for run in runs])
+
+
+@pytest.fixture(params=CONFIGS)
+def policy(request):
+    return policy_of(request.param)
+
+
+def test_actions_are_held_and_differ_between_decisions(policy):
+    actions = alone(policy).unflatten(1, (-1, 3))
+    assert (actions == actions[:, :, :1]).all()
+    assert not torch.allclose(actions[:, 1, 0], actions[:, 2, 0])
+
+
+def test_state_is_declared(policy):
+    carried = [HELD, MEMORY] if MEMORY in policy.in_keys else [HELD]
+    assert set(carried) <= set(policy.in_keys)
+    assert {("next", *key) for key in carried} <= set(policy.out_keys)
+    env = make(policy.config, 3)
+    check_env_specs(env)
+    assert not env.reset()[HELD].any()
+
+
+def test_only_declared_keys_are_read(policy):
+    env, actions = make(policy.config, 3), []
+    td = env.reset()
+    for _ in range(HORIZON):
+        acted = policy(td.select(*policy.in_keys))
+        td.update(acted.select(*policy.out_keys))
+        actions.append(td[keys.ACTION].clone())
+        td = step_mdp(env.step(td))
+    assert torch.stack(actions, 1)[0].equal(alone(policy)[0, :HORIZON])
+
+
+@pytest.mark.parametrize("cls", [SerialEnv, ParallelEnv])
+@pytest.mark.parametrize("collected", [False, True])
+def test_batched_environments_act_as_alone(policy, cls, collected):
+    env = cls(2, [partial(make, policy.config, seed) for seed in (3, 4)])
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        if collected:
+            collector = Collector(env, policy, frames_per_batch=2 * STEPS, total_frames=2 * STEPS)
+            run = next(iter(collector))
+        else:
+            run = env.rollout(STEPS, policy, break_when_any_done=False)
+    actions = run[keys.ACTION].clone().flatten(1, 2).unflatten(1, (STEPS, -1)).flatten(2, 2)
+    actions = run[keys.ACTION].squeeze(1).clone()
+    if not env.is_closed:
+        env.close()
+    assert torch.allclose(actions, alone(policy), atol=1e-5)
+
+
+@pytest.mark.heavy
+def test_multi_sync_collector_acts_as_alone(policy):
+    makers = [partial(make, policy.config, seed) for seed in (3, 4)]
+    collector = MultiSyncCollector(
+        makers, policy, frames_per_batch=2 * STEPS, total_frames=2 * STEPS, cat_results="stack"
+    )
+    try:
+        run = next(iter(collector))
+        assert torch.allclose(run[keys.ACTION].squeeze(1), alone(policy), atol=1e-5)
+    finally:
+        collector.shutdown()
+
+
+def inputs(policy, td):
+    present = td.keys(True)
+    return {"_".join(k) if isinstance(k, tuple) else k: td[k] for k in policy.in_keys if k in present}
+
+
+def test_exported_policy_acts_as_the_policy(policy):
+    start = make(policy.config, 3).reset()
+    program = torch.export.export(policy, args=(), kwargs=inputs(policy, start), strict=False)
+    exported, env, actions = program.module(), make(policy.config, 3), []
+    td = env.reset()
+    for _ in range(HORIZON):
+        for key, value in zip(policy.out_keys, exported(**inputs(policy, td)), strict=True):
+            td[key] = value.clone()
+        actions.append(td[keys.ACTION].clone())
+        td = step_mdp(env.step(td))
+    assert torch.allclose(torch.stack(actions, 1)[0], alone(policy)[0, :HORIZON], atol=1e-5)
+
+
+def test_compiled_policy_acts_as_the_policy(policy):
+    compiled = torch.compile(policy, backend="eager")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        run = make(policy.config, 3).rollout(HORIZON, compiled)
+    assert torch.allclose(run[keys.ACTION][0], alone(policy)[0, :HORIZON], atol=1e-5)
+
+
+def test_policy_without_its_state_says_so_after_the_first_step(policy):
+    env = make(policy.config, 3)
+    td = env.reset().exclude(HELD, MEMORY)
+    td = step_mdp(env.step(policy(td)))
+    with pytest.raises(UserError, match="carries .*held.* from step to step"):
+        policy(td.exclude(HELD))
+
+
+def test_primer_adds_the_state_to_an_environment_without_it(policy):
+    config = policy.config
+    env = build_env(config, num_envs=1, fire=config.fire, seed=3, device="cpu")
+    env = TransformedEnv(env, policy.make_tensordict_primer())
+    assert env.rollout(HORIZON, policy)[keys.ACTION][0].equal(alone(policy)[0, :HORIZON])
+
+
+def test_own_loop_without_primer_keeps_the_state(policy):
+    config, actions = policy.config, []
+    env = build_env(config, num_envs=1, fire=config.fire, seed=3, device="cpu")
+    td = env.reset()
+    for _ in range(HORIZON):
+        td = env.step(policy(td))
+        actions.append(td[keys.ACTION])
+        td = step_mdp(td)
+    assert torch.stack(actions, 1)[0].equal(alone(policy)[0, :HORIZON])

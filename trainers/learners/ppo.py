@@ -1,0 +1,423 @@
+"""PPO (Schulman et al. 2017) for all UAVs, from whole episodes: IPPO and MAPPO.
+
+IPPO's critic reads what its UAV observes (de Witt et al. 2020). MAPPO's reads what the team
+observes (Yu et al. 2022, NeurIPS). The losses and the advantages are TorchRL's `MAPPOLoss` and
+`MultiAgentGAE`; its standardisation of advantages and its `ValueNorm` are not used, since both
+count what follows the failure of a UAV.
+"""
+
+from abc import abstractmethod
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Annotated, Any
+
+import torch
+from pydantic import Field
+from pydantic.dataclasses import dataclass
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import (
+    ProbabilisticTensorDictModule,
+    ProbabilisticTensorDictSequential,
+    TensorDictModule,
+)
+from torch import Tensor
+from torchrl.data import Composite
+from torchrl.modules import IndependentNormal
+from torchrl.objectives.multiagent import MAPPOLoss
+from torchrl.objectives.value import MultiAgentGAE
+
+from emberlink.envs import keys
+from emberlink.policies.gaussian import LOG_PROB, MEAN, GaussianActor, GaussianExplorer
+from emberlink.policies.networks.sequence import GaussianNetwork, SequenceNetwork, TeamNetwork
+from emberlink.policies.settings import PolicyConfig
+from emberlink.trainers.learners.base import (
+    STRICT,
+    Count,
+    Learner,
+    LearnerConfig,
+    LearnerContext,
+    Losses,
+    NotNegative,
+    Positive,
+    mean_over_batch,
+)
+from emberlink.trainers.learners.tensors import copy_into, flatten, group, prefixed, unflatten
+
+VALUE = (keys.AGENTS, "state_value")
+"""float32 [..., 1]: the critics' output, in units of the returns' standard deviation"""
+ADVANTAGE = (keys.AGENTS, "advantage")
+"""float32 [..., 1]: standardised"""
+RETURN = (keys.AGENTS, "value_target")
+"""float32 [..., 1], in units of the returns' standard deviation"""
+_STD, _ENDS, _TERMINATED = (keys.AGENTS, "std"), (keys.AGENTS, "ends"), (keys.AGENTS, "terminated")
+_KEPT = 0.9
+"""share of the earlier spread of the returns that is kept from episode to episode"""
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class IPPOConfig(LearnerConfig):
+    """Stores the settings of IPPO."""
+
+    share_parameters: bool = True
+    """whether all UAVs use the same weights; if not, each UAV has its own"""
+    gamma: Annotated[float, Field(ge=0, lt=1)]
+    """discount per decision"""
+    gae_lambda: Annotated[float, Field(ge=0, le=1)]
+    """factor of generalised advantage estimation (Schulman et al. 2016), per decision"""
+    clip: Annotated[float, Field(gt=0, lt=1)]
+    """clip range of the probability ratio, [1 - clip, 1 + clip]"""
+    epochs: Count
+    """passes over the episodes of an iteration"""
+    minibatches: Count
+    """updates of a pass; each uses whole episodes of some of the environments"""
+    lr: Positive
+    """learning rate of Adam at the beginning; it falls linearly to 0 at the end of the run"""
+    gradient_norm: Positive
+    """largest Euclidean norm of the gradient of a network"""
+    entropy: NotNegative
+    """weight of the entropy of the actions in the actors' loss"""
+    log_std: Annotated[float, Field(ge=-10, le=2)] = -0.5
+    """logarithm of the standard deviation of the actions at the beginning, also of a warm start"""
+    warm_start: str = ""
+    """run folder, or `pretrained:…`, whose actors the run begins with; none if empty"""
+
+    @property
+    def replays(self) -> bool:
+        return False
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class MAPPOConfig(IPPOConfig):
+    """Stores the settings of MAPPO."""
+
+    critic_map: bool = False
+    """whether the critic, in training, also reads the true map: burning cells, seen and not seen"""
+
+    @property
+    def reads_map(self) -> bool:
+        return self.critic_map
+
+
+class PPO(Learner):
+    """Updates actors and critics after each episode, from the episode of every environment.
+
+    IPPO and MAPPO define the critics.
+    """
+
+    config: IPPOConfig
+
+    def __init__(self, config: Any, context: LearnerContext):
+        self.config, self.context = config, context
+        # Networks.
+        specs = context.observation_spec, context.action_spec
+        initial = torch.Generator().manual_seed(context.seed)
+        self.actor = self.make_actor(config, *specs, initial, context.policy)
+        self.critic: Any = self.make_critic(context, initial)
+        self._reset_std()
+        # Exploration.
+        self.generator = torch.Generator(context.device).manual_seed(context.seed)
+        self.explorer = GaussianExplorer(self.actor, self.generator)
+        # Losses and advantages.
+        self.loss = self._make_loss()
+        self.gae = MultiAgentGAE(
+            gamma=config.gamma,
+            lmbda=config.gae_lambda,
+            value_network=None,
+            average_gae=False,
+            device=torch.device(context.device),
+        )
+        self.gae.set_keys(
+            advantage=ADVANTAGE,
+            value_target=RETURN,
+            value=VALUE,
+            reward=keys.REWARD,
+            done=_ENDS,
+            terminated=_TERMINATED,
+        )
+        self.spread = torch.zeros(self._networks_of_actors, device=context.device)
+        """standard deviation of the returns of each network's UAVs, averaged over iterations; the
+        unit of the critics' values; 0 before the first iteration"""
+        # Optimizer.
+        self.parts = [list(part.module.parameters()) for part in (self.actor, self.critic)]
+        weights = [*self.parts[0], *self.parts[1]]
+        self.optimizer = torch.optim.Adam(weights, lr=config.lr, eps=1e-5, fused=True)
+        self.learning_starts = context.horizon
+        self.decisions = 0
+        """decisions so far, in the whole run"""
+        self._episode: list[TensorDictBase] = []
+        """transitions of the current episode, batch size [environments, steps] each"""
+
+    @classmethod
+    def make_actor(
+        cls,
+        config: Any,
+        observation_spec: Composite,
+        action_spec: Composite,
+        generator: torch.Generator | None = None,
+        policy: PolicyConfig | None = None,
+    ) -> GaussianActor:
+        """Returns new actors, with a memory if the policy has one."""
+        uavs, actions = action_spec[keys.ACTION].shape[-2:]
+        network = GaussianNetwork(
+            uavs,
+            keys.observation_shapes(observation_spec),
+            actions,
+            config.hidden,
+            policy=policy or PolicyConfig(),
+            share_parameters=config.share_parameters,
+            device=observation_spec.device,
+            generator=generator,
+        )
+        return GaussianActor(network, observation_spec)
+
+    @abstractmethod
+    def make_critic(self, context: LearnerContext, generator: torch.Generator) -> TensorDictModule:
+        """Returns new critics, which write `VALUE` for whole episodes."""
+
+    def _make_loss(self) -> MAPPOLoss:
+        outputs: list[Any] = [MEAN, _STD]
+        draw = ProbabilisticTensorDictModule(
+            in_keys={"loc": MEAN, "scale": _STD},  # pyright: ignore[reportArgumentType]
+            out_keys=[keys.ACTION],
+            distribution_class=IndependentNormal,
+        )
+        actor = TensorDictModule(self.actor.module, in_keys=self.actor.observed, out_keys=outputs)
+        loss = MAPPOLoss(
+            ProbabilisticTensorDictSequential(actor, draw),
+            self.critic,
+            clip_epsilon=self.config.clip,
+            entropy_bonus=self.config.entropy > 0,
+            entropy_coeff=self.config.entropy,
+            normalize_advantage=False,
+            loss_critic_type="l2",
+            log_explained_variance=False,
+            functional=False,
+            reduction="none",
+            device=torch.device(self.context.device),
+        )
+        loss.set_keys(
+            action=keys.ACTION,
+            sample_log_prob=LOG_PROB,
+            advantage=ADVANTAGE,
+            value_target=RETURN,
+            value=VALUE,
+        )
+        return loss
+
+    @property
+    def _networks_of_actors(self) -> int:
+        return 1 if self.config.share_parameters else self.context.num_uavs
+
+    @property
+    def _minibatches(self) -> int:
+        """Number of updates of an epoch."""
+        return min(self.config.minibatches, self.context.num_envs)
+
+    def learn(self, rollout: TensorDictBase) -> list[Losses]:
+        """Stores a rollout, and makes all updates of an iteration at the end of an episode."""
+        self._episode.append(self._transitions(rollout))
+        self.decisions += rollout.shape[1]
+        if self.decisions % self.context.horizon:
+            return []
+        episode: Any = torch.cat(self._episode, 1)  # pyright: ignore[reportArgumentType]
+        self._episode = []
+        self._estimate(episode, rollout.get("next")[:, -1:])
+        done = (self.decisions - self.context.horizon) / self.context.total_steps
+        for entry in self.optimizer.param_groups:
+            entry["lr"] = self.config.lr * max(0.0, 1 - done)
+        return [self.update(batch) for batch in self._batches(episode)]
+
+    def _transitions(self, rollout: TensorDictBase) -> TensorDict:
+        """Returns what is learnt from of a rollout, batch size [environments, steps]."""
+        read = [*self.actor.observed, *self.critic.in_keys, keys.ACTION, LOG_PROB]
+        result = {key: rollout.get(key).clone() for key in read}
+        result[keys.REWARD] = rollout.get(("next", *keys.REWARD)).clone()
+        if self.context.failures:
+            result[keys.ALIVE] = rollout.get(("next", *keys.ALIVE)).clone()
+        return TensorDict(result, batch_size=rollout.shape, device=rollout.device)
+
+    def _estimate(self, episode: TensorDictBase, last: TensorDictBase) -> None:
+        """Writes the critics' advantages and returns into an episode.
+
+        Args:
+            episode: batch size [environments, decisions].
+            last: the time step after the last decision, batch size [environments, 1].
+        """
+        read = [part.select(*self.critic.in_keys) for part in (episode, last)]
+        values = []
+        # The environments of a minibatch at a time, to save memory.
+        for rows in torch.arange(len(episode)).tensor_split(self._minibatches):
+            whole: Any = torch.cat([part[rows] for part in read], 1)  # pyright: ignore[reportArgumentType]
+            with torch.no_grad():
+                values.append(self.critic(whole).get(VALUE))
+        reward, alive = episode.pop(keys.REWARD), episode.get(keys.ALIVE, None)
+        advantage, returns = self.advantages(torch.cat(values), reward, alive)
+        episode.set(ADVANTAGE, advantage).set(RETURN, returns)
+
+    def advantages(
+        self, value: Tensor, reward: Tensor, alive: Tensor | None
+    ) -> tuple[Tensor, Tensor]:
+        """Returns advantages, standardised, and returns in units of the new `spread`.
+
+        The horizon truncates an episode and does not end the world: the value of the last
+        observation stands for what would follow. The episode of a UAV that fails is truncated
+        before the decision that it does not survive.
+
+        Args:
+            value: float32 [envs, decisions + 1, uavs, 1], in units of the old `spread`.
+            reward: float32 [envs, decisions, uavs, 1].
+            alive: bool [envs, decisions, uavs], whether a UAV still flew after a decision; None if
+                UAVs do not fail.
+        """
+        uavs = reward.shape[2] // len(self.spread)  # of a network
+
+        def of_uavs(x: Tensor) -> Tensor:
+            return x.repeat_interleave(uavs).unsqueeze(-1)
+
+        value = value * of_uavs(torch.where(self.spread > 0, self.spread, 1.0))
+        flew = torch.ones_like(reward, dtype=torch.bool) if alive is None else alive.unsqueeze(-1)
+        ends = torch.cat((~flew[:, 1:], torch.ones_like(flew[:, :1])), 1)
+        after = {VALUE: value[:, 1:], keys.REWARD: reward, _ENDS: ends}
+        after[_TERMINATED] = torch.zeros_like(ends)
+        batch = reward.shape[:2]
+        episode = TensorDict({VALUE: value[:, :-1], "next": TensorDict(after, batch)}, batch)
+        self.gae(episode)
+        advantage, returns = episode.get(ADVANTAGE), episode.get(RETURN)
+        mean, std = self._moments(advantage, flew)
+        _, spread = self._moments(returns, flew)
+        kept = (self.spread > 0).to(self.spread.dtype) * _KEPT
+        self.spread.copy_(torch.lerp(spread, self.spread, kept).clamp(min=1e-6))
+        advantage = (advantage - of_uavs(mean)) / of_uavs(std + 1e-8)
+        return advantage, returns / of_uavs(self.spread)
+
+    def _moments(self, x: Tensor, flew: Tensor) -> tuple[Tensor, Tensor]:
+        """Returns mean and standard deviation for each network, over the decisions in flight."""
+        weight = flew.to(x.dtype)
+        shape, rest = (2, (len(self.spread), -1)), (0, 1, 3, 4)
+        x, weight = x.unflatten(*shape), weight.unflatten(*shape)
+        count = weight.sum(rest).clamp(min=1)
+        mean = (x * weight).sum(rest) / count
+        squares = (x - mean[:, None, None]).square() * weight
+        return mean, (squares.sum(rest) / count).sqrt()
+
+    def _batches(self, episode: TensorDictBase) -> Iterator[TensorDictBase]:
+        """Yields the batches of an iteration, whole episodes of some environments each."""
+        for _ in range(self.config.epochs):
+            size, device = self.context.num_envs, self.context.device
+            order = torch.randperm(size, generator=self.generator, device=device)
+            for chosen in order.tensor_split(self._minibatches):
+                yield episode[chosen]
+
+    def update(self, batch: TensorDictBase) -> Losses:
+        """Performs one step of the optimizer.
+
+        Args:
+            batch: episodes, batch size [environments, decisions].
+        """
+        losses = self.losses(batch)
+        torch.stack([self._of_networks(*item) for item in losses.items()]).sum().backward()
+        for part in self.parts:
+            gradients = [value.grad for value in part if value.grad is not None]
+            clip_by_row(gradients, self.config.gradient_norm)
+        self.optimizer.step()
+        self.optimizer.zero_grad()
+        self.updates += 1
+        return {name: value.detach() for name, value in losses.items()}
+
+    def losses(self, batch: TensorDictBase) -> Losses:
+        """Computes the losses with gradients, one number per UAV."""
+        computed, alive = self.loss(batch.copy()), batch.get(keys.ALIVE, None)
+        names = {"actor": "loss_objective", "critic": "loss_critic", "entropy": "loss_entropy"}
+        return {
+            name: mean_over_batch(computed.get(key), alive)
+            for name, key in names.items()
+            if key in computed.keys()  # noqa: SIM118  (a TensorDict iterates over its rows)
+        }
+
+    def _of_networks(self, name: str, loss: Tensor) -> Tensor:
+        """Returns the sum of the losses of all networks, each the mean over its UAVs."""
+        networks = len(self.parts[name == "critic"][0])
+        return loss.unflatten(-1, (networks, -1)).mean(-1).sum()
+
+    def start_from(self, weights: Mapping[str, Tensor]) -> None:
+        self.copy_actor(weights)
+        self._reset_std()
+
+    def _reset_std(self) -> None:
+        """Sets the standard deviation of the actions to that of the beginning of a run."""
+        with torch.no_grad():
+            self.actor.module.log_std.fill_(self.config.log_std)
+
+    def state_dict(self) -> dict[str, Tensor]:
+        episode: Any = torch.cat(self._episode, 1) if self._episode else TensorDict({})  # pyright: ignore[reportArgumentType]
+        returns = {"spread": self.spread, "decisions": torch.tensor(self.decisions)}
+        return super().state_dict() | prefixed(returns=returns, episode=flatten(episode))
+
+    def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
+        super().load_state_dict(state)
+        copy_into({"spread": self.spread}, {"spread": state["returns/spread"]})
+        self.decisions = int(state["returns/decisions"])
+        episode = group(state, "episode")
+        self._episode = [unflatten(episode, 2, self.context.device)] if episode else []
+
+
+class IPPO(PPO):
+    """Values what each UAV observes."""
+
+    config_type = IPPOConfig
+
+    def make_critic(self, context: LearnerContext, generator: torch.Generator) -> TensorDictModule:
+        observed: Any = keys.observation_keys(context.observation_spec)
+        network = SequenceNetwork(
+            context.num_uavs,
+            keys.observation_shapes(context.observation_spec),
+            1,
+            self.config.hidden,
+            policy=context.policy,
+            gain=1.0,
+            share_parameters=self.config.share_parameters,
+            device=context.device,
+            generator=generator,
+        )
+        return TensorDictModule(network, in_keys=observed, out_keys=[VALUE])
+
+
+class MAPPO(PPO):
+    """Values the observations and positions of the whole team, with one number for each UAV.
+
+    With `critic_map`, it also reads the true map, which no actor does. The critic has one set of
+    weights and is used in training alone.
+    """
+
+    config_type = MAPPOConfig
+    config: MAPPOConfig
+
+    def make_critic(self, context: LearnerContext, generator: torch.Generator) -> TensorDictModule:
+        spec, world = context.observation_spec, context.world
+        network = TeamNetwork(
+            context.num_uavs,
+            keys.observation_shapes(spec),
+            world.low,
+            world.high,
+            hidden=self.config.hidden,
+            policy=context.policy,
+            gain=1.0,
+            grid=world.grid if self.config.critic_map else None,
+            device=context.device,
+            generator=generator,
+        )
+        observed: list[Any] = [keys.POSITION, *keys.observation_keys(spec)]
+        observed += [keys.TRUE_MAP] if self.config.critic_map else []
+        return TensorDictModule(network, in_keys=observed, out_keys=[VALUE])
+
+
+def clip_by_row(gradients: Sequence[Tensor], limit: float) -> None:
+    """Shortens the gradients of a network to a Euclidean norm, in place and per row.
+
+    Args:
+        gradients: [rows, ...] each; a row belongs to a UAV or, with shared weights, to the team.
+        limit: largest norm of a row of all gradients together.
+    """
+    rows = [torch.linalg.vector_norm(gradient.flatten(1), dim=1) for gradient in gradients]
+    factor = (limit / (torch.stack(rows).square().sum(0).sqrt() + 1e-6)).clamp(max=1)
+    for gradient in gradients:
+        gradient.mul_(factor.view(-1, *[1] * (gradient.ndim - 1)))
