@@ -44,8 +44,8 @@ class Stateful(TensorDictModuleBase):
         if not began.all():
             raise UserError(
                 f"the policy carries {key} from step to step, and the TensorDict lacks it after "
-                "the first step: use step_mdp(env.step(...)), and for ParallelEnv add "
-                "policy.make_tensordict_primer() to each environment"
+                "the first step: append policy.make_tensordict_primer() to the environment, and "
+                "carry it with step_mdp"
             )
         shape = *began.shape, self.uavs, self.carries[key]
         return torch.zeros(shape, dtype=torch.float32, device=began.device)

@@ -6,8 +6,8 @@ from collections.abc import Iterator
 import torch
 from torch import Tensor, nn
 
+from emberlink.policies.networks.actor_critic import StackedActor, StackedCritic
 from emberlink.policies.networks.layers import StackedLayerNorm, StackedLinear
-from emberlink.policies.networks.stacked import StackedActor, StackedCritic
 
 
 class SingleActor(nn.Module):
@@ -46,7 +46,7 @@ def matched(
     """Yields name, the UAV's slice of the stack, and the single network's parameter."""
     assert not list(stack.encoder.parameters())  # a vector
     for name, layer in stack.named_children():
-        if name in ("encoder", "memory"):
+        if name == "encoder":
             continue
         assert isinstance(layer, StackedLinear | StackedLayerNorm)
         module = single.get_submodule(name)

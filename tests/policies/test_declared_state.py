@@ -121,7 +121,8 @@ def test_multi_sync_collector_acts_as_alone(policy):
 
 def inputs(policy, td):
     present = td.keys(True)
-    return {"_".join(k) if isinstance(k, tuple) else k: td[k] for k in policy.in_keys if k in present}
+    names = [key for key in policy.in_keys if key in present]
+    return {"_".join(k) if isinstance(k, tuple) else k: td[k] for k in names}
 
 
 def test_exported_policy_acts_as_the_policy(policy):
@@ -149,7 +150,7 @@ def test_policy_without_its_state_says_so_after_the_first_step(policy):
     env = make(policy.config, 3)
     td = env.reset().exclude(HELD, MEMORY)
     td = step_mdp(env.step(policy(td)))
-    with pytest.raises(UserError, match="carries .*held.* from step to step"):
+    with pytest.raises(UserError, match=r"carries .*held.* from step to step"):
         policy(td.exclude(HELD))
 
 

@@ -21,46 +21,46 @@ COUNT = (keys.AGENTS, "count")
 class Counting(TensorDictModuleBase):
     """Writes the number of its decisions as the action."""
 
-    in_keys, out_keys = [keys.STEP], [keys.ACTION, COUNT]
+    in_keys, out_keys = [keys.STEP, COUNT], [keys.ACTION, ("next", *COUNT)]
 
     def forward(self, tensordict):
         before = tensordict.get(COUNT, None)
         before = torch.zeros_like(tensordict.get(keys.POSITION)) if before is None else before
-        tensordict.set(COUNT, before + 1)
+        tensordict.set(("next", *COUNT), before + 1)
         return tensordict.set(keys.ACTION, before + 1)
 
 
 def test_holding_for_one_step_is_the_policy_itself():
     policy = Counting()
-    assert hold(policy, 1) is policy
+    assert hold(policy, 1, 2) is policy
     td: Any = TensorDict({}, batch_size=[2, 3])
     assert decisions(td, 1) is td
 
 
 def test_an_action_is_held_and_what_is_carried_changes_at_decisions_alone():
     env = make_env("independent", num_envs=2, num_uavs=2, horizon=8, seed=1)
-    rollout = env.rollout(8, Held(Counting(), 3))
+    rollout = env.rollout(8, Held(Counting(), 3, 2))
     actions = rollout[keys.ACTION][:, :, 0, 0]
     assert actions.tolist() == [[1, 1, 1, 2, 2, 2, 3, 3]] * 2
-    assert rollout[COUNT][:, :, 0, 0].equal(actions)
+    assert rollout["next", *COUNT][:, :, 0, 0].equal(actions)
 
 
 def test_environments_decide_at_their_own_steps():
     """Environment 1 begins a new episode while the action of environment 0 is held."""
     env = make_env("independent", num_envs=2, num_uavs=2, seed=1)
-    policy, td = Held(Counting(), 3), env.reset()
+    policy, td = Held(Counting(), 3, 2), env.reset()
     for _ in range(2):
         td = step_mdp(env.step(policy(td)))
     td[keys.STEP] = torch.tensor([2, 0])
     acted = policy(td)
     assert acted[keys.ACTION][:, 0, 0].tolist() == [1, 2]
-    assert acted[HELD].equal(acted[keys.ACTION])
-    assert acted[COUNT][:, 0, 0].tolist() == [1, 2]
+    assert acted["next", *HELD].equal(acted[keys.ACTION])
+    assert acted["next", *COUNT][:, 0, 0].tolist() == [1, 2]
 
 
 def test_a_transition_leads_from_one_decision_to_the_next():
     env = make_env("independent", num_envs=2, num_uavs=2, horizon=6, seed=1)
-    whole = env.rollout(6, Held(Counting(), 3))
+    whole = env.rollout(6, Held(Counting(), 3, 2))
     folded = decisions(whole, 3)
     assert folded.shape == (2, 2)
     assert folded[keys.STEP].tolist() == [[0, 3]] * 2

@@ -7,10 +7,9 @@ from torch import nn
 
 from emberlink.envs import keys
 from emberlink.envs.utils.errors import UserError
-from emberlink.policies.gaussian import MEAN, MEMORY, GaussianExplorer, MemoryActor
+from emberlink.policies.gaussian import MEMORY, GaussianActor, GaussianExplorer
 from emberlink.policies.networks import memory
 from emberlink.policies.networks.memory.gru import GRU
-from emberlink.policies.networks.memory.stack import Stack
 from emberlink.policies.networks.sequence import GaussianNetwork, SequenceNetwork, TeamNetwork
 from emberlink.policies.settings import PolicyConfig
 from emberlink.trainers import make_env
@@ -19,15 +18,15 @@ from emberlink.trainers.config.compose import resolve
 UAVS, FEATURES = 3, 6
 
 
-def network(kind: str, teams: int = 1, *, shared: bool = True, index=False) -> GaussianNetwork:
+def network(kind: str, *, shared: bool = True, index=False) -> GaussianNetwork:
     return GaussianNetwork(
         UAVS,
         [(FEATURES,)],
         3,
         (8,),
-        policy=PolicyConfig(memory=kind, units=5, decisions=3, agent_index=index),
+        policy=PolicyConfig(memory=kind, units=5, agent_index=index),
         share_parameters=shared,
-        generator=[torch.Generator().manual_seed(seed) for seed in range(teams)],
+        generator=torch.Generator().manual_seed(0),
     )
 
 
@@ -36,19 +35,18 @@ def drawn(*shape: int, seed: int = 0) -> torch.Tensor:
 
 
 def test_memories_are_the_files_on_disk():
-    assert memory.known() == ["gru", "none", "stack"]
+    assert memory.known() == ["gru", "none"]
     with pytest.raises(UserError, match=r"policy.memory='lstm' is not known; known: gru, none"):
         resolve("consensus", ["learner=ippo", "policy.memory=lstm"])
     with pytest.raises(UserError, match=r"policy.memory='' is not known; known: gru, none"):
         resolve("consensus", ["learner=ippo", 'policy.memory=""'])
 
 
-@pytest.mark.parametrize("kind", ["none", "gru", "stack"])
+@pytest.mark.parametrize("kind", ["none", "gru"])
 @pytest.mark.parametrize("shared", [False, True])
-@pytest.mark.parametrize("teams", [1, 2])
-def test_decision_by_decision_equals_the_whole_episode(kind, shared, teams):
-    actor = network(kind, teams, shared=shared, index=True)
-    envs, decisions = 2 * teams, 7
+def test_decision_by_decision_equals_the_whole_episode(kind, shared):
+    actor = network(kind, shared=shared, index=True)
+    envs, decisions = 2, 7
     observed = drawn(envs, decisions, UAVS, FEATURES)
     whole, std = actor(observed)
     state = None
@@ -58,9 +56,8 @@ def test_decision_by_decision_equals_the_whole_episode(kind, shared, teams):
     assert std.equal(actor.std(torch.Size((envs, UAVS)))[:, None].expand_as(whole))
 
 
-@pytest.mark.parametrize("kind", ["gru", "stack"])
-def test_an_output_depends_on_earlier_observations_of_the_same_uav_alone(kind):
-    actor = network(kind)
+def test_an_output_depends_on_earlier_observations_of_the_same_uav_alone():
+    actor = network("gru")
     observed = drawn(2, 6, UAVS, FEATURES)
     changed = observed.clone()
     changed[1, 2, 0] += 1
@@ -69,22 +66,7 @@ def test_an_output_depends_on_earlier_observations_of_the_same_uav_alone(kind):
     assert same[0].all()
     assert same[1, :2].all()
     assert same[1, :, 1:].all()
-    assert not same[1, 2:5, 0].any()
-    # a stack of three decisions has forgotten it after two more
-    assert bool(same[1, 5, 0].all()) == (kind == "stack")
-
-
-def test_a_stack_holds_the_last_inputs_the_oldest_first():
-    stack = Stack(1, 2, PolicyConfig(memory="stack", decisions=3))
-    x = torch.tensor([[1.0, 2.0], [3.0, 4.0], [5.0, 6.0], [7.0, 8.0]])[None, None]
-    output, state = stack(x, torch.zeros(1, 1, stack.size))
-    assert output[0, 0].tolist() == [
-        [0, 0, 0, 0, 1, 2],
-        [0, 0, 1, 2, 3, 4],
-        [1, 2, 3, 4, 5, 6],
-        [3, 4, 5, 6, 7, 8],
-    ]
-    assert state[0, 0].tolist() == [5, 6, 7, 8]
+    assert not same[1, 2:, 0].any()
 
 
 @pytest.mark.parametrize("groups", [1, 2])
@@ -108,19 +90,6 @@ def test_the_gru_is_that_of_torch(groups):
         expected, last = theirs(read, state[group][None])
         torch.testing.assert_close(outputs[group], expected)
         torch.testing.assert_close(states[group], last[0])
-
-
-def test_several_teams_are_the_networks_of_single_teams():
-    both = network("gru", 2)
-    observed = drawn(4, 5, UAVS, FEATURES)
-    whole, _ = both(observed)
-    for team in range(2):
-        alone = network("gru")
-        own = {name: value[team : team + 1] for name, value in both.state_dict().items()}
-        alone.load_state_dict(own)
-        envs = slice(2 * team, 2 * team + 2)
-        torch.testing.assert_close(alone(observed[envs])[0], whole[envs])
-    assert not both.output.weight[0].equal(both.output.weight[1])
 
 
 def test_the_index_tells_uavs_apart_that_share_weights():
@@ -151,43 +120,40 @@ def test_a_critic_of_a_uav_is_a_sequence_network():
     assert critic(drawn(2, 4, UAVS, FEATURES)).shape == (2, 4, UAVS, 1)
 
 
-def actor_of(kind: str) -> tuple[MemoryActor, TensorDict]:
+def actor_of(kind: str) -> tuple[GaussianActor, TensorDict]:
     env = make_env("independent", "tuned", num_envs=2, num_uavs=UAVS, seed=4)
-    actor = MemoryActor(network(kind), env.observation_spec)
+    actor = GaussianActor(network(kind), env.observation_spec)
     return actor, env.reset()
 
 
-@pytest.mark.parametrize("kind", ["gru", "stack"])
-def test_the_memory_is_empty_where_an_episode_begins(kind):
+def test_the_memory_is_empty_where_an_episode_begins():
     """Environment 0 begins again; environment 1 is within its episode."""
-    actor, td = actor_of(kind)
+    actor, td = actor_of("gru")
     fresh = actor(td.clone())
     remembered = td.clone().set(MEMORY, drawn(2, UAVS, actor.module.memory.size))
     remembered[keys.STEP] = torch.tensor([0, 5])
     after = actor(remembered)
-    for key in (MEAN, MEMORY, keys.ACTION):
+    for key in (("next", *MEMORY), keys.ACTION):
         assert after[key][0].equal(fresh[key][0])
-    assert not after[MEAN][1].isclose(fresh[MEAN][1]).any()
+        assert not after[key][1].isclose(fresh[key][1]).any()
 
 
 def test_actions_are_the_means_clipped_to_the_box():
     actor, td = actor_of("none")
     nn.init.constant_(actor.module.output.bias, 3.0)
     acted = actor(td)
-    assert acted[MEAN].min() > 2
+    assert actor.mean(td).min() > 2
     assert acted[keys.ACTION].eq(1).all()
     assert MEMORY not in acted.keys(True)
 
 
 def test_the_density_of_an_exploring_action():
     actor, td = actor_of("gru")
-    explorer = GaussianExplorer(actor)
-    torch.manual_seed(1)
-    first = explorer(td.clone())
-    torch.manual_seed(2)
-    again = explorer(td.clone())
+    first, again = (
+        GaussianExplorer(actor, torch.Generator().manual_seed(1))(td.clone()) for _ in range(2)
+    )
     assert first[keys.ACTION].equal(again[keys.ACTION])  # no global random state
-    scale = torch.tensor(-0.5).exp()
-    exact = torch.distributions.Normal(first[MEAN], scale).log_prob(first[keys.ACTION]).sum(-1)
+    mean, scale = actor.mean(td.clone()), torch.tensor(-0.5).exp()
+    exact = torch.distributions.Normal(mean, scale).log_prob(first[keys.ACTION]).sum(-1)
     torch.testing.assert_close(first["agents", "action_log_prob"], exact)
-    assert (first[keys.ACTION] - first[MEAN]).std().item() == pytest.approx(0.6065, rel=0.6)
+    assert (first[keys.ACTION] - mean).std().item() == pytest.approx(0.6065, rel=0.6)

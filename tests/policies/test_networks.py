@@ -8,9 +8,13 @@ from single_ddpg import SingleActor, SingleCritic, copy_uav
 from tensordict import TensorDict
 
 from emberlink.envs import WildfireConfig, keys, specs
-from emberlink.policies.networks import stacked
-from emberlink.policies.networks.actor_critic import STATE_ACTION_VALUE, make_actor, make_critic
-from emberlink.policies.networks.stacked import StackedActor, StackedCritic
+from emberlink.policies.networks.actor_critic import (
+    STATE_ACTION_VALUE,
+    StackedActor,
+    StackedCritic,
+    make_actor,
+    make_critic,
+)
 
 UAVS, FEATURES, ACTIONS, HIDDEN = 4, 9, 3, (20, 12)
 SIZES = UAVS, [(FEATURES,)], ACTIONS, HIDDEN
@@ -42,7 +46,7 @@ def test_stacked_actors_equal_single_networks(batch):
 def test_stacked_critics_equal_single_networks(batch):
     stack = scrambled(StackedCritic(*SIZES))
     observation, action = torch.randn(*batch, UAVS, FEATURES), torch.randn(*batch, UAVS, ACTIONS)
-    values = stack(observation, action)
+    values = stack(action, None, observation)
     assert values.shape == (*batch, UAVS, 1)
     for uav in range(UAVS):
         single = copy_uav(stack, SingleCritic(*SINGLE), uav)
@@ -51,7 +55,7 @@ def test_stacked_critics_equal_single_networks(batch):
 
 
 def test_initial_weights_are_those_of_the_ddpg_paper():
-    critic = StackedCritic(6, [(9,)], 3, generator=torch.Generator().manual_seed(0))
+    critic = StackedCritic(6, [(9,)], 3, (400, 300), generator=torch.Generator().manual_seed(0))
     bounds = {
         "first": 1 / math.sqrt(9),
         "second": 1 / math.sqrt(400),
@@ -68,7 +72,7 @@ def test_initial_weights_are_those_of_the_ddpg_paper():
     for norm in (critic.first_norm, critic.second_norm):
         assert (norm.weight == 1).all()
         assert (norm.bias == 0).all()
-    actor = StackedActor(6, [(9,)], 3)
+    actor = StackedActor(6, [(9,)], 3, (400, 300))
     assert actor.action.weight.abs().max() <= 3e-3
     assert actor.first.weight.shape[2:] == (400,)
     assert actor.second.weight.shape[1:] == (400, 300)
@@ -102,85 +106,3 @@ def test_modules_read_and_write_the_keys_of_the_environment():
     assert td[STATE_ACTION_VALUE].shape == (5, 4, 1)
     assert actor.module.first.weight.shape == (4, 6, HIDDEN[0])
     assert actor.module.second.weight.shape == (4, *HIDDEN)
-
-
-@pytest.mark.parametrize("hidden", [(12, 20), (20, 12)])
-def test_networks_one_by_one_equal_the_stack(hidden, monkeypatch):
-    """Compares values and gradients, with inputs of one team and of two."""
-    generator = torch.Generator().manual_seed(3)
-    actor = StackedActor(2, [(5,)], 3, hidden, generator=[generator, generator])
-    critic = StackedCritic(2, [(5,)], 3, hidden, generator=[generator, generator])
-    for network in (actor, critic):
-        for weight in network.parameters():
-            torch.nn.init.normal_(weight, std=0.5, generator=generator)
-
-    def evaluate(large: int, uavs: int) -> list[torch.Tensor]:
-        monkeypatch.setattr(stacked, "MAX_BATCHED", large)
-        observation = torch.randn(6, uavs, 5, generator=torch.Generator().manual_seed(4))
-        action = actor(observation)
-        value = critic(observation, action)
-        assert action.shape == (6, uavs, 3)
-        assert value.shape == (6, uavs, 1)
-        weights = [*actor.parameters(), *critic.parameters()]
-        return [action, value, *torch.autograd.grad(value.square().sum(), weights)]
-
-    for uavs in (4, 2):
-        for single, whole in zip(evaluate(10**9, uavs), evaluate(1, uavs), strict=True):
-            torch.testing.assert_close(single, whole)
-
-
-def test_a_team_reads_its_own_environments():
-    """Rows 0 to 2 belong to team 0, rows 3 to 5 to team 1."""
-    generators = [torch.Generator().manual_seed(seed) for seed in (1, 2)]
-    both = StackedActor(2, [(5,)], 3, (8, 8), generator=generators)
-    observation = torch.randn(6, 2, 5)
-    actions = both(observation)
-    for team in range(2):
-        alone = StackedActor(
-            2, [(5,)], 3, (8, 8), generator=torch.Generator().manual_seed(team + 1)
-        )
-        rows = slice(3 * team, 3 * team + 3)
-        torch.testing.assert_close(actions[rows], alone(observation[rows]))
-
-
-@pytest.mark.parametrize("large", [1, 10**9], ids=["one by one", "stack"])
-def test_critics_reuse_features_of_the_observation(large, monkeypatch):
-    """Values and gradients do not change; features of others are not reused."""
-    monkeypatch.setattr(stacked, "MAX_BATCHED", large)
-    critic, other = scrambled(StackedCritic(*SIZES)), StackedCritic(*SIZES)
-    observation, following = torch.randn(2, 5, UAVS, FEATURES)
-    taken, chosen = torch.randn(2, 5, UAVS, ACTIONS).requires_grad_()
-    fixed = {name: weight.detach() for name, weight in critic.named_parameters()}
-    target = {name: weight.detach() for name, weight in other.named_parameters()}
-    made = []
-    features = stacked.to_features
-    monkeypatch.setattr(stacked, "to_features", lambda *given: made.append(1) or features(*given))
-
-    def values() -> list[torch.Tensor]:
-        call = torch.func.functional_call
-        return [
-            critic(observation, taken),
-            call(critic, target, (observation, taken)),
-            call(critic, target, (following, taken)),
-            call(critic, fixed, (observation, chosen)),
-            call(critic, fixed, (following, chosen)),
-        ]
-
-    def gradients(value: torch.Tensor) -> tuple:
-        inputs = [*critic.parameters(), taken, chosen]
-        return torch.autograd.grad(value.sum(), inputs, allow_unused=True, retain_graph=True)
-
-    apart, runs = values(), len(made)
-    with critic.sharing():
-        together = values()
-    assert len(made) - runs == runs * 4 // 5  # four of five
-    for single, same in zip(apart, together, strict=True):
-        assert single.equal(same)
-        if single.requires_grad:
-            for expected, got in zip(gradients(single), gradients(same), strict=True):
-                assert (expected is None) == (got is None)
-                torch.testing.assert_close(expected, got) if expected is not None else None
-    before = len(made)
-    critic(observation, taken)
-    critic(observation, taken)
-    assert len(made) - before == 2 * runs // 5  # outside the context no features are kept

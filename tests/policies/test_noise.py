@@ -1,4 +1,4 @@
-"""Tests exploration: Ornstein-Uhlenbeck noise is reset per episode and off in evaluation."""
+"""Tests exploration: Ornstein-Uhlenbeck noise is reset per episode and repeatable."""
 
 import math
 
@@ -7,15 +7,11 @@ import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictSequential
 from torchrl.data import Bounded, Composite, Unbounded
-from torchrl.envs import ExplorationType, set_exploration_type
 
 from emberlink.envs import keys
-from emberlink.envs.utils import counter_rng
-from emberlink.policies.exploration import ExplorationConfig, OrnsteinUhlenbeck
+from emberlink.policies.exploration import NOISE, ExplorationConfig, OrnsteinUhlenbeck
 from emberlink.policies.networks.actor_critic import make_actor
-from emberlink.trainers import make_env
 from emberlink.trainers.config.compose import resolve
-from emberlink.trainers.evaluation import evaluate
 from emberlink.trainers.training.setup import TrainingSetup
 
 UAVS, ENVS = 2, 4000
@@ -33,7 +29,9 @@ def explorer(*, theta: float, sigma: float, dt: float, envs: int = ENVS, network
     action = Composite({keys.ACTION: Bounded(-1.0, 1.0, (envs, UAVS, 3))}, shape=(envs,))
     actor = make_actor(observation, action, (8, 8))
     actor.module = network or Still()
-    noise = OrnsteinUhlenbeck(ExplorationConfig(theta=theta, sigma=sigma, dt=dt))
+    noise = OrnsteinUhlenbeck(
+        ExplorationConfig(theta=theta, sigma=sigma, dt=dt), UAVS, torch.Generator().manual_seed(0)
+    )
     return TensorDictSequential(actor, noise)
 
 
@@ -41,14 +39,14 @@ def play(policy, starts: list[torch.Tensor | bool], envs: int = ENVS) -> torch.T
     """Returns actions of consecutive steps, [steps, envs, uavs, 3]; `starts` marks new episodes."""
     actions = []
     td = TensorDict({keys.OBSERVATION: torch.ones(envs, UAVS, 6)}, batch_size=[envs])
-    episode = step = torch.zeros(envs, dtype=torch.int64)
+    step = torch.zeros(envs, dtype=torch.int64)
     for start in starts:
         fresh = torch.as_tensor(start).flatten().expand(envs)
-        episode, step = episode + fresh, torch.where(fresh, 0, step + 1)
-        td[keys.RNG_KEY] = counter_rng.fold_in(counter_rng.seed_keys(0, envs), episode)
+        step = torch.where(fresh, 0, step + 1)
         td[keys.STEP] = step
         td = policy(td)
         actions.append(td[keys.ACTION].clone())
+        td[NOISE] = td["next", *NOISE]
     return torch.stack(actions)
 
 
@@ -102,31 +100,3 @@ def test_training_resets_the_noise_each_episode(tmp_path):
     spread = [collected[keys.ACTION].std().item() for collected in setup.collector]
     expected = [0.1 * math.sqrt(step) for step in range(1, 7)] * 3
     assert spread == pytest.approx(expected, rel=0.06)
-
-
-def test_a_frozen_policy_is_deterministic():
-    policy = explorer(theta=0.1, sigma=5.0, dt=1.0, envs=7)
-    with set_exploration_type(ExplorationType.DETERMINISTIC):
-        assert not play(policy, [True, False], envs=7).any()
-
-
-def test_an_evaluation_uses_the_actions_of_the_actor():
-    env = make_env("consensus", num_envs=3, num_uavs=UAVS, horizon=12)
-    actor = make_actor(env.observation_spec, env.full_action_spec, (8, 8))
-    torch.nn.init.normal_(actor.module.action.weight, std=0.3)
-    watched = []
-
-    def policy(td):
-        watched.append((td[keys.OBSERVATION].clone(), actor(td)[keys.ACTION].clone()))
-        return td
-
-    measured = []
-    for seed in (1, 2):
-        torch.manual_seed(seed)
-        env.set_seed(5)
-        measured.append(evaluate.play(env, policy))
-    assert len(watched) == 24
-    for observation, action in watched:
-        assert action.equal(actor.module(observation))
-    for name, values in measured[0].items():
-        assert values.equal(measured[1][name]), name

@@ -6,7 +6,7 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from torchrl.envs import EnvBase
+from torchrl.envs import TransformedEnv
 
 from emberlink.policies.state import primer_of
 
@@ -17,22 +17,27 @@ class RolloutLoop:
     Exact resuming needs this input; TorchRL's collector neither returns nor takes it.
 
     Args:
-        env: batch of environments with communication.
+        env: batch of environments with communication; it gets the state of the policy, too.
         policy: actors with exploration noise.
         total_steps: steps of the batch of environments in the whole run.
         rollout_steps: steps of a rollout.
     """
 
     def __init__(
-        self, env: EnvBase, policy: TensorDictModuleBase, *, total_steps: int, rollout_steps: int
+        self,
+        env: TransformedEnv,
+        policy: TensorDictModuleBase,
+        *,
+        total_steps: int,
+        rollout_steps: int,
     ):
         self.env, self.policy = env, policy
         self.total_steps, self.rollout_steps, self.step = total_steps, rollout_steps, 0
+        primer = primer_of(policy)
+        if not primer.primers.is_empty():
+            env.append_transform(primer)
         self.carried: TensorDictBase = env.reset()
         """the input of the next step: observations, communication, state of the policy"""
-        for key, spec in primer_of(policy).primers.items(True, True):
-            shape = *self.carried.shape, *spec.shape
-            self.carried.set(key, torch.zeros(shape, dtype=spec.dtype, device=env.device))
         self._keys = list(self.carried.keys(True, True))
 
     def __iter__(self) -> Iterator[TensorDictBase]:

@@ -12,8 +12,7 @@ from emberlink.envs import keys
 from emberlink.policies.exploration import ExplorationConfig
 from emberlink.trainers.learners.base import LearnerContext
 from emberlink.trainers.learners.ddpg import DDPG, DDPGConfig
-from emberlink.trainers.learners.nan_guard import NonFiniteGuard
-from emberlink.trainers.learners.off_policy.replay_buffer import DONE, TERMINATED
+from emberlink.trainers.learners.replay import DONE, TERMINATED
 
 UAVS, FEATURES, ACTIONS, HIDDEN, BATCH = 3, 9, 3, (16, 12), 24
 RATES = {
@@ -42,10 +41,9 @@ def make_learner() -> DDPG:
         action_spec=action,
         num_uavs=UAVS,
         num_envs=1,
-        seeds=(5,),
+        seed=5,
         shared_replay=False,
         total_steps=100,
-        guard=NonFiniteGuard("cpu"),
         device="cpu",
     )
     return DDPG(config, context)
@@ -190,8 +188,8 @@ def test_the_time_limit_is_bootstrapped(terminated):
     losses = learner.losses(batch)["critic"]
     stacks = networks(learner)
     following = batch["next", *keys.OBSERVATION]
-    value = stacks["value"](batch[keys.OBSERVATION], batch[keys.ACTION])
-    beyond = stacks["target_value"](following, stacks["target_actor"](following))
+    value = stacks["value"](batch[keys.ACTION], None, batch[keys.OBSERVATION])
+    beyond = stacks["target_value"](stacks["target_actor"](following), None, following)
     assert beyond.abs().min() > 1e-4
     target = batch["next", *keys.REWARD] + (0 if terminated else 0.95 * beyond)
     torch.testing.assert_close(losses, (value - target).square()[0, :, 0], atol=1e-5, rtol=1e-5)
