@@ -95,7 +95,8 @@ class Registry(Generic[T]):
         classes = [
             item
             for item in vars(file).values()
-            if getattr(item, "__module__", "") == file.__name__ and self._fits(item)
+            if getattr(item, "__module__", "") == file.__name__
+            and self._fits(item)
             and (name not in self.shared or item.__name__.lower() == name)
         ]
         if len(classes) != 1:

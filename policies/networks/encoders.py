@@ -138,9 +138,7 @@ class ObservationEncoder(nn.Module):
         for shape in shapes:
             if len(shape) not in ENCODERS:
                 raise ValueError(f"no encoder for an observation of shape {list(shape)} per UAV")
-        self.parts = nn.ModuleList(
-            ENCODERS[len(shape)](groups, shape, **start) for shape in shapes
-        )
+        self.parts = nn.ModuleList(ENCODERS[len(shape)](groups, shape, **start) for shape in shapes)
         self.features: int = sum(part.features for part in self.parts)  # pyright: ignore[reportArgumentType, reportCallIssue]
 
     def forward(self, tensors: Sequence[Tensor]) -> Tensor:

@@ -1,4 +1,4 @@
-"""Compares GPU and CPU results, checks for synchronisation, and times the paper's protocol."""
+"""Compares GPU and CPU results, and times the paper's protocol."""
 
 import time
 
@@ -34,22 +34,21 @@ def test_the_environment_is_the_same(method, setup):
             torch.testing.assert_close(following[1][name], value, rtol=1e-4, atol=1e-4)
 
 
-@pytest.mark.parametrize("seeds", ["seed=1", "seeds=[1,2]"])
 @pytest.mark.parametrize("method", METHODS)
-def test_a_recipe_learns_the_same(method, seeds, tmp_path):
-    """Compares 60 updates, most of them by a CUDA graph, with the CPU's."""
+def test_a_recipe_learns_the_same(method, tmp_path):
+    """Compares 60 updates, with the CPU's."""
     small = ["env.horizon=40", "episodes=2", "num_envs=2", "learner.batch_size=32"]
     weights = []
     for device in ("cpu", "cuda"):
         trainer = Trainer(
-            resolve(method, [*small, seeds, f"device={device}", f"output={tmp_path / device}"])
+            resolve(method, [*small, "seed=1", f"device={device}", f"output={tmp_path / device}"])
         )
         trainer.start()
         trainer.train()
-        weights.append([trainer.setup.learner.weights(team) for team in range(trainer.setup.teams)])
-    for cpu, gpu in zip(*weights, strict=True):
-        for name, value in cpu.items():
-            torch.testing.assert_close(gpu[name].cpu(), value, rtol=1e-2, atol=1e-3)
+        weights.append(trainer.setup.learner.weights())
+    cpu, gpu = weights
+    for name, value in cpu.items():
+        torch.testing.assert_close(gpu[name].cpu(), value, rtol=1e-2, atol=1e-3)
 
 
 def seconds_of(method: str, output, *overrides: str) -> float:
@@ -74,23 +73,3 @@ def seconds_of(method: str, output, *overrides: str) -> float:
 def test_one_method_one_seed(tell, tmp_path):
     seconds = seconds_of("consensus", tmp_path)
     tell(f"200 episodes, 200,000 updates, consensus: {seconds:.0f} s (goal: at most 180)")
-
-
-def test_four_methods_five_seeds(tell, tmp_path):
-    seconds = sum(seconds_of(method, tmp_path, "seeds=[0,1,2,3,4]") for method in METHODS)
-    tell(f"four methods x 5 seeds, the same each: {seconds / 60:.1f} min (goal: at most 20)")
-
-
-def test_no_step_synchronises_with_the_device():
-    """torch raises an error if a step synchronises with the GPU."""
-    setup = TrainingSetup(resolve("consensus", ["device=cuda", "episodes=1"]))
-    starts = setup.learner.learning_starts
-    try:
-        for step, collected in enumerate(setup.collector):
-            if step == starts + 10:
-                torch.cuda.set_sync_debug_mode("error")
-            if step == starts + 60:
-                break
-            setup.learn(collected)
-    finally:
-        torch.cuda.set_sync_debug_mode("default")

@@ -17,7 +17,7 @@ from emberlink.envs import keys
 from emberlink.envs.wildfire import WildfireEnv
 from emberlink.trainers import make_env
 from emberlink.trainers.config.compose import resolve
-from emberlink.trainers.rollout.products import fast_products
+from emberlink.trainers.learners.replay import to_batch
 from emberlink.trainers.training.setup import TrainingSetup
 
 METHODS = known("method")
@@ -84,18 +84,8 @@ def matrix_product(device: str = "cpu") -> Callable[[], object]:
     return lambda: a @ b
 
 
-def with_fast_products(work: Callable[[], object]) -> Callable[[], object]:
-    """Returns the function with its products computed as those of a training's updates."""
-
-    def fast() -> None:
-        with fast_products():
-            work()
-
-    return fast
-
-
 def batch_of(setup: TrainingSetup) -> TensorDict:
     """Returns a sample of a replay buffer with a few hundred steps."""
     learner: Any = setup.learner
     setup.dry_run(learner.learning_starts + 20)
-    return learner.sample()
+    return to_batch(learner.replay.sample())

@@ -12,8 +12,6 @@ from emberlink.envs import WildfireConfig, keys, metrics, parallel_env
 from emberlink.trainers import load, make_env, train
 from emberlink.trainers.cli import main
 from emberlink.trainers.config.compose import resolve
-from emberlink.trainers.learners.off_policy import OffPolicyLearner
-from emberlink.trainers.learners.off_policy.replay_buffer import to_rows
 
 WORLDS = [world for world in known("world") if world != "file"]
 
@@ -43,25 +41,6 @@ def test_a_training_in_relay_is_that_in_front(method, tmp_path):
     assert any(value.abs().sum() > 0 for value in front.values())
     assert front.keys() == relay.keys()
     assert all(torch.equal(front[name], relay[name]) for name in front)
-
-
-def test_failed_uavs_do_not_count_in_losses():
-    loss = torch.tensor([[1.0, 10.0], [3.0, 20.0], [100.0, 30.0]])
-    alive = torch.tensor([[True, False], [True, False], [False, False]])
-    batch = {keys.ALIVE: alive}
-    assert OffPolicyLearner.mean_over_batch(loss, batch).tolist() == [2.0, 0.0]
-    assert OffPolicyLearner.mean_over_batch(loss, {}).tolist() == loss.mean(0).tolist()
-
-
-def test_rows_say_who_was_alive_after_a_step():
-    env = make_env("independent", world="blackout", num_envs=2, seed=0, num_train_fires=2)
-    first = env.reset()
-    env.base_env._fail_step.copy_(torch.arange(12).view(2, 6))
-    rollout = env.rollout(3, auto_reset=False, tensordict=first)
-    rows = to_rows(rollout, 1, [keys.OBSERVATION], failures=True)
-    assert rows["alive"].equal(rollout["next", "agents", "alive"].flatten(0, 1))
-    assert not rows["alive"].all()
-    assert "alive" not in to_rows(rollout, 1, [keys.OBSERVATION])
 
 
 @pytest.mark.heavy
