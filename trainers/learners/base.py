@@ -13,7 +13,6 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.data import Composite
-from torchrl.objectives import LossModule
 
 from emberlink.envs.config import WildfireConfig
 from emberlink.envs.utils.errors import UserError
@@ -117,8 +116,8 @@ class Learner(ABC):
     `module`"""
     explorer: TensorDictModuleBase
     """the policy that collects transitions"""
-    loss: LossModule | torch.nn.Module
-    """holds all networks; its parameters and buffers are saved"""
+    loss: Any
+    """TorchRL's loss or another module that holds all networks; its state is saved"""
     optimizer: torch.optim.Optimizer
     """of all parameters that are trained"""
     generator: torch.Generator | None = None

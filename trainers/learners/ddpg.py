@@ -70,7 +70,6 @@ class DDPG(Learner):
     """Updates the actor, the critic and their target networks of each UAV from its own batch."""
 
     config_type = DDPGConfig
-    loss: DDPGLoss
 
     def __init__(self, config: DDPGConfig, context: LearnerContext):
         self.config, self.context = config, context
@@ -89,7 +88,8 @@ class DDPG(Learner):
         # Exploration.
         self.generator = torch.Generator(context.device).manual_seed(context.seed)
         noise = OrnsteinUhlenbeck(config.exploration, context.num_uavs, self.generator)
-        self.explorer = TensorDictSequential(self.actor, noise)
+        modules: list[Any] = [self.actor, noise]
+        self.explorer = TensorDictSequential(*modules)
         # Losses and target networks.
         loss = DDPGLoss(self.actor, critic, delay_actor=True, delay_value=True, reduction="none")
         loss.set_keys(

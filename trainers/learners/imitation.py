@@ -153,7 +153,8 @@ class Imitation(Learner):
             missing = self.sequence - len(self._recent)
             if missing and self.decisions % self.context.horizon:
                 continue
-            agents: Any = torch.cat([*self._recent, *[decision] * missing], 1).get(keys.AGENTS)  # pyright: ignore[reportArgumentType]
+            parts: Any = [*self._recent, *[decision] * missing]
+            agents: Any = torch.cat(parts, 1).get(keys.AGENTS)
             alive = agents.get("alive", torch.ones(agents.shape, dtype=torch.bool)).clone()
             alive[:, len(self._recent) :] = False
             rows = {name: value.transpose(1, 2) for name, value in agents.items()}

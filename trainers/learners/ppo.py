@@ -103,7 +103,7 @@ class PPO(Learner):
     IPPO and MAPPO define the critics.
     """
 
-    config: IPPOConfig
+    config: Any
 
     def __init__(self, config: Any, context: LearnerContext):
         self.config, self.context = config, context
@@ -157,6 +157,7 @@ class PPO(Learner):
     ) -> GaussianActor:
         """Returns new actors, with a memory if the policy has one."""
         uavs, actions = action_spec[keys.ACTION].shape[-2:]
+        device: Any = observation_spec.device
         network = GaussianNetwork(
             uavs,
             keys.observation_shapes(observation_spec),
@@ -164,7 +165,7 @@ class PPO(Learner):
             config.hidden,
             policy=policy or PolicyConfig(),
             share_parameters=config.share_parameters,
-            device=observation_spec.device,
+            device=device,
             generator=generator,
         )
         return GaussianActor(network, observation_spec)
@@ -181,8 +182,9 @@ class PPO(Learner):
             distribution_class=IndependentNormal,
         )
         actor = TensorDictModule(self.actor.module, in_keys=self.actor.observed, out_keys=outputs)
+        policy: list[Any] = [actor, draw]
         loss = MAPPOLoss(
-            ProbabilisticTensorDictSequential(actor, draw),
+            ProbabilisticTensorDictSequential(*policy),
             self.critic,
             clip_epsilon=self.config.clip,
             entropy_bonus=self.config.entropy > 0,
@@ -389,7 +391,6 @@ class MAPPO(PPO):
     """
 
     config_type = MAPPOConfig
-    config: MAPPOConfig
 
     def make_critic(self, context: LearnerContext, generator: torch.Generator) -> TensorDictModule:
         spec, world = context.observation_spec, context.world

@@ -8,7 +8,6 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import LazyTensorStorage, ReplayBuffer
 from torchrl.data.replay_buffers.samplers import RandomSampler
-from torchrl.data.replay_buffers.storages import Storage
 
 from emberlink.envs import keys
 from emberlink.trainers.learners.base import LearnerContext
@@ -113,7 +112,7 @@ class UavSampler(RandomSampler):
         self.generator, self.shared, self.joint = generator, shared, joint
         self.own = torch.arange(uavs, device=generator.device)
 
-    def sample(self, storage: Storage, batch_size: int) -> tuple[tuple[Tensor, Tensor], dict]:
+    def sample(self, storage: Any, batch_size: int) -> tuple[tuple[Tensor, Tensor], dict]:
         """Returns rows and columns, int64 [batch_size, uavs] each; [:, k] is for UAV k."""
         rows = self._draw(batch_size, len(storage))
         columns = self.own.expand(batch_size, -1)

@@ -47,7 +47,6 @@ class TD3(Learner):
     """Updates the actor and two critics of each UAV, with target smoothing and delayed actors."""
 
     config_type = TD3Config
-    loss: TD3Loss
 
     def __init__(self, config: TD3Config, context: LearnerContext):
         self.config, self.context = config, context
@@ -64,7 +63,8 @@ class TD3(Learner):
         # Exploration.
         self.generator = torch.Generator(context.device).manual_seed(context.seed)
         noise = OrnsteinUhlenbeck(config.exploration, context.num_uavs, self.generator)
-        self.explorer = TensorDictSequential(self.actor, noise)
+        modules: list[Any] = [self.actor, noise]
+        self.explorer = TensorDictSequential(*modules)
         # Losses and target networks. A list of critics, or TorchRL draws weights itself.
         bounds: Any = (-1.0, 1.0)
         loss = TD3Loss(

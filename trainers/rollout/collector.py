@@ -33,7 +33,7 @@ class RolloutLoop:
     ):
         self.env, self.policy = env, policy
         self.total_steps, self.rollout_steps, self.step = total_steps, rollout_steps, 0
-        primer = primer_of(policy)
+        primer: Any = primer_of(policy)
         if not primer.primers.is_empty():
             env.append_transform(primer)
         self.carried: TensorDictBase = env.reset()
@@ -50,7 +50,8 @@ class RolloutLoop:
                 for key in set(first.keys(True, True)).difference(later.keys(True, True)):
                     later.set(key, torch.zeros_like(first.get(key)))
             self.step += self.rollout_steps
-            yield torch.stack(steps, 1)
+            rollout: Any = torch.stack(steps, 1)
+            yield rollout
 
     def restore(self, carried: TensorDictBase, step: int) -> None:
         """Continues from an earlier value of `carried`, at a step of the run."""
