@@ -7,7 +7,6 @@ from pathlib import Path
 HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE / "site"))
 
-from inventories import write_inventories  # noqa: E402
 from sphinx.ext.napoleon.docstring import GoogleDocstring  # noqa: E402
 
 # Napoleon takes the text before a colon in the docstring of an attribute for its type.
@@ -20,7 +19,6 @@ version = release = installed("emberlink")
 extensions = [
     "myst_nb",
     "sphinx.ext.autodoc",
-    "sphinx.ext.intersphinx",
     "sphinx.ext.napoleon",
     "maths",
     "reference_pages",
@@ -42,7 +40,6 @@ autodoc_member_order = "bysource"
 autodoc_default_options = {"members": True, "show-inheritance": True}
 napoleon_numpy_docstring = False
 napoleon_use_rtype = False
-intersphinx_mapping = write_inventories(HERE.parent / "build" / "inventories")
 
 html_static_path = ["_static"]
 html_extra_path = ["replay.html"]

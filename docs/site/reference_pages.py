@@ -10,6 +10,7 @@ from dataclasses import MISSING, fields, is_dataclass
 from typing import Any, ClassVar
 
 from docutils import nodes
+from pydantic import TypeAdapter
 from sphinx.application import Sphinx
 from sphinx.pycode import ModuleAnalyzer
 from sphinx.util.docutils import SphinxDirective
@@ -23,16 +24,21 @@ from emberlink.trainers.learners import registry as learners
 from emberlink.trainers.sweep.executors import registry as executors
 
 _WORDS = {
-    int: "whole number",
-    float: "number",
-    str: "text",
-    bool: "true or false",
-    type(None): "null",
+    "integer": "whole number",
+    "number": "number",
+    "string": "text",
+    "boolean": "true or false",
+    "null": "null",
 }
 _NO_LIMIT = 1e12
 """a limit that only excludes infinity"""
-_BOUNDS = {"ge": "≥", "gt": ">", "le": "≤", "lt": "<"}
-_SKIPPED = {"baselines", "comm", "learner", "fire", "saved_copy", "sha256", "test_sha256"}
+_BOUNDS = {
+    "minimum": "≥",
+    "exclusiveMinimum": ">",
+    "maximum": "≤",
+    "exclusiveMaximum": "<",
+}
+_SKIPPED = {"comm", "learner", "fire", "saved_copy", "sha256", "test_sha256"}
 
 
 def setup(app: Sphinx) -> dict[str, Any]:
@@ -85,7 +91,7 @@ class CommandHelp(_Generated):
     """The help of every command."""
 
     def text(self) -> str:
-        first, *others = _helps(_parser())
+        first, *others = _helps(_parser()[0])
         return "\n\n".join([first[1], *(f"## {name}\n\n{text}" for name, text in others)])
 
 
@@ -125,28 +131,19 @@ def _rows(kind: str, name: str) -> Iterator[tuple[str, ...]]:
 
 def _keys(cls: type, prefix: str, values: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
     """Yields the row of each key of a configuration class, and of the classes in it."""
-    meanings = _meanings(cls)
-    hints = typing.get_type_hints(cls, include_extras=True)
+    meanings, hints = _meanings(cls), typing.get_type_hints(cls)
+    schema = TypeAdapter(cls).json_schema()
     for field in fields(cls):
-        hint, name = hints[field.name], field.name
-        inner = typing.get_args(hint)[0] if typing.get_origin(hint) is typing.Annotated else hint
+        name = field.name
         if name in _SKIPPED:
             continue
-        if is_dataclass(inner):
-            yield from _keys(inner, f"{prefix}{name}.", values.get(name, {}))
+        if is_dataclass(hints[name]):
+            yield from _keys(hints[name], f"{prefix}{name}.", values.get(name, {}))
             continue
-        default = values[name] if name in values else _default(field)
+        about = schema["properties"][name]
+        default = values.get(name, about.get("default", MISSING))
         shown = "by choice" if default is MISSING else f"`{_plain(default)}`"
-        yield f"`{prefix}{name}`", shown, f"{meanings.get(name, '')}; {_type(hint)}"
-
-
-def _default(field: Any) -> Any:
-    given = field.default
-    if type(given).__name__ == "FieldInfo":
-        given = given.default_factory() if given.default_factory else given.default
-    elif given is MISSING and field.default_factory is not MISSING:
-        given = field.default_factory()
-    return given
+        yield f"`{prefix}{name}`", shown, f"{meanings.get(name, '')}; {_type(about)}"
 
 
 def _meanings(cls: type) -> dict[str, str]:
@@ -162,33 +159,25 @@ def _meanings(cls: type) -> dict[str, str]:
     return found
 
 
-def _type(hint: Any) -> str:
-    """Returns a type and its range as text, such as "int ≥ 1"."""
-    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
-    if origin is typing.Annotated:
-        bounds = [text for part in arguments[1:] for text in _bounds(part)]
-        return f"{_type(arguments[0])} {' and '.join(bounds)}".strip()
-    if origin is typing.Literal:
-        return ", ".join(f"`{value}`" for value in arguments)
-    if origin in (typing.Union, type(int | None)):
-        return " or ".join(_type(part) for part in arguments)
-    if origin is dict:
-        return "names and values"
-    if origin is tuple:
-        if arguments[-1] is Ellipsis:
-            return f"list, each {_type(arguments[0])}"
-        parts = [_type(part) for part in arguments]
+def _type(schema: Mapping[str, Any]) -> str:
+    """Returns the type and the range of a JSON schema as text, such as "whole number ≥ 1"."""
+    if "anyOf" in schema:
+        return " or ".join(map(_type, schema["anyOf"]))
+    if "enum" in schema or "const" in schema:
+        return ", ".join(f"`{value}`" for value in schema.get("enum", [schema.get("const")]))
+    if "prefixItems" in schema:
+        parts = [_type(part) for part in schema["prefixItems"]]
         return f"{len(parts)} values, each {parts[0]}" if len({*parts}) == 1 else ", ".join(parts)
-    return _WORDS.get(hint, getattr(hint, "__name__", str(hint)))
-
-
-def _bounds(part: Any) -> Iterator[str]:
-    for item in getattr(part, "metadata", [part]):
-        for name, sign in _BOUNDS.items():
-            limit = getattr(item, name, None)
-            if isinstance(limit, int | float) and abs(limit) < _NO_LIMIT:
-                whole = f"{limit:,.0f}"
-                yield f"{sign} {whole if limit == int(limit) else f'{limit:f}'.rstrip('0')}"
+    if "items" in schema:
+        return f"list, each {_type(schema['items'])}"
+    bounds = [
+        f"{sign} {schema[bound]:,.10g}"
+        for bound, sign in _BOUNDS.items()
+        if abs(schema.get(bound, _NO_LIMIT)) < _NO_LIMIT
+    ]
+    return (
+        f"{_WORDS.get(schema.get('type', ''), 'names and values')} {' and '.join(bounds)}".strip()
+    )
 
 
 def _plain(value: Any) -> str:

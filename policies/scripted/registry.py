@@ -32,7 +32,7 @@ SCRIPTED: Mapping[str, type[Scripted]] = _Policies()
 
 
 def to_play(wanted: Collection[str]) -> list[str]:
-    """Returns the policies of an evaluation: the wanted ones, and those of other packages.
+    """Returns the policies of an evaluation in the order of tables.
 
     Raises:
         UserError: a name is not known.
@@ -40,4 +40,4 @@ def to_play(wanted: Collection[str]) -> list[str]:
     for name in wanted:
         if name not in SCRIPTED:
             raise UserError(unknown(name, SCRIPTED))
-    return [name for name in SCRIPTED if name in wanted or name not in ORDER]
+    return [name for name in SCRIPTED if name in wanted]

@@ -93,7 +93,7 @@ class EvaluationConfig:
     huygens: bool
     """whether to evaluate on fires of the scenario `huygens`, too, besides that of the training"""
     scripted: Annotated[tuple[str, ...], Strict(False), AfterValidator(_check_policies)]
-    """scripted policies to evaluate, besides those of other packages"""
+    """scripted policies to evaluate"""
     headline: Annotated[str, AfterValidator(_check_measure)]
     """the measure that chooses the networks of best.safetensors on validation fires"""
 

@@ -138,20 +138,21 @@ def test_the_lock_of_an_editor_is_no_configuration(folder):
     assert resolve("consensus", ["setup=small"]).env.horizon == 15
 
 
-def test_a_run_folder_does_not_need_its_yaml_files(folder, tmp_path, monkeypatch):
-    write(
-        folder, {"setup_method/small_consensus.yaml": "# @package _global_\ncomm:\n  jitter: 0.5\n"}
-    )
+def test_a_run_folder_needs_its_yaml_files_for_scripted_policies_alone(
+    folder, tmp_path, monkeypatch, capsys
+):
     arguments = ["train", "alone", "setup=small", *TINY, f"output={tmp_path / 'runs'}"]
     assert main.main(arguments) == 0
     (run,) = (tmp_path / "runs").iterdir()
-    before = json.loads((run / "eval.json").read_text())
-    assert before["communication"]["follow_target"]["jitter"] == 0.5
+    before = json.loads((run / "eval.json").read_text())["results"]
     shutil.rmtree(folder)
     monkeypatch.delenv("EMBERLINK_CONFIGS")
-    monkeypatch.setenv("EMBERLINK_CACHE", str(tmp_path / "cache"))
-    assert "alone" not in configs.known("method")
-    assert main.main(["eval", str(run)]) == 0
-    assert json.loads((run / "eval.json").read_text()) == before
-    assert main.main(["train", f"resume={run}", "episodes=3"]) == 0
-    assert len((run / "metrics.jsonl").read_text().splitlines()) == 3
+    assert main.main(["eval", str(run)]) == 2
+    assert "follow_target flies with the communication of consensus" in capsys.readouterr().err
+    assert main.main(["eval", str(run), "evaluation.scripted=[]"]) == 0
+    (file,) = run.glob("eval_*.json")
+    after = json.loads(file.read_text())["results"]
+    assert {k: v["learned"] for k, v in after.items()} == {
+        k: v["learned"] for k, v in before.items()
+    }
+    assert main.main(["train", f"resume={run}", "episodes=3", "evaluation.scripted=[]"]) == 0

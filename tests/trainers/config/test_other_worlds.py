@@ -13,10 +13,9 @@ from tiny_run import TINY
 
 from emberlink import trainers
 from emberlink.envs import FileFireConfig
-from emberlink.envs.utils.errors import UserError
 from emberlink.trainers.cli.main import main
 from emberlink.trainers.config.compose import evaluated_with, flat, in_world, resolve, to_values
-from emberlink.trainers.evaluation.evaluate import evaluation_scenarios, scripted_config
+from emberlink.trainers.evaluation.evaluate import scripted_config
 
 ROUND = ("paper", "front", "relay", "blackout", "swarm", "paper", "relay", "front", "paper")
 
@@ -101,49 +100,13 @@ def test_an_evaluation_in_another_world(run, tmp_path, capsys):
     assert "is left out: evaluated otherwise: world is relay, in eval.json paper" in said
 
 
-@OTHER_MAP
-def test_a_replay_in_another_world(run, tmp_path, capsys):
-    page = tmp_path / "replay.html"
-    settings = ["world=relay", "env.radio.range=0"]
-    assert main(["render", str(run), *settings, "--output", str(page)]) == 0
-    printed = " ".join(capsys.readouterr().out.split())
-    assert "independent, setup tuned, world relay, seed 0, env.radio.range=0: coverage" in printed
-    assert page.exists()
-
-
-@pytest.mark.parametrize(
-    ("scripted", "names"), [("[]", ["learned"]), ("[stationary]", ["learned", "stationary"])]
-)
-def test_scripted_policies_can_be_chosen(scripted, names, run, capsys):
-    before = (run / "eval.json").read_bytes()
-    assert main(["eval", str(run), f"evaluation.scripted={scripted}", "--fires", "1"]) == 0
-    (file,) = run.glob("eval_evaluation.scripted*.json")
-    content = json.loads(file.read_text())
-    assert all(list(played) == names for played in content["results"].values())
-    assert content["changed"][0].startswith(f"evaluation.scripted is {names[1:]} here")
-    assert "learned on 1 fire of huygens" in capsys.readouterr().out
-    assert (run / "eval.json").read_bytes() == before
-    file.unlink()
-
-
 @pytest.mark.parametrize(
     ("setting", "said"),
     [
         ("world=moon", "known: blackout, file, front, paper, relay, swarm"),
         ("world=file", "fire.path"),
-        (
-            "fire.burn_time=5",
-            "fire.burn_time=5: an evaluation on another fire needs world=NAME, too",
-        ),
-        (
-            "fire=front",
-            "can change the world and its fire, evaluation.scripted, evaluation.headline, and keys",
-        ),
-        (
-            "world=swarm",
-            "a checkpoint of uavs=2; this configuration has uavs=24 (env.num_uavs), and each UAV "
-            "has networks of its own (learner.share_parameters=false)",
-        ),
+        ("fire.burn_time=5", "needs world=NAME, too"),
+        ("world=swarm", "uavs=24"),
     ],
 )
 def test_worlds_that_a_run_cannot_be_evaluated_in(setting, said, run, capsys):
@@ -162,24 +125,12 @@ def test_networks_that_never_saw_a_base_are_warned_of():
         trainers.load("pretrained:maps", world="swarm")
 
 
-def test_another_map_is_warned_of_where_positions_are_observed(run):
-    said = r"^env\.grid=\[40, 40\] \(in training \[\d+, \d+\]\), env\.observation_scale=raw \(in "
-    with pytest.warns(UserWarning, match=said):
-        trainers.load(run, grid=[40, 40], observation_scale="raw")
-    with warnings.catch_warnings():
-        warnings.simplefilter("error", UserWarning)
-        trainers.load("pretrained:maps", grid=[40, 40])
-
-
 @pytest.mark.parametrize(
     ("name", "setting", "said"),
     [
-        ("maps", {"scales": [5, 1]}, r"^comm\.scales=\[5, 1\] \(in training \[1, 5\]\): what"),
         ("maps", {"spread": 0}, r"^comm\.spread=0 \(in training 2\): what"),
         ("maps", {"home": False}, None),
         ("consensus", {"target": "absolute"}, r"^comm\.target=absolute \(in training relative\)"),
-        ("consensus", {"redraw": 50}, None),
-        ("strong/positional", {"own_first": False}, r"^comm\.own_first=false \(in training true\)"),
     ],
 )
 def test_other_units_of_the_communication_are_warned_of(name, setting, said):
@@ -189,19 +140,6 @@ def test_other_units_of_the_communication_are_warned_of(name, setting, said):
     messages = [str(warning.message) for warning in caught]
     assert len(messages) == (said is not None)
     assert said is None or re.match(said, messages[0]), messages
-
-
-def test_a_training_state_is_not_evaluated(run, capsys):
-    state = next(run.glob("checkpoints/state_*"))
-    assert main(["eval", str(run), "--checkpoint", str(state)]) == 2
-    said = " ".join(capsys.readouterr().err.split())
-    assert f"{state.name}: a state of a training; expected networks, such as step_" in said
-
-
-def test_the_api_names_what_can_be_changed(run):
-    said = r"^policy\.hold, seed: only world, fire, headline and keys of env and comm"
-    with pytest.raises(UserError, match=said):
-        trainers.load(run, world="front", seed=2, horizon=20, **{"policy.hold": 2})
 
 
 def test_a_run_is_evaluated_on_a_fire_of_a_file(run, tmp_path):
@@ -233,10 +171,3 @@ def test_a_base_is_taken_away_with_the_headline(run, capsys):
     assert main([*arguments, "evaluation.headline=coverage"]) == 0
     without: dict[str, Any] = {"env.base": None, "headline": "coverage"}
     assert trainers.load(run, world="relay", **without).config.env.base is None
-
-
-def test_the_number_of_training_fires_does_not_change_the_test_fires():
-    run = resolve("independent", ["setup=tuned", "fire.num_train_fires=2"])
-    assert list(evaluation_scenarios(run)) == ["huygens"]
-    other = resolve("independent", ["setup=tuned", "fire.burn_time=50"])
-    assert list(evaluation_scenarios(other)) == ["huygens", "huygens_as_trained"]

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from test_resume import REPLAY, SMALL, assert_same, stopped_at, until
+from test_resume import SMALL, assert_same, until
 
 from emberlink.comm import registry
 from emberlink.envs.utils.errors import UserError
@@ -87,18 +87,3 @@ def test_a_map_of_another_package_is_restored_bit_for_bit(installed, tmp_path):
     saved = stopped.setup.env.transform.state_dict()["module.map"]
     assert torch.count_nonzero(saved) > 0
     assert_same(whole, until(resume(stopped.run.path), None))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("shared", [False, pytest.param(True, marks=pytest.mark.heavy)])
-def test_consensus_on_windows_trains_and_resumes(shared, tmp_path):
-    more = ["env.observation=window", f"learner.share_parameters={shared}", "episodes=2"]
-    trainer = Trainer(resolve("consensus", [*SMALL, *REPLAY, *more, f"output={tmp_path}"]))
-    trainer.start()
-    before = [weight.detach().clone() for weight in trainer.setup.learner.actor.parameters()]
-    until(trainer, None)
-    weights = list(trainer.setup.learner.actor.parameters())
-    assert {len(weight) for weight in weights} == {1 if shared else 2}
-    assert weights[0].shape[1:] == (16, 3, 3, 3)
-    assert not any(first.equal(other) for first, other in zip(before, weights, strict=True))
-    assert_same(trainer, stopped_at([27], "consensus", tmp_path, *more))

@@ -12,7 +12,9 @@ from emberlink.envs.fire.generator import scenarios
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import from_plain
 from emberlink.trainers.config.compose import flat, from_values, resolve, to_values
+from emberlink.trainers.config.removed import REMOVED
 from emberlink.trainers.config.schema import build_comm
+from emberlink.trainers.config.values import check_not_removed, parse
 
 METHODS = ["independent", "shared_memory", "positional", "consensus"]
 PAPER, RELEASED = "paper", "released"
@@ -169,17 +171,6 @@ def test_infinity_is_written_as_in_yaml(text):
         resolve("independent", ["env.radio.range=-.inf"])
 
 
-@pytest.mark.parametrize("value", ["Läufe", "日本", "meine Läufe (2)", "größer/ßß"])
-def test_letters_outside_of_hydras_grammar_need_no_quotes(value):
-    assert resolve("consensus", [f"output={value}"]).output == value
-
-
-def test_tuned_has_the_physics_of_released():
-    ours, theirs = (resolve("consensus", [f"setup={s}"]).env for s in ("tuned", RELEASED))
-    for key in ("grid", "num_uavs", "horizon", "altitude", "view_angle", "displacement"):
-        assert getattr(ours, key) == getattr(theirs, key), key
-
-
 def test_defaults_in_code_equal_setup_paper():
     config = resolve("consensus")
     assert WildfireConfig() == config.env
@@ -198,13 +189,14 @@ def test_the_table_has_all_setups_and_methods():
     assert known("world") == ["blackout", "file", "front", "paper", "relay", "swarm"]
 
 
-def every_choice():
-    yield from ({"learner": name} for name in known("learner"))
-    yield from ({"fire": name} for name in known("fire") if name != "file")
-    yield from ({"setup": name} for name in known("setup"))
+EVERY_CHOICE = [
+    *({"learner": name} for name in known("learner")),
+    *({"fire": name} for name in known("fire") if name != "file"),
+    *({"setup": name} for name in known("setup")),
+]
 
 
-@pytest.mark.parametrize("choice", every_choice(), ids=str)
+@pytest.mark.parametrize("choice", EVERY_CHOICE, ids=str)
 def test_every_key_of_a_configuration_can_be_set(choice):
     chosen = [f"{group}={name}" for group, name in choice.items()]
     config = resolve("maps", chosen)
@@ -216,3 +208,26 @@ def test_every_key_of_a_configuration_can_be_set(choice):
     }
     assert {"env.reward.base", "env.radio.range"} <= values.keys()
     assert resolve("maps", chosen, **values) == config
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", [*METHODS, "maps"])
+def test_every_setup_composes_with_every_world(method):
+    for setup in known("setup"):
+        for world in known("world"):
+            fire = ["fire=front"] if world == "file" else []
+            config = resolve(method, [f"setup={setup}", f"world={world}", *fire])
+            assert (config.method, config.setup, config.world) == (method, setup, world)
+            assert from_values(to_values(config)) == config
+
+
+def test_a_value_that_hydra_cannot_read_is_a_text():
+    assert parse("output=meine Läufe (2)") == ("output", "meine Läufe (2)")
+    assert parse("env.grid=[30,20]") == ("env.grid", [30, 20])
+
+
+@pytest.mark.parametrize("key", REMOVED)
+def test_a_removed_key_is_named_with_what_replaces_it(key):
+    name, _, value = key.partition("=")
+    with pytest.raises(UserError, match="is no longer a setting: "):
+        check_not_removed(name, value or None)
