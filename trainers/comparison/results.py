@@ -62,11 +62,9 @@ class Comparison:
     left_out: list[LeftOut] = field(default_factory=list)
 
     def __repr__(self) -> str:
-        lines = [f"Comparison of {self.runs['run'].nunique()} runs"]
-        for section, part in self.runs.groupby("section"):
-            seeds = part.groupby("label")["seed"].size()
-            lines.append(f"{section}: " + ", ".join(f"{k} ({v} seeds)" for k, v in seeds.items()))
-        return "\n".join(lines)
+        rows = self.runs.groupby("section")["label"].nunique()
+        told = "".join(f"\n  {section}: {count} rows" for section, count in rows.items())
+        return f"Comparison of {self.runs['run'].nunique()} runs{told}"
 
     @property
     def table(self) -> Frame:

@@ -27,6 +27,15 @@ from emberlink.trainers.runs.safe_read import MAX_JSON, check_parts, read_text
 LeftOut = tuple[str, str]
 """a folder or file that is not compared, and the reason"""
 Settings = Annotated[dict[str, Any], AfterValidator(infinite)]
+_NEEDED = {
+    "method": str,
+    "setup": str,
+    "world": str,
+    "seed": int,
+    "episodes": int,
+    "fire.name": str,
+}
+"""keys that a config.yaml must have -> their type"""
 _Measured = Annotated[float, Field(ge=-1e12, le=1e12, allow_inf_nan=False)]
 
 
@@ -148,25 +157,24 @@ def read(path: Path) -> Run:
     Raises:
         UserError: it is not finished, or not evaluated, or a file is damaged.
     """
-    folder, why = RunFolder(path), ""
-    settings = flat(folder.values())
-    for key in ("method", "setup", "seed", "episodes"):
-        if key not in settings:
-            raise UserError(f"{path / 'config.yaml'}: key {key!r} is missing")
-    settings.setdefault("world", "paper")
-    lines = _curves(path, int(settings["episodes"]))
+    folder = RunFolder(path)
+    settings = {"world": "paper", **flat(folder.values())}
+    for key, kind in _NEEDED.items():
+        if not isinstance(settings.get(key), kind):
+            raise UserError(f"{path / 'config.yaml'}: key {key!r} is missing or wrong")
+    lines = _curves(folder, settings["episodes"])
     again = f"emberlink eval {shlex.quote(str(path))}"
     try:
         evaluation = read_evaluation(path / "eval.json", settings)
     except FileNotFoundError:
         raise UserError(f"not evaluated: there is no eval.json ({again})") from None
+    step = evaluation.step
     with suppress(UserError):  # no checkpoint, or a damaged one: the numbers can be compared
-        if evaluation.step != (step := folder.step()):
-            why = (
-                f"eval.json is of step {evaluation.step}, the newest checkpoint of {step} ({again})"
-            )
-    if why:
-        raise UserError(why)
+        step = folder.step()
+    if step != evaluation.step:
+        raise UserError(
+            f"eval.json is of step {evaluation.step}, the newest checkpoint of {step} ({again})"
+        )
     return Run(path, settings["method"], settings, lines, evaluation)
 
 
@@ -206,15 +214,15 @@ def read_evaluation(file: Path, settings: Mapping[str, Any]) -> Evaluation:
     return evaluation
 
 
-def _curves(path: Path, episodes: int) -> list[dict[str, Any]]:
+def _curves(folder: RunFolder, episodes: int) -> list[dict[str, Any]]:
     """Returns the lines of metrics.jsonl, one per episode of a finished training."""
-    lines = RunFolder(path).metrics()[:episodes]
+    lines = folder.metrics()[:episodes]
     if len(lines) < episodes:
         raise UserError(f"unfinished: {len(lines)} of {episodes} episodes")
     for number, line in enumerate(lines, 1):
         values = [line.get(name, np.nan) for name in CURVES]
         if line["episode"] != number or not np.isfinite(np.array(values, float)).all():
-            raise UserError(f"{path / 'metrics.jsonl'}: line {number} is not of episode {number}")
+            raise UserError(f"{folder.path / 'metrics.jsonl'}: line {number}: not of an episode")
     return lines
 
 
@@ -233,7 +241,9 @@ def evaluated_otherwise(run: Run) -> tuple[list[Run], list[LeftOut]]:
         except (UserError, OSError) as error:
             left_out.append((str(file), str(error)))
             continue
-        changed = _changed_settings(run, evaluation)
+        learned = evaluation.communication.get(LEARNED, {})
+        now = flat({"world": evaluation.world, "env": evaluation.environment, "comm": learned})
+        changed = {key: value for key, value in now.items() if run.settings.get(key) != value}
         why = [
             f"{name} is {getattr(evaluation, name)}, in eval.json {getattr(run.evaluation, name)}"
             for name in ("world", "checkpoint", "step", "fires", "start_seed")
@@ -247,10 +257,3 @@ def evaluated_otherwise(run: Run) -> tuple[list[Run], list[LeftOut]]:
         elif changed:
             others.append(replace(run, evaluation=evaluation, evaluated_with=changed))
     return others, left_out
-
-
-def _changed_settings(run: Run, evaluation: Evaluation) -> dict[str, Any]:
-    """Returns the settings of an evaluation that differ from the training, by dotted key."""
-    learned = evaluation.communication.get(LEARNED, {})
-    settings = flat({"world": evaluation.world, "env": evaluation.environment, "comm": learned})
-    return {key: value for key, value in settings.items() if run.settings.get(key) != value}

@@ -7,7 +7,7 @@ of held-out fires. A *row* of a ranking is a label: trainings that differ in the
 import json
 import math
 import re
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -48,46 +48,36 @@ def runs_table(runs: Sequence[Run]) -> tuple[Frame, list[LeftOut]]:
     runs = sorted(runs, key=lambda r: (r.settings["seed"], r.path.name, r.path))
     runs.sort(key=lambda run: not pretrained.is_copy(run.path))
     of_section = _settings([_of_section(run) for run in runs])
-    trained = [trained_with(run) for run in runs]
-    fire = of_section["fire.name"]
+    names = of_section[["setup", "world", "fire.name"]].to_numpy()
     table: Frame = pd.DataFrame(
         {
-            "section": "setup "
-            + of_section["setup"]
-            + ", world "
-            + of_section["world"]
-            + ", trained on "
-            + fire,
+            "section": [f"setup {s}, world {w}, trained on {f}" for s, w, f in names],
             "label": [run.name for run in runs],
             "run": [str(run.path) for run in runs],
             "method": [run.settings["method"] for run in runs],
             "setup": of_section["setup"],
             "world": of_section["world"],
-            "trained_on": fire,
+            "trained_on": of_section["fire.name"],
             "radio": [radio_text(run.now) for run in runs],
             "evaluated_with": [_typed(run.evaluated_with) for run in runs],
             "seed": [run.settings["seed"] for run in runs],
-            "settings": trained,
+            "settings": [trained_with(run) for run in runs],
             "as_trained": [not run.evaluated_with for run in runs],
             "object": runs,
         }
     )
-    apart = of_section.drop(columns=["setup", "world"])
-    table["section"] = named(table["section"], apart)
-    labels = pd.Series("", table.index)
-    for _, part in table.groupby("section"):
-        labels[part.index] = named(part["label"], _settings(part["settings"]))
+    table["section"] = named(table["section"], of_section.drop(columns=["setup", "world"]))
+    parts = [named(p["label"], _settings(p["settings"])) for _, p in table.groupby("section")]
     other = table["evaluated_with"].map(lambda text: text and f", evaluated with {text}")
-    table["label"] = labels + other
+    table["label"] = pd.concat(parts) + other
     twice = table.duplicated(["section", "label", "seed"], keep="last")
     left_out = [
-        (row.run, f"seed {row.seed} of {row.label} is there twice")
-        for row in table[twice].itertuples()
+        (row["run"], f"seed {row['seed']} of {row['label']} is there twice")
+        for row in table[twice].to_dict("records")
     ]
-    table, other_fires = _same_fires(table[~twice])
-    return table.sort_values(
-        ["section", "label", "seed"], ignore_index=True
-    ), left_out + other_fires
+    table = table[~twice].sort_values(["section", "label", "seed"], ignore_index=True)
+    table, others = _same_fires(table)
+    return table, left_out + others
 
 
 def _of_section(run: Run) -> dict[str, Any]:
@@ -169,16 +159,11 @@ def radio_text(settings: Mapping[str, Any], *, bandwidth: bool = True) -> str:
 
 def _same_fires(table: Frame) -> tuple[Frame, list[LeftOut]]:
     """Leaves out the runs of each section that were evaluated on other fires than the first."""
-    left_out: list[LeftOut] = []
-    others: list[Hashable] = []
-    for _, part in table.sort_values(["section", "label", "seed"]).groupby("section", sort=False):
-        first = part.iloc[0]
-        for place, row in part.iterrows():
-            if not _alike(first["object"], row["object"]):
-                others.append(place)
-                why = f"not evaluated on the fires of {first['run']} (emberlink eval RUN)"
-                left_out.append((row["run"], why))
-    return table.drop(index=others), left_out
+    first = table.groupby("section")[["object", "run"]].transform("first")
+    alike = [_alike(*pair) for pair in zip(first["object"], table["object"], strict=True)]
+    same = pd.Series(alike, table.index)
+    why = "not evaluated on the fires of " + first["run"] + " (emberlink eval RUN)"
+    return table[same], list(zip(table["run"][~same], why[~same], strict=True))
 
 
 def _alike(first: Run, other: Run) -> bool:

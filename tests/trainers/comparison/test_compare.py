@@ -114,7 +114,7 @@ def test_the_table_is_tidy(comparison):
         "range 10, loss 0.5": [31] * 4,
     }
     assert len(repr(comparison).splitlines()) == 2
-    assert "consensus (3 seeds)" in repr(comparison)
+    assert "4 rows" in repr(comparison)
 
 
 def test_measures_where_lower_is_better(tmp_path):
