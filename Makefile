@@ -70,9 +70,12 @@ lint: $(INSTALLED)  ## check style, layout and the direction of imports
 typecheck: $(INSTALLED)  ## check the types
 	@$(BIN)/basedpyright --pythonpath $(BIN)/python
 
-docs: $(INSTALLED)  ## build the documentation site in build/docs; warnings are errors (about 2 minutes)
+docs: $(INSTALLED) docs/replay.html  ## build the documentation site in build/docs; warnings are errors (about 2 minutes)
 	@OMP_NUM_THREADS=1 $(BIN)/sphinx-build -q -W -E -b html docs build/docs
 	@echo "build/docs/index.html"
+
+docs/replay.html: | $(INSTALLED)
+	@$(BIN)/emberlink render pretrained:consensus pretrained:consensus env.radio.range=0 --fire huygens:2 --output $@
 
 install: $(INSTALLED)  ## only create .venv
 
@@ -89,5 +92,5 @@ $(INSTALLED): pyproject.toml constraints.txt
 	@mv $(UNFINISHED) $(INSTALLED) && touch $(INSTALLED)
 
 clean:  ## remove .venv and generated files, but not runs/
-	@rm -rf $(VENV) build dist *.egg-info .pytest_cache .ruff_cache .hypothesis
+	@rm -rf $(VENV) build dist docs/replay.html *.egg-info .pytest_cache .ruff_cache .hypothesis
 	@find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -14,23 +14,20 @@ from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import check_whole, shown
 from emberlink.trainers.comparison.report import free_folder, write_report
 from emberlink.trainers.comparison.results import Comparison, compare_runs
-from emberlink.trainers.config.compose import flat, in_world, override, resolve, to_values
+from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.config.schema import MAX_FIRES, RunConfig
-from emberlink.trainers.evaluation.actor import fireless, load_actor
 from emberlink.trainers.evaluation.evaluate import evaluate as evaluate_policy
-from emberlink.trainers.evaluation.policy import TrainedPolicy
+from emberlink.trainers.evaluation.policy import TrainedPolicy, load_policy
 from emberlink.trainers.evaluation.results import Results
 from emberlink.trainers.runs import pretrained
 from emberlink.trainers.runs.run_folder import RunFolder
 from emberlink.trainers.terminal.signals import Interruption
-from emberlink.trainers.training.resume import differences
 from emberlink.trainers.training.resume import resume as resumed
 from emberlink.trainers.training.trainer import ONE_AT_A_TIME, Progress, Trainer
 
 Reference = str | os.PathLike[str]
 """a run folder, or a trained policy of emberlink: `pretrained:METHOD`, `pretrained:SETUP/METHOD` or
 `pretrained:SETUP/METHOD/SEED`"""
-_CHANGEABLE = ("env.", "comm.", "evaluation.headline")
 
 
 @dataclass(frozen=True)
@@ -131,8 +128,8 @@ def evaluate(
         checkpoint: file of networks; the newest of the run if None.
         device: device of the episodes; that of the run if None.
         progress: called with the names of the fire and the policy before each evaluation.
-        settings: `world`, settings of its fire (`"fire.path"`), `headline`, or settings of `env` or
-            `comm` to change, as for `train`; the networks must fit.
+        settings: `world`, settings of its fire (`"fire.path"`), or settings of `env`, `comm` or
+            `evaluation` to change, as for `train`; the networks must fit.
 
     Returns:
         fire -> policy ("learned", or a scripted one) -> measure -> one number per episode.
@@ -162,35 +159,17 @@ def load(
         run: a run folder, or `pretrained:METHOD`.
         checkpoint: file of networks; the newest of the run if None.
         device: device of the networks; that of the run if None.
-        settings: `world`, settings of its fire (`"fire.path"`), `headline`, or settings of `env` or
-            `comm` to change, as for `train`; the networks must fit.
+        settings: `world`, settings of its fire (`"fire.path"`), or settings of `env`, `comm` or
+            `evaluation` to change, as for `train`; the networks must fit.
 
     Raises:
         UserError: there is no such run, a file in it is damaged, or a setting does not fit.
     """
     if not isinstance(run, str | os.PathLike):
         raise UserError(f"load: {shown(run)} is not the path of a run folder")
-    folder = RunFolder(pretrained.find_one(str(run)) if pretrained.is_name(str(run)) else Path(run))
-    file = folder.checkpoint() if checkpoint is None else Path(checkpoint)
-    trained = folder.config(file, **({} if device is None else {"device": device}))
-    fire = {key: settings.pop(key) for key in [*settings] if key.startswith("fire.")}
-    there = in_world(trained, str(settings.pop("world", trained.world)), **fire)
-    config = override(there, **settings)
-    fixed = [key for key in differences(there, config) if not key.startswith(_CHANGEABLE)]
-    if fixed:
-        raise UserError(
-            f"{', '.join(fixed)}: only world, fire, headline and keys of env and comm can be "
-            "changed"
-        )
-    before, now = (flat(to_values(each)) for each in (trained, config))
-    changes = [
-        f"{key}={shown(value)}"
-        for key, value in now.items()
-        if key.startswith(("world", "env.", "comm.")) and before.get(key) != value
-    ]
-    env = fireless(config)
-    actor = load_actor(config, file, env)
-    return TrainedPolicy(actor, env.observation_spec, config, file, changes)
+    folder = pretrained.find_one(str(run)) if pretrained.is_name(str(run)) else Path(run)
+    file = None if checkpoint is None else Path(checkpoint)
+    return load_policy(RunFolder(folder), (), settings, checkpoint=file, device=device)
 
 
 def compare(

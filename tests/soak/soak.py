@@ -22,7 +22,7 @@ from ends import full_disk_trial, signal_trial
 from strangers import cache_trial, config_trial, planted_trial
 
 from emberlink.trainers.config.compose import resolve
-from emberlink.trainers.evaluation.actor import load_actor
+from emberlink.trainers.evaluation.policy import load_actor
 from emberlink.trainers.training.resume import resume
 from emberlink.trainers.training.trainer import Trainer
 

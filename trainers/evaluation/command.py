@@ -8,18 +8,12 @@ from pathlib import Path
 from rich.console import Console
 
 from emberlink.envs.utils.errors import UserError
-from emberlink.trainers.config.compose import evaluated_with
-from emberlink.trainers.config.schema import RunConfig, check_device
-from emberlink.trainers.evaluation.actor import load_actor
-from emberlink.trainers.evaluation.evaluate import Policy
+from emberlink.trainers.config.schema import check_device
+from emberlink.trainers.evaluation.policy import load_policy
 from emberlink.trainers.evaluation.report import evaluate_run
-from emberlink.trainers.evaluation.results import Results
 from emberlink.trainers.evaluation.tables import print_results
-from emberlink.trainers.runs.pretrained import open_run, read_run
-from emberlink.trainers.runs.run_folder import RunFolder
+from emberlink.trainers.runs.pretrained import is_name, open_run, read_run
 
-_CHANGEABLE = ("comm.", "env.", "world=", "fire.", "evaluation.scripted=", "evaluation.headline=")
-"""beginnings of the settings that can be changed in an evaluation"""
 _MAX_LABEL = 150
 """characters; a name of a file can have 255"""
 
@@ -47,38 +41,45 @@ def evaluate_folder(
         UserError: a file cannot be read or written, or an argument does not fit.
     """
     for text in overrides:
-        _check_changeable(text)
-    run = read_run(name)
+        if "=" not in text:
+            raise UserError(f"{text!r}: one run is evaluated at a time; compare takes several runs")
     if device is not None:
         check_device(device)
-    given, checkpoint = checkpoint, checkpoint or run.checkpoint()
-    config = run.config(checkpoint, **({} if device is None else {"device": device}))
-    label = f"_{given.stem}" if given else ""
-    for text in overrides:
-        label += "_" + re.sub(r"[^\w.=+-]", "-", text)
-    config = evaluated_with(config, overrides)
-    actor = load_actor(config, checkpoint)
+    if not is_name(name):
+        _check_one_run(Path(name))
+    policy = load_policy(read_run(name), overrides, checkpoint=checkpoint, device=device)
     run = open_run(name)  # copies a trained policy of the package once all is checked
-    about = [text for text in overrides if not text.startswith("world=")]  # a title names it anyway
-    evaluate_and_print(
-        [(run, config, actor, checkpoint)],
-        console,
-        label=_shortened(label),
-        about=[*about, *([checkpoint.stem] if given else [])],
-        fires=fires,
+    about = [checkpoint.stem] if checkpoint else []
+    parts = [*about, *(re.sub(r"[^\w.=+-]", "-", text) for text in overrides)]
+    results = evaluate_run(
+        run,
+        policy.config,
+        policy,
+        checkpoint=policy.checkpoint,
+        fires=fires or policy.config.evaluation.episodes,
+        report=lambda text: console.print(f"  {text}", style="dim", soft_wrap=True),
+        label=_shortened("".join(f"_{part}" for part in parts)),
+        about=[*overrides, *about],
     )
+    print_results(console, results, policy.config)
+    console.print(str(run.path), soft_wrap=True)
     return 0
 
 
-def _check_changeable(text: str) -> None:
-    """Checks that a text is `key=value` with a key that can be changed in an evaluation."""
-    if "=" not in text:
-        raise UserError(f"{text!r}: one run is evaluated at a time; compare takes several runs")
-    if not text.startswith(_CHANGEABLE):
+def _check_one_run(folder: Path) -> None:
+    """Checks that a folder is not one of several runs.
+
+    Raises:
+        UserError: it holds run folders; the message lists them.
+    """
+    if (folder / "config.yaml").exists():
+        return
+    runs = sorted(str(file.parent) for file in folder.glob("*/config.yaml"))
+    if runs:
+        more = f" and {len(runs) - 20} more" if len(runs) > 20 else ""
         raise UserError(
-            f"{text!r}: an evaluation can change the world and its fire, evaluation.scripted, "
-            "evaluation.headline, and keys of comm. and env. only; "
-            "--fires N chooses the number of fires"
+            f"{folder}: a folder of {len(runs)} runs; one is evaluated at a time: "
+            f"{', '.join(runs[:20])}{more}"
         )
 
 
@@ -87,42 +88,3 @@ def _shortened(label: str) -> str:
     if len(label) <= _MAX_LABEL:
         return label
     return f"{label[: _MAX_LABEL - 9]}_{hashlib.sha256(label.encode()).hexdigest()[:8]}"
-
-
-def evaluate_and_print(
-    seeds: Sequence[tuple[RunFolder, RunConfig, Policy, Path]],
-    console: Console,
-    *,
-    label: str = "",
-    about: Sequence[str] = (),
-    fires: int | None = None,
-) -> list[Results]:
-    """Evaluates the frozen policies of several seeds and prints one table and the run folders.
-
-    Args:
-        seeds: run folder, configuration, frozen policy and checkpoint of each seed.
-        console: prints the table.
-        label: suffix of the file names.
-        about: see `evaluate_run`.
-        fires: number of test fires, one episode each; that of the runs if None.
-
-    Returns:
-        The results of each seed.
-    """
-    results = [
-        evaluate_run(
-            run,
-            config,
-            actor,
-            checkpoint=checkpoint,
-            fires=fires or config.evaluation.episodes,
-            report=lambda text: console.print(f"  {text}", style="dim", soft_wrap=True),
-            label=label,
-            about=about,
-        )
-        for run, config, actor, checkpoint in seeds
-    ]
-    print_results(console, results, [config for _, config, *_ in seeds])
-    for run, *_ in seeds:
-        console.print(str(run.path), soft_wrap=True)
-    return results

@@ -1,9 +1,7 @@
 """Chooses and plays the episodes that are shown side by side."""
 
-import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 from tensordict.nn import TensorDictModuleBase
@@ -16,9 +14,7 @@ from emberlink.envs.utils.validation import is_index, shown, unknown
 from emberlink.envs.wildfire import WildfireEnv
 from emberlink.policies.scripted.registry import SCRIPTED
 from emberlink.trainers.build import build_env
-from emberlink.trainers.config.compose import evaluated_with
 from emberlink.trainers.config.schema import MAX_FIRES, RunConfig, build_comm
-from emberlink.trainers.evaluation.actor import load_actor
 from emberlink.trainers.evaluation.evaluate import (
     BLOCK,
     START_SEED,
@@ -27,13 +23,10 @@ from emberlink.trainers.evaluation.evaluate import (
     scripted_config,
     shown_scenario,
 )
-from emberlink.trainers.replay.page import Replay
 from emberlink.trainers.replay.recording import Episode, Recorder
-from emberlink.trainers.runs.pretrained import read_run
 
 SHARED = ("grid", "num_uavs", "horizon", "altitude")
 """keys of `env` on which fires and start positions depend"""
-_SETTING = re.compile(r"(comm|env|fire|world)(\.[\w.]+)?=")
 
 
 @dataclass(frozen=True)
@@ -74,41 +67,6 @@ def recorder_of(config: RunConfig, policy: Any, member: int = 0) -> Recorder:
     written = build_comm(config, 1).out_keys
     advised = any(key in written for key in getattr(policy, "in_keys", ()))
     return Recorder(member=member, advised=advised, hears=getattr(policy, "hears", False))
-
-
-def learned(arguments: Sequence[str], checkpoints: Sequence[Path] = ()) -> Iterator[Panel]:
-    """Yields a panel for each run.
-
-    Args:
-        arguments: run folders or names of trained policies; a text such as `env.radio.range=0`
-            changes a setting of the run before it.
-        checkpoints: a checkpoint for each run; the newest of each run if empty.
-
-    Raises:
-        UserError: there is no such run, or a setting does not fit.
-    """
-    runs: list[tuple[str, list[str]]] = []
-    for text in arguments:
-        if not _SETTING.match(text):
-            runs.append((text, []))
-        elif runs:
-            runs[-1][1].append(text)
-        else:
-            raise UserError(f"{text!r}: a setting stands after the run that it changes")
-    if checkpoints and len(checkpoints) != len(runs):
-        raise UserError(f"{len(checkpoints)} checkpoints for {len(runs)} runs: one each")
-    titles: set[str] = set()
-    for place, (name, changes) in enumerate(runs):
-        run = read_run(name)
-        checkpoint = checkpoints[place] if checkpoints else run.checkpoint()
-        trained = run.config(checkpoint, device="cpu")
-        config = evaluated_with(trained, changes)
-        actor = load_actor(config, checkpoint)
-        title = title_of(config, *changes, *([checkpoint.stem] if checkpoints else []))
-        if title in titles:  # runs that were trained with other settings
-            title = f"{title}, {run.path.name}"
-        titles.add(title)
-        yield Panel(title, config, lambda env, actor=actor: actor)
 
 
 def title_of(config: RunConfig, *more: str) -> str:
@@ -199,9 +157,3 @@ def play_side_by_side(
         report(f"  {panel.title}: coverage {covered:.1f} %")
         episodes.append(episode)
     return f"{name}:{index}", episodes
-
-
-def replay(panels: Sequence[Panel], fire: str | int | None) -> Replay:
-    """Returns a page that plays the same episode of each panel; see `play_side_by_side`."""
-    name, episodes = play_side_by_side(panels, fire)
-    return Replay(episodes, name)

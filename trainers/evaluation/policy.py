@@ -1,21 +1,44 @@
-"""Defines the frozen policy that `emberlink.trainers.load` returns."""
+"""Loads the frozen policy of a run, also for an environment with other settings."""
 
-from collections.abc import Sequence
+import warnings
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictSequential, dispatch
 from torchrl.data import Composite
-from torchrl.envs import TensorDictPrimer
+from torchrl.envs import TensorDictPrimer, TransformedEnv
 
+from emberlink.comm import registry
 from emberlink.envs import keys
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import shown
 from emberlink.policies.state import primer_of
+from emberlink.trainers.build import build_actor, build_env
+from emberlink.trainers.config.compose import (
+    evaluated_with,
+    flat,
+    in_world,
+    override,
+    to_values,
+)
 from emberlink.trainers.config.schema import RunConfig
-from emberlink.trainers.evaluation import episodes
+from emberlink.trainers.evaluation.episodes import (
+    Panel,
+    play_side_by_side,
+    scripted,
+    title_of,
+)
+from emberlink.trainers.learners.base import ACTOR
 from emberlink.trainers.replay.page import Replay
+from emberlink.trainers.runs.checkpoint import load_weights, read_header
+from emberlink.trainers.runs.run_folder import RunFolder
+
+_CHANGEABLE = ("world", "fire", "env", "comm", "evaluation")
+"""groups of keys that an evaluation can change"""
+_UNITS = ("altitude", "horizon", "displacement", "view_angle", "observation_scale")
 
 
 class TrainedPolicy(TensorDictSequential):
@@ -58,11 +81,6 @@ class TrainedPolicy(TensorDictSequential):
         Raises:
             UserError: the observations are not those that the policy was trained with.
         """
-        self._check(tensordict)
-        return super().forward(tensordict, *args, **kwargs)
-
-    def _check(self, tensordict: TensorDictBase) -> None:
-        """Checks the number of UAVs and the shape of what each of them observes."""
         config = self.config
         for key, shape in self._observed.items():
             wanted = [config.env.num_uavs, *shape]
@@ -73,6 +91,7 @@ class TrainedPolicy(TensorDictSequential):
                     f"this policy of {config.method} reads {key} with the last sizes {wanted}, the "
                     f"environment gives {there}; make_env(policy.config) returns its environment"
                 )
+        return super().forward(tensordict, *args, **kwargs)
 
     def make_tensordict_primer(self) -> TensorDictPrimer:
         """Returns a transform that adds the policy's state to an environment.
@@ -104,12 +123,117 @@ class TrainedPolicy(TensorDictSequential):
                 raise UserError(
                     f"replay: {shown(other)} is not a policy of load(...); fire=0 chooses a fire"
                 )
-        own = [
-            episodes.Panel(
-                episodes.title_of(policy.config, *policy.changes),
-                policy.config,
-                lambda _, policy=policy: policy,
-            )
-            for policy in (self, *others)
-        ]
-        return episodes.replay([*own, *episodes.scripted(self.config, policies)], fire)
+        panels = [policy.panel() for policy in (self, *others)]
+        panels += scripted(self.config, policies)
+        name, played = play_side_by_side(panels, fire)
+        return Replay(played, name)
+
+    def panel(self, *about: str) -> Panel:
+        """Returns the policy and its title, which names changed settings and more texts."""
+        return Panel(title_of(self.config, *self.changes, *about), self.config, lambda _: self)
+
+
+def load_policy(
+    run: RunFolder,
+    overrides: Sequence[str] = (),
+    settings: Mapping[str, Any] | None = None,
+    *,
+    checkpoint: Path | None = None,
+    device: str | None = None,
+) -> TrainedPolicy:
+    """Returns the frozen policy of a run.
+
+    Its configuration is the one in the checkpoint, with changes.
+
+    Args:
+        run: the run folder.
+        overrides: texts `key=value` that change the world, its fire, `env`, `comm` or `evaluation`.
+        settings: the same as keyword arguments.
+        checkpoint: file of networks; the newest of the run if None.
+        device: device of the networks; that of the run if None.
+
+    Raises:
+        UserError: a file cannot be read, or a setting does not fit.
+    """
+    file = run.checkpoint() if checkpoint is None else checkpoint
+    trained = run.config(file, **({} if device is None else {"device": device}))
+    config, given = evaluated_with(trained, overrides), dict(settings or {})
+    fire = {key: given.pop(key) for key in [*given] if key.startswith("fire.")}
+    world = str(given.pop("world", config.world))
+    config = override(in_world(config, world, **fire), **given)
+    before, now = (flat(to_values(each)) for each in (trained, config))
+    fixed = [key for key in {**before, **now} if before.get(key) != now.get(key)]
+    fixed = [key for key in fixed if key.partition(".")[0] not in _CHANGEABLE]
+    if fixed:
+        raise UserError(
+            f"{', '.join(fixed)}: an evaluation changes only keys of {', '.join(_CHANGEABLE)}"
+        )
+    env = fireless(config)
+    actor = load_actor(config, file, env)
+    changes = [*overrides, *(f"{key}={shown(value)}" for key, value in (settings or {}).items())]
+    return TrainedPolicy(actor, env.observation_spec, config, file, changes)
+
+
+def load_actor(
+    config: RunConfig, checkpoint: Path, env: TransformedEnv | None = None
+) -> TensorDictModule:
+    """Returns the frozen networks of a checkpoint, which map observations to ("agents", "action").
+
+    It warns if the networks see a base here and saw none in training, or if the map, the altitudes,
+    the horizon, the speed, the view or the units of observations, also those of the communication,
+    are not those of the training.
+
+    Args:
+        config: configuration of the run.
+        checkpoint: file of the networks.
+        env: the environment whose observations they read; a new one of `fireless` if None.
+
+    Raises:
+        UserError: the checkpoint cannot be read or does not fit the configuration.
+    """
+    actor = build_actor(config, fireless(config) if env is None else env)
+    network: Any = actor.module
+    expected = {ACTOR + name: value for name, value in network.state_dict().items()}
+    weights = load_weights(checkpoint, expected, config)
+    trained = read_header(checkpoint).config
+    if config.env.observation == "sight" and config.env.base and not trained["env"]["base"]:
+        warnings.warn(
+            f"env.base={list(config.env.base)}: the networks were trained without a base, so the "
+            "weights of the pixels that show one keep their initial values",
+            stacklevel=2,
+        )
+    here, there = flat(to_values(config)), flat(trained)
+    differ = [
+        f"{key}={shown(here[key])} (in training {shown(there[key])})"
+        for key in units(config)
+        if here[key] != there.get(key, here[key])
+    ]
+    if differ:
+        warnings.warn(
+            f"{', '.join(differ)}: what the networks observe and do means something else here",
+            stacklevel=2,
+        )
+    network.load_state_dict({name.removeprefix(ACTOR): v for name, v in weights.items()})
+    return actor.requires_grad_(False)
+
+
+def units(config: RunConfig) -> tuple[str, ...]:
+    """Returns the keys that change what the numbers in observations and actions mean.
+
+    The grid is among them if a UAV observes where in the box it is.
+    """
+    by_map = config.env.observation != "sight" or config.comm.get("position", False)
+    world = ("grid", *_UNITS) if by_map else _UNITS
+    said = registry.find(config.comm["name"]).units
+    return (*(f"env.{key}" for key in world), *(f"comm.{key}" for key in said))
+
+
+def fireless(config: RunConfig) -> TransformedEnv:
+    """Returns one environment without a fire."""
+    return build_env(
+        config,
+        num_envs=1,
+        fire=torch.full(config.env.grid, torch.inf),
+        seed=0,
+        device=config.device,
+    )

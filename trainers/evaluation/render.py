@@ -1,7 +1,7 @@
 """Runs `emberlink render`: draws episodes side by side as GIF, MP4, picture or page."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from PIL import Image
@@ -11,9 +11,11 @@ from emberlink.envs.rendering.film import write_gif, write_mp4
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.publish import free_name, new_file, published
 from emberlink.trainers.evaluation import episodes
+from emberlink.trainers.evaluation.episodes import Panel
+from emberlink.trainers.evaluation.policy import load_policy
 from emberlink.trainers.replay.page import Replay
 from emberlink.trainers.replay.screen import Screen, even_steps
-from emberlink.trainers.runs.pretrained import open_run
+from emberlink.trainers.runs.pretrained import open_run, read_run
 
 _ALONE, _BESIDE = (480, 800), (360, 600)  # minimum and maximum pixels of a map's longer side
 _CELL = 8  # pixels of a cell, within those limits
@@ -56,7 +58,7 @@ def render(runs: Sequence[str], console: Console, choices: Choices) -> int:
     Raises:
         UserError: a run, fire or output is wrong.
     """
-    panels = [*episodes.learned(runs, choices.checkpoints)]
+    panels = [*learned(runs, choices.checkpoints)]
     panels += episodes.scripted(panels[0].config, choices.policies)
     fire, _, index = episodes.find_fire(choices.fire, panels[0].config)
     shown = "episode" if len(panels) == 1 else "side_by_side"
@@ -81,6 +83,38 @@ def render(runs: Sequence[str], console: Console, choices: Choices) -> int:
                 write(partial, map(screen.picture, steps), fps=choices.fps)
         console.print(str(path), soft_wrap=True, highlight=False)
     return 0
+
+
+def learned(arguments: Sequence[str], checkpoints: Sequence[Path] = ()) -> Iterator[Panel]:
+    """Yields a panel for each run.
+
+    Args:
+        arguments: run folders or names of trained policies; a text such as `env.radio.range=0`
+            changes a setting of the run before it.
+        checkpoints: a checkpoint for each run; the newest of each run if empty.
+
+    Raises:
+        UserError: there is no such run, or a setting does not fit.
+    """
+    runs: list[tuple[str, list[str]]] = []
+    for text in arguments:
+        if "=" not in text or Path(text).exists():
+            runs.append((text, []))
+        elif runs:
+            runs[-1][1].append(text)
+        else:
+            raise UserError(f"{text!r}: a setting stands after the run that it changes")
+    if checkpoints and len(checkpoints) != len(runs):
+        raise UserError(f"{len(checkpoints)} checkpoints for {len(runs)} runs: one each")
+    titles: set[str] = set()
+    for (name, changes), file in zip(runs, checkpoints or [None] * len(runs), strict=True):
+        run = read_run(name)
+        policy = load_policy(run, changes, checkpoint=file, device="cpu")
+        panel = policy.panel(*([file.stem] if file else []))
+        if panel.title in titles:  # runs that were trained with other settings
+            panel = replace(panel, title=f"{panel.title}, {run.path.name}")
+        titles.add(panel.title)
+        yield panel
 
 
 def _steps(choices: Choices, horizon: int, path: Path) -> list[int]:

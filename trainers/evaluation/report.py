@@ -8,7 +8,6 @@ from typing import Any
 from emberlink.envs.rendering.film import write_gif
 from emberlink.envs.scenarios import fires_of
 from emberlink.envs.utils.errors import UserError
-from emberlink.policies.scripted.registry import to_play
 from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.evaluation import evaluate, plots
 from emberlink.trainers.evaluation.episodes import recorder_of, title_of
@@ -117,11 +116,10 @@ def record(config: RunConfig, results: Results, **about: Any) -> dict[str, Any]:
         "held_out": {name: fires_of(configs[name]).describe(count) for name in results},
         "environment": asdict(config.env),
         "communication": {
-            LEARNED: config.comm,
-            **{
-                name: evaluate.scripted_config(config, name).comm
-                for name in to_play(config.evaluation.scripted)
-            },
+            name: config.comm
+            if name == LEARNED
+            else evaluate.scripted_config(config, name).comm
+            for name in next(iter(results.values()))
         },
         "device": config.device,
         "versions": versions(),

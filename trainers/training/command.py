@@ -177,7 +177,7 @@ def _train(trainer: Trainer, console: Console) -> None:
 def _evaluate(trainer: Trainer, console: Console) -> None:
     """Evaluates the trained policy and prints the results."""
     results = trainer.evaluate(lambda text: console.print(f"  {text}", style="dim", soft_wrap=True))
-    print_results(console, [results], [trainer.config])
+    print_results(console, results, trainer.config)
     console.print(str(trainer.run.path), soft_wrap=True)
 
 

@@ -10,7 +10,7 @@ from emberlink.envs.utils.validation import shown
 from emberlink.trainers.config.compose import to_values
 from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.config.values import flat
-from emberlink.trainers.evaluation.actor import units
+from emberlink.trainers.evaluation.policy import units
 from emberlink.trainers.learners.base import ACTOR, Learner
 from emberlink.trainers.runs.checkpoint import load_weights
 from emberlink.trainers.runs.pretrained import find_one, is_name

@@ -12,7 +12,7 @@ from tiny_run import TINY
 from emberlink.envs.utils.errors import UserError
 from emberlink.trainers.cli.main import main
 from emberlink.trainers.config.compose import to_values
-from emberlink.trainers.evaluation.actor import load_actor
+from emberlink.trainers.evaluation.policy import load_actor
 from emberlink.trainers.runs import pretrained
 from emberlink.trainers.runs.run_folder import RunFolder
 from emberlink.trainers.runs.seal import check_trained_with

@@ -8,7 +8,7 @@ import yaml
 
 from emberlink.envs import keys, metrics
 from emberlink.trainers.config.compose import resolve
-from emberlink.trainers.evaluation.actor import load_actor
+from emberlink.trainers.evaluation.policy import load_actor
 from emberlink.trainers.runs.checkpoint import read_header
 from emberlink.trainers.runs.run_folder import BEST, RunFolder
 from emberlink.trainers.training.trainer import Trainer
