@@ -209,19 +209,19 @@ RESULTS = {
 NUMBERS = ["-123.5", *["1000.0"] * 6, "499.5"]
 
 
-def printed(monkeypatch, capsys, columns: str | None, results, configs) -> str:
+def printed(monkeypatch, capsys, columns: str | None, results, config) -> str:
     """Returns the table as printed to a pipe of the given width."""
     monkeypatch.setenv("COLUMNS", columns or "")
     if columns is None:
         monkeypatch.delenv("COLUMNS")
-    tables.print_results(SafeConsole(), results, configs)
+    tables.print_results(SafeConsole(), results, config)
     return capsys.readouterr().out
 
 
 @pytest.mark.parametrize("columns", ["40", "64", "72", "80", "120", "0", None])
 def test_narrow_tables_keep_every_number(columns, monkeypatch, capsys):
     config = resolve("shared_memory", ["setup=released"])
-    lines = printed(monkeypatch, capsys, columns, [RESULTS], [config]).splitlines()
+    lines = printed(monkeypatch, capsys, columns, RESULTS, config).splitlines()
     parts = sum(line.startswith("test fires") for line in lines)
     assert (parts > 1) == (columns in ("40", "64", "72"))
     if columns not in ("0", None):
@@ -255,21 +255,6 @@ def test_the_files_of_an_evaluation_with_many_settings_have_short_names():
     assert {len(label) for label in short} == {150}
     assert len(short) == 2
     assert command._shortened("_env.radio.loss=0.5") == "_env.radio.loss=0.5"
-
-
-def test_several_seeds_make_one_table(monkeypatch, capsys):
-    configs = [resolve("consensus", [f"seed={seed}"]) for seed in (3, 4, 5)]
-    results = [
-        {"huygens": {**RESULTS["huygens"], "learned": {key: [value] for key in metrics.NAMES}}}
-        for value in (1.0, 2.0, 3.0)
-    ]
-    text = printed(monkeypatch, capsys, None, results, configs)
-    rows = {line[:16].strip(): line[16:].split() for line in text.splitlines()}
-    assert rows["seed 3"] == ["1.000", *["1.0"] * 7]
-    assert rows["seed 5"] == ["3.000", *["3.0"] * 7]
-    assert rows["consensus"] == ["2.000", *["2.0"] * 7]  # the mean
-    assert rows["std. dev."] == ["1.000", *["1.0"] * 7]
-    assert text.count("test fires: huygens") == text.count("oracle") == 1
 
 
 def test_validation_has_fires_and_starts_of_its_own(cache, monkeypatch):

@@ -18,9 +18,9 @@ from emberlink.trainers.comparison.rankings import trained_on
 from emberlink.trainers.comparison.results import Comparison
 from emberlink.trainers.comparison.tables import Frame
 from emberlink.trainers.evaluation import evaluate
-from emberlink.trainers.evaluation.policy import load_actor
 from emberlink.trainers.evaluation.episodes import Panel
 from emberlink.trainers.evaluation.plots import timelapse
+from emberlink.trainers.evaluation.policy import load_actor
 from emberlink.trainers.evaluation.results import CURVES, LEARNED
 from emberlink.trainers.replay.page import Replay
 from emberlink.trainers.replay.recording import Episode

@@ -12,7 +12,7 @@ from emberlink.trainers.config.schema import check_device
 from emberlink.trainers.evaluation.policy import load_policy
 from emberlink.trainers.evaluation.report import evaluate_run
 from emberlink.trainers.evaluation.tables import print_results
-from emberlink.trainers.runs.pretrained import is_name, open_run, read_run
+from emberlink.trainers.runs.pretrained import open_run, read_run
 
 _MAX_LABEL = 150
 """characters; a name of a file can have 255"""
@@ -45,8 +45,6 @@ def evaluate_folder(
             raise UserError(f"{text!r}: one run is evaluated at a time; compare takes several runs")
     if device is not None:
         check_device(device)
-    if not is_name(name):
-        _check_one_run(Path(name))
     policy = load_policy(read_run(name), overrides, checkpoint=checkpoint, device=device)
     run = open_run(name)  # copies a trained policy of the package once all is checked
     about = [checkpoint.stem] if checkpoint else []
@@ -64,23 +62,6 @@ def evaluate_folder(
     print_results(console, results, policy.config)
     console.print(str(run.path), soft_wrap=True)
     return 0
-
-
-def _check_one_run(folder: Path) -> None:
-    """Checks that a folder is not one of several runs.
-
-    Raises:
-        UserError: it holds run folders; the message lists them.
-    """
-    if (folder / "config.yaml").exists():
-        return
-    runs = sorted(str(file.parent) for file in folder.glob("*/config.yaml"))
-    if runs:
-        more = f" and {len(runs) - 20} more" if len(runs) > 20 else ""
-        raise UserError(
-            f"{folder}: a folder of {len(runs)} runs; one is evaluated at a time: "
-            f"{', '.join(runs[:20])}{more}"
-        )
 
 
 def _shortened(label: str) -> str:

@@ -155,6 +155,7 @@ def load_policy(
     Raises:
         UserError: a file cannot be read, or a setting does not fit.
     """
+    _check_one_run(run.path)
     file = run.checkpoint() if checkpoint is None else checkpoint
     trained = run.config(file, **({} if device is None else {"device": device}))
     config, given = evaluated_with(trained, overrides), dict(settings or {})
@@ -172,6 +173,20 @@ def load_policy(
     actor = load_actor(config, file, env)
     changes = [*overrides, *(f"{key}={shown(value)}" for key, value in (settings or {}).items())]
     return TrainedPolicy(actor, env.observation_spec, config, file, changes)
+
+
+def _check_one_run(folder: Path) -> None:
+    """Raises a UserError if a folder does not exist, or holds several runs, which it lists."""
+    if not folder.is_dir():
+        raise UserError(f"{folder}: there is no such run folder")
+    if (folder / "config.yaml").exists():
+        return
+    runs = sorted(str(file.parent) for file in folder.glob("*/config.yaml"))
+    if runs:
+        more = f" and {len(runs) - 20} more" if len(runs) > 20 else ""
+        raise UserError(
+            f"{folder}: a folder of {len(runs)} runs; choose one: {', '.join(runs[:20])}{more}"
+        )
 
 
 def load_actor(

@@ -116,9 +116,7 @@ def record(config: RunConfig, results: Results, **about: Any) -> dict[str, Any]:
         "held_out": {name: fires_of(configs[name]).describe(count) for name in results},
         "environment": asdict(config.env),
         "communication": {
-            name: config.comm
-            if name == LEARNED
-            else evaluate.scripted_config(config, name).comm
+            name: config.comm if name == LEARNED else evaluate.scripted_config(config, name).comm
             for name in next(iter(results.values()))
         },
         "device": config.device,

@@ -16,8 +16,10 @@ from emberlink.policies.scripted.registry import SCRIPTED
 from emberlink.trainers.build import build_actor, build_env
 from emberlink.trainers.cli import main
 from emberlink.trainers.config.compose import resolve
-from emberlink.trainers.evaluation import episodes, evaluate
+from emberlink.trainers.evaluation import episodes, evaluate, render
+from emberlink.trainers.learners.base import ACTOR
 from emberlink.trainers.replay.screen import LINK
+from emberlink.trainers.runs import checkpoint
 from emberlink.trainers.runs.run_folder import RunFolder
 
 SHORT = ("setup=tuned", "learner.hidden=[8,8]", "env.horizon=12", "env.num_uavs=3")
@@ -30,12 +32,11 @@ def make_run(folder, method="consensus", *overrides):
     env = build_env(config, num_envs=1, fire=nowhere, seed=0, device="cpu")
     actor = build_actor(config, env, torch.Generator().manual_seed(config.seed))
     weights = {
-        f"actor_network_params.module.{name}": value.contiguous()
+        f"{checkpoint.WEIGHTS}{ACTOR}{name}": value
         for name, value in actor.module.state_dict().items()
     }
     run = RunFolder.create(config)
-    run.write_config(config)
-    run.save(weights, config, 12)
+    checkpoint.write(run.newest, checkpoint.header_of(config, 12), weights)
     return run.path
 
 
@@ -90,7 +91,7 @@ def test_a_second_rendering_takes_another_name(tmp_path, capsys):
 def test_episodes_side_by_side_have_the_same_fire_and_starts(tmp_path):
     methods = known("method")
     runs = [str(make_run(tmp_path, method)) for method in methods]
-    panels = [*episodes.learned(runs)]
+    panels = [*render.learned(runs)]
     panels += episodes.scripted(panels[0].config, list(SCRIPTED))
     name, shown = episodes.play_side_by_side(panels, "paper:3")
     assert name == "paper:3"
@@ -113,7 +114,7 @@ def test_episodes_side_by_side_have_the_same_fire_and_starts(tmp_path):
 
 def test_an_episode_equals_that_of_the_evaluation(tmp_path):
     run = RunFolder(make_run(tmp_path))
-    (panel,) = episodes.learned([str(run.path)])
+    (panel,) = render.learned([str(run.path)])
     actor = panel.policy(None)
     results = evaluate.evaluate(panel.config, actor, fires=3, scripted=False)["huygens"]
     covered = results[evaluate.LEARNED]["coverage"]
@@ -183,7 +184,7 @@ def test_errors_of_render(tmp_path, capsys):
     ]
     for arguments, words in cases:
         refused(arguments, capsys, *words)
-    (run / "checkpoints" / "step_000000012.safetensors").unlink()
+    RunFolder(run).newest.unlink()
     refused([run], capsys, "holds no checkpoint")
     assert there.read_text() == "mine"
     assert not [*tmp_path.rglob("*.mp4"), *tmp_path.rglob("*.png")]
