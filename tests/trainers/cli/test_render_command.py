@@ -161,7 +161,7 @@ def test_errors_of_render(tmp_path, capsys):
     cases = [
         ([tmp_path / "none"], ["no such run folder"]),
         ([run, "world=moon"], ["world 'moon'", "known: blackout, "]),
-        ([run, "seed=1"], ["seed=1", "no such run folder"]),
+        ([run, "seed=1"], ["seed: an evaluation changes only"]),
         (
             [run, "--fire", "zzz"],
             ["fire 'zzz'", "known: "],
