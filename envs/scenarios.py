@@ -159,6 +159,7 @@ _KINDS: dict[type, Any] = {
 def _kind(value: Any) -> str:
     """Returns the tag of a scenario; one without a `kind` is of the level set."""
     kind = value.get("kind") if isinstance(value, dict) else getattr(value, "kind", None)
+    kind = "file" if kind == "masks" else kind
     return f"{TAG}{kind}" if kind in ("file", "reaction") else f"{TAG}spread"
 
 

@@ -11,7 +11,7 @@ from pydantic.dataclasses import dataclass
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import Name
 
-Units = Literal["steps", "seconds", "minutes", "hours", "days"]
+Units = Literal["steps", "seconds", "minutes", "hours", "days", "day_of_year"]
 COPY_FILE = "fires.npz"
 """Name of the file in a run folder that holds the run's copy of its fires."""
 SECONDS = {"seconds": 1.0, "minutes": 60.0, "hours": 3600.0, "days": 86400.0}
@@ -31,8 +31,10 @@ def _required(value: Any) -> Any:
 class Clock:
     """The unit of a source's times, and the calendar time of 0 where it is known."""
 
-    unit: Units
+    unit: str
+    """A unit of `SECONDS`, `steps`, or `maps` of an array of states."""
     origin: datetime | None = None
+    """In UTC."""
 
     def format(self, time: float) -> str:
         """Returns a time as text for a message."""
@@ -53,8 +55,8 @@ class Clock:
 class FileFireConfig:
     """Fires read from a file: a raster, perimeters, points of the front, or a bank."""
 
-    kind: Literal["file"] = "file"
-    """Distinguishes it from the scenarios of the generator."""
+    kind: Literal["file", "masks"] = "file"
+    """`file`, or `masks` for an array of states `[time, y, x]`, such as 0 unburnt, 1 and 2 fire."""
     name: Name = "file"
     """Name of the scenario, that of its file in configs/fire."""
     path: Annotated[_Text, BeforeValidator(_required)]
@@ -77,12 +79,22 @@ class FileFireConfig:
     """Steps for which a cell burns; inf for ever."""
     crs: _Text | None = None
     """Projection of a file that carries none, else the one to project it to."""
-    time_field: _Text | None = None
-    """Column of the perimeters' times; None takes the only column with a known name."""
     layer: _Text | None = None
-    """Layer of a GeoPackage that has several; of KML all are read if None."""
+    """Layer of a GeoPackage or KML, or variable of a NetCDF, that has several."""
+    time_field: _Text | tuple[_Text, ...] | None = None
+    """Column of the perimeters' times, or the columns of the date and the time of day."""
+    time_format: _Text | None = None
+    """`day_first`, `month_first`, `seconds` since 1970, or a pattern such as `%d.%m.%y %H:%M`."""
     incident: _Text | None = None
     """Incident whose perimeters are read, where a file has several; "*" reads all as one fire."""
+    incident_field: _Text | None = None
+    """Column in which `incident` is looked for."""
+    where: _Text | None = None
+    """Features that are read, `COLUMN=VALUE` (`*` and `|` allowed) or `COLUMN` if not empty."""
+    radius: Annotated[float, Field(gt=0, le=1e5)] | None = None
+    """Radius in metres of the circle that stands for a point, such as a detection of FIRMS."""
+    unburned: float | tuple[float, ...] | Literal["none"] | None = None
+    """Values of a raster, or states of masks, that are not fire; `none` if all values are times."""
     sha256: _Digest | None = None
     """SHA-256 of the file's content; a run records it when it begins and checks it afterwards."""
     test_sha256: _Digest | None = None
@@ -97,3 +109,10 @@ class FileFireConfig:
         if self.end is not None and self.minutes_per_step is not None:
             raise UserError("end and minutes_per_step: give one of them")
         return self
+
+    @property
+    def never(self) -> tuple[float, ...] | None:
+        """The values of `unburned`; empty for `none`, None if it is not given."""
+        if self.unburned is None or isinstance(self.unburned, tuple):
+            return self.unburned
+        return () if self.unburned == "none" else (float(self.unburned),)

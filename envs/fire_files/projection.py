@@ -1,220 +1,158 @@
-"""Imports the libraries of the extra `geo`, and chooses and applies projections onto a plane."""
+"""Chooses the plane on which a fire is gridded, and measures how its projection bends shapes."""
 
-import importlib
-import logging
 import math
-import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
-from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from emberlink.envs.fire_files.formats import beside
-from emberlink.envs.fire_files.sidecars import read_sidecar
-from emberlink.envs.utils.errors import UserError, how_to_install
+from emberlink.envs.fire_files.files import library
+from emberlink.envs.fire_files.grid import Bounds
+from emberlink.envs.utils.errors import UserError
 
-Bounds = tuple[float, float, float, float]
-"""Minimum x, minimum y, maximum x, maximum y."""
-
-Affine = tuple[float, float, float, float, float, float]
-"""(a, b, c, d, e, f): the outer corners of cells are at x = a column + b row + c and
-y = d column + e row + f."""
-
-_LOGGERS = ("rasterio", "pyogrio", "fiona", "shapely", "pyproj")
-_DEGREE_CELL = 0.1  # a cell as large as this is 11 km wide if its side is in degrees
-_DEGREE_EXTENT = 5.0  # a fire as large as this is 500 km wide if it is in degrees
+Affine = tuple[float, ...]
+"""(a, b, c, d, e, f): the corners of cells are at x = a column + b row + c, y = d column + ..."""
+MAX_CELLS = 50_000_000
+"""Cells of a raster, which is read as a whole."""
+_BENT = 1.1
+"""Ratio of a projection's axes above which a file is projected to another plane."""
 _MAX_DEGREES = 20.0  # across; a UTM zone is no plane for more
 _MAX_METRES = 1e9  # no projection of the Earth has such coordinates
 
 
-def library(name: str, what: str = "reading this file") -> Any:
-    """Imports a module of the extra `geo`.
+class Plane(NamedTuple):
+    """How the coordinates of a file get onto a plane, and what is to be said about it."""
 
-    Raises:
-        UserError: the module is not installed; `what` needs it.
-    """
-    try:
-        return importlib.import_module(name)
-    except ImportError:
-        raise UserError(
-            f"{what} needs the extra geo: {how_to_install('geo')} ({name} is missing)"
-        ) from None
+    about: str
+    change: tuple[Any, Any] | None = None
+    """source and target projection, pyproj.CRS; None if the coordinates are on a plane already"""
+    unit: float | None = None
+    """metres of a unit of length on the plane, if known"""
 
 
-@contextmanager
-def quiet() -> Iterator[None]:
-    """Silences the warnings and logs of the libraries. Damage is reported as an error instead."""
-    loggers = [logging.getLogger(name) for name in _LOGGERS]
-    levels = [logger.level for logger in loggers]
-    try:
-        for logger in loggers:
-            logger.setLevel(logging.CRITICAL + 1)
-        with warnings.catch_warnings(), np.errstate(all="ignore"):
-            warnings.simplefilter("ignore")
-            yield
-    finally:
-        for logger, level in zip(loggers, levels, strict=True):
-            logger.setLevel(level)
+def choose_plane(crs: Any, wanted: str | None, bounds: Bounds, cell: float | None) -> Plane:
+    """Chooses how coordinates of a file get onto a plane.
 
-
-def first_line(error: BaseException) -> str:
-    """Returns the first line of a library's message, at most 200 characters of it."""
-    if error.__cause__ and "previous exception" in str(error):
-        error = error.__cause__
-    lines = str(error).strip().splitlines() or [type(error).__name__]
-    return lines[0][:200]
-
-
-def projections(
-    crs: Any, wanted: str | None, bounds: Bounds, cell: float | None
-) -> tuple[Any, Any] | None:
-    """Chooses how coordinates of a file are projected onto a plane.
+    Degrees, and a projection whose axes differ by more than `_BENT` at the fire, are projected to
+    the UTM zone of the middle.
 
     Args:
         crs: the projection of the file; None if it has none.
         wanted: `fire.crs`: the projection of a file without one, otherwise the target.
         bounds: bounds of the coordinates.
         cell: side of a raster's cells in these coordinates; None for perimeters.
-
-    Returns:
-        The source and the target projection, pyproj.CRS; None if the coordinates are on a plane
-        already. Degrees are projected to the UTM zone of the middle.
-
-    Raises:
-        UserError: degrees without a projection, an unknown projection, or coordinates outside it.
     """
+    width, height = bounds[2] - bounds[0], bounds[3] - bounds[1]
+    span = f"coordinates from {bounds[:2]} to {bounds[2:]}"
     if not all(map(math.isfinite, bounds)) or max(map(abs, bounds)) > _MAX_METRES:
-        raise UserError(f"coordinates from {bounds[:2]} to {bounds[2:]} are not on the Earth")
+        raise UserError(f"{span} are not on the Earth")
+    in_degrees = max(map(abs, bounds[::2])) <= 360 and max(map(abs, bounds[1::2])) <= 90.01
     if crs is None and wanted is None:
-        _refuse_degrees(bounds, cell)
-        return None
-    source = _parse_crs(crs or wanted)
+        # Cells of 0.1 degrees would be 11 km wide, a fire of 5 degrees 500 km.
+        if in_degrees and (max(width, height) < 5 if cell is None else cell < 0.1):
+            raise UserError(
+                f"{span} may be degrees, and no projection is given; expected fire.crs, such as "
+                "fire.crs=EPSG:4326 for longitude and latitude"
+            )
+        return Plane("no projection in the file: its coordinates are taken as a plane")
+    source = parse_crs(crs or wanted)
     if crs and wanted and not (source.is_projected or source.is_geographic):
-        crs, source = None, _parse_crs(wanted)  # a plane of its own: the user knows which it is
-    if source.is_geographic and not _in_degrees(bounds):
-        raise UserError(
-            f"coordinates from {bounds[:2]} to {bounds[2:]} are not degrees, which "
-            f"{source.name} is in; expected longitude and latitude, or another fire.crs"
-        )
-    if source.is_geographic and not -180 <= bounds[0] <= bounds[2] <= 180:
-        raise UserError(
-            f"longitudes from {bounds[0]:g} to {bounds[2]:g}; expected -180 to 180, or a file in "
-            "metres for a fire across 180 degrees"
-        )
+        crs, source = None, parse_crs(wanted)  # a plane of its own: the user knows which it is
+    degrees = source.is_geographic
+    if degrees and not (in_degrees and abs(bounds[0] + bounds[2]) <= 360):
+        raise UserError(f"{span} are not the degrees of {source.name}; expected another fire.crs")
+    if not (source.is_projected or degrees):
+        return Plane(f"{source.name}, taken as a plane", None, _metres(source))
+    at = _middle(source, bounds)
+    ratio, turn = (math.inf, 0.0) if degrees else _distortion(source, at)
     if crs and wanted:
-        target = _parse_crs(wanted)
-        if not target.is_projected:
-            what = "in degrees" if target.is_geographic else "not one of a map"
-            raise UserError(f"fire.crs={wanted} is {what}; expected one in metres, as UTM is")
-        return source, target
-    return (source, _utm(bounds)) if source.is_geographic else None
-
-
-def check_projection(path: Path, crs: Any) -> None:
-    """Checks that the projection in a .prj beside a file was read.
-
-    Raises:
-        UserError: the file has a .prj, and `crs` is None.
-    """
-    prj = beside(path, ".prj")
-    if crs is None and prj is not None and prj.stat().st_size:
+        target = parse_crs(wanted)
+        if not target.is_projected or (bent := _distortion(target, at)[0]) > _BENT:
+            why = f"has axes {bent:.2f} : 1 here" if target.is_projected else "is in degrees"
+            raise UserError(f"fire.crs={wanted} {why}; expected one as UTM is")
+    elif ratio <= _BENT:
+        return Plane(f"projection {source.name} ({_shape(ratio, turn)})", None, _metres(source))
+    elif (degrees and max(width, height) > _MAX_DEGREES) or abs(at[1]) > 84:
         raise UserError(
-            f"{prj.name}, beside it, holds no projection that is known; expected one, or no such "
-            "file and fire.crs, such as fire.crs=EPSG:32611"
+            f"{span}: no UTM zone is a plane for them; expected fire.crs in metres, or a "
+            "file of the fire alone"
         )
+    else:
+        zone = min(int((at[0] + 180) // 6), 59) + 1
+        target = parse_crs(f"EPSG:{(32600 if at[1] >= 0 else 32700) + zone}")
+    bent = "degrees" if degrees else _shape(ratio, turn)
+    after = f"projected to {target.name} ({_shape(*_distortion(target, at))})"
+    return Plane(f"projection {source.name} ({bent}), {after}", (source, target), _metres(target))
 
 
-def _parse_crs(value: Any) -> Any:
+def parse_crs(value: Any) -> Any:
+    """Returns a projection, pyproj.CRS."""
     pyproj = library("pyproj", "a projection")
     try:
         return pyproj.CRS.from_user_input(value)
     except pyproj.exceptions.CRSError:
-        raise UserError(
-            f"the projection {str(value)[:100]!r} is not known; expected such as EPSG:32611"
-        ) from None
+        text = str(value)[:100]
+        raise UserError(f"projection {text!r} is not known; expected such as EPSG:32611") from None
 
 
-def _in_degrees(bounds: Bounds) -> bool:
-    return bounds[0] >= -360 and bounds[2] <= 360 and bounds[1] >= -90.01 and bounds[3] <= 90.01
+def _metres(crs: Any) -> float | None:
+    return crs.axis_info[0].unit_conversion_factor if crs.axis_info else None
 
 
-def _refuse_degrees(bounds: Bounds, cell: float | None) -> None:
-    small = max(bounds[2] - bounds[0], bounds[3] - bounds[1]) < _DEGREE_EXTENT
-    if _in_degrees(bounds) and (small if cell is None else cell < _DEGREE_CELL):
-        raise UserError(
-            f"coordinates from {bounds[:2]} to {bounds[2:]} look like degrees, and no projection "
-            "is given; expected fire.crs, such as fire.crs=EPSG:4326 for longitude and latitude"
-        )
+def _shape(ratio: float, turn: float) -> str:
+    return f"axes {ratio:.2f} : 1, north turned by {turn:.0f} degrees"
 
 
-def _utm(bounds: Bounds) -> Any:
-    """Returns the UTM zone of the middle of `bounds`."""
-    width, height = bounds[2] - bounds[0], bounds[3] - bounds[1]
-    x, y = (bounds[0] + bounds[2]) / 2, (bounds[1] + bounds[3]) / 2
-    if max(width, height) > _MAX_DEGREES or abs(y) > 84:
-        raise UserError(
-            f"{width:g} x {height:g} degrees around latitude {y:g}: no UTM zone is a plane for "
-            "them; expected fire.crs, a projection in metres, or a file of the fire alone"
-        )
-    zone = min(int((x + 180) // 6), 59) + 1
-    return _parse_crs(f"EPSG:{(32600 if y >= 0 else 32700) + zone}")
+def _middle(crs: Any, bounds: Bounds) -> tuple[float, float]:
+    """Returns longitude and latitude of the middle of bounds."""
+    at = (bounds[0] + bounds[2]) / 2, (bounds[1] + bounds[3]) / 2
+    if not crs.is_geographic:
+        change = library("pyproj").Transformer.from_crs(crs, crs.geodetic_crs, always_xy=True)
+        at = change.transform(*at)
+    if not math.isfinite(sum(at)):
+        raise UserError(f"coordinates from {bounds[:2]} to {bounds[2:]} lie outside {crs.name}")
+    return at
 
 
-def read_prj(path: Path) -> Any:
-    """Returns the projection in the .prj beside a file, None if there is none."""
-    prj = beside(path, ".prj")
-    if prj is None:
-        return None
-    pyproj = library("pyproj", "a projection")
-    try:
-        return pyproj.CRS.from_user_input(read_sidecar(prj))
-    except UserError:
-        raise
-    except (pyproj.exceptions.CRSError, ValueError):
-        return check_projection(path, None)
+def _distortion(crs: Any, at: tuple[float, float]) -> tuple[float, float]:
+    """Returns the ratio of the axes of a small circle's image, and by how much north is turned."""
+    change = library("pyproj").Transformer.from_crs(crs.geodetic_crs, crs, always_xy=True)
+    latitude = math.radians(at[1])
+    east, north = 1e-4 / max(math.cos(latitude), 1e-9), 1e-4
+    x, y = np.array(at)[:, None] + [[-east, east, 0, 0], [0, 0, -north, north]]
+    x, y = (np.array(part) for part in change.transform(x, y))
+    jacobian = np.array([[x[1] - x[0], x[3] - x[2]], [y[1] - y[0], y[3] - y[2]]])
+    jacobian[:, 0] *= 0.99331 / (1 - 0.00669 * math.sin(latitude) ** 2)  # of the ellipsoid
+    if not np.isfinite(jacobian).all() or not np.linalg.det(jacobian):
+        raise UserError(f"the fire at {at} lies outside {crs.name}; expected another fire.crs")
+    long, short = np.linalg.svd(jacobian, compute_uv=False)
+    return float(long / short), math.degrees(math.atan2(jacobian[0, 1], jacobian[1, 1]))
 
 
 def warped(
-    times: np.ndarray, affine: Affine, chosen: tuple[Any, Any] | None, max_cells: int
+    times: np.ndarray, affine: Affine, change: tuple[Any, Any] | None
 ) -> tuple[np.ndarray, Affine]:
     """Projects times and rotates the raster north up, on cells of half the size.
 
     Times are interpolated between burnt cells. A point in a cell that never burns stays inf.
-
-    Raises:
-        UserError: the result would have more than `max_cells` cells.
     """
-    rasterio = library("rasterio")
-    vrt = library("rasterio.vrt").WarpedVRT
-    source, target = chosen or ("EPSG:3857", "EPSG:3857")  # any plane: only rotated
-    about = {
-        "height": times.shape[0],
-        "width": times.shape[1],
-        "transform": rasterio.Affine(*affine),
-    }
+    rasterio, vrt = library("rasterio"), library("rasterio.vrt").WarpedVRT
+    source, target = change or ("EPSG:3857", "EPSG:3857")  # any plane: only rotated
+    about: dict[str, Any] = {"driver": "GTiff", "count": 1, "dtype": "float64", "crs": source}
+    about |= {"nodata": math.nan, "transform": rasterio.Affine(*affine)}
+    about |= dict(zip(("height", "width"), times.shape, strict=True))
     with rasterio.MemoryFile() as memory:
-        with memory.open(
-            "GTiff", count=1, dtype="float64", crs=source, nodata=math.nan, **about
-        ) as dataset:
+        with memory.open(**about) as dataset:
             dataset.write(np.where(np.isfinite(times), times, np.nan), 1)
         with memory.open() as dataset:
             with vrt(dataset, crs=target) as view:
                 size = {"width": 2 * view.width, "height": 2 * view.height}
-                if math.prod(size.values()) > max_cells:
-                    raise UserError(
-                        f"{size['width']} x {size['height']} cells after its projection to a "
-                        f"plane; at most {max_cells} are read; expected a part of the file, or "
-                        "one in metres"
-                    )
                 transform = view.transform @ rasterio.Affine.scale(0.5)
+            if math.prod(size.values()) > MAX_CELLS:
+                raise UserError(f"{size} cells on a plane; at most {MAX_CELLS}: expected a part")
+            size |= {"crs": target, "transform": transform}
             sampled = []
             for method in ("nearest", "bilinear"):
-                resampling = rasterio.enums.Resampling[method]
-                with vrt(
-                    dataset, crs=target, transform=transform, resampling=resampling, **size
-                ) as view:
+                with vrt(dataset, resampling=rasterio.enums.Resampling[method], **size) as view:
                     sampled.append(view.read(1))
     inside, between = (np.where(np.isnan(values), np.inf, values) for values in sampled)
     return np.where(np.isinf(inside) | np.isinf(between), inside, between), transform[:6]

@@ -1,122 +1,148 @@
-"""Reads rasters of arrival times: ESRI ASCII (FARSITE, FlamMap, ELMFIRE) and GeoTIFF."""
+"""Reads rasters of arrival times: ESRI ASCII, GeoTIFF, NetCDF, arrays of states, banks, points."""
 
+import itertools
 import logging
 import logging.handlers
 import math
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any
 
 import numpy as np
 
-from emberlink.envs.fire_files.config import Clock, Units
-from emberlink.envs.fire_files.plausibility import begins_at_zero, doubts_of_names, doubts_of_values
-from emberlink.envs.fire_files.projection import (
-    Affine,
-    first_line,
-    library,
-    projections,
-    read_prj,
-    warped,
+from emberlink.envs.config import SIDES
+from emberlink.envs.fire_files.config import Clock, FileFireConfig
+from emberlink.envs.fire_files.dates import in_utc, parse_dates
+from emberlink.envs.fire_files.files import check_prj, first_line, library
+from emberlink.envs.fire_files.grid import Raster, beginnings, number
+from emberlink.envs.fire_files.projection import MAX_CELLS, Affine, choose_plane, warped
+from emberlink.envs.fire_files.values import (
+    arrival,
+    check_spreads,
+    check_states,
+    doubts,
+    first_burning,
+    in_order,
+    unit_of,
 )
-from emberlink.envs.fire_files.raster_source import RasterSource, check_spreads
 from emberlink.envs.utils.errors import UserError
 
-MAX_CELLS = 50_000_000
-"""Cells of a raster, which is read as a whole."""
-MAX_TIME = 1e12
-"""Maximum time; a larger number is not a time."""
-_NEVER = (-9999.0, -1.0)  # NODATA of FARSITE and FlamMap, and of ELMFIRE
-_VOID = 1e30  # a number beyond it is NODATA although not declared, such as -3.4e38
-_COUNT, _SIZE, _PLACE = "a whole number above 0", "a size above 0", "a coordinate"
-_KEYS = {"ncols": _COUNT, "nrows": _COUNT, "cellsize": _SIZE, "dx": _SIZE, "dy": _SIZE}
-_KEYS |= dict.fromkeys(("xllcorner", "xllcenter", "yllcorner", "yllcenter"), _PLACE)
-_KEYS |= {"nodata_value": "a number"}
-_NEEDED = (("ncols",), ("nrows",), ("cellsize", "dx"), ("cellsize", "dy"))
-_NEEDED += (("xllcorner", "xllcenter"), ("yllcorner", "yllcenter"))
+MAX_BANK = 300_000_000
+"""Maximum number of cells of all fires of a bank: 1.2 GB."""
+_DRIVERS = {"tif": "GTiff", "nc": "netCDF", "asc": "AAIGrid"}
 _DAMAGE = re.compile(r"IO error|tag ignored|TIFFVSetField|(Null|Incorrect) count|_tiff\w+Proc:")
+_HEADER = re.compile(r"\s*(?!nan|inf)[a-z]", re.IGNORECASE)  # a line of ESRI ASCII
+_NORTH_UP = (1.0, 0.0, 0.0, 0.0, -1.0)
+_SIDE = 30  # cells along a side of the paper's map
+_SKIPPED = 6000  # lines of the paper's text before step 0
+_PLUS = ((0, 0), (1, 0), (-1, 0), (0, 1), (0, -1))
 
 
-def read_geotiff(path: Path, unit: Units | None, crs: str | None) -> RasterSource:
-    """Reads arrival times from a GeoTIFF with one band.
+def read_raster(path: Path, kind: str, config: FileFireConfig) -> tuple[list[Raster], int | None]:
+    """Reads the fire of a raster, or the fires of a bank and the steps for which it was written."""
+    if kind == "points":
+        return [_front_points(path, config)], None
+    if kind == "npy":
+        return _numpy(path, config)
+    with _opened(path, kind, config.layer) as dataset:
+        affine, crs, tags = tuple(dataset.transform[:6]), dataset.crs, dataset.tags()
+        if dataset.transform.is_identity:
+            affine = (*_NORTH_UP, float(dataset.height))
+        if config.kind == "masks":
+            times, text = first_burning(_read(dataset, MAX_BANK), config)
+            return [_source(times, affine, crs, config.units or "maps", config, text)], None
+        if tags.get("units") == "steps" and crs is None:
+            nodata, bands = dataset.nodata, _read(dataset, MAX_BANK)
+            bands = np.where(bands == nodata, np.inf, bands) if nodata is not None else bands
+            return _bank(bands, tags.get("horizon"), config)
+        check_prj(path, kind, crs)
+        return [_band(path, kind, dataset, affine, config)], None
 
-    `unit` is the unit of the times; if it is None, the tag units=steps tells it.
 
-    Raises:
-        UserError: the file is damaged, is not a raster of times, or has no geotransform.
-    """
-    with open_raster(path) as dataset:
-        _check_band(dataset)
-        declared = "all_valid" not in [flag.name for flag in dataset.mask_flag_enums[0]]
-        never = dataset.read_masks(1) == 0 if declared else None
-        times = clean(dataset.read(1), never) * dataset.scales[0] + dataset.offsets[0]
-        tagged: Units | None = "steps" if dataset.tags().get("units") == "steps" else None
-        affine, source_crs = dataset.transform[:6], dataset.crs
-        name, measure = (dataset.descriptions[0] or "")[:60], (dataset.units[0] or "")[:20]
-        doubts = list(doubts_of_names([*_texts(dataset), path.stem], measure))
-    name = f"{name!r} ({measure})" if measure else repr(name) if name else ""
-    return _on_plane(times, affine, source_crs, unit or tagged, crs, name, doubts)
+def _band(path: Path, kind: str, dataset: Any, affine: Affine, config: FileFireConfig) -> Raster:
+    """Returns the fire of a raster's only band, or of the last time of a NetCDF."""
+    band = dataset.count if kind == "nc" else 1
+    if dataset.count != band:
+        raise UserError(
+            f"{dataset.count} bands; expected one, a bank of fires, tagged units=steps, or maps of "
+            "states with fire.kind=masks"
+        )
+    tags = {**dataset.tags(), **dataset.tags(band)}
+    titles = dataset.descriptions[band - 1], tags.get("long_name"), tags.get("NETCDF_VARNAME")
+    declared = dataset.units[band - 1] or tags.get("units") or ""
+    what = f"band {next((title for title in titles if title), band)!r:.60}"
+    what += f", the last of {band} times" if band > 1 else ""
+    what += f" ({declared})" if declared else ""
+    flags = [flag.name for flag in dataset.mask_flag_enums[band - 1]]
+    nodata = None if "all_valid" in flags else dataset.read_masks(band) == 0
+    values = _read(dataset, MAX_CELLS, band)[0]
+    if kind == "asc":  # GDAL reads a word as 0, and wraps rows
+        values = _numbers(path, values.shape)
+        nodata = values == (math.nan if dataset.nodata is None else dataset.nodata)
+    values = values * dataset.scales[band - 1] + dataset.offsets[band - 1]
+    unit, since = unit_of(declared, config, what)
+    times = arrival(values, nodata, config)
+    return _source(times, affine, dataset.crs, unit, config, what, since)
 
 
-def read_ascii(path: Path, unit: Units | None, crs: str | None) -> RasterSource:
-    """Reads arrival times from ESRI ASCII, with the projection in a .prj beside the file.
-
-    NumPy reads the numbers, because GDAL reads a word as 0 and wraps rows of another length.
-
-    Raises:
-        UserError: a line of the header or a number is wrong.
-    """
+def _numbers(path: Path, shape: tuple[int, ...]) -> np.ndarray:
+    """Returns the numbers of ESRI ASCII, whose header GDAL has read."""
     with path.open(encoding="utf-8-sig", errors="replace") as file:
-        header, lines = _read_header(file)
-        shape = int(header["nrows"]), int(header["ncols"])
-        if math.prod(shape) > MAX_CELLS:
-            raise UserError(f"{shape[1]} x {shape[0]} cells; at most {MAX_CELLS} are read")
+        header = len(list(itertools.takewhile(_HEADER.match, file)))
+        file.seek(0)
         try:
-            values = np.loadtxt(file, comments=None, ndmin=2, max_rows=math.prod(shape) + 1)
+            values = np.loadtxt(
+                file, comments=None, ndmin=2, skiprows=header, max_rows=math.prod(shape) + 1
+            )
         except ValueError as error:
+            cause = first_line(error).split(";")[0]
             raise UserError(
-                f"after {lines} lines of header: {first_line(error).split(';')[0]}; expected "
-                f"rows of {shape[1]} numbers"
+                f"after {header} lines of header: {cause}; expected rows of {shape[1]} numbers"
             ) from None
     if values.shape != shape:
+        raise UserError(f"{values.shape} rows and columns; expected nrows, ncols={shape}")
+    return values
+
+
+def _read(dataset: Any, most: int, band: int | None = None) -> np.ndarray:
+    """Reads a band or all, [bands, rows, columns], of bounded size and a type of real numbers."""
+    count = 1 if band else dataset.count
+    size = max(count * dataset.width * dataset.height, *map(math.prod, dataset.block_shapes))
+    kind = np.dtype(dataset.dtypes[0])
+    if size > most or kind.kind not in "iuf":
         raise UserError(
-            f"{values.shape[0]} rows of {values.shape[1]} numbers; expected nrows={shape[0]} rows "
-            f"of ncols={shape[1]}"
+            f"{count} x {dataset.height} x {dataset.width} cells of {kind}, in blocks of "
+            f"{dataset.block_shapes[0]}; expected at most {most}, of real numbers; gdalwarp -te "
+            "cuts out a part"
         )
-    dx, dy = (header.get(key, header.get("cellsize", 0.0)) for key in ("dx", "dy"))
-    x = header.get("xllcorner", header.get("xllcenter", 0.0) - dx / 2)
-    y = header.get("yllcorner", header.get("yllcenter", 0.0) - dy / 2)
-    never = values == header["nodata_value"] if "nodata_value" in header else None
-    affine = dx, 0.0, x, 0.0, -dy, y + shape[0] * dy
-    doubts = list(doubts_of_names([path.stem]))
-    return _on_plane(clean(values, never), affine, read_prj(path), unit, crs, doubts=doubts)
-
-
-def _texts(dataset: Any) -> list[str]:
-    """Returns the texts in a GeoTIFF that name its values."""
-    tags = {**dataset.tags(), **dataset.tags(1)}
-    named = [tags[key] for key in ("TIFFTAG_IMAGEDESCRIPTION", "long_name") if key in tags]
-    return [text for text in (dataset.descriptions[0], *named) if text]
+    return dataset.read([band] if band else None)
 
 
 @contextmanager
-def open_raster(path: Path) -> Iterator[Any]:
-    """Opens a GeoTIFF with rasterio.
-
-    Raises:
-        UserError: the file is damaged, also if GDAL only logs the damage.
-    """
-    rasterio = library("rasterio")
+def _opened(path: Path, kind: str, layer: str | None) -> Iterator[Any]:
+    """Opens a raster by the driver of its name; damage that GDAL only logs is an error."""
+    rasterio = library("rasterio", "a raster")
     log = logging.handlers.BufferingHandler(capacity=1_000_000)
     logger = logging.getLogger("rasterio._env")
     level, propagate = logger.level, logger.propagate
     logger.setLevel(logging.WARNING)
     logger.propagate = False
     logger.addHandler(log)
+    name: Any = path.absolute()
     try:
-        with rasterio.open(path, driver="GTiff") as dataset:
+        if kind == "nc":
+            with rasterio.open(name, driver="netCDF") as dataset:
+                found = [part.rpartition(":")[2] for part in dataset.subdatasets]
+            if found and (layer not in found or '"' in str(path)):
+                some = "TIGN_G" if "TIGN_G" in found else found[0]
+                raise UserError(
+                    f"{len(found)} variables: {', '.join(found[:30])}; expected fire.layer, the "
+                    f"one of arrival times, such as fire.layer={some}"
+                )
+            name = f'NETCDF:"{name}":{layer}' if found else name
+        with rasterio.open(name, driver=_DRIVERS[kind]) as dataset:
             yield dataset
     except (rasterio.errors.RasterioError, OSError) as error:
         raise UserError(f"{first_line(error)}; expected a whole raster") from None
@@ -130,148 +156,130 @@ def open_raster(path: Path) -> Iterator[Any]:
             raise UserError(f"damaged: {message[:200]}; expected a whole raster")
 
 
-def clean(times: np.ndarray, never: np.ndarray | None = None) -> np.ndarray:
-    """Returns arrival times in which cells that never burn are inf, float32 or float64.
-
-    Args:
-        times: values of a file, any real type.
-        never: mask of the NODATA that the file declares. Without one, the maximum of an integer
-            type is NODATA, and the minimum of a signed one.
-
-    Raises:
-        UserError: a number is not a time.
-    """
-    if never is None and times.dtype.kind in "iu":
-        limits = np.iinfo(times.dtype)
-        never = (times == limits.max) | ((times == limits.min) & (limits.min < 0))
-    times = np.array(times, dtype=np.result_type(times, np.float32))
-    if never is not None:
-        times[never] = np.inf
-    odd = ~(times >= 0) | ((times > MAX_TIME) & (times < np.inf))
-    values = times[odd]
-    wrong = ~(np.isnan(values) | (np.abs(values) > _VOID) | np.isin(values, _NEVER))
-    if wrong.any():
-        raise UserError(
-            f"{values[wrong][0]:g} is not an arrival time; expected 0 or more, or NODATA (-9999, "
-            "-1, NaN or what the file declares)"
-        )
-    times[odd] = np.inf
-    return times
-
-
-def _check_band(dataset: Any) -> None:
-    if dataset.count != 1:
-        raise UserError(
-            f"{dataset.count} bands; expected one, or a bank of fires, tagged units=steps"
-        )
-    kind = np.dtype(dataset.dtypes[0])
-    if kind.kind not in "iuf":
-        raise UserError(f"values of type {kind}; expected real numbers")
-    if kind.itemsize == 1 and dataset.nodata is None:
-        raise UserError(f"values of type {kind} without NODATA, as of a picture; expected times")
-    if dataset.width * dataset.height > MAX_CELLS:
-        raise UserError(
-            f"{dataset.width} x {dataset.height} cells; at most {MAX_CELLS} are read; expected a "
-            "part, such as gdalwarp -te cuts out"
-        )
-    check_blocks(dataset)
-    if dataset.transform.is_identity:
-        raise UserError(
-            "no geotransform, so that the place of the cells is not known; expected one, such as "
-            "gdal_translate -a_ullr writes"
-        )
-
-
-def check_blocks(dataset: Any) -> None:
-    """Checks the size of the blocks of a GeoTIFF, which may be larger than the raster.
-
-    Raises:
-        UserError: a block is too large to read.
-    """
-    rows, columns = dataset.block_shapes[0]
-    if rows * columns > MAX_CELLS:
-        raise UserError(f"blocks of {columns} x {rows} cells; at most {MAX_CELLS} are read")
-
-
-def _read_header(file: TextIO) -> tuple[dict[str, float], int]:
-    """Reads the header of ESRI ASCII up to the first row.
-
-    Returns:
-        The values, and the number of lines.
-    """
-    header: dict[str, float] = {}
-    while True:
-        start = file.tell()
-        words = file.readline(1000).split()
-        key = words[0].lower() if words else ""
-        if not key[:1].isalpha() or key[:3] in ("nan", "inf"):
-            file.seek(start)
-            break
-        line = len(header) + 1
-        if key not in _KEYS:
-            raise UserError(
-                f"line {line}: {key[:30]!r} is not a key of ESRI ASCII; expected {', '.join(_KEYS)}"
-            )
-        if key in header or len(words) != 2 or not _is_valid(key, words[1]):
-            text = " ".join(words)[:60]
-            raise UserError(f"line {line}: {text!r}; expected {key} once, with {_KEYS[key]}")
-        header[key] = float(words[1])
-    for keys in _NEEDED:
-        if sum(key in header for key in keys) != 1:
-            raise UserError(f"expected one {' or '.join(keys)} in the header of ESRI ASCII")
-    return header, len(header)
-
-
-def _is_valid(key: str, text: str) -> bool:
-    """Tells whether the value of a key of ESRI ASCII is one."""
-    try:
-        value = float(text)
-    except ValueError:
-        return False
-    if _KEYS[key] is _COUNT:
-        return 1 <= value < 1e12 and value % 1 == 0
-    if _KEYS[key] is _SIZE:
-        return 0 < value < math.inf
-    return math.isfinite(value) if _KEYS[key] is _PLACE else True
-
-
-def _on_plane(
+def _source(
     times: np.ndarray,
     affine: Affine,
-    source_crs: Any,
-    unit: Units | None,
-    crs: str | None,
-    name: str = "",
-    doubts: Sequence[str] = (),
-) -> RasterSource:
-    """Returns cleaned times on a plane, north up.
-
-    Raises:
-        UserError: no fire spreads, there is no unit, or the coordinates are not valid.
-    """
-    check_spreads(times)
+    crs: Any,
+    unit: str,
+    config: FileFireConfig,
+    what: str,
+    since: str = "",
+) -> Raster:
+    """Returns times on a plane, north up."""
+    unit = "maps" if config.kind == "masks" and unit == "steps" else unit
+    if unit in ("days", "day_of_year"):
+        times, unit = in_order(times, config), "days"
+    signs = [] if config.kind == "masks" else doubts(times, unit)
     a, b, c, d, e, f = (float(value) for value in affine)
     area = abs(a * e - b * d)
     if not math.isfinite(c + f) or not 1e-20 < area < 1e12:
         raise UserError(f"cells of {a:g} x {e:g}; expected a size above 0")
-    if unit is None:
-        raise UserError(
-            "the unit of the raster's times is not known; expected fire.units=minutes (FARSITE, "
-            "FlamMap), seconds (ELMFIRE), hours, days or steps"
-        )
-    doubts = [*doubts, *doubts_of_values(times, unit)]
     rows, columns = times.shape
-    corners = [(a * u + b * v + c, d * u + e * v + f) for u in (0, columns) for v in (0, rows)]
-    x, y = zip(*corners, strict=True)
-    chosen = projections(source_crs or None, crs, (min(x), min(y), max(x), max(y)), math.sqrt(area))
-    clock, from_zero = Clock(unit), begins_at_zero(times)  # by the cells of the file
+    x, y = (
+        [p * u + q * v + r for u in (0, columns) for v in (0, rows)]
+        for p, q, r in ((a, b, c), (d, e, f))
+    )
+    about, change = "no place in the file: square cells, the first row in the north", None
+    if crs is not None or affine[:5] != _NORTH_UP:
+        bounds = (min(x), min(y), max(x), max(y))
+        about, change, _ = choose_plane(crs, config.crs, bounds, math.sqrt(area))
+    first = times.min()  # by the cells of the file
+    row, column = np.unravel_index(times.argmin(), times.shape)
+    around = times[max(row - 1, 0) : row + 2, max(column - 1, 0) : column + 2]
+    crossing = (around[np.isfinite(around)] - first).max()
     if a < 0 and not (b or d):
         times, a, c = times[:, ::-1], -a, c + columns * a
     if e > 0 and not (b or d):
         times, e, f = times[::-1], -e, f + rows * e
-    if chosen or b or d:
-        times, affine = warped(times, (a, b, c, d, e, f), chosen, MAX_CELLS)
-        a, b, c, d, e, f = affine
+    if change or b or d:
+        times, (a, b, c, d, e, f) = warped(times, (a, b, c, d, e, f), change)
         check_spreads(times)
-    about = {"name": name, "doubts": doubts, "from_zero": from_zero}
-    return RasterSource(times, (c, f), (a, -e), clock, **about)
+    clock = Clock(unit, in_utc(parse_dates([since], None, "units")[0]) if since else None)
+    source = Raster(times, (c, f), (a, -e), clock, doubts=signs)
+    if first <= crossing and not since and unit not in ("steps", "maps"):
+        source.began = 0.0  # the ignition lies between the centres of cells
+    span = f"{clock.format(source.first)} to {clock.format(source.last)}"
+    places = number(beginnings(times), "place")
+    cells = int(np.isfinite(times).sum())
+    source.facts = [f"{cells} cells burn from {span}, beginning at {places}", what, about]
+    return source
+
+
+def _numpy(path: Path, config: FileFireConfig) -> tuple[list[Raster], int | None]:
+    """Reads an array [fires, X, Y] or [X, Y] of arrival times, or [time, y, x] of states."""
+    try:
+        # Memory-mapped, so that a wrong header allocates nothing.
+        array = np.load(path, mmap_mode="r", allow_pickle=False)
+    except Exception as error:  # a damaged header raises many types
+        raise UserError(f"{first_line(error)}; expected an array in NumPy's format") from None
+    fires = array[None] if getattr(array, "ndim", 0) == 2 else array
+    if (
+        getattr(fires, "ndim", 0) != 3
+        or fires.dtype.kind not in "iufb"
+        or not (0 < fires.size <= MAX_BANK)
+    ):
+        shape, kind = list(np.shape(array)), getattr(array, "dtype", type(array).__name__)
+        raise UserError(
+            f"an array of {shape}, {kind}; expected [fires, X, Y] of at most {MAX_BANK} numbers"
+        )
+    if config.kind == "masks":
+        times, text = first_burning(np.asarray(fires), config)
+        affine = (*_NORTH_UP, float(len(times)))
+        return [_source(times, affine, None, config.units or "maps", config, text)], None
+    json = path.with_suffix(".json")
+    about = json.open(errors="replace").read(1_000_000) if json.is_file() else ""
+    horizon = re.search(r'"horizon": *(\d+)', about)
+    return _bank(fires.transpose(0, 2, 1)[:, ::-1], horizon and horizon[1], config)
+
+
+def _bank(
+    fires: np.ndarray, horizon: str | None, config: FileFireConfig
+) -> tuple[list[Raster], int | None]:
+    """Returns fires in steps, [fires, rows, columns] from north to south, each a whole map."""
+    count, rows, columns = fires.shape
+    if not SIDES[0] <= min(columns, rows) <= max(columns, rows) <= SIDES[1]:
+        raise UserError(f"fires of {columns} x {rows} cells; expected {SIDES[0]} to {SIDES[1]}")
+    check_states(fires)
+    sources = []
+    for place, values in enumerate(fires):
+        try:
+            sources.append(_whole_map(arrival(values, None, config, in_bank=True), "steps"))
+        except UserError as error:
+            raise UserError(f"fire {place}: {error}") from None
+    written = f", written for {horizon} steps" if horizon else ""
+    fires_text = number(count, "fire")
+    sources[0].facts = [f"a bank of {fires_text} of {columns} x {rows} cells, in steps{written}"]
+    return sources, int(horizon) if horizon else None
+
+
+def _whole_map(times: np.ndarray, unit: str) -> Raster:
+    return Raster(times, (0.0, float(len(times))), (1.0, 1.0), Clock(unit), whole=True)
+
+
+def _front_points(path: Path, config: FileFireConfig) -> Raster:
+    """Reads the paper's text: each point of the front marks five cells on a map of 30 x 30.
+
+    The cell of a point is int(v - (30 - 1) / 3) along x and y; the four cells beside it burn too.
+    A cell burns from the first line that marks it. Line 6000 is time 0.
+    """
+    times, count = np.full((_SIDE, _SIDE), np.inf), 0  # [x, y]
+    with path.open("rb") as lines:
+        for count, line in enumerate(lines, 1):
+            parts = line.strip().removesuffix(b",").split(b",") if count > _SKIPPED else [b""]
+            try:
+                points = np.array([float(p) for p in parts if parts != [b""]]).reshape(-1, 3)
+            except ValueError:
+                points = np.array([[math.nan]])
+            if not (np.abs(points) < 1e9).all():
+                raise UserError(f"line {count}: {line[:20]!r}; expected x,y,intensity, of points")
+            cells = np.trunc(points[:, :2] - (_SIDE - 1) / 3).astype(np.int64)
+            for x, y in _PLUS:
+                i, j = cells[:, 0] + x, cells[:, 1] + y
+                inside = (i >= 0) & (j >= 0) & (i < _SIDE) & (j < _SIDE)
+                np.minimum.at(times, (i[inside], j[inside]), float(count - 1 - _SKIPPED))
+    if count <= _SKIPPED:
+        raise UserError(f"{count} lines; expected more than {_SKIPPED}, which are skipped")
+    check_spreads(times)
+    source = _whole_map(times.T[::-1], config.units or "steps")
+    source.facts = [f"the paper's text of {count} lines, a line per time"]
+    return source

@@ -7,34 +7,29 @@ import json
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from scipy import ndimage
 from torch import Tensor
 
 from emberlink.envs.config import check_grid
-from emberlink.envs.fire_files import formats
 from emberlink.envs.fire_files.config import COPY_FILE, FileFireConfig
-from emberlink.envs.fire_files.episode_crop import on_grid
-from emberlink.envs.fire_files.grid_maps import (
-    MAX_CELLS,
-    map_of_grid,
-    read_front_points,
-    read_geotiff_bank,
-    read_numpy_bank,
-)
+from emberlink.envs.fire_files.crop import on_grid
+from emberlink.envs.fire_files.files import TABLES, digest, find_format, quiet
+from emberlink.envs.fire_files.grid import Source
 from emberlink.envs.fire_files.perimeters import read_perimeters
-from emberlink.envs.fire_files.projection import quiet
-from emberlink.envs.fire_files.raster_source import Source
-from emberlink.envs.fire_files.rasters import read_ascii, read_geotiff
-from emberlink.envs.utils.atomic_io import read_sealed, write_sealed
+from emberlink.envs.fire_files.rasters import MAX_BANK, read_raster
+from emberlink.envs.fire_files.tables import read_table
+from emberlink.envs.utils.atomic_io import read_bytes, replaced
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import printable
 
-READER_VERSION = 6  # increase it if the same file gives another grid
-_MAX_COPY = 12 * MAX_CELLS + 1_000_000  # bytes when unpacked: float32 of the cells of all sets
+READER_VERSION = 7  # increase it if the same file gives another grid
+_MAX_COPY = 12 * MAX_BANK + 1_000_000  # bytes when unpacked: float32 of the cells of all sets
 _EVERY, _VALIDATION, _TEST = 5, 3, 4  # remainders of the numbers of validation and test fires
+_OF_TABLES = ("time_field", "time_format", "incident", "incident_field", "where", "radius")
 
 
 def read_fires(config: FileFireConfig, grid: tuple[int, int], horizon: int) -> Tensor:
@@ -57,81 +52,81 @@ def read_fires(config: FileFireConfig, grid: tuple[int, int], horizon: int) -> T
 def read_with_summary(
     config: FileFireConfig, grid: tuple[int, int], horizon: int
 ) -> tuple[Tensor, str]:
-    """Returns the fires as `read_fires` does, and a line that describes the file.
+    """Returns the fires as `read_fires` does, and what was understood of the file.
 
-    Warns if a raster seems to hold something other than arrival times, such as elevation.
+    Warns of signs that it was understood wrongly.
     """
     check_grid(grid)
     path = Path(config.path).expanduser()
     name = printable(str(path))
     try:
         with quiet():
-            fires, summary, doubts = _read(path, config, grid, horizon)
+            sources = _sources(path, config, horizon)
+            fires = _on_grid(sources, config, grid, horizon)
     except UserError as error:
-        raise UserError(f"{name}: {printable(str(error))}") from None
+        text = printable(str(error)).removeprefix(f"{path.name}: ")
+        raise UserError(f"{name}: {text}") from None
     except OSError as error:
         raise UserError(f"{name}: cannot be read: {error.strerror or error}") from None
     except MemoryError:
         raise UserError(f"{name}: not enough memory to read it") from None
-    summary = printable(summary)
-    if doubts:
-        signs = printable("; ".join(doubts))
-        warnings.warn(f"{name}: {summary}; {signs}: are these arrival times?", stacklevel=3)
+    summary = printable("; ".join(sources[0].facts))
+    if sources[0].doubts:
+        doubts = printable("; ".join(sources[0].doubts))
+        warnings.warn(f"{name}: {doubts}; read: {summary}", stacklevel=3)
     return torch.from_numpy(np.stack(fires)), summary
 
 
-def _read(
-    path: Path, config: FileFireConfig, grid: tuple[int, int], horizon: int
-) -> tuple[list[np.ndarray], str, Sequence[str]]:
-    """Returns the fires in a file, [X, Y] each, a summary, and signs that they are no fires."""
-    kind = None if path.is_dir() else formats.find_format(path)
-    if config.incident is not None and kind is not None and kind not in formats.PERIMETERS:
-        raise UserError(
-            f"fire.incident={config.incident} chooses among perimeters; expected none for "
-            f"{kind.name}"
-        )
-    bank = None
-    if kind is formats.NUMPY:
-        bank = read_numpy_bank(path)
-    elif kind is formats.GEOTIFF:
-        bank = read_geotiff_bank(path)
-    if bank is None:
-        source = _read_one(path, kind, config)
-        fire = on_grid(source, config, grid, horizon)
-        return [fire], source.summary, source.doubts
-    if config.units not in (None, "steps") and config.test is None:  # no other file has units
-        raise UserError(f"fire.units={config.units}: a bank is in steps; expected none")
-    if config.minutes_per_step is not None:
-        raise UserError("fire.minutes_per_step: a bank is in steps; expected none, or fire.end")
-    _check_horizon(bank.horizon, config, horizon)
+def _sources(path: Path, config: FileFireConfig, horizon: int) -> Sequence[Source]:
+    """Returns the fires in a file; more than one are those of a bank."""
+    kind = None if path.is_dir() else find_format(path)
+    if kind is None or kind in TABLES:
+        if config.kind == "masks" or config.unburned is not None:
+            raise UserError("fire.kind=masks and fire.unburned are for rasters; expected none")
+        return [read_perimeters(*read_table(path, kind, config), config)]
+    for key in _OF_TABLES:
+        if getattr(config, key) is not None:
+            raise UserError(f"fire.{key} chooses among perimeters; expected none for a raster")
+    sources, written = read_raster(path, kind, config)
+    if sources[0].whole and sources[0].clock.unit == "steps":
+        if config.units not in (None, "steps") and config.test is None:  # no other file has units
+            raise UserError(f"fire.units={config.units}: a bank is in steps; expected none")
+        if config.start is config.end is None and written not in (None, horizon):
+            raise UserError(
+                f"its fires are of {written} steps, env.horizon is {horizon}; expected "
+                f"env.horizon={written}, or fire.end={written} to stretch them over {horizon} steps"
+            )
+    return sources
+
+
+def _on_grid(
+    sources: Sequence[Source], config: FileFireConfig, grid: tuple[int, int], horizon: int
+) -> list[np.ndarray]:
     fires: list[np.ndarray] = []
-    for times in bank.fires:
+    for source in sources:
         try:
-            fires.append(on_grid(map_of_grid(times), config, grid, horizon))
+            fires.append(on_grid(source, config, grid, horizon))
         except UserError as error:
-            raise UserError(f"fire {len(fires)}: {error}") from None
-    return fires, f"a bank of {len(fires)} fires, in steps", ()
+            place = f"fire {len(fires)}: " if len(sources) > 1 else ""
+            raise UserError(f"{place}{error}") from None
+    cells = [int(np.isfinite(fire).sum()) for fire in fires]
+    burn = f"{min(cells)} to {max(cells)}" if min(cells) < max(cells) else f"{cells[0]}"
+    sources[0].facts.append(f"{burn} of {' x '.join(map(str, grid))} cells burn")
+    if len(fires) == 1:
+        sources[0].doubts += _far_apart(fires[0])
+    return fires
 
 
-def _check_horizon(written: int | None, config: FileFireConfig, horizon: int) -> None:
-    """Checks that a bank whose times stay steps was written for this horizon."""
-    in_steps = config.start is config.end is None
-    if in_steps and written not in (None, horizon):
-        raise UserError(
-            f"its fires are of {written} steps, env.horizon is {horizon}; expected "
-            f"env.horizon={written}, or fire.end={written} to stretch them over {horizon} steps"
-        )
-
-
-def _read_one(path: Path, kind: formats.Format | None, config: FileFireConfig) -> Source:
-    """Returns the fire of a file with one fire."""
-    if kind is formats.GEOTIFF:
-        return read_geotiff(path, config.units, config.crs)
-    if kind is formats.ASCII:
-        return read_ascii(path, config.units, config.crs)
-    if kind is formats.POINTS:
-        return read_front_points(path, config.units or "steps")
-    return read_perimeters(path, config)
+def _far_apart(fire: np.ndarray) -> list[str]:
+    """Returns whether a fire has parts that never join and lie farther apart than they are long."""
+    parts: Any = ndimage.label(np.isfinite(fire), np.ones((3, 3)))
+    longest = max(c.stop - c.start for box in ndimage.find_objects(parts[0]) for c in box)
+    largest = np.bincount(parts[0].ravel())[1:].argmax() + 1
+    apart: Any = ndimage.distance_transform_edt(parts[0] != largest)
+    most = max(float(apart[parts[0] == k].min()) for k in range(1, parts[1] + 1))
+    if most <= 1.5 * longest:
+        return []
+    return [f"{parts[1]} parts of {longest} cells at most never join, {most:.0f} apart: one fire?"]
 
 
 class FireSets(NamedTuple):
@@ -148,17 +143,29 @@ def fire_sets(config: FileFireConfig, grid: tuple[int, int], horizon: int) -> Fi
     Raises:
         UserError: one line that names the file and the mistake in it.
     """
+    return _sets_with_summary(config, grid, horizon)[0]
+
+
+def summary(config: FileFireConfig, grid: tuple[int, int], horizon: int) -> str:
+    """Returns what was understood of the files, as `fire_sets` returns the fires."""
+    return _sets_with_summary(config, grid, horizon)[1]
+
+
+def _sets_with_summary(
+    config: FileFireConfig, grid: tuple[int, int], horizon: int
+) -> tuple[FireSets, str]:
     saved = _read_copy(config, grid, horizon)
     if saved is not None:
         return saved
     if config.sha256 is not None:
         with_checksum(config)
-    fires = read_fires(config, grid, horizon)
+    fires, about = read_with_summary(config, grid, horizon)
     train, validation, test = _divide(len(fires), test_file=config.test is not None)
     if config.test is None:
-        return FireSets(fires[train], fires[validation], fires[test])
+        return FireSets(fires[train], fires[validation], fires[test]), about
     other = dataclasses.replace(config, path=config.test)
-    return FireSets(fires[train], fires[validation], read_fires(other, grid, horizon))
+    tests, more = read_with_summary(other, grid, horizon)
+    return FireSets(fires[train], fires[validation], tests), f"{about}; test fires: {more}"
 
 
 def _divide(count: int, *, test_file: bool) -> tuple[list[int], list[int], list[int]]:
@@ -190,22 +197,26 @@ def with_checksum(config: FileFireConfig) -> FileFireConfig:
         UserError: a file is missing, or has another checksum than the scenario.
     """
     test = config.test and _checksum(config.test, config.test_sha256)
-    digest = _checksum(config.path, config.sha256)
-    return dataclasses.replace(config, sha256=digest, test_sha256=test)
+    return dataclasses.replace(
+        config, sha256=_checksum(config.path, config.sha256), test_sha256=test
+    )
 
 
 def _checksum(file: str, expected: str | None) -> str:
     path = Path(file).expanduser()
+    name = printable(str(path))
     try:
-        digest = formats.digest(path)
+        found = digest(path)
     except UserError as error:
-        raise UserError(f"{printable(str(path))}: {error}") from None
-    if expected not in (None, digest):
+        raise UserError(f"{name}: {str(error).removeprefix(f'{path.name}: ')}") from None
+    except OSError as error:
+        raise UserError(f"{name}: cannot be read: {error.strerror or error}") from None
+    if expected not in (None, found):
         raise UserError(
-            f"{printable(str(path))}: has changed: its SHA-256 is {digest[:12]}..., in the run "
+            f"{name}: has changed: its SHA-256 is {found[:12]}..., in the run "
             f"{str(expected)[:12]}..."
         )
-    return digest
+    return found
 
 
 def save_copy(config: FileFireConfig, folder: Path, grid: tuple[int, int], horizon: int) -> None:
@@ -214,12 +225,13 @@ def save_copy(config: FileFireConfig, folder: Path, grid: tuple[int, int], horiz
     Raises:
         UserError: the copy cannot be written.
     """
-    fires = fire_sets(config, grid, horizon)
+    fires, about = _sets_with_summary(config, grid, horizon)
+    arrays: dict[str, Any] = {name: values.numpy() for name, values in fires._asdict().items()}
+    arrays |= {"key": np.array(_key(config, grid, horizon)), "summary": np.array(about)}
     try:
-        content = io.BytesIO()
-        arrays = {name: values.numpy() for name, values in fires._asdict().items()}
-        np.savez_compressed(content, key=np.array(_key(config, grid, horizon)), **arrays)
-        write_sealed(folder / COPY_FILE, content.getbuffer())
+        folder.mkdir(parents=True, exist_ok=True)
+        with replaced(folder / COPY_FILE) as partial, partial.open("wb") as file:
+            np.savez_compressed(file, **arrays)
     except OSError as error:
         reason = error.strerror or error
         raise UserError(f"{folder / COPY_FILE}: cannot be written: {reason}") from None
@@ -233,24 +245,25 @@ def _key(config: FileFireConfig, grid: tuple[int, int], horizon: int) -> str:
     return hashlib.sha256(json.dumps(parts).encode()).hexdigest()
 
 
-def _read_copy(config: FileFireConfig, grid: tuple[int, int], horizon: int) -> FireSets | None:
+def _read_copy(
+    config: FileFireConfig, grid: tuple[int, int], horizon: int
+) -> tuple[FireSets, str] | None:
     """Returns the run's copy; None if there is none, it is damaged, or it has another grid."""
     if config.saved_copy is None or config.sha256 is None:
         return None
-    content = read_sealed(Path(config.saved_copy), _MAX_COPY)
-    if content is None:
-        return None
     try:
+        content = read_bytes(Path(config.saved_copy), _MAX_COPY)
         with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
             if sum(part.file_size for part in arrays.zip.filelist) > _MAX_COPY:
                 return None
             if str(arrays["key"]) != _key(config, grid, horizon):
                 return None
             fires = [arrays[name] for name in FireSets._fields]
+            about = printable(str(arrays["summary"]))
     except Exception:  # damage raises many types
         return None
     for values in fires:
         fits = values.ndim == 3 and values.shape[1:] == tuple(grid) and len(values) > 0
         if not fits or values.dtype != np.float32 or not (values >= 0).all():
             return None
-    return FireSets(*(torch.from_numpy(values) for values in fires))
+    return FireSets(*(torch.from_numpy(values) for values in fires)), about

@@ -1,17 +1,18 @@
-"""Samples arrival times on a raster at the cells of a grid."""
+"""The grid laid over a fire, and rasters of arrival times sampled at its cells."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Protocol
+import functools
+from dataclasses import dataclass, field, replace
+from typing import Any, Protocol
 
 import numpy as np
-from scipy.ndimage import map_coordinates, minimum_filter
+from scipy.ndimage import label, map_coordinates, minimum_filter
 
 from emberlink.envs.fire_files.config import Clock
-from emberlink.envs.fire_files.plausibility import MAX_BEGINNINGS, beginnings, doubts_of_growth
-from emberlink.envs.fire_files.projection import Bounds
+from emberlink.envs.fire_files.files import library
 from emberlink.envs.utils.errors import UserError
 
+Bounds = tuple[float, float, float, float]
+"""Minimum x, minimum y, maximum x, maximum y."""
 SAMPLES = 180
 """Sample points along the grid's shorter side. A cell of the grid gets the earliest of its samples.
 Rasters and perimeters are sampled at the same points."""
@@ -45,11 +46,8 @@ class Window:
 
     def samples(self, border: tuple[int, int] = (0, 0)) -> "Window":
         """Returns the window of the sample points: cuts x cuts per cell, and a border of them."""
-        side = self.side / self.cuts
-        grid = (
-            self.grid[0] * self.cuts + 2 * border[0],
-            self.grid[1] * self.cuts + 2 * border[1],
-        )
+        side, (columns, rows) = self.side / self.cuts, self.grid
+        grid = columns * self.cuts + 2 * border[0], rows * self.cuts + 2 * border[1]
         x, y = self.x - border[0] * side, self.y - border[1] * side
         return replace(self, x=x, y=y, side=side, grid=grid)
 
@@ -59,10 +57,20 @@ class Window:
         x0, y0, x1, y1 = bounds
         return self.x <= x0 and self.y <= y0 and x1 <= right and y1 <= upper
 
-    def centres(self) -> tuple[np.ndarray, np.ndarray]:
+    def axes(self) -> tuple[np.ndarray, np.ndarray]:
         """Returns x [X] and y [Y] of the cells' centres."""
         columns, rows = (np.arange(count) + 0.5 for count in self.grid)
         return self.x + columns * self.side, self.y + rows * self.side
+
+    def centres(self) -> list[np.ndarray]:
+        """Returns x and y of each cell's centre, [X, Y]."""
+        return np.meshgrid(*self.axes(), indexing="ij")
+
+    @functools.cache  # noqa: B019
+    def tree(self) -> Any:
+        """Returns a tree of the cells' centres, in C order."""
+        shapely = library("shapely")
+        return shapely.STRtree(shapely.points(*(at.ravel() for at in self.centres())))
 
     def earliest(self, samples: np.ndarray) -> np.ndarray:
         """Returns the minimum in each cell, [X, Y], of samples [X cuts, Y cuts]."""
@@ -86,19 +94,12 @@ class Source(Protocol):
     last: float
     """latest arrival in the file"""
     extent: Bounds
-    """bounds of the whole file"""
     whole: bool
     """True for a map of the whole grid, which is neither cropped nor burnt out"""
-
-    @property
-    def summary(self) -> str:
-        """Description of the content, for the user."""
-        ...
-
-    @property
-    def doubts(self) -> Sequence[str]:
-        """Signs that the content is something other than arrival times, for the user."""
-        ...
+    facts: list[str]
+    """what was understood, for the user"""
+    doubts: list[str]
+    """signs that it was understood wrongly, for the user"""
 
     def burnt(self, until: float) -> Bounds:
         """Returns the bounds of the area burnt by a time."""
@@ -109,77 +110,41 @@ class Source(Protocol):
         ...
 
 
-class RasterSource:
-    """Samples arrival times on a raster whose rows run from north to south.
+@dataclass
+class Raster:
+    """Samples arrival times on a raster whose rows run from north to south."""
 
-    Args:
-        times: float [rows, columns], inf for never.
-        corner: x and y of the upper left corner of the raster.
-        cell: width and height of a cell.
-        clock: unit of the times.
-        whole: as in `Source`.
-        name: name of the values in the file, for messages.
-        doubts: signs, known already, that these are not arrival times.
-        from_zero: whether the fire began at time 0, before the centre of the first cell burnt, if
-            the times are neither steps nor dates; see `begins_at_zero`.
-    """
+    times: np.ndarray
+    """float64 [rows, columns], inf for never"""
+    corner: tuple[float, float]
+    """x and y of the upper left corner of the raster"""
+    cell: tuple[float, float]
+    """width and height of a cell"""
+    clock: Clock
+    whole: bool = False
+    facts: list[str] = field(default_factory=list)
+    doubts: list[str] = field(default_factory=list)
 
-    def __init__(
-        self,
-        times: np.ndarray,
-        corner: tuple[float, float],
-        cell: tuple[float, float],
-        clock: Clock,
-        whole: bool = False,
-        name: str = "",
-        doubts: Sequence[str] = (),
-        from_zero: bool = False,
-    ):
-        rows, columns = times.shape
-        x, y = corner
-        self.extent: Bounds = x, y - rows * cell[1], x + columns * cell[0], y
-        self.times, self.clock, self.whole = times.astype(np.float64), clock, whole
-        self._corner, self._cell, self._name, self._doubts = corner, cell, name, doubts
-        burning = times[np.isfinite(times)]
+    def __post_init__(self) -> None:
+        self.times = self.times.astype(np.float64)
+        rows, columns = self.times.shape
+        (x, y), (width, height) = self.corner, self.cell
+        self.extent: Bounds = x, y - rows * height, x + columns * width, y
+        burning = self.times[np.isfinite(self.times)]
         self.first, self.last = float(burning.min()), float(burning.max())
-        from_zero = from_zero and clock.unit != "steps" and clock.origin is None
-        self.began = 0.0 if from_zero else self.first
-
-    @property
-    def summary(self) -> str:
-        """Description of the content, for the user."""
-        first, last = self.clock.format(self.first), self.clock.format(self.last)
-        count = beginnings(self.times)
-        places = "1 place" if count == 1 else f"{count} places"
-        cells = np.isfinite(self.times).sum()
-        name = f"{self._name}: " if self._name else ""
-        return f"{name}{cells} cells burn from {first} to {last}, beginning at {places}"
-
-    @property
-    def doubts(self) -> list[str]:
-        """Signs that these are not arrival times; none of a map of the whole grid."""
-        if self.whole:
-            return []
-        many = ["it would begin at many places"] if beginnings(self.times) > MAX_BEGINNINGS else []
-        growth = doubts_of_growth(self.times, self._cell, self.clock.unit)
-        return [*self._doubts, *many, *growth]
+        self.began = self.first
 
     def burnt(self, until: float) -> Bounds:
-        """Returns the bounds of the area burnt by a time: to the front, or to the edges of cells.
-
-        Raises:
-            UserError: only one cell has burnt.
-        """
+        """Returns the bounds of the area burnt by a time: to the front, or to the edges of cells."""
         times = self.times
         if (times <= until).sum() < 2:
             raise UserError(
-                f"from {self.clock.format(self.first)} to {self.clock.format(until)} a single "
-                "cell burns: no fire spreads; expected a later end"
+                f"until {self.clock.format(until)} a single cell burns: no fire spreads"
             )
         rows, columns = times.shape
         left, right = _front(times, until), columns - _front(times[:, ::-1], until)
         top, bottom = _front(times.T, until), rows - _front(times.T[:, ::-1], until)
-        (x, y), (width, height) = self._corner, self._cell
+        (x, y), (width, height) = self.corner, self.cell
         return x + left * width, y - bottom * height, x + right * width, y - top * height
 
     def on(self, window: Window, until: float) -> np.ndarray:
@@ -190,46 +155,36 @@ class RasterSource:
         centre counts only if it burns before all cells around it. A map of the whole grid, and a
         raster with the same cells as the grid, are not interpolated.
         """
-        fine = window.side < (1 - _EDGE) * min(self._cell)
+        fine = window.side < (1 - _EDGE) * min(self.cell)
         if self.whole or self._is_aligned(window):
-            return self._nearest(window, fine)
+            near = self._at(*(np.rint(at).astype(np.int64) for at in self._indices(window)))
+            if fine:
+                return near
+            without = np.isinf(self._earliest(np.zeros_like(self.times), window))
+            return np.where(without, near, self._earliest(self.times, window))
         samples = window.earliest(self._interpolate(*self._indices(window.samples())))
-        times = self.times
-        if fine:
-            times = np.where(times == minimum_filter(times, 3), times, np.inf)
+        first = self.times == minimum_filter(self.times, 3)
+        times = np.where(first, self.times, np.inf) if fine else self.times
         return np.minimum(samples, self._earliest(times, window))
-
-    def _centres(self, rows: np.ndarray, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Returns x and y of cells' centres."""
-        (x, y), (width, height) = self._corner, self._cell
-        return x + (columns + 0.5) * width, y - (rows + 0.5) * height
 
     def _indices(self, window: Window) -> tuple[np.ndarray, np.ndarray]:
         """Returns the fractional rows [Y] and columns [X] of the centres of a window's cells."""
-        (left, top), (width, height) = self._corner, self._cell
-        x, y = window.centres()
+        (left, top), (width, height) = self.corner, self.cell
+        x, y = window.axes()
         return (top - y) / height - 0.5, (x - left) / width - 0.5
 
     def _is_aligned(self, window: Window) -> bool:
         """Tells whether the cells of the grid are cells of the raster."""
         apart = [np.abs(at - np.rint(at)).max() for at in self._indices(window)]
-        same = all(abs(window.side / side - 1) < _EDGE for side in self._cell)
+        same = all(abs(window.side / side - 1) < _EDGE for side in self.cell)
         return same and max(apart) < 1e-3
-
-    def _nearest(self, window: Window, fine: bool) -> np.ndarray:
-        """Returns the earliest of the centres in each cell, or the time of the nearest centre."""
-        near = self._at(*(np.rint(at).astype(np.int64) for at in self._indices(window)))
-        if fine:
-            return near
-        earliest = self._earliest(self.times, window)
-        without_centre = np.isinf(self._earliest(np.zeros_like(self.times), window))
-        return np.where(without_centre, near, earliest)
 
     def _earliest(self, times: np.ndarray, window: Window) -> np.ndarray:
         """Returns the earliest arrival among the raster's centres in each cell of a grid."""
         earliest = np.full(window.grid, np.inf)
         rows, columns = np.nonzero(np.isfinite(times))
-        i, j = window.cells(*self._centres(rows, columns))
+        (x, y), (width, height) = self.corner, self.cell
+        i, j = window.cells(x + (columns + 0.5) * width, y - (rows + 0.5) * height)
         inside = (i >= 0) & (j >= 0) & (i < window.grid[0]) & (j < window.grid[1])
         np.minimum.at(earliest, (i[inside], j[inside]), times[rows[inside], columns[inside]])
         return earliest
@@ -253,27 +208,18 @@ class RasterSource:
         return np.where(np.isinf(inside) | (weights == 0), inside, times)
 
 
-def check_spreads(times: np.ndarray, *, may_stand: bool = False) -> None:
-    """Checks that arrival times are those of a fire that spreads.
+def beginnings(times: np.ndarray) -> int:
+    """Returns the number of places that burn before all cells around them."""
+    burns, earliest = np.isfinite(times), times == minimum_filter(times, 3)
+    # Of cells that burn at the same time, one may have an earlier neighbour: no beginning.
+    later = minimum_filter(np.where(burns & ~earliest, times, np.inf), 3) == times
+    places: Any = label(burns & earliest, np.ones((3, 3)))
+    return int(places[1] - len(np.unique(places[0][burns & earliest & later])))
 
-    Args:
-        times: with inf for never.
-        may_stand: whether all cells that burn may burn at once, as in a fire that was generated
-            for a few steps.
 
-    Raises:
-        UserError: no cell burns, only one burns, or all burn at once.
-    """
-    burning = times[np.isfinite(times)]
-    if len(burning) == 0:
-        raise UserError("no cell burns: NODATA everywhere; expected arrival times")
-    if len(burning) == 1:
-        raise UserError("a single cell burns; expected a fire that spreads")
-    if burning.min() == burning.max() and not (may_stand and len(burning) < times.size):
-        raise UserError(
-            f"all {len(burning)} cells burn at once, at {burning[0]:g}; "
-            "expected a fire that spreads"
-        )
+def number(count: int, noun: str) -> str:
+    """Returns a count with its noun, such as `2 places`."""
+    return f"{count} {noun}{'' if count == 1 else 's'}"
 
 
 def _front(times: np.ndarray, until: float) -> float:

@@ -7,9 +7,9 @@ import numpy as np
 from scipy import ndimage
 
 from emberlink.envs.config import BASE_SIDE
-from emberlink.envs.fire_files.config import SECONDS, Clock, FileFireConfig, Units
-from emberlink.envs.fire_files.perimeters.times import in_utc, parse_time
-from emberlink.envs.fire_files.raster_source import Source, Window
+from emberlink.envs.fire_files.config import SECONDS, Clock, FileFireConfig
+from emberlink.envs.fire_files.dates import in_utc, parse_dates
+from emberlink.envs.fire_files.grid import Source, Window
 from emberlink.envs.utils.errors import UserError
 
 
@@ -58,54 +58,42 @@ def _no_fire(source: Source, start: float, end: float) -> UserError:
 
 def _span(source: Source, config: FileFireConfig, horizon: int) -> tuple[float, float]:
     """Returns the times of the first and the last step, in the source's unit."""
-    start = _time(config.start, "start", source, config.units)
-    start = source.began if start is None else start
-    end = _time(config.end, "end", source, config.units)
+    clock = source.clock
+    start = source.began if config.start is None else _time(config.start, "start", source, config)
+    end = source.last if config.end is None else _time(config.end, "end", source, config)
     if config.minutes_per_step is not None:
-        if source.clock.unit == "steps":
+        if clock.unit not in SECONDS:
             raise UserError(
-                "fire.minutes_per_step: the file's times are in steps; expected fire.units in time"
+                f"fire.minutes_per_step: the file's times are in {clock.unit}; expected fire.units "
+                "in time"
             )
-        end = start + horizon * config.minutes_per_step * 60 / SECONDS[source.clock.unit]
-    end = source.last if end is None else end
+        end = start + horizon * config.minutes_per_step * 60 / SECONDS[clock.unit]
     if end < source.began or start >= source.last:
         raise _no_fire(source, start, end)
     if not start < end:
-        text = source.clock.format
+        text = clock.format
         raise UserError(f"from {text(start)} to {text(end)}: the end must be after the start")
     return start, end
 
 
-def _time(value: float | str | None, key: str, source: Source, units: Units | None) -> float | None:
+def _time(value: float | str, key: str, source: Source, config: FileFireConfig) -> float:
     """Returns `fire.start` or `fire.end` in the source's unit."""
-    clock = source.clock
-    if value is None:
-        return None
-    if isinstance(value, str):
-        if clock.origin is None:
+    clock: Clock = source.clock
+    if clock.origin is None:
+        if isinstance(value, str):
             raise UserError(
                 f"fire.{key}={value}: the file's times are {clock.unit}; expected a number of them"
             )
-        return _calendar(value, key, clock)
-    if clock.origin is None:
         return float(value)
-    if units is None or units == "steps":
+    if isinstance(value, str):
+        date = in_utc(parse_dates([value], config.time_format, f"fire.{key}")[0])
+        return (date - clock.origin).total_seconds() / SECONDS[clock.unit]
+    if config.units not in SECONDS:
         raise UserError(
             f"fire.{key}={value:g}: the file's times are dates; expected such as "
             f"{clock.format(source.first)}, or fire.units for a number"
         )
-    return source.first + float(value) * SECONDS[units] / SECONDS[clock.unit]
-
-
-def _calendar(text: str, key: str, clock: Clock) -> float:
-    assert clock.origin is not None
-    try:
-        time = in_utc(parse_time(text))
-    except UserError:
-        raise UserError(
-            f"fire.{key}={text}: not a calendar time; expected such as {clock.format(0)}"
-        ) from None
-    return (time - clock.origin).total_seconds() / SECONDS[clock.unit]
+    return source.first + float(value) * SECONDS[config.units] / SECONDS[clock.unit]
 
 
 def _burnt_out(times: np.ndarray, start: float, width: float) -> np.ndarray:

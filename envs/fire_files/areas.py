@@ -5,53 +5,48 @@ from typing import Any
 
 import numpy as np
 
-from emberlink.envs.fire_files.projection import library
+from emberlink.envs.fire_files.files import library
 from emberlink.envs.utils.errors import UserError
 
-MAX_RINGS = 20_000
-"""Closed lines of one time."""
+MANY = 50
+"""Polygons of one time above which they are not united, as detections of satellites."""
+_MAX_RINGS = 20_000
 _GAP = 0.01  # of a line's length: a smaller gap between its ends is closed
 _POINT = 1e-3  # of an area's width: the size of a fire that is a point
 
 
-def enclosed(geometries: Sequence[Any], features: Sequence[str]) -> Any:
-    """Returns the area inside perimeters of one time, a shapely polygon or several.
+def enclosed(shapes: Sequence[Any], names: Sequence[str]) -> Any:
+    """Returns the area inside shapes of one time; a closed line within another is an island.
 
-    A closed line within another is an unburnt island. Points, and open lines beside a polygon of
-    the same feature, are left out.
-
-    Args:
-        geometries: shapely geometries.
-        features: names of the features, for messages.
-
-    Raises:
-        UserError: a feature encloses nothing, or a line is not closed.
+    Points, and open lines beside a polygon of the same feature, are left out.
     """
     shapely = library("shapely")
     areas: list[Any] = []
     lines: list[tuple[Any, str]] = []
-    for geometry, feature in zip(geometries, features, strict=True):
-        parts = _parts(shapely.force_2d(geometry))
-        shapes = [part for part in parts if part.geom_type == "Polygon"]
+    for shape, name in zip(shapes, names, strict=True):
+        parts = _parts(shapely.force_2d(shape))
+        found = [part for part in parts if part.geom_type == "Polygon"]
         strokes = [part for part in parts if part.geom_type in ("LineString", "LinearRing")]
-        if not shapes and not strokes:
-            raise UserError(f"{feature} is of {geometry.geom_type}; expected polygons or lines")
-        areas += [make_valid(shape) for shape in shapes]
-        lines += [(line, feature) for line in strokes if not shapes or line.is_closed]
+        if not found and not strokes:
+            raise UserError(f"{name} is of {shape.geom_type}; expected polygons or lines")
+        areas += map(make_valid, found)
+        lines += [(line, name) for line in strokes if not found or line.is_closed]
     if lines:
         areas.append(_within_lines(lines))
-    area = shapely.union_all(areas)
+    if len(areas) > MANY:
+        area = shapely.MultiPolygon([part for area in areas for part in polygons(area)])
+    else:
+        area = shapely.union_all(areas)
     if not area.area > 0:
-        raise UserError(f"{features[0]} encloses no area; expected a perimeter")
+        raise UserError(f"{names[0]} encloses no area; expected a perimeter")
     return area
 
 
 def make_valid(area: Any) -> Any:
     """Returns an area without self-intersections, with the same shells."""
-    shapely = library("shapely")
     if area.is_valid:
         return area
-    return shapely.make_valid(area, method="structure", keep_collapsed=False)
+    return library("shapely").make_valid(area, method="structure", keep_collapsed=False)
 
 
 def polygons(area: Any) -> list[Any]:
@@ -59,15 +54,19 @@ def polygons(area: Any) -> list[Any]:
     return [part for part in _parts(area) if part.geom_type == "Polygon"]
 
 
+def nested(shapes: Sequence[Any]) -> bool:
+    """Returns whether one of some shapes lies in another that is larger by a tenth or more."""
+    shapely = library("shapely")
+    areas = [shapely.Polygon(s.coords) if s.geom_type == "LineString" else s for s in shapes]
+    inner, outer = shapely.STRtree(areas).query(areas, predicate="covered_by")
+    return any(areas[i].area < 0.9 * areas[k].area for i, k in zip(inner, outer, strict=True))
+
+
 def area_at_zero(areas: Sequence[Any], times: np.ndarray) -> Any:
-    """Returns the area that burnt at time 0, before the first perimeter.
+    """Returns the area that burnt at time 0, before the first of several perimeters.
 
     The edges of the fire's bounding box are extrapolated backwards with their speeds between the
     first two perimeters. The box around each polygon shrinks with them, to a point at most.
-
-    Args:
-        areas: shapely polygons, one for each time.
-        times: float64, ascending, above 0.
     """
     first, second = (np.array(area.bounds) for area in areas[:2])
     grown = np.concatenate([np.minimum(second - first, 0)[:2], np.maximum(second - first, 0)[2:]])
@@ -80,15 +79,12 @@ def area_at_zero(areas: Sequence[Any], times: np.ndarray) -> Any:
 
 def _shrunk(part: Any, moved: np.ndarray) -> Any:
     """Returns a polygon whose box is smaller by `moved`, the distance of each edge, [4]."""
-    shapely = library("shapely")
     now = np.array(part.bounds)
     size, then = now[2:] - now[:2], now - moved
     scale = np.maximum((then[2:] - then[:2]) / size, _POINT)
     shift = np.clip((then[:2] + then[2:]) / 2, now[:2], now[2:]) - scale * (now[:2] + size / 2)
-    small = shapely.transform(part, lambda at: at * scale + shift).intersection(part)
-    if not small.area > 0:
-        small = part.representative_point().buffer(_POINT * size.min())
-    return small
+    small = library("shapely").transform(part, lambda at: at * scale + shift).intersection(part)
+    return small if small.area > 0 else part.representative_point().buffer(_POINT * size.min())
 
 
 def _parts(geometry: Any) -> list[Any]:
@@ -112,23 +108,17 @@ def _within_lines(lines: Sequence[tuple[Any, str]]) -> Any:
         ends = np.asarray(line.coords)[[0, -1]]
         gap = float(np.hypot(*(ends[1] - ends[0])))
         if len(line.coords) < 3 or gap > _GAP * line.length:
-            end = line.coords[0]
-            feature = next(name for part, name in lines if end in list(part.coords))
-            raise UserError(
-                f"{feature}: a line of {len(line.coords)} points is not closed, {gap:g} of its "
-                f"length of {line.length:g} is missing; expected closed lines"
-            )
+            name = next(name for part, name in lines if line.coords[0] in list(part.coords))
+            raise UserError(f"{name}: a line is not closed, {gap:g} of {line.length:g} is missing")
         area = make_valid(shapely.Polygon(line.coords))
         rings.setdefault(shapely.normalize(area).wkb, area)
     areas = sorted(rings.values(), key=lambda area: -area.area)
-    if len(areas) > MAX_RINGS:
-        raise UserError(f"{len(areas)} closed lines of one time; at most {MAX_RINGS} are read")
+    if len(areas) > _MAX_RINGS:
+        raise UserError(f"{len(areas)} closed lines of one time; at most {_MAX_RINGS} are read")
     inner, outer = shapely.STRtree(areas).query(areas, predicate="covered_by")
     depth = np.bincount(inner[outer < inner], minlength=len(areas))
     burnt = shapely.Polygon()
     for level in range(int(depth.max(initial=0)) + 1):
-        here = shapely.union_all(
-            [area for area, at in zip(areas, depth, strict=True) if at == level]
-        )
+        here = shapely.union_all([a for a, at in zip(areas, depth, strict=True) if at == level])
         burnt = burnt.difference(here) if level % 2 else burnt.union(here)
     return burnt

@@ -1,0 +1,120 @@
+"""Chooses the features of one fire: by a value of a column, and by incident."""
+
+import re
+from collections.abc import Sequence
+from typing import Any
+
+from emberlink.envs.fire_files.config import FileFireConfig
+from emberlink.envs.utils.errors import UserError
+from emberlink.envs.utils.validation import as_argument, unknown
+
+_IDENTIFIER = re.compile(
+    r"(poly|attr)?(incident|incid|fire|event|burn|complex)s?(name|nm|id|num|number|no|nr|code)?"
+    r"|fname|.*irwin.*|.*uniquefire.*"
+)
+"""Columns whose values are those of a fire, by the letters and digits of their names."""
+_MAYBE = re.compile(r"name|id|num|number|label|(f|fire|ig|ignition|event)?(year|yr)")
+"""Columns that may also number the features, or name their times."""
+_CATEGORY = re.compile(r".*(category|class|kind|type|status)|(poly)?featu\w*|incidentty|type.*")
+
+
+def plain(name: Any) -> str:
+    """Returns the letters and digits of a column's name, in lower case."""
+    return re.sub(r"[\W_]", "", str(name).lower())
+
+
+def texts(column: Any) -> Any:
+    """Returns the values of a column as texts, those that are missing as empty ones."""
+    values = column.map(lambda value: re.sub(r"\.0$", "", str(value)).strip())
+    return values.where(column.notna(), "")
+
+
+def column_named(name: str, columns: Sequence[Any], key: str) -> Any:
+    """Returns the column with a name in any case."""
+    found = [column for column in columns if str(column).lower() == name.strip().lower()]
+    if not found:
+        known = ", ".join(map(str, columns[:30])) or "none"
+        raise UserError(f"no column {name.strip()!r} ({key}); there are {known}")
+    return found[0]
+
+
+def choose_features(frame: Any, config: FileFireConfig, facts: list[str]) -> Any:
+    """Returns the features of one fire; `facts` gets what is to be said about the others."""
+    columns = [name for name in frame.columns if name != frame.geometry.name]
+    for key, choose in (("where", _where), ("incident", _of_incident)):
+        before = len(frame)
+        frame = choose(frame, columns, config, facts)
+        if len(frame) < before:
+            left_out = f"{before - len(frame)} left out by fire.{key}={getattr(config, key)}"
+            facts.append(left_out)
+    return frame
+
+
+def _where(frame: Any, columns: Sequence[Any], config: FileFireConfig, _: list[str]) -> Any:
+    """Returns the features that `fire.where` keeps; asks if a category has several values."""
+    where = config.where
+    if where is not None and where != "*":
+        name, equals, pattern = where.partition("=")
+        values = texts(frame[column := column_named(name, columns, "fire.where")])
+        escaped = re.escape(pattern.strip()).replace(r"\*", ".*").replace(r"\|", "|")
+        keeps = values.str.fullmatch(escaped, case=False) if equals else values != ""
+        if not keeps.any():
+            raise UserError(f"fire.where={where} keeps no feature; {_counts(frame, column)}")
+        return frame[keeps]
+    for column in columns if where is None else ():
+        values = texts(frame[column])
+        if _CATEGORY.fullmatch(plain(column)) and 1 < values.nunique() < len(frame):
+            choice = as_argument("fire.where", f"{column}={values.mode().iloc[0]}")
+            raise UserError(
+                f"features of several kinds: {_counts(frame, column)}; expected {choice}, or "
+                "fire.where=* for all of them"
+            )
+    return frame
+
+
+def _of_incident(
+    frame: Any, columns: Sequence[Any], config: FileFireConfig, facts: list[str]
+) -> Any:
+    """Returns the features of `fire.incident`; asks if identifiers differ."""
+    wanted, field = config.incident, config.incident_field
+    sure = [name for name in columns if _IDENTIFIER.fullmatch(plain(name))]
+    known = [*sure, *(name for name in columns if _MAYBE.fullmatch(plain(name)))]
+    if field is not None:
+        places = [column_named(field, columns, "fire.incident_field")]
+        known = known if wanted else places
+        sure = [*sure, *places]
+    else:
+        places = known
+    if wanted == "*":
+        return frame
+    if wanted is not None:
+        name = wanted.strip().lower()
+        values = {text for place in places for text in texts(frame[place]) if text}
+        places = [place for place in places if (texts(frame[place]).str.lower() == name).any()]
+        if not places:
+            raise UserError(f"fire.incident={unknown(wanted, sorted(values)[:30])}")
+        frame = frame[texts(frame[places[0]]).str.lower() == name]
+    counts = {name: texts(frame[name]).replace("", None).nunique() for name in known}
+    several = [name for name, n in counts.items() if 1 < n < len(frame) + (name in sure)]
+    if not several:
+        return frame
+    listed = "; ".join(_counts(frame, name) for name in several)
+    if wanted is not None and field is not None:
+        facts.append(f"which differ in {listed}")
+        return frame
+    values = texts(frame[several[0]])
+    value = as_argument("fire.incident", values[values != ""].iloc[0])
+    other = "fire.incident=* for all as one fire"
+    if wanted is not None:
+        other = f"fire.incident_field={places[0]} beside fire.incident for all of these"
+    raise UserError(
+        f"{len(frame)} features of several fires: {listed}; expected "
+        f"fire.incident_field={several[0]} {value}, or {other}"
+    )
+
+
+def _counts(frame: Any, column: Any) -> str:
+    """Returns the values of a column with the number of features of each."""
+    counts = texts(frame[column]).value_counts()
+    shown = [f"{value or '(none)'} ({count})" for value, count in counts.head(12).items()]
+    return f"{column}: {', '.join(shown)}{', ...' if len(counts) > 12 else ''}"

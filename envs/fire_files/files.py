@@ -1,0 +1,204 @@
+"""The one door for fire files: finds the format and refuses what could harm, before GDAL opens it.
+
+A path is local, regular and of bounded size, and so are the files that GDAL would open beside it.
+The driver follows from the first bytes, so that no text in a file can choose another one.
+"""
+
+import hashlib
+import importlib
+import logging
+import os
+import re
+import sqlite3
+import struct
+import warnings
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from emberlink.envs.utils.errors import UserError, how_to_install
+
+MAX_BYTES = 300_000_000
+"""Bytes of a text file. GeoJSON takes many times as much memory while it is parsed: half as many."""
+_MAX_FILES = 500
+_TEXT = rb"(?:\xef\xbb\xbf)?\s*"  # after a byte order mark
+_HEADS = {
+    "npy": rb"\x93NUMPY",
+    "tif": rb"II[*+]\0|MM\0[*+]",
+    "nc": rb"CDF|\x89HDF",
+    "shp": rb"\0\0\x27\x0a",
+    "gpkg": rb"SQLite format 3\0",
+    "kmz": rb"PK\x03\x04",
+    "asc": _TEXT + rb"(?i:ncols|nrows)\s",
+    "json": _TEXT + rb"\{",
+    "kml": _TEXT + rb"<",
+    "csv": _TEXT + rb"(?:[\w\"]+,)*\"?(?i:latitude\"?,\"?longitude)\"?,",
+    "points": rb"\s*?(?:\n|\Z)|(?:[-+.\deE \t\r]*,){2,}[-+.\deE \t\r]*(?:\n|\Z)",
+}
+"""First bytes of each format."""
+TABLES = ("shp", "gpkg", "json", "kml", "kmz", "csv")
+"""Formats of perimeters."""
+_SUFFIXES = (".shp", ".gpkg", ".geojson", ".json", ".kml", ".kmz", ".csv")
+_BESIDE = {
+    "shp": (".shx", ".dbf", ".prj", ".cpg"),
+    "asc": (".prj",),
+    "gpkg": ("-wal", "-journal"),
+    "tif": (".aux.xml", ".msk", ".ovr", ".aux", ".prj", ".tfw", ".tifw", ".tiffw", ".wld", ".tab"),
+}
+"""Endings of the files that the libraries open beside one."""
+
+
+def library(name: str, what: str = "reading this file") -> Any:
+    """Imports a module of the extra `geo`, which `what` needs."""
+    try:
+        return importlib.import_module(name)
+    except ImportError:
+        how = how_to_install("geo")
+        raise UserError(f"{what} needs the extra geo: {how} ({name} is missing)") from None
+
+
+@contextmanager
+def quiet() -> Iterator[None]:
+    """Silences the warnings and logs of the libraries. Damage is reported as an error instead."""
+    loggers = [logging.getLogger(n) for n in ("rasterio", "pyogrio", "shapely", "pyproj")]
+    levels = [logger.level for logger in loggers]
+    try:
+        for logger in loggers:
+            logger.setLevel(logging.CRITICAL + 1)
+        with warnings.catch_warnings(), np.errstate(all="ignore"):
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        for logger, level in zip(loggers, levels, strict=True):
+            logger.setLevel(level)
+
+
+def first_line(error: BaseException) -> str:
+    """Returns the first line of a library's message, at most 200 characters of it."""
+    error = error.__cause__ if error.__cause__ and "previous exception" in str(error) else error
+    return (str(error).strip().splitlines() or [type(error).__name__])[0][:200]
+
+
+def find_format(path: Path) -> str:
+    """Returns the format of a file, a key of `_HEADS`, and checks that it is safe and whole."""
+    size, head = _regular(path), _head(path)
+    if path.name.startswith("ForestGrid"):
+        raise UserError(
+            'a map of Cell2Fire; expected an array of all, with fire.kind=masks: python -c "import '
+            "glob, numpy as n; n.save('fire.npy', [n.loadtxt(f, delimiter=',') for f in sorted("
+            "glob.glob('ForestGrid*.csv'), key=lambda f: (len(f), f))])\""
+        )
+    kind = _kind(head)
+    if not head or not kind or (kind == "kmz" and path.suffix.lower() != ".kmz"):
+        start = head[:16].decode("latin-1").encode("unicode_escape").decode()
+        what = "an archive; expected the files in it" if kind == "kmz" else f"begins with {start!r}"
+        raise UserError(
+            f"{what if head else 'is empty'}; known are GeoTIFF, NetCDF, ESRI ASCII, .npy, .shp, "
+            ".gpkg, GeoJSON, KML, KMZ, CSV of points, and the paper's text"
+        )
+    most = MAX_BYTES // 2 if kind == "json" else MAX_BYTES
+    if kind in ("asc", "csv", "kml", "points", "json") and size > most:
+        raise UserError(f"{size} bytes; a text file of this format has at most {most}")
+    for part in beside(path, kind):
+        _regular(part)
+        # GDAL opens masks and overviews in any format, of which some read other addresses.
+        if part.suffix.lower() in (".msk", ".ovr") and _kind(_head(part)) != "tif":
+            raise UserError(f"{part.name}, beside it, is no TIFF; expected one, or no such file")
+    if kind == "shp":
+        _check_shapefile(path)
+    if kind == "gpkg":  # GDAL reads the rest of a file that was cut off
+        try:
+            uri = f"{path.absolute().as_uri()}?mode=ro&immutable=1"
+            with closing(sqlite3.connect(uri, uri=True)) as database:
+                result = str(database.execute("PRAGMA integrity_check(1)").fetchone()[0])
+        except sqlite3.Error as error:
+            result = str(error)
+        if result != "ok":
+            raise UserError(f"{result[:100]}; expected a whole GeoPackage")
+    return kind
+
+
+def beside(path: Path, kind: str) -> list[Path]:
+    """Returns the files that belong to a file, with its name and an ending, in any case."""
+    endings = _BESIDE.get(kind, ())
+    names = {f"{name}{ending}".lower() for name in (path.stem, path.name) for ending in endings}
+    return sorted(path.with_name(n) for n in os.listdir(path.parent) if n.lower() in names)
+
+
+def check_prj(path: Path, kind: str, crs: Any) -> None:
+    """Checks that the projection in a .prj beside a file was understood."""
+    prj = [part for part in beside(path, kind) if part.suffix.lower() == ".prj"]
+    if crs is None and prj and prj[0].stat().st_size:
+        raise UserError(
+            f"{prj[0].name}, beside it, holds no projection that is known; expected one, or no "
+            "such file and fire.crs, such as fire.crs=EPSG:32611"
+        )
+
+
+def perimeter_files(folder: Path) -> list[Path]:
+    """Returns the perimeters in a folder, sorted by name."""
+    paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in _SUFFIXES)
+    if not 0 < len(paths) <= _MAX_FILES:
+        raise UserError(
+            f"a folder with {len(paths)} files of perimeters ({', '.join(_SUFFIXES)}); expected a "
+            f"file, or a folder of up to {_MAX_FILES} files of perimeters of one fire"
+        )
+    return paths
+
+
+def digest(path: Path) -> str:
+    """Returns the SHA-256 of a file and the files beside it, or of a folder's perimeters."""
+    content = hashlib.sha256()
+    for main in perimeter_files(path) if path.is_dir() else [path]:
+        for part in (main, *beside(main, _kind(_head(main)))):
+            name = part.name if path.is_dir() else part.name[len(path.stem) :]
+            content.update(f"{name}:{_regular(part)}:".encode())
+            with part.open("rb") as file:
+                while block := file.read(1 << 20):
+                    content.update(block)
+    return content.hexdigest()
+
+
+def _kind(head: bytes) -> str:
+    return next((kind for kind, start in _HEADS.items() if re.match(start, head)), "")
+
+
+def _head(path: Path) -> bytes:
+    _regular(path)
+    with path.open("rb") as file:
+        return file.read(4096)
+
+
+def _regular(path: Path) -> int:
+    """Returns the size of a regular file. A pipe, for example, would block for ever."""
+    try:
+        size = path.stat().st_size
+    except FileNotFoundError:
+        raise UserError(f"{path.name}: there is no such file") from None
+    except (OSError, ValueError) as error:
+        raise UserError(f"cannot be read: {getattr(error, 'strerror', None) or error}") from None
+    if not path.is_file():
+        raise UserError(f"{path.name}: no regular file")
+    return size
+
+
+def _check_shapefile(path: Path) -> None:
+    """Checks that the three files exist, are whole, and have the same number of features."""
+    parts = {part.suffix.lower(): part for part in (path, *beside(path, "shp"))}
+    for suffix in (".shx", ".dbf"):
+        if suffix not in parts:
+            raise UserError(f"{path.with_suffix(suffix).name} is missing beside it")
+    sizes = {suffix: part.stat().st_size for suffix, part in parts.items()}
+    features = (sizes[".shx"] - 100) // 8
+    for suffix in (".shp", ".shx", ".dbf"):
+        head = _head(parts[suffix])
+        if suffix == ".dbf":
+            records, start, row = struct.unpack("<IHH", head[4:12] if len(head) > 11 else bytes(8))
+            whole = records == features and start + records * row <= sizes[suffix]
+        else:
+            whole = len(head) >= 100 and 2 * struct.unpack(">I", head[24:28])[0] == sizes[suffix]
+        if not whole:
+            raise UserError(f"{parts[suffix].name} is damaged; expected {features} whole features")
