@@ -64,6 +64,11 @@ class FireSource(ABC):
         """Returns the scenario with the checksums of its files."""
         return self.config
 
+    def summary(self, grid: Grid, horizon: int) -> str:
+        """Returns what was understood of the files; empty for generated fires."""
+        del grid, horizon
+        return ""
+
     def save_copy(self, folder: Path, grid: Grid, horizon: int) -> "ScenarioConfig":
         """Copies the fires of files into a run folder and returns `load_copy(folder)`."""
         return self.config
@@ -140,6 +145,9 @@ class FromFile(FireSource):
 
     def with_checksum(self) -> "ScenarioConfig":
         return fire_files.with_checksum(self.config)
+
+    def summary(self, grid: Grid, horizon: int) -> str:
+        return fire_files.summary(self.config, grid, horizon)
 
     def save_copy(self, folder: Path, grid: Grid, horizon: int) -> "ScenarioConfig":
         fire_files.save_copy(self.config, folder, grid, horizon)

@@ -5,8 +5,8 @@ from collections.abc import Sequence
 from typing import Any
 
 from emberlink.envs.fire_files.config import FileFireConfig
-from emberlink.envs.utils.errors import UserError
-from emberlink.envs.utils.validation import as_argument, unknown
+from emberlink.envs.utils.errors import UserError, unknown
+from emberlink.envs.utils.validation import as_argument
 
 _IDENTIFIER = re.compile(
     r"(poly|attr)?(incident|incid|fire|event|burn|complex)s?(name|nm|id|num|number|no|nr|code)?"

@@ -22,7 +22,7 @@ import numpy as np
 from emberlink.envs.utils.errors import UserError, how_to_install
 
 MAX_BYTES = 300_000_000
-"""Bytes of a text file. GeoJSON takes many times as much memory while it is parsed: half as many."""
+"""Bytes of a text file; half as many of GeoJSON, which takes more memory while it is parsed."""
 _MAX_FILES = 500
 _TEXT = rb"(?:\xef\xbb\xbf)?\s*"  # after a byte order mark
 _HEADS = {

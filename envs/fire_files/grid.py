@@ -62,7 +62,7 @@ class Window:
         columns, rows = (np.arange(count) + 0.5 for count in self.grid)
         return self.x + columns * self.side, self.y + rows * self.side
 
-    def centres(self) -> list[np.ndarray]:
+    def centres(self) -> Any:
         """Returns x and y of each cell's centre, [X, Y]."""
         return np.meshgrid(*self.axes(), indexing="ij")
 
@@ -135,7 +135,7 @@ class Raster:
         self.began = self.first
 
     def burnt(self, until: float) -> Bounds:
-        """Returns the bounds of the area burnt by a time: to the front, or to the edges of cells."""
+        """Returns the bounds of the area burnt by a time: to the front, or to edges of cells."""
         times = self.times
         if (times <= until).sum() < 2:
             raise UserError(

@@ -137,7 +137,8 @@ class Perimeters:
             after = before | _rasterize(self._areas[k], window)
             new = after & ~before
             parts: Any = label(new, _AROUND)
-            reached = np.unique(parts[0][new & binary_dilation(before, _AROUND)])
+            beside: Any = binary_dilation(before, _AROUND)
+            reached = np.unique(parts[0][new & beside])
             begun, idle = begun + parts[1] - len(reached), idle + (not new.any())
             if new.any() and before.any():
                 from_last, to_next = _depth(~before), _depth(after)

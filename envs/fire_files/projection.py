@@ -66,7 +66,8 @@ def choose_plane(crs: Any, wanted: str | None, bounds: Bounds, cell: float | Non
     ratio, turn = (math.inf, 0.0) if degrees else _distortion(source, at)
     if crs and wanted:
         target = parse_crs(wanted)
-        if not target.is_projected or (bent := _distortion(target, at)[0]) > _BENT:
+        bent = _distortion(target, at)[0] if target.is_projected else math.inf
+        if bent > _BENT:
             why = f"has axes {bent:.2f} : 1 here" if target.is_projected else "is in degrees"
             raise UserError(f"fire.crs={wanted} {why}; expected one as UTM is")
     elif ratio <= _BENT:

@@ -23,8 +23,7 @@ from emberlink.envs.fire_files.perimeters import read_perimeters
 from emberlink.envs.fire_files.rasters import MAX_BANK, read_raster
 from emberlink.envs.fire_files.tables import read_table
 from emberlink.envs.utils.atomic_io import read_bytes, replaced
-from emberlink.envs.utils.errors import UserError
-from emberlink.envs.utils.validation import printable
+from emberlink.envs.utils.errors import UserError, printable
 
 READER_VERSION = 7  # increase it if the same file gives another grid
 _MAX_COPY = 12 * MAX_BANK + 1_000_000  # bytes when unpacked: float32 of the cells of all sets

@@ -72,7 +72,7 @@ def read_times(frame: Any, config: FileFireConfig, outside: Sequence[str]) -> Ti
             f"{empty[0]} has no time in {first} ({len(empty)} of {len(frame)}); expected one in "
             f"each, or fire.where={first} to leave out those without"
         )
-    numbers = [_number(value) for value in frame[first].unique()]
+    numbers: list[Any] = [_number(value) for value in frame[first].unique()]
     if len(chosen) == 1 and None not in numbers and not is_stamp(numbers):
         return _elapsed(frame, first, config)
     dates = _dates(frame[first], config.time_format)
@@ -120,7 +120,7 @@ def _number(value: Any) -> float | None:
 
 def _holds_dates(column: Any) -> bool:
     values = column.dropna().unique()
-    numbers = [_number(value) for value in values]
+    numbers: list[Any] = [_number(value) for value in values]
     return is_stamp(numbers) if None not in numbers else is_date(str(values[0]))
 
 

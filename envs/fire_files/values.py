@@ -1,4 +1,4 @@
-"""Decides which values of a raster are arrival times: NODATA, plateaus, days of the year, states."""
+"""Decides which values of a raster are arrival times: NODATA, plateaus, days, states."""
 
 import re
 
@@ -73,8 +73,8 @@ def arrival(
     wrong = found[~(np.isnan(found) | (np.abs(found) > _VOID) | np.isin(found, _NEVER))]
     if len(wrong):
         raise UserError(
-            f"{wrong[0]:g} (in {(wrong == wrong[0]).sum()} cells) is not an arrival time; expected 0 "
-            f"or more, or fire.unburned={wrong[0]:g} for cells that do not burn"
+            f"{wrong[0]:g} (in {(wrong == wrong[0]).sum()} cells) is not an arrival time; expected "
+            f"0 or more, or fire.unburned={wrong[0]:g} for cells that do not burn"
         )
     times[odd] = np.inf
     check_spreads(times, may_stand=in_bank)
@@ -91,7 +91,7 @@ def check_spreads(times: np.ndarray, *, may_stand: bool = False) -> None:
         raise UserError(f"{what}; expected arrival times of a fire that spreads")
     if burning.min() == burning.max() and not (may_stand and len(burning) < times.size):
         raise UserError(
-            f"all {len(burning)} cells burn at once, at {burning[0]:g}; expected a fire that spreads"
+            f"all {len(burning)} cells burn at {burning[0]:g}, at once; expected one that spreads"
         )
 
 
@@ -120,7 +120,7 @@ def _check_plateau(times: np.ndarray, *, of_all: bool) -> None:
         key = f"'fire.unburned=[{','.join(some)}]'" if len(odd) > 1 else f"fire.unburned={some[0]}"
         between = f"{others.min():g} to {others.max():g}" if len(others) else "none"
         raise UserError(
-            f"{' and '.join(share)} may stand for cells that do not burn (other values: {between}); "
+            f"{' and '.join(share)} may stand for cells that do not burn (others: {between}); "
             f"expected {key}, or fire.unburned=none if they burn then"
         )
 
@@ -150,7 +150,7 @@ def check_states(maps: np.ndarray) -> None:
             f"{s:g} ({100 * n / maps.size:.0f} %)" for s, n in zip(states, counts, strict=True)
         ]
         raise UserError(
-            f"{len(maps)} maps of the states {', '.join(share)}, and no cell that never burns (inf); "
+            f"{len(maps)} maps of the states {', '.join(share)}, and no inf, never; "
             "expected arrival times of fires, or fire.kind=masks for a map of states per time"
         )
 

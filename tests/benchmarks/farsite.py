@@ -25,7 +25,8 @@ from torch import Tensor
 
 from emberlink.envs.fire.ellipse import MAX_LENGTH_TO_BREADTH, ellipse_rates
 from emberlink.envs.fire.level_set import Distance, arrival_times
-from emberlink.envs.fire_files.rasters import read_ascii
+from emberlink.envs.fire_files.config import FileFireConfig
+from emberlink.envs.fire_files.rasters import read_raster
 
 SUFFIX = "_ArrivalTime.asc"
 PARTS = (0.25, 0.5, 0.75, 1.0)
@@ -67,7 +68,8 @@ def wind_of(name: str) -> Callable[[float], Tensor]:
 def read_grid(path: Path) -> Tensor:
     """Returns the arrival times of an ESRI ASCII grid, as in `Run`."""
     try:
-        times = read_ascii(path, "minutes", None).times
+        config = FileFireConfig(path=str(path), units="minutes")
+        times = read_raster(path, "asc", config)[0][0].times
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
     return torch.from_numpy(times[::-1].T.copy()).float()

@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
 _KEYS = "keys of setup, env. and fire., as for train, such as setup=tuned, 'env.grid=[60,60]'"
+_BANK = "a new file that ends in .npy, .tif or .tiff"
 
 
 def add_fire(commands: Any) -> None:
@@ -22,41 +23,23 @@ def add_fire(commands: Any) -> None:
         "to files, and imports fires from files.",
         "emberlink fire preview huygens:3",
     )
-    _add_preview(actions)
-    _add_make(actions)
-    _add_import(actions)
-
-
-def _add_preview(actions: Any) -> None:
     preview = command(
         actions,
         "preview",
         _preview,
         "draw a fire and tell whether UAVs can keep up",
-        "Draws the arrival times of a fire with contours and prints the number of burning cells, "
-        "its growth, and whether the setup's UAVs can keep up with it. No existing file is "
-        "replaced.",
+        "Draws the arrival times of a fire with contours, prints what was understood of a file, "
+        "the growth of the fire, and whether the setup's UAVs can keep up with it.",
         "emberlink fire preview ArrivalTime.asc fire.units=minutes 'env.grid=[40,40]' setup=tuned",
     )
     preview.add_argument(
-        "source",
-        metavar="SOURCE",
-        help="a scenario (huygens, or huygens:3 for its test fire 3) or a file "
-        "(or bank.tif:3 for fire 3 in it)",
+        "arguments",
+        metavar="SOURCE | key=value",
+        nargs="+",
+        help="a scenario (huygens, or huygens:3 for its test fire 3), a file (or bank.tif:3), or "
+        "fire=file fire.path=FILE; " + _KEYS,
     )
-    preview.add_argument(
-        "overrides",
-        metavar="key=value",
-        nargs="*",
-        help=_KEYS,
-    )
-    preview.add_argument(
-        "--output", metavar="PATH", type=Path, help="a folder, or a new file that ends in .png"
-    )
-    preview.set_defaults(command="fire preview")
-
-
-def _add_make(actions: Any) -> None:
+    preview.add_argument("--output", metavar="PATH", type=Path, help="a folder, or a new .png file")
     make = command(
         actions,
         "make",
@@ -66,39 +49,11 @@ def _add_make(actions: Any) -> None:
         "GeoTIFF with a band per fire, or NumPy [fires, x, y] with a .json file.",
         "emberlink fire make huygens --count 64 --split test --output fires.tif 'env.grid=[60,60]'",
     )
-    make.add_argument(
-        "scenario",
-        metavar="SCENARIO",
-        help="a file in configs/fire: huygens, ...",
-    )
-    make.add_argument(
-        "overrides",
-        metavar="key=value",
-        nargs="*",
-        help=_KEYS,
-    )
-    make.add_argument(
-        "--count",
-        metavar="N",
-        type=positive,
-        help="number of fires (default: as many as a training or an evaluation uses)",
-    )
-    make.add_argument(
-        "--split",
-        choices=("train", "validation", "test"),
-        default="train",
-        help="training fires (default), validation fires, or test fires",
-    )
-    make.add_argument(
-        "--output",
-        metavar="FILE",
-        type=Path,
-        help="a new file that ends in .npy, .tif or .tiff (default: SCENARIO_SPLIT_N.npy)",
-    )
-    make.set_defaults(command="fire make")
-
-
-def _add_import(actions: Any) -> None:
+    make.add_argument("scenario", metavar="SCENARIO", help="a file in configs/fire")
+    make.add_argument("overrides", metavar="key=value", nargs="*", help=_KEYS)
+    make.add_argument("--count", metavar="N", type=positive, help="number of fires")
+    make.add_argument("--split", choices=("train", "validation", "test"), default="train")
+    make.add_argument("--output", metavar="FILE", type=Path, help=_BANK)
     imported = command(
         actions,
         "import",
@@ -114,39 +69,30 @@ def _add_import(actions: Any) -> None:
         nargs="+",
         help="files with one fire or more; " + _KEYS,
     )
-    imported.add_argument(
-        "--output",
-        metavar="BANK",
-        type=Path,
-        required=True,
-        help="a new file that ends in .npy, .tif or .tiff",
-    )
-    imported.set_defaults(command="fire import")
+    imported.add_argument("--output", metavar="BANK", type=Path, required=True, help=_BANK)
+    for name, parser in (("preview", preview), ("make", make), ("import", imported)):
+        parser.set_defaults(command=f"fire {name}")
 
 
 # Commands import their code when they run, so that `emberlink --help` does not import torch.
 
 
 def _preview(options: argparse.Namespace, console: "Console") -> int:
-    from emberlink.trainers.fires.preview import preview
+    from emberlink.trainers.fires.commands import preview
 
-    return preview(options.source, options.overrides, console, options.output)
+    return preview(options.arguments, console, options.output)
 
 
 def _make(options: argparse.Namespace, console: "Console") -> int:
-    from emberlink.trainers.fires.banks import make
+    from emberlink.trainers.fires.commands import make
 
+    count, split, output = options.count, options.split, options.output
     return make(
-        options.scenario,
-        options.overrides,
-        console,
-        count=options.count,
-        split=options.split,
-        output=options.output,
+        options.scenario, options.overrides, console, count=count, split=split, output=output
     )
 
 
 def _import(options: argparse.Namespace, console: "Console") -> int:
-    from emberlink.trainers.fires.banks import import_files
+    from emberlink.trainers.fires.commands import import_files
 
     return import_files(options.arguments, console, options.output)

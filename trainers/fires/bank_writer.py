@@ -6,39 +6,29 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from torch import Tensor
 
-from emberlink.envs.fire_files.projection import library
+from emberlink.envs.fire_files.files import library
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.publish import new_file, published
 from emberlink.trainers.runs.compact_json import finite
 
 SUFFIXES = (".npy", ".tif", ".tiff")
-MAX_BANDS = 4096
-"""Fires of a GeoTIFF: the time that GDAL takes grows with the square of their number."""
-MAX_BYTES = 2**30
+_MAX_BANDS = 4096  # the time that GDAL takes grows with the square of their number
+_MAX_BYTES = 2**30
 _NODATA = -9999.0  # never burns, as in FARSITE and FlamMap
 
 
 def check_bank(path: Path, count: int, grid: Sequence[int]) -> None:
-    """Checks that a bank can be written, before its fires are made.
-
-    Raises:
-        UserError: the suffix is not known, the file exists, its folder does not, `rasterio` is
-            missing, or the bank would be too large.
-    """
+    """Checks that a bank can be written, before its fires are made."""
     new_file(path, SUFFIXES)
     size = 4 * count * grid[0] * grid[1]
-    if size > MAX_BYTES:
-        raise UserError(
-            f"{path}: {count} fires of {grid[0]} x {grid[1]} cells are {size} bytes; at most "
-            f"{MAX_BYTES} are written"
-        )
+    if size > _MAX_BYTES:
+        raise UserError(f"{path}: {count} fires are {size} bytes; at most {_MAX_BYTES} are written")
     if path.suffix == ".npy":
         new_file(path.with_suffix(".json"), [".json"])
-    elif count > MAX_BANDS:
-        raise UserError(f"{path}: {count} fires; a GeoTIFF gets at most {MAX_BANDS}, .npy more")
+    elif count > _MAX_BANDS:
+        raise UserError(f"{path}: {count} fires; a GeoTIFF gets at most {_MAX_BANDS}, .npy more")
     else:
         library("rasterio", f"{path}: a GeoTIFF, unlike .npy,")
 
@@ -54,30 +44,21 @@ def write_bank(
         fires: float32 [fires, X, Y], steps; inf never burns (-9999 in the GeoTIFF).
         facts: the origin of the fires: text, numbers, lists and mappings.
         names: the names of the fires.
-
-    Raises:
-        UserError: as `check_bank`, or the file cannot be written.
     """
     check_bank(path, len(fires), fires.shape[1:])
     array = np.ascontiguousarray(fires.cpu().numpy(), dtype="<f4")
     assert (array >= 0).all(), "arrival times are 0 or more, or inf"
-    facts = {"units": "steps", **(facts or {})}
+    about = finite({"units": "steps", **(facts or {})})
     names = names or [f"fire {number}" for number in range(len(array))]
-    if path.suffix == ".npy":
-        _write_numpy(path, array, facts, names)
-    else:
-        content = _geotiff(array, facts, names)
+    if path.suffix != ".npy":
+        content = _geotiff(array, about, names)
         with published(path) as partial:
             partial.write_bytes(content)
-
-
-def _write_numpy(
-    path: Path, array: NDArray[np.float32], facts: Mapping[str, Any], names: Sequence[str]
-) -> None:
-    about = {**facts, "axes": ["fire", "x", "y"], "never": "inf", "fires": list(names)}
+        return
+    about |= {"axes": ["fire", "x", "y"], "never": "inf", "fires": list(names)}
     json_path = path.with_suffix(".json")
     with published(json_path) as partial:
-        partial.write_text(json.dumps(finite(about), indent=1) + "\n", encoding="utf-8")
+        partial.write_text(json.dumps(about, indent=1) + "\n", encoding="utf-8")
     try:
         with published(path) as partial, partial.open("wb") as file:
             header = np.lib.format.header_data_from_array_1_0(array)
@@ -88,28 +69,19 @@ def _write_numpy(
         raise
 
 
-def _geotiff(
-    array: NDArray[np.float32], facts: Mapping[str, Any], names: Sequence[str]
-) -> memoryview:
+def _geotiff(array: np.ndarray, facts: Mapping[str, Any], names: Sequence[str]) -> memoryview:
     """Returns the content of a GeoTIFF, x to the right and y upwards."""
     rasterio = library("rasterio")
     count, width, height = array.shape
+    rows = array.transpose(0, 2, 1)[:, ::-1]
+    about: dict[str, Any] = {"driver": "GTiff", "count": count, "width": width, "height": height}
+    about |= {"dtype": "float32", "nodata": _NODATA, "compress": "deflate", "interleave": "band"}
+    about["transform"] = rasterio.Affine(1, 0, -0.5, 0, -1, height - 0.5)
     # In memory first: GDAL reports a full disk only in its log.
     with rasterio.MemoryFile() as memory:
-        with memory.open(
-            driver="GTiff",
-            count=count,
-            width=width,
-            height=height,
-            dtype="float32",
-            nodata=_NODATA,
-            transform=rasterio.Affine(1, 0, -0.5, 0, -1, height - 0.5),
-            compress="deflate",
-            interleave="band",
-        ) as raster:
-            rows = array.transpose(0, 2, 1)[:, ::-1]
+        with memory.open(**about) as raster:
             raster.write(np.where(np.isinf(rows), np.float32(_NODATA), rows))
-            tags = {k: v if isinstance(v, str) else json.dumps(v) for k, v in finite(facts).items()}
+            tags = {k: v if isinstance(v, str) else json.dumps(v) for k, v in facts.items()}
             raster.update_tags(**tags)
             raster.descriptions = tuple(names)
         return memoryview(memory.read())

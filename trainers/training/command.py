@@ -7,6 +7,7 @@ from contextlib import suppress
 from rich.console import Console
 
 from emberlink.configs import known
+from emberlink.envs.scenarios import fires_of
 from emberlink.envs.utils.errors import UserError
 from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.evaluation.tables import print_results
@@ -97,6 +98,8 @@ def _announce(trainer: Trainer, overrides: Sequence[str], console: Console) -> N
         )
     text = f"{config.method}, setup {config.setup}, fire {config.fire.name} -> {run.path}"
     console.print(text, soft_wrap=True)
+    if read := fires_of(config.fire).summary(config.env.grid, config.env.horizon):
+        console.print(f"read: {read}", soft_wrap=True, highlight=False, markup=False)
     if setup.step == setup.total_steps and run.evaluated():
         console.print(
             f"{run.path} is finished, {config.episodes} episodes; nothing is left to do. "

@@ -1,0 +1,135 @@
+"""Nineteen files that were misread: each gives the right grid, or the right question.
+
+`cases/NN_name` holds a file made after a public report, and `expected.npy`, the right grid [x, y]
+in steps of 1000, where it is known.
+"""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from emberlink.envs.fire_files.config import FileFireConfig
+from emberlink.envs.fire_files.reader import read_with_summary
+
+CASES = Path(__file__).parent / "cases"
+WRF = "wrfout_d01_2012-09-09_12:00:00"
+# name -> file, keys, the question if there is one, keys that answer it, what `read:` says
+TABLE = {
+    "01_acq_date_acq_time": ("viirs_areas.geojson", {}, "", {}, "8 times, .*T09:42.*T21:12"),
+    "02_gofer_two_fires": (
+        "fireProg.shp",
+        {"time_field": "tUTC"},
+        r"fname: Alder \(6\), Birch \(6\); expected fire.incident_field=fname fire.incident=Alder",
+        {"incident": "Alder"},
+        r"6 of 12 features used \(6 left out by fire.incident=Alder\)",
+    ),
+    "03_same_name": (
+        "perimeters.geojson",
+        {"incident": "Creek"},
+        r"poly_IRWINID: \{A\} \(6\), \{B\} \(6\); expected fire.incident_field=poly_IRWINID",
+        {"incident": "{A}", "incident_field": "poly_IRWINID"},
+        "6 of 12 features",
+    ),
+    "04_modis_sinusoidal": (
+        "fired_daily.shp",
+        {},
+        "",
+        {},
+        r"3\.\d+ : 1.* to WGS 84 / UTM zone 10N",
+    ),
+    "05_zero_is_unburned": (
+        "arrival.tif",
+        {"units": "minutes"},
+        r"0 \(86 % of the cells\) .*expected fire.unburned=0",
+        {"unburned": 0.0},
+        "1309 cells burn from 1 minutes",
+    ),
+    "06_new_year": (
+        "day_of_burn.tif",
+        {"units": "days"},
+        "days 1 to 6 and 358 to 365, none between.*fire.units=day_of_year",
+        {"units": "day_of_year"},
+        "from 358 days to 371 days, beginning at 1 place",
+    ),
+    "07_pm_ignored": ("perimeters.geojson", {}, "", {}, "8 times, .*05T01:30.*08T13:30"),
+    "08_day_first": (
+        "perimetros.geojson",
+        {},
+        "datetime='05/08/2020 02:00' fits day_first .* month_first .*fire.time_format=day_first",
+        {"time_format": "day_first"},
+        "from 2020-08-05T02:00.* to 2020-08-08T14:00",
+    ),
+    "09_wrfout_name": (
+        WRF,
+        {"units": "seconds"},
+        r"3005 \(45 % of the cells\) .* fire.unburned=3005",
+        {"unburned": 3005.0},
+        "band 'TIGN_G', the last of 2 times",
+    ),
+    "10_firms_command": (
+        "fire_archive_SV-C2_1.csv",
+        {},
+        "80 points, as of satellite detections; expected fire.radius",
+        {"radius": 375.0},
+        "4 times.*times from acq_date and acq_time",
+    ),
+    "11_declared_unit": (
+        "arrival.tif",
+        {"units": "minutes", "minutes_per_step": 0.5},
+        r"\(s\) is in seconds; expected fire.units=seconds, not minutes",
+        {"units": "seconds"},
+        "time_of_arrival",
+    ),
+    "12_mask_frames": (
+        "fire_maps.npy",
+        {},
+        r"20 maps of the states 0 \(78 %\), 1 .*fire.kind=masks",
+        {"kind": "masks"},
+        "137 cells burn from 0 maps to 19 maps, beginning at 1 place; 20 maps",
+    ),
+    "13_tfr_polygon": (
+        "event_polygon.geojson",
+        {},
+        r"FeatureCategory: .*Perimeter \(6\), Temporary Flight Restriction \(1\); .*fire.where=",
+        {"where": "FeatureCategory=Wildfire*"},
+        "6 of 7 features used",
+    ),
+    "14_yymmddhhmm": ("perimeters.geojson", {}, "", {}, "2018-08-19T20:00.*2018-08-20T03:00"),
+    "15_shapefile_date_only": ("Perimeters.shp", {}, "", {}, "3 times"),
+    "16_active_areas": ("active.geojson", {}, "", {}, "1 perimeter within the area burnt before"),
+    "17_forefire_geojson": ("fronts", {}, "", {}, "5 times, .*T18:00.*T22:00.*from valid_at"),
+    "18_kml_folder_time": ("ir.kml", {}, "", {}, "5 times, .*T18:00.*T22:00"),
+    "19_arcinfo_prj": ("toa.asc", {"units": "minutes"}, "", {}, "582 cells.*axes 1.00 : 1"),
+}
+
+
+def test_all_cases_are_there():
+    assert sorted(path.name for path in CASES.iterdir()) == sorted(TABLE)
+
+
+@pytest.mark.parametrize("name", TABLE)
+@pytest.mark.filterwarnings("ignore:.*order is lost")
+def test_case(name):
+    file, keys, question, answer, says = TABLE[name]
+    config = {"path": str(CASES / name / file), "ring_width": None, **keys}
+    if question:
+        with pytest.raises(ValueError, match=question) as caught:
+            read_with_summary(FileFireConfig(**config), (30, 30), 1000)
+        assert "\n" not in str(caught.value)
+        assert file in str(caught.value)
+    (fire,), read = read_with_summary(FileFireConfig(**config | answer), (30, 30), 1000)
+    assert re.search(says, read), read
+    if (expected := CASES / name / "expected.npy").exists():
+        right = np.load(expected)
+        least = 0.8 if name.startswith("15") else 0.92
+        for step in (250, 500, 750, 1000):
+            one, other = right <= step, fire.numpy() <= step
+            assert (one & other).sum() / (one | other).sum() > least, (step, read)
+
+
+def test_lost_order_is_said():
+    config = FileFireConfig(path=str(CASES / "15_shapefile_date_only" / "Perimeters.shp"))
+    with pytest.warns(UserWarning, match=r"8 features have 3 dates in poly_Polyg without a time"):
+        read_with_summary(config, (30, 30), 1000)

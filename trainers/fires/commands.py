@@ -1,0 +1,252 @@
+"""Runs `emberlink fire`: draws fires, writes generated ones to a file, joins files of fires."""
+
+import math
+import os
+import re
+import warnings
+from collections.abc import Sequence
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from rich.console import Console
+from torch import Tensor
+
+from emberlink.envs.fire.cache import GENERATOR_VERSION
+from emberlink.envs.fire.generator import GeneratedConfig, Split, fire_seeds, make_fires, scenarios
+from emberlink.envs.fire_files.config import FileFireConfig
+from emberlink.envs.fire_files.reader import read_with_summary
+from emberlink.envs.scenarios import fires_of
+from emberlink.envs.utils.errors import UserError, shown, unknown
+from emberlink.envs.utils.publish import free_name, new_file, published
+from emberlink.envs.world.burning import split_times
+from emberlink.envs.world.sensor import view_radius
+from emberlink.trainers.config.compose import resolve, to_values
+from emberlink.trainers.config.schema import MAX_FIRES, RunConfig
+from emberlink.trainers.config.values import parse
+from emberlink.trainers.fires.bank_writer import check_bank, write_bank
+from emberlink.trainers.fires.plot import arrival_figure
+
+_METHOD = "independent"  # any method; fires do not depend on it
+
+
+def preview(arguments: Sequence[str], console: Console, output: Path | None = None) -> int:
+    """Draws a fire and prints its numbers.
+
+    Args:
+        arguments: SCENARIO, SCENARIO:INDEX, FILE, FILE:INDEX or `fire=NAME`, and `key=value`.
+        console: prints the numbers and, last, the path of the picture.
+        output: a folder, or a new .png file; the working directory if None.
+    """
+    path = new_file(output, [".png"]) if output is not None and not os.path.isdir(output) else None
+    overrides = [text for text in arguments if "=" in text and not os.path.exists(text)]
+    sources = [text for text in arguments if text not in overrides]
+    names = [text.partition("=")[2] for text in overrides if text.startswith("fire=")]
+    keyed = [str(parse(text)[1]) for text in overrides if text.startswith("fire.path=")]
+    overrides = [text for text in overrides if not text.startswith(("fire=", "fire.path="))]
+    sources += keyed if names == ["file"] else names
+    if len(sources) != 1:
+        raise UserError(f"{shown(' '.join(sources))!r}: expected one scenario or file")
+    title, stem, config, arrival, read = _find(sources[0], overrides)
+    if path is None:
+        name = free_name(output or Path(), re.sub(r"[^\w.+-]", "-", stem)[:100], [".png"])
+        path = name.with_name(f"{name.name}.png")
+    world, times = config.env, arrival.numpy()
+    width = 2 * view_radius(world.altitude[1], world.view_angle)
+    with published(path) as partial, warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Glyph")  # the font may lack letters of the file's name
+        arrival_figure(partial, times, world.horizon, width, title)
+    grid = " x ".join(map(str, world.grid))
+    lines = [f"{title}: {grid} cells, {world.horizon} steps, setup {config.setup}"]
+    lines += [f"read: {read}"] if read else []
+    for line in [*lines, *_growth(times, world, width), str(path)]:
+        console.print(line, soft_wrap=True, highlight=False, markup=False)
+    return 0
+
+
+def _growth(arrival: np.ndarray, world: Any, width: float) -> list[str]:
+    """Returns lines about the growth of a fire, and whether the team can keep up with it."""
+    window = max(1, world.horizon // 20)
+    times = np.sort(arrival, axis=None)
+    burning = np.searchsorted(times, np.arange(world.horizon + 1), side="right")
+    gained = burning[window:] - burning[:-window]
+    since, end = int(gained.argmax()), int(burning[-1])
+    mean, most = (end - burning[0]) / world.horizon, float(gained[since]) / window
+    uncovered = world.num_uavs * width * world.displacement
+    in_view = min(end, world.num_uavs * width**2)
+    steps = math.ceil(max(0.0, end - in_view) / uncovered)
+    sides = " x ".join(map(_short, (world.num_uavs, width, world.displacement)))
+    rows = {
+        "burning at the start": f"{burning[0]} cells",
+        "burning at the end": f"{end} cells",
+        "growth, mean": f"{_short(mean)} cells/step",
+        "growth, maximum": f"{_short(most)} cells/step, steps {since} to {since + window}",
+        "a UAV flies": f"{_short(world.displacement)} cells/step",
+        "a UAV sees": f"{_short(width)} cells across, from full altitude",
+        "the team uncovers": f"{_short(uncovered)} cells/step at most: {sides}",
+    }
+    ratio = f": {_short(uncovered / most)} times as many" if most > 0 else ""
+    checks = {
+        f"the team can uncover {_short(uncovered)} cells/step, {_short(most)} start to burn"
+        + ratio: most <= uncovered,
+        f"of {end} cells at the end {_short(in_view)} can be in view at once; uncovering others "
+        f"takes at least {steps} of {world.horizon} steps": steps <= world.horizon,
+    }
+    return [
+        *(f"{name:21} {text}" for name, text in rows.items()),
+        f"UAVs can keep up: {'yes' if all(checks.values()) else 'no'}",
+        *(f"  {'+' if enough else '-'} {text}" for text, enough in checks.items()),
+    ]
+
+
+def _short(value: float) -> str:
+    """Returns a number with three digits, or all digits of a larger whole number."""
+    return f"{value:.0f}" if value >= 100 else f"{value:.3g}"
+
+
+def _find(text: str, overrides: Sequence[str]) -> tuple[str, str, RunConfig, Tensor, str]:
+    """Returns title, stem of file names, configuration, arrival times and `read:` of a fire."""
+    name, _, index = text.rpartition(":") if ":" in text else (text, "", "0")
+    if name in scenarios():
+        config = _generated(name, overrides)
+        place = _index(text, index, MAX_FIRES)
+        fire = fires_of(config.fire).test_fire(place, config.env.grid, config.env.horizon)
+        arrival = split_times(fire)[0][0]
+        return f"{name}, test fire {index}", f"fire_{name}_{index}", config, arrival, ""
+    if os.path.exists(text) or not os.path.exists(name):
+        name, index = text, "0"
+    if not name or not os.path.exists(name):
+        known = unknown(text.rpartition(":")[0] or text, scenarios())
+        raise UserError(f"{shown(text)}: there is no such file; as a scenario {known}")
+    path = Path(name)
+    config = _from_file(path, overrides)
+    fires, read = _read(config)
+    place, title, stem = _index(text, index, len(fires)), shown(path.name), f"fire_{path.stem}"
+    if len(fires) > 1:
+        title, stem = f"{title}, fire {index} of {len(fires)}", f"{stem}_{index}"
+    return title, stem, config, fires[place], read
+
+
+def _index(text: str, index: str, count: int) -> int:
+    if not index.isdecimal() or len(index) > 9 or int(index) >= count:
+        raise UserError(f"{shown(text)}: no fire {shown(index)!r}; known: 0 to {count - 1}")
+    return int(index)
+
+
+def _generated(scenario: str, overrides: Sequence[str]) -> RunConfig:
+    """Returns the configuration with which a scenario's fires are made."""
+    if scenario not in scenarios():
+        raise UserError(f"fire {unknown(scenario, scenarios())}")
+    return _resolved([f"fire={scenario}", *overrides], overrides)
+
+
+def _from_file(path: Path, overrides: Sequence[str]) -> RunConfig:
+    """Returns the configuration with which a file is read."""
+    # The path bypasses the parser of overrides, in which some characters have a meaning.
+    return _resolved(["fire=file", *overrides], overrides, **{"fire.path": str(path)})
+
+
+def _resolved(texts: Sequence[str], overrides: Sequence[str], **settings: Any) -> RunConfig:
+    for text in overrides:
+        if not text.startswith(("setup=", "env.", "fire.")) or text.startswith("fire.path="):
+            raise UserError(f"{shown(text)!r}: a fire depends on keys of setup, env. and fire.")
+    return resolve(_METHOD, texts, **settings)
+
+
+def _read(config: RunConfig) -> tuple[Tensor, str]:
+    assert isinstance(config.fire, FileFireConfig)
+    return read_with_summary(config.fire, config.env.grid, config.env.horizon)
+
+
+def make(
+    scenario: str,
+    overrides: Sequence[str],
+    console: Console,
+    *,
+    count: int | None = None,
+    split: Split = "train",
+    output: Path | None = None,
+) -> int:
+    """Makes fires of a scenario and writes them to a file.
+
+    Args:
+        scenario: a file in configs/fire.
+        overrides: `key=value` of setup, env. and fire.
+        console: prints the number of fires and, last, the path of the file.
+        count: number of fires; as many as a training or an evaluation uses if None.
+        split: "train", "validation" or "test".
+        output: a new .npy, .tif or .tiff file; the next free name if None.
+    """
+    config = _generated(scenario, overrides)
+    fire, evaluation = config.fire, config.evaluation
+    assert isinstance(fire, GeneratedConfig)
+    usual = {"validation": evaluation.interval_episodes, "test": evaluation.episodes}
+    count = count or usual.get(split, fire.num_train_fires)
+    if output is None:
+        name = free_name(Path(), f"{scenario}_{split}_{count}", [".npy", ".json"])
+        output = name.with_name(f"{name.name}.npy")
+    check_bank(output, count, config.env.grid)
+    seeds = fire_seeds(split, count)
+    arrival, burn_out = split_times(make_fires(fire, seeds, config.env.grid, config.env.horizon))
+    _warn_of_burn_out(fire, burn_out)
+    facts = {"scenario": scenario, "split": split, "seeds": f"{seeds[0]} to {seeds[-1]}"}
+    facts |= {**_facts(config), "generator_version": GENERATOR_VERSION}
+    _write(output, arrival, facts, [f"{scenario} {split} {n}" for n in seeds.tolist()], console)
+    return 0
+
+
+def import_files(arguments: Sequence[str], console: Console, output: Path) -> int:
+    """Reads files of fires and writes them to one.
+
+    Args:
+        arguments: paths, and `key=value` of setup, env. and fire.
+        console: prints what was read, the number of fires and, last, the path of the file.
+        output: a new .npy, .tif or .tiff file.
+    """
+    # An existing file takes precedence over a key.
+    overrides = [text for text in arguments if "=" in text and not os.path.exists(text)]
+    paths = [Path(text) for text in arguments if text not in overrides]
+    if not paths:
+        raise UserError("FILE is missing; expected a file, such as ArrivalTime.asc")
+    configs = [_from_file(path, overrides) for path in paths]
+    check_bank(output, len(paths), configs[0].env.grid)
+    fires, names, sources = [], [], []
+    for path, config in zip(paths, configs, strict=True):
+        read, about = _read(config)
+        console.print(f"{path.name}: read: {about}", soft_wrap=True, highlight=False, markup=False)
+        fires.append(read)
+        names += [f"{path.name}{f', fire {n}' if len(read) > 1 else ''}" for n in range(len(read))]
+        sources.append({"file": path.name, "sha256": to_values(config)["fire"]["sha256"]})
+    _warn_of_burn_out(configs[0].fire, None)
+    facts: dict[str, Any] = _facts(configs[0]) | {"sources": sources}
+    del facts["fire"]["path"], facts["fire"]["sha256"]  # they hold for the first file only
+    _write(output, torch.cat(fires), facts, names, console)
+    return 0
+
+
+def _warn_of_burn_out(fire: Any, burn_out: Tensor | None) -> None:
+    """Warns that a file of fires will not hold the times at which cells burn out, if they do."""
+    if burn_out is not None or math.isfinite(getattr(fire, "burn_time", math.inf)):
+        warnings.warn(
+            "a file of fires holds arrival times only, without the times at which cells burn out; "
+            "fire.burn_time=STEPS gives one for all cells when the file is read",
+            stacklevel=3,
+        )
+
+
+def _facts(config: RunConfig) -> dict[str, Any]:
+    """Returns the settings on which the fires depend."""
+    about = {"horizon": config.env.horizon, "grid": list(config.env.grid)}
+    return {**about, "fire": to_values(config)["fire"], "emberlink_version": version("emberlink")}
+
+
+def _write(
+    path: Path, fires: Tensor, facts: dict[str, Any], names: Sequence[str], console: Console
+) -> None:
+    write_bank(path, fires, facts=facts, names=names)
+    cells, word = " x ".join(map(str, fires.shape[1:])), "fire" if len(fires) == 1 else "fires"
+    text = f"{len(fires)} {word} of {cells} cells, {facts['horizon']} steps"
+    for line in (text, str(path)):
+        console.print(line, soft_wrap=True, highlight=False, markup=False)
