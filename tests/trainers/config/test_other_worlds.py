@@ -20,7 +20,7 @@ from emberlink.trainers.evaluation.evaluate import scripted_config
 ROUND = ("paper", "front", "relay", "blackout", "swarm", "paper", "relay", "front", "paper")
 
 
-@pytest.mark.parametrize(("here", "there"), pairwise(ROUND))
+@pytest.mark.parametrize(("here", "there"), [*pairwise(ROUND)])
 def test_a_run_without_settings_of_its_own_is_as_if_made_in_the_other_world(here, there):
     run, expected = (
         resolve("maps", ["setup=strong", f"world={name}", "evaluation.interval=3"])
@@ -82,10 +82,9 @@ OTHER_MAP = pytest.mark.filterwarnings("ignore:env.*means something else here:Us
 
 
 @OTHER_MAP
-def test_an_evaluation_in_another_world(run, tmp_path, capsys):
+def test_an_evaluation_in_another_world(run, capsys):
     assert main(["eval", str(run), "world=relay"]) == 0
     printed = " ".join(capsys.readouterr().out.split())
-    assert "note: world is relay here, paper in training" in printed
     assert "huygens" not in printed
     written = json.loads((run / "eval_world=relay.json").read_text())
     assert written["world"] == "relay"
@@ -95,9 +94,6 @@ def test_an_evaluation_in_another_world(run, tmp_path, capsys):
     by_python = trainers.evaluate(run, world="relay", scripted=False)
     assert by_python["front"]["learned"] == written["results"]["front"]["learned"]
     assert (run / "figures" / "replay_world=relay.html").exists()
-    assert main(["compare", str(run), "--output", str(tmp_path / "compared")]) == 0
-    said = " ".join(capsys.readouterr().out.split())
-    assert "is left out: evaluated otherwise: world is relay, in eval.json paper" in said
 
 
 @pytest.mark.parametrize(
