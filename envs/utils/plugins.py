@@ -3,38 +3,21 @@
 import importlib
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
-from functools import cache
 from importlib.metadata import EntryPoint
-from pathlib import Path
 from pkgutil import iter_modules
 from typing import Any, Generic, TypeVar
 
 from emberlink.configs import entry_points
-from emberlink.envs.utils.errors import UserError
+from emberlink.envs.utils.errors import UserError, unknown
 
 T = TypeVar("T")
-
-
-def registered(group: str) -> dict[str, EntryPoint]:
-    """Returns the entry points of a group, such as "emberlink.comm", by name.
-
-    Raises:
-        UserError: two packages have an entry point of the same name.
-    """
-    points: dict[str, EntryPoint] = {}
-    for point in entry_points.read(group):
-        other = points.setdefault(point.name, point)
-        if other.value != point.value:
-            raise UserError(
-                f"entry point {point.name!r} of {group} is in two packages: {other.value} and "
-                f"{point.value}; remove or rename one"
-            )
-    return points
 
 
 @dataclass(frozen=True)
 class Registry(Generic[T]):
     """Finds the subclasses of a class: one in each file of a package, and entry points.
+
+    Other packages are imported only where their names are asked for.
 
     Attributes:
         base: the class.
@@ -56,7 +39,7 @@ class Registry(Generic[T]):
 
     def known(self) -> list[str]:
         """Returns the names in alphabetical order."""
-        return sorted({*self._files(), *self._points()})
+        return sorted({*self._files(), *(point.name for point in self._points())})
 
     def find(self, name: str, key: str = "") -> type[T]:
         """Returns the class of a name.
@@ -69,26 +52,23 @@ class Registry(Generic[T]):
             UserError: the name is not known or not unique, or the entry point cannot be imported or
                 is not such a class.
         """
-        key = key or self.key
-        points, files = self._points(), self._files()
-        if name in points and name in files:
-            raise UserError(f"{key}={name}: also an entry point, {points[name].value}; rename it")
-        if name in points:
-            return self._load(points[name])
-        if name in files:
-            return self._class_in(name)
-        raise UserError(f"{key}={name!r} is not known; known: {', '.join(self.known())}")
+        points = {point.value: point for point in self._points() if point.name == name}
+        places = [*points, *([self.package] if name in self._files() else [])]
+        if not places:
+            raise UserError(f"{key or self.key}={unknown(name, self.known())}")
+        if len(places) > 1:
+            raise UserError(
+                f"{key or self.key}={name}: in several packages: {', '.join(places)}; rename one"
+            )
+        return self._load(*points.values()) if points else self._class_in(name)
 
-    def _points(self) -> dict[str, EntryPoint]:
-        return registered(self.group or self.package)
+    def _points(self) -> tuple[EntryPoint, ...]:
+        return entry_points.read(self.group or self.package)
 
     def _files(self) -> set[str]:
-        paths = map(Path, importlib.import_module(self.package).__path__)
-        # setuptools adds the name of a hook that is no folder.
-        files = _modules(tuple((str(p), p.stat().st_mtime_ns) for p in paths if p.exists()))
-        return {name for name in files if not name.startswith("_")} - set(self.other_files) | set(
-            self.shared
-        )
+        modules = iter_modules(importlib.import_module(self.package).__path__)
+        files = {module.name for module in modules if not module.name.startswith("_")}
+        return files - set(self.other_files) | set(self.shared)
 
     def _class_in(self, name: str) -> type[T]:
         file = importlib.import_module(f"{self.package}.{self.shared.get(name, name)}")
@@ -118,9 +98,3 @@ class Registry(Generic[T]):
 
     def _fits(self, item: Any) -> bool:
         return isinstance(item, type) and issubclass(item, self.base)
-
-
-@cache
-def _modules(folders: tuple[tuple[str, int], ...]) -> frozenset[str]:
-    """Returns the names of the modules in folders that were last changed at the given times."""
-    return frozenset(module.name for module in iter_modules([path for path, _ in folders]))

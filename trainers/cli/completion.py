@@ -26,8 +26,9 @@ def answer(parser: argparse.ArgumentParser) -> None:
     """Answers the script of a shell and exits, if it asks for words."""
     import argcomplete
 
+    words: Any = _words
     argcomplete.autocomplete(
-        parser, always_complete_options=False, exit_method=sys.exit, default_completer=_words
+        parser, always_complete_options=False, exit_method=sys.exit, default_completer=words
     )
 
 

@@ -105,9 +105,10 @@ def _flush(status: int) -> int:
 
     An output that cannot be flushed is discarded, so that Python does not report it at its end.
     """
+    if sys.stdout is None:  # closed by the shell: >&-
+        return status
     try:
-        if sys.stdout is not None:  # closed by the shell: >&-
-            sys.stdout.flush()
+        sys.stdout.flush()
     except OSError as error:
         null = os.open(os.devnull, os.O_WRONLY)
         os.dup2(null, sys.stdout.fileno())

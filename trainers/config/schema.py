@@ -164,7 +164,8 @@ class RunConfig:
     @classmethod
     def _complete_comm(cls, value: dict[str, Any]) -> dict[str, Any]:
         # A run folder keeps them if a later version of the module has other defaults.
-        return _completed("comm", value)
+        settings = _settings("comm", value, registry)
+        return {"name": value["name"], **asdict(settings)}
 
     def check_rollouts(self, decisions: int = 1) -> None:
         """Checks that an episode consists of whole rollouts, which only a training needs.
@@ -190,19 +191,3 @@ def build_comm(config: RunConfig, num_envs: int) -> CommModule:
     module = registry.build(config.comm["name"], config.env, settings, num_envs)
     module.hold = config.policy.hold
     return module
-
-
-def _completed(key: str, given: dict[str, Any]) -> dict[str, Any]:
-    """Returns the settings of a communication module, followed by those left to their defaults."""
-    return _filled(given, asdict(_settings(key, given, registry)))
-
-
-def _filled(given: Mapping[str, Any], complete: Mapping[str, Any]) -> dict[str, Any]:
-    """Returns the given settings, followed by those of `complete` that are missing."""
-    filled = dict(given)
-    for key, value in complete.items():
-        if isinstance(value, Mapping) and isinstance(given.get(key), Mapping):
-            filled[key] = _filled(given[key], value)
-        else:
-            filled.setdefault(key, value)
-    return filled

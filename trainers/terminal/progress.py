@@ -75,7 +75,8 @@ class TrainingProgress:
         """
         task = self._bar.tasks[0]
         pace = f", {speed:.0f} steps/s" if (speed := task.finished_speed or task.speed) else ""
-        left = f", {timedelta(seconds=task.time_remaining)} left" if task.time_remaining else ""
+        seconds = 0 if self._console.is_terminal else task.time_remaining  # the bar shows it
+        left = f", {timedelta(seconds=seconds)} left" if seconds else ""
         self.note(
             f"episode {episode}/{self._episodes}: coverage {line['coverage']:.1f} %, "
             f"mean reward {line['mean_reward']:.2f}{pace}{left}"

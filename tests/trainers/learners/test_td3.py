@@ -9,7 +9,7 @@ import torch
 from tensordict.nn import TensorDictModule
 from test_recipes import METHODS
 
-from emberlink.envs.utils import plugins
+from emberlink.configs import entry_points
 from emberlink.envs.utils.errors import UserError
 from emberlink.policies.settings import PolicyConfig
 from emberlink.trainers.cli import main
@@ -137,7 +137,7 @@ def test_invalid_settings_of_a_learner(values, message):
 def test_another_package_can_add_a_learner(monkeypatch):
     group = "emberlink.learners"
     point = EntryPoint("mine", "emberlink.trainers.learners.td3:TD3", group)
-    monkeypatch.setattr(plugins, "registered", lambda of: {"mine": point} if of == group else {})
+    monkeypatch.setattr(entry_points, "read", lambda of: (point,) if of == group else ())
     assert registry.known() == ["ddpg", "imitation", "ippo", "mappo", "mine", "td3"]
     assert registry.find("mine") is TD3
 
