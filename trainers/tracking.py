@@ -123,7 +123,7 @@ def _wandb(config: RunConfig, run: RunFolder) -> Any:
 
     folder = run.path / "wandb"
     folder.mkdir(exist_ok=True)
-    for path in folder.iterdir():
+    for path in [*folder.rglob("*")]:
         if path.is_symlink():  # wandb creates its own links again
             path.unlink()
     # The name of a folder that wandb created ends with the id of the run.

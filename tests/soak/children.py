@@ -1,6 +1,5 @@
 """Runs trainings in processes that are forked after the imports, and kills them."""
 
-import math
 import os
 import random
 import shutil
@@ -12,30 +11,28 @@ from pathlib import Path
 
 from emberlink.envs.utils import atomic_io
 from emberlink.trainers.config.compose import resolve
-from emberlink.trainers.runs import checkpoint_file
+from emberlink.trainers.runs import checkpoint
+from emberlink.trainers.runs.run_folder import BEST, METRICS, NEWEST
 from emberlink.trainers.training.resume import resume
 from emberlink.trainers.training.trainer import Trainer
 
 HORIZON, EPISODES, EVERY = 20, 4, 3
-BASE = [
+SMALL = [
     *(f"env.horizon={HORIZON}", "env.num_uavs=2", "num_envs=2", f"checkpoint_steps={EVERY}"),
-    *("learner.hidden=[8,8]", "fire=paper", "keep_checkpoints=3"),
-    *("evaluation.interval=0", "evaluation.episodes=1"),
+    *("learner.hidden=[8,8]", "fire=paper", "evaluation.interval=0", "evaluation.episodes=1"),
 ]
 REPLAY = ["learner.batch_size=16", "learner.buffer_size=60"]
-SMALL = [*BASE, *REPLAY]
-SEQUENCES = [*REPLAY, "policy.memory=gru", "learner.sequence=4", "learner.burn_in=2"]
-LEARNERS = {
-    "ddpg": ["learner=ddpg", *REPLAY],
-    "ddpg-gru": ["learner=ddpg", *SEQUENCES],
-    "td3-team": ["learner=td3", *SEQUENCES, "learner.critic=team"],
-    "ippo-own": ["learner=ippo", "policy.memory=gru", "learner.share_parameters=false"],
-    "mappo": ["learner=mappo", "policy.memory=stack", "policy.hold=2"],
-    "mappo-map": ["learner=mappo", "policy.memory=gru", "learner.critic_map=true"],
-}
-IMITATION = ["learner=imitation", "learner.samples=8", "learner.buffer_size=60"]
-SETTINGS = {**LEARNERS, "imitation": IMITATION}
-METHODS = ("independent", "shared_memory", "positional", "consensus")
+GRU = ["policy.memory=gru", "policy.units=6"]
+RECIPES = [
+    ("independent", ["learner=ddpg", *REPLAY]),
+    ("consensus", ["learner=ippo", *GRU, "learner.share_parameters=false"]),
+    ("positional", ["learner=td3", *REPLAY, "learner.critic=team"]),
+    ("shared_memory", ["learner=mappo", *GRU, "policy.hold=2"]),
+    ("maps", ["learner=imitation", "learner.samples=8", "learner.buffer_size=60"]),
+    ("independent", ["learner=mappo", *GRU, "learner.critic_map=true"]),
+    ("consensus", ["learner=ddpg", *REPLAY, "policy.hold=2", "env.failures=1"]),
+]
+PARTS = ("save_file", "fsync", "replace", "sync", "unlink")
 
 
 class Child:
@@ -69,7 +66,7 @@ class Child:
         return self.log.read_text().splitlines() if self.log.exists() else []
 
     def wait_for(self, condition: Callable[[], bool], seconds: float = 120) -> bool:
-        """Waits for a line in the log; returns whether it was written before the process ended."""
+        """Waits for a condition; returns whether it came before the process ended."""
         end = time.monotonic() + seconds
         while time.monotonic() < end:
             if condition():
@@ -92,8 +89,7 @@ class Child:
 
 def temporary(folder: Path) -> list[str]:
     """Returns the temporary files of incomplete saves."""
-    files = [*folder.rglob("*.part"), *folder.rglob(".tmp*")]
-    return sorted(path.name for path in files)
+    return sorted(path.name for path in [*folder.rglob("*.part"), *folder.rglob(".tmp*")])
 
 
 def watch_saves(say: Callable[[str], None], die_at: tuple[str, int] | None) -> None:
@@ -114,8 +110,7 @@ def watch_saves(say: Callable[[str], None], die_at: tuple[str, int] | None) -> N
 
         return call
 
-    for name in ("save_file", "_digest"):
-        setattr(checkpoint_file, name, dying(name, getattr(checkpoint_file, name)))
+    checkpoint.save_file = dying("save_file", checkpoint.save_file)
     atomic_io.sync = dying("sync", atomic_io.sync)
     os.fsync = dying("fsync", os.fsync)
     Path.replace = dying("replace", Path.replace)
@@ -130,17 +125,16 @@ def watch_saves(say: Callable[[str], None], die_at: tuple[str, int] | None) -> N
     Trainer.save = saying
 
 
-def training(method: str, learner: str, output: Path, die_at: tuple[str, int] | None = None):
+def training(recipe: int, output: Path, die_at: tuple[str, int] | None = None):
     """Starts a run, or resumes an existing one, and trains to the end."""
-    settings = [*BASE, *SETTINGS[learner], f"episodes={EPISODES}"]
+    method, own = RECIPES[recipe % len(RECIPES)]
+    settings = [*SMALL, *own, f"episodes={EPISODES}", f"output={output}"]
 
     def work(say: Callable[[str], None]) -> int:
         watch_saves(say, die_at)
         runs = sorted(output.glob("*/config.yaml"))
-        if runs:
-            trainer = resume(runs[0].parent)
-        else:
-            trainer = Trainer(resolve(method, [*settings, f"output={output}"]))
+        trainer = resume(runs[0].parent) if runs else Trainer(resolve(method, settings))
+        if not runs:
             trainer.start()
         say(f"at {trainer.setup.step} {','.join(temporary(output))}")
         trainer.train()
@@ -149,30 +143,19 @@ def training(method: str, learner: str, output: Path, die_at: tuple[str, int] | 
     return work
 
 
-PARTS = ("save_file", "_digest", "fsync", "replace", "sync", "unlink")
-
-
 def kill_until_finished(
-    method: str, learner: str, folder: Path, draw: random.Random, kills: int
+    recipe: int, folder: Path, draw: random.Random, kills: int
 ) -> tuple[int, list[str]]:
     """Kills and resumes a training at random times until it has finished.
-
-    Args:
-        method: name of the method.
-        learner: name of the learner, one of `SETTINGS`.
-        folder: an empty folder.
-        draw: random numbers for the times.
-        kills: maximum number of kills.
 
     Returns:
         The number of kills and the failures.
     """
-    output, failures, done, saved = folder / "runs", [], 0, 0
-    begun = saved
+    output, failures, done, saved, begun = folder / "runs", [], 0, 0, 0
     while True:
         kind = draw.choice(("time", "save", "part")) if done < kills else "none"
         part = draw.choice(PARTS), draw.randint(1, 12)
-        child = Child(training(method, learner, output, part if kind == "part" else None), folder)
+        child = Child(training(recipe, output, part if kind == "part" else None), folder)
         if kind == "time":
             child.wait_for(lambda c=child: bool(c.lines()))
             time.sleep(draw.uniform(0, 0.3))
@@ -185,8 +168,7 @@ def kill_until_finished(
         if kind in ("time", "save"):
             child.send(signal.SIGKILL)
         status = child.end()
-        lines = child.lines()
-        for line in lines:
+        for line in child.lines():
             word, _, rest = line.partition(" ")
             if word == "at":
                 step, _, left = rest.partition(" ")
@@ -200,12 +182,6 @@ def kill_until_finished(
                 begun = int(rest)
             else:
                 saved = int(rest)
-        for path in output.rglob("checkpoints/*.safetensors"):
-            if not path.name.startswith(".tmp"):
-                try:
-                    checkpoint_file.read(path)
-                except ValueError as error:
-                    failures.append(str(error))
         if status == -signal.SIGKILL:
             done += 1
         elif status == 0:
@@ -215,46 +191,33 @@ def kill_until_finished(
 
 
 def outcome(output: Path) -> dict[str, bytes]:
-    """Returns the networks and the complete files of a finished run."""
+    """Returns the metrics and the checkpoints of a finished run."""
     (folder,) = output.iterdir()
-    networks = sorted((folder / "checkpoints").glob("step_*.safetensors"))[-1]
-    files = [networks, folder / "checkpoints" / "best.safetensors", folder / "metrics.jsonl"]
-    return {path.name: path.read_bytes() for path in files}
+    return {name: (folder / name).read_bytes() for name in (NEWEST, BEST, METRICS)}
 
 
-def reference(method: str, learner: str, folder: Path) -> dict[str, bytes]:
-    """Returns the outcome of an uninterrupted run."""
-    child = Child(training(method, learner, folder / "runs"), folder)
-    assert child.end() == 0, child.text()
+def reference(recipe: int, folder: Path) -> dict[str, bytes]:
+    """Returns the outcome of an uninterrupted run, which is trained once."""
+    if not folder.exists():
+        child = Child(training(recipe, folder / "runs"), folder)
+        assert child.end() == 0, child.text()
     return outcome(folder / "runs")
 
 
 def kill_trials(folder: Path, kills: int, seed: int) -> tuple[int, list[str]]:
-    """Kills runs of all methods with all learners `kills` times in total.
-
-    The first six runs are of all methods and all learners, the seventh is an imitation; the first
-    25 are of all pairs and an imitation.
+    """Kills runs of all recipes `kills` times in total.
 
     Returns:
         The number of kills and the failures.
     """
     draw, done, failures, number = random.Random(seed), 0, [], 0
-    references: dict[tuple[str, str], dict[str, bytes]] = {}
-    most = min(8, max(1, kills // len(LEARNERS)))
-    names, cycle = [*LEARNERS], math.lcm(len(METHODS), len(LEARNERS))
-    recipes = [
-        (METHODS[n % len(METHODS)], names[(n + n // cycle) % len(names)])
-        for n in range(len(METHODS) * len(LEARNERS))
-    ]
-    recipes.insert(len(LEARNERS), ("maps", "imitation"))
+    most = min(8, max(1, kills // len(RECIPES)))
     while done < kills:
-        recipe = recipes[number % len(recipes)]
-        if recipe not in references:
-            references[recipe] = reference(*recipe, folder / f"reference_{'_'.join(recipe)}")
+        expected = reference(number, folder / f"reference_{number % len(RECIPES)}")
         here = folder / f"kill_{number}"
-        killed, new = kill_until_finished(*recipe, here, draw, min(kills - done, most))
-        if not new and outcome(here / "runs") != references[recipe]:
-            new = [f"{recipe}: the outcome differs from that of the uninterrupted run"]
+        killed, new = kill_until_finished(number, here, draw, min(kills - done, most))
+        if not new and outcome(here / "runs") != expected:
+            new = [f"{RECIPES[number % len(RECIPES)]}: differs from the uninterrupted run"]
         failures += new
         done, number = done + killed, number + 1
         shutil.rmtree(here)

@@ -11,7 +11,7 @@ from pathlib import Path
 from children import (
     EPISODES,
     HORIZON,
-    METHODS,
+    RECIPES,
     SMALL,
     Child,
     outcome,
@@ -21,9 +21,7 @@ from children import (
 )
 
 from emberlink.trainers.cli import main
-from emberlink.trainers.runs import checkpoint_file
-from emberlink.trainers.runs.checkpoints import step_of
-from emberlink.trainers.runs.run_folder import RunFolder
+from emberlink.trainers.runs.run_folder import NEWEST, RunFolder
 from emberlink.trainers.training.resume import resume
 
 
@@ -41,11 +39,11 @@ def command(arguments: list[str], before: Callable[[], None] = lambda: None):
 
 def signal_trial(number: int, folder: Path, draw: random.Random) -> list[str]:
     """Sends a signal at a random time of a training; returns the failures."""
-    method, output = draw.choice(METHODS), folder / "runs"
-    arguments = ["train", method, *SMALL, "episodes=100000", f"output={output}"]
+    (method, own), output = draw.choice(RECIPES[:3]), folder / "runs"
+    arguments = ["train", method, *SMALL, *own, "episodes=100000", f"output={output}"]
     child, failures = Child(command(arguments), folder), []
-    step = draw.randint(1, 30)
-    child.wait_for(lambda: any(step_of(p) >= step for p in output.rglob("state_*.safetensors")))
+    saved, step = output.glob, draw.randint(1, 30)
+    child.wait_for(lambda: any(RunFolder(p.parent).step() >= step for p in saved(f"*/{NEWEST}")))
     child.send(number)
     status, text = child.end(), child.text()
     (path,) = output.iterdir()
@@ -53,15 +51,13 @@ def signal_trial(number: int, folder: Path, draw: random.Random) -> list[str]:
         failures.append(f"exit status {status}")
     if f"resume with: emberlink train resume={path}" not in text or "Traceback" in text:
         failures.append(text)
-    newest, run = RunFolder(path).states()[-1], RunFolder(path)
-    header = checkpoint_file.read_header(newest)
-    lines = (path / "metrics.jsonl").read_bytes() if (path / "metrics.jsonl").exists() else b""
-    if header["sizes"][0]["metrics.jsonl"] != len(lines):
+    run = RunFolder(path)
+    if len(run.metrics()) != run.step() // HORIZON:
         failures.append("metrics.jsonl and the checkpoint are of different steps")
-    if step_of(run.checkpoint()) != header["step"] or temporary(path) or (path / "lock").exists():
+    if temporary(path) or (path / "lock").exists():
         failures.append(f"left: {sorted(p.name for p in path.rglob('*'))}")
     # With the smallest possible number of episodes, so that it ends soon.
-    done = -(-header["step"] // HORIZON)
+    done = -(-run.step() // HORIZON)
 
     def go_on(say: Callable[[str], None]) -> int:
         return not resume(path, method, [f"episodes={done}"]).train()
@@ -81,27 +77,25 @@ def full_disk_trial(folder: Path, draw: random.Random, *, mount: bool = False) -
         draw: random numbers for the size of the disk.
         mount: whether to mount a small file system (as root) or to limit the size of every file.
     """
-    method = draw.choice(METHODS)
-    undisturbed = folder.parent / f"undisturbed_{method}"
-    if not undisturbed.exists():
-        reference(method, "ddpg", undisturbed)
-    expected = outcome(undisturbed / "runs")
-    sizes = sorted(p.stat().st_size for p in undisturbed.rglob("state_*"))
+    method, own = RECIPES[0]
+    undisturbed = folder.parent / "reference_0"
+    expected = reference(0, undisturbed)
+    (size,) = (path.stat().st_size for path in undisturbed.rglob(NEWEST))
     output, failures = folder / "disk" / "runs", []
     output.mkdir(parents=True)
     if mount:
-        room = draw.randint(2 * sizes[0], 3 * sizes[0] + 60_000)
+        room = draw.randint(size, 2 * size + 60_000)
         subprocess.run(
             ["mount", "-t", "tmpfs", "-o", f"size={room}", "tmpfs", str(output)], check=True
         )
 
     def limited() -> None:
         if not mount:
-            room = draw.randint(sizes[0] - 9_000, sizes[0] - 300)
+            room = draw.randint(size // 2, size - 300)
             resource.setrlimit(resource.RLIMIT_FSIZE, (room, room))
 
     try:
-        arguments = ["train", method, *SMALL, f"episodes={EPISODES}", f"output={output}"]
+        arguments = ["train", method, *SMALL, *own, f"episodes={EPISODES}", f"output={output}"]
         child = Child(command(arguments, limited), folder)
         status, text = child.end(), child.text()
         (path,) = output.iterdir()
@@ -109,7 +103,7 @@ def full_disk_trial(folder: Path, draw: random.Random, *, mount: bool = False) -
         last = text.strip().splitlines()[-1]
         if status != 2 or "cannot be written" not in last or "Traceback" in text:
             failures.append(f"{status}: {text}")
-        good = str(run.states()[-1]) if run.states() else "there is no checkpoint yet"
+        good = str(run.newest) if run.newest.exists() else "there is no checkpoint"
         if good not in last or f"emberlink train resume={path}" not in last:
             failures.append(f"does not name the last good checkpoint: {last}")
         if temporary(path):
@@ -118,7 +112,7 @@ def full_disk_trial(folder: Path, draw: random.Random, *, mount: bool = False) -
             failures.append("half a line")
         if mount:
             subprocess.run(["mount", "-o", "remount,size=100m", str(output)], check=True)
-        again = Child(training(method, "ddpg", output), folder)
+        again = Child(training(0, output), folder)
         if again.end() != 0 or outcome(output) != expected:
             failures.append(f"cannot be resumed: {again.text()}")
     finally:

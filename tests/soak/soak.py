@@ -16,33 +16,10 @@ from pathlib import Path
 
 os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")
 
-from children import METHODS, SMALL, kill_trials
-from damage import damage_trials
+from children import kill_trials
 from ends import full_disk_trial, signal_trial
-from strangers import cache_trial, config_trial, planted_trial
-
-from emberlink.trainers.config.compose import resolve
-from emberlink.trainers.evaluation.policy import load_actor
-from emberlink.trainers.training.resume import resume
-from emberlink.trainers.training.trainer import Trainer
 
 Result = tuple[int, list[str]]
-
-
-def readable(folder: Path, method: str) -> list[tuple[Path, Callable[[Path], object]]]:
-    """Returns the state and the networks of a stopped run and their readers."""
-    trainer = Trainer(resolve(method, [*SMALL, "episodes=3", f"output={folder}"]))
-    trainer.start()
-    trainer.train(lambda progress: trainer.stop() if progress.step == 33 else None)
-    config = trainer.config
-
-    def resumed(path: Path) -> None:
-        resume(path).close()
-
-    def loaded(path: Path) -> None:
-        load_actor(config, path)
-
-    return [(trainer.run.states()[-1], resumed), (trainer.run.checkpoint(), loaded)]
 
 
 def trials(folder: Path, counts: dict[str, int], seed: int) -> dict[str, tuple[Callable, int]]:
@@ -56,22 +33,12 @@ def trials(folder: Path, counts: dict[str, int], seed: int) -> dict[str, tuple[C
 
         return many
 
-    def damaged(count: int) -> Result:
-        # The seed selects the method, so that consecutive seeds cover all four.
-        files = readable(folder / "damage", METHODS[seed % 4 - 1])
-        return damage_trials(files, count, seed)
-
     every = {
         "kill -9": lambda count: kill_trials(folder, count, seed),
         "SIGTERM": repeated(lambda here: signal_trial(signal.SIGTERM, here, draw)),
         "SIGINT": repeated(lambda here: signal_trial(signal.SIGINT, here, draw)),
         "file size limit": repeated(lambda here: full_disk_trial(here, draw)),
         "full file system": repeated(lambda here: full_disk_trial(here, draw, mount=True)),
-        "damaged checkpoint": damaged,
-        "links in a run folder": repeated(lambda here: planted_trial(here, draw, pipes=False)),
-        "pipes and devices": repeated(lambda here: planted_trial(here, draw, pipes=True)),
-        "changed bit in a cache": repeated(lambda here: cache_trial(here, draw)),
-        "changed digit in config.yaml": repeated(lambda here: config_trial(here, draw)),
     }
     return {name: (every[name], count) for name, count in counts.items() if count}
 
@@ -102,11 +69,6 @@ def main() -> int:
         "SIGINT": 50 // share,
         "file size limit": 50 // share,
         "full file system": 20 // share if os.geteuid() == 0 else 0,
-        "damaged checkpoint": 1000 // share,
-        "links in a run folder": 100 // share,
-        "pipes and devices": 100 // share,
-        "changed bit in a cache": 100 // share,
-        "changed digit in config.yaml": 100 // share,
     }
     print("| trial | how many | failures | seconds |\n|---|---|---|---|", flush=True)
     with tempfile.TemporaryDirectory() as folder:

@@ -8,11 +8,12 @@ import torch
 from tensordict import TensorDict
 from tiny_run import TINY
 
+from emberlink.trainers import train
 from emberlink.trainers.cli.main import main
 from emberlink.trainers.runs.run_folder import RunFolder
 from emberlink.trainers.terminal import signals
 from emberlink.trainers.terminal.signals import Interrupted, Interruption
-from emberlink.trainers.training.trainer import Trainer
+from emberlink.trainers.training.trainer import Progress, Trainer
 
 INT, TERM, HUP = signal.SIGINT, signal.SIGTERM, signal.SIGHUP
 USR1, USR2 = signal.SIGUSR1, signal.SIGUSR2
@@ -77,19 +78,30 @@ def test_a_signal_within_a_context_of_tensordict_is_not_an_error():
 
 @pytest.mark.parametrize("number", [USR1, USR2])
 def test_a_notice_saves_at_the_next_step(number, tmp_path, monkeypatch, capsys):
-    stopped = []
-    progress = Trainer._progress
+    due = Trainer._is_due
 
-    def step(self, **more):
-        if self.setup.step == 7:
+    def step(self, before, after):
+        if after == 7:
             os.kill(os.getpid(), number)
-            stopped.append(self.setup.step)
-        return progress(self, **more)
+        return due(self, before, after)
 
-    monkeypatch.setattr(Trainer, "_progress", step)
+    monkeypatch.setattr(Trainer, "_is_due", step)
     assert main(["train", "independent", *TINY, f"output={tmp_path}"]) == 128 + number
-    assert stopped == [7]
     (folder,) = tmp_path.iterdir()
-    (state,) = RunFolder(folder).states()
-    assert state.name == "state_000000007.safetensors"
+    assert RunFolder(folder).step() == 7
     assert f"resume with: emberlink train resume={folder}" in capsys.readouterr().out
+
+
+def test_ctrl_c_in_a_function_saves_and_restores_the_handler(tmp_path):
+    def press(progress: Progress) -> None:
+        if progress.step == 7:
+            os.kill(os.getpid(), INT)
+
+    before = signal.getsignal(INT)
+    short = {"episodes": 2, "horizon": 15, "num_envs": 2, "learner.batch_size": 8}
+    with pytest.raises(KeyboardInterrupt):
+        train("independent", output=str(tmp_path), progress=press, **short)
+    assert signal.getsignal(INT) is before
+    (folder,) = tmp_path.iterdir()
+    assert RunFolder(folder).step() == 7
+    assert not (folder / "lock").exists()

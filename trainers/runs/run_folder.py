@@ -46,17 +46,15 @@ class RunFolder:
     def __init__(self, path: Path | str):
         self.path = Path(path)
         for place, folders, files in os.walk(self.path):
-            # wandb makes links in its folder, which it replaces and nobody reads.
-            of_wandb = Path(place) == self.path / "wandb"
+            # wandb makes links in its folder; the tracker removes them before wandb writes there.
+            of_wandb = (self.path / "wandb") in (Path(place), *Path(place).parents)
             for name in (*folders, *files):
+                entry = Path(place, name)
                 with suppress(FileNotFoundError):  # a training has just removed it
-                    mode = os.lstat(os.path.join(place, name)).st_mode
-                    if stat.S_ISDIR(mode) or stat.S_ISREG(mode):
-                        continue
-                    if not (of_wandb and stat.S_ISLNK(mode)):
+                    if not _is_ordinary(entry) and not (of_wandb and entry.is_symlink()):
                         raise UserError(
-                            f"{os.path.join(place, name)}: a link, a pipe or a device; a run "
-                            "folder holds only folders and files"
+                            f"{entry}: a link, a pipe or a device; a run folder holds only folders "
+                            "and files"
                         )
 
     @classmethod
@@ -291,6 +289,13 @@ def without_time_and_seed(path: str) -> str:
     """Returns the path of a run without the time and the seed in a name that `create` has made."""
     made = re.fullmatch(r"\d{4}-\d\d-\d\d_\d\d-\d\d-\d\d_(.+)_s\d+(_\d+)?", Path(path).name)
     return str(Path(path).with_name(made[1])) if made else path
+
+
+def _is_ordinary(path: Path) -> bool:
+    """Returns whether a path is a folder or a regular file; the lock has no second name."""
+    about = path.lstat()
+    linked = path.name == "lock" and about.st_nlink > 1
+    return stat.S_ISDIR(about.st_mode) or (stat.S_ISREG(about.st_mode) and not linked)
 
 
 def _numbers(line: str) -> dict[str, Any]:

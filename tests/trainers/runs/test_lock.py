@@ -10,7 +10,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from test_resume import begun, until
+from test_resume import REPLAY, begun, until
 
 from emberlink.trainers.cli import main
 from emberlink.trainers.runs.lock import Lock
@@ -42,31 +42,17 @@ def other(tmp_path):
     process.wait()
 
 
-def test_the_second_process_is_refused_and_names_the_first(other, tmp_path):
+def test_the_second_process_is_refused_until_the_first_is_dead(other, tmp_path):
     with pytest.raises(ValueError, match=f"process {other.pid} on {socket.gethostname()}"):
         Lock(tmp_path)
-    assert (tmp_path / "lock").exists()
-
-
-def test_the_lock_of_a_dead_process_is_released(other, tmp_path):
     other.send_signal(signal.SIGKILL)
     other.wait()
     assert (tmp_path / "lock").exists()
     lock = Lock(tmp_path)
     assert str(os.getpid()) in (tmp_path / "lock").read_text()
     lock.release()
+    lock.release()
     assert not (tmp_path / "lock").exists()
-
-
-def test_a_reused_process_id_does_not_hold_the_lock(tmp_path):
-    """The file names a running process, this one, which holds no lock."""
-    (tmp_path / "lock").write_text(f"process {os.getpid()} on {socket.gethostname()}\n")
-    lock = Lock(tmp_path)
-    with pytest.raises(ValueError, match="is training here"):
-        Lock(tmp_path)
-    lock.release()
-    lock.release()
-    Lock(tmp_path).release()
 
 
 def test_a_lock_on_a_removed_file_is_not_held(tmp_path, monkeypatch):
@@ -87,35 +73,28 @@ def test_a_lock_on_a_removed_file_is_not_held(tmp_path, monkeypatch):
     second.release()
 
 
-@pytest.mark.parametrize("number", [errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP])
-def test_a_file_system_without_locks(number, tmp_path, monkeypatch):
+def test_a_file_system_without_locks(tmp_path, monkeypatch):
     def flock(handle: int, how: int) -> None:
-        raise OSError(number, os.strerror(number))
+        raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
 
     monkeypatch.setattr(fcntl, "flock", flock)
-    said = f"lock: cannot be locked: {os.strerror(number)}; the file system has no locks"
-    with pytest.raises(ValueError, match=said) as caught:
+    with pytest.raises(ValueError, match=r"lock: cannot be locked: .* has no locks"):
         Lock(tmp_path)
-    assert "\n" not in str(caught.value)
-
-
-def test_a_folder_that_cannot_be_locked(tmp_path):
-    with pytest.raises(ValueError, match=r"lock: cannot be locked"):
+    with pytest.raises(ValueError, match="lock: cannot be locked"):
         Lock(tmp_path / "missing")
 
 
 def test_two_trainings_in_one_folder(tmp_path, capsys):
-    trainer = until(begun("independent", tmp_path, "seeds=[1,2]"), 10)
+    run = until(begun("independent", tmp_path, *REPLAY), 10).run
     assert not list(tmp_path.rglob("lock"))
-    first = resume(trainer.run.path)
+    first = resume(run.path)
     try:
-        for run in first.runs:
-            before = {path: path.read_bytes() for path in run.path.rglob("*") if path.is_file()}
-            assert main.main(["train", f"resume={run.path}"]) == 2
-            error = capsys.readouterr().err
-            assert f"process {os.getpid()}" in error
-            assert error.count("\n") == 1
-            assert before == {p: p.read_bytes() for p in run.path.rglob("*") if p.is_file()}
+        before = {path: path.read_bytes() for path in run.path.rglob("*") if path.is_file()}
+        assert main.main(["train", f"resume={run.path}"]) == 2
+        error = capsys.readouterr().err
+        assert f"process {os.getpid()}" in error
+        assert error.count("\n") == 1
+        assert before == {p: p.read_bytes() for p in run.path.rglob("*") if p.is_file()}
     finally:
         first.close()
-    resume(trainer.run.path).close()
+    resume(run.path).close()

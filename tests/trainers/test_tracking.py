@@ -1,0 +1,407 @@
+"""Tests what trackers record, by reading their files, and that their failures end no training."""
+
+import csv
+import importlib
+import json
+import os
+import signal
+import socket
+import struct
+import subprocess
+import sys
+import threading
+import time
+import warnings
+from collections.abc import Callable, Collection, Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import pytest
+import wandb
+from tiny_run import PROGRAM
+from wandb.proto import wandb_internal_pb2
+
+from emberlink import trainers
+from emberlink.trainers import tracking
+from emberlink.trainers.cli import main
+from emberlink.trainers.config.compose import resolve, to_values
+from emberlink.trainers.runs.run_folder import RunFolder
+from emberlink.trainers.training.trainer import Progress, Trainer
+
+EPISODES = 4
+SHORT = {
+    "setup": "tuned",
+    "seed": 3,
+    "episodes": EPISODES,
+    "env.horizon": 8,
+    "env.num_uavs": 2,
+    "num_envs": 2,
+    "fire": "paper",
+    "learner.hidden": [8, 8],
+    "learner.batch_size": 8,
+    "evaluation.interval": 2,
+    "evaluation.interval_episodes": 1,
+    "evaluation.episodes": 1,
+    "evaluation.scripted": [],
+}
+ARGUMENTS = [f"{key}={value}" for key, value in SHORT.items()]
+
+
+@pytest.fixture(autouse=True)
+def _elsewhere(tmp_path, monkeypatch):
+    """Runs tests in an empty folder, without network and without settings of the user."""
+    monkeypatch.chdir(tmp_path)
+    for name in ("WANDB_CACHE_DIR", "WANDB_CONFIG_DIR", "WANDB_DATA_DIR"):
+        monkeypatch.setenv(name, str(tmp_path.parent / f"{tmp_path.name}-wandb"))
+    for name in ("MODE", "API_KEY", "BASE_URL", "PROJECT", "SILENT", "RUN_ID"):
+        monkeypatch.delenv(f"WANDB_{name}", raising=False)
+    connect = socket.socket.connect
+
+    def local_only(self, address):
+        host = address[0] if isinstance(address, tuple) else "local"
+        assert host in ("local", "127.0.0.1", "::1", "localhost"), address
+        return connect(self, address)
+
+    monkeypatch.setattr(socket.socket, "connect", local_only)
+    forget()
+    yield
+    for thread in threading.enumerate():
+        if thread.name == tracking.WANDB_TEARDOWN:
+            thread.join(30)
+    forget()
+
+
+def forget() -> None:
+    """Resets wandb, which reads its settings once per process."""
+    with suppress(Exception):
+        wandb.teardown()
+    os.environ.pop("WANDB_SERVICE", None)
+
+
+def command(logger: str, *more: str) -> RunFolder:
+    """Trains by the command and returns the run."""
+    arguments = ["train", "independent", *ARGUMENTS, f"logger={logger}", "output=runs", *more]
+    assert main.main(arguments) == 0
+    (folder,) = Path("runs").iterdir()
+    return RunFolder(folder)
+
+
+def means(run: RunFolder) -> dict[str, float]:
+    results = json.loads((run.path / "eval.json").read_text())["results"]
+    return {
+        f"test/{fire}/{name}": sum(values) / len(values)
+        for fire, by_policy in results.items()
+        for name, values in by_policy["learned"].items()
+    }
+
+
+def figures(run: RunFolder) -> set[str]:
+    return {f"figures/{file.stem}" for file in (run.path / "figures").glob("*.png")}
+
+
+def events_of(run: RunFolder) -> Any:
+    reader = importlib.import_module("tensorboard.backend.event_processing.event_accumulator")
+    events = reader.EventAccumulator(str(run.path / "tensorboard"))
+    events.Reload()
+    return events
+
+
+def scalars(run: RunFolder) -> dict[str, dict[int, float]]:
+    events = events_of(run)
+    return {
+        name: {event.step: event.value for event in events.Scalars(name)}
+        for name in events.Tags()["scalars"]
+    }
+
+
+def expected(run: RunFolder) -> dict[str, Any]:
+    """Returns the episodes and the evaluation of a run, name -> step -> approximate number."""
+    lines = run.metrics()
+    names = {name for line in lines for name in line}
+    table = {n: {line["episode"]: line[n] for line in lines if n in line} for n in names}
+    table |= {name: {len(lines): value} for name, value in means(run).items()}
+    return {name: pytest.approx(values, rel=1e-6) for name, values in table.items()}
+
+
+def records(file: Path) -> Iterator[wandb_internal_pb2.Record]:
+    """Yields the records of a .wandb file: LevelDB's log format after a header of 7 bytes."""
+    data, at, whole = file.read_bytes(), 7, b""
+    assert data[:4] in (b":W&B", b"")
+    while at + 7 <= len(data):
+        left = 32768 - at % 32768
+        if left < 7:  # no space for a header: the rest of the block is padding
+            at += left
+            continue
+        _, length, kind = struct.unpack("<IHB", data[at : at + 7])
+        if at + 7 + length > len(data):  # still being written
+            return
+        whole += data[at + 7 : at + 7 + length]
+        at += 7 + length
+        if kind in (1, 4):  # complete, or the last part
+            record = wandb_internal_pb2.Record()
+            record.ParseFromString(whole)
+            yield record
+            whole = b""
+
+
+def written(run: RunFolder) -> list[wandb_internal_pb2.Record]:
+    """Returns all records of a run, once wandb's process has written the last one."""
+    found = []
+    for file in sorted(run.path.rglob("*.wandb")):
+        end = time.monotonic() + 30
+        while not any(record.HasField("exit") for record in records(file)):
+            assert time.monotonic() < end, "the run's file was not finished"
+            time.sleep(0.05)
+        found += records(file)
+    return found
+
+
+def rows_of(run: RunFolder) -> list[dict[str, object]]:
+    """Returns the history of a wandb run in the order of logging."""
+    return [
+        {item.nested_key[0] or item.key: json.loads(item.value_json) for item in r.history.item}
+        for r in written(run)
+        if r.HasField("history")
+    ]
+
+
+def summary_of(run: RunFolder) -> dict[str, object]:
+    updates = [u for r in written(run) if r.HasField("summary") for u in r.summary.update]
+    return {u.key or "/".join(u.nested_key): json.loads(u.value_json) for u in updates}
+
+
+def test_wandb_has_every_episode_and_the_evaluation_in_its_summary(capfd):
+    run = command("wandb")
+    printed = capfd.readouterr()
+    assert "wandb" not in printed.out + printed.err
+    assert "WANDB_MODE" not in os.environ
+    history = rows_of(run)
+    assert [row["_step"] for row in history] == [1, 2, 3, 4]
+    for row, line in zip(history, run.metrics(), strict=True):
+        assert {k: v for k, v in row.items() if not k.startswith("_")} == line
+    summary = summary_of(run)
+    assert means(run).items() <= summary.items()
+    assert figures(run) <= summary.keys()
+    (about,) = (record.run for record in written(run) if record.HasField("run"))
+    assert about.project == "emberlink"
+    assert about.run_group == "tuned-paper"
+    assert sorted(about.tags) == ["independent", "seed-3"]
+    updates = [u for r in written(run) if r.HasField("config") for u in r.config.update]
+    settings = {u.key: json.loads(u.value_json) for u in updates if u.key != "_wandb"}
+    assert settings == json.loads(json.dumps(to_values(run.config())))
+    # The axis continues in the same run.
+    assert main.main(["train", f"resume={run.path}", "episodes=6"]) == 0
+    assert [row["_step"] for row in rows_of(run)] == [1, 2, 3, 4, 5, 6]
+    assert len({file.stem for file in run.path.rglob("*.wandb")}) == 1
+    assert means(run).items() <= summary_of(run).items()
+
+
+def test_the_id_and_the_mode_of_the_caller_are_respected(monkeypatch):
+    monkeypatch.setenv("WANDB_RUN_ID", "mine")
+    monkeypatch.setenv("WANDB_MODE", "offline")
+    before = {**os.environ}
+    short = {k: v for k, v in SHORT.items() if k not in ("setup", "fire")}
+    run = trainers.train("independent", setup="tuned", fire="paper", logger="wandb", **short)
+    after = {**os.environ}
+    after.pop("WANDB_SERVICE")  # of wandb itself
+    assert after == before
+    assert [file.name for file in run.path.rglob("*.wandb")] == ["run-mine.wandb"]
+    assert means(RunFolder(run.path)).items() <= summary_of(RunFolder(run.path)).items()
+    monkeypatch.setenv("WANDB_MODE", "disabled")
+    Path("runs").rename("before")
+    assert not [*command("wandb").path.rglob("*.wandb")]
+
+
+def test_tensorboard_shows_every_number_also_if_the_clock_is_behind():
+    run = command("tensorboard")
+    assert scalars(run) == expected(run)
+    assert set(events_of(run).Tags()["images"]) == figures(run)
+    for file in (run.path / "tensorboard").glob("events*"):
+        # TensorBoard reads files in the order of the times in their names.
+        start, stamp, rest = file.name.partition(file.name.split(".")[3])
+        file.rename(file.with_name(f"{start}{int(stamp) + 3600}{rest}"))
+    trainers.resume(run.path, episodes=6)
+    assert scalars(run) == expected(run)
+    assert scalars(run)["coverage"].keys() == {1, 2, 3, 4, 5, 6}
+
+
+def test_csv_has_a_table_for_each_number_also_after_a_resume():
+    run = command("csv")
+    trainers.resume(run.path, episodes=5)
+    folder = run.path / "csv" / "scalars"
+    tables = {
+        file.relative_to(folder).with_suffix("").as_posix(): {
+            int(step): float(value) for step, value in csv.reader(file.open())
+        }
+        for file in folder.rglob("*.csv")
+    }
+    assert tables == expected(run)
+
+
+def test_the_tracker_does_not_change_the_run():
+    command("csv", "output=runs")
+    (Path("runs")).rename("tracked")
+    plain = command("none")
+    (tracked,) = Path("tracked").glob("*/metrics.jsonl")
+    assert tracked.read_bytes() == (plain.path / "metrics.jsonl").read_bytes()
+
+
+def train(logger: str, folder: Path, watch: Callable[[Progress], None] = lambda _: None):
+    """Trains to the end and returns the warnings about the tracker."""
+    settings = [*ARGUMENTS, "evaluation.interval=0", f"logger={logger}", f"output={folder}"]
+    trainer = Trainer(resolve("independent", settings))
+    run = trainer.start()
+    began = time.monotonic()
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        assert trainer.train(watch)
+        trainer.close()
+    assert time.monotonic() - began < 30
+    assert [line["episode"] for line in run.metrics()] == [1, 2, 3, 4]
+    assert run.step() == EPISODES * 8
+    return [str(warning.message) for warning in caught if "logger=" in str(warning.message)]
+
+
+def only(messages: list[str], *words: str) -> None:
+    (message,) = messages
+    assert message.count("\n") == 0
+    for word in (*words, "training continues", "metrics.jsonl"):
+        assert word in message
+
+
+def fail() -> None:
+    raise OSError("No space\nleft on device\nnone at all")
+
+
+def leave() -> None:
+    raise SystemExit(1)
+
+
+def wait() -> None:
+    threading.Event().wait()
+
+
+@pytest.mark.parametrize("how", [fail, leave, wait])
+@pytest.mark.parametrize("stage", ["init", "log", "finish"])
+def test_a_tracker_that_fails_or_blocks(stage, how, tmp_path, monkeypatch):
+    class Fragile:
+        def __init__(self, *_: Any):
+            self.experiment, self.told = self, 0
+            self.at("init")
+
+        def at(self, now: str) -> None:
+            if now == stage:
+                how()
+
+        def log_metrics(self, _: dict, step: int) -> None:
+            self.told += 1
+            self.at("log")
+            assert stage != "log" or self.told == 1  # no calls after the failure
+
+        def close(self) -> None:
+            self.at("finish")
+
+    monkeypatch.setitem(tracking._LOGGERS, "csv", Fragile)
+    monkeypatch.setattr(tracking, "PATIENCE", 1.5)
+    said = {fail: "No space left", leave: "SystemExit", wait: "no answer within 1.5 s"}[how]
+    only(train("csv", tmp_path), "logger=csv", said)
+
+
+@pytest.mark.parametrize("logger", ["wandb", "tensorboard"])
+def test_a_missing_package_is_an_error_before_training(logger, monkeypatch, capsys):
+    monkeypatch.setattr(tracking, "find_spec", lambda name: None)
+    assert main.main(["train", "independent", *ARGUMENTS, f"logger={logger}"]) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert f"logger={logger}: {logger} is not installed: pip install" in error
+    assert not Path("runs").exists()
+
+
+def test_wandb_cannot_reach_its_server(tmp_path, monkeypatch):
+    """No server listens at port 9 of the local machine, and the key is invalid."""
+    monkeypatch.setenv("WANDB_MODE", "online")
+    monkeypatch.setenv("WANDB_BASE_URL", "http://127.0.0.1:9")
+    monkeypatch.setenv("WANDB_API_KEY", "0" * 40)
+    monkeypatch.setattr(tracking, "_CONNECTING", 1.0)
+    only(train("wandb", tmp_path), "logger=wandb")
+
+
+def services() -> set[int]:
+    """Returns the service processes of wandb that this process has started and that still run."""
+    found: set[int] = set()
+    for folder in Path("/proc").iterdir():
+        try:
+            about = (folder / "stat").read_text().rsplit(")", 1)[-1].split()
+            program = (folder / "cmdline").read_bytes()
+            if int(about[1]) == os.getpid() and about[0] != "Z" and b"wandb-core" in program:
+                found.add(int(folder.name))
+        except (OSError, IndexError, ValueError):
+            continue
+    return found
+
+
+def service(others: Collection[int] = ()) -> int:
+    """Returns the service process that wandb has started, or one of the others that it reuses."""
+    began = time.monotonic()
+    while (waited := time.monotonic() - began) < 20:
+        running = services()
+        if found := running - set(others) or (running if waited > 5 else None):
+            return found.pop()
+        time.sleep(0.02)
+    raise AssertionError("wandb has started no process")
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="needs Linux's /proc")
+@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGSTOP])
+def test_the_process_of_wandb_is_killed_or_stopped(how, tmp_path, monkeypatch):
+    struck: list[int] = []
+    before = services()  # that of an earlier test may still be ending
+    monkeypatch.setattr(tracking, "PATIENCE", 1.5)
+
+    def strike(progress: Progress) -> None:
+        if progress.step == 10:
+            time.sleep(1)  # it may still be starting
+            struck.append(service(before))
+            os.kill(struck[0], how)
+            time.sleep(0.3)
+
+    try:
+        only(train("wandb", tmp_path, strike), "logger=wandb")
+    finally:
+        for process in struck:
+            with suppress(ProcessLookupError):  # wandb may have waited for the killed one
+                os.kill(process, signal.SIGKILL)
+
+
+@pytest.mark.heavy
+def test_a_program_exits_normally_if_wandb_was_killed(tmp_path):
+    """Errors of wandb at the end of the program are not printed."""
+    program = (
+        "import os, signal, time\n"
+        "from test_tracking import service\n"
+        "from emberlink.trainers.training.trainer import Trainer\n"
+        "finish = Trainer._finish_episode\n"
+        "def strike(self, *rest):\n"
+        "    if self.setup.episode == 2:\n"
+        "        os.kill(service(), signal.SIGKILL)\n"
+        "        time.sleep(0.3)\n"
+        "    return finish(self, *rest)\n"
+        "Trainer._finish_episode = strike\n" + PROGRAM
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program, "train", "independent", *ARGUMENTS, "logger=wandb"],
+        capture_output=True,
+        text=True,
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), *sys.path])},
+        check=False,
+        timeout=100,
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stderr.count("logger=wandb has stopped") == 1, done.stderr
+    assert "Traceback" not in done.stderr
+    (folder,) = (tmp_path / "runs").iterdir()
+    assert (folder / "metrics.jsonl").read_text().count("\n") == EPISODES
+    assert (folder / "eval.json").exists()
