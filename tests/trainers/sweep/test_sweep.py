@@ -19,6 +19,7 @@ from emberlink.trainers.runs.run_folder import RunFolder
 from emberlink.trainers.sweep.combinations import combinations
 from emberlink.trainers.sweep.command import sweep
 from emberlink.trainers.sweep.executors.base import Executor, Task
+from emberlink.trainers.sweep.executors.registry import make
 
 SMALL = [
     "setup=tuned",
@@ -110,10 +111,10 @@ class Instant(Executor):
 
     workers = 2
 
-    def __init__(self, fails=(), most=9):
+    def __init__(self, fails=()):
         self.tasks: list[Task] = []
         self.cancelled: list[int] = []
-        self._fails, self._most = fails, most
+        self._fails = fails
 
     def submit(self, tasks):
         first = len(self.tasks)
@@ -232,6 +233,39 @@ def test_dry_run_and_status_print_states(tmp_path, capsys):
     lock.release()
     states = [line.split()[1:] for line in capsys.readouterr().out.splitlines()[2:5]]
     assert states == [["finished", "1/1"], ["unfinished", "0/15"], ["running", "0/15"]]
+
+
+OWN = """
+from test_sweep import Instant
+from emberlink.trainers.sweep.executors.local import LocalConfig
+
+
+class Pool(Instant):
+    config_type = LocalConfig
+
+    def __init__(self, config):
+        super().__init__()
+        self.workers = config.workers
+"""
+
+
+def test_an_executor_of_another_package(tmp_path, monkeypatch):
+    for name, text in {
+        "pool.py": OWN,
+        "pool-1.0.dist-info/METADATA": "Metadata-Version: 2.1\nName: pool\nVersion: 1.0\n",
+        "pool-1.0.dist-info/entry_points.txt": "[emberlink.executors]\npool = pool:Pool\n",
+        "mine/executor/pool.yaml": "workers: 1\nthreads: null\ngpus: null\n",
+    }.items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(text)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.setenv("EMBERLINK_CONFIGS", str(tmp_path / "mine"))
+    monkeypatch.setitem(sys.modules, "test_sweep", sys.modules[__name__])
+    monkeypatch.delitem(sys.modules, "pool", raising=False)
+    arguments = ["independent", *SMALL, f"output={tmp_path}/runs", "seed=0,1", "executor=pool"]
+    assert main(["sweep", *arguments, "executor.workers=2"]) == 0
+    assert all(run.evaluated() for run in folders_in(tmp_path / "runs"))
+    assert make(["executor=pool"]).workers == 1
 
 
 TRAINED = [*SMALL, "evaluation.scripted=[]", "evaluation.huygens=false", "checkpoint_steps=40"]
