@@ -1,5 +1,6 @@
 """Builds environments, networks and learners from a configuration."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -73,7 +74,7 @@ def build_env(
     *,
     num_envs: int,
     fire: str | ScenarioConfig | Tensor,
-    seed: int | None,
+    seed: int | Sequence[int] | None,
     device: torch.device | str,
     true_map: bool = False,
     teacher: str | None = None,
