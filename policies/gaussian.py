@@ -64,7 +64,8 @@ class GaussianExplorer(Stateful):
     def __init__(self, actor: GaussianActor, generator: torch.Generator):
         super().__init__()
         self.actor, self.generator, self.uavs, self.carries = actor, generator, actor.uavs, {}
-        self.in_keys, self.out_keys = actor.in_keys, [*actor.out_keys, LOG_PROB]
+        writes: list[Any] = [*actor.out_keys, LOG_PROB]
+        self.in_keys, self.out_keys = list[Any](actor.in_keys), writes
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         mean = self.actor.mean(tensordict)

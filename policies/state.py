@@ -25,7 +25,7 @@ class Stateful(TensorDictModuleBase):
 
     uavs: int
     """number of UAVs"""
-    carries: dict[Key, int]
+    carries: dict[Any, int]
     """key -> size of what this part itself carries"""
 
     def make_tensordict_primer(self) -> TensorDictPrimer:
@@ -64,5 +64,5 @@ def primer_of(policy: nn.Module) -> TensorDictPrimer:
         for part in parts
         for (_, name), size in part.carries.items()
     }
-    agents = {keys.AGENTS: Composite(specs, shape=(parts[0].uavs,))} if specs else {}
+    agents = {keys.AGENTS: Composite(specs, shape=torch.Size([parts[0].uavs]))} if specs else {}
     return TensorDictPrimer(Composite(agents), expand_specs=True)

@@ -154,7 +154,8 @@ class Imitation(Learner):
             if missing and self.decisions % self.context.horizon:
                 continue
             parts: Any = [*self._recent, *[decision] * missing]
-            agents: Any = torch.cat(parts, 1).get(keys.AGENTS)
+            whole: Any = torch.cat(parts, 1)
+            agents = whole.get(keys.AGENTS)
             alive = agents.get("alive", torch.ones(agents.shape, dtype=torch.bool)).clone()
             alive[:, len(self._recent) :] = False
             rows = {name: value.transpose(1, 2) for name, value in agents.items()}

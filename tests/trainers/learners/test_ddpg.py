@@ -10,9 +10,10 @@ from torchrl.data import Bounded, Composite, Unbounded
 
 from emberlink.envs import keys
 from emberlink.policies.exploration import ExplorationConfig
+from emberlink.policies.settings import PolicyConfig
 from emberlink.trainers.learners.base import LearnerContext
 from emberlink.trainers.learners.ddpg import DDPG, DDPGConfig
-from emberlink.trainers.learners.replay import DONE, TERMINATED
+from emberlink.trainers.learners.replay import DONE, TERMINATED, to_rows
 
 UAVS, FEATURES, ACTIONS, HIDDEN, BATCH = 3, 9, 3, (16, 12), 24
 RATES = {
@@ -24,7 +25,7 @@ RATES = {
 }
 
 
-def make_learner() -> DDPG:
+def make_learner(*, index=False, shared_replay=False, **more) -> DDPG:
     observation = Composite({keys.OBSERVATION: Unbounded((1, UAVS, FEATURES))}, shape=(1,))
     action = Composite({keys.ACTION: Bounded(-1, 1, (1, UAVS, ACTIONS))}, shape=(1,))
     config = DDPGConfig(
@@ -34,7 +35,7 @@ def make_learner() -> DDPG:
         batch_size=BATCH,
         buffer_size=100,
         exploration=ExplorationConfig(theta=0.2, sigma=0.15, dt=0.01),
-        **RATES,
+        **{**RATES, **more},
     )
     context = LearnerContext(
         observation_spec=observation,
@@ -42,7 +43,8 @@ def make_learner() -> DDPG:
         num_uavs=UAVS,
         num_envs=1,
         seed=5,
-        shared_replay=False,
+        shared_replay=shared_replay,
+        policy=PolicyConfig(agent_index=index),
         total_steps=100,
         device="cpu",
     )
@@ -100,10 +102,11 @@ def single(learner: DDPG, uav: int) -> SingleDDPG:
     return SingleDDPG(actor, critic, **RATES)
 
 
+@pytest.mark.parametrize("critic", ["own", "team"])
 @pytest.mark.parametrize("which", ["actor", "critic"])
 @pytest.mark.parametrize("uav", range(UAVS))
-def test_gradients_of_uavs_are_independent(which, uav):
-    learner = make_learner()
+def test_gradients_of_uavs_are_independent(which, uav, critic):
+    learner = make_learner(critic=critic)
     learner.losses(make_batch(0))[which][uav].backward()
     trained = {"actor": "actor_network_params", "critic": "value_network_params"}
     for place, network in trained.items():
@@ -193,3 +196,58 @@ def test_the_time_limit_is_bootstrapped(terminated):
     assert beyond.abs().min() > 1e-4
     target = batch["next", *keys.REWARD] + (0 if terminated else 0.95 * beyond)
     torch.testing.assert_close(losses, (value - target).square()[0, :, 0], atol=1e-5, rtol=1e-5)
+
+
+def test_the_losses_of_team_critics_are_those_of_maddpg():
+    """A UAV's critic reads the team's observations and actions, its own first."""
+    learner = make_learner(critic="team")
+    for seed in range(3):
+        learner.update(make_batch(seed))
+    batch, stacks, orders = make_batch(9), networks(learner), [[0, 1, 2], [1, 2, 0], [2, 0, 1]]
+    following, taken = batch["next"], batch[keys.ACTION]
+    own = stacks["actor"](batch[keys.OBSERVATION])
+    after = stacks["target_actor"](following[keys.OBSERVATION])
+    losses = learner.losses(batch)
+    for uav, order in enumerate(orders):
+        wide = SingleCritic(UAVS * FEATURES, UAVS * ACTIONS, HIDDEN)
+        critic = copy_uav(stacks["value"], wide, uav)
+        seen = batch[keys.OBSERVATION][:, order].flatten(1)
+        acted = torch.cat((own[:, uav], taken[:, order[1:]].flatten(1)), -1)
+        value = critic(seen, taken[:, order].flatten(1))
+        expected = -critic(seen, acted).mean()
+        torch.testing.assert_close(losses["actor"][uav], expected, rtol=1e-4, atol=1e-5)
+        critic = copy_uav(stacks["target_value"], wide, uav)
+        beyond = critic(following[keys.OBSERVATION][:, order].flatten(1), after[:, order].flatten(1))
+        target = following[keys.REWARD][:, uav] + RATES["gamma"] * beyond
+        expected = (value - target).square().mean()
+        torch.testing.assert_close(losses["critic"][uav], expected, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("own", [True, False])
+def test_which_uavs_transitions_a_shared_network_learns_from(own):
+    """A network that reads the index of a UAV learns from the column of that UAV."""
+    learner = make_learner(share_parameters=True, index=own, shared_replay=True)
+    rows = torch.arange(float(UAVS)).view(1, 1, UAVS, 1)
+    flags = torch.zeros(1, 30, 1, dtype=torch.bool)
+    agents = {"observation": rows.expand(1, 30, UAVS, FEATURES)}
+    after = {**agents, "reward": rows.expand(1, 30, UAVS, 1)}
+    following = {keys.AGENTS: after, "done": flags, "terminated": flags.clone()}
+    agents = {**agents, "action": rows.expand(1, 30, UAVS, ACTIONS)}
+    learner.replay.extend(
+        to_rows(TensorDict({keys.AGENTS: agents, "next": following}, [1, 30]), learner.context)
+    )
+    drawn = learner.replay.sample()["action"][..., 0]
+    share = (drawn == torch.arange(float(UAVS))).float().mean()
+    assert share == 1 if own else 0.1 < share < 0.7
+
+
+def test_a_warm_start_moves_the_actors_and_their_targets():
+    learner, other = make_learner(), make_learner(share_parameters=False)
+    other.update(make_batch(0))
+    learner.start_from(other.weights())
+    stacks, theirs = networks(learner), networks(other)
+    for name in ("actor", "target_actor"):
+        for mine, of_other in zip(
+            stacks[name].parameters(), theirs["actor"].parameters(), strict=True
+        ):
+            assert mine.equal(of_other)

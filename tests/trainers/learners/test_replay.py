@@ -7,32 +7,37 @@ from torchrl.data import Composite, Unbounded
 
 from emberlink.envs import keys
 from emberlink.trainers import make_env
-from emberlink.trainers.learners.base import LearnerContext
-from emberlink.trainers.learners.nan_guard import NonFiniteGuard
-from emberlink.trainers.learners.off_policy.replay_buffer import (
+from emberlink.trainers.learners.base import LearnerContext, mean_over_batch
+from emberlink.trainers.learners.replay import (
     DONE,
     TERMINATED,
-    ReplayMemory,
+    TeamReplay,
+    UavSampler,
+    to_batch,
     to_rows,
 )
 
 UAVS = 4
 
 
-def memory(*, shared: bool, capacity: int = 4000, batch: int = 64, most: int = 10**9, uavs=UAVS):
+def context(*, shared: bool, most: int = 10**9, uavs=UAVS, failures=False) -> LearnerContext:
     spec = Composite({keys.OBSERVATION: Unbounded((1, uavs, 2))}, shape=(1,))
-    context = LearnerContext(
+    return LearnerContext(
         observation_spec=spec,
         action_spec=spec,
         num_uavs=uavs,
         num_envs=1,
-        seeds=(0,),
+        seed=0,
         shared_replay=shared,
         total_steps=most,
-        guard=NonFiniteGuard("cpu"),
         device="cpu",
+        failures=failures,
     )
-    return ReplayMemory(context, batch_size=batch, buffer_size=capacity)
+
+
+def memory(*, capacity: int = 4000, batch: int = 64, **about) -> TeamReplay:
+    draws = torch.Generator().manual_seed(0)
+    return TeamReplay(context(**about), draws, batch_size=batch, buffer_size=capacity)
 
 
 def labelled(first: int, count: int, uavs: int = UAVS) -> TensorDict:
@@ -53,12 +58,12 @@ def labelled(first: int, count: int, uavs: int = UAVS) -> TensorDict:
 
 def drawn(buffer, samples: int) -> torch.Tensor:
     """Returns (row, UAV) of the transitions in many samples, [draws, uavs, 2]."""
-    return torch.cat([buffer.sample()[keys.OBSERVATION] for _ in range(samples)]).long()
+    return torch.cat([buffer.sample()["observation"] for _ in range(samples)]).long()
 
 
 def test_private_memory_samples_transitions_of_the_same_uav():
     buffer = memory(shared=False)
-    buffer.extend_rows(labelled(0, 50))
+    buffer.extend(labelled(0, 50))
     sample = drawn(buffer, 40)
     assert sample.shape == (40 * 64, UAVS, 2)
     assert (sample[..., 1] == torch.arange(UAVS)).all()
@@ -69,7 +74,7 @@ def test_private_memory_samples_transitions_of_the_same_uav():
 
 def test_shared_memory_samples_all_uavs_equally():
     buffer = memory(shared=True)
-    buffer.extend_rows(labelled(0, 50))
+    buffer.extend(labelled(0, 50))
     sample = drawn(buffer, 200)
     for reader in range(UAVS):
         whose = sample[:, reader, 1].bincount(minlength=UAVS) / len(sample)
@@ -82,7 +87,7 @@ def test_shared_memory_samples_all_uavs_equally():
 @pytest.mark.parametrize("shared", [False, True])
 def test_uavs_sample_independently(shared):
     buffer = memory(shared=shared)
-    buffer.extend_rows(labelled(0, 1000))
+    buffer.extend(labelled(0, 1000))
     rows = drawn(buffer, 1)[..., 0]
     for other in range(1, UAVS):
         assert (rows[:, 0] == rows[:, other]).float().mean() < 0.1
@@ -92,8 +97,8 @@ def test_uavs_sample_independently(shared):
 @pytest.mark.parametrize("shared", [False, True])
 def test_samples_are_stored_transitions(shared):
     buffer = memory(shared=shared)
-    buffer.extend_rows(labelled(0, 300))
-    sample = buffer.sample()
+    buffer.extend(labelled(0, 300))
+    sample = to_batch(buffer.sample())
     assert sample.batch_size == (64,)
     label, following = sample[keys.OBSERVATION], sample["next"]
     assert sample[keys.ACTION].equal(-label)
@@ -114,7 +119,7 @@ def test_capacity_counts_uav_transitions():
 def test_the_oldest_transitions_are_overwritten(shared, rows):
     buffer = memory(shared=shared, capacity=40, batch=500)
     for first in range(0, 100, 5):
-        buffer.extend_rows(labelled(first, 5))
+        buffer.extend(labelled(first, 5))
     assert len(buffer) == rows
     assert drawn(buffer, 2)[..., 0].unique().tolist() == list(range(100 - rows, 100))
 
@@ -129,7 +134,8 @@ def test_a_full_batch_is_counted_in_transitions(uavs, shared, rows):
 def test_rows_are_the_transitions_of_the_environment():
     env = make_env("consensus", num_envs=2, horizon=3, num_uavs=UAVS)
     rollout = env.rollout(3, break_when_any_done=False)
-    rows = to_rows(rollout, 1, [keys.OBSERVATION])
+    rows = to_rows(rollout, context(shared=False))
+    assert "alive" not in rows
     assert rows.batch_size == (6, UAVS)
     for at in range(6):
         step = rollout[at // 3, at % 3]
@@ -143,57 +149,47 @@ def test_rows_are_the_transitions_of_the_environment():
         assert not row["next", "terminated"].any()
 
 
-@pytest.mark.parametrize("shared", [False, True])
-def test_memory_of_a_million_transitions(shared):
-    """A transition has two observations, action, reward and two flags."""
-    buffer = memory(shared=shared, capacity=1_000_000, uavs=6)
-    row = to_rows(make_env("consensus", horizon=2).rollout(1), 1, [keys.OBSERVATION])
-    buffer.extend_rows(row)
-    transitions = 1_000_002 if shared else 6_000_000  # rows of six
-    assert len(buffer._buffer.storage._storage) * 6 == transitions
-    numbers = 4 * (9 + 9 + 3 + 1) * transitions
-    assert buffer._buffer.storage._storage.bytes() <= 1.2 * numbers
-
-
-def test_several_tensors_of_any_shape_are_stored():
-    """Stores a vector and a window of bits, for two seeds of two environments."""
-    observation, window = (keys.AGENTS, "observation"), (keys.AGENTS, "window")
-    agents = {
-        "observation": torch.rand(4, 3, UAVS, 6),
-        "window": torch.rand(4, 3, UAVS, 3, 5, 5) < 0.5,
-        "action": torch.rand(4, 3, UAVS, 3),
-    }
-    following = {
-        keys.AGENTS: {name: agents[name].clone() for name in ("observation", "window")}
-        | {"reward": torch.rand(4, 3, UAVS, 1)},
-        "done": torch.zeros(4, 3, 1, dtype=torch.bool),
-        "terminated": torch.zeros(4, 3, 1, dtype=torch.bool),
-    }
-    rollout = TensorDict({keys.AGENTS: agents, "next": following}, batch_size=[4, 3])
-    rows = to_rows(rollout, 2, [observation, window])
-    assert rows["window"].shape == (6, 2 * UAVS, 3, 5, 5)
-    assert rows["window"].dtype == torch.bool
-    # Row 4 is the second environment's second step; the second seed's UAVs come last.
-    assert rows["window"][4, UAVS:].equal(agents["window"][3, 1])
-    assert rows["next", "window"][4, :UAVS].equal(agents["window"][1, 1])
-    assert rows["next", "reward"][2].equal(
-        torch.cat([following[keys.AGENTS]["reward"][seed, 2] for seed in (0, 2)])
-    )
-
-
 @pytest.mark.parametrize("written", [20, 40, 55])
 def test_a_restored_memory_samples_like_the_saved_one(written):
-    def filled(rows: int) -> ReplayMemory:
+    def filled(rows: int) -> TeamReplay:
         buffer = memory(shared=False, capacity=40, batch=10)
         for first in range(rows):
-            buffer.extend_rows(labelled(first, 1))
+            buffer.extend(labelled(first, 1))
         return buffer
 
     saved, restored = filled(written), memory(shared=False, capacity=40, batch=10)
-    saved.sample()
     restored.load_state_dict({name: value.clone() for name, value in saved.state_dict().items()})
     for buffer in (saved, restored):
         for first in range(written, written + 15):
-            buffer.extend_rows(labelled(first, 1))
+            buffer.extend(labelled(first, 1))
     assert (saved.sample() == restored.sample()).all()
     assert len(saved) == len(restored)
+
+
+def test_rows_say_who_was_alive_after_a_step():
+    env = make_env("independent", world="blackout", num_envs=2, seed=0, num_train_fires=2)
+    first = env.reset()
+    env.base_env._fail_step.copy_(torch.arange(12).view(2, 6))
+    rollout = env.rollout(3, auto_reset=False, tensordict=first)
+    rows = to_rows(rollout, context(shared=False, uavs=6, failures=True))
+    assert rows["alive"].equal(rollout["next", "agents", "alive"].flatten(0, 1))
+    assert not rows["alive"].all()
+
+
+def test_failed_uavs_do_not_count_in_losses():
+    loss = torch.tensor([[1.0, 10.0], [3.0, 20.0], [100.0, 30.0]])
+    alive = torch.tensor([[True, False], [True, False], [False, False]])
+    assert mean_over_batch(loss, alive).tolist() == [2, 0]
+    assert mean_over_batch(loss, None).tolist() == loss.mean(0).tolist()
+
+
+@pytest.mark.parametrize("shared", [False, True])
+def test_a_joint_sample_has_the_same_rows_for_all_uavs(shared):
+    """With a shared buffer, the columns are rolled."""
+    sampler = UavSampler(4, torch.Generator().manual_seed(0), shared=shared, joint=True)
+    (rows, columns), _ = sampler.sample(range(100), 300)
+    assert rows.eq(rows[:, :1]).all()
+    assert rows.unique().numel() > 90
+    turned = (columns - torch.arange(4)) % 4
+    assert turned.eq(turned[:, :1]).all()
+    assert turned.unique().tolist() == ([0, 1, 2, 3] if shared else [0])
