@@ -6,23 +6,17 @@ from typing import Any
 
 import pytest
 import torch
+from tensordict import TensorDict
 from torch import Tensor
-from torchrl.envs import ExplorationType, check_env_specs, set_exploration_type
+from torchrl.envs import check_env_specs
+from torchrl.modules import PopArtValueNorm
+from torchrl.objectives.value import MultiAgentGAE
 
 from emberlink.envs import keys
-from emberlink.envs.utils.errors import UserError
 from emberlink.policies.gaussian import LOG_PROB
 from emberlink.trainers import make_env
 from emberlink.trainers.config.compose import resolve
-from emberlink.trainers.learners.nan_guard import row_norms
-from emberlink.trainers.learners.on_policy.advantages import Advantages
-from emberlink.trainers.learners.on_policy.proximal import (
-    ADVANTAGE,
-    RETURN,
-    VALUE,
-    clip_by_row,
-    mean_of_uavs,
-)
+from emberlink.trainers.learners.ppo import ADVANTAGE, RETURN, VALUE, clip_by_row
 from emberlink.trainers.training.setup import TrainingSetup
 
 LEARNERS = ["ippo", "mappo"]
@@ -36,30 +30,9 @@ def made(learner: str, *more: str, method: str = "consensus") -> TrainingSetup:
     return TrainingSetup(resolve(method, ["setup=tuned", f"learner={learner}", *SMALL, *more]))
 
 
-@pytest.mark.parametrize(
-    ("learner", "shared", "actor", "critic"),
-    [
-        *[(learner, "true", 22, 22) for learner in LEARNERS],
-        ("ippo", "false", 66, 66),
-        ("mappo", "false", 66, 22),  # one critic per team
-    ],
-)
-def test_a_loss_is_a_mean_over_the_uavs_of_a_network(learner, shared, actor, critic):
-    setup = made(learner, f"learner.share_parameters={shared}", "seeds=[0,1]")
-    loss = torch.tensor([1.0, 2.0, 3.0, 10.0, 20.0, 30.0])
-    trained: Any = setup.learner
-    assert trained._of_networks("actor", loss).item() == actor
-    assert trained._of_networks("critic", loss).item() == critic
-
-
-def test_actions_have_no_noise_if_exploration_is_off():
-    setup = made("ippo")
-    td = setup.env.reset()
-    with set_exploration_type(ExplorationType.DETERMINISTIC):
-        explored = setup.learner.explorer(td.clone())
-    learner: Any = setup.learner
-    assert explored[keys.ACTION].equal(learner.actor(td.clone())[keys.ACTION])
-    assert not setup.learner.explorer(td.clone())[keys.ACTION].equal(explored[keys.ACTION])
+def estimating(gamma: float, lam: float, *more: str) -> Any:
+    """Returns a learner whose advantages have a discount and a lambda."""
+    return made("ippo", f"learner.gamma={gamma}", f"learner.gae_lambda={lam}", *more).learner
 
 
 def column(*values: float) -> Tensor:
@@ -69,9 +42,9 @@ def column(*values: float) -> Tensor:
 
 def test_advantages_of_two_decisions_that_the_horizon_truncates():
     """With a discount of 0.5 and lambda 0.5; the last observation has the value 8."""
-    estimator = Advantages(0.5, 0.5, (1, 1), "cpu")
+    estimator = estimating(0.5, 0.5)
     alive = torch.tensor([[[True], [True]]])
-    advantage, returns = estimator.estimate(column(2, 4, 8), column(1, 3), alive)
+    advantage, returns = estimator.advantages(column(2, 4, 8), column(1, 3), alive)
     # Temporal differences: 1 + 0.5 * 4 - 2 = 1, and 3 + 0.5 * 8 - 4 = 3.
     # Advantages: 1 + 0.25 * 3 = 1.75, and 3. Returns: 3.75 and 7, whose deviation is 1.625.
     assert estimator.spread.item() == pytest.approx(1.625)
@@ -80,9 +53,9 @@ def test_advantages_of_two_decisions_that_the_horizon_truncates():
 
 
 def test_values_are_in_units_of_the_earlier_spread():
-    estimator = Advantages(0.5, 0.5, (1, 1), "cpu")
+    estimator = estimating(0.5, 0.5)
     estimator.spread.fill_(2.0)
-    _, returns = estimator.estimate(column(1, 2, 4), column(1, 3), None)
+    _, returns = estimator.advantages(column(1, 2, 4), column(1, 3), None)
     spread = 0.9 * 2 + 0.1 * 1.625
     assert estimator.spread.item() == pytest.approx(spread)
     assert returns.flatten().tolist() == pytest.approx([3.75 / spread, 7 / spread])
@@ -93,40 +66,13 @@ def test_a_failure_ends_what_is_learnt_before_it():
     alive = torch.tensor([[[True], [True], [False], [False]]])
     estimates = []
     for after in (0.0, 100.0):
-        estimator = Advantages(0.5, 0.5, (1, 1), "cpu")
+        estimator = estimating(0.5, 0.5)
         value, reward = column(2, 4, 8, after, after), column(1, 3, after, after)
-        estimates.append([x[:, :2] for x in estimator.estimate(value, reward, alive)])
+        estimates.append([x[:, :2] for x in estimator.advantages(value, reward, alive)])
         assert estimator.spread.item() == pytest.approx(1.625)
     for first, second in zip(*estimates, strict=True):
         assert first.equal(second)
     assert estimates[0][0].flatten().tolist() == pytest.approx([-1, 1])
-
-
-@pytest.mark.parametrize("networks", [1, 2])
-def test_every_network_of_every_seed_has_its_own_scale(networks):
-    estimator = Advantages(0.9, 0.8, (2, networks), "cpu")
-    generator = torch.Generator().manual_seed(0)
-    value, reward = (torch.randn(6, n, 2, 1, generator=generator) for n in (5, 4))
-    reward[3:] *= 10
-    advantage, returns = estimator.estimate(value, reward, None)
-    assert estimator.spread.shape == (2, networks)
-    for seed in range(2):
-        envs = slice(3 * seed, 3 * seed + 3)
-        for network in range(networks):
-            uavs = slice(None) if networks == 1 else slice(network, network + 1)
-            alone = Advantages(0.9, 0.8, (1, 1), "cpu")
-            expected = alone.estimate(value[envs][:, :, uavs], reward[envs][:, :, uavs], None)
-            assert estimator.spread[seed, network].item() == pytest.approx(alone.spread.item())
-            torch.testing.assert_close(advantage[envs][:, :, uavs], expected[0])
-            torch.testing.assert_close(returns[envs][:, :, uavs], expected[1])
-
-
-def test_losses_are_means_over_the_decisions_in_flight():
-    loss = torch.tensor([[[1.0, 2.0], [3.0, 4.0]], [[5.0, 6.0], [7.0, 8.0]]])
-    assert mean_of_uavs(loss, None, 1).tolist() == [4, 5]
-    assert mean_of_uavs(loss, None, 2).tolist() == [2, 3, 6, 7]
-    alive = torch.tensor([[[True, False], [True, False]], [[False, False], [True, True]]])
-    assert mean_of_uavs(loss, alive, 1).tolist() == pytest.approx([11 / 3, 8])
 
 
 def test_gradients_are_shortened_per_row():
@@ -151,26 +97,11 @@ def test_the_first_update_knows_the_density_of_the_actions(learner):
     setup = made(learner, "env.horizon=12")
     batch = first_batches(setup)[0]
     loss: Any = setup.learner
-    log_prob = loss.loss._get_cur_log_prob(batch.copy().auto_batch_size_(2))[0]
-    torch.testing.assert_close(log_prob, batch[LOG_PROB], rtol=1e-4, atol=1e-4)
+    ratio = loss.loss(batch.copy())["mean_ratio"]
+    torch.testing.assert_close(ratio, torch.ones(()), rtol=1e-4, atol=1e-4)
     actor_loss = setup.learner.losses(batch)["actor"]
     expected = -batch[ADVANTAGE][..., 0].mean((0, 1))
     torch.testing.assert_close(actor_loss, expected, rtol=1e-3, atol=1e-4)
-
-
-def test_a_pass_uses_every_episode_once_in_an_order_of_the_seed():
-    settings = ["num_envs=6", "learner.minibatches=4", "learner.epochs=2"]
-    both = first_batches(made("ippo", *settings, "seeds=[3,4]"))
-    torch.manual_seed(1)
-    alone = first_batches(made("ippo", *settings, "seed=4"))
-    assert [len(batch) for batch in both] == [4, 4, 2, 2] * 2
-    assert [len(batch) for batch in alone] == [2, 2, 1, 1] * 2
-    for batch, single in zip(both, alone, strict=True):
-        for key in (keys.ACTION, RETURN):
-            torch.testing.assert_close(batch[key][len(single) :], single[key])
-    returns = [torch.cat([x[RETURN] for x in alone[k : k + 4]]) for k in (0, 4)]
-    orders = [r.flatten(1).sum(1) for r in returns]
-    assert orders[0].sort().values.equal(orders[1].sort().values)
 
 
 @pytest.mark.parametrize("learner", LEARNERS)
@@ -184,15 +115,14 @@ def test_returns_do_not_depend_on_the_number_of_minibatches(learner):
 
 
 @pytest.mark.parametrize("learner", LEARNERS)
-def test_the_learning_rate_falls_to_zero_and_can_be_scaled(learner):
+def test_the_learning_rate_falls_to_zero(learner):
     setup = made(learner, "learner.lr=0.5")
     (entry,) = setup.learner.optimizer.param_groups  # pyright: ignore[reportAttributeAccessIssue]
     rates = []
-    for episode in range(4):
-        setup.learner.scale_lr(0.5 if episode == 2 else 1.0)
+    for _ in range(4):
         setup.dry_run(12)
         rates.append(entry["lr"])
-    assert rates == pytest.approx([0.5, 0.375, 0.125, 0.125])
+    assert rates == pytest.approx([0.5, 0.375, 0.25, 0.125])
 
 
 @pytest.mark.parametrize("learner", LEARNERS)
@@ -219,21 +149,9 @@ def test_uavs_without_shared_weights_learn_alone():
     batch = first_batches(setup)[0]
     learner: Any = setup.learner
     learner.losses(batch)["actor"][1].backward()
-    gradient = learner.parameters["actor.memory.state_weight"].grad
+    gradient = learner.actor.module.memory.state_weight.grad
     assert gradient[1].any()
     assert not gradient[[0, 2]].any()
-
-
-@pytest.mark.parametrize("learner", LEARNERS)
-def test_a_run_without_memory_or_with_a_stack_learns_too(learner):
-    for kind in ("none", "stack"):
-        setup = made(learner, f"policy.memory={kind}", "env.observation=window")
-        before = {name: value.clone() for name, value in setup.learner.weights().items()}
-        setup.dry_run(12)
-        assert setup.learner.updates == 16
-        assert not setup.guard.poll(wait=True)
-        for name, value in setup.learner.weights().items():
-            assert not value.equal(before[name]), name
 
 
 def test_only_mappos_critic_reads_the_true_map():
@@ -260,35 +178,6 @@ def test_only_mappos_critic_reads_the_true_map():
     assert learner.losses(batch)["actor"].equal(learner.losses(changed)["actor"])
 
 
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        (["learner=ippo", "env.horizon=15", "policy.hold=10"], "env.horizon=15: must be a"),
-    ],
-)
-def test_what_does_not_fit_is_refused(settings, message):
-    with pytest.raises(UserError) as error:
-        TrainingSetup(resolve("independent", settings))
-    assert str(error.value).startswith(message)
-    assert "\n" not in str(error.value)
-
-
-@pytest.mark.parametrize(
-    ("setting", "message"),
-    [
-        ("learner.clip=1.5", "learner.clip=1.5: should be less than 1"),
-        ("learner.gae_lambda=2.0", "learner.gae_lambda=2.0: should be"),
-        ("policy.hold=0", "policy.hold=0: should be"),
-        ("policy.hould=2", "policy.hould"),
-        ("learner.tau=0.1", "learner.tau"),
-    ],
-)
-def test_settings_out_of_range(setting, message):
-    with pytest.raises(UserError) as error:
-        resolve("independent", ["learner=ippo", setting])
-    assert message in str(error.value)
-
-
 @pytest.mark.parametrize("learner", LEARNERS)
 def test_the_losses_are_those_of_ppo(learner):
     setup = made(learner, "learner.clip=0.1", "learner.entropy=0.01")
@@ -308,15 +197,15 @@ def test_the_losses_are_those_of_ppo(learner):
 @pytest.mark.parametrize("learner", LEARNERS)
 def test_the_gradients_of_an_update_have_a_largest_norm(learner, monkeypatch):
     setup = made(learner, "learner.gradient_norm=0.001")
-    (batch, *_), trained, seen = first_batches(setup), setup.learner, {}
+    (batch, *_), trained, seen = first_batches(setup), setup.learner, []
 
     def step() -> None:
-        seen.update({name: value.grad.clone() for name, value in trained.parameters.items()})
+        seen.extend([value.grad.clone() for value in part] for part in trained.parts)
 
     monkeypatch.setattr(trained.optimizer, "step", step)
     type(trained).update(trained, batch)  # `first_batches` replaces that of the object
-    for network in ("actor.", "critic."):
-        norms = row_norms([value for name, value in seen.items() if name.startswith(network)])
+    for gradients in seen:
+        norms = [torch.linalg.vector_norm(value.flatten(1), dim=1) for value in gradients]
         total = torch.stack(norms).square().sum(0).sqrt()
         torch.testing.assert_close(total, torch.full_like(total, 0.001), rtol=1e-2, atol=0)
 
@@ -331,3 +220,89 @@ def test_a_critic_distinguishes_the_kinds_of_cells_of_the_true_map():
         values.append(critic(changed)[VALUE][:, 2])
     pairs = ((0, 1), (0, 2), (1, 2))
     assert not any(values[a].isclose(values[b]).any() for a, b in pairs)
+
+
+@pytest.mark.parametrize(("shared", "networks"), [("true", 1), ("false", 3)])
+def test_advantages_equal_loops(shared, networks):
+    """Rewards of UAVs pass through; each network has its own scale; failures mask decisions."""
+    learner = estimating(0.9, 0.8, f"learner.share_parameters={shared}")
+    generator = torch.Generator().manual_seed(0)
+    value, reward = (torch.randn(4, n, 3, 1, generator=generator) for n in (7, 6))
+    reward[:, :, 1] *= 10
+    last = torch.randint(1, 9, (4, 1, 3), generator=generator)  # decisions before a failure
+    alive = torch.arange(6)[None, :, None] < last
+    advantage, returns = learner.advantages(value, reward, alive)
+    assert learner.spread.shape == (networks,)
+    for network in range(networks):
+        raw, places = [], []
+        for env in range(4):
+            for uav in range(3) if networks == 1 else [network]:
+                decisions, following = min(6, int(last[env, 0, uav])), 0.0
+                for k in reversed(range(decisions)):
+                    v, after = value[env, k, uav, 0].item(), value[env, k + 1, uav, 0].item()
+                    delta = reward[env, k, uav, 0].item() + 0.9 * after - v
+                    following = delta + 0.9 * 0.8 * following
+                    raw.append((following, following + v))
+                    places.append((env, k, uav))
+        gains, sums = torch.tensor(raw).T
+        expected = (gains - gains.mean()) / gains.std(correction=0)
+        scale = sums.std(correction=0)
+        torch.testing.assert_close(learner.spread[network], scale, rtol=1e-4, atol=1e-5)
+        for place, gain, total in zip(places, expected, sums / scale, strict=True):
+            torch.testing.assert_close(advantage[place][0], gain, rtol=1e-3, atol=1e-4)
+            torch.testing.assert_close(returns[place][0], total, rtol=1e-3, atol=1e-4)
+
+
+def test_torchrls_standardisation_and_value_norm_count_what_follows_a_failure():
+    """Why they are not used: with a UAV that failed, its later rewards change the others'."""
+    alive = torch.tensor([True, True, False, False])[None, :, None]
+    ours, theirs, norms = [], [], []
+    for after in (0.0, 100.0):
+        value, reward = column(2, 4, 8, after, after), column(1, 3, after, after)
+        ours.append(estimating(0.5, 0.5).advantages(value, reward, alive)[0][:, :2])
+        gae = MultiAgentGAE(gamma=0.5, lmbda=0.5, value_network=None, average_gae=True)
+        ends = torch.tensor([False, True, True, True])[None, :, None, None]
+        episode = TensorDict(
+            {
+                "state_value": value[:, :-1],
+                "next": {
+                    "state_value": value[:, 1:],
+                    "reward": reward,
+                    "done": ends,
+                    "terminated": torch.zeros_like(ends),
+                },
+            },
+            [1, 4],
+        )
+        theirs.append(gae(episode)["advantage"][:, :2])
+        norm = PopArtValueNorm(shape=1)
+        norm.update(episode["value_target"])
+        norms.append(norm.scale())
+    assert ours[0].equal(ours[1])
+    assert not theirs[0].isclose(theirs[1]).any()
+    assert not norms[0].isclose(norms[1]).any()
+
+
+def test_a_pass_uses_every_episode_once_in_an_order_of_the_seed():
+    settings = ["num_envs=6", "learner.minibatches=4", "learner.epochs=2", "seed=4"]
+    batches = []
+    for seed in (1, 2):
+        torch.manual_seed(seed)  # no effect
+        batches.append(first_batches(made("ippo", *settings)))
+    assert [len(batch) for batch in batches[0]] == [2, 2, 1, 1] * 2
+    for one, other in zip(*batches, strict=True):
+        assert one[RETURN].equal(other[RETURN])
+    returns = [torch.cat([x[RETURN] for x in batches[0][k : k + 4]]) for k in (0, 4)]
+    orders = [r.flatten(1).sum(1) for r in returns]
+    assert orders[0].sort().values.equal(orders[1].sort().values)
+
+
+@pytest.mark.parametrize(
+    ("learner", "shared", "actor", "critic"),
+    [("ippo", "true", 2, 2), ("ippo", "false", 6, 6), ("mappo", "false", 6, 2)],
+)
+def test_a_loss_is_a_mean_over_the_uavs_of_a_network(learner, shared, actor, critic):
+    trained: Any = made(learner, f"learner.share_parameters={shared}").learner
+    loss = torch.tensor([1.0, 2.0, 3.0])
+    assert trained._of_networks("actor", loss).item() == actor
+    assert trained._of_networks("critic", loss).item() == critic
