@@ -1,61 +1,136 @@
-"""Tests that every learner goes through every command, with memories and held actions."""
+"""Tests that every learner learns, resumes exactly, and goes through every command."""
 
 import json
 from functools import cache
+from importlib.metadata import EntryPoint
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
-from inside import Inside
-from rich.console import Console
-from torchrl.envs import ExplorationType, set_exploration_type, step_mdp
-from unpack_replay import data_of
 
 from emberlink.envs import keys, parallel_env
-from emberlink.policies.gaussian import MEMORY
-from emberlink.trainers import compare, load, make_env
+from emberlink.envs.utils import plugins
+from emberlink.envs.utils.errors import UserError
+from emberlink.trainers import load, make_env
 from emberlink.trainers.cli import main
+from emberlink.trainers.config.compose import from_values, resolve, to_values
 from emberlink.trainers.evaluation.evaluate import play
-from emberlink.trainers.replay.recording import Recorder
-from emberlink.trainers.runs.run_folder import RunFolder
-from emberlink.trainers.sweep.command import sweep
+from emberlink.trainers.learners import registry
+from emberlink.trainers.learners.ddpg import DDPG
+from emberlink.trainers.learners.imitation import Imitation
+from emberlink.trainers.learners.ppo import IPPO, MAPPO
+from emberlink.trainers.learners.td3 import TD3
+from emberlink.trainers.training.setup import TrainingSetup
 
 HORIZON = 20
 SMALL = [
     *("setup=tuned", f"env.horizon={HORIZON}", "env.num_uavs=3", "num_envs=4", "episodes=2"),
     *("learner.hidden=[8,8]", "evaluation.interval=1", "evaluation.interval_episodes=2"),
-    *("evaluation.episodes=2", "evaluation.scripted=[lawnmower]"),
+    *("evaluation.episodes=2", "evaluation.scripted=[lawnmower]", "fire.num_train_fires=2"),
 ]
 CASES = {
     "ddpg": ["learner=ddpg", "policy.hold=5", "learner.batch_size=8"],
-    "td3": ["learner=td3", "policy.agent_index=true", "learner.batch_size=8"],
-    "ippo": ["learner=ippo", "policy.memory=gru", "policy.hold=5"],
-    "mappo": ["learner=mappo", "policy.memory=stack", "policy.agent_index=true"],
-    "ddpg-gru": [
-        *("learner=ddpg", "policy.memory=gru", "policy.hold=2", "learner.batch_size=8"),
-        *("learner.sequence=4", "learner.burn_in=3"),
-    ],
     "ddpg-team": ["learner=ddpg", "learner.critic=team", "learner.batch_size=8"],
-    "td3-team": [
-        *("learner=td3", "policy.memory=stack", "learner.critic=team", "learner.batch_size=8"),
-        *("learner.sequence=4", "learner.burn_in=3", "learner.share_parameters=true"),
+    "ddpg-window": [
+        *("learner=ddpg", "learner.batch_size=8", "env.observation=window"),
+        *("learner.share_parameters=true", "env.failures=1"),
     ],
-    "mappo-gru": ["learner=mappo", "policy.memory=gru", "policy.hold=10"],
-    "mappo-map": ["learner=mappo", "learner.critic_map=true", "policy.hold=4"],
+    "td3": ["learner=td3", "policy.agent_index=true", "learner.batch_size=8"],
+    "td3-team": [
+        *("learner=td3", "learner.critic=team", "learner.batch_size=8"),
+        "learner.share_parameters=true",
+    ],
+    "ippo": ["learner=ippo", "policy.memory=gru", "policy.hold=5"],
     "ippo-own": ["learner=ippo", "policy.memory=gru", "learner.share_parameters=false"],
+    "mappo": ["learner=mappo", "policy.memory=gru", "policy.agent_index=true", "env.failures=1"],
+    "mappo-map": ["learner=mappo", "learner.critic_map=true", "policy.hold=4"],
     "imitation": ["learner=imitation", "policy.hold=5", "learner.samples=8"],
     "imitation-gru": [
         *("learner=imitation", "policy.memory=gru", "policy.hold=2", "learner.samples=8"),
-        *("learner.sequence=4", "learner.burn_in=3"),
+        "learner.sequence=4",
     ],
 }
-IN_CI = {"ddpg", "td3", "ippo", "mappo", "ddpg-gru", "mappo-gru", "imitation-gru"}
+IN_CI = {"ddpg", "td3", "ippo", "mappo", "imitation-gru"}
 EACH = [case if case in IN_CI else pytest.param(case, marks=pytest.mark.heavy) for case in CASES]
 
 
-def method_of(case: str, method: str = "consensus") -> str:
+def method_of(case: str) -> str:
     """Returns the method of a case: imitation has a teacher for `maps` only."""
-    return "maps" if case.startswith("imitation") else method
+    return "maps" if case.startswith("imitation") else "consensus"
+
+
+def made(case: str, *more: str) -> TrainingSetup:
+    return TrainingSetup(resolve(method_of(case), [*SMALL, *CASES[case], *more]))
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_every_network_is_trained(case):
+    setup = made(case)
+    before = {name: value.clone() for name, value in setup.learner.loss.state_dict().items()}
+    setup.dry_run(2 * HORIZON)
+    assert setup.learner.updates
+    for name, value in setup.learner.loss.state_dict().items():
+        if "module" in name or case.startswith("imitation"):
+            assert value.isfinite().all(), name
+            trained = name != "log_std"  # imitation has no use for it
+            assert not value.equal(before[name]) or not trained, name
+
+
+@pytest.mark.parametrize("stop", [10, HORIZON])
+@pytest.mark.parametrize("case", CASES)
+def test_a_resumed_training_is_the_same_bit_for_bit(case, stop):
+    """It stops within an episode, or at its end."""
+    whole, first, second = made(case), made(case), made(case)
+    whole.dry_run(2 * HORIZON)
+    first.dry_run(stop)
+    torch.manual_seed(1)  # no effect
+    second.load_state_dict({k: v.clone() for k, v in first.state_dict().items()}, first.step)
+    second.dry_run(2 * HORIZON - first.step)
+    expected = whole.state_dict()
+    state = second.state_dict()
+    assert state.keys() == expected.keys()
+    for name, value in expected.items():
+        assert value.numpy().tobytes() == state[name].numpy().tobytes(), name
+
+
+@pytest.mark.parametrize("learner", ["ddpg", "ippo"])
+def test_a_seed_repeats_a_training_and_another_does_not(learner):
+    weights = []
+    for seed in (3, 3, 4):
+        torch.manual_seed(len(weights))  # no effect
+        setup = made(learner, f"seed={seed}")
+        setup.dry_run(HORIZON)
+        weights.append(setup.learner.weights())
+    for name, value in weights[0].items():
+        assert value.equal(weights[1][name]), name
+    assert any(not value.equal(weights[2][name]) for name, value in weights[0].items())
+
+
+def test_learners_have_names():
+    known = {"ddpg": DDPG, "imitation": Imitation, "ippo": IPPO, "mappo": MAPPO, "td3": TD3}
+    assert registry.known() == [*known]
+    assert all(registry.find(name) is learner for name, learner in known.items())
+    with pytest.raises(UserError, match="ddpg, imitation, ippo, mappo, td3"):
+        registry.find("sac")
+    for name in known:
+        config = resolve("consensus", [f"learner={name}"])
+        assert type(config.learner) is known[name].config_type
+        assert from_values(to_values(config)) == config
+
+
+def test_another_package_can_add_a_learner(monkeypatch):
+    group = "emberlink.learners"
+    point = EntryPoint("mine", "emberlink.trainers.learners.td3:TD3", group)
+    monkeypatch.setattr(plugins, "registered", lambda of: {"mine": point} if of == group else {})
+    assert registry.known() == ["ddpg", "imitation", "ippo", "mappo", "mine", "td3"]
+    assert registry.find("mine") is TD3
+
+
+@pytest.mark.parametrize("learner", ["ddpg", "td3"])
+def test_a_learner_without_a_memory_refuses_one(learner):
+    with pytest.raises(UserError, match=f"the networks of learner={learner} have none"):
+        made(learner, "policy.memory=gru")
 
 
 @pytest.fixture(scope="module")
@@ -73,9 +148,7 @@ def trained(tmp_path_factory):
     return of
 
 
-pytestmark = pytest.mark.slow
-
-
+@pytest.mark.slow
 @pytest.mark.parametrize("case", EACH)
 def test_a_run_trains_and_its_evaluation_can_be_repeated(case, trained, capsys):
     run = trained(case)
@@ -92,6 +165,7 @@ def test_a_run_trains_and_its_evaluation_can_be_repeated(case, trained, capsys):
     capsys.readouterr()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", EACH)
 def test_a_loaded_policy_needs_no_further_code(case, trained):
     """TorchRL's rollout, PettingZoo and the evaluation give the same episode."""
@@ -100,15 +174,12 @@ def test_a_loaded_policy_needs_no_further_code(case, trained):
     def env():
         return make_env(policy.config, num_envs=1, seed=7)
 
-    with set_exploration_type(ExplorationType.DETERMINISTIC), torch.no_grad():
+    with torch.no_grad():
         rollout = env().rollout(HORIZON, policy)
     flight = rollout["next", *keys.POSITION][0]
     assert flight.shape == (HORIZON, 3, 3)
     measured = play(env(), policy)
     assert measured["coverage"].isfinite().all()
-    recorder = Recorder()
-    play(env(), policy, recorder.add)
-    assert recorder.recording().steps["position"][-1].tolist() == flight[-1].tolist()
     pettingzoo = parallel_env(env())
     pettingzoo.reset()
     for step in range(HORIZON):
@@ -118,81 +189,19 @@ def test_a_loaded_policy_needs_no_further_code(case, trained):
     assert not pettingzoo.agents
 
 
-@pytest.mark.parametrize(
-    "case",
-    ["ippo", "mappo", "mappo-gru", "ddpg-gru", pytest.param("td3-team", marks=pytest.mark.heavy)],
-)
-def test_an_episode_that_begins_again_forgets_the_one_before(case, trained):
-    """Environment 0 begins again after 8 steps; environment 1 goes on."""
-    policy = load(trained(case))
-    env = make_env(policy.config, num_envs=2, seed=7)
-    with torch.no_grad():
-        td = env.reset()
-        for _ in range(8):
-            td = step_mdp(env.step(policy(td)))
-        before = td.clone()
-        td = env.reset(td.set("_reset", torch.tensor([[True], [False]])))
-        fresh = policy(td.exclude(MEMORY, ("agents", "held")).clone())
-        acted, unchanged = policy(td.clone()), policy(before)
-    for key in (keys.ACTION, MEMORY):
-        assert acted[key][0].equal(fresh[key][0])
-        assert acted[key][1].equal(unchanged[key][1])
-    assert acted[MEMORY].any()
+def test_pictures_are_stored_as_bytes_in_a_bounded_buffer():
+    more = ["learner.batch_size=6", "learner.buffer_size=20", "comm.pixels=24", "policy.hold=1"]
+    setup: Any = TrainingSetup(resolve("maps", [*SMALL, "learner=ddpg", *more]))
+    setup.dry_run(16)
+    state = setup.learner.state_dict()
+    pictures = [v for k, v in state.items() if k.startswith("replay/rows") and k.endswith("crops")]
+    assert [(v.dtype, v.shape) for v in pictures] == [(torch.uint8, (20, 3, 2, 8, 24, 24))] * 2
 
 
-ALL = pytest.param(["ddpg", "td3", "ippo", "mappo", "imitation"], marks=pytest.mark.heavy)
-
-
-@pytest.mark.parametrize("cases", [ALL, ["ddpg-gru", "ippo"]])
-def test_runs_of_all_learners_are_rendered_and_compared(cases, trained, tmp_path, capsys):
-    """A page shows the first episode of the evaluation."""
-    runs = [trained(case) for case in cases]
-    film, page = tmp_path / "film.gif", tmp_path / "page.html"
-    for output in (film, page):
-        assert main.main(["render", *map(str, runs), "--output", str(output)]) == 0
-    assert film.stat().st_size > 1000
-    for run, panel in zip(runs, data_of(page.read_text())["panels"], strict=True):
-        evaluated = json.loads((run / "eval.json").read_text())["results"]["huygens"]["learned"]
-        covered = 100 * panel["seen"][0][-1] / panel["burnt"][0][-1]
-        assert covered == pytest.approx(evaluated["coverage"][0], rel=1e-6)
-        rewards = [sum(uav[1:]) / HORIZON for uav in panel["reward"]]
-        assert sum(rewards) / 3 == pytest.approx(evaluated["mean_reward"][0], rel=1e-5)
-    comparison = compare(runs)
-    assert comparison.runs["label"].nunique() == len(cases)
-    capsys.readouterr()
-
-
-@pytest.mark.heavy
-@pytest.mark.parametrize("learners", [["ippo", "mappo"], ["td3"]])
-def test_a_sweep_over_learners(learners, tmp_path, capsys):
-    own = [] if "ippo" in learners else ["learner.batch_size=8"]
-    swept = [f"learner={','.join(learners)}", "seed=0,1", "evaluation.episodes=1"]
-    arguments = ["independent", *SMALL, *own, *swept, f"output={tmp_path}"]
-    assert sweep(arguments, Console(quiet=True), executor=Inside()) == 0
-    runs = [RunFolder(path.parent) for path in tmp_path.glob("*/config.yaml")]
-    assert sorted((run.config().learner.name, run.config().seed) for run in runs) == [
-        (learner, seed) for learner in learners for seed in (0, 1)
-    ]
-    assert all(run.evaluated() for run in runs)
-    capsys.readouterr()
-
-
-SIDE_BY_SIDE = [case for case in CASES if case != "ddpg"]  # that of ddpg is in test_seeds.py
-
-
-@pytest.mark.heavy
-@pytest.mark.parametrize("case", SIDE_BY_SIDE)
-def test_seeds_side_by_side_learn_the_same_as_alone(case, tmp_path):
-    method = method_of(case, "independent")
-    settings = ["train", method, *SMALL, *CASES[case], "evaluation.interval=0"]
-    assert main.main([*settings, "seeds=[3,11]", f"output={tmp_path / 'both'}"]) == 0
-    both = sorted((tmp_path / "both").iterdir(), key=lambda run: RunFolder(run).config().seed)
-    for seed, run in zip((3, 11), both, strict=True):
-        assert main.main([*settings, f"seed={seed}", f"output={tmp_path / str(seed)}"]) == 0
-        (alone,) = (tmp_path / str(seed)).iterdir()
-        lines = zip(RunFolder(run).metrics(), RunFolder(alone).metrics(), strict=True)
-        for line, single in lines:
-            assert line == pytest.approx(single, rel=1e-3, abs=1e-3)
-        together, own = load(run).module[0], load(alone).module[0]
-        for stacked, single in zip(together.parameters(), own.parameters(), strict=True):
-            torch.testing.assert_close(stacked, single, rtol=1e-3, atol=1e-4)
+def test_what_a_uav_observes_of_maps_does_not_depend_on_the_team():
+    shapes = set()
+    for uavs, grid in ((1, "[20,20]"), (24, "[128,128]")):
+        config = resolve("maps", [f"env.num_uavs={uavs}", f"env.grid={grid}", "env.horizon=4"])
+        spec = make_env(config).observation_spec
+        shapes.add(tuple(map(tuple, keys.observation_shapes(spec))))
+    assert shapes == {((2,), (2, 8, 24, 24))}

@@ -217,7 +217,9 @@ def test_the_losses_of_team_critics_are_those_of_maddpg():
         expected = -critic(seen, acted).mean()
         torch.testing.assert_close(losses["actor"][uav], expected, rtol=1e-4, atol=1e-5)
         critic = copy_uav(stacks["target_value"], wide, uav)
-        beyond = critic(following[keys.OBSERVATION][:, order].flatten(1), after[:, order].flatten(1))
+        beyond = critic(
+            following[keys.OBSERVATION][:, order].flatten(1), after[:, order].flatten(1)
+        )
         target = following[keys.REWARD][:, uav] + RATES["gamma"] * beyond
         expected = (value - target).square().mean()
         torch.testing.assert_close(losses["critic"][uav], expected, rtol=1e-4, atol=1e-5)
