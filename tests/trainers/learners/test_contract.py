@@ -195,7 +195,7 @@ def test_pictures_are_stored_as_bytes_in_a_bounded_buffer():
     setup.dry_run(16)
     state = setup.learner.state_dict()
     pictures = [v for k, v in state.items() if k.startswith("replay/rows") and k.endswith("crops")]
-    assert [(v.dtype, v.shape) for v in pictures] == [(torch.uint8, (20, 3, 2, 8, 24, 24))] * 2
+    assert [(v.dtype, v.shape) for v in pictures] == [(torch.uint8, (7, 3, 2, 8, 24, 24))] * 2
 
 
 def test_what_a_uav_observes_of_maps_does_not_depend_on_the_team():
