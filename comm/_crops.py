@@ -4,9 +4,7 @@ import math
 from collections.abc import Sequence
 
 import torch
-from torch import Tensor
-
-from emberlink.envs.utils.buffers import Buffers
+from torch import Tensor, nn
 
 CHANNELS = ("fire", "seen", "burnt_out", "near", "age", "outside", "uavs", "base")
 """what the channels of a picture show, see `Crops`"""
@@ -30,7 +28,7 @@ def chance_byte(age: int) -> int:
     return round(_FULL * (1 - math.exp(-age / _SPREAD)))
 
 
-class Crops(Buffers):
+class Crops(nn.Module):
     """Draws pictures of S x S pixels; the cell nearest to the UAV is in pixel (S // 2, S // 2).
 
     The channels hold bytes. `fire`, `seen` and `burnt_out` are the shares of the pixel's cells that

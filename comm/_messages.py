@@ -3,9 +3,8 @@
 from typing import NamedTuple
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
-from emberlink.envs.utils.buffers import Buffers
 from emberlink.envs.world.coverage_map import View
 from emberlink.envs.world.knowledge import Knowledge
 
@@ -80,7 +79,7 @@ def pass_on_places(
     return size * said.sum(-1)
 
 
-class CellMessages(Buffers):
+class CellMessages(nn.Module):
     """Passes on the cells of maps.
 
     A UAV says a cell if a UAV in range has no look at it, has an older one, or does not know that

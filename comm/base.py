@@ -11,12 +11,11 @@ from torchrl.envs import Transform
 
 from emberlink.envs import keys
 from emberlink.envs.config import WildfireConfig
-from emberlink.envs.utils.buffers import Buffers
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.world import radio
 
 
-class CommModule(Buffers, TensorDictModuleBase):
+class CommModule(TensorDictModuleBase):
     """Rewrites the UAVs' observations, such as from the messages that they receive.
 
     A subclass in its own file, `comm/<name>.py`, is a new communication method; the file name is
@@ -147,11 +146,10 @@ class Communication(Transform):
             return self._communicate(tensordict_reset)
         mask = mask.flatten()
         self.module.reset(tensordict_reset, mask)
-        state = self.module.state_dict()
-        before = {name: buffer.clone() for name, buffer in state.items()}
+        before = {name: buffer.clone() for name, buffer in self.module.state_dict().items()}
         result = self._communicate(tensordict_reset)
         # The other environments are within an episode; their state must not change.
-        for name, buffer in state.items():
+        for name, buffer in self.module.state_dict().items():
             began = mask.view(-1, *[1] * (buffer.ndim - 1))
             buffer.copy_(torch.where(began, buffer, before[name]))
         return result

@@ -11,8 +11,7 @@ import numpy as np
 from gymnasium.spaces import Box
 from numpy.typing import NDArray
 
-from emberlink.envs.pettingzoo import WildfireParallelEnv, parallel_env
-from emberlink.envs.spaces import to_action
+from emberlink.envs.pettingzoo import WildfireParallelEnv, parallel_env, to_action
 from emberlink.envs.utils.errors import UserError
 
 ID = "emberlink/WildfireTeam-v0"

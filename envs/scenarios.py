@@ -25,7 +25,7 @@ from emberlink.envs.fire.reaction import ReactionConfig
 from emberlink.envs.fire_files.config import COPY_FILE, FileFireConfig
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import TAG, describe
-from emberlink.envs.world.burning import split_times, with_burn_time
+from emberlink.envs.world.coverage_map import split_times, with_burn_time
 
 Grid = tuple[int, int]
 
@@ -42,7 +42,7 @@ class FireSource(ABC):
 
     @abstractmethod
     def train(self, grid: Grid, horizon: int) -> Tensor:
-        """Returns the training fires: times in steps, see `world.burning.split_times`."""
+        """Returns the training fires: times in steps, see `world.coverage_map.split_times`."""
 
     @abstractmethod
     def validation(self, count: int, grid: Grid, horizon: int) -> Tensor:

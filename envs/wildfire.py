@@ -1,4 +1,4 @@
-"""The wildfire environment: it joins fire, motion, sensor and reward."""
+"""The wildfire environment: it joins fire, motion, sensor and reward, and names its tensors."""
 
 import secrets
 from collections.abc import Sequence
@@ -7,13 +7,14 @@ from typing import Any
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
+from torchrl.data import Binary, Bounded, Composite, TensorSpec, Unbounded
+from torchrl.envs import EnvBase
 
-from emberlink.envs import keys, specs
+from emberlink.envs import keys
 from emberlink.envs.config import WildfireConfig
+from emberlink.envs.rendering import frame
 from emberlink.envs.scenarios import ScenarioConfig, default_config, load_fires
-from emberlink.envs.team_view import TeamView
 from emberlink.envs.utils import counter_rng
-from emberlink.envs.utils.buffers import Buffers
 from emberlink.envs.utils.counter_rng import Use
 from emberlink.envs.utils.device import check_device
 from emberlink.envs.utils.errors import UserError
@@ -21,13 +22,15 @@ from emberlink.envs.utils.validation import check_whole
 from emberlink.envs.world import motion
 from emberlink.envs.world.coverage_map import CoverageMap, Sighting
 from emberlink.envs.world.failures import draw_failures
+from emberlink.envs.world.knowledge import Knowledge
 from emberlink.envs.world.measures import Measures
-from emberlink.envs.world.observation import observe
 from emberlink.envs.world.reward import step_reward
 from emberlink.envs.world.sensor import Sensor
 
+_DONE = ("done", "terminated", "truncated")
 
-class WildfireEnv(Buffers, TeamView):
+
+class WildfireEnv(EnvBase):
     """A team of UAVs over a spreading fire, batched over environments.
 
     Args:
@@ -121,12 +124,55 @@ class WildfireEnv(Buffers, TeamView):
         self.register_buffer("_first_length", first_length, persistent=False)
 
     def _make_specs(self) -> None:
-        envs, uavs = self.num_envs, self.n_agents
-        shown = self._side, self._shows_map
-        self.observation_spec = specs.observation_spec(envs, self.config, *shown)
-        self.action_spec = specs.action_spec(envs, uavs)
-        self.reward_spec = specs.reward_spec(envs, uavs)
-        self.done_spec = specs.done_spec(envs, uavs if self._agent_done else None)
+        """Declares the tensors that the environment reads and writes; see `keys`."""
+        world, envs = self.config, (self.num_envs,)
+        agents, side = (*envs, self.n_agents), self._side
+
+        def real(*shape: int) -> Unbounded:
+            return Unbounded(torch.Size(shape), dtype=torch.float32)
+
+        def whole(*shape: int) -> Unbounded:
+            return Unbounded(torch.Size(shape), dtype=torch.int64)
+
+        def flag(*shape: int) -> Binary:
+            return Binary(shape=torch.Size(shape), dtype=torch.bool)
+
+        def byte(*shape: int) -> Unbounded:
+            return Unbounded(torch.Size(shape), dtype=torch.uint8)
+
+        def team(**specs: TensorSpec) -> Composite:
+            return Composite({keys.AGENTS: Composite(specs, shape=agents)}, shape=envs)
+
+        per_uav: dict[str, TensorSpec] = {
+            keys.OBSERVATION[1]: real(*agents, len(keys.FEATURES)),
+            keys.POSITION[1]: real(*agents, 3),
+            **{key[1]: whole(*agents) for key in (keys.NEW_FIRE, keys.OLD_FIRE, keys.NO_FIRE)},
+            **{key[1]: real(*agents, 2) for key in (keys.NEW_CENTRE, keys.OLD_CENTRE)},
+            keys.HIT_BOUNDARY[1]: flag(*agents, 3),
+            keys.ALIVE[1]: flag(*agents),
+        }
+        if world.observation == "window":
+            per_uav[keys.WINDOW[1]] = flag(*agents, 3, side, side)
+        if world.observation == "sight":
+            per_uav[keys.SIGHT[1]] = byte(*agents, side, side)
+        observed = team(**per_uav)
+        for key in (keys.RNG_KEY, keys.STEP, keys.SEEN, keys.BURNING, keys.BURNT):
+            observed[key] = whole(*envs)
+        if world.measures == "all":
+            observed[keys.FRONT_AGE], observed[keys.FRONT_AGE_P95] = real(*envs), real(*envs)
+        if world.base is not None:
+            observed[keys.BASE_SEEN], observed[keys.BASE_AGE] = whole(*envs), real(*envs)
+        if self._shows_map:
+            observed[keys.TRUE_MAP] = byte(*envs, *world.grid)
+        self.observation_spec = observed
+        action = Bounded(-1.0, 1.0, torch.Size((*agents, 3)), dtype=torch.float32)
+        self.action_spec = team(**{keys.ACTION[1]: action})
+        self.reward_spec = team(**{keys.REWARD[1]: real(*agents, 1)})
+        done = Composite({name: flag(*envs, 1) for name in _DONE}, shape=envs)
+        if self._agent_done:
+            flags = {name: flag(*agents, 1) for name in _DONE}
+            done[keys.AGENTS] = Composite(flags, shape=agents)
+        self.done_spec = done
 
     def load_state_dict(self, *args: Any, **kwargs: Any):
         """Restores a state, its seeds included; see `torch.nn.Module.load_state_dict`."""
@@ -234,10 +280,6 @@ class WildfireEnv(Buffers, TeamView):
             high=self._high,
         )
 
-    def _step_proc_data(self, next_tensordict_out: TensorDictBase) -> TensorDictBase:
-        """Returns its argument: TorchRL would add missing entries here, and there are none."""
-        return next_tensordict_out
-
     def _snapshot(
         self,
         position: Tensor,
@@ -249,9 +291,8 @@ class WildfireEnv(Buffers, TeamView):
         counts, time, alive = sighting.counts.long(), self._time.clone(), self._alive()
         new, old, none = counts.unbind(-1)
         new_centre, old_centre, _ = sighting.centres.unbind(-2)
-        box = self._low, self._high
         agents = {
-            keys.OBSERVATION[1]: observe(position, counts, time, self.config, box),
+            keys.OBSERVATION[1]: self._observe(position, counts, time),
             keys.POSITION[1]: position,
             keys.NEW_FIRE[1]: new,
             keys.OLD_FIRE[1]: old,
@@ -273,7 +314,7 @@ class WildfireEnv(Buffers, TeamView):
             agents |= {k: v.unsqueeze(-1).repeat(1, self.n_agents, 1) for k, v in done.items()}
         burning, burnt = self._map.count(time)
         root = {
-            keys.AGENTS: specs.known_tensordict(agents, position.shape[:-1], self.device),
+            keys.AGENTS: TensorDict(agents, position.shape[:-1], self.device),
             keys.RNG_KEY: self._step_key.clone(),
             keys.STEP: time,
             keys.SEEN: self._seen.clone(),
@@ -283,7 +324,15 @@ class WildfireEnv(Buffers, TeamView):
             **({keys.TRUE_MAP: self.fire_map} if self._shows_map else {}),
             **done,
         }
-        return specs.known_tensordict(root, self.batch_size, self.device)
+        return TensorDict(root, self.batch_size, self.device)
+
+    def _observe(self, position: Tensor, counts: Tensor, time: Tensor) -> Tensor:
+        """Returns x, y, z, new-fire flag, old-fire flag and step, float32 [num_envs, n, 6]."""
+        clock = time.float().view(-1, 1, 1).expand(-1, self.n_agents, 1)
+        if self.config.observation_scale == "box":
+            position = motion.scale_to_box(position, self._low, self._high)
+            clock = clock / self.config.horizon
+        return torch.cat((position, counts[..., :2] > 0, clock), -1)
 
     def _done(self, time: Tensor) -> dict[str, Tensor]:
         """Returns the flags of each environment, bool [num_envs, 1]."""
@@ -292,4 +341,87 @@ class WildfireEnv(Buffers, TeamView):
             length = torch.where(self._episode == 1, self._first_length, length)
         truncated = (time >= length).unsqueeze(-1)
         flags = truncated, torch.zeros_like(truncated), truncated.clone()
-        return dict(zip(specs.DONE_NAMES, flags, strict=True))
+        return dict(zip(_DONE, flags, strict=True))
+
+    def __repr__(self) -> str:
+        config = self.config
+        fire = self._fire_name or f"{len(self._map)} given"
+        return (
+            f"WildfireEnv(num_envs={self.num_envs}, grid={config.grid}, "
+            f"num_uavs={config.num_uavs}, horizon={config.horizon}, fire={fire}, "
+            f"device={self.device})"
+        )
+
+    @property
+    def num_envs(self) -> int:
+        """The number of environments."""
+        return self.batch_size[0]
+
+    @property
+    def n_agents(self) -> int:
+        """The number of UAVs in the team."""
+        return self.config.num_uavs
+
+    @property
+    def max_steps(self) -> int:
+        """The steps of an episode."""
+        return self.config.horizon
+
+    @property
+    def group_map(self) -> dict[str, list[str]]:
+        """The UAVs' names under the key that their tensors stand under."""
+        return {keys.AGENTS: [f"uav_{i}" for i in range(self.n_agents)]}
+
+    @property
+    def fire_map(self) -> Tensor:
+        """The paper's map, uint8 [num_envs, X, Y]: 0 no fire, 1 seen fire, 2 unseen fire.
+
+        A burnt-out cell is 3 if it was seen while it burned, else 4.
+        """
+        now = self._time[:, None, None]
+        fire = (self.arrival_time <= now).to(torch.uint8) * (2 - self._map.seen.to(torch.uint8))
+        if self.burn_out is not None:
+            fire += 2 * (self.burn_out <= now)
+        return fire
+
+    @property
+    def unseen_fire(self) -> Tensor:
+        """The number of burning cells that no UAV has seen while they burned, int64 [num_envs]."""
+        return (self.fire_map == 2).sum((-1, -2))
+
+    @property
+    def arrival_time(self) -> Tensor:
+        """The fire of each environment: arrival times in steps, float32 [num_envs, X, Y]."""
+        return self._map.arrival_time
+
+    @property
+    def burn_out(self) -> Tensor | None:
+        """Burn-out times in steps, float32 [num_envs, X, Y]; None if cells burn for ever."""
+        return self._map.burn_out
+
+    @property
+    def fail_step(self) -> Tensor | None:
+        """The step from which each UAV has failed, int64 [num_envs, n]; None if none can fail."""
+        return self._fail_step
+
+    @property
+    def knowledge(self) -> Knowledge | None:
+        """The knowledge of each UAV and, last, of the base; None in a world without a base."""
+        return None if self._measures is None else self._measures.knowledge
+
+    def render(self, mode: str = "rgb_array", *, env: int = 0):
+        """Draws one environment in the paper's colours, uint8 [height, width, 3].
+
+        Raises:
+            UserError: another mode than "rgb_array".
+        """
+        if mode != "rgb_array":
+            raise UserError(f"render mode {mode!r} is not known; known: 'rgb_array'")
+        flies = self._alive()
+        return frame.frame(
+            self.fire_map[env].cpu().numpy(),
+            self._position[env].cpu().numpy(),
+            view_angle=self.config.view_angle,
+            alive=None if flies is None else flies[env].cpu().numpy(),
+            base=self.config.base,
+        )

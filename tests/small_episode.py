@@ -8,7 +8,7 @@ from torchrl.envs import step_mdp
 
 from emberlink.envs import keys
 from emberlink.envs.world import radio
-from emberlink.envs.world.burning import with_burn_time
+from emberlink.envs.world.coverage_map import with_burn_time
 from emberlink.trainers.build import build_env
 from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.replay.recording import Recorder, Recording

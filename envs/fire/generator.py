@@ -10,6 +10,7 @@ has 30 cells (`BASE_SIDE`); on another grid lengths and rates are scaled by min(
 
 import dataclasses
 import math
+from collections.abc import Callable, Mapping
 from typing import Annotated, Any, Literal, get_args
 
 import torch
@@ -19,9 +20,7 @@ from torch import Tensor
 
 from emberlink.configs import known
 from emberlink.envs.config import BASE_SIDE, check_grid
-from emberlink.envs.fire.advection import current, max_time_step, tide_speed
-from emberlink.envs.fire.ellipse import MAX_LENGTH_TO_BREADTH
-from emberlink.envs.fire.level_set import arrival_times, disc
+from emberlink.envs.fire.level_set import MAX_LENGTH_TO_BREADTH, arrival_times, disc
 from emberlink.envs.fire.ranges import (
     Degrees,
     Fraction,
@@ -42,6 +41,7 @@ Split = Literal["train", "validation", "test"]
 
 _MIN_NODES = 60  # along the shorter side: twice the resolution of 30 cells
 _MAX_NODES = 200_000  # computed together, so that the data fits in the processor's cache
+_STEPS_PER_TIDE = 32  # at least, so that a time step resolves a tide
 _MIN_RADIUS = 1e-6  # of a patch, cells, so that its square does not underflow
 
 _Signed = Annotated[float, Field(ge=-30, le=30)]
@@ -215,7 +215,7 @@ def _spread(
     def azimuth(time: float) -> Tensor:
         return start + turning * (time / 1000)
 
-    fastest = config.drift_rate[1] + tide_speed(config.tide_reach[1], config.tide_period[0])
+    fastest = config.drift_rate[1] + math.pi * config.tide_reach[1] / config.tide_period[0]
     arrival = arrival_times(
         distance,
         grid,
@@ -226,7 +226,7 @@ def _spread(
         two_sided=config.two_sided,
         drift=current(draw, azimuth, scale) if fastest > 0 else None,
         margin=_margin(config, grid),
-        max_step=max_time_step(config.tide_period[0]) if config.tide_reach[1] > 0 else math.inf,
+        max_step=config.tide_period[0] / _STEPS_PER_TIDE if config.tide_reach[1] > 0 else math.inf,
         refine=refine,
         rate_field=_fuel(config, seeds, centre, draw["core_radius"], start, grid),
         max_rate=(config.head_ros[1] + fastest) * scale,
@@ -276,3 +276,32 @@ def _fuel(
     wide = (width * scale).clamp_min(_MIN_RADIUS)[..., None, None]
     apart = ((x - px) ** 2 + (y - py) ** 2) / wide**2
     return (1 - loss[..., None, None] * torch.exp(-apart)).prod(1)
+
+
+def current(
+    draw: Mapping[str, Tensor], azimuth: Callable[[float], Tensor], scale: float
+) -> Callable[[float], Tensor]:
+    """Returns the velocity of the medium as a function of time.
+
+    u(t) = `drift_rate` · w(t) + s · cos(2π t / `tide_period` + `tide_phase`) · v, with w the unit
+    vector along the azimuth, v that along `tide_bearing` and s = π `tide_reach` / `tide_period`.
+
+    Args:
+        draw: the fields of a `FireConfig` named above, float [fires] each, in its units.
+        azimuth: from the time in steps to radians [fires].
+        scale: cells of the grid per cell of the scenario.
+
+    Returns:
+        From the time in steps to cells of the grid per step, [fires, 2].
+    """
+    steady = draw["drift_rate"] * scale
+    strength = math.pi * draw["tide_reach"] / draw["tide_period"] * scale
+    phase, bearing = draw["tide_phase"].deg2rad(), draw["tide_bearing"].deg2rad()
+
+    def velocity(time: float) -> Tensor:
+        along = azimuth(time)
+        tide = strength * torch.cos(2 * math.pi * time / draw["tide_period"] + phase)
+        x = steady * along.cos() + tide * bearing.cos()
+        return torch.stack([x, steady * along.sin() + tide * bearing.sin()], 1)
+
+    return velocity

@@ -27,7 +27,7 @@ class Registry(Generic[T]):
             underscore.
         group: group of the entry points; the package's name if empty.
         shared: name -> file, of subclasses that share a file; their names are those of the classes
-            in lower case.
+            in lower case, with underscores.
     """
 
     base: type[T]
@@ -77,7 +77,7 @@ class Registry(Generic[T]):
             for item in vars(file).values()
             if getattr(item, "__module__", "") == file.__name__
             and self._fits(item)
-            and (name not in self.shared or item.__name__.lower() == name)
+            and (name not in self.shared or item.__name__.lower() == name.replace("_", ""))
         ]
         if len(classes) != 1:
             kind = self.base.__name__

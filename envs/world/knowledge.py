@@ -1,9 +1,8 @@
 """Stores what each UAV knows: the last step at which each cell was seen."""
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
-from emberlink.envs.utils.buffers import Buffers
 from emberlink.envs.world import radio
 from emberlink.envs.world.coverage_map import View
 
@@ -16,7 +15,7 @@ def step_type(horizon: int) -> torch.dtype:
     return torch.int16 if horizon < torch.iinfo(torch.int16).max else torch.int32
 
 
-class Knowledge(Buffers):
+class Knowledge(nn.Module):
     """Stores a map per UAV of the last step at which each cell was seen, by it or by others.
 
     At each step, a UAV merges into its map the maps of all radios whose messages arrive, directly

@@ -3,10 +3,9 @@
 import math
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from emberlink.envs.config import WildfireConfig
-from emberlink.envs.utils.buffers import Buffers
 from emberlink.envs.world import motion
 
 
@@ -20,7 +19,7 @@ def view_radius(altitude: float, view_angle: float) -> float:
     return altitude * math.tan(math.radians(view_angle))
 
 
-class Sensor(Buffers):
+class Sensor(nn.Module):
     """A downward camera that sees cells (i, j) with |i - x| and |j - y| <= z tan(view_angle).
 
     Each UAV has a window of W x W cells, centred at the cell nearest to it, that contains the field

@@ -4,14 +4,133 @@ import math
 
 import torch
 from tensordict import TensorDictBase
-from torch import Tensor
+from torch import Tensor, nn
 
 from emberlink.envs import keys
 from emberlink.envs.wildfire import WildfireEnv
-from emberlink.policies.planning import Foresight
+from emberlink.envs.world import radio
+from emberlink.envs.world.sensor import Sensor
 from emberlink.policies.scripted.base import Scripted
+from emberlink.policies.scripted.planning import HERE, Rally, Targets, plan_period
 
 _STEP_COST = 1000.0  # cells; above any distance on a map, so that burning cells come first
+_FLOWN = 1.0  # cells flown between two plans
+_CLAIM = 3.0  # cells; half the side of the square that a UAV claims
+_WAIT = 10.0  # steps; time scale at which the weight of a cell falls that ignites after the arrival
+_LATE = 100.0  # steps before the end; the chain leads to the cells that burn in this time
+_MEET = 0.9  # of the radio's range; distance at which a UAV that will fail meets another one
+
+
+class Foresight(nn.Module):
+    """Chooses targets for UAVs, given the fire, and when each UAV fails.
+
+    The value of a target is the number of cells in view from it that nobody has seen burn and that
+    burn when the UAV arrives, divided by its distance plus 2 cells. The UAV with the highest value
+    chooses first and claims 7 x 7 cells. With a base, a cell counts if neither a flying UAV nor the
+    base has a sighting of it while it burned. At the end of the episode the UAVs form a chain to
+    the base (`radio.chain`), each place held by the nearest UAV. Before it fails, a UAV flies to
+    the nearest UAV that will not fail.
+
+    Args:
+        env: the environment; its fire and failures are read.
+    """
+
+    _base: Tensor
+    _never: Tensor
+
+    def __init__(self, env: WildfireEnv):
+        super().__init__()
+        self._env, self._world = (env,), env.config
+        self.period = plan_period(_FLOWN, env.config.displacement)
+        self._targets = Targets(env, claim=_CLAIM)
+        self._sensor = Sensor.of(env.config)
+        self.register_buffer("_base", torch.tensor(env.config.base or (0.0, 0.0)))
+        self.register_buffer("_never", torch.tensor(math.inf))
+        self.to(env.device)
+
+    def plan(self, tensordict: TensorDictBase) -> Tensor:
+        """Returns a new target of each UAV, float32 [num_envs, n, 2], cells."""
+        ground, step = tensordict.get(keys.POSITION)[..., :2], tensordict.get(keys.STEP)
+        alive, speed = tensordict.get(keys.ALIVE), self._world.displacement
+        distance = self._targets.distance(ground)
+        arrives = step.view(-1, 1, 1, 1) + distance / speed
+        weight = self._weight(arrives, alive)
+        cost, hears = distance + HERE, alive.unsqueeze(-1) & alive.unsqueeze(-2)
+        if self._world.base is None:
+            return self._targets.choose(ground, weight, cost, hears)[0]
+        rally = self._rally(ground)
+        late = rally.too_late((self._targets.columns, self._targets.rows), arrives, speed)
+        cost.masked_fill_(late, math.inf)
+        target, value = self._targets.choose(ground, weight, cost, hears)
+        leaves = rally.leaves(ground, step, speed, self.period) & (value <= 0)
+        return torch.where(leaves.unsqueeze(-1), rally.place, target)
+
+    def _times(self) -> tuple[Tensor, Tensor]:
+        """Returns arrival and burn-out times, float32 [num_envs, 1, X, Y] or a scalar inf."""
+        (env,) = self._env
+        end = self._never if env.burn_out is None else env.burn_out.unsqueeze(1)
+        return env.arrival_time.unsqueeze(1), end
+
+    def _weight(self, arrives: Tensor, alive: Tensor) -> Tensor:
+        """Returns what seeing each cell is worth to each UAV, float32 [num_envs, n, X, Y].
+
+        Args:
+            arrives: float32 [num_envs, n, X, Y], the step at which the UAV arrives at the cell.
+            alive: bool [num_envs, n].
+        """
+        ignition, end = self._times()
+        meets = torch.maximum(arrives, ignition)
+        useful = self._unseen(alive).unsqueeze(1) & (meets < end) & (meets <= self._world.horizon)
+        useful &= alive[..., None, None]
+        wait = (meets - arrives).masked_fill_(~useful, 0.0)
+        return useful * (-wait / _WAIT).exp()
+
+    def _unseen(self, alive: Tensor) -> Tensor:
+        """Returns the cells of which no sighting while they burned is left, bool [num_envs, X, Y].
+
+        Args:
+            alive: bool [num_envs, n].
+        """
+        (env,) = self._env
+        if env.knowledge is None or env.knowledge.seen_fire is None:
+            return (env.fire_map != 1) & (env.fire_map != 3)
+        has = torch.nn.functional.pad(alive, (0, 1), value=True)
+        seen = (env.knowledge.seen_fire & has.unsqueeze(-1)).any(1)
+        return ~self._sensor.crop(seen)
+
+    def _rally(self, ground: Tensor) -> Rally:
+        """Returns where each UAV has to be at the end, or before it fails."""
+        (env,) = self._env
+        horizon, uavs = self._world.horizon, ground.shape[1]
+        fails = torch.full_like(ground[..., 0], horizon + 1)
+        fails = fails if env.fail_step is None else env.fail_step.float()
+        lasting = fails > horizon
+        place, reach = self._chain(ground, lasting)
+        apart = torch.cdist(ground, ground).masked_fill_(~lasting.unsqueeze(1), math.inf)
+        nearest, other = apart.min(-1)
+        meets = ~lasting & nearest.isfinite()
+        friend = ground.gather(1, other.unsqueeze(-1).expand(-1, uavs, 2))
+        place = torch.where(meets.unsqueeze(-1), friend, place)
+        reach = torch.where(meets, _MEET * self._world.radio.range, reach)
+        step = torch.where(meets, fails - 1, math.inf).masked_fill_(lasting, horizon)
+        return Rally(place, reach, step)
+
+    def _chain(self, ground: Tensor, lasting: Tensor) -> tuple[Tensor, Tensor]:
+        """Returns the place and reach of each UAV in a chain of the UAVs that do not fail."""
+        ignition, end = self._times()
+        late = (ignition <= self._world.horizon) & (end > self._world.horizon - _LATE)
+        envs, uavs = lasting.shape
+        centre, count = radio.middle(late), lasting.sum(-1, keepdim=True)
+        rank = torch.full_like(lasting, uavs, dtype=torch.int64)
+        env = torch.arange(envs, device=ground.device)
+        for link in range(uavs):
+            here = torch.full_like(count, link)
+            place, _ = radio.chain(self._world, self._base, centre, here, count)
+            apart = torch.linalg.vector_norm(ground - place, dim=-1)
+            apart.masked_fill_(~lasting | (rank < uavs), math.inf)
+            nearest, uav = apart.min(-1)
+            rank[env, uav] = torch.where(nearest.isfinite(), link, rank[env, uav])
+        return radio.chain(self._world, self._base, centre, rank, count)
 
 
 class Oracle(Scripted):

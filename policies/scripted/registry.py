@@ -1,4 +1,4 @@
-"""Finds scripted policies by name: files of this folder, and entry points of other packages."""
+"""Finds scripted policies by name: those of this folder, and entry points of other packages."""
 
 from collections.abc import Collection, Iterator, Mapping
 
@@ -8,7 +8,20 @@ from emberlink.envs.utils.validation import unknown
 from emberlink.policies.scripted import ORDER
 from emberlink.policies.scripted.base import Scripted
 
-_REGISTRY = Registry(Scripted, "emberlink.policies.scripted", "policy", group="emberlink.scripted")
+_SHARED = {
+    **dict.fromkeys(
+        ("stationary", "random_actions", "random_waypoints", "follow_target"), "simple"
+    ),
+    **dict.fromkeys(("map_greedy_alone", "map_greedy", "map_greedy_all", "courier"), "map_greedy"),
+}
+_REGISTRY = Registry(
+    Scripted,
+    "emberlink.policies.scripted",
+    "policy",
+    other_files=("base", "registry", "simple", "planning", "team_maps"),
+    group="emberlink.scripted",
+    shared=_SHARED,
+)
 
 
 class _Policies(Mapping[str, type[Scripted]]):

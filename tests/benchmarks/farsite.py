@@ -23,8 +23,12 @@ import torch
 from scipy.optimize import minimize
 from torch import Tensor
 
-from emberlink.envs.fire.ellipse import MAX_LENGTH_TO_BREADTH, ellipse_rates
-from emberlink.envs.fire.level_set import Distance, arrival_times
+from emberlink.envs.fire.level_set import (
+    MAX_LENGTH_TO_BREADTH,
+    Distance,
+    arrival_times,
+    ellipse_rates,
+)
 from emberlink.envs.fire_files.config import FileFireConfig
 from emberlink.envs.fire_files.rasters import read_raster
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from emberlink.envs.world import burning
-from emberlink.envs.world.burning import PassedCounts
+from emberlink.envs.world.coverage_map import PassedCounts
 
 
 @pytest.mark.parametrize("chunk", [1, 250, 2**22])

@@ -11,7 +11,7 @@ from robustness import SOAK
 
 from emberlink.configs import known
 from emberlink.envs import keys
-from emberlink.envs.world.burning import with_burn_time
+from emberlink.envs.world.coverage_map import with_burn_time
 from emberlink.trainers.build import build_env
 from emberlink.trainers.config.compose import from_values, resolve, to_values
 

@@ -13,11 +13,10 @@ from emberlink.envs import WildfireConfig, WildfireEnv, keys
 from emberlink.envs.config import RadioConfig, RewardConfig
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.world import radio
-from emberlink.envs.world.burning import with_burn_time
-from emberlink.envs.world.coverage_map import View
+from emberlink.envs.world.coverage_map import View, with_burn_time
 from emberlink.envs.world.failures import draw_failures
 from emberlink.envs.world.knowledge import Knowledge
-from emberlink.envs.world.sighting_ages import SightingAges, age_limits, cell_ages
+from emberlink.envs.world.measures import SightingAges, age_limits, cell_ages
 
 ENVS = 3
 COUNTS = (keys.NEW_FIRE, keys.OLD_FIRE, keys.NO_FIRE)

@@ -8,10 +8,7 @@ from torchrl.envs import step_mdp
 
 from emberlink.envs import WildfireConfig, WildfireEnv, keys
 from emberlink.envs.config import RadioConfig
-from emberlink.policies.scripted.courier import Courier
-from emberlink.policies.scripted.map_greedy import MapGreedy
-from emberlink.policies.scripted.map_greedy_all import MapGreedyAll
-from emberlink.policies.scripted.map_greedy_alone import MapGreedyAlone
+from emberlink.policies.scripted.map_greedy import Courier, MapGreedy, MapGreedyAll, MapGreedyAlone
 
 NEVER = math.inf
 VARIANTS = [MapGreedyAlone, MapGreedy, MapGreedyAll, Courier]

@@ -11,10 +11,9 @@ from torchrl.envs import step_mdp
 from emberlink.envs import WildfireConfig, WildfireEnv, keys
 from emberlink.envs.config import RadioConfig
 from emberlink.envs.world import radio
-from emberlink.policies.planning import Rally, Targets, plan_period
-from emberlink.policies.scripted.courier import Courier
-from emberlink.policies.scripted.map_greedy import MapGreedy
+from emberlink.policies.scripted.map_greedy import Courier, MapGreedy
 from emberlink.policies.scripted.oracle import Oracle
+from emberlink.policies.scripted.planning import Rally, Targets, plan_period
 
 NEVER = math.inf
 BASE = torch.tensor([0.0, 30.0])

@@ -15,10 +15,10 @@ from emberlink.configs import known
 from emberlink.envs import WildfireConfig, WildfireEnv, keys, metrics
 from emberlink.envs.world.sensor import view_radius
 from emberlink.policies.scripted.base import Scripted
-from emberlink.policies.scripted.follow_target import FollowTarget
 from emberlink.policies.scripted.lawnmower import Lawnmower, search_path
 from emberlink.policies.scripted.oracle import Oracle
 from emberlink.policies.scripted.registry import SCRIPTED
+from emberlink.policies.scripted.simple import FollowTarget
 from emberlink.trainers.build import build_env
 from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.evaluation.evaluate import play, scripted_config

@@ -9,7 +9,7 @@ import pytest
 import torch
 from exact_front import exact_arrival
 
-from emberlink.envs.fire.ellipse import ellipse_rates
+from emberlink.envs.fire.level_set import ellipse_rates
 
 pytestmark = pytest.mark.drawn
 

@@ -13,14 +13,13 @@ from pydantic import ValidationError
 from torch import Tensor
 
 from emberlink.envs.fire import generator
-from emberlink.envs.fire.ellipse import ellipse_rates
 from emberlink.envs.fire.generator import (
     FireConfig,
     fire_seeds,
     load_scenario,
     make_fires,
 )
-from emberlink.envs.fire.level_set import arrival_times, disc
+from emberlink.envs.fire.level_set import arrival_times, disc, ellipse_rates
 
 GRID, HORIZON = (30, 30), 1000
 NEW = ("drift_rate", "tide_reach", "tide_period", "tide_phase", "tide_bearing", "two_sided")

@@ -6,8 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from emberlink.envs.fire.ellipse import ellipse_rates, length_to_breadth
-from emberlink.envs.fire.level_set import arrival_times, disc
+from emberlink.envs.fire.level_set import arrival_times, disc, ellipse_rates, length_to_breadth
 
 SIDE, CORE, HEAD, HORIZON = 30.0, 3.0, 0.01, 1000.0
 STRAIGHT, TURNING = 0.0, math.pi

@@ -9,9 +9,8 @@ from small_episode import STEPS, play_small
 
 from emberlink.envs import WildfireConfig, keys
 from emberlink.envs.rendering.frame import BASE, BURNT_OUT, FAILED, FIELD_OF_VIEW, MISSED, UAV
-from emberlink.policies.scripted.follow_target import FollowTarget
-from emberlink.policies.scripted.map_greedy import MapGreedy
-from emberlink.policies.scripted.map_greedy_alone import MapGreedyAlone
+from emberlink.policies.scripted.map_greedy import MapGreedy, MapGreedyAlone
+from emberlink.policies.scripted.simple import FollowTarget
 from emberlink.trainers import make_env
 from emberlink.trainers.evaluation.evaluate import play
 from emberlink.trainers.replay import screen as screens

@@ -4,10 +4,9 @@ from typing import Literal
 
 import torch
 from tensordict import TensorDictBase
-from torch import Tensor
+from torch import Tensor, nn
 
 from emberlink.envs import keys
-from emberlink.envs.utils.buffers import Buffers
 from emberlink.envs.wildfire import WildfireEnv
 from emberlink.envs.world import radio
 from emberlink.envs.world.coverage_map import View
@@ -17,7 +16,7 @@ from emberlink.envs.world.sensor import Sensor
 Messages = Literal["none", "in range", "everyone"]
 
 
-class TeamMaps(Buffers):
+class TeamMaps(nn.Module):
     """Stores the last step at which each UAV knows each cell to have been seen.
 
     The maps are made from the positions of the UAVs alone. The state of the fire is read only for

@@ -1,18 +1,20 @@
-"""Assigns target cells to UAVs: the highest weight in view per cost that no other UAV claims."""
+"""Plans the flights of scripted policies: target cells, and places to meet in time."""
+
+from typing import NamedTuple
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
-from emberlink.envs.utils.buffers import Buffers
 from emberlink.envs.wildfire import WildfireEnv
 from emberlink.envs.world import motion
+from emberlink.envs.world.radio import PASSING
 from emberlink.envs.world.sensor import view_radius
 
 HERE = 2.0
 """cells added to distances, so that no cell is at distance 0"""
 
 
-class Targets(Buffers):
+class Targets(nn.Module):
     """Chooses the cell above which each UAV sees the highest sum of weights per cost.
 
     Args:
@@ -95,3 +97,42 @@ def band(side: int, reach: float) -> Tensor:
 def plan_period(flown: float, displacement: float) -> int:
     """Returns the steps in which a UAV flies `flown` cells, from 1 to 10."""
     return min(10, max(1, round(flown / displacement)))
+
+
+class Rally(NamedTuple):
+    """Stores where each UAV has to be, and from which step on."""
+
+    place: Tensor
+    """float32 [envs, n, 2], cells"""
+    reach: Tensor
+    """float32 [envs, n]: greatest distance from the place, cells"""
+    step: Tensor
+    """float32 [envs, n]; inf for a UAV that does not have to be anywhere"""
+
+    def too_late(self, cells: tuple[Tensor, Tensor], arrives: Tensor, speed: float) -> Tensor:
+        """Returns whether a UAV that flies to a cell first is late, bool [envs, n, X, Y].
+
+        Args:
+            cells: the places of the cells along x, [X], and along y, [Y].
+            arrives: float32 [envs, n, X, Y], the step at which the UAV arrives at the cell.
+            speed: cells per step.
+        """
+        along_x = (self.place[..., :1] - cells[0]).unsqueeze(-1)
+        along_y = (self.place[..., 1:] - cells[1]).unsqueeze(-2)
+        apart = torch.hypot(along_x, along_y) - self.reach[..., None, None]
+        outside = apart > 0
+        needs = (apart.clamp(min=0) / speed + PASSING) * outside
+        return arrives + needs > self.step[..., None, None]
+
+    def leaves(self, ground: Tensor, step: Tensor, speed: float, period: int) -> Tensor:
+        """Returns whether a UAV has to leave for its place before the next plan, bool [envs, n].
+
+        Args:
+            ground: float32 [envs, n, 2], positions, cells.
+            step: int64 [envs].
+            speed: cells per step.
+            period: steps between plans.
+        """
+        apart = torch.linalg.vector_norm(self.place - ground, dim=-1) - self.reach
+        needs = apart.clamp(min=0) / speed + PASSING + period
+        return (apart > 0) & (step.unsqueeze(-1) + needs >= self.step)
