@@ -4,63 +4,83 @@ Importing this module registers "emberlink/WildfireTeam-v0", so that
 `gymnasium.make("emberlink.envs.gymnasium:emberlink/WildfireTeam-v0")` finds it.
 """
 
+from collections.abc import Callable
 from typing import Any
 
 import gymnasium
 import numpy as np
-from gymnasium.spaces import Box
+from gymnasium.spaces import Box, Dict, Space
 from numpy.typing import NDArray
+from tensordict import TensorDictBase
 
+from emberlink.envs import keys
 from emberlink.envs.pettingzoo import WildfireParallelEnv, parallel_env, to_action
-from emberlink.envs.utils.errors import UserError
 
 ID = "emberlink/WildfireTeam-v0"
 
 
-class WildfireTeamEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
+class WildfireTeamEnv(gymnasium.Env[Any, NDArray[np.float32]]):
     """One agent that observes all UAVs, float32 [n * features], and moves all, float32 [n * 3].
 
-    The reward is the mean over UAVs. An episode is terminated if all UAVs have failed. `info` holds
-    the numbers of cells `seen`, `burning` and `burnt`.
+    If the UAVs observe pictures, an observation is a dictionary of "observation" and the pictures,
+    uint8 [n, ...]. The reward is the mean over UAVs. An episode is terminated if all UAVs have
+    failed. `info` holds the numbers of cells `seen`, `burning` and `burnt`.
 
     Args:
         kwargs: as for `parallel_env`.
 
     Raises:
-        UserError: as `parallel_env`, or `observation` is not `vector`.
+        UserError: as `parallel_env`.
     """
 
     metadata = WildfireParallelEnv.metadata
 
     def __init__(self, **kwargs: Any):
         self._team = parallel_env(**kwargs)
-        observation = self._team._core.config.observation
-        if observation != "vector":
-            raise UserError(f"observation={observation}: the joint view of a team is a vector")
         self.render_mode = self._team.render_mode
-        self.observation_space = self._team.state_space
-        self.action_space = Box(-1.0, 1.0, (3 * len(self._team.possible_agents),), np.float32)
+        self._ended = False, False
+        uavs = len(self._team.possible_agents)
+        self.observation_space: Space[Any] = self._team.state_space
+        one = self._team.observation_space(self._team.possible_agents[0])
+        if isinstance(one, Dict):
+            spaces: dict[str, Space[Any]] = {keys.OBSERVATION[1]: self._team.state_space}
+            for name, box in one.items():
+                if isinstance(box, Box) and name not in spaces:
+                    spaces[name] = Box(0, int(box.high.max()), (uavs, *box.shape), np.uint8)
+            self.observation_space = Dict(spaces)
+        self.action_space = Box(-1.0, 1.0, (3 * uavs,), np.float32)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
         """Starts an episode; see `WildfireParallelEnv.reset`."""
         super().reset(seed=seed)
-        _, infos = self._team.reset(seed=seed, options=options)
-        return self._team.state(), _shared(infos)
+        self._team.reset(seed=seed, options=options)
+        self._ended = False, False
+        return self._observed(), self._team.counts()
 
     def step(self, action: NDArray[np.float32]):
-        """Moves all UAVs at once.
+        """Moves all UAVs at once; after the end of an episode, nothing changes.
 
         Raises:
-            UserError: the action is not an array of shape [n * 3].
+            UserError: the action is not an array of shape [n * 3] without NaN.
         """
         every = self._team.possible_agents
         rows = to_action(action, 3 * len(every)).reshape(-1, 3)
-        actions = dict(zip(every, rows, strict=True))
-        flying = {agent: actions[agent] for agent in self._team.agents}
-        _, rewards, _, truncations, infos = self._team.step(flying)
-        reward, truncated = sum(rewards.values()) / len(every), any(truncations.values())
-        terminated = not truncated and not self._team.agents
-        return self._team.state(), reward, terminated, truncated, _shared(infos)
+        _, rewards, _, truncations, _ = self._team.step(dict(zip(every, rows, strict=True)))
+        if rewards:
+            truncated = any(truncations.values())
+            self._ended = not truncated and not self._team.agents, truncated
+        reward = sum(rewards.values()) / len(every)
+        return self._observed(), reward, *self._ended, self._team.counts()
+
+    def act(self, policy: Callable[[TensorDictBase], TensorDictBase]) -> NDArray[np.float32]:
+        """Returns the actions of a policy for `step`; see `WildfireParallelEnv.act`."""
+        actions = self._team.act(policy)
+        hover = np.zeros(3, np.float32)
+        return np.concatenate([actions.get(uav, hover) for uav in self._team.possible_agents])
+
+    def _observed(self) -> Any:
+        vector, pictures = self._team.state(), self._team.pictures()
+        return {keys.OBSERVATION[1]: vector, **pictures} if pictures else vector
 
     def render(self):
         """Draws the environment; see `WildfireParallelEnv.render`."""
@@ -69,11 +89,6 @@ class WildfireTeamEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
     def close(self) -> None:
         """Closes the window, if there is one."""
         self._team.close()
-
-
-def _shared(infos: dict[str, dict[str, Any]]) -> dict[str, int]:
-    first = next(iter(infos.values()))
-    return {key: first[key] for key in ("seen", "burning", "burnt")}
 
 
 gymnasium.register(id=ID, entry_point=f"{__name__}:WildfireTeamEnv")

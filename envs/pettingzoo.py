@@ -147,7 +147,7 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
         self._now = self._env.reset(**options)
         self.agents = list(self.possible_agents)
         self._show()
-        return self._observations(self._now), self._infos(self._now)
+        return self._observations(), self._infos(self._now)
 
     def step(
         self, actions: dict[str, Array]
@@ -158,16 +158,21 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
         dict[str, bool],
         dict[str, dict[str, Any]],
     ]:
-        """Moves all UAVs at once.
+        """Moves all UAVs at once; after the end of an episode, returns empty dictionaries.
+
+        Args:
+            actions: of the live agents; actions of agents that have left are ignored.
 
         Raises:
-            UserError: not one action of three numbers for each live agent, or no episode runs.
+            UserError: an agent is not known, an action of a live agent is missing, is no array of
+                three numbers or holds NaN, or no episode has been started.
         """
-        if self._now is None or not self.agents:
-            raise UserError("no episode is running: call reset() before step()")
+        now = self._begun("step")
+        if not self.agents:
+            return {}, {}, {}, {}, {}
         action = self._stacked(actions)
-        self._now.set(keys.ACTION, torch.from_numpy(action[None]).to(self._core.device))
-        stepped = self._env.step(self._now)
+        now.set(keys.ACTION, torch.from_numpy(action[None]).to(self._core.device))
+        stepped = self._env.step(now)
         self._now = step_mdp(stepped, keep_other=True)
         after = stepped.get("next")
         rewards = after.get(keys.REWARD)[0, :, 0].tolist()
@@ -175,7 +180,7 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
         flew, truncated = self.agents, bool(after.get("truncated"))
         self.agents = [] if truncated else [agent for agent in flew if lives[agent]]
         self._show()
-        observations, infos = self._observations(after), self._infos(after)
+        observations, infos = self._observations(), self._infos(after)
         rewards = dict(zip(self.possible_agents, rewards, strict=True))
         return (
             {agent: observations[agent] for agent in flew},
@@ -188,16 +193,19 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
     def act(self, policy: Callable[[TensorDictBase], TensorDictBase]) -> dict[str, Array]:
         """Returns the actions of a policy for `step`; each call moves its memory one step on.
 
+        After the end of an episode there are none.
+
         Args:
             policy: writes ("agents", "action"), such as `emberlink.trainers.load` returns.
 
         Raises:
-            UserError: no episode is running.
+            UserError: no episode has been started.
         """
-        if self._now is None or not self.agents:
-            raise UserError("no episode is running: call reset() before act()")
+        now = self._begun("act")
+        if not self.agents:
+            return {}
         with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
-            self._now = policy(self._now)
+            self._now = policy(now)
         actions = self._now.get(keys.ACTION)[0].cpu().numpy().copy()
         chosen = dict(zip(self.possible_agents, actions, strict=True))
         return {agent: chosen[agent] for agent in self.agents}
@@ -208,9 +216,27 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
         Raises:
             UserError: no episode has been started.
         """
-        if self._now is None:
-            raise UserError("no episode is running: call reset() before state()")
-        return self._now.get(keys.OBSERVATION)[0].flatten().cpu().numpy().copy()
+        now = self._begun("state")
+        return now.get(keys.OBSERVATION)[0].flatten().cpu().numpy().copy()
+
+    def pictures(self) -> dict[str, NDArray[np.uint8]]:
+        """Returns the other tensors of the observations of all UAVs, uint8 [n, ...], by name.
+
+        Raises:
+            UserError: no episode has been started.
+        """
+        now = self._begun("pictures")
+        _, *others = keys.observation_keys(self._env.observation_spec)
+        return {k[1]: now.get(k)[0].to(torch.uint8).cpu().numpy().copy() for k in others}
+
+    def counts(self) -> dict[str, int]:
+        """Returns the numbers of cells `seen`, `burning` and `burnt`.
+
+        Raises:
+            UserError: no episode has been started.
+        """
+        now = self._begun("counts")
+        return {key: int(now.get(key)) for key in (keys.SEEN, keys.BURNING, keys.BURNT)}
 
     def render(self) -> NDArray[np.uint8] | None:
         """Returns the picture, uint8 [height, width, 3], or None if it is shown in a window.
@@ -236,24 +262,32 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
         """Returns the state for copies, which have no window until they are rendered."""
         return {**self.__dict__, "_window": None}
 
+    def _begun(self, caller: str) -> TensorDictBase:
+        """Returns the current time step."""
+        if self._now is None:
+            raise UserError(f"no episode is running: call reset() before {caller}()")
+        return self._now
+
     def _show(self) -> None:
         if self.render_mode == "human":
             self.render()
 
     def _stacked(self, actions: dict[str, Array]) -> Array:
         """Returns the actions in the order of the agents, float32 [n, 3]."""
-        if set(actions) != set(self.agents):
+        missing = set(self.agents) - set(actions)
+        if missing or set(actions) - set(self.possible_agents):
             raise UserError(f"got actions for {sorted(actions)}; expected those of {self.agents}")
-        hover = np.zeros(3, np.float32)
-        given = {agent: actions.get(agent, hover) for agent in self.possible_agents}
-        return np.stack([to_action(action, 3, agent) for agent, action in given.items()])
+        stacked = np.zeros((len(self.possible_agents), 3), np.float32)
+        for i, agent in enumerate(self.possible_agents):
+            if agent in self.agents:
+                stacked[i] = to_action(actions[agent], 3, agent)
+        return stacked
 
-    def _observations(self, td: TensorDictBase) -> dict[str, Observation]:
-        vectors = td.get(keys.OBSERVATION)[0].cpu().numpy().copy()
-        _, *others = keys.observation_keys(self._env.observation_spec)
-        if not others:
+    def _observations(self) -> dict[str, Observation]:
+        vectors = self.state().reshape(len(self.possible_agents), -1)
+        pictures = self.pictures()
+        if not pictures:
             return dict(zip(self.possible_agents, vectors, strict=True))
-        pictures = {key[1]: td.get(key)[0].to(torch.uint8).cpu().numpy().copy() for key in others}
         return {
             agent: {keys.OBSERVATION[1]: vectors[i], **{k: v[i] for k, v in pictures.items()}}
             for i, agent in enumerate(self.possible_agents)
@@ -266,7 +300,7 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
             for key in agents.keys()  # noqa: SIM118  (a TensorDict iterates over its rows)
             if key not in _NOT_INFO
         }
-        shared = {key: int(td.get(key)) for key in (keys.SEEN, keys.BURNING, keys.BURNT)}
+        shared = self.counts()
         return {
             agent: {key: value[i] for key, value in values.items()} | shared
             for i, agent in enumerate(self.possible_agents)
@@ -277,7 +311,7 @@ def to_action(action: Any, size: int, agent: str = "the team") -> Array:
     """Returns an action as an array, float32 [size].
 
     Raises:
-        UserError: it is no array of numbers, or has another shape.
+        UserError: it is no array of numbers, has another shape, or holds NaN.
     """
     try:
         numbers = np.asarray(action, np.float32)
@@ -286,6 +320,8 @@ def to_action(action: Any, size: int, agent: str = "the team") -> Array:
     if numbers.shape != (size,):
         got = numbers.shape
         raise UserError(f"an action is an array of shape ({size},), got {got} for {agent}")
+    if np.isnan(numbers).any():
+        raise UserError(f"action of {agent}: {shown(numbers.tolist())} holds NaN")
     return numbers
 
 

@@ -156,9 +156,34 @@ def test_the_team_as_one_agent_of_gymnasium():
         assert reward == pytest.approx(after[keys.REWARD].mean().item())
         assert (terminated, truncated) == (False, step == 10)
         assert info["seen"] == after[keys.SEEN].item()
+    last = env.unwrapped.step(action)
+    assert np.array_equal(last[0], observation)
+    assert last[1:] == (0.0, False, True, info)
     env.reset()
     for wrong in (np.zeros(10, np.float32), np.zeros((3, 3), np.float32)):
         with pytest.raises(UserError, match=r"shape \(9,\), got"):
             env.unwrapped.step(wrong)
-    with pytest.raises(ValueError, match="observation=window"):
-        gymnasium.make(name, config=WildfireConfig(observation="window"))
+    with pytest.raises(UserError, match="holds NaN"):
+        env.unwrapped.step(np.full(9, np.nan, np.float32))
+
+
+@pytest.mark.parametrize("method", ["consensus", "maps"])
+def test_a_policy_flies_the_team_of_gymnasium(method):
+    name = "emberlink.envs.gymnasium:emberlink/WildfireTeam-v0"
+    given = {"fire": FIRE, "num_uavs": 3, "horizon": 10, "seed": 1}
+    env = gymnasium.make(name, env=make_env(method, **given), render_mode="rgb_array")
+    core = make_env(method, **given)
+
+    def policy(td):
+        return td.set(keys.ACTION, (td[keys.POSITION] / 20 - 0.3).clamp(-1, 1))
+
+    steps = core.rollout(10, policy)["next"]
+    env.reset()
+    for t in range(10):
+        observation, reward, _, truncated, _ = env.step(env.unwrapped.act(policy))
+        assert env.observation_space.contains(observation)
+        assert reward == pytest.approx(steps[keys.REWARD][0, t].mean().item())
+    if method == "maps":
+        assert np.array_equal(observation["crops"], steps[keys.CROPS][0, -1].numpy())
+    assert truncated
+    assert env.render().ndim == 3

@@ -262,7 +262,21 @@ def test_bad_input_is_named():
         env.step(dict.fromkeys(env.agents, np.zeros(2, np.float32)))
     with pytest.raises(UserError, match="action of uav_0: up is no array"):
         env.step(dict.fromkeys(env.agents, "up"))
-    for _ in range(30):
-        env.step(dict.fromkeys(env.agents, null))
-    with pytest.raises(ValueError, match=r"reset\(\)"):
-        env.step({})
+    with pytest.raises(UserError, match=r"action of uav_1: .* holds NaN"):
+        env.step({**dict.fromkeys(env.agents, null), "uav_1": null * np.nan})
+    with pytest.raises(ValueError, match="uav_9"):
+        env.step({**dict.fromkeys(env.agents, null), "uav_9": null})
+
+
+def test_actions_of_agents_that_have_left_are_ignored():
+    config = WildfireConfig(grid=(12, 10), num_uavs=3, horizon=30, failures=3.0)
+    env, other = (parallel_env(config=config, fire=FIRE, seed=2) for _ in range(2))
+    env.reset()
+    other.reset()
+    push = np.full(3, 0.5, np.float32)
+    left = dict.fromkeys(env.possible_agents, push * np.nan)
+    while env.agents:
+        live = dict.fromkeys(env.agents, push)
+        for here, there in zip(env.step({**left, **live}), other.step(live), strict=True):
+            assert here.keys() == there.keys()
+    assert env.step(left) == env.step({}) == ({}, {}, {}, {}, {})
