@@ -20,7 +20,7 @@ _REGISTRY = Registry(
     "policy",
     other_files=("base", "registry", "simple", "planning", "team_maps"),
     group="emberlink.scripted",
-    shared=_SHARED,
+    shared=dict.fromkeys(_SIMPLE, "simple") | dict.fromkeys(_BY_MAPS, "map_greedy"),
 )
 
 
