@@ -8,12 +8,8 @@ from emberlink.envs.utils.validation import unknown
 from emberlink.policies.scripted import ORDER
 from emberlink.policies.scripted.base import Scripted
 
-_SHARED = {
-    **dict.fromkeys(
-        ("stationary", "random_actions", "random_waypoints", "follow_target"), "simple"
-    ),
-    **dict.fromkeys(("map_greedy_alone", "map_greedy", "map_greedy_all", "courier"), "map_greedy"),
-}
+_SIMPLE = "stationary", "random_actions", "random_waypoints", "follow_target"
+_BY_MAPS = "map_greedy_alone", "map_greedy", "map_greedy_all", "courier"
 _REGISTRY = Registry(
     Scripted,
     "emberlink.policies.scripted",
