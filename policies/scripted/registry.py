@@ -8,8 +8,8 @@ from emberlink.envs.utils.validation import unknown
 from emberlink.policies.scripted import ORDER
 from emberlink.policies.scripted.base import Scripted
 
-_SIMPLE = "stationary", "random_actions", "random_waypoints", "follow_target"
-_BY_MAPS = "map_greedy_alone", "map_greedy", "map_greedy_all", "courier"
+_SIMPLE: tuple[str, ...] = "stationary", "random_actions", "random_waypoints", "follow_target"
+_BY_MAPS: tuple[str, ...] = "map_greedy_alone", "map_greedy", "map_greedy_all", "courier"
 _REGISTRY = Registry(
     Scripted,
     "emberlink.policies.scripted",
