@@ -16,7 +16,7 @@ _REGISTRY = Registry(
     "policy",
     other_files=("base", "registry", "simple", "planning", "team_maps"),
     group="emberlink.scripted",
-    shared=dict.fromkeys(_SIMPLE, "simple") | dict.fromkeys(_BY_MAPS, "map_greedy"),
+    shared={**dict.fromkeys(_SIMPLE, "simple"), **dict.fromkeys(_BY_MAPS, "map_greedy")},
 )
 
 
