@@ -21,7 +21,7 @@ from emberlink.envs.fire_files.reader import read_with_summary
 from emberlink.envs.scenarios import fires_of
 from emberlink.envs.utils.errors import UserError, shown, unknown
 from emberlink.envs.utils.publish import free_name, new_file, published
-from emberlink.envs.world.burning import split_times
+from emberlink.envs.world.coverage_map import split_times
 from emberlink.envs.world.sensor import view_radius
 from emberlink.trainers.config.compose import resolve, to_values
 from emberlink.trainers.config.schema import MAX_FIRES, RunConfig
