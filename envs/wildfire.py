@@ -1,6 +1,7 @@
 """The wildfire environment: it joins fire, motion, sensor and reward, and names its tensors."""
 
 import secrets
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -40,7 +41,8 @@ class WildfireEnv(EnvBase):
             [num_envs, X, Y] for one each; or arrival and burn-out times, [1, 2, X, Y] or
             [num_envs, 2, X, Y].
         seed: of all random numbers; the first reset draws a fresh one if None. Environment i's
-            randomness depends on (seed, i) alone.
+            randomness depends on (seed, i) alone. Several seeds have equal shares of the
+            environments, in order; each is the same as with its seed alone, unless `staggered`.
         device: where all tensors live.
         agent_done: whether done, terminated and truncated stand under "agents" too, per UAV.
         staggered: whether environments are out of phase: the first episode of environment i after
@@ -48,8 +50,9 @@ class WildfireEnv(EnvBase):
         true_map: whether the map is written under `keys.TRUE_MAP`, too.
 
     Raises:
-        UserError: an unknown scenario or device, arrival times whose shape does not fit, or a seed
-            or number of environments that is not whole.
+        UserError: an unknown scenario or device, arrival times whose shape does not fit, seeds or a
+            number of environments that are not whole, or a number of environments that is no
+            multiple of the number of seeds.
     """
 
     _low: Tensor
@@ -70,7 +73,7 @@ class WildfireEnv(EnvBase):
         num_envs: int = 1,
         config: WildfireConfig | None = None,
         fire: str | ScenarioConfig | Tensor = "paper",
-        seed: int | None = None,
+        seed: int | Sequence[int] | None = None,
         device: torch.device | str = "cpu",
         *,
         agent_done: bool = False,
@@ -88,9 +91,11 @@ class WildfireEnv(EnvBase):
         self._make_world(fire)
         self._make_specs()
         self.to(self.device)
-        self._seeded = False
+        self._seeded = seed is not None
         if seed is not None:
-            self._set_seed(seed)
+            seeds = counter_rng.check_seeds(seed, num_envs)
+            parts = [counter_rng.seed_keys(s, num_envs // len(seeds), self.device) for s in seeds]
+            self._seed_key.copy_(torch.cat(parts))
 
     def _make_world(self, fire: str | ScenarioConfig | Tensor) -> None:
         """Registers the buffers: constants, and the state of all environments."""

@@ -6,6 +6,7 @@ key. They are the same on every device and for any batch size, and there is no s
 are int64 tensors; `fold_in` derives a key from another.
 """
 
+from collections.abc import Sequence
 from enum import IntEnum, unique
 from typing import Any
 
@@ -110,6 +111,22 @@ def check_seed(seed: Any) -> int:
     if not 0 <= number < 2**63:
         raise UserError(f"seed={seed}: expected a whole number from 0 to 2^63 - 1")
     return number
+
+
+def check_seeds(seed: int | Sequence[int], num_envs: int) -> list[int]:
+    """Returns one or several seeds as a list.
+
+    Raises:
+        UserError: a seed is not a whole number from 0 to 2^63 - 1, or `num_envs` is not a multiple
+            of the number of seeds.
+    """
+    given = seed if isinstance(seed, Sequence) and not isinstance(seed, str) else [seed]
+    seeds = [check_seed(number) for number in given]
+    if not seeds:
+        raise UserError(f"seed={seed}: expected at least one seed")
+    if num_envs % len(seeds):
+        raise UserError(f"num_envs={num_envs} is not a multiple of the {len(seeds)} seeds")
+    return seeds
 
 
 def _bits(key: Tensor, count: int) -> Tensor:
