@@ -27,6 +27,10 @@ def _required(value: Any) -> Any:
     return value
 
 
+def _text(value: Any) -> Any:
+    return str(value) if isinstance(value, int) else value
+
+
 @dataclasses.dataclass(frozen=True)
 class Clock:
     """The unit of a source's times, and the calendar time of 0 where it is known."""
@@ -85,7 +89,7 @@ class FileFireConfig:
     """Column of the perimeters' times, or the columns of the date and the time of day."""
     time_format: _Text | None = None
     """`day_first`, `month_first`, `seconds` since 1970, or a pattern such as `%d.%m.%y %H:%M`."""
-    incident: _Text | None = None
+    incident: Annotated[_Text | None, BeforeValidator(_text)] = None
     """Incident whose perimeters are read, where a file has several; "*" reads all as one fire."""
     incident_field: _Text | None = None
     """Column in which `incident` is looked for."""

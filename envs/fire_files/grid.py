@@ -6,6 +6,7 @@ from typing import Any, Protocol
 
 import numpy as np
 from scipy.ndimage import label, map_coordinates, minimum_filter
+from scipy.sparse.csgraph import connected_components
 
 from emberlink.envs.fire_files.config import Clock
 from emberlink.envs.fire_files.files import library
@@ -215,6 +216,22 @@ def beginnings(times: np.ndarray) -> int:
     later = minimum_filter(np.where(burns & ~earliest, times, np.inf), 3) == times
     places: Any = label(burns & earliest, np.ones((3, 3)))
     return int(places[1] - len(np.unique(places[0][burns & earliest & later])))
+
+
+def far_apart(boxes: np.ndarray) -> list[str]:
+    """Returns whether parts with some boxes, [parts, 4], lie farther apart than they are long."""
+    size = len(boxes) + 1
+    while len(boxes) < size:
+        size, low, high = len(boxes), boxes[:, :2], boxes[:, 2:]
+        longest = (high - low).max()
+        between = np.maximum(low[:, None] - high[None], low[None] - high[:, None]).max(2)
+        count, of = connected_components(between <= 1.5 * longest)
+        groups = [boxes[of == k] for k in range(count)]
+        boxes = np.array([[*g[:, :2].min(0), *g[:, 2:].max(0)] for g in groups])
+    if size == 1:
+        return []
+    gap = between.max()
+    return [f"{size} groups of parts never join and lie {gap:g} apart, {longest:g} long: one fire?"]
 
 
 def number(count: int, noun: str) -> str:

@@ -10,12 +10,13 @@ from emberlink.envs.fire_files.areas import MANY, area_at_zero, enclosed, make_v
 from emberlink.envs.fire_files.config import Clock, FileFireConfig
 from emberlink.envs.fire_files.features import choose_features
 from emberlink.envs.fire_files.files import library
-from emberlink.envs.fire_files.grid import Bounds, Window, number
+from emberlink.envs.fire_files.grid import Bounds, Window, far_apart, number
 from emberlink.envs.fire_files.projection import Plane, choose_plane
 from emberlink.envs.fire_files.times import read_times
 from emberlink.envs.utils.errors import UserError
 
 _MAX_TIMES = 500
+_MAX_PARTS = 1000  # the largest, among which groups are looked for
 _AROUND = np.ones((3, 3))
 
 
@@ -100,6 +101,8 @@ class Perimeters:
         self.doubts: list[str] = []
         if clock.origin is None and self.first > self.last - self.first:
             self.doubts = [f"it begins at time 0 (fire.start={self.first:g}: at the first)"]
+        parts = sorted((part for area in areas for part in polygons(area)), key=lambda p: -p.area)
+        self.doubts += far_apart(np.array([part.bounds for part in parts[:_MAX_PARTS]]))
         if clock.origin is None and times[0] > 0:
             areas, times = [area_at_zero(areas, times), *areas], np.concatenate([[0.0], times])
         self._areas, self._times, self.began = areas, times, float(times[0])

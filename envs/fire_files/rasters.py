@@ -11,12 +11,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.ndimage import find_objects, label
 
 from emberlink.envs.config import SIDES
 from emberlink.envs.fire_files.config import Clock, FileFireConfig
 from emberlink.envs.fire_files.dates import in_utc, parse_dates
 from emberlink.envs.fire_files.files import check_prj, first_line, library
-from emberlink.envs.fire_files.grid import Raster, beginnings, number
+from emberlink.envs.fire_files.grid import Raster, beginnings, far_apart, number
 from emberlink.envs.fire_files.projection import MAX_CELLS, Affine, choose_plane, warped
 from emberlink.envs.fire_files.values import (
     arrival,
@@ -75,12 +76,13 @@ def _band(path: Path, kind: str, dataset: Any, affine: Affine, config: FileFireC
     what = f"band {next((title for title in titles if title), band)!r:.60}"
     what += f", the last of {band} times" if band > 1 else ""
     what += f" ({declared})" if declared else ""
-    flags = [flag.name for flag in dataset.mask_flag_enums[band - 1]]
-    nodata = None if "all_valid" in flags else dataset.read_masks(band) == 0
-    values = _read(dataset, MAX_CELLS, band)[0]
     if kind == "asc":  # GDAL reads a word as 0, and wraps rows
-        values = _numbers(path, values.shape)
+        values = _numbers(path, dataset.shape)
         nodata = values == (math.nan if dataset.nodata is None else dataset.nodata)
+    else:
+        flags = [flag.name for flag in dataset.mask_flag_enums[band - 1]]
+        nodata = None if "all_valid" in flags else dataset.read_masks(band) == 0
+        values = _read(dataset, MAX_CELLS, band)[0]
     values = values * dataset.scales[band - 1] + dataset.offsets[band - 1]
     unit, since = unit_of(declared, config, what)
     times = arrival(values, nodata, config)
@@ -196,6 +198,9 @@ def _source(
         check_spreads(times)
     clock = Clock(unit, in_utc(parse_dates([since], None, "units")[0]) if since else None)
     source = Raster(times, (c, f), (a, -e), clock, doubts=signs)
+    parts = find_objects(label(np.isfinite(times))[0])[:1000]  # pyright: ignore
+    boxes = [(x.start, y.start, x.stop, y.stop) for x, y in parts]
+    source.doubts += far_apart(np.array(boxes, float) * abs(a))
     if first <= crossing and not since and unit not in ("steps", "maps"):
         source.began = 0.0  # the ignition lies between the centres of cells
     span = f"{clock.format(source.first)} to {clock.format(source.last)}"

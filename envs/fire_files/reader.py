@@ -11,7 +11,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from scipy import ndimage
 from torch import Tensor
 
 from emberlink.envs.config import check_grid
@@ -107,25 +106,11 @@ def _on_grid(
             fires.append(on_grid(source, config, grid, horizon))
         except UserError as error:
             place = f"fire {len(fires)}: " if len(sources) > 1 else ""
-            raise UserError(f"{place}{error}") from None
+            raise UserError(f"{place}{'; '.join([str(error), *source.doubts])}") from None
     cells = [int(np.isfinite(fire).sum()) for fire in fires]
     burn = f"{min(cells)} to {max(cells)}" if min(cells) < max(cells) else f"{cells[0]}"
     sources[0].facts.append(f"{burn} of {' x '.join(map(str, grid))} cells burn")
-    if len(fires) == 1:
-        sources[0].doubts += _far_apart(fires[0])
     return fires
-
-
-def _far_apart(fire: np.ndarray) -> list[str]:
-    """Returns whether a fire has parts that never join and lie farther apart than they are long."""
-    parts: Any = ndimage.label(np.isfinite(fire), np.ones((3, 3)))
-    longest = max(c.stop - c.start for box in ndimage.find_objects(parts[0]) for c in box)
-    largest = np.bincount(parts[0].ravel())[1:].argmax() + 1
-    apart: Any = ndimage.distance_transform_edt(parts[0] != largest)
-    most = max(float(apart[parts[0] == k].min()) for k in range(1, parts[1] + 1))
-    if most <= 1.5 * longest:
-        return []
-    return [f"{parts[1]} parts of {longest} cells at most never join, {most:.0f} apart: one fire?"]
 
 
 class FireSets(NamedTuple):

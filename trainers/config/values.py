@@ -76,7 +76,8 @@ def change(
     for key, value in given:
         check_not_removed(key, value)
         group, _, last = key.partition(".")
-        if group in GROUPS and last in ("", "name", "kind"):
+        masks = (key, value) == ("fire.kind", "masks")  # of a file
+        if group in GROUPS and last in ("", "name", "kind") and not masks:
             raise UserError(f"{key}={shown(value)}: choose it with {group}=NAME")
         if key not in known:
             raise UserError(unknown_key(key, known))

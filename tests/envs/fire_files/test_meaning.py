@@ -1,0 +1,425 @@
+"""Tests what a file is understood to mean: a second case for each kind that was misread."""
+
+import json
+import re
+import shlex
+import subprocess
+import sys
+import time
+
+import geopandas
+import numpy as np
+import pandas
+import pytest
+import rasterio
+import shapely
+import torch
+from fire_files import CORNER, UTM, Ellipses, raster_of, write_asc, write_tif
+from scipy.io import netcdf_file
+
+from emberlink.envs.fire_files.config import FileFireConfig
+from emberlink.envs.fire_files.dates import date_within, parse_dates, time_of_day
+from emberlink.envs.fire_files.reader import read_with_summary
+
+HOURS = (60.0, 120.0, 180.0, 240.0)
+FIRE = Ellipses()
+
+
+def read(path, **keys):
+    """Returns the fire of a file on 20 x 20 cells, and what was understood."""
+    (fire,), about = read_with_summary(
+        FileFireConfig(path=str(path), ring_width=None, **keys), (20, 20), 100
+    )
+    return fire, about
+
+
+def asks(path, match, **keys):
+    """Checks that a file is not understood without another key."""
+    with pytest.raises(ValueError, match=match) as caught:
+        read(path, **keys)
+    assert "\n" not in str(caught.value)
+    assert path.name in str(caught.value)
+
+
+def squares(*sides, at=(0, 0), **columns):
+    """Returns concentric squares with the given sides in metres."""
+    boxes = [shapely.box(*(np.array([-s, -s, s, s]) / 2)) for s in sides]
+    shapes = [shapely.transform(b, lambda xy: xy + np.array(CORNER) + at) for b in boxes]
+    return geopandas.GeoDataFrame(columns, geometry=shapes, crs=UTM)
+
+
+@pytest.fixture
+def elapsed(tmp_path):
+    """Returns the fire of three squares an hour apart."""
+    squares(200, 300, 400, Elapsed_Mi=[0, 60, 120]).to_file(tmp_path / "elapsed.gpkg")
+    return read(tmp_path / "elapsed.gpkg")[0]
+
+
+def same(path, elapsed, says="", **keys):
+    fire, about = read(path, **keys)
+    assert torch.equal(torch.isfinite(fire), torch.isfinite(elapsed))
+    both = torch.isfinite(elapsed)
+    assert torch.allclose(fire[both], elapsed[both], atol=1e-3), about
+    assert says in about, about
+
+
+@pytest.mark.parametrize(
+    ("columns", "joined"),
+    [
+        ({"date": ["2020-09-05"] * 3, "hour": [9, 10, 11]}, "date and hour"),
+        ({"date": ["2020-09-05"] * 3, "hour": [9, 10, 11], "minute": [5] * 3}, "hour and minute"),
+        ({"DATE_": ["9/25/2020"] * 3, "TIME_": [2055, 2155, 2255]}, "DATE_ and TIME_"),
+        ({"Acq_Date": ["2020-09-05"] * 3, "Acq_Time": ["00:08", "01:08", "02:08"]}, "Acq_Time"),
+        ({"fecha": ["2020-09-05"] * 3, "hora": ["9:55 PM", "10:55 PM", "11:55 PM"]}, "fecha and"),
+    ],
+)
+def test_a_date_beside_a_time_of_day_is_joined(tmp_path, elapsed, columns, joined):
+    keys = {"time_field": "fecha"} if "fecha" in columns else {}
+    squares(200, 300, 400, **columns).to_file(tmp_path / "fire.geojson")
+    same(tmp_path / "fire.geojson", elapsed, joined, **keys)
+
+
+def test_a_time_of_day_of_another_column_is_asked_for(tmp_path, elapsed):
+    frame = squares(200, 300, 400, date=["2020-09-05"] * 3, flight_time=["0900", "1000", "1100"])
+    frame.to_file(tmp_path / "fire.gpkg")
+    asks(tmp_path / "fire.gpkg", r"flight_time may hold; expected 'fire.time_field=\[date,flight")
+    same(tmp_path / "fire.gpkg", elapsed, time_field=("date", "flight_time"))
+    frame.assign(time=["0900", "2575", "1100"]).to_file(tmp_path / "wrong.gpkg")
+    asks(tmp_path / "wrong.gpkg", "feature 1 has date=2020-09-05, time=2575; expected a date")
+
+
+@pytest.mark.parametrize("column", ["fireid", "FIRE_YEAR", "attr_UniqueFireIdentifier", "id"])
+def test_several_fires_are_listed_and_one_is_chosen(tmp_path, elapsed, column):
+    frames = [squares(200, 300, 400, date=_dates(3)), squares(9, 90, at=(9e4, 0), date=_dates(2))]
+    frame = pandas.concat([f.assign(**{column: k + 2019}) for k, f in enumerate(frames)])
+    frame.to_file(tmp_path / "fire.gpkg")
+    asks(tmp_path / "fire.gpkg", rf"{column}: 2019 \(3\), 2020 \(2\); .*incident_field={column}")
+    same(tmp_path / "fire.gpkg", elapsed, "3 of 5 features", incident="2019")
+    asks(tmp_path / "fire.gpkg", "2 groups of parts never join and lie 89755 apart", incident="*")
+    asks(tmp_path / "fire.gpkg", "'2018' is not known; .*known: 2019, 2020", incident="2018")
+
+
+def _dates(count):
+    return [f"2020-09-05T{9 + k:02}:00Z" for k in range(count)]
+
+
+def test_a_number_of_the_features_is_no_fire(tmp_path, elapsed):
+    frame = squares(200, 300, 400, date=_dates(3), id=[1, 2, 3], name=["first", "second", "third"])
+    frame.to_file(tmp_path / "fire.gpkg")
+    same(tmp_path / "fire.gpkg", elapsed)
+
+
+def test_a_prescribed_fire_is_filtered(tmp_path, elapsed):
+    kinds = ["WF", "WF", "WF", "RX"]
+    frame = squares(200, 300, 400, 4000, date=_dates(4), IncidentTypeCategory=kinds)
+    frame.to_file(tmp_path / "fire.gpkg")
+    asks(tmp_path / "fire.gpkg", r"IncidentTypeCategory: WF \(3\), RX \(1\); expected 'fire.where=")
+    same(tmp_path / "fire.gpkg", elapsed, "1 left out", where="incidenttypecategory=wf")
+    assert "4 of 4 features" in read(tmp_path / "fire.gpkg", where="*")[1]
+    asks(tmp_path / "fire.gpkg", "keeps no feature", where="IncidentTypeCategory=x*")
+
+
+def test_features_without_a_time_are_asked_about(tmp_path, elapsed):
+    frame = squares(200, 300, 400, 900, date=[*_dates(3), None])
+    frame.to_file(tmp_path / "fire.gpkg")
+    asks(tmp_path / "fire.gpkg", r"feature 3 has no time in date \(1 of 4\); .*fire.where=date")
+    same(tmp_path / "fire.gpkg", elapsed, "1 left out by fire.where=date", where="date")
+
+
+def test_a_raster_in_a_projection_that_bends(tmp_path):
+    times = raster_of(FIRE, 300.0, 80, 40.0)
+    plain = write_tif(tmp_path / "plain.tif", times, 40.0)
+    bent = tmp_path / "bent.tif"
+    with rasterio.open(plain) as source:
+        about = {
+            "crs": "+proj=sinu +R=6371007.181",
+            "resampling": rasterio.enums.Resampling.nearest,
+        }
+        with rasterio.vrt.WarpedVRT(source, **about) as view:
+            profile = {**view.profile, "driver": "GTiff"}
+            with rasterio.open(bent, "w", **profile) as target:
+                target.write(view.read())
+    right, about = read(plain, units="minutes")
+    assert "axes 1.00 : 1" in about
+    fire, about = read(bent, units="minutes")
+    assert "projected to WGS 84 / UTM zone 11N (axes 1.00 : 1" in about
+    for step in (40, 70, 100):
+        one, other = right <= step, fire <= step
+        assert (one & other).sum() / (one | other).sum() > 0.9
+    asks(plain, "has axes 3.* : 1 here", units="minutes", crs="+proj=sinu +lon_0=0")
+
+
+@pytest.mark.parametrize("value", [9999.0, 65535.0, 1e10, 305.0, 0.0])
+def test_a_plateau_is_asked_about(tmp_path, value):
+    times = np.where(raster_of(FIRE, 300.0) < 0, value, raster_of(FIRE, 300.0) + 1)
+    path = write_tif(tmp_path / "fire.tif", times, nodata=None)
+    asks(
+        path, rf"{re.escape(f'{value:g}')} \(\d+ % of the cells\).*fire.unburned=", units="minutes"
+    )
+    right = read(
+        write_asc(tmp_path / "fire.asc", raster_of(FIRE, 300.0) + 1),
+        units="minutes",
+        unburned=-9998.0,
+    )[0]
+    assert torch.equal(read(path, units="minutes", unburned=value)[0], right)
+    few = times[20:70, 20:70]
+    share = (few == value).mean()
+    if value != 305:
+        asks(write_tif(tmp_path / "few.tif", few), f".{100 * share:.0f} %", units="minutes")
+    assert read(path, units="minutes", unburned="none", end=301.0)[1]
+
+
+def test_days_of_the_year_of_perimeters(tmp_path, elapsed):
+    squares(200, 300, 400, doy=[365, 1, 2]).to_file(tmp_path / "fire.gpkg")
+    same(tmp_path / "fire.gpkg", elapsed, time_field="doy", units="day_of_year", start=365.0)
+    days = np.where(raster_of(FIRE, 300.0) < 0, -9999, 100 + raster_of(FIRE, 300.0) // 60)
+    path = write_tif(tmp_path / "fire.tif", days)
+    summer, winter = read(path, units="days")[0], read(path, units="day_of_year")[0]
+    assert torch.equal(summer, winter)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("2020-08-19T13:00-07:00", "2020-08-19T13:00:00-07:00"),
+        ("2020/08/19 13:00:00+00", "2020-08-19T13:00:00+00:00"),
+        ("8/19/2015 1:55:00 PM", "2015-08-19T13:55:00"),
+        ("19.08.2015 13:55", "2015-08-19T13:55:00"),
+        ("Fri, 13 Feb 2026 14:30:58 GMT", "2026-02-13T14:30:58+00:00"),
+        ("Saturday, September 5, 2020 12:30:00 AM", "2020-09-05T00:30:00"),
+        ("Sat Sep 05 2020 13:30:00 GMT-0700 (Pacific Daylight Time)", "2020-09-05T13:30:00-07:00"),
+        ("05-SEP-20", "2020-09-05T00:00:00"),
+        ("2020-09-05 18:00 PDT", "2020-09-05T18:00:00-07:00"),
+        ("2020-245", "2020-09-01T00:00:00"),
+        ("20200819130000", "2020-08-19T13:00:00"),
+        ("1808192000", "2018-08-19T20:00:00"),
+        ("2018081920", "2018-08-19T20:00:00"),
+        ("1598274000", "2020-08-24T13:00:00+00:00"),
+        ("1599328800000", "2020-09-05T18:00:00+00:00"),
+    ],
+)
+def test_forms_of_dates(text, expected):
+    assert parse_dates([text], None, "t")[0].isoformat() == expected
+
+
+@pytest.mark.parametrize(
+    ("texts", "form", "match"),
+    [
+        (["05-08-2020"], None, "fits day_first .2020-08-05 .* or month_first"),
+        (["05.08.20"], None, "day_first .* or month_first .* or year_first"),
+        (["1008192000"], None, "fits seconds .2001-12-12 .* or %y%m%d%H%M .2010-08-19"),
+        (["2020-09-05 18:00 CEST"], None, "is not a date"),
+        (["2020-09-05 13:30 PM"], None, "is not a date"),
+        (["2020-13-05"], None, "is not a date"),
+        (["13/08/2020", "08/14/2020"], None, "is not a date"),
+        (["5 de agosto"], None, "is not a date; expected .*fire.time_format"),
+        (["2020-09-05"], "noon", "fire.time_format=noon: expected"),
+    ],
+)
+def test_dates_that_are_asked_about(texts, form, match):
+    with pytest.raises(ValueError, match=match):
+        parse_dates(texts, form, "t")
+
+
+def test_one_date_decides_the_order_of_all():
+    dates = parse_dates(["05/08/2020 02:00", "13/08/2020 02:00"], None, "t")
+    assert [date.day for date in dates] == [5, 13]
+    assert parse_dates(["05/08/2020"], "month_first", "t")[0].month == 5
+    assert parse_dates(["5h 3. 2020"], "%Hh %d. %Y", "t")[0].hour == 5
+
+
+def test_two_flights_a_day_in_names_and_the_future(tmp_path, elapsed):
+    assert date_within("20200905_1830_Creek_IR") == "20200905 1830"
+    assert date_within("Creek/IR 2020-09-05T18-00") == "2020-09-05T18:00"
+    assert date_within("Flight 3") == date_within("2020-09-05 to 2020-09-06") == ""
+    assert time_of_day(942) == time_of_day("09:42") == time_of_day("9:42 AM")
+    later = [text.replace("2020", "2090") for text in _dates(3)]
+    squares(200, 300, 400, date=later).to_file(tmp_path / "fire.geojson")
+    with pytest.warns(UserWarning, match="2090-09-05 is in the future"):
+        same(tmp_path / "fire.geojson", elapsed)
+
+
+def test_a_unit_in_the_file_is_used_and_contradicts(tmp_path, elapsed):
+    path = write_tif(tmp_path / "fire.tif", raster_of(FIRE, 300.0))
+    with rasterio.open(path, "r+") as dataset:
+        dataset.units = ("minutes",)
+    fire, about = read(path)
+    assert "(minutes)" in about
+    assert torch.equal(fire, read(path, units="minutes")[0])
+    asks(path, "is in minutes; expected fire.units=minutes, not hours", units="hours")
+    with rasterio.open(path, "r+") as dataset:
+        dataset.units = ("kW/m",)
+    asks(path, "is in kW/m, no unit of time", units="minutes")
+    squares(200, 300, 400, Elapsed_Mi=[0, 60, 120]).to_file(tmp_path / "fire.shp")
+    asks(tmp_path / "fire.shp", "Elapsed_Mi is in minutes; expected", units="hours")
+
+
+@pytest.mark.parametrize("kind", ["bool", "float32", "int64"])
+def test_maps_of_states(tmp_path, kind):
+    maps = np.zeros((9, 12, 12), kind)
+    for step in range(9):
+        maps[step, 5 - step // 2 : 7 + step // 2, 5:7] = 1
+    np.save(tmp_path / "fire.npy", maps)
+    asks(tmp_path / "fire.npy", "9 maps of the states 0 .*expected .*fire.kind=masks")
+    fire, about = read(tmp_path / "fire.npy", kind="masks", margin=None)
+    assert "from 0 maps to 8 maps" in about
+    assert fire[10, 10] == 0
+    np.save(tmp_path / "lines.npy", np.where(maps[0] == 1, maps, 3))
+    asks(tmp_path / "lines.npy", "states .*3; expected fire.unburned", kind="masks")
+
+
+def test_a_bank_is_tested_like_a_raster(tmp_path):
+    bank = np.full((5, 10, 10), 900.0)
+    bank[:, 3:6, 3:6] = np.arange(9).reshape(3, 3)
+    np.save(tmp_path / "bank.npy", bank)
+    asks(
+        tmp_path / "bank.npy", r"fire 0: 900 \(91 % of the cells\) may stand for cells that do not"
+    )
+    config = FileFireConfig(path=str(tmp_path / "bank.npy"), unburned=900.0)
+    assert torch.isfinite(read_with_summary(config, (10, 10), 1000)[0]).sum() == 5 * 9
+
+
+@pytest.mark.parametrize("name", ["fire_archive_SV-C2_1.csv", "SUOMI_VIIRS_C2_2023001.txt"])
+def test_detections_of_firms_by_hand(tmp_path, name):
+    """Two detections a kilometre apart and a radius of 600 m: 2.2 km wide, 1.2 km high."""
+    daily = name.endswith("txt")
+    rows = ["latitude,longitude,bright_ti4,acq_date,acq_time,daynight"]
+    clocks = ("00:08", "12:30") if daily else ("8", "1230")
+    rows += [f"{45},{-117 + k * 0.01268},330,2020-09-05,{clocks[k]},N" for k in range(2)]
+    (tmp_path / name).write_text("\n".join([*rows, ""]))
+    asks(tmp_path / name, "2 points, .*expected fire.radius")
+    fire, about = read(tmp_path / name, radius=600.0, margin=0.0)
+    assert "from 2020-09-05T00:08+00:00 to 2020-09-05T12:30+00:00" in about
+    assert "times from acq_date and acq_time, no zone" in about
+    wide, high = (torch.isfinite(fire).any(axis).sum() for axis in (1, 0))
+    assert (wide, high) == (20, pytest.approx(11, abs=1))
+
+
+def wrf(path, variables=("TIGN_G",), **attributes):
+    """Writes a file of WRF-SFIRE with two times; the fire starts in the south-west."""
+    y, x = np.mgrid[:20, :24]
+    times = np.hypot(x - 5, y - 4) * 60.0
+    with netcdf_file(path, "w") as file:
+        for name, size in (("Time", 2), ("south_north_subgrid", 20), ("west_east_subgrid", 24)):
+            file.createDimension(name, size)
+        for name in variables:
+            dimensions = ("Time", "south_north_subgrid", "west_east_subgrid")
+            variable = file.createVariable(name, "f4", dimensions)
+            variable[0], variable[1] = np.minimum(times, 305), np.where(times < 600, times, 605)
+            for key, value in attributes.items():
+                setattr(variable, key, value)
+    return path
+
+
+def test_wrf_sfire_is_read_without_a_conversion(tmp_path):
+    path = wrf(tmp_path / "wrfout_d01_2012-09-09_12:00:00", ("FGRNHFX", "TIGN_G"))
+    asks(path, "2 variables: FGRNHFX, TIGN_G; expected fire.layer, .*fire.layer=TIGN_G")
+    asks(path, "fire.units=.*seconds .*WRF-SFIRE", layer="TIGN_G")
+    asks(path, "605 .*fire.unburned=605", layer="TIGN_G", units="seconds")
+    fire, about = read(path, layer="TIGN_G", units="seconds", unburned=605.0, margin=None)
+    assert "the last of 2 times" in about
+    i, j = np.unravel_index(int(fire.argmin()), fire.shape)
+    assert i < 6
+    assert j < 6, "the south is below"
+
+
+def test_a_unit_with_a_date_of_netcdf(tmp_path):
+    path = wrf(tmp_path / "fire.nc", ("arrival_time_of_front",), units="seconds since 2012-09-09")
+    fire, about = read(path, unburned=605.0)
+    assert "from 2012-09-09T00:00+00:00 to 2012-09-09T00:09+00:00" in about
+    late = read(path, unburned=605.0, start="2012-09-09T00:05")[0]
+    assert (late <= 0).sum() > (fire <= 0).sum()
+
+
+def test_the_command_for_cell2fire_can_be_copied(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for step in range(11):
+        grid = np.zeros((10, 12), int)
+        grid[5, 5 - min(step, 5) : 6 + step // 2] = 1
+        np.savetxt(f"ForestGrid{step}.csv", grid, "%d", ",")
+    with pytest.raises(ValueError, match="Cell2Fire") as caught:
+        read(tmp_path / "ForestGrid0.csv")
+    command = shlex.split(str(caught.value).partition("fire.kind=masks: ")[2])
+    subprocess.run([sys.executable, *command[1:]], check=True)
+    assert "11 maps of the states 0, 1" in read(tmp_path / "fire.npy", kind="masks")[1]
+
+
+def test_perimeters_that_shrink_count_as_their_union(tmp_path, elapsed):
+    frame = squares(
+        400, 100, 200, 300, date=[*_dates(3)[::-1][:1], "2020-09-05T11:30Z", *_dates(2)]
+    )
+    frame.to_file(tmp_path / "fire.geojson")
+    fire, about = read(tmp_path / "fire.geojson")
+    assert "1 perimeter within the area burnt before" in about
+    assert torch.equal(torch.isfinite(fire), torch.isfinite(elapsed))
+    assert fire[torch.isfinite(fire)].max() <= 80
+    reverse = squares(400, 300, 200, date=_dates(3))
+    reverse.to_file(tmp_path / "reverse.geojson")
+    asks(tmp_path / "reverse.geojson", "no fire spreads")
+
+
+@pytest.mark.parametrize("place", ["folder", "name", "file", "collection", "placemark", "document"])
+def test_times_outside_the_features(tmp_path, elapsed, place):
+    whole = squares(200, 300, 400, kept=[1, 1, 1]).to_crs("EPSG:4326")
+    stamps = [f"2020-09-05T{9 + k:02}:00:00Z" for k in range(3)]
+    if place in ("file", "collection"):
+        path = tmp_path / "fires"
+        path.mkdir()
+        for k in range(3):
+            text = json.loads(whole.iloc[k : k + 1].to_json())
+            if place == "collection":
+                text["properties"] = {"datetime": stamps[k]}
+            name = f"Creek_20200905_{9 + k:02}00" if place == "file" else f"front_{k}"
+            (path / f"{name}.geojson").write_text(json.dumps(text))
+    else:
+        path = tmp_path / "fire.kml"
+        marks = []
+        for stamp, shape in zip(stamps, whole.geometry, strict=True):
+            ring = " ".join(f"{x},{y},0" for x, y in shape.exterior.coords)
+            area = f"<Polygon><outerBoundaryIs><LinearRing><coordinates>{ring}</coordinates>"
+            area += "</LinearRing></outerBoundaryIs></Polygon>"
+            time = f"<TimeSpan><begin>{stamp}</begin></TimeSpan>"
+            spot = "<Placemark><Point><coordinates>1,2</coordinates></Point></Placemark>"
+            inner = f"<Placemark><name>Heat</name>{area}</Placemark>{spot}"
+            marks.append(
+                {
+                    "folder": f"<Folder><name>IR {stamp}</name>{inner}</Folder>",
+                    "document": f"<Folder>{time}<Folder>{inner}</Folder></Folder>",
+                    "name": f"<Placemark><name>{stamp[:16]}</name>{area}</Placemark>",
+                    "placemark": f"<Placemark>{time}{area}</Placemark>",
+                }[place]
+            )
+        path.write_text(f"<kml><Document>{''.join(marks)}</Document></kml>")
+    same(path, elapsed)
+
+
+def test_an_arcinfo_projection_in_feet(tmp_path):
+    path = write_asc(tmp_path / "fire.asc", raster_of(FIRE, 300.0))
+    path.with_suffix(".prj").write_text(
+        "Projection STATEPLANE\nFipszone 405\nDatum NAD83\nUnits FEET\nParameters\n"
+    )
+    with rasterio.open(path, driver="AAIGrid") as dataset:
+        name = dataset.crs and dataset.crs.to_wkt()
+    if name:
+        assert "projection" in read(path, units="minutes")[1]
+    else:
+        asks(path, "fire.prj, beside it, holds no projection", units="minutes")
+    path.with_suffix(".prj").write_text("nonsense")
+    asks(path, "fire.prj, beside it, holds no projection", units="minutes")
+
+
+def test_a_fire_of_28110_detections_takes_seconds(tmp_path):
+    random = np.random.default_rng(0)
+    passes = np.sort(random.integers(0, 76, 28110))
+    angle, far = random.uniform(0, 2 * np.pi, 28110), random.uniform(0.5, 1, 28110) * passes * 200
+    x, y = far * np.cos(angle) * 1.4 + CORNER[0], far * np.sin(angle) + CORNER[1]
+    stamps = pandas.Timestamp("2020-09-05T09:42") + pandas.to_timedelta(passes * 12, "h")
+    points = geopandas.GeoSeries(geopandas.points_from_xy(x, y), crs=UTM).to_crs("EPSG:4326")
+    about = {"acq_date": stamps.strftime("%Y-%m-%d"), "acq_time": stamps.strftime("%H%M")}
+    frame = geopandas.GeoDataFrame(about, geometry=points.buffer(0.002), crs="EPSG:4326")
+    frame.to_file(tmp_path / "viirs.gpkg")
+    began = time.process_time()
+    fire, read_as = read(tmp_path / "viirs.gpkg")
+    assert time.process_time() - began < 5
+    assert "76 times" in read_as
+    assert torch.isfinite(fire).sum() > 150

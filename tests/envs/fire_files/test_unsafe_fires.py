@@ -1,0 +1,224 @@
+"""Tests that damaged and hostile files give one line that names the file, at the one door."""
+
+import json
+import os
+import shutil
+import socket
+import sys
+import zipfile
+
+import geopandas
+import numpy as np
+import pytest
+import rasterio
+import torch
+from fire_files import UTM, Ellipses, frame_of, points_text, raster_of, write_asc, write_tif
+
+from emberlink.envs.fire_files.config import FileFireConfig
+from emberlink.envs.fire_files.reader import read_fires, with_checksum
+
+FIRE, TIMES = Ellipses(), (60.0, 120.0, 180.0, 240.0, 300.0)
+
+
+def read(path, **keys):
+    keys = {"units": "minutes"} | keys if path.suffix in (".asc", ".tif", ".tiff") else keys
+    return read_fires(FileFireConfig(path=str(path), **keys), (12, 10), 50)
+
+
+def refused(path, match, **keys):
+    with pytest.raises(ValueError, match=match) as caught:
+        read(path, **keys)
+    text = str(caught.value)
+    assert "\n" not in text
+    assert path.name[:60] in text
+    assert len(text) < 700
+
+
+@pytest.fixture
+def wholes(tmp_path):
+    """Writes a valid file of each format."""
+    times, frame = raster_of(FIRE, 300.0, cells=40, cell=75.0), frame_of(FIRE, TIMES)
+    write_asc(tmp_path / "fire.asc", times, 75.0)
+    write_tif(tmp_path / "fire.tif", times.astype("float32"), 75.0)
+    np.save(tmp_path / "bank.npy", np.where(times < 0, np.inf, times / 6).astype("f4")[None])
+    for suffix in ("shp", "geojson", "gpkg"):
+        frame.to_file(tmp_path / f"front.{suffix}")
+    frame.to_crs("EPSG:4326").to_file(tmp_path / "front.kml", driver="LIBKML")
+    with zipfile.ZipFile(tmp_path / "front.kmz", "w") as archive:
+        archive.write(tmp_path / "front.kml", "DOC.KML")
+    (tmp_path / "front.txt").write_text(points_text(FIRE, 6040, points=24))
+    mains = (".asc", ".tif", ".npy", ".shp", ".geojson", ".gpkg", ".kml", ".kmz", ".txt")
+    return {p.suffix: p for p in sorted(tmp_path.iterdir()) if p.suffix in mains}
+
+
+def test_valid_files_are_read(wholes):
+    assert len(wholes) == 9
+    for path in wholes.values():
+        keys = {"time_field": "Elapsed_Mi"} if path.suffix in (".kml", ".kmz") else {}
+        assert 4 < torch.isfinite(read(path, **keys)[0]).sum() <= 120
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_cut_and_overwritten_files(wholes, tmp_path):
+    """Files that are cut off or have other bytes are refused, or give the same fire."""
+    random = np.random.default_rng(7)
+    for suffix, path in wholes.items():
+        keys = {"time_field": "Elapsed_Mi"} if suffix in (".kml", ".kmz") else {}
+        whole, content = read(path, **keys), path.read_bytes()
+        spoilt = [content[: len(content) * k // 10] for k in (1, 5, 9)]
+        spoilt += [random.bytes(1000), b"seen from the tower\n" * 40, b""]
+        spoilt += [random.bytes(64) + content[64:]]
+        for number, damaged in enumerate(spoilt):
+            folder = tmp_path / f"{suffix[1:]}_{number}"
+            folder.mkdir()
+            for part in tmp_path.glob(f"{path.stem}.*") if suffix == ".shp" else [path]:
+                shutil.copy(part, folder)
+            (folder / path.name).write_bytes(damaged)
+            if suffix == ".txt" and number < 3:
+                continue  # a text may end after any line
+            try:
+                fires = read(folder / path.name, **keys)
+            except ValueError as error:
+                message = str(error)
+            else:
+                message = path.name
+                assert torch.equal(fires, whole), (suffix, number)
+            assert path.name in message.splitlines()[0], (suffix, number)
+
+
+def test_no_regular_files_and_no_addresses(tmp_path, wholes):
+    os.mkfifo(tmp_path / "pipe.tif")
+    refused(tmp_path / "pipe.tif", "no regular file")
+    (tmp_path / "loop.shp").symlink_to(tmp_path / "loop.shp")
+    refused(tmp_path / "loop.shp", "cannot be read|no such file")
+    refused(tmp_path / "none.gpkg", "no such file")
+    refused(tmp_path / ("x" * 300), "cannot be read")
+    (tmp_path / "empty").mkdir()
+    refused(tmp_path / "empty", "a folder with 0 files of perimeters")
+    for text in ("/vsicurl/http://localhost:9/fire.tif", "http://localhost:9/fire.geojson"):
+        with pytest.raises(ValueError, match="no such file"):
+            read_fires(FileFireConfig(path=text), (12, 10), 50)
+    shutil.copy(wholes[".kmz"], tmp_path / "fire.zip")
+    refused(tmp_path / "fire.zip", "an archive; expected the files in it")
+    with (tmp_path / "large.geojson").open("wb") as file:
+        file.write(b"{")
+        file.truncate(150_000_001)  # a hole, which takes no space
+    refused(tmp_path / "large.geojson", "150000001 bytes; .* at most 150000000")
+
+
+@pytest.mark.parametrize("ending", [".msk", ".MSK", ".ovr"])
+def test_nothing_is_fetched_through_a_file_beside_a_raster(tmp_path, ending, wholes, monkeypatch):
+    def no_network(*_):
+        raise AssertionError("opens a socket")
+
+    monkeypatch.setattr(socket.socket, "connect", no_network)
+    beside = tmp_path / f"fire.tif{ending}"
+    beside.write_text('<VRTDataset rasterXSize="40" rasterYSize="40"><VRTRasterBand band="1"/>')
+    refused(wholes[".tif"], f"fire.tif{ending}, beside it, is no TIFF")
+    beside.unlink()
+    os.mkfifo(beside)
+    refused(wholes[".tif"], "no regular file")
+
+
+def test_links_and_declarations_in_texts_are_refused(tmp_path, wholes):
+    whole = json.loads(wholes[".geojson"].read_text())
+    whole["crs"] = {"type": "link", "properties": {"href": "http://localhost:9/", "type": "proj4"}}
+    path = tmp_path / "link.geojson"
+    path.write_text(json.dumps(whole))
+    refused(path, "its crs is a link, which is not followed")
+    for text, match in (
+        ('{"a":' * 100_000, "levels|recursion|expected"),
+        (json.dumps({**whole, "crs": None, "type": "Topology"}), "'Topology'; expected a Feature"),
+        (json.dumps({**whole, "crs": None, "features": [1]}), "expected"),
+    ):
+        path.write_text(text)
+        refused(path, match)
+    kml = wholes[".kml"].read_text()
+    head = '<?xml version="1.0"?><!DOCTYPE kml [<!ENTITY a "aaaa">]>'
+    (tmp_path / "entity.kml").write_text(head + kml.partition("?>")[2])
+    refused(tmp_path / "entity.kml", "document type declaration")
+    (tmp_path / "other.kml").write_text("<html></html>")
+    refused(tmp_path / "other.kml", "the first element is 'html'; expected KML")
+
+
+def test_parts_of_a_shapefile(tmp_path, wholes):
+    refused(wholes[".shp"].with_suffix(".dbf"), "begins with")
+    content = wholes[".shp"].with_suffix(".dbf").read_bytes()
+    wholes[".shp"].with_suffix(".dbf").write_bytes(content[: len(content) // 2])
+    refused(wholes[".shp"], "front.dbf is damaged")
+    wholes[".shp"].with_suffix(".dbf").unlink()
+    refused(wholes[".shp"], "front.dbf is missing beside it")
+
+
+@pytest.mark.parametrize(
+    ("spoil", "match"),
+    [
+        (lambda rows: [*rows[:20], rows[20] + " 7", *rows[21:]], "row"),
+        (lambda rows: rows[:-1], "39, 40.* expected nrows, ncols=.40, 40"),
+        (lambda rows: [*rows[:20], rows[20].replace(" ", " x ", 1), *rows[21:]], "row|convert"),
+        (lambda rows: ["NCOLS 1000000000", *rows[1:]], "40 x 1000000000|expected"),
+    ],
+)
+def test_texts_of_esri_ascii(wholes, spoil, match):
+    rows = wholes[".asc"].read_text().splitlines()
+    wholes[".asc"].write_text("\n".join(spoil(rows)))
+    refused(wholes[".asc"], match)
+
+
+def test_values_that_are_no_times(tmp_path):
+    times = raster_of(FIRE, 300.0, cells=40, cell=75.0)
+    one = np.full_like(times, -9999.0)
+    one[20, 20] = 5.0
+    for values, match in (
+        (np.full_like(times, np.nan), "no cell burns"),
+        (one, "a single cell burns"),
+        (np.where(times >= 0, 3.0, times), "at once"),
+        (np.where(one == 5, -0.5, times), r"-0.5 \(in 1 cells\) is not an arrival time"),
+        (np.where(times < 0, -32768.0, times), "fire.unburned=-32768"),
+        (times.astype("complex64"), "of real numbers"),
+        (np.stack([times] * 3), "3 bands; expected one"),
+    ):
+        path = write_tif(tmp_path / "fire.tif", values)
+        refused(path, match)
+    refused(write_tif(path, times, crs="EPSG:4326"), "are not the degrees of WGS 84")
+    small = rasterio.Affine(0.001, 0, -117, 0, -0.001, 45)
+    refused(write_tif(path, times, crs=None, transform=small), "may be degrees.*fire.crs=EPSG:4326")
+    refused(write_tif(path, times), "fire.incident chooses among perimeters", incident="Creek")
+
+
+def test_geometries_that_enclose_nothing(tmp_path):
+    shapes = [*frame_of(FIRE, TIMES).geometry]
+    half = type(shapes[0].boundary)([*shapes[0].boundary.coords][:40])
+    for geometry, match in (
+        ([shapes[0].centroid] * 5, "5 points"),
+        ([half, *shapes[1:]], "feature 0: a line is not closed"),
+        ([None] * 5, "no feature with a geometry"),
+        ([shapes[0]] * 5, "no fire spreads"),
+    ):
+        frame = geopandas.GeoDataFrame({"Elapsed_Mi": TIMES}, geometry=geometry, crs=UTM)
+        frame.to_file(tmp_path / "fire.gpkg")
+        refused(tmp_path / "fire.gpkg", match)
+    for layer in ("one", "two"):
+        frame_of(FIRE, TIMES).to_file(tmp_path / "several.gpkg", layer=layer)
+    refused(tmp_path / "several.gpkg", "2 layers .*fire.layer, one of one, two")
+    assert read(tmp_path / "several.gpkg", layer="two").isfinite().any()
+
+
+@pytest.mark.parametrize("ending", [".aux.xml", ".msk", ".tfw"])
+def test_the_checksum_contains_the_files_beside(wholes, ending):
+    config = FileFireConfig(path=str(wholes[".tif"]), units="minutes")
+    before = with_checksum(config).sha256
+    other = wholes[".tif"].parent / f"fire{ending}"
+    other.write_text("x")
+    assert with_checksum(config).sha256 != before
+    other.unlink()
+    assert with_checksum(config).sha256 == before
+
+
+@pytest.mark.parametrize("module", ["rasterio", "geopandas"])
+def test_without_the_extra_the_message_names_it(wholes, module, monkeypatch):
+    monkeypatch.setitem(sys.modules, module, None)
+    refused(
+        wholes[".tif" if module == "rasterio" else ".gpkg"], r"needs the extra geo: pip install"
+    )
+    assert read(wholes[".npy"]).isfinite().any()
