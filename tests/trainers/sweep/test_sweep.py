@@ -9,6 +9,7 @@ import time
 from contextlib import nullcontext
 
 import pytest
+import torch
 from rich.console import Console
 from safetensors.torch import load_file
 
@@ -297,7 +298,9 @@ def test_a_stopped_sweep_saves_and_the_same_command_completes_it(tmp_path):
         assert (resumed.path / file).read_bytes() == (whole.path / file).read_bytes()
     weights = [load_file(run.checkpoint()) for run in (resumed, whole)]
     assert weights[0].keys() == weights[1].keys()
-    assert all(tensor.equal(weights[1][name]) for name, tensor in weights[0].items())
+    # Cells that never burn have the arrival time NaN.
+    for name, tensor in weights[0].items():
+        torch.testing.assert_close(tensor, weights[1][name], rtol=0, atol=0, equal_nan=True)
 
 
 @pytest.mark.heavy
