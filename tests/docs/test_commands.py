@@ -113,7 +113,7 @@ def _train(rest: list[str]) -> list[str]:
     from_file = any(word.endswith("=file") for word in rest)
     fires = [] if from_file else ["fire.num_train_fires=2", "evaluation.huygens=false"]
     # A warm start needs a run of the same method: test_imitation.py tests it.
-    rest = [word for word in rest if not word.startswith(("learner.warm_start", "learner.anchor"))]
+    rest = [word for word in rest if not word.startswith("learner.warm_start")]
     return [*_without_sizes(rest), *_small(rest), *fires, "output=trained"]
 
 
