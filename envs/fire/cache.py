@@ -1,10 +1,9 @@
 """Caches banks of generated fires in files."""
 
+import contextlib
 import dataclasses
 import hashlib
-import io
 import json
-import math
 import os
 import warnings
 from pathlib import Path
@@ -15,10 +14,9 @@ from torch import Tensor
 
 from emberlink.envs.fire.generator import GeneratedConfig, Split, fire_seeds, make_fires
 from emberlink.envs.fire.reaction import ReactionConfig
-from emberlink.envs.utils.atomic_io import read_sealed, write_sealed
+from emberlink.envs.utils.atomic_io import replaced
 
 GENERATOR_VERSION = 1  # increase it if the same config and seed give another fire
-_MAX_HEADER = 10_000  # bytes of NumPy's format before the numbers
 
 
 def cache_folder() -> Path:
@@ -51,8 +49,8 @@ def fire_bank(
 ) -> Tensor:
     """Returns the first `count` fires of a split, computed once and then read from a file.
 
-    The file, in `cache_folder()`, ends with the SHA-256 of its content. A damaged file is replaced.
-    If the folder cannot be written to, a warning is issued and the fires are computed each time.
+    A file in `cache_folder()` that cannot be read is replaced. If the folder cannot be written to,
+    a warning is issued and the fires are computed each time.
 
     Args:
         config, grid, horizon: as in `make_fires`.
@@ -64,33 +62,15 @@ def fire_bank(
     seeds = fire_seeds(split, count)
     file = cache_folder() / f"fire-{bank_key(config, split, count, grid, horizon)}.npy"
     times = (2,) if isinstance(config, ReactionConfig) else ()
-    stored = _read(file, (count, *times, *grid))
-    if stored is not None:
-        return stored
+    with contextlib.suppress(Exception):  # a damaged header raises many types
+        stored = torch.from_numpy(np.load(file, allow_pickle=False))
+        if stored.dtype == torch.float32 and stored.shape == (count, *times, *grid):
+            return stored
     fires = make_fires(config, seeds, grid, horizon)
-    _write(file, fires)
-    return fires
-
-
-def _read(file: Path, shape: tuple[int, ...]) -> Tensor | None:
-    """Returns the bank in a file; None if there is no file or its content has changed."""
-    content = read_sealed(file, 4 * math.prod(shape) + _MAX_HEADER)
-    if content is None:
-        return None
     try:
-        array = np.load(io.BytesIO(content), allow_pickle=False)
-    except Exception:  # a damaged header raises many types
-        return None
-    if array.dtype != np.float32 or array.shape != shape or not (array >= 0).all():
-        return None
-    return torch.from_numpy(array)
-
-
-def _write(file: Path, fires: Tensor) -> None:
-    """Writes a bank atomically. Warns if the folder cannot be written to."""
-    content = io.BytesIO()
-    np.save(content, fires.numpy(), allow_pickle=False)
-    try:
-        write_sealed(file, content.getbuffer())
+        file.parent.mkdir(parents=True, exist_ok=True)
+        with replaced(file) as partial, partial.open("wb") as handle:
+            np.save(handle, fires.numpy(), allow_pickle=False)
     except OSError as error:
-        warnings.warn(f"fires are not cached: cannot write {file}: {error}", stacklevel=3)
+        warnings.warn(f"fires are not cached: cannot write {file}: {error}", stacklevel=2)
+    return fires

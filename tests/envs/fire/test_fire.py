@@ -288,10 +288,6 @@ def _other_type(file: Path) -> None:
     np.save(file, np.zeros((2, 12, 10)))
 
 
-def _not_a_time(file: Path) -> None:
-    np.save(file, np.full((2, 12, 10), np.nan, np.float32))
-
-
 def _pickle(file: Path) -> None:
     np.save(file, np.array([[{}]], dtype=object), allow_pickle=True)
 
@@ -300,7 +296,6 @@ DAMAGE = [
     _truncate,
     _other_shape,
     _other_type,
-    _not_a_time,
     _pickle,
     lambda file: file.write_bytes(b""),
     lambda file: file.write_bytes(b"PK\x03\x04 not a zip file"),
@@ -325,16 +320,6 @@ def test_a_folder_that_cannot_be_written_to_is_no_error(tmp_path: Path, calls: l
         fires = bank(occupied / "cache")
     assert fires.shape == (2, 12, 10)
     assert calls == [2]
-
-
-def test_a_failed_write_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    def full(*_):
-        raise OSError("no space left on device")
-
-    monkeypatch.setattr(bank_module.os, "replace", full)
-    with pytest.warns(UserWarning, match="no space left"):
-        bank(tmp_path)
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_the_cache_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
