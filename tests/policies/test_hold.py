@@ -5,12 +5,12 @@ from typing import Any
 import pytest
 import torch
 from tensordict import TensorDict
-from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import step_mdp
 
 from emberlink.envs import keys
 from emberlink.envs.utils.errors import UserError
 from emberlink.policies.hold import HELD, Held, decisions, hold
+from emberlink.policies.state import Stateful
 from emberlink.trainers import make_env
 from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.training.setup import TrainingSetup
@@ -18,9 +18,10 @@ from emberlink.trainers.training.setup import TrainingSetup
 COUNT = (keys.AGENTS, "count")
 
 
-class Counting(TensorDictModuleBase):
+class Counting(Stateful):
     """Writes the number of its decisions as the action."""
 
+    uavs, carries = 2, {COUNT: 3}
     in_keys, out_keys = [keys.STEP, COUNT], [keys.ACTION, ("next", *COUNT)]
 
     def forward(self, tensordict):
@@ -39,7 +40,9 @@ def test_holding_for_one_step_is_the_policy_itself():
 
 def test_an_action_is_held_and_what_is_carried_changes_at_decisions_alone():
     env = make_env("independent", num_envs=2, num_uavs=2, horizon=8, seed=1)
-    rollout = env.rollout(8, Held(Counting(), 3, 2))
+    policy = Held(Counting(), 3, 2)
+    env.append_transform(policy.make_tensordict_primer())
+    rollout = env.rollout(8, policy)
     actions = rollout[keys.ACTION][:, :, 0, 0]
     assert actions.tolist() == [[1, 1, 1, 2, 2, 2, 3, 3]] * 2
     assert rollout["next", *COUNT][:, :, 0, 0].equal(actions)
@@ -60,7 +63,9 @@ def test_environments_decide_at_their_own_steps():
 
 def test_a_transition_leads_from_one_decision_to_the_next():
     env = make_env("independent", num_envs=2, num_uavs=2, horizon=6, seed=1)
-    whole = env.rollout(6, Held(Counting(), 3, 2))
+    policy = Held(Counting(), 3, 2)
+    env.append_transform(policy.make_tensordict_primer())
+    whole = env.rollout(6, policy)
     folded = decisions(whole, 3)
     assert folded.shape == (2, 2)
     assert folded[keys.STEP].tolist() == [[0, 3]] * 2
