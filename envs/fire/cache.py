@@ -14,7 +14,7 @@ from torch import Tensor
 
 from emberlink.envs.fire.generator import GeneratedConfig, Split, fire_seeds, make_fires
 from emberlink.envs.fire.reaction import ReactionConfig
-from emberlink.envs.utils.atomic_io import replaced
+from emberlink.envs.utils.atomic_io import replaced, user_path
 
 GENERATOR_VERSION = 1  # increase it if the same config and seed give another fire
 
@@ -22,8 +22,8 @@ GENERATOR_VERSION = 1  # increase it if the same config and seed give another fi
 def cache_folder() -> Path:
     """Returns $EMBERLINK_CACHE, else $XDG_CACHE_HOME/emberlink, else ~/.cache/emberlink."""
     if folder := os.environ.get("EMBERLINK_CACHE"):
-        return Path(folder).expanduser()
-    return Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "emberlink"
+        return user_path(folder)
+    return user_path(os.environ.get("XDG_CACHE_HOME") or "~/.cache") / "emberlink"
 
 
 def bank_key(

@@ -21,7 +21,7 @@ from emberlink.envs.fire_files.grid import Source
 from emberlink.envs.fire_files.perimeters import read_perimeters
 from emberlink.envs.fire_files.rasters import MAX_BANK, read_raster
 from emberlink.envs.fire_files.tables import read_table
-from emberlink.envs.utils.atomic_io import read_bytes, replaced
+from emberlink.envs.utils.atomic_io import read_bytes, replaced, user_path
 from emberlink.envs.utils.errors import UserError, printable
 
 READER_VERSION = 7  # increase it if the same file gives another grid
@@ -55,7 +55,7 @@ def read_with_summary(
     Warns of signs that it was understood wrongly.
     """
     check_grid(grid)
-    path = Path(config.path).expanduser()
+    path = user_path(config.path)
     name = printable(str(path))
     try:
         with quiet():
@@ -187,7 +187,7 @@ def with_checksum(config: FileFireConfig) -> FileFireConfig:
 
 
 def _checksum(file: str, expected: str | None) -> str:
-    path = Path(file).expanduser()
+    path = user_path(file)
     name = printable(str(path))
     try:
         found = digest(path)

@@ -8,8 +8,8 @@ from PIL import Image
 from rich.console import Console
 
 from emberlink.envs.rendering.film import write_gif, write_mp4
+from emberlink.envs.utils.atomic_io import created, free_name, new_file
 from emberlink.envs.utils.errors import UserError
-from emberlink.envs.utils.publish import free_name, new_file, published
 from emberlink.trainers.evaluation import episodes
 from emberlink.trainers.evaluation.episodes import Panel
 from emberlink.trainers.evaluation.policy import load_policy
@@ -72,7 +72,7 @@ def render(runs: Sequence[str], console: Console, choices: Choices) -> int:
     size = choices.size or min(max(_CELL * max(panels[0].config.env.grid), least), most)
     screen = Screen(played, size=size, grey_seen=choices.seen)
     for path in paths:
-        with published(path) as partial:
+        with created(path) as partial:
             if path.suffix == ".html":
                 Replay(played, name).save(partial)
             elif path.suffix == ".png":

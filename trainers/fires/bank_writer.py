@@ -9,8 +9,8 @@ import numpy as np
 from torch import Tensor
 
 from emberlink.envs.fire_files.files import library
+from emberlink.envs.utils.atomic_io import created, new_file
 from emberlink.envs.utils.errors import UserError
-from emberlink.envs.utils.publish import new_file, published
 from emberlink.trainers.runs.compact_json import finite
 
 SUFFIXES = (".npy", ".tif", ".tiff")
@@ -52,15 +52,15 @@ def write_bank(
     names = names or [f"fire {number}" for number in range(len(array))]
     if path.suffix != ".npy":
         content = _geotiff(array, about, names)
-        with published(path) as partial:
+        with created(path) as partial:
             partial.write_bytes(content)
         return
     about |= {"axes": ["fire", "x", "y"], "never": "inf", "fires": list(names)}
     json_path = path.with_suffix(".json")
-    with published(json_path) as partial:
+    with created(json_path) as partial:
         partial.write_text(json.dumps(about, indent=1) + "\n", encoding="utf-8")
     try:
-        with published(path) as partial, partial.open("wb") as file:
+        with created(path) as partial, partial.open("wb") as file:
             header = np.lib.format.header_data_from_array_1_0(array)
             np.lib.format.write_array_header_1_0(file, header)
             file.write(array.data)  # NumPy's own does not report a full disk

@@ -19,8 +19,8 @@ from emberlink.envs.fire.generator import GeneratedConfig, Split, fire_seeds, ma
 from emberlink.envs.fire_files.config import FileFireConfig
 from emberlink.envs.fire_files.reader import read_with_summary
 from emberlink.envs.scenarios import fires_of
+from emberlink.envs.utils.atomic_io import created, free_name, new_file
 from emberlink.envs.utils.errors import UserError, shown, unknown
-from emberlink.envs.utils.publish import free_name, new_file, published
 from emberlink.envs.world.coverage_map import split_times
 from emberlink.envs.world.sensor import view_radius
 from emberlink.trainers.config.compose import resolve, to_values
@@ -55,7 +55,7 @@ def preview(arguments: Sequence[str], console: Console, output: Path | None = No
         path = name.with_name(f"{name.name}.png")
     world, times = config.env, arrival.numpy()
     width = 2 * view_radius(world.altitude[1], world.view_angle)
-    with published(path) as partial, warnings.catch_warnings():
+    with created(path) as partial, warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Glyph")  # the font may lack letters of the file's name
         arrival_figure(partial, times, world.horizon, width, title)
     grid = " x ".join(map(str, world.grid))

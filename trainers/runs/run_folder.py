@@ -44,7 +44,7 @@ class RunFolder:
     """
 
     def __init__(self, path: Path | str):
-        self.path = Path(path)
+        self.path = atomic_io.user_path(path)
         for place, folders, files in os.walk(self.path):
             # wandb makes links in its folder; the tracker removes them before wandb writes there.
             of_wandb = (self.path / "wandb") in (Path(place), *Path(place).parents)
@@ -71,7 +71,7 @@ class RunFolder:
         stamp = datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
         name = name or f"{stamp}_{config.method}_{config.setup}_{config.world}_s{config.seed}"
         try:
-            path = _new_folder(Path(config.output) / name)
+            path = _new_folder(atomic_io.user_path(config.output) / name)
             (path / "figures").mkdir()
         except OSError as error:
             raise UserError(f"output={config.output}: {error.strerror or error}") from None

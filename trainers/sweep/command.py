@@ -10,6 +10,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
+from emberlink.envs.utils.atomic_io import user_path
 from emberlink.envs.utils.errors import UserError
 from emberlink.trainers.runs.lock import Lock, LockedError
 from emberlink.trainers.runs.run_folder import RunFolder
@@ -56,7 +57,7 @@ def sweep(
     chosen = [text for text in arguments if text.startswith(("executor=", "executor."))]
     runs = combinations([text for text in arguments if text not in chosen])
     executor = executor or make(chosen)
-    output = Path(runs[0].config.output)
+    output = user_path(runs[0].config.output)
     for note in find_folders(runs, output):
         console.print(f"note: {note}", style="yellow", soft_wrap=True)
     _check([run for run in runs if run.folder is None])

@@ -1,6 +1,5 @@
 """Resumes a stopped run exactly where its newest checkpoint was made."""
 
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -38,7 +37,7 @@ def resume(
     Raises:
         UserError: the run cannot be resumed, and no file has changed; or a file cannot be written.
     """
-    run = RunFolder(os.path.expanduser(path))
+    run = RunFolder(path)
     # The device of the run may not exist here, so it is replaced before it is checked.
     devices = [text.partition("=")[2] for text in overrides if text.startswith("device=")]
     devices += [settings["device"]] if "device" in settings else []

@@ -1,6 +1,5 @@
 """Begins a run with the actors of another run (`learner.warm_start`)."""
 
-import os
 import warnings
 from typing import Any
 
@@ -40,7 +39,7 @@ def start(learner: Learner, config: RunConfig) -> None:
     network: Any = learner.actor.module
     expected = {ACTOR + key: value for key, value in network.state_dict().items()}
     try:
-        run = RunFolder(find_one(name) if is_name(name) else os.path.expanduser(name))
+        run = RunFolder(find_one(name) if is_name(name) else name)
         # The device of that run may not exist here.
         theirs = run.config(device=config.device)
         weights = load_weights(run.checkpoint(), expected, config)

@@ -12,8 +12,8 @@ from rich.text import Text
 from emberlink.configs import known
 from emberlink.envs import metrics
 from emberlink.envs.scenarios import fires_of
+from emberlink.envs.utils.atomic_io import created, new_file
 from emberlink.envs.utils.errors import UserError
-from emberlink.envs.utils.publish import new_file, published
 from emberlink.policies.scripted.registry import to_play
 from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.config.schema import RunConfig
@@ -177,7 +177,7 @@ def check(
         numbers = {"fires": fires, "split": split, "headline": config.evaluation.headline}
         record[config.world] = numbers | _record(measured, found)
     if output is not None:
-        with published(output) as partial:
+        with created(output) as partial:
             partial.write_text(compact_json.dumps(record) + "\n", encoding="utf-8")
     passing = sum(world["passes"] for world in record.values())
     console.print(f"{passing} of {len(record)} worlds pass")
