@@ -26,9 +26,6 @@ def on_grid(
 
     Returns:
         float32 [X, Y], steps; 0 burns from the start, inf never burns.
-
-    Raises:
-        UserError: no fire spreads in the chosen span of time.
     """
     no_span = config.start is config.end is config.minutes_per_step is None
     in_steps = no_span and source.clock.unit == "steps"

@@ -9,7 +9,7 @@ from emberlink.envs.utils.errors import UserError, unknown
 from emberlink.envs.utils.validation import as_argument
 
 _IDENTIFIER = re.compile(
-    r"(poly|attr)?(incident|incid|fire|event|burn|complex)s?(name|nm|id|num|number|no|nr|code)?"
+    r"(poly|attr)?(incident|incid|fire|event|burn|complex|cluster)s?(name|nm|id|num|number|no|nr|code)?"
     r"|fname|.*irwin.*|.*uniquefire.*"
 )
 """Columns whose values are those of a fire, by the letters and digits of their names."""
@@ -63,7 +63,8 @@ def _where(frame: Any, columns: Sequence[Any], config: FileFireConfig, _: list[s
         return frame[keeps]
     for column in columns if where is None else ():
         values = texts(frame[column])
-        if _CATEGORY.fullmatch(plain(column)) and 1 < values.nunique() < len(frame):
+        sure = re.search("categ|featu", plain(column)) is not None
+        if _CATEGORY.fullmatch(plain(column)) and 1 < values.nunique() < len(frame) + sure:
             choice = as_argument("fire.where", f"{column}={values.mode().iloc[0]}")
             raise UserError(
                 f"features of several kinds: {_counts(frame, column)}; expected {choice}, or "

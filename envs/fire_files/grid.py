@@ -220,7 +220,7 @@ def beginnings(times: np.ndarray) -> int:
 
 def far_apart(boxes: np.ndarray) -> list[str]:
     """Returns whether parts with some boxes, [parts, 4], lie farther apart than they are long."""
-    size = len(boxes) + 1
+    size, longest, between = len(boxes) + 1, 0.0, np.zeros(1)
     while len(boxes) < size:
         size, low, high = len(boxes), boxes[:, :2], boxes[:, 2:]
         longest = (high - low).max()

@@ -19,13 +19,13 @@ from emberlink.envs.fire_files.dates import in_utc, parse_dates
 from emberlink.envs.fire_files.files import check_prj, first_line, library
 from emberlink.envs.fire_files.grid import Raster, beginnings, far_apart, number
 from emberlink.envs.fire_files.projection import MAX_CELLS, Affine, choose_plane, warped
+from emberlink.envs.fire_files.times import in_order
 from emberlink.envs.fire_files.values import (
     arrival,
     check_spreads,
     check_states,
     doubts,
     first_burning,
-    in_order,
     unit_of,
 )
 from emberlink.envs.utils.errors import UserError

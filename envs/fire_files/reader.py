@@ -33,16 +33,8 @@ _OF_TABLES = ("time_field", "time_format", "incident", "incident_field", "where"
 def read_fires(config: FileFireConfig, grid: tuple[int, int], horizon: int) -> Tensor:
     """Returns the fires of `config.path` on a grid.
 
-    Args:
-        config: the scenario.
-        grid: (X, Y), each 8 to 256 cells.
-        horizon: steps of an episode.
-
     Returns:
         float32 [fires, X, Y], steps: 0 burns from the start, inf never burns.
-
-    Raises:
-        UserError: one line that names the file and the mistake in it.
     """
     return read_with_summary(config, grid, horizon)[0]
 
@@ -122,11 +114,7 @@ class FireSets(NamedTuple):
 
 
 def fire_sets(config: FileFireConfig, grid: tuple[int, int], horizon: int) -> FireSets:
-    """Returns the fires from the run's copy if it has this grid and horizon, else from the files.
-
-    Raises:
-        UserError: one line that names the file and the mistake in it.
-    """
+    """Returns the fires from the run's copy if it has this grid and horizon, else from files."""
     return _sets_with_summary(config, grid, horizon)[0]
 
 
@@ -175,11 +163,7 @@ def _divide(count: int, *, test_file: bool) -> tuple[list[int], list[int], list[
 
 
 def with_checksum(config: FileFireConfig) -> FileFireConfig:
-    """Computes the checksums of the files and returns the scenario with them.
-
-    Raises:
-        UserError: a file is missing, or has another checksum than the scenario.
-    """
+    """Computes the checksums of the files and returns the scenario with them."""
     test = config.test and _checksum(config.test, config.test_sha256)
     return dataclasses.replace(
         config, sha256=_checksum(config.path, config.sha256), test_sha256=test
@@ -204,11 +188,7 @@ def _checksum(file: str, expected: str | None) -> str:
 
 
 def save_copy(config: FileFireConfig, folder: Path, grid: tuple[int, int], horizon: int) -> None:
-    """Writes the run's copy of its fires. Afterwards the run does not need the files.
-
-    Raises:
-        UserError: the copy cannot be written.
-    """
+    """Writes the run's copy of its fires. Afterwards the run does not need the files."""
     fires, about = _sets_with_summary(config, grid, horizon)
     arrays: dict[str, Any] = {name: values.numpy() for name, values in fires._asdict().items()}
     arrays |= {"key": np.array(_key(config, grid, horizon)), "summary": np.array(about)}
@@ -246,8 +226,4 @@ def _read_copy(
             about = printable(str(arrays["summary"]))
     except Exception:  # damage raises many types
         return None
-    for values in fires:
-        fits = values.ndim == 3 and values.shape[1:] == tuple(grid) and len(values) > 0
-        if not fits or values.dtype != np.float32 or not (values >= 0).all():
-            return None
     return FireSets(*(torch.from_numpy(values) for values in fires)), about

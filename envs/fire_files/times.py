@@ -232,18 +232,27 @@ def _elapsed(frame: Any, name: Any, config: FileFireConfig) -> Times:
             f"the unit of {name} ({values.min():g} to {values.max():g}) is not known; expected "
             "fire.units=minutes, seconds, hours, days, day_of_year or steps"
         )
-    if unit == "day_of_year":
-        values, unit = turned(values), "days"
+    if unit in ("days", "day_of_year"):
+        values, unit = in_order(values, config), "days"
     return Times(values, Clock(unit), str(name), [f"times from {name}"], [])
 
 
-def turned(days: np.ndarray) -> np.ndarray:
-    """Returns days of the year so that those before the largest gap follow the others."""
-    distinct = np.unique(days[np.isfinite(days)])
-    year = 366 if distinct[-1] > 365 else 365
-    gaps = np.diff(distinct, append=distinct[0] + year)
-    first = distinct[(int(gaps.argmax()) + 1) % len(distinct)]
-    return np.where(days < first, days + year, days)
+def in_order(values: np.ndarray, config: FileFireConfig) -> np.ndarray:
+    """Returns days, those of the year ascending over New Year; asks if days may be these."""
+    days = np.unique(values[np.isfinite(values)])
+    gaps = np.diff(days, append=days[0] + (366 if days[-1] > 365 else 365))
+    last = int(gaps.argmax())
+    first = days[(last + 1) % len(days)]
+    if config.units == "day_of_year":
+        return np.where(values < first, values + gaps.sum(), values)
+    cyclic = days[0] >= 1 and days[-1] <= 366 and (days % 1 == 0).all()
+    if config.start is None and cyclic and last < len(days) - 1 and gaps[last] > 183:
+        raise UserError(
+            f"days {days[0]:g} to {days[last]:g} and {first:g} to {days[-1]:g}, none between, as "
+            "of a fire over New Year; expected fire.units=day_of_year, or "
+            f"fire.start={days[0]:g} for days as they are"
+        )
+    return values
 
 
 def _outside(frame: Any, outside: Sequence[str], config: FileFireConfig) -> Times:

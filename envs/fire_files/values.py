@@ -6,7 +6,6 @@ import numpy as np
 
 from emberlink.envs.fire_files.config import FileFireConfig
 from emberlink.envs.fire_files.grid import beginnings
-from emberlink.envs.fire_files.times import turned
 from emberlink.envs.utils.errors import UserError
 
 _MAX_TIME = 1e12
@@ -99,7 +98,7 @@ def _check_plateau(times: np.ndarray, *, of_all: bool) -> None:
     """Asks about a value that may stand for cells that do not burn.
 
     That is one that holds more than half of the cells, or the first or last one if it is farther
-    from the others than these are apart, or holds a tenth and five times as much as any other.
+    from the others than these are apart, or holds a tenth and three times as much as any other.
     """
     values, counts = np.unique(times[np.isfinite(times)], return_counts=True)
     cells = times.size if of_all else counts.sum()
@@ -107,7 +106,7 @@ def _check_plateau(times: np.ndarray, *, of_all: bool) -> None:
     for end, rest in ((0, slice(1, None)), (-1, slice(0, -1))) if len(values) > 3 else ():
         others = values[rest]
         gap = abs(values[end] - others[end]) > others[-1] - others[0]
-        often = counts[end] > max(0.1 * cells, 5 * counts[rest].max())
+        often = counts[end] > max(0.1 * cells, 3 * counts[rest].max())
         if (gap or often) and not of_all:
             odd.add(end % len(values))
     if odd:
@@ -123,22 +122,6 @@ def _check_plateau(times: np.ndarray, *, of_all: bool) -> None:
             f"{' and '.join(share)} may stand for cells that do not burn (others: {between}); "
             f"expected {key}, or fire.unburned=none if they burn then"
         )
-
-
-def in_order(times: np.ndarray, config: FileFireConfig) -> np.ndarray:
-    """Returns days of the year so that they ascend over New Year; asks if days may be these."""
-    if config.units == "day_of_year":
-        return turned(times)
-    days = np.unique(times[np.isfinite(times)])
-    gap = int(np.diff(days, prepend=days[0]).argmax())
-    cyclic = days[0] >= 1 and days[-1] <= 366 and (days % 1 == 0).all()
-    if config.start is None and cyclic and days[gap] - days[gap - 1] > 183:
-        raise UserError(
-            f"days {days[0]:g} to {days[gap - 1]:g} and {days[gap]:g} to {days[-1]:g}, none "
-            "between, as of a fire over New Year; expected fire.units=day_of_year, or "
-            f"fire.start={days[0]:g} for days as they are"
-        )
-    return times
 
 
 def check_states(maps: np.ndarray) -> None:

@@ -172,6 +172,7 @@ def test_a_plateau_is_asked_about(tmp_path, value):
 def test_days_of_the_year_of_perimeters(tmp_path, elapsed):
     squares(200, 300, 400, doy=[365, 1, 2]).to_file(tmp_path / "fire.gpkg")
     same(tmp_path / "fire.gpkg", elapsed, time_field="doy", units="day_of_year", start=365.0)
+    asks(tmp_path / "fire.gpkg", "days 1 to 2 and 365 to 365", time_field="doy", units="days")
     days = np.where(raster_of(FIRE, 300.0) < 0, -9999, 100 + raster_of(FIRE, 300.0) // 60)
     path = write_tif(tmp_path / "fire.tif", days)
     summer, winter = read(path, units="days")[0], read(path, units="day_of_year")[0]

@@ -2,8 +2,6 @@
 
 import json
 import resource
-import sys
-import warnings
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -141,37 +139,6 @@ def test_preview_does_not_overwrite(capsys, tmp_path):
     assert len(list(tmp_path.iterdir())) == 4
 
 
-@pytest.mark.filterwarnings("error::UserWarning")
-def test_names_with_special_characters_are_shown_unchanged(capsys, tmp_path):
-    keys = ("fire.units=minutes", "env.grid=[20,20]")
-    odd = tmp_path / "a b=[1]$_{$ 火, it's $.asc"
-    ascii_raster(tmp_path / "plain.asc", disc()).rename(odd)
-    lines = ran(capsys, "preview", odd, *keys)
-    assert lines[0].startswith(odd.name)
-    assert Path(lines[-1]).stat().st_size > 5000
-    longer = odd.rename(tmp_path / f"{'long' * 50}.asc")
-    (*_, name) = ran(capsys, "preview", longer, keys[0], "env.grid=[8,64]")
-    assert len(name) < 120
-    with Image.open(name) as picture:  # no cut-off at the sides
-        assert (np.asarray(picture.convert("L"))[:, [0, -1]] == 255).all()
-
-
-@pytest.mark.parametrize(
-    ("changes", "failing"),
-    [
-        (["env.displacement=0.03", "env.num_uavs=1"], ["the team can uncover 0.139"]),
-        (["env.horizon=5", "env.num_uavs=1"], ["of 77 cells at the end 21.3"]),
-    ],
-)
-def test_preview_explains_why_uavs_cannot_keep_up(changes, failing, capsys):
-    lines = ran(capsys, "preview", "paper", *changes)
-    assert lines[-4] == "UAVs can keep up: no"
-    bad = [line for line in lines[-3:-1] if line.startswith("  - ")]
-    assert len(bad) == len(failing), lines
-    for line, words in zip(bad, failing, strict=True):
-        assert words in line
-
-
 @pytest.mark.parametrize("suffix", [".npy", ".tif", ".tiff"])
 def test_make_writes_the_scenarios_fires(suffix, capsys, tmp_path):
     file = tmp_path / f"bank{suffix}"
@@ -212,18 +179,6 @@ def test_make_writes_the_scenarios_fires(suffix, capsys, tmp_path):
     }
     assert int(about["generator_version"]) == GENERATOR_VERSION
     assert about["emberlink_version"]
-
-
-def test_make_writes_the_training_fires_by_default(capsys, tmp_path):
-    assert ran(capsys, "make", "paper")[-1] == "paper_train_1.npy"
-    assert ran(capsys, "make", "paper")[-1] == "paper_train_1_2.npy"
-    assert ran(capsys, "make", "huygens", "env.horizon=9", "fire.num_train_fires=3")[-1] == (
-        "huygens_train_3.npy"
-    )
-    expected = make_fires(HUYGENS, fire_seeds("train", 3), (30, 30), 9).numpy()
-    assert np.array_equal(np.load("huygens_train_3.npy"), expected)
-    assert ran(capsys, "make", "paper", "--split", "test", "env.horizon=9")[0].startswith("100")
-    assert not list(tmp_path.glob(".*"))
 
 
 @pytest.mark.parametrize("suffix", [".npy", ".tif"])
@@ -281,12 +236,6 @@ def test_import_of_several_files(capsys, tmp_path):
     assert lines[-1] == "fire_both_1.png"
     with pytest.warns(UserWarning, match="without the times at which cells burn out"):
         ran(capsys, "import", first, *keys, "fire.burn_time=50", "--output", "burnt.npy")
-
-
-def test_a_file_named_like_a_scenario_is_read_by_its_path(capsys, tmp_path):
-    ascii_raster(tmp_path / "huygens.asc", disc()).rename(tmp_path / "huygens")
-    assert ran(capsys, "preview", "huygens")[0].startswith("huygens, test fire 0: ")
-    assert ran(capsys, "preview", "./huygens", "fire.units=minutes")[0].startswith("huygens: 30")
 
 
 KNOWN = "known: front, huygens, oil_slick, paper, reaction, swarm"
@@ -348,34 +297,6 @@ def test_preview_takes_the_keys_of_train(capsys, tmp_path):
     assert ran(capsys, "preview", "fire=paper")[:-1] == ran(capsys, "preview", "paper")[:-1]
 
 
-def cli_actions() -> tuple[str, ...]:
-    return "preview", "make", "import"
-
-
-def test_without_an_action_the_help_is_printed(capsys):
-    out = "\n".join(ran(capsys))
-    assert "usage: emberlink fire" in out
-    for action in cli_actions():
-        assert f"\n    {action} " in out
-        with pytest.raises(SystemExit) as ended:
-            main.main(["fire", action, "--help"])
-        assert ended.value.code == 0
-        assert f"example:\n  emberlink fire {action} " in capsys.readouterr().out
-
-
-def test_without_the_extra_the_error_names_it(capsys, tmp_path, monkeypatch):
-    ran(capsys, "make", "paper", "--output", "bank.tif")
-    monkeypatch.setitem(sys.modules, "rasterio", None)
-    for arguments in (
-        ["make", "paper", "--output", "a.tif"],
-        ["import", "bank.tif", "--output", "a.npy"],
-        ["preview", "bank.tif"],
-    ):
-        assert "pip install '.[geo]'" in refused(capsys, *arguments)
-    assert ran(capsys, "make", "paper", "--output", "a.npy")[-1] == "a.npy"
-    assert [path.name for path in sorted(tmp_path.iterdir())] == ["a.json", "a.npy", "bank.tif"]
-
-
 @contextmanager
 def files_of_at_most(size: int):
     """Limits the size of files, like a full disk."""
@@ -398,12 +319,3 @@ def test_a_full_disk_gives_one_line_and_leaves_no_files(size, capsys, tmp_path):
         with files_of_at_most(size):
             assert "File too large" in refused(capsys, *arguments)
         assert list(tmp_path.iterdir()) == []
-
-
-def test_make_says_that_burn_out_times_are_not_written():
-    arguments = ["fire", "make", "front", "--count", "1", "env.horizon=20", "--output", "a.npy"]
-    with pytest.warns(UserWarning, match="without the times at which cells burn out"):
-        assert main.main(arguments) == 0
-    with warnings.catch_warnings():
-        warnings.simplefilter("error", UserWarning)
-        assert main.main([*arguments[:-1], "b.npy", "fire.burn_time=.inf"]) == 0
