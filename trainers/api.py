@@ -12,8 +12,8 @@ from typing import Any
 
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import check_whole, shown
+from emberlink.trainers.comparison.comparison import Comparison, compare_runs
 from emberlink.trainers.comparison.report import free_folder, write_report
-from emberlink.trainers.comparison.results import Comparison, compare_runs
 from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.config.schema import MAX_FIRES, RunConfig
 from emberlink.trainers.evaluation.evaluate import evaluate as evaluate_policy

@@ -63,6 +63,23 @@ def add_compare(commands: Any) -> None:
 
 
 def _compare(options: argparse.Namespace, console: "Console") -> int:
-    from emberlink.trainers.comparison.command import compare
+    from rich.text import Text
 
-    return compare(options.folders, console, options.output, options.label, options.extras)
+    from emberlink.trainers.comparison.comparison import compare_runs
+    from emberlink.trainers.comparison.report import free_folder, printed, tables, write_report
+
+    def say(text: str, style: str = "yellow") -> None:
+        console.print(Text(text, style=style), soft_wrap=True)
+
+    folder = free_folder(options.output)
+    comparison = compare_runs(options.folders, options.label)
+    for path, why in comparison.left_out:
+        say(f"note: {path} is left out: {why}")
+    write_report(comparison, folder, lambda text: say(f"  {text}", "dim"), options.extras)
+    for note in comparison.notes:
+        say(f"note: {note}")
+    for section in comparison.sections:
+        for table in tables(comparison, section):
+            console.print(printed(table, section))
+    say(str(folder / "compare.html"), "")
+    return 0

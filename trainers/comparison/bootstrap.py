@@ -73,41 +73,44 @@ def as_ratio(share: float) -> float:
     return share / (1 - share) if share < 1 else float("inf")
 
 
-def interval(statistic: Callable[..., Any], *samples: Sequence[float]) -> Interval | None:
-    """Returns the 95 % stratified percentile bootstrap interval of a statistic.
+def interval(
+    statistic: Callable[..., Any],
+    *samples: Sequence[float] | Values,
+    axis: int = -1,
+    resamples: int = RESAMPLES,
+    paired: bool = False,
+) -> Any:
+    """Returns the 95 % percentile bootstrap interval of a statistic.
 
     Args:
         statistic: a function of arrays with the keyword `axis`.
         samples: one number per run, for each method. Each resample draws as many runs as a method
             has, with replacement.
+        axis: axis of the runs; a number for each entry of the other axes.
+        resamples: number of resamples.
+        paired: whether entry i of all samples is drawn together, such as of the same fire.
 
     Returns:
-        Lower and upper end; None if a method has only one run.
+        Lower and upper end; None if a method has only one run, or if an end is not finite.
     """
-    if min(map(len, samples)) < 2:
-        return None
     values = [np.asarray(sample, float) for sample in samples]
-    low, high = _bootstrap(statistic, values, -1, RESAMPLES)
-    return float(low), float(high)
-
-
-def paired_interval(statistic: Callable[..., Any], *samples: Values) -> Interval | None:
-    """Returns the 95 % percentile bootstrap interval of a statistic of paired samples.
-
-    Args:
-        statistic: a function of arrays with the keyword `axis`.
-        samples: [episodes] each; entry i of all samples is drawn together.
-
-    Returns:
-        Lower and upper end; None with one episode, or if an end is not finite.
-    """
-    if len(samples[0]) < 2:
+    if min(sample.shape[axis] for sample in values) < 2:
         return None
-    values = [np.asarray(sample, float) for sample in samples]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", stats.DegenerateDataWarning)
-        low, high = _bootstrap(statistic, values, -1, RESAMPLES, paired=True)
-    return (float(low), float(high)) if np.isfinite([low, high]).all() else None
+        ends = stats.bootstrap(
+            values,
+            statistic,
+            paired=paired,
+            axis=axis,
+            n_resamples=resamples,
+            batch=1000,
+            confidence_level=LEVEL,
+            method="percentile",
+            vectorized=True,
+            rng=np.random.default_rng(BOOTSTRAP_SEED),
+        ).confidence_interval
+    return _finite(ends)
 
 
 def crossed_interval(statistic: Callable[..., Any], *samples: Values) -> Interval | None:
@@ -134,32 +137,8 @@ def crossed_interval(statistic: Callable[..., Any], *samples: Values) -> Interva
         seeds = generator.integers(len(sample), size=(len(sample), RESAMPLES))
         drawn.append(np.take_along_axis(sample @ share, seeds, axis=0))
     tail = (1 - LEVEL) / 2
-    low, high = np.quantile(statistic(*drawn, axis=0), [tail, 1 - tail])
-    return (float(low), float(high)) if np.isfinite([low, high]).all() else None
+    return _finite(np.quantile(statistic(*drawn, axis=0), [tail, 1 - tail]))
 
 
-def band(values: Values) -> tuple[Values, Values] | None:
-    """Returns the ends of the interval of the IQM, [episodes] each, of values [seeds, episodes]."""
-    return _bootstrap(iqm, [values], 0, BAND_RESAMPLES) if len(values) > 1 else None
-
-
-def _bootstrap(
-    statistic: Callable[..., Any],
-    samples: Sequence[Values],
-    axis: int,
-    resamples: int,
-    paired: bool = False,
-) -> Any:
-    result = stats.bootstrap(
-        samples,
-        statistic,
-        paired=paired,
-        axis=axis,
-        n_resamples=resamples,
-        batch=1000,
-        confidence_level=LEVEL,
-        method="percentile",
-        vectorized=True,
-        rng=np.random.default_rng(BOOTSTRAP_SEED),
-    )
-    return result.confidence_interval
+def _finite(ends: Any) -> Any:
+    return tuple(np.asarray(ends).tolist()) if np.isfinite(ends).all() else None

@@ -1,6 +1,7 @@
 """Tests the claims of the paper (sections V and VI) with intervals over seeds."""
 
 from functools import partial
+from itertools import product
 from typing import Any, NamedTuple
 
 import pandas as pd
@@ -8,7 +9,7 @@ import pandas as pd
 from emberlink.envs import metrics
 from emberlink.trainers.comparison import bootstrap
 from emberlink.trainers.comparison.bootstrap import Interval
-from emberlink.trainers.comparison.tables import Frame, learned, telling_apart
+from emberlink.trainers.comparison.tables import Frame, learned, telling_apart, trained_settings
 
 ROUNDING = 1e-6
 """relative error of a ratio of measures, which are float32"""
@@ -23,51 +24,45 @@ infinite for a ratio to 0"""
 
 
 class Claim(NamedTuple):
-    """The claim that a method is better than the best other method by a factor."""
+    """The claim that consensus is better than the best other method by a factor."""
 
-    method: str
     measure: str
     factor: float
     text: str
 
 
+METHOD = "consensus"
 CLAIMS = (
-    Claim("consensus", "coverage", 1.3, "1.3 times the coverage"),
-    Claim("consensus", "tracking_first", 1.4, "1.4 times faster tracking"),
-    Claim("consensus", "tracking_last", 1.4, "1.4 times faster tracking, by the slowest UAV"),
-    Claim("consensus", "boundary_exits", 2.0, "half the boundary exits"),
+    Claim("coverage", 1.3, "1.3 times the coverage"),
+    Claim("tracking_first", 1.4, "1.4 times faster tracking"),
+    Claim("tracking_last", 1.4, "1.4 times faster tracking, by the slowest UAV"),
+    Claim("boundary_exits", 2.0, "half the boundary exits"),
 )
-"""claims of the paper about method 4, compared with the next best method"""
+"""claims of the paper about method 4"""
 
 
 def verdicts(runs: Frame, means: Frame, notes: list[str]) -> Frame:
-    """Returns the verdict of each claim on each set of fires, for each label of its method.
+    """Returns the verdict of each claim on each set of fires, for each label of consensus.
 
-    If the method was trained in several ways, a label is compared with those labels of other
-    methods that have the same settings in the keys that tell these ways apart. Communication may
-    differ. A note is appended for a label with which none can be compared.
+    If consensus was trained in several ways, a label is compared with those labels of other methods
+    that have the same settings in the keys that tell these ways apart. Communication may differ. A
+    note is appended for a label with which none can be compared.
     """
     rows: list[dict[str, Any]] = []
-    first = runs[runs["as_trained"]].drop_duplicates("label").set_index("label")
-    settings: Frame = pd.DataFrame(list(first["settings"]), first.index).fillna("")
+    settings = trained_settings(runs)
+    is_own = settings["method"] == METHOD
     settings = settings[[key for key in settings if not key.startswith(_COMMUNICATION)]]
-    sets = sorted(means["fires"].unique())
-    for method in dict.fromkeys(claim.method for claim in CLAIMS):
-        own, others = settings[first["method"] == method], settings[first["method"] != method]
-        keys = telling_apart(own)
-        for label in own.index if len(others) else ():
-            alike = others.index[(others[keys] == own.loc[label, keys]).all(axis=1)]
-            if alike.empty:
-                notes.append(f"{label}: no claims; no other method was trained with its settings")
-                continue
-            part = learned(means)[learned(means)["label"].isin([label, *alike])]
-            rows += [
-                {"section": first["section"].iloc[0], "fires": fires, "label": label}
-                | _verdict(part[part["fires"] == fires], label, claim)
-                for fires in sets
-                for claim in CLAIMS
-                if claim.method == method
-            ]
+    own, others = settings[is_own], settings[~is_own]
+    keys = telling_apart(own)
+    for label in own.index if len(others) else ():
+        alike = others.index[(others[keys] == own.loc[label, keys]).all(axis=1)]
+        if alike.empty:
+            notes.append(f"{label}: no claims; no other method was trained with its settings")
+            continue
+        part = learned(means)[learned(means)["label"].isin([label, *alike])]
+        for fires, claim in product(sorted(means["fires"].unique()), CLAIMS):
+            about = {"section": runs["section"].iloc[0], "fires": fires, "label": label}
+            rows.append(about | _verdict(part[part["fires"] == fires], label, claim))
     return pd.DataFrame(rows, columns=list(COLUMNS))
 
 

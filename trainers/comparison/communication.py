@@ -1,7 +1,8 @@
 """Computes the gain of messages and the value of communication: how much of the gain is reached."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from itertools import product
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -9,9 +10,8 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from emberlink.trainers.comparison import bootstrap
-from emberlink.trainers.comparison.bootstrap import Interval
-from emberlink.trainers.comparison.runs import Run
-from emberlink.trainers.comparison.tables import RADIO, WARM_START, Frame, radio_text, trained_with
+from emberlink.trainers.comparison.reading import RADIO, Run
+from emberlink.trainers.comparison.tables import WARM_START, Frame, radio_text, trained_with
 from emberlink.trainers.evaluation.results import LEARNED
 
 SCRIPTED = ("map_greedy", "courier")
@@ -55,8 +55,9 @@ def communication_values(runs: Frame) -> Frame:
         for label, group in trained.items():
             if _radio(group[0]) in (_OFF, _FULL):
                 continue
-            for how, find in (("evaluated", _evaluated), ("retrained", _retrained)):
-                none, full = (find(groups.values(), group, radio) for radio in (_OFF, _FULL))
+            for how, same in (("evaluated", _evaluated), ("retrained", _retrained)):
+                alike = {_radio(o[0]): o for o in [*groups.values()][::-1] if same(group, o)}
+                none, full = alike.get(_OFF), alike.get(_FULL)
                 if none is not None:
                     found = [none, group, *([full] if full else [])]
                     measure = group[0].headline
@@ -85,36 +86,24 @@ def heeded(run: Run) -> _Radio:
     return (*_radio(run)[:2], None)
 
 
-def _evaluated(groups: Iterable[Group], group: Group, radio: _Radio) -> Group | None:
-    """Returns the evaluation of a group's own networks with another radio."""
-    paths = {run.path for run in group}
-    alike = (
-        other
-        for other in groups
-        if other[0].evaluated_with
-        and {run.path for run in other} == paths
-        and set(other[0].evaluated_with) <= set(RADIO)
-        and _radio(other[0]) == radio
-    )
-    return next(alike, None)
+def _evaluated(group: Group, other: Group) -> bool:
+    """Returns whether the other group holds evaluations of the same networks with other radios."""
+    changed = set(other[0].evaluated_with)
+    return len(changed) > 0 and changed <= {*RADIO} and _paths(group) == _paths(other)
 
 
-def _retrained(groups: Iterable[Group], group: Group, radio: _Radio) -> Group | None:
-    """Returns the group that was trained with another radio and equal settings otherwise."""
+def _retrained(group: Group, other: Group) -> bool:
+    """Returns whether the other group has the same seeds and settings except for the radio."""
 
-    def without_radio(run: Run) -> dict[str, str]:
+    def same(run: Run) -> dict[str, str]:
         return {k: v for k, v in trained_with(run).items() if k not in (*RADIO, WARM_START)}
 
-    seeds = [run.settings["seed"] for run in group]
-    alike = (
-        other
-        for other in groups
-        if not other[0].evaluated_with
-        and [run.settings["seed"] for run in other] == seeds
-        and _radio(other[0]) == radio
-        and without_radio(other[0]) == without_radio(group[0])
-    )
-    return next(alike, None)
+    seeds = [[run.settings["seed"] for run in runs] for runs in (group, other)]
+    return not other[0].evaluated_with and seeds[0] == seeds[1] and same(group[0]) == same(other[0])
+
+
+def _paths(group: Group) -> set[Path]:
+    return {run.path for run in group}
 
 
 def _scripted(
@@ -153,28 +142,21 @@ def _row(samples: Sequence[Values], retrained: bool) -> dict[str, Any]:
     """Returns the numbers of samples [seeds, fires]: radio off, the world's and maybe no limits."""
     means = [sample.mean(0) for sample in samples]
 
-    def ends(statistic: Callable[..., Any], count: int) -> Interval | tuple[None, None]:
+    def ends(statistic: Callable[..., Any], count: int) -> tuple[Any, Any]:
         if retrained:
             found = bootstrap.crossed_interval(statistic, *samples[:count])
         else:
-            found = bootstrap.paired_interval(statistic, *means[:count])
+            found = bootstrap.interval(statistic, *means[:count], paired=True)
         return found or (None, None)
 
     none, with_radio, *rest = (float(mean.mean()) for mean in means)
-    full = rest[0] if rest else None
-    low, high = ends(_gain, 2)
-    least, most = (None, None) if full is None else ends(_share, 3)
-    return {
-        "none": none,
-        "with_radio": with_radio,
-        "full": full,
-        "gain": with_radio - none,
-        "gain_low": low,
-        "gain_high": high,
-        "value": None if full in (None, none) else (with_radio - none) / (full - none),
-        "value_low": least,
-        "value_high": most,
-    }
+    row: dict[str, Any] = {"none": none, "with_radio": with_radio, "gain": with_radio - none}
+    row["gain_low"], row["gain_high"] = ends(_gain, 2)
+    for full in rest:
+        row["full"] = full
+        row["value"] = None if full == none else (with_radio - none) / (full - none)
+        row["value_low"], row["value_high"] = ends(_share, 3)
+    return row
 
 
 def _gain(none: Values, with_radio: Values, axis: int = -1) -> Any:

@@ -9,7 +9,8 @@ import pandas as pd
 
 from emberlink.envs import metrics
 from emberlink.trainers.comparison import bootstrap
-from emberlink.trainers.comparison.tables import Frame, learned
+from emberlink.trainers.comparison.bootstrap import BAND_RESAMPLES
+from emberlink.trainers.comparison.tables import Frame, learned, settings_table, trained_settings
 from emberlink.trainers.evaluation.results import CURVES, LEARNED
 
 REWARD = "mean_reward"
@@ -63,7 +64,7 @@ def _everywhere(measure: str, means: Frame) -> bool:
 
 def _rows(means: Frame, higher: bool, unranked: bool) -> list[dict[str, Any]]:
     """Returns the rows of the trained policies of one measure, best first."""
-    groups = dict(iter(means.groupby("label")))
+    groups: dict[Any, Frame] = dict(iter(means.groupby("label")))
     values = {label: part["value"].to_numpy(float) for label, part in groups.items()}
     iqms = {label: float(bootstrap.iqm(sample)) for label, sample in values.items()}
     order = list(groups)
@@ -75,18 +76,13 @@ def _rows(means: Frame, higher: bool, unranked: bool) -> list[dict[str, Any]]:
         row = {"label": label, "policy": LEARNED, "seeds": groups[label]["seed"].tolist()}
         row |= {"values": values[label].tolist(), "iqm": iqms[label], "low": low, "high": high}
         row |= {"next": other or ""}
-        if other is not None and not same_trainings(groups[label], groups[other]):
+        if other and groups[label]["run"].isin(groups[other]["run"]).sum() == 0:
             pair = (values[label], values[other])[:: 1 if higher else -1]
             if ends := bootstrap.interval(bootstrap.probability_of_improvement, *pair):
                 row["probability"] = float(bootstrap.probability_of_improvement(*pair))
                 row["probability_low"], row["probability_high"] = ends
         rows.append(row)
     return rows
-
-
-def same_trainings(first: Frame, second: Frame) -> bool:
-    """Returns whether two labels are evaluations of the same runs."""
-    return not set(first["run"]).isdisjoint(second["run"])
 
 
 def _scripted(means: Frame, measure: str) -> list[dict[str, Any]]:
@@ -123,10 +119,9 @@ def different_rewards(runs: Frame, scripted: Mapping[str, Sequence[Mapping[str, 
         runs: the runs of the section.
         scripted: measure -> rows of the scripted policies.
     """
-    settings: Frame = pd.DataFrame(list(runs["settings"])).filter(regex=r"^env\.reward\.")
-    for key in settings.columns:
-        if settings[key].nunique(dropna=False) > 1:
-            return f"the methods' rewards differ in {key}"
+    settings = settings_table(runs["settings"]).filter(regex=r"^env\.reward\.")
+    for key in settings.columns[settings.nunique() > 1]:
+        return f"the methods' rewards differ in {key}"
     for policy in dict.fromkeys(row["policy"] for row in scripted[REWARD]):
         several = {
             name: sum(row["policy"] == policy for row in rows) for name, rows in scripted.items()
@@ -138,15 +133,9 @@ def different_rewards(runs: Frame, scripted: Mapping[str, Sequence[Mapping[str, 
 
 def differing(runs: Frame) -> Frame:
     """Returns the settings in which the labels of a section differ, besides communication."""
-    first = runs[runs["as_trained"]].drop_duplicates("label").set_index("label")
-    settings: Frame = pd.DataFrame(list(first["settings"]), first.index).fillna("")
-    return settings[
-        [
-            key
-            for key in settings
-            if not key.startswith(("method", "comm.", "replay")) and settings[key].nunique() > 1
-        ]
-    ]
+    settings = trained_settings(runs)
+    settings = settings.loc[:, settings.nunique() > 1]
+    return settings[[key for key in settings if not key.startswith(("method", "comm.", "replay"))]]
 
 
 def unequal_scripted(means: Frame) -> list[str]:
@@ -171,7 +160,8 @@ def curves(runs: Frame) -> Frame:
     for label, group in runs[runs["as_trained"]].groupby("label"):
         for measure in CURVES:
             values = np.array([[line[measure] for line in r.lines] for r in group["object"]], float)
-            low, high = bootstrap.band(values) or (np.nan, np.nan)
+            ends = bootstrap.interval(bootstrap.iqm, values, axis=0, resamples=BAND_RESAMPLES)
+            low, high = ends or (np.nan, np.nan)
             about = {"section": group["section"].iloc[0], "label": label, "measure": measure}
             numbers = {"iqm": bootstrap.iqm(values, 0), "low": low, "high": high}
             episode = np.arange(1, values.shape[1] + 1)

@@ -6,17 +6,16 @@ of held-out fires. A *row* of a ranking is a label: trainings that differ in the
 
 import json
 import math
-import re
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import pandas as pd
 
-from emberlink.trainers.comparison.runs import LeftOut, Run
+from emberlink.trainers.comparison.reading import RADIO, LeftOut, Run
 from emberlink.trainers.config.values import flat
 from emberlink.trainers.evaluation.results import LEARNED
 from emberlink.trainers.runs import pretrained
+from emberlink.trainers.runs.run_folder import without_time_and_seed
 
 NOT_COMPARED = (
     *("seed", "seeds", "output", "evaluation", "baselines", "device", "logger", "on_nan"),
@@ -24,15 +23,12 @@ NOT_COMPARED = (
 )
 """first parts of keys that do not affect training"""
 WARM_START = "learner.warm_start"
-RADIO = "env.radio.range", "env.radio.loss", "env.radio.bandwidth"
 _FIRST = ("learner.name", "policy.memory")
 """keys that name a group before all others, which often follow from them"""
 _OF_SECTION = ("setup", "world", "env.horizon", "env.grid", "fires", "start_seed")
 
 Frame = Any
 """a pandas table; the types that pandas infers for its parts are too wide to be checked"""
-Settings = Frame
-"""one row per run, one column per key; values as on the command line, "" for a missing key"""
 
 
 def runs_table(runs: Sequence[Run]) -> tuple[Frame, list[LeftOut]]:
@@ -47,7 +43,7 @@ def runs_table(runs: Sequence[Run]) -> tuple[Frame, list[LeftOut]]:
     """
     runs = sorted(runs, key=lambda r: (r.settings["seed"], r.path.name, r.path))
     runs.sort(key=lambda run: not pretrained.is_copy(run.path))
-    of_section = _settings([_of_section(run) for run in runs])
+    of_section = settings_table(pd.Series([_of_section(run) for run in runs]))
     names = of_section[["setup", "world", "fire.name"]].to_numpy()
     table: Frame = pd.DataFrame(
         {
@@ -59,7 +55,10 @@ def runs_table(runs: Sequence[Run]) -> tuple[Frame, list[LeftOut]]:
             "world": of_section["world"],
             "trained_on": of_section["fire.name"],
             "radio": [radio_text(run.now) for run in runs],
-            "evaluated_with": [_typed(run.evaluated_with) for run in runs],
+            "evaluated_with": [
+                ", ".join(f"{key}={word(value)}" for key, value in run.evaluated_with.items())
+                for run in runs
+            ],
             "seed": [run.settings["seed"] for run in runs],
             "settings": [trained_with(run) for run in runs],
             "as_trained": [not run.evaluated_with for run in runs],
@@ -67,7 +66,7 @@ def runs_table(runs: Sequence[Run]) -> tuple[Frame, list[LeftOut]]:
         }
     )
     table["section"] = named(table["section"], of_section.drop(columns=["setup", "world"]))
-    parts = [named(p["label"], _settings(p["settings"])) for _, p in table.groupby("section")]
+    parts = [named(p["label"], settings_table(p["settings"])) for _, p in table.groupby("section")]
     other = table["evaluated_with"].map(lambda text: text and f", evaluated with {text}")
     table["label"] = pd.concat(parts) + other
     twice = table.duplicated(["section", "label", "seed"], keep="last")
@@ -76,8 +75,11 @@ def runs_table(runs: Sequence[Run]) -> tuple[Frame, list[LeftOut]]:
         for row in table[twice].to_dict("records")
     ]
     table = table[~twice].sort_values(["section", "label", "seed"], ignore_index=True)
-    table, others = _same_fires(table)
-    return table, left_out + others
+    first = table.groupby("section")[["object", "run"]].transform("first")
+    alike = [_same_fires(*pair) for pair in zip(first["object"], table["object"], strict=True)]
+    same = pd.Series(alike, table.index)
+    why = "not evaluated on the fires of " + first["run"] + " (emberlink eval RUN)"
+    return table[same], left_out + list(zip(table["run"][~same], why[~same], strict=True))
 
 
 def _of_section(run: Run) -> dict[str, Any]:
@@ -87,14 +89,10 @@ def _of_section(run: Run) -> dict[str, Any]:
 
 
 def trained_with(run: Run) -> dict[str, str]:
-    """Returns the settings that affect training, as on the command line, without the seed.
-
-    The path of a warm start loses its time and seed, since each seed has a start of its own.
-    """
+    """Returns the settings that affect training, as on the command line, but not the seed's."""
     settings = {k: word(v) for k, v in run.settings.items() if k.split(".")[0] not in NOT_COMPARED}
-    if start := settings.get(WARM_START):
-        name = re.sub(r"^\d{4}-\d\d-\d\d_\d\d-\d\d-\d\d_|_s\d+(_\d+)?$", "", Path(start).name)
-        settings[WARM_START] = str(Path(start).with_name(name))
+    if start := settings.get(WARM_START):  # each seed has a start of its own
+        settings[WARM_START] = without_time_and_seed(start)
     return settings
 
 
@@ -105,18 +103,19 @@ def word(value: Any) -> str:
     return value if isinstance(value, str) else json.dumps(value)
 
 
-def _typed(settings: Mapping[str, Any]) -> str:
-    return ", ".join(f"{key}={word(value)}" for key, value in settings.items())
-
-
-def _settings(rows: Sequence[Mapping[str, Any]] | pd.Series) -> Settings:
-    """Returns settings as a table of text."""
-    index = rows.index if isinstance(rows, pd.Series) else None
+def settings_table(rows: Frame) -> Frame:
+    """Returns settings as text, one column per key, with "" for a missing key."""
     words = [{key: word(value) for key, value in row.items()} for row in rows]
-    return pd.DataFrame(words, index, dtype=object).fillna("")
+    return pd.DataFrame(words, rows.index, dtype=object).fillna("")
 
 
-def named(names: Frame, settings: Settings) -> Frame:
+def trained_settings(runs: Frame) -> Frame:
+    """Returns the settings that affect training, one row per label."""
+    first = runs[runs["as_trained"]].drop_duplicates("label").set_index("label")
+    return settings_table(first["settings"])
+
+
+def named(names: Frame, settings: Frame) -> Frame:
     """Adds to each name, in brackets, the settings that tell it from others of the same name.
 
     The value that more than half of the distinct settings have is not named.
@@ -136,7 +135,7 @@ def named(names: Frame, settings: Settings) -> Frame:
     return result
 
 
-def telling_apart(settings: Settings) -> list[str]:
+def telling_apart(settings: Frame) -> list[str]:
     """Returns keys that tell distinct rows apart; none that follows from those before it."""
     keys: list[str] = []
     parts = 1
@@ -157,16 +156,7 @@ def radio_text(settings: Mapping[str, Any], *, bandwidth: bool = True) -> str:
     return ", ".join(parts) or "no limits"
 
 
-def _same_fires(table: Frame) -> tuple[Frame, list[LeftOut]]:
-    """Leaves out the runs of each section that were evaluated on other fires than the first."""
-    first = table.groupby("section")[["object", "run"]].transform("first")
-    alike = [_alike(*pair) for pair in zip(first["object"], table["object"], strict=True)]
-    same = pd.Series(alike, table.index)
-    why = "not evaluated on the fires of " + first["run"] + " (emberlink eval RUN)"
-    return table[same], list(zip(table["run"][~same], why[~same], strict=True))
-
-
-def _alike(first: Run, other: Run) -> bool:
+def _same_fires(first: Run, other: Run) -> bool:
     """Returns whether two evaluations are of the same fires, as far as both describe them."""
     one, two = (flat(run.evaluation.held_out) for run in (first, other))
     same = all(two[key] == value for key, value in one.items() if key in two)

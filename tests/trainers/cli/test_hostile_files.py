@@ -24,7 +24,7 @@ from emberlink.envs.fire.cache import bank_key, fire_bank
 from emberlink.envs.fire.generator import load_scenario
 from emberlink.envs.utils.errors import UserError
 from emberlink.trainers.cli import main
-from emberlink.trainers.comparison.runs import read_evaluation
+from emberlink.trainers.comparison.reading import read_evaluation
 from emberlink.trainers.runs.run_folder import RunFolder
 from emberlink.trainers.runs.safe_read import parse_json
 

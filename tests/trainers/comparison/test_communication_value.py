@@ -7,7 +7,7 @@ import pytest
 from synthetic_runs import read_evaluation, write_run
 
 from emberlink.policies.scripted.registry import SCRIPTED
-from emberlink.trainers.comparison.results import compare_runs
+from emberlink.trainers.comparison.comparison import compare_runs
 from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.evaluation.evaluate import evaluation_fires, play_blocks
 
@@ -59,7 +59,7 @@ def test_networks_trained_with_other_radios(tmp_path):
     """The interval is over seeds, too; there is none with one seed."""
     for override, coverage in (("", 60.0), (OFF, 50.0), (FULL, 70.0)):
         for seed in range(2):
-            overrides = (override, "keep_checkpoints=9") if override else ()
+            overrides = (override, "checkpoint_interval=9") if override else ()
             name = f"run{override}{seed}".replace("=", "_")
             learned = {"coverage": coverage + 2 * seed}
             write_run(tmp_path, seed=seed, name=name, overrides=overrides, learned=learned)

@@ -17,9 +17,9 @@ from unpack_replay import data_of
 from emberlink.envs import metrics
 from emberlink.envs.utils.errors import UserError
 from emberlink.trainers.cli import main
-from emberlink.trainers.comparison import claims, plots
+from emberlink.trainers.comparison import claims, drawing
 from emberlink.trainers.comparison.bootstrap import crossed_interval, iqm_difference
-from emberlink.trainers.comparison.results import compare_runs
+from emberlink.trainers.comparison.comparison import compare_runs
 
 METHODS = ("consensus", "independent", "positional", "shared_memory")
 LOST = "consensus, evaluated with env.radio.loss=0.5"
@@ -421,13 +421,13 @@ def test_curves_are_over_seeds(comparison, runs):
 
 def test_scripted_policies_are_drawn_in_their_rows(tmp_path):
     """A line is drawn only in the rows that have its value."""
-    assert list(plots.stretches([0, 1, 3, 5, 6])) == [(0, 1), (3, 3), (5, 6)]
+    assert list(drawing.stretches([0, 1, 3, 5, 6])) == [(0, 1), (3, 3), (5, 6)]
     for seed, (setting, own) in enumerate((("0.1", 40), ("0.2", 20), ("0.3", 40))):
         overrides, learned = (f"env.radio.loss={setting}",), {"coverage": 90 - 10 * seed}
         run = write_run(tmp_path, "consensus", seed, overrides=overrides, learned=learned)
         change_policy(run, "random_actions", "coverage", own)
     comparison = compare_runs([tmp_path])
-    figure = plots.frozen(comparison.ranking, list(comparison.runs["label"]))
+    figure = drawing.frozen(comparison.ranking, list(comparison.runs["label"]))
     drawn: Any = figure.axes[0].lines
     lines = [(line.get_xdata()[0], *line.get_ydata()) for line in drawn]
     assert {(20, 0.5, 1.5), (40, -0.5, 0.5), (40, 1.5, 2.5)} <= set(lines)
@@ -550,6 +550,13 @@ def spoilt(**changes):
     return lambda run: change(run, **changes)
 
 
+def rewrite(run, old, new):
+    file = run / "config.yaml"
+    text = file.read_text()
+    assert old in text
+    file.write_text(text.replace(old, new))
+
+
 SPOILT = {
     "no json": (lambda run: (run / "eval.json").write_text("{"), "eval.json"),
     "another's": (spoilt(seed=5), "seed=5"),
@@ -562,6 +569,10 @@ SPOILT = {
     "nan": (lambda run: change_policy(run, "learned", "coverage", float("nan")), "finite"),
     "not evaluated": (lambda run: (run / "eval.json").unlink(), "emberlink eval"),
     "config": (lambda run: (run / "config.yaml").write_text("seed: 1"), "'method' is missing"),
+    "radio": (
+        lambda run: rewrite(run, "range: 10", "range: far"),
+        "'env.radio.range' is wrong: far",
+    ),
     "unfinished": (lambda run: (run / "metrics.jsonl").write_text(""), "unfinished: 0 of 3"),
     "metrics": (lambda run: (run / "metrics.jsonl").write_text("{\n" * 3), "metrics.jsonl"),
 }

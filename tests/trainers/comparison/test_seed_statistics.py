@@ -10,13 +10,11 @@ from hypothesis import strategies as st
 from emberlink.trainers.comparison import bootstrap as statistics
 from emberlink.trainers.comparison.bootstrap import (
     as_ratio,
-    band,
     crossed_interval,
     interval,
     iqm,
     iqm_difference,
     iqm_ratio_share,
-    paired_interval,
     probability_of_improvement,
 )
 
@@ -147,17 +145,14 @@ def test_interval_of_a_difference_is_over_the_seeds_of_both():
     assert interval(iqm_difference, first, [2.0]) is None
 
 
-def test_band_equals_the_interval_at_every_episode(monkeypatch):
-    monkeypatch.setattr(statistics, "RESAMPLES", statistics.BAND_RESAMPLES)
+def test_intervals_along_another_axis_equal_those_of_each_episode():
     values = np.random.default_rng(0).random((5, 3)) * [1, 10, 100]
-    ends = band(values)
-    assert ends is not None
+    low, high = interval(iqm, values, axis=0, resamples=2000)
     for episode, column in enumerate(values.T.tolist()):
-        got = ends[0][episode], ends[1][episode]
-        assert got == interval(iqm, column)
+        got = low[episode], high[episode]
+        assert got == interval(iqm, column, resamples=2000)
         expected = plain_interval(lambda chosen: plain_iqm(chosen), column)
         assert got == pytest.approx(expected, abs=0.06 * (max(column) - min(column)))
-    assert band(values[:1]) is None
 
 
 def mean_difference(first, second, axis=-1):
@@ -166,8 +161,8 @@ def mean_difference(first, second, axis=-1):
 
 def test_the_paired_interval_draws_fires_together():
     first = np.array([1.0, 2.0, 3.0, 4.0])
-    assert paired_interval(mean_difference, first, first + 1) == (-1.0, -1.0)
-    assert paired_interval(mean_difference, first[:1], first[:1]) is None
+    assert interval(mean_difference, first, first + 1, paired=True) == (-1.0, -1.0)
+    assert interval(mean_difference, first[:1], first[:1], paired=True) is None
 
 
 def test_the_crossed_interval_draws_seeds_and_the_same_fires():
@@ -195,7 +190,8 @@ def test_the_crossed_interval_contains_the_truth_and_one_over_fires_does_not(mon
         ]
         low, high = crossed_interval(mean_difference, *samples) or (1, 1)
         crossed += low <= 0 <= high
-        low, high = paired_interval(mean_difference, *(s.mean(0) for s in samples)) or (1, 1)
+        fires = [sample.mean(0) for sample in samples]
+        low, high = interval(mean_difference, *fires, resamples=500, paired=True)
         over_fires += low <= 0 <= high
     assert 180 <= crossed <= 198
     assert over_fires < 160

@@ -17,7 +17,7 @@ from emberlink.trainers.comparison import bootstrap, rankings, tables
 from emberlink.trainers.comparison.bootstrap import Interval
 from emberlink.trainers.comparison.claims import verdicts
 from emberlink.trainers.comparison.communication import communication_values
-from emberlink.trainers.comparison.runs import LeftOut, read_all
+from emberlink.trainers.comparison.reading import LeftOut, read_all
 from emberlink.trainers.comparison.tables import Frame
 from emberlink.trainers.evaluation.results import LEARNED
 from emberlink.trainers.runs.compact_json import finite
@@ -105,7 +105,7 @@ class Comparison:
             raise UserError(f"{measure} has no differences: {why}")
         known = trained["label"].unique()
         parts = [means[means["label"] == _one("label", label, known)] for label in (first, second)]
-        if rankings.same_trainings(*parts):
+        if parts[0]["run"].isin(parts[1]["run"]).any():
             raise UserError(f"{first!r} and {second!r} are evaluations of the same runs")
         iqms = [float(bootstrap.iqm(part["value"].to_numpy(float))) for part in parts]
         samples = [np.array(part["values"].tolist(), float) for part in parts]

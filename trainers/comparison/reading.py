@@ -16,7 +16,7 @@ from pydantic import AfterValidator, ConfigDict, Field, TypeAdapter, ValidationE
 from pydantic.dataclasses import dataclass as checked
 
 from emberlink.envs.utils.errors import UserError
-from emberlink.envs.utils.validation import describe
+from emberlink.envs.utils.validation import describe, shown
 from emberlink.trainers.config.values import flat
 from emberlink.trainers.evaluation.results import CURVES, LEARNED
 from emberlink.trainers.runs import pretrained
@@ -27,21 +27,20 @@ from emberlink.trainers.runs.safe_read import MAX_JSON, check_parts, read_text
 LeftOut = tuple[str, str]
 """a folder or file that is not compared, and the reason"""
 Settings = Annotated[dict[str, Any], AfterValidator(infinite)]
-_NEEDED = {
-    "method": str,
-    "setup": str,
-    "world": str,
-    "seed": int,
-    "episodes": int,
-    "fire.name": str,
+RADIO = "env.radio.range", "env.radio.loss", "env.radio.bandwidth"
+_TYPES: dict[str, Any] = {
+    **dict.fromkeys(("method", "setup", "world", "fire.name"), str),
+    **dict.fromkeys(("seed", "episodes", "num_envs", "env.horizon"), int),
+    **dict.fromkeys(RADIO, int | float | None),
+    "evaluation.headline": str | None,
 }
-"""keys that a config.yaml must have -> their type"""
+"""keys that are read here -> their type, with None if they may be missing"""
 _Measured = Annotated[float, Field(ge=-1e12, le=1e12, allow_inf_nan=False)]
 
 
 @checked(frozen=True, config=ConfigDict(extra="ignore"))
 class Evaluation:
-    """The content of eval.json."""
+    """The content of eval.json or of an eval_*.json."""
 
     method: str
     setup: str
@@ -67,24 +66,18 @@ class Evaluation:
 
 @dataclass(frozen=True)
 class Run:
-    """A finished run with an evaluation.
-
-    Attributes:
-        path: the run folder.
-        name: the method, or the label that the user gave.
-        settings: configuration of the training by dotted key.
-        lines: lines of metrics.jsonl, one per training episode.
-        evaluation: content of eval.json or of an eval_*.json.
-        evaluated_with: dotted key -> value of each setting of the evaluation that differs from the
-            training, such as env.radio.loss; empty for eval.json.
-    """
+    """A finished run with an evaluation."""
 
     path: Path
     name: str
+    """the method, or the label that the user gave"""
     settings: Mapping[str, Any]
+    """configuration of the training by dotted key"""
     lines: Sequence[Mapping[str, Any]]
+    """lines of metrics.jsonl, one per training episode"""
     evaluation: Evaluation
     evaluated_with: Mapping[str, Any] = field(default_factory=dict)
+    """dotted key -> value where the evaluation differs from the training; empty for eval.json"""
 
     @property
     def now(self) -> dict[str, Any]:
@@ -94,7 +87,7 @@ class Run:
     @property
     def headline(self) -> str:
         """The headline measure of the run's world."""
-        return self.settings.get("evaluation.headline", "coverage")
+        return self.settings.get("evaluation.headline") or "coverage"
 
 
 def read_all(
@@ -159,9 +152,7 @@ def read(path: Path) -> Run:
     """
     folder = RunFolder(path)
     settings = {"world": "paper", **flat(folder.values())}
-    for key, kind in _NEEDED.items():
-        if not isinstance(settings.get(key), kind):
-            raise UserError(f"{path / 'config.yaml'}: key {key!r} is missing or wrong")
+    _check_types(settings, path / "config.yaml")
     lines = _curves(folder, settings["episodes"])
     again = f"emberlink eval {shlex.quote(str(path))}"
     try:
@@ -176,6 +167,13 @@ def read(path: Path) -> Run:
             f"eval.json is of step {evaluation.step}, the newest checkpoint of {step} ({again})"
         )
     return Run(path, settings["method"], settings, lines, evaluation)
+
+
+def _check_types(settings: Mapping[str, Any], file: Path) -> None:
+    for key, kind in _TYPES.items():
+        if not isinstance(value := settings.get(key), kind):
+            wrong = "missing" if value is None else f"wrong: {shown(value)}"
+            raise UserError(f"{file}: key {key!r} is {wrong}")
 
 
 def read_evaluation(file: Path, settings: Mapping[str, Any]) -> Evaluation:
@@ -238,20 +236,19 @@ def evaluated_otherwise(run: Run) -> tuple[list[Run], list[LeftOut]]:
     for file in sorted(run.path.glob("eval_*.json")):
         try:
             evaluation = read_evaluation(file, run.settings)
+            learned = evaluation.communication.get(LEARNED, {})
+            now = flat({"world": evaluation.world, "env": evaluation.environment, "comm": learned})
+            _check_types({**run.settings, **now}, file)
         except (UserError, OSError) as error:
             left_out.append((str(file), str(error)))
             continue
-        learned = evaluation.communication.get(LEARNED, {})
-        now = flat({"world": evaluation.world, "env": evaluation.environment, "comm": learned})
         changed = {key: value for key, value in now.items() if run.settings.get(key) != value}
-        why = [
-            f"{name} is {getattr(evaluation, name)}, in eval.json {getattr(run.evaluation, name)}"
-            for name in ("world", "checkpoint", "step", "fires", "start_seed")
-            if getattr(evaluation, name) != getattr(run.evaluation, name)
-        ]
-        why += [f"{key}={changed[key]}" for key in ("env.horizon", "env.grid") if key in changed]
-        if changed and why:
-            left_out.append((str(file), f"evaluated otherwise: {', '.join(why)}"))
+        names = ("world", "checkpoint", "step", "fires", "start_seed")
+        apart = [n for n in names if getattr(evaluation, n) != getattr(run.evaluation, n)]
+        apart += [key for key in ("env.horizon", "env.grid") if key in changed]
+        if changed and apart:
+            why = f"evaluated with another {', '.join(apart)} than eval.json"
+            left_out.append((str(file), why))
         elif any(other.evaluated_with == changed for other in others):
             left_out.append((str(file), "another file has the same settings"))
         elif changed:
