@@ -18,7 +18,6 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from emberlink.envs import keys
 from emberlink.envs.config import WildfireConfig
-from emberlink.envs.rendering.window import Window
 from emberlink.envs.scenarios import default_config
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import describe, shown, unknown
@@ -249,7 +248,7 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
             raise UserError(f"render() needs a render_mode; known: {known}")
         if self.render_mode == "rgb_array":
             return self._core.render()
-        self._window = self._window or Window(self.metadata["name"])
+        self._window = self._window or _Window()
         return self._window.show(self._core.render())
 
     def close(self) -> None:
@@ -305,6 +304,30 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
             agent: {key: value[i] for key, value in values.items()} | shared
             for i, agent in enumerate(self.possible_agents)
         }
+
+
+class _Window:
+    """Shows pictures in a matplotlib window; nothing is shown without a display."""
+
+    def __init__(self) -> None:
+        from matplotlib import pyplot  # imported here, since it takes a second
+
+        self._pyplot, self._figure = pyplot, pyplot.figure()
+        manager: Any = self._figure.canvas.manager
+        manager.set_window_title(WildfireParallelEnv.metadata["name"])
+        self._image: Any = None
+
+    def show(self, picture: NDArray[np.uint8]) -> None:
+        if self._image is None:
+            axes = self._figure.add_axes((0, 0, 1, 1), frame_on=False, xticks=[], yticks=[])
+            self._image = axes.imshow(picture)
+            self._figure.show(warn=False)
+        self._image.set_data(picture)
+        self._figure.canvas.draw_idle()
+        self._figure.canvas.flush_events()
+
+    def close(self) -> None:
+        self._pyplot.close(self._figure)
 
 
 def to_action(action: Any, size: int, agent: str = "the team") -> Array:

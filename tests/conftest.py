@@ -55,13 +55,13 @@ def _blank_figures(request, monkeypatch) -> None:
         return
     from matplotlib.figure import Figure
 
-    from emberlink.trainers.evaluation import plots, report
+    from emberlink.trainers.evaluation import evaluate_run, figures
 
     blank = _blank()
     for name in ("coverage_bars", "timelapse", "training_curves"):
-        monkeypatch.setattr(plots, name, lambda path, *_: path.write_bytes(blank))
+        monkeypatch.setattr(figures, name, lambda path, *_: path.write_bytes(blank))
     monkeypatch.setattr(Figure, "savefig", lambda _, path, **__: path.write_bytes(blank))
-    monkeypatch.setattr(report, "write_gif", lambda path, *_: path.write_bytes(blank))
+    monkeypatch.setattr(evaluate_run, "write_gif", lambda path, *_: path.write_bytes(blank))
 
 
 @cache

@@ -11,14 +11,14 @@ from pathlib import Path
 from typing import Any
 
 from emberlink.envs.utils.errors import UserError
-from emberlink.envs.utils.validation import check_whole, shown
+from emberlink.envs.utils.validation import check_whole
 from emberlink.trainers.comparison.comparison import Comparison, compare_runs
 from emberlink.trainers.comparison.report import free_folder, write_report
 from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.config.schema import MAX_FIRES, RunConfig
 from emberlink.trainers.evaluation.evaluate import evaluate as evaluate_policy
 from emberlink.trainers.evaluation.policy import TrainedPolicy, load_policy
-from emberlink.trainers.evaluation.results import Results
+from emberlink.trainers.evaluation.scores import Results
 from emberlink.trainers.runs import pretrained
 from emberlink.trainers.runs.run_folder import RunFolder
 from emberlink.trainers.terminal.signals import Interruption
@@ -56,8 +56,8 @@ def train(
 ) -> Run:
     """Trains a method, evaluates its frozen policy, and writes a run folder.
 
-    Ctrl-C ends it after the current step, with a checkpoint; `resume` continues. Of several threads
-    that call it, one trains at a time: processes train at the same time.
+    Ctrl-C ends it after the current step, with a checkpoint; `resume` continues. Several threads
+    train one after the other; several processes train at the same time.
 
     Args:
         method: independent, shared_memory, positional, consensus, maps, or a method of your own.
@@ -95,8 +95,7 @@ def resume(
 
     Args:
         run: a run folder.
-        progress: see `train`.
-        evaluate_after: see `train`.
+        progress, evaluate_after: see `train`.
         settings: settings that do not affect learning: `episodes`, `device`, `logger`,
             `checkpoint_interval`, `checkpoint_steps`, and those of `evaluation`.
 
@@ -121,21 +120,17 @@ def evaluate(
     """Evaluates the frozen policy of a run on test fires without writing files.
 
     Args:
-        run: a run folder, or `pretrained:METHOD`.
+        run, checkpoint, device, settings: see `load`.
         episodes: number of episodes, each on another fire; if None, the run's
             `evaluation.episodes`.
         scripted: whether to evaluate the scripted policies, too.
-        checkpoint: file of networks; the newest of the run if None.
-        device: device of the episodes; that of the run if None.
         progress: called with the names of the fire and the policy before each evaluation.
-        settings: `world`, settings of its fire (`"fire.path"`), or settings of `env`, `comm` or
-            `evaluation` to change, as for `train`; the networks must fit.
 
     Returns:
         fire -> policy ("learned", or a scripted one) -> measure -> one number per episode.
 
     Raises:
-        UserError: there is no such run, a file in it is damaged, or a setting does not fit.
+        UserError: see `load`.
     """
     policy = load(run, checkpoint=checkpoint, device=device, **settings)
     count = policy.config.evaluation.episodes
@@ -143,7 +138,8 @@ def evaluate(
         count = check_whole("episodes", episodes)
     if not 1 <= count <= MAX_FIRES:
         raise UserError(f"episodes={count}: expected 1 to {MAX_FIRES}")
-    return evaluate_policy(policy.config, policy, fires=count, scripted=scripted, report=progress)
+    report = progress or (lambda *_: None)
+    return evaluate_policy(policy.config, policy, fires=count, scripted=scripted, report=report)
 
 
 def load(
@@ -165,11 +161,9 @@ def load(
     Raises:
         UserError: there is no such run, a file in it is damaged, or a setting does not fit.
     """
-    if not isinstance(run, str | os.PathLike):
-        raise UserError(f"load: {shown(run)} is not the path of a run folder")
-    folder = pretrained.find_one(str(run)) if pretrained.is_name(str(run)) else Path(run)
-    file = None if checkpoint is None else Path(checkpoint)
-    return load_policy(RunFolder(folder), (), settings, checkpoint=file, device=device)
+    name, file = os.fspath(run), None if checkpoint is None else Path(checkpoint)
+    folder = RunFolder(pretrained.find_one(name) if pretrained.is_name(name) else name)
+    return load_policy(folder, (), settings, checkpoint=file, device=device)
 
 
 def compare(

@@ -1,7 +1,10 @@
 """Writes frames as a GIF, or with ffmpeg as an MP4 video."""
 
 from collections.abc import Iterable
+from contextlib import suppress
+from itertools import chain
 from pathlib import Path
+from subprocess import PIPE, Popen
 from typing import Any, cast
 
 import imageio_ffmpeg
@@ -21,32 +24,17 @@ _COLOURS = (
 # for animations preserve flat colours and sharp edges. The colour matrix is stored, so that players
 # do not guess it. With "faststart" a video can start before it is loaded completely.
 _OPTIONS = [
-    *("-crf", "18", "-preset", "medium", "-tune", "animation"),
+    *("-c:v", "libx264", "-pix_fmt", "yuv420p", "-crf", "18", "-tune", "animation"),
     *("-vf", _COLOURS),
     *("-threads", "1", "-movflags", "+faststart", "-f", "mp4"),
 ]
 
 
 def write_gif(path: Path, frames: Iterable[NDArray[np.uint8]], *, fps: int = 20) -> None:
-    """Writes frames, uint8 [height, width, 3] each, as a GIF that repeats.
-
-    Raises:
-        ValueError: there is no frame.
-    """
-    images = [Image.fromarray(picture).quantize(_PALETTE) for picture in frames]
-    if not images:
-        raise ValueError(f"{path}: an animation needs at least one frame")
-    images = _share_palette(images)
-    duration = round(1000 / fps)
-    images[0].save(
-        path,
-        "GIF",
-        save_all=True,
-        append_images=images[1:],
-        duration=duration,
-        loop=0,
-        optimize=False,
-    )
+    """Writes frames, uint8 [height, width, 3] each, as a GIF that repeats."""
+    first, *others = _share_palette([Image.fromarray(one).quantize(_PALETTE) for one in frames])
+    time = round(1000 / fps)
+    first.save(path, "GIF", save_all=True, append_images=others, duration=time, loop=0)
 
 
 def _share_palette(images: list[Image.Image]) -> list[Image.Image]:
@@ -76,43 +64,18 @@ def write_mp4(path: Path, frames: Iterable[NDArray[np.uint8]], *, fps: int = 20)
     """Writes frames, uint8 [height, width, 3] each, both sides even, as a video.
 
     Raises:
-        UserError: ffmpeg failed, or did not write all frames.
-        OSError: the file cannot be written.
-        ValueError: there is no frame.
+        UserError: ffmpeg failed.
     """
-    path.touch()  # raises an error that names the path; ffmpeg's does not
-    path = path.absolute()  # ffmpeg takes `fire:3.mp4` for an address and `-x.mp4` for an option
-    written, writer = 0, None
-    try:
-        for picture in frames:
-            if writer is None:
-                writer = _start(path, picture, fps)
-            writer.send(np.ascontiguousarray(picture))
-            written += 1
-        if writer is not None:
-            writer.close()
-        complete = written > 0 and imageio_ffmpeg.count_frames_and_secs(path)[0] == written
-    except (OSError, RuntimeError) as error:
-        reason = str(error).strip().splitlines()[0]
-        raise UserError(f"{path.name}: ffmpeg failed: {reason}") from None
-    if written == 0:
-        raise ValueError(f"{path}: a video needs at least one frame")
-    if not complete:
-        raise UserError(f"{path.name}: ffmpeg failed: not all {written} frames were written")
-
-
-def _start(path: Path, picture: NDArray[np.uint8], fps: int):
-    """Starts ffmpeg for frames of the size of `picture`."""
-    height, width = picture.shape[:2]
-    writer = imageio_ffmpeg.write_frames(
-        path,
-        (width, height),
-        fps=fps,
-        codec="libx264",
-        quality=cast(Any, None),  # the rate factor is among the options
-        macro_block_size=2,
-        ffmpeg_log_level="quiet",
-        output_params=_OPTIONS,
-    )
-    writer.send(None)
-    return writer
+    frames = iter(frames)
+    first = next(frames)
+    raw = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{first.shape[1]}x{first.shape[0]}"]
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-v", "error", *raw, "-r", str(fps)]
+    command += ["-i", "-", *_OPTIONS, f"file:{path.absolute()}"]
+    with Popen(command, stdin=PIPE, stderr=PIPE) as ffmpeg:
+        with suppress(BrokenPipeError):  # its status tells why
+            for picture in chain([first], frames):
+                cast(Any, ffmpeg.stdin).write(picture.tobytes())
+        said = ffmpeg.communicate()[1].decode(errors="replace").strip().splitlines()
+    if ffmpeg.returncode:
+        reason = said[0] if said else f"status {ffmpeg.returncode}"
+        raise UserError(f"{path.name}: ffmpeg failed: {reason}")

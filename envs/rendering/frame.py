@@ -1,6 +1,7 @@
 """Draws a map with fields of view and UAVs in the paper's colours (section IV.A)."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +21,7 @@ FAILED = (150, 150, 150)
 BASE = (230, 0, 230)
 
 Colour = tuple[int, int, int]
+Pen = ImageDraw.ImageDraw
 
 
 class Chart:
@@ -64,8 +66,7 @@ class Chart:
             self.pen.rectangle((left - 1, top - 1, right + 1, bottom + 1), outline=NO_FIRE)
             self.pen.rectangle((left, top, right, bottom), outline=FIELD_OF_VIEW, width=line)
         if base is not None:
-            x, y = base
-            draw_base(self.pen, self.point(x, y), max(0.6 * scale, 6.0))
+            draw_base(self.pen, self.point(*base), max(0.6 * scale, 6.0))
 
     def point(self, x: float, y: float) -> tuple[float, float]:
         """Returns the pixel of a point in cells; x grows to the right and y upwards."""
@@ -85,18 +86,13 @@ class Chart:
             draw_cross(self.pen, self.point(x, y), half * self.scale, FAILED)
 
 
-def draw_base(pen: ImageDraw.ImageDraw, place: tuple[float, float], half: float) -> None:
+def draw_base(pen: Pen, place: tuple[float, float], half: float) -> None:
     """Draws the base station as a magenta square with a white edge, 2 * half pixels wide."""
     x, y = place
     pen.rectangle((x - half, y - half, x + half, y + half), fill=BASE, outline=FIRE, width=2)
 
 
-def draw_cross(
-    pen: ImageDraw.ImageDraw,
-    place: tuple[float, float],
-    half: float,
-    colour: Colour,
-) -> None:
+def draw_cross(pen: Pen, place: tuple[float, float], half: float, colour: Colour) -> None:
     """Draws a diagonal cross with dark edges, 2 * half pixels wide."""
     x, y = place
     for width, fill in ((4, NO_FIRE), (2, colour)):
@@ -109,25 +105,16 @@ def frame(
     fire_map: NDArray[np.uint8],
     position: NDArray[np.float32],
     *,
-    view_angle: float,
     size: int = 360,
     alive: NDArray[np.bool_] | None = None,
-    base: Sequence[float] | None = None,
+    **chart: Any,
 ) -> NDArray[np.uint8]:
-    """Returns one frame: no fire black, fire white, fields of view yellow, UAVs blue.
+    """Returns a `Chart` with its UAVs, uint8 [Y * scale, X * scale, 3].
 
-    Args:
-        fire_map: uint8 [X, Y], see `WildfireEnv.fire_map`.
-        position: [n, 3], cells.
-        view_angle: half the opening angle of the cameras, degrees.
-        size: approximate pixels of the longer side of the grid.
-        alive, base: see `Chart`.
-
-    Returns:
-        uint8 [Y * scale, X * scale, 3]; x grows to the right and y upwards.
+    `size` is the approximate number of pixels of the longer side of the grid.
     """
     scale = max(2, size // max(fire_map.shape))
-    chart = Chart(fire_map, position, view_angle=view_angle, scale=scale, alive=alive, base=base)
+    drawn = Chart(fire_map, position, scale=scale, alive=alive, **chart)
     for index, (x, y, _) in enumerate(position.tolist()):
-        chart.draw_uav(x, y, alive=alive is None or bool(alive[index]))
-    return np.asarray(chart.image)
+        drawn.draw_uav(x, y, alive=alive is None or bool(alive[index]))
+    return np.asarray(drawn.image)

@@ -40,8 +40,7 @@ def policy_of(name):
     with torch.no_grad():
         for value in actor.module.parameters():
             value.mul_(3)
-    spec = make_env(config, seed=0).observation_spec
-    return TrainedPolicy(actor, spec, config, Path()).requires_grad_(False)
+    return TrainedPolicy(actor, config, Path()).requires_grad_(False)
 
 
 def make(config, seed):

@@ -16,7 +16,7 @@ from emberlink.policies.scripted.registry import SCRIPTED
 from emberlink.trainers.build import build_actor, build_env
 from emberlink.trainers.cli import main
 from emberlink.trainers.config.compose import resolve
-from emberlink.trainers.evaluation import command, evaluate, plots, tables
+from emberlink.trainers.evaluation import evaluate, scores
 from emberlink.trainers.runs.run_folder import RunFolder
 from emberlink.trainers.terminal.console import SafeConsole
 
@@ -52,14 +52,9 @@ def played(monkeypatch):
     return count
 
 
-def test_evaluations_have_a_hundred_fires():
-    assert resolve("consensus").evaluation.episodes == 100
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("method", ["consensus", "independent"])
-def test_an_episode_does_not_depend_on_the_others(method, cache):
-    config = small(method)
+def test_an_episode_does_not_depend_on_the_others(cache):
+    config = small()
     actor = untrained(config)
     few, more, many = (evaluate.evaluate(config, actor, fires=n) for n in (1, 3, 53))
     for fire, policy, name in itertools.product(many, many["huygens"], metrics.NAMES):
@@ -70,17 +65,16 @@ def test_an_episode_does_not_depend_on_the_others(method, cache):
     assert len(set(many["huygens"]["learned"]["coverage_auc"])) > 25
 
 
-@pytest.mark.parametrize(("number", "said"), [(torch.nan, "nan"), (-torch.inf, "-inf")])
-def test_an_action_that_is_not_finite_is_an_error(number, said):
+def test_an_action_that_is_not_finite_is_an_error():
     config = resolve("independent", ["env.num_uavs=3", "env.horizon=5"])
     env = build_env(config, num_envs=2, fire="paper", seed=0, device="cpu")
 
     def policy(td):
         action = torch.zeros(2, 3, 3)
-        action[1, 2, 0] = number if td[keys.STEP][0] == 3 else 0
+        action[1, 2, 0] = torch.nan if td[keys.STEP][0] == 3 else 0
         return td.set(keys.ACTION, action)
 
-    message = rf"action is {said} for UAV 2 of environment 1 at step 4; expected finite numbers"
+    message = r"action is nan for UAV 2 of environment 1 at step 4; expected finite numbers"
     with pytest.raises(UserError, match=message):
         evaluate.play(env, policy)
 
@@ -126,15 +120,14 @@ def test_follow_target_uses_the_consensus_of_the_setup():
                 assert evaluate.scripted_config(config, name) is config
 
 
-@pytest.mark.parametrize("name", ["random_waypoints", "map_greedy"])
-def test_no_rule_of_a_method_changes_the_flight_of_a_scripted_policy(name, cache):
+def test_no_rule_of_a_method_changes_the_flight_of_a_scripted_policy(cache):
     """In `maps`, UAVs would fly home."""
     measured = []
     for method in ("maps", "independent"):
         more = ["env.horizon=60", "fire.num_train_fires=2", "evaluation.episodes=2"]
         config = resolve(method, ["world=relay", "setup=tuned", *more])
         arrival = evaluate.evaluation_fires(config, 2)["front"]
-        measured.append(evaluate.play_scripted(config, name, arrival, block=2))
+        measured.append(evaluate.play_scripted(config, "map_greedy", arrival, block=2))
     assert measured[0] == measured[1]
 
 
@@ -209,52 +202,22 @@ RESULTS = {
 NUMBERS = ["-123.5", *["1000.0"] * 6, "499.5"]
 
 
-def printed(monkeypatch, capsys, columns: str | None, results, config) -> str:
-    """Returns the table as printed to a pipe of the given width."""
-    monkeypatch.setenv("COLUMNS", columns or "")
-    if columns is None:
-        monkeypatch.delenv("COLUMNS")
-    tables.print_results(SafeConsole(), results, config)
-    return capsys.readouterr().out
-
-
-@pytest.mark.parametrize("columns", ["40", "64", "72", "80", "120", "0", None])
+@pytest.mark.parametrize("columns", ["40", "64", "80", "120"])
 def test_narrow_tables_keep_every_number(columns, monkeypatch, capsys):
     config = resolve("shared_memory", ["setup=released"])
-    lines = printed(monkeypatch, capsys, columns, RESULTS, config).splitlines()
+    monkeypatch.setenv("COLUMNS", columns)
+    scores.print_results(SafeConsole(), RESULTS, config)
+    lines = capsys.readouterr().out.splitlines()
     parts = sum(line.startswith("test fires") for line in lines)
-    assert (parts > 1) == (columns in ("40", "64", "72"))
-    if columns not in ("0", None):
-        assert max(map(len, lines)) <= int(columns)
+    assert (parts > 1) == (columns != "120")
+    assert max(map(len, lines)) <= int(columns)
     for policy in ("shared_memory", *POLICIES):
-        # At 80 columns, a name may take two lines.
+        # A name may take two lines.
         heads = (f"{policy} ", f"{policy.partition('_')[0]}_ ")
         rows = [line.split() for line in lines if line.startswith(heads)]
         assert len(rows) in (parts, 2 * parts)  # two of the names begin with "random_"
         rows = rows[:: len(rows) // parts]
         assert [number for row in rows for number in row[1:]] == NUMBERS
-    words = " ".join(lines).split()
-    for name in metrics.NAMES:
-        assert set(name.split("_")) <= set(words), name
-
-
-@pytest.mark.drawn
-def test_curves_of_a_strange_file_are_drawn(tmp_path):
-    """A name is no formula, and absurd numbers are left out."""
-    lines = [
-        {"episode": 1, "mean_reward": 1e308, "$\\frac{$/mean_reward": 1.0, "coverage": 1.0},
-        {"episode": 1e300, "mean_reward": -1e308, "coverage": 2.0},
-    ]
-    plots.training_curves(tmp_path / "curves.png", lines, "title")
-    assert (tmp_path / "curves.png").stat().st_size > 1000
-
-
-def test_the_files_of_an_evaluation_with_many_settings_have_short_names():
-    long = [f"_env.reward.base=0.{i:0200d}" for i in (1, 2)]
-    short = {command._shortened(label) for label in long}
-    assert {len(label) for label in short} == {150}
-    assert len(short) == 2
-    assert command._shortened("_env.radio.loss=0.5") == "_env.radio.loss=0.5"
 
 
 def test_validation_has_fires_and_starts_of_its_own(cache, monkeypatch):

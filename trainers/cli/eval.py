@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 def add_eval(commands: Any) -> None:
     """Adds the command to the parser."""
-    evaluation = command(
+    add = command(
         commands,
         "eval",
         _eval,
@@ -21,13 +21,9 @@ def add_eval(commands: Any) -> None:
         "the same test fires, prints a table, and writes eval.json, figures, a GIF and a replay "
         "page to the run folder.",
         "emberlink eval runs/2026-01-31_12-00-00_consensus_tuned_paper_s0 --fires 64",
-    )
-    evaluation.add_argument(
-        "folder",
-        metavar="RUN",
-        help="a run folder, or pretrained:METHOD, pretrained:SETUP/METHOD",
-    )
-    evaluation.add_argument(
+    ).add_argument
+    add("folder", metavar="RUN", help="a run folder, or pretrained:METHOD, pretrained:SETUP/METHOD")
+    add(
         "overrides",
         metavar="key=value",
         nargs="*",
@@ -36,26 +32,13 @@ def add_eval(commands: Any) -> None:
         "evaluation.scripted=[] for the frozen policies alone; "
         "the names of the files contain them",
     )
-    evaluation.add_argument(
-        "--checkpoint", metavar="FILE", type=Path, help="a checkpoint (default: the newest)"
-    )
-    evaluation.add_argument(
-        "--fires",
-        metavar="N",
-        type=between(1, MOST_FIRES),
-        help="number of episodes (default: the run's)",
-    )
-    evaluation.add_argument("--device", help="cpu, cuda, ... (default: the run's)")
+    add("--checkpoint", metavar="FILE", type=Path, help="a checkpoint (default: the newest)")
+    episodes = between(1, MOST_FIRES)
+    add("--fires", metavar="N", type=episodes, help="number of episodes (default: the run's)")
+    add("--device", help="cpu, cuda, ... (default: the run's)")
 
 
 def _eval(options: argparse.Namespace, console: "Console") -> int:
-    from emberlink.trainers.evaluation.command import evaluate_folder
+    from emberlink.trainers.evaluation.evaluate_run import run_command
 
-    return evaluate_folder(
-        options.folder,
-        console,
-        overrides=options.overrides,
-        checkpoint=options.checkpoint,
-        fires=options.fires,
-        device=options.device,
-    )
+    return run_command(options, console)

@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from emberlink.trainers.cli.parser import Parser, between, command, positive
+from emberlink.trainers.cli.parser import between, command, positive
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 def add_render(commands: Any) -> None:
     """Adds the command to the parser."""
-    rendering = command(
+    add = command(
         commands,
         "render",
         _render,
@@ -24,14 +24,7 @@ def add_render(commands: Any) -> None:
         "No existing file is replaced.",
         "emberlink render pretrained:consensus pretrained:consensus env.radio.range=0 "
         "--output replay.html",
-    )
-    _add_episodes(rendering)
-    _add_output(rendering)
-
-
-def _add_episodes(rendering: Parser) -> None:
-    """Adds the arguments that choose what is played."""
-    add = rendering.add_argument
+    ).add_argument
     add(
         "runs",
         metavar="RUN",
@@ -60,11 +53,6 @@ def _add_episodes(rendering: Parser) -> None:
         default=[],
         help="a checkpoint in place of the newest; one for each run",
     )
-
-
-def _add_output(rendering: Parser) -> None:
-    """Adds the arguments that choose what is written."""
-    add = rendering.add_argument
     add(
         "--output",
         metavar="PATH",
@@ -72,28 +60,15 @@ def _add_output(rendering: Parser) -> None:
         help="a folder, or a new file that ends in .html (a page to play), .gif, .mp4 or .png (one "
         "picture)",
     )
-    add("--step", metavar="STEP", type=_step, help="step of a .png (default: the last)")
+    step, fps, size = between(0, 1_000_000), between(1, 50), between(100, 2000)
+    add("--step", metavar="STEP", type=step, help="step of a .png (default: the last)")
     add("--frames", type=positive, default=126, help="maximum number of frames (default: 126)")
-    add("--fps", type=_fps, default=12, help="frames per second, 1 to 50 (default: 12)")
-    add("--size", type=_size, help="pixels of a map's longer side, 100 to 2000")
+    add("--fps", type=fps, default=12, help="frames per second, 1 to 50 (default: 12)")
+    add("--size", type=size, help="pixels of a map's longer side, 100 to 2000")
     add("--seen", action="store_true", help="draw seen fire in grey")
 
 
-_step, _fps, _size = between(0, 1_000_000), between(1, 50), between(100, 2000)
-
-
 def _render(options: argparse.Namespace, console: "Console") -> int:
-    from emberlink.trainers.evaluation.render import Choices, render
+    from emberlink.trainers.evaluation.render import render
 
-    choices = Choices(
-        fire=options.fire,
-        policies=options.policy,
-        checkpoints=options.checkpoint,
-        output=options.output,
-        frames=options.frames,
-        fps=options.fps,
-        size=options.size,
-        step=options.step,
-        seen=options.seen,
-    )
-    return render(options.runs, console, choices)
+    return render(options, console)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from emberlink.trainers.comparison import bootstrap
 from emberlink.trainers.comparison.reading import RADIO, Run
 from emberlink.trainers.comparison.tables import WARM_START, Frame, radio_text, trained_with
-from emberlink.trainers.evaluation.results import LEARNED
+from emberlink.trainers.evaluation.scores import LEARNED
 
 SCRIPTED = ("map_greedy", "courier")
 """scripted policies whose value of communication is computed"""

@@ -19,7 +19,7 @@ from emberlink.trainers.comparison.claims import verdicts
 from emberlink.trainers.comparison.communication import communication_values
 from emberlink.trainers.comparison.reading import LeftOut, read_all
 from emberlink.trainers.comparison.tables import Frame
-from emberlink.trainers.evaluation.results import LEARNED
+from emberlink.trainers.evaluation.scores import LEARNED
 from emberlink.trainers.runs.compact_json import finite
 
 

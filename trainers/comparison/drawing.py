@@ -9,7 +9,7 @@ from matplotlib.ticker import MaxNLocator, StrMethodFormatter
 
 from emberlink.envs import metrics
 from emberlink.trainers.comparison.tables import Frame
-from emberlink.trainers.evaluation.results import CURVES, LEARNED
+from emberlink.trainers.evaluation.scores import CURVES, LEARNED
 
 FIGURES = {
     5: (("mean_reward",), "Averaged rewards collected by all UAVs at each episode."),

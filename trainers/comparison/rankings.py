@@ -11,7 +11,7 @@ from emberlink.envs import metrics
 from emberlink.trainers.comparison import bootstrap
 from emberlink.trainers.comparison.bootstrap import BAND_RESAMPLES
 from emberlink.trainers.comparison.tables import Frame, learned, settings_table, trained_settings
-from emberlink.trainers.evaluation.results import CURVES, LEARNED
+from emberlink.trainers.evaluation.scores import CURVES, LEARNED
 
 REWARD = "mean_reward"
 """the measure that depends on a method's own reward"""

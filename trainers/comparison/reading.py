@@ -18,7 +18,7 @@ from pydantic.dataclasses import dataclass as checked
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import describe, shown
 from emberlink.trainers.config.values import flat
-from emberlink.trainers.evaluation.results import CURVES, LEARNED
+from emberlink.trainers.evaluation.scores import CURVES, LEARNED
 from emberlink.trainers.runs import pretrained
 from emberlink.trainers.runs.compact_json import infinite
 from emberlink.trainers.runs.run_folder import RunFolder

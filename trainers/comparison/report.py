@@ -25,9 +25,9 @@ from emberlink.trainers.comparison.rankings import differing, trained_on
 from emberlink.trainers.comparison.tables import Frame
 from emberlink.trainers.evaluation import evaluate
 from emberlink.trainers.evaluation.episodes import Panel
-from emberlink.trainers.evaluation.plots import timelapse
+from emberlink.trainers.evaluation.figures import timelapse
 from emberlink.trainers.evaluation.policy import load_actor
-from emberlink.trainers.evaluation.results import CURVES, LEARNED
+from emberlink.trainers.evaluation.scores import CURVES, LEARNED
 from emberlink.trainers.replay.page import Replay
 from emberlink.trainers.replay.recording import Episode
 from emberlink.trainers.runs.run_folder import RunFolder

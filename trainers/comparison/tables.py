@@ -13,7 +13,7 @@ import pandas as pd
 
 from emberlink.trainers.comparison.reading import RADIO, LeftOut, Run
 from emberlink.trainers.config.values import flat
-from emberlink.trainers.evaluation.results import LEARNED
+from emberlink.trainers.evaluation.scores import LEARNED
 from emberlink.trainers.runs import pretrained
 from emberlink.trainers.runs.run_folder import without_time_and_seed
 

@@ -39,14 +39,10 @@ class Panel:
     """returns the policy for an environment"""
 
     def play(self, arrival: Tensor, index: int = 0) -> Episode:
-        """Plays and records episode `index` of the evaluation.
+        """Plays and records episode `index` of the evaluation on a fire, [1, X, Y].
 
         As many environments are stepped as in an evaluation, so that the numbers are the same to
         the last bit.
-
-        Args:
-            arrival: the fire, for one environment.
-            index: number of the episode.
         """
         env = build_env(
             self.config,
@@ -80,28 +76,11 @@ def title_of(config: RunConfig, *more: str) -> str:
 
 def scripted(config: RunConfig, names: Sequence[str]) -> Iterator[Panel]:
     """Yields a panel for each scripted policy, in the environment of a configuration."""
-    for name in [names] if isinstance(names, str) else names:
+    for name in names:
         if name not in SCRIPTED:
             raise UserError(f"policy {unknown(name, SCRIPTED)}")
         title = f"{name.replace('_', ' ')} (scripted)"
         yield Panel(title, scripted_config(config, name), SCRIPTED[name])
-
-
-def check_comparable(panels: Sequence[Panel]) -> None:
-    """Checks that episodes on the same fire have the same start positions.
-
-    Raises:
-        UserError: a setting of `SHARED` differs.
-    """
-    first, *others = panels
-    for other in others:
-        for name in SHARED:
-            expected, actual = (getattr(panel.config.env, name) for panel in (first, other))
-            if actual != expected:
-                raise UserError(
-                    f"{other.title} has env.{name}={actual}, {first.title} has {expected}: side by "
-                    f"side, {', '.join(SHARED)} must be the same"
-                )
 
 
 def find_fire(text: str | int | None, run: RunConfig) -> tuple[str, ScenarioConfig, int]:
@@ -116,18 +95,15 @@ def find_fire(text: str | int | None, run: RunConfig) -> tuple[str, ScenarioConf
         UserError: there is no such scenario or fire.
     """
     usual, evaluated = shown_scenario(run), evaluation_scenarios(run)
-    text = usual if text is None else str(text)
-    name, colon, index = text.rpartition(":")
+    name, colon, index = (usual if text is None else str(text)).rpartition(":")
     if not colon:
-        is_number = text.lstrip("-").isdecimal()
-        name, index = (usual, text) if is_number else (text, "0")
+        is_number = index.lstrip("-").isdecimal()
+        name, index = (usual, index) if is_number else (index, "0")
     known = dict.fromkeys([*scenarios(), *evaluated])
     if name not in known:
         raise UserError(f"fire {shown(name)!r} is not known; known: {', '.join(known)}")
     if not is_index(index, MAX_FIRES):
-        raise UserError(
-            f"fire {shown(text)!r}: there is no held-out fire; known: 0 to {MAX_FIRES - 1}"
-        )
+        raise UserError(f"fire {shown(index)!r}: no held-out fire; known: 0 to {MAX_FIRES - 1}")
     return name, evaluated.get(name) or load_scenario(name), int(index)
 
 
@@ -144,10 +120,17 @@ def play_side_by_side(
         report: called with a line of text after each episode.
 
     Raises:
-        UserError: there is no such fire, or the panels cannot be compared.
+        UserError: there is no such fire, or a setting of `SHARED` differs.
     """
-    check_comparable(panels)
     world = panels[0].config.env
+    for panel in panels:
+        for name in SHARED:
+            expected, actual = getattr(world, name), getattr(panel.config.env, name)
+            if actual != expected:
+                raise UserError(
+                    f"{panel.title} has env.{name}={actual}, {panels[0].title} has {expected}: "
+                    f"side by side, {', '.join(SHARED)} must be the same"
+                )
     name, scenario, index = find_fire(fire, panels[0].config)
     arrival = fires_of(scenario).test_fire(index, world.grid, world.horizon)
     episodes = []

@@ -6,7 +6,7 @@ import json
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import asdict, replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, cast
 
@@ -31,7 +31,7 @@ from emberlink.policies.scripted.registry import SCRIPTED, to_play
 from emberlink.trainers.build import build_env
 from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.config.schema import RunConfig
-from emberlink.trainers.evaluation.results import LEARNED, Measured, Results, means
+from emberlink.trainers.evaluation.scores import LEARNED, Measured, Results, means
 from emberlink.trainers.rollout.finite_actions import check_finite
 
 HELD_OUT_SCENARIO = "huygens"
@@ -49,17 +49,8 @@ Watch = Callable[[WildfireEnv, TensorDictBase], None]
 result of the reset, or the "next" of the step"""
 
 
-def play(
-    env: TransformedEnv,
-    policy: Policy,
-    watch: Watch | None = None,
-) -> dict[str, Tensor]:
+def play(env: TransformedEnv, policy: Policy, watch: Watch | None = None) -> dict[str, Tensor]:
     """Plays one episode in each environment without exploration noise.
-
-    Args:
-        env: environments with communication.
-        policy: writes ("agents", "action").
-        watch: see `Watch`.
 
     Returns:
         The measures of `metrics.names`, float32 [num_envs] each.
@@ -68,32 +59,26 @@ def play(
         NonFiniteActionError: an action is NaN or infinite.
     """
     world: Any = env.base_env
-    horizon: int = world.config.horizon
     steps: list[TensorDictBase] = []
     actions: list[Tensor] = []
     with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
         td = env.reset()
         if watch is not None:
             watch(world, td)
-        for _ in range(horizon):
+        for _ in range(world.config.horizon):
             td = env.step(policy(td))
             actions.append(td.get(keys.ACTION))
-            _count_messages(policy, td.get("next"))
+            after = td.get("next")
+            if isinstance(policy, Scripted) and after.get(keys.BYTES_SENT, None) is not None:
+                sent = policy.bytes_sent(after)  # its messages, not those of the method
+                after.update({} if sent is None else {keys.BYTES_SENT: sent})
             if watch is not None:
-                watch(world, td.get("next"))
-            steps.append(td.get("next").select(*metrics.STEP_KEYS, strict=False))
+                watch(world, after)
+            steps.append(after.select(*metrics.STEP_KEYS, strict=False))
             td = step_mdp(td, keep_other=True)
     check_finite(torch.stack(actions))
     episode: Any = torch.stack(cast(Any, steps), dim=1)
     return metrics.episode_metrics(episode)
-
-
-def _count_messages(policy: Policy, td: TensorDictBase) -> None:
-    """Replaces the bytes sent by those of a scripted policy, in a world that measures them."""
-    if isinstance(policy, Scripted) and td.get(keys.BYTES_SENT, None) is not None:
-        sent = policy.bytes_sent(td)
-        if sent is not None:
-            td.set(keys.BYTES_SENT, sent)
 
 
 def shown_scenario(config: RunConfig) -> str:
@@ -114,15 +99,10 @@ def evaluation_scenarios(config: RunConfig) -> dict[str, ScenarioConfig]:
 
 
 def evaluation_fires(config: RunConfig, count: int) -> dict[str, Tensor]:
-    """Returns the test fires of an evaluation by scenario.
+    """Returns the test fires of an evaluation: scenario -> times of `count` fires.
 
-    Args:
-        config: configuration of the run.
-        count: number of fires per scenario.
-
-    Returns:
-        Times in steps, float32 [count, X, Y] or [count, 2, X, Y] each (`burning.split_times`). A
-        scenario with a single fire repeats it; the start positions differ.
+    Times are steps, float32 [count, X, Y] or [count, 2, X, Y] (`split_times`). A scenario with a
+    single fire repeats it; the start positions differ.
     """
     grid, horizon = config.env.grid, config.env.horizon
     return {
@@ -144,7 +124,7 @@ def evaluate(
     *,
     fires: int,
     scripted: bool = True,
-    report: Callable[[str, str], None] | None = None,
+    report: Callable[[str, str], None] = lambda *_: None,
     watch: Watch | None = None,
 ) -> Results:
     """Evaluates a frozen policy and the scripted ones on test fires with the same start positions.
@@ -165,15 +145,10 @@ def evaluate(
         fire -> policy -> measure -> one number per episode.
     """
     results: Results = {}
-    shown = shown_scenario(config)
     for fire, arrival in evaluation_fires(config, fires).items():
-
-        def say(policy: str, fire: str = fire) -> None:
-            if report is not None:
-                report(fire, policy)
-
+        say = partial(report, fire)
         say(LEARNED)
-        watched = watch if fire == shown else None
+        watched = watch if fire == shown_scenario(config) else None
         results[fire] = {LEARNED: play_blocks(config, lambda _: actor, arrival, watch=watched)}
         for name in to_play(config.evaluation.scripted) if scripted else ():
             results[fire][name] = play_scripted(config, name, arrival, report=say)
@@ -183,12 +158,8 @@ def evaluate(
 def validate(config: RunConfig, actor: Policy) -> dict[str, float]:
     """Evaluates a frozen policy on validation fires, for selecting the best checkpoint.
 
-    Fires and start positions differ from those of tests. A batch has one environment per episode,
-    at most `BLOCK`.
-
-    Args:
-        config: configuration of the run; `evaluation.interval_episodes` episodes are played.
-        actor: the frozen policy.
+    `evaluation.interval_episodes` episodes are played, on other fires and from other starts than
+    those of tests. A batch has one environment per episode, at most `BLOCK`.
 
     Returns:
         "fire/measure" -> mean.
@@ -197,13 +168,8 @@ def validate(config: RunConfig, actor: Policy) -> dict[str, float]:
     result: dict[str, float] = {}
     for name, scenario in evaluation_scenarios(config).items():
         arrival = fires_of(scenario).validation(count, config.env.grid, config.env.horizon)
-        measured = play_blocks(
-            config,
-            lambda _: actor,
-            arrival,
-            start_seed=VALIDATION_START_SEED,
-            block=min(count, BLOCK),
-        )
+        seed, block = VALIDATION_START_SEED, min(count, BLOCK)
+        measured = play_blocks(config, lambda _: actor, arrival, start_seed=seed, block=block)
         result |= {f"{name}/{measure}": value for measure, value in means(measured).items()}
     return result
 
@@ -224,9 +190,8 @@ def play_scripted(
     Args:
         config: configuration of the run.
         name: a name in `SCRIPTED`.
-        arrival: times in steps, float32 [fires, X, Y] or [fires, 2, X, Y].
-        start_seed, block: as in `play_blocks`.
-        report: called with the name if the policy is evaluated.
+        arrival, start_seed, block: as in `play_blocks`.
+        report: called with the name if no file has the results.
     """
     world, policy = scripted_config(config, name), SCRIPTED[name]
     settings = asdict(world.env), world.comm, world.policy.hold, world.device, start_seed, block
@@ -268,9 +233,9 @@ def source_digest() -> str:
 def scripted_config(config: RunConfig, name: str) -> RunConfig:
     """Returns the configuration of the environment of a scripted policy.
 
-    It is that of the run. If the policy needs the communication of another method, its settings in
-    the run's setup replace those of the run. Where the run's communication would replace actions of
-    the policy, there is none.
+    It is that of the run, with two exceptions. A policy that needs the communication of another
+    method has its settings in the run's setup. Where the run's communication would replace actions
+    of the policy, there is none.
     """
     recipe = SCRIPTED[name].recipe
     if recipe is None:
@@ -308,7 +273,7 @@ def play_blocks(
     Args:
         config: configuration of the environment.
         policy: returns the policy for an environment.
-        arrival: times in steps, float32 [fires, X, Y] or [fires, 2, X, Y].
+        arrival: times of the fires in steps, float32 [fires, X, Y] or [fires, 2, X, Y].
         start_seed: seed of episode 0; episode i has this seed plus i.
         block: environments per batch. The last batch is padded with episodes that are not counted.
         watch: watches the first batch.

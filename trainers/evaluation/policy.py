@@ -6,31 +6,17 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModule, TensorDictSequential, dispatch
-from torchrl.data import Composite
-from torchrl.envs import TensorDictPrimer, TransformedEnv
+from tensordict.nn import TensorDictModule, TensorDictSequential
+from torchrl.envs import TensorDictPrimer
 
 from emberlink.comm import registry
-from emberlink.envs import keys
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import shown
 from emberlink.policies.state import primer_of
 from emberlink.trainers.build import build_actor, build_env
-from emberlink.trainers.config.compose import (
-    evaluated_with,
-    flat,
-    in_world,
-    override,
-    to_values,
-)
+from emberlink.trainers.config.compose import evaluated_with, flat, in_world, override, to_values
 from emberlink.trainers.config.schema import RunConfig
-from emberlink.trainers.evaluation.episodes import (
-    Panel,
-    play_side_by_side,
-    scripted,
-    title_of,
-)
+from emberlink.trainers.evaluation.episodes import Panel, play_side_by_side, scripted, title_of
 from emberlink.trainers.learners.base import ACTOR
 from emberlink.trainers.replay.page import Replay
 from emberlink.trainers.runs.checkpoint import load_weights, read_header
@@ -50,7 +36,6 @@ class TrainedPolicy(TensorDictSequential):
 
     Args:
         actor: the networks.
-        observation_spec: of their environment.
         config: configuration of the run.
         checkpoint: file of the networks.
         changes: settings that are not those of the training, such as `env.radio.range=0`.
@@ -59,45 +44,18 @@ class TrainedPolicy(TensorDictSequential):
     def __init__(
         self,
         actor: TensorDictModule,
-        observation_spec: Composite,
         config: RunConfig,
         checkpoint: Path,
         changes: Sequence[str] = (),
     ):
         modules: Any = [actor]
         super().__init__(*modules)
-        names = keys.observation_keys(observation_spec)
-        self._observed = dict(zip(names, keys.observation_shapes(observation_spec), strict=True))
         self.config = config
         self.checkpoint = checkpoint
         self.changes = tuple(changes)
 
-    @dispatch(auto_batch_size=False)
-    def forward(  # pyright: ignore[reportIncompatibleVariableOverride]
-        self, tensordict: TensorDictBase, *args: Any, **kwargs: Any
-    ) -> TensorDictBase:
-        """Writes the actions of all UAVs.
-
-        Raises:
-            UserError: the observations are not those that the policy was trained with.
-        """
-        config = self.config
-        for key, shape in self._observed.items():
-            wanted = [config.env.num_uavs, *shape]
-            given = tensordict.get(key, None)
-            there = None if given is None else list(given.shape[-len(wanted) :])
-            if there != wanted:
-                raise UserError(
-                    f"this policy of {config.method} reads {key} with the last sizes {wanted}, the "
-                    f"environment gives {there}; make_env(policy.config) returns its environment"
-                )
-        return super().forward(tensordict, *args, **kwargs)
-
     def make_tensordict_primer(self) -> TensorDictPrimer:
-        """Returns a transform that adds the policy's state to an environment.
-
-        `make_env` has added it already.
-        """
+        """Returns a transform that adds the policy's state to an environment; `make_env` does."""
         return primer_of(self)
 
     def replay(
@@ -155,7 +113,12 @@ def load_policy(
     Raises:
         UserError: a file cannot be read, or a setting does not fit.
     """
-    _check_one_run(run.path)
+    folder = run.path
+    if not folder.is_dir():
+        raise UserError(f"{folder}: there is no such run folder")
+    runs = sorted(str(file.parent) for file in folder.glob("*/config.yaml"))
+    if runs and not (folder / "config.yaml").exists():
+        raise UserError(f"{folder}: a folder of {len(runs)} runs; choose one: {', '.join(runs)}")
     file = run.checkpoint() if checkpoint is None else checkpoint
     trained = run.config(file, **({} if device is None else {"device": device}))
     config, given = evaluated_with(trained, overrides), dict(settings or {})
@@ -163,64 +126,38 @@ def load_policy(
     world = str(given.pop("world", config.world))
     config = override(in_world(config, world, **fire), **given)
     before, now = (flat(to_values(each)) for each in (trained, config))
-    fixed = [key for key in {**before, **now} if before.get(key) != now.get(key)]
-    fixed = [key for key in fixed if key.partition(".")[0] not in _CHANGEABLE]
+    changed = [key for key in {**before, **now} if before.get(key) != now.get(key)]
+    fixed = [key for key in changed if key.partition(".")[0] not in _CHANGEABLE]
     if fixed:
         raise UserError(
             f"{', '.join(fixed)}: an evaluation changes only keys of {', '.join(_CHANGEABLE)}"
         )
-    env = fireless(config)
-    actor = load_actor(config, file, env)
     changes = [*overrides, *(f"{key}={shown(value)}" for key, value in (settings or {}).items())]
-    return TrainedPolicy(actor, env.observation_spec, config, file, changes)
+    return TrainedPolicy(load_actor(config, file), config, file, changes)
 
 
-def _check_one_run(folder: Path) -> None:
-    """Raises a UserError if a folder does not exist, or holds several runs, which it lists."""
-    if not folder.is_dir():
-        raise UserError(f"{folder}: there is no such run folder")
-    if (folder / "config.yaml").exists():
-        return
-    runs = sorted(str(file.parent) for file in folder.glob("*/config.yaml"))
-    if runs:
-        more = f" and {len(runs) - 20} more" if len(runs) > 20 else ""
-        raise UserError(
-            f"{folder}: a folder of {len(runs)} runs; choose one: {', '.join(runs[:20])}{more}"
-        )
-
-
-def load_actor(
-    config: RunConfig, checkpoint: Path, env: TransformedEnv | None = None
-) -> TensorDictModule:
+def load_actor(config: RunConfig, checkpoint: Path) -> TensorDictModule:
     """Returns the frozen networks of a checkpoint, which map observations to ("agents", "action").
 
-    It warns if the networks see a base here and saw none in training, or if the map, the altitudes,
-    the horizon, the speed, the view or the units of observations, also those of the communication,
-    are not those of the training.
-
-    Args:
-        config: configuration of the run.
-        checkpoint: file of the networks.
-        env: the environment whose observations they read; a new one of `fireless` if None.
+    It warns of settings that give observations or actions another meaning than in training (see
+    `units`), and of a base that the networks never saw.
 
     Raises:
         UserError: the checkpoint cannot be read or does not fit the configuration.
     """
-    actor = build_actor(config, fireless(config) if env is None else env)
+    nowhere = torch.full(config.env.grid, torch.inf)
+    env = build_env(config, num_envs=1, fire=nowhere, seed=0, device=config.device)
+    actor = build_actor(config, env)
     network: Any = actor.module
     expected = {ACTOR + name: value for name, value in network.state_dict().items()}
     weights = load_weights(checkpoint, expected, config)
-    trained = read_header(checkpoint).config
-    if config.env.observation == "sight" and config.env.base and not trained["env"]["base"]:
-        warnings.warn(
-            f"env.base={list(config.env.base)}: the networks were trained without a base, so the "
-            "weights of the pixels that show one keep their initial values",
-            stacklevel=2,
-        )
-    here, there = flat(to_values(config)), flat(trained)
+    here, there = flat(to_values(config)), flat(read_header(checkpoint).config)
+    compared = units(config)
+    if config.env.observation == "sight" and there["env.base"] is None:
+        compared += ("env.base",)
     differ = [
         f"{key}={shown(here[key])} (in training {shown(there[key])})"
-        for key in units(config)
+        for key in compared
         if here[key] != there.get(key, here[key])
     ]
     if differ:
@@ -241,14 +178,3 @@ def units(config: RunConfig) -> tuple[str, ...]:
     world = ("grid", *_UNITS) if by_map else _UNITS
     said = registry.find(config.comm["name"]).units
     return (*(f"env.{key}" for key in world), *(f"comm.{key}" for key in said))
-
-
-def fireless(config: RunConfig) -> TransformedEnv:
-    """Returns one environment without a fire."""
-    return build_env(
-        config,
-        num_envs=1,
-        fire=torch.full(config.env.grid, torch.inf),
-        seed=0,
-        device=config.device,
-    )

@@ -1,7 +1,8 @@
 """Runs `emberlink render`: draws episodes side by side as GIF, MP4, picture or page."""
 
+import argparse
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 from PIL import Image
@@ -22,55 +23,25 @@ _CELL = 8  # pixels of a cell, within those limits
 _SUFFIXES = (".gif", ".mp4", ".png", ".html")
 
 
-@dataclass(frozen=True, kw_only=True)
-class Choices:
-    """The options of the command, with the defaults of the command line."""
-
-    fire: str | None = None
-    """NAME, INDEX or NAME:INDEX of a held-out fire; see `find_fire`"""
-    policies: Sequence[str] = ()
-    """names of scripted policies to draw, too"""
-    checkpoints: Sequence[Path] = ()
-    """a checkpoint for each run; the newest of each run if empty"""
-    output: Path | None = None
-    """a file or a folder; the figures of the first run if None"""
-    frames: int = 126
-    fps: int = 12
-    size: int | None = None
-    """pixels of a map's longer side"""
-    step: int | None = None
-    """step of a single picture; the last if None"""
-    seen: bool = False
-    """whether seen fire is grey"""
-
-
-def render(runs: Sequence[str], console: Console, choices: Choices) -> int:
-    """Plays an episode of each run on the same fire and writes the files.
-
-    Args:
-        runs: run folders; settings such as `env.radio.range=0` change the run before them.
-        console: prints the progress and the paths.
-        choices: options of the command.
-
-    Returns:
-        The exit status 0.
+def render(options: argparse.Namespace, console: Console) -> int:
+    """Plays an episode of each run on the same fire, writes the files and returns 0.
 
     Raises:
         UserError: a run, fire or output is wrong.
     """
-    panels = [*learned(runs, choices.checkpoints)]
-    panels += episodes.scripted(panels[0].config, choices.policies)
-    fire, _, index = episodes.find_fire(choices.fire, panels[0].config)
+    panels = [*learned(options.runs, options.checkpoint)]
+    panels += episodes.scripted(panels[0].config, options.policy)
+    fire, _, index = episodes.find_fire(options.fire, panels[0].config)
     shown = "episode" if len(panels) == 1 else "side_by_side"
-    stem = "_".join([shown, fire, str(index), *(path.stem for path in choices.checkpoints)])
-    paths = _free_paths(choices.output, runs[0], stem)
-    steps = _steps(choices, panels[0].config.env.horizon, paths[0])
+    stem = "_".join([shown, fire, str(index), *(path.stem for path in options.checkpoint)])
+    paths = _free_paths(options.output, options.runs[0], stem)
+    steps = _steps(options, panels[0].config.env.horizon, paths[0])
     name, played = episodes.play_side_by_side(
         panels, f"{fire}:{index}", lambda text: console.print(text, style="dim", highlight=False)
     )
     least, most = _ALONE if len(panels) == 1 else _BESIDE
-    size = choices.size or min(max(_CELL * max(panels[0].config.env.grid), least), most)
-    screen = Screen(played, size=size, grey_seen=choices.seen)
+    size = options.size or min(max(_CELL * max(panels[0].config.env.grid), least), most)
+    screen = Screen(played, size=size, grey_seen=options.seen)
     for path in paths:
         with created(path) as partial:
             if path.suffix == ".html":
@@ -80,7 +51,7 @@ def render(runs: Sequence[str], console: Console, choices: Choices) -> int:
                 image.save(partial, "PNG", optimize=True)
             else:
                 write = write_gif if path.suffix == ".gif" else write_mp4
-                write(partial, map(screen.picture, steps), fps=choices.fps)
+                write(partial, map(screen.picture, steps), fps=options.fps)
         console.print(str(path), soft_wrap=True, highlight=False)
     return 0
 
@@ -117,34 +88,24 @@ def learned(arguments: Sequence[str], checkpoints: Sequence[Path] = ()) -> Itera
         yield panel
 
 
-def _steps(choices: Choices, horizon: int, path: Path) -> list[int]:
+def _steps(options: argparse.Namespace, horizon: int, path: Path) -> list[int]:
     """Returns the steps to draw."""
-    if path.suffix == ".png":
-        step = horizon if choices.step is None else choices.step
-        if step > horizon:
-            raise UserError(f"step={step}: the episode has the steps 0 to {horizon}")
-        return [step]
-    if choices.step is not None:
-        other = f"a page opens at a step with {path.name}#t=STEP"
-        needs = other if path.suffix == ".html" else "needs a picture, --output FILE.png"
-        raise UserError(f"step={choices.step}: {needs}")
-    return even_steps(horizon, choices.frames)
+    step = options.step
+    if path.suffix != ".png":
+        if step is None:
+            return even_steps(horizon, options.frames)
+        raise UserError(
+            f"step={step}: needs a picture, --output FILE.png; a page opens at FILE.html#t={step}"
+        )
+    if step is not None and step > horizon:
+        raise UserError(f"step={step}: the episode has the steps 0 to {horizon}")
+    return [horizon if step is None else step]
 
 
 def _free_paths(output: Path | None, run: str, stem: str) -> list[Path]:
-    """Returns the paths of the new files: a GIF and an MP4, or the file that the user named.
-
-    Raises:
-        UserError: the named file exists or is of an unknown kind, or its folder does not exist.
-    """
+    """Returns the paths of the new files: a GIF and an MP4, or the file that the user named."""
     if output is not None and not output.is_dir():
-        if output.suffix not in _SUFFIXES:
-            known = ", ".join(_SUFFIXES)
-            raise UserError(f"{output}: there is no such folder, and a file ends in {known}")
         return [new_file(output, _SUFFIXES)]
-    try:
-        folder = open_run(run).figures() if output is None else output
-    except OSError as error:
-        raise UserError(f"{run}: {error.strerror or error}") from None
+    folder = output or open_run(run).figures()
     path = free_name(folder, stem, [".gif", ".mp4"])
     return [path.with_name(f"{path.name}{suffix}") for suffix in (".gif", ".mp4")]

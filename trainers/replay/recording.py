@@ -93,7 +93,8 @@ class Episode:
 class Recorder:
     """Records the episode of one environment; `add` is called at each step.
 
-    The ages are measured in every world, with the environment's own rules.
+    It repeats what the environment computes and does not show: views, links and, in every world,
+    the ages.
 
     Args:
         member: index of the environment.
@@ -104,7 +105,6 @@ class Recorder:
     def __init__(self, *, member: int = 0, advised: bool = True, hears: bool = False):
         self._member, self._advised, self._hears = member, advised, hears
         self._steps: dict[str, list[NDArray[Any]]] = {}
-        self._observer: _Observer | None = None
 
     def add(self, world: WildfireEnv, td: TensorDictBase) -> None:
         """Adds one step.
@@ -113,83 +113,64 @@ class Recorder:
             world: the environments, at this step.
             td: what they returned: the result of a reset, or the "next" of a step.
         """
-        now = td[self._member : self._member + 1].cpu()
-        if self._observer is None:
-            self._observer = _Observer(world, self._member)
-        for name, value in {**self._observer.look(now), **self._told(now)}.items():
-            self._steps.setdefault(name, []).append(value[0].numpy().copy())
-
-    def _told(self, now: TensorDictBase) -> dict[str, Tensor]:
-        """Returns what the environment and the communication wrote."""
+        now: Any = td[self._member : self._member + 1].cpu()
+        if not self._steps:
+            self._start(world)
         wanted = {"position": keys.POSITION, "alive": keys.ALIVE, **COUNTS}
-        told = {name: now.get(key) for name, key in wanted.items()}
+        values = {name: now.get(key) for name, key in wanted.items()}
         reward = now.get(keys.REWARD, None)
-        told["reward"] = torch.zeros(1, len(told["alive"][0])) if reward is None else reward[..., 0]
+        values["reward"] = torch.zeros(values["alive"].shape) if reward is None else reward[..., 0]
         if self._advised:
             self._hears |= now.get(keys.HEARS, None) is not None
             advice = {name: now.get(key, None) for name, key in ADVICE.items()}
-            told |= {name: value for name, value in advice.items() if value is not None}
-        return told
+            values |= {name: value for name, value in advice.items() if value is not None}
+        for name, value in (values | self._look(now)).items():
+            self._steps.setdefault(name, []).append(value[0].numpy().copy())
 
     def recording(self) -> Recording:
         """Returns what was recorded."""
-        assert self._observer is not None, "no step was recorded"
-        ignition, end = self._observer.fire
+        crop, times = self._sensor.crop, self._measures.times
+        ignition, end = crop(times.ignition)[0].numpy(), crop(times.end)[0].numpy()
         steps = {name: np.stack(values) for name, values in self._steps.items()}
-        world = self._observer.config
-        listens = self._hears or world.base is not None
-        return Recording(world=world, listens=listens, ignition=ignition, end=end, steps=steps)
+        listens = self._hears or self._config.base is not None
+        return Recording(
+            world=self._config, listens=listens, ignition=ignition, end=end, steps=steps
+        )
 
-
-class _Observer:
-    """Repeats what one environment computes and does not show: views, links and ages.
-
-    Args:
-        world: the environments, after their reset.
-        member: index of the environment.
-    """
-
-    def __init__(self, world: WildfireEnv, member: int):
-        self.config = world.config
-        self._sensor = Sensor.of(self.config)
-        measured = dataclasses.replace(self.config, measures="all")
+    def _start(self, world: WildfireEnv) -> None:
+        """Takes the fire of the environment."""
+        self._config, self._sensor = world.config, Sensor.of(world.config)
+        measured = dataclasses.replace(world.config, measures="all")
         self._measures = Measures(measured, 1, self._sensor.area)
-        arrival, burn_out = world.arrival_time[[member]].cpu(), world.burn_out
+        member, burn_out = [self._member], world.burn_out
         self._measures.start_episodes(
             torch.ones(1, dtype=torch.bool),
-            self._sensor.pad(arrival, torch.nan),
-            None if burn_out is None else self._sensor.pad(burn_out[[member]].cpu(), torch.nan),
+            self._sensor.pad(world.arrival_time[member].cpu(), torch.nan),
+            None if burn_out is None else self._sensor.pad(burn_out[member].cpu(), torch.nan),
         )
-        base = self.config.base
+        base = world.config.base
         self._base = torch.zeros(1, 0, 3) if base is None else torch.tensor([[[*base, 0.0]]])
 
-    @property
-    def fire(self) -> tuple[NDArray[Any], NDArray[Any]]:
-        """The first step of each cell's fire and the first after it, [X, Y]."""
-        times = self._measures.times
-        crop = self._sensor.crop
-        return crop(times.ignition)[0].numpy(), crop(times.end)[0].numpy()
-
-    def look(self, now: TensorDictBase) -> dict[str, Tensor]:
+    def _look(self, now: TensorDictBase) -> dict[str, Tensor]:
         """Returns the views, links and ages of a time step of batch size [1]."""
         position, alive = now.get(keys.POSITION).double(), now.get(keys.ALIVE)
         key, step = now.get(keys.RNG_KEY), now.get(keys.STEP)
         view = self._view(position, alive, step)
         if step > 0:  # nobody looks at the reset
             self._measures.update(view, position, key, step, alive)
-        seen = {"view": self._bounds(view) if step > 0 else _no_view(alive)}
-        given = key, step, alive
-        if self.config.base is None:
-            hears = radio.links(self.config.radio, position, *given[:2], alive=alive)
         else:
-            hears = self._measures.hears(position, *given)
+            view.in_view.zero_()
+        if self._config.base is None:
+            hears = radio.links(self._config.radio, position, key, step, alive=alive)
+        else:
+            hears = self._measures.hears(position, key, step, alive)
         lives = torch.nn.functional.pad(alive, (0, self._base.shape[1]), value=True)
         places = torch.cat((position, self._base.double()), 1)
-        near = radio.neighbours(places, self.config.radio.range)
+        near = radio.neighbours(places, self._config.radio.range)
         near &= lives.unsqueeze(-1) & lives.unsqueeze(-2)
-        values = self._measures.values()
-        ages = {name: values[key] for name, key in {**AGES, **OF_BASE}.items() if key in values}
-        return {**seen, "hears": hears, "lost": near & ~hears, **ages}
+        measured = self._measures.values()
+        ages = {name: measured[key] for name, key in (AGES | OF_BASE).items() if key in measured}
+        return {"view": self._bounds(view), "hears": hears, "lost": near & ~hears, **ages}
 
     def _view(self, position: Tensor, alive: Tensor, step: Tensor) -> View:
         _, cells, in_view = self._sensor.look(position, torch.zeros(1, 1, dtype=torch.int64))
@@ -200,14 +181,9 @@ class _Observer:
         """Returns the first and last cells in view along x and y, int16 [1, n, 4]."""
         seen = torch.zeros(view.cells.shape[1], self._sensor.area, dtype=torch.bool)
         inside = self._sensor.crop(seen.scatter_(1, view.cells[0], view.in_view[0]))
-        none = torch.tensor([1, 0, 1, 0])
         bounds = []
         for axis in (2, 1):
             line = inside.any(axis).int()
             bounds += [line.argmax(-1), line.shape[-1] - 1 - line.flip(-1).argmax(-1)]
-        found = torch.stack(bounds, -1)
+        found, none = torch.stack(bounds, -1), torch.tensor([1, 0, 1, 0])
         return torch.where(inside.any(2).any(1)[:, None], found, none).short().unsqueeze(0)
-
-
-def _no_view(alive: Tensor) -> Tensor:
-    return torch.tensor([1, 0, 1, 0], dtype=torch.int16).expand(*alive.shape, 4)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from emberlink.envs.rendering import frame
-from emberlink.envs.rendering.frame import Chart, Colour
+from emberlink.envs.rendering.frame import Chart, Colour, Pen
 from emberlink.trainers.replay.recording import ROLES, Episode, Recording
 
 SEEN_FIRE = (140, 140, 140)
@@ -29,12 +29,12 @@ _TEXT = 15
 _SAMPLE = 30  # width of the sample before the text of a legend entry
 
 # Corners of the shape of each role: offsets to the right and downwards, in half widths.
-_DIAMOND = ((0, -1.3), (1.3, 0), (0, 1.3), (-1.3, 0))
-_TRIANGLE = ((0, -1.4), (1.35, 1), (-1.35, 1))
-_SQUARE = ((-1, -1), (1, -1), (1, 1), (-1, 1))
-_SHAPES = (_DIAMOND, _TRIANGLE, _SQUARE)
+_SHAPES = (
+    ((0, -1.3), (1.3, 0), (0, 1.3), (-1.3, 0)),
+    ((0, -1.4), (1.35, 1), (-1.35, 1)),
+    ((-1, -1), (1, -1), (1, 1), (-1, 1)),
+)
 
-Pen = ImageDraw.ImageDraw
 Sample = Callable[[Pen, float, float], None]
 
 
@@ -71,7 +71,7 @@ class Screen:
             sample(pen, x + 10, top + y + _LINE / 2)
             self._write(pen, x + _SAMPLE, top + y, word)
         for (x, y), episode in zip(self._corners, episodes, strict=True):
-            self._write(pen, x, y, self._cut(episode.title, panel[0] - _GAP))
+            self._write(pen, x, y, self._shortened(episode.title, panel[0] - _GAP))
 
     def map_corner(self, panel: int) -> tuple[int, int]:
         """Returns the upper left pixel of a panel's map, (x, y)."""
@@ -94,11 +94,8 @@ class Screen:
     def _write(self, pen: Pen, x: float, y: float, text: str) -> None:
         pen.text((x, y + _LINE / 2), text, fill=_INK, font=self._font, anchor="lm")
 
-    def _cut(self, text: str, width: float) -> str:
-        """Returns the text, shortened in its middle to fit a width in pixels.
-
-        The end often names the setting in which panels differ.
-        """
+    def _shortened(self, text: str, width: float) -> str:
+        """Cuts the middle of a text to fit a width; its end often names how panels differ."""
         kept, cut = len(text), text
         while kept and self._font.getlength(cut) > width:
             kept -= 1

@@ -10,7 +10,7 @@ from emberlink.configs import known
 from emberlink.envs.scenarios import fires_of
 from emberlink.envs.utils.errors import UserError
 from emberlink.trainers.config.compose import resolve
-from emberlink.trainers.evaluation.tables import print_results
+from emberlink.trainers.evaluation.scores import print_results
 from emberlink.trainers.terminal.console import OutputError
 from emberlink.trainers.terminal.progress import TrainingProgress
 from emberlink.trainers.terminal.signals import Interrupted, Interruption

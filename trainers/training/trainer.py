@@ -11,8 +11,8 @@ from emberlink.envs import metrics
 from emberlink.envs.utils.errors import UserError
 from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.evaluation import evaluate
-from emberlink.trainers.evaluation.report import evaluate_run
-from emberlink.trainers.evaluation.results import Results, learned_means
+from emberlink.trainers.evaluation.evaluate_run import evaluate_run
+from emberlink.trainers.evaluation.scores import Results, learned_means
 from emberlink.trainers.learners.base import Losses
 from emberlink.trainers.rollout.finite_actions import NonFiniteActionError
 from emberlink.trainers.runs import checkpoint

@@ -18,7 +18,7 @@ from emberlink.policies.scripted.registry import to_play
 from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.evaluation.evaluate import BLOCK, VALIDATION_START_SEED, play_scripted
-from emberlink.trainers.evaluation.results import Measured, means
+from emberlink.trainers.evaluation.scores import Measured, means
 from emberlink.trainers.runs import compact_json
 
 Split = Literal["test", "validation"]

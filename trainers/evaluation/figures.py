@@ -8,46 +8,34 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
-from numpy.typing import NDArray
 
 from emberlink.envs.rendering.frame import frame
-from emberlink.trainers.evaluation.results import CURVES, LEARNED, Results
+from emberlink.trainers.evaluation.scores import CURVES, LEARNED, Results
 from emberlink.trainers.replay.recording import Recording
 from emberlink.trainers.replay.screen import even_steps
 
 
 def training_curves(path: Path, lines: Sequence[Mapping[str, Any]], title: str) -> None:
-    """Draws the paper's figures 5 to 9 for one run.
+    """Draws the paper's figures 5 to 9 for one run as PNG.
 
-    Args:
-        path: a .png file.
-        lines: lines of metrics.jsonl. Keys are measures of the exploring policy, and "fire/measure"
-            for the frozen policy on validation fires.
-        title: title of the figure.
+    Keys of `lines`, those of metrics.jsonl, are measures of the exploring policy, and
+    "fire/measure" for the frozen policy on validation fires.
     """
     figure = Figure(figsize=(11, 6), layout="constrained")
     figure.suptitle(title)
     for axes, (name, label) in zip(figure.subplots(2, 3).flat, CURVES.items(), strict=True):
-        axes.plot(*_points(lines, name), color="0.6", label="with noise")
-        for key in sorted({k for line in lines for k in line if k.endswith("/" + name)}):
-            fire = key.split("/")[0]
-            axes.plot(*_points(lines, key), marker="o", ms=3, label=f"without noise, {fire}")
+        fires = sorted({k for line in lines for k in line if k.endswith("/" + name)})
+        for key in (name, *fires):
+            points = [(line["episode"], line[key]) for line in lines if key in line]
+            frozen = {"marker": "o", "ms": 3, "label": f"without noise, {key.split('/')[0]}"}
+            style = frozen if key in fires else {"color": "0.6", "label": "with noise"}
+            axes.plot(*np.reshape(points, (-1, 2)).T, **style)
         axes.set(xlabel="episode", ylabel=label)
         axes.xaxis.set_major_locator(MaxNLocator(integer=True))
         axes.grid(alpha=0.3)
     for text in figure.axes[0].legend(fontsize="small").get_texts():
         text.set_parse_math(False)
     figure.savefig(path, format="png", dpi=120)
-
-
-def _points(lines: Sequence[Mapping[str, Any]], key: str) -> NDArray[np.float32]:
-    """Returns the episodes that have a measure, and its values, float32 [2, episodes].
-
-    float32 makes absurd numbers of a damaged file infinite, which are not drawn.
-    """
-    points = [(line["episode"], line[key]) for line in lines if key in line]
-    with np.errstate(over="ignore"):
-        return np.array(points, np.float64).reshape(-1, 2).T.astype(np.float32)
 
 
 def coverage_bars(path: Path, results: Results) -> None:
@@ -61,34 +49,20 @@ def coverage_bars(path: Path, results: Results) -> None:
             values = np.asarray(measured["coverage"])
             colour = "tab:orange" if policy == LEARNED else "0.75"
             axes.bar(place, values.mean(), color=colour)
-            axes.annotate(
-                f"{values.mean():.0f}",
-                (place, 101),
-                ha="center",
-                va="bottom",
-                fontsize="small",
-                annotation_clip=False,
-            )
+            axes.text(place, 101, f"{values.mean():.0f}", ha="center", fontsize="small")
             spread = place + np.linspace(-0.3, 0.3, len(values))
             axes.plot(spread, values, "k.", ms=2, alpha=0.4)
         names = [name.replace("_", " ") for name in by_policy]
         axes.set_xticks(range(len(by_policy)), names, rotation=35, ha="right")
         axes.set_title(f"test fires:\n{fire}", pad=18)
-        axes.set_ylim(0, 100)
+        axes.set(ylim=(0, 100), axisbelow=True)
         axes.grid(axis="y", alpha=0.3)
-        axes.set_axisbelow(True)
     panels[0].set_ylabel("coverage, % (mean above)")
     figure.savefig(path, format="png", dpi=120)
 
 
 def timelapse(path: Path, episode: Recording, title: str = "") -> None:
-    """Draws a row of up to five steps of an episode, as in the paper's figure 3.
-
-    Args:
-        path: a .png file.
-        episode: the episode.
-        title: title of the figure; none if empty.
-    """
+    """Draws a row of up to five steps of an episode as PNG, as in the paper's figure 3."""
     steps = even_steps(episode.horizon, 5)
     figure = Figure(figsize=(2.4 * len(steps), 2.7), layout="constrained")
     for axes, step in zip(figure.subplots(1, len(steps), squeeze=False)[0], steps, strict=True):

@@ -1,0 +1,148 @@
+"""Evaluates the frozen policy of a run and writes eval.json, figures, a GIF and a replay page."""
+
+import argparse
+import hashlib
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import asdict
+from pathlib import Path
+
+from rich.console import Console
+
+from emberlink.envs.rendering.film import write_gif
+from emberlink.envs.scenarios import fires_of
+from emberlink.envs.utils.errors import UserError
+from emberlink.trainers.config.schema import RunConfig
+from emberlink.trainers.evaluation import evaluate, figures
+from emberlink.trainers.evaluation.episodes import recorder_of, title_of
+from emberlink.trainers.evaluation.policy import load_policy
+from emberlink.trainers.evaluation.scores import LEARNED, Results, print_results
+from emberlink.trainers.replay.page import Replay
+from emberlink.trainers.replay.recording import Episode
+from emberlink.trainers.replay.screen import Screen, even_steps
+from emberlink.trainers.runs.checkpoint import read_header
+from emberlink.trainers.runs.pretrained import open_run, read_run
+from emberlink.trainers.runs.run_folder import RunFolder
+from emberlink.trainers.runs.versions import versions
+from emberlink.trainers.terminal.console import OutputError
+
+_MAX_LABEL = 150
+"""characters; a name of a file can have 255"""
+
+
+def run_command(options: argparse.Namespace, console: Console) -> int:
+    """Runs `emberlink eval`: evaluates a run, prints the table and returns 0.
+
+    Raises:
+        UserError: a file cannot be read or written, or a setting does not fit.
+    """
+    changes, file = options.overrides, options.checkpoint
+    policy = load_policy(read_run(options.folder), changes, checkpoint=file, device=options.device)
+    run = open_run(options.folder)  # copies a trained policy of the package once all is checked
+    about = [file.stem] if file else []
+    parts = [*about, *(re.sub(r"[^\w.=+-]", "-", text) for text in changes)]
+    label = "".join(f"_{part}" for part in parts)
+    if len(label) > _MAX_LABEL:
+        label = f"{label[: _MAX_LABEL - 9]}_{hashlib.sha256(label.encode()).hexdigest()[:8]}"
+    results = evaluate_run(
+        run,
+        policy.config,
+        policy,
+        checkpoint=policy.checkpoint,
+        fires=options.fires or policy.config.evaluation.episodes,
+        report=lambda text: console.print(f"  {text}", style="dim", soft_wrap=True),
+        label=label,
+        about=[*changes, *about],
+    )
+    print_results(console, results, policy.config)
+    console.print(str(run.path), soft_wrap=True)
+    return 0
+
+
+def evaluate_run(
+    run: RunFolder,
+    config: RunConfig,
+    actor: evaluate.Policy,
+    *,
+    checkpoint: Path,
+    fires: int,
+    report: Callable[[str], None],
+    label: str = "",
+    about: Sequence[str] = (),
+) -> Results:
+    """Evaluates a frozen policy and writes eval.json, the figures, a GIF and a replay page.
+
+    Args:
+        run: folder of the files.
+        config: configuration of the run.
+        actor: the frozen policy.
+        checkpoint: file of the policy.
+        fires: number of test fires, one episode each.
+        report: called with a line of text before each part of the work.
+        label: suffix of the file names.
+        about: texts that the title of the replay names, such as changed settings.
+
+    Raises:
+        UserError: a file cannot be written.
+    """
+    count = f"{fires} fire{'s' * (fires > 1)}"
+    try:
+        run.figures()  # an unusable folder is an error before the episodes, not after
+        recorder = recorder_of(config, actor)
+        results = evaluate.evaluate(
+            config,
+            actor,
+            fires=fires,
+            report=lambda fire, policy: report(f"{policy} on {count} of {fire}"),
+            watch=recorder.add,
+        )
+        shown = Episode(title=title_of(config, *about), recording=recorder.recording())
+        _draw(run, config, results, shown, label)
+    except OutputError:
+        raise
+    except OSError as error:
+        why = error.strerror or error
+        raise UserError(f"{run.path / 'figures'}: cannot be written: {why}") from None
+    scenarios = evaluate.evaluation_scenarios(config)
+    policies = next(iter(results.values()))
+    content = {
+        "method": config.method,
+        "setup": config.setup,
+        "world": config.world,
+        "seed": config.seed,
+        "start_seed": evaluate.START_SEED,
+        "checkpoint": checkpoint.name,
+        "step": read_header(checkpoint).step,
+        "fires": fires,
+        "start_seeds": list(range(evaluate.START_SEED, evaluate.START_SEED + fires)),
+        "held_out": {name: fires_of(scenarios[name]).describe(fires) for name in results},
+        "environment": asdict(config.env),
+        "communication": {
+            name: config.comm if name == LEARNED else evaluate.scripted_config(config, name).comm
+            for name in policies
+        },
+        "device": config.device,
+        "versions": versions(),
+        "results": results,
+    }
+    run.write(f"eval{label}.json", content)  # last: an evaluation with this file is complete
+    return results
+
+
+def _draw(
+    run: RunFolder, config: RunConfig, results: Results, episode: Episode, label: str
+) -> None:
+    with run.figure(f"coverage{label}.png") as path:
+        figures.coverage_bars(path, results)
+    if lines := run.metrics():
+        title = f"{config.method}, setup {config.setup}, fire {config.fire.name}"
+        with run.figure("training.png") as path:
+            figures.training_curves(path, lines, title)
+    name = evaluate.shown_scenario(config)
+    with run.figure(f"episode_{name}{label}.gif") as path:
+        screen = Screen([episode], size=480)
+        write_gif(path, map(screen.picture, even_steps(config.env.horizon, 100)))
+    with run.figure(f"timelapse_{name}{label}.png") as path:
+        figures.timelapse(path, episode.recording)
+    with run.figure(f"replay{label}.html") as path:
+        Replay([episode], f"{name}:0").save(path)

@@ -1,0 +1,73 @@
+"""Defines the results of an evaluation, their means, and the table that is printed."""
+
+from collections.abc import Mapping
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from emberlink.envs import metrics
+from emberlink.trainers.config.schema import RunConfig
+from emberlink.trainers.terminal.table import print_table
+
+CURVES = {
+    "mean_reward": "mean reward",
+    "coverage": "coverage, %",
+    "tracking_first": "first UAV on fire, step",
+    "tracking_last": "last UAV on fire, step",
+    "boundary_exits": "boundary exits per UAV",
+    "fire_losses": "fire losses per UAV",
+}
+"""measure -> axis label, in the order of the paper's figures 5 to 9"""
+
+LEARNED = "learned"
+"""name of the learned policy in results"""
+
+Measured = dict[str, list[float]]
+"""measure -> one number per episode"""
+
+Results = dict[str, dict[str, Measured]]
+"""fire -> policy -> measure -> one number per episode"""
+
+
+def means(measured: Mapping[str, list[float]]) -> dict[str, float]:
+    """Returns the mean over episodes of each measure."""
+    return {name: float(np.mean(values)) for name, values in measured.items()}
+
+
+def learned_means(results: Results) -> dict[str, float]:
+    """Returns "test/fire/measure" -> mean over episodes of the learned policy."""
+    return {
+        f"test/{fire}/{name}": value
+        for fire, by_policy in results.items()
+        for name, value in means(by_policy[LEARNED]).items()
+    }
+
+
+def print_results(console: Console, results: Results, config: RunConfig) -> None:
+    """Prints means over episodes: a table per fire, a row per policy, a column per measure.
+
+    Measures besides the paper's have a table of their own.
+    """
+    for fire, by_policy in results.items():
+        others = [name for name in by_policy[LEARNED] if name not in metrics.NAMES]
+        episodes = len(by_policy[LEARNED]["coverage"])
+        settings = f"{episodes} episodes, mean; setup {config.setup}, world {config.world}"
+        for measures in filter(None, (metrics.NAMES, others)):
+            table = Table(title=Text(f"test fires: {fire} ({settings})"))
+            table.add_column()
+            for name in measures:  # one word per line, so that the table fits 80 columns
+                table.add_column(name.replace("_", "\n"), justify="right")
+            for policy, measured in by_policy.items():
+                mean, learned = means(measured), policy == LEARNED
+                numbers = [_number(name, mean[name]) for name in measures]
+                name, style = (config.method, "bold") if learned else (policy, None)
+                table.add_row(name, *numbers, style=style)
+            print_table(console, table)
+
+
+def _number(measure: str, value: float) -> str:
+    """Formats a value with one decimal place, but a mean reward with at least four digits."""
+    digits = max(1, 4 - len(str(int(abs(value))))) if measure == "mean_reward" else 1
+    return f"{value:.{digits}f}"
