@@ -60,14 +60,10 @@ def train(
     train one after the other; several processes train at the same time.
 
     Args:
-        method: independent, shared_memory, positional, consensus, maps, or a method of your own.
-        setup: paper, released, tuned, strong, or a setup of your own.
-        world: paper, front, relay, swarm, blackout, file, or a world of your own.
-        fire: name of a scenario; that of the setup or the world if None.
-        learner: name of a learner; that of the setup if None.
+        method, setup, world: names that `emberlink list` shows, or of files of your own.
+        fire, learner: the same; those of the setup or the world if None.
         progress: called after each decision of the team; an exception in it ends the training.
-        evaluate_after: whether to evaluate at the end, which writes eval.json, figures, a GIF and a
-            replay.
+        evaluate_after: whether to evaluate at the end, as `emberlink eval` does.
         settings: other settings, by the last part of their key (`episodes=5`, `horizon=50`) or the
             whole key (`**{"learner.gamma": 0.9}`); `output="runs"` is the folder of run folders.
 

@@ -14,7 +14,6 @@ from PIL import Image
 
 from emberlink.envs.utils.errors import UserError
 
-_PALETTE = 256  # colours of a GIF
 _COLOURS = (
     "scale=out_color_matrix=bt709:out_range=tv,"
     "setparams=color_primaries=bt709:color_trc=bt709:colorspace=bt709:range=tv"
@@ -32,32 +31,8 @@ _OPTIONS = [
 
 def write_gif(path: Path, frames: Iterable[NDArray[np.uint8]], *, fps: int = 20) -> None:
     """Writes frames, uint8 [height, width, 3] each, as a GIF that repeats."""
-    first, *others = _share_palette([Image.fromarray(one).quantize(_PALETTE) for one in frames])
-    time = round(1000 / fps)
-    first.save(path, "GIF", save_all=True, append_images=others, duration=time, loop=0)
-
-
-def _share_palette(images: list[Image.Image]) -> list[Image.Image]:
-    """Converts images to a common palette if all their colours fit into it.
-
-    Pixels that do not change between frames then take almost no space in the file.
-    """
-    colours: dict[bytes, int] = {}
-    tables: list[list[int]] = []
-    for image in images:
-        palette = bytes(image.getpalette() or ())
-        entries = (palette[i : i + 3] for i in range(0, len(palette), 3))
-        tables.append([colours.setdefault(entry, len(colours)) for entry in entries])
-    # One entry must be free for pixels that do not change.
-    if len(colours) >= _PALETTE:
-        return images
-    shared = []
-    for image, table in zip(images, tables, strict=True):
-        numbers = np.array(table, np.uint8)[np.asarray(image)]
-        renumbered = Image.fromarray(numbers, "P")
-        renumbered.putpalette(b"".join(colours))
-        shared.append(renumbered)
-    return shared
+    images, time = map(Image.fromarray, frames), round(1000 / fps)
+    next(images).save(path, "GIF", save_all=True, append_images=images, duration=time, loop=0)
 
 
 def write_mp4(path: Path, frames: Iterable[NDArray[np.uint8]], *, fps: int = 20) -> None:

@@ -73,14 +73,8 @@ class TrainedPolicy(TensorDictSequential):
             policies: names of scripted policies to show, too.
 
         Raises:
-            UserError: a name is not known, or the others are no policies, or have another map, team
-                or horizon.
+            UserError: a name is not known, or the others have another map, team or horizon.
         """
-        for other in others:
-            if not isinstance(other, TrainedPolicy):
-                raise UserError(
-                    f"replay: {shown(other)} is not a policy of load(...); fire=0 chooses a fire"
-                )
         panels = [policy.panel() for policy in (self, *others)]
         panels += scripted(self.config, policies)
         name, played = play_side_by_side(panels, fire)

@@ -9,9 +9,9 @@ import torch
 from PIL import Image
 
 from emberlink.envs import WildfireConfig, WildfireEnv
+from emberlink.envs.pettingzoo import _Window
 from emberlink.envs.rendering import film
 from emberlink.envs.rendering.frame import BASE, FAILED, FIELD_OF_VIEW, UAV, frame
-from emberlink.envs.rendering.window import Window
 from emberlink.envs.utils.errors import UserError
 from emberlink.trainers import make_env
 
@@ -54,14 +54,6 @@ def test_x_points_to_the_right_and_y_upwards():
     blue = np.argwhere((image == BLUE).all(-1))
     assert blue[:, 0].mean() < height / 10
     assert blue[:, 1].mean() < width / 10
-
-
-def test_a_cell_fills_its_square():
-    image = picture(fire=[(3, 4)], grid=(8, 8))
-    rows, columns = np.nonzero((image == WHITE).all(-1))
-    scale = 360 // 8
-    assert (columns.min(), columns.max()) == (3 * scale, 4 * scale - 1)
-    assert (rows.min(), rows.max()) == (3 * scale, 4 * scale - 1)  # row 3 from the top is y = 4
 
 
 @pytest.mark.parametrize(
@@ -114,26 +106,23 @@ def test_a_gif_has_every_frame(tmp_path):
             assert np.array_equal(np.asarray(shown.convert("RGB")), expected)
 
 
-@pytest.mark.parametrize("name", ["huygens:3.mp4", "-x.mp4"])
-def test_a_video_has_every_frame(name, tmp_path, monkeypatch):
+def test_a_video_has_every_frame(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
+    name = "huygens:3.mp4"  # no address for ffmpeg
     frames = [np.zeros((16, 16, 3), np.uint8)] * 3
     film.write_mp4(Path(name), frames)
     assert imageio_ffmpeg.count_frames_and_secs(tmp_path / name)[0] == 3
-    monkeypatch.setattr(imageio_ffmpeg, "count_frames_and_secs", lambda _: (2, 1.0))
-    with pytest.raises(UserError, match="not all 3 frames"):
-        film.write_mp4(Path("part.mp4"), frames)
 
 
 @pytest.mark.filterwarnings("error")
 def test_window_shows_the_last_picture(monkeypatch):
     monkeypatch.setenv("MPLBACKEND", "agg")
-    window = Window("test")
+    window = _Window()
     first, last = picture(positions=[(3, 3, 4)]), picture(positions=[(9, 9, 4)])
     window.show(first)
     window.show(last)
     assert np.array_equal(window._image.get_array(), last)
-    other = Window("test")
+    other = _Window()
     other.show(first)
     assert np.array_equal(window._image.get_array(), last)
     other.close()

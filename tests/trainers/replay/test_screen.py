@@ -10,7 +10,6 @@ from small_episode import STEPS, play_small
 from emberlink.envs import WildfireConfig, keys
 from emberlink.envs.rendering.frame import BASE, BURNT_OUT, FAILED, FIELD_OF_VIEW, MISSED, UAV
 from emberlink.policies.scripted.map_greedy import MapGreedy, MapGreedyAlone
-from emberlink.policies.scripted.simple import FollowTarget
 from emberlink.trainers import make_env
 from emberlink.trainers.evaluation.evaluate import play
 from emberlink.trainers.replay import screen as screens
@@ -118,14 +117,6 @@ def test_a_target_is_a_cross_with_a_line_to_it():
     assert TARGET in around(drawn(recorded(target=target)), 2, 12)
 
 
-def test_a_large_team_has_no_lines_to_its_targets():
-    n = screens.MANY + 1
-    target = np.array([(2, 16, 1)] * n, np.float32)
-    image = drawn(recorded(position=[(2, 2, 1)] * n, follows=np.arange(n), target=target))
-    assert ROLE_COLOURS[0] in around(image, 2, 16)
-    assert ROLE_COLOURS[0] not in around(image, 2, 9, reach=20)
-
-
 def test_each_panel_shows_its_own_episode():
     left, right = recorded(follows=FOLLOWS, hears=linked((0, 1))), recorded()
     assert {LINK, ROLE_COLOURS[0]} <= all_of(drawn(left, right, panel=0))
@@ -178,8 +169,8 @@ def test_the_base_is_drawn():
     assert BASE not in all_of(drawn(recorded()))
 
 
-@pytest.mark.parametrize("grid", [(8, 8), (60, 40), (8, 256), (256, 256)])
-@pytest.mark.parametrize("count", [1, 2, 3, 7])
+@pytest.mark.parametrize("grid", [(60, 40), (8, 256)])
+@pytest.mark.parametrize("count", [1, 3, 7])
 def test_panels_do_not_overlap_and_sides_are_even(grid, count):
     made = screen(*[recorded(grid=grid, position=[(0, 0, 0)])] * count, size=250)
     height, width, _ = made.picture(0).shape
@@ -220,12 +211,3 @@ def test_links_of_every_policy_that_hears_and_of_the_base_are_drawn(policy, base
         places = [*position.tolist(), *([[*base, 0.0]] if base else [])]
         near = [[0 < math.dist(a, b) < 7 for b in places] for a in places]
         assert hears.tolist() == near
-
-
-@pytest.mark.parametrize(("loss", "drawn"), [(0.0, True), (1.0, False)])
-def test_links_are_received_messages(loss, drawn):
-    fire = torch.zeros(12, 12)
-    env = make_env("consensus", fire=fire, horizon=4, seed=0, **{"env.radio.loss": loss})
-    recorder = Recorder()
-    play(env, FollowTarget(env.base_env), recorder.add)
-    assert all(hears.any() == drawn for hears in recorder.recording().steps["hears"])
