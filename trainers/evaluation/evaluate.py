@@ -24,6 +24,7 @@ from emberlink.envs.fire.generator import load_scenario
 from emberlink.envs.fire_files.config import FileFireConfig
 from emberlink.envs.scenarios import ScenarioConfig, fires_of, same_tests
 from emberlink.envs.utils.atomic_io import write_bytes
+from emberlink.envs.utils.errors import UserError
 from emberlink.envs.wildfire import WildfireEnv
 from emberlink.policies.scripted.base import Scripted
 from emberlink.policies.scripted.registry import SCRIPTED, to_play
@@ -243,7 +244,13 @@ def scripted_config(config: RunConfig, name: str) -> RunConfig:
     if recipe == config.method:
         return config
     choices = [f"setup={config.setup}", f"world={config.world}", "fire=paper"]
-    usual, other = (resolve(method, choices) for method in (config.method, recipe))
+    try:
+        usual, other = (resolve(method, choices) for method in (config.method, recipe))
+    except UserError as error:
+        raise UserError(
+            f"{name} flies with the communication of {recipe}: {error}; evaluation.scripted=[] "
+            "leaves scripted policies out"
+        ) from None
     if other.comm["name"] == config.comm["name"]:
         return config
     usually = asdict(usual.env.radio)
