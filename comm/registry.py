@@ -1,4 +1,4 @@
-"""Finds communication modules by name: files of this folder, and entry points of other packages."""
+"""Finds communication modules by name: emberlink's own, and entry points of other packages."""
 
 import warnings
 from collections.abc import Mapping
@@ -9,7 +9,13 @@ from emberlink.envs.config import WildfireConfig
 from emberlink.envs.utils.plugins import Registry
 from emberlink.envs.utils.validation import from_plain
 
-_REGISTRY = Registry(CommModule, "emberlink.comm", "comm.name")
+_OWN = {
+    "consensus": "comm.consensus:Consensus",
+    "maps": "comm.maps:Maps",
+    "no_comm": "comm.no_comm:NoComm",
+    "positional": "comm.positional:Positional",
+}
+_REGISTRY = Registry(CommModule, "emberlink.comm", "comm.name", _OWN)
 known, find = _REGISTRY.known, _REGISTRY.find
 
 

@@ -1,5 +1,1 @@
-"""Configuration files in YAML, and the search for those of other packages and folders."""
-
-from emberlink.configs.search import describe, folders, known
-
-__all__ = ["describe", "folders", "known"]
+"""Configuration files in YAML: a folder for each group of choices."""

@@ -16,9 +16,8 @@ from emberlink.envs.rendering import frame
 from emberlink.envs.scenarios import ScenarioConfig, default_config, load_fires
 from emberlink.envs.utils import counter_rng
 from emberlink.envs.utils.counter_rng import Use
-from emberlink.envs.utils.device import check_device
 from emberlink.envs.utils.errors import UserError
-from emberlink.envs.utils.validation import check_whole
+from emberlink.envs.utils.validation import check_device, check_whole
 from emberlink.envs.world import motion
 from emberlink.envs.world.coverage_map import CoverageMap, Sighting
 from emberlink.envs.world.failures import draw_failures

@@ -6,9 +6,9 @@ from pathlib import Path
 from emberlink.envs.utils.config_files import find
 
 PAGE = (Path(__file__).parents[1] / "docs" / "extensions.md").read_text()
-MODULE, METHOD, PROJECT, _, SETUP_OF_PAGE, CONSENSUS_OF_PAGE = re.findall(
-    r"```\w+\n(.*?)```", PAGE, re.DOTALL
-)
+MODULE, *_ = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
+METHOD, _, SETUP_OF_PAGE, CONSENSUS_OF_PAGE = re.findall(r"```yaml\n(.*?)```", PAGE, re.DOTALL)
+(PROJECT,) = re.findall(r"```toml\n(.*?)```", PAGE, re.DOTALL)
 SETUP = """# @package _global_
 defaults:
   - paper

@@ -10,11 +10,12 @@ from torchrl.envs import TransformedEnv
 from emberlink.comm.base import Communication
 from emberlink.envs.scenarios import ScenarioConfig, grid_of
 from emberlink.envs.utils.errors import UserError
+from emberlink.envs.utils.validation import check_device
 from emberlink.envs.wildfire import WildfireEnv
 from emberlink.policies.hold import hold
 from emberlink.policies.state import primer_of
 from emberlink.trainers.config.compose import override, resolve
-from emberlink.trainers.config.schema import RunConfig, build_comm, check_device
+from emberlink.trainers.config.schema import RunConfig, build_comm
 from emberlink.trainers.learners import registry
 from emberlink.trainers.learners.base import Learner, LearnerContext
 from emberlink.trainers.rollout.teacher import Teacher

@@ -18,7 +18,6 @@ from pydantic import ConfigDict, Field, ValidationError
 from pydantic.dataclasses import dataclass
 from torch import Tensor
 
-from emberlink.configs import known
 from emberlink.envs.config import BASE_SIDE, check_grid
 from emberlink.envs.fire.level_set import MAX_LENGTH_TO_BREADTH, arrival_times, disc
 from emberlink.envs.fire.ranges import (
@@ -31,7 +30,7 @@ from emberlink.envs.fire.ranges import (
     unit_draws,
 )
 from emberlink.envs.fire.reaction import ReactionConfig, reaction_fires
-from emberlink.envs.utils.config_files import find, read
+from emberlink.envs.utils.config_files import find, known, read
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import Name, describe
 

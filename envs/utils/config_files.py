@@ -1,10 +1,71 @@
-"""Finds and reads YAML files of configuration groups."""
+"""Finds and reads the YAML files of configuration groups of emberlink, other packages and the user.
 
-from pathlib import Path
+A group is a folder such as `method` or `fire`. Each file in it is a choice of the group.
+"""
+
+import os
+import re
+import sys
+import warnings
+from collections.abc import Mapping
+from functools import lru_cache
+from importlib import metadata
+from importlib.util import find_spec
+from pathlib import Path, PurePath
 from typing import Any
 
-from emberlink.configs import folders, known
-from emberlink.envs.utils.errors import UserError, unknown
+from emberlink import configs
+from emberlink.envs.utils.errors import UserError, shown, unknown
+
+VARIABLE = "EMBERLINK_CONFIGS"
+"""environment variable with folders of groups, separated as in PATH"""
+PACKAGES = "emberlink.configs"
+"""group of entry points; each names a package whose folder holds groups"""
+
+
+def entry_points(group: str) -> tuple[metadata.EntryPoint, ...]:
+    """Returns the entry points of a group, such as "emberlink.comm".
+
+    They are read again when `sys.path` changes. Reading takes 20 ms, and an evaluation asks a
+    hundred times.
+    """
+    return _entry_points(group, tuple(sys.path))
+
+
+@lru_cache(maxsize=64)
+def _entry_points(group: str, path: tuple[str, ...]) -> tuple[metadata.EntryPoint, ...]:
+    return tuple(metadata.entry_points(group=group))
+
+
+def folders() -> list[Path]:
+    """Returns the folders of groups: those in `VARIABLE`, of other packages, and of emberlink.
+
+    Folders that do not exist are ignored, as in PATH. For an entry point whose package does not
+    exist, there is a warning.
+    """
+    listed = [Path(text) for text in os.environ.get(VARIABLE, "").split(os.pathsep) if text]
+    plugins = [path for point in entry_points(PACKAGES) for path in _package(point.value)]
+    every = [path.resolve() for path in (*listed, *plugins, Path(str(configs.__file__)).parent)]
+    return [path for path in dict.fromkeys(every) if path.is_dir()]
+
+
+def _package(name: str) -> list[Path]:
+    """Returns the folders of a package, without importing it; its parents are imported."""
+    spec, why = None, f"there is no package {name}"
+    try:
+        spec = find_spec(name)
+    except Exception as error:  # of the parents' code
+        why += f" ({type(error).__name__}: {error})"
+    if spec is None or not spec.submodule_search_locations:
+        warnings.warn(f"entry point of {PACKAGES}: {why}", stacklevel=4)
+        return []
+    return [Path(folder) for folder in spec.submodule_search_locations]
+
+
+def known(group: str) -> list[str]:
+    """Returns the choices of a group, such as "method" or "fire", in alphabetical order."""
+    files = (file for folder in folders() for file in (folder / group).glob("*.yaml"))
+    return sorted({file.stem for file in files if file.is_file()})
 
 
 def find(group: str, name: str) -> Path:
@@ -17,8 +78,7 @@ def find(group: str, name: str) -> Path:
     Raises:
         UserError: there is no such file, or several folders have one.
     """
-    searched = folders()
-    files = [file for folder in searched if (file := folder / group / f"{name}.yaml").is_file()]
+    files = [file for folder in folders() if (file := folder / group / f"{name}.yaml").is_file()]
     if not files:
         raise UserError(f"{group} {unknown(name, known(group))}")
     if len(files) > 1:
@@ -26,8 +86,19 @@ def find(group: str, name: str) -> Path:
     return files[0]
 
 
+def summary(group: str, name: str) -> str:
+    """Returns the first sentence of the comment at the beginning of a file, without full stop.
+
+    It is "" if the file does not begin with a comment.
+    """
+    text = find(group, name).read_text(encoding="utf-8", errors="replace")
+    (comment,) = re.findall(r"\A(?:# @package.*\n)?((?:#.*\n)*)", text)
+    words = "".join(c for c in " ".join(comment.replace("#", " ").split()) if c.isprintable())
+    return re.split(r"\.(?= |$)", words, maxsplit=1)[0]
+
+
 def read(group: str, name: str) -> dict[str, Any]:
-    """Returns the content of a configuration file.
+    """Returns the content of a configuration file, without the files in its `defaults`.
 
     Raises:
         UserError: there is no such file, or it does not hold keys and values.
@@ -42,3 +113,22 @@ def read(group: str, name: str) -> dict[str, Any]:
     if not isinstance(values, dict):
         raise UserError(f"{file}: expected keys and values")
     return values
+
+
+def plain(value: Any) -> Any:
+    """Returns a value with types that JSON has: of tensors, arrays and ranges lists, of paths text.
+
+    Raises:
+        UserError: the value holds another type.
+    """
+    if hasattr(value, "tolist"):
+        value = value.tolist()
+    if isinstance(value, Mapping):
+        return {name: plain(item) for name, item in value.items()}
+    if isinstance(value, list | tuple | range):
+        return [plain(item) for item in value]
+    if isinstance(value, PurePath):
+        return str(value)
+    if not isinstance(value, str | int | float | None):
+        raise UserError(f"{shown(value)}: expected a number, text or list")
+    return value

@@ -5,11 +5,11 @@ import operator
 import re
 import shlex
 from collections.abc import Mapping
-from pathlib import PurePath
 from typing import Annotated, Any, TypeVar
 
 from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 
+from emberlink.envs.utils.config_files import plain
 from emberlink.envs.utils.errors import UserError, printable, shown, unknown
 
 __all__ = [
@@ -18,6 +18,7 @@ __all__ = [
     "CountOrZero",
     "Name",
     "as_argument",
+    "check_device",
     "check_whole",
     "describe",
     "from_plain",
@@ -64,25 +65,6 @@ def from_plain(config_type: type[T], values: Mapping[str, Any], key: str = "") -
         if isinstance(error, UserError):
             raise
         raise UserError(f"{key or 'the configuration'}: {error}") from None
-
-
-def plain(value: Any) -> Any:
-    """Returns a value with types that JSON has: of tensors, arrays and ranges lists, of paths text.
-
-    Raises:
-        UserError: the value holds another type.
-    """
-    if hasattr(value, "tolist"):
-        value = value.tolist()
-    if isinstance(value, Mapping):
-        return {name: plain(item) for name, item in value.items()}
-    if isinstance(value, list | tuple | range):
-        return [plain(item) for item in value]
-    if isinstance(value, PurePath):
-        return str(value)
-    if not isinstance(value, str | int | float | None):
-        raise UserError(f"{shown(value)}: expected a number, text or list")
-    return value
 
 
 def describe(error: ValidationError, prefix: str = "") -> str:
@@ -140,3 +122,17 @@ def as_argument(key: str, value: str) -> str:
         return f"{key}={value}"
     escaped = value.replace('"', '\\"')
     return shlex.quote(f'{key}="{escaped}"')
+
+
+def check_device(name: str) -> str:
+    """Checks that a device is available and returns its name.
+
+    Raises:
+        UserError: it is not available; the message lists the available devices.
+    """
+    import torch
+
+    present = ["cpu", *(f"cuda:{i}" for i in range(torch.cuda.device_count()))]
+    if name not in present and not (name == "cuda" and len(present) > 1):
+        raise UserError(f"device={shown(name)} is not available; known: {', '.join(present)}")
+    return name

@@ -1,4 +1,4 @@
-"""Finds scripted policies by name: those of this folder, and entry points of other packages."""
+"""Finds scripted policies by name: emberlink's own, and entry points of other packages."""
 
 from collections.abc import Collection, Iterator, Mapping
 
@@ -8,15 +8,23 @@ from emberlink.envs.utils.validation import unknown
 from emberlink.policies.scripted import ORDER
 from emberlink.policies.scripted.base import Scripted
 
-_SIMPLE: tuple[str, ...] = "stationary", "random_actions", "random_waypoints", "follow_target"
-_BY_MAPS: tuple[str, ...] = "map_greedy_alone", "map_greedy", "map_greedy_all", "courier"
+_OWN = {
+    "stationary": "simple:Stationary",
+    "random_actions": "simple:RandomActions",
+    "random_waypoints": "simple:RandomWaypoints",
+    "lawnmower": "lawnmower:Lawnmower",
+    "follow_target": "simple:FollowTarget",
+    "map_greedy_alone": "map_greedy:MapGreedyAlone",
+    "map_greedy": "map_greedy:MapGreedy",
+    "map_greedy_all": "map_greedy:MapGreedyAll",
+    "courier": "map_greedy:Courier",
+    "oracle": "oracle:Oracle",
+}
 _REGISTRY = Registry(
     Scripted,
-    "emberlink.policies.scripted",
+    "emberlink.scripted",
     "policy",
-    other_files=("base", "registry", "simple", "planning", "team_maps"),
-    group="emberlink.scripted",
-    shared={**dict.fromkeys(_SIMPLE, "simple"), **dict.fromkeys(_BY_MAPS, "map_greedy")},
+    {name: f"policies.scripted.{place}" for name, place in _OWN.items()},
 )
 
 

@@ -12,8 +12,8 @@ from typing import Any
 import torch
 from tensordict import TensorDict
 
-from emberlink.configs import known
 from emberlink.envs import keys
+from emberlink.envs.utils.config_files import known
 from emberlink.envs.wildfire import WildfireEnv
 from emberlink.trainers import make_env
 from emberlink.trainers.config.compose import resolve

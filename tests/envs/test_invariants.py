@@ -9,8 +9,8 @@ import pytest
 import torch
 from robustness import SOAK
 
-from emberlink.configs import known
 from emberlink.envs import keys
+from emberlink.envs.utils.config_files import known
 from emberlink.envs.world.coverage_map import with_burn_time
 from emberlink.trainers.build import build_env
 from emberlink.trainers.config.compose import from_values, resolve, to_values

@@ -11,8 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torchrl.envs import step_mdp
 
-from emberlink.configs import known
 from emberlink.envs import WildfireConfig, WildfireEnv, keys, metrics
+from emberlink.envs.utils.config_files import known
 from emberlink.envs.world.sensor import view_radius
 from emberlink.policies.scripted.base import Scripted
 from emberlink.policies.scripted.lawnmower import Lawnmower, search_path

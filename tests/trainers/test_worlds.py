@@ -7,8 +7,8 @@ import torch
 from tiny_run import TINY
 from torchrl.envs.utils import check_env_specs
 
-from emberlink.configs import known
 from emberlink.envs import WildfireConfig, metrics, parallel_env
+from emberlink.envs.utils.config_files import known
 from emberlink.trainers import load, make_env, train
 from emberlink.trainers.cli import main
 from emberlink.trainers.config.compose import resolve

@@ -7,7 +7,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from emberlink import configs
+from emberlink.envs.utils import config_files
 
 SHELLS = ("bash", "zsh", "fish")
 
@@ -38,7 +38,7 @@ def _words(prefix: str, action: argparse.Action, **_: Any) -> list[str]:
 
     name = str(action.metavar)
     if name.startswith("METHOD"):
-        return configs.known("method")
+        return config_files.known("method")
     if name == "RUN":
         folders = [path.rstrip("/") for path in glob.glob(f"{glob.escape(prefix)}*/")]
         return [*_pretrained(), *sorted(folders)]

@@ -2,9 +2,10 @@
 
 import argparse
 import ast
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from emberlink.configs import describe, entry_points, known
+from emberlink.envs.utils.config_files import entry_points, known, summary
 from emberlink.envs.utils.errors import UserError, unknown
 from emberlink.policies import scripted
 from emberlink.trainers.cli.parser import command
@@ -16,8 +17,7 @@ KINDS = ("methods", "setups", "worlds", "fires", "learners", "executors", "polic
 
 
 def add_list(commands: Any) -> None:
-    """Adds the command to the parser."""
-    listing = command(
+    add = command(
         commands,
         "list",
         _list,
@@ -25,9 +25,8 @@ def add_list(commands: Any) -> None:
         "Prints the names that other commands accept and what they stand for, one per line.",
         "emberlink list worlds",
     )
-    listing.add_argument(
-        "kinds", metavar="KIND", nargs="*", default=[], help=f"{', '.join(KINDS)} (default: all)"
-    )
+    kinds = f"{', '.join(KINDS)} (default: all)"
+    add("kinds", metavar="KIND", nargs="*", default=[], help=kinds)
 
 
 def _list(options: argparse.Namespace, console: "Console") -> int:
@@ -38,10 +37,7 @@ def _list(options: argparse.Namespace, console: "Console") -> int:
             raise UserError(unknown(kind, KINDS))
     wanted = options.kinds or KINDS
     for kind in wanted:
-        table = Table(box=None, show_header=False, padding=(0, 2, 0, 0), pad_edge=False)
-        table.add_column(no_wrap=True)
-        if len(wanted) > 1:
-            table.title, table.title_justify, table.title_style = f"{kind}:", "left", "bold"
+        table = Table(show_header=False, title=f"{kind}:" if len(wanted) > 1 else None)
         for name, text in described(kind):
             table.add_row(name, text)
         console.print(table)
@@ -55,15 +51,15 @@ def described(kind: str) -> list[tuple[str, str]]:
     """
     if kind != "policies":
         group = kind.removesuffix("s")
-        return [(name, describe(group, name)) for name in known(group)]
+        return [(name, summary(group, name)) for name in known(group)]
     (folder,) = scripted.__path__
-    rows = []
-    for name in scripted.ORDER:
-        with open(f"{folder}/{name}.py", encoding="utf-8") as file:
-            classes = [
-                node for node in ast.parse(file.read()).body if isinstance(node, ast.ClassDef)
-            ]
-        text = ast.get_docstring(classes[-1]) or ""
-        rows.append((name, " ".join(text.split("\n\n")[0].split())))
-    points = entry_points.read("emberlink.scripted")
-    return [*rows, *sorted((point.name, f"of the package {point.module}") for point in points)]
+    classes = {
+        node.name.lower(): ast.get_docstring(node) or ""
+        for file in sorted(Path(folder).glob("*.py"))
+        for node in ast.parse(file.read_text(encoding="utf-8")).body
+        if isinstance(node, ast.ClassDef)
+    }
+    own = [(name, classes[name.replace("_", "")].split("\n\n")[0]) for name in scripted.ORDER]
+    points = entry_points("emberlink.scripted")
+    others = sorted((point.name, f"of the package {point.module}") for point in points)
+    return [*((name, " ".join(text.split())) for name, text in own), *others]

@@ -4,32 +4,23 @@ import argparse
 import errno
 import os
 import sys
-from collections.abc import Sequence
-from contextlib import suppress
-from typing import Any
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from importlib.metadata import version
 
 from emberlink.envs.utils.errors import UserError, unknown
-from emberlink.trainers.cli.compare import add_compare
+from emberlink.trainers.cli import commands as of
 from emberlink.trainers.cli.completion import SHELLS, PrintScript, answer
-from emberlink.trainers.cli.doctor import add_doctor
-from emberlink.trainers.cli.eval import add_eval
 from emberlink.trainers.cli.fire import add_fire
 from emberlink.trainers.cli.list import add_list
 from emberlink.trainers.cli.parser import Parser
-from emberlink.trainers.cli.render import add_render
-from emberlink.trainers.cli.sweep import add_sweep
-from emberlink.trainers.cli.train import add_train
-from emberlink.trainers.cli.world import add_world
-from emberlink.trainers.terminal.warning_lines import one_line_warnings
 
-INTERRUPTED = 130
-"""exit status after Ctrl-C"""
-_BROKEN_PIPE = 141
-"""exit status of shells after a closed pipe"""
-_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EIO)
-"""errors of full or broken disks"""
-_OF_PATHS = (errno.EACCES, errno.EPERM, errno.ENAMETOOLONG, errno.ELOOP, errno.EROFS)
-"""errors of paths that the user gave: without access, too long, links in a circle, read-only"""
+_ONE_LINE = (
+    *(errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EBADF),  # full, broken or closed outputs
+    *(errno.EACCES, errno.EPERM, errno.ENAMETOOLONG, errno.ELOOP, errno.EROFS),  # paths of the user
+)
+"""errors of the system that are not defects of the program"""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -42,13 +33,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _report("emberlink", "runs on Linux and macOS; on Windows, use WSL")
     words = list(sys.argv[1:] if arguments is None else arguments)
     try:
-        with one_line_warnings():
+        with _one_line_warnings():
             return _flush(_run(words))
     except SystemExit as ended:  # of argparse, after a help or an error
         raise SystemExit(_flush(int(ended.code or 0))) from None
-    except OSError as error:  # of a help or the version
-        error.filename = error.filename or "standard output"
-        return _of_system("emberlink", error)
 
 
 def _run(words: list[str]) -> int:
@@ -69,7 +57,7 @@ def _run(words: list[str]) -> int:
 
         return options.run(options, SafeConsole())
     except KeyboardInterrupt:
-        return _report(program, "stopped", INTERRUPTED)
+        return _report(program, "stopped", 130)
     except UserError as error:
         return _report(program, str(error))
     except OSError as error:
@@ -84,12 +72,11 @@ def _run(words: list[str]) -> int:
 def _of_system(program: str, error: OSError) -> int:
     """Reports an error of the output, of a full disk or of a path; others are defects."""
     if error.errno == errno.EPIPE:
-        return _BROKEN_PIPE
-    if error.errno not in (*_FULL, *_OF_PATHS, errno.EBADF):
+        return 141  # that of shells after a closed pipe
+    if error.errno not in _ONE_LINE:
         raise error
     status = 1 if error.filename == "standard output" else 2
-    written = "cannot be written: " if error.errno in _FULL or status == 1 else ""
-    return _report(program, f"{error.filename or 'a file'}: {written}{error.strerror}", status)
+    return _report(program, f"{error.filename or 'a file'}: {error.strerror}", status)
 
 
 def _report(program: str, message: str, status: int = 2) -> int:
@@ -125,27 +112,42 @@ def _parser() -> tuple[Parser, list[str]]:
         description="Teams of UAVs that learn to find and cover a spreading wildfire.",
         epilog="Runs on Linux and macOS.",
     )
-    parser.add_argument("--version", action=_Version, nargs=0, help="print the version and exit")
+    parser.add_argument("--version", action="version", version=f"emberlink {version('emberlink')}")
     parser.add_argument(
         "--completion",
         action=PrintScript,
         choices=SHELLS,
+        default=argparse.SUPPRESS,
         help="print a completion script, which the shell evaluates, and exit",
     )
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
     for add in (
-        *(add_train, add_eval, add_compare, add_render),
-        *(add_sweep, add_fire, add_world, add_list, add_doctor),
+        *(of.add_train, of.add_eval, of.add_compare, of.add_render),
+        *(of.add_sweep, add_fire, of.add_world, add_list, of.add_doctor),
     ):
         add(commands)
     return parser, list(commands.choices)
 
 
-class _Version(argparse.Action):
-    """Prints the version of the installed package."""
+@contextmanager
+def _one_line_warnings() -> Iterator[None]:
+    """Prints each `UserWarning` once as `emberlink: warning: ...`, until the end of the context.
 
-    def __call__(self, parser: Any, *_: object) -> None:
-        from importlib.metadata import version
+    Other categories are not meant for users and keep their place. Only what is printed changes:
+    warnings can still be recorded, ignored, or turned into errors.
+    """
+    before, printed = warnings.formatwarning, set[str]()
 
-        print(f"emberlink {version('emberlink')}")
-        parser.exit()
+    def formatted(message, category, *place) -> str:
+        if not issubclass(category, UserWarning):
+            return before(message, category, *place)
+        text = "".join(c if c.isprintable() else "?" for c in " ".join(str(message).split()))
+        line = "" if text in printed else f"emberlink: warning: {text}\n"
+        printed.add(text)
+        return line
+
+    warnings.formatwarning = formatted
+    try:
+        yield
+    finally:
+        warnings.formatwarning = before

@@ -5,6 +5,7 @@ import difflib
 import sys
 from collections.abc import Callable
 from contextlib import suppress
+from importlib import import_module
 from typing import Any, NoReturn
 
 MOST_FIRES = 65_536
@@ -37,13 +38,11 @@ class Parser(argparse.ArgumentParser):
             self._is_intermixed = False
         for text in unknown:
             if text.startswith("-"):
-                self.error(f"option {text} is not known{self._hint(text)}")
+                options = [option for action in self._actions for option in action.option_strings]
+                near = difflib.get_close_matches(text.partition("=")[0], options, n=1)
+                hint = f"did you mean {near[0]}?" if near else "settings are given as key=value"
+                self.error(f"option {text} is not known; {hint}")
         return parsed, unknown
-
-    def _print_message(self, message: str, file: Any = None) -> None:
-        """Writes a message; argparse itself would not report that it cannot be written."""
-        if stream := file or sys.stderr:
-            stream.write(message)
 
     def error(self, message: str) -> NoReturn:
         """Prints the message and exits with status 2."""
@@ -52,46 +51,55 @@ class Parser(argparse.ArgumentParser):
             print(f"{self.prog}: {text} (see {self.prog} --help)", file=sys.stderr)
         raise SystemExit(2)
 
-    def _hint(self, text: str) -> str:
-        """Returns the most similar option, or that settings are given as key=value."""
-        options = [option for action in self._actions for option in action.option_strings]
-        near = difflib.get_close_matches(text.partition("=")[0], options, n=1)
-        if near:
-            return f"; did you mean {near[0]}?"
-        keys = any("key=value" in str(action.metavar) for action in self._actions)
-        return "; settings are given as key=value" if keys else ""
-
 
 def command(
     commands: Any,
     name: str,
-    run: Callable[..., int],
+    run: Callable[..., int] | str,
     summary: str,
     description: str,
     example: str,
     usage: str | None = None,
-) -> Parser:
-    """Adds a command and returns its parser.
+) -> Callable[..., Any]:
+    """Adds a command and returns the function that adds an argument to it.
 
     Args:
         commands: result of `add_subparsers`.
-        name: name of the command.
-        run: called with the options and a console; returns the exit status.
+        name: name of the command, with that of its group, such as "world check".
+        run: called with the options and a console, or `module:function` of emberlink.trainers,
+            which is imported when the command runs and called with the options and the console
+            as keyword arguments; returns the exit status.
         summary: text in the list of commands.
         description: description of the command.
         example: example of a command line.
         usage: usage of the command; generated from its arguments if None.
     """
+    epilog = f"example:\n  {example}"
     parser = commands.add_parser(
-        name,
+        name.split()[-1],
         help=summary,
         description=description,
-        epilog=f"example:\n  {example}",
+        epilog=epilog,
         usage=usage,
         formatter_class=_Help,
     )
-    parser.set_defaults(run=run)
-    return parser
+    parser.set_defaults(run=_calling(run) if isinstance(run, str) else run, command=name)
+    return parser.add_argument
+
+
+def _calling(target: str) -> Callable[..., int]:
+    def run(options: argparse.Namespace, console: Any) -> int:
+        module, _, function = target.partition(":")
+        own = {name: value for name, value in vars(options).items() if name not in _PARSERS}
+        return getattr(import_module(f"emberlink.trainers.{module}"), function)(
+            console=console, **own
+        )
+
+    return run
+
+
+_PARSERS = ("run", "command", "action")
+"""options that are not of a command"""
 
 
 def command_group(commands: Any, name: str, summary: str, description: str, example: str) -> Any:
@@ -104,23 +112,21 @@ def command_group(commands: Any, name: str, summary: str, description: str, exam
         console.print(group.format_help(), soft_wrap=True, end="")
         return 0
 
-    group = command(commands, name, print_help, summary, description, example)
+    command(commands, name, print_help, summary, description, example)
+    group = commands.choices[name]
     return group.add_subparsers(dest="action", metavar="ACTION")
 
 
-def positive(text: str) -> int:
-    """Converts an argument to a whole number above 0."""
-    if not text.isdecimal() or int(text) < 1:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number above 0")
-    return int(text)
-
-
-def between(low: int, high: int) -> Callable[[str], int]:
+def between(low: int, high: int | None = None) -> Callable[[str], int]:
     """Returns a converter of arguments to whole numbers from `low` to `high`."""
 
     def number(text: str) -> int:
-        if not text.isdecimal() or not low <= int(text) <= high:
-            raise argparse.ArgumentTypeError(f"{text!r} is not a whole number {low} to {high}")
+        if not text.isdecimal() or not low <= int(text) <= (high or int(text)):
+            to = f" from {low}" + (f" to {high}" if high else "")
+            raise argparse.ArgumentTypeError(f"{text!r} is not a whole number{to}")
         return int(text)
 
     return number
+
+
+positive = between(1)

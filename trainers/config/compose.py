@@ -1,17 +1,14 @@
 """Composes and changes the configuration of a run."""
 
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
-from dataclasses import fields, replace
+from dataclasses import replace
 from typing import Any
 
 from pydantic import TypeAdapter
 
-from emberlink import configs
 from emberlink.envs.scenarios import fires_of
-from emberlink.envs.utils.config_files import read
 from emberlink.envs.utils.errors import UserError
-from emberlink.envs.utils.validation import from_plain, shown
+from emberlink.envs.utils.validation import from_plain, plain, shown
 from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.config.values import (
     GROUPS,
@@ -22,7 +19,6 @@ from emberlink.trainers.config.values import (
     parse,
     put,
 )
-from emberlink.trainers.learners import registry as learners
 
 __all__ = ["evaluated_with", "flat", "from_values", "in_world", "override", "resolve", "to_values"]
 
@@ -39,10 +35,7 @@ def resolve(method: str, overrides: Sequence[str] = (), **settings: Any) -> RunC
     Raises:
         UserError: the method, a key or a value is wrong; the message names it and what is known.
     """
-    values = composed(method, overrides, **settings)
-    given = {text.partition("=")[0] for text in overrides}
-    _drop_settings_of_others(values["learner"], given | settings.keys())
-    config = from_values(values)
+    config = from_values(composed(method, overrides, **settings))
     return replace(config, fire=fires_of(config.fire).with_checksum())
 
 
@@ -136,26 +129,4 @@ def from_values(values: Mapping[str, Any]) -> RunConfig:
 
 def to_values(config: RunConfig) -> dict[str, Any]:
     """Returns a configuration as plain values, for YAML and trackers."""
-    return _lists(TypeAdapter(RunConfig).dump_python(config))
-
-
-def _lists(value: Any) -> Any:
-    """Returns a value with lists in place of tuples; unlike JSON, it keeps infinite numbers."""
-    if isinstance(value, Mapping):
-        return {key: _lists(item) for key, item in value.items()}
-    return [_lists(item) for item in value] if isinstance(value, list | tuple) else value
-
-
-def _drop_settings_of_others(learner: Any, given: set[str]) -> None:
-    """Removes settings of other learners that a setup holds, such as `critic_lr` for PPO.
-
-    What the user gave or no learner's file holds stays, and is an error later.
-    """
-    own = {field.name for field in fields(learners.find(learner["name"]).config_type)}
-    foreign = {key for key in learner.keys() - own if not given & {key, f"learner.{key}"}}
-    of_files: set[str] = set()
-    for name in configs.known("learner") if foreign else ():
-        with suppress(UserError):  # another package's file that cannot be read
-            of_files |= read("learner", name).keys()
-    for key in foreign & of_files:
-        del learner[key]
+    return plain(TypeAdapter(RunConfig).dump_python(config))

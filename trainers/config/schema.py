@@ -20,16 +20,22 @@ from emberlink.comm.base import CommModule
 from emberlink.envs import metrics
 from emberlink.envs.config import WildfireConfig
 from emberlink.envs.scenarios import Scenario
-from emberlink.envs.utils.device import check_device as check_device
 from emberlink.envs.utils.errors import UserError
-from emberlink.envs.utils.validation import STRICT, CountOrZero, Name, from_plain, shown, unknown
+from emberlink.envs.utils.validation import (
+    STRICT,
+    CountOrZero,
+    Name,
+    check_device,
+    from_plain,
+    shown,
+)
 from emberlink.policies.networks import memory
 from emberlink.policies.scripted.registry import to_play
 from emberlink.policies.settings import PolicyConfig
 from emberlink.trainers.learners import registry as learners
 from emberlink.trainers.learners.base import Count, LearnerConfig
 
-NOT_LEARNT_WITH = (*("device", "logger", "checkpoint_interval", "checkpoint_steps"),)
+NOT_LEARNT_WITH = ("device", "logger", "checkpoint_interval", "checkpoint_steps")
 """keys that do not affect learning: configurations that differ only in them are of the same run"""
 
 MAX_FIRES = 65_536
@@ -48,10 +54,8 @@ def _settings(key: str, values: Any, registry: Any) -> Any:
     """
     if is_dataclass(values):
         return values
-    if not isinstance(values, Mapping):
-        raise UserError(f"{key}={shown(values)}: expected keys and values")
-    if not isinstance(name := values.get("name"), str):
-        raise UserError(f"{key}.name is missing; known: {', '.join(registry.known())}")
+    if not isinstance(values, Mapping) or not isinstance(name := values.get("name"), str):
+        raise UserError(f"{key}={shown(values)}: expected a name and settings")
     config_type = registry.find(name).config_type
     known = [field.name for field in fields(config_type)]
     # A type may have the name among its fields.
@@ -69,17 +73,6 @@ LearnerChoice = Annotated[
 """settings of the learner `learner.name`"""
 
 
-def _check_measure(value: str) -> str:
-    if value not in metrics.ALL:
-        raise UserError(unknown(value, metrics.ALL))
-    return value
-
-
-def _check_policies(value: tuple[str, ...]) -> tuple[str, ...]:
-    to_play(value)
-    return value
-
-
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class EvaluationConfig:
     """Stores the settings of evaluations of frozen policies on held-out fires."""
@@ -92,10 +85,16 @@ class EvaluationConfig:
     """episodes of an evaluation during training, each on another validation fire"""
     huygens: bool
     """whether to evaluate on fires of the scenario `huygens`, too, besides that of the training"""
-    scripted: Annotated[tuple[str, ...], Strict(False), AfterValidator(_check_policies)]
+    scripted: Annotated[tuple[str, ...], Strict(False)]
     """scripted policies to evaluate"""
-    headline: Annotated[str, AfterValidator(_check_measure)]
+    headline: str
     """the measure that chooses the networks of best.safetensors on validation fires"""
+
+    @field_validator("scripted")
+    @classmethod
+    def _check_policies(cls, value: tuple[str, ...]) -> tuple[str, ...]:
+        to_play(value)
+        return value
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
@@ -128,7 +127,7 @@ class RunConfig:
     """environments, stepped in one batch"""
     seed: Seed
     """seed of all random numbers"""
-    device: str
+    device: Annotated[str, AfterValidator(check_device)]
     """device of the environment, the replay buffer and the networks"""
     logger: Literal["wandb", "tensorboard", "csv", "none"]
     """experiment tracker, in addition to metrics.jsonl"""
@@ -148,11 +147,6 @@ class RunConfig:
                 f"env.base); known: {', '.join(known)}"
             )
         return self
-
-    @field_validator("device")
-    @classmethod
-    def _check_device(cls, value: str) -> str:
-        return check_device(value)
 
     @field_validator("policy")
     @classmethod

@@ -4,9 +4,10 @@ Imports no torch, so that a wrong name or key is reported at once.
 """
 
 import difflib
+import math
 import threading
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from copy import deepcopy
 from functools import lru_cache, reduce
 from operator import getitem
@@ -22,10 +23,9 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
-from emberlink import configs
-from emberlink.envs.utils.config_files import find
-from emberlink.envs.utils.errors import UserError
-from emberlink.envs.utils.validation import plain, shown
+from emberlink.envs.utils import config_files
+from emberlink.envs.utils.config_files import find, plain, read
+from emberlink.envs.utils.errors import UserError, shown
 from emberlink.trainers.config.removed import REMOVED
 
 GROUPS = ("setup", "world", "fire", "learner")
@@ -52,10 +52,28 @@ def composed(method: str, overrides: Sequence[str] = (), **settings: Any) -> dic
         if equals and key in GROUPS:
             names[key] = str(parse(text)[1])
     values = _from_files(names)
+    _drop_settings_of_others(values["learner"])
     changed = [text for text in overrides if text.partition("=")[0] not in GROUPS]
     change(values, changed, settings)
     values = _interpolated(values)
     return values | {group: names[group] for group in ("method", "setup", "world")}
+
+
+def _drop_settings_of_others(learner: dict[str, Any]) -> None:
+    """Removes settings of other learners that a setup holds, such as `critic_lr` for PPO."""
+    own, others = _keys_of(learner["name"]), set[str]()
+    for name in config_files.known("learner") if learner.keys() - own else ():
+        with suppress(UserError):  # another package's file that cannot be read
+            others |= _keys_of(name)
+    for key in learner.keys() & others - own:
+        del learner[key]
+
+
+def _keys_of(learner: str) -> set[str]:
+    """Returns the keys in the file of a learner and in those of its `defaults`."""
+    values = read("learner", learner)
+    bases = [base for base in values.pop("defaults", ()) if base != "_self_"]
+    return values.keys() | {key for base in bases for key in _keys_of(base)}
 
 
 def change(
@@ -69,7 +87,6 @@ def change(
     known = list(all_keys(values))
     given = [parse(text, values) for text in overrides]
     for name, value in (settings or {}).items():
-        check_not_removed(name, value)
         if name in ("method", *GROUPS):
             raise UserError(f"{name}={shown(value)}: names a file, so it is not a setting")
         given.append((full_key(known, name), plain(value)))
@@ -110,14 +127,9 @@ def parse(text: str, values: Mapping[str, Any] | None = None) -> tuple[str, Any]
         raise UserError(f"{shown(text)!r}: only one value is possible here; {hint}")
     if parsed.is_delete():
         raise UserError(f"{shown(text)!r}: a key cannot be removed")
-    return parsed.get_key_element(), _with_infinity(parsed.value())
-
-
-def _with_infinity(value: Any) -> Any:
-    """Reads `.inf` as the files do; Hydra's grammar knows `inf` only."""
-    if isinstance(value, list):
-        return [_with_infinity(item) for item in value]
-    return float(value.replace(".", "")) if value in (".inf", "+.inf", "-.inf") else value
+    given = parsed.value()
+    # As in the files; Hydra's grammar knows `inf` only.
+    return parsed.get_key_element(), math.inf if given == ".inf" else given
 
 
 def put(values: dict[str, Any], key: str, value: Any) -> None:
@@ -130,28 +142,27 @@ def put(values: dict[str, Any], key: str, value: Any) -> None:
     parent = reduce(getitem, path, values)
     old = parent.get(last)
     both = isinstance(old, dict) and isinstance(value, Mapping)
-    same = both and old.get("name") == value.get("name", old.get("name"))  # pyright: ignore
-    if not same:
+    if both and old.get("name") == value.get("name", old.get("name")):  # pyright: ignore
+        for name, item in value.items():
+            put(values, f"{key}.{name}", item)
+    else:
         parent[last] = value
-        return
-    for name, item in value.items():
-        put(values, f"{key}.{name}", item)
 
 
 def full_key(known: Sequence[str], key: str) -> str:
     """Returns the known key that equals `key`, or else the only one that ends with it.
 
+    The key itself if there is none.
+
     Raises:
-        UserError: there is no such key, or several.
+        UserError: there are several.
     """
     if key in known:
         return key
     matching = [name for name in known if name.endswith(f".{key}")]
     if len(matching) > 1:
         raise UserError(f"key {key!r} is ambiguous: {', '.join(matching)}")
-    if not matching:
-        raise UserError(unknown_key(key, known))
-    return matching[0]
+    return matching[0] if matching else key
 
 
 def check_not_removed(key: str, value: Any = None) -> None:
@@ -165,14 +176,10 @@ def unknown_key(key: str, known: Iterable[str]) -> str:
     """Returns a message that a key is not known, with similar keys or those beside it."""
     names = list(known)
     parent, _, last = key.rpartition(".")
-    lasts = {name.rpartition(".")[2]: name for name in names}
-    near = (
-        [name for name in names if name.endswith((f".{last}", f"_{last}"))]
-        or difflib.get_close_matches(key, names, n=1)
-        or [lasts[name] for name in difflib.get_close_matches(last, lasts, n=1)]
-    )
-    parent = parent if parent in names else ""
-    beside = [name for name in names if name.rpartition(".")[0] == parent]
+    beside = [name for name in names if name.rpartition(".")[0] == parent * (parent in names)]
+    lasts = {name.rpartition(".")[2]: name for name in beside}
+    near = [name for name in names if name.endswith((f".{last}", f"_{last}"))]
+    near = near or [lasts[name] for name in difflib.get_close_matches(last, lasts, n=1)]
     hint = f"did you mean {' or '.join(near[:4])}?" if near else f"known: {', '.join(beside)}"
     return f"key {shown(key)!r} is not known; {hint}"
 
@@ -201,10 +208,10 @@ def _from_files(names: Mapping[str, str]) -> dict[str, Any]:
         UserError: a file is not known or not a configuration.
     """
     own = f"{names['setup']}_{names['method']}"
-    more = {"setup_method": own} if own in configs.known("setup_method") else {}
+    more = {"setup_method": own} if own in config_files.known("setup_method") else {}
     for group, name in {**names, **more}.items():
         find(group, name)
-    folders = configs.folders()
+    folders = config_files.folders()
     files = sorted(file for folder in folders for file in folder.glob("**/*.yaml"))
     # Editors lock a file with a link to nowhere.
     stamps = tuple((file, file.stat().st_mtime_ns) for file in files if file.is_file())

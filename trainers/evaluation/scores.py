@@ -9,7 +9,7 @@ from rich.text import Text
 
 from emberlink.envs import metrics
 from emberlink.trainers.config.schema import RunConfig
-from emberlink.trainers.terminal.table import print_table
+from emberlink.trainers.terminal.console import print_table
 
 CURVES = {
     "mean_reward": "mean reward",

@@ -1,15 +1,16 @@
-"""Defines the console of the command line."""
+"""Defines the console of the command line, and how it prints tables."""
 
 import os
 import sys
 from collections.abc import Iterator
+from contextlib import contextmanager
+from copy import copy
 from typing import Any
 
+from rich import box
 from rich.console import Console, ConsoleOptions, RenderableType
 from rich.segment import Segment
 from rich.table import Table
-
-from emberlink.trainers.terminal.table import print_table
 
 _CONTROL_CODES = (
     *(code for code in range(0x20) if chr(code) not in "\t\n"),
@@ -62,21 +63,53 @@ class _Output:
     """Forwards to the current `sys.stdout`."""
 
     def write(self, text: str) -> int:
-        try:
-            encoding = sys.stdout.encoding or "utf-8"
+        encoding = sys.stdout.encoding or "utf-8"
+        with _named():
             return sys.stdout.write(text.encode(encoding, "replace").decode(encoding))
-        except OSError as error:
-            raise _named(error) from None
 
     def flush(self) -> None:
-        try:
+        with _named():
             sys.stdout.flush()
-        except OSError as error:
-            raise _named(error) from None
 
     def __getattr__(self, name: str) -> Any:
         return getattr(sys.stdout, name)
 
 
-def _named(error: OSError) -> OutputError:
-    return OutputError(error.errno, error.strerror or str(error), "standard output")
+@contextmanager
+def _named() -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise OutputError(error.errno, error.strerror or str(error), "standard output") from None
+
+
+def print_table(console: Console, table: Table) -> None:
+    """Prints a table; if it is too wide, in parts with the first column and some of the others.
+
+    Numbers and the words of the first column are never broken.
+    """
+    title, caption = table.title, table.caption
+    table.box, table.show_edge, table.padding = box.SIMPLE_HEAD, False, 0
+    table.title = table.caption = None
+    first, *others = table.columns
+    words = [word for cell in (first.header, *first.cells) for word in str(cell).split()]
+    first.min_width = max(map(len, words), default=0)
+    first.no_wrap = not table.show_header  # a list of names and texts
+    for column in others:
+        column.no_wrap = column.justify == "right"
+        column.overflow = "fold"
+    if title:
+        console.print(title, style="bold")
+    part, unlimited = copy(table), console.options.update(width=10_000)
+    part.columns = [first]
+    for column in others:
+        wider = copy(table)
+        wider.columns = [*part.columns, column]
+        too_wide = console.measure(wider, options=unlimited).minimum > console.width
+        if too_wide and len(part.columns) > 1:
+            Console.print(console, part)  # that of SafeConsole calls this function
+            wider.columns = [first, column]
+        part = wider
+    Console.print(console, part)
+    if caption:
+        console.print(caption, style="dim")

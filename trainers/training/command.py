@@ -6,8 +6,8 @@ from contextlib import suppress
 
 from rich.console import Console
 
-from emberlink.configs import known
 from emberlink.envs.scenarios import fires_of
+from emberlink.envs.utils.config_files import known
 from emberlink.envs.utils.errors import UserError
 from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.evaluation.scores import print_results

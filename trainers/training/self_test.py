@@ -8,8 +8,8 @@ import torch
 from rich.console import Console
 from torchrl.envs.utils import check_env_specs
 
-from emberlink.configs import known
 from emberlink.envs.fire.generator import load_scenario, make_fires
+from emberlink.envs.utils.config_files import known
 from emberlink.envs.utils.errors import how_to_install
 from emberlink.trainers.build import make_env
 from emberlink.trainers.config.compose import resolve

@@ -9,10 +9,10 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from emberlink.configs import known
 from emberlink.envs import metrics
 from emberlink.envs.scenarios import fires_of
 from emberlink.envs.utils.atomic_io import created, new_file
+from emberlink.envs.utils.config_files import known
 from emberlink.envs.utils.errors import UserError
 from emberlink.policies.scripted.registry import to_play
 from emberlink.trainers.config.compose import resolve

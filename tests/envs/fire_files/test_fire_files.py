@@ -10,11 +10,11 @@ import torch
 from fire_files import Ellipses, raster_of, write_asc, write_tif
 from tiny_run import TINY
 
-from emberlink.configs import known
 from emberlink.envs.fire.generator import load_scenario, make_fires
 from emberlink.envs.fire_files.config import COPY_FILE, FileFireConfig
 from emberlink.envs.fire_files.reader import fire_sets, read_fires, save_copy, with_checksum
 from emberlink.envs.scenarios import fires_of
+from emberlink.envs.utils.config_files import known
 from emberlink.trainers.cli import main
 from emberlink.trainers.config.compose import resolve
 

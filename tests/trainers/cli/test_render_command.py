@@ -10,8 +10,8 @@ import pytest
 import torch
 from PIL import Image
 
-from emberlink.configs import known
 from emberlink.envs.fire.generator import load_scenario
+from emberlink.envs.utils.config_files import known
 from emberlink.policies.scripted.registry import SCRIPTED
 from emberlink.trainers.build import build_actor, build_env
 from emberlink.trainers.cli import main

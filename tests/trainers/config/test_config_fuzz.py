@@ -18,9 +18,9 @@ from pydantic import TypeAdapter
 from robustness import SOAK
 
 from emberlink.comm import registry
-from emberlink.configs import known
 from emberlink.envs import keys
 from emberlink.envs.fire.generator import scenarios
+from emberlink.envs.utils.config_files import known
 from emberlink.envs.utils.errors import UserError
 from emberlink.trainers.build import build_env
 from emberlink.trainers.config.compose import from_values, resolve, to_values

@@ -13,10 +13,10 @@ import pytest
 from own_package import CONSENSUS_OF_PAGE, METHOD, SETUP, SETUP_OF_PAGE, write, yaml_files
 from tiny_run import TINY
 
-from emberlink import configs
 from emberlink.comm import registry
 from emberlink.comm.consensus import Consensus
 from emberlink.envs.fire.generator import load_scenario, scenarios
+from emberlink.envs.utils import config_files
 from emberlink.envs.utils.config_files import find
 from emberlink.envs.utils.errors import UserError
 from emberlink.trainers.cli import main
@@ -35,7 +35,7 @@ def folder(tmp_path, monkeypatch) -> Path:
 
 
 def test_a_folder_adds_a_method_a_setup_and_a_fire(folder):
-    assert {"alone", "headcount"} < set(configs.known("method"))
+    assert {"alone", "headcount"} < set(config_files.known("method"))
     assert find("setup", "small") == folder / "setup" / "small.yaml"
     config = resolve("alone", ["setup=small", "env.num_uavs=3"])
     assert (config.env.horizon, config.env.num_uavs, config.fire.name) == (15, 3, "faint")
@@ -94,7 +94,7 @@ def test_a_broken_learner_of_another_package_is_no_error(monkeypatch):
 def entry_point(monkeypatch, group: str, name: str, value: str) -> None:
     point = metadata.EntryPoint(name, value, group)
     monkeypatch.setattr(
-        "emberlink.configs.entry_points.read",
+        "emberlink.envs.utils.config_files.entry_points",
         lambda group: (point,) if point.group == group else (),
     )
 
@@ -114,7 +114,7 @@ def test_an_invalid_entry_point_is_named_in_the_error(monkeypatch, tmp_path):
     entry_point(monkeypatch, "emberlink.comm", "other", "emberlink.comm.consensus:Consensus")
     assert registry.find("other") is Consensus
     monkeypatch.setattr(
-        "emberlink.configs.entry_points.read",
+        "emberlink.envs.utils.config_files.entry_points",
         lambda group: [metadata.EntryPoint("one", value, group) for value in ("a:A", "b:B")],
     )
     with pytest.raises(UserError, match=r"one: in several packages: a:A, b:B"):
@@ -123,13 +123,13 @@ def test_an_invalid_entry_point_is_named_in_the_error(monkeypatch, tmp_path):
     for value in ("nowhere.configs", "json.decoder"):
         entry_point(monkeypatch, "emberlink.configs", "other", value)
         with pytest.warns(UserWarning, match=f"emberlink.configs: there is no package {value}"):
-            assert "consensus" in configs.known("method")
+            assert "consensus" in config_files.known("method")
     (tmp_path / "broken").mkdir()
     (tmp_path / "broken" / "__init__.py").write_text("raise RuntimeError('no licence')")
     monkeypatch.syspath_prepend(tmp_path)
     entry_point(monkeypatch, "emberlink.configs", "other", "broken.configs")
     with pytest.warns(UserWarning, match=r"no package broken.configs \(RuntimeError: no licence"):
-        assert "consensus" in configs.known("method")
+        assert "consensus" in config_files.known("method")
 
 
 def test_the_lock_of_an_editor_is_no_configuration(folder):

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from emberlink.configs import known as known_files
+from emberlink.envs.utils.config_files import known as known_files
 from emberlink.envs.utils.config_files import read
 from emberlink.trainers.cli.main import main
 from emberlink.trainers.sweep.executors import base, ray, registry, submitit

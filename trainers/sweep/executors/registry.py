@@ -1,4 +1,4 @@
-"""Finds executors by name: files of this folder, and entry points of other packages."""
+"""Finds executors by name: emberlink's own, and entry points of other packages."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -10,9 +10,12 @@ from emberlink.envs.utils.validation import from_plain, unknown
 from emberlink.trainers.config.values import check_not_removed, parse
 from emberlink.trainers.sweep.executors.base import Executor
 
-_REGISTRY = Registry(
-    Executor, "emberlink.trainers.sweep.executors", "executor", group="emberlink.executors"
-)
+_OWN = {
+    "local": "trainers.sweep.executors.local:LocalExecutor",
+    "ray": "trainers.sweep.executors.ray:RayExecutor",
+    "submitit": "trainers.sweep.executors.submitit:SubmititExecutor",
+}
+_REGISTRY = Registry(Executor, "emberlink.executors", "executor", _OWN)
 known, find = _REGISTRY.known, _REGISTRY.find
 
 

@@ -1,0 +1,318 @@
+"""Defines the commands and their arguments, but those of `fire` and `list`.
+
+Their code is imported when they run, so that `emberlink --help` does not import torch.
+"""
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from emberlink.envs.utils.errors import UserError
+from emberlink.trainers.cli.parser import MOST_FIRES, between, command, command_group, positive
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+EXTRAS = {
+    "csv": "compare.csv, one row per run, fire and measure",
+    "latex": "compare.tex, the rankings by the world's headline measure",
+    "marl-eval": "marl_eval.json, training and held-out fires in the format of MARL-eval",
+    "replay": "a page that plays the methods side by side, for each section and fire",
+    "png": "the figures as PNG",
+    "pdf": "the figures as PDF",
+    "svg": "the figures as SVG",
+}
+"""what `compare` can write beside its page -> its help"""
+
+
+def add_train(commands: Any) -> None:
+    add = command(
+        commands,
+        "train",
+        _train,
+        "train one of the methods and evaluate it",
+        "Trains a method, evaluates the frozen policies on test fires, and writes a run folder "
+        "with config.yaml, metrics.jsonl, checkpoints, eval.json, figures, a GIF and a replay "
+        "page.",
+        "emberlink train consensus setup=tuned episodes=20 seed=1",
+        usage="emberlink train METHOD [key=value ...]\n"
+        "       emberlink train resume=RUN [key=value ...]",
+    )
+    add(
+        "method",
+        metavar="METHOD",
+        help="a method: independent, shared_memory, positional, consensus, maps, or your own "
+        "(see emberlink list methods); or resume=RUN, to resume the training of a run folder",
+    )
+    add(
+        "overrides",
+        metavar="key=value",
+        nargs="*",
+        default=[],
+        help="any key of configs/base.yaml or of the chosen setup, such as setup=tuned, "
+        "fire=huygens, seed=1, env.num_uavs=3, logger=csv",
+    )
+
+
+def _train(options: argparse.Namespace, console: "Console") -> int:
+    _check_names(options.method, options.overrides)
+    from emberlink.trainers.training.command import train
+
+    return train(options.method, options.overrides, console)
+
+
+def _check_names(method: str, overrides: list[str]) -> None:
+    """Reports a wrong name or key before torch is imported, which takes seconds."""
+    from emberlink.envs.utils.config_files import find
+
+    if any(text.startswith("resume=") for text in (method, *overrides)):
+        return
+    find("method", method)
+    if other := next((text for text in overrides if "=" not in text), None):
+        raise UserError(
+            f"{other!r} is not of the form key=value; several methods: emberlink sweep "
+            f"{method} {other} ..."
+        )
+    from emberlink.trainers.config.values import composed  # imports Hydra
+
+    composed(method, overrides)
+
+
+def add_eval(commands: Any) -> None:
+    add = command(
+        commands,
+        "eval",
+        _eval,
+        "evaluate the frozen policies of a run",
+        "Loads the newest checkpoint of a run, plays the frozen policies and the scripted ones on "
+        "the same test fires, prints a table, and writes eval.json, figures, a GIF and a replay "
+        "page to the run folder.",
+        "emberlink eval runs/2026-01-31_12-00-00_consensus_tuned_paper_s0 --fires 64",
+    )
+    add("folder", metavar="RUN", help="a run folder, or pretrained:METHOD, pretrained:SETUP/METHOD")
+    add(
+        "overrides",
+        metavar="key=value",
+        nargs="*",
+        default=[],
+        help="keys of comm. or env. to change, such as env.radio.loss=0.5, world=NAME, or "
+        "evaluation.scripted=[] for the frozen policies alone; "
+        "the names of the files contain them",
+    )
+    add("--checkpoint", metavar="FILE", type=Path, help="a checkpoint (default: the newest)")
+    fires = between(1, MOST_FIRES)
+    add("--fires", metavar="N", type=fires, help="number of episodes (default: the run's)")
+    add("--device", help="cpu, cuda, ... (default: the run's)")
+
+
+def _eval(options: argparse.Namespace, console: "Console") -> int:
+    from emberlink.trainers.evaluation.evaluate_run import run_command
+
+    return run_command(options, console)
+
+
+def add_compare(commands: Any) -> None:
+    add = command(
+        commands,
+        "compare",
+        _compare,
+        "compare runs: methods, setups, several seeds",
+        "Gathers finished runs by setup, world, training fire and method and prints interquartile "
+        "means with 95 % bootstrap intervals over seeds, the gain of messages, and the paper's "
+        "claims; writes a new folder with compare.html, one page with all tables and figures, and "
+        "compare.json.",
+        "emberlink compare runs/ --output comparison",
+    )
+    add(
+        "folders",
+        metavar="RUN",
+        nargs="+",
+        type=Path,
+        help="run folders, folders of run folders, or names such as pretrained:tuned",
+    )
+    add("--output", metavar="FOLDER", type=Path, help="a new folder (default: compare)")
+    add(
+        "--label",
+        metavar="NAME",
+        action="append",
+        default=[],
+        help="name of the runs of the first RUN, of the second, and so on (default: their method)",
+    )
+    extras: dict[str, Any] = {"action": "append_const", "dest": "extras", "default": []}
+    for name, what in EXTRAS.items():
+        add(f"--{name}", const=name, help=f"also write {what}", **extras)
+
+
+def _compare(options: argparse.Namespace, console: "Console") -> int:
+    from rich.text import Text
+
+    from emberlink.trainers.comparison.comparison import compare_runs
+    from emberlink.trainers.comparison.report import free_folder, printed, tables, write_report
+
+    def say(text: str, style: str = "yellow") -> None:
+        console.print(Text(text, style=style), soft_wrap=True)
+
+    folder = free_folder(options.output)
+    comparison = compare_runs(options.folders, options.label)
+    for path, why in comparison.left_out:
+        say(f"note: {path} is left out: {why}")
+    write_report(comparison, folder, lambda text: say(f"  {text}", "dim"), options.extras)
+    for note in comparison.notes:
+        say(f"note: {note}")
+    for section in comparison.sections:
+        for table in tables(comparison, section):
+            console.print(printed(table, section))
+    say(str(folder / "compare.html"), "")
+    return 0
+
+
+def add_render(commands: Any) -> None:
+    add = command(
+        commands,
+        "render",
+        _render,
+        "an episode as GIF and MP4, or as a page to play; several runs side by side",
+        "Plays the frozen policies of one or more runs on the same held-out fire from the same "
+        "start positions, and draws fire, UAVs, their roles and the links of their network. Writes "
+        "a GIF and an MP4 to the first run's figures, or with --output FILE.html one page that "
+        "plays the episodes in a browser. A text KEY=VALUE changes a setting of the run before it. "
+        "No existing file is replaced.",
+        "emberlink render pretrained:consensus pretrained:consensus env.radio.range=0 "
+        "--output replay.html",
+    )
+    add(
+        "runs",
+        metavar="RUN",
+        nargs="+",
+        help="a run folder, or pretrained:METHOD; after it KEY=VALUE, such as env.radio.range=0, "
+        "for other settings of env and comm, or world=NAME",
+    )
+    several: dict[str, Any] = {"action": "append", "default": []}
+    add(
+        "--policy",
+        metavar="NAME",
+        help="a scripted policy to draw, too; may be given several times",
+        **several,
+    )
+    add(
+        "--fire",
+        metavar="FIRE",
+        help="a held-out fire: NAME, INDEX or NAME:INDEX, such as huygens:3 (default: huygens:0, "
+        "or the first of the run's own fires if evaluations leave huygens out)",
+    )
+    add(
+        "--checkpoint",
+        metavar="FILE",
+        type=Path,
+        help="a checkpoint in place of the newest; one for each run",
+        **several,
+    )
+    add(
+        "--output",
+        metavar="PATH",
+        type=Path,
+        help="a folder, or a new file that ends in .html (a page to play), .gif, .mp4 or .png (one "
+        "picture)",
+    )
+    steps = between(0, 1_000_000)
+    add("--step", metavar="STEP", type=steps, help="step of a .png (default: the last)")
+    add("--frames", type=positive, default=126, help="maximum number of frames (default: 126)")
+    add("--fps", type=between(1, 50), default=12, help="frames per second, 1 to 50 (default: 12)")
+    add("--size", type=between(100, 2000), help="pixels of a map's longer side, 100 to 2000")
+    add("--seen", action="store_true", help="draw seen fire in grey")
+
+
+def _render(options: argparse.Namespace, console: "Console") -> int:
+    from emberlink.trainers.evaluation.render import render
+
+    return render(options, console)
+
+
+def add_sweep(commands: Any) -> None:
+    add = command(
+        commands,
+        "sweep",
+        _sweep,
+        "train methods x seeds x setups",
+        "Trains and evaluates every combination, several runs at a time. Finished runs in the "
+        "output folder are skipped, and stopped ones are resumed, so that the same command can be "
+        "repeated. `status FOLDER` prints the state of each run in an output folder.",
+        "emberlink sweep consensus positional setup=paper,tuned seed=0,1,2 output=runs",
+        usage="emberlink sweep [--jobs N] [--dry-run] [METHOD ...] [key=value,value ...]\n"
+        "       emberlink sweep status FOLDER",
+    )
+    add(
+        "arguments",
+        metavar="METHOD | key=value,value",
+        nargs="+",
+        help="methods (default: all); keys as for train, with one value or several; "
+        "executor=local, submitit (SLURM) or ray, and its keys executor.KEY=value",
+    )
+    add("--jobs", metavar="N", type=positive, help="the same as executor.workers=N")
+    add("--dry-run", action="store_true", help="only print the state of each run")
+
+
+def _sweep(options: argparse.Namespace, console: "Console") -> int:
+    from emberlink.trainers.sweep.command import status, sweep
+
+    first, *others = options.arguments
+    if first == "status" and len(others) == 1:
+        return status(Path(others[0]), console)
+    jobs = [f"executor.workers={options.jobs}"] if options.jobs else []
+    return sweep([*options.arguments, *jobs], console, dry=options.dry_run)
+
+
+def add_world(commands: Any) -> None:
+    actions = command_group(
+        commands,
+        "world",
+        "test whether worlds are calibrated",
+        "Plays scripted policies to find out whether a world is hard enough and what messages "
+        "are worth in it.",
+        "emberlink world check front",
+    )
+    add = command(
+        actions,
+        "world check",
+        "worlds.check:check",
+        "test the conditions of the suite in worlds",
+        "Plays the scripted policies of worlds on test fires and prints their measures and the "
+        "conditions of the suite. The exit status is 1 if a world does not satisfy one.",
+        "emberlink world check front fire.burn_time=90 --validation --fires 32",
+    )
+    add(
+        "arguments",
+        metavar="NAME | key=value",
+        nargs="*",
+        help="worlds (default: all that evaluate the needed policies); keys of the world to "
+        "change, such as fire.burn_time=90 or setup=tuned",
+    )
+    number = between(1, MOST_FIRES)
+    add("--fires", metavar="N", type=number, default=100, help="number of fires (default: 100)")
+    add(
+        "--validation",
+        dest="split",
+        action="store_const",
+        const="validation",
+        default="test",
+        help="play on validation fires, for the design of a world, in place of test fires",
+    )
+    add(
+        "--json",
+        dest="output",
+        metavar="FILE",
+        type=Path,
+        help="a new .json file for the numbers",
+    )
+
+
+def add_doctor(commands: Any) -> None:
+    command(
+        commands,
+        "doctor",
+        "training.self_test:doctor",
+        "check the installation",
+        "Prints versions and devices and runs a self-test: a short fire, the environment of every "
+        "method, and updates of its networks. Prints how long the self-test took.",
+        "emberlink doctor",
+    )
