@@ -41,14 +41,14 @@ CLAIMS = (
 """claims of the paper about method 4"""
 
 
-def verdicts(runs: Frame, means: Frame, notes: list[str]) -> Frame:
-    """Returns the verdict of each claim on each set of fires, for each label of consensus.
+def verdicts(runs: Frame, means: Frame) -> tuple[Frame, list[str]]:
+    """Returns the verdict of each claim, set of fires and label of consensus, and notes.
 
     If consensus was trained in several ways, a label is compared with those labels of other methods
-    that have the same settings in the keys that tell these ways apart. Communication may differ. A
-    note is appended for a label with which none can be compared.
+    that have the same settings in the keys that tell these ways apart. Communication may differ.
     """
     rows: list[dict[str, Any]] = []
+    notes: list[str] = []
     settings = trained_settings(runs)
     is_own = settings["method"] == METHOD
     settings = settings[[key for key in settings if not key.startswith(_COMMUNICATION)]]
@@ -63,7 +63,7 @@ def verdicts(runs: Frame, means: Frame, notes: list[str]) -> Frame:
         for fires, claim in product(sorted(means["fires"].unique()), CLAIMS):
             about = {"section": runs["section"].iloc[0], "fires": fires, "label": label}
             rows.append(about | _verdict(part[part["fires"] == fires], label, claim))
-    return pd.DataFrame(rows, columns=list(COLUMNS))
+    return pd.DataFrame(rows, columns=list(COLUMNS)), notes
 
 
 def _verdict(means: Frame, label: str, claim: Claim) -> dict[str, Any]:

@@ -3,7 +3,7 @@
 import json
 import shlex
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,47 +19,39 @@ from emberlink.trainers.comparison.claims import verdicts
 from emberlink.trainers.comparison.communication import communication_values
 from emberlink.trainers.comparison.reading import LeftOut, read_all
 from emberlink.trainers.comparison.tables import Frame
-from emberlink.trainers.evaluation.scores import LEARNED
 from emberlink.trainers.runs.compact_json import finite
 
 
 class Difference(NamedTuple):
-    """The difference between the interquartile means of two labels, first minus second.
-
-    Attributes:
-        value: the difference.
-        interval: its interval over seeds and fires; None if a label has only one seed.
-    """
+    """The difference between the interquartile means of two labels, first minus second."""
 
     value: float
     interval: Interval | None
+    """over seeds and fires; None if a label has only one seed"""
 
 
 @dataclass(frozen=True, repr=False)
 class Comparison:
-    """The results of a comparison, as pandas tables.
-
-    Attributes:
-        paths: compared folders, as given.
-        runs: one row per evaluation of a run.
-        means: one row per run, set of fires, policy and measure.
-        ranking: one row per set of fires, measure and label, best first; see `rankings.RANKING`.
-        claims: verdicts of the paper's claims; see `claims.COLUMNS`.
-        communication: gain of messages and value of communication; see `communication.COLUMNS`.
-        curves: one row per label, measure and training episode.
-        notes: what a reader should know.
-        left_out: folders and files that are not compared, with the reason.
-    """
+    """The results of a comparison, as pandas tables."""
 
     paths: tuple[Path, ...]
+    """compared folders, as given"""
     runs: Frame
+    """one row per evaluation of a run"""
     means: Frame
+    """one row per run, set of fires, policy and measure"""
     ranking: Frame
+    """one row per set of fires, measure and label, best first; see `rankings.RANKING`"""
     claims: Frame
+    """verdicts of the paper's claims; see `claims.COLUMNS`"""
     communication: Frame
+    """gain of messages and value of communication; see `communication.COLUMNS`"""
     curves: Frame
-    notes: list[str] = field(default_factory=list)
-    left_out: list[LeftOut] = field(default_factory=list)
+    """one row per label, measure and training episode"""
+    notes: list[str]
+    """remarks on differences between runs and on missing results"""
+    left_out: list[LeftOut]
+    """folders and files that are not compared, with the reason"""
 
     def __repr__(self) -> str:
         rows = self.runs.groupby("section")["label"].nunique()
@@ -96,8 +88,7 @@ class Comparison:
             UserError: a name is not known, the measure is not ranked, or both labels are
                 evaluations of the same runs, which are not independent samples.
         """
-        ranking, means = self.ranking, tables.learned(self.means)
-        trained = ranking[ranking["policy"] == LEARNED]
+        trained, means = tables.learned(self.ranking), tables.learned(self.means)
         for column, name in (("section", section), ("fires", fires), ("measure", measure)):
             name = _one(column, name, trained[column].unique())
             trained, means = (part[part[column] == name] for part in (trained, means))
@@ -179,23 +170,17 @@ def compare_runs(paths: Sequence[Path], labels: Sequence[str] = ()) -> Compariso
         raise UserError("nothing to compare: expected at least one run folder")
     read, left_out = read_all(paths, labels)
     if not read:
-        reasons = "".join(f"; {path}: {why}" for path, why in left_out[:1])
-        raise UserError(f"no finished run among {len(left_out)}: nothing to compare{reasons}")
+        path, why = left_out[0]
+        raise UserError(f"no finished run among {len(left_out)}: nothing to compare; {path}: {why}")
     runs, others = tables.runs_table(read)
     means = tables.means_table(runs)
     notes: list[str] = []
     parts: list[tuple[Frame, ...]] = []
     for section, part in runs.groupby("section"):
         of_section = means[means["section"] == section]
-        found: list[str] = []
-        parts.append(
-            (
-                rankings.rank(part, of_section),
-                verdicts(part, of_section, found),
-                communication_values(part),
-                rankings.curves(part),
-            )
-        )
+        claims, found = verdicts(part, of_section)
+        ranking, curves = rankings.rank(part, of_section), rankings.curves(part)
+        parts.append((ranking, claims, communication_values(part), curves))
         if apart := list(rankings.differing(part)):
             found.append(f"the rows differ in {', '.join(apart)}")
         found += rankings.unequal_scripted(of_section)

@@ -39,7 +39,9 @@ def rank(runs: Frame, means: Frame) -> Frame:
     may have different ones. Scripted policies follow the trained ones; their `seeds` are empty and
     `iqm` is the mean over fires.
     """
-    known = [name for name in metrics.ALL if _everywhere(name, learned(means))]
+    count = learned(means)["measure"].value_counts()
+    everywhere = len(learned(means).drop_duplicates(["run", "evaluated_with", "fires"]))
+    known = [name for name in metrics.ALL if count.get(name) == everywhere]
     known.sort(key=lambda name: (name == REWARD, name != runs["object"].iloc[0].headline))
     first = trained_on(runs)
     rows: list[dict[str, Any]] = []
@@ -49,17 +51,10 @@ def rank(runs: Frame, means: Frame) -> Frame:
         for measure in known:
             about = {"section": runs["section"].iloc[0], "fires": fires, "measure": measure}
             why = different_rewards(runs, scripted) if measure == REWARD else ""
-            part = learned(on_fires)[learned(on_fires)["measure"] == measure]
+            part = learned(on_fires[on_fires["measure"] == measure])
             ranked = _rows(part, measure in metrics.HIGHER_IS_BETTER, bool(why))
             rows += [{**about, "not_ranked": why, **row} for row in [*ranked, *scripted[measure]]]
     return pd.DataFrame(rows, columns=list(RANKING))
-
-
-def _everywhere(measure: str, means: Frame) -> bool:
-    """Returns whether all runs have a measure."""
-    cells = ["run", "evaluated_with", "fires"]
-    having = means[means["measure"] == measure]
-    return len(having) == len(means.drop_duplicates(cells))
 
 
 def _rows(means: Frame, higher: bool, unranked: bool) -> list[dict[str, Any]]:
@@ -73,9 +68,9 @@ def _rows(means: Frame, higher: bool, unranked: bool) -> list[dict[str, Any]]:
     rows: list[dict[str, Any]] = []
     for label, other in zip_longest(order, [] if unranked else order[1:]):
         low, high = bootstrap.interval(bootstrap.iqm, values[label]) or (None, None)
-        row = {"label": label, "policy": LEARNED, "seeds": groups[label]["seed"].tolist()}
-        row |= {"values": values[label].tolist(), "iqm": iqms[label], "low": low, "high": high}
-        row |= {"next": other or ""}
+        row: dict[str, Any] = {"label": label, "policy": LEARNED, "next": other or ""}
+        row |= {"seeds": groups[label]["seed"].tolist(), "values": values[label].tolist()}
+        row |= {"iqm": iqms[label], "low": low, "high": high}
         if other and groups[label]["run"].isin(groups[other]["run"]).sum() == 0:
             pair = (values[label], values[other])[:: 1 if higher else -1]
             if ends := bootstrap.interval(bootstrap.probability_of_improvement, *pair):
@@ -113,12 +108,7 @@ def _same(first: float, second: float) -> bool:
 
 
 def different_rewards(runs: Frame, scripted: Mapping[str, Sequence[Mapping[str, Any]]]) -> str:
-    """Returns why the rewards of a section cannot be compared; an empty text if they can.
-
-    Args:
-        runs: the runs of the section.
-        scripted: measure -> rows of the scripted policies.
-    """
+    """Returns why the rewards of a section cannot be compared; an empty text if they can."""
     settings = settings_table(runs["settings"]).filter(regex=r"^env\.reward\.")
     for key in settings.columns[settings.nunique() > 1]:
         return f"the methods' rewards differ in {key}"

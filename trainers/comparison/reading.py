@@ -93,14 +93,7 @@ class Run:
 def read_all(
     paths: Sequence[Path | str], labels: Sequence[str] = ()
 ) -> tuple[list[Run], list[LeftOut]]:
-    """Reads the runs of a comparison.
-
-    Args:
-        paths: run folders, folders of run folders, or names such as `pretrained:tuned`.
-        labels: a name for the runs of each path, in place of their method.
-
-    Returns:
-        The finished runs, one entry per evaluation, and the folders and files left out.
+    """Returns the finished runs of paths, one entry per evaluation, and what is left out.
 
     Raises:
         UserError: a path holds no run, or the labels are not as many as the paths.
@@ -127,11 +120,7 @@ def read_all(
 
 
 def find(path: Path | str) -> list[Path]:
-    """Returns the run folder of a path, or those directly within it.
-
-    Raises:
-        UserError: there is none.
-    """
+    """Returns the run folder of a path, or those directly within it; a UserError without one."""
     folder = Path(path)
     if pretrained.is_name(str(path)):
         return pretrained.find(str(path))
@@ -145,11 +134,7 @@ def find(path: Path | str) -> list[Path]:
 
 
 def read(path: Path) -> Run:
-    """Returns a run.
-
-    Raises:
-        UserError: it is not finished, or not evaluated, or a file is damaged.
-    """
+    """Returns a run; a UserError if it is not finished or not evaluated, or a file is damaged."""
     folder = RunFolder(path)
     settings = {"world": "paper", **flat(folder.values())}
     _check_types(settings, path / "config.yaml")
@@ -159,12 +144,12 @@ def read(path: Path) -> Run:
         evaluation = read_evaluation(path / "eval.json", settings)
     except FileNotFoundError:
         raise UserError(f"not evaluated: there is no eval.json ({again})") from None
-    step = evaluation.step
+    trained, tested = evaluation.step, evaluation.step
     with suppress(UserError):  # no checkpoint, or a damaged one: the numbers can be compared
-        step = folder.step()
-    if step != evaluation.step:
+        trained = folder.step()
+    if trained != tested:
         raise UserError(
-            f"eval.json is of step {evaluation.step}, the newest checkpoint of {step} ({again})"
+            f"eval.json is of step {tested}, the newest checkpoint of {trained} ({again})"
         )
     return Run(path, settings["method"], settings, lines, evaluation)
 
@@ -177,11 +162,7 @@ def _check_types(settings: Mapping[str, Any], file: Path) -> None:
 
 
 def read_evaluation(file: Path, settings: Mapping[str, Any]) -> Evaluation:
-    """Returns the content of an eval.json.
-
-    Args:
-        file: path of the file.
-        settings: configuration of its run, by dotted key.
+    """Returns the content of an eval.json of a run with these settings.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -204,11 +185,9 @@ def read_evaluation(file: Path, settings: Mapping[str, Any]) -> Evaluation:
             raise UserError(f"{file}: results.{fire} has no policy {LEARNED!r}")
         for policy, measured in policies.items():
             for name, values in measured.items():
-                if len(values) != evaluation.fires:
-                    raise UserError(
-                        f"{file}: results.{fire}.{policy}.{name} has {len(values)} episodes; "
-                        f"fires={evaluation.fires}"
-                    )
+                if (count := len(values)) != evaluation.fires:
+                    where = f"{file}: results.{fire}.{policy}.{name}"
+                    raise UserError(f"{where} has {count} episodes; fires={evaluation.fires}")
     return evaluation
 
 
@@ -225,11 +204,10 @@ def _curves(folder: RunFolder, episodes: int) -> list[dict[str, Any]]:
 
 
 def evaluated_otherwise(run: Run) -> tuple[list[Run], list[LeftOut]]:
-    """Reads the evaluations of a run with changed settings, one per eval_*.json.
+    """Returns a run with each evaluation in an eval_*.json, and the files left out.
 
-    Returns:
-        The run with each of these evaluations, and the files left out: damaged ones, those whose
-        checkpoint or fires differ from those of eval.json, and a second one with equal settings.
+    Left out are damaged files, those whose checkpoint or fires differ from eval.json, and a second
+    file with equal settings.
     """
     others: list[Run] = []
     left_out: list[LeftOut] = []

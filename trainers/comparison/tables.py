@@ -100,7 +100,7 @@ def word(value: Any) -> str:
     """Returns a value as on the command line."""
     if isinstance(value, float):
         return str(int(value) if value.is_integer() else value)
-    return value if isinstance(value, str) else json.dumps(value)
+    return value if isinstance(value, str) else json.dumps(value, default=str)
 
 
 def settings_table(rows: Frame) -> Frame:

@@ -103,26 +103,6 @@ def test_scripted_policies_have_a_value_for_each_radio(tmp_path):
     assert found == {"map greedy, range 20": 0.8, "map greedy, range 5": 0.2}
 
 
-def test_nothing_to_gain_has_no_value(tmp_path):
-    run = write_run(tmp_path, learned={"coverage": [50.0, 60, 70, 80]})
-    evaluate_otherwise(run, 0.0, [40.0, 50, 60, 70])
-    evaluate_otherwise(run, float("inf"), [40.0, 50, 60, 70])
-    (row,) = values(tmp_path)
-    assert (row["gain"], interval(row, "gain")) == (10.0, (10.0, 10.0))
-    assert (row["value"], interval(row, "value")) == (None, (None, None))
-
-
-def test_scripted_policies_have_a_value(tmp_path):
-    names = ("map_greedy_alone", "map_greedy", "map_greedy_all")
-    run = write_run(tmp_path, scripted=names)
-    content = read_evaluation(run)
-    for name, coverage in zip(names, (50.0, 55.0, 60.0), strict=True):
-        content["results"]["huygens"][name]["coverage"] = [coverage] * 4
-    (run / "eval.json").write_text(json.dumps(content))
-    (row,) = values(tmp_path)
-    assert (row["label"], row["radios"], row["value"]) == ("map greedy", "scripted", 0.5)
-
-
 def scripted_run(folder, base, results: dict[str, dict[str, float]]):
     """Writes a run with evaluations of scripted policies: file name -> policy -> coverage."""
     names = list(dict.fromkeys(name for played in results.values() for name in played))
@@ -154,28 +134,6 @@ def test_with_a_base_scripted_policies_need_the_other_radios(tmp_path):
         ("courier", 45.0, 85.0, 95.0, 0.8),
     ]
     assert not any("does not have the same" in note for note in compared.notes)
-
-
-def test_the_other_radios_of_scripted_policies_are_those_of_the_same_team(tmp_path):
-    own = {"map_greedy": 80.0, "courier": 85.0}
-    scripted_run(tmp_path, [0, 0], {"eval.json": own})
-    for reach, name in (("0", "off"), ("inf", "full")):
-        overrides = ("env.base=[0,0]", f"env.radio.range={reach}", "env.num_uavs=3")
-        write_run(tmp_path, name=name, scripted=tuple(own), overrides=overrides)
-    assert not values(tmp_path)
-
-
-def test_groups_with_other_headlines_are_compared(tmp_path):
-    ages = ("env.measures=all", "evaluation.headline=front_age")
-    learned = {"front_age": 30.0, "front_age_p95": 60.0, "bytes_per_step": 9.0}
-    write_run(tmp_path, overrides=ages, learned=learned)
-    for override, coverage in ((OFF, 50.0), ("env.radio.range=10", 60.0), (FULL, 70.0)):
-        name = f"run{override}".replace("=", "_")
-        more = {"learned": {"coverage": coverage}, "overrides": (override,)}
-        write_run(tmp_path, "independent", name=name, **more)
-    (row,) = values(tmp_path)
-    assert (row["measure"], row["value"]) == ("coverage", 0.5)
-    assert row["label"].startswith("independent")
 
 
 def test_a_resample_without_anything_to_gain_leaves_no_interval(tmp_path):

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from synthetic_runs import read_evaluation, write_evaluation, write_run
 from unpack_replay import data_of
@@ -21,7 +21,6 @@ from emberlink.trainers.comparison import claims, drawing
 from emberlink.trainers.comparison.bootstrap import crossed_interval, iqm_difference
 from emberlink.trainers.comparison.comparison import compare_runs
 
-METHODS = ("consensus", "independent", "positional", "shared_memory")
 LOST = "consensus, evaluated with env.radio.loss=0.5"
 
 
@@ -113,8 +112,6 @@ def test_the_table_is_tidy(comparison):
         "range 10": [65, 75, 65, 75],
         "range 10, loss 0.5": [31] * 4,
     }
-    assert len(repr(comparison).splitlines()) == 2
-    assert "4 rows" in repr(comparison)
 
 
 def test_measures_where_lower_is_better(tmp_path):
@@ -138,37 +135,21 @@ def test_the_headline_of_the_world_is_first_and_the_reward_last(tmp_path):
 
 
 @pytest.mark.slow
-@settings(
-    deadline=None, max_examples=6, suppress_health_check=[HealthCheck.function_scoped_fixture]
-)
-@given(st.lists(st.integers(1, 6), min_size=1, max_size=4), st.integers(0, 2**20))
-def test_any_number_of_methods_and_seeds(tmp_path_factory, counts, start):
+@settings(deadline=None, max_examples=4)
+@given(st.lists(st.integers(1, 6), min_size=1, max_size=3))
+def test_any_number_of_methods_and_seeds(tmp_path_factory, counts):
     folder = tmp_path_factory.mktemp("any")
-    for method, count in zip(METHODS, counts, strict=False):
+    seeds = dict(zip(("consensus", "independent", "positional"), counts, strict=False))
+    for method, count in seeds.items():
         for seed in range(count):
-            write_run(folder, method, start + seed)
-    comparison = compare_runs([folder])
-    learned = comparison.ranking[comparison.ranking["policy"] == "learned"]
-    for measure, rows in learned.groupby("measure"):
-        assert dict(zip(rows["label"], rows["seeds"].map(len), strict=True)) == dict(
-            zip(METHODS, counts, strict=False)
-        )
-        if not rows["not_ranked"].iloc[0]:
-            higher = measure in metrics.HIGHER_IS_BETTER
-            assert list(rows["iqm"]) == sorted(rows["iqm"], reverse=higher)
-            assert list(rows["next"]) == [*rows["label"][1:], ""]
-        for row in rows.to_dict("records"):
-            assert pd.isna(row["low"]) == (len(row["seeds"]) == 1)
-            if not pd.isna(row["low"]):
-                assert min(row["values"]) - 1e-9 <= row["low"] <= row["high"]
-                assert row["high"] <= max(row["values"]) + 1e-9
-    assert len(comparison.claims) == (4 if len(counts) > 1 else 0)
-
-
-def test_results_do_not_depend_on_the_order_of_runs(runs):
-    folders = sorted(runs.iterdir())
-    values = [compare_runs(order).to_json() for order in (folders, folders[::-1])]
-    assert values[0] == values[1]
+            write_run(folder, method, seed)
+    rows = only(compare_runs([folder]))
+    assert rows["seeds"].map(len).to_dict() == seeds
+    assert rows["iqm"].is_monotonic_decreasing
+    assert list(rows["next"]) == [*rows.index[1:], ""]
+    for row in rows.to_dict("records"):
+        assert pd.isna(row["low"]) == (len(row["seeds"]) == 1)
+        assert pd.isna(row["low"]) or min(row["values"]) <= row["low"] <= row["high"]
 
 
 @pytest.mark.slow
@@ -186,6 +167,12 @@ def test_fires_are_not_independent_runs(runs, tmp_path):
     numbers = ["iqm", "low", "high", "probability", "probability_low", "probability_high"]
     before, after = (compare_runs([folder]).ranking for folder in (runs, copy))
     np.testing.assert_allclose(*(r[numbers].to_numpy(float) for r in (before, after)), rtol=1e-9)
+
+
+def test_results_do_not_depend_on_the_order_of_runs(runs):
+    folders = sorted(runs.iterdir())
+    values = [compare_runs(order).to_json() for order in (folders, folders[::-1])]
+    assert values[0] == values[1]
 
 
 # Sections, labels
@@ -348,15 +335,6 @@ def test_errors_of_a_difference(comparison, arguments, why):
 # The paper's claims
 
 
-def test_the_claims_are_those_of_the_paper():
-    assert [(claim.measure, claim.factor) for claim in claims.CLAIMS] == [
-        ("coverage", 1.3),
-        ("tracking_first", 1.4),
-        ("tracking_last", 1.4),
-        ("boundary_exits", 2.0),
-    ]
-
-
 def test_verdicts(tmp_path):
     """The ratios are 2, 1 and about 1.3, with little or much spread between seeds."""
     cases = {"holds": (60, 30, 0), "does not hold": (30, 30, 0), "undecided": (39, 30, 10)}
@@ -367,20 +345,7 @@ def test_verdicts(tmp_path):
             write_run(tmp_path / verdict, "positional", seed, learned={"coverage": other - shift})
         found = compare_runs([tmp_path / verdict]).claims.set_index("measure")
         assert found.loc["coverage", "verdict"] == verdict
-
-
-@pytest.mark.parametrize(
-    ("interval", "verdict"),
-    [
-        ((2.0, 3.0), "holds"),
-        ((1.99999994, 3.0), "holds"),  # 2 in float32, rounded
-        ((0.0, 1.99999996), "undecided"),
-        ((0.0, 1.99), "does not hold"),
-        (None, "undecided"),
-    ],
-)
-def test_rounding_does_not_decide_a_claim(interval, verdict):
-    assert claims.decision(interval, 2.0) == verdict
+    assert claims.decision((1.99999994, 3.0), 2.0) == "holds"  # 2 in float32, rounded
 
 
 def test_a_ratio_to_zero_is_infinite(tmp_path):
@@ -436,52 +401,35 @@ def test_scripted_policies_are_drawn_in_their_rows(tmp_path):
 # The report
 
 
-class Tags(html.parser.HTMLParser):
-    """Collects unclosed tags and loaded resources of an HTML page."""
+class Page(html.parser.HTMLParser):
+    """Collects the tags, loaded resources and text of compare.html."""
 
-    VOID = frozenset({"meta", "img", "br", "link"})
-
-    def __init__(self):
+    def __init__(self, folder: Path):
         super().__init__()
-        self.open, self.seen, self.loaded, self.text = [], set(), [], ""
+        self.tags, self.loaded, self.text = set(), [], ""
+        self.feed((folder / "compare.html").read_text())
 
     def handle_starttag(self, tag, attrs):
-        self.seen.add(tag)
+        self.tags.add(tag)
         self.loaded += [value for key, value in attrs if key in ("src", "href")]
-        if tag not in self.VOID:
-            self.open.append(tag)
-
-    def handle_endtag(self, tag):
-        assert self.open.pop() == tag
 
     def handle_data(self, data):
         self.text += data
-
-
-def page(folder) -> Tags:
-    tags = Tags()
-    tags.feed((folder / "compare.html").read_text())
-    tags.close()
-    assert tags.open == []
-    return tags
 
 
 def test_the_report_is_one_page(runs, tmp_path, capsys):
     out = tmp_path / "out"
     assert main.main(["compare", str(runs), "--output", str(out)]) == 0
     assert sorted(file.name for file in out.iterdir()) == ["compare.html", "compare.json"]
-    tags = page(out)
-    assert "script" not in tags.seen
-    assert len(tags.loaded) == 6
-    assert all(address.startswith("data:image/png;base64,iVBOR") for address in tags.loaded)
-    source = (out / "compare.html").read_text()
-    for scheme in ("http:", "https:", "url(", "@import"):
-        assert scheme not in source
+    page = Page(out)
+    assert "script" not in page.tags
+    assert len(page.loaded) == 6
+    assert all(address.startswith("data:image/png;base64,iVBOR") for address in page.loaded)
     printed = " ".join(capsys.readouterr().out.split())
     for said in (*metrics.NAMES, "consensus", "independent", "60.0", "[50.0, 70.0]", "3*"):
-        assert said in tags.text
+        assert said in page.text
         assert said in printed
-    assert "With one seed there is no interval" in tags.text
+    assert "With one seed there is no interval" in page.text
     content = json.loads((out / "compare.json").read_text())
     rows = [row for row in content["ranking"] if row["measure"] == "coverage"]
     assert rows[0]["values"] == [50, 70, 60]
@@ -519,9 +467,9 @@ def test_names_from_files_are_escaped(tmp_path, capsys):
     write_evaluation(run, content)
     arguments = ["compare", str(run), "--latex", "--output", str(tmp_path / "out")]
     assert main.main(arguments) == 0
-    tags = page(tmp_path / "out")
-    assert "script" not in tags.seen
-    assert HOSTILE in tags.text
+    page = Page(tmp_path / "out")
+    assert "script" not in page.tags
+    assert HOSTILE in page.text
     assert HOSTILE.replace("_", " ") in "".join(capsys.readouterr().out.split("\n"))
     assert all(file.parent == tmp_path / "out" for file in (tmp_path / "out").rglob("*"))
 
@@ -546,10 +494,6 @@ def test_nothing_is_overwritten(runs, tmp_path, monkeypatch, capsys):
 # Runs that cannot be compared
 
 
-def spoilt(**changes):
-    return lambda run: change(run, **changes)
-
-
 def rewrite(run, old, new):
     file = run / "config.yaml"
     text = file.read_text()
@@ -559,11 +503,11 @@ def rewrite(run, old, new):
 
 SPOILT = {
     "no json": (lambda run: (run / "eval.json").write_text("{"), "eval.json"),
-    "another's": (spoilt(seed=5), "seed=5"),
-    "no policy": (spoilt(results={"huygens": {}}), "has no policy 'learned'"),
-    "fewer fires": (spoilt(fires=3), "has 4 episodes; fires=3"),
+    "another's": (lambda run: change(run, seed=5), "seed=5"),
+    "no policy": (lambda run: change(run, results={"huygens": {}}), "has no policy 'learned'"),
+    "fewer fires": (lambda run: change(run, fires=3), "has 4 episodes; fires=3"),
     "other fires": (
-        spoilt(held_out={"huygens": {"fire_seeds": [9]}}),
+        lambda run: change(run, held_out={"huygens": {"fire_seeds": [9]}}),
         "not evaluated on the fires",
     ),
     "nan": (lambda run: change_policy(run, "learned", "coverage", float("nan")), "finite"),
@@ -601,21 +545,15 @@ def test_a_run_that_cannot_be_read_costs_its_row(case, tmp_path, capsys):
     assert not (tmp_path / "out").exists()
 
 
-def test_without_runs(tmp_path):
-    for path, said in ((tmp_path, "that holds runs"), (tmp_path / "no", "no such run folder")):
-        with pytest.raises(UserError, match=said):
-            compare_runs([path])
-
-
 @pytest.mark.slow
 def test_a_real_run_has_a_timelapse_and_a_replay(finished, tmp_path):
     broken = write_run(tmp_path / "runs", "independent", overrides=("setup=paper",))
     (broken / "checkpoint.safetensors").write_bytes(b"no weights")
     paths = [str(finished), str(broken)]
     assert main.main(["compare", *paths, "--replay", "--output", str(tmp_path / "out")]) == 0
-    tags = page(tmp_path / "out")
-    assert "consensus, seed 0: the frozen policy on the first held-out fire" in tags.text
-    assert "independent: no timelapse" in tags.text
+    page = Page(tmp_path / "out")
+    assert "consensus, seed 0: the frozen policy on the first held-out fire" in page.text
+    assert "independent: no timelapse" in page.text
     (replay,) = (tmp_path / "out").glob("*_replay_1.html")
     assert [panel["title"] for panel in data_of(replay.read_text())["panels"]] == [
         "consensus, seed 0"

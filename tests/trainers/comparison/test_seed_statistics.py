@@ -103,14 +103,6 @@ def test_ratio_to_the_best_other(sample, others, higher, ratio):
     assert as_ratio(float(share)) == pytest.approx(ratio)
 
 
-def test_one_seed_has_no_interval_and_two_have_their_range():
-    assert interval(iqm, [3.0]) is None
-    assert interval(probability_of_improvement, [3.0, 4.0], [1.0]) is None
-    assert interval(iqm, [3.0, 5.0]) == (3, 5)
-    assert interval(iqm, [3.0, 5.0, 4.0]) == (3, 5)
-    assert interval(iqm, [4.0, 4.0, 4.0]) == (4, 4)
-
-
 @pytest.mark.parametrize("values", [[1, 2, 4, 8], [0.1, 0.7, 0.2, 0.9, 0.4]])
 def test_interval_equals_that_of_all_resamples(values):
     low, high = plain_interval(lambda chosen: plain_iqm(chosen), values)
