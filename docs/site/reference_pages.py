@@ -21,7 +21,7 @@ from emberlink.trainers import RunConfig, resolve
 from emberlink.trainers.cli.main import _parser
 from emberlink.trainers.config.compose import to_values
 from emberlink.trainers.learners import registry as learners
-from emberlink.trainers.sweep.executors import registry as executors
+from emberlink.trainers.sweep.executors import base as executors
 
 _WORDS = {
     "integer": "whole number",

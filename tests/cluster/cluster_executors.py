@@ -94,19 +94,6 @@ def local(tmp_path_factory) -> dict[str, bytes]:
     return results(folder)
 
 
-def test_submitit_requeues_a_run_at_the_end_of_its_time(local, tmp_path):
-    folder = tmp_path / "a%j b"
-    folder.mkdir()
-    process = start(folder, "executor=submitit", "executor.cluster=local", "executor.workers=2")
-    wait_for(lambda: training(folder), process)
-    jobs = subprocess.check_output(["pgrep", "-f", "submitit.core._submit"], text=True).split()
-    os.kill(int(jobs[0]), signal.SIGUSR2)  # as submitit and SLURM do
-    wait_for(lambda: resumed(folder), process)
-    finish(process, folder)
-    assert results(folder) == local
-    assert [file.name for file in tmp_path.iterdir()] == ["a%j b"]
-
-
 @pytest.fixture
 def slurm(tmp_path):
     (tmp_path / "slurm").mkdir()
@@ -114,8 +101,8 @@ def slurm(tmp_path):
         yield env
 
 
-def test_slurm_requeues_a_preempted_run(local, tmp_path, slurm):
-    """A job of a partition with precedence takes both cores."""
+def test_slurm_requeues_runs_that_are_preempted_or_whose_time_ends(local, tmp_path, slurm):
+    """A job of a partition with precedence takes both cores; later a run is asked to save."""
     process = start(
         tmp_path, "executor=submitit", "executor.partition=low", "executor.time=20", env=slurm
     )
@@ -123,6 +110,10 @@ def test_slurm_requeues_a_preempted_run(local, tmp_path, slurm):
     command = ["sbatch", "--partition=high", "--ntasks=2", "--output=/dev/null"]
     subprocess.run([*command, "--wrap=sleep 1"], env=slurm, check=True)
     wait_for(lambda: resumed(tmp_path), process)
+    before = resumed(tmp_path)
+    wait_for(lambda: training(tmp_path), process)
+    subprocess.run(["scancel", "--signal=USR2", "--me"], env=slurm, check=True)  # as at the end
+    wait_for(lambda: resumed(tmp_path) > before, process)
     finish(process, tmp_path)
     said = [log.read_text() for log in (tmp_path / "runs/logs/submitit").glob("*.err")]
     assert any("DUE TO PREEMPTION" in text for text in said)

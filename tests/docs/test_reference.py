@@ -7,7 +7,7 @@ import pytest
 
 from emberlink.comm import registry as communication
 from emberlink.trainers.learners import registry as learners
-from emberlink.trainers.sweep.executors import registry as executors
+from emberlink.trainers.sweep.executors import base as executors
 
 PAGE = Path(__file__).parents[2] / "docs" / "reference" / "configuration.md"
 REGISTRIES = {"learner": learners, "comm": communication, "executor": executors}

@@ -2,7 +2,7 @@
 
 import hashlib
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 
@@ -14,6 +14,7 @@ from emberlink.envs.utils.errors import UserError
 from emberlink.trainers.config.compose import flat, resolve, to_values
 from emberlink.trainers.config.schema import NOT_LEARNT_WITH, RunConfig
 from emberlink.trainers.runs import pretrained
+from emberlink.trainers.runs.lock import Lock, LockedError
 from emberlink.trainers.runs.run_folder import RunFolder
 from emberlink.trainers.sweep.executors.base import Task
 
@@ -23,7 +24,6 @@ _NAMED = ("setup", "world", "seed")
 """keys whose values are in every name"""
 
 Identity = tuple[tuple[str, str], ...]
-"""keys and values that tell a run from others"""
 
 
 @dataclass(eq=False)
@@ -31,37 +31,48 @@ class Combination:
     """A run of a sweep.
 
     Attributes:
-        name: the method, the setup, the world, the other keys with several values, the seed.
         config: the configuration.
+        swept: `key=value` of the other keys with several values, for the name.
         overrides: given `key=value` of keys that do not affect learning; a resumed run gets them.
         folder: the run folder; None if there is none yet.
-        failed: the last line of the log if the training has failed, else empty.
+        failed: why the training has failed, else empty.
     """
 
-    name: str
     config: RunConfig
-    overrides: tuple[str, ...]
+    swept: Sequence[str] = ()
+    overrides: tuple[str, ...] = ()
     folder: RunFolder | None = None
     failed: str = ""
 
     @property
-    def finished(self) -> bool:
-        """Whether the run has all episodes and an evaluation of its newest checkpoint."""
-        return (
-            self.folder is not None
-            and self.episodes >= self.config.episodes
-            and self.folder.evaluated()
-        )
-
-    @property
-    def state(self) -> str:
-        """The state: "finished", "unfinished" or "new"."""
-        return "finished" if self.finished else "unfinished" if self.folder else "new"
+    def name(self) -> str:
+        """The method, the setup, the world, the other keys with several values, the seed."""
+        config = self.config
+        parts = [config.method, config.setup, config.world, *self.swept, f"seed {config.seed}"]
+        return ", ".join(parts)
 
     @property
     def episodes(self) -> int:
         """Number of finished episodes."""
-        return len(lines_of(self.folder.path / "metrics.jsonl")) if self.folder else 0
+        return len(self.folder.metrics()) if self.folder else 0
+
+    @property
+    def finished(self) -> bool:
+        """Whether the run has all episodes and an evaluation of its newest checkpoint."""
+        folder = self.folder
+        return folder is not None and self.episodes >= self.config.episodes and folder.evaluated()
+
+    @property
+    def state(self) -> str:
+        """The state: "new", "failed", "finished", "running" or "unfinished"."""
+        if self.folder is None or self.failed or self.finished:
+            return "failed" if self.failed else "finished" if self.folder else "new"
+        try:
+            if (self.folder.path / "lock").exists():  # also after SIGKILL
+                Lock(self.folder.path).release()
+        except LockedError:
+            return "running"
+        return "unfinished"
 
     @property
     def log(self) -> Path:
@@ -99,9 +110,8 @@ def combinations(arguments: Sequence[str]) -> list[Combination]:
         config = resolve(method, overrides)
         outputs.add(config.output)
         swept = [text for text in overrides if _key(text) in several]
-        parts = [method, config.setup, config.world, *swept, f"seed {config.seed}"]
         free = tuple(text for text in overrides if _key(text) in NOT_LEARNT_WITH)
-        found.setdefault(_identity(config), Combination(", ".join(parts), config, free))
+        found.setdefault(identity(config), Combination(config, swept, free))
     if not found:
         raise UserError("no run: a key has no value, as in seed=range(3,3)")
     if len(outputs) > 1:
@@ -115,7 +125,7 @@ def find_folders(wanted: Sequence[Combination], output: Path) -> Iterator[str]:
     A folder belongs to a combination if its config.yaml has the same values, apart from the keys
     that do not affect learning; its name does not matter. A finished one goes before others.
     """
-    by_identity = {_identity(run.config): run for run in wanted}
+    by_identity = {identity(run.config): run for run in wanted}
     for file in sorted(output.glob("*/config.yaml")):
         if pretrained.is_copy(file.parent):
             continue
@@ -126,32 +136,20 @@ def find_folders(wanted: Sequence[Combination], output: Path) -> Iterator[str]:
         except ValueError as error:
             yield f"{file.parent} is left out: {error}"
             continue
-        run = by_identity.get(_identity(config))
+        run = by_identity.get(identity(config))
         if run is not None and not run.finished:
             run.folder = folder
 
 
-def lines_of(file: Path) -> list[str]:
-    """Returns the lines of a text file that are not empty; none if it cannot be read."""
-    try:
-        return [line for line in file.read_text(errors="replace").splitlines() if line.strip()]
-    except OSError:
-        return []
-
-
-def without_seed(config: RunConfig) -> Identity:
-    """Returns what the configurations of several seeds have in common."""
-    return _identity(replace(config, seed=0))
-
-
-def _identity(config: RunConfig) -> Identity:
+def identity(config: RunConfig) -> Identity:
+    """Returns the keys and values that tell a run from others."""
     values = flat(to_values(config))
     return tuple(sorted((k, str(v)) for k, v in values.items() if k.split(".")[0] not in _IGNORED))
 
 
 def _folder_name(config: RunConfig) -> str:
     """Returns the name of a new folder: it ends with a hash of the configuration."""
-    digest = hashlib.sha256(repr(_identity(config)).encode()).hexdigest()[:8]
+    digest = hashlib.sha256(repr(identity(config)).encode()).hexdigest()[:8]
     return f"{config.method}_{config.setup}_{config.world}_s{config.seed}_{digest}"
 
 

@@ -3,34 +3,37 @@
 import shlex
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TaskID,
+    TextColumn,
+    TimeElapsedColumn,
+)
 from rich.table import Table
 
 from emberlink.envs.utils.atomic_io import user_path
 from emberlink.envs.utils.errors import UserError
-from emberlink.trainers.runs.lock import Lock, LockedError
 from emberlink.trainers.runs.run_folder import RunFolder
 from emberlink.trainers.sweep.combinations import (
     Combination,
     combinations,
     find_folders,
-    lines_of,
-    without_seed,
+    identity,
 )
-from emberlink.trainers.sweep.executors.base import Executor
-from emberlink.trainers.sweep.executors.registry import make
+from emberlink.trainers.sweep.executors.base import Executor, make
 from emberlink.trainers.terminal.signals import Interruption
 from emberlink.trainers.tracking import check_installed
 from emberlink.trainers.training.setup import check_setup
 
 _INTERVAL = 0.5
 """seconds between two looks at the runs"""
-_AGAIN = 60.0
-"""seconds after which runs that a cluster did not take are submitted again"""
 
 
 def sweep(
@@ -61,15 +64,16 @@ def sweep(
     for note in find_folders(runs, output):
         console.print(f"note: {note}", style="yellow", soft_wrap=True)
     _check([run for run in runs if run.folder is None])
-    waiting = [run for run in runs if not run.finished]
-    done = len(runs) - len(waiting)
-    console.print(f"{len(runs)} runs, of which {done} are finished -> {output}", soft_wrap=True)
     if dry:
-        for run in runs:
-            console.print(f"  {run.name}: {run.state}", highlight=False, soft_wrap=True)
+        console.print(_table(runs))
         return 0
-    status = _Sweep(executor, runs, waiting, console).work()
-    _print_table(runs, console)
+    done = sum(run.finished for run in runs)
+    console.print(f"{len(runs)} runs, of which {done} are finished -> {output}", soft_wrap=True)
+    status = _Trainings(executor, runs, console).work()
+    console.print(_table(runs))
+    for run in runs:
+        if run.failed:
+            console.print(f"{run.name}: {run.failed} (log: {run.log})", soft_wrap=True)
     if status == 0:
         again = f"emberlink compare {shlex.quote(str(output))}"
         console.print(f"compare them with: {again}", soft_wrap=True)
@@ -78,13 +82,35 @@ def sweep(
     return status
 
 
+def status(output: Path, console: Console) -> int:
+    """Prints the state and the episodes of each run in an output folder.
+
+    Raises:
+        UserError: there is none.
+    """
+    folders = [RunFolder(file.parent) for file in sorted(output.glob("*/config.yaml"))]
+    if not folders:
+        raise UserError(f"{output}: holds no run")
+    runs = [Combination(folder.config(device="cpu"), folder=folder) for folder in folders]
+    console.print(_table(runs))
+    return 0
+
+
+def _table(runs: Sequence[Combination]) -> Table:
+    table = Table("run", "state", "episodes", "folder")
+    for run in runs:
+        place = run.folder.path.name if run.folder else "-"
+        table.add_row(run.name, run.state, f"{run.episodes}/{run.config.episodes}", place)
+    return table
+
+
 def _check(runs: Sequence[Combination]) -> None:
     """Checks that new runs can be trained; those that differ in their seed only, once.
 
     Raises:
         UserError: one cannot.
     """
-    for run in {without_seed(run.config): run for run in reversed(runs)}.values():
+    for run in {identity(replace(run.config, seed=0)): run for run in reversed(runs)}.values():
         check_installed(run.config.logger)
         try:
             check_setup(run.config)
@@ -92,26 +118,28 @@ def _check(runs: Sequence[Combination]) -> None:
             raise UserError(f"{run.name}: {error}") from None
 
 
-class _Sweep:
-    """Submits runs, follows them, and cancels them after a signal."""
+class _Trainings:
+    """Submits runs, follows them with a bar for each, and cancels them after a signal."""
 
-    def __init__(
-        self,
-        executor: Executor,
-        runs: Sequence[Combination],
-        waiting: list[Combination],
-        console: Console,
-    ):
-        self._executor, self._waiting = executor, waiting
-        self._running: dict[Combination, Any] = {}
+    def __init__(self, executor: Executor, runs: Sequence[Combination], console: Console):
+        self._executor, self._runs = executor, runs
+        self._waiting = [run for run in runs if not run.finished]
+        self._running: dict[Combination, tuple[Any, TaskID]] = {}
         self._stopped = False
-        self._submit_at = 0.0
-        self._progress = _RunProgress(console, len(runs), len(runs) - len(waiting))
+        self._most = len(runs) if executor.workers is None else executor.workers
+        self._progress = Progress(
+            TextColumn("{task.description}", markup=False),
+            BarColumn(bar_width=20),
+            MofNCompleteColumn(),
+            TimeElapsedColumn(),
+            console=console,
+        )
+        done = len(runs) - len(self._waiting)
+        self._all = self._progress.add_task("runs", total=len(runs), completed=done)
 
     def work(self) -> int:
         """Trains all runs and returns the exit status of the sweep."""
         interruption = Interruption(lambda: None)
-        failed = 0
         with interruption, self._progress:
             try:
                 while self._running or (self._waiting and not self._stopped):
@@ -119,15 +147,13 @@ class _Sweep:
                         self._submit()
                     elif not self._stopped:
                         self._stop()
-                    failed += self._look()
-                    if self._running:
-                        time.sleep(_INTERVAL)
+                    self._look()
             finally:  # after a second signal or an error, the trainings end, too
                 self._stop()
                 while self._running:
                     self._look()
-                    time.sleep(_INTERVAL / 5)
-        return interruption.status if interruption.received else int(failed > 0)
+        failed = any(run.failed for run in self._runs)
+        return interruption.status if interruption.received else int(failed)
 
     def _submit(self) -> None:
         """Submits as many of the waiting runs as the executor takes.
@@ -135,111 +161,46 @@ class _Sweep:
         Raises:
             UserError: it takes none, and no run is left to wait for.
         """
-        workers = self._executor.workers
-        room = len(self._waiting) if workers is None else workers - len(self._running)
-        if room <= 0 or not self._waiting or time.monotonic() < self._submit_at:
+        batch = self._waiting[: max(self._most - len(self._running), 0)]
+        if not batch:
             return
-        batch, self._waiting = self._waiting[:room], self._waiting[room:]
         try:
             handles = self._executor.submit([run.task() for run in batch])
         except UserError as error:
             if not self._running:
                 raise
-            self._waiting = batch + self._waiting
-            self._submit_at = time.monotonic() + _AGAIN
-            self._progress.say(str(error))
+            self._most = len(self._running)  # the cluster takes no more at a time
+            self._say(str(error))
             return
-        self._running |= zip(batch, handles, strict=True)
+        del self._waiting[: len(batch)]
+        for run, handle in zip(batch, handles, strict=True):
+            bar = self._progress.add_task(run.name, total=run.config.episodes, visible=False)
+            self._running[run] = handle, bar
 
-    def _look(self) -> int:
-        """Updates the progress and returns the number of runs that have failed since."""
-        failed = 0
-        for run, handle in list(self._running.items()):
+    def _look(self) -> None:
+        """Updates the bars and removes the runs that have ended, then waits."""
+        for run, (handle, bar) in list(self._running.items()):
             status = self._executor.poll(handle)
             if status is None:
-                self._progress.follow(run)
+                episodes = run.episodes
+                self._progress.update(bar, completed=episodes, visible=episodes > 0)
                 continue
             del self._running[run]
             if not run.finished and not self._stopped:
-                said = lines_of(run.log)
-                run.failed = said[-1].strip() if said else f"exit status {status}"
-                failed += 1
+                said = run.log.read_text(errors="replace").split("\n") if run.log.exists() else []
+                run.failed = next(filter(str.strip, said[::-1]), f"exit status {status}").strip()
+            self._progress.remove_task(bar)
+            self._progress.advance(self._all)
             state = "failed" if run.failed else "finished" if run.finished else "stopped"
-            self._progress.end(run, state)
-        return failed
+            self._say(f"{run.name}: {state}")
+        if self._running:
+            time.sleep(_INTERVAL)
+
+    def _say(self, text: str) -> None:
+        """Prints a line above the bars."""
+        self._progress.console.print(f"  {text}", highlight=False, soft_wrap=True)
 
     def _stop(self) -> None:
         self._stopped = True
-        for handle in self._running.values():
+        for handle, _ in self._running.values():
             self._executor.cancel(handle)
-
-
-class _RunProgress(Progress):
-    """Shows a bar for all runs and one for each run that has begun, and prints those that end."""
-
-    def __init__(self, console: Console, total: int, done: int):
-        super().__init__(
-            TextColumn("{task.description}", markup=False),
-            BarColumn(bar_width=20),
-            TextColumn("{task.completed:.0f}/{task.total:.0f}"),
-            TimeElapsedColumn(),
-            console=console,
-        )
-        self._all = self.add_task("runs", total=total, completed=done)
-        self._bars: dict[Combination, TaskID] = {}
-
-    def follow(self, run: Combination) -> None:
-        """Shows the episodes of a run as soon as it has one."""
-        if episodes := run.episodes:
-            if run not in self._bars:
-                self._bars[run] = self.add_task(run.name, total=run.config.episodes)
-            self.update(self._bars[run], completed=episodes)
-
-    def end(self, run: Combination, state: str) -> None:
-        """Prints how a run ended and removes its bar."""
-        if run in self._bars:
-            self.remove_task(self._bars.pop(run))
-        self.advance(self._all)
-        self.say(f"{run.name}: {state}")
-
-    def say(self, text: str) -> None:
-        """Prints a line above the bars."""
-        self.console.print(f"  {text}", highlight=False, soft_wrap=True)
-
-
-def _print_table(runs: Sequence[Combination], console: Console) -> None:
-    """Prints the state and the folder of each run, and the last line of those that failed."""
-    table = Table("run", "state", "folder")
-    for run in runs:
-        state = "failed" if run.failed else run.state
-        table.add_row(run.name, state, run.folder.path.name if run.folder else "-")
-    console.print(table)
-    for run in runs:
-        if run.failed:
-            console.print(f"{run.name}: {run.failed} (log: {run.log})", soft_wrap=True)
-
-
-def status(output: Path, console: Console) -> int:
-    """Prints the state and the episodes of each run in an output folder.
-
-    Raises:
-        UserError: there is none.
-    """
-    table = Table("run", "state", "episodes")
-    for file in sorted(output.glob("*/config.yaml")):
-        folder = RunFolder(file.parent)
-        run = Combination("", folder.config(device="cpu"), (), folder)
-        table.add_row(folder.path.name, _state(run), f"{run.episodes}/{run.config.episodes}")
-    if not table.row_count:
-        raise UserError(f"{output}: holds no run")
-    console.print(table)
-    return 0
-
-
-def _state(run: Combination) -> str:
-    try:
-        if run.folder and (run.folder.path / "lock").exists():  # also after SIGKILL
-            Lock(run.folder.path).release()
-    except LockedError:
-        return "running"
-    return run.state

@@ -13,12 +13,13 @@ import signal
 import sys
 import threading
 import time
+from contextlib import suppress
 from pathlib import Path
 
 from emberlink.envs.utils.errors import UserError
 from emberlink.trainers.runs.lock import Lock, LockedError
 
-_PATIENCE = 60.0
+_PATIENCE = 60
 """seconds in which an earlier process of the run may save and end"""
 
 
@@ -29,15 +30,14 @@ def _end_with_parent() -> None:
 
 def _wait_for_lock(run: Path) -> None:
     """Waits while another process trains the run; `train` reports if it still does so then."""
-    deadline = time.monotonic() + _PATIENCE
-    while time.monotonic() < deadline:
-        try:
-            Lock(run).release()
-            break
-        except LockedError:
-            time.sleep(0.5)
-        except UserError:
-            break
+    for _ in range(_PATIENCE):
+        with suppress(UserError):
+            try:
+                Lock(run).release()
+            except LockedError:
+                time.sleep(1)
+                continue
+        return
 
 
 if __name__ == "__main__":

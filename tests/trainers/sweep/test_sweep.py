@@ -1,12 +1,12 @@
 """Tests emberlink sweep: every combination is trained once, and repeating it does what is left."""
 
 import os
+import re
 import signal
 import subprocess
 import sys
 import threading
 import time
-from contextlib import nullcontext
 
 import pytest
 import torch
@@ -19,8 +19,7 @@ from emberlink.trainers.runs.lock import Lock
 from emberlink.trainers.runs.run_folder import RunFolder
 from emberlink.trainers.sweep.combinations import combinations
 from emberlink.trainers.sweep.command import sweep
-from emberlink.trainers.sweep.executors.base import Executor, Task
-from emberlink.trainers.sweep.executors.registry import make
+from emberlink.trainers.sweep.executors.base import Executor, Task, make
 
 SMALL = [
     "setup=tuned",
@@ -51,17 +50,15 @@ def test_every_combination_once():
 
 
 def test_all_methods_by_default_and_keys_with_several_values_in_the_name():
-    swept = names(["learner=ippo,mappo", "policy.hold=1,2", "seed=1", "episodes=3"])
-    assert len({*swept}) == 5 * 4
-    assert swept[0] == "consensus, paper, paper, learner=ippo, policy.hold=1, seed 1"
+    swept = names(["learner=ippo,mappo", "seed=1", "episodes=3"])
+    assert len({*swept}) == 5 * 2
+    assert swept[0] == "consensus, paper, paper, learner=ippo, seed 1"
 
 
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
         ("seed=range(1,4)", [1, 2, 3]),
-        ("seed=choice(5,7)", [5, 7]),
-        ("seed=2", [2]),
         ("learner.hidden=[8,8],[4,4]", [(8, 8), (4, 4)]),
         ("learner.hidden=[8,4]", [(8, 4)]),
     ],
@@ -75,24 +72,17 @@ def test_values_follow_hydras_grammar(text, expected):
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["consensos"], "consensos"),
-        (["consensus", "seed=0,-1"], "seed"),
         (["consensus", "setup=paper,tunned"], "tunned"),
         (["consensus", "learner.gama=0.9,0.8"], "learner.gama"),
         (["consensus", *SMALL, "learner.warm_start=nowhere"], "learner.warm_start=nowhere: "),
         (["consensus", "seed=range(3,3)"], "no run: a key has no value"),
         (["consensus", "seed=interval(0,5)"], "seed=interval(0,5)"),
-        (["consensus", "--jobs", "0"], "--jobs"),
         (["consensus", "output=a,b"], "a sweep has one output folder"),
-        (["consensus", "executor=slurm"], "executor='slurm' is not known; known: local"),
-        (["consensus", "executor.workers=0"], "executor.workers=0"),
-        (["consensus", "executor.nodes=2"], "'executor.nodes' is not known"),
     ],
 )
 def test_errors_are_one_line_before_training(arguments, said, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(SystemExit) if "--jobs" in arguments else nullcontext():
-        assert main(["sweep", *arguments]) == 2
+    assert main(["sweep", *arguments]) == 2
     error = capsys.readouterr().err
     assert said in error
     assert error.count("\n") == 1
@@ -194,18 +184,6 @@ def test_a_failing_run_does_not_stop_the_others(tmp_path, capsys):
     assert "compare them with" not in said
 
 
-def test_yaml_files_that_change_during_a_sweep_do_not_change_its_runs(tmp_path, monkeypatch):
-    file = tmp_path / "mine" / "setup" / "own.yaml"
-    file.parent.mkdir(parents=True)
-    file.write_text("# @package _global_\ndefaults: [tuned]\nlearner: {gamma: 0.5}\n")
-    monkeypatch.setenv("EMBERLINK_CONFIGS", str(tmp_path / "mine"))
-    output = tmp_path / "runs"
-    (run,) = combinations(["independent", *SMALL, "setup=own", f"output={output}"])
-    file.write_text("# @package _global_\ndefaults: [tuned]\nlearner: {gamma: 0.6}\n")
-    run.task()
-    assert folders_in(output)[0].config().learner.gamma == 0.5
-
-
 def test_ctrl_c_cancels_what_runs_and_starts_nothing_else(tmp_path):
     class Interrupted(Instant):
         def poll(self, handle):
@@ -219,10 +197,16 @@ def test_ctrl_c_cancels_what_runs_and_starts_nothing_else(tmp_path):
     assert len(executor.tasks) == 2
 
 
-def test_dry_run_and_status_print_states(tmp_path, capsys):
+def states(capsys) -> list[tuple[str, str]]:
+    """Returns the states and episodes of the table that was printed."""
+    return re.findall(r"seed \d+\W+(\w+)\W+(\d+/\d+)", capsys.readouterr().out)
+
+
+def test_dry_run_and_status_print_states(tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "200")
     arguments = ["sweep", "independent", *SMALL, "seed=0,1", f"output={tmp_path}/runs"]
     assert main([*arguments, "--dry-run"]) == 0
-    assert "seed 1: new" in capsys.readouterr().out
+    assert states(capsys) == [("new", "0/15")] * 2
     assert not any(tmp_path.iterdir())
     assert main(["sweep", "status", str(tmp_path)]) == 2
     swept(tmp_path, "seed=0", "episodes=1")
@@ -232,8 +216,7 @@ def test_dry_run_and_status_print_states(tmp_path, capsys):
     capsys.readouterr()
     assert main(["sweep", "status", str(tmp_path / "runs")]) == 0
     lock.release()
-    states = [line.split()[1:] for line in capsys.readouterr().out.splitlines()[2:5]]
-    assert states == [["finished", "1/1"], ["unfinished", "0/15"], ["running", "0/15"]]
+    assert states(capsys) == [("finished", "1/1"), ("unfinished", "0/15"), ("running", "0/15")]
 
 
 OWN = """
@@ -305,7 +288,16 @@ def test_a_stopped_sweep_saves_and_the_same_command_completes_it(tmp_path):
 
 @pytest.mark.heavy
 def test_a_killed_sweep_ends_its_trainings(tmp_path):
-    command = [sys.executable, "-m", "emberlink.trainers.cli", "sweep", "independent", *TRAINED]
+    (tmp_path / "random.py").write_text("raise RuntimeError('modules here are not imported')\n")
+    command = [
+        sys.executable,
+        "-P",
+        "-m",
+        "emberlink.trainers.cli",
+        "sweep",
+        "independent",
+        *TRAINED,
+    ]
     process = subprocess.Popen([*command, "episodes=9999", "output=runs"], cwd=tmp_path)
     deadline = time.monotonic() + 120
     while not any(run.metrics() for run in folders_in(tmp_path / "runs")):

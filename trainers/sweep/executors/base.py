@@ -1,10 +1,10 @@
-"""Defines the base class of executors, which run the trainings of a sweep."""
+"""Defines the base class of executors, which run the trainings of a sweep, and finds them."""
 
 import os
 import subprocess
 import sys
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib.util import find_spec
 from pathlib import Path
@@ -12,7 +12,11 @@ from typing import Annotated, Any, ClassVar
 
 from pydantic import Field
 
-from emberlink.envs.utils.errors import UserError, how_to_install
+from emberlink.envs.utils.config_files import read
+from emberlink.envs.utils.errors import UserError, how_to_install, unknown
+from emberlink.envs.utils.plugins import Registry
+from emberlink.envs.utils.validation import from_plain
+from emberlink.trainers.config.values import check_not_removed, parse
 
 Positive = Annotated[int, Field(ge=1)]
 DIED = -9
@@ -96,11 +100,40 @@ class Executor(ABC):
         """Requests that a task saves and ends, without waiting; has no effect if it has ended."""
 
 
-def require(executor: str, package: str, extra: str) -> None:
-    """Checks that the package of an executor is installed.
+_OWN = {
+    "local": "trainers.sweep.executors.local:LocalExecutor",
+    "ray": "trainers.sweep.executors.ray:RayExecutor",
+    "submitit": "trainers.sweep.executors.submitit:SubmititExecutor",
+}
+_REGISTRY = Registry(Executor, "emberlink.executors", "executor", _OWN)
+known, find = _REGISTRY.known, _REGISTRY.find
+
+
+def make(arguments: Sequence[str]) -> Executor:
+    """Returns the executor of `executor=NAME` (`local` if missing) and `executor.KEY=VALUE`.
+
+    Raises:
+        UserError: the name or a key is not known, or a value is wrong.
+    """
+    given = dict(map(parse, arguments))
+    name = str(given.pop("executor", "local"))
+    executor = find(name)
+    values = {key: value for key, value in read("executor", name).items() if key != "name"}
+    for key, value in given.items():
+        _, first, *rest = key.split(".", 2)
+        if first not in values or (rest and not isinstance(values[first], Mapping)):
+            check_not_removed(key, value)
+            raise UserError(f"key {unknown(key, [f'executor.{known}' for known in values])}")
+        values[first] = {**values[first], rest[0]: value} if rest else value
+    config: Any = from_plain(executor.config_type, values, "executor")
+    return executor(config)
+
+
+def require(package: str, extra: str) -> None:
+    """Checks that the package of an executor, which has its name, is installed.
 
     Raises:
         UserError: it is not; the message says how to install emberlink's extra.
     """
     if find_spec(package) is None:
-        raise UserError(f"executor={executor}: {package} is not installed: {how_to_install(extra)}")
+        raise UserError(f"executor={package}: not installed: {how_to_install(extra)}")

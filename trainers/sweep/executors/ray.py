@@ -4,11 +4,11 @@ import os
 import signal
 import time
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from importlib import import_module
 from typing import Annotated, Any
 
-from pydantic import AfterValidator, Field
+from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from emberlink.envs.utils.errors import UserError
@@ -18,15 +18,7 @@ from emberlink.trainers.sweep.executors.base import DIED, Executor, Positive, Ta
 _STOPPED = 128 + signal.SIGTERM
 
 
-def _whole_above_1(value: float) -> float:
-    if value > 1 and value % 1:
-        raise UserError("expected a fraction of 1 or a whole number")
-    return value
-
-
-Part = Annotated[
-    float, Field(ge=0, strict=False, allow_inf_nan=False), AfterValidator(_whole_above_1)
-]
+Part = Annotated[float, Field(ge=0, strict=False, allow_inf_nan=False)]
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
@@ -41,7 +33,7 @@ class RayConfig:
     """GPUs of a run; a fraction shares one"""
     memory: Positive | None = None
     """bytes of a run"""
-    resources: dict[str, Annotated[Part, Field(gt=0)]] = Field(default_factory=dict)
+    resources: dict[str, Part] = Field(default_factory=dict)
     """other resources of a run"""
     restarts: CountOrZero = 3
     """how often a run is started again after its node died"""
@@ -68,21 +60,33 @@ class RayExecutor(Executor):
     config_type = RayConfig
 
     def __init__(self, config: RayConfig):
-        require("ray", "ray", "ray")
+        require("ray", "ray")
         self.workers = config.workers
         self._config = config
 
     def submit(self, tasks: Sequence[Task]) -> Sequence[Any]:
         ray, config = import_module("ray"), self._config
-        self._connect()
-        train = ray.remote(_train).options(
-            num_cpus=config.cpus,
-            num_gpus=config.gpus,
-            memory=config.memory,
-            resources=config.resources,
-            max_retries=config.restarts,
-        )
-        return [train.remote(task, config.cpus) for task in tasks]
+        path = os.environ.get("PYTHONPATH")
+        try:
+            if not ray.is_initialized():
+                ray.init(
+                    config.address,
+                    log_to_driver=False,
+                    logging_level="ERROR",
+                    runtime_env={"env_vars": {"PYTHONPATH": path}} if path else None,
+                )
+                self._check_nodes(ray.nodes())
+            train = ray.remote(_train).options(
+                num_cpus=config.cpus,
+                num_gpus=config.gpus,
+                memory=config.memory,
+                resources=config.resources,
+                max_retries=config.restarts,
+            )
+            return [train.remote(task, config.cpus) for task in tasks]
+        except (ConnectionError, ValueError, RuntimeError) as error:
+            text = " ".join(str(error).split())[:200]
+            raise UserError(f"executor=ray executor.address={config.address}: {text}") from None
 
     def poll(self, handle: Any) -> int | None:
         ray = import_module("ray")
@@ -98,29 +102,12 @@ class RayExecutor(Executor):
     def cancel(self, handle: Any) -> None:
         import_module("ray").cancel(handle, force=False)
 
-    def _connect(self) -> None:
-        """Connects to the cluster, and warns if no node is large enough for a run.
-
-        Raises:
-            UserError: there is none at the address.
-        """
-        ray, config = import_module("ray"), self._config
-        if ray.is_initialized():
-            return
-        path = os.environ.get("PYTHONPATH")
-        try:
-            ray.init(
-                config.address,
-                log_to_driver=False,
-                logging_level="ERROR",
-                runtime_env={"env_vars": {"PYTHONPATH": path}} if path else None,
-            )
-        except (ConnectionError, ValueError, RuntimeError) as error:
-            text = " ".join(str(error).split())[:200]
-            raise UserError(f"executor.address={config.address}: {text}") from None
+    def _check_nodes(self, nodes: Sequence[Mapping[str, Any]]) -> None:
+        """Warns if no node is large enough for a run, which would wait for one."""
+        config = self._config
         wanted = {"CPU": config.cpus, "GPU": config.gpus, "memory": config.memory or 0}
         wanted = {key: value for key, value in {**wanted, **config.resources}.items() if value}
-        nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
-        if not any(all(node.get(k, 0) >= v for k, v in wanted.items()) for node in nodes):
+        alive = [node["Resources"] for node in nodes if node["Alive"]]
+        if not any(all(node.get(k, 0) >= v for k, v in wanted.items()) for node in alive):
             text = ", ".join(f"{key}={value:g}" for key, value in wanted.items())
             warnings.warn(f"executor=ray: no node has {text}; the runs wait for one", stacklevel=2)
