@@ -1,7 +1,9 @@
 """Runs `emberlink world check`: plays scripted policies and tests the conditions of a world."""
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+import operator
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -39,7 +41,7 @@ _METHOD = "independent"  # any method; scripted policies do not depend on it
 
 @dataclass(frozen=True)
 class Condition:
-    """A bound on one figure or several of a world, of which one suffices."""
+    """A bound that at least one figure of a world has to keep."""
 
     name: str
     """the policies that are measured"""
@@ -52,9 +54,8 @@ class Condition:
     @property
     def passes(self) -> bool:
         """Whether at least one of the figures keeps the bound."""
-        if self.at_most:
-            return any(number <= self.bound for number in self.figures.values())
-        return any(number >= self.bound for number in self.figures.values())
+        keeps = operator.le if self.at_most else operator.ge
+        return any(keeps(number, self.bound) for number in self.figures.values())
 
     def __str__(self) -> str:
         figures = "; ".join(f"{name} {number:.1f}" for name, number in self.figures.items())
@@ -88,7 +89,8 @@ def world_config(overrides: Sequence[str]) -> RunConfig:
     """Returns the configuration of a world: `world=NAME` and other `key=value`.
 
     Raises:
-        UserError: a key or value is wrong, or the headline is not a share.
+        UserError: a key or value is wrong, the headline is not a share, or the world does not
+            evaluate all needed policies.
     """
     config = resolve(_METHOD, overrides)
     headline = config.evaluation.headline
@@ -97,6 +99,9 @@ def world_config(overrides: Sequence[str]) -> RunConfig:
             f"world {config.world}: evaluation.headline={headline} is not a share in %; "
             f"known: {', '.join(SHARES)}"
         )
+    policies = config.evaluation.scripted
+    if lacking := [name for name in (RANDOM, ALONE, ALL, ORACLE) if name not in policies]:
+        raise UserError(f"world {config.world}: evaluation.scripted lacks {', '.join(lacking)}")
     return config
 
 
@@ -122,8 +127,8 @@ def played(
         arrival = scenario.test(fires, world.grid, world.horizon)
         return play_scripted(config, policy, arrival, report=report)
     arrival = scenario.validation(fires, world.grid, world.horizon)
-    start, block = VALIDATION_START_SEED, min(fires, BLOCK)
-    return play_scripted(config, policy, arrival, start_seed=start, block=block, report=report)
+    seeds = {"start_seed": VALIDATION_START_SEED, "block": min(fires, BLOCK)}
+    return play_scripted(config, policy, arrival, **seeds, report=report)
 
 
 def check(
@@ -147,7 +152,7 @@ def check(
         0 if all worlds satisfy all conditions, else 1.
 
     Raises:
-        UserError: a world or a key is wrong, or a world lacks a policy or a measure.
+        UserError: a world or a key is wrong, or a world lacks a policy.
     """
     if output is not None:
         new_file(output, [".json"])
@@ -156,15 +161,9 @@ def check(
         raise UserError("world=NAME: the worlds are given without a key here")
     names = [text for text in arguments if text not in overrides] or suite(console)
     configs = [world_config([f"world={name}", *overrides]) for name in dict.fromkeys(names)]
-    for config in configs:
-        if lacking := _lacking(config.evaluation.scripted):
-            raise UserError(f"world {config.world}: {lacking}")
     record = {}
     for config in configs:
-
-        def say(policy: str, world: str = config.world) -> None:
-            console.print(f"  {world}: {policy} plays", style="dim")
-
+        say = partial(console.print, f"  {config.world} is played by", style="dim")
         measured = {
             policy: means(played(config, policy, fires=fires, split=split, report=say))
             for policy in to_play(config.evaluation.scripted)
@@ -177,8 +176,8 @@ def check(
         numbers = {"fires": fires, "split": split, "headline": config.evaluation.headline}
         record[config.world] = numbers | _record(measured, found)
     if output is not None:
-        with created(output) as partial:
-            partial.write_text(compact_json.dumps(record) + "\n", encoding="utf-8")
+        with created(output) as file:
+            file.write_text(compact_json.dumps(record) + "\n", encoding="utf-8")
     passing = sum(world["passes"] for world in record.values())
     console.print(f"{passing} of {len(record)} worlds pass")
     return int(passing < len(record))
@@ -189,20 +188,11 @@ def suite(console: Console) -> list[str]:
     names = []
     for name in known("world"):
         try:
-            lacking = _lacking(world_config([f"world={name}"]).evaluation.scripted)
-        except UserError as error:
-            lacking = str(error)
-        if lacking:
-            console.print(f"note: world {name} is left out: {lacking}", soft_wrap=True)
-        else:
+            world_config([f"world={name}"])
             names.append(name)
+        except UserError as error:
+            console.print(f"note: {name} is left out: {error}", soft_wrap=True)
     return names
-
-
-def _lacking(policies: Collection[str]) -> str:
-    """Returns which of the needed policies a world does not evaluate; empty if none."""
-    lacking = [name for name in (RANDOM, ALONE, ALL, ORACLE) if name not in policies]
-    return f"evaluation.scripted lacks {', '.join(lacking)}" if lacking else ""
 
 
 def _table(config: RunConfig, measured: Means, fires: str) -> Table:
@@ -219,20 +209,20 @@ def _table(config: RunConfig, measured: Means, fires: str) -> Table:
 
 def _record(measured: Means, found: Sequence[Condition]) -> dict[str, Any]:
     """Returns the conditions and means of a world for JSON."""
-
-    def rounded(figures: Mapping[str, float]) -> dict[str, float]:
-        return {name: round(number, 3) for name, number in figures.items()}
-
     return {
         "passes": all(condition.passes for condition in found),
         "conditions": [
             {
                 "policies": condition.name,
-                "figures": rounded(condition.figures),
+                "figures": _rounded(condition.figures),
                 "at_most" if condition.at_most else "at_least": condition.bound,
                 "passes": condition.passes,
             }
             for condition in found
         ],
-        "means": {policy: rounded(of_policy) for policy, of_policy in measured.items()},
+        "means": {policy: _rounded(of_policy) for policy, of_policy in measured.items()},
     }
+
+
+def _rounded(figures: Mapping[str, float]) -> dict[str, float]:
+    return {name: round(number, 3) for name, number in figures.items()}

@@ -35,6 +35,7 @@ def test_settings_that_are_texts_keep_their_form(monkeypatch):
     monkeypatch.setattr(submitit, "require", lambda *_: None)
     texts = ["account=007", "memory=4G", "options.qos=low", "partition=12", "workers=9"]
     made = base.make(["executor=submitit", *(f"executor.{text}" for text in texts)])
+    assert isinstance(made, submitit.SubmititExecutor)
     config = made._config
     assert (config.account, config.memory, config.partition) == ("007", "4G", "12")
     assert (config.options, made.workers) == ({"qos": "low"}, 9)

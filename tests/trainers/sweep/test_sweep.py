@@ -261,7 +261,7 @@ def test_a_stopped_sweep_saves_and_the_same_command_completes_it(tmp_path):
     arguments = ["consensus", *TRAINED, "episodes=6", "fire.num_train_fires=2"]
 
     def stop() -> None:
-        deadline = time.monotonic() + 120
+        deadline = time.monotonic() + 300
         while time.monotonic() < deadline:
             if any(1 <= len(run.metrics()) < 5 for run in folders_in(tmp_path / "a")):
                 os.kill(os.getpid(), signal.SIGINT)
@@ -299,7 +299,7 @@ def test_a_killed_sweep_ends_its_trainings(tmp_path):
         *TRAINED,
     ]
     process = subprocess.Popen([*command, "episodes=9999", "output=runs"], cwd=tmp_path)
-    deadline = time.monotonic() + 120
+    deadline = time.monotonic() + 300
     while not any(run.metrics() for run in folders_in(tmp_path / "runs")):
         assert time.monotonic() < deadline
         time.sleep(0.1)
