@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 
 CHANNELS = ("fire", "seen", "burnt_out", "near", "age", "outside", "uavs", "base")
-"""what the channels of a picture show, see `Crops`"""
+"""names of a picture's channels, see `Crops`"""
 LARGEST_SCALE = 16
 """cells along the side of a pixel; sums over a pixel fit into the bits of a field"""
 _FULL = 255
@@ -66,7 +66,7 @@ class Crops(nn.Module):
         super().__init__()
         self.grid, self.pixels, self.scales, self.spread = grid, pixels, tuple(scales), spread
         fields = []
-        ages = range(min(horizon, int(_OLD)) + 2)  # the bytes of older ones are those of the last
+        ages = range(min(horizon, int(_OLD)) + 2)  # older looks have the bytes of the last age
         for age in ages:
             old, chance = age_byte(age) << _AGE, chance_byte(age) << _NEAR
             never = (_FULL << _AGE) + (_FULL << _NEAR)
@@ -90,13 +90,13 @@ class Crops(nn.Module):
         """Returns the pictures, uint8 [rows, *shape].
 
         Args:
-            known: integers [rows, X, Y], 4 times the step of the last look plus what was seen (0 no
-                fire, 1 fire, 2 burnt out), -1 for never.
+            known: integers [rows, X, Y], 4 times the step of the last look plus the cell's state
+                then (0 no fire, 1 fire, 2 burnt out), -1 for never.
             seen: bool [rows, X, Y], whether a cell was seen while it burned.
             step: int64 [rows], steps since the episode began.
             centre: int64 [rows, 2], the cell nearest to the UAV.
-            points: cells of other UAVs, int64 [rows, k, 2], the step at which they are known,
-                int64 [rows, k], -1 for never, and the cell of the base, int64 [rows, 0 or 1, 2].
+            points: cells of other UAVs, int64 [rows, k, 2], the step at which they are known, int64
+                [rows, k], -1 for never, and the cell of the base, int64 [rows, 0 or 1, 2].
         """
         block = max(1, _DRAWN // (self.grid[0] * self.grid[1]))
         parts = zip(*(x.split(block) for x in (known, seen, step, centre, *points)), strict=True)
@@ -166,14 +166,7 @@ class Crops(nn.Module):
     def _marks(
         self, cell: Tensor, value: Tensor, centre: Tensor, edges: Tensor, scale: int
     ) -> Tensor:
-        """Returns a channel with the largest value of the points in each pixel, [rows, S, S].
-
-        Args:
-            cell: int64 [rows, k, 2].
-            value: int64 [rows, k].
-            centre: int64 [rows, 1, 2].
-            edges, scale: of the pixels.
-        """
+        """Returns a channel with the largest value of the points in each pixel, [rows, S, S]."""
         pixel = torch.div(cell - centre - edges[0], scale, rounding_mode="floor")
         shown = ((pixel >= 0) & (pixel < self.pixels)).all(-1)
         x, y = pixel.clamp(0, self.pixels - 1).unbind(-1)

@@ -1,4 +1,4 @@
-"""Passes on maps and positions: what UAVs say, within a limit of bytes, and who knows it then."""
+"""Passes on maps and positions between UAVs, within a limit of bytes."""
 
 from typing import NamedTuple
 
@@ -9,39 +9,29 @@ from emberlink.envs.world.coverage_map import View
 from emberlink.envs.world.knowledge import Knowledge
 
 OLD = 100
-"""steps; a look that is newer by more is not worth more"""
+"""largest gain of a look for one hearer, steps"""
 _COMPARED = 2**11
 """pairs of maps that are compared at a time"""
 
 
 class News(NamedTuple):
-    """The cells that are new to UAVs in range of the speaker.
-
-    Entries of maps, [envs, n, area], are given by their index in the flat array.
-    """
+    """The cells that are new to UAVs in range, as indices into flat maps [envs * n * area]."""
 
     told: Tensor
-    """int64 [k], the entries of the speakers; ascend"""
+    """int64 [k], entries of the speakers' maps, sorted"""
     row: Tensor
-    """int64 [m], which of these is new to a UAV in range; ascends"""
+    """int64 [m], index into `told`, sorted"""
     theirs: Tensor
-    """int64 [m], the entry of the UAV to which it is new"""
+    """int64 [m], entry of the hearer's map"""
 
 
 def cell_bytes(horizon: int) -> int:
-    """Returns the bytes of a message about a cell.
-
-    They hold the index of the cell (2 bytes), the step of the last look, and what was seen (1
-    byte).
-    """
+    """Returns the bytes of a message about a cell: index (2), step of the last look, state (1)."""
     return 2 + _bytes_of_step(horizon) + 1
 
 
 def place_bytes(horizon: int) -> int:
-    """Returns the bytes of a message about a position.
-
-    They hold a UAV (2 bytes), a step, and three float32 numbers.
-    """
+    """Returns the bytes of a message about a position: UAV (2), step, three float32 numbers."""
     return 2 + _bytes_of_step(horizon) + 12
 
 
@@ -54,7 +44,7 @@ def pass_on_places(
 ) -> Tensor:
     """Passes on the positions that UAVs know of each other, in place.
 
-    A UAV says a position if one of those in range knows an older one or none.
+    A UAV says a position if a UAV in range knows an older one or none.
 
     Args:
         stamp: int64 [envs, n, n], the step at which a UAV (row) knows the position of another one
@@ -83,8 +73,8 @@ class CellMessages(nn.Module):
     """Passes on the cells of maps.
 
     A UAV says a cell if a UAV in range has no look at it, has an older one, or does not know that
-    it was seen while it burned. A map holds 4 times the step of the last look plus what was
-    seen (1 for fire), -1 for never.
+    it was seen while it burned. A map holds 4 times the step of the last look plus the cell's state
+    then (1 for fire), -1 for never.
 
     Between UAVs in contact, a cell can be new only if a UAV saw it at this step, was told it at the
     step before, had no bytes left to say it, or said it without being heard. So whole maps are
@@ -100,7 +90,7 @@ class CellMessages(nn.Module):
     fresh: Tensor
     """bool [envs, uavs, area]: cells that may be new to UAVs in range"""
     heard: Tensor
-    """bool [envs, uavs, uavs]: whom each UAV was in range of at the step before"""
+    """bool [envs, uavs, uavs]: links without losses at the step before"""
     _shift: Tensor
 
     def __init__(self, envs: int, uavs: int, area: int, size: int):
@@ -125,7 +115,7 @@ class CellMessages(nn.Module):
         flat.scatter_reduce_(0, index, view.in_view.flatten().view(torch.uint8), "amax")
 
     def compare(self, known: Knowledge, near: Tensor) -> News:
-        """Returns what is new to UAVs in range.
+        """Returns the cells that are new to UAVs in range.
 
         Args:
             known: the maps.
@@ -160,13 +150,13 @@ class CellMessages(nn.Module):
         news: News,
         chosen: Tensor | None = None,
     ) -> Tensor:
-        """Changes the maps of those that hear others.
+        """Passes on the new cells: updates the maps of the hearers.
 
         Args:
             known: the maps.
             near: bool [envs, n, n], whether a UAV (row) is in range of another one (column).
-            hears: bool [envs, n, n], of these, who hears the other one: no message is lost.
-            news: what `compare` returned.
+            hears: bool [envs, n, n], the links of `near` on which no message is lost.
+            news: the new cells, from `compare`.
             chosen: bool [envs, n, area], which of the new cells a UAV says; None for all.
 
         Returns:
@@ -198,16 +188,7 @@ class CellMessages(nn.Module):
 
 
 def _heard_by(near: Tensor, told: Tensor, area: int) -> tuple[Tensor, Tensor]:
-    """Returns the entries of UAVs that are in range of speakers.
-
-    Args:
-        near: bool [envs, n, n], whether a UAV (row) is in range of another one (column).
-        told: int64 [k], entries of the speakers, see `News`.
-        area: cells of a map.
-
-    Returns:
-        For each UAV in range, which of the k entries it can hear, and its entry, int64 [m] each.
-    """
+    """Returns, for each hearer of an entry in `told`, the index into `told` and its own entry."""
     _, speaker, hearer = near.transpose(1, 2).nonzero(as_tuple=True)
     shift = (hearer - speaker) * area
     count = near.sum(1).view(-1)
@@ -218,20 +199,15 @@ def _heard_by(near: Tensor, told: Tensor, area: int) -> tuple[Tensor, Tensor]:
 
 
 def _is_new(told: tuple[Tensor, Tensor], theirs: tuple[Tensor, Tensor]) -> Tensor:
-    """Returns whether what is told is newer than what others know, or tells of fire new to them.
-
-    Args:
-        told, theirs: maps of the speakers and of the others, integers, and whether cells were seen
-            while they burned, bool.
-    """
+    """Returns whether a look, (map, seen fire), is newer or the first one in flames."""
     return (told[0] > theirs[0]) | (told[1] > theirs[1])
 
 
 class Offers(NamedTuple):
-    """The new cells of UAVs, those of the highest gain first: int64 [envs, n, k] each."""
+    """The new cells of UAVs by falling gain: int64 [envs, n, k] each."""
 
     gain: Tensor
-    """steps by which the looks of those in range get newer; 0 behind the last cell"""
+    """steps by which hearers' looks get newer, see `offers`; 0 behind the last cell"""
     cell: Tensor
 
 
@@ -245,7 +221,7 @@ def offers(known: Knowledge, news: News, most: int) -> Offers:
 
     Args:
         known: the maps.
-        news: what `CellMessages.compare` returned.
+        news: the new cells, from `CellMessages.compare`.
         most: number of cells.
     """
     last, seen = known.last_seen, known.seen_fire
@@ -271,7 +247,7 @@ def offers(known: Knowledge, news: News, most: int) -> Offers:
 def place_gain(stamp: Tensor, near: Tensor) -> Tensor:
     """Returns the steps by which positions get newer, int64 [envs, n, n].
 
-    They are summed over the UAVs in range of the speaker (row).
+    Summed over the UAVs in range of the speaker (row).
 
     Args:
         stamp: int64 [envs, n, n], the step at which a UAV (row) knows the position of another one
@@ -293,13 +269,13 @@ def said_within(
 
     Args:
         limit: bytes of a UAV.
-        cells: the new cells; those that fit if there are no positions, or more.
+        cells: the new cells, at least as many as fit into `limit`.
         places: int64 [envs, n, n], from `place_gain`, 0 for a position that is not new.
         area: number of cells.
         sizes: bytes of a cell and of a position.
 
     Returns:
-        Masks of what is said, bool [envs, n, area] and [envs, n, n].
+        Masks of the cells and positions said, bool [envs, n, area] and [envs, n, n].
     """
     cell, place = sizes
     uavs = torch.arange(area, area + places.shape[-1], device=places.device)
@@ -310,7 +286,7 @@ def said_within(
     is_place &= (place * is_place + cell * is_cell).cumsum(-1) <= limit
     left = limit - place * is_place.sum(-1, keepdim=True)
     is_cell &= cell * is_cell.cumsum(-1) <= left
-    # What is not said is written behind the last entry.
+    # Cells that are not said are written behind the last entry.
     entries = area + len(uavs)
     index = torch.where(is_place | is_cell, index, entries)
     shape = *gain.shape[:2], entries + 1

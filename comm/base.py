@@ -41,8 +41,7 @@ class CommModule(TensorDictModuleBase):
     heeds_bandwidth: ClassVar[bool] = False
     """whether UAVs say no more than `env.radio.bandwidth`; if not, a limit causes a warning"""
     units: ClassVar[tuple[str, ...]] = ()
-    """settings that change what the numbers of an observation mean; if they are not those of the
-    training, an evaluation warns"""
+    """settings that define the observation's units; an evaluation with other values warns"""
     hold: int = 1
     """steps from one decision of the policy to the next (`policy.hold`); between them, no policy
     reads observations"""
@@ -74,7 +73,7 @@ class CommModule(TensorDictModuleBase):
     def shaping(self, tensordict: TensorDictBase) -> Tensor | None:
         """Returns a term to add to the reward of a step, float32 [num_envs, n], or None.
 
-        It is called before `forward`, when the state is still that of the previous time step.
+        Called before `forward`, with the state of the previous time step.
 
         Args:
             tensordict: the time step after the move, before `forward`.
@@ -82,7 +81,7 @@ class CommModule(TensorDictModuleBase):
         return None
 
     def steer(self, tensordict: TensorDictBase) -> Tensor | None:
-        """Returns the actions that the UAVs perform, float32 [num_envs, n, 3].
+        """Returns the actions to perform, float32 [num_envs, n, 3]; None keeps the policy's.
 
         It is called before each step, with the state of the last `forward`. The learner learns from
         the action of the policy, which does not change. Scripted policies are evaluated without a
@@ -90,9 +89,6 @@ class CommModule(TensorDictModuleBase):
 
         Args:
             tensordict: has ("agents", "action"), and not always the rest of the time step.
-
-        Returns:
-            The actions; None for those of the policy.
         """
         return None
 

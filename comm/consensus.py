@@ -48,7 +48,7 @@ class ConsensusConfig:
     agree: bool = True
     """whether sub-networks reach consensus; if not, a UAV knows only discoverers that it hears"""
     follow: Literal["best", "nearest"] = "best"
-    """the known discoverer that a UAV follows: the one of highest rank, or the nearest"""
+    """whether a UAV follows the known discoverer of highest rank or the nearest"""
     wander: bool = True
     """whether wanderers get random targets; if not, a wanderer's target is its own position"""
     redraw: Annotated[int, Field(ge=1, le=1_000_000)] | None = None
@@ -84,7 +84,7 @@ class Consensus(CommModule):
     leaderless: Tensor
     """bool [num_envs, n]: whether a UAV was a wanderer at the previous time step"""
     old_fire_only: Tensor
-    """bool [num_envs, n]: whether a UAV was then a discoverer that saw no new fire"""
+    """bool [num_envs, n]: whether a UAV was a discoverer without new fire at that step"""
 
     def __init__(self, world: WildfireConfig, config: ConsensusConfig, num_envs: int = 1):
         super().__init__(world, config, num_envs)
@@ -155,7 +155,8 @@ class Consensus(CommModule):
     def bytes_sent(self, tensordict: TensorDictBase) -> Tensor:
         """Returns 16 for each record of a discoverer that a UAV sends, int64 [num_envs, n].
 
-        A discoverer sends its own record. Others pass on those that they know, if they `agree`.
+        A discoverer sends its own record. Other UAVs pass on the records that they know, if they
+        `agree`.
         """
         discovers = self._discovers(tensordict)
         known = known_discoverers(tensordict.get(keys.HEARS), discovers, agree=self.config.agree)
@@ -211,7 +212,7 @@ class Consensus(CommModule):
         return self._jittered(tensordict, target) if self.config.jitter else target
 
     def _redraw_key(self, tensordict: TensorDictBase) -> Tensor:
-        """Returns the random key of new waypoints; at step 0 it differs from that of `reset`."""
+        """Returns the random key of new waypoints; differs from the key of `reset` at step 0."""
         step = tensordict.get(keys.STEP)
         use = Use.WAYPOINT + (step == 0) * (Use.FIRST_WAYPOINT_REDRAW - Use.WAYPOINT)
         return counter_rng.step_key(tensordict.get(keys.RNG_KEY), step, use)

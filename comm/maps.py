@@ -1,4 +1,4 @@
-"""Keeps maps of what UAVs know, which they exchange by radio and look at."""
+"""Keeps a belief map per UAV, exchanged by radio and observed as pictures."""
 
 from typing import Annotated, Any, ClassVar
 
@@ -53,13 +53,13 @@ class MapsConfig:
 
 
 class Maps(CommModule):
-    """Keeps a map per UAV of what it saw and was told, and shows it to the UAV as pictures.
+    """Keeps a belief map per UAV and shows it to the UAV as pictures.
 
-    At each step, a UAV says to those in range the cells, and the positions of UAVs, that are new to
-    one of them. With a limit of bytes, it says what is worth most first. It can pass on what it
-    hears at the next step. A UAV observes its altitude, the time and pictures of its own map
-    (`Crops`). With a limit, a sender chooses by the maps of all UAVs in range, so what one of them
-    receives may depend on the maps of the others.
+    At each step, a UAV sends the cells and the positions of UAVs that are new to a UAV in range;
+    received messages are passed on at the next step. With a limit of bytes, the highest gain is
+    sent first. A UAV observes its altitude, the time and pictures of its map (`Crops`). With a
+    limit, a sender chooses by the maps of all UAVs in range, so what one of them receives may
+    depend on the maps of the others.
 
     With `home` and a base, a UAV leaves for its place in a chain of radios from the base to the
     fire that it knows when it would otherwise come too late (`steer`).
@@ -95,7 +95,7 @@ class Maps(CommModule):
         self.register_buffer("high", high, persistent=False)
         self.sensor = Sensor.of(world)
         uavs, area = world.num_uavs, self.sensor.area
-        # Steps are stored times 4, plus what was seen.
+        # Stored: 4 * step + state of the cell.
         last = 4 * world.horizon + 3
         self.known = Knowledge(envs=num_envs, uavs=uavs, area=area, horizon=last, fires=True)
         size = cell_bytes(world.horizon)
@@ -158,14 +158,14 @@ class Maps(CommModule):
         """Returns the last look of each UAV at each cell, as it knows it.
 
         Returns:
-            The step, int64 [num_envs, n, X, Y], -1 for never, and what was seen: 0 no fire, 1 fire,
-            2 burnt out; 3 for never.
+            The step, int64 [num_envs, n, X, Y], -1 for never, and the cell's state then: 0 no fire,
+            1 fire, 2 burnt out; 3 for never.
         """
         known = self.sensor.crop(self.known.last_seen).long()
         return known >> 2, known & 3
 
     def _look(self, tensordict: TensorDictBase) -> None:
-        """Adds what each UAV sees, and where it is, to what it knows."""
+        """Adds each UAV's view and position to its maps."""
         position, step = tensordict.get(keys.POSITION), tensordict.get(keys.STEP)
         sight = tensordict.get(keys.SIGHT).flatten(-2)
         cells = self.sensor.look(position.double(), self._start)[1]
@@ -180,7 +180,7 @@ class Maps(CommModule):
         self.place.diagonal(dim1=1, dim2=2).copy_(position.mT)
 
     def _talk(self, tensordict: TensorDictBase) -> None:
-        """Passes on what is new to those in range, and counts the bytes."""
+        """Exchanges messages between UAVs in range, and counts the bytes."""
         near = hears = tensordict.get(keys.HEARS)
         settings, limit = self.world.radio, self.world.radio.bandwidth
         if settings.loss:
@@ -237,10 +237,7 @@ class Maps(CommModule):
         return torch.cat((place, reach.unsqueeze(-1)), -1)
 
     def _vector(self, tensordict: TensorDictBase) -> Tensor:
-        """Returns altitude, time, and what else is wanted, float32 [num_envs, n, k].
-
-        The box is scaled to [-1, 1], the horizon to [0, 1].
-        """
+        """Returns scaled altitude, time and, if wanted, x and y, float32 [num_envs, n, k]."""
         scaled = motion.scale_to_box(tensordict.get(keys.POSITION), self.low, self.high)
         clock = tensordict.get(keys.STEP).float().view(-1, 1, 1) / self.world.horizon
         parts = [scaled[..., 2:], clock.expand(-1, scaled.shape[1], 1)]
@@ -264,8 +261,8 @@ def steer_home(
 ) -> Tensor:
     """Returns the actions of a step: home, if a UAV that flies on would come too late.
 
-    A UAV has to be home, and at the ceiling, 15 steps before the end and from then on. The two are
-    decided apart from each other: the action along x and y, and that along z.
+    A UAV has to be home, and at the ceiling, 15 steps before the end and from then on. The action
+    over the ground and the action along z are decided independently.
 
     Args:
         world: the world and the team.

@@ -19,7 +19,7 @@ class PositionalConfig:
     """Stores the settings under `comm`."""
 
     own_first: bool = False
-    """whether a UAV's own vector comes first, then those of the next UAVs, 0 after the last"""
+    """whether UAV k observes the vectors in the order k, k + 1, ..., n - 1, 0, ..., k - 1"""
 
 
 class Positional(CommModule):
@@ -36,7 +36,7 @@ class Positional(CommModule):
 
     _own: Tensor
     _order: Tensor
-    """int64 [n * n]: of all pairs of an observer and a UAV, numbered in order, the order shown"""
+    """int64 [n * n]: order in which pairs (observer, UAV) are shown with `own_first`"""
 
     def __init__(self, world: WildfireConfig, config: PositionalConfig, num_envs: int = 1):
         super().__init__(world, config, num_envs)
@@ -66,6 +66,6 @@ class Positional(CommModule):
         return tensordict.set(keys.OBSERVATION, joined.flatten(-2))
 
     def bytes_sent(self, tensordict: TensorDictBase) -> Tensor:
-        """Returns 24 for each UAV: the six float32 numbers of its own vector."""
+        """Returns 24 for each UAV: the six float32 numbers of its vector."""
         links = tensordict.get(keys.HEARS)
         return torch.full_like(links[..., 0], 4 * len(keys.FEATURES), dtype=torch.int64)

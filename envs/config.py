@@ -30,7 +30,7 @@ class RewardConfig:
     no_fire: Number = -10.0
     """per cell in view that does not burn"""
     base: Number = 0.0
-    """per cell of which the base learns that it burned, to each UAV whose messages arrive there"""
+    """per burnt cell new to the base, to each UAV whose messages arrive there"""
     exit: Number = -100.0
     """replaces the reward for cells and news in a step whose move would have left the box"""
     exit_axes: Literal["xyz", "xy"] = "xyz"
@@ -80,8 +80,8 @@ class WildfireConfig:
     displacement: Annotated[float, Field(gt=0, le=256)] = 1.0
     """cells per unit of action"""
     observation: Literal["vector", "window", "sight"] = "vector"
-    """six numbers per UAV, or also the classes of the cells in view (see `keys.WINDOW`), or what
-    the camera shows, for methods that keep maps (see `keys.SIGHT`)"""
+    """six numbers per UAV; `window` adds the classes of the cells in view (`keys.WINDOW`), `sight`
+    the camera's picture for methods that keep maps (`keys.SIGHT`)"""
     observation_scale: Literal["raw", "box"] = "raw"
     """cells and steps as they are, or scaled: the box to [-1, 1], the horizon to [0, 1]"""
     reward: RewardConfig = RewardConfig()
@@ -131,7 +131,7 @@ class WildfireConfig:
 
 
 def check_grid(grid: tuple[int, int]) -> None:
-    """Checks that each side of a grid has a number of cells that fires are made and read for.
+    """Checks that each side of a grid has a supported number of cells, see `SIDES`.
 
     Raises:
         UserError: a side has fewer or more.

@@ -19,10 +19,10 @@ fire in view, by x and y offset from the cell nearest to the UAV, which is in th
 outside of the grid and of the field of view. W is odd and fits the view from the highest altitude.
 Only with `observation: window`."""
 SIGHT: Final = (AGENTS, "sight")
-"""uint8 [..., W, W]: what the camera shows of the same cells: 0 nothing, 1 no fire, 2 fire, 3 burnt
-out. It holds nothing of what others have seen. Only with `observation: sight`."""
+"""uint8 [..., W, W]: the camera's view of the same cells: 0 not in view, 1 no fire, 2 fire, 3 burnt
+out; without other UAVs' sightings. Only with `observation: sight`."""
 CROPS: Final = (AGENTS, "crops")
-"""uint8 [..., scales, channels, S, S]: pictures of what the UAV knows, around it. Written by
+"""uint8 [..., scales, channels, S, S]: pictures of the UAV's belief map around it. Written by
 communication."""
 ACTION: Final = (AGENTS, "action")
 """float32 [..., 3] in [-1, 1]: a displacement in x, y and z."""
@@ -72,8 +72,7 @@ if it was not seen since; over all burning cells and steps so far. Only with `me
 FRONT_AGE_P95: Final = "front_age_p95"
 """float32 [num_envs]: 95th percentile of the same steps. Only with `measures: all`."""
 BASE_SEEN: Final = "base_seen"
-"""int64 [num_envs]: cells of which the base has a sighting made while they burned. Only with a
-base."""
+"""int64 [num_envs]: cells with a sighting in flames known to the base. Only with a base."""
 BASE_AGE: Final = "base_age"
 """float32 [num_envs]: as `FRONT_AGE`, with the last sighting that the base has. Only with a
 base."""
@@ -81,7 +80,7 @@ TRUE_MAP: Final = "true_map"
 """uint8 [num_envs, X, Y]: `WildfireEnv.fire_map`. Only with `true_map=True`; no UAV knows it."""
 
 TEACHER: Final = (AGENTS, "teacher")
-"""float32 [..., 3]: the action of a teacher that knows what the UAV knows; 0 at steps without a
+"""float32 [..., 3]: the action of a teacher with the UAV's own belief map; 0 at steps without a
 decision. Only in trainings with `learner=imitation`."""
 
 FEATURES: Final = ("x", "y", "z", "new_fire", "old_fire", "timestep")
@@ -103,6 +102,6 @@ def observation_keys(spec: Composite) -> list[tuple[str, str]]:
 
 
 def observation_shapes(spec: Composite) -> list[Sequence[int]]:
-    """Returns the shapes of those tensors, per UAV."""
+    """Returns the shapes of the tensors of `observation_keys`, per UAV."""
     batch = spec.ndim + 1
     return [spec[key].shape[batch:] for key in observation_keys(spec)]

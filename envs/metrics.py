@@ -21,14 +21,14 @@ NAMES = (
     "boundary_exits",
     "fire_losses",
 )
-"""the measures of every episode, those of the paper first"""
+"""the measures of every episode, the paper's first"""
 MEASURED = ("front_age", "front_age_p95", "bytes_per_step")
 """the measures that `measures: all` adds"""
 OF_BASE = ("base_coverage", "base_age")
 """the measures that a base station adds"""
 ALL = (*NAMES, *MEASURED, *OF_BASE)
 HIGHER_IS_BETTER = frozenset({"mean_reward", "coverage", "coverage_auc", "base_coverage"})
-"""the measures of which more is better; of the others less is better"""
+"""the measures to maximise; the others are to be minimised"""
 
 
 def mean_reward(reward: Tensor) -> Tensor:
@@ -107,7 +107,7 @@ def boundary_exits(left: Tensor) -> Tensor:
 def fire_losses(on_fire: Tensor) -> Tensor:
     """Returns how often a UAV lost sight of fire, mean over UAVs (figure 9).
 
-    A UAV that fails while it sees fire loses it, too.
+    A UAV that fails while it sees fire counts.
 
     Args:
         on_fire: as for `tracking_first`.
@@ -153,7 +153,7 @@ def bytes_per_step(sent: Tensor) -> Tensor:
 
 
 def base_coverage(seen: Tensor, burnt: Tensor) -> Tensor:
-    """Returns the share of burnt cells of which a sighting reached the base, at the end, in %.
+    """Returns the share of burnt cells with a sighting at the base, at the end, in %.
 
     The sighting was made while the cell burned.
 
@@ -180,8 +180,7 @@ def episode_metrics(steps: TensorDictBase) -> dict[str, Tensor]:
         steps: the "next" of each step of a `WildfireEnv`, batch size [..., T].
 
     Returns:
-        float32 [...] for each of `NAMES`, and for those of `MEASURED` and `OF_BASE` that the
-        environment measures.
+        float32 [...] for each of `NAMES`, and for the measured names of `MEASURED` and `OF_BASE`.
     """
     reward = steps[keys.REWARD].squeeze(-1)
     seen, burnt = steps[keys.SEEN], steps[keys.BURNT]

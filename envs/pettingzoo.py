@@ -42,7 +42,7 @@ def parallel_env(
         env: a TorchRL environment of batch size [1] over a `WildfireEnv`, such as
             `emberlink.trainers.make_env` returns; without it, a `WildfireEnv` is made.
         render_mode: "rgb_array", "human" (a window) or None.
-        max_cycles: steps of an episode, in place of the config's horizon.
+        max_cycles: steps of an episode, instead of the config's horizon.
         kwargs: for `WildfireEnv`, if there is no `env`.
 
     Raises:
@@ -78,7 +78,7 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
     and leaves `agents`. `infos` hold, for each agent, the other tensors under ("agents", ...) of
     the TorchRL environment, and the numbers of cells `seen`, `burning` and `burnt`. With
     `observation: window` an observation is a dictionary of "observation", float32 [6], and
-    "window", uint8 [3, W, W]; with method `maps` it has "crops" in place of the window.
+    "window", uint8 [3, W, W]; with method `maps` it has "crops" instead of the window.
 
     Args:
         env: see `parallel_env`.

@@ -65,7 +65,7 @@ class FireSource(ABC):
         return self.config
 
     def summary(self, grid: Grid, horizon: int) -> str:
-        """Returns what was understood of the files; empty for generated fires."""
+        """Returns the findings about the files; empty for generated fires."""
         del grid, horizon
         return ""
 
@@ -189,7 +189,7 @@ def fires_of(scenario: ScenarioConfig) -> FireSource:
 def same_tests(one: ScenarioConfig, other: ScenarioConfig) -> bool:
     """Returns whether two scenarios have the same test fires.
 
-    The number of training fires makes no difference to them.
+    The number of training fires is ignored.
     """
     if not (isinstance(one, GeneratedConfig) and isinstance(other, GeneratedConfig)):
         return one == other

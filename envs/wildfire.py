@@ -35,10 +35,9 @@ class WildfireEnv(EnvBase):
     Args:
         num_envs: number of environments; the batch size is [num_envs].
         config: constants of the world and the team.
-        fire: a scenario's name, its config (each reset draws one of its training fires), or
-            arrival times in steps, inf where a cell never burns: [X, Y] for all environments or
-            [num_envs, X, Y] for one each; or arrival and burn-out times, [1, 2, X, Y] or
-            [num_envs, 2, X, Y].
+        fire: a scenario's name, its config (each reset draws one of its training fires), or arrival
+            times in steps, inf where a cell never burns: [X, Y] for all environments or [num_envs,
+            X, Y] for one each; or arrival and burn-out times, [1, 2, X, Y] or [num_envs, 2, X, Y].
         seed: of all random numbers; the first reset draws a fresh one if None. Environment i's
             randomness depends on (seed, i) alone. Several seeds have equal shares of the
             environments, in order; each is the same as with its seed alone, unless `staggered`.
@@ -46,7 +45,7 @@ class WildfireEnv(EnvBase):
         agent_done: whether done, terminated and truncated stand under "agents" too, per UAV.
         staggered: whether environments are out of phase: the first episode of environment i after
             seeding is truncated after horizon * (i + 1) / num_envs steps, rounded up.
-        true_map: whether the map is written under `keys.TRUE_MAP`, too.
+        true_map: whether the map is written under `keys.TRUE_MAP`.
 
     Raises:
         UserError: an unknown scenario or device, arrival times whose shape does not fit, seeds or a
@@ -195,8 +194,8 @@ class WildfireEnv(EnvBase):
         """Starts an episode in the environments that "_reset" names, else in all.
 
         Keyword Args:
-            position: start positions in cells, [num_envs, num_uavs, 3] or [num_uavs, 3], in
-                place of random ones.
+            position: start positions in cells, [num_envs, num_uavs, 3] or [num_uavs, 3]; random by
+                default.
         """
         if unknown:
             raise UserError(f"reset: {', '.join(sorted(unknown))} not known; known: position")

@@ -67,8 +67,8 @@ def hold(policy: TensorDictModuleBase, steps: int, uavs: int) -> Any:
 def decisions(rollout: TensorDictBase, steps: int) -> TensorDictBase:
     """Returns a rollout with one transition per decision.
 
-    A transition leads from the step of a decision to that of the next one; its reward is the sum
-    over the steps in between.
+    A transition leads from one decision to the next; its reward is the sum over the steps in
+    between.
 
     Args:
         rollout: batch size [environments, decisions * steps]; begins with a decision.

@@ -65,7 +65,7 @@ def make_env(
     fire = config.fire if fire is None else fire
     env = build_env(config, num_envs=num_envs, fire=fire, seed=seed, device=device)
     if config.policy.memory != "none" or config.policy.hold > 1:
-        # What the policies of this configuration carry from step to step.
+        # The state that the policies carry from step to step.
         env.append_transform(primer_of(build_actor(config, env)))
     return env
 
@@ -82,7 +82,7 @@ def build_env(
 ) -> TransformedEnv:
     """Returns the environment and communication of a configuration; see `WildfireEnv`.
 
-    With a `teacher`, as in `LearnerConfig.reads_teacher`, its actions are written, too.
+    With a `teacher` (`LearnerConfig.reads_teacher`), its actions are written under `keys.TEACHER`.
     """
     world = WildfireEnv(num_envs, config.env, fire, seed, device, true_map=true_map)
     module = build_comm(config, num_envs).to(world.device)
@@ -97,7 +97,7 @@ def build_actor(
 ) -> Any:
     """Returns new actors of a configuration's learner for an environment.
 
-    They are a TensorDict module with the networks in `module`.
+    A TensorDict module with the networks in `module`.
     """
     learner = registry.find(config.learner.name)
     specs = env.observation_spec, env.full_action_spec

@@ -151,7 +151,7 @@ def _wandb(config: RunConfig, run: RunFolder) -> Any:
 
 
 def _tensorboard(_: RunConfig, run: RunFolder) -> Any:
-    """Returns a logger to new event files; those of the run before it was resumed are removed."""
+    """Returns a logger to new event files; removes the files from before a resume."""
     from torchrl.record.loggers import TensorboardLogger
 
     for path in run.path.glob("tensorboard/events.*"):

@@ -61,7 +61,7 @@ class FireConfig:
     """A distribution of fires: each pair (low, high) is the range of a uniform draw."""
 
     name: Name
-    """Name of the scenario, that of its file."""
+    """Name of the scenario and its file."""
     num_train_fires: Annotated[int, Field(ge=1, lt=TEST_FROM)]
     """Number of fires to train on."""
     head_ros: Annotated[tuple[_Rate, _Rate], Pair, Ordered]
@@ -282,8 +282,8 @@ def current(
 ) -> Callable[[float], Tensor]:
     """Returns the velocity of the medium as a function of time.
 
-    u(t) = `drift_rate` · w(t) + s · cos(2π t / `tide_period` + `tide_phase`) · v, with w the unit
-    vector along the azimuth, v that along `tide_bearing` and s = π `tide_reach` / `tide_period`.
+    u(t) = `drift_rate` · w(t) + s · cos(2π t / `tide_period` + `tide_phase`) · v, with w and v the
+    unit vectors along the azimuth and `tide_bearing` and s = π `tide_reach` / `tide_period`.
 
     Args:
         draw: the fields of a `FireConfig` named above, float [fires] each, in its units.

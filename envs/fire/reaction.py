@@ -60,7 +60,7 @@ class ReactionConfig:
     kind: Literal["reaction"]
     """Distinguishes it from other scenarios."""
     name: Name
-    """Name of the scenario, that of its file."""
+    """Name of the scenario and its file."""
     num_train_fires: Annotated[int, Field(ge=1, lt=1_000_000)]
     """Number of fires to train on."""
     cell_size: Annotated[float, Field(gt=0, le=1000)]

@@ -63,11 +63,7 @@ def nested(shapes: Sequence[Any]) -> bool:
 
 
 def area_at_zero(areas: Sequence[Any], times: np.ndarray) -> Any:
-    """Returns the area that burnt at time 0, before the first of several perimeters.
-
-    The edges of the fire's bounding box are extrapolated backwards with their speeds between the
-    first two perimeters. The box around each polygon shrinks with them, to a point at most.
-    """
+    """Returns the area burnt at time 0, by extrapolating the boxes of the first two perimeters."""
     first, second = (np.array(area.bounds) for area in areas[:2])
     grown = np.concatenate([np.minimum(second - first, 0)[:2], np.maximum(second - first, 0)[2:]])
     speed = grown / (times[1] - times[0])

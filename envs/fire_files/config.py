@@ -62,7 +62,7 @@ class FileFireConfig:
     kind: Literal["file", "masks"] = "file"
     """`file`, or `masks` for an array of states `[time, y, x]`, such as 0 unburnt, 1 and 2 fire."""
     name: Name = "file"
-    """Name of the scenario, that of its file in configs/fire."""
+    """Name of the scenario and its file in configs/fire."""
     path: Annotated[_Text, BeforeValidator(_required)]
     """The file, or a folder of one fire's perimeters; relative to the working directory."""
     test: _Text | None = None
@@ -74,7 +74,7 @@ class FileFireConfig:
     end: _Time | None = None
     """Time of the last step, as `start`; the last arrival if None."""
     minutes_per_step: Annotated[float, Field(gt=0, le=1e9)] | None = None
-    """Minutes of the fire per step of the episode, in place of `end`."""
+    """Minutes of the fire per step of the episode, instead of `end`."""
     margin: Annotated[float, Field(ge=0, le=0.45)] | None = 0.1
     """Part of the grid left free on each side of the burnt area; None takes the file's extent."""
     ring_width: Annotated[float, Field(gt=0, le=30)] | None = 3.0
@@ -82,7 +82,7 @@ class FileFireConfig:
     burn_time: Annotated[float, Field(ge=1)] = math.inf
     """Steps for which a cell burns; inf for ever."""
     crs: _Text | None = None
-    """Projection of a file that carries none, else the one to project it to."""
+    """Projection of a file that carries none, else the target projection."""
     layer: _Text | None = None
     """Layer of a GeoPackage or KML, or variable of a NetCDF, that has several."""
     time_field: _Text | tuple[_Text, ...] | None = None

@@ -94,11 +94,7 @@ def _time(value: float | str, key: str, source: Source, config: FileFireConfig) 
 
 
 def _burnt_out(times: np.ndarray, start: float, width: float) -> np.ndarray:
-    """Returns the mask of burnt cells that are deeper inside than the width of the ring, [X, Y].
-
-    Depth is measured from the front at the start. A hole that never burns, such as a lake, has no
-    front.
-    """
+    """Returns the mask of burnt cells deeper behind the front than the ring's width, [X, Y]."""
     burnt = times <= start
     if not burnt.any() or math.isinf(width):
         return np.zeros_like(burnt)

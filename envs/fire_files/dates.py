@@ -1,4 +1,4 @@
-"""Reads calendar times by strict patterns; what fits several of them is asked for."""
+"""Reads calendar times by strict patterns; asks if several patterns fit."""
 
 import re
 from collections.abc import Callable, Sequence
@@ -40,12 +40,12 @@ class Date(datetime):
 
 
 def parse_dates(texts: Sequence[str], form: str | None, key: str) -> list[datetime]:
-    """Reads calendar times that are written alike; those without a time of day are `Date`.
+    """Reads calendar times in one format; times without a time of day are `Date`.
 
     Args:
         texts: such as 2020-08-19T13:00-07:00, 8/19/2020 1:55 PM, 20200819, 1597842000000.
         form: `fire.time_format`.
-        key: what holds the texts, for messages.
+        key: source of the texts, for messages.
     """
     fits: dict[str, list[datetime]] = {}
     wrong = texts[0]
@@ -112,7 +112,7 @@ def time_of_day(value: Any, *, hours: bool = False) -> timedelta:
 
 
 def at_midnight(date: datetime) -> bool:
-    """Returns whether a date has no time of day, or that of midnight."""
+    """Returns whether a date has no time of day, or midnight."""
     return isinstance(date, Date) or date.time() == time()
 
 

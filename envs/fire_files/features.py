@@ -12,7 +12,7 @@ _IDENTIFIER = re.compile(
     r"(poly|attr)?(incident|incid|fire|event|burn|complex|cluster)s?(name|nm|id|num|number|no|nr|code)?"
     r"|fname|.*irwin.*|.*uniquefire.*"
 )
-"""Columns whose values are those of a fire, by the letters and digits of their names."""
+"""Columns that identify a fire, by the letters and digits of their names."""
 _MAYBE = re.compile(r"name|id|num|number|label|(f|fire|ig|ignition|event)?(year|yr)")
 """Columns that may also number the features, or name their times."""
 _CATEGORY = re.compile(r".*(category|class|kind|type|status)|(poly)?featu\w*|incidentty|type.*")
@@ -24,7 +24,7 @@ def plain(name: Any) -> str:
 
 
 def texts(column: Any) -> Any:
-    """Returns the values of a column as texts, those that are missing as empty ones."""
+    """Returns the values of a column as texts; missing values are empty."""
     values = column.map(lambda value: re.sub(r"\.0$", "", str(value)).strip())
     return values.where(column.notna(), "")
 
@@ -39,7 +39,7 @@ def column_named(name: str, columns: Sequence[Any], key: str) -> Any:
 
 
 def choose_features(frame: Any, config: FileFireConfig, facts: list[str]) -> Any:
-    """Returns the features of one fire; `facts` gets what is to be said about the others."""
+    """Returns the features of one fire; notes on the others are appended to `facts`."""
     columns = [name for name in frame.columns if name != frame.geometry.name]
     for key, choose in (("where", _where), ("incident", _of_incident)):
         before = len(frame)

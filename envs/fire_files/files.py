@@ -104,7 +104,7 @@ def find_format(path: Path) -> str:
         raise UserError(f"{size} bytes; a text file of this format has at most {most}")
     for part in beside(path, kind):
         _regular(part)
-        # GDAL opens masks and overviews in any format, of which some read other addresses.
+        # GDAL opens masks and overviews in any format; some formats read other addresses.
         if part.suffix.lower() in (".msk", ".ovr") and _kind(_head(part)) != "tif":
             raise UserError(f"{part.name}, beside it, is no TIFF; expected one, or no such file")
     if kind == "shp":

@@ -46,7 +46,7 @@ class Window:
         return max(1, round(SAMPLES / min(self.grid)))
 
     def samples(self, border: tuple[int, int] = (0, 0)) -> "Window":
-        """Returns the window of the sample points: cuts x cuts per cell, and a border of them."""
+        """Returns the window of the sample points: cuts x cuts per cell, and a border of points."""
         side, (columns, rows) = self.side / self.cuts, self.grid
         grid = columns * self.cuts + 2 * border[0], rows * self.cuts + 2 * border[1]
         x, y = self.x - border[0] * side, self.y - border[1] * side
@@ -89,7 +89,7 @@ class Source(Protocol):
 
     clock: Clock
     began: float
-    """time at which the fire began, as far as it is known"""
+    """time of ignition; the first arrival where it is unknown"""
     first: float
     """earliest arrival in the file"""
     last: float
@@ -98,9 +98,9 @@ class Source(Protocol):
     whole: bool
     """True for a map of the whole grid, which is neither cropped nor burnt out"""
     facts: list[str]
-    """what was understood, for the user"""
+    """findings about the file, for the user"""
     doubts: list[str]
-    """signs that it was understood wrongly, for the user"""
+    """signs of a misreading, for the user"""
 
     def burnt(self, until: float) -> Bounds:
         """Returns the bounds of the area burnt by a time."""
@@ -151,10 +151,9 @@ class Raster:
     def on(self, window: Window, until: float) -> np.ndarray:
         """Returns the earliest arrival in each cell of a grid.
 
-        The candidates are the sample points in the cell, interpolated between the burnt cells
-        around them, and the centres of the raster's cells. On a grid finer than the raster, a
-        centre counts only if it burns before all cells around it. A map of the whole grid, and a
-        raster with the same cells as the grid, are not interpolated.
+        Candidates are the bilinear sample points in the cell and the centres of the raster's cells;
+        on a finer grid only centres that burn before all their neighbours. A map of the whole grid,
+        and a raster with the grid's cells, are not interpolated.
         """
         fine = window.side < (1 - _EDGE) * min(self.cell)
         if self.whole or self._is_aligned(window):
@@ -240,12 +239,7 @@ def number(count: int, noun: str) -> str:
 
 
 def _front(times: np.ndarray, until: float) -> float:
-    """Returns the position of the front along the lines of cells, in cells from their start.
-
-    The front is interpolated between two cells that burn. Beyond the first cell of a line it
-    continues at its last speed, unless it would reach the next cell; then the burnt area ends at
-    the edge of the cell.
-    """
+    """Returns the front along lines of cells, in cells, extrapolated beyond the first cell."""
     times = times[(times <= until).any(1)]
     lines, last = np.arange(len(times)), times.shape[1] - 1
     at = (times <= until).argmax(1)

@@ -174,10 +174,7 @@ def _to_boundary(area: Any, window: Window, cells: np.ndarray) -> np.ndarray:
 
 
 def _rasterize(area: Any, window: Window) -> np.ndarray:
-    """Returns the mask of cells whose centre lies in an area, bool [X, Y].
-
-    A polygon that covers no centre gets the cell of a point inside it, so that it is not lost.
-    """
+    """Returns the mask of cells centred in an area, at least one per part, bool [X, Y]."""
     shapely, parts = library("shapely"), polygons(area)
     if len(parts) > MANY:  # they may overlap
         inside = np.zeros(window.grid, bool)

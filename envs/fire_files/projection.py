@@ -20,7 +20,7 @@ _MAX_METRES = 1e9  # no projection of the Earth has such coordinates
 
 
 class Plane(NamedTuple):
-    """How the coordinates of a file get onto a plane, and what is to be said about it."""
+    """The transformation of a file's coordinates to a plane, and notes for the user."""
 
     about: str
     change: tuple[Any, Any] | None = None
@@ -30,7 +30,7 @@ class Plane(NamedTuple):
 
 
 def choose_plane(crs: Any, wanted: str | None, bounds: Bounds, cell: float | None) -> Plane:
-    """Chooses how coordinates of a file get onto a plane.
+    """Chooses the plane for the coordinates of a file.
 
     Degrees, and a projection whose axes differ by more than `_BENT` at the fire, are projected to
     the UTM zone of the middle.
@@ -56,7 +56,7 @@ def choose_plane(crs: Any, wanted: str | None, bounds: Bounds, cell: float | Non
         return Plane("no projection in the file: its coordinates are taken as a plane")
     source = parse_crs(crs or wanted)
     if crs and wanted and not (source.is_projected or source.is_geographic):
-        crs, source = None, parse_crs(wanted)  # a plane of its own: the user knows which it is
+        crs, source = None, parse_crs(wanted)  # a local plane that the user knows
     degrees = source.is_geographic
     if degrees and not (in_degrees and abs(bounds[0] + bounds[2]) <= 360):
         raise UserError(f"{span} are not the degrees of {source.name}; expected another fire.crs")

@@ -42,9 +42,9 @@ def read_fires(config: FileFireConfig, grid: tuple[int, int], horizon: int) -> T
 def read_with_summary(
     config: FileFireConfig, grid: tuple[int, int], horizon: int
 ) -> tuple[Tensor, str]:
-    """Returns the fires as `read_fires` does, and what was understood of the file.
+    """Returns the fires of `read_fires` and the findings about the file.
 
-    Warns of signs that it was understood wrongly.
+    Warns of signs of a misreading.
     """
     check_grid(grid)
     path = user_path(config.path)
@@ -68,7 +68,7 @@ def read_with_summary(
 
 
 def _sources(path: Path, config: FileFireConfig, horizon: int) -> Sequence[Source]:
-    """Returns the fires in a file; more than one are those of a bank."""
+    """Returns the fires in a file; only a bank has more than one."""
     kind = None if path.is_dir() else find_format(path)
     if kind is None or kind in TABLES:
         if config.kind == "masks" or config.unburned is not None:
@@ -119,7 +119,7 @@ def fire_sets(config: FileFireConfig, grid: tuple[int, int], horizon: int) -> Fi
 
 
 def summary(config: FileFireConfig, grid: tuple[int, int], horizon: int) -> str:
-    """Returns what was understood of the files, as `fire_sets` returns the fires."""
+    """Returns the findings about the files, one text for all sets."""
     return _sets_with_summary(config, grid, horizon)[1]
 
 

@@ -122,7 +122,7 @@ def _geojson(whole: Any) -> tuple[Any, list[str]]:
 
 
 def _kml(path: Path, kind: str, layer: str | None) -> tuple[Any, list[str]]:
-    """Reads placemarks; a time of a folder holds for what is in it."""
+    """Reads placemarks; a folder's time holds for the placemarks in it."""
     rows: list[dict[str, Any]] = []
     for content in _kml_texts(path, kind):
         if b"\0" in content[:1000] or re.search(rb"<!(DOCTYPE|ENTITY)", content, re.IGNORECASE):

@@ -238,7 +238,7 @@ def _elapsed(frame: Any, name: Any, config: FileFireConfig) -> Times:
 
 
 def in_order(values: np.ndarray, config: FileFireConfig) -> np.ndarray:
-    """Returns days, those of the year ascending over New Year; asks if days may be these."""
+    """Returns days, days of the year continued over New Year; asks if unsure."""
     days = np.unique(values[np.isfinite(values)])
     gaps = np.diff(days, append=days[0] + (366 if days[-1] > 365 else 365))
     last = int(gaps.argmax())

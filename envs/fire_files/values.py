@@ -95,11 +95,7 @@ def check_spreads(times: np.ndarray, *, may_stand: bool = False) -> None:
 
 
 def _check_plateau(times: np.ndarray, *, of_all: bool) -> None:
-    """Asks about a value that may stand for cells that do not burn.
-
-    That is one that holds more than half of the cells, or the first or last one if it is farther
-    from the others than these are apart, or holds a tenth and three times as much as any other.
-    """
+    """Asks about a first, last or most frequent value that may stand for cells that do not burn."""
     values, counts = np.unique(times[np.isfinite(times)], return_counts=True)
     cells = times.size if of_all else counts.sum()
     odd = {int(i) for i in np.flatnonzero(counts > 0.5 * cells)}

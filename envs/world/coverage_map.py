@@ -95,11 +95,10 @@ class Sighting(NamedTuple):
     classes: Tensor
     """bool [..., 3, W * W]: mask of the cells in the UAV's window"""
     burnt_out: Tensor | None = None
-    """bool [..., W * W]: mask of those cells without fire that burned earlier; None if cells never
-    burn out"""
+    """bool [..., W * W]: mask of the burnt-out cells in view; None if cells never burn out"""
 
     def shown(self) -> Tensor:
-        """Returns what the camera shows of the window, uint8 [..., W * W]; see `keys.SIGHT`."""
+        """Returns the camera's view of the window, uint8 [..., W * W]; see `keys.SIGHT`."""
         new, old, none = self.classes.to(torch.uint8).unbind(-2)
         shown = none + 2 * (new + old)
         return shown if self.burnt_out is None else shown.add(self.burnt_out, alpha=2)
@@ -111,7 +110,7 @@ class View(NamedTuple):
     cells: Tensor
     """int64 [envs, uavs, W * W]: indices in the flat padded maps of all environments"""
     in_view: Tensor
-    """bool [envs, uavs, W * W]: whether the UAV sees the cell; True outside of the grid, too"""
+    """bool [envs, uavs, W * W]: whether the cell is in view, padding included"""
     burning: Tensor
     """bool [envs, uavs, W * W]: whether the UAV sees the cell and it burns"""
 
@@ -208,7 +207,7 @@ class CoverageMap(nn.Module):
         self._stamp.copy_(torch.where(mask[:, None, None], self._uav, self._stamp))
 
     def count(self, step: Tensor) -> tuple[Tensor, Tensor]:
-        """Counts the cells that burn at a step, and those that burn or have burnt.
+        """Counts the cells that burn at a step, and the cells that burn or have burnt.
 
         Args:
             step: int64 [envs], steps since the episode began.

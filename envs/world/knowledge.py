@@ -1,4 +1,4 @@
-"""Stores what each UAV knows: the last step at which each cell was seen."""
+"""Stores the belief map of each UAV: the last step at which each cell was seen."""
 
 import torch
 from torch import Tensor, nn
@@ -7,7 +7,7 @@ from emberlink.envs.world import radio
 from emberlink.envs.world.coverage_map import View
 
 NEVER = -1
-"""last step at which a cell was seen that never was"""
+"""last step of a cell that was never seen"""
 
 
 def step_type(horizon: int) -> torch.dtype:
@@ -20,9 +20,9 @@ class Knowledge(nn.Module):
 
     At each step, a UAV merges into its map the maps of all radios whose messages arrive, directly
     or passed on. The later step of each cell is kept. Since a fire is a function of time, the step
-    of the last look gives what was seen there.
+    of the last look gives the cell's state then.
 
-    Two UAVs that stay in contact differ only in what they have seen at this step. So whole maps are
+    Two UAVs that stay in contact differ only in the sightings of this step. So whole maps are
     compared only where a message arrives that did not arrive at the step before.
 
     Args:

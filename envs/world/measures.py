@@ -1,4 +1,4 @@
-"""Measures what the team and the base know of the fire at each step."""
+"""Measures the sightings of the team and of the base at each step."""
 
 import math
 
@@ -18,7 +18,7 @@ _GROWTH = 1.01
 
 
 def cell_ages(step: Tensor, last_seen: Tensor, ignition: Tensor) -> Tensor:
-    """Returns the steps since each cell was last seen, from its ignition if it was not seen since.
+    """Returns the steps since the later of each cell's last look and its ignition.
 
     Args:
         step: [...], the current step.
@@ -167,10 +167,10 @@ class Measures(nn.Module):
     team_seen: Tensor
     """integers [envs, area]: the last step at which any UAV saw the cell"""
     base_seen: Tensor
-    """int64 [envs]: number of cells of which a sighting in flames has reached the base"""
+    """int64 [envs]: number of cells with a sighting in flames at the base"""
     told: Tensor | None
-    """int64 [envs, uavs]: for UAVs whose messages arrived at the base in the last step, the number
-    of cells of which it learnt that they burned, else 0; None without a base"""
+    """int64 [envs, uavs]: number of burnt cells new to the base in the last step, for UAVs whose
+    messages arrived there, else 0; None without a base"""
     _base: Tensor
 
     def __init__(self, world: WildfireConfig, envs: int, area: int):
@@ -231,7 +231,7 @@ class Measures(nn.Module):
             self._tell(self.knowledge)
 
     def _tell(self, knowledge: Knowledge) -> None:
-        """Counts the cells of which the base learnt in this step, for those who told it."""
+        """Counts the burnt cells new to the base, for the UAVs whose messages arrived."""
         assert knowledge.seen_fire is not None
         seen = knowledge.seen_fire[:, -1].sum(-1)
         self.told = (seen - self.base_seen).unsqueeze(-1) * knowledge.reach[:, -1, :-1]
@@ -251,7 +251,7 @@ class Measures(nn.Module):
     ) -> Tensor:
         """Returns the links of the UAVs and the base, which is last, bool [envs, n + 1, n + 1].
 
-        The links between UAVs are those of `radio.links` without a base.
+        The links between UAVs equal `radio.links` without a base.
         """
         given = rng_key, step
         return radio.links_with_base(self._world.radio, position, self._base, *given, alive)

@@ -8,7 +8,7 @@ from emberlink.envs.utils import counter_rng
 from emberlink.envs.utils.counter_rng import Use
 from emberlink.envs.world import motion
 
-PASSING = 15  # steps that a chain has to pass on what is known: over one link per step, with losses
+PASSING = 15  # steps that a chain needs to pass on all sightings: one link per step, with losses
 _NEARER = 0.97  # of the range, so that rounding and small errors of position break no link
 _AT_PLACE = 0.01  # of the range over the ground; distance at which a relay is at its place
 _SILENT = 150  # steps; a UAV not heard of for so long counts as lost where UAVs fail
@@ -67,7 +67,7 @@ def links_with_base(
 ) -> Tensor:
     """Returns the links of the UAVs and the base, which is last, bool [envs, n + 1, n + 1].
 
-    The links between UAVs are those of `links` without a base.
+    The links between UAVs equal `links` without a base.
 
     Args:
         config, position, rng_key, step, alive: see `links`.
@@ -183,12 +183,12 @@ def chain_to_fire(
 def believed_to_fly(world: WildfireConfig, step: Tensor, heard: Tensor) -> Tensor:
     """Returns whether each UAV (row) believes that another one flies, bool [envs, n, n].
 
-    In a world in which UAVs fail, a UAV of which nothing was heard for 150 steps counts as lost.
+    In a world in which UAVs fail, 150 steps without news of a UAV count as its loss.
 
     Args:
         world: the world and the team.
         step: int64 [envs].
-        heard: [envs, n, n], the last step of which a UAV knows of another one.
+        heard: [envs, n, n], step of the latest news that a UAV (row) has of another one (column).
     """
     if not world.failures:
         return torch.ones_like(heard, dtype=torch.bool)

@@ -34,7 +34,7 @@ def step_reward(
         new, old, none: [...], number of cells of new fire, old fire and no fire in view.
         hit_boundary: bool [..., 3], the axes along which the move would have left the box.
         config: reward per cell of each class, and the penalty.
-        told: integers [...], number of burning cells of which the base learns; None for none.
+        told: integers [...], number of burning cells new to the base; None for none.
         unseen: integers [...], number of burning cells that no UAV has seen; None for none.
 
     Returns:

@@ -24,7 +24,7 @@ class Sensor(nn.Module):
 
     Each UAV has a window of W x W cells, centred at the cell nearest to it, that contains the field
     of view at any altitude. Maps are stored flat and padded by half a window, so that windows lie
-    within them. The cost of a step depends on the size of the window, not on that of the map.
+    within them. The cost of a step depends on the size of the window, not of the map.
 
     Args:
         grid: cells along x and y.

@@ -29,12 +29,12 @@ class _Stacked(nn.Module):
 
     Args:
         uavs: number of UAVs in a team.
-        observations: shape of each tensor of an observation, per UAV: [features],
-            [channels, W, W] or [pictures, channels, S, S].
+        observations: shape of each tensor of an observation, per UAV: [features], [channels, W, W]
+            or [pictures, channels, S, S].
         actions: number of components of an action.
         hidden: units of the hidden layers, 1 to 8 layers.
         share_parameters: whether the UAVs share their weights.
-        agent_index: whether the index of the UAV is an input, too.
+        agent_index: whether the index of the UAV is an input.
         team: whether the inputs of a UAV are the observations and actions of its whole team.
         start: see `layers.Start`.
 
@@ -111,8 +111,8 @@ class StackedCritic(_Stacked):
     A linear map of the action is added to the normalised last hidden layer before its ReLU.
 
     The critic of a UAV with `team` reads the observations and actions of all UAVs (MADDPG, Lowe et
-    al. 2017, NeurIPS). For the actors' losses, a UAV's own action is that of its actor, and those
-    of the others are from the replay buffer.
+    al. 2017, NeurIPS). In the actors' losses, only a UAV's own action comes from its actor; the
+    other actions are from the replay buffer.
     """
 
     def _add_output(self, groups: int, actions: int, inputs: int, **start: Any) -> None:
@@ -124,7 +124,7 @@ class StackedCritic(_Stacked):
 
         Args:
             action: [*batch, uavs, actions].
-            taken: the actions of the other UAVs, for `team`; those of `action` if None.
+            taken: the actions of the other UAVs, for `team`; `action` if None.
             observations: the tensors of an observation, [*batch, uavs, ...].
         """
         batch = action.shape[:-1]
@@ -159,7 +159,7 @@ def make_critic(
 ) -> TensorDictModule:
     """Returns the critics of all UAVs, which write `STATE_ACTION_VALUE`.
 
-    Arguments and errors are those of `make_actor`; `team` makes critics of the team.
+    Arguments and errors as for `make_actor`; `team` makes critics of the team.
     """
     network = _build(StackedCritic, observation_spec, action_spec, hidden, **more)
     reads: Any = [keys.ACTION, TAKEN, *keys.observation_keys(observation_spec)]

@@ -37,9 +37,9 @@ class Grouping:
         return torch.cat((x, index.expand(*x.shape[:-1], -1)), -1)
 
     def of_team(self, x: Tensor, dims: int) -> Tensor:
-        """Joins the features of all UAVs of the team, those of the UAV itself first.
+        """Joins the features of all UAVs of the team, per UAV, its own first.
 
-        Those of UAV k + 1 follow, and so on; UAV 0 follows the last one.
+        UAV k gets the order k, k + 1, ..., 0, ..., k - 1.
 
         Args:
             x: [*batch, features, ...], with the batch [..., uavs].

@@ -23,12 +23,12 @@ FIRE = (1, 2)
 class SequenceNetwork(nn.Module):
     """An encoder, a memory, hidden layers with a tanh each, and a linear map.
 
-    Weights are orthogonal at the beginning, those of the last map are scaled by `gain`.
+    Initial weights are orthogonal, the last map's scaled by `gain`.
 
     Args:
         uavs: number of UAVs.
-        observations: shape of each tensor of an observation, per UAV: [features],
-            [channels, W, W] or [pictures, channels, S, S].
+        observations: shape of each tensor of an observation, per UAV: [features], [channels, W, W]
+            or [pictures, channels, S, S].
         outputs: number of outputs per UAV.
         hidden: units of the hidden layers.
         policy: the memory, and whether the index of a UAV is an input.
@@ -117,7 +117,7 @@ class SequenceNetwork(nn.Module):
 class GaussianNetwork(SequenceNetwork):
     """Maps observations to the means of actions; their standard deviations are weights.
 
-    Arguments are those of `SequenceNetwork`.
+    Arguments as for `SequenceNetwork`.
     """
 
     def __init__(self, *args: Any, device: torch.device | str | None = None, **more: Any):
@@ -141,7 +141,7 @@ class GaussianNetwork(SequenceNetwork):
 
 
 class TeamNetwork(nn.Module):
-    """Maps what all UAVs of a team observe, and the true map, to an output for each of them.
+    """Maps the observations of a whole team, and the true map, to an output per UAV.
 
     Args:
         uavs: number of UAVs.

@@ -59,7 +59,7 @@ class Scripted(TensorDictModuleBase):
     def bytes_sent(self, tensordict: TensorDictBase) -> torch.Tensor | None:
         """Returns the bytes that each UAV sends at a step, int64 [num_envs, n]; zeros by default.
 
-        If None, the bytes that the communication module counts are those of the policy.
+        If None, the bytes that the communication module counts are used.
 
         Args:
             tensordict: the time step.

@@ -18,8 +18,8 @@ from emberlink.policies.scripted.team_maps import Messages, TeamMaps
 _FLOWN = 2.0  # cells flown between two plans
 _NEAR = 2  # cells; within this distance of known fire a cell may have ignited
 _SPREAD = 50.0  # steps; time scale at which the chance of ignition near known fire grows
-_FAR = 0.04  # chance of a cell of which the UAV knows no sighting, far from known fire
-_AGAIN = 0.02  # the same of a cell that was seen without fire, long ago
+_FAR = 0.04  # chance of fire in a cell never seen, far from known fire
+_AGAIN = 0.02  # chance of fire in a cell seen without fire long ago
 _FORGET = 300.0  # steps; time scale of "long ago"
 _AROUND = 6  # cells; within this distance, cells seen without fire make fire less likely
 _CLAIM = 2.0  # cells; half the side of the square that a UAV claims
@@ -37,21 +37,21 @@ class MapGreedy(Scripted):
     the more cells around them were seen without fire. The value of a target is the sum of the
     weights in view from it, divided by its distance plus 2 cells.
 
-    UAVs choose anew whenever they can have flown 2 cells (every 10 steps at most), the one with
-    the highest value first. A UAV gives no weight to cells within 2 cells (along x and y) of the
-    targets of those whose messages it has. All fly at the maximum altitude.
+    UAVs choose anew whenever they can have flown 2 cells (every 10 steps at most), in the order of
+    falling values. A UAV gives no weight to cells within 2 cells (along x and y) of the targets of
+    UAVs whose messages it has. All fly at the maximum altitude.
 
     The targets are carried in the TensorDict under "_map_greedy_target", the maps in the policy.
 
     Args:
         env: the environment that it acts in.
-        maps: what the UAVs know, with the methods of `TeamMaps`; maps of its own if None.
+        maps: the belief maps, with the methods of `TeamMaps`; new ones if None.
     """
 
     hears: ClassVar[bool] = True
     messages: ClassVar[Messages] = "in range"
     informs_base: ClassVar[bool] = False
-    """whether it brings what the UAVs know to a base"""
+    """whether it brings sightings to a base"""
     TARGET = "_map_greedy_target"
 
     _near_x: Tensor
@@ -105,7 +105,7 @@ class MapGreedy(Scripted):
         Args:
             step: int64 [num_envs].
             last_seen: float [num_envs, n, X, Y], negative for never.
-            ignited, burning: bool [num_envs, n, X, Y], what is known of the fire.
+            ignited, burning: bool [num_envs, n, X, Y], the cells' states at the last look.
         """
         never = last_seen < 0
         age = step.view(-1, 1, 1, 1) - last_seen
@@ -149,8 +149,8 @@ class Courier(MapGreedy):
     Each UAV computes a chain of places from the base to the middle of the fire that it knows, one
     radio range apart (`radio.chain`). UAV 0 holds the place next to the base, UAV 1 the next one,
     and so on. UAVs that are not needed in the chain stay in range of its last place. A UAV that
-    knows of no fire has to be in range of the base. In a world in which UAVs fail, a UAV takes no
-    account of those of which it has heard nothing for 150 steps, directly or through others.
+    knows of no fire has to be in range of the base. In a world in which UAVs fail, a UAV ignores
+    UAVs without news, direct or passed on, for 150 steps.
 
     Until then UAVs search, and choose only cells from which they still come to their place in time,
     15 steps before the end. Without a base they search as `MapGreedy`.

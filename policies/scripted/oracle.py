@@ -72,12 +72,7 @@ class Foresight(nn.Module):
         return env.arrival_time.unsqueeze(1), end
 
     def _weight(self, arrives: Tensor, alive: Tensor) -> Tensor:
-        """Returns what seeing each cell is worth to each UAV, float32 [num_envs, n, X, Y].
-
-        Args:
-            arrives: float32 [num_envs, n, X, Y], the step at which the UAV arrives at the cell.
-            alive: bool [num_envs, n].
-        """
+        """Returns the value of seeing each cell on arrival, float32 [num_envs, n, X, Y]."""
         ignition, end = self._times()
         meets = torch.maximum(arrives, ignition)
         useful = self._unseen(alive).unsqueeze(1) & (meets < end) & (meets <= self._world.horizon)
@@ -86,11 +81,7 @@ class Foresight(nn.Module):
         return useful * (-wait / _WAIT).exp()
 
     def _unseen(self, alive: Tensor) -> Tensor:
-        """Returns the cells of which no sighting while they burned is left, bool [num_envs, X, Y].
-
-        Args:
-            alive: bool [num_envs, n].
-        """
+        """Returns the cells without a surviving sighting in flames, bool [num_envs, X, Y]."""
         (env,) = self._env
         if env.knowledge is None or env.knowledge.seen_fire is None:
             return (env.fire_map != 1) & (env.fire_map != 3)
@@ -143,7 +134,7 @@ class Oracle(Scripted):
     go to the lower index of UAVs and of cells. A UAV without a cell stays at its position, and one
     that has failed gets none. All UAVs fly at the maximum altitude.
 
-    Where cells burn out, or with a base, the targets are those of `Foresight` instead.
+    Where cells burn out, or with a base, `Foresight` chooses the targets.
 
     Args:
         env: the environment that it acts in; its fire is read at every step.
@@ -198,10 +189,7 @@ class Oracle(Scripted):
         return target
 
     def _delay(self, step: Tensor) -> Tensor:
-        """Returns the cost of the wait for each cell, float64 [num_envs, X, Y], cells.
-
-        It is infinite for cells that have been seen or never burn.
-        """
+        """Returns the cost of waiting for each cell, inf if seen, float64 [num_envs, X, Y]."""
         (env,) = self._env
         arrival = env.arrival_time.double()
         wait = (arrival - step.view(-1, 1, 1)).clamp_(min=0)
@@ -209,16 +197,7 @@ class Oracle(Scripted):
         return (wait * _STEP_COST).masked_fill_(done, math.inf)
 
     def _nearest(self, delay: Tensor, ground: Tensor) -> tuple[Tensor, Tensor]:
-        """Returns the cell of lowest cost for one UAV of every environment.
-
-        Args:
-            delay: float64 [num_envs, X, Y], from `_delay`.
-            ground: float64 [num_envs, 2], the UAV's position, cells.
-
-        Returns:
-            The cost, float64 [num_envs], inf if there is no cell, and the cell, float64
-            [num_envs, 2].
-        """
+        """Returns one UAV's lowest cost, [num_envs], and its cell, [num_envs, 2], float64."""
         along_x = (ground[:, :1] - self.columns).abs().unsqueeze(-1)
         along_y = (ground[:, 1:] - self.rows).abs().unsqueeze(-2)
         distance, index = (torch.maximum(along_x, along_y) + delay).flatten(1).min(-1)

@@ -53,7 +53,7 @@ class Targets(nn.Module):
     def choose(
         self, ground: Tensor, weight: Tensor, cost: Tensor, hears: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Assigns a cell to each UAV, to that with the highest value first.
+        """Assigns a cell to each UAV, in the order of falling values.
 
         Args:
             ground: float32 [envs, n, 2], positions, cells.
@@ -62,8 +62,8 @@ class Targets(nn.Module):
             hears: bool [envs, n, n], whether a UAV (row) knows of another one's target.
 
         Returns:
-            The cells, float32 [envs, n, 2], the position of a UAV without a cell of positive
-            value; and the values, float32 [envs, n].
+            The cells, float32 [envs, n, 2], the position of a UAV without a cell of positive value;
+            and the values, float32 [envs, n].
         """
         envs, uavs = ground.shape[:2]
         value = (self.in_view(weight) / cost).flatten(2).amax(-1)

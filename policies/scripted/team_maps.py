@@ -1,4 +1,4 @@
-"""Maps of what each UAV knows, as scripted policies keep them."""
+"""Keeps the belief maps of the UAVs for scripted policies."""
 
 from typing import Literal
 
@@ -20,18 +20,18 @@ class TeamMaps(nn.Module):
     """Stores the last step at which each UAV knows each cell to have been seen.
 
     The maps are made from the positions of the UAVs alone. The state of the fire is read only for
-    cells and steps of which a UAV has a sighting.
+    cells and steps that a UAV has seen.
 
     Args:
         env: the environment that the policy acts in.
-        messages: whose maps a UAV takes over at each step: nobody's, those of the UAVs and of the
-            base whose messages arrive, or those of all UAVs.
+        messages: whose maps a UAV takes over at each step: nobody's, the UAVs' and the base's whose
+            messages arrive, or all UAVs'.
     """
 
     reach: Tensor
     """bool [envs, radios, radios]: whose messages arrive at each radio at this step"""
     heard: Tensor
-    """float32 [envs, n, n]: the last step of which each UAV (row) has a message of another one"""
+    """float32 [envs, n, n]: step of the latest news that each UAV (row) has of another one"""
     _start: Tensor
     _base: Tensor
 
@@ -78,7 +78,7 @@ class TeamMaps(nn.Module):
         self._update_heard(step, alive)
 
     def _update_heard(self, step: Tensor, alive: Tensor) -> None:
-        """Stores whose messages arrived, also as those know it whose messages arrived."""
+        """Stores the steps of the latest news, direct or passed on."""
         now, uavs = step.view(-1, 1, 1).float(), self._world.num_uavs
         reach = self.reach[:, :uavs, :uavs]
         self.heard.masked_fill_(now == 0, 0.0)

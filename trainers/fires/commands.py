@@ -202,7 +202,7 @@ def import_files(arguments: Sequence[str], console: Console, output: Path) -> in
 
     Args:
         arguments: paths, and `key=value` of setup, env. and fire.
-        console: prints what was read, the number of fires and, last, the path of the file.
+        console: prints the findings, the number of fires and, last, the path of the file.
         output: a new .npy, .tif or .tiff file.
     """
     # An existing file takes precedence over a key.

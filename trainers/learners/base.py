@@ -93,8 +93,8 @@ class LearnerContext:
     horizon: int = 1000
     """decisions of an episode; steps if actions are not held"""
     failures: bool = False
-    """whether UAVs can fail; losses leave out decisions after a failure, and those that use rewards
-    also the decision during which it happens"""
+    """whether UAVs can fail; losses leave out decisions after a failure, and if they use rewards,
+    the decision of the failure"""
 
 
 class Learner(ABC):
@@ -102,8 +102,8 @@ class Learner(ABC):
 
     A learner owns the networks, their updates, the transitions that it learns from, and the
     exploration policy. A subclass sets `actor`, `loss`, `optimizer`, and a `generator` if it draws
-    random numbers after `__init__`; these are saved. What else learning changes, `state_dict` and
-    `load_state_dict` of the subclass add.
+    random numbers after `__init__`; these are saved. Other state is added by the subclass's
+    `state_dict` and `load_state_dict`.
 
     Args:
         config: an instance of `config_type`.
@@ -176,7 +176,7 @@ class Learner(ABC):
         """Begins the run with the actors of another run.
 
         Args:
-            weights: the weights of its actors by name, as those of `weights`.
+            weights: the weights of its actors, from `weights`.
 
         Raises:
             UserError: the learner has no warm start.
@@ -184,7 +184,7 @@ class Learner(ABC):
         raise UserError(f"learner.warm_start: learner={type(self).__name__} has no warm start")
 
     def copy_actor(self, weights: Mapping[str, Tensor]) -> None:
-        """Copies weights as those of `weights` into the actors."""
+        """Copies weights, from `weights`, into the actors."""
         network = self.actor.module
         copy_into(network.state_dict(), {k: weights[ACTOR + k] for k in network.state_dict()})
 

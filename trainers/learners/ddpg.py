@@ -51,7 +51,7 @@ class DDPGConfig(LearnerConfig):
     buffer_size: Count
     """capacity of a replay buffer, in transitions of a UAV"""
     critic: Literal["own", "team"] = "own"
-    """what a critic reads: the observation and action of its UAV (own), or of all UAVs (team)"""
+    """inputs of a critic: observation and action of its UAV (own), or of all UAVs (team)"""
     exploration: ExplorationConfig
     """exploration noise"""
     warm_start: str = ""
@@ -73,7 +73,7 @@ class DDPG(Learner):
 
     def __init__(self, config: DDPGConfig, context: LearnerContext):
         self.config, self.context = config, context
-        # Networks: those of all UAVs are stacked, with weights per UAV or shared.
+        # Networks of all UAVs, stacked, with weights per UAV or shared.
         specs, policy = (context.observation_spec, context.action_spec), context.policy
         initial = torch.Generator().manual_seed(context.seed)
         self.actor = self.make_actor(config, *specs, initial, policy)

@@ -1,4 +1,4 @@
-"""Imitation of a scripted teacher on what the student visits (DAgger, Ross et al. 2011)."""
+"""Imitation of a scripted teacher in states visited by the student (DAgger, Ross et al. 2011)."""
 
 from collections.abc import Mapping
 from typing import Annotated, Any
@@ -68,9 +68,9 @@ class ImitationConfig(LearnerConfig):
 class Imitation(Learner):
     """Trains actors to act as the teacher would, where they and the teacher have flown.
 
-    Each UAV's decision is the teacher's with a probability that falls to 0. What the UAV observed
-    and what the teacher would have done is kept in a buffer. An update draws from it; the loss is
-    the smooth L1 distance to the teacher's action.
+    Each UAV takes the teacher's action with a probability that falls to 0. A replay buffer holds
+    the UAV's observations and the teacher's actions. The loss of an update is the smooth L1
+    distance to the teacher's action.
 
     With a memory, the buffer holds sequences of decisions, with the state of the memory before the
     first one (Kapturowski et al. 2019, ICLR).

@@ -1,9 +1,9 @@
 """PPO (Schulman et al. 2017) for all UAVs, from whole episodes: IPPO and MAPPO.
 
-IPPO's critic reads what its UAV observes (de Witt et al. 2020). MAPPO's reads what the team
-observes (Yu et al. 2022, NeurIPS). The losses and the advantages are TorchRL's `MAPPOLoss` and
+IPPO's critic reads its UAV's observation (de Witt et al. 2020), MAPPO's the observations of the
+team (Yu et al. 2022, NeurIPS). The losses and the advantages are TorchRL's `MAPPOLoss` and
 `MultiAgentGAE`; its standardisation of advantages and its `ValueNorm` are not used, since both
-count what follows the failure of a UAV.
+count decisions after the failure of a UAV.
 """
 
 from abc import abstractmethod
@@ -229,7 +229,7 @@ class PPO(Learner):
         return [self.update(batch) for batch in self._batches(episode)]
 
     def _transitions(self, rollout: TensorDictBase) -> TensorDict:
-        """Returns what is learnt from of a rollout, batch size [environments, steps]."""
+        """Returns the learner's tensors of a rollout, batch size [environments, steps]."""
         read = [*self.actor.observed, *self.critic.in_keys, keys.ACTION, LOG_PROB]
         result = {key: rollout.get(key).clone() for key in read}
         result[keys.REWARD] = rollout.get(("next", *keys.REWARD)).clone()
@@ -345,7 +345,7 @@ class PPO(Learner):
         self._reset_std()
 
     def _reset_std(self) -> None:
-        """Sets the standard deviation of the actions to that of the beginning of a run."""
+        """Resets the standard deviation of the actions to `log_std`."""
         with torch.no_grad():
             self.actor.module.log_std.fill_(self.config.log_std)
 
@@ -363,7 +363,7 @@ class PPO(Learner):
 
 
 class IPPO(PPO):
-    """Values what each UAV observes."""
+    """Values each UAV's observation."""
 
     config_type = IPPOConfig
 

@@ -1,4 +1,4 @@
-"""Stores what UAVs experienced, per UAV or shared by all (paper, sections IV.C and IV.D)."""
+"""Stores the UAVs' transitions, per UAV or shared by all (paper, sections IV.C and IV.D)."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -103,8 +103,8 @@ class UavSampler(RandomSampler):
         uavs: number of UAVs.
         generator: on the device of the storage.
         shared: whether a UAV draws the entries of all UAVs, or only its own.
-        joint: whether all UAVs draw the same rows. If `shared` is true, too, the columns are rolled
-            by a random shift per row.
+        joint: whether all UAVs draw the same rows; with `shared`, the columns are rolled by a
+            random shift per row.
     """
 
     def __init__(self, uavs: int, generator: torch.Generator, *, shared: bool, joint: bool):

@@ -40,7 +40,7 @@ class TD3Config(DDPGConfig):
     target_noise: NotNegative
     """standard deviation of the noise on the target actors' actions"""
     target_noise_clip: Annotated[float, Field(ge=0, le=2)]
-    """maximum absolute value of that noise; actions are in [-1, 1]"""
+    """maximum absolute value of the target noise; actions are in [-1, 1]"""
 
 
 class TD3(Learner):
@@ -50,7 +50,7 @@ class TD3(Learner):
 
     def __init__(self, config: TD3Config, context: LearnerContext):
         self.config, self.context = config, context
-        # Networks: those of all UAVs are stacked, with weights per UAV or shared.
+        # Networks of all UAVs, stacked, with weights per UAV or shared.
         specs, policy = (context.observation_spec, context.action_spec), context.policy
         initial = torch.Generator().manual_seed(context.seed)
         self.actor = self.make_actor(config, *specs, initial, policy)
@@ -160,7 +160,7 @@ class TD3(Learner):
 class SmoothedActor(TensorDictModuleBase):
     """Adds the noise in a batch, if there is any, to the actors' actions and clips them.
 
-    It passes on what the critics read.
+    It passes on the critics' inputs.
     """
 
     def __init__(self, actor: TensorDictModuleBase, critic: TensorDictModuleBase):

@@ -17,7 +17,7 @@ class RolloutLoop:
     Exact resuming needs this input; TorchRL's collector neither returns nor takes it.
 
     Args:
-        env: batch of environments with communication; it gets the state of the policy, too.
+        env: batch of environments with communication; the policy's state is added to it.
         policy: actors with exploration noise.
         total_steps: steps of the batch of environments in the whole run.
         rollout_steps: steps of a rollout.

@@ -1,4 +1,4 @@
-"""Adds the actions of a scripted teacher, made from what each UAV knows, to an environment."""
+"""Adds the actions of a scripted teacher, made from each UAV's belief map, to an environment."""
 
 from typing import Any
 
@@ -20,8 +20,8 @@ from emberlink.policies.scripted.registry import SCRIPTED
 class KnownMaps:
     """Shows the maps of method `maps` in the form that scripted policies read.
 
-    The policy of a UAV also knows the targets of those that it hears at a step. Such a target may
-    depend on cells that the UAV receives one step later, or never with `env.radio.bandwidth`.
+    A UAV also knows the targets of the UAVs that it hears. Such a target may depend on cells that
+    it receives one step later, or never with `env.radio.bandwidth`.
 
     Args:
         maps: the communication module of the environment.
@@ -50,8 +50,8 @@ class KnownMaps:
 class Teacher(Transform):
     """Writes the actions of a scripted policy under `keys.TEACHER`, made from the maps of the UAVs.
 
-    It is added after the communication. For each UAV it uses what that UAV knows, and the targets
-    of those that it hears (see `KnownMaps`). It does not change the environment. An action flies
+    It is added after the communication. Each UAV's action depends on its own map and on the targets
+    of the UAVs that it hears (see `KnownMaps`). The environment does not change. An action flies
     towards the target at full speed, or reaches it at the end of the steps for which it is held.
     With held actions, targets are chosen at each decision, else as often as the policy chooses
     them.
@@ -120,7 +120,7 @@ def find(name: str) -> type[MapGreedy]:
     A policy that informs a base is none: UAVs of `maps` come home by themselves.
 
     Raises:
-        UserError: there is none of this name; the message lists those that there are.
+        UserError: no teacher has this name; the message lists the known ones.
     """
     known = {
         other: policy

@@ -29,7 +29,7 @@ WEIGHTS = "weights/"
 
 _KEY = "emberlink"
 _MAX_HEADER = 4_000_000
-"""bytes; that of a checkpoint with 2,000 tensors has a tenth of it"""
+"""bytes; the header of a checkpoint with 2,000 tensors has a tenth of it"""
 _MAX_FILE = 2**35
 """bytes; the largest checkpoint measured has 333 MB"""
 
@@ -141,7 +141,7 @@ def load_weights(
 
     Args:
         path: a checkpoint file.
-        expected: tensors with the expected names, shapes and types: those of actors.
+        expected: the actors' tensors, with the expected names, shapes and types.
         config: configuration of the networks that get the weights, for messages.
 
     Raises:

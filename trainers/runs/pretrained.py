@@ -111,7 +111,7 @@ def find(text: str) -> list[Path]:
 
     Args:
         text: see `open_run`; `pretrained:SETUP` matches all policies of a setup. A method alone
-            means those of the first of `USUAL_SETUPS` that has it, or of all setups if none has.
+            matches its policies in the first of `USUAL_SETUPS` that has it, else in all setups.
 
     Raises:
         UserError: there is no such policy.
@@ -193,7 +193,7 @@ def pack(run: RunFolder, into: Path) -> Path:
 
 
 def _without_path(learner: Any) -> Any:
-    """Returns the settings of a learner with `warm_start=runs/NAME` in place of a path."""
+    """Returns the settings of a learner with a path shortened to `warm_start=runs/NAME`."""
     start = getattr(learner, "warm_start", "")
     if not start or is_name(start):
         return learner

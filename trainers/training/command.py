@@ -42,7 +42,7 @@ def train(method: str | None, overrides: Sequence[str], console: Console) -> int
         _announce(trainer, overrides, console)
         with interruption:
             _train(trainer, console)
-            # The run folder is locked during the evaluation, too.
+            # The run folder stays locked during the evaluation.
             interruption.at_once = True
             if interruption.received:
                 raise Interrupted
@@ -112,7 +112,7 @@ def _announce(trainer: Trainer, overrides: Sequence[str], console: Console) -> N
 
 
 def _notes(trainer: Trainer, overrides: Sequence[str]) -> Iterator[str]:
-    """Yields what a user might not expect of a training."""
+    """Yields notes on surprising settings of a training."""
     config = trainer.config
     learner, world = config.learner, config.env
     if not _learns(trainer):

@@ -17,7 +17,7 @@ from emberlink.trainers.training import warm_start
 from emberlink.trainers.training.trainer import Trainer
 
 MAY_CHANGE = ("episodes", *NOT_LEARNT_WITH)
-"""keys that may be changed when a run is resumed, besides those of `evaluation`"""
+"""keys that may be changed when a run is resumed, besides the keys of `evaluation`"""
 
 
 def resume(

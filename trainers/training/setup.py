@@ -116,10 +116,10 @@ def check_setup(config: RunConfig) -> None:
 
 
 def _make_env(config: RunConfig, num_envs: int) -> TransformedEnv:
-    """Returns training environments, with what the learner reads in training only.
+    """Returns training environments, with the map and teacher that the learner reads.
 
     Raises:
-        UserError: the environment shows what cameras see, and the communication does not read it.
+        UserError: `env.observation=sight`, and the communication does not read it.
     """
     if config.env.observation == "sight" and keys.SIGHT not in build_comm(config, 1).in_keys:
         raise UserError(
@@ -138,7 +138,7 @@ def _make_env(config: RunConfig, num_envs: int) -> TransformedEnv:
 
 
 def _make_learner(config: RunConfig, env: TransformedEnv) -> Learner:
-    """Returns a new learner; what does not fit it fails here and not in the training."""
+    """Returns a new learner; validates before training."""
     config.check_rollouts()  # learners divide by the decisions of an episode
     learner = build_learner(config, env)
     config.check_rollouts(learner.rollout_steps)

@@ -62,11 +62,11 @@ class Trainer:
         self.config = config
         self.setup = TrainingSetup(config)
         self.best: float | None = None
-        """best headline measure, that of best.safetensors"""
+        """headline measure of best.safetensors"""
         self.saved: int | None = None
         """step of the newest checkpoint"""
         self.changed_versions = ""
-        """packages whose version is not that of the checkpoint that was resumed"""
+        """packages with another version than in the resumed checkpoint"""
         self._lock: Lock | None = None
         self._tracker: Tracker | None = None
         self._stopping = False

@@ -16,11 +16,10 @@ from emberlink.trainers.runs.pretrained import find_one, is_name
 from emberlink.trainers.runs.run_folder import RunFolder
 
 _OBSERVED = ("comm.", "env.observation", "policy.hold")
-"""beginnings of the keys of settings that change what a UAV observes, or what its action does,
-besides `units`"""
+"""prefixes of keys that define the meaning of observations and actions, besides `units`"""
 
 _REWARD = "comm.heading."
-"""beginning of the keys of `comm` that change rewards only"""
+"""prefix of the keys of `comm` that change rewards only"""
 
 
 def start(learner: Learner, config: RunConfig) -> None:

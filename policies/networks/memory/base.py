@@ -9,7 +9,7 @@ from emberlink.policies.settings import PolicyConfig
 
 
 class Memory(nn.Module):
-    """Maps the inputs of successive decisions to features that depend on the earlier ones, too.
+    """Maps the inputs of successive decisions to features of the sequence so far.
 
     A subclass in its own file, `policies/networks/memory/<name>.py`, is a new kind of memory. The
     first dimension of its weights is the group, see `networks.layers`.
