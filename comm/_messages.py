@@ -118,7 +118,6 @@ class CellMessages(nn.Module):
         """Returns the cells that are new to UAVs in range.
 
         Args:
-            known: the maps.
             near: bool [envs, n, n], whether a UAV (row) is in range of another one (column).
         """
         last, seen = known.last_seen, known.seen_fire
@@ -153,10 +152,8 @@ class CellMessages(nn.Module):
         """Passes on the new cells: updates the maps of the hearers.
 
         Args:
-            known: the maps.
             near: bool [envs, n, n], whether a UAV (row) is in range of another one (column).
             hears: bool [envs, n, n], the links of `near` on which no message is lost.
-            news: the new cells, from `compare`.
             chosen: bool [envs, n, area], which of the new cells a UAV says; None for all.
 
         Returns:
@@ -218,11 +215,6 @@ def offers(known: Knowledge, news: News, most: int) -> Offers:
     gets newer, at most `OLD` each. A UAV that has not looked, or that does not know that the cell
     was seen while it burned, counts as one that looked at step -1. Of equal gain, the cells that a
     UAV offers first depend on its number, so that UAVs offer different ones.
-
-    Args:
-        known: the maps.
-        news: the new cells, from `CellMessages.compare`.
-        most: number of cells.
     """
     last, seen = known.last_seen, known.seen_fire
     assert seen is not None
@@ -245,15 +237,7 @@ def offers(known: Knowledge, news: News, most: int) -> Offers:
 
 
 def place_gain(stamp: Tensor, near: Tensor) -> Tensor:
-    """Returns the steps by which positions get newer, int64 [envs, n, n].
-
-    Summed over the UAVs in range of the speaker (row).
-
-    Args:
-        stamp: int64 [envs, n, n], the step at which a UAV (row) knows the position of another one
-            (column), -1 for never.
-        near: bool [envs, n, n], whether a UAV (row) is in range of another one (column).
-    """
+    """Returns the steps by which positions get newer, summed over hearers, int64 [envs, n, n]."""
     # [envs, hearers, speakers, known]
     newer = (stamp.unsqueeze(1) - stamp.unsqueeze(2)).clamp(min=0)
     return (newer * near.unsqueeze(-1)).sum(1)
@@ -271,7 +255,6 @@ def said_within(
         limit: bytes of a UAV.
         cells: the new cells, at least as many as fit into `limit`.
         places: int64 [envs, n, n], from `place_gain`, 0 for a position that is not new.
-        area: number of cells.
         sizes: bytes of a cell and of a position.
 
     Returns:

@@ -74,9 +74,6 @@ class CommModule(TensorDictModuleBase):
         """Returns a term to add to the reward of a step, float32 [num_envs, n], or None.
 
         Called before `forward`, with the state of the previous time step.
-
-        Args:
-            tensordict: the time step after the move, before `forward`.
         """
         return None
 
@@ -97,9 +94,6 @@ class CommModule(TensorDictModuleBase):
 
         It is called after `forward`, with `measures: all` and a range above 0. A message that
         several UAVs hear counts once. UAVs that have failed send nothing, whatever is returned.
-
-        Args:
-            tensordict: the time step after `forward`.
         """
         return None
 

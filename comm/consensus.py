@@ -155,8 +155,7 @@ class Consensus(CommModule):
     def bytes_sent(self, tensordict: TensorDictBase) -> Tensor:
         """Returns 16 for each record of a discoverer that a UAV sends, int64 [num_envs, n].
 
-        A discoverer sends its own record. Other UAVs pass on the records that they know, if they
-        `agree`.
+        A discoverer sends its own record; other UAVs pass on known records, if they `agree`.
         """
         discovers = self._discovers(tensordict)
         known = known_discoverers(tensordict.get(keys.HEARS), discovers, agree=self.config.agree)
@@ -247,7 +246,6 @@ def known_discoverers(hears: Tensor, discovers: Tensor, *, agree: bool = True) -
     Args:
         hears: bool [..., n, n], whether a UAV (row) hears another one (column).
         discovers: bool [..., n], whether a UAV is a discoverer.
-        agree: whether non-discoverers share the discoverers that they hear.
     """
     known = hears & discovers.unsqueeze(-2)
     if not agree:
@@ -325,7 +323,6 @@ def heading_reward(before: Tensor, after: Tensor, target: Tensor, config: Headin
     Args:
         before, after: float32 [..., 3], positions before and after the move, cells.
         target: float32 [..., 3], the target that the UAV had before the move, cells.
-        config: form and weight.
     """
     before = before.double()
     term = HEADING_FORMS[config.form](target.double() - before, after.double() - before)

@@ -265,7 +265,6 @@ def steer_home(
     over the ground and the action along z are decided independently.
 
     Args:
-        world: the world and the team.
         action: float32 [envs, n, 3], the actions of the policy.
         home: float32 [envs, n, 3], each UAV's place along x and y, and the greatest distance from
             it, cells.

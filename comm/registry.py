@@ -27,10 +27,7 @@ def build(
     It warns if the world limits the bytes of messages and the module does not heed the limit.
 
     Args:
-        name: name of the communication method.
-        world: the environment's constants.
         settings: the keys under `comm`, without `name`.
-        num_envs: number of environments.
 
     Raises:
         UserError: the name or a setting is not known, or a value is out of range.

@@ -92,11 +92,7 @@ NETWORKS_READ: Final = (OBSERVATION, WINDOW, CROPS)
 
 
 def observation_keys(spec: Composite) -> list[tuple[str, str]]:
-    """Returns the keys of the tensors per UAV that networks read, in a fixed order.
-
-    Args:
-        spec: an environment's observation spec.
-    """
+    """Returns the keys of `NETWORKS_READ` that an environment's observation spec has."""
     present = spec.keys(True, True)
     return [key for key in NETWORKS_READ if key in present]
 

@@ -165,11 +165,7 @@ def base_coverage(seen: Tensor, burnt: Tensor) -> Tensor:
 
 
 def base_age(ages: Tensor) -> Tensor:
-    """Returns `front_age` with the sightings that reached the base.
-
-    Args:
-        ages: `keys.BASE_AGE` after each step, [..., T].
-    """
+    """Returns `front_age` with the base's sightings, from `keys.BASE_AGE`, [..., T]."""
     return ages[..., -1]
 
 

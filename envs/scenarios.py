@@ -187,10 +187,7 @@ def fires_of(scenario: ScenarioConfig) -> FireSource:
 
 
 def same_tests(one: ScenarioConfig, other: ScenarioConfig) -> bool:
-    """Returns whether two scenarios have the same test fires.
-
-    The number of training fires is ignored.
-    """
+    """Returns whether two scenarios have the same test fires; ignores the training fires."""
     if not (isinstance(one, GeneratedConfig) and isinstance(other, GeneratedConfig)):
         return one == other
     return dataclasses.replace(one, num_train_fires=other.num_train_fires) == other
@@ -219,19 +216,13 @@ def load_fires(
     fire: str | ScenarioConfig | Tensor, config: WildfireConfig, num_envs: int
 ) -> tuple[Tensor, bool]:
     """Returns the fires of a `WildfireEnv`.
-
-    Args:
-        fire: a scenario's name, a config, or arrival times.
-        config: of the environment.
-        num_envs: environments.
-
     Returns:
         Arrival times, float32 [fires, X, Y], or arrival and burn-out times, [fires, 2, X, Y]; and
         whether they are fixed: environment i always has fire i, or the only one.
 
     Raises:
-        UserError: an unknown scenario, a file that cannot be read, or arrival times whose shape
-            or values do not fit.
+        UserError: an unknown scenario, a file that cannot be read, or arrival times whose shape or
+            values do not fit.
     """
     if isinstance(fire, str):
         fire = load_scenario(fire)

@@ -55,10 +55,7 @@ class Tab:
         self.page.goto(address)
 
     def wait_for(self, expression: str, seconds: float = 30.0) -> None:
-        """Waits until an expression is true.
-
-        Playwright's wait_for_function evaluates text within the page, which its policy forbids.
-        """
+        """Waits until an expression is true; the page's policy forbids wait_for_function."""
         end = time.monotonic() + seconds
         while not self.page.evaluate(expression):
             assert time.monotonic() < end, f"still false: {expression}"

@@ -49,7 +49,7 @@ def wave(config, wind: float, low: float, high: float) -> tuple[float, float]:
     Args:
         config: a `ReactionConfig`.
         wind: towards the unburnt side, m/s.
-        low, high: speeds below and above that of the fast wave.
+        low, high: speeds below and above the fast wave's.
     """
     assert (profile(config, wind, low)[1], profile(config, wind, high)[1]) == (-1, 1)
     for _ in range(30):

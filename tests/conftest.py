@@ -1,7 +1,7 @@
 """Fixtures for all tests.
 
-The process that starts the others of pytest-xdist reads this file first, so what is slow to import
-is imported in the fixtures.
+The process that starts the others of pytest-xdist reads this file first, so slow imports are in the
+fixtures.
 """
 
 import importlib
@@ -47,10 +47,7 @@ def _torchrl_is_imported() -> None:
 
 @pytest.fixture(autouse=True)
 def _blank_figures(request, monkeypatch) -> None:
-    """Saves a blank picture for each figure and GIF, except in tests marked `drawn`.
-
-    Drawing takes half of the time of a short training.
-    """
+    """Saves blank pictures, except in tests marked `drawn`: drawing takes half of a training."""
     if request.node.get_closest_marker("drawn"):
         return
     from matplotlib.figure import Figure

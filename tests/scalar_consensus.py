@@ -34,7 +34,7 @@ class ScalarConsensus:
 
         Args:
             position, new, old: position and cells of new and old fire in view of each UAV.
-            lost: the pairs (i, j) of which i does not hear j.
+            lost: the pairs (i, j) where i does not hear j.
         """
         uavs = range(len(position))
         finds = [new[i] > 0 or (self.any_fire and old[i] > 0) for i in uavs]

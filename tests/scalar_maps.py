@@ -24,8 +24,6 @@ def picture(looks, fires, grid, centre, others, base, step, *, pixels, scale, sp
         grid, centre: cells.
         others: (cell, step) of the other UAVs that are known.
         base: cell or None.
-        step: the current one.
-        pixels, scale, spread: of the picture.
     """
     names = ("fire", "seen", "burnt_out", "near", "age", "outside", "uavs", "base")
     result = {name: [[0] * pixels for _ in range(pixels)] for name in names}
@@ -86,10 +84,10 @@ class Teller:
                 self.fires[uav].add(cell)
 
     def talk(self, near, hears, limit=None, sizes=(5, 16), area=0) -> list[tuple[int, int]]:
-        """Passes on what is new, and returns the numbers of cells and positions of each UAV.
+        """Passes on new cells and positions, and returns their numbers for each UAV.
 
-        What is said depends on the UAVs in range, what is received on those that hear. With a
-        limit, `area` is the number of cells of the map.
+        Messages depend on the UAVs in range; only hearers receive them. With a limit, `area` is the
+        number of cells of the map.
         """
         looks, fires = [dict(m) for m in self.looks], [set(m) for m in self.fires]
         places, counts = [dict(m) for m in self.places], []
@@ -123,7 +121,7 @@ class Teller:
 
 
 def within(limit: int, worth: dict, sizes: tuple[int, int], turn: int, area: int) -> set:
-    """Returns what is said: the best that fit together, and then cells.
+    """Returns the entries said: the best that fit together, and then cells.
 
     Of equal worth, cells come first, in the order of their indices plus `turn`, modulo `area`.
     """

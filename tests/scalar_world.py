@@ -1,4 +1,4 @@
-"""Re-implements what the team and the base know of a fire, in plain Python, cell by cell."""
+"""Re-implements the belief maps of the team and the base in plain Python, cell by cell."""
 
 import math
 
@@ -21,7 +21,7 @@ class ScalarWorld:
         self.known = [{cell: set() for cell in self.cells} for _ in range(uavs + 1)]
         self.ages: list[int] = []
         self.base_ages: list[int] = []
-        self.told: list[int] = []  # cells of which the base learnt in the last step, per UAV
+        self.told: list[int] = []  # cells new to the base in the last step, per UAV
 
     def burns(self, cell, step) -> bool:
         i, j = cell
@@ -31,9 +31,7 @@ class ScalarWorld:
         """Adds one step.
 
         Args:
-            step: of the episode, from 1.
             position: (x, y, z) of each UAV.
-            alive: whether each UAV flies.
             hears: [radios][radios], whether a radio (row) hears another one; the base is last.
         """
         before = self.base_seen()

@@ -1,4 +1,4 @@
-"""Plays short episodes with random actions, and keeps what the environment says at each step."""
+"""Plays short episodes with random actions, and records the environment at each step."""
 
 from dataclasses import dataclass, field
 from typing import Any
@@ -25,7 +25,7 @@ LIMITED = (
 
 @dataclass
 class Episode:
-    """What was recorded, and what the environment returned and stored at each step."""
+    """The recording, and the environment's outputs and state at each step."""
 
     config: Any
     recording: Recording
@@ -69,7 +69,7 @@ def play_small(*overrides: str, seed: int = 5, member: int = 1, burn_time: float
 
 
 def _keep(episode: Episode, world: Any, now: Any, member: int) -> None:
-    """Adds what the environment knows at a step."""
+    """Adds the environment's state at a step."""
     episode.steps.append(now)
     episode.fire_map.append(world.fire_map[member].clone())
     knowledge = world.knowledge

@@ -10,7 +10,7 @@ CODES = {"u1": "B", "i1": "b", "u2": "H", "i2": "h", "u4": "I", "i4": "i", "f4":
 
 
 def data_of(page: str) -> dict:
-    """Returns the header of a page, with lists in place of its arrays."""
+    """Returns the header of a page, with lists instead of arrays."""
     (text,) = re.findall(r'<script type="text/plain" id="data">([A-Za-z0-9+/=]*)</script>', page)
     plain = gzip.decompress(base64.b64decode(text))
     (length,) = struct.unpack("<I", plain[:4])

@@ -41,10 +41,8 @@ def make_env(
             configuration.
         world: paper (if None), front, relay, swarm, blackout, file, or a world of your own; not
             with a configuration.
-        num_envs: number of environments, the batch size.
         fire: see `WildfireEnv`; the scenario of the setup or of the run if None.
         seed: seed of all random numbers of the environment; a random one if None.
-        device: device of all tensors.
         settings: other settings, by the last part of their key (`horizon=50`, `num_uavs=3`) or the
             whole key (`**{"env.reward.exit": -10.0}`).
 

@@ -202,10 +202,7 @@ def _finish(logger: Any) -> None:
 
 
 def _release_wandb() -> None:
-    """Shuts wandb down, so that its exit hook does not wait for a service that has ended.
-
-    The shutdown may block, so it runs in a thread.
-    """
+    """Shuts wandb down in a thread, so that its exit hook does not wait for an ended service."""
 
     def teardown() -> None:
         with suppress(BaseException):

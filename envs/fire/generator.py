@@ -169,11 +169,9 @@ def make_fires(
     """Returns the times of one fire per seed. A fire depends on its seed alone.
 
     Args:
-        config: the scenario.
         seeds: int64 [fires].
         grid: (X, Y), each 8 to 256 cells.
         horizon: steps. Later arrivals are inf. A longer horizon continues the same fires.
-        device: where to compute.
 
     Returns:
         Arrival times in steps, float32 [fires, X, Y]: 0 burns from the start, inf never burns. Of a

@@ -163,17 +163,7 @@ class _Wave(NamedTuple):
 
 
 def _march(phi: Tensor, wave: _Wave, border: int, horizon: float, step: float) -> Tensor:
-    """Advances a level set by Heun's method (RK2) and returns the arrival times at the cells.
-
-    The step follows from the maximum rate and the resolution. A fire therefore does not depend on
-    the horizon, nor, if `max_rate` is given, on the other fires of the batch.
-
-    Args:
-        phi: the level set at time 0 at the nodes, [fires, NX, NY].
-        wave: the rates.
-        border: nodes outside the grid on each side.
-        horizon, step: total time and time step, steps.
-    """
+    """Returns the arrival times at the cells of a level set advanced by Heun's method (RK2)."""
     inner = slice(border, -border, wave.refine)
     cells = (slice(None), inner, inner)
     blocked = torch.zeros_like(phi[cells], dtype=torch.bool)
@@ -213,11 +203,7 @@ def _rate_bound(
 
 
 def _refined(field: Tensor, grid: tuple[int, int], x: Tensor, y: Tensor) -> Tensor:
-    """Returns the multiplier at the fine nodes: bilinear between cells, 0 on barriers.
-
-    A barrier is sharp: it does not slow the cells beside it. A node on the edge between cells
-    belongs to all of them, or the front would slip between two barriers that touch at a corner.
-    """
+    """Returns the multiplier at the nodes: bilinear, 0 on barriers, their edges and corners."""
     if field.dim() != 3 or tuple(field.shape[1:]) != tuple(grid):
         raise UserError(f"rate_field must be [fires, {grid[0]}, {grid[1]}], got {field.shape}")
     if not (field >= 0).all():
@@ -247,12 +233,7 @@ def _hamiltonian(
     azimuth: Tensor,
     drift: Tensor | None,
 ) -> Tensor:
-    """Computes −φ_t with unit multiplier; `phi` is scaled to unit spacing of the nodes.
-
-    H is convex and homogeneous of degree one, so H = V·∇φ with V = ∂H/∂∇φ the velocity of the
-    characteristics in the medium: V from central differences, and the drift on top of it, tell
-    which side is upwind.
-    """
+    """Computes −φ_t at unit multiplier and node spacing, upwind of ∂H/∂∇φ plus the drift."""
     a, b, c = (r[:, None, None] for r in wavelet)
     wx, wy = torch.cos(azimuth)[:, None, None], torch.sin(azimuth)[:, None, None]
 

@@ -30,7 +30,6 @@ def unit_draws(seeds: Tensor, field: int, count: int) -> Tensor:
     Args:
         seeds: int64 [fires].
         field: number of the field in its scenario.
-        count: draws per fire.
     """
     key = torch.tensor([Use.FIRE_PARAMETER, field], device=seeds.device)
     return uniform(fold_in(fold_in(seeds, key[0]), key[1]), count)

@@ -210,7 +210,6 @@ def reaction_fires(
     """Returns the arrival and burn-out times of one fire per seed.
 
     Args:
-        config: the scenario.
         seeds: int64 [fires], on the device where to compute.
         grid: (X, Y) cells.
         horizon: steps. Later times are inf. A longer horizon continues the same fires.

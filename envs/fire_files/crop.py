@@ -16,13 +16,7 @@ from emberlink.envs.utils.errors import UserError
 def on_grid(
     source: Source, config: FileFireConfig, grid: tuple[int, int], horizon: int
 ) -> np.ndarray:
-    """Crops a fire to a grid and stretches its times over an episode.
-
-    Args:
-        source: the fire.
-        config: the span of time, the margin and the ring.
-        grid: (X, Y).
-        horizon: steps.
+    """Crops a fire to a grid (X, Y) and stretches its times over an episode.
 
     Returns:
         float32 [X, Y], steps; 0 burns from the start, inf never burns.

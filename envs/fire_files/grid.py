@@ -151,9 +151,9 @@ class Raster:
     def on(self, window: Window, until: float) -> np.ndarray:
         """Returns the earliest arrival in each cell of a grid.
 
-        Candidates are the bilinear sample points in the cell and the centres of the raster's cells;
-        on a finer grid only centres that burn before all their neighbours. A map of the whole grid,
-        and a raster with the grid's cells, are not interpolated.
+        Candidates are the bilinear sample points in the cell and the centres of the raster's cells
+        (on a finer grid, only centres that burn before all their neighbours). A map of the whole
+        grid, and a raster with the grid's cells, are not interpolated.
         """
         fine = window.side < (1 - _EDGE) * min(self.cell)
         if self.whole or self._is_aligned(window):

@@ -38,7 +38,6 @@ def choose_plane(crs: Any, wanted: str | None, bounds: Bounds, cell: float | Non
     Args:
         crs: the projection of the file; None if it has none.
         wanted: `fire.crs`: the projection of a file without one, otherwise the target.
-        bounds: bounds of the coordinates.
         cell: side of a raster's cells in these coordinates; None for perimeters.
     """
     width, height = bounds[2] - bounds[0], bounds[3] - bounds[1]

@@ -262,11 +262,7 @@ def _whole_map(times: np.ndarray, unit: str) -> Raster:
 
 
 def _front_points(path: Path, config: FileFireConfig) -> Raster:
-    """Reads the paper's text: each point of the front marks five cells on a map of 30 x 30.
-
-    The cell of a point is int(v - (30 - 1) / 3) along x and y; the four cells beside it burn too.
-    A cell burns from the first line that marks it. Line 6000 is time 0.
-    """
+    """Reads the paper's text: a point v marks the cell int(v - 29 / 3) and the four beside it."""
     times, count = np.full((_SIDE, _SIDE), np.inf), 0  # [x, y]
     with path.open("rb") as lines:
         for count, line in enumerate(lines, 1):

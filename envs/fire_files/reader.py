@@ -31,21 +31,14 @@ _OF_TABLES = ("time_field", "time_format", "incident", "incident_field", "where"
 
 
 def read_fires(config: FileFireConfig, grid: tuple[int, int], horizon: int) -> Tensor:
-    """Returns the fires of `config.path` on a grid.
-
-    Returns:
-        float32 [fires, X, Y], steps: 0 burns from the start, inf never burns.
-    """
+    """Returns the fires of `config.path`, float32 [fires, X, Y], steps; inf never burns."""
     return read_with_summary(config, grid, horizon)[0]
 
 
 def read_with_summary(
     config: FileFireConfig, grid: tuple[int, int], horizon: int
 ) -> tuple[Tensor, str]:
-    """Returns the fires of `read_fires` and the findings about the file.
-
-    Warns of signs of a misreading.
-    """
+    """Returns the fires of `read_fires` and the findings about the file; warns of a misreading."""
     check_grid(grid)
     path = user_path(config.path)
     name = printable(str(path))
@@ -141,16 +134,7 @@ def _sets_with_summary(
 
 
 def _divide(count: int, *, test_file: bool) -> tuple[list[int], list[int], list[int]]:
-    """Divides the fires of a file into training, validation and test fires.
-
-    Of five or more fires every fifth is a test fire and every fifth a validation fire. Of fewer
-    the last is the test fire and the last but one the validation fire. A set without a fire shares
-    the last one, so the only fire of a file is in all three sets.
-
-    Args:
-        count: number of fires in the file.
-        test_file: whether another file holds the test fires.
-    """
+    """Divides fires by number modulo 5; of fewer than 5, the last two validate and test."""
     fires = list(range(count))
     many = count >= _EVERY
     test = [i for i in fires if i % _EVERY == _TEST] if many else fires[-1:]

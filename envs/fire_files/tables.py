@@ -33,11 +33,10 @@ def read_table(path: Path, kind: str | None, config: FileFireConfig) -> tuple[An
     Args:
         path: a file, or a folder of files of one fire.
         kind: format of the file, None for a folder.
-        config: the scenario.
 
     Returns:
-        A table of geopandas with a row per feature, whose index names the features in messages,
-        and the names of the columns whose values stand outside the attributes.
+        A table of geopandas with a row per feature, whose index names the features in messages, and
+        the names of the columns whose values stand outside the attributes.
     """
     if kind is not None:
         return _of_file(path, kind, config.layer)

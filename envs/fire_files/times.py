@@ -53,7 +53,6 @@ def read_times(frame: Any, config: FileFireConfig, outside: Sequence[str]) -> Ti
 
     Args:
         frame: a table with a column per attribute; the index names the features in messages.
-        config: the scenario.
         outside: columns whose values stand outside the attributes.
     """
     columns = [name for name in frame.columns if name != frame.geometry.name]

@@ -27,7 +27,6 @@ def unit_of(declared: str, config: FileFireConfig, what: str) -> tuple[str, str]
 
     Args:
         declared: unit that the file declares; empty if none.
-        config: the scenario.
         what: the band or variable, for messages.
     """
     name, _, since = declared.strip().partition(" since ")
@@ -60,7 +59,6 @@ def arrival(
     Args:
         values: [rows, columns] of a file, any real type.
         nodata: mask of the NODATA that the file declares.
-        config: the scenario.
         in_bank: whether inf says which cells never burn, and all others may burn at once.
     """
     times = np.array(values, dtype=np.result_type(values, np.float32))

@@ -27,14 +27,11 @@ def split_times(fires: Tensor) -> tuple[Tensor, Tensor | None]:
 
 
 def with_burn_time(arrival: Tensor, burn_time: float) -> Tensor:
-    """Returns fires whose cells burn for `burn_time` steps each; `arrival` itself if it is inf.
-
-    Args:
-        arrival: arrival times in steps, float32 [fires, X, Y].
-        burn_time: steps, at least 1.
+    """Returns fires, [fires, X, Y], with burn-out times after `burn_time` steps.
 
     Returns:
-        Arrival and burn-out times, float32 [fires, 2, X, Y], or `arrival`.
+        Arrival and burn-out times, float32 [fires, 2, X, Y]; `arrival` itself if `burn_time` is
+        inf.
     """
     if math.isinf(burn_time):
         return arrival
@@ -192,12 +189,7 @@ class CoverageMap(nn.Module):
         return self._sensor.crop(self._first_seen < _NEVER)
 
     def start_episodes(self, mask: Tensor, fire: Tensor) -> None:
-        """Starts new episodes in the environments of a mask.
-
-        Args:
-            mask: bool [envs].
-            fire: int64 [envs], the index of each environment's fire.
-        """
+        """Starts episodes where a mask, bool [envs], is true, with fires of index int64 [envs]."""
         began = mask[:, None]
         self._arrival_time.copy_(torch.where(began, self._fires[fire], self._arrival_time))
         if self._burn_out is not None and self._fires_end is not None:
@@ -207,14 +199,7 @@ class CoverageMap(nn.Module):
         self._stamp.copy_(torch.where(mask[:, None, None], self._uav, self._stamp))
 
     def count(self, step: Tensor) -> tuple[Tensor, Tensor]:
-        """Counts the cells that burn at a step, and the cells that burn or have burnt.
-
-        Args:
-            step: int64 [envs], steps since the episode began.
-
-        Returns:
-            int64 [envs] each.
-        """
+        """Counts burning cells, and burning or burnt cells, at steps [envs]: int64 [envs] each."""
         burnt = self._ignited.at(self._fire_index, step)
         if self._burnt_out is None:
             return burnt, burnt.clone()

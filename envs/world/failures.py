@@ -10,15 +10,8 @@ from emberlink.envs.utils.counter_rng import Use
 def draw_failures(episode_key: Tensor, expected: float, uavs: int, horizon: int) -> Tensor:
     """Draws the step from which each UAV has failed, int64 [..., uavs].
 
-    Each UAV fails with probability `expected / uavs`, independently, at a step that is uniform
-    from 1 to the horizon.
-
-    Args:
-        episode_key: int64 [...], the random key of the episode.
-        expected: expected number of UAVs that fail in an episode.
-        uavs: UAVs in the team.
-        horizon: steps of an episode.
-
+    Each UAV fails with probability `expected / uavs`, independently, at a step that is uniform from
+    1 to the horizon.
     Returns:
         Steps; `horizon + 1` for a UAV that does not fail.
     """

@@ -79,7 +79,6 @@ class Knowledge(nn.Module):
         """Adds what each UAV sees to its own map alone.
 
         Args:
-            view: the cells that the UAVs see.
             stored: integers [envs, uavs, cells], the step of each sighting, or a number that is
                 larger for later steps.
         """
@@ -94,7 +93,6 @@ class Knowledge(nn.Module):
         """Adds the sightings and messages of a step.
 
         Args:
-            view: the cells that the UAVs see.
             step: int64 [envs], steps since the episode began.
             hears: bool [envs, radios, radios], whether a radio (row) hears another one (column).
         """
@@ -113,11 +111,7 @@ class Knowledge(nn.Module):
         self.reach.copy_(reach)
 
     def _merge(self, new: Tensor) -> None:
-        """Takes over the maps of radios whose messages arrive for the first time.
-
-        Args:
-            new: bool [envs, radios, radios], whether a radio (row) takes over another's map.
-        """
+        """Takes over maps (column) into maps (row) where bool [envs, radios, radios] is true."""
         env, taker, source = new.nonzero(as_tuple=True)
         for number in source.unique().tolist():
             rows = source == number

@@ -96,12 +96,7 @@ class SightingAges(nn.Module):
         self.histogram.masked_fill_(mask[:, None], 0)
 
     def add(self, ages: Tensor, env: Tensor) -> None:
-        """Adds the ages of one step.
-
-        Args:
-            ages: int64 [cells], at least 0.
-            env: int64 [cells], the environment of each cell.
-        """
+        """Adds the ages of one step, int64 [cells], in the environments int64 [cells]."""
         one = torch.ones_like(env)
         self.total.scatter_add_(0, env, ages)
         self.count.scatter_add_(0, env, one)
@@ -139,12 +134,7 @@ class FireTimes(nn.Module):
             self.register_buffer(name, steps)
 
     def start_episodes(self, mask: Tensor, arrival: Tensor, burn_out: Tensor | None) -> None:
-        """Stores the fires of new episodes.
-
-        Args:
-            mask: bool [envs].
-            arrival, burn_out: float32 [envs, area], steps; NaN outside of the grid.
-        """
+        """Stores new fires, steps [envs, area] (NaN outside), where a mask, bool [envs], is set."""
         for steps, times in ((self.ignition, arrival), (self.end, burn_out)):
             if times is not None:
                 known = times.nan_to_num(nan=self._never).clamp(0, self._never).ceil()
@@ -213,7 +203,6 @@ class Measures(nn.Module):
         """Adds one step.
 
         Args:
-            view: the cells that the UAVs see.
             position: float64 [envs, uavs, 3], cells.
             rng_key: int64 [envs], `keys.RNG_KEY`.
             step: int64 [envs], steps since the episode began.

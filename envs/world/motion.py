@@ -39,8 +39,8 @@ def move(
         low, high: float64 [3], the corners of the box, from `corners`.
 
     Returns:
-        The new positions, float32 [..., 3], and the axes along which the move would have left
-        the box, bool [..., 3].
+        The new positions, float32 [..., 3], and the axes along which the move would have left the
+        box, bool [..., 3].
     """
     clipped = action.nan_to_num(0.0).clamp_(-1, 1)
     wanted = torch.add(position.double(), clipped, alpha=displacement)

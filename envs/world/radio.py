@@ -28,11 +28,9 @@ def links(
     The lost messages are a function of the episode's random key and the step.
 
     Args:
-        config: range and probability of loss.
         position, alive: see `in_range`.
         rng_key: int64 [...], `keys.RNG_KEY`.
         step: int64 [...], steps since the episode began.
-        use: purpose of the random numbers.
     """
     linked = in_range(config, position, alive)
     if config.loss:
@@ -47,7 +45,6 @@ def in_range(config: RadioConfig, position: Tensor, alive: Tensor | None = None)
     """Returns the links of a step if no message is lost, bool [..., n, n].
 
     Args:
-        config: the range.
         position: float [..., n, 3], cells.
         alive: bool [..., n]; a radio that is not neither hears nor is heard. All are alive if None.
     """
@@ -118,7 +115,6 @@ def chain(
     All fly at the maximum altitude, which the range has to exceed for the base to hear anything.
 
     Args:
-        world: the world and the team.
         base: float32 [2], cells.
         centre: float32 [envs, n, 2], the middle of the fire, cells.
         rank: int64 [envs, n], place of each UAV in the chain, 0 next to the base.
@@ -146,10 +142,7 @@ def chain(
 
 
 def middle(cells: Tensor) -> Tensor:
-    """Returns the mean place of the cells of a mask, bool [..., X, Y], float32 [..., 2].
-
-    It is 0 without any cells.
-    """
+    """Returns the mean place of a mask's cells, bool [..., X, Y]: float32 [..., 2], 0 if none."""
     count = cells.sum((-2, -1)).clamp(min=1)
     sides = (torch.arange(side, device=cells.device) for side in cells.shape[-2:])
     sums = ((cells.sum(axis) * side).sum(-1) for axis, side in zip((-1, -2), sides, strict=True))
@@ -164,7 +157,6 @@ def chain_to_fire(
     UAVs take their places in the order of their numbers. Without known fire, all are at the base.
 
     Args:
-        world: the world and the team.
         base: float32 [2], cells.
         burning: bool [envs, n, X, Y], the cells that each UAV knows to burn.
         step, heard: see `believed_to_fly`; UAVs that do not fly have no place.
@@ -186,7 +178,6 @@ def believed_to_fly(world: WildfireConfig, step: Tensor, heard: Tensor) -> Tenso
     In a world in which UAVs fail, 150 steps without news of a UAV count as its loss.
 
     Args:
-        world: the world and the team.
         step: int64 [envs].
         heard: [envs, n, n], step of the latest news that a UAV (row) has of another one (column).
     """

@@ -8,12 +8,7 @@ from emberlink.envs.config import RewardConfig
 
 
 def left_box(hit_boundary: Tensor, axes: Literal["xyz", "xy"]) -> Tensor:
-    """Returns whether the last move would have left the box on the tested axes, bool [...].
-
-    Args:
-        hit_boundary: bool [..., 3], per axis, from `motion.move`.
-        axes: the axes that are tested.
-    """
+    """Returns whether a move, bool [..., 3], left the box on the tested axes, bool [...]."""
     return hit_boundary[..., : len(axes)].any(-1)
 
 
@@ -33,7 +28,6 @@ def step_reward(
     Args:
         new, old, none: [...], number of cells of new fire, old fire and no fire in view.
         hit_boundary: bool [..., 3], the axes along which the move would have left the box.
-        config: reward per cell of each class, and the penalty.
         told: integers [...], number of burning cells new to the base; None for none.
         unseen: integers [...], number of burning cells that no UAV has seen; None for none.
 

@@ -10,12 +10,7 @@ from emberlink.envs.world import motion
 
 
 def view_radius(altitude: float, view_angle: float) -> float:
-    """Returns half the side of the square in view, in cells.
-
-    Args:
-        altitude: cells.
-        view_angle: half the opening angle, degrees.
-    """
+    """Returns half the side of the square in view, cells, from altitude (cells) and angle (°)."""
     return altitude * math.tan(math.radians(view_angle))
 
 

@@ -43,7 +43,6 @@ class Grouping:
 
         Args:
             x: [*batch, features, ...], with the batch [..., uavs].
-            dims: number of dimensions of the batch.
 
         Returns:
             [*batch, uavs * features, ...].

@@ -60,33 +60,16 @@ class Scripted(TensorDictModuleBase):
         """Returns the bytes that each UAV sends at a step, int64 [num_envs, n]; zeros by default.
 
         If None, the bytes that the communication module counts are used.
-
-        Args:
-            tensordict: the time step.
         """
         return torch.zeros_like(tensordict.get(keys.ALIVE), dtype=torch.int64)
 
     def fly(self, tensordict: TensorDictBase, target: torch.Tensor) -> TensorDictBase:
-        """Writes the action that flies straight to a target at full speed and stops there.
-
-        Args:
-            tensordict: the current time step.
-            target: float [num_envs, n, 3], cells.
-
-        Returns:
-            The same TensorDict.
-        """
+        """Writes the action that flies at full speed to a target, float [num_envs, n, 3], cells."""
         way = target - tensordict.get(keys.POSITION)
         return tensordict.set(keys.ACTION, motion.towards(way, self.stride))
 
     def carried(self, tensordict: TensorDictBase, key: str, initial: torch.Tensor) -> torch.Tensor:
-        """Returns the tensor under `key`, or `initial` at the first step of an episode.
-
-        Args:
-            tensordict: the current time step.
-            key: where the previous step wrote the tensor.
-            initial: [num_envs, ...].
-        """
+        """Returns the tensor under `key`; `initial`, [num_envs, ...], where an episode begins."""
         previous = tensordict.get(key, None)
         if previous is None:
             return initial

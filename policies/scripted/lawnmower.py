@@ -65,12 +65,7 @@ class Lawnmower(Scripted):
 
 
 def search_path(grid: tuple[int, int], radius: float) -> Tensor:
-    """Returns a path of waypoints from which every cell is seen, float32 [waypoints, 2], cells.
-
-    Args:
-        grid: cells along x and y.
-        radius: half the side of the square in view, cells.
-    """
+    """Returns waypoints from which all cells within `radius` are seen, float32 [waypoints, 2]."""
     width = max(1, math.floor(2 * (radius - _SLACK)) + 1)
     across, along = _centres(grid[0], width), _centres(grid[1], width)
     strips = [

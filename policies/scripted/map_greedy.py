@@ -100,13 +100,7 @@ class MapGreedy(Scripted):
         return self._choose(tensordict.get(keys.STEP), ground, burning, weight, distance)
 
     def _weight(self, step: Tensor, last_seen: Tensor, ignited: Tensor, burning: Tensor) -> Tensor:
-        """Returns the chance that a look at a cell shows new fire, float32 [num_envs, n, X, Y].
-
-        Args:
-            step: int64 [num_envs].
-            last_seen: float [num_envs, n, X, Y], negative for never.
-            ignited, burning: bool [num_envs, n, X, Y], the cells' states at the last look.
-        """
+        """Returns the chance that a look at a cell shows new fire, float32 [num_envs, n, X, Y]."""
         never = last_seen < 0
         age = step.view(-1, 1, 1, 1) - last_seen
         near = self._near_x @ burning.float() @ self._near_y > 0

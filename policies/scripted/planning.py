@@ -129,9 +129,8 @@ class Rally(NamedTuple):
 
         Args:
             ground: float32 [envs, n, 2], positions, cells.
-            step: int64 [envs].
+            step, period: int64 [envs], and steps between plans.
             speed: cells per step.
-            period: steps between plans.
         """
         apart = torch.linalg.vector_norm(self.place - ground, dim=-1) - self.reach
         needs = apart.clamp(min=0) / speed + PASSING + period

@@ -105,14 +105,7 @@ class TeamMaps(nn.Module):
         return seen.float()
 
     def was_fire(self, last_seen: Tensor) -> tuple[Tensor, Tensor]:
-        """Returns whether cells had ignited and had burnt out when they were last seen.
-
-        Args:
-            last_seen: float [envs, n, X, Y], from `last_seen`.
-
-        Returns:
-            bool [envs, n, X, Y] each; False for cells that were never seen.
-        """
+        """Returns whether cells had ignited and burnt out at `last_seen`, bool like `last_seen`."""
         (env,) = self._env
         seen = last_seen >= 0
         ignited = seen & (last_seen >= env.arrival_time.unsqueeze(1))

@@ -225,7 +225,7 @@ def test_links_are_written_once(limit, loss):
 
 
 def test_a_uav_observes_its_own_vector_first():
-    """Without limit, in turn: those of UAVs 1, 2, …, 0 for UAV 1; what is not heard is 0."""
+    """Without limit, UAV 1 observes the vectors of UAVs 1, 2, …, 0; unheard ones are 0."""
     for reach in (float("inf"), 4.0):
         world = replace(WORLD, radio=RadioConfig(range=reach))
         own = TransformedEnv(

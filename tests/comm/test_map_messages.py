@@ -30,7 +30,7 @@ def draw(seed: int, *shape: int) -> torch.Tensor:
 
 
 def looks(step: int) -> tuple[View, torch.Tensor]:
-    """Returns what the UAVs see at a step, and the codes: the state of a cell is that of a step."""
+    """Returns the views of the UAVs at a step, and the codes of the cells' states."""
     cells = torch.stack([draw(97 * step + k, AREA).argsort()[:6] for k in range(ENVS * UAVS)])
     cells = cells.view(ENVS, UAVS, 6)
     state = (draw(7 * step + 1, ENVS, AREA) * 3).long()
@@ -105,7 +105,7 @@ def test_exchange_matches_reference(limit, density, loss):
 
 
 def check_knowledge(teller, known, stamp, place, env) -> None:
-    """Checks that UAVs of an environment know what those of the teller know."""
+    """Checks that the UAVs of an environment have the teller's maps."""
     for uav in range(UAVS):
         last = {
             cell: (number // 4, number % 4)
@@ -164,7 +164,7 @@ def test_what_fits_equals_a_greedy_choice(data):
 
 
 def two_uavs(known: list, theirs: list, stamp: list) -> tuple:
-    """Returns the maps of two UAVs, of which the second one is in range of the first one."""
+    """Returns the maps of two UAVs; the second one is in range of the first one."""
     area = len(known)
     maps = Knowledge(envs=1, uavs=2, area=area, horizon=1203, fires=True)
     maps.last_seen[0] = torch.tensor([known, theirs])
@@ -194,7 +194,7 @@ def test_the_oldest_knowledge_is_renewed_first():
     assert gain.tolist() == [[[35, 0], [0, 0]]]
     cells_offered = offers(maps, news, 9)
     assert cells_offered.cell[0, 0].tolist() == [4, 3, 2, 1, 0]
-    # 300 to 100 is 200, of which 100 count.
+    # 300 to 100 is 200, at most 100 count.
     assert cells_offered.gain[0].tolist() == [[100, 61, 50, 30, 1], [0, 0, 0, 0, 0]]
 
 

@@ -1,4 +1,4 @@
-"""Tests that UAVs with method `maps` observe what they know, and nothing else."""
+"""Tests that UAVs with method `maps` observe their belief maps, and nothing else."""
 
 import pytest
 import torch
@@ -215,7 +215,7 @@ def test_with_losses_and_a_limit_nothing_comes_from_a_uav_out_of_range():
 
 
 def test_lost_messages_are_counted_and_said_again():
-    """A UAV sees 25 cells at each step, of which it leaves 5 behind; the other one hovers."""
+    """A UAV sees 25 cells at each step and leaves 5 behind; the other one hovers."""
     position = torch.tensor([[[4.0, 4.0, 3.5], [20.0, 15.0, 3.5]]])
     lossy = RadioConfig(range=60.0, loss=0.5)
     env = environment(torch.full((1, 50, 20), torch.inf), position, radio=lossy)

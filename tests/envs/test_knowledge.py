@@ -171,7 +171,7 @@ def looks(cells: list[list[int]], envs: int = 1) -> View:
 
 
 def heard(*pairs: tuple[int, int]) -> torch.Tensor:
-    """Returns links, bool [1, 3, 3]: each pair is a radio and the one that it hears."""
+    """Returns links, bool [1, 3, 3]: pairs (radio, heard radio)."""
     links = torch.zeros(1, 3, 3, dtype=torch.bool)
     for pair in pairs:
         links[0][pair] = True

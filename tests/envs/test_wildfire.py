@@ -64,7 +64,7 @@ def test_each_cell_goes_to_the_uav_of_lowest_index():
     env = world(num_uavs=3)
     start(env, [4.0, 3, 2], [3, 3, 2], [5, 4, 2])
     td = act(env)
-    # UAV 1 adds column 2; UAV 2 sees columns 4 to 6, rows 3 to 5, of which UAV 0 saw 2 x 2.
+    # UAV 1 adds column 2; UAV 2 sees columns 4 to 6, rows 3 to 5; UAV 0 saw 2 x 2 of them.
     assert counts(td) == [(9, 0, 0), (3, 6, 0), (5, 4, 0)]
     assert rewards(td) == [9, 3 - 24, 5 - 16]
     assert td[keys.SEEN].item() == 17

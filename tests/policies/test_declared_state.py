@@ -48,7 +48,7 @@ def make(config, seed):
 
 
 def alone(policy):
-    """Returns the actions of two environments, each in a rollout of its own."""
+    """Returns the actions of two environments, each in a separate rollout."""
     runs = [
         make(policy.config, seed).rollout(STEPS, policy, break_when_any_done=False)
         for seed in (3, 4)

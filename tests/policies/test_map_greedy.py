@@ -1,4 +1,4 @@
-"""Tests the scripted policies that search by maps: what they know, and where they fly."""
+"""Tests the scripted policies that search by maps: their belief maps and targets."""
 
 import math
 
@@ -96,11 +96,11 @@ def test_who_learns_of_a_fire_out_of_range(kind, told):
     assert ignited[0, 1].any()
 
 
-# What they know
+# Belief maps
 
 
 def test_the_maps_are_those_of_the_world():
-    """The policy's maps in range equal those that the environment keeps of a world with a base."""
+    """The policy's maps in range equal the environment's in a world with a base."""
     radio = RadioConfig(range=8.0, loss=0.5)
     settings = {"num_uavs": 5, "failures": 2.5, "base": (0.0, 15.0), "horizon": 40}
     config = world(radio=radio, **settings)

@@ -22,7 +22,7 @@ SINGLE = FEATURES, ACTIONS, HIDDEN
 
 
 def scrambled(network):
-    """Sets all parameters to random values of ordinary size, those of the norms included."""
+    """Sets all parameters, the norms' included, to random values of ordinary size."""
     generator = torch.Generator().manual_seed(1)
     with torch.no_grad():
         for parameter in network.parameters():

@@ -1,4 +1,4 @@
-"""Tests how scripted policies come to a meeting place in time, and what the oracle foresees."""
+"""Tests how scripted policies come to a meeting place in time, and the oracle's foresight."""
 
 import math
 
@@ -84,8 +84,8 @@ def test_a_chain_holds_if_each_uav_is_within_its_reach(heard, height, along):
     place, reach = radio.chain(world, BASE, centre, torch.arange(6)[None], torch.tensor(6))
     relays = int((reach[0] < reach[0, -1]).sum())
     along, reach = place[0, : relays + 1, 0].double(), reach[0, : relays + 1].double()
-    # The greatest distances from the base on the ground, and between neighbours in the chain. The
-    # last of these is that of a UAV without a place of its own to the UAV at the last place.
+    # The greatest distances from the base on the ground, and between neighbours in the chain; the
+    # last one is between a UAV without a place and the UAV at the last place.
     assert math.hypot(along[0] + reach[0], top) < heard
     assert (along.diff() + reach[1:] + reach[:-1] < heard).all()
 

@@ -28,7 +28,7 @@ def _no_nohup():
 
 
 def send(*numbers) -> Interruption:
-    """Sends signals to a waiting training and returns what it received."""
+    """Sends signals to a waiting training and returns the received ones."""
     interruption = Interruption(lambda: None)
     with interruption:
         for number in numbers:

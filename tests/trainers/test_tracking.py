@@ -357,7 +357,7 @@ def service(others: Collection[int] = ()) -> int:
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGSTOP])
 def test_the_process_of_wandb_is_killed_or_stopped(how, tmp_path, monkeypatch):
     struck: list[int] = []
-    before = services()  # that of an earlier test may still be ending
+    before = services()  # an earlier test's may still be ending
     monkeypatch.setattr(tracking, "PATIENCE", 1.5)
 
     def strike(progress: Progress) -> None:

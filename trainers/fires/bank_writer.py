@@ -43,7 +43,6 @@ def write_bank(
             Beside an .npy, a .json of the same name holds the facts.
         fires: float32 [fires, X, Y], steps; inf never burns (-9999 in the GeoTIFF).
         facts: the origin of the fires: text, numbers, lists and mappings.
-        names: the names of the fires.
     """
     check_bank(path, len(fires), fires.shape[1:])
     array = np.ascontiguousarray(fires.cpu().numpy(), dtype="<f4")

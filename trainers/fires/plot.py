@@ -23,11 +23,9 @@ def arrival_figure(
     """Draws arrival times as colours with contours, and the view of a UAV to scale.
 
     Args:
-        path: a .png file.
         arrival: [X, Y], steps; inf never burns.
         horizon: steps of the episode.
         width: side of the square that a UAV sees from full altitude, cells.
-        title: title above the map.
     """
     across, up = arrival.shape
     scale = _SIDE / max(across, up)

@@ -173,14 +173,7 @@ class Learner(ABC):
         """
 
     def start_from(self, weights: Mapping[str, Tensor]) -> None:
-        """Begins the run with the actors of another run.
-
-        Args:
-            weights: the weights of its actors, from `weights`.
-
-        Raises:
-            UserError: the learner has no warm start.
-        """
+        """Begins the run with the actors of another run, from its `weights`."""
         raise UserError(f"learner.warm_start: learner={type(self).__name__} has no warm start")
 
     def copy_actor(self, weights: Mapping[str, Tensor]) -> None:

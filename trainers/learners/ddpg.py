@@ -129,11 +129,7 @@ class DDPG(Learner):
         return [self.update(to_batch(self.replay.sample())) for _ in updates]
 
     def update(self, batch: TensorDictBase) -> Losses:
-        """Performs one step of the optimizers and of the target networks.
-
-        Args:
-            batch: transitions for each UAV, batch size [batch].
-        """
+        """Performs one step of the optimizers and the target networks on transitions, [batch]."""
         losses = self.losses(batch)
         torch.stack([*losses.values()]).sum().backward()
         self.optimizer.step()

@@ -140,10 +140,7 @@ class Imitation(Learner):
         return losses
 
     def _store(self, rollout: TensorDictBase) -> None:
-        """Stores the decisions of a rollout as rows of `sequence` decisions of an episode.
-
-        The last row of an episode is padded with decisions that are not learnt from.
-        """
+        """Stores rows of `sequence` decisions; pads the last row of an episode."""
         kept: list[Any] = [*self.observed, keys.TEACHER]
         kept += [keys.ALIVE] if self.context.failures else []
         kept += [MEMORY] if self.remembers else []
@@ -167,11 +164,7 @@ class Imitation(Learner):
             self._recent = []
 
     def update(self, batch: TensorDictBase) -> Losses:
-        """Performs one step of the optimizer.
-
-        Args:
-            batch: rows of the buffer for each UAV, batch size [batch, uavs].
-        """
+        """Performs one step of the optimizer on rows of the buffer, [batch, uavs]."""
         losses = self.losses(batch)
         networks = 1 if self.config.share_parameters else self.context.num_uavs
         losses["imitation"].unflatten(0, (networks, -1)).mean(1).sum().backward()

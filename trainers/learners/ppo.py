@@ -238,12 +238,7 @@ class PPO(Learner):
         return TensorDict(result, batch_size=rollout.shape, device=rollout.device)
 
     def _estimate(self, episode: TensorDictBase, last: TensorDictBase) -> None:
-        """Writes the critics' advantages and returns into an episode.
-
-        Args:
-            episode: batch size [environments, decisions].
-            last: the time step after the last decision, batch size [environments, 1].
-        """
+        """Writes the advantages and returns of an episode; `last` is the time step after it."""
         read = [part.select(*self.critic.in_keys) for part in (episode, last)]
         values = []
         # The environments of a minibatch at a time, to save memory.
@@ -310,11 +305,7 @@ class PPO(Learner):
                 yield episode[chosen]
 
     def update(self, batch: TensorDictBase) -> Losses:
-        """Performs one step of the optimizer.
-
-        Args:
-            batch: episodes, batch size [environments, decisions].
-        """
+        """Performs one step of the optimizer on episodes, [environments, decisions]."""
         losses = self.losses(batch)
         torch.stack([self._of_networks(*item) for item in losses.items()]).sum().backward()
         for part in self.parts:

@@ -21,9 +21,7 @@ def unflatten(tensors: Mapping[str, Tensor], dims: int, device: torch.device | s
     """Reverses `flatten`.
 
     Args:
-        tensors: leaves by name, at least one.
         dims: number of batch dimensions; entries under "agents" have one more, for the UAVs.
-        device: device of the result.
     """
     batch = next(iter(tensors.values())).shape[:dims]
     tree = TensorDict({}, batch_size=batch, device=device)

@@ -121,7 +121,6 @@ def read_config(path: Path, **changes: Any) -> RunConfig:
     """Returns the configuration that a checkpoint was trained with.
 
     Args:
-        path: a checkpoint file.
         changes: keys and values to change, such as `device="cpu"`.
 
     Raises:
@@ -140,7 +139,6 @@ def load_weights(
     """Returns the weights of a checkpoint.
 
     Args:
-        path: a checkpoint file.
         expected: the actors' tensors, with the expected names, shapes and types.
         config: configuration of the networks that get the weights, for messages.
 

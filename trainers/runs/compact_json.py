@@ -14,10 +14,6 @@ def dumps(value: Any) -> str:
 
     A list of numbers or texts is on one line, however long. A mapping is on one line if that has at
     most 240 characters; otherwise each of its keys begins a line.
-
-    Args:
-        value: mappings, lists, texts, numbers, bool and None.
-
     Raises:
         ValueError: a number is NaN.
     """

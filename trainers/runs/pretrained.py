@@ -66,11 +66,6 @@ def read_run(text: str, output: Path | str = "runs") -> RunFolder:
 
     Nothing is written: a trained policy of the package is its copy in `output`, or the installed
     folder if there is no copy.
-
-    Args:
-        text: see `open_run`.
-        output: folder of run folders.
-
     Raises:
         UserError: there is no such policy, or several; or the copy holds other networks.
     """
@@ -138,10 +133,6 @@ def find(text: str) -> list[Path]:
 
 def find_one(text: str) -> Path:
     """Returns the folder of the trained policy with a name and, among several, the lowest seed.
-
-    Args:
-        text: see `open_run`.
-
     Raises:
         UserError: there is no such policy, or the name matches several methods or setups.
     """
@@ -159,11 +150,6 @@ def collection(config: RunConfig) -> str:
 
 def pack(run: RunFolder, into: Path) -> Path:
     """Copies a finished run to the trained policies, without training states and critics.
-
-    Args:
-        run: a trained and evaluated run.
-        into: folder of the trained policies.
-
     Returns:
         The new folder.
 

@@ -62,7 +62,6 @@ class RunFolder:
         """Creates a new run folder in `config.output`, with config.yaml and the fires of files.
 
         Args:
-            config: configuration of the run.
             name: name of the folder; made of the date and the configuration if empty.
 
         Raises:

@@ -143,11 +143,7 @@ def _learns(trainer: Trainer) -> bool:
 
 
 def _train(trainer: Trainer, console: Console) -> None:
-    """Trains and shows the progress.
-
-    Raises:
-        OutputError: the output cannot be written; the training has stopped and saved.
-    """
+    """Trains and shows the progress; raises OutputError after a stop by a lost output."""
     setup = trainer.setup
     if setup.step == setup.total_steps:
         return

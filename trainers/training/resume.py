@@ -76,11 +76,7 @@ def _restored(trainer: Trainer, run: RunFolder, lock: Lock, before: RunConfig) -
 
 
 def _changed(config: RunConfig, overrides: Sequence[str], settings: dict[str, Any]) -> RunConfig:
-    """Returns the configuration with the overrides.
-
-    Raises:
-        UserError: an override changes a key that may not change.
-    """
+    """Returns the configuration with the overrides; refuses keys that may not change."""
     changed = override(config, overrides, **settings)
     for key, (new, old) in differences(changed, config).items():
         if key not in MAY_CHANGE and not key.startswith("evaluation."):

@@ -116,11 +116,7 @@ def check_setup(config: RunConfig) -> None:
 
 
 def _make_env(config: RunConfig, num_envs: int) -> TransformedEnv:
-    """Returns training environments, with the map and teacher that the learner reads.
-
-    Raises:
-        UserError: `env.observation=sight`, and the communication does not read it.
-    """
+    """Returns training environments, with the map and teacher that the learner reads."""
     if config.env.observation == "sight" and keys.SIGHT not in build_comm(config, 1).in_keys:
         raise UserError(
             f"env.observation=sight: comm.name={config.comm['name']} does not read what cameras "

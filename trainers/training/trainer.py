@@ -215,10 +215,7 @@ class Trainer:
         return line
 
     def _keep_best(self, line: Mapping[str, Any]) -> None:
-        """Writes best.safetensors if the headline measure is the best so far.
-
-        It is measured on validation fires or, without evaluations during training, in the episode.
-        """
+        """Writes best.safetensors if the headline measure is the best so far."""
         headline = self.config.evaluation.headline
         evaluated = [value for name, value in line.items() if name.endswith(f"/{headline}")]
         if self.config.evaluation.interval and not evaluated:
@@ -241,11 +238,7 @@ class Trainer:
         return any(after // steps > before // steps for steps in intervals if steps)
 
     def _check(self, updates: Sequence[Losses]) -> None:
-        """Checks that all losses are finite.
-
-        Raises:
-            NonFiniteError: one is not.
-        """
+        """Raises NonFiniteError if a loss is not finite."""
         for losses in updates:
             for name, value in losses.items():
                 if not value.isfinite().all():

@@ -250,7 +250,7 @@ def lehr(minutes: float, knots: float) -> tuple[float, float]:
     """Returns length and breadth of 79,000 barrels, in cells of 500 m (Lehr et al. 1984).
 
     The area in m² is 2270 (Δ V)^(2/3) t^(1/2) + 40 (Δ V)^(1/3) W^(4/3) t, with V in barrels, t in
-    minutes, W in knots; its first part is that of a circle, whose diameter is the breadth.
+    minutes, W in knots; its first part is a circle, whose diameter is the breadth.
     """
     size = (79_000 * (1025 - 870) / 870) ** (1 / 3)
     calm = 2270 * size**2 * math.sqrt(minutes)

@@ -96,7 +96,7 @@ def test_the_speed_converges_with_second_order():
 
 
 def point(**changes: float) -> ReactionConfig:
-    """Returns the scenario with single values in place of ranges."""
+    """Returns the scenario with single values instead of ranges."""
     names = ("azimuth", "wind_shift", "centre_x", "centre_y", "core_radius", "ring_width")
     values = {"wind_speed": 0.0, **dict.fromkeys(names, 0.0), **changes}
     ranges = {k: (v, v) for k, v in values.items() if k in (*names, "wind_speed")}

@@ -1,4 +1,4 @@
-"""Tests what a file is understood to mean: a second case for each kind that was misread."""
+"""Tests the reading of ambiguous files: a second case for each kind of misreading."""
 
 import json
 import re
@@ -26,7 +26,7 @@ FIRE = Ellipses()
 
 
 def read(path, **keys):
-    """Returns the fire of a file on 20 x 20 cells, and what was understood."""
+    """Returns the fire of a file on 20 x 20 cells, and the findings."""
     (fire,), about = read_with_summary(
         FileFireConfig(path=str(path), ring_width=None, **keys), (20, 20), 100
     )

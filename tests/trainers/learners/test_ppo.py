@@ -155,7 +155,7 @@ def test_uavs_without_shared_weights_learn_alone():
 
 
 def test_only_mappos_critic_reads_the_true_map():
-    """The map is that of the environment before each decision; evaluations do not have it."""
+    """The map is the environment's before each decision; evaluations do not have it."""
     setup = made("mappo", "learner.critic_map=true", "env.grid=[12,9]")
     maps = [setup.env.base_env.fire_map.clone()]
     for rollout in islice(setup.collector, 6):
@@ -203,7 +203,7 @@ def test_the_gradients_of_an_update_have_a_largest_norm(learner, monkeypatch):
         seen.extend([value.grad.clone() for value in part] for part in trained.parts)
 
     monkeypatch.setattr(trained.optimizer, "step", step)
-    type(trained).update(trained, batch)  # `first_batches` replaces that of the object
+    type(trained).update(trained, batch)  # `first_batches` replaces the object's
     for gradients in seen:
         norms = [torch.linalg.vector_norm(value.flatten(1), dim=1) for value in gradients]
         total = torch.stack(norms).square().sum(0).sqrt()

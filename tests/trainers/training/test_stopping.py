@@ -14,10 +14,7 @@ SOAK = Path(__file__).parents[2] / "soak" / "soak.py"
 
 @pytest.fixture(scope="module")
 def table(tmp_path_factory) -> dict[str, list[str]]:
-    """Returns the printed table, by kind of trial.
-
-    The program forks, so it runs in a separate process without threads.
-    """
+    """Returns the printed table, by kind of trial, of a separate process without threads."""
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     result = subprocess.run(
         [sys.executable, str(SOAK), "--counts", json.dumps(COUNTS)],
