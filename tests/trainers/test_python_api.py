@@ -12,10 +12,9 @@ from tensordict.nn import TensorDictModule
 import emberlink.trainers as trainers
 from emberlink.envs import keys, metrics
 from emberlink.envs.utils.errors import UserError
-from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.runs.run_folder import RunFolder
 
-POLICIES = resolve("consensus").evaluation.scripted
+POLICIES = ["lawnmower"]
 ROOT = Path(__file__).parents[2]
 SHORT = {
     "episodes": 2,
@@ -26,6 +25,7 @@ SHORT = {
     "batch_size": 8,
     "evaluation.episodes": 2,
     "evaluation.interval": 0,
+    "evaluation.scripted": POLICIES,
 }
 
 

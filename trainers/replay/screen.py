@@ -60,12 +60,11 @@ class Screen:
             (_GAP + i % columns * panel[0], _GAP + i // columns * panel[1])
             for i in range(len(episodes))
         ]
-        self.width = _even(columns * panel[0] + _GAP)
-        top = rows * panel[1] + _GAP
-        legend = self.legend()
-        places, used = self._wrap([*legend])
-        self.height = _even(top + used + _GAP)
-        self._blank = Image.new("RGB", (self.width, self.height), _PAPER)
+        width, top, legend = columns * panel[0] + _GAP, rows * panel[1] + _GAP, self.legend()
+        places, used = self._wrap([*legend], width)
+        height = top + used + _GAP
+        # Videos need even sides.
+        self._blank = Image.new("RGB", (width + width % 2, height + height % 2), _PAPER)
         pen = ImageDraw.Draw(self._blank)
         for (x, y), (word, sample) in zip(places, legend.items(), strict=True):
             sample(pen, x + 10, top + y + _LINE / 2)
@@ -102,13 +101,13 @@ class Screen:
             cut = f"{text[: -(-kept // 2)]}…{text[len(text) - kept // 2 :]}"
         return cut
 
-    def _wrap(self, words: Sequence[str]) -> tuple[list[tuple[float, float]], int]:
+    def _wrap(self, words: Sequence[str], most: int) -> tuple[list[tuple[float, float]], int]:
         """Returns the position of each legend entry, and the height of the legend."""
         places: list[tuple[float, float]] = []
         x, y = _GAP, 0
         for word in words:
             width = _SAMPLE + math.ceil(self._font.getlength(word)) + 2 * _GAP
-            if x > _GAP and x + width > self.width + _GAP:
+            if x > _GAP and x + width > most + _GAP:
                 x, y = _GAP, y + _LINE
             places.append((x, y))
             x += width
@@ -205,10 +204,6 @@ def _columns(count: int, width: int, height: int) -> int:
         return max(columns * width, math.ceil(count / columns) * height)
 
     return min(range(1, count + 1), key=lambda columns: (side(columns), -columns))
-
-
-def _even(pixels: int) -> int:
-    return pixels + pixels % 2
 
 
 def _dashes(pen: Pen, start: tuple[float, float], end: tuple[float, float], colour: Colour) -> None:
