@@ -131,11 +131,14 @@ def training(recipe: int, output: Path, die_at: tuple[str, int] | None = None):
     settings = [*SMALL, *own, f"episodes={EPISODES}", f"output={output}"]
 
     def work(say: Callable[[str], None]) -> int:
-        watch_saves(say, die_at)
         runs = sorted(output.glob("*/config.yaml"))
-        trainer = resume(runs[0].parent) if runs else Trainer(resolve(method, settings))
-        if not runs:
+        if runs:
+            watch_saves(say, die_at)
+            trainer = resume(runs[0].parent)
+        else:  # a folder without config.yaml is no run: the kills begin with the training
+            trainer = Trainer(resolve(method, settings))
             trainer.start()
+            watch_saves(say, die_at)
         say(f"at {trainer.setup.step} {','.join(temporary(output))}")
         trainer.train()
         return 0
