@@ -1,4 +1,4 @@
-"""Collects transitions by stepping the environments with the exploring policy."""
+"""Collects transitions with TorchRL's Collector, from any step of a run."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -6,21 +6,24 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from torchrl.envs import TransformedEnv
+from torchrl.collectors import Collector
+from torchrl.envs import Transform, TransformedEnv, step_mdp
 
+from emberlink.envs import keys
 from emberlink.policies.state import primer_of
 
 
-class RolloutLoop:
-    """Yields rollouts as TorchRL's Collector does, and shows the input of the next step.
+class ResumableCollector:
+    """Yields the rollouts of TorchRL's Collector, whose next input can be saved and restored.
 
-    Exact resuming needs this input; TorchRL's collector neither returns nor takes it.
+    Exact resuming needs this input (observations, communication, state of the policy), which is
+    not in the state of TorchRL's collector.
 
     Args:
         env: batch of environments with communication; the policy's state is added to it.
         policy: actors with exploration noise.
         total_steps: steps of the batch of environments in the whole run.
-        rollout_steps: steps of a rollout.
+        rollout_steps: steps of a rollout; divides the horizon.
     """
 
     def __init__(
@@ -31,33 +34,60 @@ class RolloutLoop:
         total_steps: int,
         rollout_steps: int,
     ):
-        self.env, self.policy = env, policy
         self.total_steps, self.rollout_steps, self.step = total_steps, rollout_steps, 0
         primer: Any = primer_of(policy)
         if not primer.primers.is_empty():
             env.append_transform(primer)
-        self.carried: TensorDictBase = env.reset()
-        """the input of the next step: observations, communication, state of the policy"""
-        self._keys = list(self.carried.keys(True, True))
+        self._resets = _Resets()
+        env.append_transform(self._resets)
+        self._collector = Collector(
+            env,
+            policy,
+            frames_per_batch=env.batch_size.numel() * rollout_steps,
+            total_frames=-1,  # `step` counts, from where the run was resumed
+            trust_policy=True,
+            track_traj_ids=False,
+            auto_register_policy_transforms=False,
+        )
+        # The explorer always explores, so that this mode of the whole process need not change.
+        self._collector.exploration_type = None
+        self.carried = self._resets.last
+        """the input of the next step"""
 
     def __iter__(self) -> Iterator[TensorDictBase]:
         """Yields rollouts, batch size [environments, rollout_steps]."""
+        rollouts = iter(self._collector)
         while self.step < self.total_steps:
-            with torch.no_grad():
-                steps: Any = [self._advance() for _ in range(self.rollout_steps)]
-            first, *others = steps
-            for later in others:  # a held action has no logarithm of its probability
-                for key in set(first.keys(True, True)).difference(later.keys(True, True)):
-                    later.set(key, torch.zeros_like(first.get(key)))
+            rollout = next(rollouts)
             self.step += self.rollout_steps
-            rollout: Any = torch.stack(steps, 1)
+            last: Any = rollout[:, -1]
+            ended = bool(last["next", "done"].any())  # all environments end together
+            self.carried = self._resets.last if ended else self._input_after(last)
             yield rollout
 
     def restore(self, carried: TensorDictBase, step: int) -> None:
         """Continues from an earlier value of `carried`, at a step of the run."""
-        self.carried, self.step = carried, step
+        self._resets.instead = self.carried = carried
+        self._collector.reset()
+        self.step = step
 
-    def _advance(self) -> TensorDictBase:
-        stepped, following = self.env.step_and_maybe_reset(self.policy(self.carried))
-        self.carried = following.select(*self._keys)
-        return stepped
+    def _input_after(self, last: TensorDictBase) -> TensorDictBase:
+        following: Any = step_mdp(last)
+        return following.select(*self._resets.last.keys(True, True)).clone()
+
+
+class _Resets(Transform):
+    """Keeps the last reset, and gives another TensorDict in place of the next one if told to."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.last: Any = None
+        self.instead: TensorDictBase | None = None
+
+    def _reset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
+        if self.instead is not None:
+            tensordict_reset, self.instead = tensordict_reset.update(self.instead), None
+        self.last = tensordict_reset.clone()
+        return tensordict_reset

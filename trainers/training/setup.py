@@ -15,7 +15,7 @@ from emberlink.trainers.build import build_env, build_learner
 from emberlink.trainers.config.schema import RunConfig, build_comm
 from emberlink.trainers.learners.base import Learner, Losses
 from emberlink.trainers.learners.tensors import copy_into, flatten, group, prefixed, unflatten
-from emberlink.trainers.rollout.collector import RolloutLoop
+from emberlink.trainers.rollout.collector import ResumableCollector
 from emberlink.trainers.training import warm_start
 from emberlink.trainers.training.episode import EpisodeRecord
 
@@ -39,7 +39,7 @@ class TrainingSetup:
         self.learner = _make_learner(config, self.env)
         self.rollout_steps = self.learner.rollout_steps * config.policy.hold
         """steps of the batch of environments in a rollout"""
-        self.collector = RolloutLoop(
+        self.collector = ResumableCollector(
             self.env,
             hold(self.learner.explorer, config.policy.hold, config.env.num_uavs),
             total_steps=self.total_steps,
