@@ -3,13 +3,11 @@
 from collections.abc import Iterator
 from typing import Any
 
-import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torchrl.collectors import Collector
 from torchrl.envs import Transform, TransformedEnv, step_mdp
 
-from emberlink.envs import keys
 from emberlink.policies.state import primer_of
 
 
