@@ -216,6 +216,7 @@ def load_fires(
     fire: str | ScenarioConfig | Tensor, config: WildfireConfig, num_envs: int
 ) -> tuple[Tensor, bool]:
     """Returns the fires of a `WildfireEnv`.
+
     Returns:
         Arrival times, float32 [fires, X, Y], or arrival and burn-out times, [fires, 2, X, Y]; and
         whether they are fixed: environment i always has fire i, or the only one.

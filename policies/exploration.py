@@ -35,8 +35,6 @@ class OrnsteinUhlenbeck(Stateful):
     draws from the global generator, and adds noise according to a variable of the whole process.
 
     Args:
-        config: constants of the process.
-        uavs: number of UAVs.
         generator: of the noise, on the device of the actions.
     """
 

@@ -57,7 +57,6 @@ class GaussianExplorer(Stateful):
     global generator.
 
     Args:
-        actor: the actors of all UAVs.
         generator: of the actions, on their device.
     """
 

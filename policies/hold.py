@@ -23,7 +23,6 @@ class Held(Stateful):
     Args:
         policy: writes ("agents", "action").
         steps: steps for which an action is held.
-        uavs: number of UAVs.
     """
 
     def __init__(self, policy: Any, steps: int, uavs: int):

@@ -41,10 +41,6 @@ class Tracker:
 
     The logger runs in a thread, since it may block on a network or a process. If it fails, there is
     a warning and nothing more is logged. metrics.jsonl does not depend on it.
-
-    Args:
-        config: configuration of the run.
-        run: the run folder, which the logger writes to.
     """
 
     def __init__(self, config: RunConfig, run: RunFolder):

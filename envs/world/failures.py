@@ -12,6 +12,7 @@ def draw_failures(episode_key: Tensor, expected: float, uavs: int, horizon: int)
 
     Each UAV fails with probability `expected / uavs`, independently, at a step that is uniform from
     1 to the horizon.
+
     Returns:
         Steps; `horizon + 1` for a UAV that does not fail.
     """

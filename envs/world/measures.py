@@ -64,10 +64,6 @@ class SightingAges(nn.Module):
     """Accumulates the ages of burning cells over the steps of an episode.
 
     The memory does not grow with the number of steps.
-
-    Args:
-        envs: number of environments.
-        horizon: steps of an episode.
     """
 
     total: Tensor

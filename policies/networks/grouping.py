@@ -10,10 +10,6 @@ class Grouping:
     """Arranges tensors of UAVs by group; the inputs of a group use the same weights.
 
     With weights per UAV, a group is a UAV; with shared weights, there is one group.
-
-    Args:
-        uavs: number of UAVs in the team.
-        shared: whether the UAVs share their weights.
     """
 
     def __init__(self, uavs: int, *, shared: bool = False):

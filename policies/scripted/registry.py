@@ -29,7 +29,7 @@ _REGISTRY = Registry(
 
 
 class _Policies(Mapping[str, type[Scripted]]):
-    """The scripted policies by name: emberlink's in a fixed order, then those of other packages."""
+    """The scripted policies by name: emberlink's in a fixed order, then other packages'."""
 
     def __getitem__(self, name: str) -> type[Scripted]:
         if name not in _REGISTRY.known():

@@ -69,10 +69,7 @@ def arrival_figure(
 
 
 def burnt_out(arrival: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Returns the mask of cells that burnt before step 0, [X, Y].
-
-    These never burn, most cells around them burn at step 0, and they do not touch the map's edge.
-    """
+    """Returns the mask of cells burnt before step 0, bool [X, Y]: gaps in the fire at step 0."""
     parts, count = label(np.isinf(arrival))  # pyright: ignore[reportGeneralTypeIssues]
     inside = np.zeros(arrival.shape, bool)
     for number in range(1, count + 1):

@@ -104,10 +104,6 @@ class Learner(ABC):
     exploration policy. A subclass sets `actor`, `loss`, `optimizer`, and a `generator` if it draws
     random numbers after `__init__`; these are saved. Other state is added by the subclass's
     `state_dict` and `load_state_dict`.
-
-    Args:
-        config: an instance of `config_type`.
-        context: environment and run.
     """
 
     config_type: ClassVar[type[LearnerConfig]]

@@ -50,7 +50,7 @@ class ImitationConfig(LearnerConfig):
     samples: Count
     """decisions per update and UAV; with a memory, rounded up to whole sequences"""
     buffer_size: Count
-    """capacity of the buffer, in decisions of a UAV"""
+    """capacity of the replay buffer, in decisions of a UAV"""
     sequence: Count = 16
     """successive decisions that a memory learns from at once"""
 
@@ -72,8 +72,8 @@ class Imitation(Learner):
     the UAV's observations and the teacher's actions. The loss of an update is the smooth L1
     distance to the teacher's action.
 
-    With a memory, the buffer holds sequences of decisions, with the state of the memory before the
-    first one (Kapturowski et al. 2019, ICLR).
+    With a memory, the replay buffer holds sequences of decisions, with the state of the memory
+    before the first one (Kapturowski et al. 2019, ICLR).
     """
 
     config_type = ImitationConfig
@@ -89,7 +89,7 @@ class Imitation(Learner):
         self.observed = keys.observation_keys(context.observation_spec)
         self.remembers = context.policy.memory != "none"
         self.sequence = min(config.sequence, context.horizon) if self.remembers else 1
-        """decisions of a row of the buffer"""
+        """decisions of a row of the replay buffer"""
         self.replay = TeamReplay(
             context,
             self.generator,
@@ -164,7 +164,7 @@ class Imitation(Learner):
             self._recent = []
 
     def update(self, batch: TensorDictBase) -> Losses:
-        """Performs one step of the optimizer on rows of the buffer, [batch, uavs]."""
+        """Performs one step of the optimizer on rows of the replay buffer, [batch, uavs]."""
         losses = self.losses(batch)
         networks = 1 if self.config.share_parameters else self.context.num_uavs
         losses["imitation"].unflatten(0, (networks, -1)).mean(1).sum().backward()

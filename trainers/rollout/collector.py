@@ -19,7 +19,6 @@ class ResumableCollector:
 
     Args:
         env: batch of environments with communication; the policy's state is added to it.
-        policy: actors with exploration noise.
         total_steps: steps of the batch of environments in the whole run.
         rollout_steps: steps of a rollout; divides the horizon.
     """

@@ -6,14 +6,7 @@ from emberlink.envs.utils.errors import UserError
 
 
 class NonFiniteActionError(UserError):
-    """Reports the first action of an episode that is NaN or infinite.
-
-    Args:
-        value: the number as text.
-        uav: index of the UAV.
-        environment: index of the environment.
-        step: step of the episode, counted from 1.
-    """
+    """Reports the first action of an episode that is NaN or infinite."""
 
     def __init__(self, value: str, uav: int, environment: int, step: int):
         super().__init__(

@@ -57,12 +57,10 @@ def header_of(config: RunConfig, step: int, **more: Any) -> Header:
 
 
 def write(path: Path, header: Header, tensors: Mapping[str, Tensor]) -> None:
-    """Writes a checkpoint completely, or leaves the earlier file.
-
-    The file is written under another name, flushed to the disk and renamed.
+    """Writes a checkpoint by temporary file, flush to the disk and rename.
 
     Raises:
-        UserError: the file cannot be written, such as to a full disk.
+        UserError: the file cannot be written, such as to a full disk; the earlier file stays.
     """
     content = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
     text = json.dumps({"format": FORMAT, **asdict(header)})

@@ -14,6 +14,7 @@ def dumps(value: Any) -> str:
 
     A list of numbers or texts is on one line, however long. A mapping is on one line if that has at
     most 240 characters; otherwise each of its keys begins a line.
+
     Raises:
         ValueError: a number is NaN.
     """

@@ -23,9 +23,6 @@ class Lock:
     The operating system releases the lock when the process ends, also after SIGKILL. The file holds
     the process number and the host name, for error messages.
 
-    Args:
-        folder: the run folder.
-
     Raises:
         LockedError: another process holds the lock.
         UserError: the folder does not exist, or its file system has no locks.

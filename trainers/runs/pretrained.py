@@ -66,6 +66,7 @@ def read_run(text: str, output: Path | str = "runs") -> RunFolder:
 
     Nothing is written: a trained policy of the package is its copy in `output`, or the installed
     folder if there is no copy.
+
     Raises:
         UserError: there is no such policy, or several; or the copy holds other networks.
     """
@@ -133,6 +134,7 @@ def find(text: str) -> list[Path]:
 
 def find_one(text: str) -> Path:
     """Returns the folder of the trained policy with a name and, among several, the lowest seed.
+
     Raises:
         UserError: there is no such policy, or the name matches several methods or setups.
     """
@@ -150,6 +152,7 @@ def collection(config: RunConfig) -> str:
 
 def pack(run: RunFolder, into: Path) -> Path:
     """Copies a finished run to the trained policies, without training states and critics.
+
     Returns:
         The new folder.
 

@@ -24,10 +24,6 @@ _MAX_DIGITS = 20
 def read_text(path: Path, max_bytes: int) -> str:
     """Returns the text of a regular file or of the target of a link.
 
-    Args:
-        path: path of the file.
-        max_bytes: maximum size.
-
     Raises:
         FileNotFoundError: there is no such file.
         UserError: it is not a regular file, is too large, or is not UTF-8.

@@ -29,10 +29,8 @@ def resume(
     again.
 
     Args:
-        path: a run folder.
         method: if given, must be the method of the run.
         overrides: texts `key=value`, of keys that do not affect learning.
-        settings: the same as keyword arguments.
 
     Raises:
         UserError: the run cannot be resumed, and no file has changed; or a file cannot be written.

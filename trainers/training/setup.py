@@ -23,9 +23,6 @@ from emberlink.trainers.training.episode import EpisodeRecord
 class TrainingSetup:
     """Holds all objects that training changes, and accesses no files.
 
-    Args:
-        config: configuration of the run.
-
     Raises:
         UserError: the horizon is not a multiple of the steps of a rollout.
     """
@@ -105,9 +102,6 @@ class TrainingSetup:
 
 def check_setup(config: RunConfig) -> None:
     """Checks that a configuration can be trained, in one environment, without training.
-
-    Args:
-        config: configuration of a run.
 
     Raises:
         UserError: the fire, the learner or its warm start does not fit the rest.

@@ -25,10 +25,6 @@ _REWARD = "comm.heading."
 def start(learner: Learner, config: RunConfig) -> None:
     """Copies the actors of the run `learner.warm_start`, of its newest checkpoint, to a learner.
 
-    Args:
-        learner: a new learner.
-        config: its configuration.
-
     Raises:
         UserError: the run or its checkpoint cannot be read, or does not fit.
     """
