@@ -30,7 +30,7 @@ class ScalarWildfire:
         self.box = [(float(np.float32(low)), float(np.float32(high))) for low, high in corners]
         self.rewards = rewards
         self.exit_axes = ["xyz".index(axis) for axis in exit_axes]
-        self.time = 0
+        self.time, self.views = 0, {}
         self.fire = [[NO_FIRE] * y for _ in range(x)]
         self.spread()
 
@@ -62,12 +62,14 @@ class ScalarWildfire:
         x, y, z = (float(c) for c in self.position[n])
         radius = z * self.slope
         counts = {NEW_FIRE: 0, OLD_FIRE: 0, NO_FIRE: 0}
+        view = self.views[n] = {}  # offset from the cell nearest to the UAV -> class
         rows = [j for j in range(len(self.fire[0])) if abs(j - y) <= radius]
         for i in range(len(self.fire)):
             if abs(i - x) > radius:
                 continue
             for j in rows:
                 counts[self.fire[i][j]] += 1
+                view[i - round(x), j - round(y)] = self.fire[i][j]
                 if self.fire[i][j] == NEW_FIRE:
                     self.fire[i][j] = OLD_FIRE
         return counts[NEW_FIRE], counts[OLD_FIRE], counts[NO_FIRE]

@@ -72,7 +72,7 @@ def wind_of(name: str) -> Callable[[float], Tensor]:
 def read_grid(path: Path) -> Tensor:
     """Returns the arrival times of an ESRI ASCII grid, as in `Run`."""
     try:
-        config = FileFireConfig(path=str(path), units="minutes")
+        config = FileFireConfig(path=str(path), units="minutes", unburned="none")
         times = read_raster(path, "asc", config)[0][0].times
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None

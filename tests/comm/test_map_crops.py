@@ -96,24 +96,3 @@ def test_beyond_the_horizon_what_was_never_seen_stays_so():
     assert fire.sum() == out.sum() == 255
     assert age[4, 3] == 255
     assert age[4, 4] == age[4, 5] == age[4, 6] == age_byte(HORIZON + 1)
-
-
-def test_large_batches_are_drawn_in_parts(monkeypatch):
-    crops = Crops((10, 9), pixels=8, scales=(1, 2), spread=1, horizon=HORIZON)
-    generator = torch.Generator().manual_seed(0)
-    known = torch.randint(-1, 200, (7, 10, 9), generator=generator)
-    known = known.masked_fill(known % 4 == 3, -1)
-    seen, step = known % 4 == 1, torch.full((7,), 60)
-    centre = torch.stack((torch.arange(7), torch.arange(7)), -1)
-    points = centre.unsqueeze(1), step.unsqueeze(1), torch.zeros(7, 0, 2).long()
-    whole = crops.draw(known, seen, step, centre, points)
-    monkeypatch.setattr(_crops, "_DRAWN", 180)
-    assert crops.draw(known, seen, step, centre, points).equal(whole)
-
-
-def test_ages_are_logarithmic():
-    assert [_crops.age_byte(age) for age in (0, 1, 10, 100, 1000, 5000)] == [
-        age_byte(age) for age in (0, 1, 10, 100, 1000, 5000)
-    ]
-    assert _crops.age_byte(0) == 0
-    assert _crops.age_byte(10**6) == 254

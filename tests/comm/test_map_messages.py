@@ -2,14 +2,10 @@
 
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from scalar_maps import Teller, within
+from scalar_maps import Teller
 
-from emberlink.comm import _messages
 from emberlink.comm._messages import (
     CellMessages,
-    Offers,
     cell_bytes,
     offers,
     pass_on_places,
@@ -17,7 +13,6 @@ from emberlink.comm._messages import (
     place_gain,
     said_within,
 )
-from emberlink.envs.config import SIDES
 from emberlink.envs.world.coverage_map import View
 from emberlink.envs.world.knowledge import Knowledge
 
@@ -52,10 +47,6 @@ def links(step: int, density: float, loss: float) -> tuple[torch.Tensor, torch.T
 )
 def test_steps_above_65535_take_four_bytes(horizon, cell, position):
     assert (cell_bytes(horizon), place_bytes(horizon)) == (cell, position)
-
-
-def test_the_index_of_a_cell_fits_into_two_bytes():
-    assert SIDES[1] ** 2 <= 2**16
 
 
 def talk(messages, known, places, links, limit) -> list:
@@ -119,111 +110,3 @@ def check_knowledge(teller, known, stamp, place, env) -> None:
             assert stamp[env, uav, other] == step
             if step >= 0:
                 assert (place[env, uav, other] == 10.0 * step + other).all()
-
-
-@pytest.mark.parametrize("lost", [False, True])
-def test_positions_are_passed_on_a_hop_a_step(lost):
-    uavs = 4
-    stamp, place = torch.full((1, uavs, uavs), -1), torch.zeros(1, uavs, uavs, 3)
-    near = torch.zeros(1, uavs, uavs, dtype=torch.bool)
-    for uav in range(uavs - 1):  # a chain
-        near[0, uav, uav + 1] = near[0, uav + 1, uav] = True
-    own = torch.arange(uavs)
-    for step in range(12):
-        stamp[0, own, own], place[0, own, own] = step, 10.0 * step + own[:, None].float()
-        before = stamp.clone()
-        hears = near & (draw(step, uavs, uavs) < 0.6) if lost else near
-        pass_on_places(stamp, place, near, hears, None, PLACE_BYTES)
-        for hearer in range(uavs):
-            told = [before[0, k] for k in range(uavs) if k == hearer or hears[0, hearer, k]]
-            assert stamp[0, hearer].equal(torch.stack(told).amax(0))
-    if not lost:
-        assert stamp[0, 0].tolist() == [11, 11, 10, 9]
-
-
-@settings(max_examples=200, deadline=None)
-@given(st.data())
-def test_what_fits_equals_a_greedy_choice(data):
-    area, sizes = 7, data.draw(st.sampled_from([(5, 16), (7, 18), (9, 18)]))
-    limit = data.draw(st.integers(0, 90))
-    cells = data.draw(st.lists(st.integers(0, 9), min_size=area, max_size=area))
-    places = data.draw(st.lists(st.integers(0, 9), min_size=2, max_size=2))
-    more = data.draw(st.integers(0, 3))
-    order = sorted(range(area), key=lambda k: (-cells[k], k))[: limit // sizes[0] + more]
-    worths = [cells[k] for k in order]
-    offered = Offers(*torch.tensor([[[worths]], [[order]]], dtype=torch.int64))
-    said = said_within(limit, offered, torch.tensor([[places]]), area, sizes)
-    worth = {("cell", k): x for k, x in enumerate(cells) if x}
-    worth |= {("place", k): x for k, x in enumerate(places) if x}
-    result = {
-        (kind, k)
-        for kind, mask in zip(("cell", "place"), said, strict=True)
-        for k in mask[0, 0].nonzero().flatten().tolist()
-    }
-    assert result == within(limit, worth, sizes, 0, area)
-
-
-def two_uavs(known: list, theirs: list, stamp: list) -> tuple:
-    """Returns the maps of two UAVs; the second one is in range of the first one."""
-    area = len(known)
-    maps = Knowledge(envs=1, uavs=2, area=area, horizon=1203, fires=True)
-    maps.last_seen[0] = torch.tensor([known, theirs])
-    near = torch.tensor([[[False, False], [True, False]]])
-    return CellMessages(1, 2, area, CELL_BYTES), maps, near, torch.tensor([stamp])
-
-
-def test_the_oldest_knowledge_is_renewed_first():
-    """A UAV tells another one of five cells; 16 bytes are three cells or a position."""
-    known, theirs = [360, 320, 281, 242, 1200], [356, 200, 81, -1, 400]
-    messages, maps, near, stamp = two_uavs(known, theirs, [[90, -1], [55, 90]])
-    news = messages.compare(maps, near)
-    for limit, cells, place in (
-        (4, [], False),
-        (5, [4], False),
-        (10, [3, 4], False),
-        (20, [1, 2, 3, 4], False),  # the position is next and does not fit; a cell does
-        (31, [2, 3, 4], True),
-        (36, [1, 2, 3, 4], True),
-        (41, [0, 1, 2, 3, 4], True),
-    ):
-        cells_offered = offers(maps, news, limit // CELL_BYTES)
-        gain = place_gain(stamp, near)
-        said = said_within(limit, cells_offered, gain, 5, (CELL_BYTES, PLACE_BYTES))
-        assert said[0][0, 0].nonzero().flatten().tolist() == cells
-        assert said[1][0, 0].tolist() == [place, False]
-    assert gain.tolist() == [[[35, 0], [0, 0]]]
-    cells_offered = offers(maps, news, 9)
-    assert cells_offered.cell[0, 0].tolist() == [4, 3, 2, 1, 0]
-    # 300 to 100 is 200, at most 100 count.
-    assert cells_offered.gain[0].tolist() == [[100, 61, 50, 30, 1], [0, 0, 0, 0, 0]]
-
-
-@pytest.mark.parametrize("limit", [5, 16, 20])
-def test_all_is_said_in_the_end(limit):
-    """One UAV knows old cells of never seen fire; it goes on, and its position changes."""
-    area = 30
-    messages, maps, near, stamp = two_uavs([4 * 9 + 1] * area, [4 * 10 + 1] * area, [[9, -1]] * 2)
-    maps.seen_fire[0, 0] = True
-    place = torch.zeros(1, 2, 2, 3)
-    for step in range(10, 200):
-        stamp[0, 0, 0] = step
-        talk(messages, maps, (stamp, place), (near, near), limit)
-        if limit >= PLACE_BYTES and step > 60:
-            assert step - stamp[0, 1, 0] < 60
-    assert maps.seen_fire[0, 1].all()
-
-
-def test_uavs_with_the_same_news_offer_different_cells():
-    uavs, area = 4, 40
-    maps = Knowledge(envs=1, uavs=uavs, area=area, horizon=403, fires=True)
-    maps.last_seen[0, :-1] = 80
-    near = torch.zeros(1, uavs, uavs, dtype=torch.bool)
-    near[0, -1, :-1] = True
-    messages = CellMessages(1, uavs, area, CELL_BYTES)
-    offered = offers(maps, messages.compare(maps, near), 10).cell[0, :-1]
-    assert offered.tolist() == [[*range(10)], [*range(30, 40)], [*range(20, 30)]]
-
-
-def test_pairs_are_compared_in_parts(monkeypatch):
-    monkeypatch.setattr(_messages, "_COMPARED", 3)
-    test_exchange_matches_reference(None, 0.8, 0.0)

@@ -1,4 +1,4 @@
-"""Tests the environment with other programs: seeds, names, sizes, options, Gymnasium."""
+"""Tests the environment with other programs: seeds, ends, Gymnasium."""
 
 import copy
 import pickle
@@ -12,7 +12,6 @@ from tensordict import TensorDict
 from torchrl.envs import ParallelEnv, SerialEnv, check_env_specs
 
 from emberlink.envs import WildfireConfig, WildfireEnv, keys
-from emberlink.envs.metrics import episode_metrics
 from emberlink.envs.utils.errors import UserError
 from emberlink.trainers import make_env
 
@@ -64,21 +63,6 @@ def test_the_workers_of_a_parallel_environment_differ():
     assert not first[0].equal(first[1])
 
 
-@pytest.mark.slow
-def test_sizes_and_names():
-    env = make(4)
-    assert (env.num_envs, env.n_agents, env.max_steps) == (4, 3, 10)
-    assert env.group_map == {"agents": ["uav_0", "uav_1", "uav_2"]}
-    wrapped = make_env("consensus", num_envs=4, fire=FIRE, horizon=10)
-    assert (wrapped.num_envs, wrapped.n_agents, wrapped.max_steps) == (4, 6, 10)
-    assert repr(env) == (
-        "WildfireEnv(num_envs=4, grid=(12, 10), num_uavs=3, horizon=10, fire=1 given, device=cpu)"
-    )
-    assert "fire=huygens" in repr(
-        WildfireEnv(1, WildfireConfig(grid=(8, 8), horizon=10), "huygens")
-    )
-
-
 @pytest.mark.filterwarnings("error")
 def test_done_per_agent():
     env = make(agent_done=True)
@@ -99,40 +83,6 @@ def test_staggered_first_episodes():
     assert ends == [[3, 13, 23], [5, 15, 25], [8, 18, 28], [10, 20, 30]]
     assert steps[keys.STEP][0, :5].tolist() == [1, 2, 3, 1, 2]
     assert starts(make(4, staggered=True, seed=0)).equal(starts(make(4, seed=0)))
-
-
-def test_observations_are_float32_for_any_default_dtype():
-    torch.set_default_dtype(torch.float64)
-    try:
-        for scale in ("raw", "box"):
-            config = WildfireConfig(grid=(12, 10), num_uavs=3, horizon=10, observation_scale=scale)
-            env = make(config=config, seed=1)
-            check_env_specs(env)
-            steps = env.rollout(10)["next"]
-            assert steps[keys.OBSERVATION].dtype == torch.float32
-            assert {value.dtype for value in episode_metrics(steps).values()} == {torch.float32}
-    finally:
-        torch.set_default_dtype(torch.float32)
-
-
-def test_missing_devices_and_unknown_options_are_named():
-    if not torch.cuda.is_available():
-        with pytest.raises(ValueError, match="device=cuda is not available; known: cpu"):
-            WildfireEnv(device="cuda")
-    with pytest.raises(ValueError, match="device=abacus"):
-        WildfireEnv(device="abacus")
-    with pytest.raises(ValueError, match=r"positions not known; known: position"):
-        make().reset(positions=torch.ones(3, 3))
-
-
-def test_a_long_horizon_needs_little_memory():
-    fires = torch.rand(64, 12, 10) * 2e6
-    env = WildfireEnv(64, WildfireConfig(grid=(12, 10), horizon=1_000_000), fires)
-    assert sum(buffer.nbytes for buffer in env.buffers()) < 2**20
-    env.reset()
-    assert env.step(env.rand_action(env.reset()))["next"][keys.BURNING].equal(
-        (fires <= 1).sum((1, 2))
-    )
 
 
 @pytest.mark.filterwarnings("error")

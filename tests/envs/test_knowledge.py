@@ -11,12 +11,10 @@ from scalar_world import ScalarWorld, percentile
 
 from emberlink.envs import WildfireConfig, WildfireEnv, keys
 from emberlink.envs.config import RadioConfig, RewardConfig
-from emberlink.envs.utils.errors import UserError
 from emberlink.envs.world import radio
-from emberlink.envs.world.coverage_map import View, with_burn_time
+from emberlink.envs.world.coverage_map import with_burn_time
 from emberlink.envs.world.failures import draw_failures
-from emberlink.envs.world.knowledge import Knowledge
-from emberlink.envs.world.measures import SightingAges, age_limits, cell_ages
+from emberlink.envs.world.measures import SightingAges
 
 ENVS = 3
 COUNTS = (keys.NEW_FIRE, keys.OLD_FIRE, keys.NO_FIRE)
@@ -100,46 +98,6 @@ def test_every_step_equals_plain_python(seed, uavs, limit, loss, failures, burn_
                 assert maps[e, node, i, j] == scalar.last_seen(node, (i, j))
 
 
-def test_burn_out_by_hand():
-    # Three cells of a row burn from steps 0, 2.5 and never, for 3 steps.
-    arrival = torch.full((8, 8), math.inf)
-    arrival[0, 0], arrival[1, 0] = 0.0, 2.5
-    world = WildfireConfig(grid=(8, 8), num_uavs=1, horizon=7, altitude=(1.0, 1.0))
-    env = WildfireEnv(1, world, with_burn_time(arrival[None], 3.0), seed=0)
-    now = env.reset(position=torch.tensor([[7.0, 7.0, 1.0]]))
-    burning, burnt = [now[keys.BURNING].item()], [now[keys.BURNT].item()]
-    maps = [env.fire_map[0, :2, 0].tolist()]
-    for _ in range(6):
-        now = env.step(now.set(keys.ACTION, torch.zeros(1, 1, 3)))["next"]
-        burning.append(now[keys.BURNING].item())
-        burnt.append(now[keys.BURNT].item())
-        maps.append(env.fire_map[0, :2, 0].tolist())
-    assert burning == [1, 1, 1, 1, 1, 1, 0]  # the first until step 2, the second from 3 to 5
-    assert burnt == [1, 1, 1, 2, 2, 2, 2]
-    assert maps == [[2, 0], [2, 0], [2, 0], [4, 2], [4, 2], [4, 2], [4, 4]]
-
-
-def test_a_cell_seen_after_it_burnt_out_does_not_count():
-    arrival = torch.full((8, 8), math.inf)
-    arrival[4, 4] = 0.0
-    world = WildfireConfig(grid=(8, 8), num_uavs=1, horizon=9, altitude=(1.0, 1.0))
-    for first_look, seen in ((3, 1), (4, 0)):  # it burns at steps 0 to 3
-        env = WildfireEnv(1, world, with_burn_time(arrival[None], 4.0), seed=0)
-        now = env.reset(position=torch.tensor([[4.0, 4.0 - first_look, 1.0]]))
-        for _ in range(first_look):
-            now = env.step(now.set(keys.ACTION, torch.tensor([[[0.0, 1.0, 0.0]]])))["next"]
-        assert now[keys.POSITION][0, 0, 1] == 4
-        assert now[keys.SEEN].item() == seen
-        assert now[keys.OLD_FIRE].item() == 0
-
-
-def test_ages_by_hand():
-    step, never = torch.tensor(10), -1
-    last_seen = torch.tensor([10, 7, 3, never, never])
-    ignition = torch.tensor([0, 4, 5, 6, 10])
-    assert cell_ages(step, last_seen, ignition).tolist() == [0, 3, 5, 4, 0]
-
-
 def test_percentiles_by_hand():
     ages = SightingAges(2, 100)
     env = torch.tensor([0] * 20 + [1])
@@ -151,56 +109,6 @@ def test_percentiles_by_hand():
     assert ages.percentile(0.95).tolist() == [0.0, 50.0]
 
 
-@pytest.mark.parametrize("horizon", [1, 511, 512, 1000, 1_000_000])
-def test_classes_of_ages_are_narrow_and_few(horizon):
-    limits = age_limits(horizon)
-    assert limits[0] == 0
-    assert limits[-1] >= horizon
-    assert len(limits) < 1300
-    assert limits[: min(512, horizon + 1)].equal(torch.arange(min(512, horizon + 1)))
-    width = limits[1:] - limits[:-1]
-    assert ((width == 1) | (width <= 0.01 * limits[:-1])).all()
-
-
-def looks(cells: list[list[int]], envs: int = 1) -> View:
-    """Returns the view of UAVs that see the given cells of a map of 4 cells, -1 for none."""
-    index = torch.tensor([cells] * envs)
-    index = index.clamp(min=0) + 4 * torch.arange(envs).view(-1, 1, 1)
-    in_view = torch.tensor([cells] * envs) >= 0
-    return View(index, in_view, in_view)
-
-
-def heard(*pairs: tuple[int, int]) -> torch.Tensor:
-    """Returns links, bool [1, 3, 3]: pairs (radio, heard radio)."""
-    links = torch.zeros(1, 3, 3, dtype=torch.bool)
-    for pair in pairs:
-        links[0][pair] = True
-    return links
-
-
-def test_knowledge_merges_over_groups_by_hand():
-    known = Knowledge(envs=1, uavs=3, area=4, horizon=9)
-    silent = heard()
-    known.update(looks([[0], [1], [-1]]), torch.tensor([1]), silent)
-    assert known.last_seen.tolist() == [[[1, -1, -1, -1], [-1, 1, -1, -1], [-1, -1, -1, -1]]]
-    # 2 hears 1 alone; a message that is not heard back merges one map only.
-    known.update(looks([[-1], [-1], [3]]), torch.tensor([2]), heard((2, 1)))
-    assert known.last_seen.tolist() == [[[1, -1, -1, -1], [-1, 1, -1, -1], [-1, 1, -1, 2]]]
-    # A chain passes on: 0 hears 1, 1 hears 2.
-    known.update(looks([[-1], [-1], [2]]), torch.tensor([3]), heard((0, 1), (1, 2)))
-    assert known.last_seen.tolist() == [[[1, 1, 3, 2], [-1, 1, 3, 2], [-1, 1, 3, 2]]]
-    # In contact that lasts, new sightings arrive; older ones never replace them.
-    known.update(looks([[-1], [-1], [1]]), torch.tensor([4]), heard((0, 1), (1, 2)))
-    assert known.last_seen.tolist() == [[[1, 4, 3, 2], [-1, 4, 3, 2], [-1, 4, 3, 2]]]
-    known.start_episodes(torch.tensor([True]))
-    assert (known.last_seen == -1).all()
-
-
-def test_long_episodes_use_wider_integers():
-    for horizon, kind in ((32766, torch.int16), (32767, torch.int32)):
-        assert Knowledge(envs=1, uavs=1, area=1, horizon=horizon).last_seen.dtype == kind
-
-
 def test_failures_are_drawn_at_the_expected_rate():
     key = torch.arange(20_000)
     steps = draw_failures(key, 2.0, 6, 100)
@@ -210,28 +118,6 @@ def test_failures_are_drawn_at_the_expected_rate():
     assert steps[fails].float().mean().item() == pytest.approx(50.5, abs=0.6)
     assert draw_failures(key, 0.0, 6, 100).min() == 101
     assert draw_failures(key, 6.0, 6, 100).max() <= 100
-
-
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"base": (30.0, 3.0)}, r"outside of the map, \[0, 0\] to \[29, 29\]"),
-        ({"base": (-0.1, 3.0)}, "outside of the map"),
-        ({"failures": 6.5}, "the team has 6 UAVs"),
-    ],
-)
-def test_wrong_worlds_are_refused(settings, message):
-    with pytest.raises(ValueError, match=message):
-        WildfireConfig(**settings)
-
-
-def test_fires_that_burn_out_too_early_are_refused():
-    times = torch.tensor([3.0, 2.0]).view(1, 2, 1, 1).expand(1, 2, 8, 8)
-    world = WildfireConfig(grid=(8, 8))
-    with pytest.raises(UserError, match="a cell burns out before the fire arrives"):
-        WildfireEnv(1, world, times)
-    with pytest.raises(UserError, match="arrival and burn-out times of shape"):
-        WildfireEnv(1, world, torch.zeros(1, 3, 8, 8))
 
 
 def test_partial_resets_start_all_records_anew():

@@ -72,30 +72,6 @@ def test_fire_losses_include_every_loss():
     assert metrics.fire_losses(on_fire).item() == (2 + 0 + 0 + 3) / 4
 
 
-def test_every_measure_takes_any_batch():
-    generator = torch.Generator().manual_seed(0)
-    flags = torch.rand(2, 3, 7, 4, generator=generator) < 0.3
-    burning = torch.arange(5, 12).expand(2, 3, 7)
-    seen = (torch.rand(2, 3, 7, generator=generator) * burning).round().long()
-    cases = {
-        metrics.mean_reward: (flags.float(),),
-        metrics.coverage: (seen, burning),
-        metrics.coverage_auc: (seen, burning),
-        metrics.time_to_full_coverage: (seen, burning),
-        metrics.tracking_first: (flags,),
-        metrics.tracking_last: (flags,),
-        metrics.boundary_exits: (flags,),
-        metrics.fire_losses: (flags,),
-    }
-    assert [measure.__name__ for measure in cases] == list(metrics.NAMES)
-    for measure, data in cases.items():
-        together = measure(*data)
-        assert together.shape == (2, 3)
-        assert together.dtype == torch.float32
-        for at in [(0, 0), (1, 2)]:
-            assert together[at] == measure(*(part[at] for part in data)), measure.__name__
-
-
 def by_hand(steps) -> dict[str, float]:
     """Computes the measures of one episode [T] with loops."""
     horizon, uavs = steps[keys.NEW_FIRE].shape

@@ -9,6 +9,7 @@ from torchrl.envs import step_mdp
 from emberlink.envs import WildfireConfig, WildfireEnv, keys
 from emberlink.envs.config import RadioConfig
 from emberlink.policies.scripted.map_greedy import Courier, MapGreedy, MapGreedyAll, MapGreedyAlone
+from emberlink.policies.scripted.registry import SCRIPTED
 
 NEVER = math.inf
 VARIANTS = [MapGreedyAlone, MapGreedy, MapGreedyAll, Courier]
@@ -50,14 +51,6 @@ def test_a_uav_flies_to_the_neighbourhood_of_known_fire():
     # 5 / (1 + 2); no other place is better.
     fire = torch.full((30, 30), NEVER)
     fire[7, 5] = 0
-    assert first_plan(WildfireEnv(1, world(), fire), MapGreedy, [[5.0, 5, 4]]) == [[[7, 5]]]
-
-
-def test_a_burnt_out_cell_attracts_nobody():
-    fire = torch.full((1, 2, 30, 30), NEVER)
-    fire[:, :, 7, 5] = torch.tensor([-9.0, 1.0])  # burns until step 1, when it is looked at
-    assert first_plan(WildfireEnv(1, world(), fire), MapGreedy, [[5.0, 5, 4]]) != [[[7, 5]]]
-    fire[:, 1, 7, 5] = 2.0
     assert first_plan(WildfireEnv(1, world(), fire), MapGreedy, [[5.0, 5, 4]]) == [[[7, 5]]]
 
 
@@ -139,8 +132,9 @@ def test_only_cells_that_were_seen_matter(kind):
 # Episodes and batches
 
 
-@pytest.mark.parametrize("kind", VARIANTS)
-def test_a_reset_of_one_environment_leaves_the_others(kind):
+@pytest.mark.parametrize("name", sorted(SCRIPTED.keys() - {"follow_target"}))
+def test_a_reset_of_one_environment_leaves_the_others(name):
+    kind = SCRIPTED[name]
     config = world(num_uavs=3, horizon=60, base=(0.0, 15.0))
     fires = random_fires(config, 2)
     env, undisturbed = (WildfireEnv(2, config, fires, seed=9) for _ in range(2))

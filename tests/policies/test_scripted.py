@@ -3,7 +3,6 @@
 import functools
 import itertools
 import math
-from dataclasses import replace
 
 import pytest
 import torch
@@ -11,17 +10,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torchrl.envs import step_mdp
 
-from emberlink.envs import WildfireConfig, WildfireEnv, keys, metrics
+from emberlink.envs import WildfireConfig, WildfireEnv, keys
 from emberlink.envs.utils.config_files import known
 from emberlink.envs.world.sensor import view_radius
-from emberlink.policies.scripted.base import Scripted
 from emberlink.policies.scripted.lawnmower import Lawnmower, search_path
 from emberlink.policies.scripted.oracle import Oracle
 from emberlink.policies.scripted.registry import SCRIPTED
 from emberlink.policies.scripted.simple import FollowTarget
 from emberlink.trainers.build import build_env
 from emberlink.trainers.config.compose import resolve
-from emberlink.trainers.evaluation.evaluate import play, scripted_config
 
 NEVER = math.inf
 THREE = math.degrees(math.atan(1.2 / 4))  # the view angle: 3 x 3 cells are in view from altitude 4
@@ -62,33 +59,8 @@ def test_lawnmower_with_one_uav_by_hand():
     assert [uavs[0] for uavs in places] == expected
 
 
-def test_lawnmower_assigns_strips_to_uavs():
-    # The paper's world: the view is 5 cells wide, six strips of 30 for six UAVs.
-    env = WildfireEnv(1, WildfireConfig(), torch.zeros(30, 30))
-    mower = Lawnmower(env)
-    assert sorted({x for x, _ in mower.path.tolist()}) == [2, 7, 12, 17, 22, 27]
-    assert sorted({y for _, y in mower.path.tolist()}) == [2, 7, 12, 17, 22, 27]
-    places = flown(env, mower, 140, [[x, 14.0, 1.0] for x in (2.0, 7.0, 12.0, 17.0, 22.0, 27.0)])
-    for uav, x in enumerate((2, 7, 12, 17, 22, 27)):
-        path = [place[uav] for place in places[20:]]
-        assert {(place[0], place[2]) for place in path} == {(x, 4)}
-        turns = [place[1] for place in path if place[1] in (2, 27)]
-        assert turns in ([2, 27, 2, 27, 2], [27, 2, 27, 2, 27])
-
-
-def test_more_uavs_than_stops_and_fewer_than_strips():
-    env = WildfireEnv(1, world((8, 8), uavs=5, view_angle=60.0), torch.zeros(8, 8))
-    mower = Lawnmower(env)  # a view 13 wide: one stop for all
-    assert mower.path.tolist() == [[3.5, 3.5]]
-    assert flown(env, mower, 12, [[0.0, 0.0, 2.0]] * 5)[-1] == [[3.5, 3.5, 4]] * 5
-    env = WildfireEnv(1, world((30, 30), uavs=4), torch.zeros(30, 30))
-    mower = Lawnmower(env)  # 36 stops, nine each
-    assert mower.first.tolist() == [0, 9, 18, 27]
-    assert mower.period.tolist() == [16] * 4
-
-
 @pytest.mark.heavy
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(
     grid=st.tuples(st.integers(8, 21), st.integers(8, 21)),
     uavs=st.integers(1, 9),
@@ -162,32 +134,7 @@ def sent(env, oracle, td):
     return td[keys.POSITION][..., :2] + action[..., :2] * env.config.displacement
 
 
-def test_the_oracle_by_hand():
-    # The view from 4 is 3 x 3 cells. (4, 4) burns, (0, 8) ignites at step 3, (8, 0) at step 2,
-    # (8, 1) at 2.5 and within the same view, (4, 0) after the horizon.
-    arrival = torch.full((9, 9), NEVER)
-    arrival[4, 4], arrival[0, 8], arrival[8, 0], arrival[8, 1], arrival[4, 0] = 0, 3, 2, 2.5, 50
-    config = world(uavs=4, displacement=16.0, horizon=20, view_angle=THREE)
-    env = WildfireEnv(1, config, arrival)
-    start = torch.tensor([[0.0, 0, 4], [8, 8, 4], [5, 4, 4], [1, 1, 4]])
-    td = env.reset(position=start)
-    # UAV 2 is nearest to (4, 4), at 1; UAVs 1 and 3 are at 4 and 3. Then UAVs 3, 0 and 1 choose.
-    places = sent(env, Oracle(env), td)
-    assert places.mul(1e3).round().tolist() == [[[0, 8e3], [8e3, 8e3], [4e3, 4e3], [8e3, 0]]]
-    # If UAV 2 has failed, it gets and reserves nothing: UAV 3 is the nearest, then 0, then 1.
-    td[keys.ALIVE] = torch.tensor([[True, True, False, True]])
-    places = sent(env, Oracle(env), td)
-    assert places.mul(1e3).round().tolist() == [[[8e3, 0], [0, 8e3], [5e3, 4e3], [4e3, 4e3]]]
-
-
-def test_the_oracle_flies_at_full_altitude_and_stops_at_full_coverage():
-    env = WildfireEnv(1, world(uavs=2, displacement=1.0), torch.full((9, 9), NEVER))
-    td = env.reset(position=torch.tensor([[2.0, 2, 1], [6, 6, 4]]))
-    action = Oracle(env)(td)[keys.ACTION]
-    assert action.mul(1e4).round().tolist() == [[[0, 0, 1e4], [0, 0, 0]]]
-
-
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(
     seed=st.integers(0, 10**6),
     grid=st.tuples(st.integers(8, 12), st.integers(8, 12)),
@@ -221,66 +168,12 @@ def test_the_oracle_equals_loops(seed, grid, uavs, angle):
 
 # All policies
 
-SHAPES = [((30, 30), 6, 0.1), ((8, 17), 1, 1.0), ((21, 9), 9, 30.0)]
-
-
-def build(method: str, name: str, shape, *, seeds, fire):
-    """Returns an environment for a policy, and the policy."""
-    grid, uavs, displacement = shape
-    changed = [f"env.grid=[{grid[0]},{grid[1]}]", f"env.num_uavs={uavs}", "env.horizon=25"]
-    config = resolve(method, ["setup=tuned", *changed, f"env.displacement={displacement}"])
-    config = scripted_config(config, name)
-    env = build_env(config, num_envs=len(seeds), fire=fire, seed=seeds, device="cpu")
-    return env, SCRIPTED[name](env.base_env)
-
 
 def fires(shape, count: int):
     """Returns random fires that grow, [count, X, Y]."""
     draw = torch.Generator().manual_seed(count)
     arrival = 60 * torch.rand(count, *shape[0], generator=draw) - 20
     return arrival.where(arrival < 30, NEVER)
-
-
-@pytest.mark.heavy
-@pytest.mark.parametrize("shape", SHAPES, ids=str)
-@pytest.mark.parametrize("method", known("method"))
-@pytest.mark.parametrize("name", SCRIPTED)
-def test_every_policy_in_every_recipe(name, method, shape):
-    arrival = fires(shape, 3)
-    env, policy = build(method, name, shape, seeds=[5, 6, 7], fire=arrival)
-    tds = episode(env, policy, 25)
-    for td in tds:
-        action = td[keys.ACTION]
-        assert action.shape == (3, shape[1], 3)
-        assert action.dtype == torch.float32
-        assert action.isfinite().all()
-        assert action.abs().max() <= 1
-        if name != "random_actions":  # policies that fly to points in the box do not leave it
-            assert not td[keys.HIT_BOUNDARY].any()
-    # The second environment alone equals the second of the batch.
-    env, policy = build(method, name, shape, seeds=[6], fire=arrival[1:2])
-    for alone, td in zip(episode(env, policy, 25), tds, strict=True):
-        assert alone[keys.ACTION][0].equal(td[keys.ACTION][1])
-        assert alone[keys.POSITION][0].equal(td[keys.POSITION][1])
-
-
-@pytest.mark.parametrize("name", SCRIPTED)
-def test_a_policy_restarts_with_every_episode(name):
-    env, policy = build("consensus", name, SHAPES[0], seeds=[3, 4], fire=fires(SHAPES[0], 2))
-    assert isinstance(policy, Scripted)
-    tds = episode(env, policy, 20)
-    env.set_seed(1)
-    first = episode(env, policy, 20)
-    env.set_seed(1)
-    td = env.reset()
-    # Entries of the previous episode in the TensorDict have no effect on the first step.
-    for key in tds[-1].keys():  # noqa: SIM118
-        if key.startswith("_"):
-            td[key] = tds[-1][key]
-    for expected in first:
-        td = policy(td)
-        assert td[keys.ACTION].equal(expected[keys.ACTION])
-        td = step_mdp(env.step(td), keep_other=True)
 
 
 @functools.cache
@@ -298,9 +191,10 @@ def test_every_policy_in_every_world(name, place):
 
     def actions(seeds, fire):
         env = build_env(config, num_envs=len(seeds), fire=fire, seed=seeds, device="cpu")
-        return torch.stack(
-            [td[keys.ACTION] for td in episode(env, SCRIPTED[name](env.base_env), 12)]
-        )
+        tds = episode(env, SCRIPTED[name](env.base_env), 12)
+        if name != "random_actions":  # policies that fly to points in the box do not leave it
+            assert not any(td[keys.HIT_BOUNDARY].any() for td in tds)
+        return torch.stack([td[keys.ACTION] for td in tds])
 
     batch = actions([5, 6], both)
     assert batch.shape[1:3] == (2, config.env.num_uavs)
@@ -308,30 +202,3 @@ def test_every_policy_in_every_world(name, place):
     assert batch.abs().max() <= 1
     # The second environment alone equals the second of the batch.
     assert actions([6], both[1:])[:, 0].equal(batch[:, 1])
-
-
-@pytest.mark.heavy
-def test_coverage_of_each_policy():
-    """The bounds are wide; docs/evaluation.md has the measured values."""
-    config = resolve("consensus", ["setup=tuned"])
-    # Communication takes half of a step, and only follow_target uses it.
-    silent = replace(config, comm=resolve("independent", ["setup=tuned"]).comm)
-    bounds = {
-        "stationary": (2, 12),
-        "random_actions": (12, 28),
-        "random_waypoints": (82, 96),
-        "lawnmower": (86, 98),
-        "follow_target": (8, 35),
-        "map_greedy_alone": (91, 99),
-        "map_greedy": (96, 100),
-        "map_greedy_all": (96, 100),
-        "courier": (96, 100),
-        "oracle": (99, 100),
-    }
-    assert bounds.keys() == SCRIPTED.keys()
-    for name, (least, most) in bounds.items():
-        played = config if name == "follow_target" else silent
-        env = build_env(played, num_envs=6, fire="huygens", seed=11, device="cpu")
-        measured = play(env, SCRIPTED[name](env.base_env))
-        assert measured.keys() == set(metrics.NAMES)
-        assert least <= measured["coverage"].mean().item() <= most, name

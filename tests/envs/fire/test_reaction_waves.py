@@ -1,4 +1,4 @@
-"""Compares the fronts of the heat equation with exact and with independently computed waves."""
+"""Compares the fronts of the heat equation with independently computed waves."""
 
 import dataclasses
 import math
@@ -9,90 +9,10 @@ import torch
 from combustion_wave import profile, wave
 
 from emberlink.envs.fire.generator import load_scenario
-from emberlink.envs.fire.reaction import (
-    ReactionConfig,
-    advance,
-    arrhenius,
-    reaction_fires,
-    time_step,
-)
+from emberlink.envs.fire.reaction import ReactionConfig, reaction_fires
 
 CONFIG = load_scenario("reaction")
 assert isinstance(CONFIG, ReactionConfig)
-SPACING = 0.75  # m, of the nodes on 30 x 30 cells
-BRACKETS = {-0.03: (0.05, 0.3), 0.0: (0.1, 0.3), 0.05: (0.15, 0.35), 0.15: (0.25, 0.5)}
-
-
-def winds(x: float, y: float = 0.0) -> tuple[torch.Tensor, torch.Tensor]:
-    wind = torch.tensor([[x, y]], dtype=torch.float64)
-    return wind, wind
-
-
-def crossings(line: torch.Tensor, level: float, spacing: float) -> float:
-    """Returns the place of the last node above a level, between nodes."""
-    last = int((line > level).nonzero()[-1])
-    above, below = line[last].item(), line[last + 1].item()
-    return (last + (above - level) / (above - below)) * spacing
-
-
-def speed_of(times: list[float], places: list[float]) -> float:
-    return float(np.polyfit(times, places, 1)[0])
-
-
-def bistable_speed(spacing: float, wind: float) -> float:
-    """Returns the speed of a wave of u_t = k u_xx - v u_x + r u (1 - u) (u - a), started exactly.
-
-    k = 0.5, r = 2, a = 0.2: u = 1 / (1 + exp(sqrt(r / 2 k) x)) moves at sqrt(k r / 2) (1 - 2 a).
-    """
-
-    def cubic(u: torch.Tensor, fuel: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        return 2 * u * (1 - u) * (u - 0.2), torch.zeros_like(fuel)
-
-    x = torch.arange(int(24 / spacing), dtype=torch.float64) * spacing
-    u = torch.sigmoid(-math.sqrt(2) * (x - 12))[None, :, None].expand(1, -1, 3)
-    fuel, step = torch.ones_like(u), 0.4 * spacing**2
-    times, places = [], []
-    for k in range(int(8 / step)):
-        times.append(k * step)
-        places.append(crossings(u[0, :, 1], 0.5, spacing))
-        u, fuel = advance(u, fuel, cubic, winds(wind), 0.5, spacing, step)
-    return speed_of(times, places)
-
-
-@pytest.mark.parametrize("wind", [0.0, 0.3, -0.2])
-def test_a_cubic_reaction_has_its_exact_speed(wind: float):
-    exact = math.sqrt(0.5 * 2 / 2) * (1 - 2 * 0.2) + wind
-    coarse, fine = (bistable_speed(spacing, wind) / exact - 1 for spacing in (0.4, 0.2))
-    assert abs(fine) < 0.015
-    assert 3 < coarse / fine < 5  # second order
-
-
-def plane_speed(wind: float, spacing: float) -> float:
-    """Returns the speed of a plane front of the scenario, wind along its normal."""
-    x = torch.arange(int(120 / spacing), dtype=torch.float64)[None, :, None] * spacing
-    x = x.expand(1, -1, 3)
-    rise, fuel = 900.0 * ((x > 15) & (x < 25)), (x > 16).double()
-    step = time_step(dataclasses.replace(CONFIG, wind_speed=(0.0, abs(wind))), spacing)
-    times, places = [0.0], [25.0]
-    while places[-1] < 100:
-        rise, fuel = advance(
-            rise, fuel, arrhenius(CONFIG), winds(wind), CONFIG.diffusivity, spacing, step
-        )
-        times.append(times[-1] + step)
-        places.append(crossings(rise[0, :, 1], 300.0, spacing))
-    steady = [i for i, place in enumerate(places) if place > 70]
-    return speed_of([times[i] for i in steady], [places[i] for i in steady])
-
-
-@pytest.mark.parametrize("wind", BRACKETS)
-def test_a_plane_front_moves_at_the_speed_of_the_travelling_wave(wind: float):
-    assert plane_speed(wind, SPACING) == pytest.approx(wave(CONFIG, wind, *BRACKETS[wind])[0], 0.01)
-
-
-def test_the_speed_converges_with_second_order():
-    speed, _ = wave(CONFIG, 0.05, *BRACKETS[0.05])
-    errors = [plane_speed(0.05, spacing) / speed - 1 for spacing in (1.5, 0.75)]
-    assert 3 < errors[0] / errors[1] < 5.5
 
 
 def point(**changes: float) -> ReactionConfig:
@@ -135,7 +55,7 @@ def test_a_fire_is_as_fast_along_a_diagonal_as_along_an_axis():
         assert torch.allclose(turned, arrival, rtol=1e-4)
 
 
-@pytest.mark.parametrize(("wind", "known"), [(0.05, True), (0.06, False), (0.1, False)])
+@pytest.mark.parametrize(("wind", "known"), [(0.05, True), (0.06, False)])
 def test_a_fire_goes_out_against_the_same_wind_as_the_wave(wind: float, known: bool):
     speeds = np.linspace(0.03, 0.13, 21)
     assert any(profile(CONFIG, -wind, speed)[1] < 0 for speed in speeds) == known
