@@ -25,13 +25,13 @@ ENTRY_POINTS = """[emberlink.comm]
 headcount = extensions_block:Headcount
 visited = communication_block:Visited
 [emberlink.learners]
-slow_actor = learners_block:SlowActor
+sac = extensions_block:SAC
 [emberlink.memory]
 fading = learners_block:Fading
 [emberlink.scripted]
 gather = extensions_block:Gather
 """
-BLOCKS = {"communication": 1, "extensions": 2, "learners": 2, "worlds": 0}
+BLOCKS = {"communication": 1, "extensions": 3, "learners": 1, "worlds": 0}
 """the number of Python blocks of a page, from its first, that make up a module"""
 
 

@@ -89,13 +89,12 @@ class TrainingSetup:
         Raises:
             ValueError, KeyError, RuntimeError: the state does not fit this configuration.
         """
-        device = self.config.device
+        device, carried = self.config.device, group(state, "carried")
+        copy_into(flatten(self.collector.carried), carried)
+        self.collector.restore(unflatten(carried, 1, device), step)  # resets the environments
         self.learner.load_state_dict(group(state, "learner"))
         copy_into(self.env.base_env.state_dict(), group(state, "environments"))
         copy_into(self.env.transform.state_dict(), group(state, "communication"))
-        carried = group(state, "carried")
-        copy_into(flatten(self.collector.carried), carried)
-        self.collector.restore(unflatten(carried, 1, device), step)
         self.record.load_state_dict(group(state, "episode"), device)
         self.step = step
 
