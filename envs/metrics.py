@@ -165,7 +165,11 @@ def base_coverage(seen: Tensor, burnt: Tensor) -> Tensor:
 
 
 def base_age(ages: Tensor) -> Tensor:
-    """Returns `front_age` with the base's sightings, from `keys.BASE_AGE`, [..., T]."""
+    """Returns `front_age` of what the base knows.
+
+    Args:
+        ages: `keys.BASE_AGE` after each step, [..., T].
+    """
     return ages[..., -1]
 
 

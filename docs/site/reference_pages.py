@@ -141,7 +141,10 @@ def _keys(cls: type, prefix: str, values: Mapping[str, Any]) -> Iterator[tuple[s
             yield from _keys(hints[name], f"{prefix}{name}.", values.get(name, {}))
             continue
         about = schema["properties"][name]
-        default = values.get(name, about.get("default", MISSING))
+        default = about.get("default", MISSING)
+        if field.default_factory is not MISSING:
+            default = field.default_factory()
+        default = values.get(name, default)
         shown = "by choice" if default is MISSING else f"`{_plain(default)}`"
         yield f"`{prefix}{name}`", shown, f"{meanings.get(name, '')}; {_type(about)}"
 
