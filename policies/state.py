@@ -60,7 +60,7 @@ def primer_of(policy: nn.Module) -> TensorDictPrimer:
     """Returns a transform that adds the state of all parts of a policy to an environment."""
     parts = [part for part in policy.modules() if isinstance(part, Stateful)]
     specs: dict[str, Any] = {
-        name: Unbounded((part.uavs, size), dtype=torch.float32)
+        name: Unbounded(torch.Size((part.uavs, size)), dtype=torch.float32)
         for part in parts
         for (_, name), size in part.carries.items()
     }

@@ -7,7 +7,7 @@ import torch
 from single_ddpg import SingleActor, SingleCritic, copy_uav
 from tensordict import TensorDict
 
-from emberlink.envs import WildfireConfig, keys, specs
+from emberlink.envs import WildfireConfig, WildfireEnv, keys
 from emberlink.policies.networks.actor_critic import (
     STATE_ACTION_VALUE,
     StackedActor,
@@ -91,10 +91,8 @@ def test_uavs_start_from_different_weights_and_a_seed_repeats_them():
 
 
 def test_modules_read_and_write_the_keys_of_the_environment():
-    observation, action = (
-        specs.observation_spec(5, WildfireConfig(num_uavs=4), window=5),
-        specs.action_spec(5, 4),
-    )
+    env = WildfireEnv(5, WildfireConfig(num_uavs=4))
+    observation, action = env.observation_spec, env.full_action_spec
     actor, critic = (
         make_actor(observation, action, HIDDEN),
         make_critic(observation, action, HIDDEN),

@@ -114,7 +114,7 @@ def test_worlds_that_a_run_cannot_be_evaluated_in(setting, said, run, capsys):
 
 
 def test_networks_that_never_saw_a_base_are_warned_of():
-    with pytest.warns(UserWarning, match=r"^env\.base=\[0\.0, 30\.0\]: the networks were trained"):
+    with pytest.warns(UserWarning, match=r"^env\.base=\[0\.0, 30\.0\] \(in training null\)"):
         trainers.load("pretrained:maps", world="relay")
     with warnings.catch_warnings():
         warnings.simplefilter("error", UserWarning)

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from emberlink.envs import keys, parallel_env
-from emberlink.envs.utils import plugins
+from emberlink.envs.utils import config_files
 from emberlink.envs.utils.errors import UserError
 from emberlink.trainers import load, make_env
 from emberlink.trainers.cli import main
@@ -122,7 +122,7 @@ def test_learners_have_names():
 def test_another_package_can_add_a_learner(monkeypatch):
     group = "emberlink.learners"
     point = EntryPoint("mine", "emberlink.trainers.learners.td3:TD3", group)
-    monkeypatch.setattr(plugins, "registered", lambda of: {"mine": point} if of == group else {})
+    monkeypatch.setattr(config_files, "entry_points", lambda of: [point] * (of == group))
     assert registry.known() == ["ddpg", "imitation", "ippo", "mappo", "mine", "td3"]
     assert registry.find("mine") is TD3
 

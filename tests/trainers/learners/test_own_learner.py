@@ -9,7 +9,7 @@ from types import ModuleType
 import pytest
 import torch
 
-from emberlink.envs.utils import plugins
+from emberlink.envs.utils import config_files
 from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.training.setup import TrainingSetup
 
@@ -35,7 +35,7 @@ def sac(tmp_path, monkeypatch):
     monkeypatch.setenv("EMBERLINK_CONFIGS", str(tmp_path))
     group = "emberlink.learners"
     point = EntryPoint("sac", "own_sac:SAC", group)
-    monkeypatch.setattr(plugins, "registered", lambda of: {"sac": point} if of == group else {})
+    monkeypatch.setattr(config_files, "entry_points", lambda of: [point] * (of == group))
 
 
 def made() -> TrainingSetup:

@@ -122,7 +122,7 @@ def test_a_copy_cannot_be_resumed(shipped, capsys):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["eval", "{}", "policy.hold=5"], "'policy.hold=5': an evaluation can change"),
+        (["eval", "{}", "policy.hold=5"], "policy.hold"),
         (["eval", "{}", "env.num_uavs=0"], "env.num_uavs=0"),
         (["eval", "{}", "world=moon"], "world 'moon'"),
         (["eval", "{}", "evaluation.scripted=[nobody]"], "nobody"),

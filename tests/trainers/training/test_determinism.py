@@ -38,7 +38,7 @@ ON_POLICY = ["learner=mappo", "env.base=[0,15]", "env.horizon=40"]
 )
 def test_the_default_dtype_does_not_change_a_training(method, more, tmp_path):
     """A program that uses emberlink may prefer float64."""
-    step = 40 if more else 15  # on-policy learners learn at the end of an episode
+    step = 40 if more else 35  # on-policy learners learn at the end of an episode
     usual = until(begun(method, tmp_path / "usual", *more), step)
     torch.set_default_dtype(torch.float64)
     try:
