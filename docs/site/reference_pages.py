@@ -142,8 +142,9 @@ def _keys(cls: type, prefix: str, values: Mapping[str, Any]) -> Iterator[tuple[s
             continue
         about = schema["properties"][name]
         default = about.get("default", MISSING)
-        if field.default_factory is not MISSING:
-            default = field.default_factory()
+        factory = cls.__pydantic_fields__[name].default_factory
+        if factory is not None:
+            default = factory()
         default = values.get(name, default)
         shown = "by choice" if default is MISSING else f"`{_plain(default)}`"
         yield f"`{prefix}{name}`", shown, f"{meanings.get(name, '')}; {_type(about)}"

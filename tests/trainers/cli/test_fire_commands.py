@@ -246,7 +246,6 @@ KNOWN = "known: front, huygens, oil_slick, paper, reaction, swarm"
     [
         (["preview", "huygns"], ["huygns", "did you mean huygens?", KNOWN]),
         (["preview", "zzz:3"], ["zzz:3", KNOWN]),
-        (["preview", "paper", "--output", "x" * 5000 + ".png"], ["File name too long"]),
         (["preview", "huygens:-1"], ["'-1'", "0 to 65535"]),
         (["preview", "huygens:65536"], ["'65536'", "0 to 65535"]),
         (["preview", "bank.npy:2"], ["bank.npy:2", "no fire '2'", "0 to 1"]),

@@ -3,7 +3,7 @@
 import pytest
 import torch
 from test_recipes import METHODS
-from test_resume import begun, until
+from test_resume import REPLAY, begun, until
 from torchrl.envs import check_env_specs
 
 from emberlink.envs import keys
@@ -17,7 +17,9 @@ from emberlink.trainers import make_env
 def test_a_seed_repeats_its_run_byte_for_byte(method, tmp_path):
     def run(folder: str, seed: int) -> tuple[bytes, dict[str, torch.Tensor]]:
         torch.manual_seed(len(folder))  # earlier draws must not matter
-        trainer = until(begun(method, tmp_path / folder, "episodes=2", f"seed={seed}"), None)
+        trainer = until(
+            begun(method, tmp_path / folder, "episodes=2", f"seed={seed}", *REPLAY), None
+        )
         learner = trainer.setup.learner
         assert learner.updates > 0
         return (trainer.run.path / "metrics.jsonl").read_bytes(), learner.weights()
@@ -38,7 +40,9 @@ ON_POLICY = ["learner=mappo", "env.base=[0,15]", "env.horizon=40"]
 )
 def test_the_default_dtype_does_not_change_a_training(method, more, tmp_path):
     """A program that uses emberlink may prefer float64."""
-    step = 40 if more else 35  # on-policy learners learn at the end of an episode
+    more, step = (
+        (more, 40) if more else (REPLAY, 35)
+    )  # on-policy learners learn at the end of an episode
     usual = until(begun(method, tmp_path / "usual", *more), step)
     torch.set_default_dtype(torch.float64)
     try:
