@@ -1,6 +1,6 @@
 """The actor and critic of the paper (section III.C), with weights per UAV or shared."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -11,7 +11,7 @@ from torchrl.data import Composite
 from emberlink.envs import keys
 from emberlink.policies.networks.encoders import ObservationEncoder
 from emberlink.policies.networks.grouping import Grouping
-from emberlink.policies.networks.layers import StackedLayerNorm, StackedLinear
+from emberlink.policies.networks.layers import Layer, StackedLayerNorm, StackedLinear
 
 STATE_ACTION_VALUE = (keys.AGENTS, "state_action_value")
 """float32 [..., uavs, 1]: the critics' output"""
@@ -20,6 +20,9 @@ TAKEN = (keys.AGENTS, "taken")
 UAVs take the actions of their (target) actors"""
 LAYER_NAMES = ("first", "second", "third", "fourth", "fifth", "sixth", "seventh", "eighth")
 """names of the hidden layers"""
+MAX_BATCHED = 2**17
+"""activations of a group's widest layer below which a CPU computes all groups in one product; more
+(over 0.5 MB) would not stay in its cache from one layer to the next"""
 FINAL_BOUND = 3e-3
 """bound of the initial weights of the last layer (Lillicrap et al. 2016, section 7)"""
 
@@ -59,7 +62,7 @@ class _Stacked(nn.Module):
         if not 1 <= len(hidden) <= len(LAYER_NAMES):
             raise ValueError(f"hidden={list(hidden)}: 1 to {len(LAYER_NAMES)} layers are possible")
         self.grouping = Grouping(uavs, shared=share_parameters)
-        self.names = LAYER_NAMES[: len(hidden)]
+        self.names, self.widest = LAYER_NAMES[: len(hidden)], max(hidden)
         self._dims, self._indexed, self._team = len(observations[0]), agent_index, team
         if team:
             observations = [(n * uavs, *sides) for n, *sides in observations]
@@ -79,17 +82,54 @@ class _Stacked(nn.Module):
     def _add_output(self, groups: int, actions: int, inputs: int, **start: Any) -> None:
         raise NotImplementedError
 
-    def _features(self, observations: Sequence[Tensor], batch: torch.Size) -> Tensor:
-        """Returns the last hidden layer before its ReLU, [groups, rows, units]."""
+    def _encode(self, observations: Sequence[Tensor], batch: torch.Size) -> Tensor:
+        """Returns the input of the hidden layers, [groups, rows, features]."""
         if self._team:
             observations = [self.grouping.of_team(x, len(batch)) for x in observations]
         if self._indexed:
             observations = [self.grouping.with_index(observations[0]), *observations[1:]]
-        x = self.encoder([self.grouping.split(x, batch) for x in observations])
-        for name in self.names:
-            x = x if name == self.names[0] else x.relu_()
-            x = getattr(self, f"{name}_norm")(getattr(self, name)(x))
-        return x
+        return self.encoder([self.grouping.split(x, batch) for x in observations])
+
+    def _hidden_layers(self) -> list[Any]:
+        return [getattr(self, name + kind) for name in self.names for kind in ("", "_norm")]
+
+    def _map(self, function: Callable[..., Tensor], layers: list[Any], *inputs: Tensor) -> Tensor:
+        """Applies a function of layers and inputs to all groups at once, or to one after another.
+
+        Args:
+            function: maps layers and inputs to an output.
+            layers: the stacked layers.
+            inputs: [groups, rows, features] each.
+
+        Returns:
+            [groups, rows, features].
+        """
+        x = inputs[0]
+        if x.is_cuda or x.shape[1] * self.widest < MAX_BATCHED:
+            return function(layers, *inputs)
+        by_group = zip(*(layer.per_group() for layer in layers), strict=True)
+        return torch.stack([function(*group) for group in zip(by_group, *inputs, strict=True)])
+
+
+# ReLU and tanh are computed in place: no gradient needs the output of the layer before.
+
+
+def _to_features(layers: Sequence[Layer], x: Tensor) -> Tensor:
+    """Returns the last hidden layer before its ReLU, given a linear map and a norm per layer."""
+    *before, last, last_norm = layers
+    for linear, norm in zip(before[::2], before[1::2], strict=True):
+        x = norm(linear(x)).relu_()
+    return last_norm(last(x))
+
+
+def _to_action(layers: Sequence[Layer], x: Tensor) -> Tensor:
+    *hidden, last = layers
+    return last(_to_features(hidden, x).relu_()).tanh_()
+
+
+def _to_value(layers: Sequence[Layer], x: Tensor, action: Tensor) -> Tensor:
+    *hidden, from_action, last = layers
+    return last((_to_features(hidden, x) + from_action(action)).relu_())
 
 
 class StackedActor(_Stacked):
@@ -101,7 +141,8 @@ class StackedActor(_Stacked):
     def forward(self, *observations: Tensor) -> Tensor:
         """Maps the tensors of an observation, [*batch, uavs, ...], to [*batch, uavs, actions]."""
         batch = observations[0].shape[: -self._dims]
-        x = self.action(self._features(observations, batch).relu_()).tanh_()
+        layers = [*self._hidden_layers(), self.action]
+        x = self._map(_to_action, layers, self._encode(observations, batch))
         return self.grouping.join(x, batch)
 
 
@@ -131,9 +172,9 @@ class StackedCritic(_Stacked):
         if self._team:
             others = self.grouping.of_team(action if taken is None else taken, len(batch))
             action = torch.cat((action, others[..., action.shape[-1] :]), -1)
-        features = self._features(observations, batch)
-        x = features + self.action(self.grouping.split(action, batch))
-        return self.grouping.join(self.value(x.relu_()), batch)
+        layers = [*self._hidden_layers(), self.action, self.value]
+        inputs = self._encode(observations, batch), self.grouping.split(action, batch)
+        return self.grouping.join(self._map(_to_value, layers, *inputs), batch)
 
 
 def make_actor(

@@ -4,11 +4,13 @@ The first dimension of every weight is the group: a UAV, or the team if its UAVs
 """
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
+Layer = Callable[[Tensor], Tensor]
 Start = dict[str, Any]
 """`device` of the weights and `generator` of their initial values, on the CPU; None for global"""
 
@@ -74,6 +76,11 @@ class StackedLinear(nn.Module):
         """Maps [groups, rows, inputs] to [groups, rows, outputs]."""
         return torch.baddbmm(self.bias, x, self.weight)
 
+    def per_group(self) -> list[Layer]:
+        """Returns the layer of each group, which maps [rows, inputs] to [rows, outputs]."""
+        groups = zip(self.weight.unbind(0), self.bias.squeeze(1).unbind(0), strict=True)
+        return [lambda x, w=weight, b=bias: torch.addmm(b, x, w) for weight, bias in groups]
+
 
 class StackedLayerNorm(nn.Module):
     """Applies layer normalisation (Ba et al. 2016) with a scale and a shift per group."""
@@ -87,6 +94,12 @@ class StackedLayerNorm(nn.Module):
         """Maps [groups, rows, features] to the same shape."""
         normal = nn.functional.layer_norm(x, x.shape[-1:])
         return torch.addcmul(self.bias, normal, self.weight)
+
+    def per_group(self) -> list[Layer]:
+        """Returns the layer of each group, which maps [rows, features] to the same shape."""
+        norm = nn.functional.layer_norm
+        groups = zip(self.weight.squeeze(1), self.bias.squeeze(1), strict=True)
+        return [lambda x, w=weight, b=bias: norm(x, w.shape, w, b) for weight, bias in groups]
 
 
 class StackedConv2d(nn.Module):
