@@ -175,7 +175,7 @@ def _type(schema: Mapping[str, Any]) -> str:
     if "items" in schema:
         return f"list, each {_type(schema['items'])}"
     bounds = [
-        f"{sign} {schema[bound]:,.10g}"
+        f"{sign} {schema[bound]:,.10f}".rstrip("0").rstrip(".")
         for bound, sign in _BOUNDS.items()
         if abs(schema.get(bound, _NO_LIMIT)) < _NO_LIMIT
     ]

@@ -11,7 +11,7 @@ from emberlink.envs import metrics
 
 DOCS = Path(__file__).parents[2] / "docs"
 PAGES = sorted(DOCS.rglob("*.md"))
-CODE = re.compile(r"\[\.\.\.|->|int64|float32|\bbool\b|\bTensor\b|\bNone\b|Undefined")
+CODE = re.compile(r"\[\.\.\.|->|int64|float32|\bbool\b|\bTensor\b|\bNone\b|Undefined|e[+-]\d\d")
 
 
 @pytest.fixture

@@ -209,6 +209,7 @@ def test_narrow_tables_keep_every_number(columns, monkeypatch, capsys):
     scores.print_results(SafeConsole(), RESULTS, config)
     lines = capsys.readouterr().out.splitlines()
     parts = sum(line.startswith("oracle ") for line in lines)
+    assert (parts > 1) == (columns != "120")
     assert max(map(len, lines)) <= int(columns)
     for policy in ("shared_memory", *POLICIES):
         # A name may take two lines.
@@ -217,6 +218,9 @@ def test_narrow_tables_keep_every_number(columns, monkeypatch, capsys):
         assert len(rows) in (parts, 2 * parts)  # two of the names begin with "random_"
         rows = rows[:: len(rows) // parts]
         assert [number for row in rows for number in row[1:]] == NUMBERS
+    words = " ".join(lines).replace("_", " ").split()
+    for name in metrics.NAMES:
+        assert set(name.split("_")) <= set(words), name
 
 
 def test_validation_has_fires_and_starts_of_its_own(cache, monkeypatch):
