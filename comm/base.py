@@ -12,6 +12,7 @@ from torchrl.envs import Transform
 from emberlink.envs import keys
 from emberlink.envs.config import WildfireConfig
 from emberlink.envs.utils.errors import UserError
+from emberlink.envs.utils.plugins import Plugins
 from emberlink.envs.world import radio
 
 
@@ -207,3 +208,6 @@ class Communication(Transform):
             shape = torch.Size((*batch, uavs))
             spec[keys.BYTES_SENT] = Unbounded(shape, device=spec.device, dtype=torch.int64)
         return self.module.specs(spec)
+
+
+MODULES = Plugins(CommModule, "emberlink.comm", "comm.name")

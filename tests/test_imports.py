@@ -49,8 +49,8 @@ import torchrl.envs, torchrl.collectors, torchrl.objectives
 import torchrl.record.loggers
 state = torch.get_rng_state(), random.getstate(), torch.get_num_threads()
 threads, default = threading.active_count(), torch.get_default_dtype()
-import emberlink.envs, emberlink.envs.pettingzoo, emberlink.comm.registry, emberlink.comm.consensus
-import emberlink.policies.scripted.registry, emberlink.policies.networks.actor_critic
+import emberlink.envs, emberlink.envs.pettingzoo, emberlink.comm.consensus
+import emberlink.policies.scripted.base, emberlink.policies.networks.actor_critic
 import emberlink.trainers.training.trainer
 assert torch.equal(state[0], torch.get_rng_state())
 assert state[1:] == (random.getstate(), torch.get_num_threads())

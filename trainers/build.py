@@ -16,8 +16,7 @@ from emberlink.policies.hold import hold
 from emberlink.policies.state import primer_of
 from emberlink.trainers.config.compose import override, resolve
 from emberlink.trainers.config.schema import RunConfig, build_comm
-from emberlink.trainers.learners import registry
-from emberlink.trainers.learners.base import Learner, LearnerContext
+from emberlink.trainers.learners.base import LEARNERS, Learner, LearnerContext
 from emberlink.trainers.rollout.teacher import Teacher
 
 
@@ -97,7 +96,7 @@ def build_actor(
 
     A TensorDict module with the networks in `module`.
     """
-    learner = registry.find(config.learner.name)
+    learner = LEARNERS.find(config.learner.name)
     specs = env.observation_spec, env.full_action_spec
     actor = learner.make_actor(config.learner, *specs, generator, config.policy)
     return hold(actor, config.policy.hold, config.env.num_uavs)
@@ -119,4 +118,4 @@ def build_learner(config: RunConfig, env: TransformedEnv) -> Learner:
         device=config.device,
         failures=config.env.failures > 0,
     )
-    return registry.build(config.learner, context)
+    return LEARNERS.find(config.learner.name)(config.learner, context)

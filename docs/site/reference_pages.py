@@ -15,13 +15,13 @@ from sphinx.application import Sphinx
 from sphinx.pycode import ModuleAnalyzer
 from sphinx.util.docutils import SphinxDirective
 
-from emberlink.comm import registry as communication
+from emberlink.comm.base import MODULES
 from emberlink.envs import FileFireConfig, FireConfig, ReactionConfig, metrics
 from emberlink.trainers import RunConfig, resolve
 from emberlink.trainers.cli.main import _parser
 from emberlink.trainers.config.compose import to_values
-from emberlink.trainers.learners import registry as learners
-from emberlink.trainers.sweep.executors import base as executors
+from emberlink.trainers.learners.base import LEARNERS
+from emberlink.trainers.sweep.executors.base import EXECUTORS
 
 _WORDS = {
     "integer": "whole number",
@@ -124,9 +124,9 @@ def _rows(kind: str, name: str) -> Iterator[tuple[str, ...]]:
         types = {"spread": FireConfig, "reaction": ReactionConfig, "file": FileFireConfig}
         yield from _keys(types[name], "fire.", {})
     else:
-        registry = {"learner": learners, "comm": communication, "executor": executors}[kind]
+        plugins = {"learner": LEARNERS, "comm": MODULES, "executor": EXECUTORS}[kind]
         values = to_values(resolve("independent", [f"learner={name}"])) if kind == "learner" else {}
-        yield from _keys(registry.find(name).config_type, f"{kind}.", values.get(kind, {}))
+        yield from _keys(plugins.find(name).config_type, f"{kind}.", values.get(kind, {}))
 
 
 def _keys(cls: type, prefix: str, values: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:

@@ -1,8 +1,12 @@
-"""Finds classes by name: emberlink's own, and entry points of other packages."""
+"""Finds classes by name: those in a folder of emberlink, and entry points of other packages."""
 
-from collections.abc import Mapping
+import ast
+import re
+import sys
 from dataclasses import dataclass
+from functools import cache
 from importlib.metadata import EntryPoint
+from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 from emberlink.envs.utils import config_files
@@ -11,21 +15,50 @@ from emberlink.envs.utils.errors import UserError, unknown
 T = TypeVar("T")
 
 
+@cache
+def defined(folder: Path, base: str) -> dict[str, tuple[str, str]]:
+    """Returns `module:class` and docstring by name of the subclasses in the files of a folder.
+
+    A subclass alone in its file has the name of the file; of several, `MapGreedy` is `map_greedy`.
+    Classes that are private or inherit from ABC themselves have no name. Nothing is imported.
+    """
+    classes = [
+        (file.stem, node)
+        for file in sorted(folder.glob("*.py"))
+        for node in ast.parse(file.read_text("utf-8")).body
+        if isinstance(node, ast.ClassDef)
+    ]
+    bases = {node.name: [ast.unparse(parent) for parent in node.bases] for _, node in classes}
+
+    def inherits(name: str) -> bool:
+        return any(parent == base or inherits(parent) for parent in bases.get(name, ()))
+
+    named = [
+        (stem, node)
+        for stem, node in classes
+        if inherits(node.name) and node.name[0] != "_" and "ABC" not in bases[node.name]
+    ]
+    stems, found = [stem for stem, _ in named], dict[str, tuple[str, str]]()
+    for stem, node in named:
+        snake = re.sub("(?<=[a-z])(?=[A-Z])", "_", node.name).lower()
+        name = stem if stems.count(stem) == 1 else snake
+        found[name] = f"{stem}:{node.name}", ast.get_docstring(node) or ""
+    return found
+
+
 @dataclass(frozen=True)
-class Registry(Generic[T]):
-    """Finds the subclasses of a class; each is imported when its name is asked for.
+class Plugins(Generic[T]):
+    """Finds the subclasses of a class in its folder; each is imported when it is asked for.
 
     Attributes:
-        base: the class.
+        base: the class; the other files of its folder define its subclasses, see `defined`.
         group: group of the entry points of other packages.
         key: configuration key of the name, for messages.
-        own: name -> `module:class`, of emberlink's own subclasses.
     """
 
     base: type[T]
     group: str
     key: str
-    own: Mapping[str, str]
 
     def known(self) -> list[str]:
         """Returns the names in alphabetical order."""
@@ -47,8 +80,13 @@ class Registry(Generic[T]):
         return self._load(*points.values())
 
     def _points(self) -> list[EntryPoint]:
-        own = [EntryPoint(n, f"emberlink.{place}", self.group) for n, place in self.own.items()]
-        return [*config_files.entry_points(self.group), *own]
+        module = self.base.__module__
+        folder, package = Path(str(sys.modules[module].__file__)).parent, module.rpartition(".")[0]
+        own = defined(folder, self.base.__name__)
+        return [
+            *config_files.entry_points(self.group),
+            *(EntryPoint(n, f"{package}.{place}", self.group) for n, (place, _) in own.items()),
+        ]
 
     def _load(self, point: EntryPoint) -> type[T]:
         package = point.dist.name if point.dist else point.module

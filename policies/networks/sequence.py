@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from emberlink.policies.networks.encoders import ObservationEncoder
 from emberlink.policies.networks.grouping import Grouping
 from emberlink.policies.networks.layers import StackedLinear
-from emberlink.policies.networks.memory.registry import find
+from emberlink.policies.networks.memory.base import MEMORIES
 from emberlink.policies.settings import PolicyConfig
 
 FIRST_LOG_STD = -0.5
@@ -56,7 +56,7 @@ class SequenceNetwork(nn.Module):
         shapes = [(first[0] + uavs * policy.agent_index,), *others]
         groups = self.grouping.groups
         self.encoder = ObservationEncoder(groups, shapes, **start)
-        self.memory = find(policy.memory)(groups, self.encoder.features, policy, **start)
+        self.memory = MEMORIES.find(policy.memory)(groups, self.encoder.features, policy, **start)
         inputs, self.hidden = self.memory.features, nn.ModuleList()
         for units in hidden:
             self.hidden.append(StackedLinear(groups, inputs, units, gain=math.sqrt(2), **start))

@@ -8,6 +8,7 @@ from tensordict.nn import TensorDictModuleBase
 
 from emberlink.envs import keys
 from emberlink.envs.utils import counter_rng
+from emberlink.envs.utils.plugins import Plugins
 from emberlink.envs.wildfire import WildfireEnv
 from emberlink.envs.world import motion
 from emberlink.envs.world.sensor import view_radius
@@ -75,3 +76,6 @@ class Scripted(TensorDictModuleBase):
             return initial
         begins = tensordict.get(keys.STEP) == 0
         return torch.where(begins.view(-1, *[1] * (initial.ndim - 1)), initial, previous)
+
+
+SCRIPTED = Plugins(Scripted, "emberlink.scripted", "policy")

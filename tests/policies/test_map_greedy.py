@@ -8,8 +8,8 @@ from torchrl.envs import step_mdp
 
 from emberlink.envs import WildfireConfig, WildfireEnv, keys
 from emberlink.envs.config import RadioConfig
+from emberlink.policies.scripted.base import SCRIPTED
 from emberlink.policies.scripted.map_greedy import Courier, MapGreedy, MapGreedyAll, MapGreedyAlone
-from emberlink.policies.scripted.registry import SCRIPTED
 
 NEVER = math.inf
 VARIANTS = [MapGreedyAlone, MapGreedy, MapGreedyAll, Courier]
@@ -132,9 +132,9 @@ def test_only_cells_that_were_seen_matter(kind):
 # Episodes and batches
 
 
-@pytest.mark.parametrize("name", sorted(SCRIPTED.keys() - {"follow_target"}))
+@pytest.mark.parametrize("name", sorted({*SCRIPTED.known()} - {"follow_target"}))
 def test_a_reset_of_one_environment_leaves_the_others(name):
-    kind = SCRIPTED[name]
+    kind = SCRIPTED.find(name)
     config = world(num_uavs=3, horizon=60, base=(0.0, 15.0))
     fires = random_fires(config, 2)
     env, undisturbed = (WildfireEnv(2, config, fires, seed=9) for _ in range(2))

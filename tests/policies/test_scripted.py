@@ -13,9 +13,9 @@ from torchrl.envs import step_mdp
 from emberlink.envs import WildfireConfig, WildfireEnv, keys
 from emberlink.envs.utils.config_files import known
 from emberlink.envs.world.sensor import view_radius
+from emberlink.policies.scripted.base import SCRIPTED
 from emberlink.policies.scripted.lawnmower import Lawnmower, search_path
 from emberlink.policies.scripted.oracle import Oracle
-from emberlink.policies.scripted.registry import SCRIPTED
 from emberlink.policies.scripted.simple import FollowTarget
 from emberlink.trainers.build import build_env
 from emberlink.trainers.config.compose import resolve
@@ -183,7 +183,7 @@ def world_of(name: str):
 
 
 @pytest.mark.parametrize("place", [name for name in known("world") if name != "file"])
-@pytest.mark.parametrize("name", SCRIPTED)
+@pytest.mark.parametrize("name", SCRIPTED.known())
 def test_every_policy_in_every_world(name, place):
     config = world_of(place)
     arrival = fires((config.env.grid,), 2)
@@ -191,7 +191,7 @@ def test_every_policy_in_every_world(name, place):
 
     def actions(seeds, fire):
         env = build_env(config, num_envs=len(seeds), fire=fire, seed=seeds, device="cpu")
-        tds = episode(env, SCRIPTED[name](env.base_env), 12)
+        tds = episode(env, SCRIPTED.find(name)(env.base_env), 12)
         if name != "random_actions":  # policies that fly to points in the box do not leave it
             assert not any(td[keys.HIT_BOUNDARY].any() for td in tds)
         return torch.stack([td[keys.ACTION] for td in tds])

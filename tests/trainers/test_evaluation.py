@@ -12,7 +12,7 @@ import torch
 from emberlink.envs import keys, metrics
 from emberlink.envs.fire.generator import fire_seeds, load_scenario, make_fires
 from emberlink.envs.utils.errors import UserError
-from emberlink.policies.scripted.registry import SCRIPTED
+from emberlink.policies.scripted.base import SCRIPTED
 from emberlink.trainers.build import build_actor, build_env
 from emberlink.trainers.cli import main
 from emberlink.trainers.config.compose import resolve
@@ -116,7 +116,7 @@ def test_follow_target_uses_the_consensus_of_the_setup():
             assert changed.comm == resolve("consensus", [f"setup={setup}"]).comm
             assert changed.env.radio == resolve("consensus", [f"setup={setup}"]).env.radio
             assert replace(changed, comm=config.comm, env=config.env) == config
-            for name in SCRIPTED.keys() - {"follow_target"}:
+            for name in {*SCRIPTED.known()} - {"follow_target"}:
                 assert evaluate.scripted_config(config, name) is config
 
 

@@ -8,7 +8,7 @@ from rich.console import Console
 
 from emberlink.envs import metrics
 from emberlink.envs.scenarios import fires_of
-from emberlink.policies.scripted.registry import SCRIPTED
+from emberlink.policies.scripted.base import SCRIPTED
 from emberlink.trainers.cli import main
 from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.evaluation import evaluate
@@ -93,7 +93,11 @@ def test_check_plays_on_validation_fires_as_an_evaluation_does(tmp_path):
     config = resolve("independent", ["world=front", *TINY])
     fires = fires_of(config.fire).validation(3, (12, 12), 12)
     measured = evaluate.play_blocks(
-        config, SCRIPTED["map_greedy"], fires, start_seed=evaluate.VALIDATION_START_SEED, block=3
+        config,
+        SCRIPTED.find("map_greedy"),
+        fires,
+        start_seed=evaluate.VALIDATION_START_SEED,
+        block=3,
     )
     assert (found["split"], found["fires"]) == ("validation", 3)
     for name, values in measured.items():

@@ -1,12 +1,12 @@
 """Defines the arguments of `emberlink list` and prints the names."""
 
 import argparse
-import ast
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from emberlink.envs.utils.config_files import entry_points, known, summary
 from emberlink.envs.utils.errors import UserError, unknown
+from emberlink.envs.utils.plugins import defined
 from emberlink.policies import scripted
 from emberlink.trainers.cli.parser import command
 
@@ -52,14 +52,7 @@ def described(kind: str) -> list[tuple[str, str]]:
     if kind != "policies":
         group = kind.removesuffix("s")
         return [(name, summary(group, name)) for name in known(group)]
-    (folder,) = scripted.__path__
-    classes = {
-        node.name.lower(): ast.get_docstring(node) or ""
-        for file in sorted(Path(folder).glob("*.py"))
-        for node in ast.parse(file.read_text(encoding="utf-8")).body
-        if isinstance(node, ast.ClassDef)
-    }
-    own = [(name, classes[name.replace("_", "")].split("\n\n")[0]) for name in scripted.ORDER]
+    own = defined(Path(scripted.__path__[0]), "Scripted")
+    texts = {name: " ".join(text.split("\n\n")[0].split()) for name, (_, text) in own.items()}
     points = entry_points("emberlink.scripted")
-    others = sorted((point.name, f"of the package {point.module}") for point in points)
-    return [*((name, " ".join(text.split())) for name, text in own), *others]
+    return sorted((texts | {p.name: f"of the package {p.module}" for p in points}).items())

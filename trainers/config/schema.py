@@ -1,5 +1,6 @@
 """Defines the schema of a run's configuration."""
 
+import warnings
 from collections.abc import Mapping
 from dataclasses import asdict, fields, is_dataclass
 from typing import Annotated, Any, Literal
@@ -15,12 +16,12 @@ from pydantic import (
 )
 from pydantic.dataclasses import dataclass
 
-from emberlink.comm import registry
-from emberlink.comm.base import CommModule
+from emberlink.comm.base import MODULES, CommModule
 from emberlink.envs import metrics
 from emberlink.envs.config import WildfireConfig
 from emberlink.envs.scenarios import Scenario
 from emberlink.envs.utils.errors import UserError
+from emberlink.envs.utils.plugins import Plugins
 from emberlink.envs.utils.validation import (
     STRICT,
     CountOrZero,
@@ -29,11 +30,10 @@ from emberlink.envs.utils.validation import (
     from_plain,
     shown,
 )
-from emberlink.policies.networks import memory
-from emberlink.policies.scripted.registry import to_play
+from emberlink.policies.networks.memory.base import MEMORIES
+from emberlink.policies.scripted.base import SCRIPTED
 from emberlink.policies.settings import PolicyConfig
-from emberlink.trainers.learners import registry as learners
-from emberlink.trainers.learners.base import Count, LearnerConfig
+from emberlink.trainers.learners.base import LEARNERS, Count, LearnerConfig
 
 NOT_LEARNT_WITH = ("device", "logger", "checkpoint_interval", "checkpoint_steps")
 """keys that do not affect learning: configurations that differ only in them are of the same run"""
@@ -44,19 +44,19 @@ Many = Annotated[int, Field(ge=1, le=MAX_FIRES)]
 Seed = Annotated[int, Field(ge=0, lt=2**31)]
 
 
-def _settings(key: str, values: Any, registry: Any) -> Any:
+def _settings(key: str, values: Any, plugins: Plugins) -> Any:
     """Returns name and settings as an instance of the `config_type` of the named class.
 
     Args:
         key: `comm` or `learner`, for messages.
         values: name and settings as plain values, or an instance of a `config_type`.
-        registry: module with `known()` and `find(name)`.
+        plugins: finds the class.
     """
     if is_dataclass(values):
         return values
     if not isinstance(values, Mapping) or not isinstance(name := values.get("name"), str):
         raise UserError(f"{key}={shown(values)}: expected a name and settings")
-    config_type = registry.find(name).config_type
+    config_type = plugins.find(name).config_type
     known = [field.name for field in fields(config_type)]
     # A type may have the name among its fields.
     given = {name: value for name, value in values.items() if name != "name" or name in known}
@@ -68,7 +68,7 @@ def _settings(key: str, values: Any, registry: Any) -> Any:
 
 LearnerChoice = Annotated[
     SerializeAsAny[LearnerConfig],
-    PlainValidator(lambda values: _settings("learner", values, learners)),
+    PlainValidator(lambda values: _settings("learner", values, LEARNERS)),
 ]
 """settings of the learner `learner.name`"""
 
@@ -93,7 +93,8 @@ class EvaluationConfig:
     @field_validator("scripted")
     @classmethod
     def _check_policies(cls, value: tuple[str, ...]) -> tuple[str, ...]:
-        to_play(value)
+        for name in value:
+            SCRIPTED.find(name)
         return value
 
 
@@ -151,14 +152,14 @@ class RunConfig:
     @field_validator("policy")
     @classmethod
     def _check_memory(cls, value: PolicyConfig) -> PolicyConfig:
-        memory.find(value.memory)
+        MEMORIES.find(value.memory)
         return value
 
     @field_validator("comm")
     @classmethod
     def _complete_comm(cls, value: dict[str, Any]) -> dict[str, Any]:
         # A run folder keeps them if a later version of the module has other defaults.
-        settings = _settings("comm", value, registry)
+        settings = _settings("comm", value, MODULES)
         return {"name": value["name"], **asdict(settings)}
 
     def check_rollouts(self, decisions: int = 1) -> None:
@@ -180,8 +181,14 @@ class RunConfig:
 
 
 def build_comm(config: RunConfig, num_envs: int) -> CommModule:
-    """Returns a new communication module for `num_envs` environments."""
-    settings = {key: value for key, value in config.comm.items() if key != "name"}
-    module = registry.build(config.comm["name"], config.env, settings, num_envs)
+    """Returns a new communication module; warns if it does not heed a limit of bytes."""
+    kind, limit = MODULES.find(config.comm["name"]), config.env.radio.bandwidth
+    if limit is not None and kind.hears and not kind.heeds_bandwidth:
+        warnings.warn(
+            f"env.radio.bandwidth={limit}: the messages of comm.name={config.comm['name']} are not "
+            "limited",
+            stacklevel=2,
+        )
+    module = kind(config.env, _settings("comm", config.comm, MODULES), num_envs)
     module.hold = config.policy.hold
     return module

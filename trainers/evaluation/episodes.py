@@ -10,9 +10,9 @@ from torch import Tensor
 from emberlink.envs.fire.generator import load_scenario, scenarios
 from emberlink.envs.scenarios import ScenarioConfig, fires_of
 from emberlink.envs.utils.errors import UserError
-from emberlink.envs.utils.validation import is_index, shown, unknown
+from emberlink.envs.utils.validation import is_index, shown
 from emberlink.envs.wildfire import WildfireEnv
-from emberlink.policies.scripted.registry import SCRIPTED
+from emberlink.policies.scripted.base import SCRIPTED
 from emberlink.trainers.build import build_env
 from emberlink.trainers.config.schema import MAX_FIRES, RunConfig, build_comm
 from emberlink.trainers.evaluation.evaluate import (
@@ -77,10 +77,8 @@ def title_of(config: RunConfig, *more: str) -> str:
 def scripted(config: RunConfig, names: Sequence[str]) -> Iterator[Panel]:
     """Yields a panel for each scripted policy, in the environment of a configuration."""
     for name in names:
-        if name not in SCRIPTED:
-            raise UserError(f"policy {unknown(name, SCRIPTED)}")
         title = f"{name.replace('_', ' ')} (scripted)"
-        yield Panel(title, scripted_config(config, name), SCRIPTED[name])
+        yield Panel(title, scripted_config(config, name), SCRIPTED.find(name))
 
 
 def find_fire(text: str | int | None, run: RunConfig) -> tuple[str, ScenarioConfig, int]:

@@ -16,8 +16,7 @@ from torch import Tensor
 from torchrl.envs import TransformedEnv, set_exploration_type, step_mdp
 from torchrl.envs.utils import ExplorationType
 
-from emberlink.comm import registry
-from emberlink.comm.base import CommModule
+from emberlink.comm.base import MODULES, CommModule
 from emberlink.envs import keys, metrics
 from emberlink.envs.fire.cache import cache_folder
 from emberlink.envs.fire.generator import load_scenario
@@ -26,8 +25,7 @@ from emberlink.envs.scenarios import ScenarioConfig, fires_of, same_tests
 from emberlink.envs.utils.atomic_io import write_bytes
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.wildfire import WildfireEnv
-from emberlink.policies.scripted.base import Scripted
-from emberlink.policies.scripted.registry import SCRIPTED, to_play
+from emberlink.policies.scripted.base import SCRIPTED, Scripted
 from emberlink.trainers.build import build_env
 from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.config.schema import RunConfig
@@ -150,7 +148,7 @@ def evaluate(
         say(LEARNED)
         watched = watch if fire == shown_scenario(config) else None
         results[fire] = {LEARNED: play_blocks(config, lambda _: actor, arrival, watch=watched)}
-        for name in to_play(config.evaluation.scripted) if scripted else ():
+        for name in config.evaluation.scripted if scripted else ():
             results[fire][name] = play_scripted(config, name, arrival, report=say)
     return results
 
@@ -189,11 +187,11 @@ def play_scripted(
 
     Args:
         config: configuration of the run.
-        name: a name in `SCRIPTED`.
+        name: name of the policy.
         arrival, start_seed, block: as in `play_blocks`.
         report: called with the name if no file has the results.
     """
-    world, policy = scripted_config(config, name), SCRIPTED[name]
+    world, policy = scripted_config(config, name), SCRIPTED.find(name)
     settings = asdict(world.env), world.comm, world.policy.hold, world.device, start_seed, block
     file = _kept_file(policy, settings, arrival)
     if file is not None and file.exists():
@@ -237,9 +235,9 @@ def scripted_config(config: RunConfig, name: str) -> RunConfig:
     method has its settings in the run's setup. Where the run's communication would replace actions
     of the policy, there is none.
     """
-    recipe = SCRIPTED[name].recipe
+    recipe = SCRIPTED.find(name).recipe
     if recipe is None:
-        steers = registry.find(config.comm["name"]).steer is not CommModule.steer
+        steers = MODULES.find(config.comm["name"]).steer is not CommModule.steer
         return replace(config, comm={"name": "no_comm"}) if steers else config
     if recipe == config.method:
         return config

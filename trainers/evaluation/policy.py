@@ -9,7 +9,7 @@ import torch
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torchrl.envs import TensorDictPrimer
 
-from emberlink.comm import registry
+from emberlink.comm.base import MODULES
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import shown
 from emberlink.policies.state import primer_of
@@ -170,5 +170,5 @@ def units(config: RunConfig) -> tuple[str, ...]:
     """
     by_map = config.env.observation != "sight" or config.comm.get("position", False)
     world = ("grid", *_UNITS) if by_map else _UNITS
-    said = registry.find(config.comm["name"]).units
+    said = MODULES.find(config.comm["name"]).units
     return (*(f"env.{key}" for key in world), *(f"comm.{key}" for key in said))

@@ -16,6 +16,7 @@ from torchrl.data import Composite
 
 from emberlink.envs.config import WildfireConfig
 from emberlink.envs.utils.errors import UserError
+from emberlink.envs.utils.plugins import Plugins
 from emberlink.envs.utils.validation import STRICT, Name
 from emberlink.policies.networks import make_actor
 from emberlink.policies.settings import PolicyConfig
@@ -206,6 +207,9 @@ class Learner(ABC):
     def _networks(self) -> dict[str, Tensor]:
         state = self.loss.state_dict()
         return {name: value for name, value in state.items() if isinstance(value, Tensor)}
+
+
+LEARNERS = Plugins(Learner, "emberlink.learners", "learner.name")
 
 
 def mean_over_batch(loss: Tensor, alive: Tensor | None) -> Tensor:

@@ -16,8 +16,8 @@ from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import Name
 from emberlink.policies.gaussian import MEMORY, GaussianActor
 from emberlink.policies.settings import PolicyConfig
-from emberlink.trainers.learners import registry
 from emberlink.trainers.learners.base import (
+    LEARNERS,
     STRICT,
     Count,
     Learner,
@@ -116,9 +116,9 @@ class Imitation(Learner):
         policy: PolicyConfig | None = None,
     ) -> Any:
         """Returns new actors of the learner `actor_of`."""
-        learner = registry.find(config.actor_of, "learner.actor_of")
+        learner = LEARNERS.find(config.actor_of, "learner.actor_of")
         if issubclass(learner, cls):
-            others = ", ".join(name for name in registry.known() if name != config.actor_of)
+            others = ", ".join(name for name in LEARNERS.known() if name != config.actor_of)
             raise UserError(
                 f"learner.actor_of={config.actor_of}: has no actors of its own; known: {others}"
             )

@@ -6,7 +6,7 @@ team (Yu et al. 2022, NeurIPS). The losses and the advantages are TorchRL's `MAP
 count decisions after the failure of a UAV.
 """
 
-from abc import abstractmethod
+from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Annotated, Any
 
@@ -97,7 +97,7 @@ class MAPPOConfig(IPPOConfig):
         return self.critic_map
 
 
-class PPO(Learner):
+class PPO(Learner, ABC):
     """Updates actors and critics after each episode, from the episode of every environment.
 
     IPPO and MAPPO define the critics.

@@ -13,8 +13,8 @@ from emberlink.envs import keys
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import unknown
 from emberlink.envs.wildfire import WildfireEnv
+from emberlink.policies.scripted.base import SCRIPTED
 from emberlink.policies.scripted.map_greedy import MapGreedy
-from emberlink.policies.scripted.registry import SCRIPTED
 
 
 class KnownMaps:
@@ -124,7 +124,7 @@ def find(name: str) -> type[MapGreedy]:
     """
     known = {
         other: policy
-        for other, policy in SCRIPTED.items()
+        for other, policy in ((other, SCRIPTED.find(other)) for other in SCRIPTED.known())
         if issubclass(policy, MapGreedy)
         and policy.messages == "in range"
         and not policy.informs_base

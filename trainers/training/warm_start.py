@@ -3,7 +3,7 @@
 import warnings
 from typing import Any
 
-from emberlink.comm import registry
+from emberlink.comm.base import MODULES
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import shown
 from emberlink.trainers.config.compose import to_values
@@ -50,7 +50,7 @@ def _warn_of_other_observations(name: str, theirs: RunConfig, mine: RunConfig) -
     before, now = flat(to_values(theirs)), flat(to_values(mine))
     more = units(mine)
     more += ("env.base",) if mine.env.observation == "sight" else ()  # maps show the base
-    more += ("env.radio.",) if registry.find(mine.comm["name"]).hears else ()
+    more += ("env.radio.",) if MODULES.find(mine.comm["name"]).hears else ()
     observed = (key for key in now if key.startswith(_OBSERVED + more) and key in before)
     for key in observed:
         if before[key] != now[key] and not key.startswith(_REWARD):

@@ -16,7 +16,6 @@ from emberlink.envs.scenarios import fires_of
 from emberlink.envs.utils.atomic_io import created, new_file
 from emberlink.envs.utils.config_files import known
 from emberlink.envs.utils.errors import UserError
-from emberlink.policies.scripted.registry import to_play
 from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.evaluation.evaluate import BLOCK, VALIDATION_START_SEED, play_scripted
@@ -117,7 +116,7 @@ def played(
 
     Args:
         config: configuration of the world.
-        policy: a name in `SCRIPTED`.
+        policy: name of the policy.
         fires: number of fires, one episode each.
         split: test fires as in an evaluation, or validation fires as during a training.
         report: called with the name if the policy is played.
@@ -166,7 +165,7 @@ def check(
         say = partial(console.print, f"  {config.world} is played by", style="dim")
         measured = {
             policy: means(played(config, policy, fires=fires, split=split, report=say))
-            for policy in to_play(config.evaluation.scripted)
+            for policy in config.evaluation.scripted
         }
         found = conditions(measured, config.evaluation.headline)
         console.print(_table(config, measured, f"{fires} {split} fires"))

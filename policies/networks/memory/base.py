@@ -5,6 +5,7 @@ from typing import Any
 
 from torch import Tensor, nn
 
+from emberlink.envs.utils.plugins import Plugins
 from emberlink.policies.settings import PolicyConfig
 
 
@@ -41,3 +42,6 @@ class Memory(nn.Module):
         Returns:
             Features, [groups, rows, decisions, features], and the state after the last decision.
         """
+
+
+MEMORIES = Plugins(Memory, "emberlink.memory", "policy.memory")

@@ -12,7 +12,7 @@ from PIL import Image
 
 from emberlink.envs.fire.generator import load_scenario
 from emberlink.envs.utils.config_files import known
-from emberlink.policies.scripted.registry import SCRIPTED
+from emberlink.policies.scripted.base import SCRIPTED
 from emberlink.trainers.build import build_actor, build_env
 from emberlink.trainers.cli import main
 from emberlink.trainers.config.compose import resolve
@@ -108,9 +108,9 @@ def test_episodes_side_by_side_have_the_same_fire_and_starts(tmp_path):
         assert record.listens == (method in ("consensus", "maps", "positional"))
         assert ("follows" in record.steps) == ("target" in record.steps) == (method == "consensus")
     for name, episode in zip(policies, shown[len(methods) :], strict=True):
-        follows = SCRIPTED[name].recipe is not None
+        follows = SCRIPTED.find(name).recipe is not None
         assert ("follows" in episode.recording.steps) == follows
-        assert episode.recording.listens == (follows or SCRIPTED[name].hears)
+        assert episode.recording.listens == (follows or SCRIPTED.find(name).hears)
 
 
 def test_an_episode_equals_that_of_the_evaluation(tmp_path):

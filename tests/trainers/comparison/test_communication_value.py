@@ -6,7 +6,7 @@ import warnings
 import pytest
 from synthetic_runs import read_evaluation, write_run
 
-from emberlink.policies.scripted.registry import SCRIPTED
+from emberlink.policies.scripted.base import SCRIPTED
 from emberlink.trainers.comparison.comparison import compare_runs
 from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.evaluation.evaluate import evaluation_fires, play_blocks
@@ -154,8 +154,8 @@ def test_without_a_base_map_greedy_plays_as_alone_and_as_all_with_the_other_radi
         world = resolve("independent", choices)
         changed = resolve("independent", [*choices, f"env.radio.range={reach}"])
         fires = evaluation_fires(world, 2)["front"]
-        expected = play_blocks(world, SCRIPTED[other], fires, block=2)
-        actual = play_blocks(changed, SCRIPTED["map_greedy"], fires, block=2)
+        expected = play_blocks(world, SCRIPTED.find(other), fires, block=2)
+        actual = play_blocks(changed, SCRIPTED.find("map_greedy"), fires, block=2)
         assert {k: v for k, v in actual.items() if k != "bytes_per_step"} == {
             k: v for k, v in expected.items() if k != "bytes_per_step"
         }

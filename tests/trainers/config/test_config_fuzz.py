@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from pydantic import TypeAdapter
 from robustness import SOAK
 
-from emberlink.comm import registry
+from emberlink.comm.base import MODULES
 from emberlink.envs import keys
 from emberlink.envs.fire.generator import scenarios
 from emberlink.envs.utils.config_files import known
@@ -64,9 +64,7 @@ FIXED = {
     "policy.hold": [1],  # others must fit the horizon
 }
 SCHEMA = TypeAdapter(RunConfig).json_schema()
-COMM = {
-    name: TypeAdapter(registry.find(name).config_type).json_schema() for name in registry.known()
-}
+COMM = {name: TypeAdapter(MODULES.find(name).config_type).json_schema() for name in MODULES.known()}
 
 
 def entered(schema: dict, root: dict) -> dict:

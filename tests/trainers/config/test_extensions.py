@@ -13,7 +13,7 @@ import pytest
 from own_package import CONSENSUS_OF_PAGE, METHOD, SETUP, SETUP_OF_PAGE, write, yaml_files
 from tiny_run import TINY
 
-from emberlink.comm import registry
+from emberlink.comm.base import MODULES
 from emberlink.comm.consensus import Consensus
 from emberlink.envs.fire.generator import load_scenario, scenarios
 from emberlink.envs.utils import config_files
@@ -107,19 +107,19 @@ def test_an_invalid_entry_point_is_named_in_the_error(monkeypatch, tmp_path):
     ):
         entry_point(monkeypatch, "emberlink.comm", "other", value)
         with pytest.raises(UserError, match=f"entry point 'other' of emberlink.comm.*{message}"):
-            registry.find("other")
+            MODULES.find("other")
     entry_point(monkeypatch, "emberlink.comm", "no_comm", "emberlink.comm.consensus:Consensus")
     with pytest.raises(UserError, match="no_comm: in several packages"):
-        registry.find("no_comm")
+        MODULES.find("no_comm")
     entry_point(monkeypatch, "emberlink.comm", "other", "emberlink.comm.consensus:Consensus")
-    assert registry.find("other") is Consensus
+    assert MODULES.find("other") is Consensus
     monkeypatch.setattr(
         "emberlink.envs.utils.config_files.entry_points",
         lambda group: [metadata.EntryPoint("one", value, group) for value in ("a:A", "b:B")],
     )
     with pytest.raises(UserError, match=r"one: in several packages: a:A, b:B"):
-        registry.find("one")
-    assert registry.find("consensus") is Consensus  # what nobody names breaks nothing
+        MODULES.find("one")
+    assert MODULES.find("consensus") is Consensus  # what nobody names breaks nothing
     for value in ("nowhere.configs", "json.decoder"):
         entry_point(monkeypatch, "emberlink.configs", "other", value)
         with pytest.warns(UserWarning, match=f"emberlink.configs: there is no package {value}"):

@@ -6,11 +6,12 @@ import pytest
 import torch
 from test_resume import SMALL, assert_same, until
 
-from emberlink.comm import registry
+from emberlink.comm.base import MODULES
 from emberlink.envs.utils.errors import UserError
-from emberlink.policies.scripted import ORDER
-from emberlink.policies.scripted.registry import SCRIPTED
+from emberlink.policies.networks.memory.base import MEMORIES
+from emberlink.policies.scripted.base import SCRIPTED
 from emberlink.trainers.config.compose import resolve
+from emberlink.trainers.sweep.executors.base import EXECUTORS
 from emberlink.trainers.training.resume import resume
 from emberlink.trainers.training.trainer import Trainer
 
@@ -49,10 +50,16 @@ def installed(tmp_path, monkeypatch):
 
 
 def test_policies_of_other_packages_are_known(installed):
-    assert [*SCRIPTED] == [*ORDER, "still"]
-    assert len(SCRIPTED) == len(ORDER) + 1
-    assert SCRIPTED["still"].__name__ == "Still"
-    assert {"broken", "visited_map", "consensus"} <= {*registry.known()}
+    own = {
+        *("stationary", "random_actions", "random_waypoints", "lawnmower", "follow_target"),
+        *("map_greedy_alone", "map_greedy", "map_greedy_all", "courier", "oracle"),
+    }
+    assert {*SCRIPTED.known()} == {*own, "still"}
+    assert SCRIPTED.find("still").__name__ == "Still"
+    assert MEMORIES.known() == ["gru", "none"]
+    assert EXECUTORS.known() == ["local", "ray", "submitit"]
+    own = {"consensus", "maps", "no_comm", "positional"}
+    assert {*MODULES.known()} == own | {"broken", "number", "visited_map"}
 
 
 @pytest.mark.parametrize(
@@ -64,7 +71,7 @@ def test_policies_of_other_packages_are_known(installed):
 )
 def test_a_broken_package_is_named_in_one_line(installed, name, message):
     with pytest.raises(UserError, match=r"^package guests: entry point ") as error:
-        registry.find(name)
+        MODULES.find(name)
     assert message in str(error.value)
     assert "\n" not in str(error.value)
 

@@ -16,7 +16,7 @@ from emberlink.trainers import load, make_env
 from emberlink.trainers.cli import main
 from emberlink.trainers.config.compose import from_values, resolve, to_values
 from emberlink.trainers.evaluation.evaluate import play
-from emberlink.trainers.learners import registry
+from emberlink.trainers.learners.base import LEARNERS
 from emberlink.trainers.learners.ddpg import DDPG
 from emberlink.trainers.learners.imitation import Imitation
 from emberlink.trainers.learners.ppo import IPPO, MAPPO
@@ -109,10 +109,10 @@ def test_a_seed_repeats_a_training_and_another_does_not(learner):
 
 def test_learners_have_names():
     known = {"ddpg": DDPG, "imitation": Imitation, "ippo": IPPO, "mappo": MAPPO, "td3": TD3}
-    assert registry.known() == [*known]
-    assert all(registry.find(name) is learner for name, learner in known.items())
+    assert LEARNERS.known() == [*known]
+    assert all(LEARNERS.find(name) is learner for name, learner in known.items())
     with pytest.raises(UserError, match="ddpg, imitation, ippo, mappo, td3"):
-        registry.find("sac")
+        LEARNERS.find("sac")
     for name in known:
         config = resolve("consensus", [f"learner={name}"])
         assert type(config.learner) is known[name].config_type
@@ -123,8 +123,8 @@ def test_another_package_can_add_a_learner(monkeypatch):
     group = "emberlink.learners"
     point = EntryPoint("mine", "emberlink.trainers.learners.td3:TD3", group)
     monkeypatch.setattr(config_files, "entry_points", lambda of: [point] * (of == group))
-    assert registry.known() == ["ddpg", "imitation", "ippo", "mappo", "mine", "td3"]
-    assert registry.find("mine") is TD3
+    assert LEARNERS.known() == ["ddpg", "imitation", "ippo", "mappo", "mine", "td3"]
+    assert LEARNERS.find("mine") is TD3
 
 
 @pytest.mark.parametrize("learner", ["ddpg", "td3"])

@@ -14,7 +14,7 @@ from pydantic import Field
 
 from emberlink.envs.utils.config_files import read
 from emberlink.envs.utils.errors import UserError, how_to_install, unknown
-from emberlink.envs.utils.plugins import Registry
+from emberlink.envs.utils.plugins import Plugins
 from emberlink.envs.utils.validation import from_plain
 from emberlink.trainers.config.values import check_not_removed, parse
 
@@ -100,13 +100,7 @@ class Executor(ABC):
         """Requests that a task saves and ends, without waiting; has no effect if it has ended."""
 
 
-_OWN = {
-    "local": "trainers.sweep.executors.local:LocalExecutor",
-    "ray": "trainers.sweep.executors.ray:RayExecutor",
-    "submitit": "trainers.sweep.executors.submitit:SubmititExecutor",
-}
-_REGISTRY = Registry(Executor, "emberlink.executors", "executor", _OWN)
-known, find = _REGISTRY.known, _REGISTRY.find
+EXECUTORS = Plugins(Executor, "emberlink.executors", "executor")
 
 
 def make(arguments: Sequence[str]) -> Executor:
@@ -117,7 +111,7 @@ def make(arguments: Sequence[str]) -> Executor:
     """
     given = dict(map(parse, arguments))
     name = str(given.pop("executor", "local"))
-    executor = find(name)
+    executor = EXECUTORS.find(name)
     values = {key: value for key, value in read("executor", name).items() if key != "name"}
     for key, value in given.items():
         _, first, *rest = key.split(".", 2)
