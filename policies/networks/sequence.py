@@ -63,19 +63,22 @@ class SequenceNetwork(nn.Module):
             inputs = units
         self.output = StackedLinear(groups, inputs, outputs, gain=gain, **start)
 
-    def forward(self, *observations: Tensor) -> Any:
-        """Maps whole episodes, [envs, decisions, uavs, ...], to [envs, decisions, uavs, outputs].
+    def forward(self, state: Tensor, *observations: Tensor) -> tuple[Tensor, Tensor]:
+        """Maps sequences of decisions.
 
-        The memory is empty before the first decision.
+        Args:
+            state: of the memory before the first decision, [rows, uavs, size].
+            observations: [rows, decisions, uavs, ...] each.
+
+        Returns:
+            Outputs, [rows, decisions, uavs, outputs], and the state after the last decision.
         """
-        envs, decisions, uavs = observations[0].shape[:3]
-        batch = torch.Size((envs, uavs))
-        arranged = [
-            self.grouping.split(x.transpose(1, 2), batch) for x in self._indexed(observations)
-        ]
-        output, _ = self._run(arranged, self._empty(arranged[0]))
-        joined = self.grouping.join(output.flatten(2), batch)
-        return joined.unflatten(-1, (decisions, -1)).transpose(1, 2)
+        rows, decisions, uavs = observations[0].shape[:3]
+        batch, split, join = torch.Size((rows, uavs)), self.grouping.split, self.grouping.join
+        arranged = [split(x.transpose(1, 2), batch) for x in self._indexed(observations)]
+        output, after = self._run(arranged, split(state, batch))
+        joined = join(output.flatten(2), batch).unflatten(-1, (decisions, -1))
+        return joined.transpose(1, 2), join(after, batch)
 
     def step(self, observations: Sequence[Tensor], state: Tensor | None) -> tuple[Tensor, Tensor]:
         """Maps the observations of one decision.
@@ -104,6 +107,10 @@ class SequenceNetwork(nn.Module):
             x = layer(x).tanh()
         return self.output(x).unflatten(1, (rows, decisions)), state
 
+    def empty_state(self, rows: int) -> Tensor:
+        """Returns the state before the first decision, [rows, uavs, size]."""
+        return self.output.weight.new_zeros(rows, self.grouping.uavs, self.memory.size)
+
     def _empty(self, x: Tensor) -> Tensor:
         return x.new_zeros(*x.shape[:2], self.memory.size)
 
@@ -128,9 +135,9 @@ class GaussianNetwork(SequenceNetwork):
             torch.full(shape, FIRST_LOG_STD, dtype=torch.float32, device=device)
         )
 
-    def forward(self, *observations: Tensor) -> tuple[Tensor, Tensor]:
-        """Returns means and standard deviations of whole episodes, see `SequenceNetwork`."""
-        mean = super().forward(*observations)
+    def forward(self, state: Tensor, *observations: Tensor) -> tuple[Tensor, Tensor]:
+        """Returns means and standard deviations of sequences, see `SequenceNetwork`."""
+        mean, _ = super().forward(state, *observations)
         batch = torch.Size((mean.shape[0], mean.shape[2]))
         return mean, self.std(batch).unsqueeze(1).expand_as(mean)
 
@@ -173,13 +180,21 @@ class TeamNetwork(nn.Module):
         self.register_buffer("middle", corners.mean(0), persistent=False)
         self.register_buffer("half_width", (corners[1] - corners[0]) / 2 + 1e-6, persistent=False)
 
-    def forward(self, position: Tensor, *inputs: Tensor) -> Tensor:
-        """Maps positions and observations, [envs, decisions, uavs, ...], to outputs [..., uavs, 1].
+    def empty_state(self, rows: int) -> Tensor:
+        """Returns the state before the first decision, [rows, 1, size]."""
+        return self.network.empty_state(rows)
+
+    def forward(self, state: Tensor, position: Tensor, *inputs: Tensor) -> tuple[Tensor, Tensor]:
+        """Maps sequences of decisions.
 
         Args:
-            position: float32 [envs, decisions, uavs, 3], cells.
-            inputs: the tensors of the observation, and the map if there is one, uint8
-                [envs, decisions, X, Y].
+            state: of the memory before the first decision, [rows, 1, size].
+            position: float32 [rows, decisions, uavs, 3], cells.
+            inputs: the tensors of the observation, [rows, decisions, uavs, ...], and the map if
+                there is one, uint8 [rows, decisions, X, Y].
+
+        Returns:
+            Outputs, [rows, decisions, uavs, 1], and the state after the last decision.
         """
         observations = inputs if self.grid is None else inputs[:-1]
         first, *windows = observations
@@ -187,4 +202,5 @@ class TeamNetwork(nn.Module):
         team = [vectors.flatten(2), *(x.flatten(2, 3) for x in windows)]
         if self.grid is not None:
             team.append(torch.stack([inputs[-1] == kind for kind in FIRE], 2))
-        return self.network(*(x.unsqueeze(2) for x in team)).transpose(2, 3)
+        output, after = self.network(state, *(x.unsqueeze(2) for x in team))
+        return output.transpose(2, 3), after

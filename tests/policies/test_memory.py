@@ -48,7 +48,7 @@ def test_decision_by_decision_equals_the_whole_episode(kind, shared):
     actor = network(kind, shared=shared, index=True)
     envs, decisions = 2, 7
     observed = drawn(envs, decisions, UAVS, FEATURES)
-    whole, std = actor(observed)
+    whole, std = actor(actor.empty_state(envs), observed)
     state = None
     for k in range(decisions):
         mean, state = actor.step([observed[:, k]], state)
@@ -61,7 +61,7 @@ def test_an_output_depends_on_earlier_observations_of_the_same_uav_alone():
     observed = drawn(2, 6, UAVS, FEATURES)
     changed = observed.clone()
     changed[1, 2, 0] += 1
-    before, after = (actor(x)[0] for x in (observed, changed))
+    before, after = (actor(actor.empty_state(2), x)[0] for x in (observed, changed))
     same = before == after
     assert same[0].all()
     assert same[1, :2].all()
@@ -94,7 +94,8 @@ def test_the_gru_is_that_of_torch(groups):
 
 def test_the_index_tells_uavs_apart_that_share_weights():
     observed = drawn(1, 1, 1, FEATURES).expand(1, 1, UAVS, FEATURES)
-    same, other = network("none")(observed)[0], network("none", index=True)(observed)[0]
+    empty = observed.new_zeros(1, UAVS, 0)
+    same, other = (network("none", index=index)(empty, observed)[0] for index in (False, True))
     assert same[0, 0, 0].equal(same[0, 0, 1])
     assert not other[0, 0, 0].isclose(other[0, 0, 1]).any()
 
@@ -104,12 +105,13 @@ def test_the_values_of_a_team_depend_on_every_observation_and_position():
     more = {"hidden": (8,), "policy": config, "gain": 1.0}
     critic = TeamNetwork(UAVS, [(FEATURES,), (3, 5, 5)], (0, 0, 1), (9, 9, 4), **more)
     given = drawn(2, 4, UAVS, 3), drawn(2, 4, UAVS, FEATURES), drawn(2, 4, UAVS, 3, 5, 5)
-    values = critic(*given)
+    state = critic.empty_state(2)
+    values, _ = critic(state, *given)
     assert values.shape == (2, 4, UAVS, 1)
     for k in range(3):
         changed = [x.clone() for x in given]
         changed[k][0, 1, 2] += 1
-        differs = critic(*changed) != values
+        differs = critic(state, *changed)[0] != values
         assert differs[0, 1:].all()
         assert not differs[0, 0].any()
         assert not differs[1].any()
@@ -117,7 +119,7 @@ def test_the_values_of_a_team_depend_on_every_observation_and_position():
 
 def test_a_critic_of_a_uav_is_a_sequence_network():
     critic = SequenceNetwork(UAVS, [(FEATURES,)], 1, (8,), policy=PolicyConfig(), gain=1.0)
-    assert critic(drawn(2, 4, UAVS, FEATURES)).shape == (2, 4, UAVS, 1)
+    assert critic(critic.empty_state(2), drawn(2, 4, UAVS, FEATURES))[0].shape == (2, 4, UAVS, 1)
 
 
 def actor_of(kind: str) -> tuple[GaussianActor, TensorDict]:

@@ -175,15 +175,16 @@ class Imitation(Learner):
 
     def losses(self, batch: TensorDictBase) -> Losses:
         """Computes the loss with gradients, one number per UAV."""
-        state, actions = batch.get("memory", None), []
-        for decision in range(self.sequence):
-            now = [batch.get(name)[:, :, decision] for _, name in self.observed]
-            if isinstance(self.actor, GaussianActor):  # the mean before it is clipped
-                action, state = self.actor.module.step(now, state)
-            else:
-                action = self.actor.module(*now)
-            actions.append(action)
-        action, teacher = torch.stack(actions, 1), batch.get(keys.TEACHER[1]).transpose(1, 2)
+        network, observed = (
+            self.actor.module,
+            [batch.get(name).transpose(1, 2) for _, name in self.observed],
+        )
+        if isinstance(self.actor, GaussianActor):  # the mean before it is clipped
+            state = batch.get("memory") if self.remembers else network.empty_state(len(batch))
+            action, _ = network(state, *observed)
+        else:
+            action = network(*observed)
+        teacher = batch.get(keys.TEACHER[1]).transpose(1, 2)
         loss = nn.functional.smooth_l1_loss(action, teacher, reduction="none").mean(-1)
         return {"imitation": mean_over_batch(loss, batch.get("alive").transpose(1, 2))}
 

@@ -1,9 +1,10 @@
-"""PPO (Schulman et al. 2017) for all UAVs, from whole episodes: IPPO and MAPPO.
+"""PPO (Schulman et al. 2017) for all UAVs, from the episodes of an iteration: IPPO and MAPPO.
 
 IPPO's critic reads its UAV's observation (de Witt et al. 2020), MAPPO's the observations of the
 team (Yu et al. 2022, NeurIPS). The losses and the advantages are TorchRL's `MAPPOLoss` and
 `MultiAgentGAE`; its standardisation of advantages and its `ValueNorm` are not used, since both
-count decisions after the failure of a UAV.
+count decisions after the failure of a UAV. A memory learns from chunks of an episode, each from the
+state that was stored at its beginning (Yu et al. 2022, appendix A).
 """
 
 from abc import ABC, abstractmethod
@@ -13,7 +14,7 @@ from typing import Annotated, Any
 import torch
 from pydantic import Field
 from pydantic.dataclasses import dataclass
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDict, TensorDictBase, pad
 from tensordict.nn import (
     ProbabilisticTensorDictModule,
     ProbabilisticTensorDictSequential,
@@ -26,7 +27,7 @@ from torchrl.objectives.multiagent import MAPPOLoss
 from torchrl.objectives.value import MultiAgentGAE
 
 from emberlink.envs import keys
-from emberlink.policies.gaussian import LOG_PROB, MEAN, GaussianActor, GaussianExplorer
+from emberlink.policies.gaussian import LOG_PROB, MEAN, MEMORY, GaussianActor, GaussianExplorer
 from emberlink.policies.networks.sequence import GaussianNetwork, SequenceNetwork, TeamNetwork
 from emberlink.policies.settings import PolicyConfig
 from emberlink.trainers.learners.base import (
@@ -48,6 +49,8 @@ ADVANTAGE = (keys.AGENTS, "advantage")
 """float32 [..., 1]: standardised"""
 RETURN = (keys.AGENTS, "value_target")
 """float32 [..., 1], in units of the returns' standard deviation"""
+ACTOR_STATE, CRITIC_STATE = "actor_state", "critic_state"
+"""float32 [..., size]: states of the memories before a chunk"""
 _STD, _ENDS, _TERMINATED = (keys.AGENTS, "std"), (keys.AGENTS, "ends"), (keys.AGENTS, "terminated")
 _KEPT = 0.9
 """share of the earlier spread of the returns that is kept from episode to episode"""
@@ -68,7 +71,9 @@ class IPPOConfig(LearnerConfig):
     epochs: Count
     """passes over the episodes of an iteration"""
     minibatches: Count
-    """updates of a pass; each uses whole episodes of some of the environments"""
+    """updates of a pass, each from other chunks"""
+    chunk: Annotated[int, Field(ge=0, le=1_000_000)] = 0
+    """successive decisions through which gradients of a memory flow; 0 for whole episodes"""
     lr: Positive
     """learning rate of Adam at the beginning; it falls linearly to 0 at the end of the run"""
     gradient_norm: Positive
@@ -113,6 +118,8 @@ class PPO(Learner, ABC):
         self.actor = self.make_actor(config, *specs, initial, context.policy)
         self.critic: Any = self.make_critic(context, initial)
         self._reset_std()
+        self.chunk = min(config.chunk or context.horizon, context.horizon)
+        """decisions of a chunk; the last one of an episode may have fewer"""
         # Exploration.
         self.generator = torch.Generator(context.device).manual_seed(context.seed)
         self.explorer = GaussianExplorer(self.actor, self.generator)
@@ -172,7 +179,7 @@ class PPO(Learner, ABC):
 
     @abstractmethod
     def make_critic(self, context: LearnerContext, generator: torch.Generator) -> TensorDictModule:
-        """Returns new critics, which write `VALUE` for whole episodes."""
+        """Returns new critics, which read `CRITIC_STATE` first and write `VALUE` for chunks."""
 
     def _make_loss(self) -> MAPPOLoss:
         outputs: list[Any] = [MEAN, _STD]
@@ -181,7 +188,8 @@ class PPO(Learner, ABC):
             out_keys=[keys.ACTION],
             distribution_class=IndependentNormal,
         )
-        actor = TensorDictModule(self.actor.module, in_keys=self.actor.observed, out_keys=outputs)
+        reads: list[Any] = [ACTOR_STATE, *self.actor.observed]
+        actor = TensorDictModule(self.actor.module, in_keys=reads, out_keys=outputs)
         policy: list[Any] = [actor, draw]
         loss = MAPPOLoss(
             ProbabilisticTensorDictSequential(*policy),
@@ -209,11 +217,6 @@ class PPO(Learner, ABC):
     def _networks_of_actors(self) -> int:
         return 1 if self.config.share_parameters else self.context.num_uavs
 
-    @property
-    def _minibatches(self) -> int:
-        """Number of updates of an epoch."""
-        return min(self.config.minibatches, self.context.num_envs)
-
     def learn(self, rollout: TensorDictBase) -> list[Losses]:
         """Stores a rollout, and makes all updates of an iteration at the end of an episode."""
         self._episode.append(self._transitions(rollout))
@@ -222,33 +225,68 @@ class PPO(Learner, ABC):
             return []
         episode: Any = torch.cat(self._episode, 1)  # pyright: ignore[reportArgumentType]
         self._episode = []
-        self._estimate(episode, rollout.get("next")[:, -1:])
+        states = self._estimate(episode, rollout.get("next")[:, -1:])
+        chunks = self._chunks(episode, states)
         done = (self.decisions - self.context.horizon) / self.context.total_steps
         for entry in self.optimizer.param_groups:
             entry["lr"] = self.config.lr * max(0.0, 1 - done)
-        return [self.update(batch) for batch in self._batches(episode)]
+        return [self.update(batch) for batch in self._batches(chunks)]
 
     def _transitions(self, rollout: TensorDictBase) -> TensorDict:
         """Returns the learner's tensors of a rollout, batch size [environments, steps]."""
-        read = [*self.actor.observed, *self.critic.in_keys, keys.ACTION, LOG_PROB]
+        read = [*self.actor.observed, *self.critic.in_keys[1:], keys.ACTION, LOG_PROB]
+        read += self.actor.carries  # the state of the memory before the decision
         result = {key: rollout.get(key).clone() for key in read}
         result[keys.REWARD] = rollout.get(("next", *keys.REWARD)).clone()
         if self.context.failures:
             result[keys.ALIVE] = rollout.get(("next", *keys.ALIVE)).clone()
         return TensorDict(result, batch_size=rollout.shape, device=rollout.device)
 
-    def _estimate(self, episode: TensorDictBase, last: TensorDictBase) -> None:
-        """Writes the advantages and returns of an episode; `last` is the time step after it."""
-        read = [part.select(*self.critic.in_keys) for part in (episode, last)]
-        values = []
-        # The environments of a minibatch at a time, to save memory.
-        for rows in torch.arange(len(episode)).tensor_split(self._minibatches):
-            whole: Any = torch.cat([part[rows] for part in read], 1)  # pyright: ignore[reportArgumentType]
-            with torch.no_grad():
-                values.append(self.critic(whole).get(VALUE))
+    def _estimate(self, episode: TensorDictBase, last: TensorDictBase) -> Tensor:
+        """Writes the advantages and returns of an episode; `last` is the time step after it.
+
+        Returns:
+            The states of the critics' memory before each chunk, [environments, chunks, ...].
+        """
+        read = [part.select(*self.critic.in_keys[1:]) for part in (episode, last)]
+        whole: Any = torch.cat(read, 1)  # pyright: ignore[reportArgumentType]
+        # Some environments at a time, to save memory.
+        parts = [self._values(part) for part in whole.chunk(self.config.minibatches)]
+        values, states = (torch.cat(of_parts) for of_parts in zip(*parts, strict=True))
         reward, alive = episode.pop(keys.REWARD), episode.get(keys.ALIVE, None)
-        advantage, returns = self.advantages(torch.cat(values), reward, alive)
+        advantage, returns = self.advantages(values, reward, alive)
         episode.set(ADVANTAGE, advantage).set(RETURN, returns)
+        return states
+
+    @torch.no_grad()
+    def _values(self, episode: TensorDictBase) -> tuple[Tensor, Tensor]:
+        """Returns values, [environments, decisions + 1, ...], and states before the chunks."""
+        state, states, values = self.critic.module.empty_state(len(episode)), [], []
+        for chunk in episode.split(self.chunk, 1):
+            states.append(state)
+            observed = [chunk.get(key) for key in self.critic.in_keys[1:]]
+            value, state = self.critic.module(state, *observed)
+            values.append(value)
+        chunks = -(-self.context.horizon // self.chunk)  # the time step after them may be another
+        return torch.cat(values, 1), torch.stack(states[:chunks], 1)
+
+    def _chunks(self, episode: TensorDictBase, critic_states: Tensor) -> TensorDictBase:
+        """Cuts an episode into chunks, batch size [environments * chunks].
+
+        The last one is padded with decisions in which no UAV flies.
+        """
+        missing = -self.context.horizon % self.chunk
+        if missing:
+            flew = torch.ones_like(episode.get(LOG_PROB), dtype=torch.bool)
+            episode = pad(
+                episode.set(keys.ALIVE, episode.get(keys.ALIVE, flew)), [0, 0, 0, missing]
+            )
+        chunks: Any = episode.reshape(-1, self.chunk)
+        memory = chunks.pop(MEMORY, None)
+        rows = len(chunks), self.context.num_uavs
+        first = critic_states.new_zeros(*rows, 0) if memory is None else memory[:, 0]
+        chunks.batch_size = rows[:1]
+        return chunks.set(ACTOR_STATE, first).set(CRITIC_STATE, critic_states.flatten(0, 1))
 
     def advantages(
         self, value: Tensor, reward: Tensor, alive: Tensor | None
@@ -296,16 +334,16 @@ class PPO(Learner, ABC):
         squares = (x - mean[:, None, None]).square() * weight
         return mean, (squares.sum(rest) / count).sqrt()
 
-    def _batches(self, episode: TensorDictBase) -> Iterator[TensorDictBase]:
-        """Yields the batches of an iteration, whole episodes of some environments each."""
+    def _batches(self, chunks: TensorDictBase) -> Iterator[TensorDictBase]:
+        """Yields the batches of an iteration, [chunks, decisions] of each."""
+        size, device = len(chunks), self.context.device
         for _ in range(self.config.epochs):
-            size, device = self.context.num_envs, self.context.device
             order = torch.randperm(size, generator=self.generator, device=device)
-            for chosen in order.tensor_split(self._minibatches):
-                yield episode[chosen]
+            for chosen in order.tensor_split(min(self.config.minibatches, size)):
+                yield chunks[chosen]
 
     def update(self, batch: TensorDictBase) -> Losses:
-        """Performs one step of the optimizer on episodes, [environments, decisions]."""
+        """Performs one step of the optimizer on chunks."""
         losses = self.losses(batch)
         torch.stack([self._of_networks(*item) for item in losses.items()]).sum().backward()
         for part in self.parts:
@@ -371,7 +409,7 @@ class IPPO(PPO):
             device=context.device,
             generator=generator,
         )
-        return TensorDictModule(network, in_keys=observed, out_keys=[VALUE])
+        return TensorDictModule(network, in_keys=[CRITIC_STATE, *observed], out_keys=[VALUE, "_"])
 
 
 class MAPPO(PPO):
@@ -399,7 +437,7 @@ class MAPPO(PPO):
         )
         observed: list[Any] = [keys.POSITION, *keys.observation_keys(spec)]
         observed += [keys.TRUE_MAP] if self.config.critic_map else []
-        return TensorDictModule(network, in_keys=observed, out_keys=[VALUE])
+        return TensorDictModule(network, in_keys=[CRITIC_STATE, *observed], out_keys=[VALUE, "_"])
 
 
 def clip_by_row(gradients: Sequence[Tensor], limit: float) -> None:

@@ -144,6 +144,71 @@ def test_actions_of_failed_uavs_have_no_effect(learner, share):
         assert value.equal(other[name]), name
 
 
+def first_iteration(setup: TrainingSetup) -> tuple[Any, Any]:
+    """Returns an episode as it was flown, with advantages, and the batch of the first update."""
+    learner: Any = setup.learner
+    estimate, episodes = learner._estimate, []
+
+    def estimated(episode: Any, last: Any) -> Tensor:
+        states = estimate(episode, last)
+        episodes.append(episode.clone())
+        return states
+
+    learner._estimate = estimated
+    batch = first_batches(setup)[0]
+    return episodes[0], batch
+
+
+@pytest.mark.parametrize("learner", LEARNERS)
+@pytest.mark.parametrize("shared", ["true", "false"])
+@pytest.mark.parametrize("failures", [0, 3])
+@pytest.mark.parametrize("chunk", [2, 4, 6])
+def test_losses_and_gradients_of_chunks_equal_a_loop(learner, shared, failures, chunk):
+    """Of six decisions, from states without gradients; chunks of four divide them into 4 and 2."""
+    more = f"learner.share_parameters={shared}", f"env.failures={failures}"
+    setup = made(learner, *more, f"learner.chunk={chunk}", "learner.minibatches=1")
+    episode, batch = first_iteration(setup)
+    trained: Any = setup.learner
+    actor, critic = trained.actor.module, trained.critic.module
+    assert len(batch) == 4 * -(-6 // chunk)
+    errors, ratios, alive = [], [], []
+    actor_state, critic_state = None, critic.empty_state(4)
+    for k in range(6):
+        if k % chunk == 0:
+            actor_state = None if actor_state is None else actor_state.detach()
+            critic_state = critic_state.detach()
+        now = episode[:, k]
+        mean, actor_state = actor.step([now[key] for key in trained.actor.observed], actor_state)
+        observed = [now[key][:, None] for key in trained.critic.in_keys[1:]]
+        value, critic_state = critic(critic_state, *observed)
+        drawn = torch.distributions.Normal(mean, actor.std(mean.shape[:-1]))
+        ratio = (drawn.log_prob(now[keys.ACTION]).sum(-1) - now[LOG_PROB]).exp()
+        ratios.append(ratio * now[ADVANTAGE][..., 0])
+        errors.append((value[:, 0, :, 0] - now[RETURN][..., 0]).square())
+        alive.append(now.get(keys.ALIVE, torch.ones(4, 3, dtype=torch.bool)))
+    flew = torch.stack(alive, 1).float()
+    mean_of = [(torch.stack(x, 1) * flew).sum((0, 1)) / flew.sum((0, 1)) for x in (ratios, errors)]
+    losses = trained.losses(batch)
+    torch.testing.assert_close(losses["actor"], -mean_of[0], rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(losses["critic"], mean_of[1], rtol=1e-4, atol=1e-5)
+    weights = [*actor.parameters(), *critic.parameters()]
+    ours, theirs = (
+        torch.autograd.grad(total, weights)
+        for total in (
+            losses["actor"].sum() + losses["critic"].sum(),
+            mean_of[1].sum() - mean_of[0].sum(),
+        )
+    )
+    for one, other in zip(ours, theirs, strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-3, atol=1e-5)
+
+
+def test_a_chunk_of_the_episode_is_the_whole_episode():
+    whole, same = (first_batches(made("mappo", f"learner.chunk={chunk}"))[0] for chunk in (0, 6))
+    for key, value in whole.items(True, True):
+        assert value.equal(same[key]), key
+
+
 def test_uavs_without_shared_weights_learn_alone():
     setup = made("ippo", "learner.share_parameters=false")
     batch = first_batches(setup)[0]
