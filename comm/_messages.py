@@ -77,8 +77,9 @@ class CellMessages(nn.Module):
     then (1 for fire), -1 for never.
 
     Between UAVs in contact, a cell can be new only if a UAV saw it at this step, was told it at the
-    step before, had no bytes left to say it, or said it without being heard. So whole maps are
-    compared only where a UAV was not in range of another one at the step before.
+    step before by a UAV that others in range did not hear, had no bytes left to say it, or said it
+    without being heard. So whole maps are compared only where a UAV was not in range of another one
+    at the step before.
 
     Args:
         envs: number of environments.
@@ -162,7 +163,7 @@ class CellMessages(nn.Module):
         last, seen = known.last_seen, known.seen_fire
         assert seen is not None
         told, row, theirs = news
-        area, fresh = last.shape[2], self.fresh.view(-1)
+        area, fresh, uavs = last.shape[2], self.fresh.view(-1), near.shape[1]
         speaker = told // area
         fresh.zero_()
         said = speaker
@@ -171,15 +172,18 @@ class CellMessages(nn.Module):
             fresh[told[~says]] = True
             goes, said = says[row], speaker[says]
             row, theirs = row[goes], theirs[goes]
+        link = theirs // area * uavs + (speaker % uavs)[row]
         if near is not hears:
-            uavs = near.shape[1]
-            arrives = hears.take(theirs // area * uavs + (speaker % uavs)[row])
+            arrives = hears.take(link)
             fresh[told[row[~arrives]]] = True
-            row, theirs = row[arrives], theirs[arrives]
+            row, theirs, link = row[arrives], theirs[arrives], link[arrives]
         last.view(-1).scatter_reduce_(0, theirs, last.take(told)[row], "amax")
         was_fire, flat = seen.take(told).view(torch.uint8)[row], seen.view(-1).view(torch.uint8)
         flat.scatter_reduce_(0, theirs, was_fire, "amax")
-        fresh[theirs] = True
+        # Only what somebody in range did not hear from the speaker has to be told again.
+        own = torch.eye(uavs, dtype=torch.bool, device=near.device)
+        relays = (near.mT.float() @ (~(hears | own)).float()) > 0  # [envs, hearers, speakers]
+        fresh[theirs[relays.take(link)]] = True
         self.heard.copy_(near)
         return self.size * said.bincount(minlength=near.shape[:2].numel()).view(near.shape[:2])
 

@@ -251,7 +251,7 @@ class WildfireEnv(EnvBase):
         alive = self._alive()
         position, hit_boundary = self._move(tensordict.get(keys.ACTION), alive)
         self._position.copy_(position)
-        sighting, view = self._map.look(self._position, self._time.float(), alive)
+        sighting, view = self._map.look(self._position, self._time, alive)
         if self._measures is not None:
             self._measures.update(view, self._position, self._step_key, self._time, alive)
         new, old, none = sighting.counts.unbind(-1)
@@ -385,7 +385,7 @@ class WildfireEnv(EnvBase):
     @property
     def unseen_fire(self) -> Tensor:
         """The number of burning cells that no UAV has seen while they burned, int64 [num_envs]."""
-        return (self.fire_map == 2).sum((-1, -2))
+        return self._map.count(self._time)[0] - self._map.seen_burning
 
     @property
     def arrival_time(self) -> Tensor:

@@ -38,33 +38,39 @@ def with_burn_time(arrival: Tensor, burn_time: float) -> Tensor:
     return torch.stack((arrival, arrival + burn_time), 1)
 
 
-class PassedCounts(nn.Module):
-    """Counts the cells of a fire whose time has passed at a step by binary search.
+class PassedCells(nn.Module):
+    """Finds the cells of a fire whose time has passed, or passes at a step, by binary search.
 
     The table has one entry for each fire and step at which the time of a cell passes. Its size is
     at most the number of cells and does not depend on the horizon.
 
     Args:
-        times: arrival or burn-out times in steps, float32 [fires, X, Y]; inf for never.
+        times: arrival or burn-out times in steps, float32 [fires, cells]; inf for never, NaN for
+            cells outside of the grid.
         horizon: steps of an episode.
+        listed: whether the cells themselves are stored, for `passing`.
     """
 
     _step: Tensor
     _total: Tensor
+    _order: Tensor
 
-    def __init__(self, times: Tensor, horizon: int):
+    def __init__(self, times: Tensor, horizon: int, *, listed: bool = False):
         super().__init__()
-        self._horizon, self._cells = horizon, times[0].numel()
-        tables = []
+        self._horizon, self._cells = horizon, times.shape[1]
+        tables, orders = [], []
         for first in range(0, len(times), max(1, _CHUNK // self._cells)):
-            chunk = times[first : first + max(1, _CHUNK // self._cells)].flatten(1)
-            step = chunk.ceil().clamp(0, horizon + 1).long()
+            chunk = times[first : first + max(1, _CHUNK // self._cells)]
+            step = chunk.nan_to_num(nan=math.inf).ceil().clamp(0, horizon + 1).long()
             fire = torch.arange(first, first + len(chunk), device=times.device).unsqueeze(-1)
             tables.append(self._entry(fire, step).unique(return_counts=True))
+            orders += [step.argsort(1).int()] if listed else []
         steps, counts = (torch.cat(parts) for parts in zip(*tables, strict=True))
         total = torch.cat((counts.new_zeros(1), counts.cumsum(0)))
         self.register_buffer("_step", steps, persistent=False)
         self.register_buffer("_total", total, persistent=False)
+        if listed:
+            self.register_buffer("_order", torch.cat(orders), persistent=False)
 
     def _entry(self, fire: Tensor, step: Tensor) -> Tensor:
         """Returns integers that sort by fire first and by step second."""
@@ -80,6 +86,18 @@ class PassedCounts(nn.Module):
         entry = self._entry(fire, step.clamp(max=self._horizon))
         before = torch.searchsorted(self._step, entry, right=True)
         return self._total.take(before) - fire * self._cells
+
+    def passing(self, fire: Tensor, step: Tensor) -> tuple[Tensor, Tensor]:
+        """Returns the cells whose time passes at a step: index into `fire` and cell, int64 [k].
+
+        Args:
+            fire, step: int64 [envs], see `at`; steps from 1 on.
+        """
+        first = self.at(fire, step - 1)
+        count = self.at(fire, step) - first
+        row = torch.arange(len(fire), device=fire.device).repeat_interleave(count)
+        place = torch.arange(len(row), device=fire.device) + (first - count.cumsum(0) + count)[row]
+        return row, self._order[fire[row], place].long()
 
 
 class Sighting(NamedTuple):
@@ -139,17 +157,19 @@ class CoverageMap(nn.Module):
     _fire_index: Tensor
     _first_seen: Tensor
     _stamp: Tensor
+    seen_burning: Tensor
+    """int64 [envs]: burning cells that a UAV has seen while they burned"""
 
     def __init__(self, sensor: Sensor, fires: Tensor, *, horizon: int, envs: int, uavs: int):
         super().__init__()
         self._sensor, self._uavs = sensor, uavs
         arrival, burn_out = split_times(fires)
-        self._ignited = PassedCounts(arrival, horizon)
-        self._burnt_out = None if burn_out is None else PassedCounts(burn_out, horizon)
         # Padding is NaN: all comparisons with it are false, so it belongs to no class.
         self.register_buffer("_fires", sensor.pad(arrival, torch.nan), persistent=False)
         ends = None if burn_out is None else sensor.pad(burn_out, torch.nan)
         self.register_buffer("_fires_end", ends, persistent=False)
+        self._ignited = PassedCells(self._fires, horizon)
+        self._burnt_out = None if ends is None else PassedCells(ends, horizon, listed=True)
         self.register_buffer(
             "_start", torch.arange(envs).unsqueeze(-1) * sensor.area, persistent=False
         )
@@ -163,6 +183,7 @@ class CoverageMap(nn.Module):
         first_seen = torch.full((envs, sensor.area), _NEVER, dtype=torch.int32)
         self.register_buffer("_first_seen", first_seen)
         self.register_buffer("_stamp", self._uav.repeat(envs, 1, 1))
+        self.register_buffer("seen_burning", torch.zeros(envs, dtype=torch.int64))
 
     def __len__(self) -> int:
         """Returns the number of fires."""
@@ -196,6 +217,7 @@ class CoverageMap(nn.Module):
             self._burn_out.copy_(torch.where(began, self._fires_end[fire], self._burn_out))
         self._fire_index.copy_(torch.where(mask, fire, self._fire_index))
         self._first_seen.masked_fill_(began, _NEVER)
+        self.seen_burning.masked_fill_(mask, 0)
         self._stamp.copy_(torch.where(mask[:, None, None], self._uav, self._stamp))
 
     def count(self, step: Tensor) -> tuple[Tensor, Tensor]:
@@ -214,7 +236,7 @@ class CoverageMap(nn.Module):
 
         Args:
             position: float64 [envs, uavs, 3], cells.
-            step: float32 [envs], steps since the episode began.
+            step: int64 [envs], steps since the episode began.
             alive: bool [envs, uavs]; the others see nothing. All are alive if None.
 
         Returns:
@@ -223,7 +245,7 @@ class CoverageMap(nn.Module):
         centre, cells, in_view = self._sensor.look(position, self._start)
         if alive is not None:
             in_view &= alive.unsqueeze(-1)
-        stamp, first_seen, time = self._stamp, self._first_seen, step.view(-1, 1, 1)
+        stamp, first_seen, time = self._stamp, self._first_seen, step.float().view(-1, 1, 1)
         stamp.add_(self._uavs)
         arrival_time, burnt_out = self._arrival_time.take(cells), None
         burning = in_view & (arrival_time <= time)
@@ -237,4 +259,9 @@ class CoverageMap(nn.Module):
         classes = torch.stack((new, burning ^ new, no_fire), -2)
         counted = self._sensor.count_classes(classes, centre)
         sighting = Sighting(*counted, classes, burnt_out)
+        self.seen_burning.add_(sighting.counts[..., 0].sum(-1).long())
+        if self._burnt_out is not None:
+            env, cell = self._burnt_out.passing(self._fire_index, step)
+            gone = self._first_seen[env, cell] < _NEVER
+            self.seen_burning.sub_(env[gone].bincount(minlength=len(step)))
         return sighting, View(cells, in_view, burning)
