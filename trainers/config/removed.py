@@ -4,7 +4,6 @@ REMOVED: dict[str, str] = {
     "executor.seeds": "each seed is a run: seed=0,1,2",
     "executor.share": "each run is a job; executor.gpus=0.25 of executor=ray shares a GPU",
     "executor.restarts": "a killed run is listed at the end; the same command resumes it",
-    "executor.cluster": "executor=submitit runs SLURM jobs; executor=local, processes here",
     "on_nan": "NaN or Inf ends a run; train a new one with smaller learning rates",
     "keep_checkpoints": "a run keeps its newest and its best checkpoint",
     "seeds": "a run trains one seed; several: emberlink sweep METHOD seed=0,1,2",

@@ -1,5 +1,6 @@
 """Runs trainings as SLURM jobs, through submitit: an array for the tasks of each call."""
 
+import hashlib
 import os
 import signal
 import subprocess
@@ -9,11 +10,12 @@ from contextlib import redirect_stderr, suppress
 from importlib import import_module
 from io import StringIO
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field
 from pydantic.dataclasses import dataclass
 
+from emberlink.envs.fire.cache import cache_folder
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import STRICT, CountOrZero
 from emberlink.trainers.sweep.executors.base import DIED, Executor, Positive, Task, require
@@ -36,6 +38,8 @@ Text = Annotated[str, BeforeValidator(lambda value: str(value) if type(value) is
 class SubmititConfig:
     """Stores the settings of SLURM jobs."""
 
+    cluster: Literal["slurm", "local"] = "slurm"
+    """slurm, or submitit's processes on this machine, to try a sweep"""
     partition: Text | None = None
     """partition; SLURM's default if None"""
     account: Text | None = None
@@ -136,26 +140,25 @@ class SubmititExecutor(Executor):
         """Returns submitit's executor, which writes to a folder.
 
         Raises:
-            ValueError: submitit and SLURM would replace parts of the folder's name.
             RuntimeError: there is no SLURM here.
         """
-        if "%" in str(folder):
-            raise ValueError(f"{folder}: SLURM reads the % as a pattern; choose another output=")
         config = self._config
-        slurm = import_module("submitit").SlurmExecutor(folder, max_num_timeout=config.requeues)
-        slurm.update_parameters(
-            partition=config.partition,
-            account=config.account,
-            time=config.time,
+        executor = import_module("submitit").AutoExecutor(
+            _without_patterns(folder), config.cluster, slurm_max_num_timeout=config.requeues
+        )
+        executor.update_parameters(
+            name="emberlink",
+            timeout_min=config.time,
             cpus_per_task=config.cpus,
             gpus_per_node=config.gpus or None,
-            job_name="emberlink",
-            signal_delay_s=config.notice,
-            array_parallelism=_MOST,
-            additional_parameters={"requeue": True, **config.options},
-            **({"mem": config.memory} if config.memory else {}),
+            slurm_partition=config.partition,
+            slurm_account=config.account,
+            slurm_mem=config.memory,
+            slurm_signal_delay_s=config.notice,
+            slurm_array_parallelism=_MOST,
+            slurm_additional_parameters={"requeue": True, **config.options},
         )
-        return slurm
+        return executor
 
     def poll(self, handle: _Handle) -> int | None:
         job, now = handle.job, time.monotonic()
@@ -164,7 +167,7 @@ class SubmititExecutor(Executor):
                 return job.result()
             except Exception as error:  # whatever the training's process has raised
                 said = str(error)
-        elif self._is_queued(job.job_id):
+        elif not job.done() if self._config.cluster == "local" else self._is_queued(job.job_id):
             handle.seen = now
             return None
         elif now - handle.seen < handle.grace:
@@ -189,3 +192,15 @@ class SubmititExecutor(Executor):
     def cancel(self, handle: _Handle) -> None:
         handle.grace = 0.0
         handle.job.cancel(check=False)
+
+
+def _without_patterns(folder: Path) -> Path:
+    """Returns the folder, or a link to it if submitit and SLURM would replace parts of its path."""
+    if "%" not in str(folder):
+        return folder
+    link = cache_folder() / "submitit" / hashlib.sha256(str(folder).encode()).hexdigest()[:16]
+    for parent in (folder, link.parent):
+        parent.mkdir(parents=True, exist_ok=True)
+    with suppress(FileExistsError):
+        link.symlink_to(folder)
+    return link
