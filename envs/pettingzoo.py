@@ -104,6 +104,7 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
         self.render_mode = render_mode
         self._env, self._core, self._window = env, core, None
         self._now: TensorDictBase | None = None
+        self._unplayed: int | None = None
         self.possible_agents = core.group_map[keys.AGENTS]
         self.agents: list[str] = []
         vector, pictures = team_spaces(env, core.config)
@@ -130,6 +131,9 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
     ) -> tuple[dict[str, Observation], dict[str, dict[str, Any]]]:
         """Starts an episode: the first of `seed` if it is given, else the next.
 
+        The first episode of a seed is the next one until a step is made, since wrappers such as
+        TorchRL's reset an environment when they are made, and again before the first step.
+
         Args:
             seed: of all random numbers from here on.
             options: "position", start positions in cells, [num_uavs, 3].
@@ -141,8 +145,9 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
         options.pop("options", None)  # PettingZoo's own tests pass {"options": 1}
         if wrong := sorted(set(options) - {"position"}):
             raise UserError(f"options: {', '.join(wrong)} not known; known: position")
-        if seed is not None:
-            self._env.set_seed(seed)
+        self._unplayed = self._unplayed if seed is None else seed
+        if self._unplayed is not None:
+            self._env.set_seed(self._unplayed)
         self._now = self._env.reset(**options)
         self.agents = list(self.possible_agents)
         self._show()
@@ -169,7 +174,7 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
         now = self._begun("step")
         if not self.agents:
             return {}, {}, {}, {}, {}
-        action = self._stacked(actions)
+        action, self._unplayed = self._stacked(actions), None
         now.set(keys.ACTION, torch.from_numpy(action[None]).to(self._core.device))
         stepped = self._env.step(now)
         self._now = step_mdp(stepped, keep_other=True)

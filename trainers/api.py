@@ -10,12 +10,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from emberlink.envs.utils.atomic_io import user_path
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import check_whole
 from emberlink.trainers.comparison.comparison import Comparison, compare_runs
 from emberlink.trainers.comparison.report import free_folder, write_report
 from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.config.schema import MAX_FIRES, RunConfig
+from emberlink.trainers.evaluation.evaluate import ONE_AT_A_TIME
 from emberlink.trainers.evaluation.evaluate import evaluate as evaluate_policy
 from emberlink.trainers.evaluation.policy import TrainedPolicy, load_policy
 from emberlink.trainers.evaluation.scores import Results
@@ -23,11 +25,11 @@ from emberlink.trainers.runs import pretrained
 from emberlink.trainers.runs.run_folder import RunFolder
 from emberlink.trainers.terminal.signals import Interruption
 from emberlink.trainers.training.resume import resume as resumed
-from emberlink.trainers.training.trainer import ONE_AT_A_TIME, Progress, Trainer
+from emberlink.trainers.training.trainer import Progress, Trainer
 
 Reference = str | os.PathLike[str]
-"""a run folder, or a trained policy of emberlink: `pretrained:METHOD`, `pretrained:SETUP/METHOD` or
-`pretrained:SETUP/METHOD/SEED`"""
+"""a run or its folder, or a trained policy of emberlink: `pretrained:METHOD`,
+`pretrained:SETUP/METHOD` or `pretrained:SETUP/METHOD/SEED`"""
 
 
 @dataclass(frozen=True)
@@ -41,6 +43,10 @@ class Run:
     results: Results
     """fire -> policy ("learned", or a scripted one) -> measure -> one number per episode; empty if
     the run was not evaluated"""
+
+    def __fspath__(self) -> str:
+        """Returns the run folder, so that a run can be given where its path can."""
+        return str(self.path)
 
 
 def train(
@@ -90,7 +96,7 @@ def resume(
     """Resumes a stopped training exactly where its newest checkpoint was made.
 
     Args:
-        run: a run folder.
+        run: the run, or its folder.
         progress, evaluate_after: see `train`.
         settings: settings that do not affect learning: `episodes`, `device`, `logger`,
             `checkpoint_interval`, `checkpoint_steps`, and those of `evaluation`.
@@ -100,7 +106,7 @@ def resume(
         NonFiniteError: a number became NaN or infinite.
     """
     with _quiet():
-        return _finish(resumed(Path(run), **settings), progress, evaluate_after)
+        return _finish(resumed(os.fspath(run), **settings), progress, evaluate_after)
 
 
 def evaluate(
@@ -157,7 +163,7 @@ def load(
     Raises:
         UserError: there is no such run, a file in it is damaged, or a setting does not fit.
     """
-    name, file = os.fspath(run), None if checkpoint is None else Path(checkpoint)
+    name, file = os.fspath(run), None if checkpoint is None else user_path(checkpoint)
     folder = RunFolder(pretrained.find_one(name) if pretrained.is_name(name) else name)
     return load_policy(folder, (), settings, checkpoint=file, device=device)
 
@@ -181,9 +187,9 @@ def compare(
     Raises:
         UserError: there are no runs, or `output` is not empty.
     """
-    folder = None if output is None else free_folder(Path(output))
+    folder = None if output is None else free_folder(user_path(output))
     several = [paths] if isinstance(paths, str | os.PathLike) else paths
-    comparison = compare_runs([Path(path) for path in several], labels)
+    comparison = compare_runs([user_path(path) for path in several], labels)
     return comparison if folder is None else write_report(comparison, folder)
 
 
@@ -199,7 +205,7 @@ def _finish(
             trainer.train(progress or (lambda _: None))
             stopping.at_once = True
             if stopping.received:
-                raise KeyboardInterrupt
+                raise KeyboardInterrupt(f"saved; resume({str(trainer.run.path)!r}) continues")
             if evaluate_after:
                 results = trainer.evaluate()
     finally:

@@ -122,13 +122,13 @@ def _wandb(config: RunConfig, run: RunFolder) -> Any:
     for path in [*folder.rglob("*")]:
         if path.is_symlink():  # wandb creates its own links again
             path.unlink()
-    # The name of a folder that wandb created ends with the id of the run.
-    before = [path.name.rpartition("-")[2] for path in sorted(folder.glob("*run-*-*"))]
+    # wandb names the folders run-TIME-ID or offline-run-TIME-ID.
+    before = [path.name.partition("run-")[2] for path in sorted(folder.glob("*run-*-*"))]
     mode = os.environ.get("WANDB_MODE") or "offline"
     logger = WandbLogger(
         exp_name=run.path.name,
         project=os.environ.get("WANDB_PROJECT", "emberlink"),
-        id=os.environ.get("WANDB_RUN_ID") or (before[-1] if before else None),
+        id=os.environ.get("WANDB_RUN_ID") or (before[-1].partition("-")[2] if before else None),
         save_dir=str(run.path.absolute()),
         log_env_packages=False,  # it would overwrite "env" in the configuration
         mode=mode,

@@ -26,7 +26,9 @@ def user_path(path: Path | str) -> Path:
     try:
         return Path(path).expanduser()
     except RuntimeError:
-        raise UserError(f"{shown(str(path))}: there is no such home folder") from None
+        raise UserError(
+            f"{shown(str(path))}: there is no such home folder; the variable HOME names yours"
+        ) from None
 
 
 def open_regular(path: Path, max_bytes: int) -> BinaryIO:

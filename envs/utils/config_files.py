@@ -15,6 +15,7 @@ from pathlib import Path, PurePath
 from typing import Any
 
 from emberlink import configs
+from emberlink.envs.utils.atomic_io import user_path
 from emberlink.envs.utils.errors import UserError, shown, unknown
 
 VARIABLE = "EMBERLINK_CONFIGS"
@@ -43,7 +44,7 @@ def folders() -> list[Path]:
     Folders that do not exist are ignored, as in PATH. For an entry point whose package does not
     exist, there is a warning.
     """
-    listed = [Path(text) for text in os.environ.get(VARIABLE, "").split(os.pathsep) if text]
+    listed = [user_path(text) for text in os.environ.get(VARIABLE, "").split(os.pathsep) if text]
     plugins = [path for point in entry_points(PACKAGES) for path in _package(point.value)]
     every = [path.resolve() for path in (*listed, *plugins, Path(str(configs.__file__)).parent)]
     return [path for path in dict.fromkeys(every) if path.is_dir()]

@@ -4,13 +4,14 @@ import warnings
 from functools import partial
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from torchrl.collectors import Collector, MultiSyncCollector
 from torchrl.envs import ParallelEnv, SerialEnv, TransformedEnv
 from torchrl.envs.utils import check_env_specs, step_mdp
 
-from emberlink.envs import keys
+from emberlink.envs import keys, parallel_env
 from emberlink.envs.utils.errors import UserError
 from emberlink.policies.gaussian import MEMORY
 from emberlink.policies.hold import HELD
@@ -21,14 +22,13 @@ from emberlink.trainers.evaluation.policy import TrainedPolicy
 HORIZON, STEPS = 12, 24
 """two episodes"""
 CONFIGS = {
-    "gru": ("independent", ["learner=ippo", "policy.memory=gru", "policy.units=8", "gamma=0.9"]),
+    "gru": ("independent", ["learner=ippo", "policy.memory=gru", "policy.units=8"]),
     "maps": ("maps", ["setup=tuned"]),
 }
 
 
 def config_of(name):
     method, given = CONFIGS[name]
-    given = [text for text in given if text != "gamma=0.9"]
     short = {"policy.hold": 3, "env.horizon": HORIZON, "env.num_uavs": 3}
     return resolve(method, given, **short)
 
@@ -87,8 +87,15 @@ def test_only_declared_keys_are_read(policy):
     assert torch.stack(actions, 1)[0].equal(alone(policy)[0, :HORIZON])
 
 
-@pytest.mark.parametrize("cls", [SerialEnv, ParallelEnv])
-@pytest.mark.parametrize("collected", [False, True])
+@pytest.mark.parametrize(
+    ("cls", "collected"),
+    [
+        (SerialEnv, False),
+        (SerialEnv, True),
+        (partial(ParallelEnv, mp_start_method="fork"), False),
+        pytest.param(ParallelEnv, True, marks=pytest.mark.heavy),
+    ],
+)
 def test_batched_environments_act_as_alone(policy, cls, collected):
     env = cls(2, [partial(make, policy.config, seed) for seed in (3, 4)])
     with warnings.catch_warnings():
@@ -98,7 +105,6 @@ def test_batched_environments_act_as_alone(policy, cls, collected):
             run = next(iter(collector))
         else:
             run = env.rollout(STEPS, policy, break_when_any_done=False)
-    actions = run[keys.ACTION].clone().flatten(1, 2).unflatten(1, (STEPS, -1)).flatten(2, 2)
     actions = run[keys.ACTION].squeeze(1).clone()
     if not env.is_closed:
         env.close()
@@ -143,6 +149,15 @@ def test_compiled_policy_acts_as_the_policy(policy):
         warnings.simplefilter("ignore")
         run = make(policy.config, 3).rollout(HORIZON, compiled)
     assert torch.allclose(run[keys.ACTION][0], alone(policy)[0, :HORIZON], atol=1e-5)
+
+
+def test_pettingzoo_carries_the_state(policy):
+    env, actions = parallel_env(make(policy.config, 3)), []
+    env.reset()
+    while env.agents:
+        actions.append(np.stack([*env.act(policy).values()]))
+        env.step(dict(zip(env.agents, actions[-1], strict=True)))
+    assert np.array_equal(np.stack(actions), alone(policy)[0, :HORIZON].numpy())
 
 
 def test_policy_without_its_state_says_so_after_the_first_step(policy):

@@ -8,7 +8,7 @@ import torch
 from tensordict import TensorDict
 from tiny_run import TINY
 
-from emberlink.trainers import train
+from emberlink.trainers import resume, train
 from emberlink.trainers.cli.main import main
 from emberlink.trainers.runs.run_folder import RunFolder
 from emberlink.trainers.terminal import signals
@@ -99,9 +99,12 @@ def test_ctrl_c_in_a_function_saves_and_restores_the_handler(tmp_path):
 
     before = signal.getsignal(INT)
     short = {"episodes": 2, "horizon": 15, "num_envs": 2, "learner.batch_size": 8}
-    with pytest.raises(KeyboardInterrupt):
-        train("independent", output=str(tmp_path), progress=press, **short)
+    with pytest.raises(KeyboardInterrupt, match="resume"):
+        train("independent", output=str(tmp_path / "stopped"), progress=press, **short)
     assert signal.getsignal(INT) is before
-    (folder,) = tmp_path.iterdir()
+    (folder,) = (tmp_path / "stopped").iterdir()
     assert RunFolder(folder).step() == 7
     assert not (folder / "lock").exists()
+    short |= {"output": str(tmp_path / "whole"), "evaluate_after": False}
+    whole, resumed = train("independent", **short), resume(folder, evaluate_after=False)
+    assert RunFolder(resumed.path).metrics() == RunFolder(whole.path).metrics()

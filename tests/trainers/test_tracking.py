@@ -198,7 +198,7 @@ def test_wandb_has_every_episode_and_the_evaluation_in_its_summary(capfd):
 
 
 def test_the_id_and_the_mode_of_the_caller_are_respected(monkeypatch):
-    monkeypatch.setenv("WANDB_RUN_ID", "mine")
+    monkeypatch.setenv("WANDB_RUN_ID", "run-of-mine")
     monkeypatch.setenv("WANDB_MODE", "offline")
     before = {**os.environ}
     short = {k: v for k, v in SHORT.items() if k not in ("setup", "fire")}
@@ -206,7 +206,10 @@ def test_the_id_and_the_mode_of_the_caller_are_respected(monkeypatch):
     after = {**os.environ}
     after.pop("WANDB_SERVICE")  # of wandb itself
     assert after == before
-    assert [file.name for file in run.path.rglob("*.wandb")] == ["run-mine.wandb"]
+    monkeypatch.delenv("WANDB_RUN_ID")
+    trainers.resume(run, episodes=5)  # the id is that of the first part
+    assert {file.name for file in run.path.rglob("*.wandb")} == {"run-run-of-mine.wandb"}
+    assert [row["_step"] for row in rows_of(RunFolder(run.path))] == [1, 2, 3, 4, 5]
     assert means(RunFolder(run.path)).items() <= summary_of(RunFolder(run.path)).items()
     monkeypatch.setenv("WANDB_MODE", "disabled")
     Path("runs").rename("before")

@@ -4,11 +4,17 @@ Their code is imported when they run, so that `emberlink --help` does not import
 """
 
 import argparse
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from emberlink.envs.utils.errors import UserError
-from emberlink.trainers.cli.parser import MOST_FIRES, between, command, command_group, positive
+from emberlink.trainers.cli.parser import (
+    MOST_FIRES,
+    between,
+    command,
+    command_group,
+    path,
+    positive,
+)
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -63,16 +69,15 @@ def _train(options: argparse.Namespace, console: "Console") -> int:
 
 def _check_names(method: str, overrides: list[str]) -> None:
     """Reports a wrong name or key before torch is imported, which takes seconds."""
-    from emberlink.envs.utils.config_files import find
+    from emberlink.envs.utils.config_files import find, known
 
     if any(text.startswith("resume=") for text in (method, *overrides)):
         return
     find("method", method)
     if other := next((text for text in overrides if "=" not in text), None):
-        raise UserError(
-            f"{other!r} is not of the form key=value; several methods: emberlink sweep "
-            f"{method} {other} ..."
-        )
+        hint = f"; several methods: emberlink sweep {method} {other}"
+        hint *= other in known("method")
+        raise UserError(f"{other!r} is not of the form key=value{hint}")
     from emberlink.trainers.config.values import composed  # imports Hydra
 
     composed(method, overrides)
@@ -99,7 +104,7 @@ def add_eval(commands: Any) -> None:
         "evaluation.scripted=[] for the frozen policies alone; "
         "the names of the files contain them",
     )
-    add("--checkpoint", metavar="FILE", type=Path, help="a checkpoint (default: the newest)")
+    add("--checkpoint", metavar="FILE", type=path, help="a checkpoint (default: the newest)")
     fires = between(1, MOST_FIRES)
     add("--fires", metavar="N", type=fires, help="number of episodes (default: the run's)")
     add("--device", help="cpu, cuda, ... (default: the run's)")
@@ -127,10 +132,10 @@ def add_compare(commands: Any) -> None:
         "folders",
         metavar="RUN",
         nargs="+",
-        type=Path,
+        type=path,
         help="run folders, folders of run folders, or names such as pretrained:tuned",
     )
-    add("--output", metavar="FOLDER", type=Path, help="a new folder (default: compare)")
+    add("--output", metavar="FOLDER", type=path, help="a new folder (default: compare)")
     add(
         "--label",
         metavar="NAME",
@@ -154,8 +159,8 @@ def _compare(options: argparse.Namespace, console: "Console") -> int:
 
     folder = free_folder(options.output)
     comparison = compare_runs(options.folders, options.label)
-    for path, why in comparison.left_out:
-        say(f"note: {path} is left out: {why}")
+    for run, why in comparison.left_out:
+        say(f"note: {run} is left out: {why}")
     write_report(comparison, folder, lambda text: say(f"  {text}", "dim"), options.extras)
     for note in comparison.notes:
         say(f"note: {note}")
@@ -203,14 +208,14 @@ def add_render(commands: Any) -> None:
     add(
         "--checkpoint",
         metavar="FILE",
-        type=Path,
+        type=path,
         help="a checkpoint in place of the newest; one for each run",
         **several,
     )
     add(
         "--output",
         metavar="PATH",
-        type=Path,
+        type=path,
         help="a folder, or a new file that ends in .html (a page to play), .gif, .mp4 or .png (one "
         "picture)",
     )
@@ -257,7 +262,7 @@ def _sweep(options: argparse.Namespace, console: "Console") -> int:
 
     first, *others = options.arguments
     if first == "status" and len(others) == 1:
-        return status(Path(others[0]), console)
+        return status(path(others[0]), console)
     jobs = [f"executor.workers={options.jobs}"] if options.jobs else []
     return sweep([*options.arguments, *jobs], console, dry=options.dry_run)
 
@@ -301,7 +306,7 @@ def add_world(commands: Any) -> None:
         "--json",
         dest="output",
         metavar="FILE",
-        type=Path,
+        type=path,
         help="a new .json file for the numbers",
     )
 

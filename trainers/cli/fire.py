@@ -1,9 +1,8 @@
 """Defines the arguments of `emberlink fire`: preview, make, import."""
 
-from pathlib import Path
 from typing import Any
 
-from emberlink.trainers.cli.parser import command, command_group, positive
+from emberlink.trainers.cli.parser import command, command_group, path, positive
 
 _KEYS = "keys of setup, env. and fire., as for train, such as setup=tuned, 'env.grid=[60,60]'"
 _BANK = "a new file that ends in .npy, .tif or .tiff"
@@ -35,7 +34,7 @@ def add_fire(commands: Any) -> None:
         help="a scenario (huygens, or huygens:3 for its test fire 3), a file (or bank.tif:3), or "
         "fire=file fire.path=FILE; " + _KEYS,
     )
-    preview("--output", metavar="PATH", type=Path, help="a folder, or a new .png file")
+    preview("--output", metavar="PATH", type=path, help="a folder, or a new .png file")
     make = command(
         actions,
         "fire make",
@@ -49,7 +48,7 @@ def add_fire(commands: Any) -> None:
     make("overrides", metavar="key=value", nargs="*", help=_KEYS)
     make("--count", metavar="N", type=positive, help="number of fires")
     make("--split", choices=("train", "validation", "test"), default="train")
-    make("--output", metavar="FILE", type=Path, help=_BANK)
+    make("--output", metavar="FILE", type=path, help=_BANK)
     imported = command(
         actions,
         "fire import",
@@ -65,4 +64,4 @@ def add_fire(commands: Any) -> None:
         nargs="+",
         help="files with one fire or more; " + _KEYS,
     )
-    imported("--output", metavar="BANK", type=Path, required=True, help=_BANK)
+    imported("--output", metavar="BANK", type=path, required=True, help=_BANK)

@@ -6,7 +6,11 @@ import sys
 from collections.abc import Callable
 from contextlib import suppress
 from importlib import import_module
+from pathlib import Path
 from typing import Any, NoReturn
+
+from emberlink.envs.utils.atomic_io import user_path
+from emberlink.envs.utils.errors import UserError
 
 MOST_FIRES = 65_536
 """largest number of fires of an evaluation; that of `config.schema`, which imports torch"""
@@ -130,3 +134,11 @@ def between(low: int, high: int | None = None) -> Callable[[str], int]:
 
 
 positive = between(1)
+
+
+def path(text: str) -> Path:
+    """Converts an argument to a path; see `user_path`."""
+    try:
+        return user_path(text)
+    except UserError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None

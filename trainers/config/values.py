@@ -85,7 +85,7 @@ def change(
         UserError: a key is not known or names a file, or a text is of another form.
     """
     known = list(all_keys(values))
-    given = [parse(text, values) for text in overrides]
+    given = [parse(text) for text in overrides]
     for name, value in (settings or {}).items():
         if name in ("method", *GROUPS):
             raise UserError(f"{name}={shown(value)}: names a file, so it is not a setting")
@@ -101,14 +101,10 @@ def change(
         put(values, key, value)
 
 
-def parse(text: str, values: Mapping[str, Any] | None = None) -> tuple[str, Any]:
+def parse(text: str) -> tuple[str, Any]:
     """Returns the key and the value of `key=value` by Hydra's grammar.
 
     A value that the grammar cannot read, as in `output=Läufe`, is a text.
-
-    Args:
-        text: the text.
-        values: values that it changes, for the message if it gives several.
 
     Raises:
         UserError: the text is of another form, or gives several values.
@@ -121,10 +117,10 @@ def parse(text: str, values: Mapping[str, Any] | None = None) -> tuple[str, Any]
     except (HydraException, ValueError, RecursionError):
         return key, value
     if parsed.is_sweep_override():
-        hint = "several runs are a sweep, see emberlink sweep --help"
-        if isinstance(flat(values or {}).get(key), list) and parsed.is_choice_sweep():
-            hint = f"a list is written {key}=[{value}]"
-        raise UserError(f"{shown(text)!r}: only one value is possible here; {hint}")
+        raise UserError(
+            f"{shown(text)!r}: only one value is possible here; a list stands in brackets, several "
+            "runs are a sweep (emberlink sweep --help)"
+        )
     if parsed.is_delete():
         raise UserError(f"{shown(text)!r}: a key cannot be removed")
     given = parsed.value()

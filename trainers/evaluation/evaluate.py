@@ -3,6 +3,7 @@
 import hashlib
 import inspect
 import json
+import threading
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import asdict, replace
@@ -41,6 +42,10 @@ VALIDATION_START_SEED = 20_350_923
 BLOCK = 50
 """environments in a batch of an evaluation, even if fewer episodes are needed"""
 
+ONE_AT_A_TIME = threading.RLock()
+"""held while a policy is trained or played: TorchRL's collectors, losses and `play` set its
+exploration type, one variable of the process, which two threads in turn would leave set"""
+
 Policy = Callable[[TensorDictBase], TensorDictBase]
 Watch = Callable[[WildfireEnv, TensorDictBase], None]
 """called at each step, from 0 to the horizon, with the environments and what they returned: the
@@ -59,7 +64,7 @@ def play(env: TransformedEnv, policy: Policy, watch: Watch | None = None) -> dic
     world: Any = env.base_env
     steps: list[TensorDictBase] = []
     actions: list[Tensor] = []
-    with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
+    with ONE_AT_A_TIME, torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
         td = env.reset()
         if watch is not None:
             watch(world, td)

@@ -19,7 +19,7 @@ from emberlink.envs.fire.generator import GeneratedConfig, Split, fire_seeds, ma
 from emberlink.envs.fire_files.config import FileFireConfig
 from emberlink.envs.fire_files.reader import read_with_summary
 from emberlink.envs.scenarios import fires_of
-from emberlink.envs.utils.atomic_io import created, free_name, new_file
+from emberlink.envs.utils.atomic_io import created, free_name, new_file, user_path
 from emberlink.envs.utils.errors import UserError, shown, unknown
 from emberlink.envs.world.coverage_map import split_times
 from emberlink.envs.world.sensor import view_radius
@@ -42,11 +42,11 @@ def preview(arguments: Sequence[str], console: Console, output: Path | None = No
     """
     path = new_file(output, [".png"]) if output is not None and not os.path.isdir(output) else None
     overrides = [text for text in arguments if "=" in text and not os.path.exists(text)]
-    sources = [text for text in arguments if text not in overrides]
+    sources = [str(user_path(text)) for text in arguments if text not in overrides]
     names = [text.partition("=")[2] for text in overrides if text.startswith("fire=")]
     keyed = [str(parse(text)[1]) for text in overrides if text.startswith("fire.path=")]
     overrides = [text for text in overrides if not text.startswith(("fire=", "fire.path="))]
-    sources += keyed if names == ["file"] else names
+    sources += [str(user_path(text)) for text in keyed] if names == ["file"] else names
     if len(sources) != 1:
         raise UserError(f"{shown(' '.join(sources))!r}: expected one scenario or file")
     title, stem, config, arrival, read = _find(sources[0], overrides)
@@ -207,7 +207,7 @@ def import_files(arguments: Sequence[str], console: Console, output: Path) -> in
     """
     # An existing file takes precedence over a key.
     overrides = [text for text in arguments if "=" in text and not os.path.exists(text)]
-    paths = [Path(text) for text in arguments if text not in overrides]
+    paths = [user_path(text) for text in arguments if text not in overrides]
     if not paths:
         raise UserError("FILE is missing; expected a file, such as ArrivalTime.asc")
     configs = [_from_file(path, overrides) for path in paths]

@@ -16,6 +16,7 @@ import numpy as np
 from jinja2 import Environment, StrictUndefined
 from numpy.typing import NDArray
 
+from emberlink.envs.utils.atomic_io import user_path
 from emberlink.trainers.replay.recording import AGES, COUNTS, OF_BASE, ROLES, Episode
 
 SCRIPTS = ("unpack.js", "knowledge.js", "palette.js", "map.js", "curves.js", "replay.js")
@@ -48,9 +49,9 @@ class Replay:
         )
         """the whole page"""
 
-    def save(self, path: Path) -> None:
+    def save(self, path: Path | str) -> None:
         """Writes the page to a file."""
-        path.write_text(self.html, encoding="utf-8")
+        user_path(path).write_text(self.html, encoding="utf-8")
 
     def __repr__(self) -> str:
         return f"<Replay, {len(self.html) // 1000} kB of HTML>"

@@ -37,7 +37,7 @@ class ResumableCollector:
             env.append_transform(primer)
         self._resets = _Resets()
         env.append_transform(self._resets)
-        collector: Any = Collector(
+        self._collector = Collector(
             env,
             policy,
             frames_per_batch=env.batch_size.numel() * rollout_steps,
@@ -46,9 +46,6 @@ class ResumableCollector:
             track_traj_ids=False,
             auto_register_policy_transforms=False,
         )
-        # The explorer always explores, so that this mode of the whole process need not change.
-        collector.exploration_type = None
-        self._collector = collector
         self.carried = self._resets.last
         """the input of the next step"""
 

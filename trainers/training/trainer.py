@@ -1,6 +1,5 @@
 """Runs the training loop: collects, learns, measures, evaluates and saves."""
 
-import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -21,9 +20,6 @@ from emberlink.trainers.runs.run_folder import BEST, RunFolder
 from emberlink.trainers.tracking import Tracker
 from emberlink.trainers.training import warm_start
 from emberlink.trainers.training.setup import TrainingSetup
-
-ONE_AT_A_TIME = threading.RLock()
-"""held while a training runs: TorchRL's exploration type is one variable for all threads"""
 
 
 class NonFiniteError(UserError):
@@ -97,8 +93,7 @@ class Trainer:
     def train(self, report: Callable[[Progress], None] = lambda _: None) -> bool:
         """Trains to the end, or until `stop`, and saves.
 
-        After an exception, nothing is saved: a setup is consistent only between rollouts. A second
-        training in another thread of the process waits for the first one.
+        After an exception, nothing is saved: a setup is consistent only between rollouts.
 
         Args:
             report: called after each rollout.
@@ -111,25 +106,24 @@ class Trainer:
             UserError: a file cannot be written, such as to a full disk.
         """
         setup, line = self.setup, {}
-        with ONE_AT_A_TIME:
-            self._tracker = self._tracker or Tracker(self.config, self.run)
-            for rollout in setup.collector:
-                before = setup.step
-                self._check(setup.learn(rollout))
-                if setup.step % setup.horizon == 0:
-                    line = self._finish_episode()
-                if self._is_due(before, setup.step):
-                    self.save()
-                report(
-                    Progress(
-                        *(setup.step, setup.total_steps),
-                        *(setup.episode, self.config.episodes, line),
-                    )
-                )
-                if self._stopping:
-                    break
-            if self.saved != setup.step:
+        self._tracker = self._tracker or Tracker(self.config, self.run)
+        for rollout in setup.collector:
+            before = setup.step
+            self._check(setup.learn(rollout))
+            if setup.step % setup.horizon == 0:
+                line = self._finish_episode()
+            if self._is_due(before, setup.step):
                 self.save()
+            report(
+                Progress(
+                    *(setup.step, setup.total_steps),
+                    *(setup.episode, self.config.episodes, line),
+                )
+            )
+            if self._stopping:
+                break
+        if self.saved != setup.step:
+            self.save()
         return setup.step == setup.total_steps
 
     def evaluate(self, report: Callable[[str], None] = lambda _: None) -> Results:
@@ -142,15 +136,14 @@ class Trainer:
             UserError: a file cannot be written.
         """
         config, run = self.config, self.run
-        with ONE_AT_A_TIME:
-            results = evaluate_run(
-                run,
-                config,
-                self.setup.actor,
-                checkpoint=run.checkpoint(),
-                fires=config.evaluation.episodes,
-                report=report,
-            )
+        results = evaluate_run(
+            run,
+            config,
+            self.setup.actor,
+            checkpoint=run.checkpoint(),
+            fires=config.evaluation.episodes,
+            report=report,
+        )
         self._tracker = self._tracker or Tracker(config, run)
         figures = sorted((run.path / "figures").glob("*.png"))
         self._tracker.log_evaluation(learned_means(results), figures)

@@ -49,7 +49,7 @@ def test_settings_that_are_texts_keep_their_form(monkeypatch):
         (["executor=slurm"], "executor='slurm' is not known; known: local"),
         (["executor.workers=0"], "executor.workers=0"),
         (["executor.nodes=2"], "'executor.nodes' is not known"),
-        (["executor=submitit", "executor.cluster=local"], "executor.cluster is no longer"),
+        (["executor=submitit", "executor.cluster=here"], 'executor.cluster="here"'),
         (["executor=submitit"], "submitit: not installed: pip install '.[slurm]'"),
         (["executor=ray"], "ray: not installed: pip install '.[ray]'"),
     ],

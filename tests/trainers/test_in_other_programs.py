@@ -1,0 +1,127 @@
+"""Tests that the package fits into other programs: threads, paths, accounts, hints."""
+
+import logging
+import os
+import pwd
+from concurrent.futures import ThreadPoolExecutor
+from types import SimpleNamespace
+
+import pytest
+from tiny_run import TINY
+from torchrl.envs.utils import exploration_type
+
+from emberlink import trainers
+from emberlink.trainers.cli.main import main
+from emberlink.trainers.runs.run_folder import RunFolder
+from emberlink.trainers.sweep.executors import submitit
+
+SHORT = {"horizon": 15, "num_uavs": 2, "num_envs": 2, "batch_size": 8, "evaluation.episodes": 2}
+SHORT |= {"episodes": 4, "evaluation.interval": 1, "evaluation.interval_episodes": 2}
+
+
+def test_two_threads_train_as_one_alone(tmp_path):
+    """Validations beside a training leave its noise as it is, and nothing of the process set."""
+
+    def train(seed, place):
+        more = {"output": str(tmp_path / place), "evaluation.scripted": [], "seed": seed}
+        run = trainers.train("independent", setup="tuned", **SHORT, **more)
+        return RunFolder(run.path).metrics(), trainers.evaluate(run, scripted=False), run.results
+
+    before = {**os.environ}, exploration_type(), logging.getLogger("torchrl").level
+    alone = [train(seed, "alone") for seed in (0, 1)]
+    with ThreadPoolExecutor(2) as pool:
+        assert list(pool.map(train, (0, 1), ("both", "both"))) == alone
+    assert before == ({**os.environ}, exploration_type(), logging.getLogger("torchrl").level)
+
+
+NOWHERE = "~nobody_here/x"
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        f"train independent {' '.join(TINY)} output={NOWHERE}",
+        f"train independent world=file setup=tuned fire.path={NOWHERE}",
+        f"train independent learner=imitation learner.warm_start={NOWHERE}",
+        f"train resume={NOWHERE}",
+        f"eval {NOWHERE}",
+        f"eval pretrained:consensus --checkpoint={NOWHERE}",
+        f"render {NOWHERE}",
+        f"render pretrained:consensus --output={NOWHERE}.gif",
+        f"compare {NOWHERE}",
+        f"compare pretrained:tuned --output={NOWHERE}",
+        f"sweep independent output={NOWHERE}",
+        f"sweep status {NOWHERE}",
+        f"fire preview {NOWHERE}",
+        f"fire preview fire=file fire.path={NOWHERE}",
+        f"fire import {NOWHERE} --output=fires.npy",
+        f"fire make paper --output={NOWHERE}.npy",
+        f"world check --json={NOWHERE}.json",
+    ],
+)
+def test_an_unknown_home_folder_is_one_line(words, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit) as ended:
+        raise SystemExit(main(words.split()))
+    error = capsys.readouterr().err
+    assert (ended.value.code, error.count("\n")) == (2, 1)
+    assert "~nobody_here" in error
+    assert "home folder" in error
+    assert not any(tmp_path.iterdir())
+
+
+def test_home_folders_are_expanded(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("HOME", str(tmp_path))
+    (tmp_path / "setup").mkdir()
+    (tmp_path / "setup" / "mine.yaml").write_text("# @package _global_\ndefaults: [tuned]\n")
+    monkeypatch.setenv("EMBERLINK_CONFIGS", "~")
+    make = ["fire", "make", "paper", "--count=1", "--output=~/fires.npy", "env.grid=[9,9]"]
+    assert main([*make, "setup=mine"]) == 0
+    assert main(["fire", "preview", "~/fires.npy", "--output=~/fire.png", "env.grid=[9,9]"]) == 0
+    policy = trainers.load("pretrained:consensus")
+    (tmp_path / "here").write_bytes(policy.checkpoint.read_bytes())
+    assert trainers.load("pretrained:consensus", checkpoint="~/here").checkpoint.parent == tmp_path
+    assert not (tmp_path / "~").exists()
+    assert {"fires.npy", "fire.png"} < {file.name for file in tmp_path.iterdir()}
+
+
+def test_an_account_without_a_home_folder_is_one_line(monkeypatch, capsys):
+    for name in ("HOME", "XDG_CACHE_HOME", "EMBERLINK_CACHE"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(pwd, "getpwuid", {}.__getitem__)
+    assert main(["train", "independent", *TINY]) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert "HOME" in error
+
+
+def test_what_a_message_proposes_is_possible(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(["train", "independent", "consensus"]) == 2
+    assert "emberlink sweep independent consensus" in capsys.readouterr().err
+    assert main(["sweep", "independent", "consensus", "--dry-run"]) == 0
+    assert main(["train", "independent", "fast"]) == 2
+    assert "sweep" not in capsys.readouterr().err
+    for text in ("seed=range(0,3)", "seed=interval(0,3)", "learner.hidden=[8,8],[9,9]"):
+        assert main(["train", "independent", text]) == 2
+        error = capsys.readouterr().err
+        assert "Sweep" not in error
+        assert "=[" not in error.removeprefix("emberlink train: ").replace(text, "")
+
+
+@pytest.mark.parametrize("pattern", ["%j", "%A_%a", "%%", "100%"])
+def test_patterns_of_slurm_in_a_path(pattern, tmp_path, monkeypatch):
+    monkeypatch.setenv("EMBERLINK_CACHE", str(tmp_path / "cache"))
+    made = []
+    update = SimpleNamespace(update_parameters=lambda **_: None)
+    monkeypatch.setattr(submitit, "require", lambda *_: None)
+    library = SimpleNamespace(AutoExecutor=lambda folder, *_, **__: made.append(folder) or update)
+    monkeypatch.setattr(submitit, "import_module", lambda _: library)
+    executor = submitit.SubmititExecutor(submitit.SubmititConfig())
+    executor._make(tmp_path / pattern)
+    executor._make(tmp_path / pattern)  # again, when the sweep is repeated
+    assert "%" not in str(made[0])
+    assert made[0] == made[1]
+    (made[0] / "log.txt").write_text("")
+    assert (tmp_path / pattern / "log.txt").exists()
