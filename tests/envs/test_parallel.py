@@ -136,6 +136,7 @@ def test_start_positions_are_an_option():
         small().state()
 
 
+@pytest.mark.filterwarnings("ignore:PettingZoo in TorchRL")
 @pytest.mark.parametrize("seed", [5, 6])
 def test_torchrls_wrapper_plays_the_first_episodes_of_its_seed(seed):
     """It resets when it is made and before the first step, and sends actions of failed UAVs."""

@@ -42,7 +42,7 @@ NOWHERE = "~nobody_here/x"
     [
         f"train independent {' '.join(TINY)} output={NOWHERE}",
         f"train independent world=file setup=tuned fire.path={NOWHERE}",
-        f"train independent learner=imitation learner.warm_start={NOWHERE}",
+        f"train independent learner=ippo learner.warm_start={NOWHERE}",
         f"train resume={NOWHERE}",
         f"eval {NOWHERE}",
         f"eval pretrained:consensus --checkpoint={NOWHERE}",
@@ -61,7 +61,7 @@ NOWHERE = "~nobody_here/x"
 )
 def test_an_unknown_home_folder_is_one_line(words, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(SystemExit) as ended:
+    with pytest.raises(SystemExit) as ended:  # of argparse, for options
         raise SystemExit(main(words.split()))
     error = capsys.readouterr().err
     assert (ended.value.code, error.count("\n")) == (2, 1)

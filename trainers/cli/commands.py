@@ -6,6 +6,7 @@ Their code is imported when they run, so that `emberlink --help` does not import
 import argparse
 from typing import TYPE_CHECKING, Any
 
+from emberlink.envs.utils.atomic_io import user_path
 from emberlink.envs.utils.errors import UserError
 from emberlink.trainers.cli.parser import (
     MOST_FIRES,
@@ -262,7 +263,7 @@ def _sweep(options: argparse.Namespace, console: "Console") -> int:
 
     first, *others = options.arguments
     if first == "status" and len(others) == 1:
-        return status(path(others[0]), console)
+        return status(user_path(others[0]), console)
     jobs = [f"executor.workers={options.jobs}"] if options.jobs else []
     return sweep([*options.arguments, *jobs], console, dry=options.dry_run)
 

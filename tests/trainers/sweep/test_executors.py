@@ -17,9 +17,9 @@ from emberlink.trainers.sweep.executors.local import LocalConfig, LocalExecutor
 
 
 def test_every_executor_has_a_file_with_its_settings():
-    assert base.known() == known_files("executor") == ["local", "ray", "submitit"]
-    for name in base.known():
-        keys = {field.name for field in fields(base.find(name).config_type)}
+    assert base.EXECUTORS.known() == known_files("executor") == ["local", "ray", "submitit"]
+    for name in base.EXECUTORS.known():
+        keys = {field.name for field in fields(base.EXECUTORS.find(name).config_type)}
         assert keys == {*read("executor", name)} - {"name"}
 
 
