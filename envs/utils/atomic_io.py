@@ -17,7 +17,7 @@ _NO_SYNC = {errno.EINVAL, errno.EBADF, errno.ENOTSUP}
 """errors of file systems that cannot flush a folder"""
 
 
-def user_path(path: Path | str) -> Path:
+def user_path(path: os.PathLike[str] | str) -> Path:
     """Returns a path that the user gave, with the home folder for `~`.
 
     Raises:
@@ -27,7 +27,7 @@ def user_path(path: Path | str) -> Path:
         return Path(path).expanduser()
     except RuntimeError:
         raise UserError(
-            f"{shown(str(path))}: there is no such home folder; the variable HOME names yours"
+            f"{shown(os.fspath(path))}: there is no such home folder; the variable HOME names yours"
         ) from None
 
 
