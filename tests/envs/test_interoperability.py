@@ -1,4 +1,4 @@
-"""Tests the environment with other programs: seeds, ends, Gymnasium."""
+"""Tests the environment with other programs: seeds, ends, TorchRL's wrapper, Gymnasium."""
 
 import copy
 import pickle
@@ -10,8 +10,9 @@ import torch
 from gymnasium.utils.env_checker import check_env
 from tensordict import TensorDict
 from torchrl.envs import ParallelEnv, SerialEnv, check_env_specs
+from torchrl.envs.libs.pettingzoo import PettingZooWrapper
 
-from emberlink.envs import WildfireConfig, WildfireEnv, keys
+from emberlink.envs import WildfireConfig, WildfireEnv, keys, parallel_env
 from emberlink.envs.utils.errors import UserError
 from emberlink.trainers import make_env
 
@@ -137,3 +138,19 @@ def test_a_policy_flies_the_team_of_gymnasium(method):
         assert np.array_equal(observation["crops"], steps[keys.CROPS][0, -1].numpy())
     assert truncated
     assert env.render().ndim == 3
+
+
+@pytest.mark.parametrize("seed", [5, 6])
+def test_torchrls_wrapper_plays_the_first_episodes_of_its_seed(seed):
+    """It resets when it is made and before the first step, and sends actions of failed UAVs."""
+    config = WildfireConfig(grid=(12, 10), num_uavs=3, horizon=8, failures=3.0)
+    core = WildfireEnv(1, config, FIRE, seed=seed)
+    made = {"use_mask": True, "done_on_any": False, "seed": seed}
+    env = PettingZooWrapper(parallel_env(config=config, fire=FIRE), **made)
+    for _ in range(2):
+        core.reset()
+        last = core.fail_step.max().clamp(max=8).item()
+        steps = env.rollout(20)["next"]
+        assert len(steps) == last
+        fell = [flags.nonzero()[0].item() + 1 for flags in steps["uav", "terminated"][..., 0].T]
+        assert fell == core.fail_step[0].tolist()

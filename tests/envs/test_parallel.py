@@ -15,7 +15,6 @@ from pettingzoo.test.state_test import state_test
 from pettingzoo.utils.conversions import parallel_to_aec
 from tensordict import TensorDict
 from torchrl.envs import EnvBase, step_mdp
-from torchrl.envs.libs.pettingzoo import PettingZooWrapper
 
 from emberlink.envs import WildfireConfig, WildfireEnv, keys, parallel_env, pettingzoo
 from emberlink.trainers import make_env
@@ -134,23 +133,6 @@ def test_start_positions_are_an_option():
             env.reset(options=options)
     with pytest.raises(ValueError, match=r"state\(\)"):
         small().state()
-
-
-@pytest.mark.filterwarnings("ignore:PettingZoo in TorchRL")
-@pytest.mark.parametrize("seed", [5, 6])
-def test_torchrls_wrapper_plays_the_first_episodes_of_its_seed(seed):
-    """It resets when it is made and before the first step, and sends actions of failed UAVs."""
-    config = WildfireConfig(grid=(12, 10), num_uavs=3, horizon=8, failures=3.0)
-    core = WildfireEnv(1, config, FIRE, seed=seed)
-    made = {"use_mask": True, "done_on_any": False, "seed": seed}
-    env = PettingZooWrapper(parallel_env(config=config, fire=FIRE), **made)
-    for _ in range(2):
-        core.reset()
-        last = core.fail_step.max().clamp(max=8).item()
-        steps = env.rollout(20)["next"]
-        assert len(steps) == last
-        fell = [flags.nonzero()[0].item() + 1 for flags in steps["uav", "terminated"][..., 0].T]
-        assert fell == core.fail_step[0].tolist()
 
 
 def test_actions_of_agents_that_have_left_are_ignored():
