@@ -2,6 +2,7 @@
 
 import argparse
 import errno
+import logging
 import os
 import sys
 import warnings
@@ -52,6 +53,7 @@ def _run(words: list[str]) -> int:
     program = f"emberlink {options.command}"
     # torchrl's messages of level INFO would disturb the progress bar.
     os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")
+    logging.getLogger("matplotlib").setLevel(logging.ERROR)  # of a cache in no home folder
     try:
         from emberlink.trainers.terminal.console import SafeConsole
 
