@@ -14,7 +14,6 @@ from pettingzoo.utils.conversions import parallel_to_aec
 from pydantic import ValidationError
 from tensordict import TensorDictBase
 from torchrl.envs import EnvBase, TransformedEnv, step_mdp
-from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from emberlink.envs import keys
 from emberlink.envs.config import WildfireConfig
@@ -208,7 +207,7 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
         now = self._begun("act")
         if not self.agents:
             return {}
-        with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
+        with torch.no_grad():
             self._now = policy(now)
         actions = self._now.get(keys.ACTION)[0].cpu().numpy().copy()
         chosen = dict(zip(self.possible_agents, actions, strict=True))

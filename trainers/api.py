@@ -17,7 +17,6 @@ from emberlink.trainers.comparison.comparison import Comparison, compare_runs
 from emberlink.trainers.comparison.report import free_folder, write_report
 from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.config.schema import MAX_FIRES, RunConfig
-from emberlink.trainers.evaluation.evaluate import ONE_AT_A_TIME
 from emberlink.trainers.evaluation.evaluate import evaluate as evaluate_policy
 from emberlink.trainers.evaluation.policy import TrainedPolicy, load_policy
 from emberlink.trainers.evaluation.scores import Results
@@ -30,6 +29,10 @@ from emberlink.trainers.training.trainer import Progress, Trainer
 Reference = str | os.PathLike[str]
 """a run or its folder, or a trained policy of emberlink: `pretrained:METHOD`,
 `pretrained:SETUP/METHOD` or `pretrained:SETUP/METHOD/SEED`"""
+
+_ONE_AT_A_TIME = threading.Lock()
+"""held while a run is trained: TorchRL's collectors and losses set its exploration type, a variable
+of the process, which two threads in turn would leave set"""
 
 
 @dataclass(frozen=True)
@@ -81,9 +84,8 @@ def train(
     names = {"setup": setup, "world": world, "fire": fire, "learner": learner}
     chosen = [f"{key}={name}" for key, name in names.items() if name is not None]
     trainer = Trainer(resolve(method, chosen, **settings))
-    with _quiet():
-        trainer.start()
-        return _finish(trainer, progress, evaluate_after)
+    trainer.start()
+    return _finish(trainer, progress, evaluate_after)
 
 
 def resume(
@@ -105,8 +107,7 @@ def resume(
         UserError: the run cannot be resumed, or a file cannot be written.
         NonFiniteError: a number became NaN or infinite.
     """
-    with _quiet():
-        return _finish(resumed(os.fspath(run), **settings), progress, evaluate_after)
+    return _finish(resumed(os.fspath(run), **settings), progress, evaluate_after)
 
 
 def evaluate(
@@ -201,7 +202,7 @@ def _finish(
     in_main_thread = threading.current_thread() is threading.main_thread()
     results: Results = {}
     try:
-        with stopping if in_main_thread else nullcontext(), ONE_AT_A_TIME:
+        with stopping if in_main_thread else nullcontext(), _ONE_AT_A_TIME, _quiet():
             trainer.train(progress or (lambda _: None))
             stopping.at_once = True
             if stopping.received:

@@ -19,7 +19,7 @@ SHORT = {"horizon": 15, "num_uavs": 2, "num_envs": 2, "batch_size": 8, "evaluati
 SHORT |= {"episodes": 4, "evaluation.interval": 1, "evaluation.interval_episodes": 2}
 
 
-def test_two_threads_train_as_one_alone(tmp_path):
+def test_two_threads_train_as_one_alone(tmp_path, monkeypatch):
     """Validations beside a training leave its noise as it is, and nothing of the process set."""
 
     def train(seed, place):
@@ -27,7 +27,9 @@ def test_two_threads_train_as_one_alone(tmp_path):
         run = trainers.train("independent", setup="tuned", **SHORT, **more)
         return RunFolder(run.path).metrics(), trainers.evaluate(run, scripted=False), run.results
 
-    before = {**os.environ}, exploration_type(), logging.getLogger("torchrl").level
+    monkeypatch.delenv("RL_LOGGING_LEVEL", raising=False)
+    logging.getLogger("torchrl").setLevel(logging.INFO)
+    before = {**os.environ}, exploration_type(), logging.INFO
     alone = [train(seed, "alone") for seed in (0, 1)]
     with ThreadPoolExecutor(2) as pool:
         assert list(pool.map(train, (0, 1), ("both", "both"))) == alone

@@ -3,7 +3,6 @@
 import hashlib
 import inspect
 import json
-import threading
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import asdict, replace
@@ -14,8 +13,7 @@ from typing import Any, cast
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.envs import TransformedEnv, set_exploration_type, step_mdp
-from torchrl.envs.utils import ExplorationType
+from torchrl.envs import TransformedEnv, step_mdp
 
 from emberlink.comm.base import MODULES, CommModule
 from emberlink.envs import keys, metrics
@@ -42,10 +40,6 @@ VALIDATION_START_SEED = 20_350_923
 BLOCK = 50
 """environments in a batch of an evaluation, even if fewer episodes are needed"""
 
-ONE_AT_A_TIME = threading.RLock()
-"""held while a policy is trained or played: TorchRL's collectors, losses and `play` set its
-exploration type, one variable of the process, which two threads in turn would leave set"""
-
 Policy = Callable[[TensorDictBase], TensorDictBase]
 Watch = Callable[[WildfireEnv, TensorDictBase], None]
 """called at each step, from 0 to the horizon, with the environments and what they returned: the
@@ -53,7 +47,7 @@ result of the reset, or the "next" of the step"""
 
 
 def play(env: TransformedEnv, policy: Policy, watch: Watch | None = None) -> dict[str, Tensor]:
-    """Plays one episode in each environment without exploration noise.
+    """Plays one episode in each environment with a policy that adds no noise.
 
     Returns:
         The measures of `metrics.names`, float32 [num_envs] each.
@@ -64,7 +58,7 @@ def play(env: TransformedEnv, policy: Policy, watch: Watch | None = None) -> dic
     world: Any = env.base_env
     steps: list[TensorDictBase] = []
     actions: list[Tensor] = []
-    with ONE_AT_A_TIME, torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
+    with torch.no_grad():
         td = env.reset()
         if watch is not None:
             watch(world, td)
