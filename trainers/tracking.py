@@ -124,11 +124,12 @@ def _wandb(config: RunConfig, run: RunFolder) -> Any:
             path.unlink()
     # wandb names the folders run-TIME-ID or offline-run-TIME-ID.
     before = [path.name.partition("run-")[2] for path in sorted(folder.glob("*run-*-*"))]
-    mode = os.environ.get("WANDB_MODE") or "offline"
+    chosen = os.environ.get  # wandb's own variables
+    mode = chosen("WANDB_MODE") or "offline"
     logger = WandbLogger(
-        exp_name=run.path.name,
-        project=os.environ.get("WANDB_PROJECT", "emberlink"),
-        id=os.environ.get("WANDB_RUN_ID") or (before[-1].partition("-")[2] if before else None),
+        exp_name=chosen("WANDB_NAME") or run.path.name,
+        project=chosen("WANDB_PROJECT") or "emberlink",
+        id=chosen("WANDB_RUN_ID") or (before[-1].partition("-")[2] if before else None),
         save_dir=str(run.path.absolute()),
         log_env_packages=False,  # it would overwrite "env" in the configuration
         mode=mode,
@@ -139,7 +140,7 @@ def _wandb(config: RunConfig, run: RunFolder) -> Any:
             finish_timeout=PATIENCE / 2,
         ),
         reinit="create_new",  # the caller may have a run of their own
-        group=f"{config.setup}-{config.fire.name}",
+        group=chosen("WANDB_RUN_GROUP") or f"{config.setup}-{config.fire.name}",
         tags=[config.method, f"seed-{config.seed}"],
     )
     logger.log_hparams(to_values(config))

@@ -54,7 +54,7 @@ def _elsewhere(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for name in ("WANDB_CACHE_DIR", "WANDB_CONFIG_DIR", "WANDB_DATA_DIR"):
         monkeypatch.setenv(name, str(tmp_path.parent / f"{tmp_path.name}-wandb"))
-    for name in ("MODE", "API_KEY", "BASE_URL", "PROJECT", "SILENT", "RUN_ID"):
+    for name in ("MODE", "API_KEY", "BASE_URL", "PROJECT", "SILENT", "RUN_ID", "NAME", "RUN_GROUP"):
         monkeypatch.delenv(f"WANDB_{name}", raising=False)
     connect = socket.socket.connect
 
@@ -199,6 +199,7 @@ def test_wandb_has_every_episode_and_the_evaluation_in_its_summary(capfd):
 
 def test_the_id_and_the_mode_of_the_caller_are_respected(monkeypatch):
     monkeypatch.setenv("WANDB_RUN_ID", "run-of-mine")
+    monkeypatch.setenv("WANDB_NAME", "mine")
     monkeypatch.setenv("WANDB_MODE", "offline")
     before = {**os.environ}
     short = {k: v for k, v in SHORT.items() if k not in ("setup", "fire")}
@@ -206,6 +207,9 @@ def test_the_id_and_the_mode_of_the_caller_are_respected(monkeypatch):
     after = {**os.environ}
     after.pop("WANDB_SERVICE")  # of wandb itself
     assert after == before
+    assert {r.run.display_name for r in written(RunFolder(run.path)) if r.HasField("run")} == {
+        "mine"
+    }
     monkeypatch.delenv("WANDB_RUN_ID")
     trainers.resume(run, episodes=5)  # the id is that of the first part
     assert {file.name for file in run.path.rglob("*.wandb")} == {"run-run-of-mine.wandb"}
