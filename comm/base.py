@@ -107,15 +107,17 @@ class Communication(Transform):
 
     Args:
         module: the communication module, built for the same number of environments.
+        message_bytes: bytes that a policy's UAVs send at each decision; 0 if it has no messages.
 
     Raises:
         ValueError: a persistent buffer of the module does not have `num_envs` as its first
             dimension.
     """
 
-    def __init__(self, module: CommModule):
+    def __init__(self, module: CommModule, message_bytes: int = 0):
         super().__init__()
-        self.module = module
+        self.module, self.message_bytes = module, message_bytes
+        self.listens = module.hears or message_bytes > 0
         for name, buffer in module.state_dict().items():
             if buffer.shape[:1] != (module.num_envs,):
                 raise ValueError(
@@ -164,9 +166,9 @@ class Communication(Transform):
         return self._speak(self.module(tensordict))
 
     def _listen(self, tensordict: TensorDictBase) -> None:
-        """Writes the links of a step, if the module reads them."""
+        """Writes the links of a step, if the module or the policy reads them."""
         world = self.module.world
-        if self.module.hears:
+        if self.listens:
             links = radio.links(
                 world.radio,
                 tensordict.get(keys.POSITION),
@@ -183,6 +185,9 @@ class Communication(Transform):
             alive = tensordict.get(keys.ALIVE)
             sent = self.module.bytes_sent(tensordict) if world.radio.range else None
             sent = torch.zeros_like(alive, dtype=torch.int64) if sent is None else sent * alive
+            if self.message_bytes and world.radio.range:
+                decides = tensordict.get(keys.STEP) % self.module.hold == 0
+                sent = sent + self.message_bytes * (alive & decides.unsqueeze(-1))
             tensordict.set(keys.BYTES_SENT, sent)
         return tensordict
 
@@ -201,7 +206,7 @@ class Communication(Transform):
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         spec = observation_spec.clone()
         *batch, uavs = spec[keys.AGENTS].shape
-        if self.module.hears:
+        if self.listens:
             shape = torch.Size((*batch, uavs, uavs))
             spec[keys.HEARS] = Binary(shape=shape, device=spec.device, dtype=torch.bool)
         if self.module.world.measures == "all":

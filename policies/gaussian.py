@@ -32,6 +32,8 @@ class GaussianActor(Stateful):
         super().__init__()
         self.module: Any = network
         self.observed = keys.observation_keys(observation_spec)
+        if network.messages is not None:
+            self.observed.append(keys.HEARS)
         size = network.memory.size
         self.uavs, self.carries = network.grouping.uavs, {MEMORY: size} if size else {}
         reads: list[Any] = [*self.observed, *([keys.STEP, MEMORY] if size else [])]

@@ -13,6 +13,7 @@ from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import check_device
 from emberlink.envs.wildfire import WildfireEnv
 from emberlink.policies.hold import hold
+from emberlink.policies.networks.messages import message_bytes
 from emberlink.policies.state import primer_of
 from emberlink.trainers.config.compose import override, resolve
 from emberlink.trainers.config.schema import RunConfig, build_comm
@@ -83,7 +84,7 @@ def build_env(
     """
     world = WildfireEnv(num_envs, config.env, fire, seed, device, true_map=true_map)
     module = build_comm(config, num_envs).to(world.device)
-    env = TransformedEnv(world, Communication(module))
+    env = TransformedEnv(world, Communication(module, message_bytes(config.policy)))
     if teacher is not None:
         env.append_transform(Teacher(world, module, teacher, config.policy.hold))
     return env

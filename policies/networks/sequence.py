@@ -11,6 +11,7 @@ from emberlink.policies.networks.encoders import ObservationEncoder
 from emberlink.policies.networks.grouping import Grouping
 from emberlink.policies.networks.layers import StackedLinear
 from emberlink.policies.networks.memory.base import MEMORIES
+from emberlink.policies.networks.messages import MESSAGES, Messages
 from emberlink.policies.settings import PolicyConfig
 
 FIRST_LOG_STD = -0.5
@@ -34,6 +35,9 @@ class SequenceNetwork(nn.Module):
         policy: the memory, and whether the index of a UAV is an input.
         gain: factor of the weights of the last map.
         share_parameters: whether the UAVs share their weights.
+        speaks: whether the UAVs say the messages of `policy`, if it has any. What a UAV hears is
+            then an input of its memory, and the links, bool [..., uavs, uavs], are the last tensor
+            of an observation.
         start: see `layers.Start`.
     """
 
@@ -47,6 +51,7 @@ class SequenceNetwork(nn.Module):
         policy: PolicyConfig,
         gain: float,
         share_parameters: bool = True,
+        speaks: bool = False,
         **start: Any,
     ):
         super().__init__()
@@ -56,12 +61,19 @@ class SequenceNetwork(nn.Module):
         shapes = [(first[0] + uavs * policy.agent_index,), *others]
         groups = self.grouping.groups
         self.encoder = ObservationEncoder(groups, shapes, **start)
-        self.memory = MEMORIES.find(policy.memory)(groups, self.encoder.features, policy, **start)
+        speaks = speaks and policy.message != "none"
+        inputs = self.encoder.features + policy.message_size * speaks
+        self.memory = MEMORIES.find(policy.memory)(groups, inputs, policy, **start)
         inputs, self.hidden = self.memory.features, nn.ModuleList()
         for units in hidden:
             self.hidden.append(StackedLinear(groups, inputs, units, gain=math.sqrt(2), **start))
             inputs = units
         self.output = StackedLinear(groups, inputs, outputs, gain=gain, **start)
+        self.messages = None
+        if speaks:
+            inputs = self.encoder.features + self.memory.size
+            scheme = MESSAGES.find(policy.message)
+            self.messages = scheme(self.grouping, inputs, policy.message_size, **start)
 
     def forward(self, state: Tensor, *observations: Tensor) -> tuple[Tensor, Tensor]:
         """Maps sequences of decisions.
@@ -75,8 +87,9 @@ class SequenceNetwork(nn.Module):
         """
         rows, decisions, uavs = observations[0].shape[:3]
         batch, split, join = torch.Size((rows, uavs)), self.grouping.split, self.grouping.join
+        observations, hears = self._apart(observations)
         arranged = [split(x.transpose(1, 2), batch) for x in self._indexed(observations)]
-        output, after = self._run(arranged, split(state, batch))
+        output, after = self._run(arranged, split(state, batch), hears)
         joined = join(output.flatten(2), batch).unflatten(-1, (decisions, -1))
         return joined.transpose(1, 2), join(after, batch)
 
@@ -92,20 +105,51 @@ class SequenceNetwork(nn.Module):
         """
         batch = observations[0].shape[:-1]
         split = self.grouping.split
+        observations, hears = self._apart(observations)
+        if hears is not None:
+            hears = hears.reshape(-1, 1, *hears.shape[-2:])
         arranged = [split(x, batch).unsqueeze(2) for x in self._indexed(observations)]
         before = self._empty(arranged[0]) if state is None else split(state, batch)
-        output, after = self._run(arranged, before)
+        output, after = self._run(arranged, before, hears)
         return self.grouping.join(output.squeeze(2), batch), self.grouping.join(after, batch)
 
-    def _run(self, tensors: Sequence[Tensor], state: Tensor) -> tuple[Tensor, Tensor]:
+    def _run(
+        self, tensors: Sequence[Tensor], state: Tensor, hears: Tensor | None
+    ) -> tuple[Tensor, Tensor]:
         """Maps tensors [groups, rows, decisions, ...] and returns the state after the last."""
         rows, decisions = tensors[0].shape[1:3]
-        encoded = self.encoder([x.flatten(1, 2) for x in tensors])
-        x, state = self.memory(encoded.unflatten(1, (rows, decisions)), state)
+        encoded = self.encoder([x.flatten(1, 2) for x in tensors]).unflatten(1, (rows, decisions))
+        if self.messages is None or hears is None:
+            x, state = self.memory(encoded, state)
+        else:
+            x, state = self._converse(self.messages, encoded, state, hears)
         x = x.flatten(1, 2)
         for layer in self.hidden:
             x = layer(x).tanh()
         return self.output(x).unflatten(1, (rows, decisions)), state
+
+    def _converse(
+        self, messages: Messages, encoded: Tensor, state: Tensor, hears: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Runs the memory decision by decision, since a UAV may say what it has heard before.
+
+        Args:
+            encoded: [groups, rows, decisions, features].
+            state: [groups, rows, size].
+            hears: bool [envs, decisions, uavs, uavs].
+        """
+        features = []
+        for now, links in zip(encoded.unbind(2), hears.unbind(1), strict=True):
+            heard = messages(torch.cat((now, state), -1), links)
+            x, state = self.memory(torch.cat((now, heard), -1).unsqueeze(2), state)
+            features.append(x)
+        return torch.cat(features, 2), state
+
+    def _apart(self, observations: Sequence[Tensor]) -> tuple[Sequence[Tensor], Tensor | None]:
+        """Returns the tensors that are encoded, and the links if there are messages."""
+        if self.messages is None:
+            return observations, None
+        return observations[:-1], observations[-1]
 
     def empty_state(self, rows: int) -> Tensor:
         """Returns the state before the first decision, [rows, uavs, size]."""
@@ -128,7 +172,7 @@ class GaussianNetwork(SequenceNetwork):
     """
 
     def __init__(self, *args: Any, device: torch.device | str | None = None, **more: Any):
-        super().__init__(*args, gain=0.01, device=device, **more)
+        super().__init__(*args, gain=0.01, speaks=True, device=device, **more)
         actions = self.output.bias.shape[-1]
         shape = self.grouping.groups, 1, actions
         self.log_std = nn.Parameter(

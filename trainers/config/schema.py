@@ -31,6 +31,7 @@ from emberlink.envs.utils.validation import (
     shown,
 )
 from emberlink.policies.networks.memory.base import MEMORIES
+from emberlink.policies.networks.messages import MESSAGES
 from emberlink.policies.scripted.base import SCRIPTED
 from emberlink.policies.settings import PolicyConfig
 from emberlink.trainers.learners.base import LEARNERS, Count, LearnerConfig
@@ -153,6 +154,8 @@ class RunConfig:
     @classmethod
     def _check_memory(cls, value: PolicyConfig) -> PolicyConfig:
         MEMORIES.find(value.memory)
+        if value.message != "none":
+            MESSAGES.find(value.message)
         return value
 
     @field_validator("comm")

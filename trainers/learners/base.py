@@ -141,14 +141,15 @@ class Learner(ABC):
         """Returns new actors.
 
         Raises:
-            UserError: the policy has a memory, and the networks have none.
+            UserError: the policy has a memory or messages, and the networks have none.
         """
         policy = policy or PolicyConfig()
-        if policy.memory != "none":
-            raise UserError(
-                f"policy.memory={policy.memory}: the networks of learner={config.name} have none; "
-                "those of ippo and mappo have"
-            )
+        for key, value in (("memory", policy.memory), ("message", policy.message)):
+            if value != "none":
+                raise UserError(
+                    f"policy.{key}={value}: the networks of learner={config.name} have none; those "
+                    "of ippo and mappo have"
+                )
         return make_actor(
             observation_spec,
             action_spec,

@@ -87,6 +87,8 @@ class Imitation(Learner):
         self.generator = torch.Generator(context.device).manual_seed(context.seed)
         self.explorer: Any = Mixture(self.actor, self.generator)
         self.observed = keys.observation_keys(context.observation_spec)
+        speaks = context.policy.message != "none"
+        self.observed += [keys.HEARS] if speaks else []
         self.remembers = context.policy.memory != "none"
         self.sequence = min(config.sequence, context.horizon) if self.remembers else 1
         """decisions of a row of the replay buffer"""
@@ -95,7 +97,9 @@ class Imitation(Learner):
             self.generator,
             batch_size=-(-config.samples // self.sequence),
             buffer_size=-(-config.buffer_size // self.sequence),
-            mixed=not context.policy.agent_index,  # the input is the index of a column
+            joint=speaks,  # messages are those of a team at one time
+            # With `agent_index`, the input is the index of a column.
+            mixed=not speaks and not context.policy.agent_index,
             decisions=self.sequence,
         )
         self.learning_starts = self.replay.learning_starts

@@ -1,0 +1,105 @@
+"""Messages that are learned: what UAVs say, and how a UAV joins what it hears.
+
+At a decision, each UAV makes a message from its features; the UAVs that hear it by the radio of the
+world read the message at the same decision. Numbers are rounded to 8 bits, with the gradient of the
+number before (straight-through, Bengio et al. 2013). Gradients flow from the hearer to the weights
+of the speaker. A subclass of `Messages` is a new scheme.
+"""
+
+import math
+from abc import abstractmethod
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor, nn
+
+from emberlink.envs.utils.plugins import Plugins
+from emberlink.policies.networks.grouping import Grouping
+from emberlink.policies.networks.layers import StackedLinear
+from emberlink.policies.settings import PolicyConfig
+
+_LEVELS = 127
+
+
+class Messages(nn.Module):
+    """Maps the features of a team's UAVs to what each of them hears.
+
+    Args:
+        grouping: which UAVs share weights.
+        inputs: number of features of a UAV.
+        size: numbers of a message.
+        start: see `layers.Start`.
+    """
+
+    key_size: ClassVar[int] = 0
+    """numbers of a message besides its `size`, each a byte"""
+
+    def __init__(self, grouping: Grouping, inputs: int, size: int, **start: Any):
+        super().__init__()
+        self.grouping = grouping
+        self.say = StackedLinear(grouping.groups, inputs, size, gain=1.0, **start)
+
+    def forward(self, features: Tensor, hears: Tensor) -> Tensor:
+        """Returns what UAVs hear, [groups, rows, size]; 0 for a UAV that hears nobody.
+
+        Args:
+            features: [groups, rows, inputs], see `Grouping.split`.
+            hears: bool [envs, uavs, uavs], whether a UAV (row) hears another one (column).
+        """
+        batch = hears.shape[:2]
+        said = self.grouping.join(eight_bits(self.say(features)), batch)
+        weights = self.weights(features, hears).to(said.dtype)
+        return self.grouping.split(weights @ said, batch)
+
+    @abstractmethod
+    def weights(self, features: Tensor, hears: Tensor) -> Tensor:
+        """Returns the weight of each message (column) for a UAV (row), [envs, uavs, uavs].
+
+        It must be 0 where no message is heard.
+        """
+
+
+class Mean(Messages):
+    """Takes the mean of the messages that a UAV hears (CommNet, Sukhbaatar et al. 2016)."""
+
+    def weights(self, features: Tensor, hears: Tensor) -> Tensor:
+        return hears / hears.sum(-1, keepdim=True).clamp(min=1)
+
+
+class Attention(Messages):
+    """Weighs messages by their keys (TarMAC, Das et al. 2019, ICML).
+
+    A message is a value and a key; the weights are the softmax of the products of the keys with the
+    hearer's query, over the messages that it hears.
+    """
+
+    key_size = 8
+
+    def __init__(self, grouping: Grouping, inputs: int, size: int, **start: Any):
+        super().__init__(grouping, inputs, size, **start)
+        self.key = StackedLinear(grouping.groups, inputs, self.key_size, gain=1.0, **start)
+        self.query = StackedLinear(grouping.groups, inputs, self.key_size, gain=1.0, **start)
+
+    def weights(self, features: Tensor, hears: Tensor) -> Tensor:
+        batch = hears.shape[:2]
+        key = self.grouping.join(eight_bits(self.key(features)), batch)
+        query = self.grouping.join(self.query(features), batch)
+        scores = (query @ key.mT / math.sqrt(self.key_size)).masked_fill(~hears, -torch.inf)
+        # A UAV that hears nobody has no softmax.
+        return scores.masked_fill(~hears.any(-1, keepdim=True), 0.0).softmax(-1) * hears
+
+
+def eight_bits(x: Tensor) -> Tensor:
+    """Returns tanh(x), rounded to one of 255 numbers, with the gradient of tanh(x)."""
+    y = x.tanh()
+    return y + ((y * _LEVELS).round() / _LEVELS - y).detach()
+
+
+MESSAGES = Plugins(Messages, "emberlink.messages", "policy.message")
+
+
+def message_bytes(policy: PolicyConfig) -> int:
+    """Returns the bytes that a UAV sends at a decision, 0 without messages."""
+    if policy.message == "none":
+        return 0
+    return policy.message_size + MESSAGES.find(policy.message).key_size

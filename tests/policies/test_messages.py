@@ -1,0 +1,244 @@
+"""Tests messages that are learned against a scalar twin, and what may cross which link."""
+
+import itertools
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from emberlink.envs import keys
+from emberlink.policies.gaussian import MEMORY, GaussianActor
+from emberlink.policies.networks.messages import message_bytes
+from emberlink.policies.networks.sequence import GaussianNetwork
+from emberlink.policies.settings import PolicyConfig
+from emberlink.trainers import make_env
+from emberlink.trainers.config.compose import resolve
+from emberlink.trainers.training.setup import TrainingSetup
+
+UAVS, FEATURES, SIZE, ENVS = 4, 6, 5, 2
+SCHEMES = ["mean", "attention"]
+CASES = list(itertools.product(SCHEMES, ["none", "gru"], [True, False]))
+
+
+def network(scheme: str, memory: str = "gru", shared: bool = True, uavs=UAVS) -> GaussianNetwork:
+    policy = PolicyConfig(memory=memory, units=7, message=scheme, message_size=SIZE)
+    start = torch.Generator().manual_seed(3)
+    made = GaussianNetwork(
+        uavs, [(FEATURES,)], 3, (8,), policy=policy, share_parameters=shared, generator=start
+    )
+    for weight in made.parameters():  # no zeros, and outputs that differ
+        weight.data.add_(torch.randn(weight.shape, generator=start), alpha=0.3)
+    return made.double()
+
+
+def drawn(*shape: int, seed: int = 0) -> torch.Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    return torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+
+def links(decisions: int, seed: int = 1) -> torch.Tensor:
+    """Returns random links, in which some UAVs hear nobody."""
+    hears = drawn(ENVS, decisions, UAVS, UAVS, seed=seed) > 0.2
+    hears[:, 0, 1] = False
+    return hears & ~torch.eye(UAVS, dtype=torch.bool)
+
+
+class Twin:
+    """Computes means UAV by UAV and message by message.
+
+    Args:
+        net: the network.
+        kept: rounding errors of an earlier pass, which are added in place of rounding.
+    """
+
+    def __init__(self, net: GaussianNetwork, kept: list[torch.Tensor] | None = None):
+        self.net, self.kept, self.errors = net, kept, []
+
+    def row(self, uav: int) -> int:
+        return 0 if self.net.grouping.shared else uav
+
+    def linear(self, layer, uav: int, x: torch.Tensor) -> torch.Tensor:
+        return x @ layer.weight[self.row(uav)] + layer.bias[self.row(uav), 0]
+
+    def rounded(self, x: torch.Tensor) -> torch.Tensor:
+        y = x.tanh()
+        error = (y * 127).round() / 127 - y if self.kept is None else self.kept[len(self.errors)]
+        self.errors.append(error.detach())
+        return y + error.detach()
+
+    def gru(self, uav: int, x: torch.Tensor, h: torch.Tensor) -> torch.Tensor:
+        memory = self.net.memory
+        if memory.size == 0:
+            return x
+        x = self.linear(memory.input, uav, x).tanh()
+        k = self.row(uav)
+        a = memory.input_weight[k] @ x + memory.input_bias[k]
+        b = memory.state_weight[k] @ h + memory.state_bias[k]
+        (ar, az, an), (br, bz, bn) = a.chunk(3), b.chunk(3)
+        keep = (az + bz).sigmoid()
+        return (1 - keep) * (an + (ar + br).sigmoid() * bn).tanh() + keep * h
+
+    def means(self, observed: torch.Tensor, hears: torch.Tensor) -> torch.Tensor:
+        """Maps one environment, [decisions, uavs, features], to [decisions, uavs, 3]."""
+        size, states, means = self.net.memory.size, None, []
+        states = [observed.new_zeros(size) for _ in range(UAVS)]
+        said = self.net.messages
+        for x, heard in zip(observed, hears, strict=True):
+            mine = [torch.cat((x[u], states[u])) for u in range(UAVS)]
+            message = [self.rounded(self.linear(said.say, u, mine[u])) for u in range(UAVS)]
+            read = []
+            attends = hasattr(said, "key")
+            key = (
+                [self.rounded(self.linear(said.key, u, mine[u])) for u in range(UAVS)]
+                if attends
+                else []
+            )
+            for u in range(UAVS):
+                total = observed.new_zeros(SIZE)
+                others = [v for v in range(UAVS) if heard[u, v]]
+                if attends and others:
+                    query = self.linear(said.query, u, mine[u])
+                    weight = [(query @ key[v] / 8**0.5).exp() for v in others]
+                    for w, v in zip(weight, others, strict=True):
+                        total = total + w / sum(weight) * message[v]
+                elif others:
+                    total = sum(message[v] for v in others) / len(others)
+                read.append(total)
+            outputs = []
+            for u in range(UAVS):
+                y = self.gru(u, torch.cat((x[u], read[u])), states[u])
+                states[u] = y if size else states[u]
+                for layer in self.net.hidden:
+                    y = self.linear(layer, u, y).tanh()
+                outputs.append(self.linear(self.net.output, u, y))
+            means.append(torch.stack(outputs))
+        return torch.stack(means)
+
+
+@pytest.mark.parametrize(("scheme", "memory", "shared"), CASES)
+def test_means_equal_those_of_a_scalar_twin(scheme, memory, shared):
+    net, observed, hears = network(scheme, memory, shared), drawn(ENVS, 5, UAVS, FEATURES), links(5)
+    mean, _ = net(net.empty_state(ENVS), observed, hears)
+    for env in range(ENVS):
+        torch.testing.assert_close(mean[env], Twin(net).means(observed[env], hears[env]))
+
+
+@pytest.mark.parametrize(("scheme", "memory", "shared"), CASES)
+def test_gradients_cross_uavs_as_finite_differences_say(scheme, memory, shared):
+    """The rounding errors of messages count as constants."""
+    net, observed, hears = network(scheme, memory, shared), drawn(3, UAVS, FEATURES), links(3)[0]
+    first = Twin(net)
+    first.means(observed, hears)
+    hearer = 2
+
+    def output() -> torch.Tensor:
+        return Twin(net, first.errors).means(observed, hears)[-1, hearer].sum()
+
+    mean, _ = net(net.empty_state(1), observed[None], hears[None])
+    weights = [w for name, w in net.named_parameters() if name.startswith("messages")]
+    gradients = torch.autograd.grad(mean[0, -1, hearer].sum(), weights)
+    for weight, gradient in zip(weights, gradients, strict=True):
+        for index in [*drawn(4, seed=weight.numel()).argsort()[:2].tolist(), weight.numel() - 1]:
+            entry, step = weight.data.view(-1), 1e-6
+            entry[index] += step
+            above = output()
+            entry[index] -= 2 * step
+            below = output()
+            entry[index] += step
+            slope = (above - below) / (2 * step)
+            torch.testing.assert_close(gradient.reshape(-1)[index], slope, rtol=1e-4, atol=1e-7)
+    if not shared:  # the weights of the hearer itself say nothing to it, except through others
+        assert gradients[0].abs().sum((1, 2)).count_nonzero() >= 2
+
+
+@pytest.mark.parametrize(("scheme", "memory", "shared"), CASES)
+def test_nothing_crosses_a_missing_link(scheme, memory, shared):
+    net = network(scheme, memory, shared)
+    observed, hears = drawn(ENVS, 4, UAVS, FEATURES), torch.zeros(ENVS, 4, UAVS, UAVS, dtype=bool)
+    hears[:, :, 0, 1] = hears[:, :, 2, 3] = hears[:, :, 3, 2] = True
+    observed.requires_grad_()
+    mean, _ = net(net.empty_state(ENVS), observed, hears)
+    (gradient,) = torch.autograd.grad(mean[0, :, 0].sum(), observed)
+    reached = gradient.abs().sum((1, 3)) > 0
+    assert reached.tolist() == [[True, True, False, False], [False] * UAVS]
+    assert gradient[0, -1, 1].any(), "a message is read at the decision at which it is said"
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
+@pytest.mark.parametrize("memory", ["none", "gru"])
+def test_a_permutation_of_the_uavs_permutes_the_actions(scheme, memory):
+    net, observed, hears = network(scheme, memory), drawn(ENVS, 4, UAVS, FEATURES), links(4)
+    order = torch.tensor([2, 0, 3, 1])
+    mean, _ = net(net.empty_state(ENVS), observed, hears)
+    moved, _ = net(net.empty_state(ENVS), observed[:, :, order], hears[:, :, order][..., order])
+    torch.testing.assert_close(moved, mean[:, :, order])
+
+
+@pytest.mark.parametrize(("scheme", "memory", "shared"), CASES)
+def test_decision_by_decision_equals_the_sequence(scheme, memory, shared):
+    net, observed, hears = network(scheme, memory, shared), drawn(ENVS, 6, UAVS, FEATURES), links(6)
+    whole, _ = net(net.empty_state(ENVS), observed, hears)
+    state = None
+    for k in range(6):
+        mean, state = net.step([observed[:, k], hears[:, k]], state)
+        torch.testing.assert_close(mean, whole[:, k])
+
+
+def test_a_network_flies_teams_of_any_size():
+    net = network("attention")
+    larger = network("attention", uavs=9)
+    larger.load_state_dict(net.state_dict())
+    hears = torch.ones(1, 9, 9, dtype=torch.bool) & ~torch.eye(9, dtype=torch.bool)
+    mean, _ = larger.step([drawn(1, 9, FEATURES), hears], None)
+    assert mean.shape == (1, 9, 3)
+
+
+def test_bytes_are_those_of_values_and_keys():
+    sizes = [message_bytes(PolicyConfig(message=s, message_size=16)) for s in ("none", *SCHEMES)]
+    assert sizes == [0, 16, 24]
+
+
+@pytest.mark.parametrize("hold", [1, 5])
+def test_bytes_are_sent_at_decisions_by_those_that_fly(hold):
+    more = {"policy.message": "mean", "policy.message_size": 3, "policy.hold": hold}
+    env = make_env("independent", "strong", num_envs=4, seed=0, horizon=20, failures=3.0,
+                   measures="all", **more)  # fmt: skip
+    rollout = env.rollout(20)
+    sent, alive = rollout["next", *keys.BYTES_SENT], rollout["next", *keys.ALIVE]
+    decides = (rollout["next", keys.STEP] % hold == 0)[..., None]
+    assert not alive.all()
+    assert sent.equal(3 * (alive & decides))
+
+
+@pytest.mark.parametrize(
+    ("method", "learner"),
+    [("independent", "ippo"), ("consensus", "mappo"), ("maps", "mappo"), ("maps", "imitation")],
+)
+def test_methods_and_learners_train_with_messages(method, learner):
+    setup = TrainingSetup(resolve(method, [
+        "setup=strong", f"learner={learner}", "policy.message=attention", "policy.message_size=4",
+        "env.horizon=40", "num_envs=4", "episodes=2", "env.radio.range=20", "env.failures=1",
+        *(["learner.samples=16"] if learner == "imitation" else ["learner.chunk=2"]),
+    ]))  # fmt: skip
+    before = setup.learner.actor.module.messages.say.weight.clone()
+    setup.dry_run(80)
+    after = setup.learner.actor.module.messages.say.weight
+    assert after.isfinite().all()
+    assert not after.equal(before)
+
+
+def test_the_actor_reads_the_links():
+    env = make_env("independent", "strong", **{"policy.message": "mean"})
+    net = GaussianNetwork(
+        6, keys.observation_shapes(env.observation_spec), 3, (8,),
+        policy=PolicyConfig(memory="gru", message="mean"),
+    )  # fmt: skip
+    actor = GaussianActor(net, env.observation_spec)
+    assert keys.HEARS in actor.in_keys
+    first = env.reset()
+    given = first.select(*actor.in_keys, strict=False)
+    assert isinstance(given, TensorDict)
+    heard = given.clone().set(keys.HEARS, ~torch.eye(6, dtype=torch.bool).expand(1, 6, 6))
+    silent = given.clone().set(keys.HEARS, torch.zeros(1, 6, 6, dtype=torch.bool))
+    assert not actor(heard)[keys.ACTION].equal(actor(silent)[keys.ACTION])
+    assert ("next", *MEMORY) in heard.keys(True, True)
