@@ -87,8 +87,8 @@ class SequenceNetwork(nn.Module):
         """
         rows, decisions, uavs = observations[0].shape[:3]
         batch, split, join = torch.Size((rows, uavs)), self.grouping.split, self.grouping.join
-        observations, hears = self._apart(observations)
-        arranged = [split(x.transpose(1, 2), batch) for x in self._indexed(observations)]
+        seen, hears = self._apart(observations)
+        arranged = [split(x.transpose(1, 2), batch) for x in self._indexed(seen)]
         output, after = self._run(arranged, split(state, batch), hears)
         joined = join(output.flatten(2), batch).unflatten(-1, (decisions, -1))
         return joined.transpose(1, 2), join(after, batch)

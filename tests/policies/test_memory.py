@@ -8,7 +8,7 @@ from torch import nn
 from emberlink.envs import keys
 from emberlink.envs.utils.errors import UserError
 from emberlink.policies.gaussian import MEMORY, GaussianActor, GaussianExplorer
-from emberlink.policies.networks import memory
+from emberlink.policies.networks.memory.base import MEMORIES
 from emberlink.policies.networks.memory.gru import GRU
 from emberlink.policies.networks.sequence import GaussianNetwork, SequenceNetwork, TeamNetwork
 from emberlink.policies.settings import PolicyConfig
@@ -35,7 +35,7 @@ def drawn(*shape: int, seed: int = 0) -> torch.Tensor:
 
 
 def test_memories_are_the_files_on_disk():
-    assert memory.known() == ["gru", "none"]
+    assert MEMORIES.known() == ["gru", "none"]
     with pytest.raises(UserError, match=r"policy.memory='lstm' is not known; known: gru, none"):
         resolve("consensus", ["learner=ippo", "policy.memory=lstm"])
     with pytest.raises(UserError, match=r"policy.memory='' is not known; known: gru, none"):

@@ -1,6 +1,7 @@
 """Tests messages that are learned against a scalar twin, and what may cross which link."""
 
 import itertools
+from typing import Any
 
 import pytest
 import torch
@@ -20,7 +21,7 @@ SCHEMES = ["mean", "attention"]
 CASES = list(itertools.product(SCHEMES, ["none", "gru"], [True, False]))
 
 
-def network(scheme: str, memory: str = "gru", shared: bool = True, uavs=UAVS) -> GaussianNetwork:
+def network(scheme: str, memory: str = "gru", shared: bool = True, uavs=UAVS) -> Any:
     policy = PolicyConfig(memory=memory, units=7, message=scheme, message_size=SIZE)
     start = torch.Generator().manual_seed(3)
     made = GaussianNetwork(
@@ -51,7 +52,7 @@ class Twin:
         kept: rounding errors of an earlier pass, which are added in place of rounding.
     """
 
-    def __init__(self, net: GaussianNetwork, kept: list[torch.Tensor] | None = None):
+    def __init__(self, net: Any, kept: list[torch.Tensor] | None = None):
         self.net, self.kept, self.errors = net, kept, []
 
     def row(self, uav: int) -> int:
@@ -154,7 +155,10 @@ def test_gradients_cross_uavs_as_finite_differences_say(scheme, memory, shared):
 @pytest.mark.parametrize(("scheme", "memory", "shared"), CASES)
 def test_nothing_crosses_a_missing_link(scheme, memory, shared):
     net = network(scheme, memory, shared)
-    observed, hears = drawn(ENVS, 4, UAVS, FEATURES), torch.zeros(ENVS, 4, UAVS, UAVS, dtype=bool)
+    observed, hears = (
+        drawn(ENVS, 4, UAVS, FEATURES),
+        torch.zeros(ENVS, 4, UAVS, UAVS, dtype=torch.bool),
+    )
     hears[:, :, 0, 1] = hears[:, :, 2, 3] = hears[:, :, 3, 2] = True
     observed.requires_grad_()
     mean, _ = net(net.empty_state(ENVS), observed, hears)
@@ -228,7 +232,7 @@ def test_methods_and_learners_train_with_messages(method, learner):
 
 
 def test_the_actor_reads_the_links():
-    env = make_env("independent", "strong", **{"policy.message": "mean"})
+    env = make_env("independent", "strong", message="mean")
     net = GaussianNetwork(
         6, keys.observation_shapes(env.observation_spec), 3, (8,),
         policy=PolicyConfig(memory="gru", message="mean"),
