@@ -57,7 +57,11 @@ def _blank_figures(request, monkeypatch) -> None:
     blank = _blank()
     for name in ("coverage_bars", "timelapse", "training_curves"):
         monkeypatch.setattr(figures, name, lambda path, *_: path.write_bytes(blank))
-    monkeypatch.setattr(Figure, "savefig", lambda _, path, **__: path.write_bytes(blank))
+
+    def save(_: Figure, file: io.BytesIO | Path, **__) -> None:
+        file.write(blank) if isinstance(file, io.BytesIO) else file.write_bytes(blank)
+
+    monkeypatch.setattr(Figure, "savefig", save)
     monkeypatch.setattr(evaluate_run, "write_gif", lambda path, *_: path.write_bytes(blank))
 
 

@@ -1,13 +1,10 @@
 """Sends a run's numbers and figures to TorchRL's loggers: wandb, TensorBoard, CSV."""
 
 import os
-import queue
 import shutil
-import sys
-import threading
 import warnings
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -17,20 +14,14 @@ from emberlink.trainers.config.compose import to_values
 from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.runs.run_folder import RunFolder
 
-PATIENCE = 60.0
-"""maximum seconds that a finished training waits for its tracker"""
+_PATIENCE = 30.0
+"""maximum seconds that a finished training waits for wandb"""
 _CONNECTING = 20.0
 """maximum seconds for wandb to connect to its server, if WANDB_MODE=online"""
-WANDB_TEARDOWN = "emberlink-wandb-teardown"
-"""name of the thread that shuts down a failed wandb"""
 
 
 def check_installed(name: str) -> None:
-    """Checks that the package of the tracker `logger=NAME` is installed.
-
-    Raises:
-        UserError: it is not installed; the message says how to install it.
-    """
+    """Checks that the package of the tracker `logger=NAME` is installed."""
     if name in ("wandb", "tensorboard") and find_spec(name) is None:
         how = how_to_install(name) if name == "tensorboard" else f"pip install {name}"
         raise UserError(f"logger={name}: {name} is not installed: {how}")
@@ -39,77 +30,55 @@ def check_installed(name: str) -> None:
 class Tracker:
     """Logs the episodes and the final evaluation of one run, as `config.logger` says.
 
-    The logger runs in a thread, since it may block on a network or a process. If it fails, there is
-    a warning and nothing more is logged. metrics.jsonl does not depend on it.
+    If the logger fails, there is a warning and nothing more is logged. metrics.jsonl does not
+    depend on it.
     """
 
     def __init__(self, config: RunConfig, run: RunFolder):
         self._name, self._episodes = config.logger, config.episodes
-        self._jobs: queue.SimpleQueue[Callable[[Any], None] | None] = queue.SimpleQueue()
-        self._failure: str | None = None
-        self._thread: threading.Thread | None = None
-        if self._name == "none":
-            return
-        self._thread = threading.Thread(target=self._work, args=(config, run), daemon=True)
+        self._logger: Any = None
+        if self._name != "none":
+            with self._at_most_a_warning():
+                self._logger = _LOGGERS[self._name](config, run)
         if self._name != "wandb":  # its server has the earlier episodes
-            for line in run.metrics():
+            for line in run.metrics() if self._logger else ():
                 self.log(line)
-        self._thread.start()
 
     def log(self, line: Mapping[str, float]) -> None:
         """Logs a line of metrics.jsonl, with its episode as the step."""
-        numbers, step = dict(line), int(line["episode"])
-        if self._name == "wandb":
-            self._put(lambda at: at.log_metrics(numbers, step=step, override_global_step=True))
-        else:
-            self._put(lambda at: at.log_metrics(numbers, step=step))
+        more = {"override_global_step": True} if self._name == "wandb" else {}
+        with self._at_most_a_warning():
+            if self._logger is not None:
+                self._logger.log_metrics(dict(line), step=int(line["episode"]), **more)
 
     def log_evaluation(self, numbers: Mapping[str, float], figures: Sequence[Path]) -> None:
         """Logs the final evaluation: means by name, and PNG files."""
         log = _to_summary if self._name == "wandb" else _at_the_end
-        self._put(lambda logger: log(logger, dict(numbers), figures, self._episodes))
+        with self._at_most_a_warning():
+            if self._logger is not None:
+                log(self._logger, dict(numbers), figures, self._episodes)
 
     def close(self) -> None:
-        """Closes the logger; waits at most `PATIENCE` seconds."""
-        if self._thread is None:
-            return
-        self._jobs.put(None)
-        self._thread.join(PATIENCE)
-        if self._thread.is_alive() and self._failure is None:
-            self._failure = f"no answer within {PATIENCE:g} s"
-        if self._failure is not None:
-            self._give_up(self._failure)
-        self._thread = None
+        """Flushes and closes the logger."""
+        with self._at_most_a_warning():
+            experiment = getattr(self._logger, "experiment", None)
+            close = getattr(experiment, "finish", None) or getattr(experiment, "close", None)
+            if close is not None:
+                close()
+        self._logger = None
 
-    def _put(self, job: Callable[[Any], None]) -> None:
-        if self._thread is None:
-            return
-        self._jobs.put(job)
-        if self._failure is not None:
-            self._give_up(self._failure)
-
-    def _work(self, config: RunConfig, run: RunFolder) -> None:
-        logger = None
+    @contextmanager
+    def _at_most_a_warning(self) -> Iterator[None]:
         try:
-            logger = _LOGGERS[self._name](config, run)
-            while (job := self._jobs.get()) is not None:
-                job(logger)
-            _finish(logger)
-        except BaseException as error:  # an error of a tracker must not end the training
-            self._failure = " ".join(f"{type(error).__name__}: {error}".split())
-            with suppress(BaseException):
-                _finish(logger)
-
-    def _give_up(self, reason: str) -> None:
-        self._thread = None
-        if self._name == "wandb":
-            _release_wandb()
-        shown = reason if len(reason) <= 200 else reason[:200] + " ..."
-        warnings.warn(
-            f"logger={self._name} has stopped ({shown}); "
-            "the training continues, metrics.jsonl is complete",
-            stacklevel=4,
-        )
+            yield
+        except (Exception, SystemExit) as error:  # an error of a tracker must not end the training
+            self._logger = None
+            why = " ".join(f"{type(error).__name__}: {error}".split())
+            warnings.warn(
+                f"logger={self._name} has stopped ({why[:200]}); the training continues, "
+                "metrics.jsonl is complete",
+                stacklevel=4,
+            )
 
 
 def _wandb(config: RunConfig, run: RunFolder) -> Any:
@@ -137,7 +106,7 @@ def _wandb(config: RunConfig, run: RunFolder) -> Any:
             silent=mode != "online",
             console="off",
             init_timeout=_CONNECTING,
-            finish_timeout=PATIENCE / 2,
+            finish_timeout=_PATIENCE,
         ),
         reinit="create_new",  # the caller may have a run of their own
         group=chosen("WANDB_RUN_GROUP") or f"{config.setup}-{config.fire.name}",
@@ -188,25 +157,3 @@ def _at_the_end(
     for path in figures:
         pixels = np.asarray(Image.open(path).convert("RGB"))
         logger.experiment.add_image(f"figures/{path.stem}", pixels, episode, dataformats="HWC")
-
-
-def _finish(logger: Any) -> None:
-    """Flushes and closes a logger."""
-    experiment = getattr(logger, "experiment", None)
-    close = getattr(experiment, "finish", None) or getattr(experiment, "close", None)
-    if close is not None:
-        close()
-
-
-def _release_wandb() -> None:
-    """Shuts wandb down in a thread, so that its exit hook does not wait for an ended service."""
-
-    def teardown() -> None:
-        with suppress(BaseException):
-            sys.modules["wandb"].teardown()
-
-    thread = threading.Thread(target=teardown, name=WANDB_TEARDOWN, daemon=True)
-    thread.start()
-    thread.join(2.0)
-    # With this variable, a later run of this process would connect to the service that has ended.
-    os.environ.pop("WANDB_SERVICE", None)

@@ -5,6 +5,7 @@ import os
 import stat
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
+from itertools import count
 from pathlib import Path
 from typing import BinaryIO
 
@@ -12,17 +13,10 @@ from emberlink.envs.utils.errors import UserError, shown
 
 PART = ".part"
 """suffix of incomplete files"""
-_NO_LINKS = {errno.EPERM, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS, errno.EMLINK}
-_NO_SYNC = {errno.EINVAL, errno.EBADF, errno.ENOTSUP}
-"""errors of file systems that cannot flush a folder"""
 
 
 def user_path(path: os.PathLike[str] | str) -> Path:
-    """Returns a path that the user gave, with the home folder for `~`.
-
-    Raises:
-        UserError: the account of `~NAME` is not known, or has no home folder.
-    """
+    """Returns a path that the user gave, with the home folder for `~`."""
     try:
         return Path(path).expanduser()
     except RuntimeError:
@@ -60,16 +54,20 @@ def read_bytes(path: Path, max_bytes: int) -> bytes:
 
 @contextmanager
 def replaced(path: Path) -> Iterator[Path]:
-    """Yields a new empty file, which is renamed to `path` when the block ends without an error.
-
-    Raises:
-        OSError: the file cannot be written; `path` is unchanged.
-    """
-    with _temporary(path) as partial:
+    """Yields a new empty file, which is renamed to `path` when the block ends without an error."""
+    # The process number distinguishes processes that write to the same folder.
+    partial = path.with_name(f"{path.name}.{os.getpid()}{PART}")
+    partial.unlink(missing_ok=True)
+    try:
+        partial.touch(exist_ok=False)
         yield partial
         sync(partial)
         partial.replace(path)
-    sync(path.parent)
+    finally:
+        with suppress(OSError):
+            partial.unlink(missing_ok=True)
+    with suppress(OSError):  # not all file systems can flush a folder
+        sync(path.parent)
 
 
 def write_bytes(path: Path, content: bytes | memoryview) -> None:
@@ -80,19 +78,12 @@ def write_bytes(path: Path, content: bytes | memoryview) -> None:
 
 @contextmanager
 def created(path: Path) -> Iterator[Path]:
-    """Yields a new empty file, which is renamed to `path` when the block ends without an error.
-
-    Raises:
-        UserError: the path exists, or the file cannot be written, such as to a full disk. No
-            partial file is left.
-    """
+    """Yields a new empty file, which is renamed to `path` at the end; nothing is overwritten."""
     try:
-        with _temporary(path) as partial:
+        with replaced(path) as partial:
             yield partial
-            sync(partial)
-            _rename_new(partial, path)
-    except FileExistsError:
-        raise UserError(f"{path} exists already; nothing is overwritten") from None
+            if os.path.lexists(path):
+                raise UserError(f"{path} exists already; nothing is overwritten")
     except OSError as error:
         raise UserError(f"{shown(str(path))}: {error.strerror or error}") from None
 
@@ -103,9 +94,6 @@ def new_file(output: Path, suffixes: Sequence[str]) -> Path:
     Args:
         output: the path.
         suffixes: accepted suffixes.
-
-    Raises:
-        UserError: the path exists, has another suffix, or is in a folder that does not exist.
     """
     output = user_path(output)
     if output.is_dir():
@@ -122,16 +110,12 @@ def new_file(output: Path, suffixes: Sequence[str]) -> Path:
 
 
 def free_name(folder: Path, stem: str, suffixes: Sequence[str]) -> Path:
-    """Returns the first of the paths `stem`, `stem_2`, ... that no file has yet, without a suffix.
-
-    Raises:
-        UserError: 9999 names are taken.
-    """
-    for attempt in range(1, 10_000):
+    """Returns the first of `stem`, `stem_2`, ... that no file has yet with one of the suffixes."""
+    for attempt in count(1):
         name = folder / (stem if attempt == 1 else f"{stem}_{attempt}")
         if not any(os.path.lexists(f"{name}{suffix}") for suffix in suffixes):
             return name
-    raise UserError(f"{folder}: {stem} and 9998 more exist already")
+    raise AssertionError
 
 
 def sync(path: Path) -> None:
@@ -139,34 +123,5 @@ def sync(path: Path) -> None:
     handle = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
     try:
         os.fsync(handle)
-    except OSError as error:
-        if error.errno not in _NO_SYNC or not path.is_dir():
-            raise
     finally:
         os.close(handle)
-
-
-@contextmanager
-def _temporary(path: Path) -> Iterator[Path]:
-    """Yields a new empty file beside `path`, and removes it at the end if it exists."""
-    # The process number distinguishes processes that write to the same folder.
-    partial = path.with_name(f"{path.name}.{os.getpid()}{PART}")
-    partial.unlink(missing_ok=True)
-    os.close(os.open(partial, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666))
-    try:
-        yield partial
-    finally:
-        with suppress(OSError):
-            partial.unlink(missing_ok=True)
-
-
-def _rename_new(partial: Path, path: Path) -> None:
-    """Gives a complete file the name `path`, which only one of several processes can do."""
-    try:
-        os.link(partial, path)
-    except OSError as error:
-        if error.errno not in _NO_LINKS:
-            raise
-        # Some file systems have no hard links; an empty file reserves the name.
-        path.open("x").close()
-        partial.replace(path)

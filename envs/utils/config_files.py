@@ -75,9 +75,6 @@ def find(group: str, name: str) -> Path:
     Args:
         group: name of the group, such as "method", "setup", "setup_method" or "fire".
         name: name of the file without `.yaml`.
-
-    Raises:
-        UserError: there is no such file, or several folders have one.
     """
     files = [file for folder in folders() if (file := folder / group / f"{name}.yaml").is_file()]
     if not files:
@@ -99,11 +96,7 @@ def summary(group: str, name: str) -> str:
 
 
 def read(group: str, name: str) -> dict[str, Any]:
-    """Returns the content of a configuration file, without the files in its `defaults`.
-
-    Raises:
-        UserError: there is no such file, or it does not hold keys and values.
-    """
+    """Returns the content of a configuration file, without the files in its `defaults`."""
     from omegaconf import OmegaConf  # imported here, since `find` answers a mistyped name at once
 
     file = find(group, name)
@@ -117,11 +110,7 @@ def read(group: str, name: str) -> dict[str, Any]:
 
 
 def plain(value: Any) -> Any:
-    """Returns a value with types that JSON has: of tensors, arrays and ranges lists, of paths text.
-
-    Raises:
-        UserError: the value holds another type.
-    """
+    """Returns a value with types that JSON has: lists of arrays and ranges, text of paths."""
     if hasattr(value, "tolist"):
         value = value.tolist()
     if isinstance(value, Mapping):

@@ -41,14 +41,9 @@ class Use(IntEnum):
     REPORT_LOSS = 104
     SCRIPTED_WAYPOINT = 200
     SCRIPTED_ACTION = 201
-    EXPLORATION_NOISE = 300
     TEACHER = 301
     # for `fold_in` with the seed of a fire
     FIRE_PARAMETER = 0xF12E
-    # for `fold_in` with a seed; distinct from the indices of environments
-    REPLAY_SAMPLE = 2**40
-    TARGET_NOISE = 2**40 + 1
-    MINIBATCH = 2**40 + 2
 
 
 def _shift(x: Tensor, bits: int) -> Tensor:
@@ -63,11 +58,6 @@ def _mix(x: Tensor) -> Tensor:
     return x ^ _shift(x, 31)
 
 
-def _signed(value: int) -> int:
-    """Wraps a Python integer to signed 64 bits, as int64 tensors do."""
-    return (value + 2**63) % 2**64 - 2**63
-
-
 def fold_in(key: Tensor, counter: Tensor | int) -> Tensor:
     """Returns a new key from a key and a counter.
 
@@ -79,8 +69,8 @@ def fold_in(key: Tensor, counter: Tensor | int) -> Tensor:
         int64 of the broadcast shape; different counters give statistically independent keys.
     """
     offset = (counter + 1) * _GOLDEN
-    if isinstance(offset, int):
-        offset = _signed(offset)
+    if isinstance(offset, int):  # wrapped to signed 64 bits, as int64 tensors are
+        offset = (offset + 2**63) % 2**64 - 2**63
     return _mix(_mix(key + _GOLDEN) + offset)
 
 
@@ -102,11 +92,7 @@ def seed_keys(seed: int, count: int, device: torch.device | str | None = None) -
 
 
 def check_seed(seed: Any) -> int:
-    """Returns a seed as an int.
-
-    Raises:
-        UserError: it is not a whole number from 0 to 2^63 - 1.
-    """
+    """Returns a seed, a whole number from 0 to 2^63 - 1, as an int."""
     number = check_whole("seed", seed)
     if not 0 <= number < 2**63:
         raise UserError(f"seed={seed}: expected a whole number from 0 to 2^63 - 1")
@@ -114,17 +100,10 @@ def check_seed(seed: Any) -> int:
 
 
 def check_seeds(seed: int | Sequence[int], num_envs: int) -> list[int]:
-    """Returns one or several seeds as a list.
-
-    Raises:
-        UserError: a seed is not a whole number from 0 to 2^63 - 1, or `num_envs` is not a multiple
-            of the number of seeds.
-    """
+    """Returns one or several seeds as a list; `num_envs` is a multiple of their number."""
     given = seed if isinstance(seed, Sequence) and not isinstance(seed, str) else [seed]
     seeds = [check_seed(number) for number in given]
-    if not seeds:
-        raise UserError(f"seed={seed}: expected at least one seed")
-    if num_envs % len(seeds):
+    if not seeds or num_envs % len(seeds):
         raise UserError(f"num_envs={num_envs} is not a multiple of the {len(seeds)} seeds")
     return seeds
 

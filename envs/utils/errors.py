@@ -1,8 +1,10 @@
 """Defines the error for mistakes of the user, and texts for its messages."""
 
 import difflib
+import re
 import reprlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 
@@ -12,6 +14,16 @@ class UserError(ValueError):
     The command line prints its message in one line. Any other exception is a defect of the program
     and keeps its traceback.
     """
+
+
+@contextmanager
+def naming(path: object, *more: type[Exception]) -> Iterator[None]:
+    """Raises errors of the system, of values and of `more` types as a UserError naming a file."""
+    try:
+        yield
+    except (OSError, ValueError, RecursionError, *more) as error:
+        text = " ".join(str(getattr(error, "strerror", None) or error).split())[:300]
+        raise UserError(text if str(path) in text else f"{path}: {text}") from None
 
 
 def how_to_install(extra: str) -> str:
@@ -30,6 +42,12 @@ def shown(value: Any) -> str:
 def printable(text: str) -> str:
     """Returns the text on one line, with escapes for characters that cannot be printed."""
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
+
+
+def one_line(text: str) -> str:
+    """Returns a message on one line, without control characters, with its longest words cut."""
+    line = "".join(c if c.isprintable() else "?" for c in " ".join(text.split()))
+    return re.sub(r"\S{1000,}", lambda word: f"{word[0][:300]}...{word[0][-100:]}", line)
 
 
 def unknown(value: str, known: Iterable[str]) -> str:

@@ -52,9 +52,6 @@ def from_plain(config_type: type[T], values: Mapping[str, Any], key: str = "") -
         config_type: a pydantic dataclass.
         values: mappings, lists and tuples of text, numbers, bool and None.
         key: key of the values in the whole configuration, for messages.
-
-    Raises:
-        UserError: a key or a value is wrong; the message names the first one and the reason.
     """
     # From JSON, strict validation accepts lists as tuples and mappings as dataclasses.
     try:
@@ -96,11 +93,7 @@ def describe(error: ValidationError, prefix: str = "") -> str:
 
 
 def check_whole(name: str, number: Any) -> int:
-    """Returns a whole number, such as a tensor's or NumPy's, as an int.
-
-    Raises:
-        UserError: it is another number or no number; the message begins with `name`.
-    """
+    """Returns a whole number, such as a tensor's or NumPy's, as an int."""
     try:
         if not isinstance(number, bool):
             return operator.index(number)
@@ -125,11 +118,7 @@ def as_argument(key: str, value: str) -> str:
 
 
 def check_device(name: str) -> str:
-    """Checks that a device is available and returns its name.
-
-    Raises:
-        UserError: it is not available; the message lists the available devices.
-    """
+    """Checks that a device is available and returns its name."""
     import torch
 
     present = ["cpu", *(f"cuda:{i}" for i in range(torch.cuda.device_count()))]

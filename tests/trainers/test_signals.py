@@ -11,7 +11,6 @@ from tiny_run import TINY
 from emberlink.trainers import resume, train
 from emberlink.trainers.cli.main import main
 from emberlink.trainers.runs.run_folder import RunFolder
-from emberlink.trainers.terminal import signals
 from emberlink.trainers.terminal.signals import Interrupted, Interruption
 from emberlink.trainers.training.trainer import Progress, Trainer
 
@@ -53,13 +52,6 @@ def test_signals_that_a_cluster_sends_together_let_the_training_save(numbers):
 def test_a_second_signal_of_the_user_ends_at_once(numbers):
     with pytest.raises(Interrupted):
         send(*numbers)
-
-
-@pytest.mark.parametrize("later", [TERM, HUP])
-def test_a_later_signal_of_the_machine_ends_at_once(later, monkeypatch):
-    monkeypatch.setattr(signals, "_TOGETHER", 0.0)
-    with pytest.raises(Interrupted):
-        send(TERM, later)
 
 
 def test_a_signal_within_a_context_of_tensordict_is_not_an_error():

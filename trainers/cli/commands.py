@@ -6,7 +6,6 @@ Their code is imported when they run, so that `emberlink --help` does not import
 import argparse
 from typing import TYPE_CHECKING, Any
 
-from emberlink.envs.utils.atomic_io import user_path
 from emberlink.envs.utils.errors import UserError
 from emberlink.trainers.cli.parser import (
     MOST_FIRES,
@@ -22,12 +21,7 @@ if TYPE_CHECKING:
 
 EXTRAS = {
     "csv": "compare.csv, one row per run, fire and measure",
-    "latex": "compare.tex, the rankings by the world's headline measure",
-    "marl-eval": "marl_eval.json, training and held-out fires in the format of MARL-eval",
-    "replay": "a page that plays the methods side by side, for each section and fire",
-    "png": "the figures as PNG",
     "pdf": "the figures as PDF",
-    "svg": "the figures as SVG",
 }
 """what `compare` can write beside its page -> its help"""
 
@@ -242,10 +236,9 @@ def add_sweep(commands: Any) -> None:
         "train methods x seeds x setups",
         "Trains and evaluates every combination, several runs at a time. Finished runs in the "
         "output folder are skipped, and stopped ones are resumed, so that the same command can be "
-        "repeated. `status FOLDER` prints the state of each run in an output folder.",
+        "repeated.",
         "emberlink sweep consensus positional setup=paper,tuned seed=0,1,2 output=runs",
-        usage="emberlink sweep [--jobs N] [--dry-run] [METHOD ...] [key=value,value ...]\n"
-        "       emberlink sweep status FOLDER",
+        usage="emberlink sweep [--jobs N] [--dry-run] [METHOD ...] [key=value,value ...]",
     )
     add(
         "arguments",
@@ -259,11 +252,8 @@ def add_sweep(commands: Any) -> None:
 
 
 def _sweep(options: argparse.Namespace, console: "Console") -> int:
-    from emberlink.trainers.sweep.command import status, sweep
+    from emberlink.trainers.sweep.command import sweep
 
-    first, *others = options.arguments
-    if first == "status" and len(others) == 1:
-        return status(user_path(others[0]), console)
     jobs = [f"executor.workers={options.jobs}"] if options.jobs else []
     return sweep([*options.arguments, *jobs], console, dry=options.dry_run)
 

@@ -30,14 +30,14 @@ def add_list(commands: Any) -> None:
 
 
 def _list(options: argparse.Namespace, console: "Console") -> int:
-    from rich.table import Table
+    from emberlink.trainers.terminal.console import plain_table
 
     for kind in options.kinds:
         if kind not in KINDS:
             raise UserError(unknown(kind, KINDS))
     wanted = options.kinds or KINDS
     for kind in wanted:
-        table = Table(show_header=False, title=f"{kind}:" if len(wanted) > 1 else None)
+        table = plain_table(show_header=False, title=f"{kind}:" if len(wanted) > 1 else None)
         for name, text in described(kind):
             table.add_row(name, text)
         console.print(table)

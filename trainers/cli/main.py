@@ -2,6 +2,7 @@
 
 import argparse
 import errno
+import io
 import logging
 import os
 import sys
@@ -10,7 +11,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from importlib.metadata import version
 
-from emberlink.envs.utils.errors import UserError, unknown
+from emberlink.envs.utils.errors import UserError, one_line, unknown
 from emberlink.trainers.cli import commands as of
 from emberlink.trainers.cli.completion import SHELLS, PrintScript, answer
 from emberlink.trainers.cli.fire import add_fire
@@ -18,7 +19,7 @@ from emberlink.trainers.cli.list import add_list
 from emberlink.trainers.cli.parser import Parser
 
 _ONE_LINE = (
-    *(errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EBADF),  # full, broken or closed outputs
+    *(errno.ENOSPC, errno.EDQUOT, errno.EIO),  # full or broken disks
     *(errno.EACCES, errno.EPERM, errno.ENAMETOOLONG, errno.ELOOP, errno.EROFS),  # paths of the user
 )
 """errors of the system that are not defects of the program"""
@@ -27,17 +28,14 @@ _ONE_LINE = (
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs a command and returns its exit status, which is 2 for a mistake of the user.
 
-    The status is 1 if standard output cannot be written. Only defects of the program end in a
-    traceback.
+    Only defects of the program end in a traceback.
     """
     if sys.platform == "win32":
         return _report("emberlink", "runs on Linux and macOS; on Windows, use WSL")
-    words = list(sys.argv[1:] if arguments is None else arguments)
-    try:
-        with _one_line_warnings():
-            return _flush(_run(words))
-    except SystemExit as ended:  # of argparse, after a help or an error
-        raise SystemExit(_flush(int(ended.code or 0))) from None
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="replace")  # for characters that the encoding lacks
+    with _one_line_warnings():
+        return _run(list(sys.argv[1:] if arguments is None else arguments))
 
 
 def _run(words: list[str]) -> int:
@@ -63,7 +61,9 @@ def _run(words: list[str]) -> int:
     except UserError as error:
         return _report(program, str(error))
     except OSError as error:
-        return _of_system(program, error)
+        if error.errno not in _ONE_LINE:
+            raise
+        return _report(program, f"{error.filename or 'a file'}: {error.strerror}")
     except RuntimeError as error:
         # PyTorch has no error of its own for memory of the CPU.
         if "DefaultCPUAllocator" in str(error) or type(error).__name__ == "OutOfMemoryError":
@@ -71,39 +71,10 @@ def _run(words: list[str]) -> int:
         raise
 
 
-def _of_system(program: str, error: OSError) -> int:
-    """Reports an error of the output, of a full disk or of a path; others are defects."""
-    if error.errno == errno.EPIPE:
-        return 141  # that of shells after a closed pipe
-    if error.errno not in _ONE_LINE:
-        raise error
-    status = 1 if error.filename == "standard output" else 2
-    return _report(program, f"{error.filename or 'a file'}: {error.strerror}", status)
-
-
 def _report(program: str, message: str, status: int = 2) -> int:
     """Prints a message on one line and returns the exit status."""
-    line = "".join(c if c.isprintable() else " " for c in " ".join(message.split()))
     with suppress(OSError):  # the terminal may be gone
-        print(f"{program}: {line}", file=sys.stderr)
-    return status
-
-
-def _flush(status: int) -> int:
-    """Flushes standard output and returns the exit status.
-
-    An output that cannot be flushed is discarded, so that Python does not report it at its end.
-    """
-    if sys.stdout is None:  # closed by the shell: >&-
-        return status
-    try:
-        sys.stdout.flush()
-    except OSError as error:
-        null = os.open(os.devnull, os.O_WRONLY)
-        os.dup2(null, sys.stdout.fileno())
-        os.close(null)
-        error.filename = "standard output"
-        return status or _of_system("emberlink", error)
+        print(f"{program}: {one_line(message)}", file=sys.stderr)
     return status
 
 
@@ -143,7 +114,7 @@ def _one_line_warnings() -> Iterator[None]:
     def formatted(message, category, *place) -> str:
         if not issubclass(category, UserWarning):
             return before(message, category, *place)
-        text = "".join(c if c.isprintable() else "?" for c in " ".join(str(message).split()))
+        text = one_line(str(message))
         line = "" if text in printed else f"emberlink: warning: {text}\n"
         printed.add(text)
         return line

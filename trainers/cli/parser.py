@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from emberlink.envs.utils.atomic_io import user_path
-from emberlink.envs.utils.errors import UserError
+from emberlink.envs.utils.errors import UserError, one_line
 
 MOST_FIRES = 65_536
 """largest number of fires of an evaluation; that of `config.schema`, which imports torch"""
@@ -50,9 +50,8 @@ class Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         """Prints the message and exits with status 2."""
-        text = "".join(c if c.isprintable() else "?" for c in message)
         with suppress(OSError):  # the terminal may be gone
-            print(f"{self.prog}: {text} (see {self.prog} --help)", file=sys.stderr)
+            print(f"{self.prog}: {one_line(message)} (see {self.prog} --help)", file=sys.stderr)
         raise SystemExit(2)
 
 

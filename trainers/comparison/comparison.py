@@ -162,9 +162,6 @@ def compare_runs(paths: Sequence[Path], labels: Sequence[str] = ()) -> Compariso
     Args:
         paths: run folders, folders of run folders, or names such as `pretrained:tuned`.
         labels: a name for the runs of each path, in place of their method.
-
-    Raises:
-        UserError: there is no finished run.
     """
     if not paths:
         raise UserError("nothing to compare: expected at least one run folder")
@@ -183,7 +180,6 @@ def compare_runs(paths: Sequence[Path], labels: Sequence[str] = ()) -> Compariso
         parts.append((ranking, claims, communication_values(part), curves))
         if apart := list(rankings.differing(part)):
             found.append(f"the rows differ in {', '.join(apart)}")
-        found += rankings.unequal_scripted(of_section)
         notes += [f"{section}: {note}" for note in found]
     ranking, claims, communication, curves = (
         pd.concat([table for table in column if len(table)] or column[:1], ignore_index=True)

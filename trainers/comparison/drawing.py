@@ -1,7 +1,8 @@
 """Draws the paper's figures 5 to 9 and the results of frozen policies."""
 
 import textwrap
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -28,10 +29,7 @@ COLOURS = (
 )
 """colours of labels, distinguishable with colour blindness (Okabe and Ito, 2008, with a darker
 yellow), and the same lighter"""
-DASHES = (
-    *((0, (7, 3)), (0, (7, 2, 1, 2)), (0, (3, 2)), (0, (7, 2, 1, 2, 1, 2)), (0, (12, 4))),
-    *((0, (3, 2, 1, 2)), (0, (12, 2, 3, 2)), (0, (1, 1)), (0, (1, 4)), (0, (12, 2, 1, 2, 1, 2))),
-)
+DASHES = tuple((0, dash) for dash in ((7, 3), (7, 2, 1, 2), (3, 2), (12, 4), (1, 1), (1, 4)))
 """line styles of scripted policies"""
 FROZEN = ("coverage", "tracking_first", "tracking_last", "boundary_exits")
 """measures of the figure of frozen policies, besides the world's headline"""
@@ -41,9 +39,8 @@ DOTTED = "tracking_last"
 """measure with dotted lines, as in the paper's figure 7"""
 FROZEN_CAPTION = (
     "frozen policies. Small dots: each seed's mean over the fires. Large dot: interquartile mean "
-    "over seeds; line: 95 % bootstrap interval, none with one seed. Dashed: scripted policies, in "
-    "the rows of the runs that they were played with. The first UAV's step and exits are on a "
-    "logarithmic scale, linear near 0."
+    "over seeds; line: 95 % bootstrap interval, none with one seed. Dashed: scripted policies. The "
+    "first UAV's step and exits are on a logarithmic scale, linear near 0."
 )
 CURVES_CAPTION = (
     "The exploring policy in each episode of training, mean over its environments. Line: "
@@ -67,9 +64,7 @@ def training(curves: Frame, scripted: Frame, measures: Sequence[str]) -> Figure:
     panels = figure.subplots(1, len(measures), squeeze=False)[0]
     for axes, measure in zip(panels, measures, strict=True):
         for row in scripted[scripted["measure"] == measure].to_dict("records"):
-            shown = [name for name in row["values"] if name in colours]
-            colour = colours[shown[0]] if len(shown) == 1 < len(colours) else "0.3"
-            axes.axhline(row["iqm"], color=colour, ls=dashes[row["policy"]], lw=1.3, zorder=1)
+            axes.axhline(row["iqm"], color="0.3", ls=dashes[row["label"]], lw=1.3, zorder=1)
         for label, curve in curves[curves["measure"] == measure].groupby("label"):
             style = {"color": colours[label], "ls": ":" if measure == DOTTED else "-"}
             marker = "o" if len(curve) == 1 else ""
@@ -108,9 +103,7 @@ def frozen(ranking: Frame, labels: Sequence[str]) -> Figure:
             axes.plot([row["iqm"]], [y], "o", ms=6, **style)
             axes.plot([row["low"], row["high"]], [y, y], "|-", lw=2, ms=9, mew=1.5, **style)
         for row in scripted[scripted["measure"] == measure].to_dict("records"):
-            for low, high in stretches([order.index(label) for label in row["values"]]):
-                style = {"color": "0.3", "ls": dashes[row["policy"]], "lw": 1.3}
-                axes.plot([row["iqm"]] * 2, [low - 0.5, high + 0.5], zorder=1, **style)
+            axes.axvline(row["iqm"], color="0.3", ls=dashes[row["label"]], lw=1.3, zorder=1)
         if measure in LOGARITHMIC:
             axes.set_xscale("symlog", linthresh=LOGARITHMIC[measure])
             axes.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
@@ -123,14 +116,6 @@ def frozen(ranking: Frame, labels: Sequence[str]) -> Figure:
     return _with_legend(figure, {}, dashes)
 
 
-def stretches(places: Sequence[int]) -> Iterator[tuple[int, int]]:
-    """Yields the first and the last of each run of consecutive rows."""
-    ordered = sorted(places)
-    starts = [i for i in ordered if i - 1 not in ordered]
-    ends = [i for i in ordered if i + 1 not in ordered]
-    yield from zip(starts, ends, strict=True)
-
-
 def _wrapped(label: str) -> str:
     return textwrap.fill(label, 34, break_on_hyphens=False)
 
@@ -140,22 +125,22 @@ def _colours(labels: Sequence[str]) -> dict[str, str]:
     return {label: COLOURS[i % len(COLOURS)] for i, label in enumerate(labels)}
 
 
-def _dashes(scripted: Frame) -> dict[str, tuple[int, tuple[int, ...]]]:
+def _dashes(scripted: Frame) -> dict[str, Any]:
     """Returns the line style of each scripted policy."""
-    names = sorted(scripted["policy"].unique())
+    names = sorted(scripted["label"].unique())
     return {name: DASHES[i % len(DASHES)] for i, name in enumerate(names)}
 
 
 def _with_legend(
     figure: Figure,
     colours: Mapping[str, str],
-    dashes: Mapping[str, tuple[int, tuple[int, ...]]],
+    dashes: Mapping[str, Any],
 ) -> Figure:
     handles = [
         Line2D([], [], color=colour, lw=2, label=_wrapped(name)) for name, colour in colours.items()
     ]
     handles += [
-        Line2D([], [], color="0.3", ls=dash, lw=1.3, label=f"scripted: {name.replace('_', ' ')}")
+        Line2D([], [], color="0.3", ls=dash, lw=1.3, label=_wrapped(f"scripted: {name}"))
         for name, dash in dashes.items()
     ]
     if handles:

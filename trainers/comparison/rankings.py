@@ -15,8 +15,8 @@ from emberlink.trainers.evaluation.scores import CURVES, LEARNED
 
 REWARD = "mean_reward"
 """the measure that depends on a method's own reward"""
-TOLERANCE = 1e-5
-"""relative difference that is possible between devices for a scripted policy on the same fires"""
+DIGITS = 3
+"""decimal places in which a scripted policy may differ between devices"""
 RANKING = (
     *("section", "fires", "measure", "label", "policy", "seeds", "values", "iqm", "low", "high"),
     *("next", "probability", "probability_low", "probability_high", "not_ranked"),
@@ -89,22 +89,12 @@ def _scripted(means: Frame, measure: str) -> list[dict[str, Any]]:
     rows: list[dict[str, Any]] = []
     for policy, part in played.groupby("policy"):
         of_labels = part.groupby("label")["value"].first()
-        distinct: list[float] = []
-        for value in of_labels:
-            distinct += [] if any(_same(value, other) for other in distinct) else [value]
-        labels = [[n for n, v in of_labels.items() if _same(v, value)] for value in distinct]
-        most = max(map(len, labels))
-        for value, names in zip(distinct, labels, strict=True):
-            whose = "all others" if len(names) == most > 2 else ", ".join(map(str, names))
-            name = str(policy).replace("_", " ") + (f" ({whose})" if len(distinct) > 1 else "")
-            rows.append(
-                {"label": name, "policy": policy, "seeds": [], "values": names, "iqm": value}
-            )
+        groups = [group for _, group in of_labels.groupby(of_labels.round(DIGITS))]
+        for group in groups:
+            name = str(policy).replace("_", " ")
+            name += f" ({', '.join(group.index)})" if len(groups) > 1 else ""
+            rows.append({"label": name, "policy": policy, "seeds": [], "iqm": group.iloc[0]})
     return rows
-
-
-def _same(first: float, second: float) -> bool:
-    return abs(first - second) <= TOLERANCE * max(1.0, abs(first), abs(second))
 
 
 def different_rewards(runs: Frame, scripted: Mapping[str, Sequence[Mapping[str, Any]]]) -> str:
@@ -126,18 +116,6 @@ def differing(runs: Frame) -> Frame:
     settings = trained_settings(runs)
     settings = settings.loc[:, settings.nunique() > 1]
     return settings[[key for key in settings if not key.startswith(("method", "comm.", "replay"))]]
-
-
-def unequal_scripted(means: Frame) -> list[str]:
-    """Returns notes about scripted policies that differ between the runs of a label."""
-    played = means[means["policy"] != LEARNED].groupby(["policy", "fires", "measure", "label"])
-    ends = played["value"].agg(["min", "max"])
-    apart = ends[~np.isclose(ends["min"], ends["max"], rtol=TOLERANCE, atol=TOLERANCE)]
-    return [
-        f"{policy} does not have the same {measure} on {fires} in all runs of {label} "
-        f"({row['min']:.6g} to {row['max']:.6g}): other fires, starts or another version"
-        for (policy, fires, measure, label), row in apart.iterrows()
-    ]
 
 
 def curves(runs: Frame) -> Frame:

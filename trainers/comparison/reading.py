@@ -21,8 +21,7 @@ from emberlink.trainers.config.values import flat
 from emberlink.trainers.evaluation.scores import CURVES, LEARNED
 from emberlink.trainers.runs import pretrained
 from emberlink.trainers.runs.compact_json import infinite
-from emberlink.trainers.runs.run_folder import RunFolder
-from emberlink.trainers.runs.safe_read import MAX_JSON, check_parts, read_text
+from emberlink.trainers.runs.run_folder import MAX_JSON, RunFolder, read_text
 
 LeftOut = tuple[str, str]
 """a folder or file that is not compared, and the reason"""
@@ -42,9 +41,6 @@ _Measured = Annotated[float, Field(ge=-1e12, le=1e12, allow_inf_nan=False)]
 class Evaluation:
     """The content of eval.json or of an eval_*.json."""
 
-    method: str
-    setup: str
-    seed: int
     start_seed: int
     """seed of the start positions"""
     checkpoint: str
@@ -93,11 +89,7 @@ class Run:
 def read_all(
     paths: Sequence[Path | str], labels: Sequence[str] = ()
 ) -> tuple[list[Run], list[LeftOut]]:
-    """Returns the finished runs of paths, one entry per evaluation, and what is left out.
-
-    Raises:
-        UserError: a path holds no run, or the labels are not as many as the paths.
-    """
+    """Returns the finished runs of paths, one entry per evaluation, and what is left out."""
     if labels and len(labels) != len(paths):
         raise UserError(f"{len(labels)} labels for {len(paths)} paths: one each")
     folders: dict[Path, tuple[Path, str]] = {}
@@ -140,10 +132,9 @@ def read(path: Path) -> Run:
     _check_types(settings, path / "config.yaml")
     lines = _curves(folder, settings["episodes"])
     again = f"emberlink eval {shlex.quote(str(path))}"
-    try:
-        evaluation = read_evaluation(path / "eval.json", settings)
-    except FileNotFoundError:
-        raise UserError(f"not evaluated: there is no eval.json ({again})") from None
+    if not (path / "eval.json").exists():
+        raise UserError(f"not evaluated: there is no eval.json ({again})")
+    evaluation = read_evaluation(path / "eval.json")
     trained, tested = evaluation.step, evaluation.step
     with suppress(UserError):  # no checkpoint, or a damaged one: the numbers can be compared
         trained = folder.step()
@@ -161,33 +152,19 @@ def _check_types(settings: Mapping[str, Any], file: Path) -> None:
             raise UserError(f"{file}: key {key!r} is {wrong}")
 
 
-def read_evaluation(file: Path, settings: Mapping[str, Any]) -> Evaluation:
-    """Returns the content of an eval.json of a run with these settings.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        UserError: the file is damaged, incomplete, or of another run.
-    """
+def read_evaluation(file: Path) -> Evaluation:
+    """Returns the content of an eval.json."""
     text = read_text(file, MAX_JSON)
     try:
-        check_parts(text)
         evaluation = TypeAdapter(Evaluation).validate_json(text)
     except ValidationError as error:
         raise UserError(f"{file}: {' '.join(describe(error).split())[:300]}") from None
-    except UserError as error:
-        raise UserError(f"{file}: {error}") from None
-    for key in ("method", "setup", "seed"):
-        actual, expected = getattr(evaluation, key), settings[key]
-        if actual != expected:
-            raise UserError(f"{file}: {key}={actual}, but the run's config.yaml says {expected}")
     for fire, policies in evaluation.results.items():
         if LEARNED not in policies:
             raise UserError(f"{file}: results.{fire} has no policy {LEARNED!r}")
         for policy, measured in policies.items():
-            for name, values in measured.items():
-                if (count := len(values)) != evaluation.fires:
-                    where = f"{file}: results.{fire}.{policy}.{name}"
-                    raise UserError(f"{where} has {count} episodes; fires={evaluation.fires}")
+            if any(len(values) != evaluation.fires for values in measured.values()):
+                raise UserError(f"{file}: {policy} on {fire}: not {evaluation.fires} episodes")
     return evaluation
 
 
@@ -206,14 +183,13 @@ def _curves(folder: RunFolder, episodes: int) -> list[dict[str, Any]]:
 def evaluated_otherwise(run: Run) -> tuple[list[Run], list[LeftOut]]:
     """Returns a run with each evaluation in an eval_*.json, and the files left out.
 
-    Left out are damaged files, those whose checkpoint or fires differ from eval.json, and a second
-    file with equal settings.
+    Left out are damaged files, and those whose checkpoint or fires differ from eval.json.
     """
     others: list[Run] = []
     left_out: list[LeftOut] = []
     for file in sorted(run.path.glob("eval_*.json")):
         try:
-            evaluation = read_evaluation(file, run.settings)
+            evaluation = read_evaluation(file)
             learned = evaluation.communication.get(LEARNED, {})
             now = flat({"world": evaluation.world, "env": evaluation.environment, "comm": learned})
             _check_types({**run.settings, **now}, file)
@@ -227,8 +203,6 @@ def evaluated_otherwise(run: Run) -> tuple[list[Run], list[LeftOut]]:
         if changed and apart:
             why = f"evaluated with another {', '.join(apart)} than eval.json"
             left_out.append((str(file), why))
-        elif any(other.evaluated_with == changed for other in others):
-            left_out.append((str(file), "another file has the same settings"))
         elif changed:
             others.append(replace(run, evaluation=evaluation, evaluated_with=changed))
     return others, left_out

@@ -16,11 +16,8 @@ from emberlink.trainers.config.values import (
     check_not_removed,
     composed,
     flat,
-    parse,
     put,
 )
-
-__all__ = ["evaluated_with", "flat", "from_values", "in_world", "override", "resolve", "to_values"]
 
 
 def resolve(method: str, overrides: Sequence[str] = (), **settings: Any) -> RunConfig:
@@ -47,9 +44,6 @@ def override(config: RunConfig, overrides: Sequence[str] = (), **settings: Any) 
         overrides: texts `key=value`, as on the command line; `setup`, `world`, `fire` and `learner`
             cannot change.
         settings: as for `resolve`.
-
-    Raises:
-        UserError: a key is not known, or a value does not fit.
     """
     values, texts = to_values(config), []
     for text in overrides:
@@ -65,29 +59,16 @@ def override(config: RunConfig, overrides: Sequence[str] = (), **settings: Any) 
     return replace(changed, fire=config.fire) if changed.fire == config.fire else changed
 
 
-def evaluated_with(config: RunConfig, overrides: Sequence[str]) -> RunConfig:
-    """Returns the configuration of an evaluation with other settings than those of the training.
-
-    Args:
-        config: configuration of the run.
-        overrides: texts `key=value`, as on the command line. `world=NAME` is applied first, with
-            keys of `fire`.
-
-    Raises:
-        UserError: a key or a value is wrong.
-    """
-    given = [(text, text.partition("=")[0]) for text in overrides]
-    worlds = [str(parse(text)[1]) for text, key in given if key == "world"]
-    fire = [text for text, key in given if key.startswith("fire.")]
-    others = [text for text, key in given if key != "world" and text not in fire]
-    if fire and not worlds:
-        raise UserError(f"{shown(fire[0])}: an evaluation on another fire needs world=NAME, too")
-    for world in worlds:
-        config = in_world(config, world, fire)
-    return override(config, others) if others else config
+def evaluated_with(config: RunConfig, changes: Mapping[str, Any]) -> RunConfig:
+    """Returns a configuration with the `world` and its `fire`, then other keys changed."""
+    fire = {key: value for key, value in changes.items() if key.startswith("fire.")}
+    if fire and "world" not in changes:
+        raise UserError(f"{', '.join(fire)}: an evaluation on another fire needs world=NAME, too")
+    others = {key: value for key, value in changes.items() if key != "world" and key not in fire}
+    return override(in_world(config, str(changes.get("world", config.world)), **fire), **others)
 
 
-def in_world(config: RunConfig, world: str, fire: Sequence[str] = (), **settings: Any) -> RunConfig:
+def in_world(config: RunConfig, world: str, **fire: Any) -> RunConfig:
     """Returns a run's configuration in another world.
 
     The fire is that of the world. Of `env` and `evaluation`, the keys in which the two worlds
@@ -96,17 +77,13 @@ def in_world(config: RunConfig, world: str, fire: Sequence[str] = (), **settings
     Args:
         config: configuration of the run.
         world: name of a file in configs/world.
-        fire: texts `key=value` of the world's fire, such as `fire.path=ArrivalTime.asc`.
-        settings: the same as keyword arguments.
-
-    Raises:
-        UserError: the world is not known, or needs other settings.
+        fire: values of keys of the world's fire, such as `fire.path`.
     """
-    if world == config.world and not (fire or settings):
+    if world == config.world and not fire:
         return config
     setup = f"setup={config.setup}"
     here = flat(to_values(resolve(config.method, [setup, f"world={config.world}", "fire=paper"])))
-    there = resolve(config.method, [setup, f"world={world}", *fire], **settings)
+    there = resolve(config.method, [setup, f"world={world}"], **fire)
     values = to_values(config)
     for key, value in flat(to_values(there)).items():
         if key.startswith(("env.", "evaluation.")) and value != here.get(key):
@@ -114,12 +91,22 @@ def in_world(config: RunConfig, world: str, fire: Sequence[str] = (), **settings
     return replace(from_values(values | {"world": world}), fire=there.fire)
 
 
-def from_values(values: Mapping[str, Any]) -> RunConfig:
-    """Returns a configuration from plain values, such as those of a run folder's config.yaml.
+def differences(
+    one: RunConfig | Mapping[str, Any], other: RunConfig | Mapping[str, Any]
+) -> dict[str, tuple[Any, Any]]:
+    """Returns the dotted keys of both configurations whose values differ, with both values."""
+    first, second = (
+        flat(each if isinstance(each, Mapping) else to_values(each)) for each in (one, other)
+    )
+    return {
+        key: (first[key], second[key])
+        for key in first
+        if key in second and first[key] != second[key]
+    }
 
-    Raises:
-        UserError: a key or a value is wrong; the message names the first one and the reason.
-    """
+
+def from_values(values: Mapping[str, Any]) -> RunConfig:
+    """Returns a configuration from plain values, such as those of a run folder's config.yaml."""
     if isinstance(values, Mapping):
         values = {key: value for key, value in values.items() if key != "baselines"}
         for key, value in flat(values).items():

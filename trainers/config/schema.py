@@ -170,9 +170,6 @@ class RunConfig:
 
         Args:
             decisions: decisions of a rollout.
-
-        Raises:
-            UserError: `env.horizon` is not a multiple of the steps of a rollout.
         """
         steps = decisions * self.policy.hold
         if self.env.horizon % steps:

@@ -26,10 +26,22 @@ from yaml import YAMLError
 from emberlink.envs.utils import config_files
 from emberlink.envs.utils.config_files import find, plain, read
 from emberlink.envs.utils.errors import UserError, shown
-from emberlink.trainers.config.removed import REMOVED
 
 GROUPS = ("setup", "world", "fire", "learner")
 """groups whose file is chosen by `GROUP=NAME`, besides the method"""
+REMOVED: dict[str, str] = {
+    "executor.seeds": "each seed is a run: seed=0,1,2",
+    "executor.share": "each run is a job; executor.gpus=0.25 of executor=ray shares a GPU",
+    "executor.restarts": "a killed run is listed at the end; the same command resumes it",
+    "on_nan": "NaN or Inf ends a run; train a new one with smaller learning rates",
+    "keep_checkpoints": "a run keeps its newest and its best checkpoint",
+    "seeds": "a run trains one seed; several: emberlink sweep METHOD seed=0,1,2",
+    "learner.anchor": "learner.warm_start begins with the actors of another run",
+    "learner.burn_in": "the state of the memory before a sequence is stored with it",
+    "policy.decisions": "policy.memory=gru remembers earlier decisions",
+    "policy.memory=stack": "policy.memory=gru remembers earlier decisions",
+}
+"""key, or key=value -> a sentence about what to use instead"""
 _HYDRA = threading.RLock()
 
 
@@ -40,9 +52,6 @@ def composed(method: str, overrides: Sequence[str] = (), **settings: Any) -> dic
         method: name of a file in configs/method.
         overrides: texts `key=value`, as on the command line.
         settings: other keys and their values; see `full_key`.
-
-    Raises:
-        UserError: a name or a key is not known, or a text is of another form.
     """
     if isinstance(overrides, str):
         raise UserError(f"{shown(overrides)!r}: expected a list of texts key=value")
@@ -79,11 +88,7 @@ def _keys_of(learner: str) -> set[str]:
 def change(
     values: dict[str, Any], overrides: Sequence[str] = (), settings: Mapping[str, Any] | None = None
 ) -> None:
-    """Sets values by texts `key=value` and by keyword arguments.
-
-    Raises:
-        UserError: a key is not known or names a file, or a text is of another form.
-    """
+    """Sets values by texts `key=value` and by keyword arguments."""
     known = list(all_keys(values))
     given = [parse(text) for text in overrides]
     for name, value in (settings or {}).items():
@@ -105,9 +110,6 @@ def parse(text: str) -> tuple[str, Any]:
     """Returns the key and the value of `key=value` by Hydra's grammar.
 
     A value that the grammar cannot read, as in `output=Läufe`, is a text.
-
-    Raises:
-        UserError: the text is of another form, or gives several values.
     """
     key, equals, value = text.partition("=")
     if not equals or not key.strip():
@@ -149,9 +151,6 @@ def full_key(known: Sequence[str], key: str) -> str:
     """Returns the known key that equals `key`, or else the only one that ends with it.
 
     The key itself if there is none.
-
-    Raises:
-        UserError: there are several.
     """
     if key in known:
         return key
@@ -198,11 +197,7 @@ def flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 def _from_files(names: Mapping[str, str]) -> dict[str, Any]:
-    """Returns the values that Hydra composes from the files of groups, with `${...}` in them.
-
-    Raises:
-        UserError: a file is not known or not a configuration.
-    """
+    """Returns the values that Hydra composes from the files of groups, with `${...}` in them."""
     own = f"{names['setup']}_{names['method']}"
     more = {"setup_method": own} if own in config_files.known("setup_method") else {}
     for group, name in {**names, **more}.items():

@@ -38,7 +38,7 @@ class Panel:
     policy: Callable[[WildfireEnv], TensorDictModuleBase]
     """returns the policy for an environment"""
 
-    def play(self, arrival: Tensor, index: int = 0) -> Episode:
+    def play(self, arrival: Tensor, index: int) -> Episode:
         """Plays and records episode `index` of the evaluation on a fire, [1, X, Y].
 
         As many environments are stepped as in an evaluation, so that the numbers are the same to
@@ -88,9 +88,6 @@ def find_fire(text: str | int | None, run: RunConfig) -> tuple[str, ScenarioConf
         text: NAME, INDEX or NAME:INDEX. The default name is that of `shown_scenario`, and the
             default index is 0.
         run: configuration of the run; the fires of its evaluation are known, too.
-
-    Raises:
-        UserError: there is no such scenario or fire.
     """
     usual, evaluated = shown_scenario(run), evaluation_scenarios(run)
     name, colon, index = (usual if text is None else str(text)).rpartition(":")
@@ -116,9 +113,6 @@ def play_side_by_side(
         panels: what is shown side by side.
         fire: see `find_fire`.
         report: called with a line of text after each episode.
-
-    Raises:
-        UserError: there is no such fire, or a setting of `SHARED` differs.
     """
     world = panels[0].config.env
     for panel in panels:

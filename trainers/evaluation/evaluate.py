@@ -3,7 +3,7 @@
 import hashlib
 import inspect
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import asdict, replace
 from functools import cache, partial
@@ -108,13 +108,6 @@ def evaluation_fires(config: RunConfig, count: int) -> dict[str, Tensor]:
     }
 
 
-def shown_fire(config: RunConfig) -> tuple[str, Tensor]:
-    """Returns the fire to draw: the name of its scenario and its times, for one environment."""
-    name = shown_scenario(config)
-    fires = fires_of(evaluation_scenarios(config)[name])
-    return name, fires.test_fire(0, config.env.grid, config.env.horizon)
-
-
 def evaluate(
     config: RunConfig,
     actor: Policy,
@@ -180,39 +173,26 @@ def play_scripted(
     block: int = BLOCK,
     report: Callable[[str], None] = lambda _: None,
 ) -> Measured:
-    """Returns the measures of a scripted policy.
+    """Returns the measures of a scripted policy; arguments are those of `play_blocks`.
 
     They are the same for all runs in an environment, so they are kept in a file.
-
-    Args:
-        config: configuration of the run.
-        name: name of the policy.
-        arrival, start_seed, block: as in `play_blocks`.
-        report: called with the name if no file has the results.
     """
     world, policy = scripted_config(config, name), SCRIPTED.find(name)
+    fires = hashlib.sha256(arrival.cpu().contiguous().numpy().tobytes()).hexdigest()
     settings = asdict(world.env), world.comm, world.policy.hold, world.device, start_seed, block
-    file = _kept_file(policy, settings, arrival)
-    if file is not None and file.exists():
+    parts = name, settings, fires, torch.__version__, source_digest()
+    key = hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:32]
+    file, own = cache_folder() / f"scripted-{key}.json", policy.__module__.startswith("emberlink.")
+    if own and file.exists():
         with suppress(OSError, ValueError):
             return json.loads(file.read_text())
     report(name)
     measured = play_blocks(world, policy, arrival, start_seed=start_seed, block=block)
-    if file is not None:
+    if own:
         with suppress(OSError):  # the next evaluation plays it again
             file.parent.mkdir(parents=True, exist_ok=True)
             write_bytes(file, json.dumps(measured).encode())
     return measured
-
-
-def _kept_file(policy: type[Scripted], settings: Sequence[Any], arrival: Tensor) -> Path | None:
-    """Returns the file of a policy's results; None if another package defines the policy."""
-    if not policy.__module__.startswith("emberlink."):
-        return None
-    fires = hashlib.sha256(arrival.cpu().contiguous().numpy().tobytes()).hexdigest()
-    parts = policy.__name__, settings, fires, torch.__version__, source_digest()
-    key = hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
-    return cache_folder() / f"scripted-{key[:32]}.json"
 
 
 @cache

@@ -11,7 +11,7 @@ from rich.console import Console
 
 from emberlink.envs.rendering.film import write_gif
 from emberlink.envs.scenarios import fires_of
-from emberlink.envs.utils.errors import UserError
+from emberlink.envs.utils.errors import UserError, naming
 from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.evaluation import evaluate, figures
 from emberlink.trainers.evaluation.episodes import recorder_of, title_of
@@ -20,22 +20,16 @@ from emberlink.trainers.evaluation.scores import LEARNED, Results, print_results
 from emberlink.trainers.replay.page import Replay
 from emberlink.trainers.replay.recording import Episode
 from emberlink.trainers.replay.screen import Screen, even_steps
-from emberlink.trainers.runs.checkpoint import read_header
+from emberlink.trainers.runs.checkpoint import read_header, versions
 from emberlink.trainers.runs.pretrained import open_run, read_run
 from emberlink.trainers.runs.run_folder import RunFolder
-from emberlink.trainers.runs.versions import versions
-from emberlink.trainers.terminal.console import OutputError
 
 _MAX_LABEL = 150
 """characters; a name of a file can have 255"""
 
 
 def run_command(options: argparse.Namespace, console: Console) -> int:
-    """Runs `emberlink eval`: evaluates a run, prints the table and returns 0.
-
-    Raises:
-        UserError: a file cannot be read or written, or a setting does not fit.
-    """
+    """Runs `emberlink eval`: evaluates a run, prints the table and returns 0."""
     changes, file = options.overrides, options.checkpoint
     policy = load_policy(read_run(options.folder), changes, checkpoint=file, device=options.device)
     run = open_run(options.folder)  # copies a trained policy of the package once all is checked
@@ -81,28 +75,23 @@ def evaluate_run(
         report: called with a line of text before each part of the work.
         label: suffix of the file names.
         about: texts that the title of the replay names, such as changed settings.
-
-    Raises:
-        UserError: a file cannot be written.
     """
     count = f"{fires} fire{'s' * (fires > 1)}"
-    try:
+    with naming(run.path / "figures"):
         run.figures()  # an unusable folder is an error before the episodes, not after
-        recorder = recorder_of(config, actor)
-        results = evaluate.evaluate(
-            config,
-            actor,
-            fires=fires,
-            report=lambda fire, policy: report(f"{policy} on {count} of {fire}"),
-            watch=recorder.add,
-        )
-        shown = Episode(title=title_of(config, *about), recording=recorder.recording())
+    recorder = recorder_of(config, actor)
+    results = evaluate.evaluate(
+        config,
+        actor,
+        fires=fires,
+        report=lambda fire, policy: report(f"{policy} on {count} of {fire}"),
+        watch=recorder.add,
+    )
+    shown = Episode(title=title_of(config, *about), recording=recorder.recording())
+    try:
         _draw(run, config, results, shown, label)
-    except OutputError:
-        raise
     except OSError as error:
-        why = error.strerror or error
-        raise UserError(f"{run.path / 'figures'}: cannot be written: {why}") from None
+        raise UserError(f"{run.path / 'figures'}: {error.strerror or error}") from None
     scenarios = evaluate.evaluation_scenarios(config)
     policies = next(iter(results.values()))
     content = {

@@ -1,6 +1,5 @@
 """Draws the figures of a run: training curves, coverage, timelapse."""
 
-import textwrap
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -61,7 +60,7 @@ def coverage_bars(path: Path, results: Results) -> None:
     figure.savefig(path, format="png", dpi=120)
 
 
-def timelapse(path: Path, episode: Recording, title: str = "") -> None:
+def timelapse(path: Path, episode: Recording) -> None:
     """Draws a row of up to five steps of an episode as PNG, as in the paper's figure 3."""
     steps = even_steps(episode.horizon, 5)
     figure = Figure(figsize=(2.4 * len(steps), 2.7), layout="constrained")
@@ -76,6 +75,4 @@ def timelapse(path: Path, episode: Recording, title: str = "") -> None:
         axes.imshow(picture, interpolation="nearest")
         axes.set_title(f"step {step}", fontsize="medium")
         axes.set_axis_off()
-    if title:
-        figure.suptitle(textwrap.fill(title, 24 * len(steps)), parse_math=False)
     figure.savefig(path, format="png", dpi=120)

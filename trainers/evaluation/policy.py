@@ -14,8 +14,9 @@ from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import shown
 from emberlink.policies.state import primer_of
 from emberlink.trainers.build import build_actor, build_env
-from emberlink.trainers.config.compose import evaluated_with, flat, in_world, override, to_values
+from emberlink.trainers.config.compose import differences, evaluated_with
 from emberlink.trainers.config.schema import RunConfig
+from emberlink.trainers.config.values import parse
 from emberlink.trainers.evaluation.episodes import Panel, play_side_by_side, scripted, title_of
 from emberlink.trainers.learners.base import ACTOR
 from emberlink.trainers.replay.page import Replay
@@ -103,9 +104,6 @@ def load_policy(
         settings: the same as keyword arguments.
         checkpoint: file of networks; the newest of the run if None.
         device: device of the networks; that of the run if None.
-
-    Raises:
-        UserError: a file cannot be read, or a setting does not fit.
     """
     folder = run.path
     if not folder.is_dir():
@@ -115,12 +113,9 @@ def load_policy(
         raise UserError(f"{folder}: a folder of {len(runs)} runs; choose one: {', '.join(runs)}")
     file = run.checkpoint() if checkpoint is None else checkpoint
     trained = run.config(file, **({} if device is None else {"device": device}))
-    config, given = evaluated_with(trained, overrides), dict(settings or {})
-    fire = {key: given.pop(key) for key in [*given] if key.startswith("fire.")}
-    world = str(given.pop("world", config.world))
-    config = override(in_world(config, world, **fire), **given)
-    before, now = (flat(to_values(each)) for each in (trained, config))
-    changed = [key for key in {**before, **now} if before.get(key) != now.get(key)]
+    given = {**dict(parse(text) for text in overrides), **(settings or {})}
+    config = evaluated_with(trained, given)
+    changed = differences(trained, config)
     fixed = [key for key in changed if key.partition(".")[0] not in _CHANGEABLE]
     if fixed:
         raise UserError(
@@ -135,9 +130,6 @@ def load_actor(config: RunConfig, checkpoint: Path) -> TensorDictModule:
 
     It warns of settings that give observations or actions another meaning than in training (see
     `units`), and of a base that the networks never saw.
-
-    Raises:
-        UserError: the checkpoint cannot be read or does not fit the configuration.
     """
     nowhere = torch.full(config.env.grid, torch.inf)
     env = build_env(config, num_envs=1, fire=nowhere, seed=0, device=config.device)
@@ -145,14 +137,13 @@ def load_actor(config: RunConfig, checkpoint: Path) -> TensorDictModule:
     network: Any = actor.module
     expected = {ACTOR + name: value for name, value in network.state_dict().items()}
     weights = load_weights(checkpoint, expected, config)
-    here, there = flat(to_values(config)), flat(read_header(checkpoint).config)
-    compared = units(config)
-    if config.env.observation == "sight" and there["env.base"] is None:
+    trained, compared = read_header(checkpoint).config, units(config)
+    if config.env.observation == "sight" and trained["env"]["base"] is None:
         compared += ("env.base",)
     differ = [
-        f"{key}={shown(here[key])} (in training {shown(there[key])})"
-        for key in compared
-        if here[key] != there.get(key, here[key])
+        f"{key}={shown(now)} (in training {shown(before)})"
+        for key, (now, before) in differences(config, trained).items()
+        if key in compared
     ]
     if differ:
         warnings.warn(

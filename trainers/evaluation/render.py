@@ -24,11 +24,7 @@ _SUFFIXES = (".gif", ".mp4", ".png", ".html")
 
 
 def render(options: argparse.Namespace, console: Console) -> int:
-    """Plays an episode of each run on the same fire, writes the files and returns 0.
-
-    Raises:
-        UserError: a run, fire or output is wrong.
-    """
+    """Plays an episode of each run on the same fire, writes the files and returns 0."""
     panels = [*learned(options.runs, options.checkpoint)]
     panels += episodes.scripted(panels[0].config, options.policy)
     fire, _, index = episodes.find_fire(options.fire, panels[0].config)
@@ -63,9 +59,6 @@ def learned(arguments: Sequence[str], checkpoints: Sequence[Path] = ()) -> Itera
         arguments: run folders or names of trained policies; a text such as `env.radio.range=0`
             changes a setting of the run before it.
         checkpoints: a checkpoint for each run; the newest of each run if empty.
-
-    Raises:
-        UserError: there is no such run, or a setting does not fit.
     """
     runs: list[tuple[str, list[str]]] = []
     for text in arguments:

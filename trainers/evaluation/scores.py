@@ -4,12 +4,11 @@ from collections.abc import Mapping
 
 import numpy as np
 from rich.console import Console
-from rich.table import Table
 from rich.text import Text
 
 from emberlink.envs import metrics
 from emberlink.trainers.config.schema import RunConfig
-from emberlink.trainers.terminal.console import print_table
+from emberlink.trainers.terminal.console import plain_table
 
 CURVES = {
     "mean_reward": "mean reward",
@@ -55,7 +54,7 @@ def print_results(console: Console, results: Results, config: RunConfig) -> None
         episodes = len(by_policy[LEARNED]["coverage"])
         settings = f"{episodes} episodes, mean; setup {config.setup}, world {config.world}"
         for measures in filter(None, (metrics.NAMES, others)):
-            table = Table(title=Text(f"test fires: {fire} ({settings})"))
+            table = plain_table(title=Text(f"test fires: {fire} ({settings})"))
             table.add_column()
             for name in measures:  # one word per line, so that the table fits 80 columns
                 table.add_column(name.replace("_", "\n"), justify="right")
@@ -64,7 +63,7 @@ def print_results(console: Console, results: Results, config: RunConfig) -> None
                 numbers = [_number(name, mean[name]) for name in measures]
                 name, style = (config.method, "bold") if learned else (policy, None)
                 table.add_row(name, *numbers, style=style)
-            print_table(console, table)
+            console.print(table)
 
 
 def _number(measure: str, value: float) -> str:

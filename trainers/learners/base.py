@@ -187,7 +187,8 @@ class Learner(ABC):
         """Returns the state that learning changes, by name."""
         generator = {} if self.generator is None else {"state": self.generator.get_state()}
         return prefixed(
-            networks=self._networks(),
+            weights=self.weights(),
+            networks=self._other_networks(),
             optimizer=optimizer_tensors(self.optimizer),
             counters={"updates": torch.tensor(self.updates)},
             generator=generator,
@@ -199,15 +200,18 @@ class Learner(ABC):
         Raises:
             ValueError: the state does not fit this configuration.
         """
-        copy_into(self._networks(), group(state, "networks"))
+        self.copy_actor(group(state, "weights"))
+        copy_into(self._other_networks(), group(state, "networks"))
         load_optimizer(self.optimizer, group(state, "optimizer"))
         self.updates = int(state["counters/updates"])
         if self.generator is not None:
             self.generator.set_state(state["generator/state"].cpu())
 
-    def _networks(self) -> dict[str, Tensor]:
-        state = self.loss.state_dict()
-        return {name: value for name, value in state.items() if isinstance(value, Tensor)}
+    def _other_networks(self) -> dict[str, Tensor]:
+        """Returns the tensors of the loss by name, without the actors' weights."""
+        actors = {value.data_ptr() for value in self.weights().values()}
+        state = {k: v for k, v in self.loss.state_dict().items() if isinstance(v, Tensor)}
+        return {name: value for name, value in state.items() if value.data_ptr() not in actors}
 
 
 LEARNERS = Plugins(Learner, "emberlink.learners", "learner.name")

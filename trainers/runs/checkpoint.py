@@ -1,8 +1,11 @@
 """Reads and writes checkpoints: safetensors files whose header holds JSON."""
 
 import json
+import platform
 from collections.abc import Mapping
 from dataclasses import asdict
+from functools import cache
+from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -14,13 +17,11 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from emberlink.envs.utils.atomic_io import open_regular, replaced
-from emberlink.envs.utils.errors import UserError
+from emberlink.envs.utils.errors import UserError, naming
 from emberlink.envs.utils.validation import STRICT, CountOrZero, from_plain, shown
-from emberlink.trainers.config.compose import from_values, to_values
+from emberlink.trainers.config.compose import differences, from_values, to_values
 from emberlink.trainers.config.schema import RunConfig
-from emberlink.trainers.config.values import flat
 from emberlink.trainers.learners.base import ACTOR
-from emberlink.trainers.runs.versions import versions
 
 FORMAT = 2
 """version of the file format; files of another version are refused"""
@@ -50,6 +51,13 @@ class Header:
     """whether the checkpoint holds the training state, besides the networks"""
 
 
+@cache
+def versions() -> dict[str, str]:
+    """Returns the version of Python and of each package that a training's numbers depend on."""
+    names = ("emberlink", "torch", "torchrl", "tensordict", "numpy")
+    return {name: version(name) for name in names} | {"python": platform.python_version()}
+
+
 def header_of(config: RunConfig, step: int, **more: Any) -> Header:
     """Returns the header of a new checkpoint."""
     values = {key: value for key, value in to_values(config).items() if key != "output"}
@@ -57,62 +65,35 @@ def header_of(config: RunConfig, step: int, **more: Any) -> Header:
 
 
 def write(path: Path, header: Header, tensors: Mapping[str, Tensor]) -> None:
-    """Writes a checkpoint by temporary file, flush to the disk and rename.
-
-    Raises:
-        UserError: the file cannot be written, such as to a full disk; the earlier file stays.
-    """
+    """Writes a checkpoint by temporary file, flush to the disk and rename."""
     content = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
     text = json.dumps({"format": FORMAT, **asdict(header)})
-    try:
-        with replaced(path) as partial:
-            save_file(content, partial, metadata={_KEY: text})
-            partial.chmod(path.parent.stat().st_mode & 0o666)  # safetensors makes it private
-    except (OSError, SafetensorError) as error:
-        raise UserError(f"{path}: cannot be written: {_reason(error)}") from None
+    with naming(path, SafetensorError), replaced(path) as partial:
+        save_file(content, partial, metadata={_KEY: text})
+        partial.chmod(path.parent.stat().st_mode & 0o666)  # safetensors makes it private
 
 
 def read_header(path: Path) -> Header:
-    """Returns a checkpoint's header.
-
-    Raises:
-        UserError: there is no such file, or it is not a checkpoint of this format.
-    """
-    try:
+    """Returns a checkpoint's header."""
+    with naming(path):
         with open_regular(path, _MAX_FILE) as file:
             length = int.from_bytes(file.read(8), "little")
-            head = json.loads(file.read(length)) if length <= _MAX_HEADER else {}
-        values = json.loads(head["__metadata__"][_KEY])
-        version = values.pop("format")
-    except OSError as error:
-        raise UserError(f"{path}: not a readable checkpoint: {_reason(error)}") from None
-    except (KeyError, TypeError, ValueError, AttributeError, RecursionError):
-        raise UserError(
-            f"{path}: not a readable checkpoint: damaged, or of another program"
-        ) from None
-    if version != FORMAT:
-        raise UserError(
-            f"{path}: a checkpoint of format {shown(version)}; this version reads {FORMAT}"
-        )
-    try:
+            head = file.read(length) if length <= _MAX_HEADER else b""
+        try:
+            values = json.loads(json.loads(head)["__metadata__"][_KEY])
+            written = values.pop("format")
+        except (KeyError, TypeError, ValueError, AttributeError, RecursionError):
+            raise UserError("not a checkpoint: damaged, or of another program") from None
+        if written != FORMAT:
+            raise UserError(f"of format {shown(written)}; this version reads {FORMAT}")
         return from_plain(Header, values)
-    except UserError as error:
-        raise UserError(f"{path}: not a readable checkpoint: {error}") from None
 
 
 def read_tensors(path: Path, prefix: str = "") -> dict[str, Tensor]:
-    """Returns the tensors whose names begin with `prefix`, on the CPU, without the prefix.
-
-    Raises:
-        UserError: the file cannot be read.
-    """
-    try:
-        with safe_open(path, "pt") as file:
-            names = file.offset_keys()
-            chosen = [name for name in names if name.startswith(prefix)]
-            return {name.removeprefix(prefix): file.get_tensor(name) for name in chosen}
-    except (OSError, SafetensorError) as error:
-        raise UserError(f"{path}: not a readable checkpoint: {_reason(error)}") from None
+    """Returns the tensors whose names begin with `prefix`, on the CPU, without the prefix."""
+    with naming(path, SafetensorError), safe_open(path, "pt") as file:
+        chosen = [name for name in file.offset_keys() if name.startswith(prefix)]
+        return {name.removeprefix(prefix): file.get_tensor(name) for name in chosen}
 
 
 def read_config(path: Path, **changes: Any) -> RunConfig:
@@ -120,15 +101,9 @@ def read_config(path: Path, **changes: Any) -> RunConfig:
 
     Args:
         changes: keys and values to change, such as `device="cpu"`.
-
-    Raises:
-        UserError: the file cannot be read, or a key or value is not known here.
     """
-    try:
+    with naming(path):
         return from_values({**read_header(path).config, "output": "runs", **changes})
-    except UserError as error:
-        text = str(error)
-        raise UserError(text if str(path) in text else f"{path}: {text}") from None
 
 
 def load_weights(
@@ -139,18 +114,13 @@ def load_weights(
     Args:
         expected: the actors' tensors, with the expected names, shapes and types.
         config: configuration of the networks that get the weights, for messages.
-
-    Raises:
-        UserError: the file cannot be read, a weight is missing, has another shape or type or is not
-            finite, or the actors have more weights.
     """
     header, weights = read_header(path), read_tensors(path, WEIGHTS)
     if reason := _misfit(weights, expected):
-        before, now = flat(header.config), flat(to_values(config))
         changed = [
-            f"{key}={shown(now[key])} (in training {shown(before[key])})"
-            for key in now
-            if before.get(key, now[key]) != now[key] and key.startswith(("env.", "comm.", "policy"))
+            f"{key}={shown(now)} (in training {shown(before)})"
+            for key, (now, before) in differences(config, header.config).items()
+            if key.startswith(("env.", "comm.", "policy"))
         ]
         raise UserError(f"{path}: does not fit {', '.join(changed) or 'the run'}: {reason}")
     chosen = {name: weights[name] for name in expected}
@@ -180,9 +150,3 @@ def _misfit(weights: Mapping[str, Tensor], expected: Mapping[str, Tensor]) -> st
             )
     more = [name for name in weights if name.startswith(ACTOR) and name not in expected]
     return f"holds {more[0]}, which is not expected" if more else ""
-
-
-def _reason(error: Exception) -> str:
-    """Returns the message of an error on one line."""
-    text = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
-    return " ".join(text.split()).removeprefix("Error while serializing: I/O error: ")

@@ -1,6 +1,5 @@
 """Locks a run folder, so that only one process trains in it."""
 
-import errno
 import os
 import socket
 from contextlib import suppress
@@ -10,8 +9,6 @@ from filelock import FileLock, Timeout
 
 from emberlink.envs.utils.errors import UserError
 
-_NO_LOCKS = {errno.ENOLCK, errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP}
-
 
 class LockedError(UserError):
     """Reports that another process holds a lock."""
@@ -20,8 +17,7 @@ class LockedError(UserError):
 class Lock:
     """Holds an exclusive lock on the file `lock` of a run folder until `release`.
 
-    The operating system releases the lock when the process ends, also after SIGKILL. The file holds
-    the process number and the host name, for error messages.
+    The operating system releases the lock when the process ends, also after SIGKILL.
 
     Raises:
         LockedError: another process holds the lock.
@@ -31,26 +27,17 @@ class Lock:
     def __init__(self, folder: Path):
         self.path = folder / "lock"
         # No fallback to a lock without the operating system: its file would outlive the process.
-        self._lock = FileLock(
-            self.path,
-            timeout=0,
-            thread_local=False,
-            fallback_to_soft=False,
-            on_acquired=self._write_holder,
-        )
+        self._lock = FileLock(self.path, timeout=0, thread_local=False, fallback_to_soft=False)
         try:
             folder.stat()  # an error if it is missing: FileLock would create it
             self._lock.acquire()
+            self.path.write_text(f"process {os.getpid()} on {socket.gethostname()}\n")
         except Timeout:
-            with suppress(OSError):
-                holder = self.path.read_text(errors="replace").strip()
-                raise LockedError(f"{folder}: {holder} is training here") from None
-            raise LockedError(f"{folder}: another process is training here") from None
+            holder = self.path.read_text().strip() if self.path.exists() else "another process"
+            raise LockedError(f"{folder}: {holder} is training here") from None
         except OSError as error:
-            text = error.strerror or str(error)
-            if error.errno in _NO_LOCKS:
-                text += "; the file system has no locks, choose another one with output=FOLDER"
-            raise UserError(f"{self.path}: cannot be locked: {text}") from None
+            why = f"{error.strerror or error}; output=FOLDER chooses another place"
+            raise UserError(f"{self.path}: cannot be locked: {why}") from None
 
     def release(self) -> None:
         """Removes the file and releases the lock; further calls do nothing."""
@@ -58,7 +45,3 @@ class Lock:
             with suppress(OSError):  # the folder may have become read-only
                 self.path.unlink(missing_ok=True)
             self._lock.release()
-
-    def _write_holder(self, handle: int) -> None:
-        os.ftruncate(handle, 0)
-        os.pwrite(handle, f"process {os.getpid()} on {socket.gethostname()}\n".encode(), 0)

@@ -4,25 +4,22 @@ Each is a reduced run folder, policies/pretrained/SETUP/METHOD/sSEED, with confi
 metrics.jsonl, eval.json, and a checkpoint of the actors. SETUP is `collection`: the setup, and the
 world if it is not `paper`. Finished runs are packed with
 
-    python -m emberlink.trainers.runs.pretrained RUN... --into policies/pretrained
+    python -m emberlink.trainers.runs.pretrained RUN... policies/pretrained
 """
 
-import argparse
 import shutil
 import sys
-import tempfile
-from collections.abc import Sequence
 from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
 from emberlink.envs.fire_files.config import COPY_FILE
-from emberlink.envs.utils.errors import UserError
+from emberlink.envs.utils.errors import UserError, naming
 from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.learners.base import ACTOR
 from emberlink.trainers.runs import checkpoint
-from emberlink.trainers.runs.run_folder import RunFolder
+from emberlink.trainers.runs.run_folder import NEWEST, RunFolder
 
 PREFIX = "pretrained:"
 _COPY = "pretrained"
@@ -36,56 +33,35 @@ def is_name(text: str) -> bool:
     return text.startswith(PREFIX)
 
 
-def open_run(text: str, output: Path | str = "runs") -> RunFolder:
-    """Returns the run that an argument of the command line names.
-
-    A trained policy of the package is copied to a run folder in `output`, unless there is a copy.
+def read_run(text: str) -> RunFolder:
+    """Returns the run that an argument of the command line names, to be read.
 
     Args:
         text: a run folder, or `pretrained:METHOD`, `pretrained:SETUP/METHOD` or
             `pretrained:SETUP/METHOD/SEED`, where SETUP is such as `tuned` or, for the world
             front, `strong_front`.
-        output: folder of run folders.
-
-    Raises:
-        UserError: there is no such policy, or several; the message lists the known ones.
     """
-    run = read_run(text, output)
-    if not is_name(text) or is_copy(run.path):
-        return run
-    target = _copy_of(run.path, output)
-    try:
-        _copy(run.path, target)
-    except OSError as error:
-        raise UserError(f"{target}: cannot be created: {error.strerror or error}") from None
-    return RunFolder(target)
+    return RunFolder(find_one(text) if is_name(text) else text)
 
 
-def read_run(text: str, output: Path | str = "runs") -> RunFolder:
-    """Returns the run that an argument of the command line names, to be read.
+def open_run(text: str, output: Path | str = "runs") -> RunFolder:
+    """Returns the run of `read_run`, to be written to.
 
-    Nothing is written: a trained policy of the package is its copy in `output`, or the installed
-    folder if there is no copy.
-
-    Raises:
-        UserError: there is no such policy, or several; or the copy holds other networks.
+    A trained policy of the package is copied to a run folder in `output`, unless there is a copy.
     """
     if not is_name(text):
         return RunFolder(text)
     source = find_one(text)
-    target = _copy_of(source, output)
-    if not target.exists():
-        return RunFolder(source)
-    if not _is_copy(source, target):
-        raise UserError(
-            f"{target}: holds other networks than {text} of this version of emberlink; move it away"
-        )
-    return RunFolder(target)
-
-
-def _copy_of(source: Path, output: Path | str) -> Path:
-    """Returns the folder of the copy of a trained policy of the package."""
-    return Path(output) / "_".join([_COPY, *source.parts[-3:]])
+    run = RunFolder(Path(output) / "_".join([_COPY, *source.parts[-3:]]))
+    with naming(run.path):
+        run.path.mkdir(parents=True, exist_ok=True)
+        if not run.newest.exists():
+            # The checkpoint last, and without modes: an installed package may be read-only.
+            for file in sorted(source.iterdir(), key=lambda file: file.name == NEWEST):
+                shutil.copyfile(file, run.path / file.name)
+        if run.newest.read_bytes() != (source / NEWEST).read_bytes():
+            raise UserError(f"holds other networks than {text} of this version; move it away")
+    return run
 
 
 def is_copy(folder: Path) -> bool:
@@ -93,51 +69,31 @@ def is_copy(folder: Path) -> bool:
     return folder.name.startswith(f"{_COPY}_")
 
 
-def _is_copy(source: Path, target: Path) -> bool:
-    """Returns whether a run folder has no other networks than a policy of the package."""
-    mine, theirs = RunFolder(target).newest, RunFolder(source).newest
-    try:
-        return not mine.exists() or mine.read_bytes() == theirs.read_bytes()
-    except OSError as error:
-        raise UserError(f"{mine}: cannot be read: {error.strerror or error}") from None
-
-
 def find(text: str) -> list[Path]:
     """Returns the folders of the trained policies that match a name, lowest seed first.
 
     Args:
-        text: see `open_run`; `pretrained:SETUP` matches all policies of a setup. A method alone
+        text: see `read_run`; `pretrained:SETUP` matches all policies of a setup. A method alone
             matches its policies in the first of `USUAL_SETUPS` that has it, else in all setups.
-
-    Raises:
-        UserError: there is no such policy.
     """
     folders = sorted((file.parent for file in _shipped().glob("*/*/*/config.yaml")), key=_order)
     name = text.removeprefix(PREFIX).strip("/")
     wanted = name.split("/")
     if len(wanted) == 3:
         wanted[2] = f"s{wanted[2].removeprefix('s')}"
-    matching = [path for path in folders if path.parts[-3:][: len(wanted)] == tuple(wanted)]
+    matching = [path for path in folders if [*path.parts[-3:]][: len(wanted)] == wanted]
     of_method = [path for path in folders if path.parts[-2] == name]
-    usual = of_method
-    for setup in reversed(USUAL_SETUPS):
-        usual = [path for path in of_method if path.parts[-3] == setup] or usual
-    if not matching and not usual:
-        seeds = [path.name[1:] for path in folders if [*path.parts[-3:-1]] == wanted[:2]]
-        if seeds:
-            known = f"{'/'.join(wanted[:2])} has the seeds {', '.join(seeds)}"
-            raise UserError(f"{text}: no such trained policy; {known}")
-        known = ", ".join(sorted({"/".join(path.parts[-3:-1]) for path in folders})) or "none"
+    setups = [path.parts[-3] for path in of_method]
+    usual = next((setup for setup in USUAL_SETUPS if setup in setups), None)
+    matching = matching or [path for path in of_method if usual in (None, path.parts[-3])]
+    if not matching:
+        known = ", ".join("/".join(path.parts[-3:]) for path in folders)
         raise UserError(f"{text}: no such trained policy; known: {known}")
-    return matching or usual
+    return matching
 
 
 def find_one(text: str) -> Path:
-    """Returns the folder of the trained policy with a name and, among several, the lowest seed.
-
-    Raises:
-        UserError: there is no such policy, or the name matches several methods or setups.
-    """
+    """Returns the folder of the trained policy with a name and, among several, the lowest seed."""
     policies = find(text)
     recipes = sorted({"/".join(folder.parts[-3:-1]) for folder in policies})
     if len(recipes) > 1:
@@ -155,12 +111,11 @@ def pack(run: RunFolder, into: Path) -> Path:
 
     Returns:
         The new folder.
-
-    Raises:
-        UserError: the run is not finished, or the new folder exists.
     """
     trained = run.config(device="cpu")
-    learner = _without_path(trained.learner)
+    learner: Any = trained.learner
+    if (start := getattr(learner, "warm_start", "")) and not is_name(start):
+        learner = replace(learner, warm_start=f"runs/{Path(start).name}")  # no local path
     config = replace(trained, output="runs", logger="none", device="cpu", learner=learner)
     if len(run.metrics()) < config.episodes or not run.evaluated():
         raise UserError(f"{run.path}: not finished, or not evaluated")
@@ -170,7 +125,7 @@ def pack(run: RunFolder, into: Path) -> Path:
     actors = checkpoint.read_tensors(run.newest, f"{checkpoint.WEIGHTS}{ACTOR}")
     target.mkdir(parents=True)
     checkpoint.write(
-        target / run.newest.name,
+        target / NEWEST,
         checkpoint.header_of(config, run.step()),
         {f"{checkpoint.WEIGHTS}{ACTOR}{name}": value for name, value in actors.items()},
     )
@@ -179,14 +134,6 @@ def pack(run: RunFolder, into: Path) -> Path:
         if (run.path / file).is_file():
             shutil.copyfile(run.path / file, target / file)
     return target
-
-
-def _without_path(learner: Any) -> Any:
-    """Returns the settings of a learner with a path shortened to `warm_start=runs/NAME`."""
-    start = getattr(learner, "warm_start", "")
-    if not start or is_name(start):
-        return learner
-    return replace(learner, warm_start=f"runs/{Path(start).name}")
 
 
 def _shipped() -> Path:
@@ -198,32 +145,7 @@ def _order(folder: Path) -> tuple[str, str, int]:
     return setup, method, int(seed.removeprefix("s"))
 
 
-def _copy(source: Path, target: Path) -> None:
-    """Copies a folder completely or not at all."""
-    target.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=target.parent, prefix=".pretrained") as partial:
-        # Without modes, since an installed package may be read-only.
-        for file in (path for path in source.rglob("*") if path.is_file()):
-            copy = Path(partial, "run", file.relative_to(source))
-            copy.parent.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(file, copy)
-        Path(partial, "run").rename(target)
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Packs the runs named on the command line and returns the exit status."""
-    parser = argparse.ArgumentParser(prog="python -m emberlink.trainers.runs.pretrained")
-    parser.add_argument("runs", metavar="RUN", nargs="+", type=Path)
-    parser.add_argument("--into", type=Path, required=True, help="policies/pretrained")
-    options = parser.parse_args(arguments)
-    try:
-        for run in options.runs:
-            print(pack(RunFolder(run), options.into))
-    except ValueError as error:
-        print(error, file=sys.stderr)
-        return 2
-    return 0
-
-
 if __name__ == "__main__":
-    raise SystemExit(main())
+    *runs, into = sys.argv[1:]
+    for path in runs:
+        print(pack(RunFolder(path), Path(into)))

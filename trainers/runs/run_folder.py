@@ -1,6 +1,6 @@
 """Reads and writes run folders: configuration, metrics, checkpoints, evaluation, figures."""
 
-import errno
+import itertools
 import json
 import os
 import re
@@ -16,11 +16,10 @@ import yaml
 
 from emberlink.envs.scenarios import fires_of
 from emberlink.envs.utils import atomic_io
-from emberlink.envs.utils.errors import UserError
+from emberlink.envs.utils.errors import UserError, naming
 from emberlink.trainers.config.compose import from_values, to_values
 from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.runs import checkpoint, compact_json
-from emberlink.trainers.runs.safe_read import MAX_JSON, parse_json, read_text, read_yaml
 
 NEWEST = "checkpoint.safetensors"
 """file of the newest networks and the training state"""
@@ -28,6 +27,10 @@ BEST = "best.safetensors"
 """file of the networks with the best headline measure"""
 METRICS = "metrics.jsonl"
 """file with a line for each episode"""
+MAX_YAML = 100_000
+"""maximum bytes of a config.yaml; a typical one has 2,000"""
+MAX_JSON = 100_000_000
+"""maximum bytes of eval.json and metrics.jsonl"""
 
 
 class RunFolder:
@@ -38,9 +41,6 @@ class RunFolder:
 
     Args:
         path: the folder; it may itself be a link.
-
-    Raises:
-        UserError: it holds something other than folders and regular files.
     """
 
     def __init__(self, path: Path | str):
@@ -63,47 +63,34 @@ class RunFolder:
 
         Args:
             name: name of the folder; made of the date and the configuration if empty.
-
-        Raises:
-            UserError: the folder cannot be created.
         """
         stamp = datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
         name = name or f"{stamp}_{config.method}_{config.setup}_{config.world}_s{config.seed}"
-        try:
+        with naming(f"output={config.output}"):
             path = _new_folder(atomic_io.user_path(config.output) / name)
             (path / "figures").mkdir()
-        except OSError as error:
-            raise UserError(f"output={config.output}: {error.strerror or error}") from None
         run = cls(path)
         fires_of(config.fire).save_copy(path, config.env.grid, config.env.horizon)
         run.write_config(config)
         return run
 
     def write_config(self, config: RunConfig) -> None:
-        """Writes config.yaml completely, or leaves the earlier one.
-
-        Raises:
-            UserError: it cannot be written.
-        """
+        """Writes config.yaml completely, or leaves the earlier one."""
         values = to_values(config)
         text = yaml.safe_dump(values, sort_keys=False, default_flow_style=None, width=100)
         self.write_text("config.yaml", text)
 
     def values(self) -> dict[str, Any]:
-        """Returns the configuration of config.yaml as plain values, without checking them.
-
-        Raises:
-            UserError: the folder or its config.yaml does not exist, or is not readable.
-        """
+        """Returns the configuration of config.yaml as plain values, without checking them."""
         file = self.path / "config.yaml"
         if not self.path.is_dir():
             raise UserError(f"{self.path}: there is no such run folder")
-        try:
-            values = read_yaml(file)
-        except FileNotFoundError:
-            raise UserError(f"{self.path}: not a run folder, config.yaml is missing") from None
-        if not isinstance(values, dict):
-            raise UserError(f"{file}: expected keys and values, found {type(values).__name__}")
+        if not file.exists():
+            raise UserError(f"{self.path}: not a run folder, config.yaml is missing")
+        with naming(file, yaml.YAMLError):
+            values = yaml.load(read_text(file, MAX_YAML), _WithoutAliases)
+            if not isinstance(values, dict):
+                raise UserError(f"expected keys and values, found {type(values).__name__}")
         return values
 
     def config(self, file: Path | None = None, **changes: Any) -> RunConfig:
@@ -112,21 +99,13 @@ class RunFolder:
         Args:
             file: the checkpoint; the newest if None or, before there is one, config.yaml.
             changes: keys and values to change, such as `device="cpu"`.
-
-        Raises:
-            UserError: there is no such folder, or a key or value is missing or wrong.
         """
         values: dict[str, Any] = {"output": str(self.path.parent), **changes}
-        if file is not None or self.newest.exists():
-            config = checkpoint.read_config(file or self.newest, **values)
-        else:
-            try:
-                config = from_values(self.values() | values)
-            except UserError as error:
-                text = str(error)
-                where = "" if str(self.path) in text else f"{self.path / 'config.yaml'}: "
-                raise UserError(f"{where}{text}") from None
-        return self.with_fires(config)
+        if file is None and not self.newest.exists():
+            given = self.values()
+            with naming(self.path / "config.yaml"):
+                return self.with_fires(from_values(given | values))
+        return self.with_fires(checkpoint.read_config(file or self.newest, **values))
 
     def with_fires(self, config: RunConfig) -> RunConfig:
         """Returns a configuration that reads the fires of files from the run's copy."""
@@ -137,52 +116,27 @@ class RunFolder:
         """The path of the newest checkpoint, which may not exist yet."""
         return self.path / NEWEST
 
-    def checkpoint(self, name: str = NEWEST) -> Path:
-        """Returns the path of a checkpoint: the newest, or `BEST`.
-
-        Raises:
-            UserError: there is no such file.
-        """
-        path = self.path / name
-        if not path.is_file():
-            raise UserError(f"{self.path}: holds no {name}")
-        return path
+    def checkpoint(self) -> Path:
+        """Returns the path of the newest checkpoint."""
+        if not self.newest.is_file():
+            raise UserError(f"{self.path}: holds no {NEWEST}")
+        return self.newest
 
     def metrics(self) -> list[dict[str, Any]]:
         """Returns the lines of metrics.jsonl; an empty list if there is no such file.
 
         An incomplete last line, which a killed process left, is ignored.
-
-        Raises:
-            UserError: a line is not of the form {"episode": 1, NAME: NUMBER, ...}.
         """
         path = self.path / METRICS
         text = read_text(path, MAX_JSON) if path.exists() else ""
-        complete = text[: text.rfind("\n") + 1].splitlines()
-        try:
-            return [_numbers(line) for line in complete]
-        except ValueError as error:
-            raise UserError(f"{path}: not a file of JSON lines: {error}") from None
+        with naming(path):
+            return [_numbers(line) for line in text[: text.rfind("\n") + 1].splitlines()]
 
     def append(self, line: Mapping[str, Any]) -> None:
-        """Appends a line to metrics.jsonl, completely or not at all.
-
-        Raises:
-            UserError: it cannot be written, such as to a full disk.
-        """
+        """Appends a line to metrics.jsonl."""
         path = self.path / METRICS
-        try:
-            with path.open("ab", buffering=0) as file:
-                before = file.seek(0, os.SEEK_END)
-                left = (json.dumps(line) + "\n").encode()
-                try:
-                    while left:
-                        left = left[file.write(left) :]
-                except OSError:
-                    file.truncate(before)
-                    raise
-        except OSError as error:
-            raise UserError(f"{path}: cannot be written: {error.strerror}") from None
+        with naming(path), path.open("a") as file:
+            file.write(json.dumps(line) + "\n")
 
     def sync_metrics(self) -> None:
         """Flushes metrics.jsonl to the disk; a checkpoint must not be newer than its lines."""
@@ -190,11 +144,7 @@ class RunFolder:
             atomic_io.sync(self.path / METRICS)
 
     def return_to(self, episode: int) -> None:
-        """Removes the lines of later episodes and the incomplete files of a killed process.
-
-        Raises:
-            UserError: lines of earlier episodes are missing, or a file cannot be written.
-        """
+        """Removes the lines of later episodes and the incomplete files of a killed process."""
         lines = [line for line in self.metrics() if line["episode"] <= episode]
         if [line["episode"] for line in lines] != list(range(1, episode + 1)):
             raise UserError(
@@ -202,30 +152,20 @@ class RunFolder:
                 "of the checkpoint"
             )
         self.write_text(METRICS, "".join(f"{json.dumps(line)}\n" for line in lines))
-        for pattern in (
-            "*.[0-9]*.part",
-            ".tmp*",
-            "figures/*.[0-9]*.part",
-        ):  # safetensors writes to .tmp*
+        # safetensors writes to .tmp*
+        for pattern in ("*.[0-9]*.part", ".tmp*", "figures/*.[0-9]*.part"):
             for path in self.path.glob(pattern):
                 path.unlink(missing_ok=True)
 
     def evaluation(self) -> dict[str, Any] | None:
-        """Returns the content of eval.json, or None if there is no such file.
-
-        Raises:
-            UserError: it cannot be read.
-        """
+        """Returns the content of eval.json, or None if there is no such file."""
         path = self.path / "eval.json"
-        try:
-            content = parse_json(read_text(path, MAX_JSON))
-        except FileNotFoundError:
+        if not path.exists():
             return None
-        except ValueError as error:
-            text = str(error)
-            raise UserError(text if str(path) in text else f"{path}: {text}") from None
-        if not isinstance(content, dict):
-            raise UserError(f"{path}: not an evaluation")
+        with naming(path):
+            content = json.loads(read_text(path, MAX_JSON))
+            if not isinstance(content, dict):
+                raise UserError("not an evaluation")
         return content
 
     def evaluated(self) -> bool:
@@ -236,32 +176,17 @@ class RunFolder:
         return False
 
     def step(self) -> int:
-        """Returns the step of the newest checkpoint.
-
-        Raises:
-            UserError: there is none.
-        """
+        """Returns the step of the newest checkpoint."""
         return checkpoint.read_header(self.checkpoint()).step
 
     def write(self, file: str, content: Mapping[str, Any]) -> None:
-        """Writes a JSON file completely, or leaves the earlier one.
-
-        Raises:
-            UserError: it cannot be written.
-        """
+        """Writes a JSON file completely, or leaves the earlier one."""
         self.write_text(file, compact_json.dumps(content) + "\n")
 
     def write_text(self, file: str, text: str) -> None:
-        """Writes a text file completely, or leaves the earlier one.
-
-        Raises:
-            UserError: it cannot be written.
-        """
-        path = self.path / file
-        try:
-            atomic_io.write_bytes(path, text.encode())
-        except OSError as error:
-            raise UserError(f"{path}: cannot be written: {error.strerror or error}") from None
+        """Writes a text file completely, or leaves the earlier one."""
+        with naming(self.path / file):
+            atomic_io.write_bytes(self.path / file, text.encode())
 
     def figures(self) -> Path:
         """Creates the folder of the figures if it is missing, and returns it.
@@ -284,6 +209,21 @@ class RunFolder:
             yield partial
 
 
+class _WithoutAliases(yaml.SafeLoader):
+    """Refuses aliases, by which a small file can expand to any size."""
+
+    def compose_node(self, parent: Any, index: Any) -> Any:
+        if self.check_event(yaml.AliasEvent):
+            raise UserError("aliases (*name) are not allowed")
+        return super().compose_node(parent, index)
+
+
+def read_text(path: Path, max_bytes: int) -> str:
+    """Returns the text of a regular file of bounded size."""
+    with naming(path):
+        return atomic_io.read_bytes(path, max_bytes).decode()
+
+
 def without_time_and_seed(path: str) -> str:
     """Returns the path of a run without the time and the seed in a name that `create` has made."""
     made = re.fullmatch(r"\d{4}-\d\d-\d\d_\d\d-\d\d-\d\d_(.+)_s\d+(_\d+)?", Path(path).name)
@@ -299,20 +239,19 @@ def _is_ordinary(path: Path) -> bool:
 
 def _numbers(line: str) -> dict[str, Any]:
     """Returns the numbers of a line by name."""
-    value = parse_json(line)
-    if not isinstance(value, dict) or "episode" not in value:
-        raise UserError("a line is not of the form {episode: ..., ...}")
-    if not all(isinstance(number, int | float) for number in value.values()):
-        raise UserError("a line holds a value that is not a number")
+    value = json.loads(line)
+    numbers = value.values() if isinstance(value, dict) else [""]
+    if "episode" not in value or not all(isinstance(number, int | float) for number in numbers):
+        raise UserError("a line is not of the form {episode: NUMBER, NAME: NUMBER, ...}")
     return value
 
 
 def _new_folder(path: Path) -> Path:
     """Creates `path`, or `path_2` and so on if it exists, and returns the new folder."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    for attempt in range(1, 1000):
+    for attempt in itertools.count(1):
         candidate = path if attempt == 1 else path.with_name(f"{path.name}_{attempt}")
         with suppress(FileExistsError):
             candidate.mkdir()
             return candidate
-    raise FileExistsError(errno.EEXIST, f"{path} and 998 more exist already")
+    raise AssertionError

@@ -97,9 +97,6 @@ def combinations(arguments: Sequence[str]) -> list[Combination]:
     Args:
         arguments: names of methods (all methods if there are none), and `key=value` or, in Hydra's
             syntax for several values, `seed=0,1,2` or `seed=range(0,5)`.
-
-    Raises:
-        UserError: a key or a value is wrong; the message names it.
     """
     methods = [text for text in arguments if "=" not in text] or list(known("method"))
     choices = [_values(text) for text in arguments if "=" in text]

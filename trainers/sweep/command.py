@@ -4,7 +4,6 @@ import shlex
 import time
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 from rich.console import Console
@@ -20,7 +19,6 @@ from rich.table import Table
 
 from emberlink.envs.utils.atomic_io import user_path
 from emberlink.envs.utils.errors import UserError
-from emberlink.trainers.runs.run_folder import RunFolder
 from emberlink.trainers.sweep.combinations import (
     Combination,
     combinations,
@@ -28,6 +26,7 @@ from emberlink.trainers.sweep.combinations import (
     identity,
 )
 from emberlink.trainers.sweep.executors.base import Executor, make
+from emberlink.trainers.terminal.console import plain_table
 from emberlink.trainers.terminal.signals import Interruption
 from emberlink.trainers.tracking import check_installed
 from emberlink.trainers.training.setup import check_setup
@@ -53,9 +52,6 @@ def sweep(
 
     Returns:
         0; 1 if a run failed; 128 and the number of a signal, such as 130, after it.
-
-    Raises:
-        UserError: an argument is wrong, or the output folder cannot be written.
     """
     chosen = [text for text in arguments if text.startswith(("executor=", "executor."))]
     runs = combinations([text for text in arguments if text not in chosen])
@@ -82,22 +78,8 @@ def sweep(
     return status
 
 
-def status(output: Path, console: Console) -> int:
-    """Prints the state and the episodes of each run in an output folder.
-
-    Raises:
-        UserError: there is none.
-    """
-    folders = [RunFolder(file.parent) for file in sorted(output.glob("*/config.yaml"))]
-    if not folders:
-        raise UserError(f"{output}: holds no run")
-    runs = [Combination(folder.config(device="cpu"), folder=folder) for folder in folders]
-    console.print(_table(runs))
-    return 0
-
-
 def _table(runs: Sequence[Combination]) -> Table:
-    table = Table("run", "state", "episodes", "folder")
+    table = plain_table("run", "state", "episodes", "folder")
     for run in runs:
         place = run.folder.path.name if run.folder else "-"
         table.add_row(run.name, run.state, f"{run.episodes}/{run.config.episodes}", place)
@@ -105,11 +87,7 @@ def _table(runs: Sequence[Combination]) -> Table:
 
 
 def _check(runs: Sequence[Combination]) -> None:
-    """Checks that new runs can be trained; those that differ in their seed only, once.
-
-    Raises:
-        UserError: one cannot.
-    """
+    """Checks that new runs can be trained; those that differ in their seed only, once."""
     for run in {identity(replace(run.config, seed=0)): run for run in reversed(runs)}.values():
         check_installed(run.config.logger)
         try:
@@ -156,11 +134,7 @@ class _Trainings:
         return interruption.status if interruption.received else int(failed)
 
     def _submit(self) -> None:
-        """Submits as many of the waiting runs as the executor takes.
-
-        Raises:
-            UserError: it takes none, and no run is left to wait for.
-        """
+        """Submits as many of the waiting runs as the executor takes."""
         batch = self._waiting[: max(self._most - len(self._running), 0)]
         if not batch:
             return

@@ -1,15 +1,11 @@
 """Shows the progress of a training: a line per episode and, on a terminal, a bar."""
 
-import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from datetime import timedelta
 from typing import Any, Self
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
-
-_BETWEEN_REFRESHES = 0.2
-"""seconds between updates of the bar"""
 
 
 class TrainingProgress:
@@ -21,31 +17,19 @@ class TrainingProgress:
         episodes: number of episodes of the whole training.
         step: number of steps done before.
         headline: the measure of evaluations that is printed.
-        clock: returns the time in seconds.
     """
 
     def __init__(
-        self,
-        console: Console,
-        *,
-        steps: int,
-        episodes: int,
-        step: int = 0,
-        headline: str = "coverage",
-        clock: Callable[[], float] = time.monotonic,
+        self, console: Console, *, steps: int, episodes: int, step: int = 0, headline: str
     ):
-        self._console, self._clock, self._headline = console, clock, headline
-        self._steps, self._episodes = steps, episodes
-        self._next_refresh = 0.0
+        self._console, self._headline, self._episodes = console, headline, episodes
         self._bar = Progress(
             TextColumn("step {task.completed}/{task.total}"),
             BarColumn(bar_width=None),
             TimeRemainingColumn(),
             console=console,
-            auto_refresh=False,
             redirect_stdout=False,
             expand=True,
-            get_time=clock,
             speed_estimate_period=120,
             disable=not console.is_terminal,
         )
@@ -60,24 +44,15 @@ class TrainingProgress:
 
     def step(self, step: int) -> None:
         """Updates the bar at the end of a step."""
-        now = self._clock()
-        if now >= self._next_refresh or step == self._steps:
-            self._next_refresh = now + _BETWEEN_REFRESHES
-            self._bar.update(self._task, completed=step)
-            self._bar.refresh()
+        self._bar.update(self._task, completed=step)
 
     def episode(self, episode: int, line: Mapping[str, Any]) -> None:
-        """Prints the measures of an episode and of the evaluation after it, if any.
-
-        Args:
-            episode: number of the episode.
-            line: the line of metrics.jsonl.
-        """
+        """Prints the measures of an episode, and of the evaluation after it, from its line."""
         task = self._bar.tasks[0]
         pace = f", {speed:.0f} steps/s" if (speed := task.finished_speed or task.speed) else ""
         seconds = 0 if self._console.is_terminal else task.time_remaining  # the bar shows it
         left = f", {timedelta(seconds=seconds)} left" if seconds else ""
-        self.note(
+        text = (
             f"episode {episode}/{self._episodes}: coverage {line['coverage']:.1f} %, "
             f"mean reward {line['mean_reward']:.2f}{pace}{left}"
         )
@@ -85,8 +60,5 @@ class TrainingProgress:
         evaluated = [name.removesuffix(end) for name in line if name.endswith(end)]
         if evaluated:
             shown = ", ".join(f"{fire} {line[fire + end]:.1f}" for fire in evaluated)
-            self.note(f"  without noise, on validation fires: {self._headline} {shown}")
-
-    def note(self, text: str, style: str = "") -> None:
-        """Prints a line above the bar."""
-        self._console.print(text, style=style, soft_wrap=True)
+            text += f"\n  without noise, on validation fires: {self._headline} {shown}"
+        self._console.print(text, soft_wrap=True)

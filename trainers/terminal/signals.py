@@ -1,17 +1,10 @@
 """Handles signals that end a training, so that it can finish its step and save."""
 
 import signal
-import time
 from collections.abc import Callable, Sequence
 from types import FrameType
 
-_NOTICES = (signal.SIGUSR1, signal.SIGUSR2)
-"""signals that a cluster sends before it ends a process; they may follow another signal"""
-_ENDS = (signal.SIGTERM, signal.SIGHUP)
-"""signals that a machine sends together, in either order, when it ends a process"""
-_TOGETHER = 2.0
-"""seconds in which several of `_ENDS` are one"""
-_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, *_NOTICES)
+_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1, signal.SIGUSR2)
 
 
 class Interrupted(KeyboardInterrupt):
@@ -19,24 +12,19 @@ class Interrupted(KeyboardInterrupt):
 
 
 class Interruption:
-    """Calls `stop` at the first signal and raises `Interrupted` at the second.
+    """Calls `stop` at the first signal and raises `Interrupted` at a later Ctrl-C (SIGINT).
 
-    The signals are SIGINT, SIGTERM, SIGHUP, SIGUSR1 and SIGUSR2. Clusters send several of them
-    together. SIGUSR1 and SIGUSR2 therefore never count as the second signal. SIGTERM and SIGHUP
-    count only `_TOGETHER` seconds after the first.
+    Machines and clusters send several of the other signals together, so these never end the
+    program at once.
 
     Args:
         stop: called at the first signal; requests the end of the training after a step.
         signals: the signals to handle.
     """
 
-    def __init__(
-        self,
-        stop: Callable[[], None],
-        signals: Sequence[signal.Signals] = (*_SIGNALS, signal.SIGHUP),
-    ):
+    def __init__(self, stop: Callable[[], None], signals: Sequence[signal.Signals] = _SIGNALS):
         self._signals = signals
-        self._stop, self._since, self._raised = stop, 0.0, False
+        self._stop, self._raised = stop, False
         self._before: dict[signal.Signals, signal._HANDLER] = {}
         self.received: int | None = None
         """number of the first signal; None before it"""
@@ -62,12 +50,9 @@ class Interruption:
         return 128 + (self.received or signal.SIGINT)
 
     def _handle(self, number: int, _: FrameType | None) -> None:
-        first = self.received is None
+        again = self.received is not None and number == signal.SIGINT
         self.received = self.received or number
-        if first:
-            self._since = time.monotonic()
-        again = number in _ENDS and time.monotonic() - self._since < _TOGETHER
-        if self.at_once or not (first or again or number in _NOTICES):
+        if self.at_once or again:
             self._raised = True
             raise Interrupted
         self._stop()

@@ -1,18 +1,16 @@
 """Resumes a stopped run exactly where its newest checkpoint was made."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import shown
-from emberlink.trainers.config.compose import override, to_values
+from emberlink.trainers.config.compose import differences, override
 from emberlink.trainers.config.schema import NOT_LEARNT_WITH, RunConfig
-from emberlink.trainers.config.values import flat
 from emberlink.trainers.runs import checkpoint
 from emberlink.trainers.runs.lock import Lock
 from emberlink.trainers.runs.run_folder import RunFolder
-from emberlink.trainers.runs.versions import changed
 from emberlink.trainers.training import warm_start
 from emberlink.trainers.training.trainer import Trainer
 
@@ -31,9 +29,6 @@ def resume(
     Args:
         method: if given, must be the method of the run.
         overrides: texts `key=value`, of keys that do not affect learning.
-
-    Raises:
-        UserError: the run cannot be resumed, and no file has changed; or a file cannot be written.
     """
     run = RunFolder(path)
     # The device of the run may not exist here, so it is replaced before it is checked.
@@ -57,7 +52,7 @@ def _restored(trainer: Trainer, run: RunFolder, lock: Lock, before: RunConfig) -
     trainer.open(run, lock)
     if run.newest.exists():
         trainer.restore()
-        trainer.changed_versions = changed(checkpoint.read_header(run.newest).versions)
+        trainer.changed_versions = _other_versions(checkpoint.read_header(run.newest).versions)
     elif len(run.metrics()) > before.checkpoint_interval:
         raise UserError(
             f"{run.path}: holds no {run.newest.name}, and more episodes than before one"
@@ -73,6 +68,12 @@ def _restored(trainer: Trainer, run: RunFolder, lock: Lock, before: RunConfig) -
     return trainer
 
 
+def _other_versions(before: Mapping[str, str]) -> str:
+    """Returns the packages whose version is not that of `before`; "" if there are none."""
+    now = checkpoint.versions()
+    return ", ".join(f"{k} {v} (now {now.get(k)})" for k, v in before.items() if now.get(k) != v)
+
+
 def _changed(config: RunConfig, overrides: Sequence[str], settings: dict[str, Any]) -> RunConfig:
     """Returns the configuration with the overrides; refuses keys that may not change."""
     changed = override(config, overrides, **settings)
@@ -82,13 +83,3 @@ def _changed(config: RunConfig, overrides: Sequence[str], settings: dict[str, An
                 f"{key}={shown(new)}: the run has {key}={shown(old)}; a resumed run keeps it"
             )
     return changed
-
-
-def differences(one: RunConfig, other: RunConfig) -> dict[str, tuple[Any, Any]]:
-    """Returns the dotted keys in which two configurations differ, with both values."""
-    first, second = flat(to_values(one)), flat(to_values(other))
-    return {
-        key: (first.get(key), second.get(key))
-        for key in [*first, *(key for key in second if key not in first)]
-        if first.get(key) != second.get(key)
-    }

@@ -10,7 +10,6 @@ from torchrl.envs.utils import check_env_specs
 
 from emberlink.envs.fire.generator import load_scenario, make_fires
 from emberlink.envs.utils.config_files import known
-from emberlink.envs.utils.errors import how_to_install
 from emberlink.trainers.build import make_env
 from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.training.setup import TrainingSetup
@@ -23,12 +22,12 @@ _TINY = ("env.horizon=40", "env.num_uavs=3", "episodes=1", "num_envs=2", "learne
 def doctor(console: Console) -> int:
     """Prints versions and devices, runs the self-test, and returns 0 if it passed, else 1."""
     console.print(f"python {platform.python_version()} on {platform.platform()}")
-    console.print(", ".join(map(_installed, _PACKAGES)), soft_wrap=True)
+    console.print(_versions(*_PACKAGES), soft_wrap=True)
     gpus = [torch.cuda.get_device_name(i) for i in range(torch.cuda.device_count())]
     console.print(
         f"devices: cpu ({torch.get_num_threads()} threads), {', '.join(gpus) or 'no GPU'}"
     )
-    console.print(f"fires from files: {_geo()}", soft_wrap=True)
+    console.print(f"fires from files: {_versions(*_GEO)} (extra geo)", soft_wrap=True)
     checks = {"fire": _fire} | {method: _method(method) for method in known("method")}
     began, failures = time.monotonic(), 0
     for name, check in checks.items():
@@ -43,20 +42,12 @@ def doctor(console: Console) -> int:
     return int(failures > 0)
 
 
-def _installed(name: str) -> str:
-    """Returns the name and version of a package."""
+def _versions(*names: str) -> str:
+    """Returns the versions of packages, or which one is missing."""
     try:
-        return f"{name} {version(name)}"
-    except PackageNotFoundError:
-        return f"{name} not installed"
-
-
-def _geo() -> str:
-    """Returns the versions of the packages of the extra `geo`."""
-    try:
-        return ", ".join(f"{name} {version(name)}" for name in _GEO)
+        return ", ".join(f"{name} {version(name)}" for name in names)
     except PackageNotFoundError as error:
-        return f"{error.name} is not installed: {how_to_install('geo')}"
+        return f"{error.name} is not installed"
 
 
 def _fire() -> str:

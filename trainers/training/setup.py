@@ -21,11 +21,7 @@ from emberlink.trainers.training.episode import EpisodeRecord
 
 
 class TrainingSetup:
-    """Holds all objects that training changes, and accesses no files.
-
-    Raises:
-        UserError: the horizon is not a multiple of the steps of a rollout.
-    """
+    """Holds all objects that training changes, and accesses no files."""
 
     def __init__(self, config: RunConfig):
         self.config, self.horizon = config, config.env.horizon
@@ -72,8 +68,10 @@ class TrainingSetup:
         Tensors are copied, except the transitions. The state does not contain fires, which follow
         from the configuration. Random numbers of the environments are hashes of seeds and counters.
         """
+        learner = self.learner.state_dict()
         state = prefixed(
-            learner=self.learner.state_dict(),
+            weights=group(learner, "weights"),
+            learner={k: v for k, v in learner.items() if not k.startswith("weights/")},
             environments=self.env.base_env.state_dict(),
             communication=self.env.transform.state_dict(),
             carried=flatten(self.collector.carried),
@@ -92,7 +90,8 @@ class TrainingSetup:
         device, carried = self.config.device, group(state, "carried")
         copy_into(flatten(self.collector.carried), carried)
         self.collector.restore(unflatten(carried, 1, device), step)  # resets the environments
-        self.learner.load_state_dict(group(state, "learner"))
+        weights = prefixed(weights=group(state, "weights"))
+        self.learner.load_state_dict(group(state, "learner") | weights)
         copy_into(self.env.base_env.state_dict(), group(state, "environments"))
         copy_into(self.env.transform.state_dict(), group(state, "communication"))
         self.record.load_state_dict(group(state, "episode"), device)
@@ -100,11 +99,7 @@ class TrainingSetup:
 
 
 def check_setup(config: RunConfig) -> None:
-    """Checks that a configuration can be trained, in one environment, without training.
-
-    Raises:
-        UserError: the fire, the learner or its warm start does not fit the rest.
-    """
+    """Checks that a configuration can be trained, in one environment, without training."""
     warm_start.start(_make_learner(config, _make_env(config, 1)), config)
 
 

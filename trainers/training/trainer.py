@@ -131,9 +131,6 @@ class Trainer:
 
         Args:
             report: called with a line of text before each part of the work.
-
-        Raises:
-            UserError: a file cannot be written.
         """
         config, run = self.config, self.run
         results = evaluate_run(
@@ -167,11 +164,7 @@ class Trainer:
         self.saved = self.setup.step
 
     def restore(self) -> None:
-        """Restores a new setup from the newest checkpoint of the run folder.
-
-        Raises:
-            UserError: the checkpoint cannot be read, or does not fit.
-        """
+        """Restores a new setup from the newest checkpoint of the run folder."""
         path = self.run.newest
         header = checkpoint.read_header(path)
         if not header.resumable:

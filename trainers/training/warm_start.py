@@ -6,9 +6,8 @@ from typing import Any
 from emberlink.comm.base import MODULES
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import shown
-from emberlink.trainers.config.compose import to_values
+from emberlink.trainers.config.compose import differences
 from emberlink.trainers.config.schema import RunConfig
-from emberlink.trainers.config.values import flat
 from emberlink.trainers.evaluation.policy import units
 from emberlink.trainers.learners.base import ACTOR, Learner
 from emberlink.trainers.runs.checkpoint import load_weights
@@ -23,11 +22,7 @@ _REWARD = "comm.heading."
 
 
 def start(learner: Learner, config: RunConfig) -> None:
-    """Copies the actors of the run `learner.warm_start`, of its newest checkpoint, to a learner.
-
-    Raises:
-        UserError: the run or its checkpoint cannot be read, or does not fit.
-    """
+    """Copies the actors of the run `learner.warm_start`, of its newest checkpoint, to a learner."""
     name = getattr(config.learner, "warm_start", "")
     if not name:
         return
@@ -47,15 +42,13 @@ def start(learner: Learner, config: RunConfig) -> None:
 
 def _warn_of_other_observations(name: str, theirs: RunConfig, mine: RunConfig) -> None:
     """Warns of settings that give the same observations another meaning."""
-    before, now = flat(to_values(theirs)), flat(to_values(mine))
     more = units(mine)
     more += ("env.base",) if mine.env.observation == "sight" else ()  # maps show the base
     more += ("env.radio.",) if MODULES.find(mine.comm["name"]).hears else ()
-    observed = (key for key in now if key.startswith(_OBSERVED + more) and key in before)
-    for key in observed:
-        if before[key] != now[key] and not key.startswith(_REWARD):
+    for key, (before, now) in differences(theirs, mine).items():
+        if key.startswith(_OBSERVED + more) and not key.startswith(_REWARD):
             warnings.warn(
-                f"learner.warm_start={name}: its actors were trained with {key}="
-                f"{shown(before[key])}, this run has {shown(now[key])}",
+                f"learner.warm_start={name}: its actors were trained with {key}={shown(before)}, "
+                f"this run has {shown(now)}",
                 stacklevel=3,
             )

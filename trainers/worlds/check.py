@@ -21,6 +21,7 @@ from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.evaluation.evaluate import BLOCK, VALIDATION_START_SEED, play_scripted
 from emberlink.trainers.evaluation.scores import Measured, means
 from emberlink.trainers.runs import compact_json
+from emberlink.trainers.terminal.console import plain_table
 
 Split = Literal["test", "validation"]
 Means = Mapping[str, Mapping[str, float]]
@@ -196,7 +197,7 @@ def suite(console: Console) -> list[str]:
 
 def _table(config: RunConfig, measured: Means, fires: str) -> Table:
     """Returns a table with a row per policy and a column per measure, the headline first."""
-    table = Table(title=Text(f"world {config.world}: means of {fires}"))
+    table = plain_table(title=Text(f"world {config.world}: means of {fires}"))
     table.add_column()
     order = sorted(metrics.names(config.env), key=lambda name: name != config.evaluation.headline)
     for name in order:

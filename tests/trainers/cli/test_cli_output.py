@@ -1,72 +1,12 @@
-"""Tests closed and full outputs, encodings, warnings and internal errors."""
+"""Tests encodings, warnings and internal errors."""
 
 import io
-import os
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
-from tiny_run import PROGRAM, TINY
 
 from emberlink.trainers.cli import main
-
-NEEDS_FULL = pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
-
-
-def started(arguments: list[str], stdout: object) -> subprocess.Popen:
-    return subprocess.Popen(
-        [sys.executable, "-c", PROGRAM, *arguments],
-        stdout=stdout,  # pyright: ignore
-        stderr=subprocess.PIPE,
-        text=True,
-        env={**os.environ, "OMP_NUM_THREADS": "1"},
-    )
-
-
-@pytest.mark.heavy
-def test_a_closed_pipe_ends_the_training_with_a_checkpoint(tmp_path):
-    arguments = ["train", "independent", *TINY, "episodes=100000", f"output={tmp_path}"]
-    process = started(arguments, subprocess.PIPE)
-    try:
-        assert process.stdout is not None
-        process.stdout.readline()
-        process.stdout.close()  # like `| head -1`
-        _, error = process.communicate(timeout=400)
-    finally:
-        process.kill()
-    assert (process.returncode, error.count("\n")) == (2, 1), error
-    assert "standard output: Broken pipe; " in error
-    assert list(tmp_path.rglob("*.safetensors"))
-
-
-@pytest.mark.heavy
-@NEEDS_FULL
-def test_a_full_output_ends_a_training_with_one_line(tmp_path):
-    with open("/dev/full", "w") as full:
-        process = started(["train", "independent", *TINY, f"output={tmp_path}"], full)
-        _, error = process.communicate(timeout=400)
-    assert (process.returncode, error.count("\n")) == (2, 1), error
-    assert error.startswith("emberlink train: standard output: No space left on device; ")
-
-
-@NEEDS_FULL
-def test_a_full_output_of_other_commands_is_one_line():
-    """Status 0 would let a script go on without the text that it redirected to a full disk."""
-    program = (
-        "import os, sys\n"
-        "from emberlink.trainers.cli.main import main\n"
-        "for arguments in ['fire'], ['list']:\n"
-        "    if os.fork() == 0:\n"
-        "        sys.exit(main(arguments))\n"
-        "    print(os.waitstatus_to_exitcode(os.wait()[1]), file=sys.stderr)\n"
-    )
-    with open("/dev/full", "w") as full:
-        ended = subprocess.run(
-            [sys.executable, "-c", program], stdout=full, stderr=subprocess.PIPE, text=True
-        )
-    reason = "standard output: No space left on device\n1\n"
-    assert ended.stderr == f"emberlink fire: {reason}emberlink list: {reason}"
 
 
 def test_a_warning_is_one_line_without_a_path():

@@ -24,9 +24,7 @@ from emberlink.envs.fire.cache import bank_key, fire_bank
 from emberlink.envs.fire.generator import load_scenario
 from emberlink.envs.utils.errors import UserError
 from emberlink.trainers.cli import main
-from emberlink.trainers.comparison.reading import read_evaluation
 from emberlink.trainers.runs.run_folder import RunFolder
-from emberlink.trainers.runs.safe_read import parse_json
 
 
 class Bomb:
@@ -138,7 +136,6 @@ CONFIGS = {
     "deep lists": "seed: " + "[" * 2000,
     "long": "output: " + "x" * 200_000,
     "many digits": "seed: " + "9" * 5000,
-    "the same key twice": "seed: 1\nseed: 2\n",
     "two documents": "seed: 1\n---\nseed: 2\n",
     "bytes": "method: !!binary aGk=\n",
     "interpolation": "seed: ${{oc.env:HOME}}\n",
@@ -160,7 +157,7 @@ def test_a_configuration(kind, run, mark, capsys):
         replaced = set(yaml.safe_load(hostile))
     # Within an otherwise valid configuration, where possible.
     whole = yaml.safe_load(file.read_text())
-    if kind not in ("the same key twice", "billion laughs", "two documents"):
+    if kind not in ("billion laughs", "two documents"):
         rest = {name: value for name, value in whole.items() if name not in replaced}
         seed = re_keyed(hostile)
         rest.pop(seed, None)
@@ -179,7 +176,7 @@ LINES = {
     "no mapping": "[1]\n",
     "text": '{"episode": "__import__(\'os\')"}\n',
     "nested": '{"episode": 1, "mean_reward": {"a": 1}}\n',
-    "the same key twice": '{"episode": 1, "episode": 2}\n',
+    "many digits": '{"episode": 1, "mean_reward": ' + "9" * 5000 + "}\n",
     "deep": "[" * 100_000 + "\n",
     "no episode": '{"mean_reward": 1}\n',
     "no text": "\x00\x01\n",
@@ -192,21 +189,15 @@ def test_the_lines_of_a_run(kind, run, mark, capsys):
     assert "metrics.jsonl" in refused(["eval", str(run), "--fires", "1"], capsys, mark)
 
 
-def test_huge_numbers_in_a_run(run, capsys):
-    many = "9" * 5000
-    (run / "metrics.jsonl").write_text(
-        '{"episode": 1, "mean_reward": NaN, "coverage": 1e999}\n'
-        f'{{"episode": 2, "mean_reward": {many}}}\n'
-    )
+def test_infinite_numbers_in_a_run(run, capsys):
+    (run / "metrics.jsonl").write_text('{"episode": 1, "mean_reward": NaN, "coverage": 1e999}\n')
     assert main.main(["eval", str(run), "--fires", "1"]) == 0
-    assert RunFolder(run).metrics()[1]["mean_reward"] == float("inf")
 
 
 EVALUATIONS = {
     "pickle": lambda mark: pickle.dumps(Bomb(mark)),
     "deep": lambda _: b"[" * 200_000,
     "huge": lambda _: b'{"seed": ' + b"9" * 100_000 + b"}",
-    "many texts": lambda _: b"[" + b'"",' * 2_000_001 + b'""]',
     "nan": lambda _: (
         b'{"method": "x", "setup": "y", "seed": 0, "start_seed": 0, '
         b'"checkpoint": "z", "fires": 1, "results": {"a": {"b": {"coverage": [NaN]}}}}'
@@ -375,14 +366,3 @@ def test_files_of_the_working_folder_are_not_executed(tmp_path, mark):
     assert (done.returncode, done.stdout, done.stderr) == (2, "", expected)
     assert not mark.exists()
     assert sorted(tmp_path.rglob("*")) == before
-
-
-@pytest.mark.parametrize("part", ["[],", "{},", '"",', '{"":0},'])
-def test_a_text_that_takes_more_memory_as_a_value_is_refused(part, tmp_path):
-    text = f"[{part * 2_100_000}0]"
-    with pytest.raises(UserError, match="too many lists, mappings and texts"):
-        parse_json(text)
-    file = tmp_path / "eval.json"
-    file.write_text(text)
-    with pytest.raises(UserError, match="too many lists, mappings and texts"):
-        read_evaluation(file, {})

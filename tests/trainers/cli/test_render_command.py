@@ -163,7 +163,7 @@ def test_errors_of_render(tmp_path, capsys):
         ([run, "--fire", "zzz"], ["fire 'zzz'", "known: "]),
         ([run, "--fire", "65536"], ["'65536'", "0 to 65535"]),
         ([run, "--fire", "paper:x"], ["'x'", "0 to 65535"]),
-        ([run, "--policy", "zzz"], ["policy 'zzz'", "random_waypoints"]),
+        ([run, "--policy", "zzz"], ["policy='zzz'", "random_waypoints"]),
         ([run, wide], ["env.grid=(40, 30)", "(30, 30)"]),
         ([run, "--output", there], ["there.gif exists already"]),
         ([run, "--output", tmp_path / "no" / "a.gif"], [str(tmp_path / "no"), "no such folder"]),

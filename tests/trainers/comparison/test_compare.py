@@ -12,12 +12,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from synthetic_runs import read_evaluation, write_evaluation, write_run
-from unpack_replay import data_of
 
 from emberlink.envs import metrics
 from emberlink.envs.utils.errors import UserError
 from emberlink.trainers.cli import main
-from emberlink.trainers.comparison import claims, drawing
+from emberlink.trainers.comparison import claims
 from emberlink.trainers.comparison.bootstrap import crossed_interval, iqm_difference
 from emberlink.trainers.comparison.comparison import compare_runs
 
@@ -260,7 +259,7 @@ def test_other_evaluations_are_not_counted_as_runs(comparison, runs, tmp_path):
     found = compare_runs([run])
     assert sorted(found.runs["label"]) == ["consensus", LOST]
     assert {path.rpartition("/")[2] for path, _ in found.left_out} == {
-        "eval_twice.json",
+        run.name,  # the same settings twice
         "eval_step_7.json",
     }
 
@@ -283,9 +282,6 @@ def test_scripted_policies_have_rows_of_their_own(tmp_path):
     comparison = compare_runs([tmp_path])
     assert scripted(comparison) == {"random actions": 5.0}
     assert scripted(comparison, "mean_reward")["random actions (positional)"] == 7.0
-    assert not any("random_actions does not" in note for note in comparison.notes)
-    change_policy(tmp_path / "positional_tuned_s1", "random_actions", "coverage", 6.0)
-    assert any("random_actions does not" in note for note in compare_runs([tmp_path]).notes)
 
 
 def test_different_rewards_are_not_ranked(tmp_path):
@@ -384,20 +380,6 @@ def test_curves_are_over_seeds(comparison, runs):
     assert list(curves["low"]) == pytest.approx(np.min(lines, axis=0))
 
 
-def test_scripted_policies_are_drawn_in_their_rows(tmp_path):
-    """A line is drawn only in the rows that have its value."""
-    assert list(drawing.stretches([0, 1, 3, 5, 6])) == [(0, 1), (3, 3), (5, 6)]
-    for seed, (setting, own) in enumerate((("0.1", 40), ("0.2", 20), ("0.3", 40))):
-        overrides, learned = (f"env.radio.loss={setting}",), {"coverage": 90 - 10 * seed}
-        run = write_run(tmp_path, "consensus", seed, overrides=overrides, learned=learned)
-        change_policy(run, "random_actions", "coverage", own)
-    comparison = compare_runs([tmp_path])
-    figure = drawing.frozen(comparison.ranking, list(comparison.runs["label"]))
-    drawn: Any = figure.axes[0].lines
-    lines = [(line.get_xdata()[0], *line.get_ydata()) for line in drawn]
-    assert {(20, 0.5, 1.5), (40, -0.5, 0.5), (40, 1.5, 2.5)} <= set(lines)
-
-
 # The report
 
 
@@ -438,20 +420,12 @@ def test_the_report_is_one_page(runs, tmp_path, capsys):
 
 def test_extras(runs, tmp_path):
     out = tmp_path / "out"
-    extras = ["--csv", "--latex", "--marl-eval", "--svg"]
-    assert main.main(["compare", str(runs), "--output", str(out), *extras]) == 0
-    assert len(list(out.glob("*.svg"))) == 6
+    assert main.main(["compare", str(runs), "--output", str(out), "--csv", "--pdf"]) == 0
+    assert len(list(out.glob("*.pdf"))) == 6
     table = pd.read_csv(out / "compare.csv")
     pd.testing.assert_frame_equal(
         table.fillna(""), compare_runs([runs]).table, check_dtype=False, check_exact=False
     )
-    assert r"consensus & 3* & 60.0 & [50.0, 70.0]" in (out / "compare.tex").read_text()
-    (tasks,) = json.loads((out / "marl_eval.json").read_text()).values()
-    ((_, algorithms),) = tasks.items()
-    assert sorted(algorithms["consensus"]) == ["run_0", "run_1", "run_2"]
-    first = algorithms["consensus"]["run_0"]
-    assert first["absolute_metrics"]["coverage"] == [45, 55, 45, 55]
-    assert [first[f"step_{i}"]["step_count"] for i in (1, 2, 3)] == [40 * 16 * i for i in (1, 2, 3)]
 
 
 HOSTILE = '<script>alert("1")</script>[red]$x_{/../'
@@ -465,7 +439,7 @@ def test_names_from_files_are_escaped(tmp_path, capsys):
     results["huygens"][HOSTILE] = results["huygens"]["random_actions"]
     results[HOSTILE] = results["huygens"]
     write_evaluation(run, content)
-    arguments = ["compare", str(run), "--latex", "--output", str(tmp_path / "out")]
+    arguments = ["compare", str(run), "--output", str(tmp_path / "out")]
     assert main.main(arguments) == 0
     page = Page(tmp_path / "out")
     assert "script" not in page.tags
@@ -503,9 +477,8 @@ def rewrite(run, old, new):
 
 SPOILT = {
     "no json": (lambda run: (run / "eval.json").write_text("{"), "eval.json"),
-    "another's": (lambda run: change(run, seed=5), "seed=5"),
     "no policy": (lambda run: change(run, results={"huygens": {}}), "has no policy 'learned'"),
-    "fewer fires": (lambda run: change(run, fires=3), "has 4 episodes; fires=3"),
+    "fewer fires": (lambda run: change(run, fires=3), "not 3 episodes"),
     "other fires": (
         lambda run: change(run, held_out={"huygens": {"fire_seeds": [9]}}),
         "not evaluated on the fires",
@@ -545,19 +518,10 @@ def test_a_run_that_cannot_be_read_costs_its_row(case, tmp_path, capsys):
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.slow
-def test_a_real_run_has_a_timelapse_and_a_replay(finished, tmp_path):
-    broken = write_run(tmp_path / "runs", "independent", overrides=("setup=paper",))
-    (broken / "checkpoint.safetensors").write_bytes(b"no weights")
-    paths = [str(finished), str(broken)]
-    assert main.main(["compare", *paths, "--replay", "--output", str(tmp_path / "out")]) == 0
+def test_a_real_run_has_a_timelapse(finished, tmp_path):
+    assert main.main(["compare", str(finished), "--output", str(tmp_path / "out")]) == 0
     page = Page(tmp_path / "out")
-    assert "consensus, seed 0: the frozen policy on the first held-out fire" in page.text
-    assert "independent: no timelapse" in page.text
-    (replay,) = (tmp_path / "out").glob("*_replay_1.html")
-    assert [panel["title"] for panel in data_of(replay.read_text())["panels"]] == [
-        "consensus, seed 0"
-    ]
+    assert "consensus, seed 0: the frozen policy on the first held-out fire of huygens" in page.text
 
 
 def test_a_run_that_was_trained_on_is_left_out(finished, tmp_path):

@@ -48,7 +48,7 @@ def test_a_radio_of_the_run_holds_for_the_methods_of_scripted_policies_too():
     assert (played.comm, played.env.radio) == (consensus.comm, consensus.env.radio)
     own = resolve("positional", ["setup=tuned"])  # its radio has no limit
     assert scripted_config(own, "follow_target").env.radio == resolve("consensus").env.radio
-    off = evaluated_with(own, ["env.radio.range=0"])
+    off = evaluated_with(own, {"env.radio.range": 0})
     assert scripted_config(off, "follow_target").env.radio.range == 0
 
 
@@ -62,7 +62,7 @@ def test_a_run_on_a_fire_of_its_own_can_be_moved(tmp_path):
 
 def test_settings_after_the_world_change_it():
     run = resolve("maps", ["setup=tuned", "world=front"])
-    moved = evaluated_with(run, ["env.radio.range=0", "world=swarm", "env.num_uavs=3"])
+    moved = evaluated_with(run, {"env.radio.range": 0, "world": "swarm", "env.num_uavs": 3})
     assert (moved.world, moved.env.num_uavs, moved.env.radio.range) == ("swarm", 3, 0)
     keys = {key for key, value in flat(to_values(moved)).items() if "learner" in key}
     assert {key: flat(to_values(moved))[key] for key in keys} == {

@@ -12,9 +12,8 @@ from emberlink.envs.utils.config_files import known
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import from_plain
 from emberlink.trainers.config.compose import flat, from_values, resolve, to_values
-from emberlink.trainers.config.removed import REMOVED
 from emberlink.trainers.config.schema import build_comm
-from emberlink.trainers.config.values import check_not_removed, parse
+from emberlink.trainers.config.values import REMOVED, check_not_removed, parse
 
 METHODS = ["independent", "shared_memory", "positional", "consensus"]
 PAPER, RELEASED = "paper", "released"

@@ -55,30 +55,12 @@ def test_the_second_process_is_refused_until_the_first_is_dead(other, tmp_path):
     assert not (tmp_path / "lock").exists()
 
 
-def test_a_lock_on_a_removed_file_is_not_held(tmp_path, monkeypatch):
-    """The holder releases the lock between open and flock of another process."""
-    real, first = fcntl.flock, Lock(tmp_path)
-
-    def flock(handle: int, how: int) -> None:
-        monkeypatch.undo()
-        first.release()
-        real(handle, how)
-
-    monkeypatch.setattr(fcntl, "flock", flock)
-    with pytest.raises(ValueError, match="another process is training here"):
-        Lock(tmp_path)
-    second = Lock(tmp_path)
-    with pytest.raises(ValueError, match=f"process {os.getpid()} .* is training here"):
-        Lock(tmp_path)
-    second.release()
-
-
 def test_a_file_system_without_locks(tmp_path, monkeypatch):
     def flock(handle: int, how: int) -> None:
         raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
 
     monkeypatch.setattr(fcntl, "flock", flock)
-    with pytest.raises(ValueError, match=r"lock: cannot be locked: .* has no locks"):
+    with pytest.raises(ValueError, match=r"lock: cannot be locked: .*output=FOLDER"):
         Lock(tmp_path)
     with pytest.raises(ValueError, match="lock: cannot be locked"):
         Lock(tmp_path / "missing")

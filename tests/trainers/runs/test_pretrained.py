@@ -9,6 +9,7 @@ import torch
 import yaml
 from tiny_run import TINY
 
+from emberlink.envs.utils.errors import UserError
 from emberlink.trainers.cli.main import main
 from emberlink.trainers.config.compose import to_values
 from emberlink.trainers.evaluation.policy import load_actor
@@ -41,7 +42,8 @@ def packed(tmp_path_factory) -> tuple[Path, list[Path]]:
         assert main(["train", *arguments]) == 0
         (run,) = output.iterdir()
         runs.append(run)
-    assert pretrained.main([*map(str, runs), "--into", str(root)]) == 0
+    for run in runs:
+        pretrained.pack(RunFolder(run), root)
     return root, runs
 
 
@@ -151,7 +153,7 @@ def test_a_copy_of_another_version_is_not_taken_for_this_one(shipped, capsys):
     content = run.newest.read_bytes()
     run.newest.write_bytes(content[:-1] + bytes([content[-1] ^ 1]))
     assert main(["eval", "pretrained:consensus"]) == 2
-    assert f"{run.path}: holds other networks than pretrained" in capsys.readouterr().err
+    assert "holds other networks than pretrained" in capsys.readouterr().err
 
 
 def test_names_of_several_policies(shipped):
@@ -189,9 +191,9 @@ def test_shipped_policies_can_be_compared(shipped, tmp_path):
 @pytest.mark.parametrize(
     ("name", "said"),
     [
-        ("pretrained:consensos", "tuned/consensus, tuned/independent, tuned_front/positional"),
+        ("pretrained:consensos", "tuned/independent/s3, tuned_front/positional/s1"),
         ("pretrained:tuned", "is ambiguous"),
-        ("pretrained:tuned/consensus/4", "policy; tuned/consensus has the seeds 3, 10"),
+        ("pretrained:tuned/consensus/4", "known: tuned/consensus/s3, tuned/consensus/s10"),
         ("pretrained:", "no such trained policy"),
         ("pretrained:../../tuned", "no such trained policy"),
     ],
@@ -204,20 +206,17 @@ def test_unknown_names_give_one_line_errors(name, said, shipped, capsys):
         assert error.count("\n") == 1
 
 
-def test_only_finished_runs_are_packed_without_overwriting(packed, tmp_path, capsys):
+def test_only_finished_runs_are_packed_without_overwriting(packed, tmp_path):
     root, (run, *_) = packed
-    assert pretrained.main([str(run), "--into", str(root)]) == 2
-    assert "exists already" in capsys.readouterr().err
+    with pytest.raises(UserError, match="exists already"):
+        pretrained.pack(RunFolder(run), root)
     copy = tmp_path / "copy"
     shutil.copytree(run, copy)
     evaluation = json.loads((copy / "eval.json").read_text())
     older = {**evaluation, "step": 1}
     (copy / "eval.json").write_text(json.dumps(older))
-    assert pretrained.main([str(copy), "--into", str(tmp_path / "new")]) == 2
-    assert "not finished" in capsys.readouterr().err
-    (copy / "eval.json").unlink()
-    assert pretrained.main([str(copy), "--into", str(tmp_path / "new")]) == 2
-    assert "not finished" in capsys.readouterr().err
+    with pytest.raises(UserError, match="not finished"):
+        pretrained.pack(RunFolder(copy), tmp_path / "new")
     assert not (tmp_path / "new").exists()
 
 

@@ -11,15 +11,15 @@ import pytest
 from emberlink.envs.utils.config_files import known as known_files
 from emberlink.envs.utils.config_files import read
 from emberlink.trainers.cli.main import main
-from emberlink.trainers.sweep.executors import base, ray, submitit
-from emberlink.trainers.sweep.executors.base import Task
+from emberlink.trainers.sweep.executors import base, submitit
+from emberlink.trainers.sweep.executors.base import EXECUTORS, Task, make
 from emberlink.trainers.sweep.executors.local import LocalConfig, LocalExecutor
 
 
 def test_every_executor_has_a_file_with_its_settings():
-    assert base.EXECUTORS.known() == known_files("executor") == ["local", "ray", "submitit"]
-    for name in base.EXECUTORS.known():
-        keys = {field.name for field in fields(base.EXECUTORS.find(name).config_type)}
+    assert EXECUTORS.known() == known_files("executor") == ["local", "ray", "submitit"]
+    for name in EXECUTORS.known():
+        keys = {field.name for field in fields(EXECUTORS.find(name).config_type)}
         assert keys == {*read("executor", name)} - {"name"}
 
 
@@ -34,7 +34,7 @@ def test_importing_an_executor_imports_no_package_of_an_extra():
 def test_settings_that_are_texts_keep_their_form(monkeypatch):
     monkeypatch.setattr(submitit, "require", lambda *_: None)
     texts = ["account=007", "memory=4G", "options.qos=low", "partition=12", "workers=9"]
-    made = base.make(["executor=submitit", *(f"executor.{text}" for text in texts)])
+    made = make(["executor=submitit", *(f"executor.{text}" for text in texts)])
     assert isinstance(made, submitit.SubmititExecutor)
     config = made._config
     assert (config.account, config.memory, config.partition) == ("007", "4G", "12")
@@ -79,10 +79,3 @@ def test_a_task_sees_its_share_of_threads_and_gpus(tmp_path, monkeypatch):
     executor.submit([task] * 4)
     assert [env["OMP_NUM_THREADS"] for env in seen] == ["2"] * 4
     assert [env["CUDA_VISIBLE_DEVICES"] for env in seen] == ["4", "7", "4", "7"]
-
-
-def test_a_run_that_no_node_can_take_is_told(monkeypatch):
-    nodes = [{"Alive": True, "Resources": {"CPU": 2.0}}, {"Alive": False, "Resources": {"GPU": 8}}]
-    monkeypatch.setattr(ray, "require", lambda *_: None)
-    with pytest.warns(match="no node has CPU=1, GPU=1"):
-        ray.RayExecutor(ray.RayConfig(gpus=1.0))._check_nodes(nodes)

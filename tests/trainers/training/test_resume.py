@@ -226,8 +226,9 @@ def test_the_function_resumes_and_evaluates(paused):
 
 
 def test_another_version_of_a_package_gives_a_note(paused, monkeypatch, capsys):
-    monkeypatch.setattr(checkpoint, "versions", lambda: {"torch": "1.0"})
-    until(resume(paused), 35)
+    with monkeypatch.context() as earlier:
+        earlier.setattr(checkpoint, "versions", lambda: {"torch": "1.0"})
+        until(resume(paused), 35)
     assert main.main(["train", f"resume={paused}"]) == 0
     assert "made with torch 1.0 (now" in " ".join(capsys.readouterr().out.split())
 

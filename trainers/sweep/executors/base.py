@@ -104,11 +104,7 @@ EXECUTORS = Plugins(Executor, "emberlink.executors", "executor")
 
 
 def make(arguments: Sequence[str]) -> Executor:
-    """Returns the executor of `executor=NAME` (`local` if missing) and `executor.KEY=VALUE`.
-
-    Raises:
-        UserError: the name or a key is not known, or a value is wrong.
-    """
+    """Returns the executor of `executor=NAME` (`local` if missing) and `executor.KEY=VALUE`."""
     given = dict(map(parse, arguments))
     name = str(given.pop("executor", "local"))
     executor = EXECUTORS.find(name)
@@ -124,10 +120,6 @@ def make(arguments: Sequence[str]) -> Executor:
 
 
 def require(package: str, extra: str) -> None:
-    """Checks that the package of an executor, which has its name, is installed.
-
-    Raises:
-        UserError: it is not; the message says how to install emberlink's extra.
-    """
+    """Checks that the package of an executor, which has its name, is installed."""
     if find_spec(package) is None:
         raise UserError(f"executor={package}: not installed: {how_to_install(extra)}")

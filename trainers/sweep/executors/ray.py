@@ -3,8 +3,7 @@
 import os
 import signal
 import time
-import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from importlib import import_module
 from typing import Annotated, Any
 
@@ -75,7 +74,6 @@ class RayExecutor(Executor):
                     logging_level="ERROR",
                     runtime_env={"env_vars": {"PYTHONPATH": path}} if path else None,
                 )
-                self._check_nodes(ray.nodes())
             train = ray.remote(_train).options(
                 num_cpus=config.cpus,
                 num_gpus=config.gpus,
@@ -101,13 +99,3 @@ class RayExecutor(Executor):
 
     def cancel(self, handle: Any) -> None:
         import_module("ray").cancel(handle, force=False)
-
-    def _check_nodes(self, nodes: Sequence[Mapping[str, Any]]) -> None:
-        """Warns if no node is large enough for a run, which would wait for one."""
-        config = self._config
-        wanted = {"CPU": config.cpus, "GPU": config.gpus, "memory": config.memory or 0}
-        wanted = {key: value for key, value in {**wanted, **config.resources}.items() if value}
-        alive = [node["Resources"] for node in nodes if node["Alive"]]
-        if not any(all(node.get(k, 0) >= v for k, v in wanted.items()) for node in alive):
-            text = ", ".join(f"{key}={value:g}" for key, value in wanted.items())
-            warnings.warn(f"executor=ray: no node has {text}; the runs wait for one", stacklevel=2)
