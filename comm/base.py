@@ -41,6 +41,9 @@ class CommModule(TensorDictModuleBase):
     """whether the module reads `keys.HEARS`"""
     heeds_bandwidth: ClassVar[bool] = False
     """whether UAVs say no more than `env.radio.bandwidth`; if not, a limit causes a warning"""
+    every_step: bool = True
+    """whether the module takes part in every step of a held action, not only at decisions; without
+    it, a module neither shapes nor steers, and each step sends the bytes of the decision"""
     units: ClassVar[tuple[str, ...]] = ()
     """settings that define the observation's units; an evaluation with other values warns"""
     hold: int = 1
@@ -103,7 +106,8 @@ class Communication(Transform):
     """Adds a communication module to an environment.
 
     It is a transform and not part of the policy, so that both observations of a transition are
-    rewritten. It reads nothing from the previous time step: all state is in the module.
+    rewritten. It reads nothing from the previous time step: all state is in the module. Where the
+    environment holds actions (`WildfireEnv.hold`), it calls the module at each step itself.
 
     Args:
         module: the communication module, built for the same number of environments.
@@ -116,7 +120,7 @@ class Communication(Transform):
 
     def __init__(self, module: CommModule, message_bytes: int = 0):
         super().__init__()
-        self.module, self.message_bytes = module, message_bytes
+        self.module, self.message_bytes, self._joined = module, message_bytes, False
         self.listens = module.hears or message_bytes > 0
         for name, buffer in module.state_dict().items():
             if buffer.shape[:1] != (module.num_envs,):
@@ -125,6 +129,15 @@ class Communication(Transform):
                     f"first dimension of state must be num_envs={module.num_envs} (register "
                     "constants with persistent=False)"
                 )
+
+    def set_container(self, container: Any) -> None:
+        super().set_container(container)
+        world: Any = None if self.parent is None else self.parent.base_env
+        # Bytes of learned messages are counted at decisions, and not at every step.
+        counted = self.message_bytes > 0 and self.module.world.measures == "all"
+        self._joined = getattr(world, "hold", 1) > 1 and (self.module.every_step or counted)
+        if self._joined:
+            world.join(self._steered, self._stepped)
 
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
@@ -148,18 +161,25 @@ class Communication(Transform):
         return result
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
+        return tensordict if self._joined else self._steered(tensordict)
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        return next_tensordict if self._joined else self._stepped(next_tensordict)
+
+    def _steered(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Returns the action to perform at a step."""
         action = self.module.steer(tensordict)
         return tensordict if action is None else tensordict.set(keys.ACTION, action)
 
-    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        self._listen(next_tensordict)
-        bonus = self.module.shaping(next_tensordict)
+    def _stepped(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Communicates after a step of the environment."""
+        self._listen(tensordict)
+        bonus = self.module.shaping(tensordict)
         if bonus is not None:
             if self.module.world.failures:
-                bonus = bonus.masked_fill(~next_tensordict.get(keys.ALIVE), 0.0)
-            reward = next_tensordict.get(keys.REWARD) + bonus.unsqueeze(-1)
-            next_tensordict.set(keys.REWARD, reward)
-        return self._speak(self.module(next_tensordict))
+                bonus = bonus.masked_fill(~tensordict.get(keys.ALIVE), 0.0)
+            tensordict.set(keys.REWARD, tensordict.get(keys.REWARD) + bonus.unsqueeze(-1))
+        return self._speak(self.module(tensordict))
 
     def _communicate(self, tensordict: TensorDictBase) -> TensorDictBase:
         self._listen(tensordict)
@@ -202,6 +222,14 @@ class Communication(Transform):
                     f"key {key} is missing: {type(self.module).__name__} reads it; it comes from "
                     f"{source}"
                 )
+
+    def transform_reward_spec(self, reward_spec: Composite) -> Composite:
+        if not self._joined or self.module.world.measures != "all":
+            return reward_spec
+        spec = reward_spec.clone()
+        every = spec[keys.STEPS, keys.AGENTS]
+        every[keys.BYTES_SENT[1]] = Unbounded(every.shape, device=spec.device, dtype=torch.int64)
+        return spec
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         spec = observation_spec.clone()

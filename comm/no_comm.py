@@ -18,6 +18,7 @@ class NoComm(CommModule):
     """Leaves the observations unchanged: 6 numbers per UAV (paper, section IV.C)."""
 
     config_type: ClassVar[type] = NoCommConfig
+    every_step = False
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         return tensordict

@@ -42,6 +42,7 @@ class Positional(CommModule):
         super().__init__(world, config, num_envs)
         inputs: list[Any] = [keys.OBSERVATION, keys.HEARS]
         self.in_keys = inputs
+        self.every_step = world.measures == "all"  # UAVs that fail send nothing from then on
         own = torch.eye(world.num_uavs, dtype=torch.bool)
         self.register_buffer("_own", own, persistent=False)
         uav = torch.arange(world.num_uavs)

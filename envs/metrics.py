@@ -4,6 +4,8 @@
 event that never happens counts as the horizon, T.
 """
 
+from typing import Any
+
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
@@ -213,20 +215,33 @@ def names(world: WildfireConfig) -> tuple[str, ...]:
     return (*NAMES, *measured, *(OF_BASE if world.base is not None else ()))
 
 
-STEP_KEYS = (
+SERIES = (
     keys.REWARD,
     keys.SEEN,
     keys.BURNT,
     keys.NEW_FIRE,
     keys.OLD_FIRE,
     keys.HIT_BOUNDARY,
-    keys.FRONT_AGE,
-    keys.FRONT_AGE_P95,
     keys.BYTES_SENT,
-    keys.BASE_SEEN,
-    keys.BASE_AGE,
 )
-"""the keys that `episode_metrics` reads; only some worlds have the last five"""
+"""the keys of which `episode_metrics` reads every step; only some worlds have the last"""
+_AT_THE_END = (keys.FRONT_AGE, keys.FRONT_AGE_P95, keys.BASE_SEEN, keys.BASE_AGE)
+"""the keys of which it reads the last step; only some worlds have them"""
+
+
+def measured_steps(steps: TensorDictBase) -> TensorDictBase:
+    """Returns what `episode_metrics` reads, with an entry for each step of a held action.
+
+    Args:
+        steps: the "next" of successive steps or decisions of a `WildfireEnv`, batch size [..., T].
+    """
+    read = steps.select(*SERIES, *_AT_THE_END, strict=False)
+    series = steps.get(keys.STEPS, None)
+    if series is None:
+        return read
+    repeated: Any = read.unsqueeze(-1).expand(*steps.shape, series.shape[-1])
+    result: Any = repeated.clone(False).update(series)
+    return result.flatten(-2, -1)
 
 
 def _ratio(seen: Tensor, burning: Tensor) -> Tensor:

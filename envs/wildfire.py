@@ -1,8 +1,8 @@
 """The wildfire environment: it joins fire, motion, sensor and reward, and names its tensors."""
 
 import secrets
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -29,6 +29,17 @@ from emberlink.envs.world.sensor import Sensor
 _DONE = ("done", "terminated", "truncated")
 
 
+class Moved(NamedTuple):
+    """What one step of the world has changed; at a reset, there is no reward."""
+
+    position: Tensor
+    sighting: Sighting
+    hit_boundary: Tensor
+    burning: Tensor
+    burnt: Tensor
+    reward: Tensor | None
+
+
 class WildfireEnv(EnvBase):
     """A team of UAVs over a spreading fire, batched over environments.
 
@@ -43,14 +54,16 @@ class WildfireEnv(EnvBase):
             environments, in order; each is the same as with its seed alone, unless `staggered`.
         device: where all tensors live.
         agent_done: whether done, terminated and truncated stand under "agents" too, per UAV.
+        hold: steps for which a call of `step` holds its action; the reward is the sum over them.
         staggered: whether environments are out of phase: the first episode of environment i after
-            seeding is truncated after horizon * (i + 1) / num_envs steps, rounded up.
+            seeding is truncated after horizon * (i + 1) / num_envs steps, rounded up to a multiple
+            of `hold`.
         true_map: whether the map is written under `keys.TRUE_MAP`.
 
     Raises:
         UserError: an unknown scenario or device, arrival times whose shape does not fit, seeds or a
-            number of environments that are not whole, or a number of environments that is no
-            multiple of the number of seeds.
+            number of environments that are not whole, a number of environments that is no multiple
+            of the number of seeds, or a horizon that is no multiple of `hold`.
     """
 
     _low: Tensor
@@ -61,7 +74,6 @@ class WildfireEnv(EnvBase):
     _step_key: Tensor
     _time: Tensor
     _position: Tensor
-    _seen: Tensor
     _first_length: Tensor
     _fail_step: Tensor | None
     _all_alive: Tensor
@@ -74,6 +86,7 @@ class WildfireEnv(EnvBase):
         seed: int | Sequence[int] | None = None,
         device: torch.device | str = "cpu",
         *,
+        hold: int = 1,
         agent_done: bool = False,
         staggered: bool = False,
         true_map: bool = False,
@@ -84,7 +97,14 @@ class WildfireEnv(EnvBase):
         check_device(str(device))
         super().__init__(device=device, batch_size=torch.Size([num_envs]))
         self.config = default_config(fire) if config is None else config
+        self.hold = check_whole("hold", hold)
+        if self.hold < 1 or self.config.horizon % self.hold:
+            raise UserError(
+                f"hold={hold}: expected a divisor of the horizon, {self.config.horizon} steps"
+            )
         self._agent_done, self._staggered, self._shows_map = agent_done, staggered, true_map
+        self._steer: Callable[[TensorDictBase], TensorDictBase] | None = None
+        self._communicate: Callable[[TensorDictBase], TensorDictBase] | None = None
         self._fire_name = fire if isinstance(fire, str) else getattr(fire, "name", None)
         self._make_world(fire)
         self._make_specs()
@@ -109,7 +129,7 @@ class WildfireEnv(EnvBase):
         )
         measured = config.measures == "all" or config.base is not None
         self._measures = Measures(config, num_envs, sensor.area) if measured else None
-        for name in ("_seed_key", "_episode", "_episode_key", "_step_key", "_time", "_seen"):
+        for name in ("_seed_key", "_episode", "_episode_key", "_step_key", "_time"):
             self.register_buffer(name, torch.zeros(num_envs, dtype=torch.int64))
         never = torch.full((num_envs, config.num_uavs), config.horizon + 1)
         self.register_buffer("_fail_step", never if config.failures else None)
@@ -118,7 +138,8 @@ class WildfireEnv(EnvBase):
         position = torch.zeros(num_envs, config.num_uavs, 3, dtype=torch.float64)
         self.register_buffer("_position", position)
         place = torch.arange(1, num_envs + 1)
-        first_length = (place * config.horizon + num_envs - 1) // num_envs
+        share = num_envs * self.hold
+        first_length = (place * config.horizon + share - 1) // share * self.hold
         self.register_buffer("_first_length", first_length, persistent=False)
 
     def _make_specs(self) -> None:
@@ -165,7 +186,15 @@ class WildfireEnv(EnvBase):
         self.observation_spec = observed
         action = Bounded(-1.0, 1.0, torch.Size((*agents, 3)), dtype=torch.float32)
         self.action_spec = team(**{keys.ACTION[1]: action})
-        self.reward_spec = team(**{keys.REWARD[1]: real(*agents, 1)})
+        reward = {keys.REWARD[1]: real(*agents, 1)}
+        self.reward_spec = team(**reward)
+        if self.hold > 1:
+            counted = (keys.REWARD, keys.NEW_FIRE, keys.OLD_FIRE, keys.HIT_BOUNDARY)
+            step = team(**{key[1]: {**per_uav, **reward}[key[1]] for key in counted})
+            step[keys.SEEN], step[keys.BURNT] = whole(*envs), whole(*envs)
+            every = step.unsqueeze(1).expand((*envs, self.hold)).clone()
+            # Not observed: they belong to the transition, and a reset has none.
+            self.reward_spec = Composite({**team(**reward), keys.STEPS: every}, shape=envs)
         done = Composite({name: flag(*envs, 1) for name in _DONE}, shape=envs)
         if self._agent_done:
             flags = {name: flag(*agents, 1) for name in _DONE}
@@ -208,7 +237,9 @@ class WildfireEnv(EnvBase):
         start = self._start_positions(position)
         self._position.copy_(torch.where(mask[:, None, None], start, self._position))
         hit_boundary = torch.zeros_like(self._position, dtype=torch.bool)
-        return self._snapshot(self._position.float(), self._no_sighting(), hit_boundary)
+        sighting, counts = self._no_sighting(), self._map.count(self._time)
+        start = Moved(self._position.float(), sighting, hit_boundary, *counts, None)
+        return self._snapshot(start).update(self._measured())
 
     def _start_episodes(self, mask: Tensor) -> None:
         """Starts the next episode where a mask, bool [num_envs], is true."""
@@ -216,7 +247,6 @@ class WildfireEnv(EnvBase):
         self._episode_key.copy_(counter_rng.fold_in(self._seed_key, self._episode))
         self._step_key.copy_(counter_rng.fold_in(self._episode_key, Use.STEPS))
         self._time.masked_fill_(mask, 0)
-        self._seen.masked_fill_(mask, 0)
         self._map.start_episodes(mask, self._draw_fire())
         if self._measures is not None:
             self._measures.start_episodes(mask, *self._map.times)
@@ -246,10 +276,38 @@ class WildfireEnv(EnvBase):
         classes = none.new_zeros((*none.shape, self._side**2), dtype=torch.bool)
         return Sighting(none, none.new_zeros((*none.shape, 2), dtype=torch.float32), classes)
 
+    def join(
+        self,
+        steer: Callable[[TensorDictBase], TensorDictBase],
+        communicate: Callable[[TensorDictBase], TensorDictBase],
+    ) -> None:
+        """Calls `steer` on the action before every step, and `communicate` on each time step."""
+        self._steer, self._communicate = steer, communicate
+
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        chosen, result, steps = tensordict.select(keys.ACTION), TensorDict(), []
+        for left in reversed(range(self.hold)):
+            steered = chosen if self._steer is None else self._steer(chosen.copy())
+            now = self._advance(steered.get(keys.ACTION))
+            if self._communicate is not None:
+                result = self._communicate(self._snapshot(now))
+            elif not left:
+                result = self._snapshot(now)
+            if self.hold > 1:
+                steps.append(self._counted(now, result))
+        result.update(self._measured())
+        if steps:
+            every = {key: torch.stack([step[key] for step in steps], 1) for key in steps[0]}
+            series = TensorDict(every, (self.num_envs, self.hold), self.device)
+            series.get(keys.AGENTS).batch_size = (*series.shape, self.n_agents)
+            result.set(keys.STEPS, series).set(keys.REWARD, every[keys.REWARD].sum(1))
+        return result
+
+    def _advance(self, action: Tensor) -> Moved:
+        """Performs one step of the world."""
         self._time.add_(1)
         alive = self._alive()
-        position, hit_boundary = self._move(tensordict.get(keys.ACTION), alive)
+        position, hit_boundary = self._move(action, alive)
         self._position.copy_(position)
         sighting, view = self._map.look(self._position, self._time, alive)
         if self._measures is not None:
@@ -257,10 +315,27 @@ class WildfireEnv(EnvBase):
         new, old, none = sighting.counts.unbind(-1)
         told = None if self._measures is None else self._measures.told
         flies = self._all_alive if alive is None else alive
-        unseen = self.unseen_fire.unsqueeze(-1) * flies if self.config.reward.unseen else None
+        burning, burnt = self._map.count(self._time)
+        penalised = self.config.reward.unseen != 0
+        unseen = self._map.unseen(burning).unsqueeze(-1) * flies if penalised else None
         reward = step_reward(new, old, none, hit_boundary, self.config.reward, told, unseen)
-        self._seen.add_(new.sum(-1).long())
-        return self._snapshot(position, sighting, hit_boundary, reward)
+        return Moved(position, sighting, hit_boundary, burning, burnt, reward.unsqueeze(-1))
+
+    def _counted(self, now: Moved, heard: TensorDictBase) -> dict[Any, Tensor]:
+        """Returns what the measures need of a step within a held action; see `keys.STEPS`."""
+        new, old, _ = now.sighting.counts.long().unbind(-1)
+        counted = {
+            keys.REWARD: now.reward,
+            keys.SEEN: self._map.seen_count.clone(),
+            keys.BURNT: now.burnt,
+            keys.NEW_FIRE: new,
+            keys.OLD_FIRE: old,
+            keys.HIT_BOUNDARY: now.hit_boundary,
+        }
+        if self._communicate is not None:
+            changed = heard.select(keys.REWARD, keys.BYTES_SENT, strict=False)
+            counted |= dict(changed.items(True, True))
+        return counted
 
     def _alive(self) -> Tensor | None:
         """Returns which UAVs fly, bool [num_envs, n]; None if UAVs never fail."""
@@ -278,14 +353,9 @@ class WildfireEnv(EnvBase):
             high=self._high,
         )
 
-    def _snapshot(
-        self,
-        position: Tensor,
-        sighting: Sighting,
-        hit_boundary: Tensor,
-        reward: Tensor | None = None,
-    ) -> TensorDict:
-        """Returns the TensorDict of a reset (without reward) or of a step."""
+    def _snapshot(self, now: Moved) -> TensorDict:
+        """Returns the TensorDict of a reset or of a step."""
+        position, sighting = now.position, now.sighting
         counts, time, alive = sighting.counts.long(), self._time.clone(), self._alive()
         new, old, none = counts.unbind(-1)
         new_centre, old_centre, _ = sighting.centres.unbind(-2)
@@ -297,7 +367,7 @@ class WildfireEnv(EnvBase):
             keys.NO_FIRE[1]: none,
             keys.NEW_CENTRE[1]: new_centre,
             keys.OLD_CENTRE[1]: old_centre,
-            keys.HIT_BOUNDARY[1]: hit_boundary,
+            keys.HIT_BOUNDARY[1]: now.hit_boundary,
             keys.ALIVE[1]: self._all_alive.clone() if alive is None else alive,
         }
         square = self._side, self._side
@@ -305,24 +375,26 @@ class WildfireEnv(EnvBase):
             agents[keys.WINDOW[1]] = sighting.classes.unflatten(-1, square)
         if self.config.observation == "sight":
             agents[keys.SIGHT[1]] = sighting.shown().unflatten(-1, square)
-        if reward is not None:
-            agents[keys.REWARD[1]] = reward.unsqueeze(-1)
+        if now.reward is not None:
+            agents[keys.REWARD[1]] = now.reward
         done = self._done(time)
         if self._agent_done:
             agents |= {k: v.unsqueeze(-1).repeat(1, self.n_agents, 1) for k, v in done.items()}
-        burning, burnt = self._map.count(time)
         root = {
             keys.AGENTS: TensorDict(agents, position.shape[:-1], self.device),
             keys.RNG_KEY: self._step_key.clone(),
             keys.STEP: time,
-            keys.SEEN: self._seen.clone(),
-            keys.BURNING: burning,
-            keys.BURNT: burnt,
-            **({} if self._measures is None else self._measures.values()),
-            **({keys.TRUE_MAP: self.fire_map} if self._shows_map else {}),
+            keys.SEEN: self._map.seen_count.clone(),
+            keys.BURNING: now.burning,
+            keys.BURNT: now.burnt,
             **done,
         }
         return TensorDict(root, self.batch_size, self.device)
+
+    def _measured(self) -> dict[str, Tensor]:
+        """Returns what no UAV knows: the measures so far, and the map."""
+        measures = {} if self._measures is None else self._measures.values()
+        return measures | ({keys.TRUE_MAP: self.fire_map} if self._shows_map else {})
 
     def _observe(self, position: Tensor, counts: Tensor, time: Tensor) -> Tensor:
         """Returns x, y, z, new-fire flag, old-fire flag and step, float32 [num_envs, n, 6]."""
@@ -362,8 +434,8 @@ class WildfireEnv(EnvBase):
 
     @property
     def max_steps(self) -> int:
-        """The steps of an episode."""
-        return self.config.horizon
+        """The calls of `step` in an episode."""
+        return self.config.horizon // self.hold
 
     @property
     def group_map(self) -> dict[str, list[str]]:
@@ -385,7 +457,7 @@ class WildfireEnv(EnvBase):
     @property
     def unseen_fire(self) -> Tensor:
         """The number of burning cells that no UAV has seen while they burned, int64 [num_envs]."""
-        return self._map.count(self._time)[0] - self._map.seen_burning
+        return self._map.unseen(self._map.count(self._time)[0])
 
     @property
     def arrival_time(self) -> Tensor:

@@ -1,4 +1,7 @@
-"""Holds each action for several steps."""
+"""Holds each action for several steps in an environment that is stepped one by one.
+
+Training holds actions within the environment, see `WildfireEnv.hold`.
+"""
 
 from typing import Any
 
@@ -58,27 +61,9 @@ class Held(Stateful):
         return acted.set(written(HELD), action).set(keys.ACTION, action)
 
 
-def hold(policy: TensorDictModuleBase, steps: int, uavs: int) -> Any:
+def held(policy: TensorDictModuleBase, steps: int, uavs: int) -> Any:
     """Returns a policy whose actions are held for a number of steps; itself for one step."""
     return policy if steps == 1 else Held(policy, steps, uavs)
-
-
-def decisions(rollout: TensorDictBase, steps: int) -> TensorDictBase:
-    """Returns a rollout with one transition per decision.
-
-    A transition leads from one decision to the next; its reward is the sum over the steps in
-    between.
-
-    Args:
-        rollout: batch size [environments, decisions * steps]; begins with a decision.
-        steps: steps for which an action is held.
-    """
-    if steps == 1:
-        return rollout
-    first: Any = rollout[:, ::steps]
-    last: Any = rollout.get("next")[:, steps - 1 :: steps]
-    reward: Tensor = rollout.get(("next", *keys.REWARD)).unflatten(1, (-1, steps)).sum(2)
-    return first.copy().set("next", last.copy().set(keys.REWARD, reward))
 
 
 def _choose(decides: Tensor, new: Tensor, old: Tensor) -> Tensor:

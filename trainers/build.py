@@ -12,7 +12,7 @@ from emberlink.envs.scenarios import ScenarioConfig, grid_of
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import check_device
 from emberlink.envs.wildfire import WildfireEnv
-from emberlink.policies.hold import hold
+from emberlink.policies.hold import held
 from emberlink.policies.networks.messages import message_bytes
 from emberlink.policies.state import primer_of
 from emberlink.trainers.config.compose import override, resolve
@@ -75,6 +75,7 @@ def build_env(
     fire: str | ScenarioConfig | Tensor,
     seed: int | Sequence[int] | None,
     device: torch.device | str,
+    hold: int = 1,
     true_map: bool = False,
     teacher: str | None = None,
 ) -> TransformedEnv:
@@ -82,7 +83,7 @@ def build_env(
 
     With a `teacher` (`LearnerConfig.reads_teacher`), its actions are written under `keys.TEACHER`.
     """
-    world = WildfireEnv(num_envs, config.env, fire, seed, device, true_map=true_map)
+    world = WildfireEnv(num_envs, config.env, fire, seed, device, hold=hold, true_map=true_map)
     module = build_comm(config, num_envs).to(world.device)
     env = TransformedEnv(world, Communication(module, message_bytes(config.policy)))
     if teacher is not None:
@@ -100,7 +101,7 @@ def build_actor(
     learner = LEARNERS.find(config.learner.name)
     specs = env.observation_spec, env.full_action_spec
     actor = learner.make_actor(config.learner, *specs, generator, config.policy)
-    return hold(actor, config.policy.hold, config.env.num_uavs)
+    return held(actor, config.policy.hold, config.env.num_uavs)
 
 
 def build_learner(config: RunConfig, env: TransformedEnv) -> Learner:

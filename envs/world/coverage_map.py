@@ -157,8 +157,10 @@ class CoverageMap(nn.Module):
     _fire_index: Tensor
     _first_seen: Tensor
     _stamp: Tensor
-    seen_burning: Tensor
-    """int64 [envs]: burning cells that a UAV has seen while they burned"""
+    seen_count: Tensor
+    """int64 [envs]: cells that a UAV has seen while they burned"""
+    seen_gone: Tensor
+    """int64 [envs]: those of them that have burnt out"""
 
     def __init__(self, sensor: Sensor, fires: Tensor, *, horizon: int, envs: int, uavs: int):
         super().__init__()
@@ -183,7 +185,8 @@ class CoverageMap(nn.Module):
         first_seen = torch.full((envs, sensor.area), _NEVER, dtype=torch.int32)
         self.register_buffer("_first_seen", first_seen)
         self.register_buffer("_stamp", self._uav.repeat(envs, 1, 1))
-        self.register_buffer("seen_burning", torch.zeros(envs, dtype=torch.int64))
+        for name in ("seen_count", "seen_gone"):
+            self.register_buffer(name, torch.zeros(envs, dtype=torch.int64))
 
     def __len__(self) -> int:
         """Returns the number of fires."""
@@ -217,7 +220,8 @@ class CoverageMap(nn.Module):
             self._burn_out.copy_(torch.where(began, self._fires_end[fire], self._burn_out))
         self._fire_index.copy_(torch.where(mask, fire, self._fire_index))
         self._first_seen.masked_fill_(began, _NEVER)
-        self.seen_burning.masked_fill_(mask, 0)
+        self.seen_count.masked_fill_(mask, 0)
+        self.seen_gone.masked_fill_(mask, 0)
         self._stamp.copy_(torch.where(mask[:, None, None], self._uav, self._stamp))
 
     def count(self, step: Tensor) -> tuple[Tensor, Tensor]:
@@ -226,6 +230,10 @@ class CoverageMap(nn.Module):
         if self._burnt_out is None:
             return burnt, burnt.clone()
         return burnt - self._burnt_out.at(self._fire_index, step), burnt
+
+    def unseen(self, burning: Tensor) -> Tensor:
+        """Returns how many of the burning cells, int64 [envs], were not seen while they burned."""
+        return burning - self.seen_count + self.seen_gone
 
     def look(
         self, position: Tensor, step: Tensor, alive: Tensor | None = None
@@ -259,9 +267,9 @@ class CoverageMap(nn.Module):
         classes = torch.stack((new, burning ^ new, no_fire), -2)
         counted = self._sensor.count_classes(classes, centre)
         sighting = Sighting(*counted, classes, burnt_out)
-        self.seen_burning.add_(sighting.counts[..., 0].sum(-1).long())
+        self.seen_count.add_(sighting.counts[..., 0].sum(-1).long())
         if self._burnt_out is not None:
             env, cell = self._burnt_out.passing(self._fire_index, step)
             gone = self._first_seen[env, cell] < _NEVER
-            self.seen_burning.sub_(env[gone].bincount(minlength=len(step)))
+            self.seen_gone.index_add_(0, env, gone.long())
         return sighting, View(cells, in_view, burning)

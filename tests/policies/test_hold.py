@@ -1,18 +1,17 @@
-"""Tests that actions are held, and that learners receive one transition per decision."""
-
-from typing import Any
+"""Tests that actions are held, by a policy and by the environment, and what learners receive."""
 
 import pytest
 import torch
-from tensordict import TensorDict
-from torchrl.envs import step_mdp
+from torchrl.envs import TransformedEnv, check_env_specs, step_mdp
 
-from emberlink.envs import keys
+from emberlink.comm.base import CommModule, Communication
+from emberlink.envs import WildfireConfig, WildfireEnv, keys, metrics
 from emberlink.envs.utils.errors import UserError
-from emberlink.policies.hold import HELD, Held, decisions, hold
+from emberlink.policies.hold import HELD, Held, held
 from emberlink.policies.state import Stateful
 from emberlink.trainers import make_env
 from emberlink.trainers.config.compose import resolve
+from emberlink.trainers.config.schema import build_comm
 from emberlink.trainers.training.setup import TrainingSetup
 
 COUNT = (keys.AGENTS, "count")
@@ -33,9 +32,7 @@ class Counting(Stateful):
 
 def test_holding_for_one_step_is_the_policy_itself():
     policy = Counting()
-    assert hold(policy, 1, 2) is policy
-    td: Any = TensorDict({}, batch_size=[2, 3])
-    assert decisions(td, 1) is td
+    assert held(policy, 1, 2) is policy
 
 
 def test_an_action_is_held_and_what_is_carried_changes_at_decisions_alone():
@@ -61,21 +58,95 @@ def test_environments_decide_at_their_own_steps():
     assert acted["next", *COUNT][:, 0, 0].tolist() == [1, 2]
 
 
-def test_a_transition_leads_from_one_decision_to_the_next():
-    env = make_env("independent", num_envs=2, num_uavs=2, horizon=6, seed=1)
-    policy = Held(Counting(), 3, 2)
-    env.append_transform(policy.make_tensordict_primer())
-    whole = env.rollout(6, policy)
-    folded = decisions(whole, 3)
-    assert folded.shape == (2, 2)
-    assert folded[keys.STEP].tolist() == [[0, 3]] * 2
-    assert folded["next", keys.STEP].tolist() == [[3, 6]] * 2
-    assert folded["next", "done"][..., 0].tolist() == [[False, True]] * 2
-    reward = whole["next", *keys.REWARD]
-    for k in range(2):
-        total = reward[:, 3 * k] + reward[:, 3 * k + 1] + reward[:, 3 * k + 2]
-        torch.testing.assert_close(folded["next", *keys.REWARD][:, k], total)
-    assert whole["next", *keys.REWARD].shape[1] == 6  # the rollout itself is as before
+LOST = ["env.failures=2.0", "env.radio.loss=0.3", "env.measures=all", "fire.burn_time=15.0"]
+BASED = ["world=blackout", "env.horizon=60", "env.grid=[24, 24]", "env.base=[3.0, 12.0]"]
+WORLDS = {
+    "plain": (2, []),
+    "lost messages, failures, burning out": (10, LOST),
+    "base, limited radio": (4, [*BASED, "env.radio.bandwidth=90", "env.radio.range=15.0"]),
+    "window": (10, ["env.observation=window", "env.observation_scale=raw", *LOST]),
+}
+
+
+def make_pair(method: str, hold: int, options: list[str], staggered: bool):
+    """Returns environments that are stepped one by one, and ones that hold their actions."""
+    fires = ["setup=strong", "fire=front", "fire.num_train_fires=3", "env.horizon=60"]
+    config = resolve(method, [*fires, *options, f"policy.hold={hold}"])
+    envs = []
+    for steps in (1, hold):
+        core = WildfireEnv(3, config.env, config.fire, 5, hold=steps, staggered=staggered)
+        envs.append(TransformedEnv(core, Communication(build_comm(config, 3))))
+    return envs
+
+
+@pytest.mark.filterwarnings("ignore:env.radio.bandwidth")
+@pytest.mark.parametrize("world", WORLDS)
+@pytest.mark.parametrize("method", ["independent", "positional", "consensus", "maps"])
+def test_a_held_action_equals_its_steps_one_by_one(method, world):
+    """To the last digit, in the transitions, the state of the world and the measures."""
+    if method == "maps" and world == "window":
+        pytest.skip("maps observes what cameras see")
+    hold, options = WORLDS[world]
+    single, holding = make_pair(method, hold, options, staggered=world == "window")
+    generator, decisions, ends = torch.Generator().manual_seed(hold), [], 0
+    now, later, steps = single.reset(), holding.reset(), []
+    for _ in range(90 // hold):
+        action = 3 * torch.rand(3, 6, 3, generator=generator) - 1.5
+        for step in range(hold):
+            done, now = single.step_and_maybe_reset(now.set(keys.ACTION, action.clone()))
+            steps.append(done["next"])
+            if step < hold - 1:  # an episode ends with a decision
+                assert not done["next", "done"].any()
+        one, later = holding.step_and_maybe_reset(later.set(keys.ACTION, action.clone()))
+        decisions.append(one["next"])
+        ends += int(one["next", "done"].sum())
+        expected, taken = steps[-1], torch.stack(steps[-hold:], 1)
+        for key in expected.keys(True, True):
+            if key != keys.REWARD:
+                assert one["next"][key].equal(expected[key]), key
+        assert one["next"][keys.REWARD].equal(taken[keys.REWARD].sum(1))
+        for key in one["next", keys.STEPS].keys(True, True):
+            assert one["next", keys.STEPS][key].equal(taken[key]), key
+        for key in now.exclude(keys.ACTION).keys(True, True):
+            assert later[key].equal(now[key]), key
+    for part in ("base_env", "transform"):
+        states = getattr(single, part).state_dict(), getattr(holding, part).state_dict()
+        for name, value in states[0].items():
+            assert value.nan_to_num(nan=-9).equal(states[1][name].nan_to_num(nan=-9)), name
+    assert ends
+    measured = [
+        metrics.episode_metrics(metrics.measured_steps(torch.stack(each, 1)))
+        for each in (steps, decisions)
+    ]
+    assert measured[0].keys() == measured[1].keys()
+    for name, value in measured[0].items():
+        assert value.equal(measured[1][name]), name
+
+
+class Listening(CommModule):
+    """Counts the steps at which it is called."""
+
+    def __init__(self, every_step: bool):
+        super().__init__(WildfireConfig(), None, 2)
+        self.every_step = every_step
+        self.register_buffer("calls", torch.zeros(2, dtype=torch.int64))
+
+    def forward(self, tensordict):
+        self.calls.add_(1)
+        return tensordict
+
+
+@pytest.mark.parametrize(("every_step", "calls"), [(True, 9), (False, 3)])
+def test_a_module_takes_part_in_every_step_unless_it_says_otherwise(every_step, calls):
+    module = Listening(every_step)
+    env = TransformedEnv(WildfireEnv(2, hold=4, seed=0), Communication(module))
+    env.rollout(2)
+    assert module.calls.tolist() == [calls] * 2
+
+
+@pytest.mark.parametrize("method", ["independent", "positional", "consensus", "maps"])
+def test_specs_of_environments_that_hold_actions(method):
+    check_env_specs(make_pair(method, 3, LOST, staggered=False)[1])
 
 
 @pytest.mark.parametrize("learner", ["ddpg", "td3", "ippo"])
@@ -108,3 +179,8 @@ def test_an_episode_has_a_decision_at_least(learner):
     config = resolve("maps", ["world=front", f"learner={learner}", "setup=tuned", "env.horizon=8"])
     with pytest.raises(UserError, match=r"env.horizon=8: must be a multiple of 10, the steps"):
         TrainingSetup(config)
+
+
+def test_the_environment_holds_actions_for_a_part_of_the_horizon():
+    with pytest.raises(UserError, match="hold=7: expected a divisor of the horizon, 1000 steps"):
+        WildfireEnv(1, hold=7)

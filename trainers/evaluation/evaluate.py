@@ -71,7 +71,7 @@ def play(env: TransformedEnv, policy: Policy, watch: Watch | None = None) -> dic
                 after.update({} if sent is None else {keys.BYTES_SENT: sent})
             if watch is not None:
                 watch(world, after)
-            steps.append(after.select(*metrics.STEP_KEYS, strict=False))
+            steps.append(metrics.measured_steps(after))
             td = step_mdp(td, keep_other=True)
     check_finite(torch.stack(actions))
     episode: Any = torch.stack(cast(Any, steps), dim=1)

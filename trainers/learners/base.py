@@ -163,8 +163,7 @@ class Learner(ABC):
     def learn(self, rollout: TensorDictBase) -> list[Losses]:
         """Learns from a rollout, batch size [num_envs, rollout_steps].
 
-        Where actions are held for several steps, a transition leads from one decision to the next
-        (`policies.hold.decisions`).
+        Where actions are held for several steps, a transition leads from one decision to the next.
 
         Returns:
             The losses of each update; an empty list if there was no update.

@@ -19,8 +19,8 @@ class ResumableCollector:
 
     Args:
         env: batch of environments with communication; the policy's state is added to it.
-        total_steps: steps of the batch of environments in the whole run.
-        rollout_steps: steps of a rollout; divides the horizon.
+        decisions: decisions of the batch of environments in the whole run.
+        rollout: decisions of a rollout; divides those of an episode.
     """
 
     def __init__(
@@ -28,10 +28,10 @@ class ResumableCollector:
         env: TransformedEnv,
         policy: TensorDictModuleBase,
         *,
-        total_steps: int,
-        rollout_steps: int,
+        decisions: int,
+        rollout: int,
     ):
-        self.total_steps, self.rollout_steps, self.step = total_steps, rollout_steps, 0
+        self.decisions, self.rollout, self.made = decisions, rollout, 0
         primer: Any = primer_of(policy)
         if not primer.primers.is_empty():
             env.append_transform(primer)
@@ -40,31 +40,31 @@ class ResumableCollector:
         self._collector = Collector(
             env,
             policy,
-            frames_per_batch=env.batch_size.numel() * rollout_steps,
-            total_frames=-1,  # `step` counts, from where the run was resumed
+            frames_per_batch=env.batch_size.numel() * rollout,
+            total_frames=-1,  # `made` counts, from where the run was resumed
             trust_policy=True,
             track_traj_ids=False,
             auto_register_policy_transforms=False,
         )
         self.carried = self._resets.last
-        """the input of the next step"""
+        """the input of the next decision"""
 
     def __iter__(self) -> Iterator[TensorDictBase]:
-        """Yields rollouts, batch size [environments, rollout_steps]."""
+        """Yields rollouts, batch size [environments, rollout]."""
         rollouts = iter(self._collector)
-        while self.step < self.total_steps:
+        while self.made < self.decisions:
             rollout = next(rollouts)
-            self.step += self.rollout_steps
+            self.made += self.rollout
             last: Any = rollout[:, -1]
             ended = bool(last["next", "done"].any())  # all environments end together
             self.carried = self._resets.last if ended else self._input_after(last)
             yield rollout
 
-    def restore(self, carried: TensorDictBase, step: int) -> None:
-        """Continues from an earlier value of `carried`, at a step of the run."""
+    def restore(self, carried: TensorDictBase, made: int) -> None:
+        """Continues from an earlier value of `carried`, after some decisions of the run."""
         self._resets.instead = self.carried = carried
         self._collector.reset()
-        self.step = step
+        self.made = made
 
     def _input_after(self, last: TensorDictBase) -> TensorDictBase:
         following: Any = step_mdp(last)

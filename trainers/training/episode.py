@@ -23,7 +23,7 @@ class EpisodeRecord:
 
     def add(self, rollout: TensorDictBase, losses: list[Losses]) -> None:
         """Adds a rollout and the losses of the updates that followed it."""
-        self.steps.append(rollout.get("next").select(*metrics.STEP_KEYS, strict=False).clone())
+        self.steps.append(metrics.measured_steps(rollout.get("next")).clone())
         for update in losses:
             for name, value in update.items():
                 self.losses.setdefault(name, []).append(value)

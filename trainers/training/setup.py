@@ -10,7 +10,7 @@ from torchrl.envs import TransformedEnv
 
 from emberlink.envs import keys
 from emberlink.envs.utils.errors import UserError
-from emberlink.policies.hold import decisions, hold
+from emberlink.policies.hold import held
 from emberlink.trainers.build import build_env, build_learner
 from emberlink.trainers.config.schema import RunConfig, build_comm
 from emberlink.trainers.learners.base import Learner, Losses
@@ -34,9 +34,9 @@ class TrainingSetup:
         """steps of the batch of environments in a rollout"""
         self.collector = ResumableCollector(
             self.env,
-            hold(self.learner.explorer, config.policy.hold, config.env.num_uavs),
-            total_steps=self.total_steps,
-            rollout_steps=self.rollout_steps,
+            self.learner.explorer,
+            decisions=self.total_steps // config.policy.hold,
+            rollout=self.learner.rollout_steps,
         )
         self.record = EpisodeRecord()
 
@@ -47,8 +47,8 @@ class TrainingSetup:
 
     def learn(self, rollout: TensorDictBase) -> list[Losses]:
         """Learns from a rollout, records it and returns the losses of each update."""
-        self.step += rollout.shape[1]
-        losses = self.learner.learn(decisions(rollout, self.config.policy.hold))
+        self.step += self.rollout_steps
+        losses = self.learner.learn(rollout)
         self.record.add(rollout, losses)
         return losses
 
@@ -60,7 +60,7 @@ class TrainingSetup:
     @property
     def actor(self) -> Any:
         """The actors without noise; they share weights with the learner."""
-        return hold(self.learner.actor, self.config.policy.hold, self.config.env.num_uavs)
+        return held(self.learner.actor, self.config.policy.hold, self.config.env.num_uavs)
 
     def state_dict(self) -> dict[str, Tensor]:
         """Returns the state of the training, "group/name" -> tensor.
@@ -89,7 +89,8 @@ class TrainingSetup:
         """
         device, carried = self.config.device, group(state, "carried")
         copy_into(flatten(self.collector.carried), carried)
-        self.collector.restore(unflatten(carried, 1, device), step)  # resets the environments
+        restored = unflatten(carried, 1, device)
+        self.collector.restore(restored, step // self.config.policy.hold)  # resets the environments
         weights = prefixed(weights=group(state, "weights"))
         self.learner.load_state_dict(group(state, "learner") | weights)
         copy_into(self.env.base_env.state_dict(), group(state, "environments"))
@@ -105,6 +106,7 @@ def check_setup(config: RunConfig) -> None:
 
 def _make_env(config: RunConfig, num_envs: int) -> TransformedEnv:
     """Returns training environments, with the map and teacher that the learner reads."""
+    config.check_rollouts()  # learners divide by the decisions of an episode
     if config.env.observation == "sight" and keys.SIGHT not in build_comm(config, 1).in_keys:
         raise UserError(
             f"env.observation=sight: comm.name={config.comm['name']} does not read what cameras "
@@ -116,6 +118,7 @@ def _make_env(config: RunConfig, num_envs: int) -> TransformedEnv:
         fire=config.fire,
         seed=config.seed,
         device=config.device,
+        hold=config.policy.hold,
         true_map=config.learner.reads_map,
         teacher=config.learner.reads_teacher,
     )
@@ -123,7 +126,6 @@ def _make_env(config: RunConfig, num_envs: int) -> TransformedEnv:
 
 def _make_learner(config: RunConfig, env: TransformedEnv) -> Learner:
     """Returns a new learner; validates before training."""
-    config.check_rollouts()  # learners divide by the decisions of an episode
     learner = build_learner(config, env)
     config.check_rollouts(learner.rollout_steps)
     return learner
