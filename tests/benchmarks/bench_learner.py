@@ -2,13 +2,11 @@
 
 import time
 from functools import partial
-from itertools import islice
 from typing import Any
 
 import pytest
 from workloads import METHODS, in_turns
 
-from emberlink.policies.hold import decisions
 from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.training.setup import TrainingSetup
 
@@ -46,16 +44,20 @@ def test_chunks_against_whole_episodes(tell):
     learners: list[Any] = []
     for chunk in (0, 25):
         training = TrainingSetup(resolve("independent", ["setup=strong", f"learner.chunk={chunk}"]))
-        learners.append(training.learner)
+        learner: Any = training.learner
+        learners.append(learner)
         if not rollouts:
-            rollouts = [rollout.clone() for rollout in islice(training.collector, 100)]
+            learn = learner.learn
+            learner.learn = lambda rollout: rollouts.append(rollout.clone()) or []
+            training.dry_run(training.horizon)
+            learner.learn = learn
 
-    def learn(learner: Any) -> None:
+    def update(learner: Any) -> None:
         learner.decisions = 0
         for rollout in rollouts:
-            learner.learn(decisions(rollout, 10))
+            learner.learn(rollout)
 
-    whole, chunks = in_turns(3, *(partial(learn, learner) for learner in learners))
+    whole, chunks = in_turns(3, *(partial(update, learner) for learner in learners))
     tell(
         f"update of independent from chunks of 25 decisions: {whole / chunks:.2f} x whole episodes"
     )

@@ -278,9 +278,8 @@ class PPO(Learner, ABC):
         missing = -self.context.horizon % self.chunk
         if missing:
             flew = torch.ones_like(episode.get(LOG_PROB), dtype=torch.bool)
-            episode = pad(
-                episode.set(keys.ALIVE, episode.get(keys.ALIVE, flew)), [0, 0, 0, missing]
-            )
+            episode.set(keys.ALIVE, episode.get(keys.ALIVE, flew))
+            episode = pad(episode, [0, 0, 0, missing])
         chunks: Any = episode.reshape(-1, self.chunk)
         memory = chunks.pop(MEMORY, None)
         rows = len(chunks), self.context.num_uavs
