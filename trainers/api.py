@@ -21,7 +21,6 @@ from emberlink.trainers.evaluation.evaluate import evaluate as evaluate_policy
 from emberlink.trainers.evaluation.policy import TrainedPolicy, load_policy
 from emberlink.trainers.evaluation.scores import Results
 from emberlink.trainers.runs import pretrained
-from emberlink.trainers.runs.run_folder import RunFolder
 from emberlink.trainers.terminal.signals import Interruption
 from emberlink.trainers.training.resume import resume as resumed
 from emberlink.trainers.training.trainer import Progress, Trainer
@@ -165,7 +164,7 @@ def load(
         UserError: there is no such run, a file in it is damaged, or a setting does not fit.
     """
     name, file = os.fspath(run), None if checkpoint is None else user_path(checkpoint)
-    folder = RunFolder(pretrained.find_one(name) if pretrained.is_name(name) else name)
+    folder = pretrained.read_run(name)
     return load_policy(folder, (), settings, checkpoint=file, device=device)
 
 

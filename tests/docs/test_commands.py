@@ -128,8 +128,6 @@ def _small(rest: list[str]) -> list[str]:
 
 def _sweep(rest: list[str]) -> list[str]:
     """Returns the arguments of a sweep of one method and one value of each key."""
-    if rest[0] == "status":
-        return rest
     methods = [word for word in rest if "=" not in word][:1] or ["independent"]
     keys = [word for word in _without_sizes(rest) if "=" in word]
     keys = [
@@ -200,7 +198,7 @@ def test_a_command_of_the_documentation_runs(command, place):
     if "=BANK" in command:
         assert main(["fire", "import", "ArrivalTime.asc", "fire.units=minutes", *BANK]) == 0
     verb, *rest = shortened(shlex.split(command)[1:])
-    if verb == "sweep" and rest[0] != "status":
+    if verb == "sweep":
         # In this process, whatever the executor: that of a cluster needs the cluster.
         assert sweep(rest, Console(quiet=True), executor=Inside()) == 0
     elif [verb, *rest][:2] == ["world", "check"]:

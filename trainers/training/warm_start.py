@@ -11,8 +11,7 @@ from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.evaluation.policy import units
 from emberlink.trainers.learners.base import ACTOR, Learner
 from emberlink.trainers.runs.checkpoint import load_weights
-from emberlink.trainers.runs.pretrained import find_one, is_name
-from emberlink.trainers.runs.run_folder import RunFolder
+from emberlink.trainers.runs.pretrained import read_run
 
 _OBSERVED = ("comm.", "env.observation", "policy.hold")
 """prefixes of keys that define the meaning of observations and actions, besides `units`"""
@@ -29,7 +28,7 @@ def start(learner: Learner, config: RunConfig) -> None:
     network: Any = learner.actor.module
     expected = {ACTOR + key: value for key, value in network.state_dict().items()}
     try:
-        run = RunFolder(find_one(name) if is_name(name) else name)
+        run = read_run(name)
         # The device of that run may not exist here.
         theirs = run.config(device=config.device)
         weights = load_weights(run.checkpoint(), expected, config)
