@@ -67,15 +67,11 @@ def command(
     """Adds a command and returns the function that adds an argument to it.
 
     Args:
-        commands: result of `add_subparsers`.
         name: name of the command, with that of its group, such as "world check".
         run: called with the options and a console, or `module:function` of emberlink.trainers,
             which is imported when the command runs and called with the options and the console
             as keyword arguments; returns the exit status.
         summary: text in the list of commands.
-        description: description of the command.
-        example: example of a command line.
-        usage: usage of the command; generated from its arguments if None.
     """
     epilog = f"example:\n  {example}"
     parser = commands.add_parser(

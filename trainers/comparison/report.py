@@ -181,11 +181,8 @@ def write_report(
 ) -> Comparison:
     """Writes compare.html, compare.json and the extras into a new or empty folder.
 
-    Args:
-        comparison: result of `compare_runs`.
-        folder: result of `free_folder`.
-        say: called with a line of text before the figures of each section.
-        extras: "csv", and "pdf" for the figures.
+    `say` is called with a line of text before the figures of each section; `extras` are "csv", and
+    "pdf" for the figures.
     """
     environment = Environment(
         autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True

@@ -39,11 +39,7 @@ def resolve(method: str, overrides: Sequence[str] = (), **settings: Any) -> RunC
 def override(config: RunConfig, overrides: Sequence[str] = (), **settings: Any) -> RunConfig:
     """Returns a run's configuration with some values changed, without reading YAML files.
 
-    Args:
-        config: configuration of the run.
-        overrides: texts `key=value`, as on the command line; `setup`, `world`, `fire` and `learner`
-            cannot change.
-        settings: as for `resolve`.
+    Arguments are those of `resolve`; `setup`, `world`, `fire` and `learner` cannot change.
     """
     values, texts = to_values(config), []
     for text in overrides:
@@ -74,10 +70,7 @@ def in_world(config: RunConfig, world: str, **fire: Any) -> RunConfig:
     The fire is that of the world. Of `env` and `evaluation`, the keys in which the two worlds
     differ have the values of the other world; the run keeps the rest.
 
-    Args:
-        config: configuration of the run.
-        world: name of a file in configs/world.
-        fire: values of keys of the world's fire, such as `fire.path`.
+    `fire` holds values of keys of the world's fire, such as `fire.path`.
     """
     if world == config.world and not fire:
         return config

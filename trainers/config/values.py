@@ -48,10 +48,7 @@ _HYDRA = threading.RLock()
 def composed(method: str, overrides: Sequence[str] = (), **settings: Any) -> dict[str, Any]:
     """Returns the values of a method's run, whose types and ranges are not checked.
 
-    Args:
-        method: name of a file in configs/method.
-        overrides: texts `key=value`, as on the command line.
-        settings: other keys and their values; see `full_key`.
+    `overrides` are texts `key=value`, as on the command line; see `full_key` for `settings`.
     """
     if isinstance(overrides, str):
         raise UserError(f"{shown(overrides)!r}: expected a list of texts key=value")

@@ -124,10 +124,7 @@ def evaluate(
     product depends on the number of rows.
 
     Args:
-        config: configuration of the run.
-        actor: the frozen policy.
         fires: number of test fires, one episode each.
-        scripted: whether to evaluate the scripted policies, too.
         report: called with the names of the fire and the policy before each evaluation.
         watch: watches the first batch of the frozen policy on the fires of `shown_fire`.
 

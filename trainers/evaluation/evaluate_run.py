@@ -67,9 +67,6 @@ def evaluate_run(
     """Evaluates a frozen policy and writes eval.json, the figures, a GIF and a replay page.
 
     Args:
-        run: folder of the files.
-        config: configuration of the run.
-        actor: the frozen policy.
         checkpoint: file of the policy.
         fires: number of test fires, one episode each.
         report: called with a line of text before each part of the work.

@@ -94,16 +94,9 @@ def load_policy(
     checkpoint: Path | None = None,
     device: str | None = None,
 ) -> TrainedPolicy:
-    """Returns the frozen policy of a run.
+    """Returns the frozen policy of a run, with the configuration in its checkpoint and changes.
 
-    Its configuration is the one in the checkpoint, with changes.
-
-    Args:
-        run: the run folder.
-        overrides: texts `key=value` that change the world, its fire, `env`, `comm` or `evaluation`.
-        settings: the same as keyword arguments.
-        checkpoint: file of networks; the newest of the run if None.
-        device: device of the networks; that of the run if None.
+    Arguments are those of `emberlink.trainers.load`; `overrides` are settings as texts `key=value`.
     """
     folder = run.path
     if not folder.is_dir():

@@ -46,9 +46,8 @@ def sweep(
 
     Args:
         arguments: see `combinations`; and `executor=NAME`, `executor.KEY=VALUE`.
-        console: shows the progress and a table at the end.
         dry: whether to print the state of each run and do nothing else.
-        executor: runs the trainings; replaces the executor of the arguments.
+        executor: replaces the executor of the arguments.
 
     Returns:
         0; 1 if a run failed; 128 and the number of a signal, such as 130, after it.

@@ -11,12 +11,8 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 class TrainingProgress:
     """Prints a line for each episode and each evaluation; a terminal also shows a bar.
 
-    Args:
-        console: prints the lines and shows the bar.
-        steps: number of steps of the whole training.
-        episodes: number of episodes of the whole training.
-        step: number of steps done before.
-        headline: the measure of evaluations that is printed.
+    `steps` and `episodes` are those of the whole training, `step` those done before; `headline` is
+    the measure of evaluations that is printed.
     """
 
     def __init__(

@@ -21,15 +21,8 @@ from emberlink.trainers.training.trainer import NonFiniteError, Progress, Traine
 def train(method: str | None, overrides: Sequence[str], console: Console) -> int:
     """Trains a method or resumes a run, and evaluates it.
 
-    SIGINT, SIGTERM and SIGHUP end the training after the current step with a checkpoint.
-
-    Args:
-        method: name of the method, or `resume=RUN`.
-        overrides: texts `key=value`.
-        console: prints progress and results.
-
-    Returns:
-        The exit status: 0, or 128 plus the number of the signal that ended the training.
+    SIGINT, SIGTERM and SIGHUP end the training after the current step with a checkpoint; the exit
+    status is then 128 plus the number of the signal. `method` may be `resume=RUN`.
     """
     trainer = _trainer(method, overrides)
     interruption = Interruption(trainer.stop)

@@ -24,11 +24,7 @@ def resume(
     """Returns the training of a run folder, restored from its newest checkpoint.
 
     Metrics of later episodes and incomplete files are removed. A run without a checkpoint begins
-    again.
-
-    Args:
-        method: if given, must be the method of the run.
-        overrides: texts `key=value`, of keys that do not affect learning.
+    again. `method` must be that of the run; the other arguments change keys of `MAY_CHANGE`.
     """
     run = RunFolder(path)
     # The device of the run may not exist here, so it is replaced before it is checked.
