@@ -77,7 +77,8 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
     and leaves `agents`. `infos` hold, for each agent, the other tensors under ("agents", ...) of
     the TorchRL environment, and the numbers of cells `seen`, `burning` and `burnt`. With
     `observation: window` an observation is a dictionary of "observation", float32 [6], and
-    "window", uint8 [3, W, W]; with method `maps` it has "crops" instead of the window.
+    "window", uint8 [3, W, W]; with method `maps` it has "crops" instead of the window. Before the
+    first reset, methods that need an episode raise a UserError.
 
     Args:
         env: see `parallel_env`.
@@ -168,7 +169,7 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
 
         Raises:
             UserError: an agent is not known, an action of a live agent is missing, is no array of
-                three numbers or holds NaN, or no episode has been started.
+                three numbers or holds NaN.
         """
         now = self._begun("step")
         if not self.agents:
@@ -178,13 +179,13 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
         stepped = self._env.step(now)
         self._now = step_mdp(stepped, keep_other=True)
         after = stepped.get("next")
-        rewards = after.get(keys.REWARD)[0, :, 0].tolist()
+        earned = after.get(keys.REWARD)[0, :, 0].tolist()
+        rewards = dict(zip(self.possible_agents, earned, strict=True))
         lives = dict(zip(self.possible_agents, after.get(keys.ALIVE)[0].tolist(), strict=True))
         flew, truncated = self.agents, bool(after.get("truncated"))
         self.agents = [] if truncated else [agent for agent in flew if lives[agent]]
         self._show()
         observations, infos = self._observations(), self._infos(after)
-        rewards = dict(zip(self.possible_agents, rewards, strict=True))
         return (
             {agent: observations[agent] for agent in flew},
             {agent: rewards[agent] for agent in flew},
@@ -200,9 +201,6 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
 
         Args:
             policy: writes ("agents", "action"), such as `emberlink.trainers.load` returns.
-
-        Raises:
-            UserError: no episode has been started.
         """
         now = self._begun("act")
         if not self.agents:
@@ -214,30 +212,18 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
         return {agent: chosen[agent] for agent in self.agents}
 
     def state(self) -> Array:
-        """Returns the vectors of all UAVs one after another, float32 [n * features].
-
-        Raises:
-            UserError: no episode has been started.
-        """
+        """Returns the vectors of all UAVs one after another, float32 [n * features]."""
         now = self._begun("state")
         return now.get(keys.OBSERVATION)[0].flatten().cpu().numpy().copy()
 
     def pictures(self) -> dict[str, NDArray[np.uint8]]:
-        """Returns the other tensors of the observations of all UAVs, uint8 [n, ...], by name.
-
-        Raises:
-            UserError: no episode has been started.
-        """
+        """Returns the other tensors of the observations of all UAVs, uint8 [n, ...], by name."""
         now = self._begun("pictures")
         _, *others = keys.observation_keys(self._env.observation_spec)
         return {k[1]: now.get(k)[0].to(torch.uint8).cpu().numpy().copy() for k in others}
 
     def counts(self) -> dict[str, int]:
-        """Returns the numbers of cells `seen`, `burning` and `burnt`.
-
-        Raises:
-            UserError: no episode has been started.
-        """
+        """Returns the numbers of cells `seen`, `burning` and `burnt`."""
         now = self._begun("counts")
         return {key: int(now.get(key)) for key in (keys.SEEN, keys.BURNING, keys.BURNT)}
 
@@ -280,11 +266,9 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
         missing = set(self.agents) - set(actions)
         if missing or set(actions) - set(self.possible_agents):
             raise UserError(f"got actions for {sorted(actions)}; expected those of {self.agents}")
-        stacked = np.zeros((len(self.possible_agents), 3), np.float32)
-        for i, agent in enumerate(self.possible_agents):
-            if agent in self.agents:
-                stacked[i] = to_action(actions[agent], 3, agent)
-        return stacked
+        given = {agent: to_action(actions[agent], 3, agent) for agent in self.agents}
+        hover = np.zeros(3, np.float32)
+        return np.stack([given.get(agent, hover) for agent in self.possible_agents])
 
     def _observations(self) -> dict[str, Observation]:
         vectors = self.state().reshape(len(self.possible_agents), -1)
