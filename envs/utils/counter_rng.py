@@ -113,20 +113,6 @@ def _bits(key: Tensor, count: int) -> Tensor:
     return fold_in(key.unsqueeze(-1), torch.arange(count, device=key.device))
 
 
-def integers(key: Tensor, count: int, limit: int | Tensor) -> Tensor:
-    """Returns integers uniform in [0, limit), with a relative bias of at most limit / 2³².
-
-    Args:
-        key: int64 [...].
-        count: numbers per key.
-        limit: upper limit, at most 2³¹.
-
-    Returns:
-        int64 [..., count].
-    """
-    return (_shift(_bits(key, count), 32) * limit) >> 32
-
-
 def uniform(key: Tensor, count: int) -> Tensor:
     """Returns numbers uniform in (0, 1), excluding both ends.
 

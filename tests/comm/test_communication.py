@@ -74,3 +74,15 @@ def test_communication_does_not_change_the_world(method):
         bonus = (rewritten["next", *keys.REWARD] - bare["next", *keys.REWARD]).abs().max()
         assert (bonus > 0) == (method == "consensus")
         rewritten, bare = step_mdp(rewritten, keep_other=True), step_mdp(bare, keep_other=True)
+
+
+@pytest.mark.filterwarnings("error::UserWarning")
+@pytest.mark.parametrize("method", EVERY)
+def test_a_bandwidth_that_a_method_does_not_heed_causes_a_warning(method):
+    limited = {"env.radio.bandwidth": 20}
+    if method in ("positional", "consensus"):
+        message = rf"bandwidth=20: the messages of comm\.name={method} are not limited"
+        with pytest.warns(UserWarning, match=message):
+            recipe(method, **limited)
+    else:
+        recipe(method, **limited)

@@ -6,7 +6,6 @@ import pytest
 import torch
 
 from emberlink.envs.utils import counter_rng
-from emberlink.envs.utils.counter_rng import Use
 
 COUNT = 20_000
 
@@ -83,24 +82,3 @@ def test_values_equal_splitmix64():
         expected = mix((mix((key + golden) % 2**64) + (counter + 1) * golden) % 2**64)
         got = counter_rng.fold_in(torch.tensor(key), counter).item()
         assert got % 2**64 == expected
-
-
-@pytest.mark.parametrize("limit", [1, 6, 166_667, 2**31])
-def test_integers_are_uniform_below_their_limit(limit):
-    drawn = counter_rng.integers(counter_rng.seed_keys(0, 4), 25_000, limit)
-    assert drawn.shape == (4, 25_000)
-    assert 0 <= drawn.min() <= drawn.max() < limit
-    assert drawn.equal(
-        counter_rng.integers(counter_rng.seed_keys(0, 4), 25_000, torch.tensor(limit))
-    )
-    unit = (drawn.double() + 0.5) / limit
-    assert abs(unit.mean().item() - 0.5) < 0.004
-    if 1 < limit <= 6:
-        counts = drawn.flatten().bincount(minlength=limit)
-        assert (counts / 100_000 - 1 / limit).abs().max() < 0.006
-    if limit >= 1000:
-        assert abs(unit.std().item() - 12**-0.5) < 0.003
-
-
-def test_every_use_has_a_number_of_its_own():
-    assert len(Use) == len(Use.__members__)

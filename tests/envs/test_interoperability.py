@@ -47,13 +47,6 @@ def test_both_ways_of_seeding_are_equivalent():
     assert not starts(make(seed=4)).equal(starts(set_later))
 
 
-def test_a_loaded_state_keeps_its_seed():
-    old, new = make(seed=4), make()
-    old.reset()
-    new.load_state_dict(old.state_dict())
-    assert starts(new).equal(starts(old))
-
-
 @pytest.mark.heavy
 def test_the_workers_of_a_parallel_environment_differ():
     workers = ParallelEnv(2, make)

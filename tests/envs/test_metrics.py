@@ -119,12 +119,5 @@ def test_episode_metrics_equal_loops(method):
     assert measured["time_to_full_coverage"][1] == 60
 
 
-def test_only_step_keys_are_read():
-    env = WildfireEnv(1, WildfireConfig(horizon=5))
-    steps = env.rollout(5)["next"]
-    few = metrics.episode_metrics(metrics.measured_steps(steps))
-    assert few == metrics.episode_metrics(steps)
-
-
 def test_bytes_per_step_by_hand():
     assert metrics.bytes_per_step(torch.tensor([[[16, 0], [32, 16]]])).tolist() == [16]

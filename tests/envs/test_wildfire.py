@@ -6,10 +6,11 @@ import math
 import pytest
 import torch
 from tensordict import TensorDict
-from torchrl.envs import check_env_specs
+from torchrl.envs import check_env_specs, step_mdp
 
 from emberlink.envs import WildfireConfig, WildfireEnv, keys
 from emberlink.envs.fire.generator import load_scenario, make_fires
+from emberlink.envs.utils.errors import UserError
 from emberlink.trainers import make_env
 
 METHODS = ("independent", "shared_memory", "positional", "consensus", "maps")
@@ -151,7 +152,43 @@ def test_specs_of_the_bare_environment(observation):
     assert not env.reset()[keys.OBSERVATION][..., 3:].any()
 
 
-@pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize("setup", ["paper", "tuned"])
-def test_specs_of_every_recipe(method, setup):
-    check_env_specs(make_env(method, setup, num_envs=2, fire=EVERYWHERE, horizon=10))
+@pytest.mark.parametrize("method", [None, *METHODS])
+def test_a_partial_reset_leaves_the_others_alone(method):
+    fire = torch.linspace(0, 20, 144).view(12, 12)
+    env = make_env(method, num_envs=3, fire=fire, horizon=20) if method else world(fire, 3)
+    td = env.reset()
+    for _ in range(5):
+        td = step_mdp(env.step(env.rand_action(td)), keep_other=True)
+    before = td.clone()
+    after = env.reset(td.set("_reset", torch.tensor([[False], [True], [False]])))
+    for key in after.keys(True, True):
+        assert after[key][::2].equal(before[key][::2]), key
+    assert (after[keys.POSITION][1] != before[keys.POSITION][1]).any()
+    following = env.step(env.rand_action(after))["next"]
+    assert following[keys.STEP].tolist() == [6, 1, 6]
+    same = following[keys.RNG_KEY] == before[keys.RNG_KEY]
+    assert same.tolist() == [True, False, True]
+
+
+WORLD = {"config": WildfireConfig(grid=(12, 12), num_uavs=1)}
+BAD = {
+    "'papr'.*paper": {"fire": "papr"},
+    "NaN": {"fire": torch.full((12, 12), math.nan), **WORLD},
+    r"fire: .*\[12, 12\].*num_envs=3": {"fire": torch.zeros(2, 12, 12), "num_envs": 3, **WORLD},
+    "a cell burns out before": {"fire": torch.tensor([3.0, 2]).view(1, 2, 1, 1).expand(1, 2, 9, 9)},
+    "num_envs=0": {"num_envs": 0},
+    "seed=-1: expected a whole number from 0": {"seed": -1},
+    "device=abacus": {"device": "abacus"},
+}
+
+
+@pytest.mark.parametrize("message", BAD)
+def test_bad_input_is_named(message):
+    with pytest.raises(UserError, match=message):
+        WildfireEnv(**BAD[message])
+
+
+@pytest.mark.parametrize("position", [[[5.0, 5, 9]], [[math.nan, 5, 2]], [[5.0, 5, 2]] * 2])
+def test_start_positions_outside_the_box_are_named(position):
+    with pytest.raises(UserError, match="position"):
+        start(world(), *position)

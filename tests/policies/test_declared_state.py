@@ -61,12 +61,6 @@ def policy(request):
     return policy_of(request.param)
 
 
-def test_actions_are_held_and_differ_between_decisions(policy):
-    actions = alone(policy).unflatten(1, (-1, 3))
-    assert (actions == actions[:, :, :1]).all()
-    assert not torch.allclose(actions[:, 1, 0], actions[:, 2, 0])
-
-
 def test_state_is_declared(policy):
     carried = [HELD, MEMORY] if MEMORY in policy.in_keys else [HELD]
     assert set(carried) <= set(policy.in_keys)
@@ -87,6 +81,7 @@ def test_only_declared_keys_are_read(policy):
     assert torch.stack(actions, 1)[0].equal(alone(policy)[0, :HORIZON])
 
 
+# A ParallelEnv starts processes, which import torch for seconds.
 @pytest.mark.parametrize(
     ("cls", "collected"),
     [

@@ -10,11 +10,8 @@ from emberlink.envs import keys
 from emberlink.policies.networks import make_actor, make_critic
 from emberlink.policies.networks.actor_critic import StackedActor
 from emberlink.policies.networks.encoders import (
-    ObservationEncoder,
     PictureEncoder,
-    WindowEncoder,
 )
-from emberlink.policies.networks.grouping import Grouping
 
 UAVS, ACTIONS, WINDOW, HIDDEN = 3, 3, 5, (10, 8)
 
@@ -99,40 +96,6 @@ def test_shared_weights_are_the_same_for_all_uavs(window):
         torch.testing.assert_close(network(td)[out][:, order], network(permuted)[out])
 
 
-@pytest.mark.parametrize("shared", [False, True])
-@pytest.mark.parametrize("batch", [(8, 3), (2, 4, 3)])
-def test_grouping_round_trip(shared, batch):
-    grouping = Grouping(3, shared=shared)
-    x = torch.randn(*batch, 5)
-    split = grouping.split(x, torch.Size(batch))
-    assert split.shape == ((1, 24, 5) if shared else (3, 8, 5))
-    assert grouping.join(split, torch.Size(batch)).equal(x)
-
-
-@pytest.mark.parametrize(
-    ("side", "features"), [(1, 16), (5, 144), (15, 1024), (16, 256), (63, 784)]
-)
-def test_windows_of_any_size_have_a_bounded_number_of_features(side, features):
-    encoder = WindowEncoder(2, (3, side, side))
-    out = encoder(torch.rand(2, 4, 3, side, side) < 0.5)
-    assert out.shape == (2, 4, features) == (2, 4, encoder.features)
-
-
-def test_a_map_may_have_sides_of_different_lengths():
-    """A map of 40 x 12 cells is pooled to 14 x 4; the second convolution halves both sides."""
-    encoder = WindowEncoder(1, (2, 40, 12))
-    assert encoder.features == 16 * 7 * 2
-    assert encoder(torch.ones(1, 3, 2, 40, 12, dtype=torch.bool)).shape == (1, 3, encoder.features)
-
-
-def test_unsupported_observations_are_errors():
-    with pytest.raises(ValueError, match=r"no encoder for an observation of shape \[2, 3\]"):
-        ObservationEncoder(1, [(2, 3)])
-    for hidden in ((), (8,) * 9):
-        with pytest.raises(ValueError, match="1 to 8 layers"):
-            StackedActor(2, [(4,)], 3, hidden)
-
-
 def test_pictures_pass_three_convolutions_with_weights_of_their_group():
     encoder = PictureEncoder(2, [2, 3, 9, 12], generator=torch.Generator().manual_seed(1)).double()
     pictures = torch.randint(0, 256, (2, 4, 2, 3, 9, 12), dtype=torch.uint8)
@@ -148,9 +111,3 @@ def test_pictures_pass_three_convolutions_with_weights_of_their_group():
                     x = nn.functional.conv2d(x[None], weight, bias, stride=2, padding=1)[0].relu()
                 parts.append(x.flatten())
             torch.testing.assert_close(encoded[group, row], torch.cat(parts))
-
-
-def test_pictures_of_floats_are_not_written_to():
-    pictures = torch.ones(1, 2, 1, 1, 8, 8)
-    PictureEncoder(1, [1, 1, 8, 8], generator=torch.Generator().manual_seed(0))(pictures)
-    assert pictures.eq(1).all()

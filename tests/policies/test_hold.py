@@ -174,13 +174,6 @@ def test_the_horizon_is_a_multiple_of_the_held_steps():
         TrainingSetup(config)
 
 
-@pytest.mark.parametrize("learner", ["ddpg", "mappo", "imitation"])
-def test_an_episode_has_a_decision_at_least(learner):
-    config = resolve("maps", ["world=front", f"learner={learner}", "setup=tuned", "env.horizon=8"])
-    with pytest.raises(UserError, match=r"env.horizon=8: must be a multiple of 10, the steps"):
-        TrainingSetup(config)
-
-
 def test_the_environment_holds_actions_for_a_part_of_the_horizon():
     with pytest.raises(UserError, match="hold=7: expected a divisor of the horizon, 1000 steps"):
         WildfireEnv(1, hold=7)

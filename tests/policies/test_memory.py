@@ -6,14 +6,11 @@ from tensordict import TensorDict
 from torch import nn
 
 from emberlink.envs import keys
-from emberlink.envs.utils.errors import UserError
 from emberlink.policies.gaussian import MEMORY, GaussianActor, GaussianExplorer
-from emberlink.policies.networks.memory.base import MEMORIES
 from emberlink.policies.networks.memory.gru import GRU
-from emberlink.policies.networks.sequence import GaussianNetwork, SequenceNetwork, TeamNetwork
+from emberlink.policies.networks.sequence import GaussianNetwork, TeamNetwork
 from emberlink.policies.settings import PolicyConfig
 from emberlink.trainers import make_env
-from emberlink.trainers.config.compose import resolve
 
 UAVS, FEATURES = 3, 6
 
@@ -32,14 +29,6 @@ def network(kind: str, *, shared: bool = True, index=False) -> GaussianNetwork:
 
 def drawn(*shape: int, seed: int = 0) -> torch.Tensor:
     return torch.randn(*shape, generator=torch.Generator().manual_seed(seed))
-
-
-def test_memories_are_the_files_on_disk():
-    assert MEMORIES.known() == ["gru", "none"]
-    with pytest.raises(UserError, match=r"policy.memory='lstm' is not known; known: gru, none"):
-        resolve("consensus", ["learner=ippo", "policy.memory=lstm"])
-    with pytest.raises(UserError, match=r"policy.memory='' is not known; known: gru, none"):
-        resolve("consensus", ["learner=ippo", 'policy.memory=""'])
 
 
 @pytest.mark.parametrize("kind", ["none", "gru"])
@@ -115,11 +104,6 @@ def test_the_values_of_a_team_depend_on_every_observation_and_position():
         assert differs[0, 1:].all()
         assert not differs[0, 0].any()
         assert not differs[1].any()
-
-
-def test_a_critic_of_a_uav_is_a_sequence_network():
-    critic = SequenceNetwork(UAVS, [(FEATURES,)], 1, (8,), policy=PolicyConfig(), gain=1.0)
-    assert critic(critic.empty_state(2), drawn(2, 4, UAVS, FEATURES))[0].shape == (2, 4, UAVS, 1)
 
 
 def actor_of(kind: str) -> tuple[GaussianActor, TensorDict]:

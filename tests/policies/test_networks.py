@@ -5,15 +5,10 @@ import math
 import pytest
 import torch
 from single_ddpg import SingleActor, SingleCritic, copy_uav
-from tensordict import TensorDict
 
-from emberlink.envs import WildfireConfig, WildfireEnv, keys
 from emberlink.policies.networks.actor_critic import (
-    STATE_ACTION_VALUE,
     StackedActor,
     StackedCritic,
-    make_actor,
-    make_critic,
 )
 
 UAVS, FEATURES, ACTIONS, HIDDEN = 4, 9, 3, (20, 12)
@@ -88,19 +83,3 @@ def test_uavs_start_from_different_weights_and_a_seed_repeats_them():
         assert not first.equal(other)
         for uav in range(1, UAVS):
             assert not first[0].equal(first[uav])
-
-
-def test_modules_read_and_write_the_keys_of_the_environment():
-    env = WildfireEnv(5, WildfireConfig(num_uavs=4))
-    observation, action = env.observation_spec, env.full_action_spec
-    actor, critic = (
-        make_actor(observation, action, HIDDEN),
-        make_critic(observation, action, HIDDEN),
-    )
-    td = TensorDict({keys.OBSERVATION: torch.randn(5, 4, 6)}, batch_size=[5])
-    critic(actor(td))
-    assert td[keys.ACTION].shape == (5, 4, 3)
-    assert td[keys.ACTION].abs().max() < 1
-    assert td[STATE_ACTION_VALUE].shape == (5, 4, 1)
-    assert actor.module.first.weight.shape == (4, 6, HIDDEN[0])
-    assert actor.module.second.weight.shape == (4, *HIDDEN)

@@ -65,18 +65,6 @@ def test_the_noise_is_an_ornstein_uhlenbeck_process():
     assert (torch.corrcoef(flat) - torch.eye(UAVS * 3)).abs().max() < 0.08
 
 
-def test_the_noise_is_reset_at_the_start_of_an_episode():
-    starts = torch.zeros(ENVS, 1, dtype=torch.bool)
-    starts[: ENVS // 2] = True
-    policy = explorer(theta=0.0, sigma=0.1, dt=1.0)
-    x = play(policy, [True, *[False] * 8, starts, False])
-    spread = x[:, : ENVS // 2].std((1, 2, 3)), x[:, ENVS // 2 :].std((1, 2, 3))
-    walk = 0.1 * torch.arange(1, 12).sqrt()
-    torch.testing.assert_close(spread[1], walk, rtol=0.03, atol=0)
-    torch.testing.assert_close(spread[0][:9], walk[:9], rtol=0.03, atol=0)
-    torch.testing.assert_close(spread[0][9:], walk[:2], rtol=0.03, atol=0)
-
-
 def test_actions_stay_in_bounds():
     x = play(explorer(theta=0.1, sigma=5.0, dt=1.0, envs=50), [True, *[False] * 20], envs=50)
     assert x.abs().max() == 1

@@ -13,7 +13,6 @@ from emberlink.envs.config import RadioConfig
 from emberlink.envs.world import radio
 from emberlink.policies.scripted.map_greedy import Courier, MapGreedy
 from emberlink.policies.scripted.oracle import Oracle
-from emberlink.policies.scripted.planning import Rally, Targets, plan_period
 
 NEVER = math.inf
 BASE = torch.tensor([0.0, 30.0])
@@ -28,13 +27,6 @@ def played(env, policy, steps: int, position=None):
 
 
 # Rules
-
-
-def test_periods_and_middles_by_hand():
-    assert [plan_period(2.0, d) for d in (0.1, 0.2, 0.5, 2.0, 9.0)] == [10, 10, 4, 1, 1]
-    cells = torch.zeros(2, 4, 5, dtype=torch.bool)
-    cells[0, 1, 2] = cells[0, 3, 4] = cells[0, 2, 4] = True
-    assert torch.allclose(radio.middle(cells), torch.tensor([[2.0, 10 / 3], [0, 0]]))
 
 
 def test_a_chain_by_hand():
@@ -76,38 +68,6 @@ def test_a_chain_holds_if_each_uav_is_within_its_reach(heard, height, along):
     # last one is between a UAV without a place and the UAV at the last place.
     assert math.hypot(along[0] + reach[0], top) < heard
     assert (along.diff() + reach[1:] + reach[:-1] < heard).all()
-
-
-def test_who_is_late_by_hand():
-    # 15 cells from a place of reach 5 at 0.5 cells a step: 20 steps, and 15 to pass messages on.
-    rally = Rally(torch.zeros(1, 1, 2), torch.full((1, 1), 5.0), torch.full((1, 1), 100.0))
-    cells = torch.arange(20.0), torch.arange(1.0)
-    for arrives, expected in ((65, False), (66, True)):
-        late = rally.too_late(cells, torch.full((1, 1, 20, 1), float(arrives)), 0.5)
-        assert late[0, 0, 15, 0].item() is expected
-        assert not late[0, 0, :6].any()  # in reach of the place
-    ground = torch.tensor([[[15.0, 0]]])
-    for step, expected in ((62, False), (63, True)):  # the next plan is two steps later
-        assert rally.leaves(ground, torch.tensor([step]), 0.5, 2).item() is expected
-    assert not rally.leaves(torch.tensor([[[3.0, 4]]]), torch.tensor([99]), 0.5, 2).item()
-
-
-def test_targets_by_hand():
-    env = WildfireEnv(1, WildfireConfig(grid=(20, 20), num_uavs=3), torch.zeros(20, 20))
-    targets = Targets(env, claim=2.0)
-    ground = torch.tensor([[[2.0, 2], [2, 2], [19, 19]]])
-    weight = torch.zeros(1, 3, 20, 20)
-    weight[..., 10, 10], weight[..., 16, 10] = 1.0, 0.5
-    cost = targets.distance(ground) + 2
-    every = torch.ones(1, 3, 3, dtype=torch.bool)
-    target, value = targets.choose(ground, weight.clone(), cost, every)
-    # UAV 0 claims (10, 10), seen from (8, 8) at a cost of 6 + 2. UAV 1, with the same value, comes
-    # second and sees (16, 10) from (14, 8) at 12 + 2. Nothing is left for UAV 2.
-    assert target.tolist() == [[[8, 8], [14, 8], [19, 19]]]
-    assert value[0].tolist() == pytest.approx([1 / 8, 0.5 / 14, 0.0])
-    alone = torch.eye(3, dtype=torch.bool).unsqueeze(0)
-    _, value = targets.choose(ground, weight, cost, alone)
-    assert value[0].tolist() == pytest.approx([1 / 8, 1 / 8, 1 / 9])
 
 
 # Policies

@@ -4,8 +4,6 @@ import os
 import signal
 
 import pytest
-import torch
-from tensordict import TensorDict
 from tiny_run import TINY
 
 from emberlink.trainers import resume, train
@@ -52,20 +50,6 @@ def test_signals_that_a_cluster_sends_together_let_the_training_save(numbers):
 def test_a_second_signal_of_the_user_ends_at_once(numbers):
     with pytest.raises(Interrupted):
         send(*numbers)
-
-
-def test_a_signal_within_a_context_of_tensordict_is_not_an_error():
-    """The context manager converts itself to a truth value after an exception, which fails."""
-    module = torch.nn.Linear(1, 1)
-    parameters = TensorDict.from_module(module)
-
-    def end() -> None:
-        with Interruption(lambda: None), parameters.to_module(module):
-            os.kill(os.getpid(), INT)
-            os.kill(os.getpid(), INT)
-
-    with pytest.raises(Interrupted):
-        end()
 
 
 @pytest.mark.parametrize("number", [USR1, USR2])

@@ -2,7 +2,6 @@
 
 import dataclasses
 from functools import cache
-from importlib import resources
 from pathlib import Path
 from typing import Any, get_args
 
@@ -22,7 +21,6 @@ from emberlink.envs.fire.generator import (
     fire_seeds,
     load_scenario,
     make_fires,
-    scenarios,
 )
 
 GRID, HORIZON = (30, 30), 1000
@@ -36,15 +34,6 @@ RANGES = [
 def settings_of(**changes: Any) -> dict[str, Any]:
     """Returns the values of `huygens` with changes."""
     return {**dataclasses.asdict(load_scenario("huygens")), **changes}
-
-
-def test_every_file_is_a_scenario_with_its_name():
-    files = resources.files("emberlink.configs").joinpath("fire").iterdir()
-    names = sorted(Path(str(file)).stem for file in files)
-    generated = [name for name in names if name != "file"]
-    assert scenarios() == generated
-    assert {"huygens", "oil_slick", "paper"} <= set(names)
-    assert [load_scenario(name).name for name in generated] == generated
 
 
 @pytest.fixture(scope="module")

@@ -9,10 +9,44 @@ import torch
 from combustion_wave import profile, wave
 
 from emberlink.envs.fire.generator import load_scenario
-from emberlink.envs.fire.reaction import ReactionConfig, reaction_fires
+from emberlink.envs.fire.reaction import (
+    ReactionConfig,
+    advance,
+    arrhenius,
+    reaction_fires,
+    time_step,
+)
 
 CONFIG = load_scenario("reaction")
 assert isinstance(CONFIG, ReactionConfig)
+
+
+def plane_speed(wind: float, spacing: float) -> float:
+    """Returns the speed of a plane front of the scenario, wind along its normal, m/s."""
+    x = torch.arange(int(120 / spacing), dtype=torch.float64)[None, :, None] * spacing
+    x = x.expand(1, -1, 3)
+    rise, fuel = 900.0 * ((x > 15) & (x < 25)), (x > 16).double()
+    step = time_step(dataclasses.replace(CONFIG, wind_speed=(0.0, abs(wind))), spacing)
+    air = torch.tensor([[wind, 0.0]], dtype=torch.float64)
+    heat, diffusivity = arrhenius(CONFIG), CONFIG.diffusivity
+    places = [25.0]
+    while places[-1] < 100:
+        rise, fuel = advance(rise, fuel, heat, (air, air), diffusivity, spacing, step)
+        line = rise[0, :, 1]
+        last = int((line > 300).nonzero()[-1])
+        above, below = line[last].item(), line[last + 1].item()
+        places.append((last + (above - 300) / (above - below)) * spacing)
+    steady = [place for place in places if place > 70]
+    return float(np.polyfit(step * np.arange(len(steady)), steady, 1)[0])
+
+
+@pytest.mark.parametrize(("wind", "low", "high"), [(-0.03, 0.05, 0.3), (0.05, 0.15, 0.35)])
+def test_a_plane_front_moves_at_the_speed_of_the_travelling_wave(wind, low, high):
+    """On the nodes of 30 x 30 cells; the error is of second order."""
+    speed, _ = wave(CONFIG, wind, low, high)
+    coarse, fine = (plane_speed(wind, spacing) / speed - 1 for spacing in (1.5, 0.75))
+    assert abs(fine) < 0.01
+    assert 3 < coarse / fine < 5.5
 
 
 def point(**changes: float) -> ReactionConfig:

@@ -161,13 +161,6 @@ def test_symmetry_with_fuel_and_barriers():
     torch.testing.assert_close(grow(rate_field=field.mT, **even).mT, base, rtol=0, atol=0.01)
 
 
-def test_the_head_runs_towards_the_azimuth():
-    arrival = grow(azimuth=math.pi / 2, ratio=3.0)  # +y
-    burnt = arrival.isfinite().nonzero().float().mean(0)
-    assert burnt[0] == 11
-    assert burnt[1] > 13
-
-
 def test_arrival_never_decreases_outwards():
     """Checks rays, and with patchy fuel that every cell has an earlier neighbour."""
     even, field = grow(), torch.rand(1, 24, 24, generator=torch.Generator().manual_seed(3))
@@ -280,26 +273,3 @@ def test_batch_and_horizon_do_not_matter():
         disc(centres, radii), (20, 24), heads, ratios, winds, horizon=500, max_rate=0.006
     )
     assert torch.equal(half, batch.masked_fill(batch > 500, math.inf))
-
-
-def test_double_precision_and_no_rate():
-    double = grow(dtype=torch.float64)
-    assert double.dtype == torch.float64
-    torch.testing.assert_close(double.float(), grow(), rtol=0, atol=0.01)
-    still = grow(head=0.0)
-    assert set(still.unique().tolist()) == {0.0, math.inf}
-
-
-def test_errors_name_the_value():
-    with pytest.raises(ValueError, match="refine"):
-        grow(refine=0)
-    with pytest.raises(ValueError, match="horizon"):
-        grow(horizon=0)
-    with pytest.raises(ValueError, match="rate_field must be"):
-        grow(rate_field=torch.ones(1, 24, 23))
-    with pytest.raises(ValueError, match="negative"):
-        grow(rate_field=-torch.ones(1, 24, 24))
-    start = disc(torch.tensor([[5.0, 5.0]]), torch.tensor([2.0]))
-    still = lambda time: torch.tensor([0.1])  # noqa: E731
-    with pytest.raises(ValueError, match="max_rate"):
-        arrival_times(start, (9, 9), still, torch.ones(1), torch.ones(1), horizon=9)

@@ -9,7 +9,6 @@ import torch
 from PIL import Image
 
 from emberlink.envs import WildfireConfig, WildfireEnv
-from emberlink.envs.pettingzoo import _Window
 from emberlink.envs.rendering import film
 from emberlink.envs.rendering.frame import BASE, FAILED, FIELD_OF_VIEW, UAV, frame
 from emberlink.envs.utils.errors import UserError
@@ -56,18 +55,6 @@ def test_x_points_to_the_right_and_y_upwards():
     assert blue[:, 1].mean() < width / 10
 
 
-@pytest.mark.parametrize(
-    ("grid", "shape"),
-    [((30, 30), (360, 360, 3)), ((8, 16), (352, 176, 3)), ((256, 100), (200, 512, 3))],
-)
-def test_size(grid, shape):
-    image = picture(grid=grid, positions=[(5, 5, 0)])
-    assert image.shape == shape
-    assert image.dtype == np.uint8
-    assert colour(image, 5, 5, grid) == BLUE
-    assert (image == BLUE).all(-1).sum() >= 30  # visible on the largest map
-
-
 def test_the_environment_draws_one_of_its_members():
     fire = torch.full((2, 12, 12), torch.inf)
     fire[1, 2, 3] = 0
@@ -112,19 +99,3 @@ def test_a_video_has_every_frame(tmp_path, monkeypatch):
     frames = [np.zeros((16, 16, 3), np.uint8)] * 3
     film.write_mp4(Path(name), frames)
     assert imageio_ffmpeg.count_frames_and_secs(tmp_path / name)[0] == 3
-
-
-@pytest.mark.filterwarnings("error")
-def test_window_shows_the_last_picture(monkeypatch):
-    monkeypatch.setenv("MPLBACKEND", "agg")
-    window = _Window()
-    first, last = picture(positions=[(3, 3, 4)]), picture(positions=[(9, 9, 4)])
-    window.show(first)
-    window.show(last)
-    assert np.array_equal(window._image.get_array(), last)
-    other = _Window()
-    other.show(first)
-    assert np.array_equal(window._image.get_array(), last)
-    other.close()
-    assert window._pyplot.fignum_exists(window._figure.number)
-    window.close()

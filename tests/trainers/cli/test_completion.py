@@ -45,8 +45,6 @@ def completed(line: str, folder: Path) -> list[str]:
         ("tra", {"train"}),
         ("train con", {"consensus"}),
         ("eval pretrained:strong/m", {"pretrained:strong/maps"}),
-        ("eval ru", {"runs"}),
-        ("eval --che", {"--checkpoint"}),
     ],
 )
 def test_commands_and_names_are_completed(line, expected, tmp_path):

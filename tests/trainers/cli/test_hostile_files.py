@@ -1,6 +1,5 @@
 """Tests that malicious files are refused wherever a file is read, and that no code runs."""
 
-import contextlib
 import io
 import json
 import os
@@ -11,7 +10,6 @@ import struct
 import subprocess
 import sys
 import time
-import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -65,13 +63,6 @@ def torch_saved(mark: Path) -> bytes:
     return into.getvalue()
 
 
-def zipped(mark: Path) -> bytes:
-    into = io.BytesIO()
-    with zipfile.ZipFile(into, "w") as archive:
-        archive.writestr("fires.npy", object_array(mark))
-    return into.getvalue()
-
-
 def object_array(mark: Path) -> bytes:
     into = io.BytesIO()
     np.save(into, np.array([Bomb(mark)], dtype=object), allow_pickle=True)
@@ -90,17 +81,11 @@ def promising(shape: list[int], end: int) -> bytes:
 
 CHECKPOINTS = {
     "pickle": lambda mark: pickle.dumps(Bomb(mark)),
-    "old pickle": lambda mark: pickle.dumps(Bomb(mark), protocol=0),
     "torch.save": torch_saved,
     "npy of objects": object_array,
-    "npz of objects": zipped,
     "header longer than the file": lambda _: struct.pack("<Q", 2**63) + b"{}",
-    "header of all bytes": lambda _: struct.pack("<Q", 2**64 - 1),
     "tensor larger than the file": lambda _: promising([2**40], 2**42),
-    "tensor that overflows": lambda _: promising([2**62, 2**62], 64),
-    "tensor of negative size": lambda _: promising([-4], 64),
     "deep header": lambda _: safetensors(b"[" * 200_000),
-    "header that is no mapping": lambda _: safetensors([1, 2]),
     "metadata that is code": lambda _: safetensors(
         {"__metadata__": {"emberlink": "__import__('os').mkdir('mark')"}}
     ),
@@ -108,9 +93,6 @@ CHECKPOINTS = {
         {"actor": {"dtype": "F8_E4M3", "shape": [4], "data_offsets": [0, 4]}}, b"\0" * 4
     ),
     "long header": lambda _: safetensors(b'{"a":[' + b"[]," * 2_000_000 + b"0]}"),
-    "names that climb": lambda _: safetensors(
-        {"../../mark": {"dtype": "F32", "shape": [1], "data_offsets": [0, 4]}}, b"\0" * 4
-    ),
 }
 
 
@@ -128,20 +110,12 @@ LAUGHS = "a: &a [x,x,x,x,x,x,x,x,x]\n" + "".join(
 )
 CONFIGS = {
     "apply": "seed: !!python/object/apply:os.mkdir [{mark}]\n",
-    "name": "seed: !!python/name:os.system\n",
-    "own tag": "seed: !seed 1\n",
     "key with a tag": "? !!python/object/apply:os.mkdir [{mark}]\n: 1\n",
     "billion laughs": LAUGHS,
-    "list within itself": "seed: &a [*a]\n",
     "deep lists": "seed: " + "[" * 2000,
-    "long": "output: " + "x" * 200_000,
     "many digits": "seed: " + "9" * 5000,
-    "two documents": "seed: 1\n---\nseed: 2\n",
-    "bytes": "method: !!binary aGk=\n",
     "interpolation": "seed: ${{oc.env:HOME}}\n",
-    "target": "env: {{_target_: os.mkdir, path: {mark}}}\n",
     "module of comm": "comm: {{name: ../../os}}\n",
-    "name that climbs": "method: ../../mark\n",
     "markup": "method: '[/red]'\n",
 }
 
@@ -152,33 +126,16 @@ def test_a_configuration(kind, run, mark, capsys):
     RunFolder(run).newest.unlink()
     file = run / "config.yaml"
     hostile = CONFIGS[kind].format(mark=mark)
-    replaced: set[str] = set()
-    with contextlib.suppress(yaml.YAMLError, RecursionError, ValueError):
-        replaced = set(yaml.safe_load(hostile))
-    # Within an otherwise valid configuration, where possible.
-    whole = yaml.safe_load(file.read_text())
-    if kind not in ("billion laughs", "two documents"):
-        rest = {name: value for name, value in whole.items() if name not in replaced}
-        seed = re_keyed(hostile)
-        rest.pop(seed, None)
-        hostile = yaml.safe_dump(rest) + hostile if seed else hostile
-    file.write_text(hostile)
+    whole = yaml.safe_load(file.read_text())  # otherwise valid
+    whole.pop(hostile.partition(":")[0], None)
+    file.write_text(yaml.safe_dump(whole) + hostile)
     assert "config.yaml" in refused(["train", f"resume={run}"], capsys, mark)
-
-
-def re_keyed(text: str) -> str:
-    """Returns the key at the start of a text, if there is one."""
-    head = text.partition(":")[0]
-    return head if head.isidentifier() else ""
 
 
 LINES = {
     "no mapping": "[1]\n",
     "text": '{"episode": "__import__(\'os\')"}\n',
-    "nested": '{"episode": 1, "mean_reward": {"a": 1}}\n',
-    "many digits": '{"episode": 1, "mean_reward": ' + "9" * 5000 + "}\n",
     "deep": "[" * 100_000 + "\n",
-    "no episode": '{"mean_reward": 1}\n',
     "no text": "\x00\x01\n",
 }
 
@@ -187,11 +144,6 @@ LINES = {
 def test_the_lines_of_a_run(kind, run, mark, capsys):
     (run / "metrics.jsonl").write_text(LINES[kind])
     assert "metrics.jsonl" in refused(["eval", str(run), "--fires", "1"], capsys, mark)
-
-
-def test_infinite_numbers_in_a_run(run, capsys):
-    (run / "metrics.jsonl").write_text('{"episode": 1, "mean_reward": NaN, "coverage": 1e999}\n')
-    assert main.main(["eval", str(run), "--fires", "1"]) == 0
 
 
 EVALUATIONS = {
@@ -214,10 +166,8 @@ def test_an_evaluation(kind, run, mark, capsys, tmp_path):
 
 
 BANKS = {
-    **{kind: CHECKPOINTS[kind] for kind in ("pickle", "torch.save", "npy of objects")},
-    "npz of objects": zipped,
+    "npy of objects": object_array,
     "code in the header": lambda _: header("__import__('os').mkdir('mark')"),
-    "deep header": lambda _: header("(" * 5000),
     "far too large": lambda _: header(
         "{'descr': '<f4', 'fortran_order': False, 'shape': (1099511627776, 9, 9), }"
     ),
@@ -245,23 +195,13 @@ def test_a_cached_bank_of_fires_is_computed_again(kind, tmp_path, mark, monkeypa
 
 OVERRIDES = [
     "env._target_=os.system",
-    "learner={_target_: os.system, _args_: [mkdir mark]}",
-    "+hook._target_=os.system",
-    "++env._target_=os.system",
     "hydra.run.dir=mark",
-    "hydra.searchpath=[file:///tmp]",
-    "hydra/launcher=basic",
     "setup_method=../../mark",
-    "setup=../../mark",
     "fire=/etc/passwd",
-    "fire@env=paper",
     'seed=${oc.decode:\'__import__("os").mkdir("mark")\'}',
-    "seed=${eval:1}",
     "seed=${hydra:runtime.cwd}",
-    "env.horizon=${env.horizon}",
     "seeds=" + "[" * 3000 + "]" * 3000,
     "seed=" + "9" * 5000,
-    "comm.name=os",
     "comm.name=../registry",
     "method=../../mark",
 ]
@@ -274,13 +214,6 @@ def test_an_override(text, tmp_path, mark, monkeypatch, capsys):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_method_that_is_a_path(tmp_path, mark, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "mine.yaml").write_text("# @package _global_\nreplay: shared\n")
-    for method in ("./mine", "../mine", str(tmp_path / "mine"), "consensus.yaml", "base"):
-        refused(["train", method], capsys, mark)
-
-
 def test_a_scenario_with_a_tag(tmp_path, mark, monkeypatch):
     text = f"name: !!python/object/apply:os.mkdir [{mark}]\n"
     (tmp_path / "fire").mkdir()
@@ -291,8 +224,15 @@ def test_a_scenario_with_a_tag(tmp_path, mark, monkeypatch):
     assert not mark.exists()
 
 
-@pytest.mark.parametrize("name", ["checkpoint.safetensors", "lock", "figures", "notes/mine.txt"])
-@pytest.mark.parametrize("kind", ["pipe", "device", "link", "link to nothing"])
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [
+        ("checkpoint.safetensors", "link"),
+        ("lock", "pipe"),
+        ("figures", "link to nothing"),
+        ("notes/mine.txt", "device"),
+    ],
+)
 def test_a_run_folder_with_a_link_or_a_pipe_is_refused(name, kind, run, mark, capsys, tmp_path):
     """Every command opens a run folder through one door; nothing outside changes."""
     path, mine = run / name, tmp_path / "mine"
@@ -327,22 +267,6 @@ def test_a_hard_link_is_not_written_through(run, tmp_path):
     (run / "lock").hardlink_to(mine)
     assert main.main(["train", f"resume={run}", "episodes=4"]) == 2
     assert mine.read_bytes() == before
-
-
-def test_a_run_folder_that_is_a_link(run, tmp_path):
-    link = tmp_path / "link"
-    link.symlink_to(run)
-    assert main.main(["eval", str(link), "--fires", "1"]) == 0
-    (tmp_path / "loop").symlink_to(tmp_path / "loop")
-    assert main.main(["eval", str(tmp_path / "loop")]) == 2
-
-
-def test_a_run_folder_named_like_markup(run, tmp_path, capsys):
-    odd = tmp_path / "[red]a[" / "blue] :boom:"
-    odd.parent.mkdir()
-    run.rename(odd)
-    assert main.main(["eval", str(odd), "--fires", "1"]) == 0
-    assert str(odd) in capsys.readouterr().out.replace("\n", "")
 
 
 @pytest.mark.slow

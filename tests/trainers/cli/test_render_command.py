@@ -1,22 +1,19 @@
 """Tests `emberlink render`: its files, their contents, and its errors."""
 
-import dataclasses
 import os
 from pathlib import Path
 
 import imageio_ffmpeg
 import numpy as np
-import pytest
 import torch
 from PIL import Image
 
-from emberlink.envs.fire.generator import load_scenario
 from emberlink.envs.utils.config_files import known
 from emberlink.policies.scripted.base import SCRIPTED
 from emberlink.trainers.build import build_actor, build_env
 from emberlink.trainers.cli import main
 from emberlink.trainers.config.compose import resolve
-from emberlink.trainers.evaluation import episodes, evaluate, render
+from emberlink.trainers.evaluation import episodes, render
 from emberlink.trainers.learners.base import ACTOR
 from emberlink.trainers.replay.screen import LINK
 from emberlink.trainers.runs import checkpoint
@@ -113,26 +110,6 @@ def test_episodes_side_by_side_have_the_same_fire_and_starts(tmp_path):
         assert episode.recording.listens == (follows or SCRIPTED.find(name).hears)
 
 
-def test_an_episode_equals_that_of_the_evaluation(tmp_path):
-    run = RunFolder(make_run(tmp_path))
-    (panel,) = render.learned([str(run.path)])
-    actor = panel.policy(None)
-    results = evaluate.evaluate(panel.config, actor, fires=3, scripted=False)["huygens"]
-    covered = results[evaluate.LEARNED]["coverage"]
-    assert len(set(covered)) > 1
-    for index in range(3):
-        _, (episode,) = episodes.play_side_by_side([panel], index)
-        assert episode.recording.coverage(12) == pytest.approx(covered[index], rel=1e-6)
-
-
-@pytest.mark.parametrize(("horizon", "uavs"), [(1, 1), (1, 24)])
-def test_other_teams_and_horizons(horizon, uavs, tmp_path, capsys):
-    run = make_run(tmp_path, "consensus", f"env.horizon={horizon}", f"env.num_uavs={uavs}")
-    *_, gif, mp4 = rendered(capsys, run, "--frames", 3)
-    assert len(gif_frames(gif)) == horizon + 1
-    assert imageio_ffmpeg.count_frames_and_secs(mp4)[0] == horizon + 1
-
-
 def test_a_picture_of_another_grid(tmp_path, capsys):
     run = make_run(tmp_path, "positional", "env.grid=[8,64]")
     out = tmp_path / "shot.png"
@@ -159,17 +136,13 @@ def test_errors_of_render(tmp_path, capsys):
     cases = [
         ([tmp_path / "none"], ["no such run folder"]),
         ([run, "world=moon"], ["world 'moon'", "known: blackout, "]),
-        ([run, "seed=1"], ["seed: an evaluation changes only"]),
         ([run, "--fire", "zzz"], ["fire 'zzz'", "known: "]),
-        ([run, "--fire", "65536"], ["'65536'", "0 to 65535"]),
         ([run, "--fire", "paper:x"], ["'x'", "0 to 65535"]),
         ([run, "--policy", "zzz"], ["policy='zzz'", "random_waypoints"]),
         ([run, wide], ["env.grid=(40, 30)", "(30, 30)"]),
         ([run, "--output", there], ["there.gif exists already"]),
         ([run, "--output", tmp_path / "no" / "a.gif"], [str(tmp_path / "no"), "no such folder"]),
-        ([run, "--step", "3"], ["step=3", ".png"]),
         ([run, "--output", tmp_path / "a.png", "--step", "13"], ["step=13", "0 to 12"]),
-        ([run, "--checkpoint", tmp_path / "x"], ["not a readable checkpoint"]),
         ([run, run, "--checkpoint", there], ["1 checkpoints for 2 runs"]),
     ]
     for arguments, words in cases:
@@ -186,18 +159,3 @@ def test_a_failing_ffmpeg_gives_one_line(tmp_path, capsys, monkeypatch):
     refused([run, "--output", tmp_path / "a.mp4"], capsys, "a.mp4", "ffmpeg failed")
     assert not list(tmp_path.glob("*.mp4"))
     assert not list(tmp_path.glob(".*"))
-
-
-def test_a_changed_fire_is_drawn_as_it_was_evaluated():
-    run = resolve("consensus", ["setup=tuned", "fire.head_ros=[0.005,0.005]"])
-    own, usual = (episodes.find_fire(name, run)[1] for name in ("huygens_as_trained", "huygens"))
-    assert own.head_ros == (0.005, 0.005)
-    assert usual == load_scenario("huygens")
-
-
-def test_settings_of_starts_and_fires_must_agree():
-    """Start positions and fires depend on exactly these settings."""
-    base = resolve("independent", SHORT).env
-    other = {"reward", "observation", "observation_scale", "displacement", "view_angle"}
-    other |= {"radio", "base", "failures", "measures"}
-    assert {field.name for field in dataclasses.fields(base)} == other | set(episodes.SHARED)

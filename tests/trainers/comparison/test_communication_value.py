@@ -46,15 +46,6 @@ def test_networks_evaluated_with_other_radios(tmp_path):
     assert 1 / 3 <= low < 0.4 < high <= 0.5
 
 
-def test_without_an_evaluation_without_limits_there_is_a_gain_and_no_value(tmp_path):
-    run = write_run(tmp_path, learned={"coverage": [50.0, 60, 70, 80]})
-    assert not values(tmp_path)
-    evaluate_otherwise(run, 0.0, [48.0, 58, 68, 78])
-    (row,) = values(tmp_path)
-    assert (row["gain"], interval(row, "gain")) == (2.0, (2.0, 2.0))
-    assert (row["full"], row["value"], row["value_low"]) == (None, None, None)
-
-
 def test_networks_trained_with_other_radios(tmp_path):
     """The interval is over seeds, too; there is none with one seed."""
     for override, coverage in (("", 60.0), (OFF, 50.0), (FULL, 70.0)):
@@ -74,18 +65,6 @@ def test_networks_trained_with_other_radios(tmp_path):
         (None, None),
         (None, None),
     )
-
-
-def test_a_radio_with_little_bandwidth_has_limits(tmp_path):
-    free, narrow = (FULL,), (FULL, "env.radio.bandwidth=8")
-    for name, overrides, coverage in (
-        ("off", (OFF,), 50.0),
-        ("a", narrow, 60.0),
-        ("b", free, 70.0),
-    ):
-        write_run(tmp_path, name=name, overrides=overrides, learned={"coverage": coverage})
-    (row,) = values(tmp_path)
-    assert (row["radios"], row["value"]) == ("retrained", 0.5)
 
 
 def test_scripted_policies_have_a_value_for_each_radio(tmp_path):

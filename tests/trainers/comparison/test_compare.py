@@ -9,8 +9,6 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from synthetic_runs import read_evaluation, write_evaluation, write_run
 
 from emberlink.envs import metrics
@@ -123,32 +121,6 @@ def test_measures_where_lower_is_better(tmp_path):
     assert rows["probability"].iloc[0] == 1
     claim = comparison.claims.set_index("measure").loc["tracking_first"]
     assert (claim["ratio"], claim["verdict"]) == (pytest.approx(31 / 11), "holds")
-
-
-def test_the_headline_of_the_world_is_first_and_the_reward_last(tmp_path):
-    ages = ("env.measures=all", "evaluation.headline=front_age")
-    learned = {"front_age": 30.0, "front_age_p95": 60.0, "bytes_per_step": 9.0}
-    write_run(tmp_path, overrides=ages, learned=learned)
-    measures = list(compare_runs([tmp_path]).ranking["measure"].unique())
-    assert (measures[0], measures[-1]) == ("front_age", "mean_reward")
-
-
-@pytest.mark.slow
-@settings(deadline=None, max_examples=4)
-@given(st.lists(st.integers(1, 6), min_size=1, max_size=3))
-def test_any_number_of_methods_and_seeds(tmp_path_factory, counts):
-    folder = tmp_path_factory.mktemp("any")
-    seeds = dict(zip(("consensus", "independent", "positional"), counts, strict=False))
-    for method, count in seeds.items():
-        for seed in range(count):
-            write_run(folder, method, seed)
-    rows = only(compare_runs([folder]))
-    assert rows["seeds"].map(len).to_dict() == seeds
-    assert rows["iqm"].is_monotonic_decreasing
-    assert list(rows["next"]) == [*rows.index[1:], ""]
-    for row in rows.to_dict("records"):
-        assert pd.isna(row["low"]) == (len(row["seeds"]) == 1)
-        assert pd.isna(row["low"]) or min(row["values"]) <= row["low"] <= row["high"]
 
 
 @pytest.mark.slow
@@ -368,16 +340,6 @@ def test_claims_compare_runs_that_were_trained_alike(tmp_path):
 
 
 # The curves and the figures
-
-
-def test_curves_are_over_seeds(comparison, runs):
-    lines = [
-        [json.loads(line)["coverage"] for line in (run / "metrics.jsonl").read_text().splitlines()]
-        for run in sorted(runs.glob("consensus*"))
-    ]
-    curves = comparison.curves.set_index(["label", "measure"]).loc[("consensus", "coverage")]
-    assert list(curves["iqm"]) == pytest.approx(np.mean(lines, axis=0))
-    assert list(curves["low"]) == pytest.approx(np.min(lines, axis=0))
 
 
 # The report

@@ -114,17 +114,6 @@ def test_interval_equals_that_of_all_resamples(values):
     assert (got == (min(values), max(values))) == (len(values) < statistics.FEW)
 
 
-def test_interval_resamples_within_each_method():
-    sample, reference = [1.0, 4.0, 5.0], [2.0, 3.0, 6.0]
-    expected = plain_interval(plain_improvement, sample, reference)
-    assert interval(probability_of_improvement, sample, reference) == pytest.approx(
-        expected, abs=1 / 9
-    )
-    # Resampling both together would give the ends 0 and 1.
-    apart = interval(probability_of_improvement, [1.0, 2.0, 3.0], [7.0, 8.0, 9.0])
-    assert apart == (0, 0)
-
-
 def test_interval_of_a_difference_is_over_the_seeds_of_both():
     first, second = [1.0, 3.0, 8.0], [2.0, 6.0]
     got = interval(iqm_difference, first, second)
@@ -135,16 +124,6 @@ def test_interval_of_a_difference_is_over_the_seeds_of_both():
     assert got == pytest.approx(expected, abs=1e-9)
     assert interval(iqm_difference, first, second) == got
     assert interval(iqm_difference, first, [2.0]) is None
-
-
-def test_intervals_along_another_axis_equal_those_of_each_episode():
-    values = np.random.default_rng(0).random((5, 3)) * [1, 10, 100]
-    low, high = interval(iqm, values, axis=0, resamples=2000)
-    for episode, column in enumerate(values.T.tolist()):
-        got = low[episode], high[episode]
-        assert got == interval(iqm, column, resamples=2000)
-        expected = plain_interval(lambda chosen: plain_iqm(chosen), column)
-        assert got == pytest.approx(expected, abs=0.06 * (max(column) - min(column)))
 
 
 def mean_difference(first, second, axis=-1):

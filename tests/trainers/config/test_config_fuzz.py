@@ -252,28 +252,21 @@ def refused(key: str, build) -> str:
     return text
 
 
-def every_key() -> list[tuple[str, str, dict]]:
-    """Yields a method that has the key, the key and its schema."""
+def every_key() -> list[tuple[tuple, str, dict]]:
+    """Returns the choice of a recipe that has the key, the key and its schema."""
     of_comm = {recipe(method, "paper")["comm"]["name"]: method for method in known("method")}
-    rows = [("consensus", key, schema) for key, schema in KEYS.items()]
+    rows = [(("consensus", "tuned"), key, schema) for key, schema in KEYS.items()]
+    rows += [(("consensus", "tuned", "fire=reaction"), *row) for row in REACTION.items()]
     for name, several in COMM_KEYS.items():
-        rows += [(of_comm[name], key, schema) for key, schema in several.items()]
+        rows += [((of_comm[name], "tuned"), *row) for row in several.items()]
     return rows
 
 
 @pytest.mark.parametrize(
-    ("method", "key", "schema"), every_key(), ids=lambda value: str(value)[:40]
+    ("chosen", "key", "schema"), every_key(), ids=lambda value: str(value)[:40]
 )
-def test_an_invalid_value_gives_one_line_that_names_the_key(method, key, schema):
-    refuse_changes(recipe(method, "tuned"), key, schema)
-
-
-@pytest.mark.parametrize(("key", "schema"), REACTION.items(), ids=lambda value: str(value)[:40])
-def test_an_invalid_value_of_the_heat_equation_gives_one_line(key, schema):
-    refuse_changes(recipe("consensus", "tuned", "fire=reaction"), key, schema)
-
-
-def refuse_changes(values: dict, key: str, schema: dict) -> None:
+def test_an_invalid_value_gives_one_line_that_names_the_key(chosen, key, schema):
+    values = recipe(*chosen)
     for value in invalid_values(schema):
         refused(key, lambda value=value: from_values(put(values, key, value)))
     *path, last = key.split(".")
@@ -285,19 +278,6 @@ def refuse_changes(values: dict, key: str, schema: dict) -> None:
     del at[last]
     if "default" not in schema:
         refused(key, lambda: from_values(without))
-
-
-@FUZZ
-@given(st.data())
-def test_several_invalid_values_give_one_line_that_names_a_key(data):
-    method = data.draw(st.sampled_from(known("method")))
-    values = recipe(method, data.draw(st.sampled_from(known("setup"))), "learner=ddpg")
-    there = {**KEYS, **COMM_KEYS[values["comm"]["name"]]}
-    chosen = data.draw(st.lists(st.sampled_from(sorted(there)), min_size=1, max_size=3))
-    for key in chosen:
-        values = put(values, key, data.draw(st.sampled_from(invalid_values(there[key]))))
-    text = refused("", lambda: from_values(values))
-    assert any(key in text for key in chosen), (chosen, text)
 
 
 def flat(values: dict, prefix: str = "") -> Iterator[str]:
@@ -339,8 +319,3 @@ def test_numpys_numbers_are_numbers_and_paths_are_text(given, plain):
     for part in key.split("."):
         values = values[part]
     assert values == plain
-
-
-@pytest.mark.parametrize("name", ["setup", "method_", "setups"])
-def test_a_choice_is_not_a_setting(name):
-    refused(name, lambda: resolve("consensus", **{name: "tuned"}))

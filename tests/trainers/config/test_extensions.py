@@ -6,11 +6,14 @@
 import json
 import os
 import shutil
+import sys
 from importlib import metadata
 from pathlib import Path
 
 import pytest
+import torch
 from own_package import CONSENSUS_OF_PAGE, METHOD, SETUP, SETUP_OF_PAGE, write, yaml_files
+from test_resume import SMALL, assert_same, until
 from tiny_run import TINY
 
 from emberlink.comm.base import MODULES
@@ -19,8 +22,13 @@ from emberlink.envs.fire.generator import load_scenario, scenarios
 from emberlink.envs.utils import config_files
 from emberlink.envs.utils.config_files import find
 from emberlink.envs.utils.errors import UserError
+from emberlink.policies.networks.memory.base import MEMORIES
+from emberlink.policies.scripted.base import SCRIPTED
 from emberlink.trainers.cli import main
 from emberlink.trainers.config.compose import resolve
+from emberlink.trainers.sweep.executors.base import EXECUTORS
+from emberlink.trainers.training.resume import resume
+from emberlink.trainers.training.trainer import Trainer
 
 
 @pytest.fixture
@@ -86,11 +94,6 @@ def test_an_invalid_file_of_a_user(text, message, folder):
     assert resolve("consensus").method == "consensus"
 
 
-def test_a_broken_learner_of_another_package_is_no_error(monkeypatch):
-    entry_point(monkeypatch, "emberlink.learners", "other", "nowhere:Learner")
-    assert resolve("consensus", ["setup=tuned", "learner=ippo"]).learner.name == "ippo"
-
-
 def entry_point(monkeypatch, group: str, name: str, value: str) -> None:
     point = metadata.EntryPoint(name, value, group)
     monkeypatch.setattr(
@@ -99,10 +102,9 @@ def entry_point(monkeypatch, group: str, name: str, value: str) -> None:
     )
 
 
-def test_an_invalid_entry_point_is_named_in_the_error(monkeypatch, tmp_path):
+def test_an_invalid_entry_point_is_named_in_the_error(monkeypatch):
     for value, message in (
         ("nowhere:Module", "cannot be imported: ModuleNotFoundError: No module named 'nowhere'"),
-        ("emberlink.comm.consensus:Nothing", "cannot be imported"),
         ("emberlink.comm.consensus:ConsensusConfig", "not a subclass of CommModule"),
     ):
         entry_point(monkeypatch, "emberlink.comm", "other", value)
@@ -124,17 +126,6 @@ def test_an_invalid_entry_point_is_named_in_the_error(monkeypatch, tmp_path):
         entry_point(monkeypatch, "emberlink.configs", "other", value)
         with pytest.warns(UserWarning, match=f"emberlink.configs: there is no package {value}"):
             assert "consensus" in config_files.known("method")
-    (tmp_path / "broken").mkdir()
-    (tmp_path / "broken" / "__init__.py").write_text("raise RuntimeError('no licence')")
-    monkeypatch.syspath_prepend(tmp_path)
-    entry_point(monkeypatch, "emberlink.configs", "other", "broken.configs")
-    with pytest.warns(UserWarning, match=r"no package broken.configs \(RuntimeError: no licence"):
-        assert "consensus" in config_files.known("method")
-
-
-def test_the_lock_of_an_editor_is_no_configuration(folder):
-    (folder / "setup" / ".#small.yaml").symlink_to("user@host.1234")
-    assert resolve("consensus", ["setup=small"]).env.horizon == 15
 
 
 def test_a_run_folder_needs_its_yaml_files_for_scripted_policies_alone(
@@ -155,3 +146,68 @@ def test_a_run_folder_needs_its_yaml_files_for_scripted_policies_alone(
         k: v["learned"] for k, v in before.items()
     }
     assert main.main(["train", f"resume={run}", "episodes=3", "evaluation.scripted=[]"]) == 0
+
+
+STILL = """
+from emberlink.policies.scripted.base import Scripted
+from emberlink.policies.scripted.simple import Stationary
+
+
+class Still(Stationary):
+    pass
+"""
+POINTS = """
+[emberlink.comm]
+visited_map = visited_map:VisitedMap
+broken = broken_on_import:Module
+number = still:STILL
+
+[emberlink.scripted]
+still = still:Still
+"""
+
+
+@pytest.fixture
+def installed(tmp_path, monkeypatch):
+    """Writes a package and its pip metadata to a new folder on the path."""
+    (tmp_path / "still.py").write_text(STILL + "\nSTILL = 3\n")
+    (tmp_path / "broken_on_import.py").write_text("raise RuntimeError('no such\\nsensor')\n")
+    about = tmp_path / "guests-1.0.dist-info"
+    about.mkdir()
+    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: guests\nVersion: 1.0\n")
+    (about / "entry_points.txt").write_text(POINTS)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    yield tmp_path
+    for name in ("still", "broken_on_import"):
+        sys.modules.pop(name, None)
+
+
+def test_policies_of_other_packages_are_known(installed):
+    own = {
+        *("stationary", "random_actions", "random_waypoints", "lawnmower", "follow_target"),
+        *("map_greedy_alone", "map_greedy", "map_greedy_all", "courier", "oracle"),
+    }
+    assert {*SCRIPTED.known()} == {*own, "still"}
+    assert SCRIPTED.find("still").__name__ == "Still"
+    assert MEMORIES.known() == ["gru", "none"]
+    assert EXECUTORS.known() == ["local", "ray", "submitit"]
+    own = {"consensus", "maps", "no_comm", "positional"}
+    assert {*MODULES.known()} == own | {"broken", "number", "visited_map"}
+
+
+def test_a_map_of_another_package_is_restored_bit_for_bit(installed, tmp_path):
+    given = {"name": "visited_map"}
+    radio = {"range": 8.0, "loss": 0.1}
+
+    def begin() -> Trainer:
+        settings = [*SMALL, f"output={tmp_path / 'runs'}"]
+        trainer = Trainer(resolve("shared_memory", settings, comm=given, radio=radio))
+        trainer.start()
+        return trainer
+
+    whole = until(begin(), None)
+    stopped = until(begin(), 27)
+    saved = stopped.setup.env.transform.state_dict()
+    (seen,) = (value for key, value in saved.items() if key.endswith("module.map"))
+    assert torch.count_nonzero(seen) > 0
+    assert_same(whole, until(resume(stopped.run.path), None))

@@ -1,18 +1,20 @@
 """Tests evaluations of a run in another world than that of its training."""
 
 import json
-import re
 import warnings
 from itertools import pairwise
 from typing import Any
 
-import numpy as np
 import pytest
+import torch
 from fire_files import Ellipses, raster_of, write_asc
 from tiny_run import TINY
+from torchrl.envs.utils import check_env_specs
 
 from emberlink import trainers
-from emberlink.envs import FileFireConfig
+from emberlink.envs import FileFireConfig, WildfireConfig, metrics, parallel_env
+from emberlink.envs.utils.config_files import known
+from emberlink.trainers import load, make_env, train
 from emberlink.trainers.cli.main import main
 from emberlink.trainers.config.compose import evaluated_with, flat, in_world, resolve, to_values
 from emberlink.trainers.evaluation.evaluate import scripted_config
@@ -50,14 +52,6 @@ def test_a_radio_of_the_run_holds_for_the_methods_of_scripted_policies_too():
     assert scripted_config(own, "follow_target").env.radio == resolve("consensus").env.radio
     off = evaluated_with(own, {"env.radio.range": 0})
     assert scripted_config(off, "follow_target").env.radio.range == 0
-
-
-def test_a_run_on_a_fire_of_its_own_can_be_moved(tmp_path):
-    np.save(tmp_path / "bank.npy", np.full((4, 60, 60), 5.0, dtype=np.float32))
-    path = f"fire.path={tmp_path}/bank.npy"
-    run = resolve("consensus", ["setup=tuned", "world=file", path, "env.view_angle=40"])
-    moved = in_world(run, "swarm")
-    assert (moved.fire.name, moved.env.num_uavs, moved.env.view_angle) == ("swarm", 24, 40)
 
 
 def test_settings_after_the_world_change_it():
@@ -121,23 +115,6 @@ def test_networks_that_never_saw_a_base_are_warned_of():
         trainers.load("pretrained:maps", world="swarm")
 
 
-@pytest.mark.parametrize(
-    ("name", "setting", "said"),
-    [
-        ("maps", {"spread": 0}, r"^comm\.spread=0 \(in training 2\): what"),
-        ("maps", {"home": False}, None),
-        ("consensus", {"target": "absolute"}, r"^comm\.target=absolute \(in training relative\)"),
-    ],
-)
-def test_other_units_of_the_communication_are_warned_of(name, setting, said):
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always", UserWarning)
-        trainers.load(f"pretrained:{name}", **setting)
-    messages = [str(warning.message) for warning in caught]
-    assert len(messages) == (said is not None)
-    assert said is None or re.match(said, messages[0]), messages
-
-
 def test_a_run_is_evaluated_on_a_fire_of_a_file(run, tmp_path):
     write_asc(tmp_path / "fire.asc", raster_of(Ellipses(), 240))
     fire = f"fire.path={tmp_path / 'fire.asc'}", "fire.units=minutes"
@@ -158,12 +135,52 @@ def test_a_run_is_evaluated_on_a_fire_of_a_file(run, tmp_path):
     assert policy.config.fire.path == str(tmp_path / "fire.asc")
 
 
-@OTHER_MAP
-def test_a_base_is_taken_away_with_the_headline(run, capsys):
-    arguments = ["eval", str(run), "world=relay", "env.base=null", "--fires", "1"]
-    assert main(arguments) == 2
-    said = " ".join(capsys.readouterr().err.split())
-    assert "evaluation.headline=base_coverage is not measured in this world" in said
-    assert main([*arguments, "evaluation.headline=coverage"]) == 0
-    without: dict[str, Any] = {"env.base": None, "headline": "coverage"}
-    assert trainers.load(run, world="relay", **without).config.env.base is None
+WORLDS = [world for world in known("world") if world != "file"]
+
+
+@pytest.mark.parametrize("world", WORLDS)
+@pytest.mark.parametrize("method", known("method"))
+def test_every_method_has_an_environment_in_every_world(method, world):
+    small = {"num_envs": 2, "seed": 0, "num_train_fires": 2}
+    env = make_env(method, "tuned", world=world, **small)
+    check_env_specs(env)
+    steps = env.rollout(3)["next"]
+    measured = metrics.episode_metrics(steps)
+    assert tuple(measured) == metrics.names(env.base_env.config)
+    assert resolve(method, [f"world={world}"]).evaluation.headline in measured
+    assert all(value.isfinite().all() for value in measured.values())
+
+
+@pytest.mark.parametrize("method", ["consensus", "independent"])
+def test_a_training_in_relay_is_that_in_front(method, tmp_path):
+    """A base changes neither rewards nor observations, so docs/worlds.md uses networks of front."""
+    small = {"episodes": 2, "horizon": 15, "num_envs": 2, "num_train_fires": 2, "batch_size": 8}
+    shared = {"setup": "tuned", "evaluate_after": False, "interval": 0, **small}
+    front, relay = (
+        load(train(method, world=world, output=str(tmp_path / world), **shared).path).state_dict()
+        for world in ("front", "relay")
+    )
+    assert any(value.abs().sum() > 0 for value in front.values())
+    assert front.keys() == relay.keys()
+    assert all(torch.equal(front[name], relay[name]) for name in front)
+
+
+def test_failed_uavs_leave_pettingzoo():
+    world = WildfireConfig(grid=(8, 8), num_uavs=3, horizon=12, failures=3.0)
+    env = parallel_env(config=world, fire="paper", seed=0)
+    env.reset(seed=1)
+    env._core._fail_step.copy_(torch.tensor([[4, 13, 2]]))
+    flying = {1: 3, 2: 2, 3: 2, **dict.fromkeys(range(4, 12), 1), 12: 0}
+    for step, count in flying.items():
+        before = list(env.agents)
+        actions = {agent: env.action_space(agent).sample() for agent in before}
+        observations, rewards, terminations, truncations, infos = env.step(actions)
+        for part in (observations, rewards, terminations, truncations, infos):
+            assert list(part) == before
+        assert len(env.agents) == count
+        assert [agent for agent, ended in terminations.items() if ended] == {
+            2: ["uav_2"],
+            4: ["uav_0"],
+        }.get(step, [])
+        assert all(rewards[agent] == 0 for agent in before if terminations[agent])
+    assert all(truncations.values())

@@ -5,15 +5,14 @@ import math
 
 import pytest
 
-from emberlink.comm.consensus import ConsensusConfig, HeadingConfig
+from emberlink.comm.consensus import ConsensusConfig
 from emberlink.envs.config import RewardConfig, WildfireConfig
-from emberlink.envs.fire.generator import scenarios
 from emberlink.envs.utils.config_files import known
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import from_plain
 from emberlink.trainers.config.compose import flat, from_values, resolve, to_values
 from emberlink.trainers.config.schema import build_comm
-from emberlink.trainers.config.values import REMOVED, check_not_removed, parse
+from emberlink.trainers.config.values import REMOVED, check_not_removed
 
 METHODS = ["independent", "shared_memory", "positional", "consensus"]
 PAPER, RELEASED = "paper", "released"
@@ -139,37 +138,6 @@ def test_maps_differ_from_the_other_methods_in_listed_settings(setup):
     assert maps.policy.hold == (10 if setup == "tuned" else 1)
 
 
-def test_paper_is_the_default():
-    for method in METHODS:
-        assert resolve(method) == resolve(method, ["setup=paper"])
-
-
-@pytest.mark.parametrize(
-    ("setup", "fire"), [("paper", "paper"), ("released", "paper"), ("tuned", "huygens")]
-)
-def test_each_setup_has_a_fire_that_can_be_overridden(setup, fire):
-    assert resolve("consensus", [f"setup={setup}"]).fire.name == fire
-    for other in scenarios():
-        assert resolve("consensus", [f"setup={setup}", f"fire={other}"]).fire.name == other
-
-
-def test_defaults_of_a_communication_module_are_written_out():
-    config = resolve("consensus", ["setup=tuned"])
-    values = to_values(config)
-    del values["comm"]["jitter"], values["comm"]["heading"]["circle"]
-    completed = from_values(values)
-    assert flat(completed.comm).keys() == flat(config.comm).keys()
-    assert completed.comm["jitter"] == ConsensusConfig().jitter
-    assert completed.comm["heading"]["circle"] == HeadingConfig().circle
-
-
-@pytest.mark.parametrize("text", [".inf", "inf"])
-def test_infinity_is_written_as_in_yaml(text):
-    assert resolve("independent", [f"env.radio.range={text}"]).env.radio.range == math.inf
-    with pytest.raises(UserError, match=r"env.radio.range="):
-        resolve("independent", ["env.radio.range=-.inf"])
-
-
 def test_defaults_in_code_equal_setup_paper():
     config = resolve("consensus")
     assert WildfireConfig() == config.env
@@ -177,15 +145,6 @@ def test_defaults_in_code_equal_setup_paper():
     settings = {key: value for key, value in config.comm.items() if key != "name"}
     assert settings.keys() == {field.name for field in dataclasses.fields(ConsensusConfig)}
     assert ConsensusConfig() == from_plain(ConsensusConfig, settings)
-
-
-def test_the_table_has_all_setups_and_methods():
-    assert known("method") == sorted([*METHODS, "maps"])
-    assert known("setup") == ["paper", "released", "strong", "tuned"]
-    assert known("fire") == [
-        *("file", "front", "huygens", "oil_slick", "paper", "reaction", "swarm"),
-    ]
-    assert known("world") == ["blackout", "file", "front", "paper", "relay", "swarm"]
 
 
 EVERY_CHOICE = [
@@ -218,11 +177,6 @@ def test_every_setup_composes_with_every_world(method):
             config = resolve(method, [f"setup={setup}", f"world={world}", *fire])
             assert (config.method, config.setup, config.world) == (method, setup, world)
             assert from_values(to_values(config)) == config
-
-
-def test_a_value_that_hydra_cannot_read_is_a_text():
-    assert parse("output=meine Läufe (2)") == ("output", "meine Läufe (2)")
-    assert parse("env.grid=[30,20]") == ("env.grid", [30, 20])
 
 
 @pytest.mark.parametrize("key", REMOVED)

@@ -2,7 +2,6 @@
 
 import json
 from functools import cache
-from importlib.metadata import EntryPoint
 from pathlib import Path
 from typing import Any
 
@@ -10,17 +9,11 @@ import pytest
 import torch
 
 from emberlink.envs import keys, parallel_env
-from emberlink.envs.utils import config_files
 from emberlink.envs.utils.errors import UserError
 from emberlink.trainers import load, make_env
 from emberlink.trainers.cli import main
-from emberlink.trainers.config.compose import from_values, resolve, to_values
+from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.evaluation.evaluate import play
-from emberlink.trainers.learners.base import LEARNERS
-from emberlink.trainers.learners.ddpg import DDPG
-from emberlink.trainers.learners.imitation import Imitation
-from emberlink.trainers.learners.ppo import IPPO, MAPPO
-from emberlink.trainers.learners.td3 import TD3
 from emberlink.trainers.training.setup import TrainingSetup
 
 HORIZON = 20
@@ -65,30 +58,24 @@ def made(case: str, *more: str) -> TrainingSetup:
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_every_network_is_trained(case):
-    setup = made(case)
-    before = {name: value.clone() for name, value in setup.learner.loss.state_dict().items()}
-    setup.dry_run(2 * HORIZON)
-    assert setup.learner.updates
-    for name, value in setup.learner.loss.state_dict().items():
+def test_every_network_is_trained_and_a_resumed_training_is_the_same_bit_for_bit(case):
+    """It stops within an episode and at its end."""
+    whole, resumed = made(case), made(case)
+    before = {name: value.clone() for name, value in whole.learner.loss.state_dict().items()}
+    whole.dry_run(2 * HORIZON)
+    assert whole.learner.updates
+    for name, value in whole.learner.loss.state_dict().items():
         if "module" in name or case.startswith("imitation"):
             assert value.isfinite().all(), name
             trained = name != "log_std"  # imitation has no use for it
             assert not value.equal(before[name]) or not trained, name
-
-
-@pytest.mark.parametrize("stop", [10, HORIZON])
-@pytest.mark.parametrize("case", CASES)
-def test_a_resumed_training_is_the_same_bit_for_bit(case, stop):
-    """It stops within an episode, or at its end."""
-    whole, first, second = made(case), made(case), made(case)
-    whole.dry_run(2 * HORIZON)
-    first.dry_run(stop)
-    torch.manual_seed(1)  # no effect
-    second.load_state_dict({k: v.clone() for k, v in first.state_dict().items()}, first.step)
-    second.dry_run(2 * HORIZON - first.step)
-    expected = whole.state_dict()
-    state = second.state_dict()
+    for stop in (10, HORIZON, 2 * HORIZON):
+        state, step = {k: v.clone() for k, v in resumed.state_dict().items()}, resumed.step
+        resumed = made(case)
+        torch.manual_seed(1)  # no effect
+        resumed.load_state_dict(state, step)
+        resumed.dry_run(stop - step)
+    expected, state = whole.state_dict(), resumed.state_dict()
     assert state.keys() == expected.keys()
     for name, value in expected.items():
         assert value.numpy().tobytes() == state[name].numpy().tobytes(), name
@@ -105,26 +92,6 @@ def test_a_seed_repeats_a_training_and_another_does_not(learner):
     for name, value in weights[0].items():
         assert value.equal(weights[1][name]), name
     assert any(not value.equal(weights[2][name]) for name, value in weights[0].items())
-
-
-def test_learners_have_names():
-    known = {"ddpg": DDPG, "imitation": Imitation, "ippo": IPPO, "mappo": MAPPO, "td3": TD3}
-    assert LEARNERS.known() == [*known]
-    assert all(LEARNERS.find(name) is learner for name, learner in known.items())
-    with pytest.raises(UserError, match="ddpg, imitation, ippo, mappo, td3"):
-        LEARNERS.find("sac")
-    for name in known:
-        config = resolve("consensus", [f"learner={name}"])
-        assert type(config.learner) is known[name].config_type
-        assert from_values(to_values(config)) == config
-
-
-def test_another_package_can_add_a_learner(monkeypatch):
-    group = "emberlink.learners"
-    point = EntryPoint("mine", "emberlink.trainers.learners.td3:TD3", group)
-    monkeypatch.setattr(config_files, "entry_points", lambda of: [point] * (of == group))
-    assert LEARNERS.known() == ["ddpg", "imitation", "ippo", "mappo", "mine", "td3"]
-    assert LEARNERS.find("mine") is TD3
 
 
 @pytest.mark.parametrize("learner", ["ddpg", "td3"])

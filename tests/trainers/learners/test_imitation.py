@@ -3,7 +3,6 @@
 import json
 import math
 import shutil
-import warnings
 from typing import Any
 
 import pytest
@@ -176,25 +175,6 @@ def test_each_uav_takes_the_action_of_the_teacher_with_the_same_probability():
     assert (torch.corrcoef(taken.T) - torch.eye(3)).abs().max() < 0.05
 
 
-@pytest.mark.parametrize(
-    ("arguments", "said"),
-    [
-        (["maps", *settings("imitation"), "learner.actor_of=imitation"], "no actors of its own"),
-        (
-            ["maps", *settings("imitation"), "learner.samples=9", "learner.buffer_size=8"],
-            "samples=9 is larger than buffer_size=8",
-        ),
-        (["consensus", "learner=imitation"], "which only method maps keeps"),
-        (["maps", *settings("imitation"), "learner.teacher=courier"], "known: map_greedy"),
-        (["maps", *settings("ippo"), "learner.warm_start=nowhere"], "learner.warm_start=nowhere:"),
-    ],
-)
-def test_what_cannot_be_imitated_is_one_line(arguments, said, tmp_path, capsys):
-    assert main.main(["train", *arguments, f"output={tmp_path}"]) == 2
-    assert said in " ".join(capsys.readouterr().err.split())
-    assert not list(tmp_path.iterdir())
-
-
 @pytest.fixture(scope="module")
 def imitated(tmp_path_factory):
     """Trains actors for each kind of learner and returns the run folders."""
@@ -254,21 +234,6 @@ def test_a_run_begins_with_the_actors_of_another(learner, actor_of, more, imitat
     assert targets
     for name in targets:
         assert state[name].equal(state[name.removeprefix("target_")]), name
-
-
-@pytest.mark.slow
-def test_other_units_are_warned_of(imitated, tmp_path):
-    def prepare(*more: str) -> None:
-        start = f"learner.warm_start={imitated['ippo']}", f"output={tmp_path}"
-        started(resolve("maps", settings("ippo", *start, *more)))
-
-    with pytest.warns(UserWarning, match=r"comm.scales=\[1, 5\], this run has \[1, 3\]"):
-        prepare("comm.scales=[1,3]")
-    with pytest.warns(UserWarning, match=r"env.displacement=[\d.]+, this run has 0.7"):
-        prepare("env.displacement=0.7")
-    with warnings.catch_warnings():
-        warnings.simplefilter("error", UserWarning)
-        prepare()
 
 
 @pytest.mark.slow

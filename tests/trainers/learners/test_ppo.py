@@ -16,7 +16,7 @@ from emberlink.envs import keys
 from emberlink.policies.gaussian import LOG_PROB
 from emberlink.trainers import make_env
 from emberlink.trainers.config.compose import resolve
-from emberlink.trainers.learners.ppo import ADVANTAGE, RETURN, VALUE, clip_by_row
+from emberlink.trainers.learners.ppo import ADVANTAGE, RETURN, VALUE
 from emberlink.trainers.training.setup import TrainingSetup
 
 LEARNERS = ["ippo", "mappo"]
@@ -59,27 +59,6 @@ def test_values_are_in_units_of_the_earlier_spread():
     spread = 0.9 * 2 + 0.1 * 1.625
     assert estimator.spread.item() == pytest.approx(spread)
     assert returns.flatten().tolist() == pytest.approx([3.75 / spread, 7 / spread])
-
-
-def test_a_failure_ends_what_is_learnt_before_it():
-    """The UAV fails in the third decision; its rewards and values there have no effect."""
-    alive = torch.tensor([[[True], [True], [False], [False]]])
-    estimates = []
-    for after in (0.0, 100.0):
-        estimator = estimating(0.5, 0.5)
-        value, reward = column(2, 4, 8, after, after), column(1, 3, after, after)
-        estimates.append([x[:, :2] for x in estimator.advantages(value, reward, alive)])
-        assert estimator.spread.item() == pytest.approx(1.625)
-    for first, second in zip(*estimates, strict=True):
-        assert first.equal(second)
-    assert estimates[0][0].flatten().tolist() == pytest.approx([-1, 1])
-
-
-def test_gradients_are_shortened_per_row():
-    first, second = torch.tensor([[3.0, 0.0], [0.3, 0.0]]), torch.tensor([[4.0], [0.4]])
-    clip_by_row([first, second], 1.0)
-    torch.testing.assert_close(first, torch.tensor([[0.6, 0.0], [0.3, 0.0]]))
-    torch.testing.assert_close(second, torch.tensor([[0.8], [0.4]]))
 
 
 def first_batches(setup: TrainingSetup) -> list[Any]:
@@ -275,18 +254,6 @@ def test_the_gradients_of_an_update_have_a_largest_norm(learner, monkeypatch):
         torch.testing.assert_close(total, torch.full_like(total, 0.001), rtol=1e-2, atol=0)
 
 
-def test_a_critic_distinguishes_the_kinds_of_cells_of_the_true_map():
-    """No fire, fire, and fire that was seen."""
-    setup = made("mappo", "learner.critic_map=true")
-    batch, critic, values = first_batches(setup)[0], setup.learner.critic, []
-    for kind in (0, 1, 2):
-        changed = batch.clone()
-        changed[keys.TRUE_MAP][:, 2] = kind
-        values.append(critic(changed)[VALUE][:, 2])
-    pairs = ((0, 1), (0, 2), (1, 2))
-    assert not any(values[a].isclose(values[b]).any() for a, b in pairs)
-
-
 @pytest.mark.parametrize(("shared", "networks"), [("true", 1), ("false", 3)])
 def test_advantages_equal_loops(shared, networks):
     """Rewards of UAVs pass through; each network has its own scale; failures mask decisions."""
@@ -360,14 +327,3 @@ def test_a_pass_uses_every_episode_once_in_an_order_of_the_seed():
     returns = [torch.cat([x[RETURN] for x in batches[0][k : k + 4]]) for k in (0, 4)]
     orders = [r.flatten(1).sum(1) for r in returns]
     assert orders[0].sort().values.equal(orders[1].sort().values)
-
-
-@pytest.mark.parametrize(
-    ("learner", "shared", "actor", "critic"),
-    [("ippo", "true", 2, 2), ("ippo", "false", 6, 6), ("mappo", "false", 6, 2)],
-)
-def test_a_loss_is_a_mean_over_the_uavs_of_a_network(learner, shared, actor, critic):
-    trained: Any = made(learner, f"learner.share_parameters={shared}").learner
-    loss = torch.tensor([1.0, 2.0, 3.0])
-    assert trained._of_networks("actor", loss).item() == actor
-    assert trained._of_networks("critic", loss).item() == critic

@@ -85,16 +85,6 @@ def test_shared_memory_samples_all_uavs_equally():
 
 
 @pytest.mark.parametrize("shared", [False, True])
-def test_uavs_sample_independently(shared):
-    buffer = memory(shared=shared)
-    buffer.extend(labelled(0, 1000))
-    rows = drawn(buffer, 1)[..., 0]
-    for other in range(1, UAVS):
-        assert (rows[:, 0] == rows[:, other]).float().mean() < 0.1
-    assert not rows.equal(drawn(buffer, 1)[..., 0])
-
-
-@pytest.mark.parametrize("shared", [False, True])
 def test_samples_are_stored_transitions(shared):
     buffer = memory(shared=shared)
     buffer.extend(labelled(0, 300))

@@ -2,13 +2,11 @@
 
 import json
 import math
-import re
 from html.parser import HTMLParser
 
 import numpy as np
 import pytest
 import torch
-from scalar_world import ScalarWorld
 from small_episode import SIDES, STEPS, play_small
 from test_render_command import make_run, refused, rendered
 from unpack_replay import bit, data_of
@@ -16,7 +14,7 @@ from unpack_replay import bit, data_of
 from emberlink.envs import keys
 from emberlink.trainers import load
 from emberlink.trainers.cli import main
-from emberlink.trainers.replay.page import Replay, script
+from emberlink.trainers.replay.page import Replay
 from emberlink.trainers.replay.recording import Episode
 
 HOSTILE = "</script><script>alert(1)</script><img src=x onerror=alert(2)>{{ 7*7 }}\"'&amp;"
@@ -56,49 +54,9 @@ def test_numbers_of_every_step_are_those_of_the_environment(episode, data):
             assert (step < panel["fails"][uav]) == now[keys.ALIVE][uav].item()
 
 
-def test_knowledge_follows_from_the_data_alone(episode, data):
-    """The browser computes it in the same way, from fields of view, links and fire."""
-    (panel,) = data["panels"]
-    radios = panel["uavs"] + 1
-    burn_out = [[time if time <= STEPS else math.inf for time in row] for row in _map(data["end"])]
-    scalar = ScalarWorld(_map(data["ignition"]), burn_out, 30.0, panel["uavs"])
-    for step in range(1, STEPS + 1):
-        hears = [
-            [bit(panel["hears"], radios * i + j, step) for j in range(radios)]
-            for i in range(radios)
-        ]
-        assert hears == episode.hears[step].tolist()
-        position, alive = _squares(panel, step)
-        scalar.slope = 1.0  # the squares are given by their middle and half their side
-        _step(scalar, step, position, alive, hears)
-        for radio in range(radios):
-            known = [
-                [scalar.last_seen(radio, (i, j)) for j in range(SIDES[1])] for i in range(SIDES[0])
-            ]
-            assert known == episode.knowledge[step][radio].tolist(), (step, radio)
-        assert scalar.seen_fire() == panel["seen"][0][step]
-
-
 def _map(rows) -> list[list[int]]:
     (flat,) = rows
     return [flat[x * SIDES[1] : (x + 1) * SIDES[1]] for x in range(SIDES[0])]
-
-
-def _squares(panel, step: int):
-    """Returns the bounds of each field of view, and whether there is one."""
-    bounds = [[panel["view"][4 * uav + side][step] for side in range(4)] for uav in range(3)]
-    return bounds, [left <= right for left, right, _, _ in bounds]
-
-
-def _step(scalar: ScalarWorld, step: int, bounds, alive, hears) -> None:
-    """Adds a step to a scalar world whose UAVs see the cells within bounds."""
-    for uav, (left, right, low, high) in enumerate(bounds):
-        for i, j in scalar.cells:
-            if alive[uav] and left <= i <= right and low <= j <= high:
-                scalar.seen[i, j].append(step)
-                scalar.known[uav][i, j].add(step)
-    away = [(-99.0, -99.0, 0.0)] * len(bounds)
-    scalar.step(step, away, alive, hears)
 
 
 def test_fields_of_view_are_those_of_the_camera(episode, data):
@@ -140,25 +98,6 @@ def test_fire_is_that_of_the_environment(episode, data):
             assert state == [[0, 1, 1, 2, 2][cell] for cell in seen[step][i].tolist()]
 
 
-def test_worlds_without_a_base_or_measures_are_recorded_with_ages():
-    recorded = play_small("env.base=null", "env.failures=0", "env.radio.loss=0", burn_time=math.inf)
-    plain = play_small(
-        *("env.base=null", "env.failures=0", "env.radio.loss=0", "env.measures=paper"),
-        burn_time=math.inf,
-    )
-    first, second = (one.recording.steps for one in (recorded, plain))
-    assert set(first) == set(second)
-    for name, values in first.items():
-        assert np.array_equal(values, second[name]), name
-    assert keys.FRONT_AGE not in plain.steps[-1].keys()  # noqa: SIM118
-    expected = [now[keys.FRONT_AGE].item() for now in recorded.steps]
-    assert second["front_age"].tolist() == expected
-    (panel,) = data_of(Replay([Episode(title="", recording=plain.recording)], "x:0").html)["panels"]
-    assert panel["base"] is None
-    assert "lost" not in panel
-    assert panel["fails"] == [STEPS + 1] * 3
-
-
 def test_a_hostile_name_is_text(episode):
     page = Replay([Episode(title=HOSTILE, recording=episode.recording)], HOSTILE).html
     plain = Replay([Episode(title="one", recording=episode.recording)], "x:0").html
@@ -178,15 +117,6 @@ def _tags(page: str) -> list:
 
     Reader().feed(page)
     return found
-
-
-def test_the_page_needs_nothing_else(episode):
-    page = Replay([Episode(title="one", recording=episode.recording)], "x:0").html
-    for name in ("src", "href"):
-        linked = re.findall(rf'<\w+[^>]* {name}="([^"]*)"', page)
-        assert all(address.startswith("data:") for address in linked)
-    assert "default-src 'none'" in page
-    assert not re.search(r"^(import|export) ", script(), re.MULTILINE)
 
 
 def test_render_writes_a_page_of_several_runs(tmp_path, capsys):

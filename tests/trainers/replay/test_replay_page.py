@@ -1,6 +1,5 @@
 """Tests the page that plays episodes in a browser, on a desktop and on a phone."""
 
-import html
 import re
 
 import numpy as np
@@ -132,19 +131,6 @@ def test_it_plays_pauses_and_steps(tab):
         assert step_of(tab) == expected
 
 
-def test_nothing_is_wider_than_the_screen(tab):
-    page = tab.page
-    width = page.viewport_size["width"]
-    assert page.evaluate("document.documentElement.scrollWidth") <= width
-    for control in ("first", "play", "end", "slider", "speed", "heat", "uav"):
-        page.locator(f"#{control}").scroll_into_view_if_needed()
-        box = page.locator(f"#{control}").bounding_box()
-        assert box["x"] >= 0, control
-        assert box["x"] + box["width"] <= width, control
-    boxes = [canvas.bounding_box() for canvas in page.locator("canvas.map").all()]
-    assert len({box["y"] for box in boxes}) == (1 if width > 1000 else 2)
-
-
 def picture(tab, place: int = 0) -> str:
     return tab.page.locator("canvas.map").nth(place).evaluate("map => map.toDataURL()")
 
@@ -239,17 +225,4 @@ def test_a_damaged_page_gives_a_message(damage, browser, replay, tmp_path):
     tab.wait_for("!document.getElementById('message').hidden")
     assert "damaged" in tab.page.inner_text("#message")
     assert not tab.page.is_visible("#page")
-    tab.close()
-
-
-def test_jupyter_shows_the_page_inline(browser, replay, tmp_path):
-    notebook = tmp_path / "notebook.html"
-    notebook.write_text(f"<title>{html.escape('a notebook')}</title>{replay._repr_html_()}")
-    tab = Tab(browser, f"file://{notebook}", viewport={"width": 1000, "height": 900})
-    frame = tab.page.frame_locator("iframe")
-    frame.locator("#curves .uplot").first.wait_for()
-    frame.locator("#forth").click()
-    assert frame.locator("#step").inner_text() == "1"
-    assert tab.page.url == f"file://{notebook}"
-    assert tab.problems == []
     tab.close()

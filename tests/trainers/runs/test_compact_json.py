@@ -8,7 +8,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from emberlink.trainers.runs.compact_json import dumps, infinite
-from emberlink.trainers.runs.pretrained import find
 
 numbers = st.integers() | st.floats(allow_nan=False)
 plain = st.none() | st.booleans() | numbers | st.text().filter(lambda t: t not in ("inf", "-inf"))
@@ -30,18 +29,3 @@ def test_numbers_that_json_lacks_are_texts():
     assert dumps({"a": math.inf, "b": (-math.inf, [2])}) == '{"a": "inf", "b": ["-inf", [2]]}'
     with pytest.raises(ValueError, match="JSON compliant"):
         dumps({"a": [math.nan]})
-
-
-def test_a_measure_takes_one_line():
-    text = dumps(
-        {"results": {"huygens": {"learned": {"coverage": [1.5] * 100, "exits": [2] * 100}}}}
-    )
-    assert [line.count(",") for line in text.splitlines()] == [0, 0, 0, 0, 100, 99, 0, 0, 0, 0]
-    assert dumps({"a": [1, {"b": 2}]}) == '{"a": [1, {"b": 2}]}'
-
-
-def test_shipped_evaluations_are_compact():
-    for folder in find("pretrained:tuned"):
-        text = (folder / "eval.json").read_text()
-        assert text == dumps(json.loads(text)) + "\n"
-        assert text.count("\n") < 300

@@ -2,7 +2,6 @@
 
 import os
 import subprocess
-import sys
 from dataclasses import fields
 from types import SimpleNamespace
 
@@ -10,8 +9,8 @@ import pytest
 
 from emberlink.envs.utils.config_files import known as known_files
 from emberlink.envs.utils.config_files import read
-from emberlink.trainers.cli.main import main
-from emberlink.trainers.sweep.executors import base, submitit
+from emberlink.envs.utils.errors import UserError
+from emberlink.trainers.sweep.executors import base
 from emberlink.trainers.sweep.executors.base import EXECUTORS, Task, make
 from emberlink.trainers.sweep.executors.local import LocalConfig, LocalExecutor
 
@@ -23,45 +22,11 @@ def test_every_executor_has_a_file_with_its_settings():
         assert keys == {*read("executor", name)} - {"name"}
 
 
-def test_importing_an_executor_imports_no_package_of_an_extra():
-    code = (
-        "import sys; from emberlink.trainers.sweep.executors import ray, submitit; "
-        "print([name for name in ('ray', 'submitit') if name in sys.modules])"
-    )
-    assert subprocess.check_output([sys.executable, "-c", code], text=True) == "[]\n"
-
-
-def test_settings_that_are_texts_keep_their_form(monkeypatch):
-    monkeypatch.setattr(submitit, "require", lambda *_: None)
-    texts = ["account=007", "memory=4G", "options.qos=low", "partition=12", "workers=9"]
-    made = make(["executor=submitit", *(f"executor.{text}" for text in texts)])
-    assert isinstance(made, submitit.SubmititExecutor)
-    config = made._config
-    assert (config.account, config.memory, config.partition) == ("007", "4G", "12")
-    assert (config.options, made.workers) == ({"qos": "low"}, 9)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "said"),
-    [
-        (["executor=submitit", "executor.time=soon"], 'executor.time="soon": should be a valid'),
-        (["executor=submitit", "executor.time=2"], "executor.notice=90: executor.time=2 must be"),
-        (["executor=slurm"], "executor='slurm' is not known; known: local"),
-        (["executor.workers=0"], "executor.workers=0"),
-        (["executor.nodes=2"], "'executor.nodes' is not known"),
-        (["executor=submitit", "executor.cluster=here"], 'executor.cluster="here"'),
-        (["executor=submitit"], "submitit: not installed: pip install '.[slurm]'"),
-        (["executor=ray"], "ray: not installed: pip install '.[ray]'"),
-    ],
-)
-def test_what_is_wrong_is_named_in_one_line(arguments, said, tmp_path, capsys, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+@pytest.mark.parametrize(("name", "extra"), [("submitit", "slurm"), ("ray", "ray")])
+def test_a_missing_package_is_named_with_its_extra(name, extra, monkeypatch):
     monkeypatch.setattr(base, "find_spec", lambda _: None)
-    assert main(["sweep", "independent", *arguments]) == 2
-    error = capsys.readouterr().err
-    assert said in error
-    assert error.count("\n") == 1
-    assert not any(tmp_path.iterdir())
+    with pytest.raises(UserError, match=rf"{name}: not installed: pip install '\.\[{extra}\]'"):
+        make([f"executor={name}"])
 
 
 def test_a_task_sees_its_share_of_threads_and_gpus(tmp_path, monkeypatch):

@@ -49,12 +49,6 @@ def test_every_combination_once():
     ]
 
 
-def test_all_methods_by_default_and_keys_with_several_values_in_the_name():
-    swept = names(["learner=ippo,mappo", "seed=1", "episodes=3"])
-    assert len({*swept}) == 5 * 2
-    assert swept[0] == "consensus, paper, paper, learner=ippo, seed 1"
-
-
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
@@ -67,26 +61,6 @@ def test_values_follow_hydras_grammar(text, expected):
     configs = [run.config for run in combinations(["consensus", text])]
     found = [config.learner.hidden if "hidden" in text else config.seed for config in configs]
     assert found == expected
-
-
-@pytest.mark.parametrize(
-    ("arguments", "said"),
-    [
-        (["consensus", "setup=paper,tunned"], "tunned"),
-        (["consensus", "learner.gama=0.9,0.8"], "learner.gama"),
-        (["consensus", *SMALL, "learner.warm_start=nowhere"], "learner.warm_start=nowhere: "),
-        (["consensus", "seed=range(3,3)"], "no run: a key has no value"),
-        (["consensus", "seed=interval(0,5)"], "seed=interval(0,5)"),
-        (["consensus", "output=a,b"], "a sweep has one output folder"),
-    ],
-)
-def test_errors_are_one_line_before_training(arguments, said, capsys, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    assert main(["sweep", *arguments]) == 2
-    error = capsys.readouterr().err
-    assert said in error
-    assert error.count("\n") == 1
-    assert not any(tmp_path.iterdir())
 
 
 def finish(run: RunFolder) -> None:
@@ -166,13 +140,6 @@ def test_a_run_is_known_by_its_configuration_and_not_by_its_name(tmp_path):
     assert [*executor.tasks[0].overrides] == ["device=cpu", "logger=csv"]
     assert swept(tmp_path, "episodes=1", "learner.gamma=0.5") == [0]
     assert swept(tmp_path, "episodes=2") == [0]
-
-
-def test_a_config_that_cannot_be_read_is_named(tmp_path, capsys):
-    (tmp_path / "runs" / "old").mkdir(parents=True)
-    (tmp_path / "runs" / "old" / "config.yaml").write_text("method: [")
-    assert swept(tmp_path, "episodes=1") == [0]
-    assert "old is left out: " in "".join(capsys.readouterr().out.split("\n"))
 
 
 def test_a_failing_run_does_not_stop_the_others(tmp_path, capsys):

@@ -1,0 +1,101 @@
+"""Tests that the pages agree with the code and with each other, and runs their Python blocks."""
+
+import re
+import tomllib
+from dataclasses import fields
+from pathlib import Path
+
+import pytest
+import yaml
+from fire_files import Ellipses, raster_of, write_asc
+
+from emberlink.comm.base import MODULES
+from emberlink.trainers.learners.base import LEARNERS
+from emberlink.trainers.sweep.executors.base import EXECUTORS
+
+ROOT = Path(__file__).parents[2]
+TEXTS = {
+    page: page.read_text() for page in [ROOT / "README.md", *sorted(ROOT.glob("docs/**/*.md"))]
+}
+ROOMS = ("envs", "comm", "policies", "trainers", "configs")
+FIGURE = re.compile(r"!\[[^\]]*\]\(([^)]+)\)")
+BLOCK = re.compile(r"```python\n(.*?)```", re.DOTALL)
+
+
+def test_architecture_names_every_room_and_nothing_else():
+    text = TEXTS[ROOT / "docs" / "architecture.md"]
+    for path in re.findall(rf"`((?:{'|'.join(ROOMS)})/[\w/.]*)`", text):
+        assert (ROOT / path).exists(), path
+    rooms = {file.parent for room in ROOMS for file in (ROOT / room).rglob("__init__.py")}
+    names = {room.relative_to(ROOT).as_posix() for room in rooms}
+    assert {name for name in names if f"{name}/" not in text} == set()
+
+
+def test_the_version_the_licence_and_the_date_agree():
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    version, date = re.findall(r"^## (\S+), (.+)$", (ROOT / "CHANGELOG.md").read_text(), re.M)[0]
+    assert citation["version"] == project["version"] == version
+    assert citation["license"] == project["license"]
+    released = citation.get("date-released")
+    assert date == (f"{released:%d %B %Y}" if released else "not released yet")
+
+
+def test_a_command_stands_beside_each_figure():
+    shown = "".join(TEXTS.values())
+    assert [file for file in (ROOT / "docs/images").iterdir() if file.name not in shown] == []
+    for page, text in TEXTS.items():
+        blocks = text.split("\n\n") if page.parent != ROOT else []
+        for block, after in zip(blocks, [*blocks[1:], ""], strict=True):
+            for file in FIGURE.findall(block):
+                assert (page.parent / file).is_file()
+                assert re.match(r"Made with `(emberlink|python) [^`]+`", after), file
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "page", [page for page, text in TEXTS.items() if BLOCK.search(text)], ids=lambda page: page.stem
+)
+def test_the_blocks_of_a_page_run(page, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    write_asc(tmp_path / "ArrivalTime.asc", raster_of(Ellipses(), 240))
+    names = {"__name__": "page"}
+    for number, block in enumerate(BLOCK.findall(TEXTS[page])):
+        exec(compile(block, f"{page.name}, block {number}", "exec"), names)
+
+
+PLUGINS = {"learner": LEARNERS, "comm": MODULES, "executor": EXECUTORS}
+KINDS = [(kind, name) for kind, plugins in PLUGINS.items() for name in plugins.known()]
+
+
+@pytest.mark.parametrize(("kind", "name"), KINDS)
+def test_the_keys_of_everything_that_can_be_chosen_are_listed(kind, name):
+    text = TEXTS[ROOT / "docs" / "reference" / "configuration.md"]
+    listed = f"```{{configuration-keys}} {kind} {name}\n" in text
+    assert listed == bool(fields(PLUGINS[kind].find(name).config_type))
+    assert listed or f"`{name}`" in text
+
+
+def test_a_range_is_written_out(monkeypatch):
+    monkeypatch.syspath_prepend(str(ROOT / "docs" / "site"))
+    import reference_pages
+
+    rows = {row[0]: row for row in reference_pages._rows("run", "")}
+    assert rows["`env.grid`"][2].endswith("; 2 values, each whole number ≥ 8 and ≤ 256")
+    assert rows["`env.reward.exit`"][2].endswith("; number")
+    rows = {row[0]: row for row in reference_pages._rows("executor", "ray")}
+    assert rows["`executor.resources`"][1] == "`{}`"
+
+
+def test_no_line_is_a_comment():
+    """MyST leaves out a line of text that begins with a percent sign, such as a wrapped `98 %`."""
+    comment = re.compile(r"^\s*%.*", re.M)
+    assert [line for text in TEXTS.values() for line in comment.findall(text)] == []
+
+
+def test_formulas_can_be_drawn_without_the_network():
+    from docutils.utils.math.latex2mathml import tex2mathml
+
+    formulas = re.findall(r"\$\$(.+?)\$\$", "".join(TEXTS.values()), re.S)
+    assert formulas
+    assert all("<mfrac>" in tex2mathml(formula, as_block=True) for formula in formulas)
