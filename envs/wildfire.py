@@ -309,13 +309,14 @@ class WildfireEnv(EnvBase):
         alive = self._alive()
         position, hit_boundary = self._move(action, alive)
         self._position.copy_(position)
-        sighting, view = self._map.look(self._position, self._time, alive)
+        sighting, view, ended = self._map.look(self._position, self._time, alive)
+        burning, burnt = self._map.count(self._time)
         if self._measures is not None:
-            self._measures.update(view, self._position, self._step_key, self._time, alive)
+            at = self._position, self._step_key, self._time
+            self._measures.update(view, *at, alive, burnt, ended)
         new, old, none = sighting.counts.unbind(-1)
         told = None if self._measures is None else self._measures.told
         flies = self._all_alive if alive is None else alive
-        burning, burnt = self._map.count(self._time)
         penalised = self.config.reward.unseen != 0
         unseen = self._map.unseen(burning).unsqueeze(-1) * flies if penalised else None
         reward = step_reward(new, old, none, hit_boundary, self.config.reward, told, unseen)
@@ -393,7 +394,7 @@ class WildfireEnv(EnvBase):
 
     def _measured(self) -> dict[str, Tensor]:
         """Returns what no UAV knows: the measures so far, and the map."""
-        measures = {} if self._measures is None else self._measures.values()
+        measures = {} if self._measures is None else self._measures.values(self._time)
         return measures | ({keys.TRUE_MAP: self.fire_map} if self._shows_map else {})
 
     def _observe(self, position: Tensor, counts: Tensor, time: Tensor) -> Tensor:

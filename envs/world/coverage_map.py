@@ -237,7 +237,7 @@ class CoverageMap(nn.Module):
 
     def look(
         self, position: Tensor, step: Tensor, alive: Tensor | None = None
-    ) -> tuple[Sighting, View]:
+    ) -> tuple[Sighting, View, tuple[Tensor, Tensor]]:
         """Classifies the cells in view of all UAVs and marks the burning ones as seen.
 
         It must be called exactly once per step.
@@ -248,7 +248,8 @@ class CoverageMap(nn.Module):
             alive: bool [envs, uavs]; the others see nothing. All are alive if None.
 
         Returns:
-            The cells in view of each UAV by class, batch shape [envs, uavs], and their indices.
+            The cells in view of each UAV by class, batch shape [envs, uavs], and their indices; and
+            the environments and cells that burned until this step, int64 [k] each.
         """
         centre, cells, in_view = self._sensor.look(position, self._start)
         if alive is not None:
@@ -268,8 +269,9 @@ class CoverageMap(nn.Module):
         counted = self._sensor.count_classes(classes, centre)
         sighting = Sighting(*counted, classes, burnt_out)
         self.seen_count.add_(sighting.counts[..., 0].sum(-1).long())
+        env = cell = self._fire_index[:0]
         if self._burnt_out is not None:
             env, cell = self._burnt_out.passing(self._fire_index, step)
             gone = self._first_seen[env, cell] < _NEVER
             self.seen_gone.index_add_(0, env, gone.long())
-        return sighting, View(cells, in_view, burning)
+        return sighting, View(cells, in_view, burning), (env, cell)

@@ -9,26 +9,12 @@ from emberlink.envs import keys
 from emberlink.envs.config import WildfireConfig
 from emberlink.envs.world import radio
 from emberlink.envs.world.coverage_map import View
-from emberlink.envs.world.knowledge import NEVER, Knowledge, step_type
+from emberlink.envs.world.knowledge import Knowledge, step_type
 
 _EXACT = 512
 """ages below are counted one by one"""
 _GROWTH = 1.01
 """ratio of the limits of the other classes of ages"""
-
-
-def cell_ages(step: Tensor, last_seen: Tensor, ignition: Tensor) -> Tensor:
-    """Returns the steps since the later of each cell's last look and its ignition.
-
-    Args:
-        step: [...], the current step.
-        last_seen: [...], the step of the last look at the cell, negative for none.
-        ignition: [...], the first step at which the cell burned.
-
-    Returns:
-        [...]; meaningful for burning cells.
-    """
-    return step - torch.maximum(last_seen, ignition)
 
 
 def age_limits(horizon: int) -> Tensor:
@@ -42,70 +28,113 @@ def age_limits(horizon: int) -> Tensor:
     return torch.tensor(ages)
 
 
-def percentile(histogram: Tensor, limits: Tensor, share: float) -> Tensor:
-    """Returns the age that at least a share of all counted ages do not exceed.
-
-    Args:
-        histogram: int64 [..., classes], number of ages in each class.
-        limits: int64 [classes], lowest age of each class.
-        share: from 0 to 1.
-
-    Returns:
-        float32 [...]: the lowest age of the class in which the percentile lies (nearest rank); 0
-        without any ages.
-    """
-    total = histogram.cumsum(-1)
-    rank = (total[..., -1:].double() * share).ceil()
-    place = (total < rank).sum(-1).clamp(max=len(limits) - 1)
-    return limits.take(place).float()
+Cells = tuple[Tensor, Tensor]
+"""environments and cells of padded maps, int64 [k] each"""
 
 
 class SightingAges(nn.Module):
     """Accumulates the ages of burning cells over the steps of an episode.
 
-    The memory does not grow with the number of steps.
+    The age of a burning cell is the number of steps since its last look, or since its ignition.
+    Only cells that change are touched: a run of ages begins with an ignition or a look, grows by
+    one at each step, and ends with the next look or when the cell has burnt out.
     """
 
+    since: Tensor
+    """integers [envs, area]: the step of the last look at a burning cell, or of its ignition"""
+    burning: Tensor
+    """int64 [envs]: number of burning cells"""
+    since_sum: Tensor
+    """int64 [envs]: sum of `since` over them"""
+    waiting: Tensor
+    """int64 [envs, steps]: number of them by `since`"""
+    edges: Tensor
+    """int64 [envs, ages]: number of runs that began at an age, less those that ended before it"""
     total: Tensor
     """int64 [envs]: sum of all ages"""
     count: Tensor
     """int64 [envs]: number of ages"""
-    histogram: Tensor
-    """int64 [envs, classes]"""
-    _limits: Tensor
-    _class: Tensor
+    _rounded: Tensor
 
-    def __init__(self, envs: int, horizon: int):
+    def __init__(self, envs: int, area: int, horizon: int):
         super().__init__()
         limits = age_limits(horizon)
-        classes = torch.searchsorted(limits, torch.arange(horizon + 1), right=True) - 1
-        self.register_buffer("_limits", limits, persistent=False)
-        self.register_buffer("_class", classes, persistent=False)
-        for name in ("total", "count"):
+        ages = torch.arange(horizon + 2)
+        lower = torch.searchsorted(limits, ages, right=True) - 1
+        self.register_buffer("_rounded", limits[lower], persistent=False)
+        self.register_buffer("since", torch.zeros(envs, area, dtype=step_type(horizon)))
+        for name in ("burning", "since_sum", "total", "count"):
             self.register_buffer(name, torch.zeros(envs, dtype=torch.int64))
-        self.register_buffer("histogram", torch.zeros(envs, len(limits), dtype=torch.int64))
+        for name in ("waiting", "edges"):
+            self.register_buffer(name, torch.zeros(envs, len(ages), dtype=torch.int64))
 
-    def start_episodes(self, mask: Tensor) -> None:
-        """Removes all ages of the environments of a mask, bool [envs]."""
-        self.total.masked_fill_(mask, 0)
-        self.count.masked_fill_(mask, 0)
-        self.histogram.masked_fill_(mask[:, None], 0)
+    def start_episodes(self, mask: Tensor, times: "FireTimes") -> None:
+        """Begins with the fires of the environments of a mask, bool [envs]."""
+        began = mask[:, None]
+        self.since.copy_(torch.where(began, times.ignition, self.since))
+        for record in (self.since_sum, self.total, self.count):
+            record.masked_fill_(mask, 0)
+        first = times.burning(torch.zeros_like(times.ignition[:, :1])).sum(-1)
+        self.burning.copy_(torch.where(mask, first, self.burning))
+        for record, at in (
+            (self.waiting, 0),
+            (self.edges, 1),
+        ):  # the first ages are those of step 1
+            record.masked_fill_(began, 0)
+            record[:, at] = torch.where(mask, first, record[:, at])
 
-    def add(self, ages: Tensor, env: Tensor) -> None:
-        """Adds the ages of one step, int64 [cells], in the environments int64 [cells]."""
-        one = torch.ones_like(env)
-        self.total.scatter_add_(0, env, ages)
-        self.count.scatter_add_(0, env, one)
-        place = self._class.take(ages).add_(env, alpha=len(self._limits))
-        self.histogram.view(-1).scatter_add_(0, place, one)
+    def add(
+        self, step: Tensor, ignited: Tensor, ended: Cells, seen: Cells, looks: Tensor | None = None
+    ) -> None:
+        """Adds the ages of a step.
+
+        Args:
+            step: int64 [envs], from 1 on.
+            ignited: int64 [envs], number of cells that burn since this step.
+            ended: the cells that burned until this step.
+            seen: burning cells with a new look, each once.
+            looks: int64 [k], the steps of these looks; this step if None.
+        """
+        now = step.clamp(max=self.waiting.shape[1] - 2)
+        self._count(torch.arange(len(now), device=now.device), now, now, ignited)
+        env, cell = (torch.cat(both) for both in zip(ended, seen, strict=True))
+        self._count(env, self.since[env, cell].long(), now, torch.full_like(env, -1))
+        looks = now[seen[0]] if looks is None else looks
+        self._count(seen[0], looks, now, torch.ones_like(looks))
+        self.since[seen] = looks.to(self.since.dtype)
+        self.total.add_(self.burning * now - self.since_sum)
+        self.count.add_(self.burning)
+
+    def _count(self, env: Tensor, since: Tensor, now: Tensor, by: Tensor) -> None:
+        """Adds numbers of burning cells with a last look, and of runs that begin at their age."""
+        first = env * self.waiting.shape[1]
+        self.burning.index_add_(0, env, by)
+        self.since_sum.index_add_(0, env, by * since)
+        self.waiting.view(-1).index_add_(0, first + since, by)
+        self.edges.view(-1).index_add_(0, first + now[env] - since, by)
 
     def mean(self) -> Tensor:
         """Returns the mean age, float32 [envs]; 0 without any ages."""
         return (self.total.double() / self.count.clamp(min=1)).float()
 
-    def percentile(self, share: float) -> Tensor:
-        """Returns a percentile of the ages, float32 [envs]; see `percentile`."""
-        return percentile(self.histogram, self._limits, share)
+    def percentile(self, share: float, step: Tensor) -> Tensor:
+        """Returns the age that at least a share of all ages do not exceed (nearest rank).
+
+        Args:
+            share: from 0 to 1.
+            step: int64 [envs], the step of the last `add`.
+
+        Returns:
+            float32 [envs], rounded down to a limit of `age_limits`; 0 without any ages.
+        """
+        steps = self.waiting.shape[1]
+        now = step.clamp(max=steps - 2).unsqueeze(-1)
+        ages = torch.arange(int(now.max()) + 2, device=now.device)
+        # Runs that have not ended reach from where they began to the age at this step.
+        going_on = self.waiting.gather(1, (now + 1 - ages) % steps)
+        counted = (self.edges[:, : len(ages)] - going_on).cumsum(1).cumsum(1)
+        rank = (counted[:, -1:].double() * share).ceil()
+        return self._rounded.take((counted < rank).sum(-1)).float()
 
 
 class FireTimes(nn.Module):
@@ -150,8 +179,8 @@ class Measures(nn.Module):
         area: cells of a padded map (`Sensor.area`).
     """
 
-    team_seen: Tensor
-    """integers [envs, area]: the last step at which any UAV saw the cell"""
+    burnt: Tensor
+    """int64 [envs]: number of cells that have ignited"""
     base_seen: Tensor
     """int64 [envs]: number of cells with a sighting in flames at the base"""
     told: Tensor | None
@@ -164,10 +193,9 @@ class Measures(nn.Module):
         self._world = world
         self.times = FireTimes(envs, area, world.horizon)
         self.knowledge = self.base_ages = self.ages = self.told = None
+        self.register_buffer("burnt", torch.zeros(envs, dtype=torch.int64))
         if world.measures == "all":
-            self.ages = SightingAges(envs, world.horizon)
-            seen = torch.full((envs, area), NEVER, dtype=step_type(world.horizon))
-            self.register_buffer("team_seen", seen)
+            self.ages = SightingAges(envs, area, world.horizon)
         if world.base is not None:
             self.knowledge = Knowledge(
                 envs=envs,
@@ -177,7 +205,7 @@ class Measures(nn.Module):
                 listeners=1,
                 fires=True,
             )
-            self.base_ages = SightingAges(envs, world.horizon)
+            self.base_ages = SightingAges(envs, area, world.horizon)
             self.register_buffer("base_seen", torch.zeros(envs, dtype=torch.int64))
             base = torch.tensor([[*world.base, 0.0]], dtype=torch.float64)
             self.register_buffer("_base", base.repeat(envs, 1, 1), persistent=False)
@@ -185,16 +213,23 @@ class Measures(nn.Module):
     def start_episodes(self, mask: Tensor, arrival: Tensor, burn_out: Tensor | None) -> None:
         """Starts new episodes; see `FireTimes.start_episodes`."""
         self.times.start_episodes(mask, arrival, burn_out)
-        for part in (self.ages, self.base_ages, self.knowledge):
+        self.burnt.copy_(torch.where(mask, (self.times.ignition == 0).sum(-1), self.burnt))
+        for part in (self.ages, self.base_ages):
             if part is not None:
-                part.start_episodes(mask)
-        if self.ages is not None:
-            self.team_seen.masked_fill_(mask[:, None], NEVER)
+                part.start_episodes(mask, self.times)
         if self.knowledge is not None:
+            self.knowledge.start_episodes(mask)
             self.base_seen.masked_fill_(mask, 0)
 
     def update(
-        self, view: View, position: Tensor, rng_key: Tensor, step: Tensor, alive: Tensor | None
+        self,
+        view: View,
+        position: Tensor,
+        rng_key: Tensor,
+        step: Tensor,
+        alive: Tensor | None,
+        burnt: Tensor,
+        ended: Cells,
     ) -> None:
         """Adds one step.
 
@@ -203,16 +238,25 @@ class Measures(nn.Module):
             rng_key: int64 [envs], `keys.RNG_KEY`.
             step: int64 [envs], steps since the episode began.
             alive: bool [envs, uavs]; all are alive if None.
+            burnt: int64 [envs], number of cells that have ignited.
+            ended: the cells that burned until this step.
         """
-        now = step.to(self.times.end.dtype).view(-1, 1, 1)
+        ignited = burnt - self.burnt
+        self.burnt.copy_(burnt)
         if self.ages is not None:
-            seen = torch.where(view.in_view, now, NEVER)
-            flat = self.team_seen.view(-1)
-            flat.scatter_reduce_(0, view.cells.view(-1), seen.view(-1), "amax")
-            self._add_ages(self.ages, self.team_seen, step)
+            seen = view.cells[view.burning].unique()
+            area = self.times.end.shape[1]
+            self.ages.add(step, ignited, ended, (seen // area, seen % area))
         if self.knowledge is not None and self.base_ages is not None:
+            before = self.knowledge.last_seen[:, -1].clone()
             self.knowledge.update(view, step, self.hears(position, rng_key, step, alive))
-            self._add_ages(self.base_ages, self.knowledge.last_seen[:, -1], step)
+            after = self.knowledge.last_seen[:, -1]
+            env, cell = (after > before).nonzero(as_tuple=True)
+            looks = after[env, cell]
+            burns = self.times.burning(step.to(looks.dtype).unsqueeze(-1))[env, cell]
+            newer = burns & (looks > self.base_ages.since[env, cell])
+            learnt = env[newer], cell[newer]
+            self.base_ages.add(step, ignited, ended, learnt, looks[newer].long())
             self._tell(self.knowledge)
 
     def _tell(self, knowledge: Knowledge) -> None:
@@ -221,15 +265,6 @@ class Measures(nn.Module):
         seen = knowledge.seen_fire[:, -1].sum(-1)
         self.told = (seen - self.base_seen).unsqueeze(-1) * knowledge.reach[:, -1, :-1]
         self.base_seen.copy_(seen)
-
-    def _add_ages(self, ages: SightingAges, last_seen: Tensor, step: Tensor) -> None:
-        """Adds the ages of the burning cells of all environments, from int [envs, area]."""
-        ignition = self.times.ignition
-        burning = self.times.burning(step.to(ignition.dtype).unsqueeze(-1)).flatten()
-        cell = burning.nonzero().squeeze(-1)
-        env = cell // ignition.shape[1]
-        age = cell_ages(step.take(env), last_seen.take(cell), ignition.take(cell))
-        ages.add(age.clamp(min=0), env)
 
     def hears(
         self, position: Tensor, rng_key: Tensor, step: Tensor, alive: Tensor | None
@@ -241,12 +276,12 @@ class Measures(nn.Module):
         given = rng_key, step
         return radio.links_with_base(self._world.radio, position, self._base, *given, alive)
 
-    def values(self) -> dict[str, Tensor]:
-        """Returns the measures of the episode so far by key, [envs] each."""
+    def values(self, step: Tensor) -> dict[str, Tensor]:
+        """Returns the measures of the episode up to a step, int64 [envs], by key, [envs] each."""
         values: dict[str, Tensor] = {}
         if self.ages is not None:
             values[keys.FRONT_AGE] = self.ages.mean()
-            values[keys.FRONT_AGE_P95] = self.ages.percentile(0.95)
+            values[keys.FRONT_AGE_P95] = self.ages.percentile(0.95, step)
         if self.knowledge is not None and self.base_ages is not None:
             values[keys.BASE_SEEN] = self.base_seen.clone()
             values[keys.BASE_AGE] = self.base_ages.mean()

@@ -1,13 +1,17 @@
 """Measures UAV-steps per second of the environment, and of VMAS in the same run."""
 
+import math
 import time
 from dataclasses import replace
 from itertools import islice
 
 import pytest
+import torch
 from workloads import flying, in_turns, make, steps_for, vmas_flying
 
 from emberlink.envs.wildfire import WildfireEnv
+from emberlink.envs.world.coverage_map import with_burn_time
+from emberlink.trainers.build import build_env
 from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.training.setup import TrainingSetup
 
@@ -48,6 +52,55 @@ def test_knowledge_maps(tell, num_envs):
         f"{num_envs:5} environments: {alone:9,.0f} UAV-steps/s, with knowledge maps "
         f"{maps:9,.0f}, {maps / 100_000:.2f} x the goal; maps and all measures {measured:9,.0f}"
     )
+
+
+def strong(method: str, num_envs: int, *options: str, hold: int = 1):
+    """Returns a training environment of `strong` that holds actions."""
+    config = resolve(method, ["setup=strong", "fire.num_train_fires=16", *options])
+    return build_env(config, num_envs=num_envs, fire=config.fire, seed=0, device="cpu", hold=hold)
+
+
+@pytest.mark.parametrize("world", ["paper", "front"])
+@pytest.mark.parametrize("method", ["independent", "consensus"])
+def test_held_actions(tell, method, world):
+    """64 environments: a call of `step` for ten steps, beside ten calls."""
+    works = [flying(strong(method, 64, f"world={world}", hold=h), 20 // h) for h in (1, 10)]
+    single, held = (6 * 64 * 20 / taken for taken in in_turns(7, *works))
+    tell(
+        f"{method:11} in {world:5}: held {held:9,.0f} UAV-steps/s, {held / single:.2f} x steps one "
+        "by one"
+    )
+
+
+def test_all_measures(tell):
+    """In `front`, 1,024 environments."""
+    works = [
+        flying(strong("independent", 1024, "world=front", f"env.measures={measures}"), 5)
+        for measures in ("paper", "all")
+    ]
+    paper, every = (6 * 1024 * 5 / taken for taken in in_turns(5, *works))
+    tell(f"all measures: {every:9,.0f} UAV-steps/s, {every / paper:.2f} x those of the paper alone")
+
+
+@pytest.mark.parametrize("burn_time", [math.inf, 30.0])
+def test_price_of_unseen_fire(tell, burn_time):
+    """64 environments with one round fire each, 30 x 30 and 256 x 256 cells."""
+    works = []
+    for side in (30, 256):
+        line = torch.arange(side) - side / 2
+        arrival = 20 * (torch.hypot(line[:, None], line[None]) - 6).clamp(min=0)
+        fire = with_burn_time(arrival.expand(64, -1, -1), burn_time)
+        works.append(flying(make("independent", 64, setup="strong", fire=fire), 20))
+    small, large = in_turns(7, *works)
+    tell(f"a step with a price of unseen fire, 256 x 256 cells: {large / small:.2f} x 30 x 30")
+
+
+def test_maps_in_one_clique(tell):
+    """4 environments, 64 UAVs that all hear each other."""
+    env = make("maps", 4, world="front", num_uavs=64, **{"env.radio.range": math.inf})
+    (taken,) = in_turns(3, flying(env, 4))
+    rate = 4 * 64 * 4 / taken
+    tell(f"maps, 64 UAVs in one clique: {rate:,.0f} UAV-steps/s, {rate / 9000:.2f} x the goal")
 
 
 @pytest.mark.parametrize("hold", [1, 10])

@@ -157,7 +157,9 @@ class Recorder:
         key, step = now.get(keys.RNG_KEY), now.get(keys.STEP)
         view = self._view(position, alive, step)
         if step > 0:  # nobody looks at the reset
-            self._measures.update(view, position, key, step, alive)
+            times = self._measures.times
+            burnt, ended = (times.ignition <= step).sum(-1), (times.end == step).nonzero().unbind(1)
+            self._measures.update(view, position, key, step, alive, burnt, ended)
         else:
             view.in_view.zero_()
         if self._config.base is None:
@@ -168,7 +170,7 @@ class Recorder:
         places = torch.cat((position, self._base.double()), 1)
         near = radio.neighbours(places, self._config.radio.range)
         near &= lives.unsqueeze(-1) & lives.unsqueeze(-2)
-        measured = self._measures.values()
+        measured = self._measures.values(step)
         ages = {name: measured[key] for name, key in (AGES | OF_BASE).items() if key in measured}
         return {"view": self._bounds(view), "hears": hears, "lost": near & ~hears, **ages}
 
