@@ -97,7 +97,8 @@ def test_price_of_unseen_fire(tell, burn_time):
 
 def test_maps_in_one_clique(tell):
     """4 environments, 64 UAVs that all hear each other."""
-    env = make("maps", 4, world="front", num_uavs=64, **{"env.radio.range": math.inf})
+    settings = {"env.radio.range": math.inf, "policy.hold": 10}
+    env = make("maps", 4, world="front", num_uavs=64, **settings)
     (taken,) = in_turns(3, flying(env, 4))
     rate = 4 * 64 * 4 / taken
     tell(f"maps, 64 UAVs in one clique: {rate:,.0f} UAV-steps/s, {rate / 9000:.2f} x the goal")
