@@ -82,6 +82,9 @@ class WildfireConfig:
     observation: Literal["vector", "window", "sight"] = "vector"
     """six numbers per UAV; `window` adds the classes of the cells in view (`keys.WINDOW`), `sight`
     the camera's picture for methods that keep maps (`keys.SIGHT`)"""
+    knowledge: Literal["team", "own"] = "team"
+    """which fire is old to a UAV: what the team has seen while it burned, as in the paper, or what
+    the UAV itself has; rewards and measures count what is new to the team"""
     observation_scale: Literal["raw", "box"] = "raw"
     """cells and steps as they are, or scaled: the box to [-1, 1], the horizon to [0, 1]"""
     reward: RewardConfig = RewardConfig()

@@ -31,9 +31,10 @@ REWARD: Final = (AGENTS, "reward")
 POSITION: Final = (AGENTS, "position")
 """float32 [..., 3]: x, y and z in cells."""
 NEW_FIRE: Final = (AGENTS, "new_fire")
-"""int64 [...]: cells in view that burn and that no UAV had seen before."""
+"""int64 [...]: cells in view that burn and that no UAV had seen before; with `knowledge: own`, that
+the UAV itself had not seen."""
 OLD_FIRE: Final = (AGENTS, "old_fire")
-"""int64 [...]: cells in view that burn and that a UAV had seen before."""
+"""int64 [...]: the other cells in view that burn."""
 NO_FIRE: Final = (AGENTS, "no_fire")
 """int64 [...]: cells in view that do not burn."""
 NEW_CENTRE: Final = (AGENTS, "new_centre")

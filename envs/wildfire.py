@@ -125,7 +125,12 @@ class WildfireEnv(EnvBase):
         self._side = sensor.side
         fires, self._one_fire_each = load_fires(fire, config, num_envs)
         self._map = CoverageMap(
-            sensor, fires, horizon=config.horizon, envs=num_envs, uavs=config.num_uavs
+            sensor,
+            fires,
+            horizon=config.horizon,
+            envs=num_envs,
+            uavs=config.num_uavs,
+            own=config.knowledge == "own",
         )
         measured = config.measures == "all" or config.base is not None
         self._measures = Measures(config, num_envs, sensor.area) if measured else None
@@ -309,18 +314,18 @@ class WildfireEnv(EnvBase):
         alive = self._alive()
         position, hit_boundary = self._move(action, alive)
         self._position.copy_(position)
-        sighting, view, ended = self._map.look(self._position, self._time, alive)
+        look = self._map.look(self._position, self._time, alive)
         burning, burnt = self._map.count(self._time)
         if self._measures is not None:
             at = self._position, self._step_key, self._time
-            self._measures.update(view, *at, alive, burnt, ended)
-        new, old, none = sighting.counts.unbind(-1)
+            self._measures.update(look.view, *at, alive, burnt, look.ended)
+        new, old, none = look.team.counts.unbind(-1)
         told = None if self._measures is None else self._measures.told
         flies = self._all_alive if alive is None else alive
         penalised = self.config.reward.unseen != 0
         unseen = self._map.unseen(burning).unsqueeze(-1) * flies if penalised else None
         reward = step_reward(new, old, none, hit_boundary, self.config.reward, told, unseen)
-        return Moved(position, sighting, hit_boundary, burning, burnt, reward.unsqueeze(-1))
+        return Moved(position, look.shown, hit_boundary, burning, burnt, reward.unsqueeze(-1))
 
     def _counted(self, now: Moved, heard: TensorDictBase) -> dict[Any, Tensor]:
         """Returns what the measures need of a step within a held action; see `keys.STEPS`."""

@@ -130,6 +130,19 @@ class View(NamedTuple):
     """bool [envs, uavs, W * W]: whether the UAV sees the cell and it burns"""
 
 
+class Look(NamedTuple):
+    """What the UAVs see at a step."""
+
+    team: Sighting
+    """the cells in view by class, new fire as new to the team"""
+    shown: Sighting
+    """the same as shown to the UAVs, which differs with `own`"""
+    view: View
+    """the indices of the cells"""
+    ended: tuple[Tensor, Tensor]
+    """int64 [k] each: the environments and cells that burned until this step"""
+
+
 class CoverageMap(nn.Module):
     """Stores the fire of every environment and the cells that its UAVs have seen.
 
@@ -145,6 +158,7 @@ class CoverageMap(nn.Module):
         horizon: steps of an episode.
         envs: number of environments.
         uavs: UAVs per environment.
+        own: whether each UAV is shown as old fire what it has seen itself, and not what any has.
     """
 
     _fires: Tensor
@@ -157,12 +171,23 @@ class CoverageMap(nn.Module):
     _fire_index: Tensor
     _first_seen: Tensor
     _stamp: Tensor
+    _own_seen: Tensor | None
+    _own_first: Tensor
     seen_count: Tensor
     """int64 [envs]: cells that a UAV has seen while they burned"""
     seen_gone: Tensor
     """int64 [envs]: those of them that have burnt out"""
 
-    def __init__(self, sensor: Sensor, fires: Tensor, *, horizon: int, envs: int, uavs: int):
+    def __init__(
+        self,
+        sensor: Sensor,
+        fires: Tensor,
+        *,
+        horizon: int,
+        envs: int,
+        uavs: int,
+        own: bool = False,
+    ):
         super().__init__()
         self._sensor, self._uavs = sensor, uavs
         arrival, burn_out = split_times(fires)
@@ -185,6 +210,12 @@ class CoverageMap(nn.Module):
         first_seen = torch.full((envs, sensor.area), _NEVER, dtype=torch.int32)
         self.register_buffer("_first_seen", first_seen)
         self.register_buffer("_stamp", self._uav.repeat(envs, 1, 1))
+        seen = torch.zeros(envs, uavs, sensor.area, dtype=torch.bool) if own else None
+        self.register_buffer("_own_seen", seen)
+        # A view's cell of environment e is at e * area; the map of its UAV u begins at
+        # (e * uavs + u) * area.
+        shift = torch.arange(envs).view(-1, 1, 1) * (uavs - 1) + torch.arange(uavs).view(-1, 1)
+        self.register_buffer("_own_first", shift * sensor.area, persistent=False)
         for name in ("seen_count", "seen_gone"):
             self.register_buffer(name, torch.zeros(envs, dtype=torch.int64))
 
@@ -220,6 +251,8 @@ class CoverageMap(nn.Module):
             self._burn_out.copy_(torch.where(began, self._fires_end[fire], self._burn_out))
         self._fire_index.copy_(torch.where(mask, fire, self._fire_index))
         self._first_seen.masked_fill_(began, _NEVER)
+        if self._own_seen is not None:
+            self._own_seen.masked_fill_(mask[:, None, None], False)
         self.seen_count.masked_fill_(mask, 0)
         self.seen_gone.masked_fill_(mask, 0)
         self._stamp.copy_(torch.where(mask[:, None, None], self._uav, self._stamp))
@@ -237,7 +270,7 @@ class CoverageMap(nn.Module):
 
     def look(
         self, position: Tensor, step: Tensor, alive: Tensor | None = None
-    ) -> tuple[Sighting, View, tuple[Tensor, Tensor]]:
+    ) -> Look:
         """Classifies the cells in view of all UAVs and marks the burning ones as seen.
 
         It must be called exactly once per step.
@@ -248,8 +281,7 @@ class CoverageMap(nn.Module):
             alive: bool [envs, uavs]; the others see nothing. All are alive if None.
 
         Returns:
-            The cells in view of each UAV by class, batch shape [envs, uavs], and their indices; and
-            the environments and cells that burned until this step, int64 [k] each.
+            What the UAVs see, batch shape [envs, uavs].
         """
         centre, cells, in_view = self._sensor.look(position, self._start)
         if alive is not None:
@@ -267,11 +299,22 @@ class CoverageMap(nn.Module):
         new = first_seen.take(cells) == stamp
         classes = torch.stack((new, burning ^ new, no_fire), -2)
         counted = self._sensor.count_classes(classes, centre)
-        sighting = Sighting(*counted, classes, burnt_out)
+        sighting = shown = Sighting(*counted, classes, burnt_out)
+        if self._own_seen is not None:
+            new = self._see_alone(self._own_seen, cells + self._own_first, burning)
+            classes = torch.stack((new, burning ^ new, no_fire), -2)
+            shown = Sighting(*self._sensor.count_classes(classes, centre), classes, burnt_out)
         self.seen_count.add_(sighting.counts[..., 0].sum(-1).long())
         env = cell = self._fire_index[:0]
         if self._burnt_out is not None:
             env, cell = self._burnt_out.passing(self._fire_index, step)
             gone = self._first_seen[env, cell] < _NEVER
             self.seen_gone.index_add_(0, env, gone.long())
-        return sighting, View(cells, in_view, burning), (env, cell)
+        return Look(sighting, shown, View(cells, in_view, burning), (env, cell))
+
+    def _see_alone(self, seen: Tensor, cells: Tensor, burning: Tensor) -> Tensor:
+        """Marks burning cells as seen by their UAV, and returns those that are new to it."""
+        new = burning & ~seen.take(cells)
+        flat = seen.view(-1).view(torch.uint8)
+        flat.scatter_reduce_(0, cells.view(-1), burning.view(torch.uint8).view(-1), "amax")
+        return new
