@@ -268,9 +268,7 @@ class CoverageMap(nn.Module):
         """Returns how many of the burning cells, int64 [envs], were not seen while they burned."""
         return burning - self.seen_count + self.seen_gone
 
-    def look(
-        self, position: Tensor, step: Tensor, alive: Tensor | None = None
-    ) -> Look:
+    def look(self, position: Tensor, step: Tensor, alive: Tensor | None = None) -> Look:
         """Classifies the cells in view of all UAVs and marks the burning ones as seen.
 
         It must be called exactly once per step.
