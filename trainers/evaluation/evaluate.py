@@ -126,7 +126,7 @@ def evaluate(
     Args:
         fires: number of test fires, one episode each.
         report: called with the names of the fire and the policy before each evaluation.
-        watch: watches the first batch of the frozen policy on the fires of `shown_fire`.
+        watch: watches the first batch of the frozen policy on the fires of `shown_scenario`.
 
     Returns:
         fire -> policy -> measure -> one number per episode.

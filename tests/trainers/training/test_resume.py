@@ -234,7 +234,7 @@ def test_folders_that_cannot_be_resumed(paused, tmp_path, capsys):
     (paused / METRICS).write_text(lines)
     run, content = RunFolder(paused), RunFolder(paused).newest.read_bytes()
     run.newest.write_bytes(content[:-10])
-    refused(paused, str(run.newest), "not a readable checkpoint")
+    refused(paused, str(run.newest))
     shutil.copy(run.path / BEST, run.newest)
     refused(paused, "holds networks alone")
 
