@@ -53,7 +53,6 @@ NOWHERE = "~nobody_here/x"
         f"compare {NOWHERE}",
         f"compare pretrained:tuned --output={NOWHERE}",
         f"sweep independent output={NOWHERE}",
-        f"sweep status {NOWHERE}",
         f"fire preview {NOWHERE}",
         f"fire preview fire=file fire.path={NOWHERE}",
         f"fire import {NOWHERE} --output=fires.npy",
