@@ -9,12 +9,12 @@ from scipy import ndimage
 from emberlink.envs.config import BASE_SIDE
 from emberlink.envs.fire_files.config import SECONDS, Clock, FileFireConfig
 from emberlink.envs.fire_files.dates import in_utc, parse_dates
-from emberlink.envs.fire_files.grid import Source, Window
+from emberlink.envs.fire_files.grid import Raster, Window
 from emberlink.envs.utils.errors import UserError
 
 
 def on_grid(
-    source: Source, config: FileFireConfig, grid: tuple[int, int], horizon: int
+    source: Raster, config: FileFireConfig, grid: tuple[int, int], horizon: int
 ) -> np.ndarray:
     """Crops a fire to a grid (X, Y) and stretches its times over an episode.
 
@@ -23,10 +23,17 @@ def on_grid(
     """
     no_span = config.start is config.end is config.minutes_per_step is None
     in_steps = no_span and source.clock.unit == "steps"
-    start, end = (0.0, float(horizon)) if in_steps else _span(source, config, horizon)
+    burns = source.first, source.last
+    if in_steps:
+        start, end = 0.0, float(horizon)
+    else:
+        began = source.first if source.began is None else source.began
+        start, end = span(source.clock, burns, began, config, horizon)
     margin = None if source.whole else config.margin
-    bounds = source.extent if margin is None else source.burnt(end)
-    times = source.on(Window.around(bounds, grid, margin or 0), end)
+    window = source.window
+    if window is None:
+        window = Window.around(source.bounds(None if margin is None else end), grid, margin or 0)
+    times = source.on(window)
     times[times > end] = np.inf
     if config.start is None and not in_steps and not (times <= start).any():
         times[times == times.min()] = start  # the first cell burns from step 0
@@ -35,23 +42,24 @@ def on_grid(
     steps = (np.maximum(times, start) - start) / (end - start) * horizon
     burning = steps[np.isfinite(steps)]
     if len(burning) < 2 or (not in_steps and burning.min() == burning.max()):
-        raise _no_fire(source, start, end)
+        raise _no_fire(source.clock, (start, end), burns)
     return steps.astype(np.float32)
 
 
-def _no_fire(source: Source, start: float, end: float) -> UserError:
-    text = source.clock.format
-    return UserError(
-        f"from {text(start)} to {text(end)} no fire spreads; it burns from {text(source.first)} to "
-        f"{text(source.last)}"
-    )
+def span(
+    clock: Clock, burns: tuple[float, float], began: float, config: FileFireConfig, horizon: int
+) -> tuple[float, float]:
+    """Returns the times of the first and the last step, in the clock's unit.
 
-
-def _span(source: Source, config: FileFireConfig, horizon: int) -> tuple[float, float]:
-    """Returns the times of the first and the last step, in the source's unit."""
-    clock = source.clock
-    start = source.began if config.start is None else _time(config.start, "start", source, config)
-    end = source.last if config.end is None else _time(config.end, "end", source, config)
+    Args:
+        clock: of the file.
+        burns: first and last arrival in the file.
+        began: time of ignition.
+    """
+    given = {"start": config.start, "end": config.end}
+    values = {key: _time(value, key, clock, burns[0], config) for key, value in given.items()}
+    start, end = values["start"], values["end"]
+    start, end = began if start is None else start, burns[1] if end is None else end
     if config.minutes_per_step is not None:
         if clock.unit not in SECONDS:
             raise UserError(
@@ -59,32 +67,38 @@ def _span(source: Source, config: FileFireConfig, horizon: int) -> tuple[float, 
                 "in time"
             )
         end = start + horizon * config.minutes_per_step * 60 / SECONDS[clock.unit]
-    if end < source.began or start >= source.last:
-        raise _no_fire(source, start, end)
+    if end < began or start >= burns[1]:
+        raise _no_fire(clock, (start, end), burns)
     if not start < end:
         text = clock.format
         raise UserError(f"from {text(start)} to {text(end)}: the end must be after the start")
     return start, end
 
 
-def _time(value: float | str, key: str, source: Source, config: FileFireConfig) -> float:
-    """Returns `fire.start` or `fire.end` in the source's unit."""
-    clock: Clock = source.clock
+def _no_fire(clock: Clock, span: tuple[float, float], burns: tuple[float, float]) -> UserError:
+    start, end, first, last = map(clock.format, (*span, *burns))
+    return UserError(f"from {start} to {end} no fire spreads; it burns from {first} to {last}")
+
+
+def _time(
+    value: float | str | None, key: str, clock: Clock, first: float, config: FileFireConfig
+) -> float | None:
+    """Returns `fire.start` or `fire.end` in the clock's unit."""
+    if value is None or (clock.origin is None and not isinstance(value, str)):
+        return value
     if clock.origin is None:
-        if isinstance(value, str):
-            raise UserError(
-                f"fire.{key}={value}: the file's times are {clock.unit}; expected a number of them"
-            )
-        return float(value)
+        raise UserError(
+            f"fire.{key}={value}: the file's times are {clock.unit}; expected a number of them"
+        )
     if isinstance(value, str):
         date = in_utc(parse_dates([value], config.time_format, f"fire.{key}")[0])
         return (date - clock.origin).total_seconds() / SECONDS[clock.unit]
     if config.units not in SECONDS:
         raise UserError(
             f"fire.{key}={value:g}: the file's times are dates; expected such as "
-            f"{clock.format(source.first)}, or fire.units for a number"
+            f"{clock.format(first)}, or fire.units for a number"
         )
-    return source.first + float(value) * SECONDS[config.units] / SECONDS[clock.unit]
+    return first + value * SECONDS[config.units] / SECONDS[clock.unit]
 
 
 def _burnt_out(times: np.ndarray, start: float, width: float) -> np.ndarray:
@@ -93,8 +107,7 @@ def _burnt_out(times: np.ndarray, start: float, width: float) -> np.ndarray:
     if not burnt.any() or math.isinf(width):
         return np.zeros_like(burnt)
     around = np.pad(burnt, 1)  # cells outside the grid have not burnt
-    labelled: Any = ndimage.label(~around)
-    holes = labelled[0]
+    holes: Any = ndimage.label(~around)[0]  # pyright: ignore[reportGeneralTypeIssues]
     later = np.pad(np.isfinite(times) & ~burnt, 1)
     around |= ~np.isin(holes, [holes[0, 0], *holes[later]])
     depth: Any = ndimage.distance_transform_edt(around)

@@ -9,8 +9,8 @@ from emberlink.envs.utils.errors import UserError, unknown
 from emberlink.envs.utils.validation import as_argument
 
 _IDENTIFIER = re.compile(
-    r"(poly|attr)?(incident|incid|fire|event|burn|complex|cluster)s?(name|nm|id|num|number|no|nr|code)?"
-    r"|fname|.*irwin.*|.*uniquefire.*"
+    r"(poly|attr)?(incident|incid|fire|event|burn|complex|cluster|merged?)s?"
+    r"(name|nm|id|num|number|no|nr|code)?|fname|.*irwin.*|.*uniquefire.*"
 )
 """Columns that identify a fire, by the letters and digits of their names."""
 _MAYBE = re.compile(r"name|id|num|number|label|(f|fire|ig|ignition|event)?(year|yr)")
@@ -25,8 +25,9 @@ def plain(name: Any) -> str:
 
 def texts(column: Any) -> Any:
     """Returns the values of a column as texts; missing values are empty."""
-    values = column.map(lambda value: re.sub(r"\.0$", "", str(value)).strip())
-    return values.where(column.notna(), "")
+    written = column.astype(str)
+    read = {text: re.sub(r"\.0$", "", text).strip() for text in written.unique()}
+    return written.map(read).where(column.notna(), "")
 
 
 def column_named(name: str, columns: Sequence[Any], key: str) -> Any:
@@ -40,13 +41,13 @@ def column_named(name: str, columns: Sequence[Any], key: str) -> Any:
 
 def choose_features(frame: Any, config: FileFireConfig, facts: list[str]) -> Any:
     """Returns the features of one fire; notes on the others are appended to `facts`."""
-    columns = [name for name in frame.columns if name != frame.geometry.name]
     for key, choose in (("where", _where), ("incident", _of_incident)):
-        before = len(frame)
-        frame = choose(frame, columns, config, facts)
-        if len(frame) < before:
-            left_out = f"{before - len(frame)} left out by fire.{key}={getattr(config, key)}"
-            facts.append(left_out)
+        columns = [name for name in frame.columns if name != frame.geometry.name]
+        kept = choose(frame, columns, config, facts)
+        if len(kept) < len(frame):
+            left_out = len(frame) - len(kept)
+            facts.append(f"{left_out} left out by fire.{key}={getattr(config, key)}")
+        frame = kept
     return frame
 
 
@@ -62,8 +63,7 @@ def _where(frame: Any, columns: Sequence[Any], config: FileFireConfig, _: list[s
             raise UserError(f"fire.where={where} keeps no feature; {_counts(frame, column)}")
         return frame[keeps]
     for column in columns if where is None else ():
-        values = texts(frame[column])
-        sure = re.search("categ|featu", plain(column)) is not None
+        values, sure = texts(frame[column]), re.search("categ|featu", plain(column)) is not None
         if _CATEGORY.fullmatch(plain(column)) and 1 < values.nunique() < len(frame) + sure:
             choice = as_argument("fire.where", f"{column}={values.mode().iloc[0]}")
             raise UserError(
@@ -78,40 +78,35 @@ def _of_incident(
 ) -> Any:
     """Returns the features of `fire.incident`; asks if identifiers differ."""
     wanted, field = config.incident, config.incident_field
-    sure = [name for name in columns if _IDENTIFIER.fullmatch(plain(name))]
-    known = [*sure, *(name for name in columns if _MAYBE.fullmatch(plain(name)))]
-    if field is not None:
-        places = [column_named(field, columns, "fire.incident_field")]
-        known = known if wanted else places
-        sure = [*sure, *places]
-    else:
-        places = known
     if wanted == "*":
         return frame
+    sure = [name for name in columns if _IDENTIFIER.fullmatch(plain(name))]
+    known = [*sure, *(name for name in columns if _MAYBE.fullmatch(plain(name)))]
+    place = None if field is None else column_named(field, columns, "fire.incident_field")
     if wanted is not None:
-        name = wanted.strip().lower()
-        values = {text for place in places for text in texts(frame[place]) if text}
-        places = [place for place in places if (texts(frame[place]).str.lower() == name).any()]
-        if not places:
+        name, places = wanted.strip().lower(), known if place is None else [place]
+        found = [at for at in places if (texts(frame[at]).str.lower() == name).any()]
+        if not found:
+            values = {text for at in places for text in texts(frame[at]) if text}
             raise UserError(f"fire.incident={unknown(wanted, sorted(values)[:30])}")
-        frame = frame[texts(frame[places[0]]).str.lower() == name]
+        frame = frame[texts(frame[found[0]]).str.lower() == name]
+        other = f"fire.incident_field={found[0]} beside fire.incident for all of these"
+    else:
+        sure, known = ([place], [place]) if place is not None else (sure, known)
+        other = "fire.incident=* for all as one fire"
     counts = {name: texts(frame[name]).replace("", None).nunique() for name in known}
     several = [name for name, n in counts.items() if 1 < n < len(frame) + (name in sure)]
-    if not several:
-        return frame
     listed = "; ".join(_counts(frame, name) for name in several)
-    if wanted is not None and field is not None:
+    if wanted is not None and field is not None and several:
         facts.append(f"which differ in {listed}")
-        return frame
-    values = texts(frame[several[0]])
-    value = as_argument("fire.incident", values[values != ""].iloc[0])
-    other = "fire.incident=* for all as one fire"
-    if wanted is not None:
-        other = f"fire.incident_field={places[0]} beside fire.incident for all of these"
-    raise UserError(
-        f"{len(frame)} features of several fires: {listed}; expected "
-        f"fire.incident_field={several[0]} {value}, or {other}"
-    )
+    elif several:
+        values = texts(frame[several[0]])
+        value = as_argument("fire.incident", values[values != ""].iloc[0])
+        raise UserError(
+            f"{len(frame)} features of several fires: {listed}; expected "
+            f"fire.incident_field={several[0]} {value}, or {other}"
+        )
+    return frame
 
 
 def _counts(frame: Any, column: Any) -> str:

@@ -39,7 +39,7 @@ _HEADS = {
     "points": rb"\s*?(?:\n|\Z)|(?:[-+.\deE \t\r]*,){2,}[-+.\deE \t\r]*(?:\n|\Z)",
 }
 """First bytes of each format."""
-TABLES = ("shp", "gpkg", "json", "kml", "kmz", "csv")
+TABLES = ("shp", "gpkg", "json", "kml", "kmz", "csv", "folder")
 """Formats of perimeters."""
 _SUFFIXES = (".shp", ".gpkg", ".geojson", ".json", ".kml", ".kmz", ".csv")
 _BESIDE = {
@@ -83,14 +83,10 @@ def first_line(error: BaseException) -> str:
 
 
 def find_format(path: Path) -> str:
-    """Returns the format of a file, a key of `_HEADS`, and checks that it is safe and whole."""
+    """Returns the format of a file or folder, and checks that it is safe and whole."""
+    if path.is_dir():
+        return "grids" if forest_grids(path) else "folder"
     size, head = _regular(path), _head(path)
-    if path.name.startswith("ForestGrid"):
-        raise UserError(
-            'a map of Cell2Fire; expected an array of all, with fire.kind=masks: python -c "import '
-            "glob, numpy as n; n.save('fire.npy', [n.loadtxt(f, delimiter=',') for f in sorted("
-            "glob.glob('ForestGrid*.csv'), key=lambda f: (len(f), f))])\""
-        )
     kind = _kind(head)
     if not head or not kind or (kind == "kmz" and path.suffix.lower() != ".kmz"):
         start = head[:16].decode("latin-1").encode("unicode_escape").decode()
@@ -99,6 +95,8 @@ def find_format(path: Path) -> str:
             f"{what if head else 'is empty'}; known are GeoTIFF, NetCDF, ESRI ASCII, .npy, .shp, "
             ".gpkg, GeoJSON, KML, KMZ, CSV of points, and the paper's text"
         )
+    if path in forest_grids(path.parent):
+        raise UserError("one map of Cell2Fire; expected its folder, with fire.kind=masks")
     most = MAX_BYTES // 2 if kind == "json" else MAX_BYTES
     if kind in ("asc", "csv", "kml", "points", "json") and size > most:
         raise UserError(f"{size} bytes; a text file of this format has at most {most}")
@@ -138,6 +136,12 @@ def check_prj(path: Path, kind: str, crs: Any) -> None:
         )
 
 
+def forest_grids(folder: Path) -> list[Path]:
+    """Returns the maps of Cell2Fire in a folder, in the order of their numbers."""
+    found = [path for path in folder.glob("ForestGrid*.csv") if _regular(path)]
+    return sorted(found, key=lambda path: (len(path.name), path.name))
+
+
 def perimeter_files(folder: Path) -> list[Path]:
     """Returns the perimeters in a folder, sorted by name."""
     paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in _SUFFIXES)
@@ -150,11 +154,11 @@ def perimeter_files(folder: Path) -> list[Path]:
 
 
 def digest(path: Path) -> str:
-    """Returns the SHA-256 of a file and the files beside it, or of a folder's perimeters."""
-    content = hashlib.sha256()
-    for main in perimeter_files(path) if path.is_dir() else [path]:
+    """Returns the SHA-256 of a file and the files beside it, or of a folder's fires."""
+    content, folder = hashlib.sha256(), path.is_dir()
+    for main in (forest_grids(path) or perimeter_files(path)) if folder else [path]:
         for part in (main, *beside(main, _kind(_head(main)))):
-            name = part.name if path.is_dir() else part.name[len(path.stem) :]
+            name = part.name if folder else part.name[len(path.stem) :]
             content.update(f"{name}:{_regular(part)}:".encode())
             with part.open("rb") as file:
                 while block := file.read(1 << 20):
@@ -194,11 +198,10 @@ def _check_shapefile(path: Path) -> None:
     sizes = {suffix: part.stat().st_size for suffix, part in parts.items()}
     features = (sizes[".shx"] - 100) // 8
     for suffix in (".shp", ".shx", ".dbf"):
-        head = _head(parts[suffix])
+        head = _head(parts[suffix]).ljust(100, b"\0")
+        records, start, row = struct.unpack("<IHH", head[4:12])
+        whole = 2 * struct.unpack(">I", head[24:28])[0] == sizes[suffix] > 0
         if suffix == ".dbf":
-            records, start, row = struct.unpack("<IHH", head[4:12] if len(head) > 11 else bytes(8))
-            whole = records == features and start + records * row <= sizes[suffix]
-        else:
-            whole = len(head) >= 100 and 2 * struct.unpack(">I", head[24:28])[0] == sizes[suffix]
+            whole = records == features and 0 < start + records * row <= sizes[suffix]
         if not whole:
             raise UserError(f"{parts[suffix].name} is damaged; expected {features} whole features")

@@ -1,35 +1,35 @@
-"""The grid laid over a fire, and rasters of arrival times sampled at its cells."""
+"""Samples a raster of arrival times at the cells of a grid."""
 
-import functools
-from dataclasses import dataclass, field, replace
-from typing import Any, Protocol
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
-from scipy.ndimage import label, map_coordinates, minimum_filter
-from scipy.sparse.csgraph import connected_components
+from scipy.ndimage import (
+    distance_transform_edt,
+    find_objects,
+    label,
+    map_coordinates,
+    minimum_filter,
+)
 
 from emberlink.envs.fire_files.config import Clock
-from emberlink.envs.fire_files.files import library
 from emberlink.envs.utils.errors import UserError
 
 Bounds = tuple[float, float, float, float]
 """Minimum x, minimum y, maximum x, maximum y."""
 SAMPLES = 180
-"""Sample points along the grid's shorter side. A cell of the grid gets the earliest of its samples.
-Rasters and perimeters are sampled at the same points."""
+"""Sample points along the grid's shorter side. A cell of the grid gets the earliest of them."""
+_COARSE = 128  # cells of a side on which parts are told apart
 _EDGE = 1e-6  # cells: tolerance, so that rounding does not move a centre across an edge
 
 
 @dataclass(frozen=True)
 class Window:
-    """A part of the plane that a grid covers with square cells."""
+    """A part of the plane that a grid (X, Y) covers with square cells, from a lower left corner."""
 
     x: float
-    """coordinate of the left edge"""
     y: float
-    """coordinate of the lower edge"""
     side: float
-    """side of a cell"""
     grid: tuple[int, int]
 
     @classmethod
@@ -45,75 +45,27 @@ class Window:
         """Sample points along each side of a cell."""
         return max(1, round(SAMPLES / min(self.grid)))
 
-    def samples(self, border: tuple[int, int] = (0, 0)) -> "Window":
-        """Returns the window of the sample points: cuts x cuts per cell, and a border of points."""
-        side, (columns, rows) = self.side / self.cuts, self.grid
-        grid = columns * self.cuts + 2 * border[0], rows * self.cuts + 2 * border[1]
-        x, y = self.x - border[0] * side, self.y - border[1] * side
-        return replace(self, x=x, y=y, side=side, grid=grid)
-
-    def contains(self, bounds: Bounds) -> bool:
-        """Returns whether all of an area with some bounds is within the window."""
-        right, upper = self.x + self.grid[0] * self.side, self.y + self.grid[1] * self.side
-        x0, y0, x1, y1 = bounds
-        return self.x <= x0 and self.y <= y0 and x1 <= right and y1 <= upper
+    def samples(self) -> "Window":
+        """Returns the window of the sample points, cuts x cuts per cell."""
+        grid = self.grid[0] * self.cuts, self.grid[1] * self.cuts
+        return Window(self.x, self.y, self.side / self.cuts, grid)
 
     def axes(self) -> tuple[np.ndarray, np.ndarray]:
         """Returns x [X] and y [Y] of the cells' centres."""
         columns, rows = (np.arange(count) + 0.5 for count in self.grid)
         return self.x + columns * self.side, self.y + rows * self.side
 
-    def centres(self) -> Any:
-        """Returns x and y of each cell's centre, [X, Y]."""
-        return np.meshgrid(*self.axes(), indexing="ij")
-
-    @functools.cache  # noqa: B019
-    def tree(self) -> Any:
-        """Returns a tree of the cells' centres, in C order."""
-        shapely = library("shapely")
-        return shapely.STRtree(shapely.points(*(at.ravel() for at in self.centres())))
-
-    def earliest(self, samples: np.ndarray) -> np.ndarray:
-        """Returns the minimum in each cell, [X, Y], of samples [X cuts, Y cuts]."""
-        columns, rows = self.grid
-        return samples.reshape(columns, self.cuts, rows, self.cuts).min((1, 3))
-
-    def cells(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the indices of the cells in which points lie; they may lie outside the grid."""
-        i, j = (x - self.x) / self.side, (y - self.y) / self.side
-        return np.floor(i + _EDGE).astype(np.int64), np.floor(j + _EDGE).astype(np.int64)
-
-
-class Source(Protocol):
-    """A fire read from a file, on a plane."""
-
-    clock: Clock
-    began: float
-    """time of ignition; the first arrival where it is unknown"""
-    first: float
-    """earliest arrival in the file"""
-    last: float
-    """latest arrival in the file"""
-    extent: Bounds
-    whole: bool
-    """True for a map of the whole grid, which is neither cropped nor burnt out"""
-    facts: list[str]
-    """findings about the file, for the user"""
-    doubts: list[str]
-    """signs of a misreading, for the user"""
-
-    def burnt(self, until: float) -> Bounds:
-        """Returns the bounds of the area burnt by a time."""
-        ...
-
-    def on(self, window: Window, until: float) -> np.ndarray:
-        """Returns arrival times, float64 [X, Y], inf for never. Times after `until` may be late."""
-        ...
+    def cells(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Returns the indices of the cells in which points lie, and which are in the grid."""
+        i, j = (
+            np.floor(at / self.side + _EDGE).astype(np.int64) for at in (x - self.x, y - self.y)
+        )
+        return i, j, (i >= 0) & (j >= 0) & (i < self.grid[0]) & (j < self.grid[1])
 
 
 @dataclass
 class Raster:
-    """Samples arrival times on a raster whose rows run from north to south."""
+    """A fire read from a file: arrival times on a plane, rows from north to south."""
 
     times: np.ndarray
     """float64 [rows, columns], inf for never"""
@@ -123,33 +75,37 @@ class Raster:
     """width and height of a cell"""
     clock: Clock
     whole: bool = False
+    """True for a map of the whole grid, which is neither cropped nor burnt out"""
+    window: Window | None = None
+    """the crop for whose samples perimeters were drawn; None for the bounds of the burnt area"""
+    began: float | None = None
+    """time of ignition; None for the first arrival"""
     facts: list[str] = field(default_factory=list)
+    """findings about the file, for the user"""
     doubts: list[str] = field(default_factory=list)
+    """signs of a misreading, for the user"""
 
     def __post_init__(self) -> None:
         self.times = self.times.astype(np.float64)
-        rows, columns = self.times.shape
-        (x, y), (width, height) = self.corner, self.cell
-        self.extent: Bounds = x, y - rows * height, x + columns * width, y
         burning = self.times[np.isfinite(self.times)]
         self.first, self.last = float(burning.min()), float(burning.max())
-        self.began = self.first
 
-    def burnt(self, until: float) -> Bounds:
-        """Returns the bounds of the area burnt by a time: to the front, or to edges of cells."""
-        times = self.times
-        if (times <= until).sum() < 2:
-            raise UserError(
-                f"until {self.clock.format(until)} a single cell burns: no fire spreads"
-            )
-        rows, columns = times.shape
-        left, right = _front(times, until), columns - _front(times[:, ::-1], until)
-        top, bottom = _front(times.T, until), rows - _front(times.T[:, ::-1], until)
+    def bounds(self, until: float | None = None) -> Bounds:
+        """Returns the bounds of the raster, or of the area burnt by a time, up to the front."""
+        times, (rows, columns) = self.times, self.times.shape
+        left, right, top, bottom = 0.0, float(columns), 0.0, float(rows)
+        if until is not None:
+            if (times <= until).sum() < 2:
+                raise UserError(
+                    f"until {self.clock.format(until)} a single cell burns: no fire spreads"
+                )
+            left, right = _front(times, until), columns - _front(times[:, ::-1], until)
+            top, bottom = _front(times.T, until), rows - _front(times.T[:, ::-1], until)
         (x, y), (width, height) = self.corner, self.cell
         return x + left * width, y - bottom * height, x + right * width, y - top * height
 
-    def on(self, window: Window, until: float) -> np.ndarray:
-        """Returns the earliest arrival in each cell of a grid.
+    def on(self, window: Window) -> np.ndarray:
+        """Returns the earliest arrival in each cell of a grid, float64 [X, Y], inf for never.
 
         Candidates are the bilinear sample points in the cell and the centres of the raster's cells
         (on a finer grid, only centres that burn before all their neighbours). A map of the whole
@@ -157,12 +113,13 @@ class Raster:
         """
         fine = window.side < (1 - _EDGE) * min(self.cell)
         if self.whole or self._is_aligned(window):
-            near = self._at(*(np.rint(at).astype(np.int64) for at in self._indices(window)))
-            if fine:
-                return near
-            without = np.isinf(self._earliest(np.zeros_like(self.times), window))
-            return np.where(without, near, self._earliest(self.times, window))
-        samples = window.earliest(self._interpolate(*self._indices(window.samples())))
+            near = self._at(*self._indices(window))
+            centres = self._earliest(self.times, window)
+            has_centre = np.isfinite(self._earliest(np.zeros_like(self.times), window))
+            return near if fine else np.where(has_centre, centres, near)
+        (columns, rows), cuts = window.grid, window.cuts
+        samples = self._interpolate(*self._indices(window.samples()))
+        samples = samples.reshape(columns, cuts, rows, cuts).min((1, 3))
         first = self.times == minimum_filter(self.times, 3)
         times = np.where(first, self.times, np.inf) if fine else self.times
         return np.minimum(samples, self._earliest(times, window))
@@ -184,58 +141,26 @@ class Raster:
         earliest = np.full(window.grid, np.inf)
         rows, columns = np.nonzero(np.isfinite(times))
         (x, y), (width, height) = self.corner, self.cell
-        i, j = window.cells(x + (columns + 0.5) * width, y - (rows + 0.5) * height)
-        inside = (i >= 0) & (j >= 0) & (i < window.grid[0]) & (j < window.grid[1])
+        i, j, inside = window.cells(x + (columns + 0.5) * width, y - (rows + 0.5) * height)
         np.minimum.at(earliest, (i[inside], j[inside]), times[rows[inside], columns[inside]])
         return earliest
 
     def _at(self, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
-        """Returns the times of rows [Y] and columns [X], [X, Y]; inf outside the raster."""
-        height, width = self.times.shape
-        times = self.times[np.ix_(np.clip(rows, 0, height - 1), np.clip(columns, 0, width - 1))].T
-        times[:, (rows < 0) | (rows >= height)] = np.inf
-        times[(columns < 0) | (columns >= width)] = np.inf
-        return times
+        """Returns the times of the nearest rows [Y] and columns [X], [X, Y]; inf outside."""
+        padded = np.pad(self.times, 1, constant_values=np.inf)
+        inner = [
+            np.clip(np.rint(at).astype(np.int64) + 1, 0, size + 1)
+            for at, size in zip((rows, columns), self.times.shape, strict=True)
+        ]
+        return padded[np.ix_(*inner)].T
 
     def _interpolate(self, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
         """Interpolates bilinearly between burnt cells, [X, Y]; inf in a cell that never burns."""
-        inside = self._at(np.rint(rows).astype(np.int64), np.rint(columns).astype(np.int64))
-        burns = np.isfinite(self.times)
-        at = np.meshgrid(rows, columns)
+        burns, at = np.isfinite(self.times), np.meshgrid(rows, columns)
         weights = map_coordinates(burns.astype(np.float64), at, order=1, mode="nearest")
         total = map_coordinates(np.where(burns, self.times, 0), at, order=1, mode="nearest")
         times = np.maximum(total / np.where(weights > 0, weights, 1), self.first)
-        return np.where(np.isinf(inside) | (weights == 0), inside, times)
-
-
-def beginnings(times: np.ndarray) -> int:
-    """Returns the number of places that burn before all cells around them."""
-    burns, earliest = np.isfinite(times), times == minimum_filter(times, 3)
-    # Of cells that burn at the same time, one may have an earlier neighbour: no beginning.
-    later = minimum_filter(np.where(burns & ~earliest, times, np.inf), 3) == times
-    places: Any = label(burns & earliest, np.ones((3, 3)))
-    return int(places[1] - len(np.unique(places[0][burns & earliest & later])))
-
-
-def far_apart(boxes: np.ndarray) -> list[str]:
-    """Returns whether parts with some boxes, [parts, 4], lie farther apart than they are long."""
-    size, longest, between = len(boxes) + 1, 0.0, np.zeros(1)
-    while len(boxes) < size:
-        size, low, high = len(boxes), boxes[:, :2], boxes[:, 2:]
-        longest = (high - low).max()
-        between = np.maximum(low[:, None] - high[None], low[None] - high[:, None]).max(2)
-        count, of = connected_components(between <= 1.5 * longest)
-        groups = [boxes[of == k] for k in range(count)]
-        boxes = np.array([[*g[:, :2].min(0), *g[:, 2:].max(0)] for g in groups])
-    if size == 1:
-        return []
-    gap = between.max()
-    return [f"{size} groups of parts never join and lie {gap:g} apart, {longest:g} long: one fire?"]
-
-
-def number(count: int, noun: str) -> str:
-    """Returns a count with its noun, such as `2 places`."""
-    return f"{count} {noun}{'' if count == 1 else 's'}"
+        return np.where(np.isinf(self._at(rows, columns)) | (weights == 0), np.inf, times)
 
 
 def _front(times: np.ndarray, until: float) -> float:
@@ -249,3 +174,30 @@ def _front(times: np.ndarray, until: float) -> float:
     step = np.where(between, outer - inner, inner - before)
     share = np.where(step > 0, until - inner, 0.5) / np.where(step > 0, step, 1.0)
     return float((at + 0.5 - np.where(between | (share < 1), share, 0.5)).min())
+
+
+def beginnings(times: np.ndarray) -> int:
+    """Returns the number of places that burn before all cells around them."""
+    burns, earliest = np.isfinite(times), times == minimum_filter(times, 3)
+    # Of cells that burn at the same time, one may have an earlier neighbour: no beginning.
+    later = minimum_filter(np.where(burns & ~earliest, times, np.inf), 3) == times
+    places: Any = label(burns & earliest, np.ones((3, 3)))
+    return int(places[1] - len(np.unique(places[0][burns & earliest & later])))
+
+
+def far_apart(burns: np.ndarray) -> list[str]:
+    """Returns a doubt if parts of a mask never join and lie farther apart than they are long."""
+    at = np.argwhere(burns)
+    coarse = (at - at.min(0)) * _COARSE // max(_COARSE, *(np.ptp(at, axis=0) + 1).tolist())
+    burns = np.zeros(coarse.max(0) + 1, bool)
+    burns[*coarse.T] = True
+    near: Any = distance_transform_edt(~burns)
+    reach, longest, parts = -1.0, 0.0, 2
+    while longest > reach and parts > 1:
+        reach = longest
+        groups, parts = label(near <= 0.75 * reach, np.ones((3, 3)))  # pyright: ignore
+        boxes = find_objects(np.where(burns, groups, 0))
+        longest = max(float(axis.stop - axis.start) for box in boxes for axis in box)
+    if parts < 2:
+        return []
+    return [f"{parts} groups of parts never join, and lie far apart: one fire? (fire.incident)"]

@@ -1,26 +1,32 @@
-"""Makes a fire of perimeters over time, and interpolates the front between them."""
+"""Makes a fire of features over time: areas of each time, their union, the arrival between them."""
 
+import functools
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from scipy.ndimage import binary_dilation, distance_transform_edt, label
 
-from emberlink.envs.fire_files.areas import MANY, area_at_zero, enclosed, make_valid, polygons
-from emberlink.envs.fire_files.config import Clock, FileFireConfig
+from emberlink.envs.fire_files.config import FileFireConfig
+from emberlink.envs.fire_files.crop import span
 from emberlink.envs.fire_files.features import choose_features
 from emberlink.envs.fire_files.files import library
-from emberlink.envs.fire_files.grid import Bounds, Window, far_apart, number
-from emberlink.envs.fire_files.projection import Plane, choose_plane
-from emberlink.envs.fire_files.times import read_times
+from emberlink.envs.fire_files.grid import Raster, Window, far_apart
+from emberlink.envs.fire_files.projection import choose_plane
+from emberlink.envs.fire_files.times import Times, read_times
 from emberlink.envs.utils.errors import UserError
 
 _MAX_TIMES = 500
-_MAX_PARTS = 1000  # the largest, among which groups are looked for
+_MAX_BORDER = 2000  # sample points beside the grid, to which fronts outside are drawn
+_MANY = 50  # polygons above which points are looked up in polygons, and not polygons drawn
+_GAP = 0.01  # of a line's length: a smaller gap between its ends is closed
+_POINT = 1e-3  # of an area's width: the size of a fire that is a point
 _AROUND = np.ones((3, 3))
 
 
-def read_perimeters(frame: Any, outside: Sequence[str], config: FileFireConfig) -> "Perimeters":
+def read_perimeters(
+    frame: Any, outside: Sequence[str], config: FileFireConfig, grid: tuple[int, int], horizon: int
+) -> Raster:
     """Makes a fire of a table of features; the values of columns `outside` stand beside it."""
     count, facts = len(frame), []
     frame = frame[~(frame.geometry.isna() | frame.geometry.is_empty)]
@@ -39,123 +45,181 @@ def read_perimeters(frame: Any, outside: Sequence[str], config: FileFireConfig) 
         raise UserError("no feature with a geometry; expected perimeters")
     frame = choose_features(frame, config, facts)
     times = read_times(frame, config, outside)
-    x0, y0, x1, y1 = (float(value) for value in frame.total_bounds)
-    plane = choose_plane(frame.crs, config.crs, (x0, y0, x1, y1), None)
-    if config.radius is not None:
-        frame, plane = _with_circles(frame, plane, config.radius)
+    shapes, about = _on_plane(frame, config)
     distinct, sizes = np.unique(times.values, return_counts=True)
     if not 2 <= len(distinct) <= _MAX_TIMES:
         raise UserError(
             f"{len(distinct)} times in {times.column}, {times.clock.format(distinct[0])}...; "
             f"expected 2 to {_MAX_TIMES}"
         )
-    shapes, names = frame.geometry.to_numpy(), frame.index.to_numpy()
-    areas = [enclosed(shapes[now], names[now]) for now in (times.values == t for t in distinct)]
-    source = Perimeters(_project(areas, plane), distinct, times.clock)
+    raster = _raster(
+        [_areas(shapes[times.values == t]) for t in distinct],
+        distinct,
+        times,
+        config,
+        grid,
+        horizon,
+    )
     each = f"{sizes.min()} to {sizes.max()}" if sizes.min() < sizes.max() else f"{sizes[0]}"
-    source.facts = [
-        f"perimeters of {len(distinct)} times, from {source.span}",
+    first, last = times.clock.format(distinct[0]), times.clock.format(distinct[-1])
+    raster.facts = [
+        f"perimeters of {len(distinct)} times, from {first} to {last}",
         f"{len(frame)} of {count} features used" + (f" ({'; '.join(facts)})" if facts else ""),
         f"{each} per time",
         *times.facts,
-        plane.about,
+        about,
+        *raster.facts,
     ]
-    source.doubts = [*times.doubts, *source.doubts]
-    return source
+    raster.doubts += times.doubts
+    return raster
 
 
-def _with_circles(frame: Any, plane: Plane, radius: float) -> tuple[Any, Plane]:
-    """Returns features on the plane, with a circle for each point, and that plane."""
-    if plane.unit is None:
-        raise UserError("fire.radius: the unit of the coordinates is not known; expected fire.crs")
+def _on_plane(frame: Any, config: FileFireConfig) -> tuple[Any, str]:
+    """Returns the shapes of features on a plane, with a circle for each point."""
+    x0, y0, x1, y1 = (float(value) for value in frame.total_bounds)
+    plane = choose_plane(frame.crs, config.crs, (x0, y0, x1, y1), None)
+    shapes = frame.geometry.force_2d() if frame.has_z.any() else frame.geometry
     if plane.change is not None:
-        frame = frame.set_crs(plane.change[0], allow_override=True).to_crs(plane.change[1])
-    points = frame.geom_type.isin(("Point", "MultiPoint"))
-    circles = frame.geometry.where(~points, frame.geometry.buffer(radius / plane.unit))
-    return frame.set_geometry(circles), Plane(plane.about, None, plane.unit)
+        shapes = shapes.set_crs(plane.change[0], allow_override=True).to_crs(plane.change[1])
+        if not np.isfinite(shapes.total_bounds).all():
+            raise UserError(f"features outside {plane.change[1].name}; expected another fire.crs")
+    if config.radius is not None:
+        if plane.unit is None:
+            raise UserError("fire.radius: the unit of coordinates is not known; expected fire.crs")
+        points = shapes.geom_type.isin(("Point", "MultiPoint"))
+        shapes = shapes.where(~points, shapes.buffer(config.radius / plane.unit))
+    return shapes, plane.about
 
 
-def _project(areas: Sequence[Any], plane: Plane) -> list[Any]:
-    """Returns areas on the plane."""
-    if plane.change is None:
-        return list(areas)
-    source, target = plane.change
-    projected = library("geopandas").GeoSeries(areas, crs=source).to_crs(target)
-    if not np.isfinite(projected.total_bounds).all():
-        raise UserError(f"perimeters outside {target.name}; expected another fire.crs")
-    return [area if len(polygons(area)) > MANY else make_valid(area) for area in projected]
+def _areas(shapes: Any) -> np.ndarray:
+    """Returns the polygons of shapes of one time; a closed line within another is an island.
 
-
-class Perimeters:
-    """A fire whose burnt area is known at some times; the front is interpolated between them.
-
-    A fire only grows: the area burnt by a time is the union of the perimeters until then.
+    Points, and open lines beside a polygon of the same feature, are left out.
     """
+    shapely, name = library("shapely"), shapes.index[0]
+    while shapes.geom_type.isin(("GeometryCollection", "MultiPolygon", "MultiLineString")).any():
+        shapes = shapes.explode()
+    areas = shapes[shapes.geom_type == "Polygon"]
+    lines = shapes[shapes.geom_type.isin(("LineString", "LinearRing"))]
+    lines = lines[lines.is_closed | ~lines.index.isin(areas.index)]
+    if len(areas) == len(lines) == 0:
+        raise UserError(f"{name} is of {shapes.geom_type.iloc[0]}; expected polygons or lines")
+    found = areas.to_numpy()
+    if not areas.is_valid.all():
+        found = shapely.make_valid(found, method="structure", keep_collapsed=False)
+    found = np.concatenate([found, _within(lines)]) if len(lines) else found
+    parts = shapely.get_parts(found)
+    parts = parts[shapely.area(parts) > 0]
+    if len(parts) == 0:
+        raise UserError(f"{name} encloses no area; expected a perimeter")
+    return parts
 
-    whole = False
 
-    def __init__(self, areas: Sequence[Any], times: np.ndarray, clock: Clock):
-        self.clock, self.first, self.last = clock, float(times[0]), float(times[-1])
-        self.span = f"{clock.format(self.first)} to {clock.format(self.last)}"
-        self.facts: list[str] = []
-        self.doubts: list[str] = []
-        if clock.origin is None and self.first > self.last - self.first:
-            self.doubts = [f"it begins at time 0 (fire.start={self.first:g}: at the first)"]
-        parts = sorted((part for area in areas for part in polygons(area)), key=lambda p: -p.area)
-        self.doubts += far_apart(np.array([part.bounds for part in parts[:_MAX_PARTS]]))
-        if clock.origin is None and times[0] > 0:
-            areas, times = [area_at_zero(areas, times), *areas], np.concatenate([[0.0], times])
-        self._areas, self._times, self.began = areas, times, float(times[0])
-        boxes = np.array([area.bounds for area in areas])
-        low, high = np.minimum.accumulate(boxes[:, :2]), np.maximum.accumulate(boxes[:, 2:])
-        self._boxes = np.concatenate([low, high], axis=1)
-        self.extent = self.burnt(self.last)
+def _within(lines: Any) -> np.ndarray:
+    """Returns the area inside closed lines. A line within an odd number of others is an island."""
+    shapely = library("shapely")
+    merged = shapely.get_parts(shapely.line_merge(shapely.multilinestrings(lines.to_numpy())))
+    ends = shapely.get_point(merged, 0), shapely.get_point(merged, -1)
+    gaps, lengths = shapely.distance(*ends), shapely.length(merged)
+    open_ = np.flatnonzero((gaps > _GAP * lengths) | (shapely.get_num_points(merged) < 3))
+    if len(open_):
+        name = lines.index[shapely.distance(lines.to_numpy(), ends[0][open_[0]]).argmin()]
+        gap = f"{gaps[open_[0]]:g} of {lengths[open_[0]]:g}"
+        raise UserError(f"{name}: a line is not closed, {gap} is missing")
+    rings = [shapely.linearrings(shapely.get_coordinates(line)) for line in merged]
+    return np.array([shapely.build_area(shapely.node(shapely.geometrycollections(rings)))])
 
-    def burnt(self, until: float) -> Bounds:
-        """Returns the bounds of the area burnt by a time, interpolated between perimeters."""
-        x0, y0, x1, y1 = (float(np.interp(until, self._times, edge)) for edge in self._boxes.T)
-        return x0, y0, x1, y1
 
-    def on(self, window: Window, until: float) -> np.ndarray:
-        """Returns the earliest arrival in each cell of a grid, float64 [X, Y]."""
-        count = int(min(np.searchsorted(self._times, until), len(self._times) - 1)) + 1
-        # The window must contain all of the last front, to which distances are computed.
-        x0, y0, x1, y1 = self._boxes[count - 1]
-        right = window.x + window.grid[0] * window.side
-        upper = window.y + window.grid[1] * window.side
-        outside = max(window.x - x0, x1 - right), max(window.y - y0, y1 - upper)
-        across, along = (
-            window.cuts * min(int(np.ceil(max(past, 0) / window.side)) + 1, 2 * cells)
-            for past, cells in zip(outside, window.grid, strict=True)
-        )
-        times = self._interpolate(window.samples((across, along)), count)
-        return window.earliest(times[across:-across, along:-along])
+def _raster(
+    areas: list[np.ndarray],
+    at: np.ndarray,
+    times: Times,
+    config: FileFireConfig,
+    grid: tuple[int, int],
+    horizon: int,
+) -> Raster:
+    """Rasterizes areas, and interpolates the front between them.
 
-    def _interpolate(self, window: Window, count: int) -> np.ndarray:
-        """Returns arrival times at the centres of a window's cells, by the distances to fronts."""
-        before = _rasterize(self._areas[0], window)
-        begun, idle = int(label(before, _AROUND)[1]), 0  # pyright: ignore
-        times = np.where(before, self._times[0], np.inf)
-        for k in range(1, count):
-            after = before | _rasterize(self._areas[k], window)
-            new = after & ~before
-            parts: Any = label(new, _AROUND)
-            beside: Any = binary_dilation(before, _AROUND)
-            reached = np.unique(parts[0][new & beside])
-            begun, idle = begun + parts[1] - len(reached), idle + (not new.any())
-            if new.any() and before.any():
-                from_last, to_next = _depth(~before), _depth(after)
-                if not window.contains(self._areas[k].bounds):
-                    to_next[new] = _to_boundary(self._areas[k], window, new)
-                share = from_last / (from_last + to_next)
-                between = self._times[k - 1] + (self._times[k] - self._times[k - 1]) * share
-                times[new] = between[new]
-            times[new & np.isinf(times)] = self._times[k]  # the first front lies outside
-            before = after
-        self.facts.append(f"beginning at {number(begun, 'place')}")
-        if idle:
-            self.facts.append(f"{number(idle, 'perimeter')} within the area burnt before add none")
-        return times
+    A fire only grows: the area burnt by a time is the union of the areas until then. A fire with
+    elapsed times began at 0.
+    """
+    shapely, clock, doubts = library("shapely"), times.clock, []
+    burns = float(at[0]), float(at[-1])
+    if clock.origin is None and at[0] > 0:
+        if at[0] > at[-1] - at[0]:
+            doubts = [f"it begins at time 0 (fire.start={at[0]:g}: at the first)"]
+        areas, at = [_at_zero(areas, at), *areas], np.concatenate([[0.0], at])
+    began = float(at[0])
+    _, end = span(clock, burns, began, config, horizon)
+    boxes = np.array([shapely.total_bounds(parts) for parts in areas])
+    boxes = np.hstack([np.minimum.accumulate(boxes[:, :2]), np.maximum.accumulate(boxes[:, 2:])])
+    until = at[-1] if config.margin is None else end
+    x0, y0, x1, y1 = (float(np.interp(until, at, edge)) for edge in boxes.T)
+    window = Window.around((x0, y0, x1, y1), grid, config.margin or 0)
+    count = min(int(np.searchsorted(at, end)), len(at) - 1) + 1
+    points = _around(window.samples(), boxes[count - 1])
+    arrival, facts = _between(areas[:count], at, points)
+    corner = points.x, points.y + points.grid[1] * points.side
+    cell = points.side, points.side
+    raster = Raster(arrival.T[::-1], corner, cell, clock, window=window, began=began, facts=facts)
+    raster.first, raster.last = burns
+    raster.doubts = doubts + far_apart(np.isfinite(raster.times))
+    return raster
+
+
+def _around(points: Window, box: np.ndarray) -> Window:
+    """Returns sample points continued over a box, to which distances are computed."""
+    corner, size = np.array([points.x, points.y]), np.array(points.grid)
+    past = np.array([corner - box[:2], box[2:] - corner - size * points.side])
+    below, above = np.clip(np.ceil(past / points.side).astype(int) + 1, 0, _MAX_BORDER)
+    x, y = (corner - below * points.side).tolist()
+    columns, rows = (size + below + above).tolist()
+    return Window(x, y, points.side, (columns, rows))
+
+
+def _at_zero(areas: Sequence[np.ndarray], at: np.ndarray) -> np.ndarray:
+    """Returns the area burnt at time 0, by extrapolating the boxes of the first two perimeters."""
+    shapely = library("shapely")
+    first, second = (np.array(shapely.total_bounds(parts)) for parts in areas[:2])
+    grown = np.concatenate([np.minimum(second - first, 0)[:2], np.maximum(second - first, 0)[2:]])
+    speed = grown / (at[1] - at[0])
+    width, spread = ((box[2:] - box[:2]).sum() for box in (first, speed))
+    moved = speed * (min(at[0], width / spread) if spread > 0 else 0.0)  # then it is a point
+    then = []
+    for part in areas[0]:
+        now = np.array(part.bounds)
+        size, box = now[2:] - now[:2], now - moved
+        scale = np.maximum((box[2:] - box[:2]) / size, _POINT)
+        shift = np.clip((box[:2] + box[2:]) / 2, now[:2], now[2:]) - scale * (now[:2] + size / 2)
+        small = shapely.transform(part, lambda xy, k=scale, d=shift: xy * k + d).intersection(part)
+        point = part.representative_point().buffer(_POINT * size.min())
+        then += [part for part in shapely.get_parts(small) if part.area > 0] or [point]
+    return np.array(then)
+
+
+def _between(
+    areas: Sequence[np.ndarray], at: np.ndarray, window: Window
+) -> tuple[np.ndarray, list[str]]:
+    """Returns arrival times at the centres of a window's cells, by the distances to fronts."""
+    before = _rasterize(areas[0], window)
+    begun, idle = int(label(before, _AROUND)[1]), 0  # pyright: ignore
+    times = np.where(before, at[0], np.inf)
+    for k in range(1, len(areas)):
+        after = before | _rasterize(areas[k], window)
+        new = after & ~before
+        parts: Any = label(new, _AROUND)
+        beside: Any = binary_dilation(before, _AROUND)
+        begun += parts[1] - len(np.unique(parts[0][new & beside]))
+        idle += not new.any()
+        if before.any():
+            from_last, to_next = _depth(~before), _depth(np.pad(after, 1))[1:-1, 1:-1]
+            share = from_last / (from_last + to_next)
+            times[new] = (at[k - 1] + (at[k] - at[k - 1]) * share)[new]
+        else:
+            times[new] = at[k]  # the first front lies outside
+        before = after
+    facts = [f"{begun} place{'s' * (begun != 1)} where it begins"]
+    return times, [*facts, *([f"{idle} within the area burnt before"] if idle else [])]
 
 
 def _depth(area: np.ndarray) -> np.ndarray:
@@ -164,28 +228,25 @@ def _depth(area: np.ndarray) -> np.ndarray:
     return distance - 0.5
 
 
-def _to_boundary(area: Any, window: Window, cells: np.ndarray) -> np.ndarray:
-    """Returns the distance from the centres of cells to the boundary of an area, in cells."""
+@functools.lru_cache(1)
+def _tree(window: Window) -> Any:
+    """Returns a tree of the centres of a window's cells, in C order."""
+    shapely, centres = library("shapely"), np.meshgrid(*window.axes(), indexing="ij")
+    return shapely.STRtree(shapely.points(*(at.ravel() for at in centres)))
+
+
+def _rasterize(parts: np.ndarray, window: Window) -> np.ndarray:
+    """Returns the mask of cells centred in polygons, at least one per part, bool [X, Y]."""
     shapely = library("shapely")
-    x, y = window.centres()
-    boundary = make_valid(area).boundary
-    shapely.prepare(boundary)
-    return shapely.distance(boundary, shapely.points(x[cells], y[cells])) / window.side
-
-
-def _rasterize(area: Any, window: Window) -> np.ndarray:
-    """Returns the mask of cells centred in an area, at least one per part, bool [X, Y]."""
-    shapely, parts = library("shapely"), polygons(area)
-    if len(parts) > MANY:  # they may overlap
+    if len(parts) > _MANY:
         inside = np.zeros(window.grid, bool)
-        inside.flat[window.tree().query(parts, predicate="intersects")[1]] = True
+        inside.flat[_tree(window).query(parts, predicate="intersects")[1]] = True
     else:
         affine = library("rasterio.transform").from_origin(
             window.x, window.y + window.grid[1] * window.side, window.side, window.side
         )
         about = {"out_shape": window.grid[::-1], "transform": affine, "dtype": "uint8"}
-        inside = library("rasterio.features").rasterize([area], **about)[::-1].T.astype(bool)
-    i, j = window.cells(*shapely.get_coordinates(shapely.point_on_surface(parts)).T)
-    there = (i >= 0) & (j >= 0) & (i < window.grid[0]) & (j < window.grid[1])
+        inside = library("rasterio.features").rasterize(parts, **about)[::-1].T.astype(bool)
+    i, j, there = window.cells(*shapely.get_coordinates(shapely.point_on_surface(parts)).T)
     inside[i[there], j[there]] = True
     return inside

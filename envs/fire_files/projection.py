@@ -40,16 +40,16 @@ def choose_plane(crs: Any, wanted: str | None, bounds: Bounds, cell: float | Non
         wanted: `fire.crs`: the projection of a file without one, otherwise the target.
         cell: side of a raster's cells in these coordinates; None for perimeters.
     """
-    width, height = bounds[2] - bounds[0], bounds[3] - bounds[1]
-    span = f"coordinates from {bounds[:2]} to {bounds[2:]}"
+    size = max(bounds[2] - bounds[0], bounds[3] - bounds[1])
+    where = f"coordinates from {bounds[:2]} to {bounds[2:]}"
     if not all(map(math.isfinite, bounds)) or max(map(abs, bounds)) > _MAX_METRES:
-        raise UserError(f"{span} are not on the Earth")
+        raise UserError(f"{where} are not on the Earth")
     in_degrees = max(map(abs, bounds[::2])) <= 360 and max(map(abs, bounds[1::2])) <= 90.01
     if crs is None and wanted is None:
         # Cells of 0.1 degrees would be 11 km wide, a fire of 5 degrees 500 km.
-        if in_degrees and (max(width, height) < 5 if cell is None else cell < 0.1):
+        if in_degrees and (size < 5 if cell is None else cell < 0.1):
             raise UserError(
-                f"{span} may be degrees, and no projection is given; expected fire.crs, such as "
+                f"{where} may be degrees, and no projection is given; expected fire.crs, such as "
                 "fire.crs=EPSG:4326 for longitude and latitude"
             )
         return Plane("no projection in the file: its coordinates are taken as a plane")
@@ -57,31 +57,31 @@ def choose_plane(crs: Any, wanted: str | None, bounds: Bounds, cell: float | Non
     if crs and wanted and not (source.is_projected or source.is_geographic):
         crs, source = None, parse_crs(wanted)  # a local plane that the user knows
     degrees = source.is_geographic
-    if degrees and not (in_degrees and abs(bounds[0] + bounds[2]) <= 360):
-        raise UserError(f"{span} are not the degrees of {source.name}; expected another fire.crs")
+    if degrees and not (in_degrees and size <= _MAX_DEGREES):
+        raise UserError(
+            f"{where} are not the degrees of {source.name}, or no UTM zone is a plane for them; "
+            "expected another fire.crs, or a file of the fire alone"
+        )
     if not (source.is_projected or degrees):
         return Plane(f"{source.name}, taken as a plane", None, _metres(source))
-    at = _middle(source, bounds)
-    ratio, turn = (math.inf, 0.0) if degrees else _distortion(source, at)
+    shape, ratio = _shape(source, source, bounds)
     if crs and wanted:
         target = parse_crs(wanted)
-        bent = _distortion(target, at)[0] if target.is_projected else math.inf
-        if bent > _BENT:
-            why = f"has axes {bent:.2f} : 1 here" if target.is_projected else "is in degrees"
-            raise UserError(f"fire.crs={wanted} {why}; expected one as UTM is")
     elif ratio <= _BENT:
-        return Plane(f"projection {source.name} ({_shape(ratio, turn)})", None, _metres(source))
-    elif (degrees and max(width, height) > _MAX_DEGREES) or abs(at[1]) > 84:
-        raise UserError(
-            f"{span}: no UTM zone is a plane for them; expected fire.crs in metres, or a "
-            "file of the fire alone"
-        )
+        return Plane(f"projection {source.name} ({shape})", None, _metres(source))
     else:
-        zone = min(int((at[0] + 180) // 6), 59) + 1
-        target = parse_crs(f"EPSG:{(32600 if at[1] >= 0 else 32700) + zone}")
-    bent = "degrees" if degrees else _shape(ratio, turn)
-    after = f"projected to {target.name} ({_shape(*_distortion(target, at))})"
-    return Plane(f"projection {source.name} ({bent}), {after}", (source, target), _metres(target))
+        box = library("shapely").box(*bounds)
+        try:
+            target = library("geopandas").GeoSeries([box], crs=source).estimate_utm_crs()
+        except (RuntimeError, ValueError):
+            raise UserError(
+                f"{where}: no UTM zone is there; expected fire.crs, in metres"
+            ) from None
+    after, bent = _shape(target, source, bounds)
+    if bent > _BENT:
+        raise UserError(f"fire.crs={wanted} has {after} here; expected one as UTM is")
+    about = f"projection {source.name} ({shape}), projected to {target.name} ({after})"
+    return Plane(about, (source, target), _metres(target))
 
 
 def parse_crs(value: Any) -> Any:
@@ -98,34 +98,23 @@ def _metres(crs: Any) -> float | None:
     return crs.axis_info[0].unit_conversion_factor if crs.axis_info else None
 
 
-def _shape(ratio: float, turn: float) -> str:
-    return f"axes {ratio:.2f} : 1, north turned by {turn:.0f} degrees"
-
-
-def _middle(crs: Any, bounds: Bounds) -> tuple[float, float]:
-    """Returns longitude and latitude of the middle of bounds."""
+def _shape(crs: Any, source: Any, bounds: Bounds) -> tuple[str, float]:
+    """Returns how a projection bends a small circle at the fire, as text, and the ratio of axes."""
+    if crs.is_geographic:
+        return "degrees", math.inf
+    pyproj = library("pyproj")
     at = (bounds[0] + bounds[2]) / 2, (bounds[1] + bounds[3]) / 2
-    if not crs.is_geographic:
-        change = library("pyproj").Transformer.from_crs(crs, crs.geodetic_crs, always_xy=True)
-        at = change.transform(*at)
-    if not math.isfinite(sum(at)):
-        raise UserError(f"coordinates from {bounds[:2]} to {bounds[2:]} lie outside {crs.name}")
-    return at
-
-
-def _distortion(crs: Any, at: tuple[float, float]) -> tuple[float, float]:
-    """Returns the ratio of the axes of a small circle's image, and by how much north is turned."""
-    change = library("pyproj").Transformer.from_crs(crs.geodetic_crs, crs, always_xy=True)
-    latitude = math.radians(at[1])
-    east, north = 1e-4 / max(math.cos(latitude), 1e-9), 1e-4
-    x, y = np.array(at)[:, None] + [[-east, east, 0, 0], [0, 0, -north, north]]
-    x, y = (np.array(part) for part in change.transform(x, y))
-    jacobian = np.array([[x[1] - x[0], x[3] - x[2]], [y[1] - y[0], y[3] - y[2]]])
-    jacobian[:, 0] *= 0.99331 / (1 - 0.00669 * math.sin(latitude) ** 2)  # of the ellipsoid
-    if not np.isfinite(jacobian).all() or not np.linalg.det(jacobian):
-        raise UserError(f"the fire at {at} lies outside {crs.name}; expected another fire.crs")
-    long, short = np.linalg.svd(jacobian, compute_uv=False)
-    return float(long / short), math.degrees(math.atan2(jacobian[0, 1], jacobian[1, 1]))
+    to_degrees = pyproj.Transformer.from_crs(source, source.geodetic_crs, always_xy=True)
+    longitude, latitude = to_degrees.transform(*at)
+    try:
+        factors = pyproj.Proj(crs).get_factors(longitude, latitude, errcheck=True)
+    except pyproj.exceptions.ProjError:
+        raise UserError(
+            f"the fire at {at} lies outside {crs.name}; expected another fire.crs"
+        ) from None
+    ratio = factors.tissot_semimajor / factors.tissot_semiminor
+    turn = factors.meridian_convergence
+    return f"axes {ratio:.2f} : 1, north turned by {turn:.0f} degrees", float(ratio)
 
 
 def warped(
@@ -135,24 +124,26 @@ def warped(
 
     Times are interpolated between burnt cells. A point in a cell that never burns stays inf.
     """
-    rasterio, vrt = library("rasterio"), library("rasterio.vrt").WarpedVRT
+    warp, affines = library("rasterio.warp"), library("rasterio").Affine
     source, target = change or ("EPSG:3857", "EPSG:3857")  # any plane: only rotated
-    about: dict[str, Any] = {"driver": "GTiff", "count": 1, "dtype": "float64", "crs": source}
-    about |= {"nodata": math.nan, "transform": rasterio.Affine(*affine)}
-    about |= dict(zip(("height", "width"), times.shape, strict=True))
-    with rasterio.MemoryFile() as memory:
-        with memory.open(**about) as dataset:
-            dataset.write(np.where(np.isfinite(times), times, np.nan), 1)
-        with memory.open() as dataset:
-            with vrt(dataset, crs=target) as view:
-                size = {"width": 2 * view.width, "height": 2 * view.height}
-                transform = view.transform @ rasterio.Affine.scale(0.5)
-            if math.prod(size.values()) > MAX_CELLS:
-                raise UserError(f"{size} cells on a plane; at most {MAX_CELLS}: expected a part")
-            size |= {"crs": target, "transform": transform}
-            sampled = []
-            for method in ("nearest", "bilinear"):
-                with vrt(dataset, resampling=rasterio.enums.Resampling[method], **size) as view:
-                    sampled.append(view.read(1))
-    inside, between = (np.where(np.isnan(values), np.inf, values) for values in sampled)
-    return np.where(np.isinf(inside) | np.isinf(between), inside, between), transform[:6]
+    rows, columns = times.shape
+    corners = [affines(*affine) * at for at in ((0, 0), (columns, 0), (0, rows), (columns, rows))]
+    x, y = zip(*corners, strict=True)
+    box = min(x), min(y), max(x), max(y)
+    to, width, height = warp.calculate_default_transform(source, target, columns, rows, *box)
+    if 4 * width * height > MAX_CELLS:
+        raise UserError(f"{2 * width} x {2 * height} cells on a plane; at most {MAX_CELLS}")
+    to @= affines.scale(0.5)
+    sampled = []
+    for method in ("nearest", "bilinear"):
+        place = np.full((2 * height, 2 * width), np.nan)
+        warp.reproject(
+            np.where(np.isfinite(times), times, np.nan),
+            place,
+            **{"src_transform": affines(*affine), "src_crs": source, "src_nodata": np.nan},
+            **{"dst_transform": to, "dst_crs": target, "dst_nodata": np.nan},
+            resampling=library("rasterio").enums.Resampling[method],
+        )
+        sampled.append(np.where(np.isnan(place), np.inf, place))
+    inside, between = sampled
+    return np.where(np.isinf(inside) | np.isinf(between), inside, between), to[:6]

@@ -1,8 +1,6 @@
 """Reads rasters of arrival times: ESRI ASCII, GeoTIFF, NetCDF, arrays of states, banks, points."""
 
 import itertools
-import logging
-import logging.handlers
 import math
 import re
 from collections.abc import Iterator
@@ -11,29 +9,20 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.ndimage import find_objects, label
 
 from emberlink.envs.config import SIDES
 from emberlink.envs.fire_files.config import Clock, FileFireConfig
 from emberlink.envs.fire_files.dates import in_utc, parse_dates
-from emberlink.envs.fire_files.files import check_prj, first_line, library
-from emberlink.envs.fire_files.grid import Raster, beginnings, far_apart, number
+from emberlink.envs.fire_files.files import check_prj, first_line, forest_grids, library
+from emberlink.envs.fire_files.grid import Raster, beginnings, far_apart
 from emberlink.envs.fire_files.projection import MAX_CELLS, Affine, choose_plane, warped
 from emberlink.envs.fire_files.times import in_order
-from emberlink.envs.fire_files.values import (
-    arrival,
-    check_spreads,
-    check_states,
-    doubts,
-    first_burning,
-    unit_of,
-)
+from emberlink.envs.fire_files.values import arrival, check_spreads, first_burning, unit_of
 from emberlink.envs.utils.errors import UserError
 
 MAX_BANK = 300_000_000
 """Maximum number of cells of all fires of a bank: 1.2 GB."""
 _DRIVERS = {"tif": "GTiff", "nc": "netCDF", "asc": "AAIGrid"}
-_DAMAGE = re.compile(r"IO error|tag ignored|TIFFVSetField|(Null|Incorrect) count|_tiff\w+Proc:")
 _HEADER = re.compile(r"\s*(?!nan|inf)[a-z]", re.IGNORECASE)  # a line of ESRI ASCII
 _NORTH_UP = (1.0, 0.0, 0.0, 0.0, -1.0)
 _SIDE = 30  # cells along a side of the paper's map
@@ -45,18 +34,25 @@ def read_raster(path: Path, kind: str, config: FileFireConfig) -> tuple[list[Ras
     """Reads the fire of a raster, or the fires of a bank and the steps for which it was written."""
     if kind == "points":
         return [_front_points(path, config)], None
-    if kind == "npy":
-        return _numpy(path, config)
+    if kind in ("npy", "grids"):
+        maps = _grids(path) if kind == "grids" else _numpy(path)
+        if config.kind == "masks":
+            return [_of_states(maps, (*_NORTH_UP, float(maps.shape[1])), None, config)], None
+        if kind == "grids":
+            raise UserError(f"{len(maps)} maps of Cell2Fire; expected fire.kind=masks")
+        json = path.with_suffix(".json")
+        about = json.open(errors="replace").read(1_000_000) if json.is_file() else ""
+        horizon = re.search(r'"horizon": *(\d+)', about)
+        return _bank(maps.transpose(0, 2, 1)[:, ::-1], horizon and horizon[1], config)
     with _opened(path, kind, config.layer) as dataset:
         affine, crs, tags = tuple(dataset.transform[:6]), dataset.crs, dataset.tags()
         if dataset.transform.is_identity:
             affine = (*_NORTH_UP, float(dataset.height))
         if config.kind == "masks":
-            times, text = first_burning(_read(dataset, MAX_BANK), config)
-            return [_source(times, affine, crs, config.units or "maps", config, text)], None
+            return [_of_states(_read(dataset, MAX_BANK), affine, crs, config)], None
         if tags.get("units") == "steps" and crs is None:
-            nodata, bands = dataset.nodata, _read(dataset, MAX_BANK)
-            bands = np.where(bands == nodata, np.inf, bands) if nodata is not None else bands
+            bands = _read(dataset, MAX_BANK)
+            bands = np.where(bands == dataset.nodata, np.inf, bands)
             return _bank(bands, tags.get("horizon"), config)
         check_prj(path, kind, crs)
         return [_band(path, kind, dataset, affine, config)], None
@@ -85,8 +81,9 @@ def _band(path: Path, kind: str, dataset: Any, affine: Affine, config: FileFireC
         values = _read(dataset, MAX_CELLS, band)[0]
     values = values * dataset.scales[band - 1] + dataset.offsets[band - 1]
     unit, since = unit_of(declared, config, what)
+    origin = in_utc(parse_dates([since], None, "units")[0]) if since else None
     times = arrival(values, nodata, config)
-    return _source(times, affine, dataset.crs, unit, config, what, since)
+    return _on_plane(times, affine, dataset.crs, Clock(unit, origin), config, what)
 
 
 def _numbers(path: Path, shape: tuple[int, ...]) -> np.ndarray:
@@ -94,14 +91,13 @@ def _numbers(path: Path, shape: tuple[int, ...]) -> np.ndarray:
     with path.open(encoding="utf-8-sig", errors="replace") as file:
         header = len(list(itertools.takewhile(_HEADER.match, file)))
         file.seek(0)
+        most = math.prod(shape) + 1
         try:
-            values = np.loadtxt(
-                file, comments=None, ndmin=2, skiprows=header, max_rows=math.prod(shape) + 1
-            )
+            values = np.loadtxt(file, comments=None, ndmin=2, skiprows=header, max_rows=most)
         except ValueError as error:
-            cause = first_line(error).split(";")[0]
             raise UserError(
-                f"after {header} lines of header: {cause}; expected rows of {shape[1]} numbers"
+                f"after {header} lines of header: {first_line(error).split(';')[0]}; expected rows "
+                f"of {shape[1]} numbers"
             ) from None
     if values.shape != shape:
         raise UserError(f"{values.shape} rows and columns; expected nrows, ncols={shape}")
@@ -116,22 +112,15 @@ def _read(dataset: Any, most: int, band: int | None = None) -> np.ndarray:
     if size > most or kind.kind not in "iuf":
         raise UserError(
             f"{count} x {dataset.height} x {dataset.width} cells of {kind}, in blocks of "
-            f"{dataset.block_shapes[0]}; expected at most {most}, of real numbers; gdalwarp -te "
-            "cuts out a part"
+            f"{dataset.block_shapes[0]}; expected at most {most}, of real numbers"
         )
     return dataset.read([band] if band else None)
 
 
 @contextmanager
 def _opened(path: Path, kind: str, layer: str | None) -> Iterator[Any]:
-    """Opens a raster by the driver of its name; damage that GDAL only logs is an error."""
+    """Opens a raster by the driver of its name."""
     rasterio = library("rasterio", "a raster")
-    log = logging.handlers.BufferingHandler(capacity=1_000_000)
-    logger = logging.getLogger("rasterio._env")
-    level, propagate = logger.level, logger.propagate
-    logger.setLevel(logging.WARNING)
-    logger.propagate = False
-    logger.addHandler(log)
     name: Any = path.absolute()
     try:
         if kind == "nc":
@@ -148,30 +137,20 @@ def _opened(path: Path, kind: str, layer: str | None) -> Iterator[Any]:
             yield dataset
     except (rasterio.errors.RasterioError, OSError) as error:
         raise UserError(f"{first_line(error)}; expected a whole raster") from None
-    finally:
-        logger.removeHandler(log)
-        logger.setLevel(level)
-        logger.propagate = propagate
-    for record in log.buffer:
-        message = record.getMessage()
-        if record.levelno >= logging.ERROR or _DAMAGE.search(message):
-            raise UserError(f"damaged: {message[:200]}; expected a whole raster")
 
 
-def _source(
-    times: np.ndarray,
-    affine: Affine,
-    crs: Any,
-    unit: str,
-    config: FileFireConfig,
-    what: str,
-    since: str = "",
+def _of_states(maps: np.ndarray, affine: Affine, crs: Any, config: FileFireConfig) -> Raster:
+    times, what = first_burning(maps, config)
+    unit = config.units if config.units not in (None, "steps") else "maps"
+    return _on_plane(times, affine, crs, Clock(unit), config, what)
+
+
+def _on_plane(
+    times: np.ndarray, affine: Affine, crs: Any, clock: Clock, config: FileFireConfig, what: str
 ) -> Raster:
     """Returns times on a plane, north up."""
-    unit = "maps" if config.kind == "masks" and unit == "steps" else unit
-    if unit in ("days", "day_of_year"):
-        times, unit = in_order(times, config), "days"
-    signs = [] if config.kind == "masks" else doubts(times, unit)
+    if clock.unit in ("days", "day_of_year"):
+        times, clock = in_order(times, config), Clock("days", clock.origin)
     a, b, c, d, e, f = (float(value) for value in affine)
     area = abs(a * e - b * d)
     if not math.isfinite(c + f) or not 1e-20 < area < 1e12:
@@ -196,45 +175,44 @@ def _source(
     if change or b or d:
         times, (a, b, c, d, e, f) = warped(times, (a, b, c, d, e, f), change)
         check_spreads(times)
-    clock = Clock(unit, in_utc(parse_dates([since], None, "units")[0]) if since else None)
-    source = Raster(times, (c, f), (a, -e), clock, doubts=signs)
-    parts = find_objects(label(np.isfinite(times))[0])[:1000]  # pyright: ignore
-    boxes = [(x.start, y.start, x.stop, y.stop) for x, y in parts]
-    source.doubts += far_apart(np.array(boxes, float) * abs(a))
-    if first <= crossing and not since and unit not in ("steps", "maps"):
+    source = Raster(times, (c, f), (a, -e), clock, doubts=far_apart(np.isfinite(times)))
+    if first <= crossing and clock.origin is None and clock.unit not in ("steps", "maps"):
         source.began = 0.0  # the ignition lies between the centres of cells
-    span = f"{clock.format(source.first)} to {clock.format(source.last)}"
-    places = number(beginnings(times), "place")
-    cells = int(np.isfinite(times).sum())
-    source.facts = [f"{cells} cells burn from {span}, beginning at {places}", what, about]
+    places = beginnings(times)
+    source.facts = [
+        f"{np.isfinite(times).sum()} cells burn from {clock.format(source.first)} to "
+        f"{clock.format(source.last)}",
+        f"{places} place{'s' * (places != 1)} where it begins",
+        what,
+        about,
+    ]
     return source
 
 
-def _numpy(path: Path, config: FileFireConfig) -> tuple[list[Raster], int | None]:
-    """Reads an array [fires, X, Y] or [X, Y] of arrival times, or [time, y, x] of states."""
+def _grids(folder: Path) -> np.ndarray:
+    """Reads the maps of Cell2Fire, [time, y, x]."""
+    try:
+        maps = [np.loadtxt(path, delimiter=",", ndmin=2) for path in forest_grids(folder)]
+        return np.stack(maps)
+    except ValueError as error:
+        raise UserError(f"{first_line(error)}; expected maps of one size") from None
+
+
+def _numpy(path: Path) -> np.ndarray:
+    """Opens an array [fires, X, Y] or [X, Y] of arrival times, or [time, y, x] of states."""
     try:
         # Memory-mapped, so that a wrong header allocates nothing.
         array = np.load(path, mmap_mode="r", allow_pickle=False)
+        array = array[None] if array.ndim == 2 else array
+        right = array.ndim == 3 and array.dtype.kind in "iufb" and 0 < array.size <= MAX_BANK
     except Exception as error:  # a damaged header raises many types
         raise UserError(f"{first_line(error)}; expected an array in NumPy's format") from None
-    fires = array[None] if getattr(array, "ndim", 0) == 2 else array
-    if (
-        getattr(fires, "ndim", 0) != 3
-        or fires.dtype.kind not in "iufb"
-        or not (0 < fires.size <= MAX_BANK)
-    ):
-        shape, kind = list(np.shape(array)), getattr(array, "dtype", type(array).__name__)
+    if not right:
         raise UserError(
-            f"an array of {shape}, {kind}; expected [fires, X, Y] of at most {MAX_BANK} numbers"
+            f"an array of {list(array.shape)}, {array.dtype}; expected [fires, X, Y] of at most "
+            f"{MAX_BANK} numbers"
         )
-    if config.kind == "masks":
-        times, text = first_burning(np.asarray(fires), config)
-        affine = (*_NORTH_UP, float(len(times)))
-        return [_source(times, affine, None, config.units or "maps", config, text)], None
-    json = path.with_suffix(".json")
-    about = json.open(errors="replace").read(1_000_000) if json.is_file() else ""
-    horizon = re.search(r'"horizon": *(\d+)', about)
-    return _bank(fires.transpose(0, 2, 1)[:, ::-1], horizon and horizon[1], config)
+    return array
 
 
 def _bank(
@@ -244,7 +222,15 @@ def _bank(
     count, rows, columns = fires.shape
     if not SIDES[0] <= min(columns, rows) <= max(columns, rows) <= SIDES[1]:
         raise UserError(f"fires of {columns} x {rows} cells; expected {SIDES[0]} to {SIDES[1]}")
-    check_states(fires)
+    few = np.unique(fires[:: max(1, count // 8)])
+    if count > 2 and len(few) <= 6 and np.isfinite(few).all() and (few % 1 == 0).all():
+        states, counts = np.unique(fires, return_counts=True)
+        shares = zip(states, counts, strict=True)
+        listed = ", ".join(f"{state:g} ({100 * n / fires.size:.0f} %)" for state, n in shares)
+        raise UserError(
+            f"{count} maps of the states {listed}, and no inf, never; expected arrival times of "
+            "fires, or fire.kind=masks for a map of states per time"
+        )
     sources = []
     for place, values in enumerate(fires):
         try:
@@ -252,8 +238,9 @@ def _bank(
         except UserError as error:
             raise UserError(f"fire {place}: {error}") from None
     written = f", written for {horizon} steps" if horizon else ""
-    fires_text = number(count, "fire")
-    sources[0].facts = [f"a bank of {fires_text} of {columns} x {rows} cells, in steps{written}"]
+    sources[0].facts = [
+        f"a bank of {count} fire{'s' * (count > 1)} of {columns} x {rows} cells, in steps{written}"
+    ]
     return sources, int(horizon) if horizon else None
 
 
@@ -274,8 +261,8 @@ def _front_points(path: Path, config: FileFireConfig) -> Raster:
             if not (np.abs(points) < 1e9).all():
                 raise UserError(f"line {count}: {line[:20]!r}; expected x,y,intensity, of points")
             cells = np.trunc(points[:, :2] - (_SIDE - 1) / 3).astype(np.int64)
-            for x, y in _PLUS:
-                i, j = cells[:, 0] + x, cells[:, 1] + y
+            for plus in _PLUS:
+                i, j = (cells + plus).T
                 inside = (i >= 0) & (j >= 0) & (i < _SIDE) & (j < _SIDE)
                 np.minimum.at(times, (i[inside], j[inside]), float(count - 1 - _SKIPPED))
     if count <= _SKIPPED:

@@ -17,14 +17,14 @@ from emberlink.envs.config import check_grid
 from emberlink.envs.fire_files.config import COPY_FILE, FileFireConfig
 from emberlink.envs.fire_files.crop import on_grid
 from emberlink.envs.fire_files.files import TABLES, digest, find_format, quiet
-from emberlink.envs.fire_files.grid import Source
+from emberlink.envs.fire_files.grid import Raster
 from emberlink.envs.fire_files.perimeters import read_perimeters
 from emberlink.envs.fire_files.rasters import MAX_BANK, read_raster
 from emberlink.envs.fire_files.tables import read_table
 from emberlink.envs.utils.atomic_io import read_bytes, replaced, user_path
 from emberlink.envs.utils.errors import UserError, printable
 
-READER_VERSION = 7  # increase it if the same file gives another grid
+READER_VERSION = 8  # increase it if the same file gives another grid
 _MAX_COPY = 12 * MAX_BANK + 1_000_000  # bytes when unpacked: float32 of the cells of all sets
 _EVERY, _VALIDATION, _TEST = 5, 3, 4  # remainders of the numbers of validation and test fires
 _OF_TABLES = ("time_field", "time_format", "incident", "incident_field", "where", "radius")
@@ -44,7 +44,7 @@ def read_with_summary(
     name = printable(str(path))
     try:
         with quiet():
-            sources = _sources(path, config, horizon)
+            sources = _sources(path, config, grid, horizon)
             fires = _on_grid(sources, config, grid, horizon)
     except UserError as error:
         text = printable(str(error)).removeprefix(f"{path.name}: ")
@@ -60,13 +60,15 @@ def read_with_summary(
     return torch.from_numpy(np.stack(fires)), summary
 
 
-def _sources(path: Path, config: FileFireConfig, horizon: int) -> Sequence[Source]:
+def _sources(
+    path: Path, config: FileFireConfig, grid: tuple[int, int], horizon: int
+) -> Sequence[Raster]:
     """Returns the fires in a file; only a bank has more than one."""
-    kind = None if path.is_dir() else find_format(path)
-    if kind is None or kind in TABLES:
+    kind = find_format(path)
+    if kind in TABLES:
         if config.kind == "masks" or config.unburned is not None:
             raise UserError("fire.kind=masks and fire.unburned are for rasters; expected none")
-        return [read_perimeters(*read_table(path, kind, config), config)]
+        return [read_perimeters(*read_table(path, kind, config.layer), config, grid, horizon)]
     for key in _OF_TABLES:
         if getattr(config, key) is not None:
             raise UserError(f"fire.{key} chooses among perimeters; expected none for a raster")
@@ -83,7 +85,7 @@ def _sources(path: Path, config: FileFireConfig, horizon: int) -> Sequence[Sourc
 
 
 def _on_grid(
-    sources: Sequence[Source], config: FileFireConfig, grid: tuple[int, int], horizon: int
+    sources: Sequence[Raster], config: FileFireConfig, grid: tuple[int, int], horizon: int
 ) -> list[np.ndarray]:
     fires: list[np.ndarray] = []
     for source in sources:

@@ -1,5 +1,6 @@
 """Reads the features of vector files: GeoPackage, shapefile, GeoJSON, KML, CSV, and folders."""
 
+import gc
 import json
 import re
 import zipfile
@@ -9,7 +10,8 @@ from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
-from emberlink.envs.fire_files.config import FileFireConfig
+import numpy as np
+
 from emberlink.envs.fire_files.files import (
     MAX_BYTES,
     TABLES,
@@ -22,48 +24,45 @@ from emberlink.envs.fire_files.files import (
 from emberlink.envs.fire_files.projection import parse_crs
 from emberlink.envs.utils.errors import UserError
 
-OUTSIDE = ("Name", "Folder", "File")
-"""Columns for texts that stand outside the attributes, and may hold a date."""
 _DEGREES = "EPSG:4326"
+_OF_KML = ("Name", "Folder")
 
 
-def read_table(path: Path, kind: str | None, config: FileFireConfig) -> tuple[Any, list[str]]:
+def read_table(path: Path, kind: str, layer: str | None) -> tuple[Any, list[str]]:
     """Reads the features of a file, or of all files in a folder.
 
     Args:
         path: a file, or a folder of files of one fire.
-        kind: format of the file, None for a folder.
+        kind: a format of `TABLES`.
+        layer: `fire.layer`.
 
     Returns:
         A table of geopandas with a row per feature, whose index names the features in messages, and
-        the names of the columns whose values stand outside the attributes.
+        the names of the columns whose values stand outside the attributes, and may hold a date.
     """
-    if kind is not None:
-        return _of_file(path, kind, config.layer)
+    if kind != "folder":
+        return _of_file(path, kind, layer)
     frames, outside = [], ["File"]
     for part in perimeter_files(path):
         try:
             form = find_format(part)
             if form not in TABLES:
                 raise UserError("expected perimeters")
-            frame, others = _of_file(part, form, config.layer)
+            frame, others = _of_file(part, form, layer)
         except UserError as error:
             raise UserError(f"{part.name}: {error}") from None
-        lower = {n: str(n).lower() for n in frame.columns if n not in (*OUTSIDE, "TimeStamp")}
-        frame = frame.rename(columns=lower).assign(File=part.stem)
-        twice = frame.columns[frame.columns.duplicated()]
-        if len(twice):
-            raise UserError(f"{part.name}: columns that differ in case only: {twice[0]}")
+        lower = {n: str(n).lower() for n in frame.columns if n not in (*_OF_KML, "TimeStamp")}
+        frame = frame.rename(columns=lower).rename(index=f"{part.name}: {{}}".format)
         if frames and (frame.crs is None) != (frames[0].crs is None):
             raise UserError(f"{part.name}: with and without projection; expected one in each file")
-        frame = frame.rename(index=f"{part.name}: {{}}".format)
-        frames.append(frame.to_crs(frames[0].crs) if frames and frame.crs else frame)
+        frames.append(frame.assign(File=part.stem).to_crs(frames[0].crs if frames else frame.crs))
         outside += [lower.get(name, name) for name in others]
     return library("pandas").concat(frames), list(dict.fromkeys(outside))
 
 
 def _of_file(path: Path, kind: str, layer: str | None) -> tuple[Any, list[str]]:
     geopandas, outside = library("geopandas"), []
+    gc.disable()  # it takes two thirds of the time to parse a large text
     try:
         if kind == "json":
             frame, outside = _geojson(json.loads(path.read_bytes().decode("utf-8-sig")))
@@ -80,6 +79,8 @@ def _of_file(path: Path, kind: str, layer: str | None) -> tuple[Any, list[str]]:
         raise
     except Exception as error:  # GDAL, text and geometries raise many types
         raise UserError(f"{first_line(error)}; expected perimeters") from None
+    finally:
+        gc.enable()
     if not hasattr(frame, "geometry") or len(frame) == 0:
         raise UserError("no feature with a geometry; expected perimeters")
     check_prj(path, kind, frame.crs)
@@ -107,8 +108,7 @@ def _geojson(whole: Any) -> tuple[Any, list[str]]:
         if given.get("type") != "name":
             raise UserError("its crs is a link, which is not followed; expected a name, or none")
         crs = parse_crs(given["properties"]["name"])
-    shape = library("shapely.geometry").shape
-    shapes = [shape(f["geometry"]) if f.get("geometry") else None for f in features]
+    shapes = [_shape(f["geometry"]) if f.get("geometry") else None for f in features]
     rows = [f.get("properties") or {} for f in features]
     frame = library("geopandas").GeoDataFrame(rows, geometry=shapes, crs=crs)
     if crs == _DEGREES and len(frame) and abs(frame.total_bounds).max() > 360:
@@ -120,28 +120,33 @@ def _geojson(whole: Any) -> tuple[Any, list[str]]:
     return frame.assign(**about), list(about)
 
 
+def _shape(geometry: Any) -> Any:
+    """Returns a geometry of GeoJSON, in a fifth of the time if it is a polygon without holes."""
+    if geometry["type"] == "Polygon" and len(geometry["coordinates"]) == 1:
+        return library("shapely").polygons(np.array(geometry["coordinates"][0], float))
+    return library("shapely.geometry").shape(geometry)
+
+
 def _kml(path: Path, kind: str, layer: str | None) -> tuple[Any, list[str]]:
     """Reads placemarks; a folder's time holds for the placemarks in it."""
     rows: list[dict[str, Any]] = []
-    for content in _kml_texts(path, kind):
+    for content in [path.read_bytes()] if kind == "kml" else _kml_in_archive(path):
         if b"\0" in content[:1000] or re.search(rb"<!(DOCTYPE|ENTITY)", content, re.IGNORECASE):
             raise UserError("a document type declaration or UTF-16; expected plain KML")
         root = ElementTree.fromstring(content)
-        if _tag(root) != "kml":
-            raise UserError(f"the first element is {_tag(root)[:40]!r}; expected KML")
+        for element in root.iter():
+            element.tag = str(element.tag).rpartition("}")[2]
+        if root.tag != "kml":
+            raise UserError(f"the first element is {root.tag[:40]!r}; expected KML")
         rows += [_placemark(mark, folders, time) for mark, folders, time in _placemarks(root)]
     if layer is not None:
         rows = [row for row in rows if layer in str(row["Folder"]).split("/")]
     frame = library("geopandas").GeoDataFrame(rows, geometry="geometry", crs=_DEGREES)
     frame = frame.dropna(axis="columns", how="all")
-    return frame, [name for name in ("Name", "Folder") if name in frame.columns]
+    return frame, [name for name in _OF_KML if name in frame.columns]
 
 
-def _kml_texts(path: Path, kind: str) -> Iterator[bytes]:
-    """Yields the .kml of a file, or all in an archive."""
-    if kind == "kml":
-        yield path.read_bytes()
-        return
+def _kml_in_archive(path: Path) -> list[bytes]:
     try:
         with zipfile.ZipFile(path) as archive:
             parts = [part for part in archive.infolist() if part.filename.lower().endswith(".kml")]
@@ -149,20 +154,9 @@ def _kml_texts(path: Path, kind: str) -> Iterator[bytes]:
                 raise UserError(
                     f"{len(parts)} .kml in it; expected one of {MAX_BYTES} bytes at most"
                 )
-            for part in parts:
-                yield archive.read(part)
+            return [archive.read(part) for part in parts]
     except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError) as error:
         raise UserError(f"{error}; expected KMZ") from None
-
-
-def _tag(element: Any) -> str:
-    return str(element.tag).rpartition("}")[2]
-
-
-def _texts(element: Any, *names: str) -> list[str]:
-    """Returns the texts of the elements within one that have one of the names."""
-    found = (part for part in element.iter() if _tag(part) in names)
-    return [text for part in found if (text := (part.text or "").strip())]
 
 
 def _placemarks(root: Any) -> Iterator[tuple[Any, list[str], str | None]]:
@@ -171,42 +165,45 @@ def _placemarks(root: Any) -> Iterator[tuple[Any, list[str], str | None]]:
     while rest:
         element, folders, time = rest.pop()
         for part in element:
-            if _tag(part) in ("TimeStamp", "TimeSpan"):
-                time = next(iter(_texts(part, "when", "begin")), time)
-        if _tag(element) == "Placemark":
+            if part.tag in ("TimeStamp", "TimeSpan"):
+                time = part.findtext("when") or part.findtext("begin") or time
+        if element.tag == "Placemark":
             yield element, folders, time
             continue
-        name = [part.text or "" for part in element if _tag(part) == "name"]
-        inner = [part for part in element if _tag(part) in ("Document", "Folder", "Placemark")]
-        rest += [(part, [*folders, *name], time) for part in reversed(inner)]
+        inner = [part for part in element if part.tag in ("Document", "Folder", "Placemark")]
+        folders = [*folders, *filter(None, [element.findtext("name")])]
+        rest += [(part, folders, time) for part in reversed(inner)]
 
 
 def _placemark(mark: Any, folders: Sequence[str], time: str | None) -> dict[str, Any]:
     """Returns the attributes and the geometry of a placemark."""
     shapely = library("shapely")
-    row: dict[str, Any] = {"Name": next(iter(_texts(mark, "name")), None), "TimeStamp": time}
+    row: dict[str, Any] = {"Name": mark.findtext("name"), "TimeStamp": time and time.strip()}
     row["Folder"] = "/".join(folders) or None
+    for part in (*mark.iter("Data"), *mark.iter("SimpleData")):
+        text = part.text if part.tag == "SimpleData" else part.findtext("value")
+        row.setdefault(str(part.get("name")), (text or "").strip() or None)
     shapes, edges = [], set()
-    for part in mark.iter():
-        kind = _tag(part)
-        if kind in ("Data", "SimpleData") and part.get("name"):
-            text = part.text if kind == "SimpleData" else "".join(_texts(part, "value"))
-            row.setdefault(str(part.get("name")), (text or "").strip() or None)
-        elif kind == "Polygon":
-            edges |= {*part.iter()} - {part}
-            sides = {_tag(side): [] for side in part}
-            for side in part:
-                sides[_tag(side)] += [_points(text) for text in _texts(side, "coordinates")]
-            shapes.append(
-                shapely.Polygon(sides["outerBoundaryIs"][0], sides.get("innerBoundaryIs"))
-            )
-        elif kind in ("LineString", "LinearRing", "Point") and part not in edges:
-            make = shapely.Point if kind == "Point" else shapely.LineString
-            shapes += [make(_points(text)) for text in _texts(part, "coordinates")]
-    row["geometry"] = shapely.GeometryCollection(shapes) if len(shapes) > 1 else None
-    return row | ({"geometry": shapes[0]} if len(shapes) == 1 else {})
+    for area in mark.iter("Polygon"):
+        edges |= {*area.iter()}
+        sides = [
+            [_points(text) for side in area.iter(tag) for text in side.iter("coordinates")]
+            for tag in ("outerBoundaryIs", "innerBoundaryIs")
+        ]
+        shapes.append(shapely.Polygon(sides[0][0], sides[1]))
+    for tag, make in (
+        ("LineString", "LineString"),
+        ("LinearRing", "LineString"),
+        ("Point", "Point"),
+    ):
+        found = [part for part in mark.iter(tag) if part not in edges]
+        shapes += [
+            getattr(shapely, make)(_points(at)) for p in found for at in p.iter("coordinates")
+        ]
+    shape = shapely.GeometryCollection(shapes) if len(shapes) > 1 else None
+    return row | {"geometry": shapes[0] if len(shapes) == 1 else shape}
 
 
-def _points(text: str) -> list[tuple[float, float]]:
-    pairs = (point.split(",") for point in re.sub(r"\s*,\s*", ",", text).split())
+def _points(element: Any) -> list[tuple[float, float]]:
+    pairs = (at.split(",") for at in re.sub(r"\s*,\s*", ",", element.text or "").split())
     return [(float(pair[0]), float(pair[1])) for pair in pairs]

@@ -1,40 +1,40 @@
-"""Finds the times of perimeters: elapsed or dates, in one column or more, or outside the table."""
+"""Finds the times of features: elapsed or dates, in one column or more, or outside the table."""
 
 import re
 from collections.abc import Sequence
-from datetime import UTC, datetime, time, timedelta
+from datetime import UTC, datetime, timedelta
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from emberlink.envs.fire_files.areas import nested
 from emberlink.envs.fire_files.config import Clock, FileFireConfig
 from emberlink.envs.fire_files.dates import (
-    at_midnight,
     date_within,
+    has_clock,
     in_utc,
     is_date,
-    is_stamp,
     parse_dates,
     time_of_day,
 )
 from emberlink.envs.fire_files.features import column_named, plain, texts
+from emberlink.envs.fire_files.files import library
 from emberlink.envs.utils.errors import UserError
 
-_UNITS = {
+_ELAPSED = {
     "minutes": "elapsed_mi elapsed_min elapsed_minutes minutes",
     "seconds": "elapsed_s elapsed_sec elapsed_seconds seconds",
     "hours": "elapsed_h elapsed_hours hours",
     "days": "elapsed_days days",
 }
-_CALENDAR = (
+_MAPPED = (
     "poly_polygondatetime polygondatetime perimeterdatetime perdatetime perdattime gdb_from_date "
     "datetime date_time timestamp acq_datetime tutc valid_at acq_date date time t begin"
 )
 _EDITED = "poly_datecurrent datecurrent"
 """Columns of elapsed time; of the time when a perimeter was mapped; when a record was changed."""
-_HOURS = r"(hours?|hora|heure|hr|h)"
-_CLOCKS = rf"(.*)(time|{_HOURS}|uhr|hhmm|clock)(utc|gmt|z|local)?"
+_HOUR, _MINUTE = r"(hours?|hora|heure|hr|h)", r"min(ute)?s?"
+_OF_DAY = rf"(.*)(time|{_HOUR}|uhr|hhmm|clock|ampm)(utc|gmt|z|local)?"
+_HALF = re.compile(r"\s*[ap]\.?m\.?\s*", re.IGNORECASE)
 _MAX_TIME = 1e12
 
 
@@ -58,30 +58,27 @@ def read_times(frame: Any, config: FileFireConfig, outside: Sequence[str]) -> Ti
     columns = [name for name in frame.columns if name != frame.geometry.name]
     given = config.time_field
     if given is None:
-        chosen = _candidates(frame, [name for name in columns if name not in outside])
+        chosen = _candidates(frame, [name for name in columns if name not in outside], config)
     else:
         names = [given] if isinstance(given, str) else given
         chosen = [column_named(name, columns, "fire.time_field") for name in names]
     if not chosen or (chosen[0] in outside and not _holds_dates(frame[chosen[0]])):
         return _outside(frame, chosen or outside, config)
-    first = chosen[0]
     empty = frame.index[frame[chosen].isna().any(axis=1)]
     if len(empty):
         raise UserError(
-            f"{empty[0]} has no time in {first} ({len(empty)} of {len(frame)}); expected one in "
-            f"each, or fire.where={first} to leave out those without"
+            f"{empty[0]} has no time in {chosen[0]} ({len(empty)} of {len(frame)}); expected one "
+            f"in each, or fire.where={chosen[0]} to leave out those without"
         )
-    numbers: list[Any] = [_number(value) for value in frame[first].unique()]
-    if len(chosen) == 1 and None not in numbers and not is_stamp(numbers):
-        return _elapsed(frame, first, config)
-    dates = _dates(frame[first], config.time_format)
-    if len(chosen) == 1 and all(map(at_midnight, dates)):
-        chosen += _clocks_beside(frame, first, columns, asked=given is None)
-    for name in chosen[1:]:
-        shifts = _clock(frame, first, name)
-        days = (datetime.combine(d, time(d.hour, tzinfo=d.tzinfo)) for d in dates)
-        dates = [day + shift for day, shift in zip(days, shifts, strict=True)]
-    return _calendar(frame, dates, " and ".join(map(str, chosen)))
+    dates = texts(frame[chosen[0]])
+    if len(chosen) == 1 and _is_elapsed(dates, config):
+        return _elapsed(frame, chosen[0], config)
+    read = _dates(dates, config.time_format)
+    if len(chosen) == 1 and not has_clock(read):
+        chosen += _clocks_beside(frame, chosen[0], columns, asked=given is None)
+    if len(chosen) > 1:
+        read = [day + shift for day, shift in zip(read, _clocks(frame, chosen), strict=True)]
+    return _calendar(frame, read, " and ".join(map(str, chosen)))
 
 
 def _known(names: str) -> set[str]:
@@ -89,19 +86,20 @@ def _known(names: str) -> set[str]:
     return {plain(part) for name in names.split() for part in (name, name[:10])}
 
 
-def _candidates(frame: Any, columns: Sequence[Any]) -> list[Any]:
+def _candidates(frame: Any, columns: Sequence[Any], config: FileFireConfig) -> list[Any]:
     """Returns the column with a known name; asks if several are left."""
     if "Folder" in frame and "TimeStamp" in columns and frame["TimeStamp"].notna().all():
         return ["TimeStamp"]  # of KML
-    names = {plain(name): name for name in columns if frame[name].notna().any()}
-    dated = [n for short, n in names.items() if short in _known(_CALENDAR)]
-    elapsed = [n for short, n in names.items() if short in _known(" ".join(_UNITS.values()))]
-    if any(_holds_dates(frame[name]) for name in dated):
-        elapsed = [name for name in elapsed if plain(name).startswith("elapsed")]
-    dated = [name for name in dated if _holds_dates(frame[name])] or dated
-    dated = [name for name in dated if not _date_only(frame[name])] or dated
-    edited = [n for short, n in names.items() if short in _known(_EDITED)]
-    found = elapsed or dated or edited
+    elapsed, mapped, edited = (
+        [n for n in columns if plain(n) in _known(names) and frame[n].notna().any()]
+        for names in (" ".join(_ELAPSED.values()), _MAPPED, _EDITED)
+    )
+    dated = [name for name in mapped if _holds_dates(frame[name])]
+    timed = [
+        name for name in dated if has_clock(_dates(texts(frame[name].dropna()), config.time_format))
+    ]
+    elapsed = [name for name in elapsed if not dated or plain(name).startswith("elapsed")]
+    found = elapsed or timed or dated or mapped or edited
     if len(found) > 1:
         listed = ", ".join(map(str, found))
         raise UserError(
@@ -110,32 +108,23 @@ def _candidates(frame: Any, columns: Sequence[Any]) -> list[Any]:
     return found
 
 
-def _number(value: Any) -> float | None:
-    try:
-        return float(value)
-    except (TypeError, ValueError):
-        return None
-
-
 def _holds_dates(column: Any) -> bool:
-    values = column.dropna().unique()
-    numbers: list[Any] = [_number(value) for value in values]
-    return is_stamp(numbers) if None not in numbers else is_date(str(values[0]))
+    values = texts(column.dropna())
+    return len(values) > 0 and is_date(values.iloc[0])
 
 
-def _date_only(column: Any) -> bool:
-    try:
-        return all(map(at_midnight, _dates(column.dropna(), None)))
-    except UserError:
-        return False
+def _is_elapsed(values: Any, config: FileFireConfig) -> bool:
+    """Returns whether all texts are numbers, and not dates in digits."""
+    numbers = library("pandas").to_numeric(values, errors="coerce")
+    dates = config.time_format is not None or all(map(is_date, values.unique()))
+    return bool(numbers.notna().all()) and not dates
 
 
-def _dates(column: Any, form: str | None) -> list[datetime]:
-    """Returns a date for each feature; the distinct texts are read."""
-    values = texts(column).map(lambda text: f"{float(text):.0f}" if "e+" in text else text)
+def _dates(values: Any, form: str | None) -> list[datetime]:
+    """Returns a date for each text; each distinct one is read once."""
     distinct = list(values.unique())
     try:
-        read = dict(zip(distinct, parse_dates(distinct, form, str(column.name)), strict=True))
+        read = dict(zip(distinct, parse_dates(distinct, form, str(values.name)), strict=True))
     except UserError as error:
         place = next((f"{i}: " for i, text in values.items() if repr(text[:40]) in str(error)), "")
         raise UserError(f"{place}{error}") from None
@@ -144,49 +133,67 @@ def _dates(column: Any, form: str | None) -> list[datetime]:
 
 def _clocks_beside(frame: Any, date: Any, columns: Sequence[Any], *, asked: bool) -> list[Any]:
     """Returns the columns of times of day that belong to a column of dates; asks if unsure."""
-    found = {}
+    found: dict[Any, str] = {}
     for name in columns:
-        match = re.fullmatch(_CLOCKS, plain(name))
-        if match and name != date and any(map(_is_clock, frame[name].dropna().unique())):
-            found[name] = match
+        values = texts(frame[name].dropna()).unique()
+        match = re.fullmatch(_OF_DAY, plain(name))
+        clocks = any(_HALF.fullmatch(value) or _is_clock(value) for value in values)
+        if name != date and clocks and (match or all(map(_HALF.fullmatch, values))):
+            found[name] = match[1] if match else ""
+    halves = [n for n in found if texts(frame[n]).map(_HALF.fullmatch).astype(bool).all()]
     stem = re.sub(r"(date|day|datum|fecha|data)", "", plain(date))
-    paired = [name for name, match in found.items() if match[1] == stem]
+    paired = [name for name, rest in found.items() if rest == stem and name not in halves]
     if len(paired) == 1:
-        minutes = [name for name in columns if re.fullmatch(r"min(ute)?s?", plain(name))]
-        return paired + (minutes if re.fullmatch(_HOURS, plain(paired[0])) else [])
+        minutes = [name for name in columns if re.fullmatch(_MINUTE, plain(name))]
+        hour = re.fullmatch(_HOUR, plain(paired[0]))
+        return [*paired, *(minutes if hour else []), *halves]
     if found and asked:
-        some = next(iter(found))
+        others = ", ".join(map(str, found))
         raise UserError(
-            f"{date} holds dates without a time of day, which {', '.join(map(str, found))} may "
-            f"hold; expected 'fire.time_field=[{date},{some}]' to join them, or "
+            f"{date} holds dates without a time of day, which {others} may hold; expected "
+            f"'fire.time_field=[{date},{next(iter(found))}]' to join them, or "
             f"fire.time_field={date}"
         )
     return []
 
 
-def _is_clock(value: Any) -> bool:
+def _is_clock(text: str) -> bool:
     try:
-        return bool(time_of_day(value) + timedelta(1))
+        return time_of_day(text) is not None
     except ValueError:
         return False
 
 
-def _clock(frame: Any, date: Any, name: Any) -> list[timedelta]:
-    """Reads a column of times of day: HHMM, HH:MM, with AM or PM, or hours, or minutes."""
-    minutes = re.fullmatch(r".*min(ute)?s?", plain(name))
-    hours = bool(re.fullmatch(rf".*{_HOURS}(utc|gmt|z|local)?", plain(name)))
-    read = {}
-    for feature, value in frame[name].drop_duplicates().items():
+def _clocks(frame: Any, chosen: Sequence[Any]) -> list[timedelta]:
+    """Reads the times of day in columns of hours, minutes, HHMM, HH:MM, and AM or PM."""
+    date, *parts = chosen
+    joined = texts(frame[date]).map(lambda _: "")
+    for name in parts:
+        values = texts(frame[name])
+        if re.fullmatch(rf".*{_MINUTE}", plain(name)):
+            values = values.map(lambda text: f":{text:>02}")
+        elif re.fullmatch(rf".*{_HOUR}(utc|gmt|z|local)?", plain(name)):
+            values = values.map(lambda text: f"{text:>02}" if len(text) < 3 else text)
+        joined += values
+    if re.fullmatch(rf".*{_HOUR}(utc|gmt|z|local)?", plain(parts[0])):
+        joined = joined.map(
+            lambda text: re.sub(r"^(\d\d)(?=$|\s*[ap])", r"\1:00", text, flags=re.I)
+        )
+    joined = joined.map(
+        lambda text: re.sub(r"^(\d{1,2}?)(\d\d)(?=\s*[ap])", r"\1:\2", text, flags=re.I)
+    )
+    halves = {"am": timedelta(0), "pm": timedelta(hours=12)}
+    read: dict[str, timedelta] = {}
+    for feature, text in joined.drop_duplicates().items():
+        half = re.sub(r"[\s.]", "", text).lower()
         try:
-            read[value] = (
-                timedelta(minutes=int(value)) if minutes else time_of_day(value, hours=hours)
-            )
+            read[text] = halves[half] if half in halves else time_of_day(text)
         except ValueError:
+            seen = ", ".join(f"{name}={str(frame[name][feature])[:40]}" for name in chosen)
             raise UserError(
-                f"{feature} has {date}={str(frame[date][feature])[:40]}, {name}={str(value)[:40]}; "
-                "expected a date and a time such as 2300, 23:00 or 11:00 PM"
+                f"{feature} has {seen}; expected a date and a time such as 2300, 23:00 or 11:00 PM"
             ) from None
-    return [read[value] for value in frame[name]]
+    return [read[text] for text in joined]
 
 
 def _calendar(frame: Any, dates: Sequence[datetime], name: str) -> Times:
@@ -205,8 +212,8 @@ def _calendar(frame: Any, dates: Sequence[datetime], name: str) -> Times:
     doubts = []
     if last > datetime.now(UTC) + timedelta(days=1):
         doubts.append(f"{last:%Y-%m-%d} is in the future")
-    days = np.unique(values) if all(map(at_midnight, dates)) else ()
-    within = sum(nested(frame.geometry[values == day].tolist()) for day in days)
+    days = np.unique(values) if not has_clock(dates) else ()
+    within = sum(_nested(frame.geometry[values == day]) for day in days)
     if within:
         doubts.append(
             f"{len(frame)} features have {len(days)} dates in {name} without a time of day, and "
@@ -216,13 +223,22 @@ def _calendar(frame: Any, dates: Sequence[datetime], name: str) -> Times:
     return Times(values, Clock("minutes", first), name, [f"times from {name}, {zone}"], doubts)
 
 
+def _nested(shapes: Any) -> bool:
+    """Returns whether one of some shapes lies in another that is larger by a tenth or more."""
+    areas = shapes.convex_hull
+    inner, outer = areas.sindex.query(areas, predicate="covered_by")
+    sizes = areas.area.to_numpy()
+    return bool((sizes[inner] < 0.9 * sizes[outer]).any())
+
+
 def _elapsed(frame: Any, name: Any, config: FileFireConfig) -> Times:
-    values = frame[name].astype(float).to_numpy()
+    """Returns elapsed times, in the unit of the column's name or of `fire.units`."""
+    values = texts(frame[name]).astype(float).to_numpy()
     wrong = np.flatnonzero(~((values >= 0) & (values <= _MAX_TIME)))
     if len(wrong):
         value = f"{frame.index[wrong[0]]} has {name}={values[wrong[0]]:g}"
         raise UserError(f"{value}; expected a time of 0 or more")
-    known = next((unit for unit, names in _UNITS.items() if plain(name) in _known(names)), None)
+    known = next((unit for unit, names in _ELAPSED.items() if plain(name) in _known(names)), None)
     unit = config.units or known
     if known and unit != known:
         raise UserError(f"{name} is in {known}; expected fire.units={known}, not {unit}")
@@ -268,7 +284,7 @@ def _outside(frame: Any, outside: Sequence[str], config: FileFireConfig) -> Time
     if found:
         return _calendar(frame, found[first], first)
     columns = [name for name in frame.columns if name != frame.geometry.name]
-    dated = [n for n in columns if frame[n].notna().any() and _holds_dates(frame[n])]
+    dated = [name for name in columns if _holds_dates(frame[name])]
     seen = [f"{name} ({str(frame[name].iloc[0])[:30]})" for name in (dated or columns)[:15]]
     listed = ", ".join(seen) or "none"
     raise UserError(f"no column of times is known; expected fire.time_field, one of {listed}")

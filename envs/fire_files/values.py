@@ -1,11 +1,11 @@
-"""Decides which values of a raster are arrival times: NODATA, plateaus, days, states."""
+"""Decides which values of a raster are arrival times: NODATA, plateaus, states, units."""
 
 import re
 
 import numpy as np
+from scipy.ndimage import binary_erosion
 
 from emberlink.envs.fire_files.config import FileFireConfig
-from emberlink.envs.fire_files.grid import beginnings
 from emberlink.envs.utils.errors import UserError
 
 _MAX_TIME = 1e12
@@ -31,24 +31,17 @@ def unit_of(declared: str, config: FileFireConfig, what: str) -> tuple[str, str]
     """
     name, _, since = declared.strip().partition(" since ")
     known = next((u for u, form in _UNITS.items() if re.fullmatch(form, name, re.IGNORECASE)), None)
+    unit = config.units or known
     if known is None and re.fullmatch(_NO_TIME, name, re.IGNORECASE):
         raise UserError(f"{what} is in {name[:20]}, no unit of time; expected arrival times")
-    if known is None and config.units is None:
+    if unit is None:
         raise UserError(
             f"the unit of {what} is not known; expected fire.units=minutes (FARSITE, FlamMap), "
             "seconds (ELMFIRE, WRF-SFIRE), hours, days, day_of_year or steps"
         )
-    if (
-        known
-        and config.units not in (None, known)
-        and {known, config.units}
-        != {
-            "days",
-            "day_of_year",
-        }
-    ):
-        raise UserError(f"{what} is in {known}; expected fire.units={known}, not {config.units}")
-    return config.units or str(known), since.strip()
+    if known not in (None, unit) and {known, unit} != {"days", "day_of_year"}:
+        raise UserError(f"{what} is in {known}; expected fire.units={known}, not {unit}")
+    return unit, since.strip()
 
 
 def arrival(
@@ -76,7 +69,7 @@ def arrival(
     times[odd] = np.inf
     check_spreads(times, may_stand=in_bank)
     if config.never is None:
-        _check_plateau(times, of_all=in_bank)
+        _check_plateau(times, in_bank=in_bank)
     return times
 
 
@@ -92,44 +85,36 @@ def check_spreads(times: np.ndarray, *, may_stand: bool = False) -> None:
         )
 
 
-def _check_plateau(times: np.ndarray, *, of_all: bool) -> None:
-    """Asks about a first, last or most frequent value that may stand for cells that do not burn."""
-    values, counts = np.unique(times[np.isfinite(times)], return_counts=True)
-    cells = times.size if of_all else counts.sum()
+def _check_plateau(times: np.ndarray, *, in_bank: bool) -> None:
+    """Asks about values that may stand for cells that do not burn.
+
+    They hold more than half of the cells; or are the first or last value, and far from the rest or
+    frequent along the edge of the raster, where a fire has cells of many times.
+    """
+    finite = np.isfinite(times)
+    values, counts = np.unique(times[finite], return_counts=True)
+    cells = times.size if in_bank else counts.sum()
     odd = {int(i) for i in np.flatnonzero(counts > 0.5 * cells)}
-    for end, rest in ((0, slice(1, None)), (-1, slice(0, -1))) if len(values) > 3 else ():
+    edge = times[finite & ~np.asarray(binary_erosion(finite))]
+    for end, rest in ((0, slice(1, None)), (-1, slice(0, -1))):
         others = values[rest]
-        gap = abs(values[end] - others[end]) > others[-1] - others[0]
-        often = counts[end] > max(0.1 * cells, 3 * counts[rest].max())
-        if (gap or often) and not of_all:
-            odd.add(end % len(values))
-    if odd:
-        some = [f"{values[i]:g}" for i in sorted(odd)]
-        share = [
-            f"{v} ({100 * counts[i] / cells:.0f} % of the cells)"
-            for i, v in zip(sorted(odd), some, strict=True)
-        ]
-        others = np.delete(values, sorted(odd))
-        key = f"'fire.unburned=[{','.join(some)}]'" if len(odd) > 1 else f"fire.unburned={some[0]}"
-        between = f"{others.min():g} to {others.max():g}" if len(others) else "none"
-        raise UserError(
-            f"{' and '.join(share)} may stand for cells that do not burn (others: {between}); "
-            f"expected {key}, or fire.unburned=none if they burn then"
-        )
-
-
-def check_states(maps: np.ndarray) -> None:
-    """Asks about maps that hold whole numbers of a few states, and no cell that never burns."""
-    few = np.unique(maps[:: max(1, len(maps) // 8)])
-    if len(maps) > 2 and len(few) <= 6 and np.isfinite(few).all() and (few % 1 == 0).all():
-        states, counts = np.unique(maps, return_counts=True)
-        share = [
-            f"{s:g} ({100 * n / maps.size:.0f} %)" for s, n in zip(states, counts, strict=True)
-        ]
-        raise UserError(
-            f"{len(maps)} maps of the states {', '.join(share)}, and no inf, never; "
-            "expected arrival times of fires, or fire.kind=masks for a map of states per time"
-        )
+        if len(others) > 2 and not in_bank:
+            far = abs(values[end] - others[end]) > others[-1] - others[0]
+            often = counts[end] > max(0.1 * cells, 3 * counts[rest].max())
+            if far or (often and (edge == values[end]).mean() > 0.5):
+                odd.add(end % len(values))
+    if not odd:
+        return
+    places = sorted(odd)
+    some = [f"{values[i]:g}" for i in places]
+    share = [f"{values[i]:g} ({100 * counts[i] / cells:.0f} % of the cells)" for i in places]
+    others = np.delete(values, places)
+    key = f"'fire.unburned=[{','.join(some)}]'" if len(odd) > 1 else f"fire.unburned={some[0]}"
+    between = f"{others.min():g} to {others.max():g}" if len(others) else "none"
+    raise UserError(
+        f"{' and '.join(share)} may stand for cells that do not burn (others: {between}); "
+        f"expected {key}, or fire.unburned=none if they burn then"
+    )
 
 
 def first_burning(maps: np.ndarray, config: FileFireConfig) -> tuple[np.ndarray, str]:
@@ -145,21 +130,3 @@ def first_burning(maps: np.ndarray, config: FileFireConfig) -> tuple[np.ndarray,
     times = np.where(burns.any(0), burns.argmax(0), np.inf)
     check_spreads(times)
     return times, f"{len(maps)} maps of the states {listed}, rows from north to south"
-
-
-def doubts(times: np.ndarray, unit: str) -> list[str]:
-    """Returns signs that the values of a raster are no arrival times."""
-    burns = np.isfinite(times)
-    order, places = np.sort(times[burns]), beginnings(times)
-    first, lasts = float(order[0]), float(order[-1] - order[0])
-    outer = np.pad(burns, 1)
-    inside = outer[:-2, 1:-1] & outer[2:, 1:-1] & outer[1:-1, :-2] & outer[1:-1, 2:]
-    edge = times[burns & ~inside]
-    rank = np.searchsorted(order, edge) + np.searchsorted(order, edge, side="right")
-    signs = {
-        "all values are between 0 and 1": order[-1] <= 1 and unit != "days",
-        f"it begins at {first:g} {unit} and lasts for {lasts:g}": first > lasts and unit != "days",
-        f"it begins at {places} places": places > 10,
-        "it begins at its edge and ends in its middle": rank.mean() / 2 < 0.35 * len(order),
-    }
-    return [sign for sign, is_so in signs.items() if is_so]

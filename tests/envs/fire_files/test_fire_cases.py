@@ -51,7 +51,7 @@ TABLE = {
         {"units": "days"},
         "days 1 to 6 and 358 to 365, none between.*fire.units=day_of_year",
         {"units": "day_of_year"},
-        "from 358 days to 371 days, beginning at 1 place",
+        "from 358 days to 371 days; 1 place where it begins",
     ),
     "07_pm_ignored": ("perimeters.geojson", {}, "", {}, "8 times, .*05T01:30.*08T13:30"),
     "08_day_first": (
@@ -87,7 +87,7 @@ TABLE = {
         {},
         r"20 maps of the states 0 \(78 %\), 1 .*fire.kind=masks",
         {"kind": "masks"},
-        "137 cells burn from 0 maps to 19 maps, beginning at 1 place; 20 maps",
+        "137 cells burn from 0 maps to 19 maps; 1 place .*20 maps",
     ),
     "13_tfr_polygon": (
         "event_polygon.geojson",
@@ -98,7 +98,7 @@ TABLE = {
     ),
     "14_yymmddhhmm": ("perimeters.geojson", {}, "", {}, "2018-08-19T20:00.*2018-08-20T03:00"),
     "15_shapefile_date_only": ("Perimeters.shp", {}, "", {}, "3 times"),
-    "16_active_areas": ("active.geojson", {}, "", {}, "1 perimeter within the area burnt before"),
+    "16_active_areas": ("active.geojson", {}, "", {}, "1 within the area burnt before"),
     "17_forefire_geojson": ("fronts", {}, "", {}, "5 times, .*T18:00.*T22:00.*from valid_at"),
     "18_kml_folder_time": ("ir.kml", {}, "", {}, "5 times, .*T18:00.*T22:00"),
     "19_arcinfo_prj": ("toa.asc", {"units": "minutes"}, "", {}, "582 cells.*axes 1.00 : 1"),

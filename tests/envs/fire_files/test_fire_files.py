@@ -50,7 +50,7 @@ def test_a_run_says_what_it_read_and_is_evaluated_without_its_file(source, tmp_p
     assert main.main(["train", "consensus", *TINY, *keys, f"output={tmp_path}/runs"]) == 0
     out = capsys.readouterr().out
     assert "read: " in out
-    assert "beginning at 1 place" in out
+    assert "1 place where it begins" in out
     path.unlink()
     (run,) = (tmp_path / "runs").iterdir()
     assert main.main(["eval", str(run)]) == 0

@@ -253,9 +253,9 @@ def test_no_arrival_is_lost(rows, columns, side, x, y, seed):
     times[0, 0] = 5.0
     window = Window(x, y, side, (8, 9))
     source = Raster(times, (0, rows), (1, 1), Clock("minutes"))
-    got = source.on(window, INF)
+    got = source.on(window)
     cells = Raster(times, (0, rows), (1, 1), Clock("steps"), whole=True)
-    cells = cells.on(window, INF)
+    cells = cells.on(window)
     assert (got >= times.min() - 1e-9).all()
     assert (np.isinf(got) | (got <= times[times < INF].max() + 1e-9)).all()
     expected = by_loops(times, window)

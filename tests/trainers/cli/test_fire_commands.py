@@ -203,7 +203,7 @@ def test_preview_describes_the_file(capsys, tmp_path):
     lines = ran(capsys, "preview", source, "fire.units=minutes")
     cells = np.isfinite(disc()).sum()
     assert lines[1].startswith(
-        f"read: {cells} cells burn from 0 minutes to 247.386 minutes, beginning at 1 place; band 1"
+        f"read: {cells} cells burn from 0 minutes to 247.386 minutes; 1 place where it begins; band"
     )
     ran(capsys, "make", "huygens", "--count", 2, "--output", "two.npy")
     assert ran(capsys, "preview", "two.npy:1")[1].startswith(
