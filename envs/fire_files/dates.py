@@ -44,6 +44,9 @@ _WITHIN = (
     rf"(?:(?:T|,?[\s-]+(?:at\s+)?){_CLOCK})?(?!\d)"
 )
 
+FOLDERS = " > "
+"""Between the names of folders, one within the other."""
+
 
 def parse_dates(texts: Sequence[str], form: str | None, key: str) -> list[datetime]:
     """Reads calendar times in one format.
@@ -100,7 +103,7 @@ def is_date(text: str) -> bool:
 
 def date_within(text: str) -> str:
     """Returns the only date in a name, of several folders in the innermost; empty if none."""
-    for part in reversed(text.split("/")) if not is_date(text) else [text]:
+    for part in reversed(text.split(FOLDERS)):
         part = part if is_date(part) else part.replace("_", " ")
         part = re.sub(r"(\d{4}-\d\d-\d\d[T ]\d\d)[-.h](\d\d)(?!\d)", r"\1:\2", part)
         found = {match.group() for match in re.finditer(_WITHIN, part, re.IGNORECASE)}
@@ -112,7 +115,8 @@ def date_within(text: str) -> str:
 @functools.lru_cache(4096)
 def time_of_day(text: str) -> timedelta:
     """Reads 2300, 155 (HHMM), 23:00, 1:55:00, 11:55 PM."""
-    text = re.sub(r"[\s.]|[.,]\d+(?=\D*$)|(Z|UTC|GMT)$", "", text.strip(), flags=re.IGNORECASE)
+    text = re.sub(r"(?<=:\d\d)[.,]\d+|[\s.]|(Z|UTC|GMT)$", "", text.strip(), flags=re.IGNORECASE)
+    text = re.sub(r"(?<=\d)(\d\d)(?=[ap]m)", r":\1", text, flags=re.I) if ":" not in text else text
     digits = "%H%M" if len(text) <= 4 else "%H%M%S"
     text, forms = (text.zfill(4), (digits,)) if text.isdecimal() else (text, _CLOCKS)
     for form in forms:

@@ -25,7 +25,7 @@ def plain(name: Any) -> str:
 
 def texts(column: Any) -> Any:
     """Returns the values of a column as texts; missing values are empty."""
-    written = column.astype(str)
+    written = column.astype(str).fillna("")
     read = {text: re.sub(r"\.0$", "", text).strip() for text in written.unique()}
     return written.map(read).where(column.notna(), "")
 

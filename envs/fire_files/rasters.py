@@ -223,7 +223,7 @@ def _bank(
     if not SIDES[0] <= min(columns, rows) <= max(columns, rows) <= SIDES[1]:
         raise UserError(f"fires of {columns} x {rows} cells; expected {SIDES[0]} to {SIDES[1]}")
     few = np.unique(fires[:: max(1, count // 8)])
-    if count > 2 and len(few) <= 6 and np.isfinite(few).all() and (few % 1 == 0).all():
+    if len(few) <= 6 and np.isfinite(few).all() and (few % 1 == 0).all():
         states, counts = np.unique(fires, return_counts=True)
         shares = zip(states, counts, strict=True)
         listed = ", ".join(f"{state:g} ({100 * n / fires.size:.0f} %)" for state, n in shares)

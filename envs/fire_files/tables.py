@@ -12,6 +12,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
+from emberlink.envs.fire_files.dates import FOLDERS
 from emberlink.envs.fire_files.files import (
     MAX_BYTES,
     TABLES,
@@ -26,6 +27,7 @@ from emberlink.envs.utils.errors import UserError
 
 _DEGREES = "EPSG:4326"
 _OF_KML = ("Name", "Folder")
+_ADDED = (*_OF_KML, "Description", "TimeStamp")
 
 
 def read_table(path: Path, kind: str, layer: str | None) -> tuple[Any, list[str]]:
@@ -51,7 +53,7 @@ def read_table(path: Path, kind: str, layer: str | None) -> tuple[Any, list[str]
             frame, others = _of_file(part, form, layer)
         except UserError as error:
             raise UserError(f"{part.name}: {error}") from None
-        lower = {n: str(n).lower() for n in frame.columns if n not in (*_OF_KML, "TimeStamp")}
+        lower = {n: str(n).lower() for n in frame.columns if n not in _ADDED}
         frame = frame.rename(columns=lower).rename(index=f"{part.name}: {{}}".format)
         if frames and (frame.crs is None) != (frames[0].crs is None):
             raise UserError(f"{part.name}: with and without projection; expected one in each file")
@@ -140,7 +142,7 @@ def _kml(path: Path, kind: str, layer: str | None) -> tuple[Any, list[str]]:
             raise UserError(f"the first element is {root.tag[:40]!r}; expected KML")
         rows += [_placemark(mark, folders, time) for mark, folders, time in _placemarks(root)]
     if layer is not None:
-        rows = [row for row in rows if layer in str(row["Folder"]).split("/")]
+        rows = [row for row in rows if layer in str(row["Folder"]).split(FOLDERS)]
     frame = library("geopandas").GeoDataFrame(rows, geometry="geometry", crs=_DEGREES)
     frame = frame.dropna(axis="columns", how="all")
     return frame, [name for name in _OF_KML if name in frame.columns]
@@ -179,7 +181,8 @@ def _placemark(mark: Any, folders: Sequence[str], time: str | None) -> dict[str,
     """Returns the attributes and the geometry of a placemark."""
     shapely = library("shapely")
     row: dict[str, Any] = {"Name": mark.findtext("name"), "TimeStamp": time and time.strip()}
-    row["Folder"] = "/".join(folders) or None
+    row["Folder"] = FOLDERS.join(folders) or None
+    row["Description"] = mark.findtext("description")
     for part in (*mark.iter("Data"), *mark.iter("SimpleData")):
         text = part.text if part.tag == "SimpleData" else part.findtext("value")
         row.setdefault(str(part.get("name")), (text or "").strip() or None)

@@ -60,9 +60,10 @@ def read_times(frame: Any, config: FileFireConfig, outside: Sequence[str]) -> Ti
     if given is None:
         chosen = _candidates(frame, [name for name in columns if name not in outside], config)
     else:
-        names = [given] if isinstance(given, str) else given
-        chosen = [column_named(name, columns, "fire.time_field") for name in names]
-    if not chosen or (chosen[0] in outside and not _holds_dates(frame[chosen[0]])):
+        given = (given,) if isinstance(given, str) else given
+        chosen = [column_named(name, columns, "fire.time_field") for name in given]
+    names = (*outside, "Description")
+    if not chosen or (chosen[0] in names and not _holds_dates(frame[chosen[0]])):
         return _outside(frame, chosen or outside, config)
     empty = frame.index[frame[chosen].isna().any(axis=1)]
     if len(empty):
@@ -179,9 +180,6 @@ def _clocks(frame: Any, chosen: Sequence[Any]) -> list[timedelta]:
         joined = joined.map(
             lambda text: re.sub(r"^(\d\d)(?=$|\s*[ap])", r"\1:00", text, flags=re.I)
         )
-    joined = joined.map(
-        lambda text: re.sub(r"^(\d{1,2}?)(\d\d)(?=\s*[ap])", r"\1:\2", text, flags=re.I)
-    )
     halves = {"am": timedelta(0), "pm": timedelta(hours=12)}
     read: dict[str, timedelta] = {}
     for feature, text in joined.drop_duplicates().items():
@@ -283,8 +281,12 @@ def _outside(frame: Any, outside: Sequence[str], config: FileFireConfig) -> Time
         raise UserError(f"dates in {listed} differ; expected fire.time_field={first} or such")
     if found:
         return _calendar(frame, found[first], first)
-    columns = [name for name in frame.columns if name != frame.geometry.name]
-    dated = [name for name in columns if _holds_dates(frame[name])]
-    seen = [f"{name} ({str(frame[name].iloc[0])[:30]})" for name in (dated or columns)[:15]]
-    listed = ", ".join(seen) or "none"
-    raise UserError(f"no column of times is known; expected fire.time_field, one of {listed}")
+    columns = [name for name in frame.columns if name not in (*outside, frame.geometry.name)]
+    columns = [name for name in columns if _holds_dates(frame[name])] or columns
+    seen = [f"{name} ({str(frame[name].iloc[0])[:30]})" for name in columns[:15]]
+    if not seen:
+        raise UserError("no attribute or name holds times; expected perimeters with times")
+    raise UserError(
+        f"no column of times is known, of {', '.join(seen)}; expected the one in fire.time_field, "
+        f"such as fire.time_field={columns[0]}"
+    )

@@ -61,15 +61,22 @@ def arrival(
     odd = ~(times >= 0) | ((times > _MAX_TIME) & (times < np.inf))
     found = times[odd]
     wrong = found[~(np.isnan(found) | (np.abs(found) > _VOID) | np.isin(found, _NEVER))]
-    if len(wrong):
-        raise UserError(
-            f"{wrong[0]:g} (in {(wrong == wrong[0]).sum()} cells) is not an arrival time; expected "
-            f"0 or more, or fire.unburned={wrong[0]:g} for cells that do not burn"
-        )
     times[odd] = np.inf
+    plateaus = _plateaus(times, in_bank=in_bank) if config.never is None else []
+    asked = [*np.unique(wrong)[:5].tolist(), *plateaus]
+    if asked:
+        cells = times.size if in_bank else max(1, np.isfinite(times).sum() + len(wrong))
+        parts = [(f"{value:g}", (values == value).sum() / cells) for value in asked]
+        listed = " and ".join(f"{value} ({100 * part:.0f} % of the cells)" for value, part in parts)
+        some = ",".join(value for value, _ in parts)
+        key = f"'fire.unburned=[{some}]'" if len(parts) > 1 else f"fire.unburned={some}"
+        others = times[np.isfinite(times) & ~np.isin(times, asked)]
+        between = f"{others.min():g} to {others.max():g}" if len(others) else "none"
+        raise UserError(
+            f"{listed} may stand for cells that do not burn (others: {between}); expected {key}"
+            + ("" if len(wrong) else ", or fire.unburned=none if they burn then")
+        )
     check_spreads(times, may_stand=in_bank)
-    if config.never is None:
-        _check_plateau(times, in_bank=in_bank)
     return times
 
 
@@ -85,8 +92,8 @@ def check_spreads(times: np.ndarray, *, may_stand: bool = False) -> None:
         )
 
 
-def _check_plateau(times: np.ndarray, *, in_bank: bool) -> None:
-    """Asks about values that may stand for cells that do not burn.
+def _plateaus(times: np.ndarray, *, in_bank: bool) -> list[float]:
+    """Returns values that may stand for cells that do not burn.
 
     They hold more than half of the cells; or are the first or last value, and far from the rest or
     frequent along the edge of the raster, where a fire has cells of many times.
@@ -94,7 +101,7 @@ def _check_plateau(times: np.ndarray, *, in_bank: bool) -> None:
     finite = np.isfinite(times)
     values, counts = np.unique(times[finite], return_counts=True)
     cells = times.size if in_bank else counts.sum()
-    odd = {int(i) for i in np.flatnonzero(counts > 0.5 * cells)}
+    odd = {int(i) for i in np.flatnonzero(counts > 0.5 * cells)} if len(values) > 1 else set()
     edge = times[finite & ~np.asarray(binary_erosion(finite))]
     for end, rest in ((0, slice(1, None)), (-1, slice(0, -1))):
         others = values[rest]
@@ -103,18 +110,7 @@ def _check_plateau(times: np.ndarray, *, in_bank: bool) -> None:
             often = counts[end] > max(0.1 * cells, 3 * counts[rest].max())
             if far or (often and (edge == values[end]).mean() > 0.5):
                 odd.add(end % len(values))
-    if not odd:
-        return
-    places = sorted(odd)
-    some = [f"{values[i]:g}" for i in places]
-    share = [f"{values[i]:g} ({100 * counts[i] / cells:.0f} % of the cells)" for i in places]
-    others = np.delete(values, places)
-    key = f"'fire.unburned=[{','.join(some)}]'" if len(odd) > 1 else f"fire.unburned={some[0]}"
-    between = f"{others.min():g} to {others.max():g}" if len(others) else "none"
-    raise UserError(
-        f"{' and '.join(share)} may stand for cells that do not burn (others: {between}); "
-        f"expected {key}, or fire.unburned=none if they burn then"
-    )
+    return [float(values[i]) for i in sorted(odd)]
 
 
 def first_burning(maps: np.ndarray, config: FileFireConfig) -> tuple[np.ndarray, str]:

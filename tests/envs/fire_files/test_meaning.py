@@ -228,7 +228,7 @@ def test_one_date_decides_the_order_of_all():
 
 def test_two_flights_a_day_in_names_and_the_future(tmp_path, elapsed):
     assert date_within("20200905_1830_Creek_IR") == "20200905 1830"
-    assert date_within("Creek/IR 2020-09-05T18-00") == "2020-09-05T18:00"
+    assert date_within("Creek > IR 2020-09-05T18-00") == "2020-09-05T18:00"
     assert date_within("Flight 3") == date_within("2020-09-05 to 2020-09-06") == ""
     assert time_of_day("942") == time_of_day("09:42") == time_of_day("9:42 AM")
     later = [text.replace("2020", "2090") for text in _dates(3)]
