@@ -147,7 +147,7 @@ class FromFile(FireSource):
         return fire_files.with_checksum(self.config)
 
     def summary(self, grid: Grid, horizon: int) -> str:
-        return fire_files.summary(self.config, grid, horizon)
+        return fire_files.fire_sets(self.config, grid, horizon).about
 
     def save_copy(self, folder: Path, grid: Grid, horizon: int) -> "ScenarioConfig":
         fire_files.save_copy(self.config, folder, grid, horizon)

@@ -5,9 +5,9 @@ from typing import TYPE_CHECKING
 from emberlink.envs.utils.lazy import lazy
 
 if TYPE_CHECKING:
-    from emberlink.envs.fire_files.reader import fire_sets, save_copy, summary, with_checksum
+    from emberlink.envs.fire_files.reader import fire_sets, save_copy, with_checksum
 
-__all__ = ["fire_sets", "save_copy", "summary", "with_checksum"]
+__all__ = ["fire_sets", "save_copy", "with_checksum"]
 
 # The readers import scipy, which takes a third of a second.
 __getattr__ = lazy(__name__, dict.fromkeys(__all__, "reader"))

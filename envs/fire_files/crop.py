@@ -107,7 +107,8 @@ def _burnt_out(times: np.ndarray, start: float, width: float) -> np.ndarray:
     if not burnt.any() or math.isinf(width):
         return np.zeros_like(burnt)
     around = np.pad(burnt, 1)  # cells outside the grid have not burnt
-    holes: Any = ndimage.label(~around)[0]  # pyright: ignore[reportGeneralTypeIssues]
+    labelled: Any = ndimage.label(~around)
+    holes = labelled[0]
     later = np.pad(np.isfinite(times) & ~burnt, 1)
     around |= ~np.isin(holes, [holes[0, 0], *holes[later]])
     depth: Any = ndimage.distance_transform_edt(around)

@@ -1,5 +1,6 @@
 """Reads calendar times by strict patterns; asks if several patterns fit."""
 
+import contextlib
 import functools
 import re
 from collections.abc import Sequence
@@ -62,24 +63,17 @@ def parse_dates(texts: Sequence[str], form: str | None, key: str) -> list[dateti
     lengths = {len(text) if text.isdecimal() else 0 for text in texts}
     forms = _DIGITS.get(lengths.pop(), _ORDERS) if len(lengths) == 1 else _ORDERS
     fits: dict[str, list[datetime]] = {}
-    wrong = texts[0]
+    text = ""
     for name in (form,) if form else forms:
-        dates = []
-        for text in texts:
-            try:
-                dates.append(_read(text.strip(), name))
-            except (ValueError, OverflowError, OSError):
-                wrong = text
-                break
-        else:
-            fits[name] = dates
+        with contextlib.suppress(ValueError, OverflowError, OSError):
+            fits[name] = [_read((text := each).strip(), name) for each in texts]
     if form is None and forms is not _ORDERS:
         now = datetime.now(UTC) + timedelta(days=1)
         likely = {n for n, d in fits.items() if max(map(in_utc, d)) < now and d[0].year > 1980}
         fits = {name: fits[name] for name in fits if name in likely} or fits
     if not fits:
         raise UserError(
-            f"{key}={wrong[:40]!r} is not a date; expected such as 2020-08-19T13:00-07:00, or "
+            f"{key}={text[:40]!r} is not a date; expected such as 2020-08-19T13:00-07:00, or "
             "fire.time_format, such as fire.time_format=%d.%m.%Y"
         )
     first, *others = fits.values()
@@ -92,12 +86,9 @@ def parse_dates(texts: Sequence[str], form: str | None, key: str) -> list[dateti
 
 def is_date(text: str) -> bool:
     """Returns whether a text is a calendar time in one of the patterns."""
-    forms = _DIGITS.get(len(text), ()) if text.isdecimal() else _ORDERS
-    for form in forms:
-        try:
+    for form in _DIGITS.get(len(text), ()) if text.isdecimal() else _ORDERS:
+        with contextlib.suppress(ValueError, OverflowError):
             return bool(_read(text.strip(), form))
-        except (ValueError, OverflowError):
-            continue
     return False
 
 
@@ -113,19 +104,20 @@ def date_within(text: str) -> str:
 
 
 @functools.lru_cache(4096)
-def time_of_day(text: str) -> timedelta:
-    """Reads 2300, 155 (HHMM), 23:00, 1:55:00, 11:55 PM."""
+def time_of_day(text: str) -> timedelta | None:
+    """Reads 2300, 155 (HHMM), 23:00, 1:55:00, 11:55 PM; AM or PM alone begin a half of the day."""
     text = re.sub(r"(?<=:\d\d)[.,]\d+|[\s.]|(Z|UTC|GMT)$", "", text.strip(), flags=re.IGNORECASE)
-    text = re.sub(r"(?<=\d)(\d\d)(?=[ap]m)", r":\1", text, flags=re.I) if ":" not in text else text
-    digits = "%H%M" if len(text) <= 4 else "%H%M%S"
-    text, forms = (text.zfill(4), (digits,)) if text.isdecimal() else (text, _CLOCKS)
-    for form in forms:
+    text = re.sub(r"^(?=[ap]m$)", "12", text, flags=re.IGNORECASE)
+    text = re.sub(r"^(\d\d?)(\d\d)(?=[ap]m)", r"\1:\2", text, flags=re.IGNORECASE)
+    if text.isdecimal():
+        text = re.sub(r"(\d\d)(\d\d)(\d\d)?$", r"\1:\2:\3", text.zfill(4)).rstrip(":")
+    for form in _CLOCKS:
         try:
             read = datetime.strptime(text, form)
         except ValueError:
             continue
         return timedelta(hours=read.hour, minutes=read.minute, seconds=read.second)
-    raise ValueError(text)
+    return None
 
 
 def has_clock(dates: Sequence[datetime]) -> bool:
@@ -157,17 +149,14 @@ def _read(text: str, form: str) -> datetime:
 @functools.lru_cache(4096)
 def _day(text: str, order: str) -> datetime | None:
     """Reads a day; None if no pattern fits."""
-    text = re.sub(r"^((?:19|20)\d\d)(\d\d)(\d\d)$", r"\1-\2-\3", text)
-    text = re.sub(r"^(\d{4})(\d{3})$", r"\1-\2", text)
+    text = re.sub(r"^(\d{4})(?:(\d{3})|(\d\d)(\d\d))$", r"\1-\2\3-\4", text).rstrip("-")
     text = re.sub(r"(?<=\d)(st|nd|rd|th)\b", "", text, flags=re.IGNORECASE)
     text = re.sub(_MONTH, r"-\1-", text, flags=re.IGNORECASE)
     text = re.sub(r"[-/.,\s]+", "-", text).strip("-")
     for form, needs in _DAYS.items():
-        try:
+        with contextlib.suppress(ValueError):
             if needs in ("", order):
                 return datetime.strptime(text, form)
-        except ValueError:
-            continue
     return None
 
 
@@ -175,11 +164,12 @@ def _with_clock(day: datetime, part: dict[str, Any]) -> datetime:
     """Returns a day with the time of day and the zone beside it."""
     if part.get("clock") is None:
         return day
-    zone, offset = part["zone"], part["offset"]
-    shift = timedelta(hours=_ZONES[zone.upper()] if zone else 0)
+    shift, (zone, offset) = time_of_day(part["clock"]), (part["zone"], part["offset"])
+    if shift is None:
+        raise ValueError(part)
+    away = timedelta(hours=_ZONES[zone.upper()] if zone else 0)
     if offset:
         digits = offset[1:].replace(":", "")
-        away = timedelta(hours=int(digits[:2]), minutes=int(digits[2:] or 0))
-        shift += -away if offset[0] == "-" else away
-    day += time_of_day(part["clock"])
-    return day.replace(tzinfo=timezone(shift) if zone or offset else None)
+        beside = timedelta(hours=int(digits[:2]), minutes=int(digits[2:] or 0))
+        away += -beside if offset[0] == "-" else beside
+    return (day + shift).replace(tzinfo=timezone(away) if zone or offset else None)

@@ -5,7 +5,8 @@ import hashlib
 import io
 import json
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -40,12 +41,31 @@ def read_with_summary(
 ) -> tuple[Tensor, str]:
     """Returns the fires of `read_fires` and the findings about the file; warns of a misreading."""
     check_grid(grid)
-    path = user_path(config.path)
+    fires: list[np.ndarray] = []
+    with _named(config.path) as path, quiet():
+        sources = _sources(path, config, grid, horizon)
+        for source in sources:
+            try:
+                fires.append(on_grid(source, config, grid, horizon))
+            except UserError as error:
+                place = f"fire {len(fires)}: " if len(sources) > 1 else ""
+                raise UserError(f"{place}{'; '.join([str(error), *source.doubts])}") from None
+    cells = sorted({int(np.isfinite(fire).sum()) for fire in fires})
+    burn = " to ".join(map(str, cells[:: max(1, len(cells) - 1)]))
+    facts = [*sources[0].facts, f"{burn} of {' x '.join(map(str, grid))} cells burn"]
+    summary, doubts = printable("; ".join(facts)), printable("; ".join(sources[0].doubts))
+    if doubts:
+        warnings.warn(f"{printable(str(path))}: {doubts}; read: {summary}", stacklevel=3)
+    return torch.from_numpy(np.stack(fires)), summary
+
+
+@contextmanager
+def _named(file: str) -> Iterator[Path]:
+    """Gives the path of a file, and names it in errors."""
+    path = user_path(file)
     name = printable(str(path))
     try:
-        with quiet():
-            sources = _sources(path, config, grid, horizon)
-            fires = _on_grid(sources, config, grid, horizon)
+        yield path
     except UserError as error:
         text = printable(str(error)).removeprefix(f"{path.name}: ")
         raise UserError(f"{name}: {text}") from None
@@ -53,11 +73,6 @@ def read_with_summary(
         raise UserError(f"{name}: cannot be read: {error.strerror or error}") from None
     except MemoryError:
         raise UserError(f"{name}: not enough memory to read it") from None
-    summary = printable("; ".join(sources[0].facts))
-    if sources[0].doubts:
-        doubts = printable("; ".join(sources[0].doubts))
-        warnings.warn(f"{name}: {doubts}; read: {summary}", stacklevel=3)
-    return torch.from_numpy(np.stack(fires)), summary
 
 
 def _sources(
@@ -84,43 +99,17 @@ def _sources(
     return sources
 
 
-def _on_grid(
-    sources: Sequence[Raster], config: FileFireConfig, grid: tuple[int, int], horizon: int
-) -> list[np.ndarray]:
-    fires: list[np.ndarray] = []
-    for source in sources:
-        try:
-            fires.append(on_grid(source, config, grid, horizon))
-        except UserError as error:
-            place = f"fire {len(fires)}: " if len(sources) > 1 else ""
-            raise UserError(f"{place}{'; '.join([str(error), *source.doubts])}") from None
-    cells = [int(np.isfinite(fire).sum()) for fire in fires]
-    burn = f"{min(cells)} to {max(cells)}" if min(cells) < max(cells) else f"{cells[0]}"
-    sources[0].facts.append(f"{burn} of {' x '.join(map(str, grid))} cells burn")
-    return fires
-
-
 class FireSets(NamedTuple):
-    """Training, validation and test fires, float32 [fires, X, Y] each."""
+    """Training, validation and test fires, float32 [fires, X, Y] each, and the findings."""
 
     train: Tensor
     validation: Tensor
     test: Tensor
+    about: str
 
 
 def fire_sets(config: FileFireConfig, grid: tuple[int, int], horizon: int) -> FireSets:
     """Returns the fires from the run's copy if it has this grid and horizon, else from files."""
-    return _sets_with_summary(config, grid, horizon)[0]
-
-
-def summary(config: FileFireConfig, grid: tuple[int, int], horizon: int) -> str:
-    """Returns the findings about the files, one text for all sets."""
-    return _sets_with_summary(config, grid, horizon)[1]
-
-
-def _sets_with_summary(
-    config: FileFireConfig, grid: tuple[int, int], horizon: int
-) -> tuple[FireSets, str]:
     saved = _read_copy(config, grid, horizon)
     if saved is not None:
         return saved
@@ -129,10 +118,10 @@ def _sets_with_summary(
     fires, about = read_with_summary(config, grid, horizon)
     train, validation, test = _divide(len(fires), test_file=config.test is not None)
     if config.test is None:
-        return FireSets(fires[train], fires[validation], fires[test]), about
+        return FireSets(fires[train], fires[validation], fires[test], about)
     other = dataclasses.replace(config, path=config.test)
     tests, more = read_with_summary(other, grid, horizon)
-    return FireSets(fires[train], fires[validation], tests), f"{about}; test fires: {more}"
+    return FireSets(fires[train], fires[validation], tests, f"{about}; test fires: {more}")
 
 
 def _divide(count: int, *, test_file: bool) -> tuple[list[int], list[int], list[int]]:
@@ -140,9 +129,7 @@ def _divide(count: int, *, test_file: bool) -> tuple[list[int], list[int], list[
     fires = list(range(count))
     many = count >= _EVERY
     test = [i for i in fires if i % _EVERY == _TEST] if many else fires[-1:]
-    if test_file:
-        test = []
-    rest = [i for i in fires if i not in test] or fires
+    rest = fires if test_file else [i for i in fires if i not in test] or fires
     validation = [i for i in rest if i % _EVERY == _VALIDATION] if many else rest[-1:]
     train = [i for i in rest if i not in validation] or rest
     return train, validation, test
@@ -157,27 +144,19 @@ def with_checksum(config: FileFireConfig) -> FileFireConfig:
 
 
 def _checksum(file: str, expected: str | None) -> str:
-    path = user_path(file)
-    name = printable(str(path))
-    try:
+    with _named(file) as path:
         found = digest(path)
-    except UserError as error:
-        raise UserError(f"{name}: {str(error).removeprefix(f'{path.name}: ')}") from None
-    except OSError as error:
-        raise UserError(f"{name}: cannot be read: {error.strerror or error}") from None
-    if expected not in (None, found):
-        raise UserError(
-            f"{name}: has changed: its SHA-256 is {found[:12]}..., in the run "
-            f"{str(expected)[:12]}..."
-        )
+        if expected not in (None, found):
+            here, there = found[:12], str(expected)[:12]
+            raise UserError(f"has changed: its SHA-256 is {here}..., in the run {there}...")
     return found
 
 
 def save_copy(config: FileFireConfig, folder: Path, grid: tuple[int, int], horizon: int) -> None:
     """Writes the run's copy of its fires. Afterwards the run does not need the files."""
-    fires, about = _sets_with_summary(config, grid, horizon)
-    arrays: dict[str, Any] = {name: values.numpy() for name, values in fires._asdict().items()}
-    arrays |= {"key": np.array(_key(config, grid, horizon)), "summary": np.array(about)}
+    fires = fire_sets(config, grid, horizon)._asdict()
+    arrays: dict[str, Any] = {name: np.array(values) for name, values in fires.items()}
+    arrays["key"] = np.array(_key(config, grid, horizon))
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with replaced(folder / COPY_FILE) as partial, partial.open("wb") as file:
@@ -195,21 +174,18 @@ def _key(config: FileFireConfig, grid: tuple[int, int], horizon: int) -> str:
     return hashlib.sha256(json.dumps(parts).encode()).hexdigest()
 
 
-def _read_copy(
-    config: FileFireConfig, grid: tuple[int, int], horizon: int
-) -> tuple[FireSets, str] | None:
+def _read_copy(config: FileFireConfig, grid: tuple[int, int], horizon: int) -> FireSets | None:
     """Returns the run's copy; None if there is none, it is damaged, or it has another grid."""
     if config.saved_copy is None or config.sha256 is None:
         return None
     try:
         content = read_bytes(Path(config.saved_copy), _MAX_COPY)
         with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
-            if sum(part.file_size for part in arrays.zip.filelist) > _MAX_COPY:
+            size = sum(part.file_size for part in arrays.zip.filelist)
+            if size > _MAX_COPY or str(arrays["key"]) != _key(config, grid, horizon):
                 return None
-            if str(arrays["key"]) != _key(config, grid, horizon):
-                return None
-            fires = [arrays[name] for name in FireSets._fields]
-            about = printable(str(arrays["summary"]))
+            *fires, about = (arrays[name] for name in FireSets._fields)
+            train, validation, test = map(torch.from_numpy, fires)
+            return FireSets(train, validation, test, printable(str(about)))
     except Exception:  # damage raises many types
         return None
-    return FireSets(*(torch.from_numpy(values) for values in fires)), about

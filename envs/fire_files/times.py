@@ -134,64 +134,46 @@ def _dates(values: Any, form: str | None) -> list[datetime]:
 
 def _clocks_beside(frame: Any, date: Any, columns: Sequence[Any], *, asked: bool) -> list[Any]:
     """Returns the columns of times of day that belong to a column of dates; asks if unsure."""
-    found: dict[Any, str] = {}
+    found, halves = {}, []
     for name in columns:
         values = texts(frame[name].dropna()).unique()
         match = re.fullmatch(_OF_DAY, plain(name))
-        clocks = any(_HALF.fullmatch(value) or _is_clock(value) for value in values)
-        if name != date and clocks and (match or all(map(_HALF.fullmatch, values))):
-            found[name] = match[1] if match else ""
-    halves = [n for n in found if texts(frame[n]).map(_HALF.fullmatch).astype(bool).all()]
+        if len(values) and all(map(_HALF.fullmatch, values)):
+            halves.append(name)
+        elif name != date and match and any(time_of_day(text) is not None for text in values):
+            found[name] = match[1]
     stem = re.sub(r"(date|day|datum|fecha|data)", "", plain(date))
-    paired = [name for name, rest in found.items() if rest == stem and name not in halves]
+    paired = [name for name, rest in found.items() if rest == stem]
     if len(paired) == 1:
         minutes = [name for name in columns if re.fullmatch(_MINUTE, plain(name))]
-        hour = re.fullmatch(_HOUR, plain(paired[0]))
-        return [*paired, *(minutes if hour else []), *halves]
-    if found and asked:
-        others = ", ".join(map(str, found))
+        return [*paired, *(minutes if re.fullmatch(_HOUR, plain(paired[0])) else []), *halves]
+    if (found or halves) and asked:
+        names = [*found, *halves]
         raise UserError(
-            f"{date} holds dates without a time of day, which {others} may hold; expected "
-            f"'fire.time_field=[{date},{next(iter(found))}]' to join them, or "
+            f"{date} holds dates without a time of day, which {', '.join(map(str, names))} may "
+            f"hold; expected 'fire.time_field=[{date},{names[0]}]' to join them, or "
             f"fire.time_field={date}"
         )
     return []
 
 
-def _is_clock(text: str) -> bool:
-    try:
-        return time_of_day(text) is not None
-    except ValueError:
-        return False
-
-
 def _clocks(frame: Any, chosen: Sequence[Any]) -> list[timedelta]:
     """Reads the times of day in columns of hours, minutes, HHMM, HH:MM, and AM or PM."""
-    date, *parts = chosen
-    joined = texts(frame[date]).map(lambda _: "")
-    for name in parts:
-        values = texts(frame[name])
-        if re.fullmatch(rf".*{_MINUTE}", plain(name)):
-            values = values.map(lambda text: f":{text:>02}")
-        elif re.fullmatch(rf".*{_HOUR}(utc|gmt|z|local)?", plain(name)):
-            values = values.map(lambda text: f"{text:>02}" if len(text) < 3 else text)
-        joined += values
-    if re.fullmatch(rf".*{_HOUR}(utc|gmt|z|local)?", plain(parts[0])):
-        joined = joined.map(
-            lambda text: re.sub(r"^(\d\d)(?=$|\s*[ap])", r"\1:00", text, flags=re.I)
-        )
-    halves = {"am": timedelta(0), "pm": timedelta(hours=12)}
-    read: dict[str, timedelta] = {}
-    for feature, text in joined.drop_duplicates().items():
-        half = re.sub(r"[\s.]", "", text).lower()
-        try:
-            read[text] = halves[half] if half in halves else time_of_day(text)
-        except ValueError:
+    _, first, *others = chosen
+    joined = texts(frame[first])
+    for name in others:
+        minutes = re.fullmatch(rf".*{_MINUTE}", plain(name))
+        joined += texts(frame[name]).map(":{:>02}".format if minutes else " {}".format)
+    if re.fullmatch(rf".*{_HOUR}(utc|gmt|z|local)?", plain(first)):
+        joined = joined.str.replace(r"^(\d\d?)(?=$| )", r"\1:00", regex=True)
+    read = {text: time_of_day(text) for text in joined.unique()}
+    for feature, text in joined.items():
+        if read[text] is None:
             seen = ", ".join(f"{name}={str(frame[name][feature])[:40]}" for name in chosen)
             raise UserError(
                 f"{feature} has {seen}; expected a date and a time such as 2300, 23:00 or 11:00 PM"
-            ) from None
-    return [read[text] for text in joined]
+            )
+    return [read[text] or timedelta(0) for text in joined]
 
 
 def _calendar(frame: Any, dates: Sequence[datetime], name: str) -> Times:

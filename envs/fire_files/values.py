@@ -1,6 +1,7 @@
 """Decides which values of a raster are arrival times: NODATA, plateaus, states, units."""
 
 import re
+from typing import Any
 
 import numpy as np
 from scipy.ndimage import binary_erosion
@@ -102,7 +103,8 @@ def _plateaus(times: np.ndarray, *, in_bank: bool) -> list[float]:
     values, counts = np.unique(times[finite], return_counts=True)
     cells = times.size if in_bank else counts.sum()
     odd = {int(i) for i in np.flatnonzero(counts > 0.5 * cells)} if len(values) > 1 else set()
-    edge = times[finite & ~np.asarray(binary_erosion(finite))]
+    inner: Any = binary_erosion(finite)
+    edge = times[finite & ~inner]
     for end, rest in ((0, slice(1, None)), (-1, slice(0, -1))):
         others = values[rest]
         if len(others) > 2 and not in_bank:

@@ -61,9 +61,13 @@ def preview(arguments: Sequence[str], console: Console, output: Path | None = No
     grid = " x ".join(map(str, world.grid))
     lines = [f"{title}: {grid} cells, {world.horizon} steps, setup {config.setup}"]
     lines += [f"read: {read}"] if read else []
-    for line in [*lines, *_growth(times, world, width), str(path)]:
-        console.print(line, soft_wrap=True, highlight=False, markup=False)
+    _print(console, *lines, *_growth(times, world, width), str(path))
     return 0
+
+
+def _print(console: Console, *lines: str) -> None:
+    for line in lines:
+        console.print(line, soft_wrap=True, highlight=False, markup=False)
 
 
 def _growth(arrival: np.ndarray, world: Any, width: float) -> list[str]:
@@ -215,7 +219,7 @@ def import_files(arguments: Sequence[str], console: Console, output: Path) -> in
     fires, names, sources = [], [], []
     for path, config in zip(paths, configs, strict=True):
         read, about = _read(config)
-        console.print(f"{path.name}: read: {about}", soft_wrap=True, highlight=False, markup=False)
+        _print(console, f"{path.name}: read: {about}")
         fires.append(read)
         names += [f"{path.name}{f', fire {n}' if len(read) > 1 else ''}" for n in range(len(read))]
         sources.append({"file": path.name, "sha256": to_values(config)["fire"]["sha256"]})
@@ -247,6 +251,4 @@ def _write(
 ) -> None:
     write_bank(path, fires, facts=facts, names=names)
     cells, word = " x ".join(map(str, fires.shape[1:])), "fire" if len(fires) == 1 else "fires"
-    text = f"{len(fires)} {word} of {cells} cells, {facts['horizon']} steps"
-    for line in (text, str(path)):
-        console.print(line, soft_wrap=True, highlight=False, markup=False)
+    _print(console, f"{len(fires)} {word} of {cells} cells, {facts['horizon']} steps", str(path))

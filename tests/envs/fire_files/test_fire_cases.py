@@ -5,6 +5,7 @@ in steps of 1000, where it is known.
 """
 
 import re
+import shlex
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ import pytest
 
 from emberlink.envs.fire_files.config import FileFireConfig
 from emberlink.envs.fire_files.reader import read_with_summary
+from emberlink.trainers.config.compose import resolve
 
 CASES = Path(__file__).parent / "cases"
 WRF = "wrfout_d01_2012-09-09_12:00:00"
@@ -127,6 +129,31 @@ def test_case(name):
         for step in (250, 500, 750, 1000):
             one, other = right <= step, fire.numpy() <= step
             assert (one & other).sum() / (one | other).sum() > least, (step, read)
+
+
+def keys_in(message):
+    """Returns the first keys that a message prints after `expected`, as a shell passes them on."""
+    tail = message.rpartition("expected ")[2]
+    found = re.findall(r"""'fire\.[^']*'|fire\.\w+=(?:"[^"]*"|[^\s,;]+)""", tail)
+    count = 2 if found and found[0].startswith("fire.incident_field") else 1
+    return [shlex.split(text)[0] for text in found[:count]]
+
+
+@pytest.mark.parametrize("name", [name for name, case in TABLE.items() if case[2]])
+@pytest.mark.filterwarnings("ignore")
+def test_the_keys_that_messages_print_can_be_copied(name):
+    file, given, *_ = TABLE[name]
+    texts = [f"fire.{key}={value}" for key, value in given.items()]
+    for _ in range(4):
+        keys = ["fire=file", *texts]
+        config = resolve("independent", keys, **{"fire.path": str(CASES / name / file)})
+        try:
+            assert isinstance(config.fire, FileFireConfig)
+            return read_with_summary(config.fire, (30, 30), 1000)
+        except ValueError as error:
+            (first, *_) = more = keys_in(str(error))
+            texts = [t for t in texts if t.partition("=")[0] != first.partition("=")[0]] + more
+    raise AssertionError(texts)
 
 
 def test_lost_order_is_said():
