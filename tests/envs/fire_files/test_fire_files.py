@@ -123,24 +123,6 @@ def test_a_bank_is_read_unchanged(tmp_path):
             read_fires(FileFireConfig(path=config.path, **keys), GRID, 900)
 
 
-def test_the_papers_text_by_hand(tmp_path):
-    # 20.5 - 29/3 = 10.83: cell 10; 12.0 - 29/3 = 2.33: cell 2.
-    lines = ["1,1,1,"] * 6000 + ["20.5,12.0,0.7,", "20.5,12.0,0.7,30.0,12.0,0.7,"]
-    path = tmp_path / "fire.txt"
-    path.write_text("\n".join(lines))
-    (fire,) = read_fires(FileFireConfig(path=str(path)), (30, 30), 1000)
-    assert {*map(tuple, torch.nonzero(fire == 0).tolist())} == {
-        *((10, 2), (9, 2), (11, 2), (10, 1), (10, 3))
-    }
-    assert {*map(tuple, torch.nonzero(fire == 1).tolist())} == {
-        *((20, 2), (19, 2), (21, 2), (20, 1), (20, 3))
-    }
-    assert torch.isfinite(fire).sum() == 10
-    path.write_text("\n".join([*lines[:6000], "1,2,", "3,4,5,"]))
-    with pytest.raises(ValueError, match=r"fire\.txt: line 6001: .*expected x,y,intensity"):
-        read_fires(FileFireConfig(path=str(path)), (30, 30), 1000)
-
-
 def test_random_fronts_of_the_papers_text(tmp_path):
     random = np.random.default_rng(1)
     steps = [random.uniform(3, 45, (3, 2)) for _ in range(6040)]
@@ -155,3 +137,6 @@ def test_random_fronts_of_the_papers_text(tmp_path):
     path.write_text("\n".join("".join(f"{x!r},{y!r},1.0," for x, y in p.tolist()) for p in steps))
     (fire,) = read_fires(FileFireConfig(path=str(path)), (30, 30), 1000)
     assert torch.equal(fire, expected)
+    path.write_text("\n".join([*["1,1,1,"] * 6000, "1,2,", "3,4,5,"]))
+    with pytest.raises(ValueError, match=r"line 6001: .*expected x,y,intensity"):
+        read_fires(FileFireConfig(path=str(path)), (30, 30), 1000)
