@@ -114,7 +114,7 @@ def _shape(crs: Any, source: Any, bounds: Bounds) -> tuple[str, float]:
         ) from None
     ratio = factors.tissot_semimajor / factors.tissot_semiminor
     turn = factors.meridian_convergence
-    return f"axes {ratio:.2f} : 1, north turned by {turn:.0f} degrees", float(ratio)
+    return f"axes {ratio:.2f} : 1, north turned by {round(turn)} degrees", float(ratio)
 
 
 def warped(

@@ -67,6 +67,7 @@ def same(path, elapsed, says="", **keys):
         ({"date": ["2020-09-05"] * 3, "hour": [9, 10, 11], "minute": [5] * 3}, "hour and minute"),
         ({"DATE_": ["9/25/2020"] * 3, "TIME_": [2055, 2155, 2255]}, "DATE_ and TIME_"),
         ({"Acq_Date": ["2020-09-05"] * 3, "Acq_Time": ["00:08", "01:08", "02:08"]}, "Acq_Time"),
+        ({"date": ["2020-09-05"] * 3, "time": ["930", "1030", "1130"], "half": ["AM"] * 3}, "half"),
         ({"fecha": ["2020-09-05"] * 3, "hora": ["9:55 PM", "10:55 PM", "11:55 PM"]}, "fecha and"),
     ],
 )
@@ -81,6 +82,11 @@ def test_a_time_of_day_of_another_column_is_asked_for(tmp_path, elapsed):
     frame.to_file(tmp_path / "fire.gpkg")
     asks(tmp_path / "fire.gpkg", r"flight_time may hold; expected 'fire.time_field=\[date,flight")
     same(tmp_path / "fire.gpkg", elapsed, time_field=("date", "flight_time"))
+    frame = frame.rename(columns={"flight_time": "period"})
+    frame.assign(period=["AM", "AM", "PM"]).to_file(tmp_path / "half.gpkg")
+    asks(tmp_path / "half.gpkg", r"which period may hold; expected 'fire.time_field=\[date,period")
+    about = read(tmp_path / "half.gpkg", time_field=("date", "period"))[1]
+    assert "2 times, from 2020-09-05T00:00+00:00 to 2020-09-05T12:00+00:00" in about
     frame.assign(time=["0900", "2575", "1100"]).to_file(tmp_path / "wrong.gpkg")
     asks(tmp_path / "wrong.gpkg", "feature 1 has date=2020-09-05, time=2575; expected a date")
 
@@ -98,6 +104,14 @@ def test_several_fires_are_listed_and_one_is_chosen(tmp_path, elapsed, column):
 
 def _dates(count):
     return [f"2020-09-05T{9 + k:02}:00Z" for k in range(count)]
+
+
+def test_fires_that_merge(tmp_path, elapsed):
+    frame = squares(200, 300, 400, t=_dates(3), fireid=[7, 7, 9], mergeid=[7, 7, 7])
+    frame.to_file(tmp_path / "feds.gpkg")
+    asks(tmp_path / "feds.gpkg", r"fireid: 7 \(2\), 9 \(1\); expected fire.incident_field=fireid")
+    says = r"which differ in fireid: 7 (2), 9 (1)"
+    same(tmp_path / "feds.gpkg", elapsed, says, incident_field="mergeid", incident="7")
 
 
 def test_a_number_of_the_features_is_no_fire(tmp_path, elapsed):
@@ -164,6 +178,18 @@ def test_a_plateau_is_asked_about(tmp_path, value):
     if value != 305:
         asks(write_tif(tmp_path / "few.tif", few), f".{100 * share:.0f} %", units="minutes")
     assert read(path, units="minutes", unburned="none", end=301.0)[1]
+
+
+def test_fill_values_are_asked_about_together_and_a_large_ignition_is_not(tmp_path):
+    times = np.where(raster_of(FIRE, 300.0) < 0, 0, 200 + raster_of(FIRE, 300.0) // 60)
+    times[:5] = -2
+    path = write_tif(tmp_path / "burn.tif", times.astype("int16"), nodata=None)
+    listed = r"-2 \(5 % of the cells\) and 0 \(\d+ % .*expected 'fire.unburned=\[-2,0\]'"
+    asks(path, listed, units="day_of_year")
+    assert "from 200 days to 204 days" in read(path, units="days", unburned=(-2.0, 0.0))[1]
+    times = raster_of(FIRE, 300.0)
+    lit = write_tif(tmp_path / "lit.tif", np.where(times < 0, times, np.maximum(times - 150, 0)))
+    assert "from 0 minutes to 149" in read(lit, units="minutes")[1]
 
 
 def test_days_of_the_year_of_perimeters(tmp_path, elapsed):
@@ -405,18 +431,23 @@ def test_an_arcinfo_projection_in_feet(tmp_path):
     asks(path, "fire.prj, beside it, holds no projection", units="minutes")
 
 
-def test_a_fire_of_28110_detections_takes_seconds(tmp_path):
+@pytest.mark.parametrize("suffix", ["gpkg", pytest.param("geojson", marks=pytest.mark.heavy)])
+@pytest.mark.filterwarnings("ignore")
+def test_a_fire_of_28110_detections_takes_seconds(tmp_path, suffix):
     random = np.random.default_rng(0)
     passes = np.sort(random.integers(0, 76, 28110))
     angle, far = random.uniform(0, 2 * np.pi, 28110), random.uniform(0.5, 1, 28110) * passes * 200
     x, y = far * np.cos(angle) * 1.4 + CORNER[0], far * np.sin(angle) + CORNER[1]
-    stamps = pandas.Timestamp("2020-09-05T09:42") + pandas.to_timedelta(passes * 12, "h")
+    stamps = [pandas.Timestamp("2020-09-05T09:42") + pandas.Timedelta(hours=12 * k) for k in passes]
     points = geopandas.GeoSeries(geopandas.points_from_xy(x, y), crs=UTM).to_crs("EPSG:4326")
-    about = {"acq_date": stamps.strftime("%Y-%m-%d"), "acq_time": stamps.strftime("%H%M")}
+    about = {
+        "acq_date": [f"{t:%Y-%m-%d}" for t in stamps],
+        "acq_time": [f"{t:%H%M}" for t in stamps],
+    }
     frame = geopandas.GeoDataFrame(about, geometry=points.buffer(0.002), crs="EPSG:4326")
-    frame.to_file(tmp_path / "viirs.gpkg")
+    frame.to_file(tmp_path / f"viirs.{suffix}")
     began = time.process_time()
-    fire, read_as = read(tmp_path / "viirs.gpkg")
+    fire, read_as = read(tmp_path / f"viirs.{suffix}")
     assert time.process_time() - began < 5
     assert "76 times" in read_as
     assert torch.isfinite(fire).sum() > 150
