@@ -155,7 +155,7 @@ def _checksum(file: str, expected: str | None) -> str:
 def save_copy(config: FileFireConfig, folder: Path, grid: tuple[int, int], horizon: int) -> None:
     """Writes the run's copy of its fires. Afterwards the run does not need the files."""
     fires = fire_sets(config, grid, horizon)._asdict()
-    arrays: dict[str, Any] = {name: np.array(values) for name, values in fires.items()}
+    arrays: dict[str, Any] = {name: np.asarray(values) for name, values in fires.items()}
     arrays["key"] = np.array(_key(config, grid, horizon))
     try:
         folder.mkdir(parents=True, exist_ok=True)
