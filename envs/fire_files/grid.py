@@ -187,10 +187,12 @@ def beginnings(times: np.ndarray) -> int:
 
 def far_apart(burns: np.ndarray) -> list[str]:
     """Returns a doubt if parts of a mask never join and lie farther apart than they are long."""
-    at = np.argwhere(burns)
-    coarse = (at - at.min(0)) * _COARSE // max(_COARSE, *(np.ptp(at, axis=0) + 1).tolist())
-    burns = np.zeros(coarse.max(0) + 1, bool)
-    burns[*coarse.T] = True
+    for axis in (0, 1):  # of the parts' box, on at most twice _COARSE cells
+        at = np.flatnonzero(burns.any(1 - axis))
+        burns = burns.take(range(at[0], at[-1] + 1), axis)
+    steps = max(1, max(burns.shape) // _COARSE)
+    for axis in (0, 1):
+        burns = np.logical_or.reduceat(burns, range(0, burns.shape[axis], steps), axis)
     near: Any = distance_transform_edt(~burns)
     reach, longest, parts = -1.0, 0.0, 2
     while longest > reach and parts > 1:
