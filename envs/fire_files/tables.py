@@ -110,7 +110,7 @@ def _geojson(whole: Any) -> tuple[Any, list[str]]:
         if given.get("type") != "name":
             raise UserError("its crs is a link, which is not followed; expected a name, or none")
         crs = parse_crs(given["properties"]["name"])
-    shapes = [_shape(f["geometry"]) if f.get("geometry") else None for f in features]
+    shapes = _shapes([feature.get("geometry") for feature in features])
     rows = [f.get("properties") or {} for f in features]
     frame = library("geopandas").GeoDataFrame(rows, geometry=shapes, crs=crs)
     if crs == _DEGREES and len(frame) and abs(frame.total_bounds).max() > 360:
@@ -122,11 +122,16 @@ def _geojson(whole: Any) -> tuple[Any, list[str]]:
     return frame.assign(**about), list(about)
 
 
-def _shape(geometry: Any) -> Any:
-    """Returns a geometry of GeoJSON, in a fifth of the time if it is a polygon without holes."""
-    if geometry["type"] == "Polygon" and len(geometry["coordinates"]) == 1:
-        return library("shapely").polygons(np.array(geometry["coordinates"][0], float))
-    return library("shapely.geometry").shape(geometry)
+def _shapes(geometries: Sequence[Any]) -> Sequence[Any]:
+    """Returns geometries of GeoJSON; at once if all are polygons without holes, as circles are."""
+    shapely = library("shapely.geometry")
+    kinds = {g["type"] + str(len(g.get("coordinates", ()))) if g else "" for g in geometries}
+    if kinds != {"Polygon1"}:
+        return [shapely.shape(geometry) if geometry else None for geometry in geometries]
+    rings = [np.array(geometry["coordinates"][0], float)[:, :2] for geometry in geometries]
+    of = np.repeat(np.arange(len(rings)), [len(ring) for ring in rings])
+    shapely = library("shapely")
+    return shapely.polygons(shapely.linearrings(np.concatenate(rings), indices=of))
 
 
 def _kml(path: Path, kind: str, layer: str | None) -> tuple[Any, list[str]]:
