@@ -124,14 +124,8 @@ class WildfireEnv(EnvBase):
         sensor = Sensor.of(config)
         self._side = sensor.side
         fires, self._one_fire_each = load_fires(fire, config, num_envs)
-        self._map = CoverageMap(
-            sensor,
-            fires,
-            horizon=config.horizon,
-            envs=num_envs,
-            uavs=config.num_uavs,
-            own=config.knowledge == "own",
-        )
+        own, team = config.knowledge == "own", {"envs": num_envs, "uavs": config.num_uavs}
+        self._map = CoverageMap(sensor, fires, horizon=config.horizon, own=own, **team)
         measured = config.measures == "all" or config.base is not None
         self._measures = Measures(config, num_envs, sensor.area) if measured else None
         for name in ("_seed_key", "_episode", "_episode_key", "_step_key", "_time"):
