@@ -21,7 +21,10 @@ if TYPE_CHECKING:
 
 EXTRAS = {
     "csv": "compare.csv, one row per run, fire and measure",
+    "latex": "compare.tex, the rankings by the world's headline measure",
+    "marl-eval": "marl_eval.json, training and held-out fires in the format of MARL-eval",
     "pdf": "the figures as PDF",
+    "svg": "the figures as SVG",
 }
 """what `compare` can write beside its page -> its help"""
 

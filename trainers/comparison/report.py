@@ -1,6 +1,7 @@
 """Shows a comparison: tables of text, figures, one HTML page, compare.json, and other files."""
 
 import base64
+import json
 import os
 from collections.abc import Callable, Collection, Mapping
 from importlib.resources import files
@@ -22,7 +23,7 @@ from emberlink.trainers.comparison.bootstrap import FEW
 from emberlink.trainers.comparison.comparison import Comparison, about
 from emberlink.trainers.comparison.rankings import differing, trained_on
 from emberlink.trainers.comparison.tables import Frame
-from emberlink.trainers.evaluation.scores import LEARNED
+from emberlink.trainers.evaluation.scores import CURVES, LEARNED
 from emberlink.trainers.terminal.console import plain_table
 
 NONE = "-"
@@ -181,8 +182,8 @@ def write_report(
 ) -> Comparison:
     """Writes compare.html, compare.json and the extras into a new or empty folder.
 
-    `say` is called with a line of text before the figures of each section; `extras` are "csv", and
-    "pdf" for the figures.
+    `say` is called with a line of text before the figures of each section; `extras` are "csv",
+    "latex", "marl-eval", and "pdf" and "svg" for the figures.
     """
     environment = Environment(
         autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
@@ -191,12 +192,11 @@ def write_report(
     contents: dict[str, bytes] = {}
 
     def saved(figure: Figure, name: str, caption: str) -> Picture:
-        for kind, changing in (("png", "Software"), ("pdf", "CreationDate")):
-            file = BytesIO()
-            figure.savefig(file, format=kind, dpi=120, metadata={changing: None})
-            contents[f"{name}.{kind}"] = file.getvalue()
-            if kind == "png" and "pdf" not in extras:
-                break
+        for kind, changing in (("png", "Software"), ("pdf", "CreationDate"), ("svg", "Date")):
+            if kind == "png" or kind in extras:
+                file = BytesIO()
+                figure.savefig(file, format=kind, dpi=120, metadata={changing: None})
+                contents[f"{name}.{kind}"] = file.getvalue()
         return Picture(contents.pop(f"{name}.png"), caption)
 
     chapters = []
@@ -209,6 +209,10 @@ def write_report(
     texts = {"compare.html": page, "compare.json": comparison.to_json()}
     if "csv" in extras:
         texts["compare.csv"] = comparison.table.to_csv(index=False)
+    if "latex" in extras:
+        texts["compare.tex"] = _latex(comparison)
+    if "marl-eval" in extras:
+        texts["marl_eval.json"] = _marl_eval(comparison)
     # Names of folders may hold bytes that are no characters.
     contents |= {name: text.encode(errors="backslashreplace") for name, text in texts.items()}
     with naming(f"output {folder}"):
@@ -256,6 +260,35 @@ def _chapter(
         "timelapses": _timelapses(trained),
         "details": _details(runs, folder),
     }
+
+
+def _latex(comparison: Comparison) -> str:
+    """Returns a LaTeX table for each section and set of fires: the headline measure by rank."""
+    texts: list[str] = []
+    for (section, fires), part in comparison.ranking.groupby(["section", "fires"], sort=False):
+        measure = part["measure"].iloc[0]
+        rows = map(_ranked, part[part["measure"] == measure].to_dict("records"))
+        table = pd.DataFrame(rows).drop(columns="measure")
+        caption = f"{section}, on {fires}: {measure}".replace("_", r"\_")
+        texts.append(table.to_latex(index=False, escape=True, caption=caption))
+    return "\n".join(texts)
+
+
+def _marl_eval(comparison: Comparison) -> str:
+    """Returns environment, section, label, run, step and measures as JSON that MARL-eval reads."""
+    tasks: dict[str, Any] = {}
+    for row in comparison.runs[comparison.runs["as_trained"]].itertuples():
+        run: Any = row.object
+        a_line = run.settings["env.horizon"] * run.settings["num_envs"]
+        steps: dict[str, Any] = {
+            f"step_{line['episode']}": {"step_count": line["episode"] * a_line}
+            | {name: [line[name]] for name in CURVES}
+            for line in run.lines
+        }
+        steps["absolute_metrics"] = [*run.evaluation.results.values()][-1][LEARNED]
+        of_section = tasks.setdefault(str(row.section), {})
+        of_section.setdefault(str(row.label), {})[f"run_{row.seed}"] = steps
+    return json.dumps({"emberlink": tasks}) + "\n"
 
 
 def _timelapses(trained: Frame) -> list[Picture]:

@@ -2,7 +2,9 @@
 
 import os
 from collections.abc import Iterator
+from copy import copy
 from functools import partial
+from typing import Any
 
 from rich import box
 from rich.console import Console, ConsoleOptions, RenderableType
@@ -23,7 +25,7 @@ plain_table = partial(
     Table,
     box=box.SIMPLE_HEAD,
     show_edge=False,
-    pad_edge=False,
+    padding=0,
     title_justify="left",
     title_style="bold",
     caption_justify="left",
@@ -34,13 +36,44 @@ plain_table = partial(
 class SafeConsole(Console):
     """A console on standard output, without markup; lines of pipes are as long as the text.
 
-    Control characters in names, such as escape sequences, are replaced.
+    Control characters in names, such as escape sequences, are replaced. A table that is too wide is
+    printed in parts, with the first column and some of the others.
     """
 
     def __init__(self) -> None:
         super().__init__(markup=False, emoji=False, highlight=False)
         if not self.is_terminal and "COLUMNS" not in os.environ:
             self.width = _WITHOUT_TERMINAL
+
+    def print(self, *objects: Any, **options: Any) -> None:
+        tables = [part for item in objects if isinstance(item, Table) for part in self._parts(item)]
+        for printed in [(table,) for table in tables] or [objects]:
+            super().print(*printed, **options)
+
+    def _parts(self, table: Table) -> list[Table]:
+        """Splits a table; numbers and the words of the first column are never broken."""
+        first, *others = table.columns
+        words = [word for cell in (first.header, *first.cells) for word in str(cell).split()]
+        first.min_width = max(map(len, words), default=0)
+        first.no_wrap = not table.show_header  # a list of names and texts
+        for column in others:
+            column.no_wrap, column.overflow = column.justify == "right", "fold"
+        parts, unlimited = [copy(table)], self.options.update(width=10_000)
+        parts[0].columns = [first]
+        for column in others:
+            wider = copy(table)
+            wider.columns = [*parts[-1].columns, column]
+            too_wide = self.measure(wider, options=unlimited).minimum > self.width
+            if too_wide and len(parts[-1].columns) > 1:
+                wider.columns = [first, column]
+                parts.append(wider)
+            else:
+                parts[-1] = wider
+        for part in parts[1:]:
+            part.title = None
+        for part in parts[:-1]:
+            part.caption = None
+        return parts
 
     def render(
         self, renderable: RenderableType, options: ConsoleOptions | None = None

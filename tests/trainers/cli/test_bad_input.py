@@ -44,7 +44,7 @@ METHODS = "known: consensus, independent, maps, positional, shared_memory"
         (["maps", "comm.range=0"], ["'comm.range'", "did you mean env.radio.range?"]),
         (["consensus", "comm.name=telepathy"], ["telepathy", "known: consensus, maps, no_comm"]),
         (["consensus", "seed=1,2"], ["'seed=1,2'", "one value", "emberlink sweep"]),
-        (["consensus", "env.grid=30,20"], ["one value", "env.grid=[30,20]"]),
+        (["consensus", "env.grid=30,20"], ["one value", "in brackets"]),
         (["consensus", "env.horizon=${nope}"], ["nope", "env.horizon"]),
     ],
     ids=lambda value: " ".join(value) if len(value) < 4 else "",

@@ -382,12 +382,20 @@ def test_the_report_is_one_page(runs, tmp_path, capsys):
 
 def test_extras(runs, tmp_path):
     out = tmp_path / "out"
-    assert main.main(["compare", str(runs), "--output", str(out), "--csv", "--pdf"]) == 0
-    assert len(list(out.glob("*.pdf"))) == 6
+    extras = ["--csv", "--latex", "--marl-eval", "--svg"]
+    assert main.main(["compare", str(runs), "--output", str(out), *extras]) == 0
+    assert len(list(out.glob("*.svg"))) == 6
     table = pd.read_csv(out / "compare.csv")
     pd.testing.assert_frame_equal(
         table.fillna(""), compare_runs([runs]).table, check_dtype=False, check_exact=False
     )
+    assert r"consensus & 3* & 60.0 & [50.0, 70.0]" in (out / "compare.tex").read_text()
+    (tasks,) = json.loads((out / "marl_eval.json").read_text()).values()
+    ((_, algorithms),) = tasks.items()
+    assert sorted(algorithms["consensus"]) == ["run_0", "run_1", "run_2"]
+    first = algorithms["consensus"]["run_0"]
+    assert first["absolute_metrics"]["coverage"] == [45, 55, 45, 55]
+    assert [first[f"step_{i}"]["step_count"] for i in (1, 2, 3)] == [40 * 16 * i for i in (1, 2, 3)]
 
 
 HOSTILE = '<script>alert("1")</script>[red]$x_{/../'
