@@ -57,7 +57,14 @@ class SafeConsole(Console):
         first.min_width = max(map(len, words), default=0)
         first.no_wrap = not table.show_header  # a list of names and texts
         for column in others:
-            column.no_wrap, column.overflow = column.justify == "right", "fold"
+            column.overflow = "fold"
+            if column.justify == "right":
+                lines = [
+                    line
+                    for cell in (column.header, *column.cells)
+                    for line in str(cell).split("\n")
+                ]
+                column.no_wrap, column.min_width = True, max(map(len, lines))
         parts, unlimited = [copy(table)], self.options.update(width=10_000)
         parts[0].columns = [first]
         for column in others:
