@@ -385,10 +385,8 @@ def test_extras(runs, tmp_path):
     extras = ["--csv", "--latex", "--marl-eval", "--svg"]
     assert main.main(["compare", str(runs), "--output", str(out), *extras]) == 0
     assert len(list(out.glob("*.svg"))) == 6
-    table = pd.read_csv(out / "compare.csv")
-    pd.testing.assert_frame_equal(
-        table.fillna(""), compare_runs([runs]).table, check_dtype=False, check_exact=False
-    )
+    table, expected = pd.read_csv(out / "compare.csv").fillna(""), compare_runs([runs]).table
+    pd.testing.assert_frame_equal(table, expected, check_dtype=False, check_exact=False)
     assert r"consensus & 3* & 60.0 & [50.0, 70.0]" in (out / "compare.tex").read_text()
     (tasks,) = json.loads((out / "marl_eval.json").read_text()).values()
     ((_, algorithms),) = tasks.items()
