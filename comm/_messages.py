@@ -5,7 +5,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from emberlink.envs.world.coverage_map import View
+from emberlink.envs.world.coverage_map import View, mark, own_maps
 from emberlink.envs.world.knowledge import Knowledge
 
 OLD = 100
@@ -99,11 +99,7 @@ class CellMessages(nn.Module):
         self.size = size
         self.register_buffer("fresh", torch.zeros(envs, uavs, area, dtype=torch.bool))
         self.register_buffer("heard", torch.zeros(envs, uavs, uavs, dtype=torch.bool))
-        # A view's cell of environment e is at e * area; the map of a UAV begins at
-        # (e * uavs + uav) * area.
-        maps = torch.arange(envs * uavs).view(envs, uavs, 1)
-        shift = maps - torch.arange(envs).view(-1, 1, 1)
-        self.register_buffer("_shift", shift * area, persistent=False)
+        self.register_buffer("_shift", own_maps(envs, uavs, area), persistent=False)
 
     def start_episodes(self, mask: Tensor) -> None:
         """Forgets the contacts in the environments of a mask, bool [envs]."""
@@ -111,9 +107,7 @@ class CellMessages(nn.Module):
 
     def saw(self, view: View) -> None:
         """Notes the cells that UAVs see at this step."""
-        index = (view.cells + self._shift).flatten()
-        flat = self.fresh.view(-1).view(torch.uint8)
-        flat.scatter_reduce_(0, index, view.in_view.flatten().view(torch.uint8), "amax")
+        mark(self.fresh, view.cells + self._shift, view.in_view)
 
     def compare(self, known: Knowledge, near: Tensor) -> News:
         """Returns the cells that are new to UAVs in range.
@@ -178,8 +172,7 @@ class CellMessages(nn.Module):
             fresh[told[row[~arrives]]] = True
             row, theirs, link = row[arrives], theirs[arrives], link[arrives]
         last.view(-1).scatter_reduce_(0, theirs, last.take(told)[row], "amax")
-        was_fire, flat = seen.take(told).view(torch.uint8)[row], seen.view(-1).view(torch.uint8)
-        flat.scatter_reduce_(0, theirs, was_fire, "amax")
+        mark(seen, theirs, seen.take(told)[row])
         # Only what somebody in range did not hear from the speaker has to be told again.
         own = torch.eye(uavs, dtype=torch.bool, device=near.device)
         relays = (near.mT.float() @ (~(hears | own)).float()) > 0  # [envs, hearers, speakers]

@@ -130,6 +130,22 @@ class View(NamedTuple):
     """bool [envs, uavs, W * W]: whether the UAV sees the cell and it burns"""
 
 
+def own_maps(envs: int, radios: int, area: int) -> Tensor:
+    """Returns what leads from a cell of a `View` to maps of each radio, int64 [envs, radios, 1].
+
+    A view's cell of environment e is at e * area; the map of its radio r begins at
+    (e * radios + r) * area.
+    """
+    env = torch.arange(envs).view(-1, 1, 1)
+    return (env * (radios - 1) + torch.arange(radios).view(-1, 1)) * area
+
+
+def mark(maps: Tensor, cells: Tensor, flags: Tensor) -> None:
+    """Sets the cells of bool maps, given by their flat indices, where bool `flags` are true."""
+    flat = maps.view(-1).view(torch.uint8)
+    flat.scatter_reduce_(0, cells.flatten(), flags.flatten().view(torch.uint8), "amax")
+
+
 class Look(NamedTuple):
     """What the UAVs see at a step."""
 
@@ -212,10 +228,7 @@ class CoverageMap(nn.Module):
         self.register_buffer("_stamp", self._uav.repeat(envs, 1, 1))
         seen = torch.zeros(envs, uavs, sensor.area, dtype=torch.bool) if own else None
         self.register_buffer("_own_seen", seen)
-        # A view's cell of environment e is at e * area; the map of its UAV u begins at
-        # (e * uavs + u) * area.
-        shift = torch.arange(envs).view(-1, 1, 1) * (uavs - 1) + torch.arange(uavs).view(-1, 1)
-        self.register_buffer("_own_first", shift * sensor.area, persistent=False)
+        self.register_buffer("_own_first", own_maps(envs, uavs, sensor.area), persistent=False)
         for name in ("seen_count", "seen_gone"):
             self.register_buffer(name, torch.zeros(envs, dtype=torch.int64))
 
@@ -299,7 +312,9 @@ class CoverageMap(nn.Module):
         counted = self._sensor.count_classes(classes, centre)
         sighting = shown = Sighting(*counted, classes, burnt_out)
         if self._own_seen is not None:
-            new = self._see_alone(self._own_seen, cells + self._own_first, burning)
+            own = cells + self._own_first
+            new = burning & ~self._own_seen.take(own)
+            mark(self._own_seen, own, burning)
             classes = torch.stack((new, burning ^ new, no_fire), -2)
             shown = Sighting(*self._sensor.count_classes(classes, centre), classes, burnt_out)
         self.seen_count.add_(sighting.counts[..., 0].sum(-1).long())
@@ -309,10 +324,3 @@ class CoverageMap(nn.Module):
             gone = self._first_seen[env, cell] < _NEVER
             self.seen_gone.index_add_(0, env, gone.long())
         return Look(sighting, shown, View(cells, in_view, burning), (env, cell))
-
-    def _see_alone(self, seen: Tensor, cells: Tensor, burning: Tensor) -> Tensor:
-        """Marks burning cells as seen by their UAV, and returns those that are new to it."""
-        new = burning & ~seen.take(cells)
-        flat = seen.view(-1).view(torch.uint8)
-        flat.scatter_reduce_(0, cells.view(-1), burning.view(torch.uint8).view(-1), "amax")
-        return new

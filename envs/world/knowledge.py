@@ -4,7 +4,7 @@ import torch
 from torch import Tensor, nn
 
 from emberlink.envs.world import radio
-from emberlink.envs.world.coverage_map import View
+from emberlink.envs.world.coverage_map import View, mark, own_maps
 
 NEVER = -1
 """last step of a cell that was never seen"""
@@ -59,12 +59,7 @@ class Knowledge(nn.Module):
         self.register_buffer("seen_fire", torch.zeros(shape, dtype=torch.bool) if fires else None)
         alone = torch.eye(shape[1], dtype=torch.bool)
         self.register_buffer("reach", alone.repeat(envs, 1, 1))
-        # A view's cell of environment e is at e * area; the map of radio r begins at
-        # (e * radios + r) * area.
-        env = torch.arange(envs).view(-1, 1, 1, 1) * (shape[1] - 1)
-        self.register_buffer(
-            "_first", (env + torch.arange(shape[1]).view(-1, 1, 1)) * area, persistent=False
-        )
+        self.register_buffer("_first", own_maps(envs, shape[1], area), persistent=False)
 
     def start_episodes(self, mask: Tensor) -> None:
         """Forgets everything in the environments of a mask, bool [envs]."""
@@ -82,12 +77,11 @@ class Knowledge(nn.Module):
             stored: integers [envs, uavs, cells], the step of each sighting, or a number that is
                 larger for later steps.
         """
-        index = view.cells + self._first[:, : view.cells.shape[1], :, 0]
+        index = view.cells + self._first[:, : view.cells.shape[1]]
         values = torch.where(view.in_view, stored, NEVER).to(self.last_seen.dtype)
         self.last_seen.view(-1).scatter_reduce_(0, index.view(-1), values.view(-1), "amax")
         if self.seen_fire is not None:
-            flat = self.seen_fire.view(-1).view(torch.uint8)
-            flat.scatter_reduce_(0, index.view(-1), view.burning.view(torch.uint8).view(-1), "amax")
+            mark(self.seen_fire, index, view.burning)
 
     def update(self, view: View, step: Tensor, hears: Tensor) -> None:
         """Adds the sightings and messages of a step.
@@ -99,14 +93,12 @@ class Knowledge(nn.Module):
         reach = radio.reachable(hears)
         uavs = view.cells.shape[1]
         knows = reach[..., :uavs].unsqueeze(-1)
-        index = (view.cells.unsqueeze(1) + self._first).flatten(1)
+        index = (view.cells.unsqueeze(1) + self._first.unsqueeze(-1)).flatten(1)
         now = step.to(self.last_seen.dtype).view(-1, 1, 1, 1)
         seen = torch.where(knows & view.in_view.unsqueeze(1), now, NEVER).flatten(1)
         self.last_seen.view(-1).scatter_reduce_(0, index.view(-1), seen.view(-1), "amax")
         if self.seen_fire is not None:
-            fire = (knows & view.burning.unsqueeze(1)).flatten()
-            flat = self.seen_fire.view(-1).view(torch.uint8)
-            flat.scatter_reduce_(0, index.view(-1), fire.view(torch.uint8), "amax")
+            mark(self.seen_fire, index, knows & view.burning.unsqueeze(1))
         self._merge(reach & ~self.reach)
         self.reach.copy_(reach)
 

@@ -179,10 +179,8 @@ class Imitation(Learner):
 
     def losses(self, batch: TensorDictBase) -> Losses:
         """Computes the loss with gradients, one number per UAV."""
-        network, observed = (
-            self.actor.module,
-            [batch.get(name).transpose(1, 2) for _, name in self.observed],
-        )
+        network = self.actor.module
+        observed = [batch.get(name).transpose(1, 2) for _, name in self.observed]
         if isinstance(self.actor, GaussianActor):  # the mean before it is clipped
             state = batch.get("memory") if self.remembers else network.empty_state(len(batch))
             action, _ = network(state, *observed)
