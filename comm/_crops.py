@@ -8,8 +8,6 @@ from torch import Tensor, nn
 
 CHANNELS = ("fire", "seen", "burnt_out", "near", "age", "outside", "uavs", "base")
 """names of a picture's channels, see `Crops`"""
-LARGEST_SCALE = 16
-"""cells along the side of a pixel; sums over a pixel fit into the bits of a field"""
 _FULL = 255
 _OLD = 1000.0  # steps; the age of the darkest known cells
 _SPREAD = 50.0  # steps; time scale at which the chance of ignition near known fire grows
@@ -45,7 +43,7 @@ class Crops(nn.Module):
     Args:
         grid: cells along x and y.
         pixels: S.
-        scales: cells along the side of a pixel in each picture, at most `LARGEST_SCALE`.
+        scales: cells along the side of a pixel in each picture, at most `envs.config.LARGEST_SCALE`.
         spread: cells.
         horizon: steps of an episode.
     """

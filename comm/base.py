@@ -9,6 +9,7 @@ from torch import Tensor
 from torchrl.data import Binary, Composite, Unbounded
 from torchrl.envs import Transform
 
+from emberlink.comm._belief import BeliefMaps
 from emberlink.envs import keys
 from emberlink.envs.config import WildfireConfig
 from emberlink.envs.utils.errors import UserError
@@ -49,10 +50,13 @@ class CommModule(TensorDictModuleBase):
     hold: int = 1
     """steps from one decision of the policy to the next (`policy.hold`); between them, no policy
     reads observations"""
+    maps: BeliefMaps | None
+    """with `observation: map`, what each UAV knows: `forward` may enter what UAVs hear"""
 
     def __init__(self, world: WildfireConfig, config: Any, num_envs: int = 1):
         super().__init__()
         self.world, self.config, self.num_envs = world, config, num_envs
+        self.maps = BeliefMaps(world, num_envs) if world.observation == "map" else None
         default: list[Any] = [keys.OBSERVATION]
         self.in_keys = getattr(self, "_in_keys", default)  # a subclass may define class attributes
         self.out_keys = getattr(self, "_out_keys", default)
@@ -135,7 +139,8 @@ class Communication(Transform):
         world: Any = None if self.parent is None else self.parent.base_env
         # Bytes of learned messages are counted at decisions, and not at every step.
         counted = self.message_bytes > 0 and self.module.world.measures == "all"
-        self._joined = getattr(world, "hold", 1) > 1 and (self.module.every_step or counted)
+        takes_part = self.module.every_step or counted or self.module.maps is not None
+        self._joined = getattr(world, "hold", 1) > 1 and takes_part
         if self._joined:
             world.join(self._steered, self._stepped)
 
@@ -148,12 +153,10 @@ class Communication(Transform):
             everywhere = torch.ones(
                 self.module.num_envs, dtype=torch.bool, device=tensordict_reset.device
             )
-            self.module.reset(tensordict_reset, everywhere)
-            return self._communicate(tensordict_reset)
+            return self._begin(tensordict_reset, everywhere)
         mask = mask.flatten()
-        self.module.reset(tensordict_reset, mask)
         before = {name: buffer.clone() for name, buffer in self.module.state_dict().items()}
-        result = self._communicate(tensordict_reset)
+        result = self._begin(tensordict_reset, mask)
         # The other environments are within an episode; their state must not change.
         for name, buffer in self.module.state_dict().items():
             began = mask.view(-1, *[1] * (buffer.ndim - 1))
@@ -179,11 +182,25 @@ class Communication(Transform):
             if self.module.world.failures:
                 bonus = bonus.masked_fill(~tensordict.get(keys.ALIVE), 0.0)
             tensordict.set(keys.REWARD, tensordict.get(keys.REWARD) + bonus.unsqueeze(-1))
-        return self._speak(self.module(tensordict))
+        return self._communicate(tensordict)
+
+    def _begin(self, tensordict: TensorDictBase, mask: Tensor) -> TensorDictBase:
+        """Starts the episodes of the environments of a mask, bool [num_envs]."""
+        self.module.reset(tensordict, mask)
+        if self.module.maps is not None:
+            self.module.maps.start_episodes(mask)
+        self._listen(tensordict)
+        return self._communicate(tensordict)
 
     def _communicate(self, tensordict: TensorDictBase) -> TensorDictBase:
-        self._listen(tensordict)
-        return self._speak(self.module(tensordict))
+        """Looks, calls the module, and draws what the UAVs know then."""
+        maps = self.module.maps
+        if maps is not None:
+            maps.look(tensordict)
+        tensordict = self.module(tensordict)
+        if maps is not None:
+            maps.show(tensordict, tensordict.get(keys.STEP) % self.module.hold == 0)
+        return self._speak(tensordict)
 
     def _listen(self, tensordict: TensorDictBase) -> None:
         """Writes the links of a step, if the module or the policy reads them."""
@@ -217,7 +234,7 @@ class Communication(Transform):
             if key != keys.HEARS and tensordict.get(key, None) is None:
                 source = "the environment or a transform before the communication"
                 if key in (keys.WINDOW, keys.SIGHT):
-                    source = f"env.observation={key[-1]}"
+                    source = f"env.observation={'window' if key == keys.WINDOW else 'map'}"
                 raise UserError(
                     f"key {key} is missing: {type(self.module).__name__} reads it; it comes from "
                     f"{source}"
@@ -240,7 +257,8 @@ class Communication(Transform):
         if self.module.world.measures == "all":
             shape = torch.Size((*batch, uavs))
             spec[keys.BYTES_SENT] = Unbounded(shape, device=spec.device, dtype=torch.int64)
-        return self.module.specs(spec)
+        maps = self.module.maps
+        return self.module.specs(spec if maps is None else maps.specs(spec))
 
 
 MODULES = Plugins(CommModule, "emberlink.comm", "comm.name")

@@ -27,7 +27,8 @@ class Positional(CommModule):
 
     UAV 0 is first. With a radio of unlimited range, all UAVs then observe the same numbers in the
     same order, as in algorithm 2. With `own_first`, the UAV itself is first. The vector of a UAV
-    that is not heard is replaced by zeros.
+    that is not heard is replaced by zeros. With `observation: map`, the pictures of a UAV show the
+    positions that it has heard, and vectors are its own.
     """
 
     config_type: ClassVar[type] = PositionalConfig
@@ -50,6 +51,8 @@ class Positional(CommModule):
         self.register_buffer("_order", order.flatten(), persistent=False)
 
     def specs(self, observation: Composite) -> Composite:
+        if self.maps is not None:
+            return observation
         *batch, uavs, features = observation[keys.OBSERVATION].shape
         shape = torch.Size((*batch, uavs, uavs * features))
         observation[keys.OBSERVATION] = Unbounded(
@@ -58,6 +61,9 @@ class Positional(CommModule):
         return observation
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        if self.maps is not None:
+            self.maps.hear_positions(tensordict.get(keys.HEARS))
+            return tensordict
         vectors = tensordict.get(keys.OBSERVATION)
         known = (tensordict.get(keys.HEARS) | self._own).unsqueeze(-1)
         joined = torch.where(known, vectors.unsqueeze(-3), 0.0)
@@ -67,6 +73,6 @@ class Positional(CommModule):
         return tensordict.set(keys.OBSERVATION, joined.flatten(-2))
 
     def bytes_sent(self, tensordict: TensorDictBase) -> Tensor:
-        """Returns 24 for each UAV: the six float32 numbers of its vector."""
-        links = tensordict.get(keys.HEARS)
-        return torch.full_like(links[..., 0], 4 * len(keys.FEATURES), dtype=torch.int64)
+        """Returns 24 for each UAV, the six float32 numbers of its vector; 12 for a position."""
+        said = keys.FEATURES if self.maps is None else "xyz"
+        return torch.full_like(tensordict.get(keys.HEARS)[..., 0], 4 * len(said), dtype=torch.int64)

@@ -53,6 +53,28 @@ class RadioConfig:
     limit"""
 
 
+LARGEST_SCALE = 16
+"""Cells along the side of a pixel; sums over a pixel fit into the bits of a field of `Crops`."""
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class MapConfig:
+    """The pictures of a UAV's map, with `observation: map`."""
+
+    pixels: Annotated[int, Field(ge=8, le=64)] = 24
+    """pixels along the side of a picture"""
+    scales: Annotated[
+        tuple[Annotated[int, Field(ge=1, le=LARGEST_SCALE)], ...],
+        Field(min_length=1, max_length=4),
+        Strict(False),
+    ] = (1, 5)
+    """cells along the side of a pixel, in each picture"""
+    spread: Annotated[int, Field(ge=0, le=16)] = 2
+    """cells around known fire that may burn by now, along x and y; 0 for none"""
+    position: bool = False
+    """whether a UAV also observes its own x and y"""
+
+
 BASE_SIDE = 30
 """Cells of the shorter side for which lengths of a fire are given."""
 SIDES = (8, 256)
@@ -79,9 +101,11 @@ class WildfireConfig:
     """half the opening angle of the camera, degrees"""
     displacement: Annotated[float, Field(gt=0, le=256)] = 1.0
     """cells per unit of action"""
-    observation: Literal["vector", "window", "sight"] = "vector"
-    """six numbers per UAV; `window` adds the classes of the cells in view (`keys.WINDOW`), `sight`
-    the camera's picture for methods that keep maps (`keys.SIGHT`)"""
+    observation: Literal["vector", "window", "map"] = "vector"
+    """six numbers per UAV; `window` adds the classes of the cells in view (`keys.WINDOW`); `map`:
+    altitude, time and pictures of the UAV's own map (`keys.CROPS`)"""
+    map: MapConfig = MapConfig()
+    """the pictures of the map"""
     knowledge: Literal["team", "own"] = "team"
     """which fire is old to a UAV: what the team has seen while it burned, as in the paper, or what
     the UAV itself has; rewards and measures count what is new to the team"""

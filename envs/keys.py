@@ -20,10 +20,10 @@ outside of the grid and of the field of view. W is odd and fits the view from th
 Only with `observation: window`."""
 SIGHT: Final = (AGENTS, "sight")
 """uint8 [..., W, W]: the camera's view of the same cells: 0 not in view, 1 no fire, 2 fire, 3 burnt
-out; without other UAVs' sightings. Only with `observation: sight`."""
+out; without other UAVs' sightings. Only with `observation: map`."""
 CROPS: Final = (AGENTS, "crops")
-"""uint8 [..., scales, channels, S, S]: pictures of the UAV's belief map around it. Written by
-communication."""
+"""uint8 [..., scales, channels, S, S]: pictures of the UAV's belief map around it. Only with
+`observation: map`; written with the communication."""
 ACTION: Final = (AGENTS, "action")
 """float32 [..., 3] in [-1, 1]: a displacement in x, y and z."""
 REWARD: Final = (AGENTS, "reward")

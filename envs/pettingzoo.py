@@ -77,8 +77,8 @@ class WildfireParallelEnv(ParallelEnv[str, Any, Any]):
     and leaves `agents`. `infos` hold, for each agent, the other tensors under ("agents", ...) of
     the TorchRL environment, and the numbers of cells `seen`, `burning` and `burnt`. With
     `observation: window` an observation is a dictionary of "observation", float32 [6], and
-    "window", uint8 [3, W, W]; with method `maps` it has "crops" instead of the window. Before the
-    first reset, methods that need an episode raise a UserError.
+    "window", uint8 [3, W, W]; with `observation: map` it has "crops" instead of the window. Before
+    the first reset, methods that need an episode raise a UserError.
 
     Args:
         env: see `parallel_env`.

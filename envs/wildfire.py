@@ -171,7 +171,7 @@ class WildfireEnv(EnvBase):
         }
         if world.observation == "window":
             per_uav[keys.WINDOW[1]] = flag(*agents, 3, side, side)
-        if world.observation == "sight":
+        if world.observation == "map":
             per_uav[keys.SIGHT[1]] = byte(*agents, side, side)
         observed = team(**per_uav)
         for key in (keys.RNG_KEY, keys.STEP, keys.SEEN, keys.BURNING, keys.BURNT):
@@ -373,7 +373,7 @@ class WildfireEnv(EnvBase):
         square = self._side, self._side
         if self.config.observation == "window":
             agents[keys.WINDOW[1]] = sighting.classes.unflatten(-1, square)
-        if self.config.observation == "sight":
+        if self.config.observation == "map":
             agents[keys.SIGHT[1]] = sighting.shown().unflatten(-1, square)
         if now.reward is not None:
             agents[keys.REWARD[1]] = now.reward

@@ -87,7 +87,7 @@ def build_env(
     module = build_comm(config, num_envs).to(world.device)
     env = TransformedEnv(world, Communication(module, message_bytes(config.policy)))
     if teacher is not None:
-        env.append_transform(Teacher(world, module, teacher, config.policy.hold))
+        env.append_transform(Teacher(world, module.maps, teacher, config.policy.hold))
     return env
 
 

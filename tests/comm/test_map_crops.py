@@ -6,8 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scalar_maps import age_byte, picture
 
-from emberlink.comm import _crops
 from emberlink.comm._crops import Crops
+from emberlink.envs.config import LARGEST_SCALE
 
 NAMES = ("none", "fire", "burnt out")
 HORIZON = 400
@@ -71,7 +71,7 @@ def test_pictures_of_any_size(grid, step, place, pixels, scale, spread):
 
 
 def test_the_largest_sums_fit_into_their_bits():
-    grid, side = (256, 256), _crops.LARGEST_SCALE
+    grid, side = (256, 256), LARGEST_SCALE
     crops = Crops(grid, pixels=8, scales=(side,), spread=2, horizon=HORIZON)
     never = torch.full((1, *grid), -1, dtype=torch.int16)
     points = torch.zeros(1, 0, 2).long(), torch.zeros(1, 0).long(), torch.zeros(1, 0, 2).long()

@@ -8,21 +8,22 @@ from torchrl.envs import TransformedEnv, check_env_specs
 from emberlink.comm.base import Communication
 from emberlink.comm.maps import Maps, MapsConfig, steer_home
 from emberlink.envs import keys
-from emberlink.envs.config import RadioConfig, WildfireConfig
+from emberlink.envs.config import MapConfig, RadioConfig, WildfireConfig
 from emberlink.envs.wildfire import WildfireEnv
 from emberlink.trainers import make_env
 
 OBSERVED = (keys.OBSERVATION, keys.CROPS)
 
 
-def environment(fire, position, *, config=None, hold=1, **world) -> TransformedEnv:
+def environment(fire, position, *, home=True, scales=(1, 2), hold=1, **world) -> TransformedEnv:
     """Returns an environment and resets it with given positions, [envs, n, 3]."""
     envs, uavs, _ = position.shape
     grid = tuple(fire.shape[-2:])
-    more = {"grid": grid, "num_uavs": uavs, "horizon": 60, "observation": "sight", **world}
-    world = WildfireConfig(displacement=1.0, measures="all", **more)
+    more = {"grid": grid, "num_uavs": uavs, "horizon": 60, "observation": "map", **world}
+    shown = MapConfig(pixels=8, scales=scales)
+    world = WildfireConfig(displacement=1.0, measures="all", map=shown, **more)
     env = WildfireEnv(envs, world, fire, seed=3)
-    module = Maps(world, config or MapsConfig(pixels=8, scales=(1, 2)), envs)
+    module = Maps(world, MapsConfig(home=home), envs)
     module.hold = hold
     return TransformedEnv(env, Communication(module))
 
@@ -55,7 +56,7 @@ def test_specs_and_shapes():
     check_env_specs(env)
     assert env.rollout(5)["next"][keys.CROPS].shape == (2, 5, 3, 2, 8, 24, 24)
     assert keys.observation_keys(env.observation_spec) == list(OBSERVED)
-    more = make_env("maps", "tuned", world="relay", num_train_fires=2, **{"comm.position": True})
+    more = make_env("maps", "tuned", world="relay", num_train_fires=2, **{"env.map.position": True})
     assert more.observation_spec[keys.OBSERVATION].shape == (1, 6, 4)
 
 
@@ -70,8 +71,7 @@ def test_uavs_are_home_in_time_whatever_the_policy_does():
         *((True, (0.0, 15.0), 10.0), (False, (0.0, 15.0), 10.0)),
         *((True, None, 10.0), (True, (0.0, 15.0), 4.0)),  # no base, or none that hears the ceiling
     ):
-        config = MapsConfig(pixels=8, home=home)
-        env = environment(fire, position, config=config, base=base, radio=RadioConfig(range=heard))
+        env = environment(fire, position, home=home, base=base, radio=RadioConfig(range=heard))
         end = fly(env, position, away)[-1]
         if home and base and heard == 10:
             x, y, z = end[keys.POSITION][0].unbind(-1)
@@ -157,9 +157,8 @@ def test_a_disconnected_uav_learns_nothing():
         actions = torch.cat((own, random_flight(steps, 1, seed=seed)), 2)
         actions[..., :2] *= 0.4  # so that they stay apart
         fire = torch.cat((near, burning(seed)[..., 14:, :]), -2)
-        config = MapsConfig(pixels=8, scales=(1, 4))
-        more = {"base": (0.0, 15.0), "radio": RadioConfig(range=10.0)}
-        env = environment(fire, position, config=config, **more)
+        more = {"scales": (1, 4), "base": (0.0, 15.0), "radio": RadioConfig(range=10.0)}
+        env = environment(fire, position, **more)
         flights.append(fly(env, position, actions))
         assert not any(td[keys.HEARS].any() for td in flights[-1])
         assert not any(td[keys.BYTES_SENT].any() for td in flights[-1])
@@ -219,7 +218,7 @@ def test_failed_uavs_neither_see_nor_hear():
     position = torch.tensor([[[14.0, 15.0, 4.0], [15.0, 15.0, 4.0], [16.0, 15.0, 4.0]]])
     env = environment(burning(), position, failures=3.0)
     steps = fly(env, position, random_flight(59, 3))
-    maps = env.transform.module
+    maps = env.transform.module.maps
     for uav in range(3):
         alive = [td[keys.ALIVE][0, uav].item() for td in steps]
         if not all(alive):

@@ -76,7 +76,7 @@ def test_rewards_and_measures_are_those_of_the_team():
         ("positional", "window"),
         ("consensus", "vector"),
         ("consensus", "window"),
-        ("maps", "sight"),
+        *((method, "map") for method in ("independent", "positional", "consensus", "maps")),
     ],
 )
 def test_nothing_that_a_uav_does_reaches_one_out_of_range(method, observation):

@@ -145,7 +145,7 @@ def test_an_environment_does_not_depend_on_the_batch_size():
 
 
 @pytest.mark.filterwarnings("error")
-@pytest.mark.parametrize("observation", ["vector", "window", "sight"])
+@pytest.mark.parametrize("observation", ["vector", "window", "map"])
 def test_specs_of_the_bare_environment(observation):
     env = world(num_envs=3, num_uavs=2, observation=observation)
     check_env_specs(env)

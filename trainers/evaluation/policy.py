@@ -131,7 +131,7 @@ def load_actor(config: RunConfig, checkpoint: Path) -> TensorDictModule:
     expected = {ACTOR + name: value for name, value in network.state_dict().items()}
     weights = load_weights(checkpoint, expected, config)
     trained, compared = read_header(checkpoint).config, units(config)
-    if config.env.observation == "sight" and trained["env"]["base"] is None:
+    if config.env.observation == "map" and trained["env"]["base"] is None:
         compared += ("env.base",)
     differ = [
         f"{key}={shown(now)} (in training {shown(before)})"
@@ -152,7 +152,10 @@ def units(config: RunConfig) -> tuple[str, ...]:
 
     The grid is among them if a UAV observes where in the box it is.
     """
-    by_map = config.env.observation != "sight" or config.comm.get("position", False)
-    world = ("grid", *_UNITS) if by_map else _UNITS
+    world = _UNITS
+    if config.env.observation == "map":
+        world += ("map.scales", "map.spread")
+    if config.env.observation != "map" or config.env.map.position:
+        world += ("grid",)
     said = MODULES.find(config.comm["name"]).units
     return (*(f"env.{key}" for key in world), *(f"comm.{key}" for key in said))

@@ -8,7 +8,7 @@ from torch import Tensor
 from torchrl.data import Composite, Unbounded
 from torchrl.envs import Transform
 
-from emberlink.comm.maps import Maps
+from emberlink.comm._belief import BeliefMaps
 from emberlink.envs import keys
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import unknown
@@ -18,24 +18,25 @@ from emberlink.policies.scripted.map_greedy import MapGreedy
 
 
 class KnownMaps:
-    """Shows the maps of method `maps` in the form that scripted policies read.
+    """Shows the UAVs' own maps in the form that scripted policies read.
 
     A UAV also knows the targets of the UAVs that it hears. Such a target may depend on cells that
     it receives one step later, or never with `env.radio.bandwidth`.
 
     Args:
-        maps: the communication module of the environment.
+        maps: the maps of the environment's communication.
     """
 
     sends = True
     reach: Tensor
 
-    def __init__(self, maps: Maps):
+    def __init__(self, maps: BeliefMaps):
         self._maps = maps
 
     def update(self, tensordict: TensorDictBase) -> None:
-        """Reads the links of a time step; the module has updated the maps."""
-        self.reach = tensordict.get(keys.HEARS)
+        """Reads the links of a time step, if there are any; the maps are updated already."""
+        nobody = torch.zeros_like(self._maps.stamp, dtype=torch.bool)
+        self.reach = tensordict.get(keys.HEARS, nobody)
 
     def last_seen(self) -> Tensor:
         """Returns the last step at which each UAV knows each cell seen, float [envs, n, X, Y]."""
@@ -58,24 +59,24 @@ class Teacher(Transform):
 
     Args:
         env: the environment without transforms.
-        maps: its communication module.
+        maps: the maps of its communication; None if the UAVs have none.
         name: `map_greedy`, or a policy that inherits from it.
         hold: steps for which an action is held.
 
     Raises:
-        UserError: the module keeps no maps, there is no such teacher, or the environment is on a
+        UserError: the UAVs have no maps, there is no such teacher, or the environment is on a
             GPU.
     """
 
     target: Tensor
     """float32 [num_envs, n, 2]: targets of the UAVs, cells"""
 
-    def __init__(self, env: WildfireEnv, maps: Any, name: str, hold: int):
+    def __init__(self, env: WildfireEnv, maps: BeliefMaps | None, name: str, hold: int):
         super().__init__()
-        if not isinstance(maps, Maps):
+        if maps is None:
             raise UserError(
-                "learner=imitation: the teacher flies by the maps of the UAVs, which only method "
-                "maps keeps"
+                f"env.observation={env.config.observation}: the teacher of learner=imitation flies "
+                "by the UAVs' maps, which they have with env.observation=map"
             )
         if torch.device(env.device or "cpu").type != "cpu":
             raise UserError(f"device={env.device}: the teacher needs device=cpu")
@@ -101,7 +102,7 @@ class Teacher(Transform):
         decides = tensordict.get(keys.STEP) % self._hold == 0
         if not decides.any():  # nobody acts
             return tensordict.set(keys.TEACHER, torch.zeros_like(tensordict.get(keys.POSITION)))
-        given: Any = tensordict.select(*policy.in_keys, keys.HEARS)
+        given: Any = tensordict.select(*policy.in_keys, keys.HEARS, strict=False)
         acted = policy(given.set(policy.TARGET, self.target.clone()))
         mask = decides if began is None else began.flatten() & decides
         self.target.copy_(torch.where(mask.view(-1, 1, 1), acted.get(policy.TARGET), self.target))

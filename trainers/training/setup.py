@@ -8,11 +8,9 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import TransformedEnv
 
-from emberlink.envs import keys
-from emberlink.envs.utils.errors import UserError
 from emberlink.policies.hold import held
 from emberlink.trainers.build import build_env, build_learner
-from emberlink.trainers.config.schema import RunConfig, build_comm
+from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.learners.base import Learner, Losses
 from emberlink.trainers.learners.tensors import copy_into, flatten, group, prefixed, unflatten
 from emberlink.trainers.rollout.collector import ResumableCollector
@@ -107,11 +105,6 @@ def check_setup(config: RunConfig) -> None:
 def _make_env(config: RunConfig, num_envs: int) -> TransformedEnv:
     """Returns training environments, with the map and teacher that the learner reads."""
     config.check_rollouts()  # learners divide by the decisions of an episode
-    if config.env.observation == "sight" and keys.SIGHT not in build_comm(config, 1).in_keys:
-        raise UserError(
-            f"env.observation=sight: comm.name={config.comm['name']} does not read what cameras "
-            "see; method maps does"
-        )
     return build_env(
         config,
         num_envs=num_envs,

@@ -13,7 +13,7 @@ from emberlink.trainers.learners.base import ACTOR, Learner
 from emberlink.trainers.runs.checkpoint import load_weights
 from emberlink.trainers.runs.pretrained import read_run
 
-_OBSERVED = ("comm.", "env.observation", "policy.hold")
+_OBSERVED = ("comm.", "env.observation", "env.map.", "policy.hold")
 """prefixes of keys that define the meaning of observations and actions, besides `units`"""
 
 _REWARD = "comm.heading."
@@ -42,7 +42,7 @@ def start(learner: Learner, config: RunConfig) -> None:
 def _warn_of_other_observations(name: str, theirs: RunConfig, mine: RunConfig) -> None:
     """Warns of settings that give the same observations another meaning."""
     more = units(mine)
-    more += ("env.base",) if mine.env.observation == "sight" else ()  # maps show the base
+    more += ("env.base",) if mine.env.observation == "map" else ()  # maps show the base
     more += ("env.radio.",) if MODULES.find(mine.comm["name"]).hears else ()
     for key, (before, now) in differences(theirs, mine).items():
         if key.startswith(_OBSERVED + more) and not key.startswith(_REWARD):

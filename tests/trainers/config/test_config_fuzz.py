@@ -205,7 +205,7 @@ def valid_values(draw) -> dict:
     for key, schema in {**KEYS, **COMM_KEYS[values["comm"]["name"]]}.items():
         assign(values, key, draw(values_of(key, schema)))
     if values["comm"]["name"] == "maps":
-        assign(values, "env.observation", "sight")
+        assign(values, "env.observation", "map")
     learner = values["learner"]
     learner["buffer_size"] = max(learner["buffer_size"], learner["batch_size"])
     return values
@@ -237,8 +237,6 @@ def test_valid_values_collect_and_learn(values):
     for name in ("episodes", "num_envs"):
         values[name] = 2
     values["env"]["horizon"] = max(values["env"]["horizon"], 3)
-    if values["env"]["observation"] == "sight" and values["comm"]["name"] != "maps":
-        values["env"]["observation"] = "vector"  # only maps reads what cameras see
     TrainingSetup(from_values(values)).dry_run(steps=3)
 
 

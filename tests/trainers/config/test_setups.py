@@ -134,7 +134,7 @@ def test_maps_differ_from_the_other_methods_in_listed_settings(setup):
     own = {"env.observation", "learner.share_parameters", "learner.buffer_size"}
     tuned = {"env.reward.new_fire", "policy.hold", *CORRELATED}
     assert differ == own | (tuned if setup == "tuned" else set())
-    assert (maps.comm["name"], maps.replay, maps.env.observation) == ("maps", "shared", "sight")
+    assert (maps.comm["name"], maps.replay, maps.env.observation) == ("maps", "shared", "map")
     assert maps.policy.hold == (10 if setup == "tuned" else 1)
 
 

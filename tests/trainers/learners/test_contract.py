@@ -157,7 +157,7 @@ def test_a_loaded_policy_needs_no_further_code(case, trained):
 
 
 def test_pictures_are_stored_as_bytes_in_a_bounded_buffer():
-    more = ["learner.batch_size=6", "learner.buffer_size=20", "comm.pixels=24", "policy.hold=1"]
+    more = ["learner.batch_size=6", "learner.buffer_size=20", "env.map.pixels=24", "policy.hold=1"]
     setup: Any = TrainingSetup(resolve("maps", [*SMALL, "learner=ddpg", *more]))
     setup.dry_run(16)
     state = setup.learner.state_dict()

@@ -28,7 +28,7 @@ WORLD = [
 SHORT = [
     *("env.horizon=20", "episodes=4", "learner.hidden=[8,8]"),
     *("evaluation.interval=0", "evaluation.episodes=1", "evaluation.scripted=[]"),
-    *("comm.pixels=8", "policy.hold=2"),
+    *("env.map.pixels=8", "policy.hold=2"),
 ]
 TINY = ["learner.samples=4", "learner.buffer_size=60"]
 GRU = ["policy.memory=gru", "policy.units=4", "learner.sequence=3"]
@@ -239,7 +239,12 @@ def test_a_run_begins_with_the_actors_of_another(learner, actor_of, more, imitat
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "change",
-    ["learner.share_parameters=false", "learner.hidden=[8]", "comm.pixels=24", "policy.memory=gru"],
+    [
+        "learner.share_parameters=false",
+        "learner.hidden=[8]",
+        "env.map.pixels=24",
+        "policy.memory=gru",
+    ],
 )
 def test_actors_that_do_not_fit_are_refused(change, imitated, tmp_path, capsys):
     start = f"learner.warm_start={imitated['ippo']}", change, f"output={tmp_path}"

@@ -53,7 +53,7 @@ def _marks(method: str, setup: str) -> list[pytest.MarkDecorator]:
     ],
 )
 def test_a_recipe_trains(method, setup, tmp_path):
-    pixels = ["comm.pixels=8"] if method == "maps" else []
+    pixels = ["env.map.pixels=8"] if method == "maps" else []
     config = short(method, tmp_path, "policy.hold=1", *pixels, setup=setup)
     trainer = Trainer(config)
     initial = networks(trainer)

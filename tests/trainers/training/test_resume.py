@@ -106,7 +106,7 @@ def whole(tmp_path_factory):
     ],
 )
 def test_a_resumed_run_equals_the_uninterrupted_run(method, learner, steps, whole, tmp_path):
-    more = [*LEARNERS[learner], *(["comm.pixels=8"] if method == "maps" else [])]
+    more = [*LEARNERS[learner], *(["env.map.pixels=8"] if method == "maps" else [])]
     assert_same(whole(method, *more), stopped_at(steps, method, tmp_path, *more))
 
 

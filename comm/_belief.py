@@ -1,0 +1,151 @@
+"""Keeps a belief map per UAV and shows it to the UAV as pictures (`env.observation: map`)."""
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor, nn
+from torchrl.data import Composite, Unbounded
+
+from emberlink.comm._crops import Crops
+from emberlink.envs import keys
+from emberlink.envs.config import WildfireConfig
+from emberlink.envs.world import motion
+from emberlink.envs.world.coverage_map import View
+from emberlink.envs.world.knowledge import Knowledge
+from emberlink.envs.world.sensor import Sensor
+
+
+class BeliefMaps(nn.Module):
+    """Keeps what each UAV knows of the fire and of the places of UAVs.
+
+    A UAV enters what its camera shows and where it is; what it knows from others is entered by the
+    communication method. It observes its altitude, the time and pictures of its map (`Crops`).
+
+    Args:
+        world: the environment's constants.
+        envs: number of environments.
+    """
+
+    known: Knowledge
+    """the last looks at cells; stored are 4 times the step plus the cell's state then"""
+    view: View
+    """the cells that the UAVs see at this step"""
+    stamp: Tensor
+    """int64 [envs, n, n]: steps at which UAVs know positions of UAVs, -1 for never"""
+    place: Tensor
+    """float32 [envs, n, n, 3]: these positions, cells"""
+    crops: Tensor
+    """uint8 [envs, n, ...]: the pictures last drawn"""
+    low: Tensor
+    high: Tensor
+    _start: Tensor
+    _base: Tensor
+
+    def __init__(self, world: WildfireConfig, envs: int):
+        super().__init__()
+        self.world, self.sensor = world, Sensor.of(world)
+        uavs, area, settings = world.num_uavs, self.sensor.area, world.map
+        last = 4 * world.horizon + 3
+        self.known = Knowledge(envs=envs, uavs=uavs, area=area, horizon=last, fires=True)
+        self.pictures = Crops(
+            world.grid,
+            pixels=settings.pixels,
+            scales=settings.scales,
+            spread=settings.spread,
+            horizon=world.horizon,
+        )
+        low, high = motion.corners(world.low, world.high)
+        self.register_buffer("low", low, persistent=False)
+        self.register_buffer("high", high, persistent=False)
+        self.register_buffer("stamp", torch.full((envs, uavs, uavs), -1))
+        self.register_buffer("place", torch.zeros(envs, uavs, uavs, 3, dtype=torch.float32))
+        drawn = torch.zeros(envs, uavs, *self.pictures.shape, dtype=torch.uint8)
+        self.register_buffer("crops", drawn)
+        first = torch.arange(envs).unsqueeze(-1) * area
+        self.register_buffer("_start", first, persistent=False)
+        base = torch.tensor([] if world.base is None else [world.base]).view(-1, 2)
+        self.register_buffer("_base", _nearest(base), persistent=False)
+
+    def specs(self, observation: Composite) -> Composite:
+        """Returns the environment's observation spec with the vector and the pictures."""
+        shape, device = observation[keys.AGENTS].shape, observation.device
+        features = 2 + 2 * self.world.map.position
+        vector = Unbounded(torch.Size((*shape, features)), device=device, dtype=torch.float32)
+        pictures = torch.Size((*shape, *self.pictures.shape))
+        observation[keys.OBSERVATION] = vector
+        observation[keys.CROPS] = Unbounded(pictures, device=device, dtype=torch.uint8)
+        return observation
+
+    def start_episodes(self, mask: Tensor) -> None:
+        """Forgets everything in the environments of a mask, bool [envs]."""
+        self.known.start_episodes(mask)
+        self.stamp.masked_fill_(mask[:, None, None], -1)
+
+    def look(self, tensordict: TensorDictBase) -> None:
+        """Adds each UAV's view and position to its map, and writes the vector that it observes."""
+        position, step = tensordict.get(keys.POSITION), tensordict.get(keys.STEP)
+        sight = tensordict.get(keys.SIGHT).flatten(-2)
+        cells = self.sensor.look(position.double(), self._start)[1]
+        self.view = View(cells, sight > 0, sight == 2)
+        # Beyond the horizon, a step that does not fit into the map counts as the last that does.
+        latest = torch.iinfo(self.known.last_seen.dtype).max >> 2
+        self.known.see(self.view, 4 * step.clamp(max=latest).view(-1, 1, 1) + sight - 1)
+        own = self.stamp.diagonal(dim1=1, dim2=2)
+        own.copy_(torch.where(tensordict.get(keys.ALIVE), step.unsqueeze(-1), own))
+        self.place.diagonal(dim1=1, dim2=2).copy_(position.mT)
+        tensordict.set(keys.OBSERVATION, self._vector(position, step))
+
+    def hear_positions(self, hears: Tensor) -> None:
+        """Enters the positions of the UAVs (column) that a UAV (row) hears, bool [envs, n, n]."""
+        stamp, place = (x.diagonal(dim1=1, dim2=2) for x in (self.stamp, self.place))
+        self.stamp.copy_(torch.where(hears, stamp.unsqueeze(1), self.stamp))
+        self.place.copy_(torch.where(hears.unsqueeze(-1), place.mT.unsqueeze(1), self.place))
+
+    def show(self, tensordict: TensorDictBase, due: Tensor) -> None:
+        """Writes the pictures; draws those of the environments of a mask, bool [envs]."""
+        env = due.nonzero().squeeze(-1)
+        if len(env):
+            self.crops[env] = self._draw(tensordict, env)
+        tensordict.set(keys.CROPS, self.crops.clone())
+
+    def sightings(self) -> tuple[Tensor, Tensor]:
+        """Returns the last look of each UAV at each cell, as it knows it.
+
+        Returns:
+            The step, int64 [envs, n, X, Y], -1 for never, and the cell's state then: 0 no fire, 1
+            fire, 2 burnt out; 3 for never.
+        """
+        known = self.sensor.crop(self.known.last_seen).long()
+        return known >> 2, known & 3
+
+    def _draw(self, tensordict: TensorDictBase, env: Tensor) -> Tensor:
+        """Returns the pictures of some environments, uint8 [len(env), n, ...]."""
+        uavs, seen = self.world.num_uavs, self.known.seen_fire
+        assert seen is not None
+        own = torch.eye(uavs, dtype=torch.bool, device=env.device)
+        heard = self.stamp[env].masked_fill(own, -1)
+        others = _nearest(self.place[env][..., :2])
+        centre = _nearest(tensordict.get(keys.POSITION)[env][..., :2])
+        base = self._base.expand(len(env), uavs, *self._base.shape)
+        step = tensordict.get(keys.STEP)[env].unsqueeze(-1).expand(-1, uavs)
+        drawn = self.pictures.draw(
+            self.sensor.crop(self.known.last_seen[env]).flatten(0, 1),
+            self.sensor.crop(seen[env]).flatten(0, 1),
+            step.flatten(),
+            centre.flatten(0, 1),
+            tuple(x.flatten(0, 1) for x in (others, heard, base)),
+        )
+        return drawn.unflatten(0, (len(env), uavs))
+
+    def _vector(self, position: Tensor, step: Tensor) -> Tensor:
+        """Returns scaled altitude, time and, if wanted, x and y, float32 [envs, n, k]."""
+        scaled = motion.scale_to_box(position, self.low, self.high)
+        clock = step.float().view(-1, 1, 1) / self.world.horizon
+        parts = [scaled[..., 2:], clock.expand(-1, scaled.shape[1], 1)]
+        if self.world.map.position:
+            parts.append(scaled[..., :2])
+        return torch.cat(parts, -1)
+
+
+def _nearest(place: Tensor) -> Tensor:
+    """Returns the nearest cells, int64; halves are rounded up, wherever they are in the grid."""
+    return (place + 0.5).floor().long()
