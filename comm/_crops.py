@@ -43,7 +43,7 @@ class Crops(nn.Module):
     Args:
         grid: cells along x and y.
         pixels: S.
-        scales: cells along the side of a pixel in each picture, at most `envs.config.LARGEST_SCALE`.
+        scales: cells along the side of a pixel in each picture, at most `LARGEST_SCALE`.
         spread: cells.
         horizon: steps of an episode.
     """

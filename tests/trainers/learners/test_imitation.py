@@ -64,7 +64,7 @@ def test_the_teacher_reads_the_maps_of_the_uavs_alone():
     td = env.reset()
     for _ in range(25):
         td = env.step(td.set(keys.ACTION, td[keys.TEACHER]))["next"]
-    teacher, maps = env.transform[1], env.transform[0].module
+    teacher, maps = env.transform[1], env.transform[0].module.maps
     before = teacher._teach(td.clone(), None)[keys.TEACHER]
     for name, value in env.base_env.state_dict().items():
         value.zero_()
