@@ -97,6 +97,11 @@ class CommModule(TensorDictModuleBase):
         """
         return None
 
+    @property
+    def steers(self) -> bool:
+        """Whether `steer` may return other actions."""
+        return type(self).steer is not CommModule.steer
+
     def bytes_sent(self, tensordict: TensorDictBase) -> Tensor | None:
         """Returns the bytes that each UAV sends at a step, int64 [num_envs, n]; None for none.
 
@@ -142,7 +147,7 @@ class Communication(Transform):
         takes_part = self.module.every_step or counted or self.module.maps is not None
         self._joined = getattr(world, "hold", 1) > 1 and takes_part
         if self._joined:
-            world.join(self._steered, self._stepped)
+            world.join(self._steered if self.module.steers else None, self._stepped)
 
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase

@@ -90,8 +90,12 @@ class Maps(CommModule):
             self.home[env] = self._find_home(tensordict, env)
         return tensordict
 
+    @property
+    def steers(self) -> bool:
+        return self._brings_home
+
     def steer(self, tensordict: TensorDictBase) -> Tensor | None:
-        if not self._brings_home:
+        if not self.steers:
             return None
         action, maps = tensordict.get(keys.ACTION), self.maps
         position, step = maps.place.diagonal(dim1=1, dim2=2).mT, maps.stamp.diagonal(dim1=1, dim2=2)

@@ -30,14 +30,18 @@ _DONE = ("done", "terminated", "truncated")
 
 
 class Moved(NamedTuple):
-    """What one step of the world has changed; at a reset, there is no reward."""
+    """What successive steps of the world have changed; batch shape [steps, envs]."""
 
+    time: Tensor
+    alive: Tensor | None
     position: Tensor
-    sighting: Sighting
     hit_boundary: Tensor
+    sighting: Sighting
+    seen: Tensor
     burning: Tensor
     burnt: Tensor
     reward: Tensor | None
+    """None at a reset"""
 
 
 class WildfireEnv(EnvBase):
@@ -74,6 +78,7 @@ class WildfireEnv(EnvBase):
     _step_key: Tensor
     _time: Tensor
     _position: Tensor
+    _ahead: Tensor
     _first_length: Tensor
     _fail_step: Tensor | None
     _all_alive: Tensor
@@ -136,6 +141,7 @@ class WildfireEnv(EnvBase):
         self.register_buffer("_all_alive", flies, persistent=False)
         position = torch.zeros(num_envs, config.num_uavs, 3, dtype=torch.float64)
         self.register_buffer("_position", position)
+        self.register_buffer("_ahead", torch.arange(1, self.hold + 1)[:, None], persistent=False)
         place = torch.arange(1, num_envs + 1)
         share = num_envs * self.hold
         first_length = (place * config.horizon + share - 1) // share * self.hold
@@ -235,10 +241,21 @@ class WildfireEnv(EnvBase):
         self._start_episodes(mask)
         start = self._start_positions(position)
         self._position.copy_(torch.where(mask[:, None, None], start, self._position))
-        hit_boundary = torch.zeros_like(self._position, dtype=torch.bool)
-        sighting, counts = self._no_sighting(), self._map.count(self._time)
-        start = Moved(self._position.float(), sighting, hit_boundary, *counts, None)
-        return self._snapshot(start).update(self._measured())
+        time, position = self._time.clone().unsqueeze(0), self._position.float().unsqueeze(0)
+        nowhere = torch.zeros_like(position, dtype=torch.bool)
+        burning, burnt = self._map.count(time)
+        start = Moved(
+            time,
+            self._alive(time),
+            position,
+            nowhere,
+            self._no_sighting(),
+            self._map.seen_count.clone().unsqueeze(0),
+            burning,
+            burnt,
+            None,
+        )
+        return self._snapshots(start)[0].update(self._measured())
 
     def _start_episodes(self, mask: Tensor) -> None:
         """Starts the next episode where a mask, bool [num_envs], is true."""
@@ -271,75 +288,86 @@ class WildfireEnv(EnvBase):
 
     def _no_sighting(self) -> Sighting:
         """Returns the sighting at reset: no UAV has looked yet."""
-        none = torch.zeros_like(self._position)
+        none = torch.zeros_like(self._position).unsqueeze(0)
         classes = none.new_zeros((*none.shape, self._side**2), dtype=torch.bool)
         return Sighting(none, none.new_zeros((*none.shape, 2), dtype=torch.float32), classes)
 
     def join(
         self,
-        steer: Callable[[TensorDictBase], TensorDictBase],
+        steer: Callable[[TensorDictBase], TensorDictBase] | None,
         communicate: Callable[[TensorDictBase], TensorDictBase],
     ) -> None:
         """Calls `steer` on the action before every step, and `communicate` on each time step."""
         self._steer, self._communicate = steer, communicate
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Performs the steps of a held action: all at once, unless each is steered."""
         chosen, result, steps = tensordict.select(keys.ACTION), TensorDict(), []
-        for left in reversed(range(self.hold)):
+        parts = self._ahead.split(self.hold if self._steer is None else 1)
+        for part in parts:
             steered = chosen if self._steer is None else self._steer(chosen.copy())
-            now = self._advance(steered.get(keys.ACTION))
-            if self._communicate is not None:
-                result = self._communicate(self._snapshot(now))
-            elif not left:
-                result = self._snapshot(now)
+            now = self._advance(steered.get(keys.ACTION), len(part))
+            if self._communicate is None:
+                heard = [self._snapshots(now)[-1]]
+            else:
+                heard = [self._communicate(step) for step in self._snapshots(now)]
+            result = heard[-1]
             if self.hold > 1:
-                steps.append(self._counted(now, result))
+                steps.append(self._counted(now, heard))
         result.update(self._measured())
         if steps:
-            every = {key: torch.stack([step[key] for step in steps], 1) for key in steps[0]}
+            # [envs, steps], as the time steps of a rollout are
+            every = {key: torch.cat([step[key] for step in steps]) for key in steps[0]}
+            every = {key: value.transpose(0, 1).contiguous() for key, value in every.items()}
             series = TensorDict(every, (self.num_envs, self.hold), self.device)
             series.get(keys.AGENTS).batch_size = (*series.shape, self.n_agents)
             result.set(keys.STEPS, series).set(keys.REWARD, every[keys.REWARD].sum(1))
         return result
 
-    def _advance(self, action: Tensor) -> Moved:
-        """Performs one step of the world."""
-        self._time.add_(1)
-        alive = self._alive()
-        position, hit_boundary = self._move(action, alive)
-        self._position.copy_(position)
-        look = self._map.look(self._position, self._time, alive)
-        burning, burnt = self._map.count(self._time)
+    def _advance(self, action: Tensor, steps: int) -> Moved:
+        """Performs successive steps of the world with the same action."""
+        time = self._time + self._ahead[:steps]
+        alive, moves, hits = self._alive(time), [], []
+        for step in range(steps):
+            move = self._move(action, None if alive is None else alive[step])
+            self._position.copy_(move[0])
+            moves.append(move[0])
+            hits.append(move[1])
+        position, hit_boundary = torch.stack(moves), torch.stack(hits)
+        burning, burnt = self._map.count(time)
+        look = self._map.look(position.double(), time, burning, alive)
+        told = None
         if self._measures is not None:
-            at = self._position, self._step_key, self._time
-            self._measures.update(look.view, *at, alive, burnt, look.ended)
+            told = self._measures.update(look, position, self._step_key, time, alive, burnt)
         new, old, none = look.team.counts.unbind(-1)
-        told = None if self._measures is None else self._measures.told
         flies = self._all_alive if alive is None else alive
         penalised = self.config.reward.unseen != 0
-        unseen = self._map.unseen(burning).unsqueeze(-1) * flies if penalised else None
+        unseen = look.unseen.unsqueeze(-1) * flies if penalised else None
         reward = step_reward(new, old, none, hit_boundary, self.config.reward, told, unseen)
-        return Moved(position, look.shown, hit_boundary, burning, burnt, reward.unsqueeze(-1))
+        self._time.copy_(time[-1])
+        counts = look.seen, burning, burnt
+        reward = reward.unsqueeze(-1)
+        return Moved(time, alive, position, hit_boundary, look.shown, *counts, reward)
 
-    def _counted(self, now: Moved, heard: TensorDictBase) -> dict[Any, Tensor]:
-        """Returns what the measures need of a step within a held action; see `keys.STEPS`."""
+    def _counted(self, now: Moved, heard: list[TensorDictBase]) -> dict[Any, Tensor]:
+        """Returns what the measures need of steps within a held action; see `keys.STEPS`."""
         new, old, _ = now.sighting.counts.long().unbind(-1)
-        counted = {
+        counted: dict[Any, Any] = {
             keys.REWARD: now.reward,
-            keys.SEEN: self._map.seen_count.clone(),
+            keys.SEEN: now.seen,
             keys.BURNT: now.burnt,
             keys.NEW_FIRE: new,
             keys.OLD_FIRE: old,
             keys.HIT_BOUNDARY: now.hit_boundary,
         }
         if self._communicate is not None:
-            changed = heard.select(keys.REWARD, keys.BYTES_SENT, strict=False)
-            counted |= dict(changed.items(True, True))
+            changed = [step.select(keys.REWARD, keys.BYTES_SENT, strict=False) for step in heard]
+            counted |= dict(torch.stack(changed).items(True, True))
         return counted
 
-    def _alive(self) -> Tensor | None:
-        """Returns which UAVs fly, bool [num_envs, n]; None if UAVs never fail."""
-        return None if self._fail_step is None else self._time.unsqueeze(-1) < self._fail_step
+    def _alive(self, time: Tensor) -> Tensor | None:
+        """Returns which UAVs fly at steps [...], bool [..., n]; None if UAVs never fail."""
+        return None if self._fail_step is None else time.unsqueeze(-1) < self._fail_step
 
     def _move(self, action: Tensor, alive: Tensor | None) -> tuple[Tensor, Tensor]:
         """Returns the new positions and the axes of attempted exits; see `motion.move`."""
@@ -353,12 +381,13 @@ class WildfireEnv(EnvBase):
             high=self._high,
         )
 
-    def _snapshot(self, now: Moved) -> TensorDict:
-        """Returns the TensorDict of a reset or of a step."""
-        position, sighting = now.position, now.sighting
-        counts, time, alive = sighting.counts.long(), self._time.clone(), self._alive()
+    def _snapshots(self, now: Moved) -> Sequence[TensorDictBase]:
+        """Returns the TensorDict of each step, or of a reset."""
+        position, sighting, time = now.position, now.sighting, now.time
+        counts = sighting.counts.long()
         new, old, none = counts.unbind(-1)
         new_centre, old_centre, _ = sighting.centres.unbind(-2)
+        flies = self._all_alive.expand(position.shape[:-1]) if now.alive is None else now.alive
         agents = {
             keys.OBSERVATION[1]: self._observe(position, counts, time),
             keys.POSITION[1]: position,
@@ -368,7 +397,7 @@ class WildfireEnv(EnvBase):
             keys.NEW_CENTRE[1]: new_centre,
             keys.OLD_CENTRE[1]: old_centre,
             keys.HIT_BOUNDARY[1]: now.hit_boundary,
-            keys.ALIVE[1]: self._all_alive.clone() if alive is None else alive,
+            keys.ALIVE[1]: flies.clone(),
         }
         square = self._side, self._side
         if self.config.observation == "window":
@@ -379,17 +408,18 @@ class WildfireEnv(EnvBase):
             agents[keys.REWARD[1]] = now.reward
         done = self._done(time)
         if self._agent_done:
-            agents |= {k: v.unsqueeze(-1).repeat(1, self.n_agents, 1) for k, v in done.items()}
+            agents |= {k: v.unsqueeze(-1).repeat(1, 1, self.n_agents, 1) for k, v in done.items()}
         root = {
             keys.AGENTS: TensorDict(agents, position.shape[:-1], self.device),
-            keys.RNG_KEY: self._step_key.clone(),
+            keys.RNG_KEY: self._step_key.repeat(len(time), 1),
             keys.STEP: time,
-            keys.SEEN: self._map.seen_count.clone(),
+            keys.SEEN: now.seen,
             keys.BURNING: now.burning,
             keys.BURNT: now.burnt,
             **done,
         }
-        return TensorDict(root, self.batch_size, self.device)
+        steps: Any = TensorDict(root, time.shape, self.device)
+        return steps.unbind(0)
 
     def _measured(self) -> dict[str, Tensor]:
         """Returns what no UAV knows: the measures so far, and the map."""
@@ -397,15 +427,15 @@ class WildfireEnv(EnvBase):
         return measures | ({keys.TRUE_MAP: self.fire_map} if self._shows_map else {})
 
     def _observe(self, position: Tensor, counts: Tensor, time: Tensor) -> Tensor:
-        """Returns x, y, z, new-fire flag, old-fire flag and step, float32 [num_envs, n, 6]."""
-        clock = time.float().view(-1, 1, 1).expand(-1, self.n_agents, 1)
+        """Returns x, y, z, new-fire flag, old-fire flag and step, float32 [..., n, 6]."""
+        clock = time.float()[..., None, None].expand(*position.shape[:-1], 1)
         if self.config.observation_scale == "box":
             position = motion.scale_to_box(position, self._low, self._high)
             clock = clock / self.config.horizon
         return torch.cat((position, counts[..., :2] > 0, clock), -1)
 
     def _done(self, time: Tensor) -> dict[str, Tensor]:
-        """Returns the flags of each environment, bool [num_envs, 1]."""
+        """Returns the flags at steps [..., num_envs], bool [..., num_envs, 1]."""
         length = self.config.horizon
         if self._staggered:
             length = torch.where(self._episode == 1, self._first_length, length)
@@ -457,7 +487,8 @@ class WildfireEnv(EnvBase):
     @property
     def unseen_fire(self) -> Tensor:
         """The number of burning cells that no UAV has seen while they burned, int64 [num_envs]."""
-        return self._map.unseen(self._map.count(self._time)[0])
+        burning, _ = self._map.count(self._time)
+        return burning - self._map.seen_count + self._map.seen_gone
 
     @property
     def arrival_time(self) -> Tensor:
@@ -487,7 +518,7 @@ class WildfireEnv(EnvBase):
         """
         if mode != "rgb_array":
             raise UserError(f"render mode {mode!r} is not known; known: 'rgb_array'")
-        flies = self._alive()
+        flies = self._alive(self._time)
         return frame.frame(
             self.fire_map[env].cpu().numpy(),
             self._position[env].cpu().numpy(),

@@ -91,13 +91,17 @@ class PassedCells(nn.Module):
         """Returns the cells whose time passes at a step: index into `fire` and cell, int64 [k].
 
         Args:
-            fire, step: int64 [envs], see `at`; steps from 1 on.
+            fire, step: int64 [rows], see `at`; steps from 1 on.
         """
         first = self.at(fire, step - 1)
         count = self.at(fire, step) - first
         row = torch.arange(len(fire), device=fire.device).repeat_interleave(count)
         place = torch.arange(len(row), device=fire.device) + (first - count.cumsum(0) + count)[row]
         return row, self._order[fire[row], place].long()
+
+
+Cells = tuple[Tensor, Tensor]
+"""rows (environments) and cells of padded maps, int64 [k] each"""
 
 
 class Sighting(NamedTuple):
@@ -123,11 +127,11 @@ class View(NamedTuple):
     """The cells of every UAV's window."""
 
     cells: Tensor
-    """int64 [envs, uavs, W * W]: indices in the flat padded maps of all environments"""
+    """int64 [..., envs, uavs, W * W]: indices in the flat padded maps of all environments"""
     in_view: Tensor
-    """bool [envs, uavs, W * W]: whether the cell is in view, padding included"""
+    """bool [..., envs, uavs, W * W]: whether the cell is in view, padding included"""
     burning: Tensor
-    """bool [envs, uavs, W * W]: whether the UAV sees the cell and it burns"""
+    """bool [..., envs, uavs, W * W]: whether the UAV sees the cell and it burns"""
 
 
 def own_maps(envs: int, radios: int, area: int) -> Tensor:
@@ -147,7 +151,7 @@ def mark(maps: Tensor, cells: Tensor, flags: Tensor) -> None:
 
 
 class Look(NamedTuple):
-    """What the UAVs see at a step."""
+    """What the UAVs see at successive steps; batch shape [steps, envs, uavs]."""
 
     team: Sighting
     """the cells in view by class, new fire as new to the team"""
@@ -155,8 +159,12 @@ class Look(NamedTuple):
     """the same as shown to the UAVs, which differs with `own`"""
     view: View
     """the indices of the cells"""
-    ended: tuple[Tensor, Tensor]
-    """int64 [k] each: the environments and cells that burned until this step"""
+    seen: Tensor
+    """int64 [steps, envs]: cells that a UAV has seen while they burned"""
+    unseen: Tensor
+    """int64 [steps, envs]: burning cells that no UAV has seen while they burned"""
+    ended: Cells
+    """the cells that burned until a step, with the rows of the flat [steps, envs]"""
 
 
 class CoverageMap(nn.Module):
@@ -186,8 +194,7 @@ class CoverageMap(nn.Module):
     _burn_out: Tensor | None
     _fire_index: Tensor
     _first_seen: Tensor
-    _stamp: Tensor
-    _own_seen: Tensor | None
+    _own_first_seen: Tensor | None
     _own_first: Tensor
     seen_count: Tensor
     """int64 [envs]: cells that a UAV has seen while they burned"""
@@ -225,9 +232,8 @@ class CoverageMap(nn.Module):
         self.register_buffer("_fire_index", torch.zeros(envs, dtype=torch.int64))
         first_seen = torch.full((envs, sensor.area), _NEVER, dtype=torch.int32)
         self.register_buffer("_first_seen", first_seen)
-        self.register_buffer("_stamp", self._uav.repeat(envs, 1, 1))
-        seen = torch.zeros(envs, uavs, sensor.area, dtype=torch.bool) if own else None
-        self.register_buffer("_own_seen", seen)
+        each = first_seen.unsqueeze(1).repeat(1, uavs, 1) if own else None
+        self.register_buffer("_own_first_seen", each)
         self.register_buffer("_own_first", own_maps(envs, uavs, sensor.area), persistent=False)
         for name in ("seen_count", "seen_gone"):
             self.register_buffer(name, torch.zeros(envs, dtype=torch.int64))
@@ -264,63 +270,63 @@ class CoverageMap(nn.Module):
             self._burn_out.copy_(torch.where(began, self._fires_end[fire], self._burn_out))
         self._fire_index.copy_(torch.where(mask, fire, self._fire_index))
         self._first_seen.masked_fill_(began, _NEVER)
-        if self._own_seen is not None:
-            self._own_seen.masked_fill_(mask[:, None, None], False)
+        if self._own_first_seen is not None:
+            self._own_first_seen.masked_fill_(mask[:, None, None], _NEVER)
         self.seen_count.masked_fill_(mask, 0)
         self.seen_gone.masked_fill_(mask, 0)
-        self._stamp.copy_(torch.where(mask[:, None, None], self._uav, self._stamp))
 
     def count(self, step: Tensor) -> tuple[Tensor, Tensor]:
-        """Counts burning cells, and burning or burnt cells, at steps [envs]: int64 [envs] each."""
+        """Counts burning, and burning or burnt, cells at steps [..., envs]: int64 of that shape."""
         burnt = self._ignited.at(self._fire_index, step)
         if self._burnt_out is None:
             return burnt, burnt.clone()
         return burnt - self._burnt_out.at(self._fire_index, step), burnt
 
-    def unseen(self, burning: Tensor) -> Tensor:
-        """Returns how many of the burning cells, int64 [envs], were not seen while they burned."""
-        return burning - self.seen_count + self.seen_gone
+    def look(
+        self, position: Tensor, step: Tensor, burning: Tensor, alive: Tensor | None = None
+    ) -> Look:
+        """Classifies the cells in view at successive steps and marks the burning ones as seen.
 
-    def look(self, position: Tensor, step: Tensor, alive: Tensor | None = None) -> Look:
-        """Classifies the cells in view of all UAVs and marks the burning ones as seen.
-
-        It must be called exactly once per step.
+        Every step has to be looked at once, and in order.
 
         Args:
-            position: float64 [envs, uavs, 3], cells.
-            step: int64 [envs], steps since the episode began.
-            alive: bool [envs, uavs]; the others see nothing. All are alive if None.
-
-        Returns:
-            What the UAVs see, batch shape [envs, uavs].
+            position: float64 [steps, envs, uavs, 3], cells.
+            step: int64 [steps, envs], steps since the episode began.
+            burning: int64 [steps, envs], the number of burning cells, from `count`.
+            alive: bool [steps, envs, uavs]; the others see nothing. All are alive if None.
         """
         centre, cells, in_view = self._sensor.look(position, self._start)
         if alive is not None:
             in_view &= alive.unsqueeze(-1)
-        stamp, first_seen, time = self._stamp, self._first_seen, step.float().view(-1, 1, 1)
-        stamp.add_(self._uavs)
+        time = step[..., None, None].float()
+        stamp = step[..., None, None].int() * self._uavs + self._uav
         arrival_time, burnt_out = self._arrival_time.take(cells), None
-        burning = in_view & (arrival_time <= time)
+        burns = in_view & (arrival_time <= time)
         no_fire = in_view & (arrival_time > time)
         if self._burn_out is not None:
-            burnt_out = burning & (self._burn_out.take(cells) <= time)
-            burning, no_fire = burning ^ burnt_out, no_fire | burnt_out
-        claims = torch.where(burning, stamp, self._never)
-        first_seen.view(-1).scatter_reduce_(0, cells.view(-1), claims.view(-1), "amin")
-        new = first_seen.take(cells) == stamp
-        classes = torch.stack((new, burning ^ new, no_fire), -2)
-        counted = self._sensor.count_classes(classes, centre)
-        sighting = shown = Sighting(*counted, classes, burnt_out)
-        if self._own_seen is not None:
-            own = cells + self._own_first
-            new = burning & ~self._own_seen.take(own)
-            mark(self._own_seen, own, burning)
-            classes = torch.stack((new, burning ^ new, no_fire), -2)
-            shown = Sighting(*self._sensor.count_classes(classes, centre), classes, burnt_out)
-        self.seen_count.add_(sighting.counts[..., 0].sum(-1).long())
-        env = cell = self._fire_index[:0]
+            burnt_out = burns & (self._burn_out.take(cells) <= time)
+            burns, no_fire = burns ^ burnt_out, no_fire | burnt_out
+        claims = torch.where(burns, stamp, self._never)
+
+        def sighting(first_seen: Tensor, at: Tensor) -> Sighting:
+            first_seen.view(-1).scatter_reduce_(0, at.view(-1), claims.view(-1), "amin")
+            new = first_seen.take(at) == stamp
+            classes = torch.stack((new, burns ^ new, no_fire), -2)
+            return Sighting(*self._sensor.count_classes(classes, centre), classes, burnt_out)
+
+        team = shown = sighting(self._first_seen, cells)
+        if self._own_first_seen is not None:
+            shown = sighting(self._own_first_seen, cells + self._own_first)
+        seen = self.seen_count + team.counts[..., 0].sum(-1).long().cumsum(0)
+        unseen, row = burning - seen, self._fire_index[:0]
+        ended = row, row
         if self._burnt_out is not None:
-            env, cell = self._burnt_out.passing(self._fire_index, step)
-            gone = self._first_seen[env, cell] < _NEVER
-            self.seen_gone.index_add_(0, env, gone.long())
-        return Look(sighting, shown, View(cells, in_view, burning), (env, cell))
+            fire = self._fire_index.expand_as(step).flatten()
+            ended = row, cell = self._burnt_out.passing(fire, step.flatten())
+            was_seen = self._first_seen[row % step.shape[1], cell] < _NEVER
+            gone = torch.zeros_like(fire).index_add_(0, row, was_seen.long()).view_as(step)
+            gone = self.seen_gone + gone.cumsum(0)
+            unseen = unseen + gone
+            self.seen_gone.copy_(gone[-1])
+        self.seen_count.copy_(seen[-1])
+        return Look(team, shown, View(cells, in_view, burns), seen, unseen, ended)

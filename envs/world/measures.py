@@ -8,7 +8,7 @@ from torch import Tensor, nn
 from emberlink.envs import keys
 from emberlink.envs.config import WildfireConfig
 from emberlink.envs.world import radio
-from emberlink.envs.world.coverage_map import View
+from emberlink.envs.world.coverage_map import Cells, Look, View
 from emberlink.envs.world.knowledge import Knowledge, step_type
 
 _EXACT = 512
@@ -26,10 +26,6 @@ def age_limits(horizon: int) -> Tensor:
     while ages[-1] < horizon:
         ages.append(max(ages[-1] + 1, math.floor(ages[-1] * _GROWTH)))
     return torch.tensor(ages)
-
-
-Cells = tuple[Tensor, Tensor]
-"""environments and cells of padded maps, int64 [k] each"""
 
 
 class SightingAges(nn.Module):
@@ -183,16 +179,13 @@ class Measures(nn.Module):
     """int64 [envs]: number of cells that have ignited"""
     base_seen: Tensor
     """int64 [envs]: number of cells with a sighting in flames at the base"""
-    told: Tensor | None
-    """int64 [envs, uavs]: number of burnt cells new to the base in the last step, for UAVs whose
-    messages arrived there, else 0; None without a base"""
     _base: Tensor
 
     def __init__(self, world: WildfireConfig, envs: int, area: int):
         super().__init__()
         self._world = world
         self.times = FireTimes(envs, area, world.horizon)
-        self.knowledge = self.base_ages = self.ages = self.told = None
+        self.knowledge = self.base_ages = self.ages = None
         self.register_buffer("burnt", torch.zeros(envs, dtype=torch.int64))
         if world.measures == "all":
             self.ages = SightingAges(envs, area, world.horizon)
@@ -223,48 +216,64 @@ class Measures(nn.Module):
 
     def update(
         self,
-        view: View,
+        look: Look,
         position: Tensor,
         rng_key: Tensor,
         step: Tensor,
         alive: Tensor | None,
         burnt: Tensor,
-        ended: Cells,
-    ) -> None:
-        """Adds one step.
+    ) -> Tensor | None:
+        """Adds successive steps.
 
         Args:
-            position: float64 [envs, uavs, 3], cells.
+            position: float [steps, envs, uavs, 3], cells.
             rng_key: int64 [envs], `keys.RNG_KEY`.
-            step: int64 [envs], steps since the episode began.
-            alive: bool [envs, uavs]; all are alive if None.
-            burnt: int64 [envs], number of cells that have ignited.
-            ended: the cells that burned until this step.
-        """
-        ignited = burnt - self.burnt
-        self.burnt.copy_(burnt)
-        if self.ages is not None:
-            seen = view.cells[view.burning].unique()
-            area = self.times.end.shape[1]
-            self.ages.add(step, ignited, ended, (seen // area, seen % area))
-        if self.knowledge is not None and self.base_ages is not None:
-            before = self.knowledge.last_seen[:, -1].clone()
-            self.knowledge.update(view, step, self.hears(position, rng_key, step, alive))
-            after = self.knowledge.last_seen[:, -1]
-            env, cell = (after > before).nonzero(as_tuple=True)
-            looks = after[env, cell]
-            burns = self.times.burning(step.to(looks.dtype).unsqueeze(-1))[env, cell]
-            newer = burns & (looks > self.base_ages.since[env, cell])
-            learnt = env[newer], cell[newer]
-            self.base_ages.add(step, ignited, ended, learnt, looks[newer].long())
-            self._tell(self.knowledge)
+            step: int64 [steps, envs], steps since the episode began.
+            alive: bool [steps, envs, uavs]; all are alive if None.
+            burnt: int64 [steps, envs], number of cells that have ignited.
 
-    def _tell(self, knowledge: Knowledge) -> None:
-        """Counts the burnt cells new to the base, for the UAVs whose messages arrived."""
+        Returns:
+            The burnt cells new to the base at each step, for UAVs whose messages arrived there,
+            else 0, int64 [steps, envs, uavs]; None without a base.
+        """
+        ignited = burnt.diff(dim=0, prepend=self.burnt.unsqueeze(0))
+        self.burnt.copy_(burnt[-1])
+        row, cell = look.ended
+        envs, told = burnt.shape[1], []
+        for number, now in enumerate(step):
+            view = View(*(part[number] for part in look.view))
+            ends = row // envs == number
+            ended = row[ends] % envs, cell[ends]
+            if self.ages is not None:
+                seen = view.cells[view.burning].unique()
+                area = self.times.end.shape[1]
+                self.ages.add(now, ignited[number], ended, (seen // area, seen % area))
+            if self.knowledge is not None:
+                flies = None if alive is None else alive[number]
+                hears = self.hears(position[number].double(), rng_key, now, flies)
+                told.append(self._report(view, now, hears, ignited[number], ended))
+        return torch.stack(told) if told else None
+
+    def _report(
+        self, view: View, step: Tensor, hears: Tensor, ignited: Tensor, ended: Cells
+    ) -> Tensor:
+        """Adds a step of what the base knows; returns the burnt cells that it is told."""
+        knowledge, ages = self.knowledge, self.base_ages
+        assert knowledge is not None
+        assert ages is not None
         assert knowledge.seen_fire is not None
+        before = knowledge.last_seen[:, -1].clone()
+        knowledge.update(view, step, hears)
+        after = knowledge.last_seen[:, -1]
+        env, cell = (after > before).nonzero(as_tuple=True)
+        looks = after[env, cell]
+        burns = self.times.burning(step.to(looks.dtype).unsqueeze(-1))[env, cell]
+        newer = burns & (looks > ages.since[env, cell])
+        ages.add(step, ignited, ended, (env[newer], cell[newer]), looks[newer].long())
         seen = knowledge.seen_fire[:, -1].sum(-1)
-        self.told = (seen - self.base_seen).unsqueeze(-1) * knowledge.reach[:, -1, :-1]
+        told = (seen - self.base_seen).unsqueeze(-1) * knowledge.reach[:, -1, :-1]
         self.base_seen.copy_(seen)
+        return told
 
     def hears(
         self, position: Tensor, rng_key: Tensor, step: Tensor, alive: Tensor | None

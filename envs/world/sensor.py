@@ -45,9 +45,10 @@ class Sensor(nn.Module):
         self.register_buffer(
             "_window", ((i + reach) * self._padded[1] + j + reach).flatten(), persistent=False
         )
-        # In float64, so that sums over a window of any size are exact.
         weights = torch.stack((i, j, torch.ones_like(i)), -1).flatten(0, 1)
-        self.register_buffer("_weights", weights.double(), persistent=False)
+        # Sums over a window are exact: they are whole numbers, of at most 24 bits in float32.
+        exact = torch.float32 if reach * self.side**2 < 2**24 else torch.float64
+        self.register_buffer("_weights", weights.to(exact), persistent=False)
 
     @classmethod
     def of(cls, world: WildfireConfig) -> "Sensor":
@@ -102,7 +103,7 @@ class Sensor(nn.Module):
         Returns:
             Number, float64 [..., k], and mean (i, j), float32 [..., k, 2]; 0 without any cell.
         """
-        sums = classes.double() @ self._weights
+        sums = (classes.to(self._weights.dtype) @ self._weights).double()
         offset, count = sums.split((2, 1), -1)
         total = torch.addcmul(offset, count, centre.unsqueeze(-2))
         return count.squeeze(-1), total.div_(count.clamp(min=1)).float()
