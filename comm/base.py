@@ -1,6 +1,6 @@
 """Defines communication modules and the transform that adds one to an environment."""
 
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import torch
 from tensordict import TensorDictBase
@@ -15,6 +15,17 @@ from emberlink.envs.config import WildfireConfig
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.plugins import Plugins
 from emberlink.envs.world import radio
+
+
+class Heard(NamedTuple):
+    """What communication makes of successive time steps."""
+
+    last: TensorDictBase
+    """the last one, rewritten"""
+    bonus: Tensor | None
+    """float32 [steps, num_envs, n]: terms to add to the rewards"""
+    sent: Tensor | None
+    """int64 [steps, num_envs, n]: bytes that each UAV sends"""
 
 
 class CommModule(TensorDictModuleBase):
@@ -110,6 +121,48 @@ class CommModule(TensorDictModuleBase):
         """
         return None
 
+    def take_part(self, steps: TensorDictBase) -> Heard:
+        """Takes part in successive time steps, batch size [steps, num_envs], one after another.
+
+        A module may compute them together, with the same result.
+        """
+        bonus, sent, last = [], [], steps
+        for step in steps.unbind(0):
+            bonus.append(self.shaping(step))
+            last = self.rewrite(step)
+            sent.append(self.bytes_sent(last) if self.counts else None)
+        return Heard(last, _stacked(bonus), _stacked(sent))
+
+    def rewrite(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Enters what the UAVs see into their maps, if they have any, and calls `forward`."""
+        return self.show(self(self.look(tensordict.unsqueeze(0), tensordict)))
+
+    def look(self, steps: TensorDictBase, last: TensorDictBase) -> TensorDictBase:
+        """Enters what the UAVs see at time steps [steps, num_envs] into their maps.
+
+        Returns:
+            The last of them, with the vectors that the UAVs observe beside their maps.
+        """
+        if self.maps is not None:
+            for step in (*steps.unbind(0)[:-1], last):
+                self.maps.look(step)
+        return last
+
+    def show(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Draws the UAVs' maps where they decide at a time step."""
+        if self.maps is not None:
+            self.maps.show(tensordict, tensordict.get(keys.STEP) % self.hold == 0)
+        return tensordict
+
+    @property
+    def counts(self) -> bool:
+        """Whether the bytes that UAVs send are measured."""
+        return self.world.measures == "all" and self.world.radio.range > 0
+
+
+def _stacked(parts: list[Tensor | None]) -> Tensor | None:
+    return None if parts[0] is None else torch.stack([part for part in parts if part is not None])
+
 
 class Communication(Transform):
     """Adds a communication module to an environment.
@@ -172,43 +225,46 @@ class Communication(Transform):
         return tensordict if self._joined else self._steered(tensordict)
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        return next_tensordict if self._joined else self._stepped(next_tensordict)
+        return next_tensordict if self._joined else self._stepped(next_tensordict.unsqueeze(0))[0]
 
     def _steered(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Returns the action to perform at a step."""
         action = self.module.steer(tensordict)
         return tensordict if action is None else tensordict.set(keys.ACTION, action)
 
-    def _stepped(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Communicates after a step of the environment."""
-        self._listen(tensordict)
-        bonus = self.module.shaping(tensordict)
+    def _stepped(self, steps: TensorDictBase) -> tuple[TensorDictBase, dict[Any, Tensor]]:
+        """Communicates after steps of the environment, batch size [steps, num_envs].
+
+        Returns:
+            The last time step, and of all steps the entries that communication has changed.
+        """
+        self._listen(steps)
+        last, bonus, sent = self.module.take_part(steps)
+        changed: dict[Any, Tensor] = {keys.REWARD: steps.get(keys.REWARD)}
         if bonus is not None:
             if self.module.world.failures:
-                bonus = bonus.masked_fill(~tensordict.get(keys.ALIVE), 0.0)
-            tensordict.set(keys.REWARD, tensordict.get(keys.REWARD) + bonus.unsqueeze(-1))
-        return self._communicate(tensordict)
+                bonus = bonus.masked_fill(~steps.get(keys.ALIVE), 0.0)
+            changed[keys.REWARD] = changed[keys.REWARD] + bonus.unsqueeze(-1)
+        changed |= self._bytes(steps, sent)
+        for key, value in changed.items():
+            last.set(key, value[-1])
+        return last, changed
 
     def _begin(self, tensordict: TensorDictBase, mask: Tensor) -> TensorDictBase:
         """Starts the episodes of the environments of a mask, bool [num_envs]."""
-        self.module.reset(tensordict, mask)
-        if self.module.maps is not None:
-            self.module.maps.start_episodes(mask)
+        module = self.module
+        module.reset(tensordict, mask)
+        if module.maps is not None:
+            module.maps.start_episodes(mask)
         self._listen(tensordict)
-        return self._communicate(tensordict)
-
-    def _communicate(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Looks, calls the module, and draws what the UAVs know then."""
-        maps = self.module.maps
-        if maps is not None:
-            maps.look(tensordict)
-        tensordict = self.module(tensordict)
-        if maps is not None:
-            maps.show(tensordict, tensordict.get(keys.STEP) % self.module.hold == 0)
-        return self._speak(tensordict)
+        heard = module.rewrite(tensordict)
+        sent = module.bytes_sent(heard) if module.counts else None
+        for key, value in self._bytes(heard, sent).items():
+            heard.set(key, value)
+        return heard
 
     def _listen(self, tensordict: TensorDictBase) -> None:
-        """Writes the links of a step, if the module or the policy reads them."""
+        """Writes the links of time steps, if the module or the policy reads them."""
         world = self.module.world
         if self.listens:
             links = radio.links(
@@ -220,18 +276,17 @@ class Communication(Transform):
             )
             tensordict.set(keys.HEARS, links)
 
-    def _speak(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes the bytes that the UAVs send, in a world in which they are measured."""
+    def _bytes(self, tensordict: TensorDictBase, sent: Tensor | None) -> dict[Any, Tensor]:
+        """Returns the bytes that the UAVs send, in a world in which they are measured."""
         world = self.module.world
-        if world.measures == "all":
-            alive = tensordict.get(keys.ALIVE)
-            sent = self.module.bytes_sent(tensordict) if world.radio.range else None
-            sent = torch.zeros_like(alive, dtype=torch.int64) if sent is None else sent * alive
-            if self.message_bytes and world.radio.range:
-                decides = tensordict.get(keys.STEP) % self.module.hold == 0
-                sent = sent + self.message_bytes * (alive & decides.unsqueeze(-1))
-            tensordict.set(keys.BYTES_SENT, sent)
-        return tensordict
+        if world.measures != "all":
+            return {}
+        alive = tensordict.get(keys.ALIVE)
+        total = torch.zeros_like(alive, dtype=torch.int64) if sent is None else sent * alive
+        if self.message_bytes and world.radio.range:
+            decides = tensordict.get(keys.STEP) % self.module.hold == 0
+            total = total + self.message_bytes * (alive & decides.unsqueeze(-1))
+        return {keys.BYTES_SENT: total}
 
     def _check_keys(self, tensordict: TensorDictBase) -> None:
         """Checks that the environment and the transforms before this one write every input key."""

@@ -9,7 +9,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import Bounded, Composite, Unbounded
 
-from emberlink.comm.base import CommModule
+from emberlink.comm.base import CommModule, Heard
 from emberlink.envs import keys
 from emberlink.envs.config import Number, WildfireConfig
 from emberlink.envs.utils import counter_rng
@@ -71,12 +71,10 @@ class Consensus(CommModule):
     high: Tensor
     waypoint: Tensor
     """float32 [num_envs, n, 3]: random targets of wanderers, cells"""
-    streak: Tensor
-    """int64 [num_envs, n]: consecutive steps as a discoverer"""
     fire_score: Tensor
-    """int64 [num_envs, n]: new fire cells counted over the streak"""
+    """int64 [num_envs, n]: new fire cells counted over consecutive steps as a discoverer"""
     altitude_sum: Tensor
-    """float64 [num_envs, n]: sum of the altitudes over the streak; Avg_Alt times the streak"""
+    """float64 [num_envs, n]: sum of the altitudes over these steps, the paper's Avg_Alt * Streak"""
     position: Tensor
     """float32 [num_envs, n, 3]: positions at the previous time step, cells"""
     target: Tensor
@@ -98,8 +96,7 @@ class Consensus(CommModule):
         agents = num_envs, world.num_uavs
         for name in ("waypoint", "position", "target"):
             self.register_buffer(name, torch.zeros(*agents, 3, dtype=torch.float32))
-        for name in ("streak", "fire_score"):
-            self.register_buffer(name, torch.zeros(agents, dtype=torch.int64))
+        self.register_buffer("fire_score", torch.zeros(agents, dtype=torch.int64))
         for name in ("leaderless", "old_fire_only"):
             self.register_buffer(name, torch.zeros(agents, dtype=torch.bool))
         self.register_buffer("altitude_sum", torch.zeros(agents, dtype=torch.float64))
@@ -118,103 +115,124 @@ class Consensus(CommModule):
         return observation
 
     def reset(self, tensordict: TensorDictBase, mask: Tensor) -> None:
-        """Ends the streaks and draws a random point for each UAV."""
+        """Empties the track records and draws a random point for each UAV."""
         key = self._step_key(tensordict, Use.WAYPOINT)
         points = motion.random_points(key, self.world.num_uavs, self.low, self.high)
         self.waypoint.copy_(torch.where(mask[:, None, None], points, self.waypoint))
-        for record in (self.streak, self.fire_score, self.altitude_sum):
+        for record in (self.fire_score, self.altitude_sum):
             record.masked_fill_(mask[:, None], 0)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        position = tensordict.get(keys.POSITION)
-        discovers = self._discovers(tensordict)
-        rank = self._update_track_record(tensordict, discovers)
-        known = known_discoverers(tensordict.get(keys.HEARS), discovers, agree=self.config.agree)
+        return self._rewrite(tensordict.unsqueeze(0), tensordict).last
+
+    def take_part(self, steps: TensorDictBase) -> Heard:
+        last: Any = steps[-1]
+        heard = self._rewrite(steps, self.look(steps, last))
+        self.show(last)
+        return heard
+
+    def _rewrite(self, steps: TensorDictBase, last: TensorDictBase) -> Heard:
+        """Rewrites the last time step; what depends on the step before is computed in turn."""
+        position, discovers = steps.get(keys.POSITION), self._discovers(steps)
+        known = known_discoverers(steps.get(keys.HEARS), discovers, agree=self.config.agree)
+        rank = self._update_track_record(steps, discovers)
         cost = -rank.unsqueeze(-2) if self.config.follow == "best" else pairwise_distance(position)
         follows = choose_leader(known, cost, discovers)
-        target = self._targets(tensordict, discovers, follows)
-        self._keep_for_shaping(tensordict, target, follows)
-        tensordict.set(keys.FOLLOWS, follows)
-        tensordict.set(keys.TARGET, target)
-        shown = target - position if self.config.target == "relative" else target
-        vector = tensordict.get(keys.OBSERVATION)
-        return tensordict.set(keys.OBSERVATION, torch.cat((vector, self._scaled(shown)), -1))
-
-    def shaping(self, tensordict: TensorDictBase) -> Tensor:
-        """Returns the heading term, float32 [num_envs, n]; 0 for a UAV that left the box."""
-        heading = self.config.heading
-        flight = self.position, tensordict.get(keys.POSITION), self.target
-        term = heading_reward(*flight, heading)
-        if heading.circle:
-            term = torch.where(self.old_fire_only, heading.circle * circling(*flight), term)
-        if not self.config.wander:
-            term = term.masked_fill(self.leaderless, 0.0)
-        left = left_box(tensordict.get(keys.HIT_BOUNDARY), self.world.reward.exit_axes)
-        return term.masked_fill(left, 0.0)
+        target = self._targets(steps, discovers, follows)
+        bonus = self._bonus(steps, discovers, follows, target)
+        sent = self._bytes(discovers, known) if self.counts else None
+        relative = self.config.target == "relative"
+        shown = self._scaled(target[-1] - position[-1] if relative else target[-1])
+        last.set(keys.OBSERVATION, torch.cat((last.get(keys.OBSERVATION), shown), -1))
+        last.set(keys.FOLLOWS, follows[-1]).set(keys.TARGET, target[-1])
+        return Heard(last, bonus, sent)
 
     def bytes_sent(self, tensordict: TensorDictBase) -> Tensor:
-        """Returns 16 for each record of a discoverer that a UAV sends, int64 [num_envs, n].
+        discovers = self._discovers(tensordict)
+        known = known_discoverers(tensordict.get(keys.HEARS), discovers, agree=self.config.agree)
+        return self._bytes(discovers, known)
+
+    def _bytes(self, discovers: Tensor, known: Tensor) -> Tensor:
+        """Returns 16 for each record of a discoverer that a UAV sends, int64 [..., n].
 
         A discoverer sends its own record; other UAVs pass on known records, if they `agree`.
         """
-        discovers = self._discovers(tensordict)
-        known = known_discoverers(tensordict.get(keys.HEARS), discovers, agree=self.config.agree)
         passed_on = known.sum(-1) * self.config.agree
         return RECORD_BYTES * torch.where(discovers, 1, passed_on)
 
-    def _keep_for_shaping(
-        self, tensordict: TensorDictBase, target: Tensor, follows: Tensor
-    ) -> None:
-        """Stores the positions, targets and roles that the bonus of the next step depends on."""
-        self.position.copy_(tensordict.get(keys.POSITION))
-        self.target.copy_(target)
-        if not self.config.wander:
-            self.leaderless.copy_(follows < 0)
-        if self.config.heading.circle:
-            no_new_fire = tensordict.get(keys.NEW_FIRE) == 0
-            self.old_fire_only.copy_(self._discovers(tensordict) & no_new_fire)
-
-    def _discovers(self, tensordict: TensorDictBase) -> Tensor:
-        """Returns whether each UAV is a discoverer, bool [num_envs, n]."""
-        fire = tensordict.get(keys.NEW_FIRE)
+    def _discovers(self, steps: TensorDictBase) -> Tensor:
+        """Returns whether each UAV is a discoverer, bool [..., n]."""
+        fire = steps.get(keys.NEW_FIRE)
         if self.config.discoverer == "any_fire":
-            fire = fire + tensordict.get(keys.OLD_FIRE)
+            fire = fire + steps.get(keys.OLD_FIRE)
         return fire > 0
 
-    def _update_track_record(self, tensordict: TensorDictBase, discovers: Tensor) -> Tensor:
-        """Adds this time step to the streaks and returns the ranks, float64 [num_envs, n]."""
-        discovered = tensordict.get(keys.NEW_FIRE)
-        altitude = tensordict.get(keys.POSITION)[..., 2].double()
-        self.streak.add_(1).mul_(discovers)
-        self.fire_score.add_(discovered).mul_(discovers)
-        self.altitude_sum.add_(altitude).mul_(discovers)
-        # Avg_Alt * Streak in the paper's rank is the sum of the altitudes over the streak.
-        record = self.fire_score / self.altitude_sum.clamp(min=1e-9)
-        return record * (discovered / altitude)
+    def _update_track_record(self, steps: TensorDictBase, discovers: Tensor) -> Tensor:
+        """Adds the steps to the track records; returns ranks, float64 [steps, num_envs, n]."""
+        discovered, altitude = steps.get(keys.NEW_FIRE), steps.get(keys.POSITION)[..., 2].double()
+        records = []
+        for new, height, counts in zip(discovered, altitude, discovers, strict=True):
+            self.fire_score.add_(new).mul_(counts)
+            self.altitude_sum.add_(height).mul_(counts)
+            records.append(self.fire_score / self.altitude_sum.clamp(min=1e-9))
+        return torch.stack(records) * (discovered / altitude)
 
-    def _targets(self, tensordict: TensorDictBase, discovers: Tensor, follows: Tensor) -> Tensor:
-        """Returns the targets, float32 [num_envs, n, 3], and redraws the wanderers' waypoints."""
-        position = tensordict.get(keys.POSITION)
+    def _targets(self, steps: TensorDictBase, discovers: Tensor, follows: Tensor) -> Tensor:
+        """Returns the targets, float32 [steps, num_envs, n, 3]."""
+        position = steps.get(keys.POSITION)
         wanders = (follows < 0).unsqueeze(-1)
-        key = self._redraw_key(tensordict)
-        every = self.config.redraw
-        due = tensordict.get(keys.STEP) % every == 0 if every else None
-        other = motion.next_waypoint(self.waypoint, position, key, self.low, self.high, due)
-        self.waypoint.copy_(torch.where(wanders, other, self.waypoint))
-        new = (tensordict.get(keys.NEW_FIRE) > 0).unsqueeze(-1)
-        centre = torch.where(new, tensordict.get(keys.NEW_CENTRE), tensordict.get(keys.OLD_CENTRE))
+        alone = self._wander(steps, wanders) if self.config.wander else position
+        new = (steps.get(keys.NEW_FIRE) > 0).unsqueeze(-1)
+        centre = torch.where(new, steps.get(keys.NEW_CENTRE), steps.get(keys.OLD_CENTRE))
         leader = follows.clamp(min=0).unsqueeze(-1).expand_as(position)
-        alone = self.waypoint if self.config.wander else position
         target = torch.where(wanders, alone, position.gather(-2, leader))
         over_fire = torch.cat((centre, position[..., 2:]), -1)
         target = torch.where(discovers.unsqueeze(-1), over_fire, target)
-        return self._jittered(tensordict, target) if self.config.jitter else target
+        return self._jittered(steps, target) if self.config.jitter else target
 
-    def _redraw_key(self, tensordict: TensorDictBase) -> Tensor:
-        """Returns the random key of new waypoints; differs from the key of `reset` at step 0."""
-        step = tensordict.get(keys.STEP)
+    def _wander(self, steps: TensorDictBase, wanders: Tensor) -> Tensor:
+        """Returns the waypoints at each step, drawn again where they are reached or due."""
+        position, step, every = steps.get(keys.POSITION), steps.get(keys.STEP), self.config.redraw
+        # At step 0, `reset` has used the first key.
         use = Use.WAYPOINT + (step == 0) * (Use.FIRST_WAYPOINT_REDRAW - Use.WAYPOINT)
-        return counter_rng.step_key(tensordict.get(keys.RNG_KEY), step, use)
+        key = counter_rng.step_key(steps.get(keys.RNG_KEY), step, use)
+        points = motion.random_points(key, position.shape[-2], self.low, self.high)
+        due = (step % every == 0)[..., None, None] & wanders if every else wanders & False
+        waypoints = []
+        for here, point, wander, draws in zip(position, points, wanders, due, strict=True):
+            reached = motion.distance(here, self.waypoint).unsqueeze(-1) < 1
+            self.waypoint.copy_(torch.where(reached & wander | draws, point, self.waypoint))
+            waypoints.append(self.waypoint.clone())
+        return torch.stack(waypoints)
+
+    def _bonus(
+        self, steps: TensorDictBase, discovers: Tensor, follows: Tensor, target: Tensor
+    ) -> Tensor | None:
+        """Returns the heading term, float32 [steps, num_envs, n]; 0 for a UAV that left the box.
+
+        It depends on the positions, targets and roles of the step before, which are stored.
+        """
+        heading, after = self.config.heading, steps.get(keys.POSITION)
+        if not heading.weight and not heading.circle:
+            return None
+        before = self._before(self.position, after), after, self._before(self.target, target)
+        old_fire_only = discovers & (steps.get(keys.NEW_FIRE) == 0)
+        circles = self._before(self.old_fire_only, old_fire_only)
+        leaderless = self._before(self.leaderless, follows < 0)
+        term = heading_reward(*before, heading)
+        if heading.circle:
+            term = torch.where(circles, heading.circle * circling(*before), term)
+        if not self.config.wander:
+            term = term.masked_fill(leaderless, 0.0)
+        left = left_box(steps.get(keys.HIT_BOUNDARY), self.world.reward.exit_axes)
+        return term.masked_fill(left, 0.0)
+
+    @staticmethod
+    def _before(kept: Tensor, now: Tensor) -> Tensor:
+        """Returns the values before each step, and keeps the last ones for the next step."""
+        before = torch.cat((kept.unsqueeze(0), now[:-1]))
+        kept.copy_(now[-1])
+        return before
 
     def _jittered(self, tensordict: TensorDictBase, target: Tensor) -> Tensor:
         """Adds clipped noise to x and y of targets closer than 1, within the box."""
@@ -247,12 +265,9 @@ def known_discoverers(hears: Tensor, discovers: Tensor, *, agree: bool = True) -
         hears: bool [..., n, n], whether a UAV (row) hears another one (column).
         discovers: bool [..., n], whether a UAV is a discoverer.
     """
-    known = hears & discovers.unsqueeze(-2)
-    if not agree:
-        return known
-    others = ~discovers
-    within = reachable(hears & others.unsqueeze(-1) & others.unsqueeze(-2)).float()
-    return (within @ known.float()) > 0
+    # A discoverer passes on nothing.
+    knows = reachable(hears & ~discovers.unsqueeze(-1)) if agree else hears
+    return knows & discovers.unsqueeze(-2)
 
 
 def choose_leader(known: Tensor, cost: Tensor, discovers: Tensor) -> Tensor:

@@ -54,7 +54,7 @@ class Maps(CommModule):
     config_type: ClassVar[type] = MapsConfig
     hears: ClassVar[bool] = True
     heeds_bandwidth: ClassVar[bool] = True
-    maps: BeliefMaps
+    maps: BeliefMaps  # pyright: ignore[reportIncompatibleVariableOverride]
     said: Tensor
     """int64 [num_envs, n]: the bytes said at the last step"""
     home: Tensor

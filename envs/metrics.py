@@ -215,16 +215,15 @@ def names(world: WildfireConfig) -> tuple[str, ...]:
     return (*NAMES, *measured, *(OF_BASE if world.base is not None else ()))
 
 
-SERIES = (
+COUNTED = (
     keys.REWARD,
     keys.SEEN,
     keys.BURNT,
     keys.NEW_FIRE,
     keys.OLD_FIRE,
     keys.HIT_BOUNDARY,
-    keys.BYTES_SENT,
 )
-"""the keys of which `episode_metrics` reads every step; only some worlds have the last"""
+"""the keys of which `episode_metrics` reads every step, beside `keys.BYTES_SENT`"""
 _AT_THE_END = (keys.FRONT_AGE, keys.FRONT_AGE_P95, keys.BASE_SEEN, keys.BASE_AGE)
 """the keys of which it reads the last step; only some worlds have them"""
 
@@ -235,7 +234,7 @@ def measured_steps(steps: TensorDictBase) -> TensorDictBase:
     Args:
         steps: the "next" of successive steps or decisions of a `WildfireEnv`, batch size [..., T].
     """
-    read = steps.select(*SERIES, *_AT_THE_END, strict=False)
+    read = steps.select(*COUNTED, keys.BYTES_SENT, *_AT_THE_END, strict=False)
     series = steps.get(keys.STEPS, None)
     if series is None:
         return read

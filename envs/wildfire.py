@@ -10,7 +10,7 @@ from torch import Tensor
 from torchrl.data import Binary, Bounded, Composite, TensorSpec, Unbounded
 from torchrl.envs import EnvBase
 
-from emberlink.envs import keys
+from emberlink.envs import keys, metrics
 from emberlink.envs.config import WildfireConfig
 from emberlink.envs.rendering import frame
 from emberlink.envs.scenarios import ScenarioConfig, default_config, load_fires
@@ -109,7 +109,7 @@ class WildfireEnv(EnvBase):
             )
         self._agent_done, self._staggered, self._shows_map = agent_done, staggered, true_map
         self._steer: Callable[[TensorDictBase], TensorDictBase] | None = None
-        self._communicate: Callable[[TensorDictBase], TensorDictBase] | None = None
+        self._communicate: Callable[[TensorDictBase], Any] | None = None
         self._fire_name = fire if isinstance(fire, str) else getattr(fire, "name", None)
         self._make_world(fire)
         self._make_specs()
@@ -194,9 +194,9 @@ class WildfireEnv(EnvBase):
         reward = {keys.REWARD[1]: real(*agents, 1)}
         self.reward_spec = team(**reward)
         if self.hold > 1:
-            counted = (keys.REWARD, keys.NEW_FIRE, keys.OLD_FIRE, keys.HIT_BOUNDARY)
-            step = team(**{key[1]: {**per_uav, **reward}[key[1]] for key in counted})
-            step[keys.SEEN], step[keys.BURNT] = whole(*envs), whole(*envs)
+            step = Composite({keys.AGENTS: Composite({}, shape=agents)}, shape=envs)
+            for key in metrics.COUNTED:
+                step[key] = (reward[key[1]] if key == keys.REWARD else observed[key]).clone()
             every = step.unsqueeze(1).expand((*envs, self.hold)).clone()
             # Not observed: they belong to the transition, and a reset has none.
             self.reward_spec = Composite({**team(**reward), keys.STEPS: every}, shape=envs)
@@ -242,20 +242,11 @@ class WildfireEnv(EnvBase):
         start = self._start_positions(position)
         self._position.copy_(torch.where(mask[:, None, None], start, self._position))
         time, position = self._time.clone().unsqueeze(0), self._position.float().unsqueeze(0)
-        nowhere = torch.zeros_like(position, dtype=torch.bool)
-        burning, burnt = self._map.count(time)
-        start = Moved(
-            time,
-            self._alive(time),
-            position,
-            nowhere,
-            self._no_sighting(),
-            self._map.seen_count.clone().unsqueeze(0),
-            burning,
-            burnt,
-            None,
-        )
-        return self._snapshots(start)[0].update(self._measured())
+        hits, flies = torch.zeros_like(position, dtype=torch.bool), self._alive(time)
+        counts = self._map.seen_count.clone().unsqueeze(0), *self._map.count(time)
+        start = Moved(time, flies, position, hits, self._no_sighting(), *counts, None)
+        first: Any = self._snapshots(start)[0]
+        return first.update(self._measured())
 
     def _start_episodes(self, mask: Tensor) -> None:
         """Starts the next episode where a mask, bool [num_envs], is true."""
@@ -295,33 +286,34 @@ class WildfireEnv(EnvBase):
     def join(
         self,
         steer: Callable[[TensorDictBase], TensorDictBase] | None,
-        communicate: Callable[[TensorDictBase], TensorDictBase],
+        communicate: Callable[[TensorDictBase], tuple[TensorDictBase, dict[Any, Tensor]]],
     ) -> None:
-        """Calls `steer` on the action before every step, and `communicate` on each time step."""
+        """Calls `steer` on the action before every step, and `communicate` on time steps.
+
+        `communicate` reads a batch [steps, num_envs]; it returns the last time step, and what it
+        has changed in all.
+        """
         self._steer, self._communicate = steer, communicate
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Performs the steps of a held action: all at once, unless each is steered."""
-        chosen, result, steps = tensordict.select(keys.ACTION), TensorDict(), []
-        parts = self._ahead.split(self.hold if self._steer is None else 1)
-        for part in parts:
+        chosen, parts = tensordict.select(keys.ACTION), []
+        result: Any = None
+        for ahead in self._ahead.split(self.hold if self._steer is None else 1):
             steered = chosen if self._steer is None else self._steer(chosen.copy())
-            now = self._advance(steered.get(keys.ACTION), len(part))
+            steps = self._snapshots(self._advance(steered.get(keys.ACTION), len(ahead)))
+            counted = steps.select(*metrics.COUNTED)
             if self._communicate is None:
-                heard = [self._snapshots(now)[-1]]
+                result = steps[-1]
             else:
-                heard = [self._communicate(step) for step in self._snapshots(now)]
-            result = heard[-1]
-            if self.hold > 1:
-                steps.append(self._counted(now, heard))
+                result, changed = self._communicate(steps)
+                counted.update(changed)
+            parts.append(counted)
         result.update(self._measured())
-        if steps:
+        if self.hold > 1:
             # [envs, steps], as the time steps of a rollout are
-            every = {key: torch.cat([step[key] for step in steps]) for key in steps[0]}
-            every = {key: value.transpose(0, 1).contiguous() for key, value in every.items()}
-            series = TensorDict(every, (self.num_envs, self.hold), self.device)
-            series.get(keys.AGENTS).batch_size = (*series.shape, self.n_agents)
-            result.set(keys.STEPS, series).set(keys.REWARD, every[keys.REWARD].sum(1))
+            series: Any = torch.cat(parts).transpose(0, 1).contiguous()
+            result.set(keys.STEPS, series).set(keys.REWARD, series.get(keys.REWARD).sum(1))
         return result
 
     def _advance(self, action: Tensor, steps: int) -> Moved:
@@ -349,22 +341,6 @@ class WildfireEnv(EnvBase):
         reward = reward.unsqueeze(-1)
         return Moved(time, alive, position, hit_boundary, look.shown, *counts, reward)
 
-    def _counted(self, now: Moved, heard: list[TensorDictBase]) -> dict[Any, Tensor]:
-        """Returns what the measures need of steps within a held action; see `keys.STEPS`."""
-        new, old, _ = now.sighting.counts.long().unbind(-1)
-        counted: dict[Any, Any] = {
-            keys.REWARD: now.reward,
-            keys.SEEN: now.seen,
-            keys.BURNT: now.burnt,
-            keys.NEW_FIRE: new,
-            keys.OLD_FIRE: old,
-            keys.HIT_BOUNDARY: now.hit_boundary,
-        }
-        if self._communicate is not None:
-            changed = [step.select(keys.REWARD, keys.BYTES_SENT, strict=False) for step in heard]
-            counted |= dict(torch.stack(changed).items(True, True))
-        return counted
-
     def _alive(self, time: Tensor) -> Tensor | None:
         """Returns which UAVs fly at steps [...], bool [..., n]; None if UAVs never fail."""
         return None if self._fail_step is None else time.unsqueeze(-1) < self._fail_step
@@ -373,16 +349,13 @@ class WildfireEnv(EnvBase):
         """Returns the new positions and the axes of attempted exits; see `motion.move`."""
         if alive is not None:
             action = action.masked_fill(~alive.unsqueeze(-1), 0.0)
+        stride = self.config.displacement
         return motion.move(
-            self._position,
-            action,
-            displacement=self.config.displacement,
-            low=self._low,
-            high=self._high,
+            self._position, action, displacement=stride, low=self._low, high=self._high
         )
 
-    def _snapshots(self, now: Moved) -> Sequence[TensorDictBase]:
-        """Returns the TensorDict of each step, or of a reset."""
+    def _snapshots(self, now: Moved) -> TensorDict:
+        """Returns the time steps after steps of the world, batch size [steps, num_envs]."""
         position, sighting, time = now.position, now.sighting, now.time
         counts = sighting.counts.long()
         new, old, none = counts.unbind(-1)
@@ -418,8 +391,7 @@ class WildfireEnv(EnvBase):
             keys.BURNT: now.burnt,
             **done,
         }
-        steps: Any = TensorDict(root, time.shape, self.device)
-        return steps.unbind(0)
+        return TensorDict(root, time.shape, self.device)
 
     def _measured(self) -> dict[str, Tensor]:
         """Returns what no UAV knows: the measures so far, and the map."""

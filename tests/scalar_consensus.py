@@ -75,19 +75,19 @@ class ScalarConsensus:
         """Returns the number of consecutive steps as a discoverer."""
         return len(self.history.get(uav, []))
 
+    def altitude_sum(self, uav: int) -> float:
+        """Returns the sum of the altitudes over the streak."""
+        return sum(altitude for _, altitude in self.history.get(uav, []))
+
     def fire_score(self, uav: int) -> int:
         """Returns the fire points discovered over the streak."""
         return sum(points for points, _ in self.history.get(uav, []))
 
-    def average_altitude(self, uav: int) -> float:
-        """Returns the mean altitude over the streak."""
-        altitudes = [altitude for _, altitude in self.history[uav]]
-        return sum(altitudes) / len(altitudes)
-
     def rank(self, uav: int) -> float:
         """Returns the rank of a discoverer."""
         points, altitude = self.history[uav][-1]
-        record = self.fire_score(uav) / (self.average_altitude(uav) * self.streak(uav))
+        mean = self.altitude_sum(uav) / self.streak(uav)
+        record = self.fire_score(uav) / (mean * self.streak(uav))
         return record * (points / altitude)
 
 

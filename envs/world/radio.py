@@ -87,11 +87,10 @@ def reachable(hears: Tensor) -> Tensor:
         The reflexive and transitive closure of `hears`.
     """
     radios = hears.shape[-1]
-    reach = (hears | torch.eye(radios, dtype=torch.bool, device=hears.device)).float()
-    # Each squaring doubles the number of hops; a path has at most n - 1 hops.
-    for _ in range((radios - 1).bit_length()):
-        reach = (reach @ reach).clamp_(max=1)
-    return reach > 0
+    reach = hears | torch.eye(radios, dtype=torch.bool, device=hears.device)
+    for via in range(radios):  # after it, paths over the radios up to this one are known
+        reach |= reach[..., via : via + 1] & reach[..., via : via + 1, :]
+    return reach
 
 
 def pairwise_distance(position: Tensor) -> Tensor:
