@@ -330,16 +330,16 @@ class WildfireEnv(EnvBase):
         look = self._map.look(position.double(), time, burning, alive)
         told = None
         if self._measures is not None:
-            told = self._measures.update(look, position, self._step_key, time, alive, burnt)
+            at = position, self._step_key, time, alive, burnt
+            told = self._measures.update(look.view, look.ended, *at)
         new, old, none = look.team.counts.unbind(-1)
         flies = self._all_alive if alive is None else alive
         penalised = self.config.reward.unseen != 0
         unseen = look.unseen.unsqueeze(-1) * flies if penalised else None
         reward = step_reward(new, old, none, hit_boundary, self.config.reward, told, unseen)
         self._time.copy_(time[-1])
-        counts = look.seen, burning, burnt
-        reward = reward.unsqueeze(-1)
-        return Moved(time, alive, position, hit_boundary, look.shown, *counts, reward)
+        counts = look.seen, burning, burnt, reward.unsqueeze(-1)
+        return Moved(time, alive, position, hit_boundary, look.shown, *counts)
 
     def _alive(self, time: Tensor) -> Tensor | None:
         """Returns which UAVs fly at steps [...], bool [..., n]; None if UAVs never fail."""

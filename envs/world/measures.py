@@ -8,7 +8,7 @@ from torch import Tensor, nn
 from emberlink.envs import keys
 from emberlink.envs.config import WildfireConfig
 from emberlink.envs.world import radio
-from emberlink.envs.world.coverage_map import Cells, Look, View
+from emberlink.envs.world.coverage_map import Cells, View
 from emberlink.envs.world.knowledge import Knowledge, step_type
 
 _EXACT = 512
@@ -216,7 +216,8 @@ class Measures(nn.Module):
 
     def update(
         self,
-        look: Look,
+        view: View,
+        ended: Cells,
         position: Tensor,
         rng_key: Tensor,
         step: Tensor,
@@ -226,6 +227,8 @@ class Measures(nn.Module):
         """Adds successive steps.
 
         Args:
+            view: the cells in view, [steps, envs, uavs, ...].
+            ended: the cells that burned until a step, with the rows of the flat [steps, envs].
             position: float [steps, envs, uavs, 3], cells.
             rng_key: int64 [envs], `keys.RNG_KEY`.
             step: int64 [steps, envs], steps since the episode began.
@@ -238,20 +241,20 @@ class Measures(nn.Module):
         """
         ignited = burnt.diff(dim=0, prepend=self.burnt.unsqueeze(0))
         self.burnt.copy_(burnt[-1])
-        row, cell = look.ended
+        row, cell = ended
         envs, told = burnt.shape[1], []
         for number, now in enumerate(step):
-            view = View(*(part[number] for part in look.view))
+            looks = View(*(part[number] for part in view))
             ends = row // envs == number
-            ended = row[ends] % envs, cell[ends]
+            gone = row[ends] % envs, cell[ends]
             if self.ages is not None:
-                seen = view.cells[view.burning].unique()
+                seen = looks.cells[looks.burning].unique()
                 area = self.times.end.shape[1]
-                self.ages.add(now, ignited[number], ended, (seen // area, seen % area))
+                self.ages.add(now, ignited[number], gone, (seen // area, seen % area))
             if self.knowledge is not None:
                 flies = None if alive is None else alive[number]
                 hears = self.hears(position[number].double(), rng_key, now, flies)
-                told.append(self._report(view, now, hears, ignited[number], ended))
+                told.append(self._report(looks, now, hears, ignited[number], gone))
         return torch.stack(told) if told else None
 
     def _report(

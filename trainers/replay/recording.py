@@ -159,7 +159,9 @@ class Recorder:
         if step > 0:  # nobody looks at the reset
             times = self._measures.times
             burnt, ended = (times.ignition <= step).sum(-1), (times.end == step).nonzero().unbind(1)
-            self._measures.update(view, position, key, step, alive, burnt, ended)
+            seen = View(*(part.unsqueeze(0) for part in view))
+            at = position[None], key, step[None], alive[None], burnt[None]
+            self._measures.update(seen, (ended[0], ended[1]), *at)
         else:
             view.in_view.zero_()
         if self._config.base is None:
