@@ -116,6 +116,15 @@ def frame_of(
     )
 
 
+def squares(
+    *sides: float, at: tuple[float, float] = (0, 0), **columns: object
+) -> geopandas.GeoDataFrame:
+    """Returns concentric squares with the given sides in metres."""
+    middle = np.array(CORNER) + at
+    boxes = [shapely.box(*(middle - side / 2), *(middle + side / 2)) for side in sides]
+    return geopandas.GeoDataFrame(columns, geometry=boxes, crs=UTM)
+
+
 def _with_z(shape: shapely.Geometry) -> shapely.Geometry:
     point = shapely.Point(*shape.centroid.coords[0], 7.0)
     return shapely.GeometryCollection([shapely.force_3d(shape, 7.0), point])

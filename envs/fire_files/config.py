@@ -1,8 +1,7 @@
-"""Configuration of fires that are read from files, and their units of time."""
+"""Configuration of fires that are read from files."""
 
 import dataclasses
 import math
-from datetime import datetime, timedelta
 from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, ConfigDict, Field, model_validator
@@ -14,7 +13,6 @@ from emberlink.envs.utils.validation import Name
 Units = Literal["steps", "seconds", "minutes", "hours", "days", "day_of_year"]
 COPY_FILE = "fires.npz"
 """Name of the file in a run folder that holds the run's copy of its fires."""
-SECONDS = {"seconds": 1.0, "minutes": 60.0, "hours": 3600.0, "days": 86400.0}
 _Number = Annotated[float, Field(allow_inf_nan=False)]
 _Time = _Number | Annotated[str, Field(min_length=1, max_length=40)]
 _Digest = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
@@ -25,30 +23,6 @@ def _required(value: Any) -> Any:
     if value is None:
         raise UserError("a file is needed, such as fire.path=ArrivalTime.asc")
     return value
-
-
-def _text(value: Any) -> Any:
-    return str(value) if isinstance(value, int) else value
-
-
-@dataclasses.dataclass(frozen=True)
-class Clock:
-    """The unit of a source's times, and the calendar time of 0 where it is known."""
-
-    unit: str
-    """A unit of `SECONDS`, `steps`, or `maps` of an array of states."""
-    origin: datetime | None = None
-    """In UTC."""
-
-    def format(self, time: float) -> str:
-        """Returns a time as text for a message."""
-        if self.origin is not None:
-            try:
-                date = self.origin + timedelta(seconds=time * SECONDS[self.unit])
-                return date.isoformat(timespec="minutes")
-            except OverflowError:  # not a year of four digits
-                pass
-        return f"{time:g} {self.unit}"
 
 
 @dataclass(
@@ -89,7 +63,7 @@ class FileFireConfig:
     """Column of the perimeters' times, or the columns of the date and the time of day."""
     time_format: _Text | None = None
     """`day_first`, `month_first`, `seconds` since 1970, or a pattern such as `%d.%m.%y %H:%M`."""
-    incident: Annotated[_Text | None, BeforeValidator(_text)] = None
+    incident: _Text | int | None = None
     """Incident whose perimeters are read, where a file has several; "*" reads all as one fire."""
     incident_field: _Text | None = None
     """Column in which `incident` is looked for."""
@@ -117,6 +91,6 @@ class FileFireConfig:
     @property
     def never(self) -> tuple[float, ...] | None:
         """The values of `unburned`; empty for `none`, None if it is not given."""
-        if self.unburned is None or isinstance(self.unburned, tuple):
-            return self.unburned
-        return () if self.unburned == "none" else (float(self.unburned),)
+        if isinstance(self.unburned, float):
+            return (self.unburned,)
+        return () if self.unburned == "none" else self.unburned

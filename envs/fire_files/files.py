@@ -7,7 +7,6 @@ The driver follows from the first bytes, so that no text in a file can choose an
 import hashlib
 import importlib
 import logging
-import os
 import re
 import sqlite3
 import struct
@@ -19,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from emberlink.envs.fire_files.report import ask
 from emberlink.envs.utils.errors import UserError, how_to_install
 
 MAX_BYTES = 300_000_000
@@ -63,17 +63,13 @@ def library(name: str, what: str = "reading this file") -> Any:
 @contextmanager
 def quiet() -> Iterator[None]:
     """Silences the warnings and logs of the libraries. Damage is reported as an error instead."""
-    loggers = [logging.getLogger(n) for n in ("rasterio", "pyogrio", "shapely", "pyproj")]
-    levels = [logger.level for logger in loggers]
+    before = logging.root.manager.disable
+    logging.disable(logging.CRITICAL)
     try:
-        for logger in loggers:
-            logger.setLevel(logging.CRITICAL + 1)
-        with warnings.catch_warnings(), np.errstate(all="ignore"):
-            warnings.simplefilter("ignore")
+        with warnings.catch_warnings(action="ignore"), np.errstate(all="ignore"):
             yield
     finally:
-        for logger, level in zip(loggers, levels, strict=True):
-            logger.setLevel(level)
+        logging.disable(before)
 
 
 def first_line(error: BaseException) -> str:
@@ -86,25 +82,20 @@ def find_format(path: Path) -> str:
     """Returns the format of a file or folder, and checks that it is safe and whole."""
     if path.is_dir():
         return "grids" if forest_grids(path) else "folder"
-    size, head = _regular(path), _head(path)
-    kind = _kind(head)
-    if not head or not kind or (kind == "kmz" and path.suffix.lower() != ".kmz"):
-        start = head[:16].decode("latin-1").encode("unicode_escape").decode()
-        what = "an archive; expected the files in it" if kind == "kmz" else f"begins with {start!r}"
-        raise UserError(
-            f"{what if head else 'is empty'}; known are GeoTIFF, NetCDF, ESRI ASCII, .npy, .shp, "
-            ".gpkg, GeoJSON, KML, KMZ, CSV of points, and the paper's text"
-        )
+    size, (kind, head) = _size(path), _kind(path)
+    if not kind or (kind == "kmz" and path.suffix.lower() != ".kmz"):
+        seen = "an archive" if kind else f"begins with {head[:16]!r}" if head else "is empty"
+        known = "GeoTIFF, NetCDF, ESRI ASCII, .npy, .shp, .gpkg, GeoJSON, KML, KMZ, CSV of points"
+        raise ask(seen, f"{known}, the paper's text")
     if path in forest_grids(path.parent):
-        raise UserError("one map of Cell2Fire; expected its folder, with fire.kind=masks")
+        raise ask("one map of Cell2Fire", "its folder, with fire.kind=masks")
     most = MAX_BYTES // 2 if kind == "json" else MAX_BYTES
     if kind in ("asc", "csv", "kml", "points", "json") and size > most:
-        raise UserError(f"{size} bytes; a text file of this format has at most {most}")
+        raise ask(f"{size} bytes", f"a text file of at most {most}")
     for part in beside(path, kind):
-        _regular(part)
         # GDAL opens masks and overviews in any format; some formats read other addresses.
-        if part.suffix.lower() in (".msk", ".ovr") and _kind(_head(part)) != "tif":
-            raise UserError(f"{part.name}, beside it, is no TIFF; expected one, or no such file")
+        if _size(part) and part.suffix.lower() in (".msk", ".ovr") and _kind(part)[0] != "tif":
+            raise ask(f"{part.name}, beside it, is no TIFF", "one, or no such file")
     if kind == "shp":
         _check_shapefile(path)
     if kind == "gpkg":  # GDAL reads the rest of a file that was cut off
@@ -115,7 +106,7 @@ def find_format(path: Path) -> str:
         except sqlite3.Error as error:
             result = str(error)
         if result != "ok":
-            raise UserError(f"{result[:100]}; expected a whole GeoPackage")
+            raise ask(result[:100], "a whole GeoPackage")
     return kind
 
 
@@ -123,22 +114,22 @@ def beside(path: Path, kind: str) -> list[Path]:
     """Returns the files that belong to a file, with its name and an ending, in any case."""
     endings = _BESIDE.get(kind, ())
     names = {f"{name}{ending}".lower() for name in (path.stem, path.name) for ending in endings}
-    return sorted(path.with_name(n) for n in os.listdir(path.parent) if n.lower() in names)
+    return sorted(part for part in path.parent.iterdir() if part.name.lower() in names)
 
 
 def check_prj(path: Path, kind: str, crs: Any) -> None:
     """Checks that the projection in a .prj beside a file was understood."""
-    prj = [part for part in beside(path, kind) if part.suffix.lower() == ".prj"]
-    if crs is None and prj and prj[0].stat().st_size:
-        raise UserError(
-            f"{prj[0].name}, beside it, holds no projection that is known; expected one, or no "
-            "such file and fire.crs, such as fire.crs=EPSG:32611"
-        )
+    for part in beside(path, kind) if crs is None else ():
+        if part.suffix.lower() == ".prj" and part.stat().st_size:
+            raise ask(
+                f"{part.name}, beside it, holds no projection that is known",
+                "no such file and fire.crs, such as fire.crs=EPSG:32611",
+            )
 
 
 def forest_grids(folder: Path) -> list[Path]:
     """Returns the maps of Cell2Fire in a folder, in the order of their numbers."""
-    found = [path for path in folder.glob("ForestGrid*.csv") if _regular(path)]
+    found = [path for path in folder.glob("ForestGrid*.csv") if _size(path)]
     return sorted(found, key=lambda path: (len(path.name), path.name))
 
 
@@ -146,10 +137,8 @@ def perimeter_files(folder: Path) -> list[Path]:
     """Returns the perimeters in a folder, sorted by name."""
     paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in _SUFFIXES)
     if not 0 < len(paths) <= _MAX_FILES:
-        raise UserError(
-            f"a folder with {len(paths)} files of perimeters ({', '.join(_SUFFIXES)}); expected a "
-            f"file, or a folder of up to {_MAX_FILES} files of perimeters of one fire"
-        )
+        seen = f"a folder with {len(paths)} files of perimeters ({', '.join(_SUFFIXES)})"
+        raise ask(seen, f"a file, or a folder of up to {_MAX_FILES} of one fire")
     return paths
 
 
@@ -157,51 +146,44 @@ def digest(path: Path) -> str:
     """Returns the SHA-256 of a file and the files beside it, or of a folder's fires."""
     content, folder = hashlib.sha256(), path.is_dir()
     for main in (forest_grids(path) or perimeter_files(path)) if folder else [path]:
-        for part in (main, *beside(main, _kind(_head(main)))):
+        _size(main)
+        for part in (main, *beside(main, _kind(main)[0])):
             name = part.name if folder else part.name[len(path.stem) :]
-            content.update(f"{name}:{_regular(part)}:".encode())
+            content.update(f"{name}:{_size(part)}:".encode())
             with part.open("rb") as file:
                 while block := file.read(1 << 20):
                     content.update(block)
     return content.hexdigest()
 
 
-def _kind(head: bytes) -> str:
-    return next((kind for kind, start in _HEADS.items() if re.match(start, head)), "")
-
-
-def _head(path: Path) -> bytes:
-    _regular(path)
+def _kind(path: Path) -> tuple[str, bytes]:
+    """Returns the format of a regular file, empty if none is known, and its first bytes."""
     with path.open("rb") as file:
-        return file.read(4096)
+        head = file.read(4096)
+    return next((k for k, start in _HEADS.items() if head and re.match(start, head)), ""), head
 
 
-def _regular(path: Path) -> int:
+def _size(path: Path) -> int:
     """Returns the size of a regular file. A pipe, for example, would block for ever."""
     try:
         size = path.stat().st_size
     except FileNotFoundError:
         raise UserError(f"{path.name}: there is no such file") from None
-    except (OSError, ValueError) as error:
-        raise UserError(f"cannot be read: {getattr(error, 'strerror', None) or error}") from None
     if not path.is_file():
         raise UserError(f"{path.name}: no regular file")
     return size
 
 
 def _check_shapefile(path: Path) -> None:
-    """Checks that the three files exist, are whole, and have the same number of features."""
+    """Checks that the three files exist and have the sizes that their headers tell."""
     parts = {part.suffix.lower(): part for part in (path, *beside(path, "shp"))}
-    for suffix in (".shx", ".dbf"):
+    for suffix in (".shp", ".shx", ".dbf"):
         if suffix not in parts:
             raise UserError(f"{path.with_suffix(suffix).name} is missing beside it")
-    sizes = {suffix: part.stat().st_size for suffix, part in parts.items()}
-    features = (sizes[".shx"] - 100) // 8
-    for suffix in (".shp", ".shx", ".dbf"):
-        head = _head(parts[suffix]).ljust(100, b"\0")
+        head = _kind(parts[suffix])[1].ljust(100, b"\0")
         records, start, row = struct.unpack("<IHH", head[4:12])
-        whole = 2 * struct.unpack(">I", head[24:28])[0] == sizes[suffix] > 0
-        if suffix == ".dbf":
-            whole = records == features and 0 < start + records * row <= sizes[suffix]
-        if not whole:
-            raise UserError(f"{parts[suffix].name} is damaged; expected {features} whole features")
+        told = (
+            start + records * row if suffix == ".dbf" else 2 * struct.unpack(">I", head[24:28])[0]
+        )
+        if not 0 < told <= _size(parts[suffix]):
+            raise ask(f"{parts[suffix].name} is damaged", f"a file of {told} bytes or more")

@@ -1,6 +1,7 @@
-"""Samples a raster of arrival times at the cells of a grid."""
+"""Samples arrival times at the cells of a grid, crops them, and stretches them over an episode."""
 
-from dataclasses import dataclass, field
+import math
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -12,14 +13,17 @@ from scipy.ndimage import (
     minimum_filter,
 )
 
-from emberlink.envs.fire_files.config import Clock
+from emberlink.envs.config import BASE_SIDE
+from emberlink.envs.fire_files.config import FileFireConfig
+from emberlink.envs.fire_files.plane import Bounds
+from emberlink.envs.fire_files.report import SECONDS, Clock, Report, ask
+from emberlink.envs.fire_files.times import in_utc, parse_dates
 from emberlink.envs.utils.errors import UserError
 
-Bounds = tuple[float, float, float, float]
-"""Minimum x, minimum y, maximum x, maximum y."""
 SAMPLES = 180
 """Sample points along the grid's shorter side. A cell of the grid gets the earliest of them."""
-_COARSE = 128  # cells of a side on which parts are told apart
+EIGHT = np.ones((3, 3))
+"""A cell and the eight around it."""
 _EDGE = 1e-6  # cells: tolerance, so that rounding does not move a centre across an edge
 
 
@@ -47,8 +51,10 @@ class Window:
 
     def samples(self) -> "Window":
         """Returns the window of the sample points, cuts x cuts per cell."""
-        grid = self.grid[0] * self.cuts, self.grid[1] * self.cuts
-        return Window(self.x, self.y, self.side / self.cuts, grid)
+        columns, rows = self.grid
+        return Window(
+            self.x, self.y, self.side / self.cuts, (columns * self.cuts, rows * self.cuts)
+        )
 
     def axes(self) -> tuple[np.ndarray, np.ndarray]:
         """Returns x [X] and y [Y] of the cells' centres."""
@@ -57,9 +63,8 @@ class Window:
 
     def cells(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Returns the indices of the cells in which points lie, and which are in the grid."""
-        i, j = (
-            np.floor(at / self.side + _EDGE).astype(np.int64) for at in (x - self.x, y - self.y)
-        )
+        shares = (x - self.x) / self.side, (y - self.y) / self.side
+        i, j = (np.floor(share + _EDGE).astype(np.int64) for share in shares)
         return i, j, (i >= 0) & (j >= 0) & (i < self.grid[0]) & (j < self.grid[1])
 
 
@@ -80,10 +85,6 @@ class Raster:
     """the crop for whose samples perimeters were drawn; None for the bounds of the burnt area"""
     began: float | None = None
     """time of ignition; None for the first arrival"""
-    facts: list[str] = field(default_factory=list)
-    """findings about the file, for the user"""
-    doubts: list[str] = field(default_factory=list)
-    """signs of a misreading, for the user"""
 
     def __post_init__(self) -> None:
         self.times = self.times.astype(np.float64)
@@ -96,9 +97,7 @@ class Raster:
         left, right, top, bottom = 0.0, float(columns), 0.0, float(rows)
         if until is not None:
             if (times <= until).sum() < 2:
-                raise UserError(
-                    f"until {self.clock.format(until)} a single cell burns: no fire spreads"
-                )
+                raise UserError(f"until {self.clock.format(until)} no fire spreads: a single cell")
             left, right = _front(times, until), columns - _front(times[:, ::-1], until)
             top, bottom = _front(times.T, until), rows - _front(times.T[:, ::-1], until)
         (x, y), (width, height) = self.corner, self.cell
@@ -181,25 +180,104 @@ def beginnings(times: np.ndarray) -> int:
     burns, earliest = np.isfinite(times), times == minimum_filter(times, 3)
     # Of cells that burn at the same time, one may have an earlier neighbour: no beginning.
     later = minimum_filter(np.where(burns & ~earliest, times, np.inf), 3) == times
-    places: Any = label(burns & earliest, np.ones((3, 3)))
+    places: Any = label(burns & earliest, EIGHT)
     return int(places[1] - len(np.unique(places[0][burns & earliest & later])))
 
 
 def far_apart(burns: np.ndarray) -> list[str]:
-    """Returns a doubt if parts of a mask never join and lie farther apart than they are long."""
-    for axis in (0, 1):  # of the parts' box, on at most twice _COARSE cells
-        at = np.flatnonzero(burns.any(1 - axis))
-        burns = burns.take(range(at[0], at[-1] + 1), axis)
-    steps = max(1, max(burns.shape) // _COARSE)
-    for axis in (0, 1):
-        burns = np.logical_or.reduceat(burns, range(0, burns.shape[axis], steps), axis)
+    """Returns a doubt if parts of a fire never join and lie farther apart than they are long."""
     near: Any = distance_transform_edt(~burns)
-    reach, longest, parts = -1.0, 0.0, 2
-    while longest > reach and parts > 1:
+    reach, longest = -1.0, 0.0
+    while longest > reach:
         reach = longest
-        groups, parts = label(near <= 0.75 * reach, np.ones((3, 3)))  # pyright: ignore
+        groups, parts = label(near <= 0.75 * reach, EIGHT)  # pyright: ignore
+        if parts < 2:
+            return []
         boxes = find_objects(np.where(burns, groups, 0))
         longest = max(float(axis.stop - axis.start) for box in boxes for axis in box)
-    if parts < 2:
-        return []
     return [f"{parts} groups of parts never join, and lie far apart: one fire? (fire.incident)"]
+
+
+def on_grid(
+    source: Raster, config: FileFireConfig, grid: tuple[int, int], horizon: int, report: Report
+) -> np.ndarray:
+    """Crops a fire to a grid (X, Y) and stretches its times over an episode.
+
+    Returns:
+        float32 [X, Y], steps; 0 burns from the start, inf never burns.
+    """
+    no_span = config.start is config.end is config.minutes_per_step is None
+    in_steps = no_span and source.clock.unit == "steps"
+    burns = source.first, source.last
+    if in_steps:
+        start, end = 0.0, float(horizon)
+    else:
+        began = source.first if source.began is None else source.began
+        start, end = span(source.clock, burns, began, config, horizon)
+    margin = None if source.whole else config.margin
+    window = source.window
+    if window is None:
+        window = Window.around(source.bounds(None if margin is None else end), grid, margin or 0)
+    times = source.on(window)
+    times[times > end] = np.inf
+    if config.start is None and not in_steps and not (times <= start).any():
+        times[times == times.min()] = start  # the first cell burns from step 0
+    if not source.whole and np.isfinite(times).any():
+        report.doubts += far_apart(np.isfinite(times))
+    if config.ring_width is not None and not source.whole:
+        times[_burnt_out(times, start, config.ring_width * min(grid) / BASE_SIDE)] = np.inf
+    steps = (np.maximum(times, start) - start) / (end - start) * horizon
+    burning = steps[np.isfinite(steps)]
+    if len(burning) < 2 or (not in_steps and burning.min() == burning.max()):
+        raise _no_fire(source.clock, (start, end), burns)
+    return steps.astype(np.float32)
+
+
+def span(
+    clock: Clock, burns: tuple[float, float], began: float, config: FileFireConfig, horizon: int
+) -> tuple[float, float]:
+    """Returns the times of the first and last step; a fire `burns` from and to, and `began`."""
+    start, end = (_time(key, clock, burns[0], config) for key in ("start", "end"))
+    start, end = began if start is None else start, burns[1] if end is None else end
+    if config.minutes_per_step is not None:
+        if clock.unit not in SECONDS:
+            raise ask(f"fire.minutes_per_step: times are in {clock.unit}", "fire.units in time")
+        end = start + horizon * config.minutes_per_step * 60 / SECONDS[clock.unit]
+    if end < began or start >= burns[1] or start >= end:
+        raise _no_fire(clock, (start, end), burns)
+    return start, end
+
+
+def _no_fire(clock: Clock, span: tuple[float, float], burns: tuple[float, float]) -> UserError:
+    start, end, first, last = map(clock.format, (*span, *burns))
+    return UserError(f"from {start} to {end} no fire spreads; it burns from {first} to {last}")
+
+
+def _time(key: str, clock: Clock, first: float, config: FileFireConfig) -> float | None:
+    """Returns `fire.start` or `fire.end` in the clock's unit."""
+    value = getattr(config, key)
+    if value is None or (clock.origin is None and not isinstance(value, str)):
+        return value
+    if clock.origin is None:
+        raise ask(f"fire.{key}={value}: the file's times are {clock.unit}", "a number of them")
+    if isinstance(value, str):
+        date = in_utc(parse_dates([value], config.time_format, f"fire.{key}")[0])
+        return (date - clock.origin).total_seconds() / SECONDS[clock.unit]
+    if config.units not in SECONDS:
+        seen = f"fire.{key}={value:g}: the file's times are dates"
+        raise ask(seen, f"such as {clock.format(first)}", "fire.units for a number")
+    return first + value * SECONDS[config.units] / SECONDS[clock.unit]
+
+
+def _burnt_out(times: np.ndarray, start: float, width: float) -> np.ndarray:
+    """Returns the mask of burnt cells deeper behind the front than the ring's width, [X, Y]."""
+    burnt = times <= start
+    if not burnt.any() or math.isinf(width):
+        return np.zeros_like(burnt)
+    around = np.pad(burnt, 1)  # cells outside the grid have not burnt
+    labelled: Any = label(~around)
+    holes = labelled[0]
+    later = np.pad(np.isfinite(times) & ~burnt, 1)
+    around |= ~np.isin(holes, [holes[0, 0], *holes[later]])
+    depth: Any = distance_transform_edt(around)
+    return burnt & (depth[1:-1, 1:-1] - 0.5 > width)

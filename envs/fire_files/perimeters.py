@@ -8,12 +8,12 @@ import numpy as np
 from scipy.ndimage import binary_dilation, distance_transform_edt, label
 
 from emberlink.envs.fire_files.config import FileFireConfig
-from emberlink.envs.fire_files.crop import span
-from emberlink.envs.fire_files.features import choose_features
 from emberlink.envs.fire_files.files import library
-from emberlink.envs.fire_files.grid import Raster, Window, far_apart
-from emberlink.envs.fire_files.projection import choose_plane
-from emberlink.envs.fire_files.times import Times, read_times
+from emberlink.envs.fire_files.grid import EIGHT, Raster, Window, span
+from emberlink.envs.fire_files.plane import choose_plane
+from emberlink.envs.fire_files.report import Report, ask, counted
+from emberlink.envs.fire_files.tables import choose_features
+from emberlink.envs.fire_files.times import read_times
 from emberlink.envs.utils.errors import UserError
 
 _MAX_TIMES = 500
@@ -21,74 +21,85 @@ _MAX_BORDER = 2000  # sample points beside the grid, to which fronts outside are
 _MANY = 50  # polygons above which points are looked up in polygons, and not polygons drawn
 _GAP = 0.01  # of a line's length: a smaller gap between its ends is closed
 _POINT = 1e-3  # of an area's width: the size of a fire that is a point
-_AROUND = np.ones((3, 3))
 
 
 def read_perimeters(
-    frame: Any, outside: Sequence[str], config: FileFireConfig, grid: tuple[int, int], horizon: int
+    frame: Any,
+    outside: Sequence[str],
+    config: FileFireConfig,
+    grid: tuple[int, int],
+    horizon: int,
+    report: Report,
 ) -> Raster:
-    """Makes a fire of a table of features; the values of columns `outside` stand beside it."""
-    count, facts = len(frame), []
+    """Makes a fire of a table of features; the values of columns `outside` stand beside it.
+
+    A fire only grows: the area burnt by a time is the union of the areas until then. A fire with
+    elapsed times began at 0.
+    """
+    count, left_out = len(frame), []
     frame = frame[~(frame.geometry.isna() | frame.geometry.is_empty)]
     if len(frame) < count:
-        facts.append(f"{count - len(frame)} without a geometry left out")
+        left_out.append(f"{count - len(frame)} without a geometry left out")
     points = frame.geom_type.isin(("Point", "MultiPoint"))
     if config.radius is None and points.any():
         if points.all():
-            raise UserError(
-                f"{len(frame)} points, as of satellite detections; expected fire.radius, metres of "
-                "the circle around each, such as fire.radius=375 for VIIRS"
-            )
-        facts.append(f"{points.sum()} points left out")
+            key = "fire.radius, metres of the circle around each, such as fire.radius=375 for VIIRS"
+            raise ask(f"{len(frame)} points, as of satellite detections", key)
+        left_out.append(f"{points.sum()} points left out")
         frame = frame[~points]
     if len(frame) == 0:
-        raise UserError("no feature with a geometry; expected perimeters")
-    frame = choose_features(frame, config, facts)
-    times = read_times(frame, config, outside)
-    shapes, about = _on_plane(frame, config)
-    distinct, sizes = np.unique(times.values, return_counts=True)
-    if not 2 <= len(distinct) <= _MAX_TIMES:
-        raise UserError(
-            f"{len(distinct)} times in {times.column}, {times.clock.format(distinct[0])}...; "
-            f"expected 2 to {_MAX_TIMES}"
-        )
-    raster = _raster(
-        [_areas(shapes[times.values == t]) for t in distinct],
-        distinct,
-        times,
-        config,
-        grid,
-        horizon,
-    )
-    each = f"{sizes.min()} to {sizes.max()}" if sizes.min() < sizes.max() else f"{sizes[0]}"
-    first, last = times.clock.format(distinct[0]), times.clock.format(distinct[-1])
-    raster.facts = [
-        f"perimeters of {len(distinct)} times, from {first} to {last}",
-        f"{len(frame)} of {count} features used" + (f" ({'; '.join(facts)})" if facts else ""),
-        f"{each} per time",
-        *times.facts,
-        about,
-        *raster.facts,
+        raise ask("no feature with a geometry", "perimeters")
+    frame = choose_features(frame, config, left_out)
+    values, clock = read_times(frame, config, outside, report)
+    shapes = _on_plane(frame, config, report)
+    at, sizes = np.unique(values, return_counts=True)
+    first, last = clock.format(at[0]), clock.format(at[-1])
+    if not 2 <= len(at) <= _MAX_TIMES:
+        seen = f"{report.facts[0]}: {counted(len(at), 'time')}, from {first} to {last}"
+        raise ask(seen, f"2 to {_MAX_TIMES}")
+    why = f" ({'; '.join(left_out)})" if left_out else ""
+    report.facts = [
+        f"perimeters of {len(at)} times, from {first} to {last}",
+        f"{len(frame)} of {count} features used{why}",
+        f"{' to '.join(map(str, sorted({sizes.min(), sizes.max()})))} per time",
+        *report.facts,
     ]
-    raster.doubts += times.doubts
-    return raster
+    areas, burns = [_areas(shapes[values == time]) for time in at], (float(at[0]), float(at[-1]))
+    if clock.origin is None and at[0] > 0:
+        if at[0] > at[-1] - at[0]:
+            report.doubts.append(f"it begins at time 0 (fire.start={at[0]:g}: at the first)")
+        areas, at = [_at_zero(areas, at), *areas], np.concatenate([[0.0], at])
+    _, end = span(clock, burns, float(at[0]), config, horizon)
+    boxes = np.array([library("shapely").total_bounds(parts) for parts in areas])
+    boxes = np.hstack([np.minimum.accumulate(boxes[:, :2]), np.maximum.accumulate(boxes[:, 2:])])
+    until = at[-1] if config.margin is None else end
+    x0, y0, x1, y1 = (float(np.interp(until, at, edge)) for edge in boxes.T)
+    window = Window.around((x0, y0, x1, y1), grid, config.margin or 0)
+    count = min(int(np.searchsorted(at, end)), len(at) - 1) + 1
+    points = _around(window.samples(), boxes[count - 1])
+    arrival = _between(areas[:count], at, points, report)
+    corner, cell = (points.x, points.y + points.grid[1] * points.side), (points.side, points.side)
+    fire = Raster(arrival.T[::-1], corner, cell, clock, window=window, began=float(at[0]))
+    fire.first, fire.last = burns
+    return fire
 
 
-def _on_plane(frame: Any, config: FileFireConfig) -> tuple[Any, str]:
+def _on_plane(frame: Any, config: FileFireConfig, report: Report) -> Any:
     """Returns the shapes of features on a plane, with a circle for each point."""
     x0, y0, x1, y1 = (float(value) for value in frame.total_bounds)
     plane = choose_plane(frame.crs, config.crs, (x0, y0, x1, y1), None)
+    report.facts.append(plane.about)
     shapes = frame.geometry.force_2d() if frame.has_z.any() else frame.geometry
-    if plane.change is not None:
-        shapes = shapes.set_crs(plane.change[0], allow_override=True).to_crs(plane.change[1])
+    if plane.target is not None:
+        shapes = shapes.set_crs(plane.source, allow_override=True).to_crs(plane.target)
         if not np.isfinite(shapes.total_bounds).all():
-            raise UserError(f"features outside {plane.change[1].name}; expected another fire.crs")
+            raise ask(f"features outside {plane.target.name}", "another fire.crs")
     if config.radius is not None:
         if plane.unit is None:
-            raise UserError("fire.radius: the unit of coordinates is not known; expected fire.crs")
+            raise ask("fire.radius: the unit of coordinates is not known", "fire.crs")
         points = shapes.geom_type.isin(("Point", "MultiPoint"))
         shapes = shapes.where(~points, shapes.buffer(config.radius / plane.unit))
-    return shapes, plane.about
+    return shapes
 
 
 def _areas(shapes: Any) -> np.ndarray:
@@ -103,7 +114,7 @@ def _areas(shapes: Any) -> np.ndarray:
     lines = shapes[shapes.geom_type.isin(("LineString", "LinearRing"))]
     lines = lines[lines.is_closed | ~lines.index.isin(areas.index)]
     if len(areas) == len(lines) == 0:
-        raise UserError(f"{name} is of {shapes.geom_type.iloc[0]}; expected polygons or lines")
+        raise ask(f"{name} is of {shapes.geom_type.iloc[0]}", "polygons or lines")
     found = areas.to_numpy()
     if not areas.is_valid.all():
         found = shapely.make_valid(found, method="structure", keep_collapsed=False)
@@ -111,7 +122,7 @@ def _areas(shapes: Any) -> np.ndarray:
     parts = shapely.get_parts(found)
     parts = parts[shapely.area(parts) > 0]
     if len(parts) == 0:
-        raise UserError(f"{name} encloses no area; expected a perimeter")
+        raise ask(f"{name} encloses no area", "a perimeter")
     return parts
 
 
@@ -128,43 +139,6 @@ def _within(lines: Any) -> np.ndarray:
         raise UserError(f"{name}: a line is not closed, {gap} is missing")
     rings = [shapely.linearrings(shapely.get_coordinates(line)) for line in merged]
     return np.array([shapely.build_area(shapely.node(shapely.geometrycollections(rings)))])
-
-
-def _raster(
-    areas: list[np.ndarray],
-    at: np.ndarray,
-    times: Times,
-    config: FileFireConfig,
-    grid: tuple[int, int],
-    horizon: int,
-) -> Raster:
-    """Rasterizes areas, and interpolates the front between them.
-
-    A fire only grows: the area burnt by a time is the union of the areas until then. A fire with
-    elapsed times began at 0.
-    """
-    shapely, clock, doubts = library("shapely"), times.clock, []
-    burns = float(at[0]), float(at[-1])
-    if clock.origin is None and at[0] > 0:
-        if at[0] > at[-1] - at[0]:
-            doubts = [f"it begins at time 0 (fire.start={at[0]:g}: at the first)"]
-        areas, at = [_at_zero(areas, at), *areas], np.concatenate([[0.0], at])
-    began = float(at[0])
-    _, end = span(clock, burns, began, config, horizon)
-    boxes = np.array([shapely.total_bounds(parts) for parts in areas])
-    boxes = np.hstack([np.minimum.accumulate(boxes[:, :2]), np.maximum.accumulate(boxes[:, 2:])])
-    until = at[-1] if config.margin is None else end
-    x0, y0, x1, y1 = (float(np.interp(until, at, edge)) for edge in boxes.T)
-    window = Window.around((x0, y0, x1, y1), grid, config.margin or 0)
-    count = min(int(np.searchsorted(at, end)), len(at) - 1) + 1
-    points = _around(window.samples(), boxes[count - 1])
-    arrival, facts = _between(areas[:count], at, points)
-    corner = points.x, points.y + points.grid[1] * points.side
-    cell = points.side, points.side
-    raster = Raster(arrival.T[::-1], corner, cell, clock, window=window, began=began, facts=facts)
-    raster.first, raster.last = burns
-    raster.doubts = doubts + far_apart(np.isfinite(raster.times))
-    return raster
 
 
 def _around(points: Window, box: np.ndarray) -> Window:
@@ -198,17 +172,17 @@ def _at_zero(areas: Sequence[np.ndarray], at: np.ndarray) -> np.ndarray:
 
 
 def _between(
-    areas: Sequence[np.ndarray], at: np.ndarray, window: Window
-) -> tuple[np.ndarray, list[str]]:
+    areas: Sequence[np.ndarray], at: np.ndarray, window: Window, report: Report
+) -> np.ndarray:
     """Returns arrival times at the centres of a window's cells, by the distances to fronts."""
     before = _rasterize(areas[0], window)
-    begun, idle = int(label(before, _AROUND)[1]), 0  # pyright: ignore
+    begun, idle = int(label(before, EIGHT)[1]), 0  # pyright: ignore
     times = np.where(before, at[0], np.inf)
     for k in range(1, len(areas)):
         after = before | _rasterize(areas[k], window)
         new = after & ~before
-        parts: Any = label(new, _AROUND)
-        beside: Any = binary_dilation(before, _AROUND)
+        parts: Any = label(new, EIGHT)
+        beside: Any = binary_dilation(before, EIGHT)
         begun += parts[1] - len(np.unique(parts[0][new & beside]))
         idle += not new.any()
         if before.any():
@@ -218,8 +192,9 @@ def _between(
         else:
             times[new] = at[k]  # the first front lies outside
         before = after
-    facts = [f"{begun} place{'s' * (begun != 1)} where it begins"]
-    return times, [*facts, *([f"{idle} within the area burnt before"] if idle else [])]
+    report.facts.append(f"{counted(begun, 'place')} where it begins")
+    report.facts += [f"{idle} within the area burnt before"] if idle else []
+    return times
 
 
 def _depth(area: np.ndarray) -> np.ndarray:

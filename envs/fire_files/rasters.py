@@ -3,118 +3,68 @@
 import itertools
 import math
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.ndimage import binary_erosion
 
 from emberlink.envs.config import SIDES
-from emberlink.envs.fire_files.config import Clock, FileFireConfig
-from emberlink.envs.fire_files.dates import in_utc, parse_dates
+from emberlink.envs.fire_files.config import FileFireConfig
 from emberlink.envs.fire_files.files import check_prj, first_line, forest_grids, library
-from emberlink.envs.fire_files.grid import Raster, beginnings, far_apart
-from emberlink.envs.fire_files.projection import MAX_CELLS, Affine, choose_plane, warped
-from emberlink.envs.fire_files.times import in_order
-from emberlink.envs.fire_files.values import arrival, check_spreads, first_burning, unit_of
+from emberlink.envs.fire_files.grid import Raster, beginnings
+from emberlink.envs.fire_files.plane import MAX_CELLS, Plane, choose_plane, warped
+from emberlink.envs.fire_files.report import Clock, Report, ask, counted
+from emberlink.envs.fire_files.times import decided_unit, in_order, in_utc, parse_dates
 from emberlink.envs.utils.errors import UserError
 
 MAX_BANK = 300_000_000
 """Maximum number of cells of all fires of a bank: 1.2 GB."""
 _DRIVERS = {"tif": "GTiff", "nc": "netCDF", "asc": "AAIGrid"}
+_UNITS = {
+    "seconds": r"s|secs?|seconds?",
+    "minutes": r"mins?|minutes?",
+    "hours": r"h|hrs?|hours?",
+    "days": r"d|days?",
+    "day_of_year": r"days? of (the )?year|doy|julian days?",
+    "steps": r"steps?|time ?steps?",
+    "no unit of time": r"m|ft|feet|foot|met(er|re)s?|deg(ree)?s?|%|percent|.+/.+",
+}
 _HEADER = re.compile(r"\s*(?!nan|inf)[a-z]", re.IGNORECASE)  # a line of ESRI ASCII
 _NORTH_UP = (1.0, 0.0, 0.0, 0.0, -1.0)
 _SIDE = 30  # cells along a side of the paper's map
 _SKIPPED = 6000  # lines of the paper's text before step 0
-_PLUS = ((0, 0), (1, 0), (-1, 0), (0, 1), (0, -1))
 
 
-def read_raster(path: Path, kind: str, config: FileFireConfig) -> tuple[list[Raster], int | None]:
-    """Reads the fire of a raster, or the fires of a bank and the steps for which it was written."""
+def read_raster(path: Path, kind: str, config: FileFireConfig, report: Report) -> list[Raster]:
+    """Reads the fire of a raster, or the fires of a bank."""
     if kind == "points":
-        return [_front_points(path, config)], None
+        return [_front_points(path, config, report)]
     if kind in ("npy", "grids"):
         maps = _grids(path) if kind == "grids" else _numpy(path)
         if config.kind == "masks":
-            return [_of_states(maps, (*_NORTH_UP, float(maps.shape[1])), None, config)], None
+            return [_of_states(maps, (*_NORTH_UP, float(maps.shape[1])), None, config, report)]
         if kind == "grids":
-            raise UserError(f"{len(maps)} maps of Cell2Fire; expected fire.kind=masks")
+            raise ask(f"{len(maps)} maps of Cell2Fire", "fire.kind=masks")
         json = path.with_suffix(".json")
         about = json.open(errors="replace").read(1_000_000) if json.is_file() else ""
         horizon = re.search(r'"horizon": *(\d+)', about)
-        return _bank(maps.transpose(0, 2, 1)[:, ::-1], horizon and horizon[1], config)
+        return _bank(maps.transpose(0, 2, 1)[:, ::-1], horizon and horizon[1], config, report)
     with _opened(path, kind, config.layer) as dataset:
         affine, crs, tags = tuple(dataset.transform[:6]), dataset.crs, dataset.tags()
         if dataset.transform.is_identity:
             affine = (*_NORTH_UP, float(dataset.height))
         if config.kind == "masks":
-            return [_of_states(_read(dataset, MAX_BANK), affine, crs, config)], None
+            return [_of_states(_read(dataset, MAX_BANK), affine, crs, config, report)]
         if tags.get("units") == "steps" and crs is None:
             bands = _read(dataset, MAX_BANK)
             bands = np.where(bands == dataset.nodata, np.inf, bands)
-            return _bank(bands, tags.get("horizon"), config)
+            return _bank(bands, tags.get("horizon"), config, report)
         check_prj(path, kind, crs)
-        return [_band(path, kind, dataset, affine, config)], None
-
-
-def _band(path: Path, kind: str, dataset: Any, affine: Affine, config: FileFireConfig) -> Raster:
-    """Returns the fire of a raster's only band, or of the last time of a NetCDF."""
-    band = dataset.count if kind == "nc" else 1
-    if dataset.count != band:
-        raise UserError(
-            f"{dataset.count} bands; expected one, a bank of fires, tagged units=steps, or maps of "
-            "states with fire.kind=masks"
-        )
-    tags = {**dataset.tags(), **dataset.tags(band)}
-    titles = dataset.descriptions[band - 1], tags.get("long_name"), tags.get("NETCDF_VARNAME")
-    declared = dataset.units[band - 1] or tags.get("units") or ""
-    what = f"band {next((title for title in titles if title), band)!r:.60}"
-    what += f", the last of {band} times" if band > 1 else ""
-    what += f" ({declared})" if declared else ""
-    if kind == "asc":  # GDAL reads a word as 0, and wraps rows
-        values = _numbers(path, dataset.shape)
-        nodata = values == (math.nan if dataset.nodata is None else dataset.nodata)
-    else:
-        flags = [flag.name for flag in dataset.mask_flag_enums[band - 1]]
-        nodata = None if "all_valid" in flags else dataset.read_masks(band) == 0
-        values = _read(dataset, MAX_CELLS, band)[0]
-    values = values * dataset.scales[band - 1] + dataset.offsets[band - 1]
-    unit, since = unit_of(declared, config, what)
-    origin = in_utc(parse_dates([since], None, "units")[0]) if since else None
-    times = arrival(values, nodata, config)
-    return _on_plane(times, affine, dataset.crs, Clock(unit, origin), config, what)
-
-
-def _numbers(path: Path, shape: tuple[int, ...]) -> np.ndarray:
-    """Returns the numbers of ESRI ASCII, whose header GDAL has read."""
-    with path.open(encoding="utf-8-sig", errors="replace") as file:
-        header = len(list(itertools.takewhile(_HEADER.match, file)))
-        file.seek(0)
-        most = math.prod(shape) + 1
-        try:
-            values = np.loadtxt(file, comments=None, ndmin=2, skiprows=header, max_rows=most)
-        except ValueError as error:
-            raise UserError(
-                f"after {header} lines of header: {first_line(error).split(';')[0]}; expected rows "
-                f"of {shape[1]} numbers"
-            ) from None
-    if values.shape != shape:
-        raise UserError(f"{values.shape} rows and columns; expected nrows, ncols={shape}")
-    return values
-
-
-def _read(dataset: Any, most: int, band: int | None = None) -> np.ndarray:
-    """Reads a band or all, [bands, rows, columns], of bounded size and a type of real numbers."""
-    count = 1 if band else dataset.count
-    size = max(count * dataset.width * dataset.height, *map(math.prod, dataset.block_shapes))
-    kind = np.dtype(dataset.dtypes[0])
-    if size > most or kind.kind not in "iuf":
-        raise UserError(
-            f"{count} x {dataset.height} x {dataset.width} cells of {kind}, in blocks of "
-            f"{dataset.block_shapes[0]}; expected at most {most}, of real numbers"
-        )
-    return dataset.read([band] if band else None)
+        times, clock, what = _band(path, kind, dataset, config)
+        return [_on_plane(times, affine, crs, clock, config, what, report)]
 
 
 @contextmanager
@@ -127,43 +77,109 @@ def _opened(path: Path, kind: str, layer: str | None) -> Iterator[Any]:
             with rasterio.open(name, driver="netCDF") as dataset:
                 found = [part.rpartition(":")[2] for part in dataset.subdatasets]
             if found and (layer not in found or '"' in str(path)):
-                some = "TIGN_G" if "TIGN_G" in found else found[0]
-                raise UserError(
-                    f"{len(found)} variables: {', '.join(found[:30])}; expected fire.layer, the "
-                    f"one of arrival times, such as fire.layer={some}"
-                )
+                key = f"fire.layer={'TIGN_G' if 'TIGN_G' in found else found[0]}"
+                seen = f"{len(found)} variables: {', '.join(found[:30])}"
+                raise ask(seen, f"fire.layer, the one of arrival times, such as {key}")
             name = f'NETCDF:"{name}":{layer}' if found else name
         with rasterio.open(name, driver=_DRIVERS[kind]) as dataset:
             yield dataset
     except (rasterio.errors.RasterioError, OSError) as error:
-        raise UserError(f"{first_line(error)}; expected a whole raster") from None
+        raise ask(first_line(error), "a whole raster") from None
 
 
-def _of_states(maps: np.ndarray, affine: Affine, crs: Any, config: FileFireConfig) -> Raster:
+def _read(dataset: Any, most: int, band: int | None = None) -> np.ndarray:
+    """Reads a band or all, [bands, rows, columns], of bounded size and a type of real numbers."""
+    count = 1 if band else dataset.count
+    size = max(count * dataset.width * dataset.height, *map(math.prod, dataset.block_shapes))
+    kind = np.dtype(dataset.dtypes[0])
+    if size > most or kind.kind not in "iuf":
+        seen = f"{count} x {dataset.height} x {dataset.width} cells of {kind}"
+        raise ask(f"{seen}, in blocks of {dataset.block_shapes[0]}", f"{most} real numbers at most")
+    return dataset.read([band] if band else None)
+
+
+def _band(
+    path: Path, kind: str, dataset: Any, config: FileFireConfig
+) -> tuple[np.ndarray, Clock, str]:
+    """Returns the times of a raster's only band, or of the last time of a NetCDF."""
+    band = dataset.count if kind == "nc" else 1
+    if dataset.count != band:
+        some = "a bank of fires, tagged units=steps"
+        raise ask(f"{dataset.count} bands", "one", some, "maps of states with fire.kind=masks")
+    tags = {**dataset.tags(), **dataset.tags(band)}
+    titles = dataset.descriptions[band - 1], tags.get("long_name"), tags.get("NETCDF_VARNAME")
+    declared = (dataset.units[band - 1] or tags.get("units") or "").strip()
+    what = f"band {next((title for title in titles if title), band)!r:.60}"
+    what += f", the last of {band} times" if band > 1 else ""
+    what += f" ({declared})" if declared else ""
+    if kind == "asc":
+        values = _numbers(path, dataset.shape)
+        nodata = values == (math.nan if dataset.nodata is None else dataset.nodata)
+    else:
+        flags = [flag.name for flag in dataset.mask_flag_enums[band - 1]]
+        nodata = None if "all_valid" in flags else dataset.read_masks(band) == 0
+        values = _read(dataset, MAX_CELLS, band)[0]
+    values = values * dataset.scales[band - 1] + dataset.offsets[band - 1]
+    name, _, since = declared.partition(" since ")
+    known = next((u for u, form in _UNITS.items() if re.fullmatch(form, name, re.IGNORECASE)), None)
+    if known == "no unit of time":
+        raise ask(f"{what} is in {name[:20]}, {known}", "arrival times")
+    unit = decided_unit(known, config, what)
+    origin = in_utc(parse_dates([since.strip()], None, "units")[0]) if since else None
+    return arrival(values, nodata, config), Clock(unit, origin), what
+
+
+def _numbers(path: Path, shape: tuple[int, ...]) -> np.ndarray:
+    """Returns the numbers of ESRI ASCII; GDAL reads a word as 0, and wraps rows."""
+    with path.open(encoding="utf-8-sig", errors="replace") as file:
+        header = len(list(itertools.takewhile(_HEADER.match, file)))
+        file.seek(0)
+        most = math.prod(shape) + 1
+        try:
+            values = np.loadtxt(file, comments=None, ndmin=2, skiprows=header, max_rows=most)
+        except ValueError as error:
+            seen = f"after {header} lines of header: {first_line(error).split(';')[0]}"
+            raise ask(seen, f"rows of {shape[1]} numbers") from None
+    if values.shape != shape:
+        raise ask(f"{values.shape} rows and columns", f"nrows, ncols={shape}")
+    return values
+
+
+def _of_states(
+    maps: np.ndarray, affine: Any, crs: Any, config: FileFireConfig, report: Report
+) -> Raster:
     times, what = first_burning(maps, config)
     unit = config.units if config.units not in (None, "steps") else "maps"
-    return _on_plane(times, affine, crs, Clock(unit), config, what)
+    return _on_plane(times, affine, crs, Clock(unit), config, what, report)
 
 
 def _on_plane(
-    times: np.ndarray, affine: Affine, crs: Any, clock: Clock, config: FileFireConfig, what: str
+    times: np.ndarray,
+    affine: tuple[float, ...],
+    crs: Any,
+    clock: Clock,
+    config: FileFireConfig,
+    what: str,
+    report: Report,
 ) -> Raster:
-    """Returns times on a plane, north up."""
+    """Returns times on a plane, north up.
+
+    Corners of cells are at x = a column + b row + c, y = d column + e row + f.
+    """
     if clock.unit in ("days", "day_of_year"):
         times, clock = in_order(times, config), Clock("days", clock.origin)
     a, b, c, d, e, f = (float(value) for value in affine)
     area = abs(a * e - b * d)
     if not math.isfinite(c + f) or not 1e-20 < area < 1e12:
-        raise UserError(f"cells of {a:g} x {e:g}; expected a size above 0")
+        raise ask(f"cells of {a:g} x {e:g}", "a size above 0")
     rows, columns = times.shape
     x, y = (
         [p * u + q * v + r for u in (0, columns) for v in (0, rows)]
         for p, q, r in ((a, b, c), (d, e, f))
     )
-    about, change = "no place in the file: square cells, the first row in the north", None
+    plane = Plane("no place in the file: square cells, the first row in the north")
     if crs is not None or affine[:5] != _NORTH_UP:
-        bounds = (min(x), min(y), max(x), max(y))
-        about, change, _ = choose_plane(crs, config.crs, bounds, math.sqrt(area))
+        plane = choose_plane(crs, config.crs, (min(x), min(y), max(x), max(y)), math.sqrt(area))
     first = times.min()  # by the cells of the file
     row, column = np.unravel_index(times.argmin(), times.shape)
     around = times[max(row - 1, 0) : row + 2, max(column - 1, 0) : column + 2]
@@ -172,30 +188,26 @@ def _on_plane(
         times, a, c = times[:, ::-1], -a, c + columns * a
     if e > 0 and not (b or d):
         times, e, f = times[::-1], -e, f + rows * e
-    if change or b or d:
-        times, (a, b, c, d, e, f) = warped(times, (a, b, c, d, e, f), change)
+    if plane.target or b or d:
+        north_up = library("rasterio").Affine(a, b, c, d, e, f)
+        times, (a, b, c, d, e, f, *_) = warped(times, north_up, plane)
         check_spreads(times)
-    source = Raster(times, (c, f), (a, -e), clock, doubts=far_apart(np.isfinite(times)))
+    fire = Raster(times, (c, f), (a, -e), clock)
     if first <= crossing and clock.origin is None and clock.unit not in ("steps", "maps"):
-        source.began = 0.0  # the ignition lies between the centres of cells
-    places = beginnings(times)
-    source.facts = [
-        f"{np.isfinite(times).sum()} cells burn from {clock.format(source.first)} to "
-        f"{clock.format(source.last)}",
-        f"{places} place{'s' * (places != 1)} where it begins",
-        what,
-        about,
-    ]
-    return source
+        fire.began = 0.0  # the ignition lies between the centres of cells
+    cells, begin, end = np.isfinite(times).sum(), clock.format(fire.first), clock.format(fire.last)
+    places = counted(beginnings(times), "place")
+    burn = f"{cells} cells burn from {begin} to {end}"
+    report.facts += [burn, f"{places} where it begins", what, plane.about]
+    return fire
 
 
 def _grids(folder: Path) -> np.ndarray:
     """Reads the maps of Cell2Fire, [time, y, x]."""
     try:
-        maps = [np.loadtxt(path, delimiter=",", ndmin=2) for path in forest_grids(folder)]
-        return np.stack(maps)
+        return np.stack([np.loadtxt(p, delimiter=",", ndmin=2) for p in forest_grids(folder)])
     except ValueError as error:
-        raise UserError(f"{first_line(error)}; expected maps of one size") from None
+        raise ask(first_line(error), "maps of one size") from None
 
 
 def _numpy(path: Path) -> np.ndarray:
@@ -206,68 +218,153 @@ def _numpy(path: Path) -> np.ndarray:
         array = array[None] if array.ndim == 2 else array
         right = array.ndim == 3 and array.dtype.kind in "iufb" and 0 < array.size <= MAX_BANK
     except Exception as error:  # a damaged header raises many types
-        raise UserError(f"{first_line(error)}; expected an array in NumPy's format") from None
+        raise ask(first_line(error), "an array in NumPy's format") from None
     if not right:
-        raise UserError(
-            f"an array of {list(array.shape)}, {array.dtype}; expected [fires, X, Y] of at most "
-            f"{MAX_BANK} numbers"
-        )
+        seen = f"an array of {list(array.shape)}, {array.dtype}"
+        raise ask(seen, f"[fires, X, Y] of at most {MAX_BANK} numbers")
     return array
 
 
 def _bank(
-    fires: np.ndarray, horizon: str | None, config: FileFireConfig
-) -> tuple[list[Raster], int | None]:
+    fires: np.ndarray, horizon: str | None, config: FileFireConfig, report: Report
+) -> list[Raster]:
     """Returns fires in steps, [fires, rows, columns] from north to south, each a whole map."""
     count, rows, columns = fires.shape
     if not SIDES[0] <= min(columns, rows) <= max(columns, rows) <= SIDES[1]:
-        raise UserError(f"fires of {columns} x {rows} cells; expected {SIDES[0]} to {SIDES[1]}")
+        raise ask(f"fires of {columns} x {rows} cells", f"{SIDES[0]} to {SIDES[1]}")
     few = np.unique(fires[:: max(1, count // 8)])
     if len(few) <= 6 and np.isfinite(few).all() and (few % 1 == 0).all():
-        states, counts = np.unique(fires, return_counts=True)
-        shares = zip(states, counts, strict=True)
-        listed = ", ".join(f"{state:g} ({100 * n / fires.size:.0f} %)" for state, n in shares)
-        raise UserError(
-            f"{count} maps of the states {listed}, and no inf, never; expected arrival times of "
-            "fires, or fire.kind=masks for a map of states per time"
-        )
+        listed = ", ".join(shares(fires, np.unique(fires), fires.size))
+        seen = f"{count} maps of the states {listed}, and no inf, never"
+        raise ask(seen, "arrival times of fires", "fire.kind=masks for a map of states per time")
     sources = []
     for place, values in enumerate(fires):
         try:
             sources.append(_whole_map(arrival(values, None, config, in_bank=True), "steps"))
         except UserError as error:
             raise UserError(f"fire {place}: {error}") from None
-    written = f", written for {horizon} steps" if horizon else ""
-    sources[0].facts = [
-        f"a bank of {count} fire{'s' * (count > 1)} of {columns} x {rows} cells, in steps{written}"
-    ]
-    return sources, int(horizon) if horizon else None
+    about = f"a bank of {counted(count, 'fire')} of {columns} x {rows} cells, in steps"
+    report.facts.append(about + (f", written for {horizon} steps" if horizon else ""))
+    report.written = int(horizon) if horizon else None
+    return sources
 
 
 def _whole_map(times: np.ndarray, unit: str) -> Raster:
     return Raster(times, (0.0, float(len(times))), (1.0, 1.0), Clock(unit), whole=True)
 
 
-def _front_points(path: Path, config: FileFireConfig) -> Raster:
+def _front_points(path: Path, config: FileFireConfig, report: Report) -> Raster:
     """Reads the paper's text: a point v marks the cell int(v - 29 / 3) and the four beside it."""
-    times, count = np.full((_SIDE, _SIDE), np.inf), 0  # [x, y]
+    times, count = np.full((_SIDE + 4, _SIDE + 4), np.inf), 0  # [x, y], two cells on each side
     with path.open("rb") as lines:
         for count, line in enumerate(lines, 1):
-            parts = line.strip().removesuffix(b",").split(b",") if count > _SKIPPED else [b""]
+            if count <= _SKIPPED or not line.strip():
+                continue
             try:
-                points = np.array([float(p) for p in parts if parts != [b""]]).reshape(-1, 3)
+                parts = line.strip().removesuffix(b",").split(b",")
+                points = np.array([float(part) for part in parts]).reshape(-1, 3)
+                if not (np.abs(points) < 1e9).all():
+                    raise ValueError
             except ValueError:
-                points = np.array([[math.nan]])
-            if not (np.abs(points) < 1e9).all():
-                raise UserError(f"line {count}: {line[:20]!r}; expected x,y,intensity, of points")
-            cells = np.trunc(points[:, :2] - (_SIDE - 1) / 3).astype(np.int64)
-            for plus in _PLUS:
-                i, j = (cells + plus).T
-                inside = (i >= 0) & (j >= 0) & (i < _SIDE) & (j < _SIDE)
-                np.minimum.at(times, (i[inside], j[inside]), float(count - 1 - _SKIPPED))
+                seen = f"line {count}: {line[:20]!r}"
+                raise ask(seen, "x,y,intensity, of points") from None
+            cells = np.trunc(points[:, :2] - (_SIDE - 1) / 3).clip(-2, _SIDE + 1).astype(int) + 2
+            for i, j in ((0, 0), (1, 0), (-1, 0), (0, 1), (0, -1)):
+                x, y = (cells + np.array((i, j))).clip(0, _SIDE + 3).T
+                np.minimum.at(times, (x, y), float(count - 1 - _SKIPPED))
     if count <= _SKIPPED:
-        raise UserError(f"{count} lines; expected more than {_SKIPPED}, which are skipped")
+        raise ask(f"{count} lines", f"more than {_SKIPPED}, which are skipped")
+    times = times[2:-2, 2:-2]
     check_spreads(times)
-    source = _whole_map(times.T[::-1], config.units or "steps")
-    source.facts = [f"the paper's text of {count} lines, a line per time"]
-    return source
+    report.facts.append(f"the paper's text of {count} lines, a line per time")
+    return _whole_map(times.T[::-1], config.units or "steps")
+
+
+_MAX_TIME = 1e12
+_NEVER = (-9999.0, -1.0)  # NODATA of FARSITE and FlamMap, and of ELMFIRE
+_VOID = 1e30  # a number beyond it is NODATA although not declared, such as -3.4e38
+
+
+def arrival(
+    values: np.ndarray, nodata: np.ndarray | None, config: FileFireConfig, *, in_bank: bool = False
+) -> np.ndarray:
+    """Returns arrival times, inf in cells that never burn, float32 or float64.
+
+    Args:
+        values: [rows, columns] of a file, any real type.
+        nodata: mask of the NODATA that the file declares.
+        in_bank: whether inf says which cells never burn, and all others may burn at once.
+    """
+    times = np.array(values, dtype=np.result_type(values, np.float32))
+    if nodata is not None:
+        times[nodata] = np.inf
+    times[np.isin(times, config.never or ())] = np.inf
+    odd = ~(times >= 0) | ((times > _MAX_TIME) & (times < np.inf))
+    found = times[odd]
+    wrong = found[~(np.isnan(found) | (np.abs(found) > _VOID) | np.isin(found, _NEVER))]
+    times[odd] = np.inf
+    plateaus = _plateaus(times, in_bank=in_bank) if config.never is None else []
+    asked = [*np.unique(wrong)[:5].tolist(), *plateaus]
+    if asked:
+        cells = times.size if in_bank else max(1, np.isfinite(times).sum() + len(wrong))
+        listed = " and ".join(shares(values, asked, cells, " of the cells"))
+        some = ",".join(f"{value:g}" for value in asked)
+        key = f"'fire.unburned=[{some}]'" if len(asked) > 1 else f"fire.unburned={some}"
+        others = times[np.isfinite(times) & ~np.isin(times, asked)]
+        between = f"{others.min():g} to {others.max():g}" if len(others) else "none"
+        seen = f"{listed} may stand for cells that do not burn (others: {between})"
+        raise ask(seen, key, *([] if len(wrong) else ["fire.unburned=none if they burn then"]))
+    check_spreads(times, may_stand=in_bank)
+    return times
+
+
+def shares(values: np.ndarray, asked: Iterable[float], cells: int, of: str = "") -> list[str]:
+    """Returns some values as text with their shares of the cells."""
+    return [f"{v:g} ({100 * (values == v).sum() / cells:.0f} %{of})" for v in asked]
+
+
+def check_spreads(times: np.ndarray, *, may_stand: bool = False) -> None:
+    """Checks that cells burn, more than one and, unless they `may_stand`, one after the other."""
+    burning = times[np.isfinite(times)]
+    seen = ""
+    if len(burning) < 2:
+        seen = "a single cell burns" if len(burning) else "no cell burns: NODATA everywhere"
+    elif burning.min() == burning.max() and not (may_stand and len(burning) < times.size):
+        seen = f"all {len(burning)} cells burn at {burning[0]:g}, at once"
+    if seen:
+        raise ask(seen, "arrival times of a fire that spreads")
+
+
+def _plateaus(times: np.ndarray, *, in_bank: bool) -> list[float]:
+    """Returns values that may stand for cells that do not burn.
+
+    They hold more than half of the cells; or are the first or last value, and far from the rest or
+    frequent along the edge of the raster, where a fire has cells of many times.
+    """
+    finite = np.isfinite(times)
+    values, counts = np.unique(times[finite], return_counts=True)
+    cells = times.size if in_bank else counts.sum()
+    odd = {int(i) for i in np.flatnonzero(counts > 0.5 * cells)} if len(values) > 1 else set()
+    inner: Any = binary_erosion(finite)
+    edge = times[finite & ~inner]
+    for end, rest in ((0, slice(1, None)), (-1, slice(0, -1))):
+        others = values[rest]
+        if len(others) > 2 and not in_bank:
+            far = abs(values[end] - others[end]) > others[-1] - others[0]
+            often = counts[end] > max(0.1 * cells, 3 * counts[rest].max())
+            if far or (often and (edge == values[end]).mean() > 0.5):
+                odd.add(end % len(values))
+    return [float(values[i]) for i in sorted(odd)]
+
+
+def first_burning(maps: np.ndarray, config: FileFireConfig) -> tuple[np.ndarray, str]:
+    """Returns the number of the first map in which each cell is not unburnt, and what to say."""
+    states = np.unique(maps)
+    listed = ", ".join(f"{state:g}" for state in states[:12])
+    if config.never is None and not np.isin(states, (0, 1, 2)).all():
+        some = "such as 'fire.unburned=[0,3,4,5]' of SimFire's with its lines"
+        raise ask(f"states {listed}", f"fire.unburned, those that are no fire, {some}")
+    burns = ~np.isin(maps, (0,) if config.never is None else config.never)
+    times = np.where(burns.any(0), burns.argmax(0), np.inf)
+    check_spreads(times)
+    return times, f"{len(maps)} maps of the states {listed}, rows from north to south"

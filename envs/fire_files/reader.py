@@ -1,11 +1,9 @@
 """Reads the fires of a file onto a grid, in three sets, and keeps a run's copy of them."""
 
 import dataclasses
-import hashlib
-import io
 import json
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -16,17 +14,16 @@ from torch import Tensor
 
 from emberlink.envs.config import check_grid
 from emberlink.envs.fire_files.config import COPY_FILE, FileFireConfig
-from emberlink.envs.fire_files.crop import on_grid
 from emberlink.envs.fire_files.files import TABLES, digest, find_format, quiet
-from emberlink.envs.fire_files.grid import Raster
+from emberlink.envs.fire_files.grid import Raster, on_grid
 from emberlink.envs.fire_files.perimeters import read_perimeters
 from emberlink.envs.fire_files.rasters import MAX_BANK, read_raster
+from emberlink.envs.fire_files.report import Report, ask
 from emberlink.envs.fire_files.tables import read_table
-from emberlink.envs.utils.atomic_io import read_bytes, replaced, user_path
-from emberlink.envs.utils.errors import UserError, printable
+from emberlink.envs.utils.atomic_io import open_regular, replaced, user_path
+from emberlink.envs.utils.errors import UserError, naming, printable
 
-READER_VERSION = 8  # increase it if the same file gives another grid
-_MAX_COPY = 12 * MAX_BANK + 1_000_000  # bytes when unpacked: float32 of the cells of all sets
+READER_VERSION = 9  # increase it if the same file gives another grid
 _EVERY, _VALIDATION, _TEST = 5, 3, 4  # remainders of the numbers of validation and test fires
 _OF_TABLES = ("time_field", "time_format", "incident", "incident_field", "where", "radius")
 
@@ -41,19 +38,19 @@ def read_with_summary(
 ) -> tuple[Tensor, str]:
     """Returns the fires of `read_fires` and the findings about the file; warns of a misreading."""
     check_grid(grid)
-    fires: list[np.ndarray] = []
+    fires, report = [], Report()
     with _named(config.path) as path, quiet():
-        sources = _sources(path, config, grid, horizon)
+        sources = _sources(path, config, grid, horizon, report)
         for source in sources:
             try:
-                fires.append(on_grid(source, config, grid, horizon))
+                fires.append(on_grid(source, config, grid, horizon, report))
             except UserError as error:
                 place = f"fire {len(fires)}: " if len(sources) > 1 else ""
-                raise UserError(f"{place}{'; '.join([str(error), *source.doubts])}") from None
+                raise UserError(f"{place}{'; '.join([str(error), *report.doubts])}") from None
     cells = sorted({int(np.isfinite(fire).sum()) for fire in fires})
     burn = " to ".join(map(str, cells[:: max(1, len(cells) - 1)]))
-    facts = [*sources[0].facts, f"{burn} of {' x '.join(map(str, grid))} cells burn"]
-    summary, doubts = printable("; ".join(facts)), printable("; ".join(sources[0].doubts))
+    facts = [*report.facts, f"{burn} of {' x '.join(map(str, grid))} cells burn"]
+    summary, doubts = printable("; ".join(facts)), printable("; ".join(report.doubts))
     if doubts:
         warnings.warn(f"{printable(str(path))}: {doubts}; read: {summary}", stacklevel=3)
     return torch.from_numpy(np.stack(fires)), summary
@@ -69,33 +66,33 @@ def _named(file: str) -> Iterator[Path]:
     except UserError as error:
         text = printable(str(error)).removeprefix(f"{path.name}: ")
         raise UserError(f"{name}: {text}") from None
-    except OSError as error:
-        raise UserError(f"{name}: cannot be read: {error.strerror or error}") from None
-    except MemoryError:
-        raise UserError(f"{name}: not enough memory to read it") from None
+    except (OSError, MemoryError) as error:
+        reason = getattr(error, "strerror", None) or error or "not enough memory"
+        raise UserError(f"{name}: cannot be read: {reason}") from None
 
 
 def _sources(
-    path: Path, config: FileFireConfig, grid: tuple[int, int], horizon: int
-) -> Sequence[Raster]:
+    path: Path, config: FileFireConfig, grid: tuple[int, int], horizon: int, report: Report
+) -> list[Raster]:
     """Returns the fires in a file; only a bank has more than one."""
     kind = find_format(path)
     if kind in TABLES:
         if config.kind == "masks" or config.unburned is not None:
-            raise UserError("fire.kind=masks and fire.unburned are for rasters; expected none")
-        return [read_perimeters(*read_table(path, kind, config.layer), config, grid, horizon)]
+            raise ask("fire.kind=masks and fire.unburned are for rasters", "none")
+        table = read_table(path, kind, config.layer)
+        return [read_perimeters(*table, config, grid, horizon, report)]
     for key in _OF_TABLES:
         if getattr(config, key) is not None:
-            raise UserError(f"fire.{key} chooses among perimeters; expected none for a raster")
-    sources, written = read_raster(path, kind, config)
+            raise ask(f"fire.{key} chooses among perimeters", "none for a raster")
+    sources, unit = read_raster(path, kind, config, report), config.units
     if sources[0].whole and sources[0].clock.unit == "steps":
-        if config.units not in (None, "steps") and config.test is None:  # no other file has units
-            raise UserError(f"fire.units={config.units}: a bank is in steps; expected none")
-        if config.start is config.end is None and written not in (None, horizon):
-            raise UserError(
-                f"its fires are of {written} steps, env.horizon is {horizon}; expected "
-                f"env.horizon={written}, or fire.end={written} to stretch them over {horizon} steps"
-            )
+        if unit not in (None, "steps") and config.test is None:  # no other file has units
+            raise ask(f"fire.units={unit}: a bank is in steps", "none")
+        if config.start is config.end is None and report.written not in (None, horizon):
+            steps = report.written
+            stretch = f"fire.end={steps} to stretch them over {horizon} steps"
+            seen = f"its fires are of {steps} steps, env.horizon is {horizon}"
+            raise ask(seen, f"env.horizon={steps}", stretch)
     return sources
 
 
@@ -156,36 +153,33 @@ def save_copy(config: FileFireConfig, folder: Path, grid: tuple[int, int], horiz
     """Writes the run's copy of its fires. Afterwards the run does not need the files."""
     fires = fire_sets(config, grid, horizon)._asdict()
     arrays: dict[str, Any] = {name: np.asarray(values) for name, values in fires.items()}
-    arrays["key"] = np.array(_key(config, grid, horizon))
-    try:
+    with naming(folder / COPY_FILE):
         folder.mkdir(parents=True, exist_ok=True)
         with replaced(folder / COPY_FILE) as partial, partial.open("wb") as file:
-            np.savez_compressed(file, **arrays)
-    except OSError as error:
-        reason = error.strerror or error
-        raise UserError(f"{folder / COPY_FILE}: cannot be written: {reason}") from None
+            np.savez_compressed(file, key=np.array(_key(config, grid, horizon)), **arrays)
 
 
 def _key(config: FileFireConfig, grid: tuple[int, int], horizon: int) -> str:
-    """Returns a hash of all values on which the fires depend."""
+    """Returns all values on which the fires depend."""
     values = dataclasses.asdict(config)
     del values["saved_copy"]
-    parts = [READER_VERSION, values, *grid, horizon]
-    return hashlib.sha256(json.dumps(parts).encode()).hexdigest()
+    return json.dumps([READER_VERSION, values, *grid, horizon])
 
 
 def _read_copy(config: FileFireConfig, grid: tuple[int, int], horizon: int) -> FireSets | None:
     """Returns the run's copy; None if there is none, it is damaged, or it has another grid."""
     if config.saved_copy is None or config.sha256 is None:
         return None
+    most = 12 * MAX_BANK + 1_000_000  # bytes: float32 of the cells of all sets
     try:
-        content = read_bytes(Path(config.saved_copy), _MAX_COPY)
-        with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
+        with (
+            open_regular(Path(config.saved_copy), most) as file,
+            np.load(file, allow_pickle=False) as arrays,
+        ):
             size = sum(part.file_size for part in arrays.zip.filelist)
-            if size > _MAX_COPY or str(arrays["key"]) != _key(config, grid, horizon):
+            if size > most or str(arrays["key"]) != _key(config, grid, horizon):
                 return None
             *fires, about = (arrays[name] for name in FireSets._fields)
-            train, validation, test = map(torch.from_numpy, fires)
-            return FireSets(train, validation, test, printable(str(about)))
+            return FireSets(*map(torch.from_numpy, fires), printable(str(about)))
     except Exception:  # damage raises many types
         return None

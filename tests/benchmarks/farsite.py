@@ -31,6 +31,7 @@ from emberlink.envs.fire.level_set import (
 )
 from emberlink.envs.fire_files.config import FileFireConfig
 from emberlink.envs.fire_files.rasters import read_raster
+from emberlink.envs.fire_files.report import Report
 
 SUFFIX = "_ArrivalTime.asc"
 PARTS = (0.25, 0.5, 0.75, 1.0)
@@ -73,7 +74,7 @@ def read_grid(path: Path) -> Tensor:
     """Returns the arrival times of an ESRI ASCII grid, as in `Run`."""
     try:
         config = FileFireConfig(path=str(path), units="minutes", unburned="none")
-        times = read_raster(path, "asc", config)[0][0].times
+        times = read_raster(path, "asc", config, Report())[0].times
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
     return torch.from_numpy(times[::-1].T.copy()).float()

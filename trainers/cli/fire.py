@@ -27,13 +27,9 @@ def add_fire(commands: Any) -> None:
         "the growth of the fire, and whether the setup's UAVs can keep up with it.",
         "emberlink fire preview ArrivalTime.asc fire.units=minutes 'env.grid=[40,40]' setup=tuned",
     )
-    preview(
-        "arguments",
-        metavar="SOURCE | key=value",
-        nargs="+",
-        help="a scenario (huygens, or huygens:3 for its test fire 3), a file (or bank.tif:3), or "
-        "fire=file fire.path=FILE; " + _KEYS,
-    )
+    source = "a scenario (huygens, or huygens:3 for its test fire 3), a file (or bank.tif:3), or "
+    source += "fire=file fire.path=FILE; "
+    preview("arguments", metavar="SOURCE | key=value", nargs="+", help=source + _KEYS)
     preview("--output", metavar="PATH", type=path, help="a folder, or a new .png file")
     make = command(
         actions,
@@ -58,10 +54,6 @@ def add_fire(commands: Any) -> None:
         "the configuration, in steps, to a new file for fire=file fire.path=BANK.",
         "emberlink fire import ArrivalTime.asc fire.units=minutes --output fires.npy",
     )
-    imported(
-        "arguments",
-        metavar="FILE | key=value",
-        nargs="+",
-        help="files with one fire or more; " + _KEYS,
-    )
+    files = "files with one fire or more; " + _KEYS
+    imported("arguments", metavar="FILE | key=value", nargs="+", help=files)
     imported("--output", metavar="BANK", type=path, required=True, help=_BANK)

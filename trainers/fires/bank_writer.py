@@ -1,5 +1,6 @@
 """Writes fires to a file: a bank, with a map of the whole grid for each fire."""
 
+import io
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -46,26 +47,20 @@ def write_bank(
     """
     check_bank(path, len(fires), fires.shape[1:])
     array = np.ascontiguousarray(fires.cpu().numpy(), dtype="<f4")
-    assert (array >= 0).all(), "arrival times are 0 or more, or inf"
     about = finite({"units": "steps", **(facts or {})})
     names = names or [f"fire {number}" for number in range(len(array))]
+    # In memory first: neither GDAL nor NumPy reports a full disk.
     if path.suffix != ".npy":
         content = _geotiff(array, about, names)
         with created(path) as partial:
             partial.write_bytes(content)
         return
+    memory = io.BytesIO()
+    np.save(memory, array)
     about |= {"axes": ["fire", "x", "y"], "never": "inf", "fires": list(names)}
-    json_path = path.with_suffix(".json")
-    with created(json_path) as partial:
-        partial.write_text(json.dumps(about, indent=1) + "\n", encoding="utf-8")
-    try:
-        with created(path) as partial, partial.open("wb") as file:
-            header = np.lib.format.header_data_from_array_1_0(array)
-            np.lib.format.write_array_header_1_0(file, header)
-            file.write(array.data)  # NumPy's own does not report a full disk
-    except BaseException:
-        json_path.unlink(missing_ok=True)
-        raise
+    with created(path.with_suffix(".json")) as card, created(path) as partial:
+        card.write_text(json.dumps(about, indent=1) + "\n", encoding="utf-8")
+        partial.write_bytes(memory.getbuffer())
 
 
 def _geotiff(array: np.ndarray, facts: Mapping[str, Any], names: Sequence[str]) -> memoryview:
@@ -76,7 +71,6 @@ def _geotiff(array: np.ndarray, facts: Mapping[str, Any], names: Sequence[str]) 
     about: dict[str, Any] = {"driver": "GTiff", "count": count, "width": width, "height": height}
     about |= {"dtype": "float32", "nodata": _NODATA, "compress": "deflate", "interleave": "band"}
     about["transform"] = rasterio.Affine(1, 0, -0.5, 0, -1, height - 0.5)
-    # In memory first: GDAL reports a full disk only in its log.
     with rasterio.MemoryFile() as memory:
         with memory.open(**about) as raster:
             raster.write(np.where(np.isinf(rows), np.float32(_NODATA), rows))

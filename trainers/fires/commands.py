@@ -21,6 +21,7 @@ from emberlink.envs.fire_files.reader import read_with_summary
 from emberlink.envs.scenarios import fires_of
 from emberlink.envs.utils.atomic_io import created, free_name, new_file, user_path
 from emberlink.envs.utils.errors import UserError, shown, unknown
+from emberlink.envs.utils.validation import is_index
 from emberlink.envs.world.coverage_map import split_times
 from emberlink.envs.world.sensor import view_radius
 from emberlink.trainers.config.compose import resolve, to_values
@@ -28,8 +29,6 @@ from emberlink.trainers.config.schema import MAX_FIRES, RunConfig
 from emberlink.trainers.config.values import parse
 from emberlink.trainers.fires.bank_writer import check_bank, write_bank
 from emberlink.trainers.fires.plot import arrival_figure
-
-_METHOD = "independent"  # any method; fires do not depend on it
 
 
 def preview(arguments: Sequence[str], console: Console, output: Path | None = None) -> int:
@@ -41,8 +40,7 @@ def preview(arguments: Sequence[str], console: Console, output: Path | None = No
         output: a folder, or a new .png file; the working directory if None.
     """
     path = new_file(output, [".png"]) if output is not None and not os.path.isdir(output) else None
-    overrides = [text for text in arguments if "=" in text and not os.path.exists(text)]
-    sources = [str(user_path(text)) for text in arguments if text not in overrides]
+    sources, overrides = _divided(arguments)
     names = [text.partition("=")[2] for text in overrides if text.startswith("fire=")]
     keyed = [str(parse(text)[1]) for text in overrides if text.startswith("fire.path=")]
     overrides = [text for text in overrides if not text.startswith(("fire=", "fire.path="))]
@@ -59,10 +57,77 @@ def preview(arguments: Sequence[str], console: Console, output: Path | None = No
         warnings.filterwarnings("ignore", "Glyph")  # the font may lack letters of the file's name
         arrival_figure(partial, times, world.horizon, width, title)
     grid = " x ".join(map(str, world.grid))
-    lines = [f"{title}: {grid} cells, {world.horizon} steps, setup {config.setup}"]
-    lines += [f"read: {read}"] if read else []
-    _print(console, *lines, *_growth(times, world, width), str(path))
+    _print(console, f"{title}: {grid} cells, {world.horizon} steps, setup {config.setup}")
+    _print(console, *([f"read: {read}"] if read else []), *_growth(times, world, width), str(path))
     return 0
+
+
+def make(
+    scenario: str,
+    overrides: Sequence[str],
+    console: Console,
+    *,
+    count: int | None = None,
+    split: Split = "train",
+    output: Path | None = None,
+) -> int:
+    """Makes fires of a scenario and writes them to a file.
+
+    Args:
+        scenario: a file in configs/fire.
+        overrides: `key=value` of setup, env. and fire.
+        console: prints the number of fires and, last, the path of the file.
+        count: number of fires; as many as a training or an evaluation uses if None.
+        split: "train", "validation" or "test".
+        output: a new .npy, .tif or .tiff file; the next free name if None.
+    """
+    config = _generated(scenario, overrides)
+    fire, evaluation = config.fire, config.evaluation
+    assert isinstance(fire, GeneratedConfig)
+    usual = {"validation": evaluation.interval_episodes, "test": evaluation.episodes}
+    count = count or usual.get(split, fire.num_train_fires)
+    if output is None:
+        name = free_name(Path(), f"{scenario}_{split}_{count}", [".npy", ".json"])
+        output = name.with_name(f"{name.name}.npy")
+    check_bank(output, count, config.env.grid)
+    seeds = fire_seeds(split, count)
+    arrival, burn_out = split_times(make_fires(fire, seeds, config.env.grid, config.env.horizon))
+    facts = {"scenario": scenario, "split": split, "seeds": f"{seeds[0]} to {seeds[-1]}"}
+    facts |= {**_facts(config, burn_out), "generator_version": GENERATOR_VERSION}
+    _write(output, arrival, facts, [f"{scenario} {split} {n}" for n in seeds.tolist()], console)
+    return 0
+
+
+def import_files(arguments: Sequence[str], console: Console, output: Path) -> int:
+    """Reads files of fires and writes them to one.
+
+    Args:
+        arguments: paths, and `key=value` of setup, env. and fire.
+        console: prints the findings, the number of fires and, last, the path of the file.
+        output: a new .npy, .tif or .tiff file.
+    """
+    paths, overrides = _divided(arguments)
+    if not paths:
+        raise UserError("FILE is missing; expected a file, such as ArrivalTime.asc")
+    configs = [_from_file(path, overrides) for path in paths]
+    check_bank(output, len(paths), configs[0].env.grid)
+    fires, names, sources = [], [], []
+    for path, config in zip(map(Path, paths), configs, strict=True):
+        read, about = _read(config)
+        _print(console, f"{path.name}: read: {about}")
+        fires.append(read)
+        names += [f"{path.name}{f', fire {n}' if len(read) > 1 else ''}" for n in range(len(read))]
+        sources.append({"file": path.name, "sha256": to_values(config)["fire"]["sha256"]})
+    facts: dict[str, Any] = _facts(configs[0]) | {"sources": sources}
+    del facts["fire"]["path"], facts["fire"]["sha256"]  # they hold for the first file only
+    _write(output, torch.cat(fires), facts, names, console)
+    return 0
+
+
+def _divided(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Returns sources and `key=value`; an existing file takes precedence over a key."""
+    keys = [text for text in arguments if "=" in text and not os.path.exists(text)]
+    return [str(user_path(text)) for text in arguments if text not in keys], keys
 
 
 def _print(console: Console, *lines: str) -> None:
@@ -119,13 +184,12 @@ def _find(text: str, overrides: Sequence[str]) -> tuple[str, str, RunConfig, Ten
         fire = fires_of(config.fire).test_fire(place, config.env.grid, config.env.horizon)
         arrival = split_times(fire)[0][0]
         return f"{name}, test fire {index}", f"fire_{name}_{index}", config, arrival, ""
-    if os.path.exists(text) or not os.path.exists(name):
+    if os.path.exists(text):
         name, index = text, "0"
-    if not name or not os.path.exists(name):
-        known = unknown(text.rpartition(":")[0] or text, scenarios())
+    if not os.path.exists(name):
+        known = unknown(name, scenarios())
         raise UserError(f"{shown(text)}: there is no such file; as a scenario {known}")
-    path = Path(name)
-    config = _from_file(path, overrides)
+    path, config = Path(name), _from_file(name, overrides)
     fires, read = _read(config)
     place, title, stem = _index(text, index, len(fires)), shown(path.name), f"fire_{path.stem}"
     if len(fires) > 1:
@@ -134,7 +198,7 @@ def _find(text: str, overrides: Sequence[str]) -> tuple[str, str, RunConfig, Ten
 
 
 def _index(text: str, index: str, count: int) -> int:
-    if not index.isdecimal() or len(index) > 9 or int(index) >= count:
+    if not is_index(index, count):
         raise UserError(f"{shown(text)}: no fire {shown(index)!r}; known: 0 to {count - 1}")
     return int(index)
 
@@ -143,20 +207,21 @@ def _generated(scenario: str, overrides: Sequence[str]) -> RunConfig:
     """Returns the configuration with which a scenario's fires are made."""
     if scenario not in scenarios():
         raise UserError(f"fire {unknown(scenario, scenarios())}")
-    return _resolved([f"fire={scenario}", *overrides], overrides)
+    return _resolved(scenario, overrides)
 
 
-def _from_file(path: Path, overrides: Sequence[str]) -> RunConfig:
+def _from_file(path: str, overrides: Sequence[str]) -> RunConfig:
     """Returns the configuration with which a file is read."""
     # The path bypasses the parser of overrides, in which some characters have a meaning.
-    return _resolved(["fire=file", *overrides], overrides, **{"fire.path": str(path)})
+    return _resolved("file", overrides, **{"fire.path": path})
 
 
-def _resolved(texts: Sequence[str], overrides: Sequence[str], **settings: Any) -> RunConfig:
+def _resolved(fire: str, overrides: Sequence[str], **settings: Any) -> RunConfig:
     for text in overrides:
         if not text.startswith(("setup=", "env.", "fire.")) or text.startswith("fire.path="):
             raise UserError(f"{shown(text)!r}: a fire depends on keys of setup, env. and fire.")
-    return resolve(_METHOD, texts, **settings)
+    # Fires do not depend on the method.
+    return resolve("independent", [f"fire={fire}", *overrides], **settings)
 
 
 def _read(config: RunConfig) -> tuple[Tensor, str]:
@@ -164,84 +229,14 @@ def _read(config: RunConfig) -> tuple[Tensor, str]:
     return read_with_summary(config.fire, config.env.grid, config.env.horizon)
 
 
-def make(
-    scenario: str,
-    overrides: Sequence[str],
-    console: Console,
-    *,
-    count: int | None = None,
-    split: Split = "train",
-    output: Path | None = None,
-) -> int:
-    """Makes fires of a scenario and writes them to a file.
-
-    Args:
-        scenario: a file in configs/fire.
-        overrides: `key=value` of setup, env. and fire.
-        console: prints the number of fires and, last, the path of the file.
-        count: number of fires; as many as a training or an evaluation uses if None.
-        split: "train", "validation" or "test".
-        output: a new .npy, .tif or .tiff file; the next free name if None.
-    """
-    config = _generated(scenario, overrides)
-    fire, evaluation = config.fire, config.evaluation
-    assert isinstance(fire, GeneratedConfig)
-    usual = {"validation": evaluation.interval_episodes, "test": evaluation.episodes}
-    count = count or usual.get(split, fire.num_train_fires)
-    if output is None:
-        name = free_name(Path(), f"{scenario}_{split}_{count}", [".npy", ".json"])
-        output = name.with_name(f"{name.name}.npy")
-    check_bank(output, count, config.env.grid)
-    seeds = fire_seeds(split, count)
-    arrival, burn_out = split_times(make_fires(fire, seeds, config.env.grid, config.env.horizon))
-    _warn_of_burn_out(fire, burn_out)
-    facts = {"scenario": scenario, "split": split, "seeds": f"{seeds[0]} to {seeds[-1]}"}
-    facts |= {**_facts(config), "generator_version": GENERATOR_VERSION}
-    _write(output, arrival, facts, [f"{scenario} {split} {n}" for n in seeds.tolist()], console)
-    return 0
-
-
-def import_files(arguments: Sequence[str], console: Console, output: Path) -> int:
-    """Reads files of fires and writes them to one.
-
-    Args:
-        arguments: paths, and `key=value` of setup, env. and fire.
-        console: prints the findings, the number of fires and, last, the path of the file.
-        output: a new .npy, .tif or .tiff file.
-    """
-    # An existing file takes precedence over a key.
-    overrides = [text for text in arguments if "=" in text and not os.path.exists(text)]
-    paths = [user_path(text) for text in arguments if text not in overrides]
-    if not paths:
-        raise UserError("FILE is missing; expected a file, such as ArrivalTime.asc")
-    configs = [_from_file(path, overrides) for path in paths]
-    check_bank(output, len(paths), configs[0].env.grid)
-    fires, names, sources = [], [], []
-    for path, config in zip(paths, configs, strict=True):
-        read, about = _read(config)
-        _print(console, f"{path.name}: read: {about}")
-        fires.append(read)
-        names += [f"{path.name}{f', fire {n}' if len(read) > 1 else ''}" for n in range(len(read))]
-        sources.append({"file": path.name, "sha256": to_values(config)["fire"]["sha256"]})
-    _warn_of_burn_out(configs[0].fire, None)
-    facts: dict[str, Any] = _facts(configs[0]) | {"sources": sources}
-    del facts["fire"]["path"], facts["fire"]["sha256"]  # they hold for the first file only
-    _write(output, torch.cat(fires), facts, names, console)
-    return 0
-
-
-def _warn_of_burn_out(fire: Any, burn_out: Tensor | None) -> None:
-    """Warns that a file of fires will not hold the times at which cells burn out, if they do."""
-    if burn_out is not None or math.isfinite(getattr(fire, "burn_time", math.inf)):
+def _facts(config: RunConfig, burn_out: Tensor | None = None) -> dict[str, Any]:
+    """Returns the settings on which the fires depend; warns of times that are not written."""
+    if burn_out is not None or math.isfinite(getattr(config.fire, "burn_time", math.inf)):
         warnings.warn(
             "a file of fires holds arrival times only, without the times at which cells burn out; "
             "fire.burn_time=STEPS gives one for all cells when the file is read",
             stacklevel=3,
         )
-
-
-def _facts(config: RunConfig) -> dict[str, Any]:
-    """Returns the settings on which the fires depend."""
     about = {"horizon": config.env.horizon, "grid": list(config.env.grid)}
     return {**about, "fire": to_values(config)["fire"], "emberlink_version": version("emberlink")}
 

@@ -29,8 +29,9 @@ def arrival_figure(
     """
     across, up = arrival.shape
     scale = _SIDE / max(across, up)
-    size = max(2.6, across * scale) + 1.9, max(2.0, up * scale) + 1.7
-    figure = Figure(figsize=size, layout="constrained")
+    figure = Figure(
+        figsize=(max(2.6, across * scale) + 1.9, max(2.0, up * scale) + 1.7), layout="constrained"
+    )
     axes = figure.subplots()
     box = (-0.5, across - 0.5, -0.5, up - 0.5)
     core, reached = burnt_out(arrival), arrival <= horizon
@@ -44,23 +45,20 @@ def arrival_figure(
     lines = min(6, int(((arrival > 0) & reached).sum()) // 8)
     steps = MaxNLocator(nbins=lines + 1, steps=[1, 2, 2.5, 5, 10], integer=True)
     levels = [t for t in steps.tick_values(0, horizon) if 0 < t < min(horizon, times.max())]
-    outline: Any = [withStroke(linewidth=2.2, foreground="black")]
     if lines and levels:
+        outline: Any = [withStroke(linewidth=2.2, foreground="black")]
         contours = axes.contour(times.T, levels=levels, colors="white", linewidths=1.1)
-        contours.set_path_effects(outline)
-        for text in axes.clabel(contours, fmt="%g", fontsize="small", inline=False):
-            text.set_path_effects(outline)
-    corner = (across - width - 1, up - width - 1)
-    view = f"view of one UAV, {width:.3g} cells wide"
+        for part in (contours, *axes.clabel(contours, fmt="%g", fontsize="small", inline=False)):
+            part.set_path_effects(outline)
     samples = [
         *([Patch(fc=BURNT_OUT, label="burnt out before step 0")] if core.any() else []),
         Patch(fc=NEVER, label="does not burn"),
-        Patch(fc="none", ec=_VIEW, lw=2, label=view),
+        Patch(fc="none", ec=_VIEW, lw=2, label=f"view of one UAV, {width:.3g} cells wide"),
     ]
+    corner = (across - width - 1, up - width - 1)
     axes.add_patch(Rectangle(corner, width, width, fc="none", ec=_VIEW, lw=2))
     axes.set(xlim=box[:2], ylim=box[2:], xlabel="x, cells", ylabel="y, cells")
-    most = int(10 * size[0])  # letters
-    short = title if len(title) <= most else f"{title[: most - 28]}...{title[-25:]}"
+    short = title if len(title) <= 60 else f"{title[:32]}...{title[-25:]}"
     figure.suptitle(short, parse_math=False, fontsize="medium")
     figure.colorbar(picture, ax=axes, label="arrival time, steps", shrink=0.9)
     columns = 3 if across * scale > _SIDE / 2 else 1
@@ -69,7 +67,7 @@ def arrival_figure(
 
 
 def burnt_out(arrival: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Returns the mask of cells burnt before step 0, bool [X, Y]: gaps in the fire at step 0."""
+    """Returns the mask of cells burnt before step 0: gaps in the fire at step 0, bool [X, Y]."""
     parts, count = label(np.isinf(arrival))  # pyright: ignore[reportGeneralTypeIssues]
     inside = np.zeros(arrival.shape, bool)
     for number in range(1, count + 1):

@@ -16,114 +16,94 @@ from emberlink.envs.fire_files.reader import read_with_summary
 from emberlink.trainers.config.compose import resolve
 
 CASES = Path(__file__).parent / "cases"
-WRF = "wrfout_d01_2012-09-09_12:00:00"
-# name -> file, keys, the question if there is one, keys that answer it, what `read:` says
+FIRES = {"time_field": "tUTC"}, r"Alder \(6\), Birch \(6\)", {"incident": "Alder"}
+DECLARED = {"units": "minutes", "minutes_per_step": 0.5}
+# file, keys, the question if there is one, keys that answer it, what `read:` says
 TABLE = {
-    "01_acq_date_acq_time": ("viirs_areas.geojson", {}, "", {}, "8 times, .*T09:42.*T21:12"),
-    "02_gofer_two_fires": (
-        "fireProg.shp",
-        {"time_field": "tUTC"},
-        r"fname: Alder \(6\), Birch \(6\); expected fire.incident_field=fname fire.incident=Alder",
-        {"incident": "Alder"},
-        r"6 of 12 features used \(6 left out by fire.incident=Alder\)",
-    ),
-    "03_same_name": (
-        "perimeters.geojson",
+    "01_acq_date_acq_time/viirs_areas.geojson": ({}, "", {}, "8 times, .*T09:42.*T21:12"),
+    "02_gofer_two_fires/fireProg.shp": (*FIRES, "6 of 12 features used"),
+    "03_same_name/perimeters.geojson": (
         {"incident": "Creek"},
-        r"poly_IRWINID: \{A\} \(6\), \{B\} \(6\); expected fire.incident_field=poly_IRWINID",
+        r"poly_IRWINID: \{A\} \(6\), \{B\} \(6\)",
         {"incident": "{A}", "incident_field": "poly_IRWINID"},
         "6 of 12 features",
     ),
-    "04_modis_sinusoidal": (
-        "fired_daily.shp",
-        {},
-        "",
-        {},
-        r"3\.\d+ : 1.* to WGS 84 / UTM zone 10N",
-    ),
-    "05_zero_is_unburned": (
-        "arrival.tif",
+    "04_modis_sinusoidal/fired_daily.shp": ({}, "", {}, r"3\.\d+ : 1.* UTM zone 10N"),
+    "05_zero_is_unburned/arrival.tif": (
         {"units": "minutes"},
-        r"0 \(86 % of the cells\) .*expected fire.unburned=0",
+        r"0 \(86 % .*fire.unburned=0",
         {"unburned": 0.0},
-        "1309 cells burn from 1 minutes",
+        "1309 cells",
     ),
-    "06_new_year": (
-        "day_of_burn.tif",
+    "06_new_year/day_of_burn.tif": (
         {"units": "days"},
-        "days 1 to 6 and 358 to 365, none between.*fire.units=day_of_year",
+        "days 1 to 6 and 358 to 365.*fire.units=day_of_year",
         {"units": "day_of_year"},
-        "from 358 days to 371 days; 1 place where it begins",
+        "from 358 days to 371 days; 1 place",
     ),
-    "07_pm_ignored": ("perimeters.geojson", {}, "", {}, "8 times, .*05T01:30.*08T13:30"),
-    "08_day_first": (
-        "perimetros.geojson",
+    "07_pm_ignored/perimeters.geojson": ({}, "", {}, "8 times, .*05T01:30.*08T13:30"),
+    "08_day_first/perimetros.geojson": (
         {},
-        "datetime='05/08/2020 02:00' fits day_first .* month_first .*fire.time_format=day_first",
+        "fits day_first .* month_first .*fire.time_format=day_first",
         {"time_format": "day_first"},
         "from 2020-08-05T02:00.* to 2020-08-08T14:00",
     ),
-    "09_wrfout_name": (
-        WRF,
+    "09_wrfout_name/wrfout_d01_2012-09-09_12:00:00": (
         {"units": "seconds"},
-        r"3005 \(45 % of the cells\) .* fire.unburned=3005",
+        r"3005 \(45 % .* fire.unburned=3005",
         {"unburned": 3005.0},
-        "band 'TIGN_G', the last of 2 times",
+        "TIGN_G.* the last of 2 times",
     ),
-    "10_firms_command": (
-        "fire_archive_SV-C2_1.csv",
+    "10_firms_command/fire_archive_SV-C2_1.csv": (
         {},
-        "80 points, as of satellite detections; expected fire.radius",
+        "80 points.*fire.radius",
         {"radius": 375.0},
-        "4 times.*times from acq_date and acq_time",
+        "4 times.*acq_date and acq_time",
     ),
-    "11_declared_unit": (
-        "arrival.tif",
-        {"units": "minutes", "minutes_per_step": 0.5},
-        r"\(s\) is in seconds; expected fire.units=seconds, not minutes",
+    "11_declared_unit/arrival.tif": (
+        DECLARED,
+        "seconds; expected fire.units=seconds",
         {"units": "seconds"},
         "time_of_arrival",
     ),
-    "12_mask_frames": (
-        "fire_maps.npy",
+    "12_mask_frames/fire_maps.npy": (
         {},
         r"20 maps of the states 0 \(78 %\), 1 .*fire.kind=masks",
         {"kind": "masks"},
-        "137 cells burn from 0 maps to 19 maps; 1 place .*20 maps",
+        "137 cells burn from 0 maps to 19 maps",
     ),
-    "13_tfr_polygon": (
-        "event_polygon.geojson",
+    "13_tfr_polygon/event_polygon.geojson": (
         {},
-        r"FeatureCategory: .*Perimeter \(6\), Temporary Flight Restriction \(1\); .*fire.where=",
+        r"Perimeter \(6\), Temporary Flight Restriction \(1\); .*fire.where=",
         {"where": "FeatureCategory=Wildfire*"},
         "6 of 7 features used",
     ),
-    "14_yymmddhhmm": ("perimeters.geojson", {}, "", {}, "2018-08-19T20:00.*2018-08-20T03:00"),
-    "15_shapefile_date_only": ("Perimeters.shp", {}, "", {}, "3 times"),
-    "16_active_areas": ("active.geojson", {}, "", {}, "1 within the area burnt before"),
-    "17_forefire_geojson": ("fronts", {}, "", {}, "5 times, .*T18:00.*T22:00.*from valid_at"),
-    "18_kml_folder_time": ("ir.kml", {}, "", {}, "5 times, .*T18:00.*T22:00"),
-    "19_arcinfo_prj": ("toa.asc", {"units": "minutes"}, "", {}, "582 cells.*axes 1.00 : 1"),
+    "14_yymmddhhmm/perimeters.geojson": ({}, "", {}, "2018-08-19T20:00.*2018-08-20T03:00"),
+    "15_shapefile_date_only/Perimeters.shp": ({}, "", {}, "3 times"),
+    "16_active_areas/active.geojson": ({}, "", {}, "1 within the area burnt before"),
+    "17_forefire_geojson/fronts": ({}, "", {}, "5 times, .*T18:00.*T22:00.*from valid_at"),
+    "18_kml_folder_time/ir.kml": ({}, "", {}, "5 times, .*T18:00.*T22:00"),
+    "19_arcinfo_prj/toa.asc": ({"units": "minutes"}, "", {}, "582 cells.*axes 1.00 : 1"),
 }
 
 
 def test_all_cases_are_there():
-    assert sorted(path.name for path in CASES.iterdir()) == sorted(TABLE)
+    assert sorted(path.name for path in CASES.iterdir()) == [name.split("/")[0] for name in TABLE]
 
 
 @pytest.mark.parametrize("name", TABLE)
 @pytest.mark.filterwarnings("ignore:.*order is lost")
 def test_case(name):
-    file, keys, question, answer, says = TABLE[name]
-    config = {"path": str(CASES / name / file), "ring_width": None, **keys}
+    keys, question, answer, says = TABLE[name]
+    config = {"path": str(CASES / name), "ring_width": None, **keys}
     if question:
         with pytest.raises(ValueError, match=question) as caught:
             read_with_summary(FileFireConfig(**config), (30, 30), 1000)
         assert "\n" not in str(caught.value)
-        assert file in str(caught.value)
+        assert (CASES / name).name in str(caught.value)
     (fire,), read = read_with_summary(FileFireConfig(**config | answer), (30, 30), 1000)
     assert re.search(says, read), read
-    if (expected := CASES / name / "expected.npy").exists():
+    if (expected := CASES / name.split("/")[0] / "expected.npy").exists():
         right = np.load(expected)
         least = 0.8 if name.startswith("15") else 0.92
         for step in (250, 500, 750, 1000):
@@ -139,14 +119,13 @@ def keys_in(message):
     return [shlex.split(text)[0] for text in found[:count]]
 
 
-@pytest.mark.parametrize("name", [name for name, case in TABLE.items() if case[2]])
+@pytest.mark.parametrize("name", [name for name, case in TABLE.items() if case[1]])
 @pytest.mark.filterwarnings("ignore")
 def test_the_keys_that_messages_print_can_be_copied(name):
-    file, given, *_ = TABLE[name]
-    texts = [f"fire.{key}={value}" for key, value in given.items()]
+    texts = [f"fire.{key}={value}" for key, value in TABLE[name][0].items()]
     for _ in range(4):
         keys = ["fire=file", *texts]
-        config = resolve("independent", keys, **{"fire.path": str(CASES / name / file)})
+        config = resolve("independent", keys, **{"fire.path": str(CASES / name)})
         try:
             assert isinstance(config.fire, FileFireConfig)
             return read_with_summary(config.fire, (30, 30), 1000)
@@ -158,5 +137,5 @@ def test_the_keys_that_messages_print_can_be_copied(name):
 
 def test_lost_order_is_said():
     config = FileFireConfig(path=str(CASES / "15_shapefile_date_only" / "Perimeters.shp"))
-    with pytest.warns(UserWarning, match=r"8 features have 3 dates in poly_Polyg without a time"):
+    with pytest.warns(UserWarning, match=r"8 features have 3 dates .* order is lost"):
         read_with_summary(config, (30, 30), 1000)

@@ -2,6 +2,7 @@
 
 import json
 import re
+import shlex
 import time
 
 import geopandas
@@ -9,17 +10,17 @@ import numpy as np
 import pandas
 import pytest
 import rasterio
-import shapely
 import torch
-from fire_files import CORNER, UTM, Ellipses, raster_of, write_asc, write_tif
+from fire_files import CORNER, UTM, Ellipses, raster_of, squares, write_asc, write_tif
 from scipy.io import netcdf_file
 
 from emberlink.envs.fire_files.config import FileFireConfig
-from emberlink.envs.fire_files.dates import date_within, parse_dates, time_of_day
 from emberlink.envs.fire_files.reader import read_with_summary
+from emberlink.envs.fire_files.times import date_within, parse_dates, time_of_day
+from emberlink.trainers.config.compose import resolve
 
-HOURS = (60.0, 120.0, 180.0, 240.0)
 FIRE = Ellipses()
+DAY = ["2020-09-05"] * 3
 
 
 def read(path, **keys):
@@ -31,18 +32,20 @@ def read(path, **keys):
 
 
 def asks(path, match, **keys):
-    """Checks that a file is not understood without another key."""
+    """Checks that a file is not understood, and that the first key of the message is accepted."""
     with pytest.raises(ValueError, match=match) as caught:
         read(path, **keys)
-    assert "\n" not in str(caught.value)
-    assert path.name in str(caught.value)
+    text = str(caught.value)
+    assert "\n" not in text
+    assert path.name in text
+    tail = text.rpartition("; expected ")[2]
+    found = re.search(r"""'fire\.[^']*'|fire\.\w+=(?:"[^"]*"|[^\s,;]+)""", tail)
+    if found:
+        resolve("independent", ["fire=file", "fire.path=x", *shlex.split(found[0])])
 
 
-def squares(*sides, at=(0, 0), **columns):
-    """Returns concentric squares with the given sides in metres."""
-    boxes = [shapely.box(*(np.array([-s, -s, s, s]) / 2)) for s in sides]
-    shapes = [shapely.transform(b, lambda xy: xy + np.array(CORNER) + at) for b in boxes]
-    return geopandas.GeoDataFrame(columns, geometry=shapes, crs=UTM)
+def dates(count, year=2020):
+    return [f"{year}-09-05T{9 + k:02}:00Z" for k in range(count)]
 
 
 @pytest.fixture
@@ -63,12 +66,12 @@ def same(path, elapsed, says="", **keys):
 @pytest.mark.parametrize(
     ("columns", "joined"),
     [
-        ({"date": ["2020-09-05"] * 3, "hour": [9, 10, 11]}, "date and hour"),
-        ({"date": ["2020-09-05"] * 3, "hour": [9, 10, 11], "minute": [5] * 3}, "hour and minute"),
+        ({"date": DAY, "hour": [9, 10, 11]}, "date and hour"),
+        ({"date": DAY, "hour": [9, 10, 11], "minute": [5] * 3}, "hour and minute"),
         ({"DATE_": ["9/25/2020"] * 3, "TIME_": [2055, 2155, 2255]}, "DATE_ and TIME_"),
-        ({"Acq_Date": ["2020-09-05"] * 3, "Acq_Time": ["00:08", "01:08", "02:08"]}, "Acq_Time"),
-        ({"date": ["2020-09-05"] * 3, "time": ["930", "1030", "1130"], "half": ["AM"] * 3}, "half"),
-        ({"fecha": ["2020-09-05"] * 3, "hora": ["9:55 PM", "10:55 PM", "11:55 PM"]}, "fecha and"),
+        ({"Acq_Date": DAY, "Acq_Time": ["00:08", "01:08", "02:08"]}, "Acq_Time"),
+        ({"date": DAY, "time": ["930", "1030", "1130"], "half": ["AM"] * 3}, "half"),
+        ({"fecha": DAY, "hora": ["9:55 PM", "10:55 PM", "11:55 PM"]}, "fecha and"),
     ],
 )
 def test_a_date_beside_a_time_of_day_is_joined(tmp_path, elapsed, columns, joined):
@@ -78,102 +81,85 @@ def test_a_date_beside_a_time_of_day_is_joined(tmp_path, elapsed, columns, joine
 
 
 def test_a_time_of_day_of_another_column_is_asked_for(tmp_path, elapsed):
-    frame = squares(200, 300, 400, date=["2020-09-05"] * 3, flight_time=["0900", "1000", "1100"])
+    frame = squares(200, 300, 400, date=DAY, flight_time=["0900", "1000", "1100"])
     frame.to_file(tmp_path / "fire.gpkg")
-    asks(tmp_path / "fire.gpkg", r"flight_time may hold; expected 'fire.time_field=\[date,flight")
+    asks(tmp_path / "fire.gpkg", r"'fire.time_field=\[date,flight_time\]'")
     same(tmp_path / "fire.gpkg", elapsed, time_field=("date", "flight_time"))
     frame = frame.rename(columns={"flight_time": "period"})
     frame.assign(period=["AM", "AM", "PM"]).to_file(tmp_path / "half.gpkg")
-    asks(tmp_path / "half.gpkg", r"which period may hold; expected 'fire.time_field=\[date,period")
+    asks(tmp_path / "half.gpkg", r"'fire.time_field=\[date,period\]'")
     about = read(tmp_path / "half.gpkg", time_field=("date", "period"))[1]
     assert "2 times, from 2020-09-05T00:00+00:00 to 2020-09-05T12:00+00:00" in about
     frame.assign(time=["0900", "2575", "1100"]).to_file(tmp_path / "wrong.gpkg")
-    asks(tmp_path / "wrong.gpkg", "feature 1 has date=2020-09-05, time=2575; expected a date")
+    asks(tmp_path / "wrong.gpkg", "feature 1 has time=2575")
 
 
 @pytest.mark.parametrize("column", ["fireid", "FIRE_YEAR", "attr_UniqueFireIdentifier", "id"])
 def test_several_fires_are_listed_and_one_is_chosen(tmp_path, elapsed, column):
-    frames = [squares(200, 300, 400, date=_dates(3)), squares(9, 90, at=(9e4, 0), date=_dates(2))]
+    frames = [squares(200, 300, 400, date=dates(3)), squares(9, 90, at=(9e4, 0), date=dates(2))]
     frame = pandas.concat([f.assign(**{column: k + 2019}) for k, f in enumerate(frames)])
-    frame.to_file(tmp_path / "fire.gpkg")
-    asks(tmp_path / "fire.gpkg", rf"{column}: 2019 \(3\), 2020 \(2\); .*incident_field={column}")
-    same(tmp_path / "fire.gpkg", elapsed, "3 of 5 features", incident="2019")
-    asks(tmp_path / "fire.gpkg", "2 groups of parts never join, and lie far apart", incident="*")
-    asks(tmp_path / "fire.gpkg", "'2018' is not known; .*known: 2019, 2020", incident="2018")
+    path = tmp_path / "fire.gpkg"
+    frame.to_file(path)
+    asks(path, rf"{column}: 2019 \(3\), 2020 \(2\); .*incident_field={column}")
+    same(path, elapsed, "3 of 5 features", incident="2019")
+    asks(path, "2 groups of parts never join", incident="*")
+    asks(path, "'2018' is not known; .*known: 2019, 2020", incident=2018)
 
 
-def _dates(count):
-    return [f"2020-09-05T{9 + k:02}:00Z" for k in range(count)]
-
-
-def test_fires_that_merge(tmp_path, elapsed):
-    frame = squares(200, 300, 400, t=_dates(3), fireid=[7, 7, 9], mergeid=[7, 7, 7])
+def test_fires_that_merge_and_numbers_of_features(tmp_path, elapsed):
+    frame = squares(200, 300, 400, t=dates(3), fireid=[7, 7, 9], mergeid=[7, 7, 7])
     frame.to_file(tmp_path / "feds.gpkg")
     asks(tmp_path / "feds.gpkg", r"fireid: 7 \(2\), 9 \(1\); expected fire.incident_field=fireid")
-    says = r"which differ in fireid: 7 (2), 9 (1)"
+    says = r"fireid: 7 (2), 9 (1)"
     same(tmp_path / "feds.gpkg", elapsed, says, incident_field="mergeid", incident="7")
-
-
-def test_a_number_of_the_features_is_no_fire(tmp_path, elapsed):
-    frame = squares(200, 300, 400, date=_dates(3), id=[1, 2, 3], name=["first", "second", "third"])
+    frame = squares(200, 300, 400, date=dates(3), id=[1, 2, 3], name=["first", "second", "third"])
     frame.to_file(tmp_path / "fire.gpkg")
     same(tmp_path / "fire.gpkg", elapsed)
 
 
-def test_a_prescribed_fire_is_filtered(tmp_path, elapsed):
-    kinds = ["WF", "WF", "WF", "RX"]
-    frame = squares(200, 300, 400, 4000, date=_dates(4), IncidentTypeCategory=kinds)
-    frame.to_file(tmp_path / "fire.gpkg")
-    asks(tmp_path / "fire.gpkg", r"IncidentTypeCategory: WF \(3\), RX \(1\); expected 'fire.where=")
-    same(tmp_path / "fire.gpkg", elapsed, "1 left out", where="incidenttypecategory=wf")
-    assert "4 of 4 features" in read(tmp_path / "fire.gpkg", where="*")[1]
-    asks(tmp_path / "fire.gpkg", "keeps no feature", where="IncidentTypeCategory=x*")
-
-
-def test_features_without_a_time_are_asked_about(tmp_path, elapsed):
-    frame = squares(200, 300, 400, 900, date=[*_dates(3), None])
-    frame.to_file(tmp_path / "fire.gpkg")
-    asks(tmp_path / "fire.gpkg", r"feature 3 has no time in date \(1 of 4\); .*fire.where=date")
-    same(tmp_path / "fire.gpkg", elapsed, "1 left out by fire.where=date", where="date")
+def test_features_are_filtered(tmp_path, elapsed):
+    path, kinds = tmp_path / "fire.gpkg", ["WF", "WF", "WF", "RX"]
+    squares(200, 300, 400, 4000, date=dates(4), IncidentTypeCategory=kinds).to_file(path)
+    asks(path, r"IncidentTypeCategory: WF \(3\), RX \(1\); expected 'fire.where=")
+    same(path, elapsed, "1 left out", where="incidenttypecategory=wf")
+    assert "4 of 4 features" in read(path, where="*")[1]
+    asks(path, "keeps no feature", where="IncidentTypeCategory=x*")
+    squares(200, 300, 400, 900, date=[*dates(3), None]).to_file(path)
+    asks(path, r"feature 3 has no time in date \(1 of 4\); .*fire.where=date")
+    same(path, elapsed, "1 left out by fire.where=date", where="date")
 
 
 def test_a_raster_in_a_projection_that_bends(tmp_path):
-    times = raster_of(FIRE, 300.0, 80, 40.0)
-    plain = write_tif(tmp_path / "plain.tif", times, 40.0)
-    bent = tmp_path / "bent.tif"
-    with rasterio.open(plain) as source:
-        about = {
-            "crs": "+proj=sinu +R=6371007.181",
-            "resampling": rasterio.enums.Resampling.nearest,
-        }
-        with rasterio.vrt.WarpedVRT(source, **about) as view:
-            profile = {**view.profile, "driver": "GTiff"}
-            with rasterio.open(bent, "w", **profile) as target:
-                target.write(view.read())
+    plain = write_tif(tmp_path / "plain.tif", raster_of(FIRE, 300.0, 80, 40.0), 40.0)
+    bent, crs = tmp_path / "bent.tif", "+proj=sinu +R=6371007.181"
+    nearest = rasterio.enums.Resampling.nearest
+    with (
+        rasterio.open(plain) as source,
+        rasterio.vrt.WarpedVRT(source, crs=crs, resampling=nearest) as view,
+        rasterio.open(bent, "w", **{**view.profile, "driver": "GTiff"}) as target,
+    ):
+        target.write(view.read())
     right, about = read(plain, units="minutes")
     assert "axes 1.00 : 1" in about
     fire, about = read(bent, units="minutes")
-    assert "projected to WGS 84 / UTM zone 11N (axes 1.00 : 1" in about
+    assert "UTM zone 11N (axes 1.00 : 1" in about
     for step in (40, 70, 100):
         one, other = right <= step, fire <= step
         assert (one & other).sum() / (one | other).sum() > 0.9
-    asks(plain, "has axes 3.* : 1, ", units="minutes", crs="+proj=sinu +lon_0=0")
+    asks(plain, "has axes 3.* : 1", units="minutes", crs="+proj=sinu +lon_0=0")
 
 
 @pytest.mark.parametrize("value", [9999.0, 65535.0, 1e10, 305.0, 0.0])
 def test_a_plateau_is_asked_about(tmp_path, value):
-    times = np.where(raster_of(FIRE, 300.0) < 0, value, raster_of(FIRE, 300.0) + 1)
-    path = write_tif(tmp_path / "fire.tif", times, nodata=None)
-    asks(
-        path, rf"{re.escape(f'{value:g}')} \(\d+ % of the cells\).*fire.unburned=", units="minutes"
-    )
-    right = read(
-        write_asc(tmp_path / "fire.asc", raster_of(FIRE, 300.0) + 1),
-        units="minutes",
-        unburned=-9998.0,
-    )[0]
+    times = raster_of(FIRE, 300.0)
+    burnt = np.where(times < 0, value, times + 1)
+    path = write_tif(tmp_path / "fire.tif", burnt, nodata=None)
+    question = rf"{re.escape(f'{value:g}')} \(\d+ % of the cells\).*fire.unburned="
+    asks(path, question, units="minutes")
+    plain = write_asc(tmp_path / "fire.asc", times + 1)
+    right = read(plain, units="minutes", unburned=-9998.0)[0]
     assert torch.equal(read(path, units="minutes", unburned=value)[0], right)
-    few = times[20:70, 20:70]
+    few = burnt[20:70, 20:70]
     share = (few == value).mean()
     if value != 305:
         asks(write_tif(tmp_path / "few.tif", few), f".{100 * share:.0f} %", units="minutes")
@@ -181,7 +167,8 @@ def test_a_plateau_is_asked_about(tmp_path, value):
 
 
 def test_fill_values_are_asked_about_together_and_a_large_ignition_is_not(tmp_path):
-    times = np.where(raster_of(FIRE, 300.0) < 0, 0, 200 + raster_of(FIRE, 300.0) // 60)
+    hours = raster_of(FIRE, 300.0) // 60
+    times = np.where(raster_of(FIRE, 300.0) < 0, 0, 200 + hours)
     times[:5] = -2
     path = write_tif(tmp_path / "burn.tif", times.astype("int16"), nodata=None)
     listed = r"-2 \(5 % of the cells\) and 0 \(\d+ % .*expected 'fire.unburned=\[-2,0\]'"
@@ -190,16 +177,14 @@ def test_fill_values_are_asked_about_together_and_a_large_ignition_is_not(tmp_pa
     times = raster_of(FIRE, 300.0)
     lit = write_tif(tmp_path / "lit.tif", np.where(times < 0, times, np.maximum(times - 150, 0)))
     assert "from 0 minutes to 149" in read(lit, units="minutes")[1]
+    days = write_tif(tmp_path / "days.tif", np.where(times < 0, -9999, 100 + hours))
+    assert torch.equal(read(days, units="days")[0], read(days, units="day_of_year")[0])
 
 
 def test_days_of_the_year_of_perimeters(tmp_path, elapsed):
     squares(200, 300, 400, doy=[365, 1, 2]).to_file(tmp_path / "fire.gpkg")
     same(tmp_path / "fire.gpkg", elapsed, time_field="doy", units="day_of_year", start=365.0)
     asks(tmp_path / "fire.gpkg", "days 1 to 2 and 365 to 365", time_field="doy", units="days")
-    days = np.where(raster_of(FIRE, 300.0) < 0, -9999, 100 + raster_of(FIRE, 300.0) // 60)
-    path = write_tif(tmp_path / "fire.tif", days)
-    summer, winter = read(path, units="days")[0], read(path, units="day_of_year")[0]
-    assert torch.equal(summer, winter)
 
 
 @pytest.mark.parametrize(
@@ -237,7 +222,7 @@ def test_forms_of_dates(text, expected):
         (["2020-13-05"], None, "is not a date"),
         (["13/08/2020", "08/14/2020"], None, "is not a date"),
         (["5 de agosto"], None, "is not a date; expected .*fire.time_format"),
-        (["2020-09-05"], "noon", "fire.time_format=noon: expected"),
+        (["2020-09-05"], "noon", "fire.time_format=noon; expected"),
     ],
 )
 def test_dates_that_are_asked_about(texts, form, match):
@@ -245,37 +230,32 @@ def test_dates_that_are_asked_about(texts, form, match):
         parse_dates(texts, form, "t")
 
 
-def test_one_date_decides_the_order_of_all():
-    dates = parse_dates(["05/08/2020 02:00", "13/08/2020 02:00"], None, "t")
-    assert [date.day for date in dates] == [5, 13]
+def test_orders_names_flights_and_the_future(tmp_path, elapsed):
+    read_dates = parse_dates(["05/08/2020 02:00", "13/08/2020 02:00"], None, "t")
+    assert [date.day for date in read_dates] == [5, 13]
     assert parse_dates(["05/08/2020"], "month_first", "t")[0].month == 5
     assert parse_dates(["5h 3. 2020"], "%Hh %d. %Y", "t")[0].hour == 5
-
-
-def test_two_flights_a_day_in_names_and_the_future(tmp_path, elapsed):
     assert date_within("20200905_1830_Creek_IR") == "20200905 1830"
     assert date_within("Creek > IR 2020-09-05T18-00") == "2020-09-05T18:00"
     assert date_within("Flight 3") == date_within("2020-09-05 to 2020-09-06") == ""
     assert time_of_day("942") == time_of_day("09:42") == time_of_day("9:42 AM")
-    later = [text.replace("2020", "2090") for text in _dates(3)]
-    squares(200, 300, 400, date=later).to_file(tmp_path / "fire.geojson")
+    squares(200, 300, 400, date=dates(3, 2090)).to_file(tmp_path / "fire.geojson")
     with pytest.warns(UserWarning, match="2090-09-05 is in the future"):
         same(tmp_path / "fire.geojson", elapsed)
 
 
-def test_a_unit_in_the_file_is_used_and_contradicts(tmp_path, elapsed):
+def test_a_unit_in_the_file_is_used_and_contradicts(tmp_path):
     path = write_tif(tmp_path / "fire.tif", raster_of(FIRE, 300.0))
+    plain = read(path, units="minutes")[0]
     with rasterio.open(path, "r+") as dataset:
         dataset.units = ("minutes",)
-    fire, about = read(path)
-    assert "(minutes)" in about
-    assert torch.equal(fire, read(path, units="minutes")[0])
-    asks(path, "is in minutes; expected fire.units=minutes, not hours", units="hours")
+    assert torch.equal(read(path)[0], plain)
+    asks(path, "is in minutes; expected fire.units=minutes", units="hours")
     with rasterio.open(path, "r+") as dataset:
         dataset.units = ("kW/m",)
     asks(path, "is in kW/m, no unit of time", units="minutes")
     squares(200, 300, 400, Elapsed_Mi=[0, 60, 120]).to_file(tmp_path / "fire.shp")
-    asks(tmp_path / "fire.shp", "Elapsed_Mi is in minutes; expected", units="hours")
+    asks(tmp_path / "fire.shp", "is in minutes; expected", units="hours")
 
 
 @pytest.mark.parametrize("kind", ["bool", "float32", "int64"])
@@ -296,9 +276,7 @@ def test_a_bank_is_tested_like_a_raster(tmp_path):
     bank = np.full((5, 10, 10), 900.0)
     bank[:, 3:6, 3:6] = np.arange(9).reshape(3, 3)
     np.save(tmp_path / "bank.npy", bank)
-    asks(
-        tmp_path / "bank.npy", r"fire 0: 900 \(91 % of the cells\) may stand for cells that do not"
-    )
+    asks(tmp_path / "bank.npy", r"fire 0: 900 \(91 % .* fire.unburned=900")
     config = FileFireConfig(path=str(tmp_path / "bank.npy"), unburned=900.0)
     assert torch.isfinite(read_with_summary(config, (10, 10), 1000)[0]).sum() == 5 * 9
 
@@ -306,9 +284,8 @@ def test_a_bank_is_tested_like_a_raster(tmp_path):
 @pytest.mark.parametrize("name", ["fire_archive_SV-C2_1.csv", "SUOMI_VIIRS_C2_2023001.txt"])
 def test_detections_of_firms_by_hand(tmp_path, name):
     """Two detections a kilometre apart and a radius of 600 m: 2.2 km wide, 1.2 km high."""
-    daily = name.endswith("txt")
+    clocks = ("00:08", "12:30") if name.endswith("txt") else ("8", "1230")
     rows = ["latitude,longitude,bright_ti4,acq_date,acq_time,daynight"]
-    clocks = ("00:08", "12:30") if daily else ("8", "1230")
     rows += [f"{45},{-117 + k * 0.01268},330,2020-09-05,{clocks[k]},N" for k in range(2)]
     (tmp_path / name).write_text("\n".join([*rows, ""]))
     asks(tmp_path / name, "2 points, .*expected fire.radius")
@@ -323,12 +300,12 @@ def wrf(path, variables=("TIGN_G",), **attributes):
     """Writes a file of WRF-SFIRE with two times; the fire starts in the south-west."""
     y, x = np.mgrid[:20, :24]
     times = np.hypot(x - 5, y - 4) * 60.0
+    dimensions = {"Time": 2, "south_north_subgrid": 20, "west_east_subgrid": 24}
     with netcdf_file(path, "w") as file:
-        for name, size in (("Time", 2), ("south_north_subgrid", 20), ("west_east_subgrid", 24)):
+        for name, size in dimensions.items():
             file.createDimension(name, size)
         for name in variables:
-            dimensions = ("Time", "south_north_subgrid", "west_east_subgrid")
-            variable = file.createVariable(name, "f4", dimensions)
+            variable = file.createVariable(name, "f4", tuple(dimensions))
             variable[0], variable[1] = np.minimum(times, 305), np.where(times < 600, times, 605)
             for key, value in attributes.items():
                 setattr(variable, key, value)
@@ -342,12 +319,7 @@ def test_wrf_sfire_is_read_without_a_conversion(tmp_path):
     asks(path, "605 .*fire.unburned=605", layer="TIGN_G", units="seconds")
     fire, about = read(path, layer="TIGN_G", units="seconds", unburned=605.0, margin=None)
     assert "the last of 2 times" in about
-    i, j = np.unravel_index(int(fire.argmin()), fire.shape)
-    assert i < 6
-    assert j < 6, "the south is below"
-
-
-def test_a_unit_with_a_date_of_netcdf(tmp_path):
+    assert max(np.unravel_index(int(fire.argmin()), fire.shape)) < 6, "the south is below"
     path = wrf(tmp_path / "fire.nc", ("arrival_time_of_front",), units="seconds since 2012-09-09")
     fire, about = read(path, unburned=605.0)
     assert "from 2012-09-09T00:00+00:00 to 2012-09-09T00:09+00:00" in about
@@ -360,7 +332,7 @@ def test_a_folder_of_cell2fire(tmp_path):
         grid = np.zeros((10, 12), int)
         grid[5, 5 - min(step, 5) : 6 + step // 2] = 1
         np.savetxt(tmp_path / f"ForestGrid{step}.csv", grid, "%d", ",")
-    asks(tmp_path / "ForestGrid0.csv", "one map of Cell2Fire; expected its folder")
+    asks(tmp_path / "ForestGrid0.csv", "expected its folder")
     asks(tmp_path, "11 maps of Cell2Fire; expected fire.kind=masks")
     fire, about = read(tmp_path, kind="masks", margin=None)
     assert "from 0 maps to 10 maps; 1 place where it begins; 11 maps of the states 0, 1" in about
@@ -368,16 +340,13 @@ def test_a_folder_of_cell2fire(tmp_path):
 
 
 def test_perimeters_that_shrink_count_as_their_union(tmp_path, elapsed):
-    frame = squares(
-        400, 100, 200, 300, date=[*_dates(3)[::-1][:1], "2020-09-05T11:30Z", *_dates(2)]
-    )
-    frame.to_file(tmp_path / "fire.geojson")
+    columns = {"date": [dates(3)[2], "2020-09-05T11:30Z", *dates(2)]}
+    squares(400, 100, 200, 300, **columns).to_file(tmp_path / "fire.geojson")
     fire, about = read(tmp_path / "fire.geojson")
     assert "1 within the area burnt before" in about
     assert torch.equal(torch.isfinite(fire), torch.isfinite(elapsed))
     assert fire[torch.isfinite(fire)].max() <= 80
-    reverse = squares(400, 300, 200, date=_dates(3))
-    reverse.to_file(tmp_path / "reverse.geojson")
+    squares(400, 300, 200, date=dates(3)).to_file(tmp_path / "reverse.geojson")
     asks(tmp_path / "reverse.geojson", "no fire spreads")
 
 
@@ -385,8 +354,8 @@ def test_perimeters_that_shrink_count_as_their_union(tmp_path, elapsed):
 def test_times_outside_the_features(tmp_path, elapsed, place):
     whole = squares(200, 300, 400, kept=[1, 1, 1]).to_crs("EPSG:4326")
     stamps = [f"2020-09-05T{9 + k:02}:00:00Z" for k in range(3)]
+    path = tmp_path / "fire"
     if place in ("file", "collection"):
-        path = tmp_path / "fires"
         path.mkdir()
         for k in range(3):
             text = json.loads(whole.iloc[k : k + 1].to_json())
@@ -395,7 +364,6 @@ def test_times_outside_the_features(tmp_path, elapsed, place):
             name = f"Creek_20200905_{9 + k:02}00" if place == "file" else f"front_{k}"
             (path / f"{name}.geojson").write_text(json.dumps(text))
     else:
-        path = tmp_path / "fire.kml"
         marks = []
         for stamp, shape in zip(stamps, whole.geometry, strict=True):
             ring = " ".join(f"{x},{y},0" for x, y in shape.exterior.coords)
@@ -404,14 +372,13 @@ def test_times_outside_the_features(tmp_path, elapsed, place):
             time = f"<TimeSpan><begin>{stamp}</begin></TimeSpan>"
             spot = "<Placemark><Point><coordinates>1,2</coordinates></Point></Placemark>"
             inner = f"<Placemark><name>Heat</name>{area}</Placemark>{spot}"
-            marks.append(
-                {
-                    "folder": f"<Folder><name>IR {stamp}</name>{inner}</Folder>",
-                    "document": f"<Folder>{time}<Folder>{inner}</Folder></Folder>",
-                    "name": f"<Placemark><name>{stamp[:16]}</name>{area}</Placemark>",
-                    "placemark": f"<Placemark>{time}{area}</Placemark>",
-                }[place]
-            )
+            kinds = {
+                "folder": f"<Folder><name>IR {stamp}</name>{inner}</Folder>",
+                "document": f"<Folder>{time}<Folder>{inner}</Folder></Folder>",
+                "name": f"<Placemark><name>{stamp[:16]}</name>{area}</Placemark>",
+                "placemark": f"<Placemark>{time}{area}</Placemark>",
+            }
+            marks.append(kinds[place])
         path.write_text(f"<kml><Document>{''.join(marks)}</Document></kml>")
     same(path, elapsed)
 
@@ -440,10 +407,8 @@ def test_a_fire_of_28110_detections_takes_seconds(tmp_path, suffix):
     x, y = far * np.cos(angle) * 1.4 + CORNER[0], far * np.sin(angle) + CORNER[1]
     stamps = [pandas.Timestamp("2020-09-05T09:42") + pandas.Timedelta(hours=12 * k) for k in passes]
     points = geopandas.GeoSeries(geopandas.points_from_xy(x, y), crs=UTM).to_crs("EPSG:4326")
-    about = {
-        "acq_date": [f"{t:%Y-%m-%d}" for t in stamps],
-        "acq_time": [f"{t:%H%M}" for t in stamps],
-    }
+    days, clocks = ([f"{t:{form}}" for t in stamps] for form in ("%Y-%m-%d", "%H%M"))
+    about = {"acq_date": days, "acq_time": clocks}
     frame = geopandas.GeoDataFrame(about, geometry=points.buffer(0.002), crs="EPSG:4326")
     frame.to_file(tmp_path / f"viirs.{suffix}")
     began = time.process_time()

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import shapely
 import torch
-from fire_files import CORNER, KINDS, UTM, Ellipses, frame_of, raster_of, write_asc
+from fire_files import CORNER, KINDS, UTM, Ellipses, frame_of, raster_of, squares, write_asc
 
 from emberlink.envs.fire_files.config import FileFireConfig
 from emberlink.envs.fire_files.reader import read_fires
@@ -27,10 +27,10 @@ def read(path, grid=GRID, horizon=HORIZON, **keys):
     return fire
 
 
-def overlaps(first, second, steps=(0, 250, 500, 750, 1000)):
-    """Returns the intersection over union of the burnt areas at some steps."""
-    pairs = [(first <= step, second <= step) for step in steps]
-    return [((a & b).sum() / (a | b).sum()).item() for a, b in pairs]
+def write(path, shapes, minutes):
+    """Writes perimeters around the corner of the map."""
+    shapes = [shapely.transform(shape, lambda at: at + CORNER) for shape in shapes]
+    geopandas.GeoDataFrame({"Elapsed_Mi": minutes}, geometry=shapes, crs=UTM).to_file(path)
 
 
 @pytest.mark.parametrize("name", FIRES)
@@ -43,7 +43,8 @@ def test_a_fire_is_the_same_from_its_raster_and_from_its_perimeters(tmp_path, na
     frame_of(fire, range(first - 60 * (first > 60), 390, 30), "line").to_file(tmp_path / "fire.shp")
     cells = read(raster, grid, units="minutes", **span)
     fronts = read(tmp_path / "fire.shp", grid, **span)
-    shares = overlaps(cells, fronts, range(300, 1001, 50))
+    pairs = [(cells <= step, fronts <= step) for step in range(300, 1001, 50)]
+    shares = [((a & b).sum() / (a | b).sum()).item() for a, b in pairs]
     assert min(shares) > 0.92, shares
     assert np.mean(shares) > 0.97, shares
     later = torch.isfinite(cells) & torch.isfinite(fronts) & (cells > 0) & (fronts > 0)
@@ -52,7 +53,7 @@ def test_a_fire_is_the_same_from_its_raster_and_from_its_perimeters(tmp_path, na
 
 def test_before_the_first_perimeter_by_hand(tmp_path):
     """Edges move 50 m an hour, so that a square of 300 m after an hour is one of 200 m at 0."""
-    squares(300, 400, column="Elapsed_Mi", values=[60, 120]).to_file(tmp_path / "fire.shp")
+    squares(300, 400, Elapsed_Mi=[60, 120]).to_file(tmp_path / "fire.shp")
     fire = read(tmp_path / "fire.shp", (40, 40), 120, margin=0.0)  # cells of 10 m
     assert (fire[10:30, 10:30] == 0).all()
     assert (fire == 0).sum() == 20 * 20
@@ -61,17 +62,13 @@ def test_before_the_first_perimeter_by_hand(tmp_path):
     assert (fire[5:9, 20] < 60).all()
     # The fire was a point three hours before the first perimeter, and stays one earlier.
     for first, width in ((180, 30), (360, 30)):
-        squares(300, 400, column="Elapsed_Mi", values=[first, first + 60]).to_file(
-            tmp_path / "late.shp"
-        )
+        squares(300, 400, Elapsed_Mi=[first, first + 60]).to_file(tmp_path / "late.shp")
         late = read(tmp_path / "late.shp", (40, 40), first + 60, margin=0.0)
         assert 1 <= (late == 0).sum() <= 4
         assert (late == 0)[19:21, 19:21].any()
         assert (late <= first).sum() == pytest.approx(width**2, abs=4 * width)
     # Calendar time begins at the first perimeter.
-    squares(300, 400, column="date", values=["2020-08-19", "2020-08-20"]).to_file(
-        tmp_path / "dates.gpkg"
-    )
+    squares(300, 400, date=["2020-08-19", "2020-08-20"]).to_file(tmp_path / "dates.gpkg")
     dated = read(tmp_path / "dates.gpkg", (40, 40), 120, margin=0.0)
     assert (dated == 0).sum() == pytest.approx(30 * 30, abs=4 * 30)
 
@@ -83,9 +80,7 @@ def test_before_the_first_perimeter_each_part_shrinks(tmp_path):
         shapely.MultiPolygon([shapely.box(0, 0, 200, 200), shapely.box(400, 0, 600, 200)]),
         shapely.box(-50, 0, 650, 250),
     ]
-    shapes = [shapely.transform(shape, lambda at: at + CORNER) for shape in shapes]
-    frame = geopandas.GeoDataFrame({"Elapsed_Mi": [60, 120]}, geometry=shapes, crs=UTM)
-    frame.to_file(tmp_path / "fire.gpkg")
+    write(tmp_path / "fire.gpkg", shapes, [60, 120])
     fire = read(tmp_path / "fire.gpkg", (70, 25), 120, margin=0.0)  # cells of 10 m
     expected = torch.zeros(70, 25, dtype=torch.bool)
     expected[10:20, :15] = expected[50:60, :15] = True
@@ -97,12 +92,8 @@ def test_a_small_polygon_beside_a_large_one_is_not_lost(tmp_path):
     spot = [shapely.box(2000, 0, 2000 + side, side) for side in (4, 8)]
     large = [shapely.box(0, 0, side, side) for side in (1000, 1200)]
     shapes = [shapely.MultiPolygon(pair) for pair in zip(large, spot, strict=True)]
-    shapes = [shapely.transform(shape, lambda at: at + CORNER) for shape in shapes]
     for first in (0, 60):
-        frame = geopandas.GeoDataFrame(
-            {"Elapsed_Mi": [first, first + 60]}, geometry=shapes, crs=UTM
-        )
-        frame.to_file(tmp_path / "fire.gpkg")
+        write(tmp_path / "fire.gpkg", shapes, [first, first + 60])
         fire = read(tmp_path / "fire.gpkg")
         right = fire[25:]
         assert (right == 0).sum() == 1
@@ -128,15 +119,8 @@ def test_each_kind_of_geometry_in_each_format(tmp_path, kind, suffix):
     assert torch.allclose(fire[both], plain[both], atol=1e-2)
 
 
-def squares(*sides, column, values, kind=None):
-    """Returns concentric squares with the given sides in metres."""
-    boxes = [shapely.box(*(np.array([-s, -s, s, s]) / 2)) for s in sides]
-    shapes = [shapely.transform(box, lambda at: at + CORNER) for box in boxes]
-    return geopandas.GeoDataFrame({column: values}, geometry=shapes, crs=UTM)
-
-
 def test_between_two_squares_by_hand(tmp_path):
-    squares(100, 500, column="Elapsed_Mi", values=[0, 400]).to_file(tmp_path / "fire.shp")
+    squares(100, 500, Elapsed_Mi=[0, 400]).to_file(tmp_path / "fire.shp")
     # Of 25 x 25 cells of 20 m, the middle 5 x 5 burn at 0 and the outermost last.
     fire = read(tmp_path / "fire.shp", (25, 25), 400, margin=0.0)
     assert (fire[10:15, 10:15] == 0).all()
@@ -151,7 +135,7 @@ def test_between_two_squares_by_hand(tmp_path):
 
 def test_burnt_area_stays_burnt(tmp_path):
     """Perimeters may not contain each other, or hold the growth alone. Their union counts."""
-    frame = squares(200, 300, 310, column="Elapsed_Mi", values=[0, 60, 120])
+    frame = squares(200, 300, 310, Elapsed_Mi=[0, 60, 120])
     moved = shapely.affinity.translate(frame.geometry[1], 80, 0)
     frame.loc[1, "geometry"] = moved.difference(frame.geometry[0])
     frame.to_file(tmp_path / "fire.shp")
@@ -164,14 +148,10 @@ def test_burnt_area_stays_burnt(tmp_path):
 
 
 def test_an_island_is_a_line_within_a_line(tmp_path):
-    outer, last = squares(300, 420, column="t", values=[0, 1]).geometry
-    hole = shapely.transform(shapely.box(-60, -60, 60, 60), lambda at: at + CORNER)
-    shapes = [outer.boundary, hole.boundary, last.boundary, hole.boundary]
-    frame = geopandas.GeoDataFrame({"Elapsed_Mi": [0, 0, 60, 60]}, geometry=shapes, crs=UTM)
-    frame.to_file(tmp_path / "lines.shp")
-    areas = [outer.difference(hole), last.difference(hole)]
-    frame = geopandas.GeoDataFrame({"Elapsed_Mi": [0, 60]}, geometry=areas, crs=UTM)
-    frame.to_file(tmp_path / "areas.gpkg")
+    outer, last, hole = (shapely.box(-s, -s, s, s) for s in (150, 210, 60))
+    edges = [outer.boundary, hole.boundary, last.boundary, hole.boundary]
+    write(tmp_path / "lines.shp", edges, [0, 0, 60, 60])
+    write(tmp_path / "areas.gpkg", [outer.difference(hole), last.difference(hole)], [0, 60])
     lines = read(tmp_path / "lines.shp")
     assert torch.equal(lines, read(tmp_path / "areas.gpkg"))
     assert torch.isinf(lines[14:16, 14:16]).all()
@@ -179,11 +159,9 @@ def test_an_island_is_a_line_within_a_line(tmp_path):
 
 def test_areas_that_cross_themselves(tmp_path):
     at = np.array([(0, 0), (300, 300), (300, 0), (0, 300), (0, 0)]) - 150.0
-    bow = shapely.Polygon(at + np.array(CORNER))
-    large = squares(500, column="t", values=[1]).geometry[0]
+    bow, large = shapely.Polygon(at), shapely.box(-250, -250, 250, 250)
     for name, shapes in (("areas", [bow, large]), ("lines", [bow.boundary, large.boundary])):
-        frame = geopandas.GeoDataFrame({"Elapsed_Mi": [0, 60]}, geometry=shapes, crs=UTM)
-        frame.to_file(tmp_path / f"{name}.gpkg")
+        write(tmp_path / f"{name}.gpkg", shapes, [0, 60])
         fire = read(tmp_path / f"{name}.gpkg")
         assert (fire[[9, 9, 20, 20], [12, 17, 12, 17]] == 0).all()  # in the two lobes
         assert (fire[[14, 15, 14, 15], [9, 9, 20, 20]] > 0).all()  # and between them
@@ -199,9 +177,8 @@ def test_a_front_far_outside_the_map_is_measured_to_its_boundary(tmp_path):
     A cell burns if one of its samples does, so the burnt cells reach half a cell farther.
     """
     circles = [shapely.Point(CORNER).buffer(radius, quad_segs=64) for radius in (50, 5000)]
-    frame = geopandas.GeoDataFrame({"date": ["", ""]}, geometry=circles, crs=UTM)
-    frame["date"] = ["2020-08-19T13:00", "2020-08-20T13:00"]
-    frame.to_file(tmp_path / "fire.geojson")
+    dates = {"date": ["2020-08-19T13:00", "2020-08-20T13:00"]}
+    geopandas.GeoDataFrame(dates, geometry=circles, crs=UTM).to_file(tmp_path / "fire.geojson")
     fire = read(tmp_path / "fire.geojson", end=60.0, units="minutes")
     radius, side = 50 + 4950 / 24, 2 * (50 + 4950 / 24) / (30 * 0.8)
     assert fire.isfinite().sum().item() == pytest.approx(

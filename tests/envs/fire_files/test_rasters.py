@@ -11,16 +11,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from rasterio.transform import from_origin
 
-from emberlink.envs.fire_files.config import Clock, FileFireConfig
+from emberlink.envs.fire_files.config import FileFireConfig
 from emberlink.envs.fire_files.grid import Raster, Window
 from emberlink.envs.fire_files.reader import read_fires
+from emberlink.envs.fire_files.report import Clock
 
 INF = math.inf
 PLAIN = {"units": "minutes", "ring_width": None, "margin": None, "unburned": "none"}
 
 
 def read(path, grid=(8, 8), horizon=10, **keys):
-    """Returns the fire of a file, [X, Y]."""
     (fire,) = read_fires(FileFireConfig(path=str(path), **{**PLAIN, **keys}), grid, horizon)
     return fire
 
@@ -50,8 +50,7 @@ def test_the_earliest_cell_within_a_coarse_cell_counts(tmp_path):
     # A cell of the grid is 3 x 3 cells of the raster. 1 1/3 cells stay free below and above.
     fire = read(write_asc(tmp_path / "fire.asc", times), horizon=10)
     # The raster's rows 0 and 1 are the northern two of 16; the grid's rows of 3 begin 4 lower.
-    assert fire[0, 6] == 0  # the earliest of all six, 4 minutes, is step 0
-    assert fire[7, 1] == 10
+    assert (fire[0, 6], fire[7, 1]) == (0, 10)  # the earliest of all six, 4 minutes, is step 0
     assert torch.isfinite(fire).sum() == 2
 
 
@@ -70,13 +69,12 @@ def test_times_of_a_coarser_raster_are_interpolated(tmp_path):
 
 @pytest.mark.parametrize("never", [-9999.0, -1.0, np.nan, np.inf, -3.4028234663852886e38])
 def test_cells_that_never_burn(tmp_path, never):
-    times = np.where(corner([[1, 2], [3, 4]], 2, 2) < 0, never, corner([[1, 2], [3, 4]], 2, 2))
+    burns = corner([[1, 2], [3, 4]], 2, 2)
+    times = np.where(burns < 0, never, burns)
     asc = write_asc(tmp_path / "fire.asc", times, NODATA_VALUE=None)
     tif = write_tif(tmp_path / "fire.tif", times, nodata=None)
-    declared = write_tif(
-        tmp_path / "declared.tif", np.where(times == never, 777, times), nodata=777
-    )
-    for path in (asc, tif) if np.isnan(never) else (asc, tif, declared):
+    declared = write_tif(tmp_path / "declared.tif", np.where(burns < 0, 777, burns), nodata=777)
+    for path in (asc, tif, declared):
         assert torch.isfinite(read(path)).sum() == 4
 
 
@@ -181,13 +179,9 @@ def test_a_raster_turned_by_its_transform(tmp_path):
     straight = fire.arrival(at[None, :], at[::-1, None])
     other = write_tif(tmp_path / "straight.tif", np.where(straight < 250, straight, -9999), cell)
     rotated, upright = (read(p, (30, 30), margin=0.1, end=250.0) for p in (path, other))
-    for step in (4, 6, 8, 10):
-        assert iou(rotated <= step, upright <= step) > 0.88
-    assert iou(rotated <= 10, upright <= 10) > 0.93
-
-
-def iou(a, b):
-    return ((a & b).sum() / (a | b).sum()).item()
+    for step, least in ((4, 0.88), (6, 0.88), (8, 0.88), (10, 0.93)):
+        a, b = rotated <= step, upright <= step
+        assert (a & b).sum() / (a | b).sum() > least
 
 
 @pytest.mark.parametrize("first", [0.0, 3.0, 10.0, 10.5, 700.0])
@@ -219,24 +213,23 @@ def test_a_mask_marks_cells_that_never_burn(tmp_path, internal):
 
 def by_loops(times, window):
     """Returns the earliest centre in each cell of the grid that contains one."""
-    earliest = {}
-    rows = len(times)
+    earliest, rows = {}, len(times)
     for r, row in enumerate(times):
         for c, time in enumerate(row):
             i = math.floor((c + 0.5 - window.x) / window.side + 1e-6)
             j = math.floor((rows - r - 0.5 - window.y) / window.side + 1e-6)
-            earliest[i, j] = min(time, earliest.get((i, j), INF))
+            if 0 <= i < 8 and 0 <= j < 9:
+                earliest[i, j] = min(time, earliest.get((i, j), INF))
     return earliest
+
+
+PLACE = st.floats(-3, 3)
 
 
 @settings(max_examples=60, deadline=None)
 @given(
-    st.integers(2, 12),
-    st.integers(2, 12),
-    st.floats(0.3, 4),
-    st.floats(-3, 3),
-    st.floats(-3, 3),
-    st.integers(0, 2**32 - 1),
+    *(st.integers(2, 12), st.integers(2, 12)),
+    *(st.floats(0.3, 4), PLACE, PLACE, st.integers(0, 2**32 - 1)),
 )
 def test_no_arrival_is_lost(rows, columns, side, x, y, seed):
     random = np.random.default_rng(seed)
@@ -244,19 +237,13 @@ def test_no_arrival_is_lost(rows, columns, side, x, y, seed):
     times[random.random(times.shape) < 0.3] = INF
     times[0, 0] = 5.0
     window = Window(x, y, side, (8, 9))
-    source = Raster(times, (0, rows), (1, 1), Clock("minutes"))
-    got = source.on(window)
-    cells = Raster(times, (0, rows), (1, 1), Clock("steps"), whole=True)
-    cells = cells.on(window)
+    got, cells = (
+        Raster(times, (0, rows), (1, 1), Clock("minutes"), whole=whole).on(window)
+        for whole in (False, True)
+    )
     assert (got >= times.min() - 1e-9).all()
     assert (np.isinf(got) | (got <= times[times < INF].max() + 1e-9)).all()
-    expected = by_loops(times, window)
-    for i in range(8):
-        for j in range(9):
-            if (i, j) not in expected:
-                continue
-            if side >= 1:
-                assert cells[i, j] == expected[i, j]
-                assert got[i, j] <= expected[i, j]
-            if expected[i, j] == times.min():
-                assert got[i, j] == times.min()
+    for (i, j), expected in by_loops(times, window).items():
+        assert side < 1 or cells[i, j] == expected
+        assert side < 1 or got[i, j] <= expected
+        assert expected > times.min() or got[i, j] == expected

@@ -18,10 +18,14 @@ from emberlink.envs.fire_files.config import FileFireConfig
 from emberlink.envs.fire_files.reader import read_fires, with_checksum
 
 FIRE, TIMES = Ellipses(), (60.0, 120.0, 180.0, 240.0, 300.0)
+NEEDS = {
+    **{suffix: {"units": "minutes"} for suffix in (".asc", ".tif")},
+    **{suffix: {"time_field": "Elapsed_Mi"} for suffix in (".kml", ".kmz")},
+}
 
 
 def read(path, **keys):
-    keys = {"units": "minutes"} | keys if path.suffix in (".asc", ".tif", ".tiff") else keys
+    keys = NEEDS.get(path.suffix, {}) | keys
     return read_fires(FileFireConfig(path=str(path), **keys), (12, 10), 50)
 
 
@@ -47,24 +51,18 @@ def wholes(tmp_path):
     with zipfile.ZipFile(tmp_path / "front.kmz", "w") as archive:
         archive.write(tmp_path / "front.kml", "DOC.KML")
     (tmp_path / "front.txt").write_text(points_text(FIRE, 6040, points=24))
-    mains = (".asc", ".tif", ".npy", ".shp", ".geojson", ".gpkg", ".kml", ".kmz", ".txt")
-    return {p.suffix: p for p in sorted(tmp_path.iterdir()) if p.suffix in mains}
-
-
-def test_valid_files_are_read(wholes):
-    assert len(wholes) == 9
-    for path in wholes.values():
-        keys = {"time_field": "Elapsed_Mi"} if path.suffix in (".kml", ".kmz") else {}
-        assert 4 < torch.isfinite(read(path, **keys)[0]).sum() <= 120
+    beside = (".dbf", ".shx", ".prj", ".cpg")
+    return {p.suffix: p for p in sorted(tmp_path.iterdir()) if p.suffix not in beside}
 
 
 @pytest.mark.filterwarnings("ignore")
 def test_cut_and_overwritten_files(wholes, tmp_path):
     """Files that are cut off or have other bytes are refused, or give the same fire."""
     random = np.random.default_rng(7)
+    assert len(wholes) == 9
     for suffix, path in wholes.items():
-        keys = {"time_field": "Elapsed_Mi"} if suffix in (".kml", ".kmz") else {}
-        whole, content = read(path, **keys), path.read_bytes()
+        whole, content = read(path), path.read_bytes()
+        assert 4 < torch.isfinite(whole[0]).sum() <= 120
         spoilt = [content[: len(content) * k // 10] for k in (1, 5, 9)]
         spoilt += [random.bytes(1000), b"seen from the tower\n" * 40, b""]
         spoilt += [random.bytes(64) + content[64:]]
@@ -76,34 +74,35 @@ def test_cut_and_overwritten_files(wholes, tmp_path):
             (folder / path.name).write_bytes(damaged)
             if suffix == ".txt" and number < 3:
                 continue  # a text may end after any line
+            message = path.name
             try:
-                fires = read(folder / path.name, **keys)
+                assert torch.equal(read(folder / path.name), whole), (suffix, number)
             except ValueError as error:
                 message = str(error)
-            else:
-                message = path.name
-                assert torch.equal(fires, whole), (suffix, number)
             assert path.name in message.splitlines()[0], (suffix, number)
 
 
 def test_no_regular_files_and_no_addresses(tmp_path, wholes):
     os.mkfifo(tmp_path / "pipe.tif")
-    refused(tmp_path / "pipe.tif", "no regular file")
     (tmp_path / "loop.shp").symlink_to(tmp_path / "loop.shp")
-    refused(tmp_path / "loop.shp", "cannot be read|no such file")
-    refused(tmp_path / "none.gpkg", "no such file")
-    refused(tmp_path / ("x" * 300), "cannot be read")
     (tmp_path / "empty").mkdir()
-    refused(tmp_path / "empty", "a folder with 0 files of perimeters")
-    for text in ("/vsicurl/http://localhost:9/fire.tif", "http://localhost:9/fire.geojson"):
-        with pytest.raises(ValueError, match="no such file"):
-            read_fires(FileFireConfig(path=text), (12, 10), 50)
     shutil.copy(wholes[".kmz"], tmp_path / "fire.zip")
-    refused(tmp_path / "fire.zip", "an archive; expected the files in it")
     with (tmp_path / "large.geojson").open("wb") as file:
         file.write(b"{")
         file.truncate(150_000_001)  # a hole, which takes no space
-    refused(tmp_path / "large.geojson", "150000001 bytes; .* at most 150000000")
+    for name, match in {
+        "pipe.tif": "no regular file",
+        "loop.shp": "cannot be read|no such file",
+        "none.gpkg": "no such file",
+        "x" * 300: "cannot be read",
+        "empty": "a folder with 0 files of perimeters",
+        "fire.zip": "an archive",
+        "large.geojson": "150000001 bytes; .* at most 150000000",
+    }.items():
+        refused(tmp_path / name, match)
+    for text in ("/vsicurl/http://localhost:9/fire.tif", "http://localhost:9/fire.geojson"):
+        with pytest.raises(ValueError, match="no such file"):
+            read_fires(FileFireConfig(path=text), (12, 10), 50)
 
 
 @pytest.mark.parametrize("ending", [".msk", ".MSK", ".ovr"])
@@ -122,31 +121,27 @@ def test_nothing_is_fetched_through_a_file_beside_a_raster(tmp_path, ending, who
 
 def test_links_and_declarations_in_texts_are_refused(tmp_path, wholes):
     whole = json.loads(wholes[".geojson"].read_text())
-    whole["crs"] = {"type": "link", "properties": {"href": "http://localhost:9/", "type": "proj4"}}
-    path = tmp_path / "link.geojson"
-    path.write_text(json.dumps(whole))
-    refused(path, "its crs is a link, which is not followed")
-    for text, match in (
-        ('{"a":' * 100_000, "levels|recursion|expected"),
-        (json.dumps({**whole, "crs": None, "type": "Topology"}), "'Topology'; expected a Feature"),
-        (json.dumps({**whole, "crs": None, "features": [1]}), "expected"),
+    link = {"type": "link", "properties": {"href": "http://localhost:9/", "type": "proj4"}}
+    kml = wholes[".kml"].read_text().partition("?>")[2]
+    for name, text, match in (
+        ("fire.json", json.dumps({**whole, "crs": link}), "crs is a link, which is not followed"),
+        ("fire.json", '{"a":' * 100_000, "levels|recursion|expected"),
+        ("fire.json", json.dumps({**whole, "crs": None, "type": "Topology"}), "'Topology'"),
+        ("fire.json", json.dumps({**whole, "crs": None, "features": [1]}), "expected"),
+        ("fire.kml", f'<!DOCTYPE kml [<!ENTITY a "aaaa">]>{kml}', "document type declaration"),
+        ("fire.kml", "<html></html>", "'html'; expected KML"),
     ):
-        path.write_text(text)
-        refused(path, match)
-    kml = wholes[".kml"].read_text()
-    head = '<?xml version="1.0"?><!DOCTYPE kml [<!ENTITY a "aaaa">]>'
-    (tmp_path / "entity.kml").write_text(head + kml.partition("?>")[2])
-    refused(tmp_path / "entity.kml", "document type declaration")
-    (tmp_path / "other.kml").write_text("<html></html>")
-    refused(tmp_path / "other.kml", "the first element is 'html'; expected KML")
+        (tmp_path / name).write_text(text)
+        refused(tmp_path / name, match)
 
 
-def test_parts_of_a_shapefile(tmp_path, wholes):
-    refused(wholes[".shp"].with_suffix(".dbf"), "begins with")
-    content = wholes[".shp"].with_suffix(".dbf").read_bytes()
-    wholes[".shp"].with_suffix(".dbf").write_bytes(content[: len(content) // 2])
+def test_parts_of_a_shapefile(wholes):
+    table = wholes[".shp"].with_suffix(".dbf")
+    refused(table, "begins with")
+    content = table.read_bytes()
+    table.write_bytes(content[: len(content) // 2])
     refused(wholes[".shp"], "front.dbf is damaged")
-    wholes[".shp"].with_suffix(".dbf").unlink()
+    table.unlink()
     refused(wholes[".shp"], "front.dbf is missing beside it")
 
 
@@ -166,23 +161,19 @@ def test_texts_of_esri_ascii(wholes, spoil, match):
 
 
 def test_values_that_are_no_times(tmp_path):
-    times = raster_of(FIRE, 300.0, cells=40, cell=75.0)
+    times, path = raster_of(FIRE, 300.0, cells=40, cell=75.0), tmp_path / "fire.tif"
     one = np.full_like(times, -9999.0)
     one[20, 20] = 5.0
     for values, match in (
         (np.full_like(times, np.nan), "no cell burns"),
         (one, "a single cell burns"),
         (np.where(times >= 0, 3.0, times), "at once"),
-        (
-            np.where(one == 5, -0.5, times),
-            r"-0.5 \(1 % .*fire.unburned=-0.5",
-        ),
+        (np.where(one == 5, -0.5, times), r"-0.5 \(1 % .*fire.unburned=-0.5"),
         (np.where(times < 0, -32768.0, times), "fire.unburned=-32768"),
-        (times.astype("complex64"), "of real numbers"),
+        (times.astype("complex64"), "real numbers"),
         (np.stack([times] * 3), "3 bands; expected one"),
     ):
-        path = write_tif(tmp_path / "fire.tif", values)
-        refused(path, match)
+        refused(write_tif(path, values), match)
     refused(write_tif(path, times, crs="EPSG:4326"), "are not the degrees of WGS 84")
     small = rasterio.Affine(0.001, 0, -117, 0, -0.001, 45)
     refused(write_tif(path, times, crs=None, transform=small), "may be degrees.*fire.crs=EPSG:4326")
@@ -190,7 +181,7 @@ def test_values_that_are_no_times(tmp_path):
 
 
 def test_geometries_that_enclose_nothing(tmp_path):
-    shapes = [*frame_of(FIRE, TIMES).geometry]
+    path, shapes = tmp_path / "fire.gpkg", [*frame_of(FIRE, TIMES).geometry]
     half = type(shapes[0].boundary)([*shapes[0].boundary.coords][:40])
     for geometry, match in (
         ([shapes[0].centroid] * 5, "5 points"),
@@ -198,9 +189,8 @@ def test_geometries_that_enclose_nothing(tmp_path):
         ([None] * 5, "no feature with a geometry"),
         ([shapes[0]] * 5, "no fire spreads"),
     ):
-        frame = geopandas.GeoDataFrame({"Elapsed_Mi": TIMES}, geometry=geometry, crs=UTM)
-        frame.to_file(tmp_path / "fire.gpkg")
-        refused(tmp_path / "fire.gpkg", match)
+        geopandas.GeoDataFrame({"Elapsed_Mi": TIMES}, geometry=geometry, crs=UTM).to_file(path)
+        refused(path, match)
     for layer in ("one", "two"):
         frame_of(FIRE, TIMES).to_file(tmp_path / "several.gpkg", layer=layer)
     refused(tmp_path / "several.gpkg", "2 layers .*fire.layer, one of one, two")
@@ -218,10 +208,8 @@ def test_the_checksum_contains_the_files_beside(wholes, ending):
     assert with_checksum(config).sha256 == before
 
 
-@pytest.mark.parametrize("module", ["rasterio", "geopandas"])
-def test_without_the_extra_the_message_names_it(wholes, module, monkeypatch):
+@pytest.mark.parametrize(("module", "suffix"), [("rasterio", ".tif"), ("geopandas", ".gpkg")])
+def test_without_the_extra_the_message_names_it(wholes, module, suffix, monkeypatch):
     monkeypatch.setitem(sys.modules, module, None)
-    refused(
-        wholes[".tif" if module == "rasterio" else ".gpkg"], r"needs the extra geo: pip install"
-    )
+    refused(wholes[suffix], r"needs the extra geo: pip install")
     assert read(wholes[".npy"]).isfinite().any()

@@ -10,13 +10,12 @@ import pytest
 import rasterio
 import torch
 from burning import burning_cells
+from fire_files import write_asc
 from PIL import Image
 
 from emberlink.envs.fire.cache import GENERATOR_VERSION
 from emberlink.envs.fire.generator import fire_seeds, load_scenario, make_fires
-from emberlink.envs.scenarios import fires_of
 from emberlink.trainers.cli import main
-from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.fires import plot
 from emberlink.trainers.fires.bank_writer import write_bank
 
@@ -68,19 +67,9 @@ def area(path, colour: tuple[float, ...] | str) -> int:
     return int((np.abs(pixels - wanted) <= 1).all(-1).sum())
 
 
-def ascii_raster(path: Path, times: np.ndarray, *, cell: float = 30.0) -> Path:
+def asc(path: Path, times: np.ndarray) -> Path:
     """Writes arrival times [X, Y], inf for never, north up as other programs do."""
-    rows = np.where(np.isinf(times), -9999, times).T[::-1]
-    transform = rasterio.Affine(cell, 0, 0, 0, -cell, cell * len(rows))
-    height, width = rows.shape
-    shape = {"width": width, "height": height, "count": 1, "dtype": "float32"}
-    with rasterio.open(
-        path, "w", driver="AAIGrid", nodata=-9999, transform=transform, **shape
-    ) as raster:
-        raster.write(rows.astype(np.float32), 1)
-    for beside in path.parent.glob(f"{path.stem}.prj"):
-        beside.unlink()
-    return path
+    return write_asc(path, np.where(np.isinf(times), -9999, times).T[::-1])
 
 
 def disc(side: int = 40, speed: float = 0.05, at: tuple[int, int] = (15, 22)) -> np.ndarray:
@@ -119,7 +108,7 @@ def test_preview_draws_its_numbers(capsys, tmp_path):
     assert 0.9 * never < area(name, plot.NEVER) / cell < never
     assert cell < area(name, (255, 255, 0)) < 3 * cell
     # A fire that starts from a point has no burnt-out cells.
-    source = ascii_raster(tmp_path / "point.asc", disc())
+    source = asc(tmp_path / "point.asc", disc())
     (*_, name) = ran(capsys, "preview", source, "fire.units=minutes", "fire.ring_width=null")
     assert name == "fire_point.png"
     assert area(name, plot.NEVER) > 100 * cell
@@ -130,13 +119,9 @@ def test_preview_does_not_overwrite(capsys, tmp_path):
     first = ran(capsys, "preview", "paper")[-1]
     before = Path(first).read_bytes()
     assert ran(capsys, "preview", "paper")[-1] == "fire_paper_0_2.png"
-    assert ran(capsys, "preview", "paper", "--output", tmp_path)[-1] == str(
-        tmp_path / "fire_paper_0_3.png"
-    )
-    assert ran(capsys, "preview", "--output", "own.png", "paper")[-1] == "own.png"
-    assert "own.png exists already" in refused(capsys, "preview", "paper", "--output", "own.png")
+    third = ran(capsys, "preview", "paper", "--output", tmp_path)[-1]
+    assert third == str(tmp_path / "fire_paper_0_3.png")
     assert Path(first).read_bytes() == before
-    assert len(list(tmp_path.iterdir())) == 4
 
 
 @pytest.mark.parametrize("suffix", [".npy", ".tif", ".tiff"])
@@ -172,11 +157,8 @@ def test_make_writes_the_scenarios_fires(suffix, capsys, tmp_path):
     assert np.array_equal(fires, expected)
     assert names == [f"huygens test {seed}" for seed in range(1_000_000, 1_000_005)]
     assert rate == [0.01, 0.02]
-    told = {key: str(about[key]) for key in ("units", "scenario", "split", "seeds", "horizon")}
-    assert told == {
-        **{"units": "steps", "scenario": "huygens", "split": "test", "horizon": "300"},
-        "seeds": "1000000 to 1000004",
-    }
+    told = " ".join(str(about[key]) for key in ("units", "scenario", "split", "horizon", "seeds"))
+    assert told == "steps huygens test 300 1000000 to 1000004"
     assert int(about["generator_version"]) == GENERATOR_VERSION
     assert about["emberlink_version"]
 
@@ -189,31 +171,11 @@ def test_a_bank_round_trips_bit_for_bit(suffix, count, capsys, tmp_path):
     fires = make_fires(HUYGENS, fire_seeds("train", count), (24, 40), 1000)
     ran(capsys, "import", file, "env.grid=[24,40]", "--output", again)
     assert torch.equal(torch.from_numpy(np.load(again)), fires)
-    # Of several fires every fifth is a validation fire and every fifth a test fire.
-    keys = ["fire=file", f"fire.path={file}", "env.grid=[24,40]"]
-    scenario = fires_of(resolve("consensus", keys).fire)
-    train, validation, test = ([0, 1, 2, 5, 6], [3], [4]) if count == 7 else ([0], [0], [0])
-    assert torch.equal(scenario.train((24, 40), 1000), fires[train])
-    assert torch.equal(scenario.validation(1, (24, 40), 1000), fires[validation])
-    assert torch.equal(scenario.test(1, (24, 40), 1000), fires[test])
-
-
-def test_preview_describes_the_file(capsys, tmp_path):
-    source = ascii_raster(tmp_path / "fire.asc", disc())
-    lines = ran(capsys, "preview", source, "fire.units=minutes")
-    cells = np.isfinite(disc()).sum()
-    assert lines[1].startswith(
-        f"read: {cells} cells burn from 0 minutes to 247.386 minutes; 1 place where it begins; band"
-    )
-    ran(capsys, "make", "huygens", "--count", 2, "--output", "two.npy")
-    assert ran(capsys, "preview", "two.npy:1")[1].startswith(
-        "read: a bank of 2 fires of 30 x 30 cells"
-    )
 
 
 def test_import_of_several_files(capsys, tmp_path):
-    first = ascii_raster(tmp_path / "one.asc", disc())
-    second = ascii_raster(tmp_path / "a=b.asc", disc(30, 0.03, (12, 12)))
+    first = asc(tmp_path / "one.asc", disc())
+    second = asc(tmp_path / "a=b.asc", disc(30, 0.03, (12, 12)))
     keys = ("fire.units=minutes", "env.grid=[25,20]", "env.horizon=200")
     lines = ran(capsys, "import", first, *keys, second, "--output", "both.tif")
     assert [line.partition(": read: ")[0] for line in lines[:2]] == ["one.asc", "a=b.asc"]
@@ -231,6 +193,7 @@ def test_import_of_several_files(capsys, tmp_path):
     assert [source["file"] for source in json.loads(tags["sources"])] == ["one.asc", "a=b.asc"]
     assert tags["units"] == "steps"
     lines = ran(capsys, "preview", "both.tif:1", *keys[1:])
+    assert lines[1].startswith("read: a bank of 2 fires of 25 x 20 cells")
     assert lines[0] == "both.tif, fire 1 of 2: 25 x 20 cells, 200 steps, setup paper"
     assert numbers(lines)["burning at the end"] == np.isfinite(np.load("second.npy")).sum()
     assert lines[-1] == "fire_both_1.png"
@@ -250,7 +213,6 @@ KNOWN = "known: front, huygens, oil_slick, paper, reaction, swarm"
         (["preview", "huygens:65536"], ["'65536'", "0 to 65535"]),
         (["preview", "bank.npy:2"], ["bank.npy:2", "no fire '2'", "0 to 1"]),
         (["preview", "folder"], ["folder", "expected a file"]),
-        (["preview", "empty.tif"], ["empty.tif", "empty"]),
         (["preview", "paper", "fire.units=minutes"], ["fire.units"]),
         (["preview", "paper", "seed=3"], ["'seed=3'", "keys of setup, env. and fire."]),
         (["preview", "paper", "huygens"], ["'paper huygens'", "expected one"]),
@@ -258,8 +220,8 @@ KNOWN = "known: front, huygens, oil_slick, paper, reaction, swarm"
         (["preview", "paper", "--output", "there.png"], ["there.png exists already"]),
         (["preview", "paper", "--output", "no/a.png"], ["no: there is no such folder"]),
         (["make", "zzz"], ["'zzz'", KNOWN]),
-        (["make", "paper", "--count", "5000", "--output", "a.tif"], ["5000 fires", "4096", ".npy"]),
-        (["make", "paper", "--count", "300000"], ["300000 fires", "1073741824"]),
+        (["make", "paper", "--count", "5000", "--output", "a.tif"], ["5000 fires", ".npy"]),
+        (["make", "paper", "--count", "300000"], ["300000 fires"]),
         (["make", "paper", "--output", "bank.npy"], ["bank.npy exists already"]),
         (["make", "paper", "--output", "beside.npy"], ["beside.json exists already"]),
         (["make", "paper", "--output", "a.zip"], ["a.zip", ".npy or .tif or .tiff"]),
@@ -271,7 +233,6 @@ KNOWN = "known: front, huygens, oil_slick, paper, reaction, swarm"
 )
 def test_errors_are_one_line_and_leave_no_files(arguments, words, capsys, tmp_path):
     (tmp_path / "folder").mkdir()
-    (tmp_path / "empty.tif").touch()
     (tmp_path / "there.png").write_text("mine")
     (tmp_path / "beside.json").write_text("mine")
     fires = make_fires(HUYGENS, fire_seeds("train", 2), (30, 30), 300)
@@ -286,10 +247,11 @@ def test_errors_are_one_line_and_leave_no_files(arguments, words, capsys, tmp_pa
 
 
 def test_preview_takes_the_keys_of_train(capsys, tmp_path):
-    ascii_raster(tmp_path / "my fire.asc", disc())
+    asc(tmp_path / "my fire.asc", disc())
     keys = ("fire.units=minutes", "env.grid=[20,20]")
     plain = ran(capsys, "preview", "my fire.asc", *keys)
-    assert plain[1].startswith("read: ")
+    cells = np.isfinite(disc()).sum()
+    assert plain[1].startswith(f"read: {cells} cells burn from 0 minutes to 247.386 minutes; 1 ")
     keyed = ran(capsys, "preview", "fire=file", 'fire.path="my fire.asc"', *keys)
     assert keyed[:-1] == plain[:-1]
     assert ran(capsys, "preview", "fire=paper")[:-1] == ran(capsys, "preview", "paper")[:-1]

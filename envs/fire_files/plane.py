@@ -1,0 +1,126 @@
+"""Chooses the plane on which a fire is gridded, and measures how its projection bends shapes."""
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from emberlink.envs.fire_files.files import library
+from emberlink.envs.fire_files.report import ask
+
+Bounds = tuple[float, float, float, float]
+"""Minimum x, minimum y, maximum x, maximum y."""
+MAX_CELLS = 50_000_000
+"""Cells of a raster, which is read as a whole."""
+_BENT = 1.1  # ratio of a projection's axes above which a file is projected to another plane
+_MAX_DEGREES = 20.0  # across; a UTM zone is no plane for more
+
+
+class Plane(NamedTuple):
+    """How a file's coordinates become coordinates on a plane."""
+
+    about: str
+    source: Any = None
+    target: Any = None
+    """projections, pyproj.CRS; target is None if the coordinates are on a plane already"""
+    unit: float | None = None
+    """metres of a unit of length on the plane, if known"""
+
+
+def choose_plane(crs: Any, wanted: str | None, bounds: Bounds, cell: float | None) -> Plane:
+    """Chooses the plane for the coordinates of a file; a projection that bends is replaced.
+
+    Args:
+        crs: the projection of the file; None if it has none.
+        wanted: `fire.crs`: the projection of a file without one, otherwise the target.
+        cell: side of a raster's cells in these coordinates; None for perimeters.
+    """
+    size = max(bounds[2] - bounds[0], bounds[3] - bounds[1])
+    where = f"coordinates from {bounds[:2]} to {bounds[2:]}"
+    if not max(map(abs, bounds)) <= 1e9:
+        raise ask(f"{where} are not on the Earth", "metres or degrees")
+    in_degrees = max(map(abs, bounds[::2])) <= 360 and max(map(abs, bounds[1::2])) <= 90.01
+    if crs is None and wanted is None:
+        # Cells of 0.1 degrees would be 11 km wide, a fire of 5 degrees 500 km.
+        if in_degrees and (size < 5 if cell is None else cell < 0.1):
+            seen = f"{where} may be degrees, and no projection is given"
+            raise ask(seen, "fire.crs, such as fire.crs=EPSG:4326 for longitude and latitude")
+        return Plane("no projection in the file: its coordinates are taken as a plane")
+    source = parse_crs(crs or wanted)
+    known = source.is_projected or source.is_geographic
+    if crs and wanted and not known:
+        source, known, crs = parse_crs(wanted), True, None  # a local plane that the user knows
+    if source.is_geographic and not (in_degrees and size <= _MAX_DEGREES):
+        seen = f"{where} are not the degrees of {source.name}, or too far apart for one UTM zone"
+        raise ask(seen, "another fire.crs", "a file of the fire alone")
+    if not known:
+        return Plane(f"{source.name}, taken as a plane", source, None, _metres(source))
+    shape, ratio = _shape(source, source, bounds)
+    if crs and wanted:
+        target = parse_crs(wanted)
+    elif ratio <= _BENT:
+        return Plane(f"projection {source.name} ({shape})", source, None, _metres(source))
+    else:
+        box = library("geopandas").GeoSeries([library("shapely").box(*bounds)], crs=source)
+        try:
+            target = box.estimate_utm_crs()
+        except (RuntimeError, ValueError):
+            raise ask(f"{where}: no UTM zone is there", "fire.crs, in metres") from None
+    after, bent = _shape(target, source, bounds)
+    if bent > _BENT:
+        raise ask(f"fire.crs={wanted} has {after} here", "one as UTM is")
+    about = f"projection {source.name} ({shape}), projected to {target.name} ({after})"
+    return Plane(about, source, target, _metres(target))
+
+
+def parse_crs(value: Any) -> Any:
+    """Returns a projection, pyproj.CRS."""
+    pyproj = library("pyproj", "a projection")
+    try:
+        return pyproj.CRS.from_user_input(value)
+    except pyproj.exceptions.CRSError:
+        raise ask(f"projection {str(value)[:100]!r} is not known", "such as EPSG:32611") from None
+
+
+def _metres(crs: Any) -> float | None:
+    return crs.axis_info[0].unit_conversion_factor if crs.axis_info else None
+
+
+def _shape(crs: Any, source: Any, bounds: Bounds) -> tuple[str, float]:
+    """Returns how a projection bends a small circle at the fire, as text, and the ratio of axes."""
+    if crs.is_geographic:
+        return "degrees", math.inf
+    pyproj = library("pyproj")
+    at = (bounds[0] + bounds[2]) / 2, (bounds[1] + bounds[3]) / 2
+    to_degrees = pyproj.Transformer.from_crs(source, source.geodetic_crs, always_xy=True)
+    try:
+        factors = pyproj.Proj(crs).get_factors(*to_degrees.transform(*at), errcheck=True)
+    except pyproj.exceptions.ProjError:
+        raise ask(f"the fire at {at} lies outside {crs.name}", "another fire.crs") from None
+    ratio = float(factors.tissot_semimajor / factors.tissot_semiminor)
+    turn = round(factors.meridian_convergence)
+    return f"axes {ratio:.2f} : 1, north turned by {turn} degrees", ratio
+
+
+def warped(times: np.ndarray, affine: Any, plane: Plane) -> tuple[np.ndarray, Any]:
+    """Projects times and rotates the raster north up, on cells of half the size.
+
+    Times are interpolated between burnt cells. A point in a cell that never burns stays inf.
+    """
+    warp, methods = library("rasterio.warp"), library("rasterio").enums.Resampling
+    source = plane.source if plane.target else "EPSG:3857"  # any plane: only rotated
+    target = plane.target or source
+    rows, columns = times.shape
+    corners = [affine * at for at in ((0, 0), (columns, 0), (0, rows), (columns, rows))]
+    box = *map(min, *corners), *map(max, *corners)
+    to, width, height = warp.calculate_default_transform(source, target, columns, rows, *box)
+    if 4 * width * height > MAX_CELLS:
+        raise ask(f"{2 * width} x {2 * height} cells on a plane", f"at most {MAX_CELLS}")
+    to @= affine.scale(0.5)
+    about = {"src_transform": affine, "src_crs": source, "src_nodata": np.nan}
+    about |= {"dst_transform": to, "dst_crs": target, "dst_nodata": np.nan}
+    inside, between = np.full((2, 2 * height, 2 * width), np.nan)
+    values = np.where(np.isfinite(times), times, np.nan)
+    warp.reproject(values, inside, resampling=methods.nearest, **about)
+    warp.reproject(values, between, resampling=methods.bilinear, **about)
+    return np.where(np.isnan(inside) | np.isnan(between), np.inf, between), to

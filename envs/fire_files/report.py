@@ -1,0 +1,45 @@
+"""What is said about a file: what was understood, doubts, questions, and times as text."""
+
+from dataclasses import dataclass, field
+from datetime import datetime, timedelta
+
+from emberlink.envs.utils.errors import UserError
+
+SECONDS = {"seconds": 1.0, "minutes": 60.0, "hours": 3600.0, "days": 86400.0}
+
+
+@dataclass
+class Report:
+    """Collects what was understood of a file while it is read."""
+
+    facts: list[str] = field(default_factory=list)
+    doubts: list[str] = field(default_factory=list)
+    written: int | None = None
+    """steps for which a bank was written"""
+
+
+@dataclass(frozen=True)
+class Clock:
+    """The unit of a file's times, and the calendar time of 0 where it is known."""
+
+    unit: str
+    """A unit of `SECONDS`, `steps`, or `maps` of an array of states."""
+    origin: datetime | None = None
+    """In UTC."""
+
+    def format(self, time: float) -> str:
+        """Returns a time as text."""
+        if self.origin is None or abs(time * SECONDS[self.unit]) > 1e10:
+            return f"{time:g} {self.unit}"
+        date = self.origin + timedelta(seconds=time * SECONDS[self.unit])
+        return date.isoformat(timespec="minutes")
+
+
+def ask(seen: str, *answers: str) -> UserError:
+    """Returns a question: what was seen, and what is expected, such as the keys that decide."""
+    return UserError(f"{seen}; expected {', or '.join(answers)}")
+
+
+def counted(number: int, noun: str) -> str:
+    """Returns a number with its noun."""
+    return f"{number} {noun}{'s' * (number != 1)}"
