@@ -1,6 +1,8 @@
 """Writes fires with known arrival times in the file formats of other programs."""
 
 import math
+import re
+import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -69,15 +71,8 @@ def raster_of(fire: Ellipses, until: float, cells: int = 100, cell: float = CELL
 
 def write_asc(path: Path, times: np.ndarray, cell: float = CELL, **header: object) -> Path:
     """Writes ESRI ASCII as FARSITE does."""
-    keys = {
-        "NCOLS": times.shape[1],
-        "NROWS": times.shape[0],
-        "XLLCORNER": CORNER[0],
-        "YLLCORNER": CORNER[1],
-        "CELLSIZE": cell,
-        "NODATA_VALUE": -9999.0,
-        **header,
-    }
+    keys = {"NCOLS": times.shape[1], "NROWS": times.shape[0], "XLLCORNER": CORNER[0]}
+    keys |= {"YLLCORNER": CORNER[1], "CELLSIZE": cell, "NODATA_VALUE": -9999.0, **header}
     lines = [f"{key} {value}" for key, value in keys.items() if value is not None]
     rows = [" ".join(repr(float(value)) for value in row) for row in times]
     path.write_text("\n".join([*lines, *rows, ""]))
@@ -86,20 +81,11 @@ def write_asc(path: Path, times: np.ndarray, cell: float = CELL, **header: objec
 
 def write_tif(path: Path, times: np.ndarray, cell: float = CELL, **about: object) -> Path:
     """Writes a GeoTIFF of [rows, columns] or [bands, rows, columns]."""
-    bands = np.atleast_3d(times.T).T if times.ndim == 2 else times
-    tags = about.pop("tags", {})
-    north = CORNER[1] + cell * bands.shape[1]
-    settings = {
-        "driver": "GTiff",
-        "count": len(bands),
-        "height": bands.shape[1],
-        "width": bands.shape[2],
-        "dtype": bands.dtype,
-        "nodata": -9999.0,
-        "crs": UTM,
-        "transform": from_origin(CORNER[0], north, cell, cell),
-        **about,
-    }
+    bands = times[None] if times.ndim == 2 else times
+    tags, (count, height, width) = about.pop("tags", {}), bands.shape
+    north = from_origin(CORNER[0], CORNER[1] + cell * height, cell, cell)
+    settings = {"driver": "GTiff", "count": count, "height": height, "width": width, "crs": UTM}
+    settings |= {"dtype": bands.dtype, "nodata": -9999.0, "transform": north, **about}
     with rasterio.open(path, "w", **settings) as dataset:
         dataset.write(bands)
         dataset.update_tags(**tags)
@@ -125,19 +111,14 @@ def squares(
     return geopandas.GeoDataFrame(columns, geometry=boxes, crs=UTM)
 
 
-def _with_z(shape: shapely.Geometry) -> shapely.Geometry:
-    point = shapely.Point(*shape.centroid.coords[0], 7.0)
-    return shapely.GeometryCollection([shapely.force_3d(shape, 7.0), point])
-
-
 KINDS = {
     "polygon": lambda shape: shape,
-    "multipolygon": lambda shape: (
-        shapely.MultiPolygon([shape]) if shape.geom_type == "Polygon" else shape
-    ),
+    "multipolygon": lambda shape: shapely.MultiPolygon(shapely.get_parts([shape]).tolist()),
     "line": lambda shape: shape.boundary,
     "multiline": lambda shape: _in_parts(shape.boundary),
-    "collection": _with_z,
+    "collection": lambda shape: shapely.GeometryCollection(
+        [shapely.force_3d(shape, 7.0), shapely.force_3d(shape.centroid, 7.0)]
+    ),
 }
 """conversion of a perimeter to a kind of geometry"""
 
@@ -149,6 +130,14 @@ def _in_parts(line: shapely.Geometry) -> shapely.Geometry:
         third = len(at) // 3
         parts += [at[: third + 1], at[third : 2 * third + 1][::-1], at[2 * third :]]
     return shapely.MultiLineString(parts)
+
+
+def keys_in(message: str) -> list[str]:
+    """Returns the first keys that a message prints after `expected`, as a shell passes them on."""
+    tail = message.partition("; expected ")[2]
+    found = re.findall(r"""'fire\.[^']*'|fire\.\w+=(?:"[^"]*"|[^\s,;]+)""", tail)
+    count = 2 if found and found[0].startswith("fire.incident_field") else 1
+    return [shlex.split(text)[0] for text in found[:count]]
 
 
 def points_text(fire: Ellipses, lines: int, skipped: int = 6000, points: int = 90) -> str:

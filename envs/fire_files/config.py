@@ -91,6 +91,6 @@ class FileFireConfig:
     @property
     def never(self) -> tuple[float, ...] | None:
         """The values of `unburned`; empty for `none`, None if it is not given."""
-        if isinstance(self.unburned, float):
+        if isinstance(self.unburned, int | float):
             return (self.unburned,)
         return () if self.unburned == "none" else self.unburned

@@ -82,7 +82,7 @@ def find_format(path: Path) -> str:
     """Returns the format of a file or folder, and checks that it is safe and whole."""
     if path.is_dir():
         return "grids" if forest_grids(path) else "folder"
-    size, (kind, head) = _size(path), _kind(path)
+    kind, head, size = _look(path)
     if not kind or (kind == "kmz" and path.suffix.lower() != ".kmz"):
         seen = "an archive" if kind else f"begins with {head[:16]!r}" if head else "is empty"
         known = "GeoTIFF, NetCDF, ESRI ASCII, .npy, .shp, .gpkg, GeoJSON, KML, KMZ, CSV of points"
@@ -92,12 +92,19 @@ def find_format(path: Path) -> str:
     most = MAX_BYTES // 2 if kind == "json" else MAX_BYTES
     if kind in ("asc", "csv", "kml", "points", "json") and size > most:
         raise ask(f"{size} bytes", f"a text file of at most {most}")
-    for part in beside(path, kind):
+    parts = {part.suffix.lower(): part for part in (path, *beside(path, kind))}
+    for suffix, part in parts.items():
         # GDAL opens masks and overviews in any format; some formats read other addresses.
-        if _size(part) and part.suffix.lower() in (".msk", ".ovr") and _kind(part)[0] != "tif":
+        if _look(part)[0] != "tif" and suffix in (".msk", ".ovr"):
             raise ask(f"{part.name}, beside it, is no TIFF", "one, or no such file")
-    if kind == "shp":
-        _check_shapefile(path)
+    for suffix in (".shp", ".shx", ".dbf") if kind == "shp" else ():
+        if suffix not in parts:
+            raise UserError(f"{path.with_suffix(suffix).name} is missing beside it")
+        _, head, size = _look(parts[suffix])
+        records, start, row = struct.unpack("<IHH", head.ljust(100, b"\0")[4:12])
+        told = 2 * int.from_bytes(head[24:28]) if suffix != ".dbf" else start + records * row
+        if not 0 < told <= size:
+            raise ask(f"{parts[suffix].name} is damaged", f"{told} bytes or more")
     if kind == "gpkg":  # GDAL reads the rest of a file that was cut off
         try:
             uri = f"{path.absolute().as_uri()}?mode=ro&immutable=1"
@@ -121,15 +128,13 @@ def check_prj(path: Path, kind: str, crs: Any) -> None:
     """Checks that the projection in a .prj beside a file was understood."""
     for part in beside(path, kind) if crs is None else ():
         if part.suffix.lower() == ".prj" and part.stat().st_size:
-            raise ask(
-                f"{part.name}, beside it, holds no projection that is known",
-                "no such file and fire.crs, such as fire.crs=EPSG:32611",
-            )
+            seen = f"{part.name}, beside it, holds no projection that is known"
+            raise ask(seen, "no such file and fire.crs, such as fire.crs=EPSG:32611")
 
 
 def forest_grids(folder: Path) -> list[Path]:
     """Returns the maps of Cell2Fire in a folder, in the order of their numbers."""
-    found = [path for path in folder.glob("ForestGrid*.csv") if _size(path)]
+    found = [path for path in folder.glob("ForestGrid*.csv") if _look(path)]
     return sorted(found, key=lambda path: (len(path.name), path.name))
 
 
@@ -146,44 +151,22 @@ def digest(path: Path) -> str:
     """Returns the SHA-256 of a file and the files beside it, or of a folder's fires."""
     content, folder = hashlib.sha256(), path.is_dir()
     for main in (forest_grids(path) or perimeter_files(path)) if folder else [path]:
-        _size(main)
-        for part in (main, *beside(main, _kind(main)[0])):
+        for part in (main, *beside(main, _look(main)[0])):
             name = part.name if folder else part.name[len(path.stem) :]
-            content.update(f"{name}:{_size(part)}:".encode())
+            content.update(f"{name}:{_look(part)[2]}:".encode())
             with part.open("rb") as file:
                 while block := file.read(1 << 20):
                     content.update(block)
     return content.hexdigest()
 
 
-def _kind(path: Path) -> tuple[str, bytes]:
-    """Returns the format of a regular file, empty if none is known, and its first bytes."""
+def _look(path: Path) -> tuple[str, bytes, int]:
+    """Returns the format, empty if none is known, the first bytes and the size of a file."""
+    if not path.exists():
+        raise UserError(f"{path.name}: there is no such file")
+    if not path.is_file():  # a pipe, for example, would block for ever
+        raise UserError(f"{path.name}: no regular file")
     with path.open("rb") as file:
         head = file.read(4096)
-    return next((k for k, start in _HEADS.items() if head and re.match(start, head)), ""), head
-
-
-def _size(path: Path) -> int:
-    """Returns the size of a regular file. A pipe, for example, would block for ever."""
-    try:
-        size = path.stat().st_size
-    except FileNotFoundError:
-        raise UserError(f"{path.name}: there is no such file") from None
-    if not path.is_file():
-        raise UserError(f"{path.name}: no regular file")
-    return size
-
-
-def _check_shapefile(path: Path) -> None:
-    """Checks that the three files exist and have the sizes that their headers tell."""
-    parts = {part.suffix.lower(): part for part in (path, *beside(path, "shp"))}
-    for suffix in (".shp", ".shx", ".dbf"):
-        if suffix not in parts:
-            raise UserError(f"{path.with_suffix(suffix).name} is missing beside it")
-        head = _kind(parts[suffix])[1].ljust(100, b"\0")
-        records, start, row = struct.unpack("<IHH", head[4:12])
-        told = (
-            start + records * row if suffix == ".dbf" else 2 * struct.unpack(">I", head[24:28])[0]
-        )
-        if not 0 < told <= _size(parts[suffix]):
-            raise ask(f"{parts[suffix].name} is damaged", f"a file of {told} bytes or more")
+    kind = next((k for k, start in _HEADS.items() if head and re.match(start, head)), "")
+    return kind, head, path.stat().st_size

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 from scipy.ndimage import (
+    binary_propagation,
     distance_transform_edt,
     find_objects,
     label,
@@ -20,10 +21,9 @@ from emberlink.envs.fire_files.report import SECONDS, Clock, Report, ask
 from emberlink.envs.fire_files.times import in_utc, parse_dates
 from emberlink.envs.utils.errors import UserError
 
-SAMPLES = 180
-"""Sample points along the grid's shorter side. A cell of the grid gets the earliest of them."""
 EIGHT = np.ones((3, 3))
 """A cell and the eight around it."""
+_SAMPLES = 180  # points along the grid's shorter side; a cell gets the earliest of them
 _EDGE = 1e-6  # cells: tolerance, so that rounding does not move a centre across an edge
 
 
@@ -44,17 +44,10 @@ class Window:
         x, y = (bounds[0] + bounds[2]) / 2, (bounds[1] + bounds[3]) / 2
         return cls(x - side * grid[0] / 2, y - side * grid[1] / 2, side, grid)
 
-    @property
-    def cuts(self) -> int:
-        """Sample points along each side of a cell."""
-        return max(1, round(SAMPLES / min(self.grid)))
-
-    def samples(self) -> "Window":
-        """Returns the window of the sample points, cuts x cuts per cell."""
-        columns, rows = self.grid
-        return Window(
-            self.x, self.y, self.side / self.cuts, (columns * self.cuts, rows * self.cuts)
-        )
+    def samples(self) -> tuple["Window", int]:
+        """Returns the window of the sample points, and their number along each side of a cell."""
+        (columns, rows), cuts = self.grid, max(1, round(_SAMPLES / min(self.grid)))
+        return Window(self.x, self.y, self.side / cuts, (columns * cuts, rows * cuts)), cuts
 
     def axes(self) -> tuple[np.ndarray, np.ndarray]:
         """Returns x [X] and y [Y] of the cells' centres."""
@@ -116,8 +109,8 @@ class Raster:
             centres = self._earliest(self.times, window)
             has_centre = np.isfinite(self._earliest(np.zeros_like(self.times), window))
             return near if fine else np.where(has_centre, centres, near)
-        (columns, rows), cuts = window.grid, window.cuts
-        samples = self._interpolate(*self._indices(window.samples()))
+        (columns, rows), (points, cuts) = window.grid, window.samples()
+        samples = self._interpolate(*self._indices(points))
         samples = samples.reshape(columns, cuts, rows, cuts).min((1, 3))
         first = self.times == minimum_filter(self.times, 3)
         times = np.where(first, self.times, np.inf) if fine else self.times
@@ -187,7 +180,7 @@ def beginnings(times: np.ndarray) -> int:
 def far_apart(burns: np.ndarray) -> list[str]:
     """Returns a doubt if parts of a fire never join and lie farther apart than they are long."""
     near: Any = distance_transform_edt(~burns)
-    reach, longest = -1.0, 0.0
+    reach, longest, parts = -1.0, 0.0, 0
     while longest > reach:
         reach = longest
         groups, parts = label(near <= 0.75 * reach, EIGHT)  # pyright: ignore
@@ -274,10 +267,9 @@ def _burnt_out(times: np.ndarray, start: float, width: float) -> np.ndarray:
     burnt = times <= start
     if not burnt.any() or math.isinf(width):
         return np.zeros_like(burnt)
-    around = np.pad(burnt, 1)  # cells outside the grid have not burnt
-    labelled: Any = label(~around)
-    holes = labelled[0]
-    later = np.pad(np.isfinite(times) & ~burnt, 1)
-    around |= ~np.isin(holes, [holes[0, 0], *holes[later]])
-    depth: Any = distance_transform_edt(around)
+    later = np.isfinite(times) & ~burnt
+    unburnt: Any = binary_propagation(
+        np.pad(later, 1, constant_values=True), mask=~np.pad(burnt, 1)
+    )
+    depth: Any = distance_transform_edt(~unburnt)  # gaps without cells that burn later are burnt
     return burnt & (depth[1:-1, 1:-1] - 0.5 > width)

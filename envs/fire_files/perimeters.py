@@ -24,19 +24,15 @@ _POINT = 1e-3  # of an area's width: the size of a fire that is a point
 
 
 def read_perimeters(
-    frame: Any,
-    outside: Sequence[str],
-    config: FileFireConfig,
-    grid: tuple[int, int],
-    horizon: int,
-    report: Report,
+    table: tuple[Any, list[str]], config: FileFireConfig, grid: Any, horizon: int, report: Report
 ) -> Raster:
-    """Makes a fire of a table of features; the values of columns `outside` stand beside it.
+    """Makes a fire of features, and of the columns whose values stand outside their attributes.
 
     A fire only grows: the area burnt by a time is the union of the areas until then. A fire with
     elapsed times began at 0.
     """
-    count, left_out = len(frame), []
+    (frame, outside), left_out = table, []
+    count = len(frame)
     frame = frame[~(frame.geometry.isna() | frame.geometry.is_empty)]
     if len(frame) < count:
         left_out.append(f"{count - len(frame)} without a geometry left out")
@@ -76,7 +72,7 @@ def read_perimeters(
     x0, y0, x1, y1 = (float(np.interp(until, at, edge)) for edge in boxes.T)
     window = Window.around((x0, y0, x1, y1), grid, config.margin or 0)
     count = min(int(np.searchsorted(at, end)), len(at) - 1) + 1
-    points = _around(window.samples(), boxes[count - 1])
+    points = _around(window.samples()[0], boxes[count - 1])
     arrival = _between(areas[:count], at, points, report)
     corner, cell = (points.x, points.y + points.grid[1] * points.side), (points.side, points.side)
     fire = Raster(arrival.T[::-1], corner, cell, clock, window=window, began=float(at[0]))
@@ -186,8 +182,12 @@ def _between(
         begun += parts[1] - len(np.unique(parts[0][new & beside]))
         idle += not new.any()
         if before.any():
-            from_last, to_next = _depth(~before), _depth(np.pad(after, 1))[1:-1, 1:-1]
-            share = from_last / (from_last + to_next)
+            # Distances of centres to the edges of the areas, in cells.
+            from_last, to_next = (
+                np.asarray(distance_transform_edt(area)) - 0.5
+                for area in (~before, np.pad(after, 1))
+            )
+            share = from_last / (from_last + to_next[1:-1, 1:-1])
             times[new] = (at[k - 1] + (at[k] - at[k - 1]) * share)[new]
         else:
             times[new] = at[k]  # the first front lies outside
@@ -195,12 +195,6 @@ def _between(
     report.facts.append(f"{counted(begun, 'place')} where it begins")
     report.facts += [f"{idle} within the area burnt before"] if idle else []
     return times
-
-
-def _depth(area: np.ndarray) -> np.ndarray:
-    """Returns the distance from each cell's centre to the edge of the area, in cells."""
-    distance: Any = distance_transform_edt(area)
-    return distance - 0.5
 
 
 @functools.lru_cache(1)

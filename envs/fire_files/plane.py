@@ -17,23 +17,24 @@ _MAX_DEGREES = 20.0  # across; a UTM zone is no plane for more
 
 
 class Plane(NamedTuple):
-    """How a file's coordinates become coordinates on a plane."""
+    """How a file's coordinates become coordinates on a plane: `target` is None if they are."""
 
     about: str
     source: Any = None
     target: Any = None
-    """projections, pyproj.CRS; target is None if the coordinates are on a plane already"""
-    unit: float | None = None
-    """metres of a unit of length on the plane, if known"""
+
+    @property
+    def unit(self) -> float | None:
+        """Returns the metres of a unit of length on the plane, if known."""
+        axes = getattr(self.target or self.source, "axis_info", None)
+        return axes[0].unit_conversion_factor if axes else None
 
 
 def choose_plane(crs: Any, wanted: str | None, bounds: Bounds, cell: float | None) -> Plane:
     """Chooses the plane for the coordinates of a file; a projection that bends is replaced.
 
-    Args:
-        crs: the projection of the file; None if it has none.
-        wanted: `fire.crs`: the projection of a file without one, otherwise the target.
-        cell: side of a raster's cells in these coordinates; None for perimeters.
+    `wanted` is `fire.crs`: the projection of a file without one, otherwise the target. `cell` is
+    the side of a raster's cells; None for perimeters.
     """
     size = max(bounds[2] - bounds[0], bounds[3] - bounds[1])
     where = f"coordinates from {bounds[:2]} to {bounds[2:]}"
@@ -47,19 +48,18 @@ def choose_plane(crs: Any, wanted: str | None, bounds: Bounds, cell: float | Non
             raise ask(seen, "fire.crs, such as fire.crs=EPSG:4326 for longitude and latitude")
         return Plane("no projection in the file: its coordinates are taken as a plane")
     source = parse_crs(crs or wanted)
-    known = source.is_projected or source.is_geographic
-    if crs and wanted and not known:
-        source, known, crs = parse_crs(wanted), True, None  # a local plane that the user knows
+    if crs and wanted and not (source.is_projected or source.is_geographic):
+        source, crs = parse_crs(wanted), None  # a local plane that the user knows
     if source.is_geographic and not (in_degrees and size <= _MAX_DEGREES):
         seen = f"{where} are not the degrees of {source.name}, or too far apart for one UTM zone"
         raise ask(seen, "another fire.crs", "a file of the fire alone")
-    if not known:
-        return Plane(f"{source.name}, taken as a plane", source, None, _metres(source))
+    if not (source.is_projected or source.is_geographic):
+        return Plane(f"{source.name}, taken as a plane", source)
     shape, ratio = _shape(source, source, bounds)
     if crs and wanted:
         target = parse_crs(wanted)
     elif ratio <= _BENT:
-        return Plane(f"projection {source.name} ({shape})", source, None, _metres(source))
+        return Plane(f"projection {source.name} ({shape})", source)
     else:
         box = library("geopandas").GeoSeries([library("shapely").box(*bounds)], crs=source)
         try:
@@ -70,7 +70,7 @@ def choose_plane(crs: Any, wanted: str | None, bounds: Bounds, cell: float | Non
     if bent > _BENT:
         raise ask(f"fire.crs={wanted} has {after} here", "one as UTM is")
     about = f"projection {source.name} ({shape}), projected to {target.name} ({after})"
-    return Plane(about, source, target, _metres(target))
+    return Plane(about, source, target)
 
 
 def parse_crs(value: Any) -> Any:
@@ -80,10 +80,6 @@ def parse_crs(value: Any) -> Any:
         return pyproj.CRS.from_user_input(value)
     except pyproj.exceptions.CRSError:
         raise ask(f"projection {str(value)[:100]!r} is not known", "such as EPSG:32611") from None
-
-
-def _metres(crs: Any) -> float | None:
-    return crs.axis_info[0].unit_conversion_factor if crs.axis_info else None
 
 
 def _shape(crs: Any, source: Any, bounds: Bounds) -> tuple[str, float]:
@@ -109,8 +105,7 @@ def warped(times: np.ndarray, affine: Any, plane: Plane) -> tuple[np.ndarray, An
     """
     warp, methods = library("rasterio.warp"), library("rasterio").enums.Resampling
     source = plane.source if plane.target else "EPSG:3857"  # any plane: only rotated
-    target = plane.target or source
-    rows, columns = times.shape
+    target, (rows, columns) = plane.target or source, times.shape
     corners = [affine * at for at in ((0, 0), (columns, 0), (0, rows), (columns, rows))]
     box = *map(min, *corners), *map(max, *corners)
     to, width, height = warp.calculate_default_transform(source, target, columns, rows, *box)

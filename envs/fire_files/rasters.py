@@ -20,6 +20,8 @@ from emberlink.envs.fire_files.report import Clock, Report, ask, counted
 from emberlink.envs.fire_files.times import decided_unit, in_order, in_utc, parse_dates
 from emberlink.envs.utils.errors import UserError
 
+Place = tuple[tuple[float, ...], Any]
+"""(a, b, c, d, e, f), and a projection or None: x = a column + b row + c, y = d column + ..."""
 MAX_BANK = 300_000_000
 """Maximum number of cells of all fires of a bank: 1.2 GB."""
 _DRIVERS = {"tif": "GTiff", "nc": "netCDF", "asc": "AAIGrid"}
@@ -36,6 +38,9 @@ _HEADER = re.compile(r"\s*(?!nan|inf)[a-z]", re.IGNORECASE)  # a line of ESRI AS
 _NORTH_UP = (1.0, 0.0, 0.0, 0.0, -1.0)
 _SIDE = 30  # cells along a side of the paper's map
 _SKIPPED = 6000  # lines of the paper's text before step 0
+_MAX_TIME = 1e12
+_NEVER = (-9999.0, -1.0)  # NODATA of FARSITE and FlamMap, and of ELMFIRE
+_VOID = 1e30  # a number beyond it is NODATA although not declared, such as -3.4e38
 
 
 def read_raster(path: Path, kind: str, config: FileFireConfig, report: Report) -> list[Raster]:
@@ -43,9 +48,9 @@ def read_raster(path: Path, kind: str, config: FileFireConfig, report: Report) -
     if kind == "points":
         return [_front_points(path, config, report)]
     if kind in ("npy", "grids"):
-        maps = _grids(path) if kind == "grids" else _numpy(path)
+        maps = _array(path, kind)
         if config.kind == "masks":
-            return [_of_states(maps, (*_NORTH_UP, float(maps.shape[1])), None, config, report)]
+            return [_of_states(maps, ((*_NORTH_UP, maps.shape[1]), None), config, report)]
         if kind == "grids":
             raise ask(f"{len(maps)} maps of Cell2Fire", "fire.kind=masks")
         json = path.with_suffix(".json")
@@ -57,14 +62,14 @@ def read_raster(path: Path, kind: str, config: FileFireConfig, report: Report) -
         if dataset.transform.is_identity:
             affine = (*_NORTH_UP, float(dataset.height))
         if config.kind == "masks":
-            return [_of_states(_read(dataset, MAX_BANK), affine, crs, config, report)]
+            return [_of_states(_read(dataset, MAX_BANK), (affine, crs), config, report)]
         if tags.get("units") == "steps" and crs is None:
             bands = _read(dataset, MAX_BANK)
             bands = np.where(bands == dataset.nodata, np.inf, bands)
             return _bank(bands, tags.get("horizon"), config, report)
         check_prj(path, kind, crs)
         times, clock, what = _band(path, kind, dataset, config)
-        return [_on_plane(times, affine, crs, clock, config, what, report)]
+        return [_on_plane(times, (affine, crs), clock, what, config, report)]
 
 
 @contextmanager
@@ -145,40 +150,36 @@ def _numbers(path: Path, shape: tuple[int, ...]) -> np.ndarray:
     return values
 
 
-def _of_states(
-    maps: np.ndarray, affine: Any, crs: Any, config: FileFireConfig, report: Report
-) -> Raster:
-    times, what = first_burning(maps, config)
+def _of_states(maps: np.ndarray, place: Place, config: FileFireConfig, report: Report) -> Raster:
+    """Returns the number of the first map in which each cell is not unburnt."""
+    states = np.unique(maps)
+    listed = ", ".join(f"{state:g}" for state in states[:12])
+    if config.never is None and not np.isin(states, (0, 1, 2)).all():
+        some = "such as 'fire.unburned=[0,3,4,5]' of SimFire's with its lines"
+        raise ask(f"states {listed}", f"fire.unburned, those that are no fire, {some}")
+    burns = ~np.isin(maps, (0,) if config.never is None else config.never)
+    times = np.where(burns.any(0), burns.argmax(0), np.inf)
+    check_spreads(times)
     unit = config.units if config.units not in (None, "steps") else "maps"
-    return _on_plane(times, affine, crs, Clock(unit), config, what, report)
+    what = f"{len(maps)} maps of the states {listed}, rows from north to south"
+    return _on_plane(times, place, Clock(unit), what, config, report)
 
 
 def _on_plane(
-    times: np.ndarray,
-    affine: tuple[float, ...],
-    crs: Any,
-    clock: Clock,
-    config: FileFireConfig,
-    what: str,
-    report: Report,
+    times: np.ndarray, place: Place, clock: Clock, what: str, config: FileFireConfig, report: Report
 ) -> Raster:
-    """Returns times on a plane, north up.
-
-    Corners of cells are at x = a column + b row + c, y = d column + e row + f.
-    """
+    """Returns times on a plane, north up."""
     if clock.unit in ("days", "day_of_year"):
         times, clock = in_order(times, config), Clock("days", clock.origin)
+    affine, crs = place
     a, b, c, d, e, f = (float(value) for value in affine)
-    area = abs(a * e - b * d)
+    area, (rows, columns) = abs(a * e - b * d), times.shape
     if not math.isfinite(c + f) or not 1e-20 < area < 1e12:
         raise ask(f"cells of {a:g} x {e:g}", "a size above 0")
-    rows, columns = times.shape
-    x, y = (
-        [p * u + q * v + r for u in (0, columns) for v in (0, rows)]
-        for p, q, r in ((a, b, c), (d, e, f))
-    )
     plane = Plane("no place in the file: square cells, the first row in the north")
     if crs is not None or affine[:5] != _NORTH_UP:
+        ends = [(u, v) for u in (0, columns) for v in (0, rows)]
+        x, y = ([p * u + q * v + r for u, v in ends] for p, q, r in ((a, b, c), (d, e, f)))
         plane = choose_plane(crs, config.crs, (min(x), min(y), max(x), max(y)), math.sqrt(area))
     first = times.min()  # by the cells of the file
     row, column = np.unravel_index(times.argmin(), times.shape)
@@ -202,23 +203,17 @@ def _on_plane(
     return fire
 
 
-def _grids(folder: Path) -> np.ndarray:
-    """Reads the maps of Cell2Fire, [time, y, x]."""
-    try:
-        return np.stack([np.loadtxt(p, delimiter=",", ndmin=2) for p in forest_grids(folder)])
-    except ValueError as error:
-        raise ask(first_line(error), "maps of one size") from None
-
-
-def _numpy(path: Path) -> np.ndarray:
+def _array(path: Path, kind: str) -> np.ndarray:
     """Opens an array [fires, X, Y] or [X, Y] of arrival times, or [time, y, x] of states."""
     try:
+        if kind == "grids":
+            return np.stack([np.loadtxt(p, delimiter=",", ndmin=2) for p in forest_grids(path)])
         # Memory-mapped, so that a wrong header allocates nothing.
         array = np.load(path, mmap_mode="r", allow_pickle=False)
         array = array[None] if array.ndim == 2 else array
         right = array.ndim == 3 and array.dtype.kind in "iufb" and 0 < array.size <= MAX_BANK
     except Exception as error:  # a damaged header raises many types
-        raise ask(first_line(error), "an array in NumPy's format") from None
+        raise ask(first_line(error), "an array of NumPy, or maps of one size") from None
     if not right:
         seen = f"an array of {list(array.shape)}, {array.dtype}"
         raise ask(seen, f"[fires, X, Y] of at most {MAX_BANK} numbers")
@@ -240,17 +235,14 @@ def _bank(
     sources = []
     for place, values in enumerate(fires):
         try:
-            sources.append(_whole_map(arrival(values, None, config, in_bank=True), "steps"))
+            times = arrival(values, None, config, in_bank=True)
+            sources.append(Raster(times, (0.0, rows), (1.0, 1.0), Clock("steps"), whole=True))
         except UserError as error:
             raise UserError(f"fire {place}: {error}") from None
     about = f"a bank of {counted(count, 'fire')} of {columns} x {rows} cells, in steps"
     report.facts.append(about + (f", written for {horizon} steps" if horizon else ""))
     report.written = int(horizon) if horizon else None
     return sources
-
-
-def _whole_map(times: np.ndarray, unit: str) -> Raster:
-    return Raster(times, (0.0, float(len(times))), (1.0, 1.0), Clock(unit), whole=True)
 
 
 def _front_points(path: Path, config: FileFireConfig, report: Report) -> Raster:
@@ -277,23 +269,16 @@ def _front_points(path: Path, config: FileFireConfig, report: Report) -> Raster:
     times = times[2:-2, 2:-2]
     check_spreads(times)
     report.facts.append(f"the paper's text of {count} lines, a line per time")
-    return _whole_map(times.T[::-1], config.units or "steps")
-
-
-_MAX_TIME = 1e12
-_NEVER = (-9999.0, -1.0)  # NODATA of FARSITE and FlamMap, and of ELMFIRE
-_VOID = 1e30  # a number beyond it is NODATA although not declared, such as -3.4e38
+    clock = Clock(config.units or "steps")
+    return Raster(times.T[::-1], (0.0, _SIDE), (1.0, 1.0), clock, whole=True)
 
 
 def arrival(
     values: np.ndarray, nodata: np.ndarray | None, config: FileFireConfig, *, in_bank: bool = False
 ) -> np.ndarray:
-    """Returns arrival times, inf in cells that never burn, float32 or float64.
+    """Returns arrival times, inf in cells that never burn; asks about values that may be no times.
 
-    Args:
-        values: [rows, columns] of a file, any real type.
-        nodata: mask of the NODATA that the file declares.
-        in_bank: whether inf says which cells never burn, and all others may burn at once.
+    `nodata` is the file's mask. In a bank, inf says what never burns; all others may burn at once.
     """
     times = np.array(values, dtype=np.result_type(values, np.float32))
     if nodata is not None:
@@ -355,16 +340,3 @@ def _plateaus(times: np.ndarray, *, in_bank: bool) -> list[float]:
             if far or (often and (edge == values[end]).mean() > 0.5):
                 odd.add(end % len(values))
     return [float(values[i]) for i in sorted(odd)]
-
-
-def first_burning(maps: np.ndarray, config: FileFireConfig) -> tuple[np.ndarray, str]:
-    """Returns the number of the first map in which each cell is not unburnt, and what to say."""
-    states = np.unique(maps)
-    listed = ", ".join(f"{state:g}" for state in states[:12])
-    if config.never is None and not np.isin(states, (0, 1, 2)).all():
-        some = "such as 'fire.unburned=[0,3,4,5]' of SimFire's with its lines"
-        raise ask(f"states {listed}", f"fire.unburned, those that are no fire, {some}")
-    burns = ~np.isin(maps, (0,) if config.never is None else config.never)
-    times = np.where(burns.any(0), burns.argmax(0), np.inf)
-    check_spreads(times)
-    return times, f"{len(maps)} maps of the states {listed}, rows from north to south"

@@ -24,7 +24,6 @@ from emberlink.envs.utils.atomic_io import open_regular, replaced, user_path
 from emberlink.envs.utils.errors import UserError, naming, printable
 
 READER_VERSION = 9  # increase it if the same file gives another grid
-_EVERY, _VALIDATION, _TEST = 5, 3, 4  # remainders of the numbers of validation and test fires
 _OF_TABLES = ("time_field", "time_format", "incident", "incident_field", "where", "radius")
 
 
@@ -60,15 +59,13 @@ def read_with_summary(
 def _named(file: str) -> Iterator[Path]:
     """Gives the path of a file, and names it in errors."""
     path = user_path(file)
-    name = printable(str(path))
     try:
         yield path
-    except UserError as error:
-        text = printable(str(error)).removeprefix(f"{path.name}: ")
-        raise UserError(f"{name}: {text}") from None
-    except (OSError, MemoryError) as error:
-        reason = getattr(error, "strerror", None) or error or "not enough memory"
-        raise UserError(f"{name}: cannot be read: {reason}") from None
+    except (UserError, OSError, MemoryError) as error:
+        text = str(error).removeprefix(f"{path.name}: ")
+        if not isinstance(error, UserError):
+            text = f"cannot be read: {getattr(error, 'strerror', None) or 'not enough memory'}"
+        raise UserError(printable(f"{path}: {text}")) from None
 
 
 def _sources(
@@ -80,7 +77,7 @@ def _sources(
         if config.kind == "masks" or config.unburned is not None:
             raise ask("fire.kind=masks and fire.unburned are for rasters", "none")
         table = read_table(path, kind, config.layer)
-        return [read_perimeters(*table, config, grid, horizon, report)]
+        return [read_perimeters(table, config, grid, horizon, report)]
     for key in _OF_TABLES:
         if getattr(config, key) is not None:
             raise ask(f"fire.{key} chooses among perimeters", "none for a raster")
@@ -124,29 +121,22 @@ def fire_sets(config: FileFireConfig, grid: tuple[int, int], horizon: int) -> Fi
 def _divide(count: int, *, test_file: bool) -> tuple[list[int], list[int], list[int]]:
     """Divides fires by number modulo 5; of fewer than 5, the last two validate and test."""
     fires = list(range(count))
-    many = count >= _EVERY
-    test = [i for i in fires if i % _EVERY == _TEST] if many else fires[-1:]
+    test = fires[4::5] or fires[-1:]
     rest = fires if test_file else [i for i in fires if i not in test] or fires
-    validation = [i for i in rest if i % _EVERY == _VALIDATION] if many else rest[-1:]
-    train = [i for i in rest if i not in validation] or rest
-    return train, validation, test
+    validation = [i for i in rest if i % 5 == 3] if count >= 5 else rest[-1:]
+    return [i for i in rest if i not in validation] or rest, validation, test
 
 
 def with_checksum(config: FileFireConfig) -> FileFireConfig:
     """Computes the checksums of the files and returns the scenario with them."""
-    test = config.test and _checksum(config.test, config.test_sha256)
-    return dataclasses.replace(
-        config, sha256=_checksum(config.path, config.sha256), test_sha256=test
-    )
-
-
-def _checksum(file: str, expected: str | None) -> str:
-    with _named(file) as path:
-        found = digest(path)
-        if expected not in (None, found):
-            here, there = found[:12], str(expected)[:12]
-            raise UserError(f"has changed: its SHA-256 is {here}..., in the run {there}...")
-    return found
+    sums: list[str | None] = []
+    for file, known in ((config.path, config.sha256), (config.test, config.test_sha256)):
+        with _named(file or "") as path:
+            sums.append(file and digest(path))
+            if known not in (None, sums[-1]):
+                here, there = str(sums[-1])[:12], str(known)[:12]
+                raise UserError(f"has changed: its SHA-256 is {here}..., in the run {there}...")
+    return dataclasses.replace(config, sha256=sums[0], test_sha256=sums[1])
 
 
 def save_copy(config: FileFireConfig, folder: Path, grid: tuple[int, int], horizon: int) -> None:
@@ -180,6 +170,7 @@ def _read_copy(config: FileFireConfig, grid: tuple[int, int], horizon: int) -> F
             if size > most or str(arrays["key"]) != _key(config, grid, horizon):
                 return None
             *fires, about = (arrays[name] for name in FireSets._fields)
-            return FireSets(*map(torch.from_numpy, fires), printable(str(about)))
+            train, validation, test = map(torch.from_numpy, fires)
+            return FireSets(train, validation, test, printable(str(about)))
     except Exception:  # damage raises many types
         return None

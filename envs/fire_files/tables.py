@@ -44,11 +44,9 @@ _CATEGORY = re.compile(r".*(category|class|kind|type|status)|(poly)?featu\w*|inc
 
 
 def read_table(path: Path, kind: str, layer: str | None) -> tuple[Any, list[str]]:
-    """Reads the features of a file, or of all files in a folder.
+    """Returns the features of a file or folder, and the columns that stand outside of them.
 
-    Returns:
-        A table of geopandas with a row per feature, whose index names the features in messages, and
-        the names of the columns whose values stand outside the attributes, and may hold a date.
+    The index names the features in messages. Columns outside the attributes may hold a date.
     """
     if kind != "folder":
         return _of_file(path, kind, layer)
@@ -262,9 +260,7 @@ def _where(frame: Any, columns: Sequence[Any], config: FileFireConfig, _: list[s
     return frame
 
 
-def _of_incident(
-    frame: Any, columns: Sequence[Any], config: FileFireConfig, facts: list[str]
-) -> Any:
+def _of_incident(frame: Any, columns: list[Any], config: FileFireConfig, facts: list[str]) -> Any:
     """Returns the features of `fire.incident`; asks if identifiers differ."""
     wanted, field = config.incident, config.incident_field
     if wanted == "*":

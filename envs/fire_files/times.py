@@ -17,6 +17,8 @@ from emberlink.envs.fire_files.files import library
 from emberlink.envs.fire_files.report import Clock, Report, ask
 from emberlink.envs.fire_files.tables import FOLDERS, attributes, column_named, plain, texts
 
+Times = tuple[np.ndarray, Clock]
+"""A number for each feature, and its unit."""
 _ELAPSED = {
     "minutes": "elapsed_mi elapsed_min elapsed_minutes minutes",
     "seconds": "elapsed_s elapsed_sec elapsed_seconds seconds",
@@ -68,9 +70,7 @@ _WITHIN = (
 )
 
 
-def read_times(
-    frame: Any, config: FileFireConfig, outside: Sequence[str], report: Report
-) -> tuple[np.ndarray, Clock]:
+def read_times(frame: Any, config: FileFireConfig, outside: Sequence[str], report: Report) -> Times:
     """Returns the time of each feature; the values of columns `outside` stand beside the table."""
     given = config.time_field
     if given is None:
@@ -78,9 +78,8 @@ def read_times(
     else:
         given = (given,) if isinstance(given, str) else given
         chosen = [column_named(name, attributes(frame), "fire.time_field") for name in given]
-    if not chosen or (
-        chosen[0] in (*outside, "Description") and not _holds_dates(frame[chosen[0]])
-    ):
+    names = (*outside, "Description")
+    if not chosen or (chosen[0] in names and not _holds_dates(frame[chosen[0]])):
         return _outside(frame, chosen or outside, config, report)
     empty = frame.index[frame[chosen].isna().any(axis=1)]
     if len(empty):
@@ -173,9 +172,7 @@ def _clocks(frame: Any, names: Sequence[Any]) -> list[timedelta]:
     return [read[text] or timedelta(0) for text in joined.tolist()]
 
 
-def _outside(
-    frame: Any, outside: Sequence[str], config: FileFireConfig, report: Report
-) -> tuple[np.ndarray, Clock]:
+def _outside(frame: Any, outside: Sequence[str], config: FileFireConfig, report: Report) -> Times:
     """Reads the dates in names of placemarks, folders and files, or beside the features."""
     found = {}
     for name in outside:
@@ -195,9 +192,7 @@ def _outside(
     raise ask(f"no column of times is known, of {seen}", f"such as fire.time_field={columns[0]}")
 
 
-def _calendar(
-    frame: Any, dates: Sequence[datetime], name: str, report: Report
-) -> tuple[np.ndarray, Clock]:
+def _calendar(frame: Any, dates: Sequence[datetime], name: str, report: Report) -> Times:
     """Returns minutes since the first date."""
     aware = [date.tzinfo is not None for date in dates]
     if any(aware) and not all(aware):
@@ -228,9 +223,7 @@ def _nested(shapes: Any) -> bool:
     return bool((sizes[inner] < 0.9 * sizes[outer]).any())
 
 
-def _elapsed(
-    name: Any, times: Any, config: FileFireConfig, report: Report
-) -> tuple[np.ndarray, Clock]:
+def _elapsed(name: Any, times: Any, config: FileFireConfig, report: Report) -> Times:
     """Returns elapsed times, in the unit of the column's name or of `fire.units`."""
     values = times.to_numpy()
     wrong = times[~times.between(0, 1e12)]
@@ -272,13 +265,7 @@ def in_order(values: np.ndarray, config: FileFireConfig) -> np.ndarray:
 
 
 def parse_dates(texts: Sequence[str], form: str | None, key: str) -> list[datetime]:
-    """Reads calendar times in one format.
-
-    Args:
-        texts: such as 2020-08-19T13:00-07:00, 8/19/2020 1:55 PM, 20200819, 1597842000000.
-        form: `fire.time_format`.
-        key: source of the texts, for messages.
-    """
+    """Reads calendar times in one format: `form`, which is `fire.time_format`, or the only fit."""
     known = (*_ORDERS, *_SINCE_1970)
     if form is not None and form not in known and "%" not in form:
         raise ask(f"fire.time_format={form}", ", ".join(known), "such as %d.%m.%Y")

@@ -37,13 +37,9 @@ def check_bank(path: Path, count: int, grid: Sequence[int]) -> None:
 def write_bank(
     path: Path, fires: Tensor, *, facts: Mapping[str, Any] | None = None, names: Sequence[str] = ()
 ) -> None:
-    """Writes arrival times to a new file, which `fire.path` reads. A partial file is removed.
+    """Writes fires, float32 [fires, X, Y], steps, to a new file, which `fire.path` reads.
 
-    Args:
-        path: ends in .npy, or in .tif or .tiff: one band per fire, north up, tagged units=steps.
-            Beside an .npy, a .json of the same name holds the facts.
-        fires: float32 [fires, X, Y], steps; inf never burns (-9999 in the GeoTIFF).
-        facts: the origin of the fires: text, numbers, lists and mappings.
+    Beside an .npy, a .json of the same name holds the facts. A partial file is removed.
     """
     check_bank(path, len(fires), fires.shape[1:])
     array = np.ascontiguousarray(fires.cpu().numpy(), dtype="<f4")

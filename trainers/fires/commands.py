@@ -32,13 +32,7 @@ from emberlink.trainers.fires.plot import arrival_figure
 
 
 def preview(arguments: Sequence[str], console: Console, output: Path | None = None) -> int:
-    """Draws a fire and prints its numbers.
-
-    Args:
-        arguments: SCENARIO, SCENARIO:INDEX, FILE, FILE:INDEX or `fire=NAME`, and `key=value`.
-        console: prints the numbers and, last, the path of the picture.
-        output: a folder, or a new .png file; the working directory if None.
-    """
+    """Draws a fire, SCENARIO or FILE (and :INDEX) or `fire=NAME`, and prints its numbers."""
     path = new_file(output, [".png"]) if output is not None and not os.path.isdir(output) else None
     sources, overrides = _divided(arguments)
     names = [text.partition("=")[2] for text in overrides if text.startswith("fire=")]
@@ -47,18 +41,36 @@ def preview(arguments: Sequence[str], console: Console, output: Path | None = No
     sources += [str(user_path(text)) for text in keyed] if names == ["file"] else names
     if len(sources) != 1:
         raise UserError(f"{shown(' '.join(sources))!r}: expected one scenario or file")
-    title, stem, config, arrival, read = _find(sources[0], overrides)
+    (text,) = sources
+    name, _, index = text.rpartition(":") if ":" in text else (text, "", "0")
+    name, index = (text, "0") if os.path.exists(text) else (name, index)
+    known = name in scenarios()
+    if not known and not os.path.exists(name):
+        hint = unknown(name, scenarios())
+        raise UserError(f"{shown(text)}: there is no such file; as a scenario {hint}")
+    config = _config(name, overrides) if known else _config("file", overrides, name)
+    world, (fires, read) = config.env, (None, "") if known else _read(config)
+    count = MAX_FIRES if fires is None else len(fires)
+    if not is_index(index, count):
+        raise UserError(f"{shown(text)}: no fire {shown(index)!r}; known: 0 to {count - 1}")
+    if fires is None:
+        fire = fires_of(config.fire).test_fire(int(index), world.grid, world.horizon)
+        arrival, title, stem = split_times(fire)[0][0], f"{name}, test fire {index}", name
+    else:
+        arrival, title, stem = fires[int(index)], shown(Path(name).name), Path(name).stem
+        title += f", fire {index} of {count}" if count > 1 else ""
     if path is None:
-        name = free_name(output or Path(), re.sub(r"[^\w.+-]", "-", stem)[:100], [".png"])
-        path = name.with_name(f"{name.name}.png")
-    world, times = config.env, arrival.numpy()
-    width = 2 * view_radius(world.altitude[1], world.view_angle)
+        stem = f"fire_{stem}_{index}" if count > 1 else f"fire_{stem}"
+        free = free_name(output or Path(), re.sub(r"[^\w.+-]", "-", stem)[:100], [".png"])
+        path = free.with_name(f"{free.name}.png")
+    times, width = arrival.numpy(), 2 * view_radius(world.altitude[1], world.view_angle)
     with created(path) as partial, warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Glyph")  # the font may lack letters of the file's name
         arrival_figure(partial, times, world.horizon, width, title)
     grid = " x ".join(map(str, world.grid))
-    _print(console, f"{title}: {grid} cells, {world.horizon} steps, setup {config.setup}")
-    _print(console, *([f"read: {read}"] if read else []), *_growth(times, world, width), str(path))
+    first = f"{title}: {grid} cells, {world.horizon} steps, setup {config.setup}"
+    about = [f"read: {read}"] if read else []
+    _print(console, first, *about, *_growth(times, world, width), str(path))
     return 0
 
 
@@ -71,17 +83,8 @@ def make(
     split: Split = "train",
     output: Path | None = None,
 ) -> int:
-    """Makes fires of a scenario and writes them to a file.
-
-    Args:
-        scenario: a file in configs/fire.
-        overrides: `key=value` of setup, env. and fire.
-        console: prints the number of fires and, last, the path of the file.
-        count: number of fires; as many as a training or an evaluation uses if None.
-        split: "train", "validation" or "test".
-        output: a new .npy, .tif or .tiff file; the next free name if None.
-    """
-    config = _generated(scenario, overrides)
+    """Writes fires of a scenario to a new file, as many as a training or evaluation uses."""
+    config = _config(scenario, overrides)
     fire, evaluation = config.fire, config.evaluation
     assert isinstance(fire, GeneratedConfig)
     usual = {"validation": evaluation.interval_episodes, "test": evaluation.episodes}
@@ -99,17 +102,11 @@ def make(
 
 
 def import_files(arguments: Sequence[str], console: Console, output: Path) -> int:
-    """Reads files of fires and writes them to one.
-
-    Args:
-        arguments: paths, and `key=value` of setup, env. and fire.
-        console: prints the findings, the number of fires and, last, the path of the file.
-        output: a new .npy, .tif or .tiff file.
-    """
+    """Reads files of fires, prints what was understood of each, and writes them to a new one."""
     paths, overrides = _divided(arguments)
     if not paths:
         raise UserError("FILE is missing; expected a file, such as ArrivalTime.asc")
-    configs = [_from_file(path, overrides) for path in paths]
+    configs = [_config("file", overrides, path) for path in paths]
     check_bank(output, len(paths), configs[0].env.grid)
     fires, names, sources = [], [], []
     for path, config in zip(map(Path, paths), configs, strict=True):
@@ -175,53 +172,16 @@ def _short(value: float) -> str:
     return f"{value:.0f}" if value >= 100 else f"{value:.3g}"
 
 
-def _find(text: str, overrides: Sequence[str]) -> tuple[str, str, RunConfig, Tensor, str]:
-    """Returns title, stem of file names, configuration, arrival times and `read:` of a fire."""
-    name, _, index = text.rpartition(":") if ":" in text else (text, "", "0")
-    if name in scenarios():
-        config = _generated(name, overrides)
-        place = _index(text, index, MAX_FIRES)
-        fire = fires_of(config.fire).test_fire(place, config.env.grid, config.env.horizon)
-        arrival = split_times(fire)[0][0]
-        return f"{name}, test fire {index}", f"fire_{name}_{index}", config, arrival, ""
-    if os.path.exists(text):
-        name, index = text, "0"
-    if not os.path.exists(name):
-        known = unknown(name, scenarios())
-        raise UserError(f"{shown(text)}: there is no such file; as a scenario {known}")
-    path, config = Path(name), _from_file(name, overrides)
-    fires, read = _read(config)
-    place, title, stem = _index(text, index, len(fires)), shown(path.name), f"fire_{path.stem}"
-    if len(fires) > 1:
-        title, stem = f"{title}, fire {index} of {len(fires)}", f"{stem}_{index}"
-    return title, stem, config, fires[place], read
-
-
-def _index(text: str, index: str, count: int) -> int:
-    if not is_index(index, count):
-        raise UserError(f"{shown(text)}: no fire {shown(index)!r}; known: 0 to {count - 1}")
-    return int(index)
-
-
-def _generated(scenario: str, overrides: Sequence[str]) -> RunConfig:
-    """Returns the configuration with which a scenario's fires are made."""
-    if scenario not in scenarios():
-        raise UserError(f"fire {unknown(scenario, scenarios())}")
-    return _resolved(scenario, overrides)
-
-
-def _from_file(path: str, overrides: Sequence[str]) -> RunConfig:
-    """Returns the configuration with which a file is read."""
-    # The path bypasses the parser of overrides, in which some characters have a meaning.
-    return _resolved("file", overrides, **{"fire.path": path})
-
-
-def _resolved(fire: str, overrides: Sequence[str], **settings: Any) -> RunConfig:
+def _config(fire: str, overrides: Sequence[str], path: str | None = None) -> RunConfig:
+    """Returns the configuration with which a scenario's fires are made, or a file is read."""
+    if fire != "file" and fire not in scenarios():
+        raise UserError(f"fire {unknown(fire, scenarios())}")
     for text in overrides:
         if not text.startswith(("setup=", "env.", "fire.")) or text.startswith("fire.path="):
             raise UserError(f"{shown(text)!r}: a fire depends on keys of setup, env. and fire.")
-    # Fires do not depend on the method.
-    return resolve("independent", [f"fire={fire}", *overrides], **settings)
+    # The path bypasses the parser of overrides, in which some characters have a meaning.
+    keys = {} if path is None else {"fire.path": path}
+    return resolve("independent", [f"fire={fire}", *overrides], **keys)  # any method
 
 
 def _read(config: RunConfig) -> tuple[Tensor, str]:

@@ -10,7 +10,7 @@ from matplotlib.patches import Patch, Rectangle
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
-from scipy.ndimage import binary_dilation, distance_transform_edt, label
+from scipy.ndimage import binary_fill_holes, distance_transform_edt
 
 NEVER, BURNT_OUT = "0.9", "0.45"
 _VIEW = "#ffff00"  # as in animations
@@ -20,13 +20,7 @@ _SIDE = 5.6  # inches of the map's longer side
 def arrival_figure(
     path: Path, arrival: NDArray[np.float32], horizon: int, width: float, title: str
 ) -> None:
-    """Draws arrival times as colours with contours, and the view of a UAV to scale.
-
-    Args:
-        arrival: [X, Y], steps; inf never burns.
-        horizon: steps of the episode.
-        width: side of the square that a UAV sees from full altitude, cells.
-    """
+    """Draws arrival times [X, Y] as colours with contours, and the `width` of a UAV's view."""
     across, up = arrival.shape
     scale = _SIDE / max(across, up)
     figure = Figure(
@@ -34,7 +28,8 @@ def arrival_figure(
     )
     axes = figure.subplots()
     box = (-0.5, across - 0.5, -0.5, up - 0.5)
-    core, reached = burnt_out(arrival), arrival <= horizon
+    reached = arrival <= horizon
+    core = binary_fill_holes(arrival <= 0) & np.isinf(arrival)  # burnt before step 0
     greys = ListedColormap([NEVER, BURNT_OUT])
     axes.imshow(core.T, cmap=greys, vmin=0, vmax=1, origin="lower", extent=box)
     shown = np.where(reached, arrival, np.nan).T
@@ -64,15 +59,3 @@ def arrival_figure(
     columns = 3 if across * scale > _SIDE / 2 else 1
     figure.legend(handles=samples, loc="outside lower center", ncols=columns, fontsize="small")
     figure.savefig(path, format="png", dpi=120, metadata={"Software": None})
-
-
-def burnt_out(arrival: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Returns the mask of cells burnt before step 0: gaps in the fire at step 0, bool [X, Y]."""
-    parts, count = label(np.isinf(arrival))  # pyright: ignore[reportGeneralTypeIssues]
-    inside = np.zeros(arrival.shape, bool)
-    for number in range(1, count + 1):
-        part = parts == number
-        around = binary_dilation(part, np.ones((3, 3))) & ~part
-        edge = part[[0, -1]].any() or part[:, [0, -1]].any()
-        inside |= part & (not edge and bool((arrival[around] <= 0).mean() > 0.5))
-    return inside

@@ -5,11 +5,11 @@ in steps of 1000, where it is known.
 """
 
 import re
-import shlex
 from pathlib import Path
 
 import numpy as np
 import pytest
+from fire_files import keys_in
 
 from emberlink.envs.fire_files.config import FileFireConfig
 from emberlink.envs.fire_files.reader import read_with_summary
@@ -109,14 +109,6 @@ def test_case(name):
         for step in (250, 500, 750, 1000):
             one, other = right <= step, fire.numpy() <= step
             assert (one & other).sum() / (one | other).sum() > least, (step, read)
-
-
-def keys_in(message):
-    """Returns the first keys that a message prints after `expected`, as a shell passes them on."""
-    tail = message.rpartition("expected ")[2]
-    found = re.findall(r"""'fire\.[^']*'|fire\.\w+=(?:"[^"]*"|[^\s,;]+)""", tail)
-    count = 2 if found and found[0].startswith("fire.incident_field") else 1
-    return [shlex.split(text)[0] for text in found[:count]]
 
 
 @pytest.mark.parametrize("name", [name for name, case in TABLE.items() if case[1]])

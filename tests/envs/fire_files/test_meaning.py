@@ -2,7 +2,6 @@
 
 import json
 import re
-import shlex
 import time
 
 import geopandas
@@ -11,7 +10,7 @@ import pandas
 import pytest
 import rasterio
 import torch
-from fire_files import CORNER, UTM, Ellipses, raster_of, squares, write_asc, write_tif
+from fire_files import CORNER, UTM, Ellipses, keys_in, raster_of, squares, write_asc, write_tif
 from scipy.io import netcdf_file
 
 from emberlink.envs.fire_files.config import FileFireConfig
@@ -32,16 +31,21 @@ def read(path, **keys):
 
 
 def asks(path, match, **keys):
-    """Checks that a file is not understood, and that the first key of the message is accepted."""
+    """Checks that a file is not understood, and that the keys of the message answer it."""
     with pytest.raises(ValueError, match=match) as caught:
         read(path, **keys)
     text = str(caught.value)
     assert "\n" not in text
     assert path.name in text
-    tail = text.rpartition("; expected ")[2]
-    found = re.search(r"""'fire\.[^']*'|fire\.\w+=(?:"[^"]*"|[^\s,;]+)""", tail)
-    if found:
-        resolve("independent", ["fire=file", "fire.path=x", *shlex.split(found[0])])
+    if printed := keys_in(text):
+        config = resolve("independent", ["fire=file", *printed], **{"fire.path": str(path)}).fire
+        names = [key.removeprefix("fire.").partition("=")[0] for key in printed]
+        again = ""
+        try:
+            read(path, **keys | {name: getattr(config, name) for name in names})
+        except ValueError as error:
+            again = str(error)
+        assert again != text
 
 
 def dates(count, year=2020):

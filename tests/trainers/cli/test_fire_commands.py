@@ -2,13 +2,11 @@
 
 import json
 import resource
-from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 import pytest
 import rasterio
-import torch
 from burning import burning_cells
 from fire_files import write_asc
 from PIL import Image
@@ -85,14 +83,15 @@ def test_preview_prints_the_numbers_of_the_test_fire(capsys):
     lines = ran(capsys, "preview", "huygens:3", "env.grid=[40,30]", "env.horizon=400")
     assert lines[0] == "huygens, test fire 3: 40 x 30 cells, 400 steps, setup paper"
     rows = numbers(lines)
-    assert rows["burning at the start"] == burning[0]
-    assert rows["burning at the end"] == burning[-1]
-    assert rows["growth, mean"] == pytest.approx(float(burning[-1] - burning[0]) / 400, rel=0.01)
-    most = max(int(burning[t + 20] - burning[t]) for t in range(381)) / 20
-    assert rows["growth, maximum"] == pytest.approx(most, rel=0.01)
-    assert rows["a UAV flies"] == 1
-    assert rows["a UAV sees"] == pytest.approx(8 / 3**0.5, rel=0.01)  # 2 x 4 x tan 30 degrees
-    assert rows["the team uncovers"] == pytest.approx(6 * 8 / 3**0.5, rel=0.01)
+    sees = 8 / 3**0.5  # 2 x 4 x tan 30 degrees
+    expected = {
+        "burning at the start": burning[0],
+        "burning at the end": burning[-1],
+        "growth, mean": float(burning[-1] - burning[0]) / 400,
+        "growth, maximum": max(int(burning[t + 20] - burning[t]) for t in range(381)) / 20,
+        **{"a UAV flies": 1, "a UAV sees": sees, "the team uncovers": 6 * sees},
+    }
+    assert rows == pytest.approx({k: float(v) for k, v in expected.items()}, rel=0.01)
     assert lines[-4] == "UAVs can keep up: yes"
     assert all(len(line) <= 80 for line in lines[:9])
     assert lines[-1] == "fire_huygens_3.png"
@@ -110,18 +109,8 @@ def test_preview_draws_its_numbers(capsys, tmp_path):
     # A fire that starts from a point has no burnt-out cells.
     source = asc(tmp_path / "point.asc", disc())
     (*_, name) = ran(capsys, "preview", source, "fire.units=minutes", "fire.ring_width=null")
-    assert name == "fire_point.png"
     assert area(name, plot.NEVER) > 100 * cell
     assert area(name, plot.BURNT_OUT) < cell / 2
-
-
-def test_preview_does_not_overwrite(capsys, tmp_path):
-    first = ran(capsys, "preview", "paper")[-1]
-    before = Path(first).read_bytes()
-    assert ran(capsys, "preview", "paper")[-1] == "fire_paper_0_2.png"
-    third = ran(capsys, "preview", "paper", "--output", tmp_path)[-1]
-    assert third == str(tmp_path / "fire_paper_0_3.png")
-    assert Path(first).read_bytes() == before
 
 
 @pytest.mark.parametrize("suffix", [".npy", ".tif", ".tiff"])
@@ -145,12 +134,7 @@ def test_make_writes_the_scenarios_fires(suffix, capsys, tmp_path):
         with rasterio.open(file) as raster:
             rows, about, names = raster.read(), raster.tags(), list(raster.descriptions)
             assert (raster.nodata, raster.crs) == (-9999, None)
-            # A cell's centre has its (i, j) as coordinates.
-            assert raster.xy(0, 0) == (0, 33)
-            for i, j in ((0, 0), (7, 20), (19, 33)):
-                (values,) = raster.sample([(i, j)])
-                wanted = expected[:, i, j]
-                assert np.array_equal(values, np.where(np.isinf(wanted), -9999, wanted))
+            assert raster.xy(0, 0) == (0, 33)  # a cell's centre has its (i, j) as coordinates
         fires = np.where(rows == -9999, np.inf, rows)[:, ::-1].transpose(0, 2, 1)
         rate = json.loads(about["fire"])["head_ros"]
     assert fires.dtype == np.float32
@@ -161,16 +145,9 @@ def test_make_writes_the_scenarios_fires(suffix, capsys, tmp_path):
     assert told == "steps huygens test 300 1000000 to 1000004"
     assert int(about["generator_version"]) == GENERATOR_VERSION
     assert about["emberlink_version"]
-
-
-@pytest.mark.parametrize("suffix", [".npy", ".tif"])
-@pytest.mark.parametrize("count", [1, 7])
-def test_a_bank_round_trips_bit_for_bit(suffix, count, capsys, tmp_path):
-    file, again = tmp_path / f"bank{suffix}", tmp_path / "again.npy"
-    ran(capsys, "make", "huygens", "--count", count, "env.grid=[24,40]", "--output", file)
-    fires = make_fires(HUYGENS, fire_seeds("train", count), (24, 40), 1000)
-    ran(capsys, "import", file, "env.grid=[24,40]", "--output", again)
-    assert torch.equal(torch.from_numpy(np.load(again)), fires)
+    keys = ("env.grid=[20,34]", "env.horizon=300")
+    ran(capsys, "import", file, *keys, "--output", tmp_path / "again.npy")
+    assert np.array_equal(np.load(tmp_path / "again.npy"), expected)
 
 
 def test_import_of_several_files(capsys, tmp_path):
@@ -210,7 +187,6 @@ KNOWN = "known: front, huygens, oil_slick, paper, reaction, swarm"
         (["preview", "huygns"], ["huygns", "did you mean huygens?", KNOWN]),
         (["preview", "zzz:3"], ["zzz:3", KNOWN]),
         (["preview", "huygens:-1"], ["'-1'", "0 to 65535"]),
-        (["preview", "huygens:65536"], ["'65536'", "0 to 65535"]),
         (["preview", "bank.npy:2"], ["bank.npy:2", "no fire '2'", "0 to 1"]),
         (["preview", "folder"], ["folder", "expected a file"]),
         (["preview", "paper", "fire.units=minutes"], ["fire.units"]),
@@ -218,17 +194,14 @@ KNOWN = "known: front, huygens, oil_slick, paper, reaction, swarm"
         (["preview", "paper", "huygens"], ["'paper huygens'", "expected one"]),
         (["preview", "fire=file"], ["expected one scenario or file"]),
         (["preview", "paper", "--output", "there.png"], ["there.png exists already"]),
-        (["preview", "paper", "--output", "no/a.png"], ["no: there is no such folder"]),
         (["make", "zzz"], ["'zzz'", KNOWN]),
         (["make", "paper", "--count", "5000", "--output", "a.tif"], ["5000 fires", ".npy"]),
         (["make", "paper", "--count", "300000"], ["300000 fires"]),
         (["make", "paper", "--output", "bank.npy"], ["bank.npy exists already"]),
         (["make", "paper", "--output", "beside.npy"], ["beside.json exists already"]),
-        (["make", "paper", "--output", "a.zip"], ["a.zip", ".npy or .tif or .tiff"]),
         (["import", "none.asc", "--output", "a.npy"], ["none.asc", "no such file"]),
         (["import", "env.grid=[9,9]", "--output", "a.npy"], ["FILE", "is missing"]),
         (["import", "300.npy", "env.horizon=9", "--output", "a.npy"], ["300", "fire.end=300"]),
-        (["import", "bank.npy", "--output", "bank.npy"], ["bank.npy exists already"]),
     ],
 )
 def test_errors_are_one_line_and_leave_no_files(arguments, words, capsys, tmp_path):
@@ -254,28 +227,24 @@ def test_preview_takes_the_keys_of_train(capsys, tmp_path):
     assert plain[1].startswith(f"read: {cells} cells burn from 0 minutes to 247.386 minutes; 1 ")
     keyed = ran(capsys, "preview", "fire=file", 'fire.path="my fire.asc"', *keys)
     assert keyed[:-1] == plain[:-1]
-    assert ran(capsys, "preview", "fire=paper")[:-1] == ran(capsys, "preview", "paper")[:-1]
-
-
-@contextmanager
-def files_of_at_most(size: int):
-    """Limits the size of files, like a full disk."""
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    *lines, first = ran(capsys, "preview", "fire=paper")
+    *again, second = ran(capsys, "preview", "paper", "--output", tmp_path)
+    assert again == lines
+    assert (first, second) == ("fire_paper_0.png", str(tmp_path / "fire_paper_0_2.png"))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("size", [0, 100, 2000])
 def test_a_full_disk_gives_one_line_and_leaves_no_files(size, capsys, tmp_path):
+    making, before = ["make", "huygens", "--count", 30], resource.getrlimit(resource.RLIMIT_FSIZE)
     for arguments in (
-        ["make", "huygens", "--count", 30, "--output", "a.npy"],
-        ["make", "huygens", "--count", 30, "--output", "a.tif"],
+        [*making, "--output", "a.npy"],
+        [*making, "--output", "a.tif"],
         ["preview", "huygens"],
     ):
-        with files_of_at_most(size):
+        resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+        try:
             assert "File too large" in refused(capsys, *arguments)
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, before)
         assert list(tmp_path.iterdir()) == []
