@@ -88,7 +88,7 @@ def find_format(path: Path) -> str:
         known = "GeoTIFF, NetCDF, ESRI ASCII, .npy, .shp, .gpkg, GeoJSON, KML, KMZ, CSV of points"
         raise ask(seen, f"{known}, the paper's text")
     if path in forest_grids(path.parent):
-        raise ask("one map of Cell2Fire", "its folder, with fire.kind=masks")
+        raise ask("one map of Cell2Fire", "its folder")
     most = MAX_BYTES // 2 if kind == "json" else MAX_BYTES
     if kind in ("asc", "csv", "kml", "points", "json") and size > most:
         raise ask(f"{size} bytes", f"a text file of at most {most}")
@@ -125,11 +125,11 @@ def beside(path: Path, kind: str) -> list[Path]:
 
 
 def check_prj(path: Path, kind: str, crs: Any) -> None:
-    """Checks that the projection in a .prj beside a file was understood."""
+    """Checks that the projection in a .prj beside a file was understood, or given by a key."""
     for part in beside(path, kind) if crs is None else ():
         if part.suffix.lower() == ".prj" and part.stat().st_size:
             seen = f"{part.name}, beside it, holds no projection that is known"
-            raise ask(seen, "no such file and fire.crs, such as fire.crs=EPSG:32611")
+            raise ask(seen, "fire.crs, such as fire.crs=EPSG:32611")
 
 
 def forest_grids(folder: Path) -> list[Path]:

@@ -67,7 +67,7 @@ def read_raster(path: Path, kind: str, config: FileFireConfig, report: Report) -
             bands = _read(dataset, MAX_BANK)
             bands = np.where(bands == dataset.nodata, np.inf, bands)
             return _bank(bands, tags.get("horizon"), config, report)
-        check_prj(path, kind, crs)
+        check_prj(path, kind, crs or config.crs)
         times, clock, what = _band(path, kind, dataset, config)
         return [_on_plane(times, (affine, crs), clock, what, config, report)]
 

@@ -76,7 +76,7 @@ def _sources(
     if kind in TABLES:
         if config.kind == "masks" or config.unburned is not None:
             raise ask("fire.kind=masks and fire.unburned are for rasters", "none")
-        table = read_table(path, kind, config.layer)
+        table = read_table(path, kind, config)
         return [read_perimeters(table, config, grid, horizon, report)]
     for key in _OF_TABLES:
         if getattr(config, key) is not None:

@@ -43,19 +43,19 @@ _MAYBE = re.compile(r"name|id|num|number|label|(f|fire|ig|ignition|event)?(year|
 _CATEGORY = re.compile(r".*(category|class|kind|type|status)|(poly)?featu\w*|incidentty|type.*")
 
 
-def read_table(path: Path, kind: str, layer: str | None) -> tuple[Any, list[str]]:
+def read_table(path: Path, kind: str, config: FileFireConfig) -> tuple[Any, list[str]]:
     """Returns the features of a file or folder, and the columns that stand outside of them.
 
     The index names the features in messages. Columns outside the attributes may hold a date.
     """
     if kind != "folder":
-        return _of_file(path, kind, layer)
+        return _of_file(path, kind, config)
     frames, outside = [], {"File": None}
     for part in perimeter_files(path):
         try:
             if (form := find_format(part)) not in TABLES:
                 raise ask(form, "perimeters")
-            frame, others = _of_file(part, form, layer)
+            frame, others = _of_file(part, form, config)
             if frames and (frame.crs is None) != (frames[0].crs is None):
                 raise ask("with and without projection", "one in each file")
         except UserError as error:
@@ -67,8 +67,8 @@ def read_table(path: Path, kind: str, layer: str | None) -> tuple[Any, list[str]
     return library("pandas").concat(frames), list(outside)
 
 
-def _of_file(path: Path, kind: str, layer: str | None) -> tuple[Any, list[str]]:
-    geopandas, outside = library("geopandas"), []
+def _of_file(path: Path, kind: str, config: FileFireConfig) -> tuple[Any, list[str]]:
+    geopandas, outside, layer = library("geopandas"), [], config.layer
     gc.disable()  # it takes two thirds of the time to parse a large text
     try:
         if kind == "json":
@@ -95,7 +95,7 @@ def _of_file(path: Path, kind: str, layer: str | None) -> tuple[Any, list[str]]:
         gc.enable()
     if not hasattr(frame, "geometry") or len(frame) == 0:
         raise ask("no feature with a geometry", "perimeters")
-    check_prj(path, kind, frame.crs)
+    check_prj(path, kind, frame.crs or config.crs)
     return frame.reset_index(drop=True).rename(index="feature {}".format), outside
 
 
