@@ -15,8 +15,9 @@ from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import check_whole
 from emberlink.trainers.comparison.comparison import Comparison, compare_runs
 from emberlink.trainers.comparison.report import free_folder, write_report
+from emberlink.trainers.config.basics import MAX_FIRES
 from emberlink.trainers.config.compose import resolve
-from emberlink.trainers.config.schema import MAX_FIRES, RunConfig
+from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.evaluation.evaluate import evaluate as evaluate_policy
 from emberlink.trainers.evaluation.policy import TrainedPolicy, load_policy
 from emberlink.trainers.evaluation.scores import Results

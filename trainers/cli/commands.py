@@ -4,6 +4,7 @@ Their code is imported when they run, so that `emberlink --help` does not import
 """
 
 import argparse
+from dataclasses import fields
 from typing import TYPE_CHECKING, Any
 
 from emberlink.envs.utils.errors import UserError
@@ -66,7 +67,7 @@ def _train(options: argparse.Namespace, console: "Console") -> int:
 
 
 def _check_names(method: str, overrides: list[str]) -> None:
-    """Reports a wrong name or key before torch is imported, which takes seconds."""
+    """Reports a wrong name, key or value before torch is imported, which takes seconds."""
     from emberlink.envs.utils.config_files import find, known
 
     if any(text.startswith("resume=") for text in (method, *overrides)):
@@ -76,9 +77,12 @@ def _check_names(method: str, overrides: list[str]) -> None:
         hint = f"; several methods: emberlink sweep {method} {other}"
         hint *= other in known("method")
         raise UserError(f"{other!r} is not of the form key=value{hint}")
+    from emberlink.envs.utils.validation import from_plain  # imports pydantic
+    from emberlink.trainers.config.basics import Basics
     from emberlink.trainers.config.values import composed  # imports Hydra
 
-    composed(method, overrides)
+    values = composed(method, overrides)
+    from_plain(Basics, {field.name: values[field.name] for field in fields(Basics)})
 
 
 def add_eval(commands: Any) -> None:

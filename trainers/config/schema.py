@@ -3,11 +3,10 @@
 import warnings
 from collections.abc import Mapping
 from dataclasses import asdict, fields, is_dataclass
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 from pydantic import (
     AfterValidator,
-    Field,
     PlainValidator,
     SerializeAsAny,
     Strict,
@@ -18,14 +17,12 @@ from pydantic.dataclasses import dataclass
 
 from emberlink.comm.base import MODULES, CommModule
 from emberlink.envs import metrics
-from emberlink.envs.config import WildfireConfig
 from emberlink.envs.scenarios import Scenario
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.plugins import Plugins
 from emberlink.envs.utils.validation import (
     STRICT,
     CountOrZero,
-    Name,
     check_device,
     from_plain,
     shown,
@@ -34,25 +31,15 @@ from emberlink.policies.networks.memory.base import MEMORIES
 from emberlink.policies.networks.messages import MESSAGES
 from emberlink.policies.scripted.base import SCRIPTED
 from emberlink.policies.settings import PolicyConfig
-from emberlink.trainers.learners.base import LEARNERS, Count, LearnerConfig
+from emberlink.trainers.config.basics import Basics, Many
+from emberlink.trainers.learners.base import LEARNERS, LearnerConfig
 
 NOT_LEARNT_WITH = ("device", "logger", "checkpoint_interval", "checkpoint_steps")
 """keys that do not affect learning: configurations that differ only in them are of the same run"""
 
-MAX_FIRES = 65_536
-"""maximum number of held-out fires of an evaluation"""
-Many = Annotated[int, Field(ge=1, le=MAX_FIRES)]
-Seed = Annotated[int, Field(ge=0, lt=2**31)]
-
 
 def _settings(key: str, values: Any, plugins: Plugins) -> Any:
-    """Returns name and settings as an instance of the `config_type` of the named class.
-
-    Args:
-        key: `comm` or `learner`, for messages.
-        values: name and settings as plain values, or an instance of a `config_type`.
-        plugins: finds the class.
-    """
+    """Returns name and settings as an instance of the `config_type` of the named class."""
     if is_dataclass(values):
         return values
     if not isinstance(values, Mapping) or not isinstance(name := values.get("name"), str):
@@ -100,45 +87,19 @@ class EvaluationConfig:
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
-class RunConfig:
+class RunConfig(Basics):
     """All settings of a run."""
 
-    method: Name
-    """name of the method, a file in configs/method"""
-    setup: Name
-    """name of the setup, a file in configs/setup"""
-    world: Name
-    """name of the world, a file in configs/world"""
-    replay: Literal["per_agent", "shared"]
-    """whether each UAV has its own replay buffer, or all share one"""
     comm: dict[str, Any]
     """name and settings of the communication module"""
-    env: WildfireConfig
-    """settings of the environment"""
     fire: Scenario
     """training fires"""
     learner: LearnerChoice
     """settings of the learning algorithm"""
-    policy: PolicyConfig = PolicyConfig()
-    """what the policies remember, and how often they decide"""
     evaluation: EvaluationConfig
     """settings of the evaluations"""
-    episodes: Count
-    """training episodes of each environment"""
-    num_envs: Many
-    """environments, stepped in one batch"""
-    seed: Seed
-    """seed of all random numbers"""
     device: Annotated[str, AfterValidator(check_device)]
     """device of the environment, the replay buffer and the networks"""
-    logger: Literal["wandb", "tensorboard", "csv", "none"]
-    """experiment tracker, in addition to metrics.jsonl"""
-    output: Annotated[str, Field(min_length=1)]
-    """folder in which run folders are created"""
-    checkpoint_interval: Count
-    """episodes between checkpoints"""
-    checkpoint_steps: CountOrZero = 0
-    """steps between additional checkpoints; 0 for none"""
 
     @model_validator(mode="after")
     def _check_headline(self) -> "RunConfig":
@@ -166,11 +127,7 @@ class RunConfig:
         return {"name": value["name"], **asdict(settings)}
 
     def check_rollouts(self, decisions: int = 1) -> None:
-        """Checks that an episode consists of whole rollouts, which only a training needs.
-
-        Args:
-            decisions: decisions of a rollout.
-        """
+        """Checks that an episode consists of whole rollouts, as a training needs."""
         steps = decisions * self.policy.hold
         if self.env.horizon % steps:
             raise UserError(

@@ -14,7 +14,8 @@ from emberlink.envs.utils.validation import is_index, shown
 from emberlink.envs.wildfire import WildfireEnv
 from emberlink.policies.scripted.base import SCRIPTED
 from emberlink.trainers.build import build_env
-from emberlink.trainers.config.schema import MAX_FIRES, RunConfig, build_comm
+from emberlink.trainers.config.basics import MAX_FIRES
+from emberlink.trainers.config.schema import RunConfig, build_comm
 from emberlink.trainers.evaluation.evaluate import (
     BLOCK,
     START_SEED,

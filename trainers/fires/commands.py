@@ -24,8 +24,9 @@ from emberlink.envs.utils.errors import UserError, shown, unknown
 from emberlink.envs.utils.validation import is_index
 from emberlink.envs.world.coverage_map import split_times
 from emberlink.envs.world.sensor import view_radius
+from emberlink.trainers.config.basics import MAX_FIRES
 from emberlink.trainers.config.compose import resolve, to_values
-from emberlink.trainers.config.schema import MAX_FIRES, RunConfig
+from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.config.values import parse
 from emberlink.trainers.fires.bank_writer import check_bank, write_bank
 from emberlink.trainers.fires.plot import arrival_figure
