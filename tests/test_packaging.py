@@ -117,7 +117,7 @@ def test_wheel_holds_the_package_and_nothing_else(wheel: Path):
         path.relative_to(ROOT).as_posix()
         for path in tracked_files()
         if path.is_file()
-        and path.relative_to(ROOT).parts[0] in FOLDERS
+        and path.relative_to(ROOT).parts[0] in (*FOLDERS, "__main__.py")
         and (
             path.suffix in (".py", ".yaml", ".html", ".js", ".css")
             or path.name in ("py.typed", "LICENSE")

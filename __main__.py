@@ -1,0 +1,5 @@
+"""Runs the command line: `python -m emberlink`."""
+
+from emberlink.trainers.cli.main import main
+
+raise SystemExit(main())
