@@ -28,28 +28,22 @@ Identity = tuple[tuple[str, str], ...]
 
 @dataclass(eq=False)
 class Combination:
-    """A run of a sweep.
-
-    Attributes:
-        config: the configuration.
-        swept: `key=value` of the other keys with several values, for the name.
-        overrides: given `key=value` of keys that do not affect learning; a resumed run gets them.
-        folder: the run folder; None if there is none yet.
-        failed: why the training has failed, else empty.
-    """
+    """A run of a sweep."""
 
     config: RunConfig
     swept: Sequence[str] = ()
+    """`key=value` of keys with several values, for the name"""
     overrides: tuple[str, ...] = ()
+    """given `key=value` of keys that do not affect learning, for a resumed run"""
     folder: RunFolder | None = None
     failed: str = ""
+    """why the training has failed, else empty"""
 
     @property
     def name(self) -> str:
         """The method, the setup, the world, the other keys with several values, the seed."""
-        config = self.config
-        parts = [config.method, config.setup, config.world, *self.swept, f"seed {config.seed}"]
-        return ", ".join(parts)
+        c = self.config
+        return ", ".join([c.method, c.setup, c.world, *self.swept, f"seed {c.seed}"])
 
     @property
     def episodes(self) -> int:
@@ -59,8 +53,8 @@ class Combination:
     @property
     def finished(self) -> bool:
         """Whether the run has all episodes and an evaluation of its newest checkpoint."""
-        folder = self.folder
-        return folder is not None and self.episodes >= self.config.episodes and folder.evaluated()
+        enough = self.episodes >= self.config.episodes
+        return enough and self.folder is not None and self.folder.evaluated()
 
     @property
     def state(self) -> str:
@@ -84,19 +78,20 @@ class Combination:
     def task(self) -> Task:
         """Creates the run folder if there is none, and returns the task that trains the run."""
         if self.folder is None:
+            c = self.config
+            digest = hashlib.sha256(repr(identity(c)).encode()).hexdigest()[:8]
+            name = f"{c.method}_{c.setup}_{c.world}_s{c.seed}_{digest}"
             # From the configuration and not the arguments: YAML files may have changed since.
-            self.folder = RunFolder.create(self.config, _folder_name(self.config))
+            self.folder = RunFolder.create(c, name)
         self.log.parent.mkdir(exist_ok=True)
         overrides = (f"device={self.config.device}", *self.overrides)
         return Task(self.folder.path.absolute(), overrides, self.log)
 
 
 def combinations(arguments: Sequence[str]) -> list[Combination]:
-    """Returns each combination of methods and values once.
+    """Returns each combination of methods, all if none is named, and values of `key=value` once.
 
-    Args:
-        arguments: names of methods (all methods if there are none), and `key=value` or, in Hydra's
-            syntax for several values, `seed=0,1,2` or `seed=range(0,5)`.
+    Several values have Hydra's syntax: `seed=0,1,2` or `seed=range(0,5)`.
     """
     methods = [text for text in arguments if "=" not in text] or list(known("method"))
     choices = [_values(text) for text in arguments if "=" in text]
@@ -119,8 +114,7 @@ def combinations(arguments: Sequence[str]) -> list[Combination]:
 def find_folders(wanted: Sequence[Combination], output: Path) -> Iterator[str]:
     """Sets the folder of each run that is in the output folder; yields what cannot be read.
 
-    A folder belongs to a combination if its config.yaml has the same values, apart from the keys
-    that do not affect learning; its name does not matter. A finished one goes before others.
+    A folder belongs to a run if it has the same identity, whatever its name; a finished one first.
     """
     by_identity = {identity(run.config): run for run in wanted}
     for file in sorted(output.glob("*/config.yaml")):
@@ -129,11 +123,10 @@ def find_folders(wanted: Sequence[Combination], output: Path) -> Iterator[str]:
         try:
             folder = RunFolder(file.parent)
             # The device of the run may not exist on this machine.
-            config = folder.config(device="cpu")
+            run = by_identity.get(identity(folder.config(device="cpu")))
         except ValueError as error:
             yield f"{file.parent} is left out: {error}"
             continue
-        run = by_identity.get(identity(config))
         if run is not None and not run.finished:
             run.folder = folder
 
@@ -142,12 +135,6 @@ def identity(config: RunConfig) -> Identity:
     """Returns the keys and values that tell a run from others."""
     values = flat(to_values(config))
     return tuple(sorted((k, str(v)) for k, v in values.items() if k.split(".")[0] not in _IGNORED))
-
-
-def _folder_name(config: RunConfig) -> str:
-    """Returns the name of a new folder: it ends with a hash of the configuration."""
-    digest = hashlib.sha256(repr(identity(config)).encode()).hexdigest()[:8]
-    return f"{config.method}_{config.setup}_{config.world}_s{config.seed}_{digest}"
 
 
 def _key(text: str) -> str:

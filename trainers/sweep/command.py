@@ -6,25 +6,13 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
+from rich import progress
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    TaskID,
-    TextColumn,
-    TimeElapsedColumn,
-)
 from rich.table import Table
 
 from emberlink.envs.utils.atomic_io import user_path
 from emberlink.envs.utils.errors import UserError
-from emberlink.trainers.sweep.combinations import (
-    Combination,
-    combinations,
-    find_folders,
-    identity,
-)
+from emberlink.trainers.sweep.combinations import Combination, combinations, find_folders, identity
 from emberlink.trainers.sweep.executors.base import Executor, make
 from emberlink.trainers.terminal.console import plain_table
 from emberlink.trainers.terminal.signals import Interruption
@@ -42,15 +30,10 @@ def sweep(
     dry: bool = False,
     executor: Executor | None = None,
 ) -> int:
-    """Trains and evaluates the runs that are not finished.
+    """Trains and evaluates the runs that are not finished, or only prints their states if `dry`.
 
-    Args:
-        arguments: see `combinations`; and `executor=NAME`, `executor.KEY=VALUE`.
-        dry: whether to print the state of each run and do nothing else.
-        executor: replaces the executor of the arguments.
-
-    Returns:
-        0; 1 if a run failed; 128 and the number of a signal, such as 130, after it.
+    `arguments` are those of `combinations`, and `executor=NAME` and `executor.KEY=VALUE`, which
+    `executor` replaces. Returns 1 if a run failed, 128 and the number of a signal after it, else 0.
     """
     chosen = [text for text in arguments if text.startswith(("executor=", "executor."))]
     runs = combinations([text for text in arguments if text not in chosen])
@@ -70,8 +53,8 @@ def sweep(
         if run.failed:
             console.print(f"{run.name}: {run.failed} (log: {run.log})", soft_wrap=True)
     if status == 0:
-        again = f"emberlink compare {shlex.quote(str(output))}"
-        console.print(f"compare them with: {again}", soft_wrap=True)
+        place = shlex.quote(str(output))
+        console.print(f"compare them with: emberlink compare {place}", soft_wrap=True)
     else:
         console.print("the same command trains what is left")
     return status
@@ -101,14 +84,14 @@ class _Trainings:
     def __init__(self, executor: Executor, runs: Sequence[Combination], console: Console):
         self._executor, self._runs = executor, runs
         self._waiting = [run for run in runs if not run.finished]
-        self._running: dict[Combination, tuple[Any, TaskID]] = {}
+        self._running: dict[Combination, tuple[Any, progress.TaskID]] = {}
         self._stopped = False
         self._most = len(runs) if executor.workers is None else executor.workers
-        self._progress = Progress(
-            TextColumn("{task.description}", markup=False),
-            BarColumn(bar_width=20),
-            MofNCompleteColumn(),
-            TimeElapsedColumn(),
+        self._progress = progress.Progress(
+            progress.TextColumn("{task.description}", markup=False),
+            progress.BarColumn(bar_width=20),
+            progress.MofNCompleteColumn(),
+            progress.TimeElapsedColumn(),
             console=console,
         )
         done = len(runs) - len(self._waiting)

@@ -51,35 +51,27 @@ class SafeConsole(Console):
             super().print(*printed, **options)
 
     def _parts(self, table: Table) -> list[Table]:
-        """Splits a table; numbers and the words of the first column are never broken."""
+        """Splits a table that is too wide; words of a column, and its numbers, are not broken."""
         first, *others = table.columns
-        words = [word for cell in (first.header, *first.cells) for word in str(cell).split()]
-        first.min_width = max(map(len, words), default=0)
-        first.no_wrap = not table.show_header  # a list of names and texts
-        for column in others:
+        for column in table.columns:
+            cells = [str(cell) for cell in (column.header, *column.cells)]
+            is_list = column is first and not table.show_header  # of names and texts
+            column.no_wrap = is_list or column.justify == "right" or " " not in "".join(cells)
+            words = (cell.split("\n" if column.no_wrap else None) for cell in cells)
+            column.min_width = max((len(word) for cell in words for word in cell), default=0)
             column.overflow = "fold"
-            if column.justify == "right":
-                lines = [
-                    line
-                    for cell in (column.header, *column.cells)
-                    for line in str(cell).split("\n")
-                ]
-                column.no_wrap, column.min_width = True, max(map(len, lines))
-        parts, unlimited = [copy(table)], self.options.update(width=10_000)
+        parts = [copy(table)]
         parts[0].columns = [first]
         for column in others:
-            wider = copy(table)
-            wider.columns = [*parts[-1].columns, column]
-            too_wide = self.measure(wider, options=unlimited).minimum > self.width
-            if too_wide and len(parts[-1].columns) > 1:
+            wider = copy(parts[-1])
+            wider.columns = [*wider.columns, column]
+            narrowest = self.measure(wider, options=self.options.update(width=10_000)).minimum
+            if narrowest > self.width and len(parts[-1].columns) > 1:
+                parts[-1].caption = wider.title = None
                 wider.columns = [first, column]
                 parts.append(wider)
             else:
                 parts[-1] = wider
-        for part in parts[1:]:
-            part.title = None
-        for part in parts[:-1]:
-            part.caption = None
         return parts
 
     def render(

@@ -25,29 +25,21 @@ DIED = -9
 
 @dataclass(frozen=True)
 class Task:
-    """A training to run. The same task may be run again: it resumes the run.
-
-    Attributes:
-        run: the run folder; an absolute path.
-        overrides: `key=value` of keys that a resumed training may change.
-        log: file to which the output is appended; an absolute path.
-        place: working directory, to which paths in the configuration are relative.
-    """
+    """A training to run. The same task may be run again: it resumes the run."""
 
     run: Path
+    """the run folder; an absolute path"""
     overrides: Sequence[str]
+    """`key=value` of keys that a resumed training may change"""
     log: Path
+    """file to which the output is appended; an absolute path"""
     place: Path = field(default_factory=Path.cwd)
+    """working directory, to which paths in the configuration are relative"""
 
     def start(self, threads: int, gpu: int | None = None) -> subprocess.Popen:
         """Starts the training as a child process; it saves and ends when this process ends.
 
-        Args:
-            threads: threads of the training; `OMP_NUM_THREADS` overrides it.
-            gpu: the only GPU that the training sees; None for all.
-
-        Raises:
-            OSError: the log cannot be written.
+        It has as many threads unless `OMP_NUM_THREADS` is set, and sees `gpu` alone, or all.
         """
         settings = {"OMP_NUM_THREADS": str(threads), **os.environ, "COLUMNS": "120"}
         if gpu is not None:
