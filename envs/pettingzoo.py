@@ -18,8 +18,8 @@ from torchrl.envs import EnvBase, TransformedEnv, step_mdp
 from emberlink.envs import keys
 from emberlink.envs.config import WildfireConfig
 from emberlink.envs.scenarios import default_config
-from emberlink.envs.utils.errors import UserError
-from emberlink.envs.utils.validation import describe, shown, unknown
+from emberlink.envs.utils.errors import UserError, shown, unknown
+from emberlink.envs.utils.validation import describe
 from emberlink.envs.wildfire import WildfireEnv
 
 Array = NDArray[np.float32]

@@ -213,7 +213,7 @@ class WildfireEnv(EnvBase):
 
     def _set_seed(self, seed: int | None) -> None:
         seed = secrets.randbelow(2**62) if seed is None else seed
-        seed = counter_rng.check_seed(seed)
+        (seed,) = counter_rng.check_seeds(seed, 1)
         self._seed_key.copy_(counter_rng.seed_keys(seed, self.num_envs, self.device))
         self._episode.zero_()
         self._seeded = True

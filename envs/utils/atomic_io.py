@@ -20,30 +20,22 @@ def user_path(path: os.PathLike[str] | str) -> Path:
     try:
         return Path(path).expanduser()
     except RuntimeError:
-        raise UserError(
-            f"{shown(os.fspath(path))}: there is no such home folder; the variable HOME names yours"
-        ) from None
+        raise UserError(f"{shown(path)}: there is no such home folder") from None
 
 
 def open_regular(path: Path, max_bytes: int) -> BinaryIO:
-    """Opens a regular file, or the target of a link, without blocking on a pipe or a device.
-
-    Raises:
-        OSError: the file cannot be opened, is not regular, or is too large.
-    """
+    """Opens a regular file, or the target of a link; an OSError if it is not one or too large."""
+    # A pipe or a device would block, or change when it is opened.
     handle = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC)
-    try:
-        about = os.fstat(handle)
-        if stat.S_ISDIR(about.st_mode):
-            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
-        if not stat.S_ISREG(about.st_mode):
-            raise OSError(errno.EINVAL, "it is not a regular file", str(path))
-        if about.st_size > max_bytes:
-            raise OSError(errno.EFBIG, f"it has more than {max_bytes} bytes", str(path))
-        return os.fdopen(handle, "rb")
-    except BaseException:
+    about, why = os.fstat(handle), None
+    if not stat.S_ISREG(about.st_mode):
+        why = errno.EINVAL, "it is not a regular file"
+    elif about.st_size > max_bytes:
+        why = errno.EFBIG, f"it has more than {max_bytes} bytes"
+    if why:
         os.close(handle)
-        raise
+        raise OSError(*why, str(path))
+    return os.fdopen(handle, "rb")
 
 
 def read_bytes(path: Path, max_bytes: int) -> bytes:
@@ -85,27 +77,20 @@ def created(path: Path) -> Iterator[Path]:
             if os.path.lexists(path):
                 raise UserError(f"{path} exists already; nothing is overwritten")
     except OSError as error:
-        raise UserError(f"{shown(str(path))}: {error.strerror or error}") from None
+        raise UserError(f"{shown(path)}: {error.strerror or error}") from None
 
 
 def new_file(output: Path, suffixes: Sequence[str]) -> Path:
-    """Checks that a file can be created at a path that the user gave, and returns the path.
-
-    Args:
-        output: the path.
-        suffixes: accepted suffixes.
-    """
+    """Checks that a file with one of the suffixes can be created, and returns its path."""
     output = user_path(output)
     if output.is_dir():
         raise UserError(f"{output} is a folder; a file ends in {', '.join(suffixes)}")
     if output.suffix not in suffixes:
-        raise UserError(
-            f"{shown(str(output))}: the file's name must end in {' or '.join(suffixes)}"
-        )
+        raise UserError(f"{shown(output)}: the file's name must end in {' or '.join(suffixes)}")
     if os.path.lexists(output):
         raise UserError(f"{output} exists already; nothing is overwritten")
     if not output.parent.is_dir():
-        raise UserError(f"{shown(str(output.parent))}: there is no such folder")
+        raise UserError(f"{shown(output.parent)}: there is no such folder")
     return output
 
 

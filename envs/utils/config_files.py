@@ -8,6 +8,7 @@ import re
 import sys
 import warnings
 from collections.abc import Mapping
+from contextlib import suppress
 from functools import lru_cache
 from importlib import metadata
 from importlib.util import find_spec
@@ -24,26 +25,19 @@ PACKAGES = "emberlink.configs"
 """group of entry points; each names a package whose folder holds groups"""
 
 
-def entry_points(group: str) -> tuple[metadata.EntryPoint, ...]:
-    """Returns the entry points of a group, such as "emberlink.comm".
-
-    They are read again when `sys.path` changes. Reading takes 20 ms, and an evaluation asks a
-    hundred times.
-    """
-    return _entry_points(group, tuple(sys.path))
+def entry_points(group: str) -> metadata.EntryPoints:
+    """Returns the entry points of a group, such as "emberlink.comm"."""
+    return _entry_points(tuple(sys.path)).select(group=group)
 
 
-@lru_cache(maxsize=64)
-def _entry_points(group: str, path: tuple[str, ...]) -> tuple[metadata.EntryPoint, ...]:
-    return tuple(metadata.entry_points(group=group))
+@lru_cache(maxsize=8)
+def _entry_points(_: tuple[str, ...]) -> metadata.EntryPoints:
+    """Reads all entry points, which takes 20 ms; an evaluation asks a hundred times."""
+    return metadata.entry_points()
 
 
 def folders() -> list[Path]:
-    """Returns the folders of groups: those in `VARIABLE`, of other packages, and of emberlink.
-
-    Folders that do not exist are ignored, as in PATH. For an entry point whose package does not
-    exist, there is a warning.
-    """
+    """Returns the existing folders of groups: in `VARIABLE`, of other packages, of emberlink."""
     listed = [user_path(text) for text in os.environ.get(VARIABLE, "").split(os.pathsep) if text]
     plugins = [path for point in entry_points(PACKAGES) for path in _package(point.value)]
     every = [path.resolve() for path in (*listed, *plugins, Path(str(configs.__file__)).parent)]
@@ -51,14 +45,12 @@ def folders() -> list[Path]:
 
 
 def _package(name: str) -> list[Path]:
-    """Returns the folders of a package, without importing it; its parents are imported."""
-    spec, why = None, f"there is no package {name}"
-    try:
+    """Returns the folders of a package, without importing it; warns if there is none."""
+    spec = None
+    with suppress(Exception):  # of the code of its parents, which are imported
         spec = find_spec(name)
-    except Exception as error:  # of the parents' code
-        why += f" ({type(error).__name__}: {error})"
     if spec is None or not spec.submodule_search_locations:
-        warnings.warn(f"entry point of {PACKAGES}: {why}", stacklevel=4)
+        warnings.warn(f"entry point of {PACKAGES}: there is no package {name}", stacklevel=4)
         return []
     return [Path(folder) for folder in spec.submodule_search_locations]
 
@@ -70,12 +62,7 @@ def known(group: str) -> list[str]:
 
 
 def find(group: str, name: str) -> Path:
-    """Returns the path of a configuration file.
-
-    Args:
-        group: name of the group, such as "method", "setup", "setup_method" or "fire".
-        name: name of the file without `.yaml`.
-    """
+    """Returns the file of a choice of a group, such as "tuned" of "setup"."""
     files = [file for folder in folders() if (file := folder / group / f"{name}.yaml").is_file()]
     if not files:
         raise UserError(f"{group} {unknown(name, known(group))}")
@@ -85,10 +72,7 @@ def find(group: str, name: str) -> Path:
 
 
 def summary(group: str, name: str) -> str:
-    """Returns the first sentence of the comment at the beginning of a file, without full stop.
-
-    It is "" if the file does not begin with a comment.
-    """
+    """Returns the first sentence of the comment at the beginning of a file, or ""."""
     text = find(group, name).read_text(encoding="utf-8", errors="replace")
     (comment,) = re.findall(r"\A(?:# @package.*\n)?((?:#.*\n)*)", text)
     words = "".join(c for c in " ".join(comment.replace("#", " ").split()) if c.isprintable())

@@ -8,7 +8,6 @@ are int64 tensors; `fold_in` derives a key from another.
 
 from collections.abc import Sequence
 from enum import IntEnum, unique
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -59,14 +58,9 @@ def _mix(x: Tensor) -> Tensor:
 
 
 def fold_in(key: Tensor, counter: Tensor | int) -> Tensor:
-    """Returns a new key from a key and a counter.
+    """Returns a key for each key and counter, int64 of their broadcast shape.
 
-    Args:
-        key: int64, any shape.
-        counter: int64 or an integer, broadcast against `key`.
-
-    Returns:
-        int64 of the broadcast shape; different counters give statistically independent keys.
+    Different counters give statistically independent keys.
     """
     offset = (counter + 1) * _GOLDEN
     if isinstance(offset, int):  # wrapped to signed 64 bits, as int64 tensors are
@@ -75,13 +69,7 @@ def fold_in(key: Tensor, counter: Tensor | int) -> Tensor:
 
 
 def step_key(key: Tensor, step: Tensor, use: int | Tensor) -> Tensor:
-    """Returns the key for a purpose at a step of an episode.
-
-    Args:
-        key: int64 [...], `keys.RNG_KEY` of the episode.
-        step: int64 [...].
-        use: a `Use` below 1000; the same `use` gives the same random numbers.
-    """
+    """Returns the key for a use, below 1000, at a step of the episode of a `keys.RNG_KEY`."""
     return fold_in(key, step * 1000 + use)
 
 
@@ -91,41 +79,24 @@ def seed_keys(seed: int, count: int, device: torch.device | str | None = None) -
     return fold_in(root, torch.arange(count, device=device))
 
 
-def check_seed(seed: Any) -> int:
-    """Returns a seed, a whole number from 0 to 2^63 - 1, as an int."""
-    number = check_whole("seed", seed)
-    if not 0 <= number < 2**63:
-        raise UserError(f"seed={seed}: expected a whole number from 0 to 2^63 - 1")
-    return number
-
-
 def check_seeds(seed: int | Sequence[int], num_envs: int) -> list[int]:
     """Returns one or several seeds as a list; `num_envs` is a multiple of their number."""
     given = seed if isinstance(seed, Sequence) and not isinstance(seed, str) else [seed]
-    seeds = [check_seed(number) for number in given]
+    seeds = [check_whole("seed", number) for number in given]
+    for number in seeds:
+        if not 0 <= number < 2**63:
+            raise UserError(f"seed={number}: expected a whole number from 0 to 2^63 - 1")
     if not seeds or num_envs % len(seeds):
         raise UserError(f"num_envs={num_envs} is not a multiple of the {len(seeds)} seeds")
     return seeds
 
 
-def _bits(key: Tensor, count: int) -> Tensor:
-    """Returns 64 random bits `count` times per key, int64 [..., count]."""
-    return fold_in(key.unsqueeze(-1), torch.arange(count, device=key.device))
-
-
 def uniform(key: Tensor, count: int) -> Tensor:
-    """Returns numbers uniform in (0, 1), excluding both ends.
-
-    Args:
-        key: int64 [...].
-        count: numbers per key.
-
-    Returns:
-        float32 [..., count]: odd multiples of 2⁻²⁴.
-    """
-    return (_shift(_bits(key, count), 41).to(torch.float32) + 0.5) * 2.0**-23
+    """Returns `count` numbers per key, uniform in (0, 1): odd multiples of 2⁻²⁴, float32."""
+    bits = fold_in(key.unsqueeze(-1), torch.arange(count, device=key.device))
+    return (_shift(bits, 41).to(torch.float32) + 0.5) * 2.0**-23
 
 
 def normal(key: Tensor, count: int) -> Tensor:
-    """Returns standard normal numbers, float32 [..., count], by inverse transform of `uniform`."""
+    """Returns `count` standard normal numbers per key, by inverse transform of `uniform`."""
     return torch.special.ndtri(uniform(key, count))

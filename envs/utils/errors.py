@@ -5,6 +5,7 @@ import re
 import reprlib
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from pathlib import PurePath
 from typing import Any
 
 
@@ -27,14 +28,14 @@ def naming(path: object, *more: type[Exception]) -> Iterator[None]:
 
 
 def how_to_install(extra: str) -> str:
-    """Returns the command that installs an extra of emberlink, for messages."""
+    """Returns the command that installs an extra of emberlink."""
     return f"pip install '.[{extra}]' in the folder of emberlink"
 
 
 def shown(value: Any) -> str:
-    """Returns a value as text for a message, as YAML writes it, shortened if it is long."""
+    """Returns a value as YAML writes it, on one line, shortened if it is long."""
     words = {"None": "null", "True": "true", "False": "false"}
-    text = value if isinstance(value, str) else reprlib.repr(value)
+    text = str(value) if isinstance(value, str | PurePath) else reprlib.repr(value)
     text = text if isinstance(value, str) else words.get(text, text)
     return printable(text if len(text) <= 100 else f"{text[:60]}...{text[-20:]}")
 

@@ -9,12 +9,7 @@ from typing import Any
 
 
 def lazy(package: str, modules: Mapping[str, str]) -> Callable[[str], Any]:
-    """Returns a `__getattr__` for a package.
-
-    Args:
-        package: the package's `__name__`.
-        modules: module within the package that defines each public name.
-    """
+    """Returns a `__getattr__` for a package, given the module within it of each public name."""
 
     def load(name: str) -> Any:
         if name not in modules:

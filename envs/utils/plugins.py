@@ -77,7 +77,16 @@ class Plugins(Generic[T]):
         if len(points) > 1:
             places = ", ".join(points)
             raise UserError(f"{key or self.key}={name}: in several packages: {places}; rename one")
-        return self._load(*points.values())
+        (point,) = points.values()
+        where = f"entry point {name!r} of {self.group}, {point.value}"
+        try:
+            item: Any = point.load()
+        except Exception as error:  # code of another package may raise anything
+            message = " ".join(f"{type(error).__name__}: {error}".split())
+            raise UserError(f"{where}: cannot be imported: {message}") from error
+        if not (isinstance(item, type) and issubclass(item, self.base)):
+            raise UserError(f"{where}: not a subclass of {self.base.__name__}")
+        return item
 
     def _points(self) -> list[EntryPoint]:
         module = self.base.__module__
@@ -87,15 +96,3 @@ class Plugins(Generic[T]):
             *config_files.entry_points(self.group),
             *(EntryPoint(n, f"{package}.{place}", self.group) for n, (place, _) in own.items()),
         ]
-
-    def _load(self, point: EntryPoint) -> type[T]:
-        package = point.dist.name if point.dist else point.module
-        where = f"package {package}: entry point {point.name!r} of {point.group}, {point.value}"
-        try:
-            item: Any = point.load()
-        except Exception as error:  # code of another package may raise anything
-            message = " ".join(f"{type(error).__name__}: {error}".split())
-            raise UserError(f"{where}: cannot be imported: {message}") from error
-        if not (isinstance(item, type) and issubclass(item, self.base)):
-            raise UserError(f"{where}: not a subclass of {self.base.__name__}")
-        return item

@@ -5,29 +5,13 @@ import operator
 import re
 import shlex
 from collections.abc import Mapping
+from contextlib import suppress
 from typing import Annotated, Any, TypeVar
 
 from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 
 from emberlink.envs.utils.config_files import plain
-from emberlink.envs.utils.errors import UserError, printable, shown, unknown
-
-__all__ = [
-    "STRICT",
-    "TAG",
-    "CountOrZero",
-    "Name",
-    "as_argument",
-    "check_device",
-    "check_whole",
-    "describe",
-    "from_plain",
-    "is_index",
-    "plain",
-    "printable",
-    "shown",
-    "unknown",
-]
+from emberlink.envs.utils.errors import UserError, shown
 
 T = TypeVar("T")
 
@@ -44,14 +28,10 @@ CountOrZero = Annotated[int, Field(ge=0)]
 
 
 def from_plain(config_type: type[T], values: Mapping[str, Any], key: str = "") -> T:
-    """Returns a configuration from plain values, such as those of a YAML file.
+    """Returns a pydantic dataclass of plain values, such as those of a YAML file.
 
-    Unknown keys are errors, and no value is converted to another type.
-
-    Args:
-        config_type: a pydantic dataclass.
-        values: mappings, lists and tuples of text, numbers, bool and None.
-        key: key of the values in the whole configuration, for messages.
+    Unknown keys are errors, and no value is converted to another type. `key` is that of the values
+    in the whole configuration, for messages.
     """
     # From JSON, strict validation accepts lists as tuples and mappings as dataclasses.
     try:
@@ -65,12 +45,7 @@ def from_plain(config_type: type[T], values: Mapping[str, Any], key: str = "") -
 
 
 def describe(error: ValidationError, prefix: str = "") -> str:
-    """Describes the first error of a validation in one line: key, value and reason.
-
-    Args:
-        error: pydantic's error.
-        prefix: key of the validated values, for the message.
-    """
+    """Describes the first error in one line: key, which begins with `prefix`, value and reason."""
     errors = error.errors()
     # A mistyped key is reported as missing, too.
     mistyped = [entry for entry in errors if entry["type"] == "unexpected_keyword_argument"]
@@ -94,11 +69,9 @@ def describe(error: ValidationError, prefix: str = "") -> str:
 
 def check_whole(name: str, number: Any) -> int:
     """Returns a whole number, such as a tensor's or NumPy's, as an int."""
-    try:
+    with suppress(TypeError):
         if not isinstance(number, bool):
             return operator.index(number)
-    except TypeError:
-        pass
     given = json.dumps(number) if isinstance(number, str) else number
     raise UserError(f"{name}={shown(given)}: expected a whole number")
 

@@ -53,12 +53,8 @@ def probability_of_improvement(first: Values, second: Values, axis: int = -1) ->
 def iqm_ratio_share(sample: Values, *others: Values, higher: bool, axis: int = -1) -> Any:
     """Returns the IQM share, x / (x + best of the others); above 0.5 is better.
 
-    Unlike the ratio x / best, the share is finite: 1 for a ratio to 0, and 0.5 for 0 to 0.
-
-    Args:
-        sample, others: non-negative numbers, one per run.
-        higher: whether more is better; if not, the ratio is inverted.
-        axis: axis of the runs.
+    Unlike the ratio x / best, the share is finite: 1 for a ratio to 0, and 0.5 for 0 to 0. It is
+    inverted if less is better.
     """
     value = iqm(sample, axis)
     rest = np.stack([iqm(other, axis) for other in others])
@@ -80,18 +76,10 @@ def interval(
     resamples: int = RESAMPLES,
     paired: bool = False,
 ) -> Any:
-    """Returns the 95 % percentile bootstrap interval of a statistic.
+    """Returns both ends of the 95 % percentile bootstrap interval of a statistic.
 
-    Args:
-        statistic: a function of arrays with the keyword `axis`.
-        samples: one number per run, for each method. Each resample draws as many runs as a method
-            has, with replacement.
-        axis: axis of the runs; a number for each entry of the other axes.
-        resamples: number of resamples.
-        paired: whether entry i of all samples is drawn together, such as of the same fire.
-
-    Returns:
-        Lower and upper end; None if a method has only one run, or if an end is not finite.
+    `samples` hold one number per run along `axis`, for each method; `paired` if entry i of all is
+    drawn together, such as of one fire. None if there is only one run, or an end is not finite.
     """
     values = [np.asarray(sample, float) for sample in samples]
     if min(sample.shape[axis] for sample in values) < 2:
@@ -116,16 +104,10 @@ def interval(
 def crossed_interval(statistic: Callable[..., Any], *samples: Values) -> Interval | None:
     """Returns the 95 % interval of a statistic of trainings, over their seeds and the fires.
 
-    Each resample draws fires, the same for all trainings, and seeds within each training. A run's
-    number is its mean over the drawn fires. Where fires alone are drawn, an interval describes the
-    networks at hand; this one describes another training on other fires.
-
-    Args:
-        statistic: a function of arrays with the keyword `axis`; one number per run.
-        samples: [seeds, fires] for each training; the fires are the same.
-
-    Returns:
-        Lower and upper end; None if a training has only one seed, or an end is not finite.
+    `samples` are [seeds, fires] for each training. Each resample draws fires, the same for all, and
+    seeds within each; a run's number is its mean over the drawn fires. Intervals over fires alone
+    describe the networks at hand; this one describes another training on other fires. None if a
+    training has only one seed, or an end is not finite.
     """
     if min(map(len, samples)) < 2:
         return None

@@ -2,7 +2,7 @@
 
 from functools import partial
 from itertools import product
-from typing import Any, NamedTuple
+from typing import Any
 
 import pandas as pd
 
@@ -23,22 +23,14 @@ COLUMNS = (
 infinite for a ratio to 0"""
 
 
-class Claim(NamedTuple):
-    """The claim that consensus is better than the best other method by a factor."""
-
-    measure: str
-    factor: float
-    text: str
-
-
 METHOD = "consensus"
 CLAIMS = (
-    Claim("coverage", 1.3, "1.3 times the coverage"),
-    Claim("tracking_first", 1.4, "1.4 times faster tracking"),
-    Claim("tracking_last", 1.4, "1.4 times faster tracking, by the slowest UAV"),
-    Claim("boundary_exits", 2.0, "half the boundary exits"),
+    ("coverage", 1.3, "1.3 times the coverage"),
+    ("tracking_first", 1.4, "1.4 times faster tracking"),
+    ("tracking_last", 1.4, "1.4 times faster tracking, by the slowest UAV"),
+    ("boundary_exits", 2.0, "half the boundary exits"),
 )
-"""claims of the paper about method 4"""
+"""claims of the paper about method 4: by which factor a measure is better than with others"""
 
 
 def verdicts(runs: Frame, means: Frame) -> tuple[Frame, list[str]]:
@@ -60,41 +52,36 @@ def verdicts(runs: Frame, means: Frame) -> tuple[Frame, list[str]]:
             notes.append(f"{label}: no claims; no other method was trained with its settings")
             continue
         part = learned(means)[learned(means)["label"].isin([label, *alike])]
-        for fires, claim in product(sorted(means["fires"].unique()), CLAIMS):
+        for fires, (measure, factor, text) in product(sorted(means["fires"].unique()), CLAIMS):
             about = {"section": runs["section"].iloc[0], "fires": fires, "label": label}
-            rows.append(about | _verdict(part[part["fires"] == fires], label, claim))
+            about |= {"claim": text, "measure": measure, "factor": factor}
+            of_measure = part[(part["fires"] == fires) & (part["measure"] == measure)]
+            rows.append(about | _verdict(of_measure, label, measure, factor))
     return pd.DataFrame(rows, columns=list(COLUMNS)), notes
 
 
-def _verdict(means: Frame, label: str, claim: Claim) -> dict[str, Any]:
+def _verdict(means: Frame, label: str, measure: str, factor: float) -> dict[str, Any]:
     """Returns the verdict about a label, given the means of it and of the others."""
-    of_measure = means[means["measure"] == claim.measure]
-    values = {name: part.to_numpy(float) for name, part in of_measure.groupby("label")["value"]}
+    values = {name: part.to_numpy(float) for name, part in means.groupby("label")["value"]}
     samples = [values.pop(label), *values.values()]
-    higher = claim.measure in metrics.HIGHER_IS_BETTER
+    higher = measure in metrics.HIGHER_IS_BETTER
     share = partial(bootstrap.iqm_ratio_share, higher=higher)
     shares = bootstrap.interval(share, *samples)
     ends = shares and (bootstrap.as_ratio(shares[0]), bootstrap.as_ratio(shares[1]))
     iqms = [float(bootstrap.iqm(sample)) for sample in samples[1:]]
     low, high = ends or (None, None)
     return {
-        "claim": claim.text,
-        "measure": claim.measure,
-        "factor": claim.factor,
         "best_other": [*values][iqms.index(max(iqms) if higher else min(iqms))],
         "ratio": bootstrap.as_ratio(float(share(*samples))),
         "low": low,
         "high": high,
-        "verdict": decision(ends, claim.factor),
+        "verdict": decision(ends, factor),
         "fewest_seeds": min(map(len, samples)),
     }
 
 
 def decision(interval: Interval | None, factor: float) -> str:
     """Returns the verdict of an interval; an end `ROUNDING` below the factor is at the factor."""
+    low, high = interval or (0.0, float("inf"))
     least = factor * (1 - ROUNDING)
-    if interval is not None and interval[0] >= least:
-        return "holds"
-    if interval is not None and interval[1] < least:
-        return "does not hold"
-    return "undecided"
+    return "holds" if low >= least else "does not hold" if high < least else "undecided"

@@ -1,8 +1,7 @@
 """Computes the gain of messages and the value of communication: how much of the gain is reached."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import product
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,10 +20,8 @@ _SAME = {"map_greedy": ("map_greedy_alone", "map_greedy_all")}
 worlds without a base"""
 _OF_LEARNERS = ("env.reward.", "env.observation", "env.measures")
 """beginnings of the keys of `env` that do not change what scripted policies do"""
-_Radio = tuple[float, float | None, float | None]
-"""range, loss and bandwidth; None for no loss or no limit, and where they do not matter"""
-_OFF: _Radio = (0.0, None, None)
-_FULL: _Radio = (float("inf"), None, None)
+_OFF, _FULL = (0.0, None, None), (float("inf"), None, None)
+"""range, loss and bandwidth of a radio; None for no loss or no limit, and where it has no effect"""
 COLUMNS = (
     *("section", "fires", "label", "measure", "radios", "none", "with_radio", "full"),
     *("gain", "gain_low", "gain_high", "value", "value_low", "value_high"),
@@ -46,50 +43,68 @@ def communication_values(runs: Frame) -> Frame:
     others were trained.
     """
     groups = {str(label): list(part["object"]) for label, part in runs.groupby("label")}
-    trained = {label: group for label, group in groups.items() if not group[0].evaluated_with}
-    limited = {heeded(group[0]): group[0] for group in [*trained.values()][::-1]}
-    limited = {radio: run for radio, run in limited.items() if radio not in (_OFF, _FULL)}
-    rows: list[dict[str, Any]] = []
-    for fires in runs["object"].iloc[0].evaluation.results:
-        about = {"section": runs["section"].iloc[0], "fires": fires}
-        for label, group in trained.items():
-            if _radio(group[0]) in (_OFF, _FULL):
-                continue
-            for how, same in (("evaluated", _evaluated), ("retrained", _retrained)):
-                alike = {_radio(o[0]): o for o in [*groups.values()][::-1] if same(group, o)}
-                none, full = alike.get(_OFF), alike.get(_FULL)
-                if none is not None:
-                    found = [none, group, *([full] if full else [])]
-                    measure = group[0].headline
-                    samples = [_values(one, fires, measure) for one in found]
-                    names = {"label": label, "measure": measure, "radios": how}
-                    rows.append(about | names | _row(samples, how == "retrained"))
-        for policy, world in product(SCRIPTED, limited.values()):
-            measure = world.headline
-            samples = _scripted(list(runs["object"]), fires, policy, measure, world)
-            if samples is not None:
-                several = f", {radio_text(world.now, bandwidth=False)}" if len(limited) > 1 else ""
-                names = {"label": policy.replace("_", " ") + several, "measure": measure}
-                rows.append(about | names | {"radios": "scripted"} | _row(samples, False))
+    rows = [
+        {"section": runs["section"].iloc[0], "fires": fires}
+        | {"label": label, "measure": measure, "radios": how}
+        | _row(samples, how == "retrained")
+        for fires in runs["object"].iloc[0].evaluation.results
+        for found in (_of_networks(groups, fires), _of_scripted(groups, fires))
+        for label, measure, how, samples in found
+    ]
     return pd.DataFrame(rows, columns=list(COLUMNS))
 
 
-def _radio(run: Run) -> _Radio:
-    """Returns the radio of a run's evaluation."""
+Found = Iterator[tuple[str, str, str, list[Values]]]
+"""label, measure, `radios`, and [seeds, fires] with the radio off, on and maybe without limits"""
+
+
+def _of_networks(groups: Mapping[str, Group], fires: str) -> Found:
+    for label, group in groups.items():
+        if group[0].evaluated_with or _radio(group[0]) in (_OFF, _FULL):
+            continue
+        measure = group[0].headline
+        for how, same in (("evaluated", _evaluated), ("retrained", _retrained)):
+            alike = {_radio(o[0]): o for o in [*groups.values()][::-1] if same(group, o)}
+            if none := alike.get(_OFF):
+                found = [none, group, *([alike[_FULL]] if _FULL in alike else [])]
+                played = [[run.evaluation.results[fires][LEARNED] for run in one] for one in found]
+                yield label, measure, how, [np.array([p[measure] for p in one]) for one in played]
+
+
+def _of_scripted(groups: Mapping[str, Group], fires: str) -> Found:
+    """Yields scripted policies; without a base no evaluation with another radio is needed."""
+    trained = [group[0] for group in groups.values() if not group[0].evaluated_with]
+    limited = {heeded(run): run for run in trained[::-1] if heeded(run) not in (_OFF, _FULL)}
+    for policy, world in product(SCRIPTED, limited.values()):
+        alike = [run for runs in groups.values() for run in runs if _world(run) == _world(world)]
+        none, full = (next((r for r in alike if heeded(r) == x), None) for x in (_OFF, _FULL))
+        choices = [(none, policy), (world, policy), (full, policy)]
+        if world.settings.get("env.base") is None and policy in _SAME:
+            off, unlimited = _SAME[policy]
+            choices = [(world, off), (world, policy), (world, unlimited)]
+        played = [run and run.evaluation.results[fires].get(name) for run, name in choices]
+        measured = [np.array([p[world.headline]]) for p in played if p and world.headline in p]
+        if len(measured) == len(choices):
+            several = f", {radio_text(world.now, bandwidth=False)}" if len(limited) > 1 else ""
+            yield policy.replace("_", " ") + several, world.headline, "scripted", measured
+
+
+def _radio(run: Run) -> tuple[float, Any, Any]:
+    """Returns range, loss and bandwidth of the radio of a run's evaluation."""
     reach, loss, bandwidth = (run.now.get(key) for key in RADIO)
     reach = float("inf") if reach is None else float(reach)
     return _OFF if reach == 0 else (reach, loss or None, bandwidth)
 
 
-def heeded(run: Run) -> _Radio:
+def heeded(run: Run) -> tuple[float, Any, Any]:
     """Returns the radio of a run's evaluation as far as scripted policies heed it."""
     return (*_radio(run)[:2], None)
 
 
 def _evaluated(group: Group, other: Group) -> bool:
     """Returns whether the other group holds evaluations of the same networks with other radios."""
-    changed = set(other[0].evaluated_with)
-    return len(changed) > 0 and changed <= {*RADIO} and _paths(group) == _paths(other)
+    changed, paths = set(other[0].evaluated_with), [{r.path for r in g} for g in (group, other)]
+    return len(changed) > 0 and changed <= {*RADIO} and paths[0] == paths[1]
 
 
 def _retrained(group: Group, other: Group) -> bool:
@@ -102,40 +117,10 @@ def _retrained(group: Group, other: Group) -> bool:
     return not other[0].evaluated_with and seeds[0] == seeds[1] and same(group[0]) == same(other[0])
 
 
-def _paths(group: Group) -> set[Path]:
-    return {run.path for run in group}
-
-
-def _scripted(
-    runs: Sequence[Run], fires: str, policy: str, measure: str, world: Run
-) -> list[Values] | None:
-    """Returns a scripted policy's measure with the radio off, that of a run, and no limits.
-
-    None if an evaluation is missing. Without a base no evaluation with another radio is needed.
-    """
-    alike = [run for run in runs if _world(run) == _world(world)]
-    others = [next((r for r in alike if heeded(r) == radio), None) for radio in (_OFF, _FULL)]
-    choices = [(others[0], policy), (world, policy), (others[1], policy)]
-    if world.settings.get("env.base") is None and policy in _SAME:
-        none, full = _SAME[policy]
-        choices = [(world, none), (world, policy), (world, full)]
-    played = [run and run.evaluation.results[fires].get(name) for run, name in choices]
-    measured = [np.array([p[measure]]) for p in played if p and measure in p]
-    return measured if len(measured) == len(played) else None
-
-
 def _world(run: Run) -> dict[str, Any]:
     """Returns the settings of an evaluation that scripted policies heed, without the radio."""
-    return {
-        key: value
-        for key, value in run.now.items()
-        if key.startswith("env.") and not key.startswith((*RADIO, *_OF_LEARNERS))
-    }
-
-
-def _values(group: Group, fires: str, measure: str) -> Values:
-    """Returns a measure of the runs of a group on each fire, [seeds, fires]."""
-    return np.array([run.evaluation.results[fires][LEARNED][measure] for run in group], float)
+    left_out = (*RADIO, *_OF_LEARNERS)
+    return {k: v for k, v in run.now.items() if k.startswith("env.") and not k.startswith(left_out)}
 
 
 def _row(samples: Sequence[Values], retrained: bool) -> dict[str, Any]:

@@ -11,8 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 
-from emberlink.envs.utils.errors import UserError
-from emberlink.envs.utils.validation import unknown
+from emberlink.envs.utils.errors import UserError, unknown
 from emberlink.trainers.comparison import bootstrap, rankings, tables
 from emberlink.trainers.comparison.bootstrap import Interval
 from emberlink.trainers.comparison.claims import verdicts
@@ -23,11 +22,10 @@ from emberlink.trainers.runs.compact_json import finite
 
 
 class Difference(NamedTuple):
-    """The difference between the interquartile means of two labels, first minus second."""
+    """How far one interquartile mean is above another, and the interval over seeds and fires."""
 
     value: float
     interval: Interval | None
-    """over seeds and fires; None if a label has only one seed"""
 
 
 @dataclass(frozen=True, repr=False)
@@ -60,8 +58,11 @@ class Comparison:
 
     @property
     def table(self) -> Frame:
-        """One row per run, policy, fire and measure: section, label, run, method, ..., value."""
-        return tables.tidy(self.means)
+        """One row per run, policy, fire and measure; `fire` counts from 0 in its set."""
+        table = self.means.drop(columns="value").rename(columns={"values": "value"})
+        table = table.explode("value")
+        table.insert(table.columns.get_loc("measure"), "fire", table.groupby(level=0).cumcount())
+        return table.astype({"value": float}).reset_index(drop=True)
 
     @property
     def sections(self) -> list[str]:
@@ -76,17 +77,11 @@ class Comparison:
     def difference(
         self, first: str, second: str, measure: str, fires: str = "", section: str = ""
     ) -> Difference:
-        """Returns by how much the interquartile mean of a label is above that of another.
+        """Returns by how much the interquartile mean of the label `first` is above `second`'s.
 
-        Args:
-            first, second: labels; the second is subtracted.
-            measure: a measure.
-            fires: set of fires; may be empty if there is only one.
-            section: a section; may be empty if there is only one.
-
-        Raises:
-            UserError: a name is not known, the measure is not ranked, or both labels are
-                evaluations of the same runs, which are not independent samples.
+        `fires` and `section` may be empty if there is only one. A UserError if a name is not known,
+        the measure is not ranked, or both labels are evaluations of the same runs, which are not
+        independent samples.
         """
         trained, means = tables.learned(self.ranking), tables.learned(self.means)
         for column, name in (("section", section), ("fires", fires), ("measure", measure)):

@@ -1,12 +1,11 @@
 """Finds finished runs on disk and reads them.
 
-A configuration is read as plain values and not checked, so that runs of earlier versions stay
-readable.
+A configuration is read as plain values, so that runs of earlier versions stay readable.
 """
 
 import shlex
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -98,16 +97,21 @@ def read_all(
             folders.setdefault(folder.resolve(), (folder, label))
     runs: list[Run] = []
     left_out: list[LeftOut] = []
-    for folder, label in sorted(folders.values()):
+
+    @contextmanager
+    def or_left_out(path: Path) -> Iterator[None]:
         try:
-            run = read(folder)
+            yield
         except (UserError, OSError) as error:
-            left_out.append((str(folder), str(error)))
-            continue
-        run = replace(run, name=label or run.name)
-        others, why = evaluated_otherwise(run)
-        runs += [run, *others]
-        left_out += why
+            left_out.append((str(path), str(error)))
+
+    for folder, label in sorted(folders.values()):
+        with or_left_out(folder):
+            run = read(folder)
+            runs.append(run := replace(run, name=label or run.name))
+            for file in sorted(folder.glob("eval_*.json")):
+                with or_left_out(file):
+                    runs += evaluated_otherwise(run, file)
     return runs, left_out
 
 
@@ -119,7 +123,8 @@ def find(path: Path | str) -> list[Path]:
     if (folder / "config.yaml").is_file():
         return [folder]
     if not folder.is_dir():
-        raise UserError(f"{folder}: there is no such run folder")
+        hint = " (files such as compare.csv are written to --output FOLDER)" * bool(folder.suffix)
+        raise UserError(f"{folder}: there is no such run folder{hint}")
     if not (found := [file.parent for file in folder.glob("*/config.yaml")]):
         raise UserError(f"{folder}: neither a run folder nor a folder that holds runs")
     return found
@@ -180,29 +185,19 @@ def _curves(folder: RunFolder, episodes: int) -> list[dict[str, Any]]:
     return lines
 
 
-def evaluated_otherwise(run: Run) -> tuple[list[Run], list[LeftOut]]:
-    """Returns a run with each evaluation in an eval_*.json, and the files left out.
+def evaluated_otherwise(run: Run, file: Path) -> list[Run]:
+    """Returns a run as evaluated in an eval_*.json; none if it repeats the settings of eval.json.
 
-    Left out are damaged files, and those whose checkpoint or fires differ from eval.json.
+    A UserError if the file is damaged, or its checkpoint or fires differ from eval.json.
     """
-    others: list[Run] = []
-    left_out: list[LeftOut] = []
-    for file in sorted(run.path.glob("eval_*.json")):
-        try:
-            evaluation = read_evaluation(file)
-            learned = evaluation.communication.get(LEARNED, {})
-            now = flat({"world": evaluation.world, "env": evaluation.environment, "comm": learned})
-            _check_types({**run.settings, **now}, file)
-        except (UserError, OSError) as error:
-            left_out.append((str(file), str(error)))
-            continue
-        changed = {key: value for key, value in now.items() if run.settings.get(key) != value}
-        names = ("world", "checkpoint", "step", "fires", "start_seed")
-        apart = [n for n in names if getattr(evaluation, n) != getattr(run.evaluation, n)]
-        apart += [key for key in ("env.horizon", "env.grid") if key in changed]
-        if changed and apart:
-            why = f"evaluated with another {', '.join(apart)} than eval.json"
-            left_out.append((str(file), why))
-        elif changed:
-            others.append(replace(run, evaluation=evaluation, evaluated_with=changed))
-    return others, left_out
+    evaluation = read_evaluation(file)
+    learned = evaluation.communication.get(LEARNED, {})
+    now = flat({"world": evaluation.world, "env": evaluation.environment, "comm": learned})
+    _check_types({**run.settings, **now}, file)
+    changed = {key: value for key, value in now.items() if run.settings.get(key) != value}
+    names = ("world", "checkpoint", "step", "fires", "start_seed")
+    apart = [n for n in names if getattr(evaluation, n) != getattr(run.evaluation, n)]
+    apart += [key for key in ("env.horizon", "env.grid") if key in changed]
+    if changed and apart:
+        raise UserError(f"evaluated with another {', '.join(apart)} than eval.json")
+    return [replace(run, evaluation=evaluation, evaluated_with=changed)] if changed else []

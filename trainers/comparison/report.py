@@ -4,6 +4,7 @@ import base64
 import json
 import os
 from collections.abc import Callable, Collection, Mapping
+from functools import partial
 from importlib.resources import files
 from io import BytesIO
 from pathlib import Path
@@ -17,6 +18,7 @@ from rich.table import Table as RichTable
 from rich.text import Text
 
 from emberlink.envs import metrics
+from emberlink.envs.utils.atomic_io import free_name
 from emberlink.envs.utils.errors import UserError, naming
 from emberlink.trainers.comparison import drawing
 from emberlink.trainers.comparison.bootstrap import FEW
@@ -46,16 +48,12 @@ class Table(NamedTuple):
     rows: Frame
 
 
-class Picture(NamedTuple):
-    """A PNG picture and its caption."""
+Picture = dict[str, str]
 
-    content: bytes
-    caption: str
 
-    @property
-    def uri(self) -> str:
-        """The picture as a data URI."""
-        return "data:image/png;base64," + base64.b64encode(self.content).decode()
+def _picture(png: bytes, caption: str) -> Picture:
+    """Returns a picture as a data URI, and its caption."""
+    return {"uri": f"data:image/png;base64,{base64.b64encode(png).decode()}", "caption": caption}
 
 
 def tables(comparison: Comparison, section: str) -> list[Table]:
@@ -166,8 +164,7 @@ def printed(table: Table, section: str) -> RichTable:
 def free_folder(output: Path | None) -> Path:
     """Returns a folder for a report: `output`, or the first free of `compare`, `compare_2`, ..."""
     if output is None:
-        tried = (Path("compare" if i == 1 else f"compare_{i}") for i in range(1, 10_000))
-        return next(path for path in tried if not os.path.lexists(path))
+        return free_name(Path(), "compare", [""])
     with naming(f"output {output}"):
         if os.path.lexists(output) and (not output.is_dir() or any(output.iterdir())):
             raise UserError("exists and is not an empty folder; name a new one")
@@ -191,18 +188,18 @@ def write_report(
     source = files("emberlink.trainers.comparison").joinpath("page.html").read_text("utf-8")
     contents: dict[str, bytes] = {}
 
-    def saved(figure: Figure, name: str, caption: str) -> Picture:
+    def saved(chapter: int, figure: Figure, name: str, caption: str) -> Picture:
         for kind, changing in (("png", "Software"), ("pdf", "CreationDate"), ("svg", "Date")):
             if kind == "png" or kind in extras:
                 file = BytesIO()
                 figure.savefig(file, format=kind, dpi=120, metadata={changing: None})
-                contents[f"{name}.{kind}"] = file.getvalue()
-        return Picture(contents.pop(f"{name}.png"), caption)
+                contents[f"{chapter}_{name}.{kind}"] = file.getvalue()
+        return _picture(contents.pop(f"{chapter}_{name}.png"), caption)
 
     chapters = []
     for place, section in enumerate(comparison.sections, 1):
         say(f"figures of {section}")
-        chapters.append(_chapter(comparison, section, f"{place}_", folder, saved))
+        chapters.append(_chapter(comparison, section, folder, partial(saved, place)))
     page = environment.from_string(source).render(
         comparison=comparison, chapters=chapters, settings=about(), numbers=NUMBERS
     )
@@ -225,7 +222,6 @@ def write_report(
 def _chapter(
     comparison: Comparison,
     section: str,
-    prefix: str,
     folder: Path,
     saved: Callable[[Figure, str, str], Picture],
 ) -> dict[str, Any]:
@@ -237,26 +233,21 @@ def _chapter(
     trained = runs[runs["as_trained"]]
     labels = list(trained["label"].unique())
     scripted = ranking[(ranking["fires"] == trained_on(runs)) & (ranking["policy"] != LEARNED)]
+    frozen = [
+        saved(drawing.frozen(part, labels), f"frozen_{i}", f"{fires}: {drawing.FROZEN_CAPTION}")
+        for i, (fires, part) in enumerate(ranking.groupby("fires", sort=False), 1)
+    ]
+    training = []
+    for number, (measures, content) in drawing.FIGURES.items():
+        caption = f"The paper's figure {number}. {content} {drawing.CURVES_CAPTION}"
+        figure = drawing.training(curves, scripted, measures)
+        training.append(saved(figure, f"figure_{number}", caption))
     return {
         "title": section,
         "runs": runs,
-        "frozen": [
-            saved(
-                drawing.frozen(part, labels),
-                f"{prefix}frozen_{i}",
-                f"{fires}: {drawing.FROZEN_CAPTION}",
-            )
-            for i, (fires, part) in enumerate(ranking.groupby("fires", sort=False), 1)
-        ],
+        "frozen": frozen,
         "tables": tables(comparison, section),
-        "training": [
-            saved(
-                drawing.training(curves, scripted, measures),
-                f"{prefix}figure_{number}",
-                f"The paper's figure {number}. {content} {drawing.CURVES_CAPTION}",
-            )
-            for number, (measures, content) in drawing.FIGURES.items()
-        ],
+        "training": training,
         "timelapses": _timelapses(trained),
         "details": _details(runs, folder),
     }
@@ -295,7 +286,7 @@ def _timelapses(trained: Frame) -> list[Picture]:
     """Returns the timelapse that the evaluation of the first seed of each label has drawn."""
     first = trained.drop_duplicates("label")
     return [
-        Picture(
+        _picture(
             file.read_bytes(),
             f"{label}, seed {seed}: the frozen policy on the first held-out fire of "
             f"{file.stem.removeprefix('timelapse_')}. Fire white, field of view yellow, UAVs blue.",

@@ -32,10 +32,7 @@ Frame = Any
 
 
 def runs_table(runs: Sequence[Run]) -> tuple[Frame, list[LeftOut]]:
-    """Returns one row per evaluation of a run, sorted by section, label and seed.
-
-    Columns: section, label, run, method, setup, world, trained_on, radio, evaluated_with, seed,
-    `settings` (those that affect training, as text by key), `as_trained` and `object`, the run.
+    """Returns one row per evaluation of a run, by section, label and seed, and what is left out.
 
     Of several runs of a label with one seed, the last by name is used, and a copy of the package's
     policy only if there is no other. Runs that were evaluated on other fires than the first of
@@ -60,7 +57,7 @@ def runs_table(runs: Sequence[Run]) -> tuple[Frame, list[LeftOut]]:
                 for run in runs
             ],
             "seed": [run.settings["seed"] for run in runs],
-            "settings": [trained_with(run) for run in runs],
+            "settings": [trained_with(run) for run in runs],  # that affect training
             "as_trained": [not run.evaluated_with for run in runs],
             "object": runs,
         }
@@ -166,8 +163,7 @@ def _same_fires(first: Run, other: Run) -> bool:
 def means_table(runs: Frame) -> Frame:
     """Returns one row per run, set of fires, policy and measure.
 
-    Columns: those of `runs_table` from section to seed, policy, fires, measure, `values` (one per
-    fire) and `value`, their mean.
+    Columns: those of `runs_table` up to seed, `values` (one per fire), `value` (their mean).
     """
     columns = list(runs.columns[: runs.columns.get_loc("seed") + 1])
     rows = [
@@ -178,14 +174,6 @@ def means_table(runs: Frame) -> Frame:
         for measure, values in measured.items()
     ]
     return pd.DataFrame(rows, columns=[*columns, "policy", "fires", "measure", "values", "value"])
-
-
-def tidy(means: Frame) -> Frame:
-    """Returns one row per run, policy, fire and measure; `fire` counts from 0 in its set."""
-    table = means.drop(columns="value").rename(columns={"values": "value"}).explode("value")
-    fire = table.groupby(level=0).cumcount()
-    table.insert(table.columns.get_loc("measure"), "fire", fire)
-    return table.astype({"value": float}).reset_index(drop=True)
 
 
 def learned(means: Frame) -> Frame:

@@ -10,8 +10,7 @@ from torchrl.envs import Transform
 
 from emberlink.comm._belief import BeliefMaps
 from emberlink.envs import keys
-from emberlink.envs.utils.errors import UserError
-from emberlink.envs.utils.validation import unknown
+from emberlink.envs.utils.errors import UserError, unknown
 from emberlink.envs.wildfire import WildfireEnv
 from emberlink.policies.scripted.base import SCRIPTED
 from emberlink.policies.scripted.map_greedy import MapGreedy
