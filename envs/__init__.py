@@ -25,12 +25,11 @@ __all__ = [
 __getattr__ = lazy(
     __name__,
     {
-        "FileFireConfig": "fire_files.config",
-        "FireConfig": "fire.generator",
-        "ReactionConfig": "fire.reaction",
-        "RewardConfig": "config",
-        "WildfireConfig": "config",
-        "WildfireEnv": "wildfire",
-        "parallel_env": "pettingzoo",
+        "config": "RewardConfig WildfireConfig",
+        "fire.generator": "FireConfig",
+        "fire.reaction": "ReactionConfig",
+        "fire_files.config": "FileFireConfig",
+        "pettingzoo": "parallel_env",
+        "wildfire": "WildfireEnv",
     },
 )

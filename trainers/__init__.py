@@ -30,16 +30,10 @@ __all__ = [
 __getattr__ = lazy(
     __name__,
     {
-        "Run": "api",
-        "RunConfig": "config.schema",
-        "TrainedPolicy": "api",
-        "Trainer": "training.trainer",
-        "compare": "api",
-        "evaluate": "api",
-        "load": "api",
-        "make_env": "build",
-        "resolve": "config.compose",
-        "resume": "api",
-        "train": "api",
+        "api": "Run TrainedPolicy compare evaluate load resume train",
+        "build": "make_env",
+        "config.compose": "resolve",
+        "config.schema": "RunConfig",
+        "training.trainer": "Trainer",
     },
 )

@@ -9,15 +9,16 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from PIL import Image
+
 from emberlink.envs.utils.errors import UserError, how_to_install
 from emberlink.trainers.config.compose import to_values
 from emberlink.trainers.config.schema import RunConfig
 from emberlink.trainers.runs.run_folder import RunFolder
 
-_PATIENCE = 30.0
-"""maximum seconds that a finished training waits for wandb"""
-_CONNECTING = 20.0
-"""maximum seconds for wandb to connect to its server, if WANDB_MODE=online"""
+_CONNECTING, _PATIENCE = 20.0, 30.0
+"""maximum seconds for wandb to connect to its server, and at the end of a training"""
 
 
 def check_installed(name: str) -> None:
@@ -53,10 +54,9 @@ class Tracker:
 
     def log_evaluation(self, numbers: Mapping[str, float], figures: Sequence[Path]) -> None:
         """Logs the final evaluation: means by name, and PNG files."""
-        log = _to_summary if self._name == "wandb" else _at_the_end
         with self._at_most_a_warning():
             if self._logger is not None:
-                log(self._logger, dict(numbers), figures, self._episodes)
+                _log_at_the_end(self._logger, dict(numbers), figures, self._episodes)
 
     def close(self) -> None:
         """Flushes and closes the logger."""
@@ -136,24 +136,18 @@ def _csv(_: RunConfig, run: RunFolder) -> Any:
 _LOGGERS = {"wandb": _wandb, "tensorboard": _tensorboard, "csv": _csv}
 
 
-def _to_summary(logger: Any, numbers: dict[str, float], figures: Sequence[Path], _: int) -> None:
-    """Writes the final evaluation to wandb's summary, so that it takes no episode's step."""
-    import wandb
-
-    images = {f"figures/{path.stem}": wandb.Image(str(path)) for path in figures}
-    logger.experiment.summary.update({**numbers, **images})
-
-
-def _at_the_end(
+def _log_at_the_end(
     logger: Any, numbers: dict[str, float], figures: Sequence[Path], episode: int
 ) -> None:
-    """Logs the final evaluation at the step of the last episode."""
-    logger.log_metrics(numbers, step=episode)
-    if not hasattr(logger.experiment, "add_image"):
-        return
-    import numpy as np
-    from PIL import Image
+    """Logs the final evaluation: to wandb's summary, else at the step of the last episode."""
+    experiment, images = logger.experiment, {f"figures/{path.stem}": path for path in figures}
+    if hasattr(experiment, "summary"):
+        import wandb
 
-    for path in figures:
+        pictures = {name: wandb.Image(str(path)) for name, path in images.items()}
+        experiment.summary.update({**numbers, **pictures})
+        return
+    logger.log_metrics(numbers, step=episode)
+    for name, path in images.items() if hasattr(experiment, "add_image") else ():
         pixels = np.asarray(Image.open(path).convert("RGB"))
-        logger.experiment.add_image(f"figures/{path.stem}", pixels, episode, dataformats="HWC")
+        experiment.add_image(name, pixels, episode, dataformats="HWC")

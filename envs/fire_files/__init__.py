@@ -10,4 +10,4 @@ if TYPE_CHECKING:
 __all__ = ["fire_sets", "save_copy", "with_checksum"]
 
 # The readers import scipy, which takes a third of a second.
-__getattr__ = lazy(__name__, dict.fromkeys(__all__, "reader"))
+__getattr__ = lazy(__name__, {"reader": "fire_sets save_copy with_checksum"})

@@ -83,8 +83,6 @@ def created(path: Path) -> Iterator[Path]:
 def new_file(output: Path, suffixes: Sequence[str]) -> Path:
     """Checks that a file with one of the suffixes can be created, and returns its path."""
     output = user_path(output)
-    if output.is_dir():
-        raise UserError(f"{output} is a folder; a file ends in {', '.join(suffixes)}")
     if output.suffix not in suffixes:
         raise UserError(f"{shown(output)}: the file's name must end in {' or '.join(suffixes)}")
     if os.path.lexists(output):

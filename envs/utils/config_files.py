@@ -27,13 +27,13 @@ PACKAGES = "emberlink.configs"
 
 def entry_points(group: str) -> metadata.EntryPoints:
     """Returns the entry points of a group, such as "emberlink.comm"."""
-    return _entry_points(tuple(sys.path)).select(group=group)
+    return _entry_points(group, tuple(sys.path))
 
 
-@lru_cache(maxsize=8)
-def _entry_points(_: tuple[str, ...]) -> metadata.EntryPoints:
-    """Reads all entry points, which takes 20 ms; an evaluation asks a hundred times."""
-    return metadata.entry_points()
+@lru_cache(maxsize=64)
+def _entry_points(group: str, _: tuple[str, ...]) -> metadata.EntryPoints:
+    """Reads the entry points, which takes 20 ms; an evaluation asks a hundred times."""
+    return metadata.entry_points(group=group)
 
 
 def folders() -> list[Path]:

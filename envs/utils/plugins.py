@@ -48,29 +48,20 @@ def defined(folder: Path, base: str) -> dict[str, tuple[str, str]]:
 
 @dataclass(frozen=True)
 class Plugins(Generic[T]):
-    """Finds the subclasses of a class in its folder; each is imported when it is asked for.
-
-    Attributes:
-        base: the class; the other files of its folder define its subclasses, see `defined`.
-        group: group of the entry points of other packages.
-        key: configuration key of the name, for messages.
-    """
+    """Finds the subclasses of a class in its folder; each is imported when it is asked for."""
 
     base: type[T]
     group: str
+    """group of the entry points of other packages"""
     key: str
+    """configuration key of the name, for messages"""
 
     def known(self) -> list[str]:
         """Returns the names in alphabetical order."""
         return sorted({point.name for point in self._points()})
 
     def find(self, name: str, key: str = "") -> type[T]:
-        """Returns the class of a name, which is the value of `key` or else of `self.key`.
-
-        Raises:
-            UserError: the name is not known or not unique, or the entry point cannot be imported or
-                is not such a class.
-        """
+        """Returns the class of a name, which is the value of `key` or else of `self.key`."""
         points = {point.value: point for point in self._points() if point.name == name}
         if not points:
             raise UserError(f"{key or self.key}={unknown(name, self.known())}")

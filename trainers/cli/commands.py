@@ -4,6 +4,7 @@ Their code is imported when they run, so that `emberlink --help` does not import
 """
 
 import argparse
+from collections.abc import Callable
 from dataclasses import fields
 from typing import TYPE_CHECKING, Any
 
@@ -37,8 +38,7 @@ def add_train(commands: Any) -> None:
         _train,
         "train one of the methods and evaluate it",
         "Trains a method, evaluates the frozen policies on test fires, and writes a run folder "
-        "with config.yaml, metrics.jsonl, checkpoints, eval.json, figures, a GIF and a replay "
-        "page.",
+        "with config.yaml, metrics.jsonl, checkpoints, eval.json, figures, GIF and replay page.",
         "emberlink train consensus setup=tuned episodes=20 seed=1",
         usage="emberlink train METHOD [key=value ...]\n"
         "       emberlink train resume=RUN [key=value ...]",
@@ -49,14 +49,15 @@ def add_train(commands: Any) -> None:
         help="a method: independent, shared_memory, positional, consensus, maps, or your own "
         "(see emberlink list methods); or resume=RUN, to resume the training of a run folder",
     )
-    add(
-        "overrides",
-        metavar="key=value",
-        nargs="*",
-        default=[],
-        help="any key of configs/base.yaml or of the chosen setup, such as setup=tuned, "
-        "fire=huygens, seed=1, env.num_uavs=3, logger=csv",
+    _add_overrides(
+        add,
+        "any key of configs/base.yaml or of the chosen setup, such as setup=tuned, fire=huygens, "
+        "seed=1, env.num_uavs=3, logger=csv",
     )
+
+
+def _add_overrides(add: Callable[..., Any], text: str) -> None:
+    add("overrides", metavar="key=value", nargs="*", default=[], help=text)
 
 
 def _train(options: argparse.Namespace, console: "Console") -> int:
@@ -91,20 +92,15 @@ def add_eval(commands: Any) -> None:
         "eval",
         _eval,
         "evaluate the frozen policies of a run",
-        "Loads the newest checkpoint of a run, plays the frozen policies and the scripted ones on "
-        "the same test fires, prints a table, and writes eval.json, figures, a GIF and a replay "
-        "page to the run folder.",
+        "Plays the policies of a run's newest checkpoint and the scripted ones on the same test "
+        "fires, prints a table, and writes eval.json, figures, GIF and replay page to the run.",
         "emberlink eval runs/2026-01-31_12-00-00_consensus_tuned_paper_s0 --fires 64",
     )
     add("folder", metavar="RUN", help="a run folder, or pretrained:METHOD, pretrained:SETUP/METHOD")
-    add(
-        "overrides",
-        metavar="key=value",
-        nargs="*",
-        default=[],
-        help="keys of comm. or env. to change, such as env.radio.loss=0.5, world=NAME, or "
-        "evaluation.scripted=[] for the frozen policies alone; "
-        "the names of the files contain them",
+    _add_overrides(
+        add,
+        "keys of comm. or env. to change, such as env.radio.loss=0.5, world=NAME, or "
+        "evaluation.scripted=[] for the frozen policies alone; the names of the files contain them",
     )
     add("--checkpoint", metavar="FILE", type=path, help="a checkpoint (default: the newest)")
     fires = between(1, MOST_FIRES)
@@ -126,8 +122,7 @@ def add_compare(commands: Any) -> None:
         "compare runs: methods, setups, several seeds",
         "Gathers finished runs by setup, world, training fire and method and prints interquartile "
         "means with 95 % bootstrap intervals over seeds, the gain of messages, and the paper's "
-        "claims; writes a new folder with compare.html, one page with all tables and figures, and "
-        "compare.json.",
+        "claims; writes compare.html, with all tables and figures, and compare.json to a folder.",
         "emberlink compare runs/ --output comparison",
     )
     add(
@@ -179,11 +174,9 @@ def add_render(commands: Any) -> None:
         "render",
         _render,
         "an episode as GIF and MP4, or as a page to play; several runs side by side",
-        "Plays the frozen policies of one or more runs on the same held-out fire from the same "
-        "start positions, and draws fire, UAVs, their roles and the links of their network. Writes "
-        "a GIF and an MP4 to the first run's figures, or with --output FILE.html one page that "
-        "plays the episodes in a browser. A text KEY=VALUE changes a setting of the run before it. "
-        "No existing file is replaced.",
+        "Plays the frozen policies of runs on the same held-out fire from the same start "
+        "positions. Writes a GIF and an MP4 to the first run's figures, or with --output FILE.html "
+        "a page that plays the episodes in a browser. No existing file is replaced.",
         "emberlink render pretrained:consensus pretrained:consensus env.radio.range=0 "
         "--output replay.html",
     )
@@ -195,32 +188,16 @@ def add_render(commands: Any) -> None:
         "for other settings of env and comm, or world=NAME",
     )
     several: dict[str, Any] = {"action": "append", "default": []}
-    add(
-        "--policy",
-        metavar="NAME",
-        help="a scripted policy to draw, too; may be given several times",
-        **several,
-    )
+    add("--policy", metavar="NAME", help="a scripted policy to draw, too; repeatable", **several)
     add(
         "--fire",
-        metavar="FIRE",
         help="a held-out fire: NAME, INDEX or NAME:INDEX, such as huygens:3 (default: huygens:0, "
         "or the first of the run's own fires if evaluations leave huygens out)",
     )
-    add(
-        "--checkpoint",
-        metavar="FILE",
-        type=path,
-        help="a checkpoint in place of the newest; one for each run",
-        **several,
-    )
-    add(
-        "--output",
-        metavar="PATH",
-        type=path,
-        help="a folder, or a new file that ends in .html (a page to play), .gif, .mp4 or .png (one "
-        "picture)",
-    )
+    about = {"metavar": "FILE", "help": "a checkpoint in place of the newest; one for each run"}
+    add("--checkpoint", type=path, **about, **several)
+    kinds = "a folder, or a new file: .html (a page to play), .gif, .mp4 or .png (one picture)"
+    add("--output", metavar="PATH", type=path, help=kinds)
     steps = between(0, 1_000_000)
     add("--step", metavar="STEP", type=steps, help="step of a .png (default: the last)")
     add("--frames", type=positive, default=126, help="maximum number of frames (default: 126)")
@@ -242,8 +219,7 @@ def add_sweep(commands: Any) -> None:
         _sweep,
         "train methods x seeds x setups",
         "Trains and evaluates every combination, several runs at a time. Finished runs in the "
-        "output folder are skipped, and stopped ones are resumed, so that the same command can be "
-        "repeated.",
+        "output folder are skipped, and stopped ones are resumed by the same command.",
         "emberlink sweep consensus positional setup=paper,tuned seed=0,1,2 output=runs",
         usage="emberlink sweep [--jobs N] [--dry-run] [METHOD ...] [key=value,value ...]",
     )
@@ -292,21 +268,10 @@ def add_world(commands: Any) -> None:
     )
     number = between(1, MOST_FIRES)
     add("--fires", metavar="N", type=number, default=100, help="number of fires (default: 100)")
-    add(
-        "--validation",
-        dest="split",
-        action="store_const",
-        const="validation",
-        default="test",
-        help="play on validation fires, for the design of a world, in place of test fires",
-    )
-    add(
-        "--json",
-        dest="output",
-        metavar="FILE",
-        type=path,
-        help="a new .json file for the numbers",
-    )
+    on_validation = {"const": "validation", "default": "test", "action": "store_const"}
+    why = "play on validation fires, for the design of a world, in place of test fires"
+    add("--validation", dest="split", help=why, **on_validation)
+    add("--json", dest="output", metavar="FILE", type=path, help="a new file for the numbers")
 
 
 def add_doctor(commands: Any) -> None:

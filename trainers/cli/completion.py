@@ -41,12 +41,8 @@ def _words(prefix: str, action: argparse.Action, **_: Any) -> list[str]:
         return config_files.known("method")
     if name == "RUN":
         folders = [path.rstrip("/") for path in glob.glob(f"{glob.escape(prefix)}*/")]
-        return [*_pretrained(), *sorted(folders)]
+        shipped = Path(str(files("emberlink.policies"))) / "pretrained"
+        paths = {file.parent.parent for file in shipped.glob("*/*/*/config.yaml")}
+        names = sorted(f"pretrained:{path.relative_to(shipped)}" for path in paths)
+        return [*names, *sorted(folders)]
     return FilesCompleter()(prefix)
-
-
-def _pretrained() -> list[str]:
-    """Returns the names of trained policies, as `pretrained:SETUP/METHOD`."""
-    shipped = Path(str(files("emberlink.policies"))) / "pretrained"
-    paths = sorted({file.parent.parent for file in shipped.glob("*/*/*/config.yaml")})
-    return [f"pretrained:{path.relative_to(shipped)}" for path in paths]

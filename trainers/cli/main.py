@@ -104,11 +104,7 @@ def _parser() -> tuple[Parser, list[str]]:
 
 @contextmanager
 def _one_line_warnings() -> Iterator[None]:
-    """Prints each `UserWarning` once as `emberlink: warning: ...`, until the end of the context.
-
-    Other categories are not meant for users and keep their place. Only what is printed changes:
-    warnings can still be recorded, ignored, or turned into errors.
-    """
+    """Prints each `UserWarning` once as `emberlink: warning: ...`, until the end of the context."""
     before, printed = warnings.formatwarning, set[str]()
 
     def formatted(message, category, *place) -> str:

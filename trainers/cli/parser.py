@@ -40,12 +40,11 @@ class Parser(argparse.ArgumentParser):
             parsed, unknown = self.parse_known_intermixed_args(args, namespace)
         finally:
             self._is_intermixed = False
-        for text in unknown:
-            if text.startswith("-"):
-                options = [option for action in self._actions for option in action.option_strings]
-                near = difflib.get_close_matches(text.partition("=")[0], options, n=1)
-                hint = f"did you mean {near[0]}?" if near else "settings are given as key=value"
-                self.error(f"option {text} is not known; {hint}")
+        if text := next((text for text in unknown if text.startswith("-")), ""):
+            options = [option for action in self._actions for option in action.option_strings]
+            near = difflib.get_close_matches(text.partition("=")[0], options, n=1)
+            hint = f"did you mean {near[0]}?" if near else "settings are given as key=value"
+            self.error(f"option {text} is not known; {hint}")
         return parsed, unknown
 
     def error(self, message: str) -> NoReturn:
@@ -64,48 +63,33 @@ def command(
     example: str,
     usage: str | None = None,
 ) -> Callable[..., Any]:
-    """Adds a command and returns the function that adds an argument to it.
+    """Adds a command, such as "world check", and returns the function that adds its arguments.
 
-    Args:
-        name: name of the command, with that of its group, such as "world check".
-        run: called with the options and a console, or `module:function` of emberlink.trainers,
-            which is imported when the command runs and called with the options and the console
-            as keyword arguments; returns the exit status.
-        summary: text in the list of commands.
+    `run` returns the exit status. It is called with the options and a console, or is
+    `module:function` of emberlink.trainers, which is imported when the command runs and called with
+    the options and the console as keyword arguments.
     """
-    epilog = f"example:\n  {example}"
     parser = commands.add_parser(
         name.split()[-1],
         help=summary,
         description=description,
-        epilog=epilog,
+        epilog=f"example:\n  {example}",
         usage=usage,
         formatter_class=_Help,
     )
-    parser.set_defaults(run=_calling(run) if isinstance(run, str) else run, command=name)
+
+    def call(options: argparse.Namespace, console: Any) -> int:
+        module, _, function = str(run).partition(":")
+        own = {k: v for k, v in vars(options).items() if k not in ("run", "command", "action")}
+        called = getattr(import_module(f"emberlink.trainers.{module}"), function)
+        return called(console=console, **own)
+
+    parser.set_defaults(run=call if isinstance(run, str) else run, command=name)
     return parser.add_argument
 
 
-def _calling(target: str) -> Callable[..., int]:
-    def run(options: argparse.Namespace, console: Any) -> int:
-        module, _, function = target.partition(":")
-        own = {name: value for name, value in vars(options).items() if name not in _PARSERS}
-        return getattr(import_module(f"emberlink.trainers.{module}"), function)(
-            console=console, **own
-        )
-
-    return run
-
-
-_PARSERS = ("run", "command", "action")
-"""options that are not of a command"""
-
-
 def command_group(commands: Any, name: str, summary: str, description: str, example: str) -> Any:
-    """Adds a command with subcommands, which alone prints its help; returns their group.
-
-    Arguments are those of `command`.
-    """
+    """Adds a command with subcommands, which alone prints its help; returns their group."""
 
     def print_help(_: argparse.Namespace, console: Any) -> int:
         console.print(group.format_help(), soft_wrap=True, end="")

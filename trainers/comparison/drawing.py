@@ -52,10 +52,7 @@ CURVES_CAPTION = (
 def training(curves: Frame, scripted: Frame, measures: Sequence[str]) -> Figure:
     """Returns training curves: the interquartile mean over seeds and its interval for each label.
 
-    Args:
-        curves: the training curves of a section.
-        scripted: results of scripted policies on the fires trained on.
-        measures: measure of each panel.
+    Each measure has a panel, with the results of scripted policies on the fires trained on.
     """
     colours = _colours(list(curves["label"].unique()))
     dashes = _dashes(scripted)
@@ -81,9 +78,7 @@ def training(curves: Frame, scripted: Frame, measures: Sequence[str]) -> Figure:
 def frozen(ranking: Frame, labels: Sequence[str]) -> Figure:
     """Returns the results of frozen policies: a row per label, a panel per measure.
 
-    Args:
-        ranking: the ranking on one set of fires; rows are sorted by its first measure.
-        labels: the labels as trained, which have colours.
+    Rows are sorted by the first measure of `ranking`; `labels`, as trained, have colours.
     """
     is_learned = ranking["policy"] == LEARNED
     learned, scripted = ranking[is_learned], ranking[~is_learned]
@@ -131,18 +126,12 @@ def _dashes(scripted: Frame) -> dict[str, Any]:
     return {name: DASHES[i % len(DASHES)] for i, name in enumerate(names)}
 
 
-def _with_legend(
-    figure: Figure,
-    colours: Mapping[str, str],
-    dashes: Mapping[str, Any],
-) -> Figure:
-    handles = [
-        Line2D([], [], color=colour, lw=2, label=_wrapped(name)) for name, colour in colours.items()
-    ]
-    handles += [
-        Line2D([], [], color="0.3", ls=dash, lw=1.3, label=_wrapped(f"scripted: {name}"))
-        for name, dash in dashes.items()
-    ]
+def _with_legend(figure: Figure, colours: Mapping[str, str], dashes: Mapping[str, Any]) -> Figure:
+    learned = {name: {"color": colour, "lw": 2} for name, colour in colours.items()}
+    lines = {
+        f"scripted: {name}": {"color": "0.3", "ls": d, "lw": 1.3} for name, d in dashes.items()
+    }
+    handles = [Line2D([], [], label=_wrapped(n), **s) for n, s in (learned | lines).items()]
     if handles:
         place = {"loc": "outside right upper", "frameon": False, "handlelength": 3}
         for text in figure.legend(handles=handles, **place).get_texts():

@@ -35,9 +35,8 @@ def trained_on(runs: Frame) -> str:
 def rank(runs: Frame, means: Frame) -> Frame:
     """Returns the rankings of a section: by set of fires, measure and rank.
 
-    The fires trained on are first, and the headline of the world; the reward is last, since methods
-    may have different ones. Scripted policies follow the trained ones; their `seeds` are empty and
-    `iqm` is the mean over fires.
+    The fires trained on and the world's headline are first; the reward is last, since methods may
+    have different ones. Scripted policies, without seeds, have the mean over fires as `iqm`.
     """
     count = learned(means)["measure"].value_counts()
     everywhere = len(learned(means).drop_duplicates(["run", "evaluated_with", "fires"]))
@@ -119,11 +118,7 @@ def differing(runs: Frame) -> Frame:
 
 
 def curves(runs: Frame) -> Frame:
-    """Returns the training curves of a section.
-
-    Columns: section, label, measure, episode, and the interquartile mean over seeds, `iqm`, with
-    the ends of its interval.
-    """
+    """Returns the interquartile mean over seeds, `iqm`, of each training episode of a section."""
     parts: list[Frame] = []
     for label, group in runs[runs["as_trained"]].groupby("label"):
         for measure in CURVES:

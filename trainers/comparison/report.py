@@ -38,6 +38,21 @@ NUMBERS = {
     *("radio off", "with radio", "no limits", "gain", "value"),
 }
 """columns that are aligned to the right"""
+RANKED = (
+    "IQM: interquartile mean over seeds; interval: bootstrap over seeds; ↑ more is better, "
+    "↓ less is better. A scripted policy has no seeds: its number is the mean over the fires."
+)
+GAINED = (
+    "Gain: with the world's radio less with the radio off. Value: gain / (without limits less "
+    "off), 0 where the radio adds nothing and 1 where it adds as much as one without limits. 95 % "
+    "intervals: over the fires for the same networks, over seeds and fires for retrained ones."
+)
+CLAIMED = (
+    "Ratio: interquartile mean against that of the best other method, above 1 where the method is "
+    "better, with its 95 % interval. A claim holds if the whole interval is at or above the factor "
+    "claimed, does not hold if all of it is below, and is undecided otherwise."
+)
+"""captions of the tables"""
 
 
 class Table(NamedTuple):
@@ -59,46 +74,35 @@ def _picture(png: bytes, caption: str) -> Picture:
 def tables(comparison: Comparison, section: str) -> list[Table]:
     """Returns the tables of a section: rankings, the value of communication, claims."""
     ranking, gains, claims = (
-        table[table["section"] == section].to_dict("records")
+        table[table["section"] == section]
         for table in (comparison.ranking, comparison.communication, comparison.claims)
     )
     few = f" *: fewer than {FEW} seeds are too few for an interval to be trusted."
-    caption = (
-        "IQM: interquartile mean over seeds; interval: bootstrap over seeds; ↑ more is better, "
-        "↓ less is better. A scripted policy has no seeds: its number is the mean over the fires."
-    ) + few * any(0 < len(row["seeds"]) < FEW for row in ranking)
-    found: list[Table] = []
-    for fires in dict.fromkeys(row["fires"] for row in ranking):
-        rows = [_ranked(row) for row in ranking if row["fires"] == fires]
-        found.append(Table(f"on {fires}", caption, pd.DataFrame(rows)))
-    if gains:
-        caption = (
-            "Gain: with the world's radio less with the radio off. Value: gain / (without limits "
-            "less off), 0 where the radio adds nothing and 1 where it adds as much as one without "
-            "limits. 95 % intervals: over the fires for the same networks, over seeds and fires "
-            "for retrained ones."
-        )
-        title = f"the gain of messages and the value of communication, by {gains[0]['measure']}"
-        found.append(Table(title, caption, pd.DataFrame(map(_gained, gains))))
-    if claims:
-        caption = (
-            "Ratio: interquartile mean against that of the best other method, above 1 where the "
-            "method is better, with its 95 % interval. A claim holds if the whole interval is at "
-            "or above the factor claimed, does not hold if all of it is below, and is undecided "
-            "otherwise."
-        )
-        rows = map(_claimed, sorted(claims, key=lambda row: row["label"]))
-        found.append(Table("the paper's claims", caption, pd.DataFrame(rows)))
+    few *= any(0 < len(seeds) < FEW for seeds in ranking["seeds"])
+    found = [
+        _table(f"on {fires}", RANKED + few, part, _ranked)
+        for fires, part in ranking.groupby("fires", sort=False)
+    ]
+    if len(gains):
+        title = "the gain of messages and the value of communication, by "
+        found.append(_table(title + gains["measure"].iloc[0], GAINED, gains, _gained))
+    if len(claims):
+        claims = claims.sort_values("label", kind="stable")
+        found.append(_table("the paper's claims", CLAIMED, claims, _claimed))
     return found
+
+
+def _table(title: str, caption: str, rows: Frame, text: Callable[..., dict[str, str]]) -> Table:
+    return Table(title, caption, pd.DataFrame(map(text, rows.to_dict("records"))))
 
 
 def _ranked(row: Mapping[str, Any]) -> dict[str, str]:
     measure, seeds = row["measure"], len(row["seeds"])
     digits = DIGITS.get(measure, 1)
     arrow = "↑" if measure in metrics.HIGHER_IS_BETTER else "↓"
+    not_ranked = row["not_ranked"] and f"(not ranked: {row['not_ranked']})"
     return {
-        "measure": f"{measure} "
-        + (f"(not ranked: {why})" if (why := row["not_ranked"]) else arrow),
+        "measure": f"{measure} {not_ranked or arrow}",
         "policy": row["label"],
         "seeds": f"{seeds}{'*' if seeds < FEW else ''}" if seeds else NONE,
         "IQM": _number(row["iqm"], digits),
@@ -110,9 +114,7 @@ def _ranked(row: Mapping[str, Any]) -> dict[str, str]:
 def _gained(row: Mapping[str, Any]) -> dict[str, str]:
     digits = DIGITS.get(row["measure"], 1)
     return {
-        "fires": row["fires"],
-        "policy": row["label"],
-        "radios": row["radios"],
+        **{"fires": row["fires"], "policy": row["label"], "radios": row["radios"]},
         "radio off": _number(row["none"], digits),
         "with radio": _number(row["with_radio"], digits),
         "no limits": _number(row["full"], digits),
@@ -129,8 +131,7 @@ def _claimed(row: Mapping[str, Any]) -> dict[str, str]:
         "claim": f"{row['claim']} ({row['measure']})",
         "verdict": row["verdict"] + few,
         "ratio": f"{_number(row['ratio'], 2)} {_ends(row, '', 2)}".rstrip(),
-        "best other": row["best_other"],
-        "fires": row["fires"],
+        **{"best other": row["best_other"], "fires": row["fires"]},
     }
 
 
@@ -258,10 +259,10 @@ def _latex(comparison: Comparison) -> str:
     texts: list[str] = []
     for (section, fires), part in comparison.ranking.groupby(["section", "fires"], sort=False):
         measure = part["measure"].iloc[0]
-        rows = map(_ranked, part[part["measure"] == measure].to_dict("records"))
-        table = pd.DataFrame(rows).drop(columns="measure")
         caption = f"{section}, on {fires}: {measure}".replace("_", r"\_")
-        texts.append(table.to_latex(index=False, escape=True, caption=caption))
+        rows = _table("", caption, part[part["measure"] == measure], _ranked).rows
+        rows = rows.drop(columns="measure")
+        texts.append(rows.to_latex(index=False, escape=True, caption=caption))
     return "\n".join(texts)
 
 
@@ -277,8 +278,8 @@ def _marl_eval(comparison: Comparison) -> str:
             for line in run.lines
         }
         steps["absolute_metrics"] = [*run.evaluation.results.values()][-1][LEARNED]
-        of_section = tasks.setdefault(str(row.section), {})
-        of_section.setdefault(str(row.label), {})[f"run_{row.seed}"] = steps
+        runs = tasks.setdefault(str(row.section), {}).setdefault(str(row.label), {})
+        runs[f"run_{row.seed}"] = steps
     return json.dumps({"emberlink": tasks}) + "\n"
 
 
@@ -303,15 +304,14 @@ def _details(runs: Frame, folder: Path) -> list[Table]:
     rows = trained[["label", "seed", "radio"]].rename(columns={"label": "policy"})
     rows["episodes of training"] = [run.settings["episodes"] for run in trained["object"]]
     rows["folder"] = trained["run"]
-    rows["replay"] = [_replay(Path(run), folder) for run in trained["run"]]
+    pages = [Path(run) / "figures" / "replay.html" for run in trained["run"]]
+    rows["replay"] = [
+        quote(os.fsencode(os.path.relpath(page.resolve(), folder.resolve())))
+        if page.is_file()
+        else ""
+        for page in pages
+    ]
     return [
         Table("Settings that differ", "", settings.astype(str)),
         Table("Runs", "", rows.astype(str)),
     ]
-
-
-def _replay(run: Path, folder: Path) -> str:
-    """Returns the address of a run's replay page, relative to the folder of the report."""
-    page = run / "figures" / "replay.html"
-    address = os.path.relpath(page.resolve(), folder.resolve()) if page.is_file() else ""
-    return quote(os.fsencode(address))

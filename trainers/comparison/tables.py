@@ -25,7 +25,7 @@ NOT_COMPARED = (
 WARM_START = "learner.warm_start"
 _FIRST = ("learner.name", "policy.memory")
 """keys that name a group before all others, which often follow from them"""
-_OF_SECTION = ("setup", "world", "env.horizon", "env.grid", "fires", "start_seed")
+_OF_SECTION = ("setup", "world", "env.horizon", "env.grid")
 
 Frame = Any
 """a pandas table; the types that pandas infers for its parts are too wide to be checked"""
@@ -40,7 +40,12 @@ def runs_table(runs: Sequence[Run]) -> tuple[Frame, list[LeftOut]]:
     """
     runs = sorted(runs, key=lambda r: (r.settings["seed"], r.path.name, r.path))
     runs.sort(key=lambda run: not pretrained.is_copy(run.path))
-    of_section = settings_table(pd.Series([_of_section(run) for run in runs]))
+    fixed = [
+        {k: v for k, v in run.settings.items() if k in _OF_SECTION or k.startswith("fire.")}
+        | {"fires": run.evaluation.fires, "start_seed": run.evaluation.start_seed}
+        for run in runs
+    ]
+    of_section = settings_table(pd.Series(fixed))
     names = of_section[["setup", "world", "fire.name"]].to_numpy()
     table: Frame = pd.DataFrame(
         {
@@ -77,12 +82,6 @@ def runs_table(runs: Sequence[Run]) -> tuple[Frame, list[LeftOut]]:
     same = pd.Series(alike, table.index)
     why = "not evaluated on the fires of " + first["run"] + " (emberlink eval RUN)"
     return table[same], left_out + list(zip(table["run"][~same], why[~same], strict=True))
-
-
-def _of_section(run: Run) -> dict[str, Any]:
-    """Returns the settings that are the same for all runs of a section."""
-    about = {**run.settings, "fires": run.evaluation.fires, "start_seed": run.evaluation.start_seed}
-    return {k: v for k, v in about.items() if k in _OF_SECTION or k.startswith("fire.")}
 
 
 def trained_with(run: Run) -> dict[str, str]:

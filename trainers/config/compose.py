@@ -10,14 +10,7 @@ from emberlink.envs.scenarios import fires_of
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.utils.validation import from_plain, plain, shown
 from emberlink.trainers.config.schema import RunConfig
-from emberlink.trainers.config.values import (
-    GROUPS,
-    change,
-    check_not_removed,
-    composed,
-    flat,
-    put,
-)
+from emberlink.trainers.config.values import GROUPS, change, check_not_removed, composed, flat, put
 
 
 def resolve(method: str, overrides: Sequence[str] = (), **settings: Any) -> RunConfig:
@@ -65,12 +58,10 @@ def evaluated_with(config: RunConfig, changes: Mapping[str, Any]) -> RunConfig:
 
 
 def in_world(config: RunConfig, world: str, **fire: Any) -> RunConfig:
-    """Returns a run's configuration in another world.
+    """Returns a run's configuration in another world, with its fire changed by `fire`.
 
-    The fire is that of the world. Of `env` and `evaluation`, the keys in which the two worlds
-    differ have the values of the other world; the run keeps the rest.
-
-    `fire` holds values of keys of the world's fire, such as `fire.path`.
+    Of `env` and `evaluation`, the keys in which the two worlds differ have the values of the other
+    world; the run keeps the rest.
     """
     if world == config.world and not fire:
         return config
@@ -88,22 +79,15 @@ def differences(
     one: RunConfig | Mapping[str, Any], other: RunConfig | Mapping[str, Any]
 ) -> dict[str, tuple[Any, Any]]:
     """Returns the dotted keys of both configurations whose values differ, with both values."""
-    first, second = (
-        flat(each if isinstance(each, Mapping) else to_values(each)) for each in (one, other)
-    )
-    return {
-        key: (first[key], second[key])
-        for key in first
-        if key in second and first[key] != second[key]
-    }
+    first, second = (flat(c if isinstance(c, Mapping) else to_values(c)) for c in (one, other))
+    return {key: (v, second[key]) for key, v in first.items() if second.get(key, v) != v}
 
 
 def from_values(values: Mapping[str, Any]) -> RunConfig:
     """Returns a configuration from plain values, such as those of a run folder's config.yaml."""
-    if isinstance(values, Mapping):
-        values = {key: value for key, value in values.items() if key != "baselines"}
-        for key, value in flat(values).items():
-            check_not_removed(key, value)
+    values = {key: value for key, value in values.items() if key != "baselines"}
+    for key, value in flat(values).items():
+        check_not_removed(key, value)
     return from_plain(RunConfig, values)
 
 

@@ -29,12 +29,7 @@ _ALIGNED = 8
 
 
 class Replay:
-    """A page that plays episodes on the same fire side by side; Jupyter shows it inline.
-
-    Args:
-        shown: the episodes and their titles.
-        fire: name of the fire.
-    """
+    """A page that plays episodes on the fire `fire` side by side; Jupyter shows it inline."""
 
     def __init__(self, shown: Sequence[Episode], fire: str):
         environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True)
@@ -81,10 +76,6 @@ def encode(shown: Sequence[Episode], fire: str) -> bytes:
 
     They are compressed with gzip, whose checksum finds damage, and begin with the length of a
     header in JSON. The header describes the episodes and lists the arrays, which follow.
-
-    Args:
-        shown: episodes on the same fire.
-        fire: name of the fire.
     """
     first = shown[0].recording
     arrays = _Arrays()
@@ -161,11 +152,9 @@ class _Arrays:
         self.content = b""
 
     def add(self, array: NDArray[Any], *, delta: bool = False) -> Mapping[str, Any]:
-        """Adds an array and returns where and what it is.
+        """Adds an array of integers or float32 and returns where and what it is.
 
-        Args:
-            array: integers or float32.
-            delta: whether to store the differences along the last axis, which compress better.
+        With `delta` the differences along the last axis are stored, which compress better.
         """
         stored = array
         if delta:  # differences of integers wrap round, and so do the sums in the browser

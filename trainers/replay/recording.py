@@ -94,12 +94,8 @@ class Recorder:
     """Records the episode of one environment; `add` is called at each step.
 
     It repeats what the environment computes and does not show: views, links and, in every world,
-    the ages.
-
-    Args:
-        member: index of the environment.
-        advised: whether the policy reads what the communication tells it.
-        hears: whether the policy receives messages of its own.
+    the ages. `member` is the index of the environment; `advised` tells whether the policy reads
+    what the communication tells it, and `hears` whether it receives messages of its own.
     """
 
     def __init__(self, *, member: int = 0, advised: bool = True, hears: bool = False):
@@ -107,12 +103,7 @@ class Recorder:
         self._steps: dict[str, list[NDArray[Any]]] = {}
 
     def add(self, world: WildfireEnv, td: TensorDictBase) -> None:
-        """Adds one step.
-
-        Args:
-            world: the environments, at this step.
-            td: what they returned: the result of a reset, or the "next" of a step.
-        """
+        """Adds one step, at which the environments returned `td`: of a reset, or its "next"."""
         now: Any = td[self._member : self._member + 1].cpu()
         if not self._steps:
             self._start(world)

@@ -39,12 +39,9 @@ Sample = Callable[[Pen, float, float], None]
 
 
 class Screen:
-    """Draws the same step of several episodes into one picture.
+    """Draws the same step of several episodes, of one grid and horizon, into one picture.
 
-    Args:
-        episodes: episodes with the same grid size and number of steps.
-        size: approximate pixels of a map's longer side.
-        grey_seen: whether seen fire is grey.
+    A map's longer side has about `size` pixels; seen fire is grey if `grey_seen`.
     """
 
     def __init__(self, episodes: Sequence[Episode], *, size: int, grey_seen: bool = False):

@@ -97,11 +97,7 @@ def read_tensors(path: Path, prefix: str = "") -> dict[str, Tensor]:
 
 
 def read_config(path: Path, **changes: Any) -> RunConfig:
-    """Returns the configuration that a checkpoint was trained with.
-
-    Args:
-        changes: keys and values to change, such as `device="cpu"`.
-    """
+    """Returns the configuration that a checkpoint was trained with, with changed values."""
     with naming(path):
         return from_values({**read_header(path).config, "output": "runs", **changes})
 
@@ -109,11 +105,9 @@ def read_config(path: Path, **changes: Any) -> RunConfig:
 def load_weights(
     path: Path, expected: Mapping[str, Tensor], config: RunConfig
 ) -> dict[str, Tensor]:
-    """Returns the weights of a checkpoint.
+    """Returns the weights of a checkpoint, which have the names, shapes and types of `expected`.
 
-    Args:
-        expected: the actors' tensors, with the expected names, shapes and types.
-        config: configuration of the networks that get the weights, for messages.
+    `config` is the configuration of the networks that get the weights, for messages.
     """
     header, weights = read_header(path), read_tensors(path, WEIGHTS)
     if reason := _misfit(weights, expected):

@@ -2,38 +2,16 @@
 
 import json
 import math
+import re
 from collections.abc import Mapping
 from typing import Any
 
-_WIDTH = 240
-"""maximum number of characters of a mapping on one line"""
-
 
 def dumps(value: Any) -> str:
-    """Returns a value as compact, readable JSON, with the texts "inf" and "-inf" for infinities.
-
-    A list of numbers or texts is on one line, however long. A mapping is on one line if that has at
-    most 240 characters; otherwise each of its keys begins a line.
-
-    Raises:
-        ValueError: a number is NaN.
-    """
-    return _dumps(finite(value), "")
-
-
-def _dumps(value: Any, indent: str) -> str:
-    if isinstance(value, dict):
-        line = json.dumps(value, allow_nan=False)
-        if len(line) + len(indent) <= _WIDTH:
-            return line
-        inner = indent + " "
-        items = [f"{inner}{json.dumps(key)}: {_dumps(item, inner)}" for key, item in value.items()]
-        return "{\n" + ",\n".join(items) + f"\n{indent}}}"
-    if isinstance(value, list) and any(isinstance(item, dict | list) for item in value):
-        inner = indent + " "
-        items = [inner + _dumps(item, inner) for item in value]
-        return "[\n" + ",\n".join(items) + f"\n{indent}]"
-    return json.dumps(value, allow_nan=False)
+    """Returns a value as readable JSON with infinities as text; a ValueError if a number is NaN."""
+    text = json.dumps(finite(value), indent=1, allow_nan=False)
+    # A line break after a bracket is never in a text, where it is escaped.
+    return re.sub(r"\[\n[^\[\]{}\"]*\n *\]", lambda found: " ".join(found[0].split()), text)
 
 
 def finite(value: Any) -> Any:

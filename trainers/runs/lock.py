@@ -17,11 +17,8 @@ class LockedError(UserError):
 class Lock:
     """Holds an exclusive lock on the file `lock` of a run folder until `release`.
 
-    The operating system releases the lock when the process ends, also after SIGKILL.
-
-    Raises:
-        LockedError: another process holds the lock.
-        UserError: the folder does not exist, or its file system has no locks.
+    The operating system releases the lock when the process ends, also after SIGKILL. A LockedError
+    if another process holds it.
     """
 
     def __init__(self, folder: Path):

@@ -7,9 +7,11 @@ world if it is not `paper`. Finished runs are packed with
     python -m emberlink.trainers.runs.pretrained RUN... policies/pretrained
 """
 
+import re
 import shutil
 import sys
 from dataclasses import replace
+from fnmatch import fnmatch
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -34,12 +36,9 @@ def is_name(text: str) -> bool:
 
 
 def read_run(text: str) -> RunFolder:
-    """Returns the run that an argument of the command line names, to be read.
+    """Returns the run of a folder, or of `pretrained:[SETUP/]METHOD[/SEED]`, to be read.
 
-    Args:
-        text: a run folder, or `pretrained:METHOD`, `pretrained:SETUP/METHOD` or
-            `pretrained:SETUP/METHOD/SEED`, where SETUP is such as `tuned` or, for the world
-            front, `strong_front`.
+    SETUP is such as `tuned` or, for the world front, `strong_front`.
     """
     return RunFolder(find_one(text) if is_name(text) else text)
 
@@ -72,20 +71,17 @@ def is_copy(folder: Path) -> bool:
 def find(text: str) -> list[Path]:
     """Returns the folders of the trained policies that match a name, lowest seed first.
 
-    Args:
-        text: see `read_run`; `pretrained:SETUP` matches all policies of a setup. A method alone
-            matches its policies in the first of `USUAL_SETUPS` that has it, else in all setups.
+    `pretrained:SETUP` matches all policies of a setup. A method alone matches its policies in the
+    first of `USUAL_SETUPS` that has it, else in all setups.
     """
     folders = sorted((file.parent for file in _shipped().glob("*/*/*/config.yaml")), key=_order)
     name = text.removeprefix(PREFIX).strip("/")
-    wanted = name.split("/")
-    if len(wanted) == 3:
-        wanted[2] = f"s{wanted[2].removeprefix('s')}"
-    matching = [path for path in folders if [*path.parts[-3:]][: len(wanted)] == wanted]
-    of_method = [path for path in folders if path.parts[-2] == name]
-    setups = [path.parts[-3] for path in of_method]
-    usual = next((setup for setup in USUAL_SETUPS if setup in setups), None)
-    matching = matching or [path for path in of_method if usual in (None, path.parts[-3])]
+    wanted = tuple(re.sub(r"/(\d+)$", r"/s\1", name).split("/"))
+    matching = [path for path in folders if path.parts[-3:][: len(wanted)] == wanted]
+    for setups in (*USUAL_SETUPS, "*"):
+        matching = matching or [
+            p for p in folders if fnmatch(p.parts[-3], setups) and p.parts[-2] == name
+        ]
     if not matching:
         known = ", ".join("/".join(path.parts[-3:]) for path in folders)
         raise UserError(f"{text}: no such trained policy; known: {known}")
@@ -107,11 +103,7 @@ def collection(config: RunConfig) -> str:
 
 
 def pack(run: RunFolder, into: Path) -> Path:
-    """Copies a finished run to the trained policies, without training states and critics.
-
-    Returns:
-        The new folder.
-    """
+    """Copies a finished run to the trained policies, without training states and critics."""
     trained = run.config(device="cpu")
     learner: Any = trained.learner
     if (start := getattr(learner, "warm_start", "")) and not is_name(start):

@@ -38,9 +38,6 @@ class RunFolder:
 
     A folder from somebody else may hold links, pipes or devices, through which a later command
     would read or write elsewhere. It is refused here, where every command opens it.
-
-    Args:
-        path: the folder; it may itself be a link.
     """
 
     def __init__(self, path: Path | str):
@@ -59,11 +56,7 @@ class RunFolder:
 
     @classmethod
     def create(cls, config: RunConfig, name: str = "") -> "RunFolder":
-        """Creates a new run folder in `config.output`, with config.yaml and the fires of files.
-
-        Args:
-            name: name of the folder; made of the date and the configuration if empty.
-        """
+        """Creates a new run folder in `config.output`, with config.yaml and the fires of files."""
         stamp = datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
         name = name or f"{stamp}_{config.method}_{config.setup}_{config.world}_s{config.seed}"
         with naming(f"output={config.output}"):
@@ -94,11 +87,9 @@ class RunFolder:
         return values
 
     def config(self, file: Path | None = None, **changes: Any) -> RunConfig:
-        """Returns the configuration that a checkpoint was trained with.
+        """Returns the configuration that a checkpoint was trained with, with changed values.
 
-        Args:
-            file: the checkpoint; the newest if None or, before there is one, config.yaml.
-            changes: keys and values to change, such as `device="cpu"`.
+        Without `file` it is that of the newest or, before there is one, of config.yaml.
         """
         values: dict[str, Any] = {"output": str(self.path.parent), **changes}
         if file is None and not self.newest.exists():
@@ -157,22 +148,10 @@ class RunFolder:
             for path in self.path.glob(pattern):
                 path.unlink(missing_ok=True)
 
-    def evaluation(self) -> dict[str, Any] | None:
-        """Returns the content of eval.json, or None if there is no such file."""
-        path = self.path / "eval.json"
-        if not path.exists():
-            return None
-        with naming(path):
-            content = json.loads(read_text(path, MAX_JSON))
-            if not isinstance(content, dict):
-                raise UserError("not an evaluation")
-        return content
-
     def evaluated(self) -> bool:
         """Returns whether eval.json is an evaluation of the newest checkpoint."""
-        with suppress(UserError):
-            evaluation = self.evaluation()
-            return evaluation is not None and evaluation.get("step") == self.step()
+        with suppress(ValueError, TypeError, KeyError, RecursionError):  # missing or damaged
+            return json.loads(read_text(self.path / "eval.json", MAX_JSON))["step"] == self.step()
         return False
 
     def step(self) -> int:
@@ -189,22 +168,14 @@ class RunFolder:
             atomic_io.write_bytes(self.path / file, text.encode())
 
     def figures(self) -> Path:
-        """Creates the folder of the figures if it is missing, and returns it.
-
-        Raises:
-            OSError: it cannot be created.
-        """
+        """Creates the folder of the figures if it is missing, and returns it."""
         folder = self.path / "figures"
         folder.mkdir(exist_ok=True)
         return folder
 
     @contextmanager
     def figure(self, file: str) -> Iterator[Path]:
-        """Yields a path for a figure, which is renamed to figures/FILE at the end.
-
-        Raises:
-            OSError: it cannot be written.
-        """
+        """Yields a path for a figure, which is renamed to figures/FILE at the end."""
         with atomic_io.replaced(self.figures() / file) as partial:
             yield partial
 

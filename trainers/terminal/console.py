@@ -5,19 +5,13 @@ from collections.abc import Iterator
 from copy import copy
 from functools import partial
 from typing import Any
+from unicodedata import category
 
 from rich import box
 from rich.console import Console, ConsoleOptions, RenderableType
 from rich.segment import Segment
 from rich.table import Table
 
-_CONTROL_CODES = (
-    *(code for code in range(0x20) if chr(code) not in "\t\n"),
-    *range(0x7F, 0xA0),
-    *range(0x202A, 0x202F),  # these and the next change the direction of text
-    *range(0x2066, 0x206A),
-)
-_NO_CONTROL = dict.fromkeys(_CONTROL_CODES, "?")
 _WITHOUT_TERMINAL = 1000
 """columns of a pipe or a file"""
 
@@ -79,4 +73,11 @@ class SafeConsole(Console):
     ) -> Iterator[Segment]:
         """Renders as rich does, with control characters in the text replaced."""
         for text, style, control in super().render(renderable, options):
-            yield Segment(text if control else text.translate(_NO_CONTROL), style, control)
+            shown = text if control or text.isprintable() else "".join(map(_harmless, text))
+            yield Segment(shown, style, control)
+
+
+def _harmless(character: str) -> str:
+    """Returns a character, or ? for one that controls the terminal or the direction of text."""
+    controls = category(character) in ("Cc", "Cf") and character not in "\t\n"
+    return "?" if controls else character

@@ -11,8 +11,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 class TrainingProgress:
     """Prints a line for each episode and each evaluation; a terminal also shows a bar.
 
-    `steps` and `episodes` are those of the whole training, `step` those done before; `headline` is
-    the measure of evaluations that is printed.
+    `steps` and `episodes` are those of the whole training, `step` those done before.
     """
 
     def __init__(
@@ -52,9 +51,8 @@ class TrainingProgress:
             f"episode {episode}/{self._episodes}: coverage {line['coverage']:.1f} %, "
             f"mean reward {line['mean_reward']:.2f}{pace}{left}"
         )
-        end = f"/{self._headline}"
-        evaluated = [name.removesuffix(end) for name in line if name.endswith(end)]
-        if evaluated:
-            shown = ", ".join(f"{fire} {line[fire + end]:.1f}" for fire in evaluated)
+        fires = [name.partition("/")[0] for name in line if name.endswith(f"/{self._headline}")]
+        if fires:
+            shown = ", ".join(f"{fire} {line[f'{fire}/{self._headline}']:.1f}" for fire in fires)
             text += f"\n  without noise, on validation fires: {self._headline} {shown}"
         self._console.print(text, soft_wrap=True)

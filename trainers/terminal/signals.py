@@ -14,12 +14,7 @@ class Interrupted(KeyboardInterrupt):
 class Interruption:
     """Calls `stop` at the first signal and raises `Interrupted` at a later Ctrl-C (SIGINT).
 
-    Machines and clusters send several of the other signals together, so these never end the
-    program at once.
-
-    Args:
-        stop: called at the first signal; requests the end of the training after a step.
-        signals: the signals to handle.
+    Clusters send several of the other signals together, so these never end the program at once.
     """
 
     def __init__(self, stop: Callable[[], None], signals: Sequence[signal.Signals] = _SIGNALS):

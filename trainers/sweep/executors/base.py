@@ -61,11 +61,7 @@ class Task:
 
 
 class Executor(ABC):
-    """Runs trainings.
-
-    Args:
-        config: an instance of `config_type`.
-    """
+    """Runs trainings; made of an instance of `config_type`."""
 
     config_type: ClassVar[type]
     """a dataclass; its fields are the keys of configs/executor/NAME.yaml without `name`"""
@@ -77,11 +73,7 @@ class Executor(ABC):
 
     @abstractmethod
     def submit(self, tasks: Sequence[Task]) -> Sequence[Any]:
-        """Starts or queues tasks without waiting for them and returns a handle of each.
-
-        Raises:
-            UserError: the cluster does not take them.
-        """
+        """Starts or queues tasks and returns a handle of each; a UserError if it takes no more."""
 
     @abstractmethod
     def poll(self, handle: Any) -> int | None:

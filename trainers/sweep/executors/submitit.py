@@ -137,11 +137,7 @@ class SubmititExecutor(Executor):
         return [_Handle(task, job) for task, job in zip(tasks, jobs, strict=True)]
 
     def _make(self, folder: Path) -> Any:
-        """Returns submitit's executor, which writes to a folder.
-
-        Raises:
-            RuntimeError: there is no SLURM here.
-        """
+        """Returns submitit's executor, which writes to a folder; a RuntimeError without SLURM."""
         config = self._config
         executor = import_module("submitit").AutoExecutor(
             _without_patterns(folder), config.cluster, slurm_max_num_timeout=config.requeues
