@@ -25,7 +25,7 @@ NOT_COMPARED = (
 WARM_START = "learner.warm_start"
 _FIRST = ("learner.name", "policy.memory")
 """keys that name a group before all others, which often follow from them"""
-_OF_SECTION = ("setup", "world", "env.horizon", "env.grid")
+_OF_SECTION = ("setup", "world", "env.horizon", "env.grid", "fires", "start_seed")
 
 Frame = Any
 """a pandas table; the types that pandas infers for its parts are too wide to be checked"""
@@ -40,33 +40,8 @@ def runs_table(runs: Sequence[Run]) -> tuple[Frame, list[LeftOut]]:
     """
     runs = sorted(runs, key=lambda r: (r.settings["seed"], r.path.name, r.path))
     runs.sort(key=lambda run: not pretrained.is_copy(run.path))
-    fixed = [
-        {k: v for k, v in run.settings.items() if k in _OF_SECTION or k.startswith("fire.")}
-        | {"fires": run.evaluation.fires, "start_seed": run.evaluation.start_seed}
-        for run in runs
-    ]
-    of_section = settings_table(pd.Series(fixed))
-    names = of_section[["setup", "world", "fire.name"]].to_numpy()
-    table: Frame = pd.DataFrame(
-        {
-            "section": [f"setup {s}, world {w}, trained on {f}" for s, w, f in names],
-            "label": [run.name for run in runs],
-            "run": [str(run.path) for run in runs],
-            "method": [run.settings["method"] for run in runs],
-            "setup": of_section["setup"],
-            "world": of_section["world"],
-            "trained_on": of_section["fire.name"],
-            "radio": [radio_text(run.now) for run in runs],
-            "evaluated_with": [
-                ", ".join(f"{key}={word(value)}" for key, value in run.evaluated_with.items())
-                for run in runs
-            ],
-            "seed": [run.settings["seed"] for run in runs],
-            "settings": [trained_with(run) for run in runs],  # that affect training
-            "as_trained": [not run.evaluated_with for run in runs],
-            "object": runs,
-        }
-    )
+    of_section = settings_table(pd.Series([_of_section(run) for run in runs]))
+    table: Frame = pd.DataFrame([_row(run) for run in runs])
     table["section"] = named(table["section"], of_section.drop(columns=["setup", "world"]))
     parts = [named(p["label"], settings_table(p["settings"])) for _, p in table.groupby("section")]
     other = table["evaluated_with"].map(lambda text: text and f", evaluated with {text}")
@@ -82,6 +57,24 @@ def runs_table(runs: Sequence[Run]) -> tuple[Frame, list[LeftOut]]:
     same = pd.Series(alike, table.index)
     why = "not evaluated on the fires of " + first["run"] + " (emberlink eval RUN)"
     return table[same], left_out + list(zip(table["run"][~same], why[~same], strict=True))
+
+
+def _of_section(run: Run) -> dict[str, Any]:
+    """Returns the settings that are the same for all runs of a section."""
+    about = {**run.settings, "fires": run.evaluation.fires, "start_seed": run.evaluation.start_seed}
+    return {k: v for k, v in about.items() if k in _OF_SECTION or k.startswith("fire.")}
+
+
+def _row(run: Run) -> dict[str, Any]:
+    setup, world, fire = (run.settings[key] for key in ("setup", "world", "fire.name"))
+    changed = ", ".join(f"{key}={word(value)}" for key, value in run.evaluated_with.items())
+    return {
+        "section": f"setup {setup}, world {world}, trained on {fire}",
+        **{"label": run.name, "run": str(run.path), "method": run.settings["method"]},
+        **{"setup": setup, "world": world, "trained_on": fire, "radio": radio_text(run.now)},
+        **{"evaluated_with": changed, "seed": run.settings["seed"]},
+        **{"settings": trained_with(run), "as_trained": not changed, "object": run},
+    }
 
 
 def trained_with(run: Run) -> dict[str, str]:

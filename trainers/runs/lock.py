@@ -18,13 +18,15 @@ class Lock:
     """Holds an exclusive lock on the file `lock` of a run folder until `release`.
 
     The operating system releases the lock when the process ends, also after SIGKILL. A LockedError
-    if another process holds it.
+    if another process holds it for more than `patience` seconds.
     """
 
-    def __init__(self, folder: Path):
+    def __init__(self, folder: Path, patience: float = 0):
         self.path = folder / "lock"
         # No fallback to a lock without the operating system: its file would outlive the process.
-        self._lock = FileLock(self.path, timeout=0, thread_local=False, fallback_to_soft=False)
+        self._lock = FileLock(
+            self.path, timeout=patience, thread_local=False, fallback_to_soft=False
+        )
         try:
             folder.stat()  # an error if it is missing: FileLock would create it
             self._lock.acquire()

@@ -12,12 +12,11 @@ import runpy
 import signal
 import sys
 import threading
-import time
 from contextlib import suppress
 from pathlib import Path
 
 from emberlink.envs.utils.errors import UserError
-from emberlink.trainers.runs.lock import Lock, LockedError
+from emberlink.trainers.runs.lock import Lock
 
 _PATIENCE = 60
 """seconds in which an earlier process of the run may save and end"""
@@ -28,21 +27,10 @@ def _end_with_parent() -> None:
     os.kill(os.getpid(), signal.SIGTERM)
 
 
-def _wait_for_lock(run: Path) -> None:
-    """Waits while another process trains the run; `train` reports if it still does so then."""
-    for _ in range(_PATIENCE):
-        with suppress(UserError):
-            try:
-                Lock(run).release()
-            except LockedError:
-                time.sleep(1)
-                continue
-        return
-
-
 if __name__ == "__main__":
     threading.Thread(target=_end_with_parent, daemon=True).start()
-    _wait_for_lock(Path(sys.argv[1]))
+    with suppress(UserError):  # `train` reports it
+        Lock(Path(sys.argv[1]), _PATIENCE).release()
     sys.argv[1:2] = ["train", f"resume={sys.argv[1]}"]
     # By name, since importing the command line here would be circular.
     runpy.run_module("emberlink.trainers.cli", run_name="__main__", alter_sys=True)

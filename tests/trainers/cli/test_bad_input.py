@@ -92,8 +92,16 @@ def test_a_mistake_is_one_line_and_leaves_no_files(arguments, words, tmp_path, m
     assert not any(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize(("wrong", "seconds"), [("nosuchmethod", 1), ("independent x=1", 2)])
-def test_a_wrong_name_is_answered_without_torch(wrong, seconds):
+@pytest.mark.parametrize(
+    ("wrong", "seconds"),
+    [
+        ("nosuchmethod", 1),
+        ("independent x=1", 2),
+        ("independent seed=-1", 2),
+        ("independent learner.tau=fast", 2),
+    ],
+)
+def test_a_wrong_name_or_value_is_answered_without_torch(wrong, seconds):
     program = (
         "import sys, time; from emberlink.trainers.cli.main import main\n"
         f"status = main({['train', *wrong.split()]})\n"
