@@ -57,13 +57,6 @@ class Condition:
         keeps = operator.le if self.at_most else operator.ge
         return any(keeps(number, self.bound) for number in self.figures.values())
 
-    @property
-    def record(self) -> dict[str, Any]:
-        """The condition for JSON."""
-        bound = {"at_most" if self.at_most else "at_least": self.bound}
-        figures = _rounded(self.figures)
-        return {"policies": self.name, "figures": figures, **bound, "passes": self.passes}
-
     def __str__(self) -> str:
         figures = "; ".join(f"{name} {number:.1f}" for name, number in self.figures.items())
         kind = "at most" if self.at_most else "at least"
@@ -73,7 +66,12 @@ class Condition:
 
 
 def conditions(means: Means, headline: str) -> list[Condition]:
-    """Returns the conditions of a world, of the means of at least the four needed policies."""
+    """Returns the conditions of a world.
+
+    Args:
+        means: the measures of at least the four needed policies.
+        headline: the world's headline measure, in %.
+    """
     none, merged = means[ALONE], means[ALL]
     gains = {f"{headline}, points": merged[headline] - none[headline]}
     if none.get("front_age"):
@@ -90,7 +88,9 @@ def conditions(means: Means, headline: str) -> list[Condition]:
 def world_config(overrides: Sequence[str]) -> RunConfig:
     """Returns the configuration of a world: `world=NAME` and other `key=value`.
 
-    A UserError if its headline is not a share, or it does not evaluate all needed policies.
+    Raises:
+        UserError: a key or value is wrong, the headline is not a share, or the world does not
+            evaluate all needed policies.
     """
     config = resolve(_METHOD, overrides)
     headline = config.evaluation.headline
@@ -158,14 +158,8 @@ def check(
         for condition in found:
             console.print(str(condition), style="" if condition.passes else "red", soft_wrap=True)
         console.print()
-        record[config.world] = {
-            "fires": fires,
-            "split": split,
-            "headline": config.evaluation.headline,
-            "passes": all(condition.passes for condition in found),
-            "conditions": [condition.record for condition in found],
-            "means": {policy: _rounded(numbers) for policy, numbers in measured.items()},
-        }
+        numbers = {"fires": fires, "split": split, "headline": config.evaluation.headline}
+        record[config.world] = numbers | _record(measured, found)
     if output is not None:
         with created(output) as file:
             file.write_text(compact_json.dumps(record) + "\n", encoding="utf-8")
@@ -196,6 +190,23 @@ def _table(config: RunConfig, measured: Means, fires: str) -> Table:
     for policy, of_policy in measured.items():
         table.add_row(policy, *(f"{of_policy[name]:.1f}" for name in order))
     return table
+
+
+def _record(measured: Means, found: Sequence[Condition]) -> dict[str, Any]:
+    """Returns the conditions and means of a world for JSON."""
+    return {
+        "passes": all(condition.passes for condition in found),
+        "conditions": [
+            {
+                "policies": condition.name,
+                "figures": _rounded(condition.figures),
+                "at_most" if condition.at_most else "at_least": condition.bound,
+                "passes": condition.passes,
+            }
+            for condition in found
+        ],
+        "means": {policy: _rounded(of_policy) for policy, of_policy in measured.items()},
+    }
 
 
 def _rounded(figures: Mapping[str, float]) -> dict[str, float]:
