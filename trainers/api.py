@@ -142,7 +142,9 @@ def evaluate(
     if not 1 <= count <= MAX_FIRES:
         raise UserError(f"episodes={count}: expected 1 to {MAX_FIRES}")
     report = progress or (lambda *_: None)
-    return evaluate_policy(policy.config, policy, fires=count, scripted=scripted, report=report)
+    return evaluate_policy(
+        policy.config, policy.actor, fires=count, scripted=scripted, report=report
+    )
 
 
 def load(

@@ -1,6 +1,7 @@
 """Tests that actions are held, by a policy and by the environment, and what learners receive."""
 
 import itertools
+from dataclasses import replace
 
 import pytest
 import torch
@@ -14,6 +15,7 @@ from emberlink.policies.state import Stateful
 from emberlink.trainers import make_env
 from emberlink.trainers.config.compose import resolve
 from emberlink.trainers.config.schema import build_comm
+from emberlink.trainers.evaluation import evaluate
 from emberlink.trainers.training.setup import TrainingSetup
 
 COUNT = (keys.AGENTS, "count")
@@ -184,3 +186,14 @@ def test_the_horizon_is_a_multiple_of_the_held_steps():
 def test_the_environment_holds_actions_for_a_part_of_the_horizon():
     with pytest.raises(UserError, match="hold=7: expected a divisor of the horizon, 1000 steps"):
         WildfireEnv(1, hold=7)
+
+
+def test_an_evaluation_of_held_actions_equals_one_step_by_step():
+    config = resolve("consensus", ["setup=strong", "policy.hold=5", "env.horizon=40"])
+    config = replace(config, fire=replace(config.fire, num_train_fires=1))
+    actor = TrainingSetup(replace(config, num_envs=1)).actor
+    (fires,) = evaluate.evaluation_fires(config, 3).values()
+    assert isinstance(actor, Held)
+    together = evaluate.play_learned(config, actor, fires, block=2)
+    assert together == evaluate.play_blocks(config, lambda _: actor, fires, block=2)
+    assert len(together["coverage"]) == 3

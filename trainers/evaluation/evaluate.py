@@ -24,6 +24,7 @@ from emberlink.envs.scenarios import ScenarioConfig, fires_of, same_tests
 from emberlink.envs.utils.atomic_io import write_bytes
 from emberlink.envs.utils.errors import UserError
 from emberlink.envs.wildfire import WildfireEnv
+from emberlink.policies.hold import Held
 from emberlink.policies.scripted.base import SCRIPTED, Scripted
 from emberlink.trainers.build import build_env
 from emberlink.trainers.config.compose import resolve
@@ -42,7 +43,7 @@ BLOCK = 50
 
 Policy = Callable[[TensorDictBase], TensorDictBase]
 Watch = Callable[[WildfireEnv, TensorDictBase], None]
-"""called at each step, from 0 to the horizon, with the environments and what they returned: the
+"""called at each step, from 0 to the horizon with the environments and what they returned: the
 result of the reset, or the "next" of the step"""
 
 
@@ -62,7 +63,7 @@ def play(env: TransformedEnv, policy: Policy, watch: Watch | None = None) -> dic
         td = env.reset()
         if watch is not None:
             watch(world, td)
-        for _ in range(world.config.horizon):
+        for _ in range(world.max_steps):
             td = env.step(policy(td))
             actions.append(td.get(keys.ACTION))
             after = td.get("next")
@@ -71,10 +72,10 @@ def play(env: TransformedEnv, policy: Policy, watch: Watch | None = None) -> dic
                 after.update({} if sent is None else {keys.BYTES_SENT: sent})
             if watch is not None:
                 watch(world, after)
-            steps.append(metrics.measured_steps(after))
+            steps.append(metrics.measured_steps(after.unsqueeze(1)))
             td = step_mdp(td, keep_other=True)
     check_finite(torch.stack(actions))
-    episode: Any = torch.stack(cast(Any, steps), dim=1)
+    episode: Any = torch.cat(cast(Any, steps), 1)
     return metrics.episode_metrics(episode)
 
 
@@ -136,7 +137,7 @@ def evaluate(
         say = partial(report, fire)
         say(LEARNED)
         watched = watch if fire == shown_scenario(config) else None
-        results[fire] = {LEARNED: play_blocks(config, lambda _: actor, arrival, watch=watched)}
+        results[fire] = {LEARNED: play_learned(config, actor, arrival, watch=watched)}
         for name in config.evaluation.scripted if scripted else ():
             results[fire][name] = play_scripted(config, name, arrival, report=say)
     return results
@@ -156,9 +157,22 @@ def validate(config: RunConfig, actor: Policy) -> dict[str, float]:
     for name, scenario in evaluation_scenarios(config).items():
         arrival = fires_of(scenario).validation(count, config.env.grid, config.env.horizon)
         seed, block = VALIDATION_START_SEED, min(count, BLOCK)
-        measured = play_blocks(config, lambda _: actor, arrival, start_seed=seed, block=block)
+        measured = play_learned(config, actor, arrival, start_seed=seed, block=block)
         result |= {f"{name}/{measure}": value for measure, value in means(measured).items()}
     return result
+
+
+def play_learned(
+    config: RunConfig, actor: Policy, arrival: Tensor, *, watch: Watch | None = None, **more: Any
+) -> Measured:
+    """Returns the measures of a frozen policy; arguments are those of `play_blocks`.
+
+    Where nobody watches, the steps of a held action are computed at once.
+    """
+    if watch is None and isinstance(actor, Held):
+        inner, hold = actor.policy, actor.steps
+        return play_blocks(config, lambda _: inner, arrival, hold=hold, **more)
+    return play_blocks(config, lambda _: actor, arrival, watch=watch, **more)
 
 
 def play_scripted(
@@ -240,6 +254,7 @@ def play_blocks(
     *,
     start_seed: int = START_SEED,
     block: int = BLOCK,
+    hold: int = 1,
     watch: Watch | None = None,
 ) -> Measured:
     """Plays one episode on each fire, in batches.
@@ -250,6 +265,7 @@ def play_blocks(
         arrival: times of the fires in steps, float32 [fires, X, Y] or [fires, 2, X, Y].
         start_seed: seed of episode 0; episode i has this seed plus i.
         block: environments per batch. The last batch is padded with episodes that are not counted.
+        hold: steps for which the environment holds each action.
         watch: watches the first batch.
 
     Returns:
@@ -265,6 +281,7 @@ def play_blocks(
             fire=arrival[episodes.clamp(max=count - 1)],
             seed=(start_seed + episodes).tolist(),
             device=config.device,
+            hold=hold,
         )
         world: Any = env.base_env
         played = play(env, policy(world), None if start else watch)

@@ -55,6 +55,11 @@ class TrainedPolicy(TensorDictSequential):
         self.checkpoint = checkpoint
         self.changes = tuple(changes)
 
+    @property
+    def actor(self) -> Any:
+        """The networks, with held actions."""
+        return self.module[0]
+
     def make_tensordict_primer(self) -> TensorDictPrimer:
         """Returns a transform that adds the policy's state to an environment; `make_env` does."""
         return primer_of(self)
