@@ -33,6 +33,9 @@ class Messages(nn.Module):
 
     key_size: ClassVar[int] = 0
     """numbers of a message besides its `size`, each a byte"""
+    fault: str = "none"
+    """what happens to messages on their way: nothing; `zero`, all their numbers become 0; or
+    `shuffle`, a UAV's message is replaced by that of another UAV in another environment"""
 
     def __init__(self, grouping: Grouping, inputs: int, size: int, **start: Any):
         super().__init__()
@@ -47,9 +50,20 @@ class Messages(nn.Module):
             hears: bool [envs, uavs, uavs], whether a UAV (row) hears another one (column).
         """
         batch = hears.shape[:2]
-        said = self.grouping.join(eight_bits(self.say(features)), batch)
+        said = self.arrive(self.grouping.join(eight_bits(self.say(features)), batch))
         weights = self.weights(features, hears).to(said.dtype)
         return self.grouping.split(weights @ said, batch)
+
+    def arrive(self, said: Tensor) -> Tensor:
+        """Returns numbers that UAVs say, [envs, uavs, numbers], as others hear them: see `fault`.
+
+        Shuffled numbers are those of UAV i - 1 of environment e - 1, counted cyclically.
+        """
+        if self.fault == "zero":
+            return torch.zeros_like(said)
+        if self.fault == "shuffle":
+            return said.roll((1, 1), (0, 1))
+        return said
 
     @abstractmethod
     def weights(self, features: Tensor, hears: Tensor) -> Tensor:
@@ -82,7 +96,7 @@ class Attention(Messages):
 
     def weights(self, features: Tensor, hears: Tensor) -> Tensor:
         batch = hears.shape[:2]
-        key = self.grouping.join(eight_bits(self.key(features)), batch)
+        key = self.arrive(self.grouping.join(eight_bits(self.key(features)), batch))
         query = self.grouping.join(self.query(features), batch)
         scores = (query @ key.mT / math.sqrt(self.key_size)).masked_fill(~hears, -torch.inf)
         # A UAV that hears nobody has no softmax.

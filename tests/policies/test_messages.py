@@ -246,3 +246,32 @@ def test_the_actor_reads_the_links():
     silent = given.clone().set(keys.HEARS, torch.zeros(1, 6, 6, dtype=torch.bool))
     assert not actor(heard)[keys.ACTION].equal(actor(silent)[keys.ACTION])
     assert ("next", *MEMORY) in heard.keys(True, True)
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_faults_change_what_a_trained_team_does(scheme):
+    setup = TrainingSetup(resolve("independent", [
+        "setup=strong", f"policy.message={scheme}", "env.horizon=40", "num_envs=4", "episodes=2",
+        "env.radio.range=20",
+    ]))  # fmt: skip
+    setup.dry_run(80)
+    net = setup.learner.actor.module
+    observed, hears = drawn(4, 6, FEATURES).float(), torch.ones(4, 6, 6) - torch.eye(6) > 0
+
+    def acted(fault: str, links=hears) -> torch.Tensor:
+        net.messages.fault = fault
+        return net.step([observed, links], None)[0]
+
+    as_said, silent = acted("none"), acted("none", torch.zeros_like(hears))
+    assert acted("zero").equal(silent)
+    assert not as_said.equal(silent)
+    shuffled = acted("shuffle")
+    assert not shuffled.equal(as_said)
+    # By hand: what UAV 0 of environment 0 does if only UAV 2 speaks, with the words of UAV 1 of 3.
+    only = torch.zeros_like(hears)
+    only[0, 0, 2] = only[3, 0, 1] = True
+    moved = observed.clone()
+    moved[3, 0] = observed[0, 0]
+    net.messages.fault = "none"
+    expected = net.step([moved, only], None)[0][3, 0]
+    torch.testing.assert_close(acted("shuffle", only)[0, 0], expected)

@@ -77,6 +77,8 @@ class EvaluationConfig:
     """scripted policies to evaluate"""
     headline: str
     """the measure that chooses the networks of best.safetensors on validation fires"""
+    message_fault: Literal["none", "zero", "shuffle"] = "none"
+    """what happens to learned messages when a frozen policy is evaluated (`Messages.fault`)"""
 
     @field_validator("scripted")
     @classmethod

@@ -149,6 +149,10 @@ def load_actor(config: RunConfig, checkpoint: Path) -> TensorDictModule:
             stacklevel=2,
         )
     network.load_state_dict({name.removeprefix(ACTOR): v for name, v in weights.items()})
+    if (fault := config.evaluation.message_fault) != "none":
+        if getattr(network, "messages", None) is None:
+            raise UserError(f"evaluation.message_fault={fault}: the policy has no learned messages")
+        network.messages.fault = fault
     return actor.requires_grad_(False)
 
 

@@ -81,6 +81,7 @@ def test_bad_input_gives_one_line_and_leaves_no_files(arguments, words, tmp_path
         (["world", "check", "front", "--json", "out.txt"], ["must end in .json"]),
         (["train", "consensus", "learner=imitation"], ["env.observation=vector: the teacher"]),
         (["train", "maps", "env.observation=vector"], ["comm.name=maps exchanges the UAVs' maps"]),
+        (["eval", "pretrained:maps", "evaluation.message_fault=zero"], ["no learned messages"]),
         (["train", *IMITATE, "learner.teacher=courier"], ["known: map_greedy"]),
         (["train", *IMITATE, "learner.samples=9", "learner.buffer_size=8"], ["buffer_size=8"]),
         (["train", "maps", "learner=ippo", "learner.warm_start=no"], ["learner.warm_start=no:"]),
